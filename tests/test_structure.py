@@ -102,6 +102,52 @@ def test_a_package_imports_from_lower_levels_only(own: str) -> None:
         assert [other for other in sorted(imported_rooms) if level[other] >= level[name]] == []
 
 
+LEAVES = {
+    "fleet": {"cli.fleet", "views.fleet", "views.pooled_diagnosis", "views.figures.fleet", "views.report.fleet"},
+    "exchange.certificate": {"cli.certificate", "views.certificate"},
+    "reproduction": {"cli.paper", "views.paper", "views.figures.experiment"},
+}
+"""Packages that nothing else builds on, and those who may know each: its command, its views, its page."""
+
+
+def is_in(module: str, package: str) -> bool:
+    return module == package or module.startswith(f"{package}.")
+
+
+@pytest.mark.parametrize("leaf", LEAVES)
+def test_a_leaf_is_known_to_its_command_and_its_views_alone(leaf: str) -> None:
+    """And to the package itself, whose public names are imported when they are used."""
+    package, known_to = f"kf_calib.{leaf}", {f"kf_calib.{name}" for name in LEAVES[leaf]}
+    assert known_to <= set(MODULES)
+    importing = {name for name in MODULES if any(is_in(other, package) for other in modules()[name])}
+    assert {name for name in importing if not is_in(name, package)} <= known_to | {"kf_calib"}
+    for name in known_to:
+        among = {other for other in MODULES if name in modules()[other]}
+        assert all(other in known_to or other.startswith("kf_calib.cli.") for other in among), name
+
+
+def test_everything_else_is_imported_and_the_tests_of_the_core_are_collected_without_leaves() -> None:
+    """Commands, too, which import what they need when they run."""
+    leafy = [f"kf_calib.{name}" for leaf, known_to in LEAVES.items() for name in (leaf, *known_to)
+             if not name.startswith("cli.")]  # fmt: skip
+    others = sorted(name for name in MODULES if not any(is_in(name, leaf) for leaf in leafy) and "__main__" not in name)
+    folders = [str(ROOT / "tests" / name) for name in sorted({*CORE, "sources"})]
+    code = f"""
+import sys, importlib
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if any(name == leaf or name.startswith(leaf + ".") for leaf in {leafy}):
+            raise ModuleNotFoundError(name)
+sys.meta_path.insert(0, Missing())
+for name in {others}:
+    importlib.import_module(name)
+import pytest
+sys.exit(pytest.main(["--collect-only", "-qq", "-n", "0", "-p", "no:cacheprovider", *{folders}]))
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+
+
 def test_nothing_lies_beside_the_packages() -> None:
     flat = sorted(path.name for path in PACKAGE.iterdir() if path.is_file() and path.suffix == ".py")
     assert set(flat) <= {"__init__.py", "__main__.py", "errors.py"}

@@ -28,6 +28,8 @@ UNITS = ("rad", "rad", "1", "m/s^2") * 3
 NOMINAL: dict[str, float] = dict.fromkeys(SYMBOLS, 0.0) | {
     "theta1": math.radians(0.5), "theta3": math.radians(0.5), "phi3": -math.pi / 2, "K1": 1.0, "K2": 1.0, "K3": 1.0,
 }  # fmt: skip
+DEVIATIONS = np.tile([math.radians(30 / 3600), math.radians(30 / 3600), 5e-5, 5e-5], 3)
+"""Deviations (12,) from nominal that the paper's experiment has to find, its Table 1: rad, rad, 1, m/s^2."""
 
 
 def nominal(differing: Mapping[str, float] | None = None) -> Floats:

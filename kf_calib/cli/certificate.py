@@ -70,6 +70,19 @@ def certificate(
         show(views.certificate_report(made, standing, out, xml))
 
 
+def stated_in(certificate: Path | None, statement: Path | None) -> Statement | None:
+    """What a certificate states, checked before the work; None where there is to be none."""
+    if certificate is None:
+        if statement is not None:
+            raise click.UsageError("--statement is for a certificate: name one with --certificate OUT.pdf.")
+        return None
+    from kf_calib.exchange.certificate import statement as statements
+    from kf_calib.support.extras import need
+
+    need("typst", "report", "a certificate")
+    return statements.read(statement)
+
+
 def write_certificate(
     outputs: Outputs, out: Path, own: Statement, calibrated: tuple[SavedCalibration, Model],
     before: tuple[SavedCalibration, Model] | None = None, xml: Path | None = None, schema: Path | None = None,

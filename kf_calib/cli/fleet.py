@@ -185,10 +185,10 @@ def fleet(
 
 
 def _save_page(overview: FleetOverview, commands: Sequence[str], path: Path) -> None:
-    from kf_calib.views.report.contents import page_of
+    from kf_calib.views.report.fleet import fleet_page
     from kf_calib.views.report.page import save
 
-    save(page_of(overview, (), commands), path)
+    save(fleet_page(overview, commands), path)
 
 
 def _reference(path: Path | None) -> ReferenceUnit | None:

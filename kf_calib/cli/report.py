@@ -11,7 +11,7 @@ import rich_click as click
 from click import get_current_context  # rich_click declares that there may be none
 from click.core import ParameterSource
 
-from kf_calib.cli.certificate import statement_option, write_certificate
+from kf_calib.cli.certificate import stated_in, statement_option, write_certificate
 from kf_calib.cli.files import Delivery, claimed, delivery, output_option
 from kf_calib.cli.options import (
     INPUT,
@@ -33,7 +33,6 @@ from kf_calib.cli.options import (
 
 if TYPE_CHECKING:
     from kf_calib.diagnosis.results import Diagnosis
-    from kf_calib.exchange.certificate.statement import Statement
     from kf_calib.views.report.measured import Measured
 
 report_option = output_option(
@@ -87,7 +86,7 @@ def report(
     from kf_calib.views.report.contents import page_of
     from kf_calib.views.report.page import save
 
-    outputs, stated = claimed(overwrite=overwrite), _statement(certificate, statement)
+    outputs, stated = claimed(overwrite=overwrite), stated_in(certificate, statement)
     has_other_model = against is not None and against.suffix == ".toml"
     other_options = options | ({"model_file": against, "effects": ()} if has_other_model else {})
     if has_other_model:
@@ -119,19 +118,6 @@ def report(
             show(f"saved {certificate}")
     if strict and found.test.consistent is False:
         ctx.exit(1)
-
-
-def _statement(certificate: Path | None, statement: Path | None) -> Statement | None:
-    """What a certificate states, checked before the work; None where there is to be none."""
-    if certificate is None:
-        if statement is not None:
-            raise click.UsageError("--statement is for a certificate: name one with --certificate OUT.pdf.")
-        return None
-    from kf_calib.exchange.certificate import statement as statements
-    from kf_calib.support.extras import need
-
-    need("typst", "report", "a certificate")
-    return statements.read(statement)
 
 
 def save_report(

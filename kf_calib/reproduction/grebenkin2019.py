@@ -22,6 +22,7 @@ import numpy as np
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
+from kf_calib.bench.paper_parameters import DEVIATIONS
 from kf_calib.estimation import kalman_filterpy
 from kf_calib.estimation.prior import PRIORS
 
@@ -33,8 +34,6 @@ NOISE_MPS2 = 1e-4
 READINGS = 100
 """Of each accelerometer in each orientation."""
 REPETITIONS = 200
-DEVIATIONS = np.tile([math.radians(30 / 3600), math.radians(30 / 3600), 5e-5, 5e-5], 3)
-"""Table 1: what is to be found, (12,) rad, rad, 1, m/s^2."""
 OPTIMAL_PRINTED = {
     "theta1": 0.7152, "phi1": 0.6555, "K1": 1.1370, "b1": 12.0713,
     "nu1": 0.6982, "nu2": 0.6816, "K2": 1.2563, "b2": 10.7666,

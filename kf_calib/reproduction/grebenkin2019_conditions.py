@@ -15,9 +15,9 @@ import numpy as np
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
+from kf_calib.bench.paper_parameters import DEVIATIONS
 from kf_calib.reproduction import grebenkin2019
 from kf_calib.reproduction.grebenkin2019 import (
-    DEVIATIONS,
     GRAVITY_MPS2,
     NOISE_MPS2,
     READINGS,

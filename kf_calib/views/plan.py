@@ -14,7 +14,6 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.design.orientation_plan import Plan, papers_sigma
-from kf_calib.reproduction.grebenkin2019 import DEVIATIONS
 from kf_calib.support.output_files import write_whole
 from kf_calib.support.units import Unit, shown
 from kf_calib.views.console import symbol
@@ -77,7 +76,7 @@ def _named(symbols: tuple[str, ...], values: Floats | None) -> dict[str, float] 
 
 def mean_error_percent(sigma: Floats) -> Floats:
     """The mean absolute error as in the paper's Table 2, sqrt(2/pi) sigma over the deviation, in per cent (12,)."""
-    return 100.0 * math.sqrt(2.0 / math.pi) * sigma / DEVIATIONS
+    return 100.0 * math.sqrt(2.0 / math.pi) * sigma / paper_parameters.DEVIATIONS
 
 
 def generalised_ratio(made: Plan) -> float:

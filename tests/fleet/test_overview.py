@@ -19,7 +19,7 @@ from kf_calib.estimation import bench_model
 from kf_calib.fleet.pooled_diagnosis import pooled_diagnosis
 from kf_calib.views.figures import figures
 from kf_calib.views.fleet_words import short_name
-from kf_calib.views.report.contents import page_of
+from kf_calib.views.report.fleet import fleet_page
 
 pytestmark = pytest.mark.xdist_group("fleet")
 
@@ -116,6 +116,6 @@ def test_every_figure_and_the_page_are_drawn() -> None:
     assert "flexure" in axes.get_title(loc="left") and len(axes.containers) == 3
     assert "unit03" in {each.get_text() for each in drawn["Parameters over the units"].axes[0].texts}
     assert "40 of 40" in {each.get_text() for each in drawn["Sigma achieved"].axes[0].texts}
-    html = page_of(found, (), ["kf-calib fleet runs -o fleet"]).html
+    html = fleet_page(found, ["kf-calib fleet runs -o fleet"]).html
     assert "40 runs agree with their models" in html and html.count("<svg") == len(drawn)
     assert "flexure is of the bench" in html

@@ -32,6 +32,7 @@ from kf_calib.estimation.prior import PRIORS
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
 from kf_calib.reproduction.grebenkin2019 import OPTIMAL_PRINTED, Experiment, printed, repeat
+from kf_calib.views.figures import experiment as paper
 from kf_calib.views.figures.scales import ticks, written
 from kf_calib.views.figures.style import content_of
 from kf_calib.views.figures.symbols import label
@@ -201,7 +202,7 @@ def test_a_plan_for_all_parameters_alike_has_no_targets() -> None:
 
 
 def test_table_2_has_the_printed_figures(experiment: Experiment) -> None:
-    (axes,) = plot.table2(experiment).get_axes()
+    (axes,) = paper.table2(experiment).get_axes()
     lines = {line.get_label(): line.get_ydata() for line in axes.lines}
     assert lines["optimal: printed in the paper"] == pytest.approx(printed(OPTIMAL_PRINTED))
     assert lines["non-optimal: filter, here"] == pytest.approx(experiment.nonoptimal.kalman)
@@ -210,7 +211,7 @@ def test_table_2_has_the_printed_figures(experiment: Experiment) -> None:
 def test_design_matrices_have_rows_of_plus_and_minus_g_in_the_optimal_set(experiment: Experiment) -> None:
     """Each reading of the optimal set has gravity along one axis of the platform; only the Earth turns it elsewhere."""
     optimal, others = np.split(np.array([axes.get_images()[0].get_array() for axes in
-                                         plot.design_matrices(experiment).get_axes()[:6]]), 2)  # fmt: skip
+                                         paper.design_matrices(experiment).get_axes()[:6]]), 2)  # fmt: skip
     assert optimal.shape == (3, 400, 4)
     angles_and_scale = np.sort(np.abs(optimal[:, :, :3]), axis=2)
     expected = np.broadcast_to([0.0, 0.0, 1.0], angles_and_scale.shape)
@@ -220,7 +221,7 @@ def test_design_matrices_have_rows_of_plus_and_minus_g_in_the_optimal_set(experi
 
 def test_sigmas_of_the_experiment_end_at_those_expected(experiment: Experiment) -> None:
     """But for the prior, which is 5e3 times wider in the optimal set."""
-    first = plot.falling(experiment).get_axes()[0]
+    first = paper.falling(experiment).get_axes()[0]
     optimal = np.asarray(first.lines[0].get_ydata())
     assert len(optimal) == 401 and optimal[-1] == pytest.approx(
         experiment.optimal.orientations.sigma[0] * ARCSEC, rel=1e-4

@@ -20,7 +20,6 @@ from kf_calib.views.figures.detection_limits import detection_limits  # noqa: E4
 from kf_calib.views.figures.directions import directions  # noqa: E402
 from kf_calib.views.figures.dwell import dwell  # noqa: E402
 from kf_calib.views.figures.engines import allan_deviation, three_ways, whiteness  # noqa: E402
-from kf_calib.views.figures.experiment import design_matrices, falling, table2  # noqa: E402
 from kf_calib.views.figures.history import history  # noqa: E402
 from kf_calib.views.figures.hypotheses import hypotheses  # noqa: E402
 from kf_calib.views.figures.improvement import improvement, residuals_of_steps  # noqa: E402
@@ -31,8 +30,8 @@ from kf_calib.views.figures.sphere import on_the_sphere  # noqa: E402
 from kf_calib.views.figures.suspects import suspects  # noqa: E402
 
 __all__ = [
-    "Figures", "allan_deviation", "convergence", "correlations", "design_matrices", "detection_limits", "directions",
-    "dwell", "estimates", "falling", "figures", "history", "hypotheses", "improvement", "information", "on_the_sphere",
-    "plan", "predicted_sigmas", "residuals", "residuals_of_steps", "save", "suspects", "table2", "three_ways",
+    "Figures", "allan_deviation", "convergence", "correlations", "detection_limits", "directions",
+    "dwell", "estimates", "figures", "history", "hypotheses", "improvement", "information", "on_the_sphere",
+    "plan", "predicted_sigmas", "residuals", "residuals_of_steps", "save", "suspects", "three_ways",
     "what_they_go_with", "whiteness",
 ]  # fmt: skip

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import sys
 from collections.abc import Callable, Mapping
 from functools import singledispatch
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +19,12 @@ from kf_calib.errors import InputError
 from kf_calib.estimation.engine_comparison import Comparison
 from kf_calib.estimation.results import Calibration
 from kf_calib.exchange.history import History
-from kf_calib.fleet.overview import FleetOverview
-from kf_calib.reproduction.grebenkin2019 import Experiment
 from kf_calib.support.output_files import write_whole
-from kf_calib.views.figures import fleet, style
+from kf_calib.views.figures import style
 from kf_calib.views.figures.convergence import convergence, estimates
 from kf_calib.views.figures.detection_limits import detection_limits
 from kf_calib.views.figures.directions import directions
 from kf_calib.views.figures.engines import allan_deviation, three_ways, whiteness
-from kf_calib.views.figures.experiment import design_matrices, falling, table2
 from kf_calib.views.figures.history import history
 from kf_calib.views.figures.hypotheses import hypotheses
 from kf_calib.views.figures.improvement import improvement, residuals_of_steps
@@ -38,6 +37,12 @@ from kf_calib.views.figures.suspects import suspects
 Figures = Mapping[str, Callable[[], Figure]]
 """Title of each figure, and what draws it."""
 
+_OF_LEAVES = {
+    "kf_calib.fleet": "kf_calib.views.figures.fleet",
+    "kf_calib.reproduction": "kf_calib.views.figures.experiment",
+}
+"""Packages that nothing else knows, and what registers the figures of their results, when one is to be drawn."""
+
 PROBABILITIES = "What it may be, and with what probability"
 """Title of the figure that belongs to the verdict."""
 
@@ -45,6 +50,10 @@ PROBABILITIES = "What it may be, and with what probability"
 @singledispatch
 def figures(result: Any) -> Figures:
     """The figures of a result by title, the one that tells most first; nothing is drawn before it is called for."""
+    leaf = _OF_LEAVES.get(".".join(type(result).__module__.split(".")[:2]))
+    if leaf is not None and leaf not in sys.modules:
+        import_module(leaf)
+        return figures(result)
     raise TypeError(f"there is no figure of {type(result).__name__}: give the result of calibrate, diagnose, improve, "
                     "compare, plan, history or a fleet.")  # fmt: skip
 
@@ -103,29 +112,8 @@ def _(made: Plan) -> Figures:
 
 
 @figures.register
-def _(found: Experiment) -> Figures:
-    return {
-        "Table 2 of the paper": lambda: table2(found),
-        "Sigma as readings come": lambda: falling(found),
-        "Design matrices of both sets": lambda: design_matrices(found),
-    }
-
-
-@figures.register
 def _(found: History) -> Figures:
     return {"The calibrations over time": lambda: history(found)}
-
-
-@figures.register
-def _(found: FleetOverview) -> Figures:
-    return {
-        "Parameters over the units": lambda: fleet.units(found),
-        "Units that need another look first": lambda: fleet.another_look(found),
-        "Errors of the bench over time": lambda: fleet.bench_terms(found),
-        "Verdicts by week": lambda: fleet.verdicts(found),
-        "Control charts": lambda: fleet.charts(found),
-        "Sigma achieved": lambda: fleet.sigmas(found),
-    }
 
 
 def save(what: Figure | Figures, path: str | Path, kind: str = "", width_px: int | None = None) -> Path:

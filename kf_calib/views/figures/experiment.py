@@ -16,6 +16,7 @@ from kf_calib.reproduction.grebenkin2019 import (
     falling_sigma,
     printed,
 )
+from kf_calib.views.figures.collection import Figures, figures
 from kf_calib.views.figures.parameter_panels import parameter_panels
 from kf_calib.views.figures.scales import log_scale, written
 from kf_calib.views.figures.style import GREY, blank, styled
@@ -110,3 +111,13 @@ def design_matrices(found: Experiment) -> Figure:
 def _tables(found: Experiment) -> list[tuple[Column, dict[str, float]]]:
     """Return both sets with their columns of Table 2."""
     return [(found.optimal, OPTIMAL_PRINTED), (found.nonoptimal, NONOPTIMAL_PRINTED)]
+
+
+@figures.register
+def experiment_figures(found: Experiment) -> Figures:
+    """The figures of the experiment by title."""
+    return {
+        "Table 2 of the paper": lambda: table2(found),
+        "Sigma as readings come": lambda: falling(found),
+        "Design matrices of both sets": lambda: design_matrices(found),
+    }

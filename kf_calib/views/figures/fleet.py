@@ -17,6 +17,7 @@ from kf_calib.fleet.pooled_diagnosis import BenchCoefficients, Finding
 from kf_calib.fleet.track import Track
 from kf_calib.support.units import shown
 from kf_calib.views.console import symbol
+from kf_calib.views.figures.collection import Figures, figures
 from kf_calib.views.figures.scales import log_scale
 from kf_calib.views.figures.style import (
     ACCELEROMETERS,
@@ -296,3 +297,16 @@ def _empty(text: str) -> Figure:
     figure = blank(9.0, 2.0)
     say(figure, text)
     return figure
+
+
+@figures.register
+def fleet_figures(found: FleetOverview) -> Figures:
+    """The figures of a fleet by title."""
+    return {
+        "Parameters over the units": lambda: units(found),
+        "Units that need another look first": lambda: another_look(found),
+        "Errors of the bench over time": lambda: bench_terms(found),
+        "Verdicts by week": lambda: verdicts(found),
+        "Control charts": lambda: charts(found),
+        "Sigma achieved": lambda: sigmas(found),
+    }

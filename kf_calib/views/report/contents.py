@@ -14,8 +14,7 @@ from kf_calib.diagnosis.side_by_side import SideBySide, differences
 from kf_calib.diagnosis.stepwise_selection import Improvement
 from kf_calib.estimation.engine_comparison import Comparison
 from kf_calib.estimation.results import Calibration
-from kf_calib.fleet.overview import FleetOverview
-from kf_calib.views import console, diagnosis, improvement, pooled_diagnosis, side_by_side
+from kf_calib.views import console, diagnosis, improvement, side_by_side
 from kf_calib.views.figures import figures
 from kf_calib.views.figures.collection import PROBABILITIES
 from kf_calib.views.report.drawing import Drawing
@@ -41,7 +40,7 @@ def page_of(result: Any, measured: Sequence[Measured], commands: Sequence[str], 
 
 @page_of.register
 def _(found: Diagnosis, measured: Sequence[Measured], commands: Sequence[str], remarks: Sequence[str] = ()) -> Page:
-    drawn = _drawn("", found, "found").parts
+    drawn = figures_of("", found, "found").parts
     likely = tuple(each for each in drawn if isinstance(each, Drawing) and each.title == PROBABILITIES)
     return Page(
         measured[0].name, "Calibration report", *_standing(found.test.consistent),
@@ -51,17 +50,17 @@ def _(found: Diagnosis, measured: Sequence[Measured], commands: Sequence[str], r
             Section("Residuals", tuple(each for each in drawn if each not in likely)),
             Section("Explore the residuals", (_explorer_of(found),)),
             Section("Parameters", (*_calibrated(found.before), *_with_what_is_missing(found))),
-            _drawn("The calibration", found.before, "run"),
+            figures_of("The calibration", found.before, "run"),
             Section("Suspects, and what this run could show", _evidence(found)),
-            _warnings(found.before.warnings),
+            warnings_of(found.before.warnings),
         ), tuple(commands),
     )  # fmt: skip
 
 
 @page_of.register
 def _(state: Improvement, measured: Sequence[Measured], commands: Sequence[str], remarks: Sequence[str] = ()) -> Page:
-    steps = _in_text(improvement.progress(state))
-    stopped, *rest = _in_text(improvement.improvement_report(state, None, None))[len(steps) :]
+    steps = in_text(improvement.progress(state))
+    stopped, *rest = in_text(improvement.improvement_report(state, None, None))[len(steps) :]
     assert isinstance(stopped, Paragraph)
     start, last = state.start.before, state.result
     explained = {f"{last.model.sum}": Explanation(state.effects, start, last, True).left_mps2} if state.steps else {}
@@ -70,12 +69,12 @@ def _(state: Improvement, measured: Sequence[Measured], commands: Sequence[str],
         (stopped.text, *remarks), (Facts("", tuple(facts(measured[0], last))),),
         (
             Section("The error, step by step", tuple(steps)),
-            _drawn("Figures of the steps", state, "steps"),
+            figures_of("Figures of the steps", state, "steps"),
             Section("Explore the residuals", (explorer(start, explained),)),
             Section("Parameters with the last model", tuple(rest)),
-            _drawn("The calibration with the last model", last, "run"),
+            figures_of("The calibration with the last model", last, "run"),
             Section("What is left, and what this run could show", _evidence(state.found)),
-            _warnings(state.warnings),
+            warnings_of(state.warnings),
         ), tuple(commands),
     )  # fmt: skip
 
@@ -88,12 +87,12 @@ def _(compared: Comparison, measured: Sequence[Measured], commands: Sequence[str
         measured[0].name, "Filter against batch", *_standing(result.consistency.consistent),
         (said, console.verdict(result), *remarks), (Facts("", tuple(facts(measured[0], result))),),
         (
-            Section("Time, memory and difference", _in_text(console.comparison_table(compared), with_notes=True)),
-            _drawn("Figures of the comparison", compared, "compared"),
+            Section("Time, memory and difference", in_text(console.comparison_table(compared), with_notes=True)),
+            figures_of("Figures of the comparison", compared, "compared"),
             Section("Parameters", _calibrated(result)),
             Section("Explore the residuals", (explorer(result, {}),)),
-            _drawn("The calibration", result, "run"),
-            _warnings(result.warnings),
+            figures_of("The calibration", result, "run"),
+            warnings_of(result.warnings),
         ), tuple(commands),
     )  # fmt: skip
 
@@ -120,42 +119,10 @@ def _(pair: SideBySide, measured: Sequence[Measured], commands: Sequence[str], r
     )  # fmt: skip
 
 
-@page_of.register
-def _(found: FleetOverview, measured: Sequence[Measured], commands: Sequence[str], remarks: Sequence[str] = ()) -> Page:
-    together = _in_text(pooled_diagnosis.pooled_report(found.pooled)) if found.pooled else ()
-    said = [each.text for each in together if isinstance(each, Paragraph)]
-    standing, headline = _standing_of(found)
-    return Page(
-        found.name, "Fleet report", standing, headline, (*said, *remarks),
-        (Facts("", tuple(_facts_of(found))),),
-        (
-            _drawn("The runs together", found, "fleet"),
-            Section("Effects that all runs show", tuple(each for each in together if not isinstance(each, Paragraph))),
-            _warnings(found.remarks),
-        ), tuple(commands),
-    )  # fmt: skip
-
-
-def _standing_of(found: FleetOverview) -> tuple[Standing, str]:
-    """Return whether models and measurements agree over a fleet, and in how many runs they do not."""
-    if not found.failed and not found.inconsistent:
-        return "agrees", f"{found.runs} runs agree with their models"
-    told = [f"{count} {word}" for count, word in ((found.inconsistent, "disagree"), (found.failed, "failed")) if count]
-    return "disagrees", f"Of {found.runs} runs {' and '.join(told)}"
-
-
-def _facts_of(found: FleetOverview) -> list[tuple[str, str]]:
-    """Return what was measured, a heading and words each."""
-    dates = f"{found.first:%Y-%m-%d} to {found.last:%Y-%m-%d}" if found.first and found.last else ""
-    every = [("Runs", str(found.runs)), ("Units", str(len(found.units))), ("Benches", ", ".join(found.benches)),
-             ("Dates", dates)]  # fmt: skip
-    return [each for each in every if each[1]]
-
-
 def _run(name: str, found: Diagnosis, prefix: str) -> Section:
     """Return all of one diagnosis as a section."""
-    parts = (*_drawn("", found, prefix).parts, _explorer_of(found), *_evidence(found))
-    return Section(name, (*parts, *_warnings(found.before.warnings).parts))
+    parts = (*figures_of("", found, prefix).parts, _explorer_of(found), *_evidence(found))
+    return Section(name, (*parts, *warnings_of(found.before.warnings).parts))
 
 
 _HEADLINES: dict[bool | None, tuple[Standing, str]] = {
@@ -169,7 +136,7 @@ def _standing(consistent: bool | None) -> tuple[Standing, str]:
     return _HEADLINES[consistent]
 
 
-def _drawn(title: str, result: object, prefix: str) -> Section:
+def figures_of(title: str, result: object, prefix: str) -> Section:
     """Return the section of a result's figures; it has no part where there is no figure of such a result."""
     known = figures.dispatch(type(result)) is not figures.dispatch(object)
     drawn = figures(result) if known else {}
@@ -183,19 +150,19 @@ def _explorer_of(found: Diagnosis) -> Explorer:
     return explorer(found.before, {f"with {each.name}": each.left_mps2 for each in offered})
 
 
-def _in_text(drawn: RenderableType, with_notes: bool = False) -> tuple[Part, ...]:
+def in_text(drawn: RenderableType, with_notes: bool = False) -> tuple[Part, ...]:
     """Return what the console draws, without its notes, which have a section of their own."""
     return tuple(each for each in parts_of(drawn) if with_notes or each.kind != "note")
 
 
 def _calibrated(result: Calibration) -> tuple[Part, ...]:
     """Return the tables of a calibration, less the counts of readings, which are among what was measured."""
-    return _in_text(console.summary(result))[1:]
+    return in_text(console.summary(result))[1:]
 
 
 def _evidence(found: Diagnosis) -> tuple[Part, ...]:
     """Return what the console says for a diagnosis, less the verdict, which comes first there as on the page."""
-    return _in_text(diagnosis.diagnosis_report(found))[1:]
+    return in_text(diagnosis.diagnosis_report(found))[1:]
 
 
 def _with_what_is_missing(found: Diagnosis) -> tuple[Part, ...]:
@@ -207,5 +174,5 @@ def _with_what_is_missing(found: Diagnosis) -> tuple[Part, ...]:
     return (*parts_of(table), *parts_of(console.effect_table(found.after)))
 
 
-def _warnings(said: Iterable[str], title: str = "Warnings") -> Section:
+def warnings_of(said: Iterable[str], title: str = "Warnings") -> Section:
     return Section(title, tuple(Paragraph(text, "note") for text in said))
