@@ -28,7 +28,7 @@ import numpy as np
 from bench_emulator import Emulator, Tcp
 
 from kf_calib.bench.streams import Batch
-from kf_calib.dwells.sufficient_statistics import Folder
+from kf_calib.dwells.folding import Folder
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.settings import Settings
 from kf_calib.online.progress import targets

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from kf_calib.bench.raw_input import RawInput
     from kf_calib.bench.streams import Source
     from kf_calib.bench.wrong_unit import WrongUnit
-    from kf_calib.dwells.overview import DwellFound
+    from kf_calib.dwells.overview import DwellSummary
     from kf_calib.sources.files.inventory import Inventory
     from kf_calib.views.overview import Overview
 
@@ -179,7 +179,7 @@ def _with_unit(missing: dict[str, str], words: list[str], wrong: WrongUnit | Non
 def _overview(
     inventory: Inventory,
     bench: dict[str, str],
-    dwells: list[DwellFound] | None,
+    dwells: list[DwellSummary] | None,
     missing: dict[str, str],
     words: list[str],
     warnings: list[str],
@@ -234,10 +234,10 @@ def _lacks(bench: Mapping[str, str], has_angles: bool) -> list[str]:
     return [key for key, lacks in keys.items() if lacks]
 
 
-def _dwells(source: Source, tick: Tick) -> list[DwellFound]:
-    from kf_calib.dwells.overview import dwells_found
+def _dwells(source: Source, tick: Tick) -> list[DwellSummary]:
+    from kf_calib.dwells.overview import dwell_summaries
 
-    return dwells_found(source, on_progress=tick)
+    return dwell_summaries(source, on_progress=tick)
 
 
 def _not_of(ctx: click.Context, names: Sequence[str]) -> set[str]:

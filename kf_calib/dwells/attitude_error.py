@@ -1,4 +1,4 @@
-"""What is known of the setting error of a dwell beyond its prior."""
+"""The posterior of a dwell's setting error."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ from kf_calib.bench.arrays import Floats
 
 @dataclass(frozen=True)
 class AttitudeError:
-    """What the readings show of a dwell's setting error, the rotation alpha by which it stands off its pose.
+    """What the readings show of a dwell's setting error: the small rotation alpha from its recorded pose to its true
+    one.
 
     - rotation_rad (3,): the rotation vector across the force at which the dwell is linearised.
     - variance_rad2: sum of the variances of its two components across the force, which shorten the mean of the force:
       E[R(alpha) f] = (1 - variance / 2) R(mode) f.
-    - bending (3, 3): by how much the effects of the model change the mean readings per unit of the force, m/s^2 per
-      m/s^2; it adds to the sensitivities by which a small rotation shows.
+    - bending (3, 3): derivative of the mean readings by the force that is due to the model's effects, m/s^2 per m/s^2;
+      it adds to the sensitivities through which a small rotation changes the readings.
     """
 
     rotation_rad: Floats

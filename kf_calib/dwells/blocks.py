@@ -26,8 +26,9 @@ class Block:
     """Up to 4000 consecutive readings of one dwell, or of the slew that ended it.
 
     - dwell: number of the dwell, counted from 1.
-    - arrival_s: its arrival according to the angles; felt_s: according to the readings, from which settling is counted;
-      None if not known separately.
+    - arrival_s: its arrival according to the angles.
+    - arrival_felt_s: its arrival according to the readings, from which settling is counted; None if the readings do not
+      show it.
     - elapsed_s (n,): time since the first sample of the recording.
     - accel_mps2 (n, 3): the readings.
     - pose (1, k): the mean pose if the platform stands still; (n, k) if it creeps.
@@ -44,9 +45,9 @@ class Block:
     """The course of the angles in a slew; None in a dwell."""
     variance_mps2_2: Floats | None = None
     """Variance (n, 3) of the readings in each average, if the block holds averages."""
-    taken: int = 1
+    readings_per_row: int = 1
     """Number of readings that each row stands for."""
-    felt_s: float | None = None
+    arrival_felt_s: float | None = None
     pose_sigma_rad: float = 0.0
     """Standard deviation of the pose due to noise of the angles."""
     turns: tuple[int, ...] = ()
@@ -86,7 +87,7 @@ class Tally:
     def sentences(self) -> list[str]:
         """One sentence for each kind of sample that was dropped or rejected."""
         backward_s = self.first_backward_s or 0.0
-        said = {
+        sentence_of = {
             "not_finite": "readings that were not finite (NaN or infinite), dropped: {}.",
             "too_large": f"readings beyond {LARGEST_MPS2:.0e} m/s^2, which nothing can read, dropped: {{}}.",
             "repeated": "readings that repeated the stamp before them, dropped: {}.",
@@ -98,23 +99,23 @@ class Tally:
             "temperatures_dropped": f"temperatures not finite or beyond {LARGEST_C:.0e} degC, dropped: {{}}.",
             "gated": "outlying readings (innovation gate), rejected: {}; --no-gate keeps them.",
         }
-        return [text.format(getattr(self, key)) for key, text in said.items() if getattr(self, key)]
+        return [text.format(getattr(self, key)) for key, text in sentence_of.items() if getattr(self, key)]
 
-    def unmet(self, stillness: Stillness) -> list[str]:
+    def unmet_settings(self, stillness: Stillness) -> list[str]:
         """One sentence for each setting that could not be followed."""
-        said, one = list[str](), self.short_dwells == 1
+        sentences, one = list[str](), self.short_dwells == 1
         if self.short_dwells:
-            said.append(
+            sentences.append(
                 f"{self.short_dwells} dwell{' is' if one else 's are'} too short to leave out {stillness.settle_s:g} s "
                 f"after {'its' if one else 'each'} arrival (--settle-s): a third of {'it' if one else 'each'} was left "
                 f"out, {'' if one else 'of the shortest '}{self.least_settling_s:.3g} s."
             )
         if self.turned_deg > _TURNING_DEG:
-            said.append(
+            sentences.append(
                 f"the platform turns by {self.turned_deg:.3g} deg in what counts as standing still (--still-deg "
                 f"{stillness.tolerance_deg:g}): where that is a slew, lower --still-deg."
             )
-        return said
+        return sentences
 
 
 def within(values: Floats, largest: float) -> Mask | None:

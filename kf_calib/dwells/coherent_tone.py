@@ -25,7 +25,7 @@ _LONGEST = 1 << 15  # cells of a dwell that are kept at most: more than an hour
 MOST_CELLS = 1 << 17
 """Cells of a run that are kept: four and a half hours, which take 4 MB."""
 _LONGEST_RUN = 1 << 20  # cells of a run that are transformed at most: a day and a half
-_FEWEST_CYCLES = 1.5  # per dwell; of a slower oscillation a parabola takes more than half
+_FEWEST_CYCLES = 1.5  # per dwell; a parabola removes more than half of a slower oscillation
 _HIGHEST = 0.75  # highest frequency, as a share of half the rate of cells
 _BANDS, _BAND_POINTS = 40, 16  # bands of equal ratio, with at least so many frequencies; their medians give the noise
 _DEGREE = 3  # degree of the polynomial through the logarithms of these medians
@@ -59,7 +59,7 @@ class Cells:
         """Length of a cell, s."""
         return self.step_s * self.readings
 
-    def places(self, elapsed_s: Floats) -> NDArray[np.intp]:
+    def numbers(self, elapsed_s: Floats) -> NDArray[np.intp]:
         """Numbers of the cells in which these times lie; readings on schedule lie in the middle of their step."""
         return ((elapsed_s / self.step_s + 0.5) / self.readings).astype(np.intp)
 
@@ -77,14 +77,14 @@ class Trace:
     @classmethod
     def of(cls, readings: Floats, elapsed_s: Floats, into: Cells) -> Trace:
         """The sums of a block of readings (n, 3) at increasing times (n,)."""
-        cells = into.places(elapsed_s)
+        cells = into.numbers(elapsed_s)
         starts = np.append(0, np.flatnonzero(cells[1:] != cells[:-1]) + 1)
-        places, length = cells[starts] - cells[0], int(cells[-1] - cells[0]) + 1
+        positions, length = cells[starts] - cells[0], int(cells[-1] - cells[0]) + 1
         if length > _LONGEST:
             return cls()
         sums, counts = np.zeros((length, 3)), np.zeros(length)
-        sums[places] = np.add.reduceat(readings, starts, axis=0)
-        counts[places] = np.diff(starts, append=len(cells))
+        sums[positions] = np.add.reduceat(readings, starts, axis=0)
+        counts[positions] = np.diff(starts, append=len(cells))
         return cls(into.cell_s, int(cells[0]), sums, counts)
 
     def __len__(self) -> int:
@@ -97,31 +97,31 @@ class Trace:
         if end - first > _LONGEST or other.cell_s != self.cell_s:
             return self
         sums, counts = np.zeros((end - first, 3)), np.zeros(end - first)
-        for each in (self, other):
-            part = slice(each.first - first, each.first - first + len(each))
-            sums[part] += each.sums
-            counts[part] += each.counts
+        for trace in (self, other):
+            part = slice(trace.first - first, trace.first - first + len(trace))
+            sums[part] += trace.sums
+            counts[part] += trace.counts
         return Trace(self.cell_s, first, sums, counts)
 
     @property
-    def left(self) -> Floats:
+    def residual_sums(self) -> Floats:
         """The sums (m, 3) after the least-squares parabola of the readings, weighted by their counts, has been
         removed."""
         roots = np.sqrt(self.counts)[:, None]
-        seen = roots[:, 0] > 0
-        curve = np.linalg.qr(roots[seen] * np.vander(np.linspace(-1.0, 1.0, len(self)), 3)[seen])[0]
-        means = self.sums[seen] / roots[seen]
-        out = np.zeros_like(self.sums)
-        out[seen] = roots[seen] * (means - curve @ (curve.T @ means))
-        return out
+        measured = roots[:, 0] > 0
+        curve = np.linalg.qr(roots[measured] * np.vander(np.linspace(-1.0, 1.0, len(self)), 3)[measured])[0]
+        means = self.sums[measured] / roots[measured]
+        residuals = np.zeros_like(self.sums)
+        residuals[measured] = roots[measured] * (means - curve @ (curve.T @ means))
+        return residuals
 
 
 def band_hz(traces: Sequence[Trace]) -> tuple[float, float]:
     """Lowest and highest frequency at which ``tone`` searches; infinite if it cannot."""
-    seen = [trace for trace in traces if len(trace)]
-    if not seen or np.diff(_ends(seen)) > _LONGEST_RUN:
+    recorded = [trace for trace in traces if len(trace)]
+    if not recorded or np.diff(_ends(recorded)) > _LONGEST_RUN:
         return np.inf, np.inf
-    low, high = _FEWEST_CYCLES / _usual_s(seen), _HIGHEST * 0.5 / seen[0].cell_s
+    low, high = _FEWEST_CYCLES / _median_dwell_s(recorded), _HIGHEST * 0.5 / recorded[0].cell_s
     return (low, high) if high > 2.0 * low else (np.inf, np.inf)
 
 
@@ -130,7 +130,7 @@ def _ends(traces: Sequence[Trace]) -> tuple[int, int]:
     return min(trace.first for trace in traces), max(trace.first + len(trace) for trace in traces)
 
 
-def _usual_s(traces: Sequence[Trace]) -> float:
+def _median_dwell_s(traces: Sequence[Trace]) -> float:
     """Return the length of the dwell that contains the median cell when dwells are sorted by length."""
     lengths = np.sort([len(trace) for trace in traces])
     return float(lengths[np.searchsorted(np.cumsum(lengths), 0.5 * lengths.sum())] * traces[0].cell_s)
@@ -148,24 +148,24 @@ def tone(traces: Sequence[Trace], level: float = 0.01) -> Line | None:
     low_hz, high_hz = band_hz(traces)
     if not np.isfinite(low_hz):
         return None
-    seen = [trace for trace in traces if len(trace)]
-    first, end = _ends(seen)
+    recorded = [trace for trace in traces if len(trace)]
+    first, end = _ends(recorded)
     size = 1 << (2 * (end - first)).bit_length()
     grid = np.zeros((3, end - first))
-    for trace in seen:
-        grid[:, trace.first - first :][:, : len(trace)] += trace.left.T
-    largest = max(float(np.abs(trace.sums).max()) for trace in seen)
-    moving = np.asarray(np.abs(grid).max(axis=1) > _ROUNDING * largest)
-    cell_s = seen[0].cell_s
+    for trace in recorded:
+        grid[:, trace.first - first :][:, : len(trace)] += trace.residual_sums.T
+    largest = max(float(np.abs(trace.sums).max()) for trace in recorded)
+    varying = np.asarray(np.abs(grid).max(axis=1) > _ROUNDING * largest)
+    cell_s = recorded[0].cell_s
     step_hz = 1.0 / (size * cell_s)
-    part = slice(int(np.ceil(low_hz / step_hz)), int(high_hz / step_hz) + 1)
-    if not moving.any() or part.stop - part.start < _DEGREE * _BAND_POINTS:
+    band = slice(int(np.ceil(low_hz / step_hz)), int(high_hz / step_hz) + 1)
+    if not varying.any() or band.stop - band.start < _DEGREE * _BAND_POINTS:
         return None
-    frequency_hz = step_hz * np.arange(part.start, part.stop, dtype=float)
-    wave = np.fft.rfft(grid, size, axis=1)[:, part]
+    frequency_hz = step_hz * np.arange(band.start, band.stop, dtype=float)
+    wave = np.fft.rfft(grid, size, axis=1)[:, band]
     knots = np.geomspace(frequency_hz[0], frequency_hz[-1], _KNOTS)
-    kept = np.interp(frequency_hz, knots, _share_beside_parabola(np.pi * knots * _usual_s(seen)))
-    power = (wave.real**2 + wave.imag**2)[moving] / kept
+    passed_share = np.interp(frequency_hz, knots, _share_beside_parabola(np.pi * knots * _median_dwell_s(recorded)))
+    power = (wave.real**2 + wave.imag**2)[varying] / passed_share
     levels, variance = _levels(power, frequency_hz, size / (end - first))
     heights = power / levels
     freedom, height = 2.0 * independent(heights.T), heights.mean(axis=0)
@@ -173,13 +173,13 @@ def tone(traces: Sequence[Trace], level: float = 0.01) -> Line | None:
     chances = fdtrc(freedom, freedom / variance[tall], height[tall])
     k, chance = int(tall[np.argmin(chances)]), float(chances.min())
     p_value = sidak(chance, len(height))
-    if p_value >= level or not _steady(seen, frequency_hz[k], levels[:, k] * kept[k], moving):
+    if p_value >= level or not _steady(recorded, frequency_hz[k], levels[:, k] * passed_share[k], varying):
         return None
-    held = kept[k] * np.sinc(frequency_hz[k] * cell_s) * sum(float(trace.counts.sum()) for trace in seen)
-    return Line(float(frequency_hz[k]), p_value, int(np.argmax(np.abs(wave[:, k]))), 2.0 * np.abs(wave[:, k]) / held)
+    gain = passed_share[k] * np.sinc(frequency_hz[k] * cell_s) * sum(float(trace.counts.sum()) for trace in recorded)
+    return Line(float(frequency_hz[k]), p_value, int(np.argmax(np.abs(wave[:, k]))), 2.0 * np.abs(wave[:, k]) / gain)
 
 
-def _steady(traces: Sequence[Trace], frequency_hz: float, noise: Floats, moving: Mask) -> bool:
+def _steady(traces: Sequence[Trace], frequency_hz: float, noise: Floats, varying: Mask) -> bool:
     """Tell whether more than half of the power at a frequency keeps its phase from dwell to dwell; otherwise it is
     vibration.
 
@@ -187,15 +187,15 @@ def _steady(traces: Sequence[Trace], frequency_hz: float, noise: Floats, moving:
     to the number of readings.
     """
     waves = [
-        np.exp(-2j * np.pi * frequency_hz * trace.cell_s * (trace.first + np.arange(len(trace)))) @ trace.left
+        np.exp(-2j * np.pi * frequency_hz * trace.cell_s * (trace.first + np.arange(len(trace)))) @ trace.residual_sums
         for trace in traces
     ]
     counts = np.array([trace.counts.sum() for trace in traces])
     shares = (counts / counts.sum())[:, None]
-    own = np.array(waves)[:, moving]
-    apart = np.sum(np.abs(own) ** 2 / (noise * shares) - 1.0)
-    together = np.sum(np.abs(own.sum(axis=0)) ** 2 / noise - 1.0)
-    return bool(together > 0.5 * apart)
+    amplitudes = np.array(waves)[:, varying]
+    incoherent_power = np.sum(np.abs(amplitudes) ** 2 / (noise * shares) - 1.0)
+    coherent_power = np.sum(np.abs(amplitudes.sum(axis=0)) ** 2 / noise - 1.0)
+    return bool(coherent_power > 0.5 * incoherent_power)
 
 
 def _share_beside_parabola(half_phase: Floats) -> Floats:
@@ -226,11 +226,11 @@ def _levels(power: Floats, frequency_hz: Floats, padded: float) -> tuple[Floats,
         ends.append(min(max(equal, ends[-1] + _BAND_POINTS), count))
     if len(ends) > 2 and ends[-1] - ends[-2] < _BAND_POINTS:
         ends.pop(-2)
-    places = np.array([x[a:b].mean() for a, b in itertools.pairwise(ends)])
+    centres = np.array([x[a:b].mean() for a, b in itertools.pairwise(ends)])
     medians = np.array([np.median(power[:, a:b], axis=1) for a, b in itertools.pairwise(ends)])
     logs = np.log(np.maximum(medians / np.log(2.0), 1e-300))
     weights = np.sqrt(_MEDIAN_EFFICIENCY * np.diff(ends) / padded)[:, None]
-    degree = min(_DEGREE, len(places) - 1)
-    frame, upper = np.linalg.qr(weights * np.vander(places, degree + 1))
+    degree = min(_DEGREE, len(centres) - 1)
+    basis, upper = np.linalg.qr(weights * np.vander(centres, degree + 1))
     curve = np.vander(x, degree + 1) @ np.linalg.inv(upper)
-    return np.exp(curve @ (frame.T @ (weights * logs))).T, (curve**2).sum(axis=1)
+    return np.exp(curve @ (basis.T @ (weights * logs))).T, (curve**2).sum(axis=1)

@@ -20,12 +20,12 @@ class StampOrder:
 
     def __init__(self) -> None:
         self.last_ns: int | None = None
-        self._held = Stream.empty(0)
+        self._held_back = Stream.empty(0)
         self._ended = False
 
     def __call__(self, stream: Stream, tally: Tally | None = None, first_ns: int | None = None) -> Stream:
-        if self._held.time_ns.size:
-            stream, self._held = self._held + stream, Stream.empty(0)
+        if self._held_back.time_ns.size:
+            stream, self._held_back = self._held_back + stream, Stream.empty(0)
         if not len(stream):
             return stream
         begun = 1 if self.last_ns is None else stream.time_ns[0] - self.last_ns
@@ -50,7 +50,7 @@ class StampOrder:
                 continue
             if self.last_ns is not None and stamp - self.last_ns >= _LEAP_NS:
                 if i + 1 == len(stamps) and not self._ended:  # the next stamp tells a gap from damage
-                    self._held = stream[i:]
+                    self._held_back = stream[i:]
                     break
                 if i + 1 < len(stamps) and stamps[i + 1] < stamp:
                     tally.leaping += 1
@@ -62,7 +62,7 @@ class StampOrder:
     def flush(self) -> Stream:
         """Return the samples that were held back at the end of the stream; they have to be passed through once more."""
         self._ended = True
-        held, self._held = self._held, Stream.empty(0)
+        held, self._held_back = self._held_back, Stream.empty(0)
         return held
 
 
@@ -79,7 +79,7 @@ class OpenDwell:
 
     - number: its number, counted from 1.
     - arrival_ns: its arrival according to the angles.
-    - felt_ns: its arrival according to the readings, from which settling is counted.
+    - arrival_felt_ns: its arrival according to the readings, from which settling is counted.
     - first_pose_ns: stamp of the first pose message that belongs to it.
     - settling_ns: length of the margin left out after the arrival; None while it is not known whether the dwell is long
       enough for the whole margin.
@@ -89,7 +89,7 @@ class OpenDwell:
 
     number: int
     arrival_ns: int
-    felt_ns: int
+    arrival_felt_ns: int
     first_pose_ns: int
     settling_ns: int | None
     pose: Floats | None = None

@@ -43,17 +43,17 @@ def inliers(columns: Floats, readings: Floats, innovation: Floats, static: bool,
     if _plainly_clean(innovation, threshold):
         return None
     keep: Mask = np.ones(count, bool)
-    kept = innovation
+    kept_innovation = innovation
     for _ in range(5):
-        centre = np.median(kept, axis=1, keepdims=True)
-        sigma = _GAUSSIAN_MAD * np.median(np.abs(kept - centre), axis=1, keepdims=True)
-        sigma = np.where(sigma > 0, sigma, kept.std(axis=1, keepdims=True))
-        now: Mask = np.all(np.abs(innovation - centre) <= threshold * np.maximum(sigma, 1e-12), axis=0)
-        if (now == keep).all():
+        centre = np.median(kept_innovation, axis=1, keepdims=True)
+        sigma = _GAUSSIAN_MAD * np.median(np.abs(kept_innovation - centre), axis=1, keepdims=True)
+        sigma = np.where(sigma > 0, sigma, kept_innovation.std(axis=1, keepdims=True))
+        inlying: Mask = np.all(np.abs(innovation - centre) <= threshold * np.maximum(sigma, 1e-12), axis=0)
+        if (inlying == keep).all():
             break
-        keep = now
+        keep = inlying
         innovation = innovations(columns, readings, static, keep)
-        kept = innovation[:, keep]
+        kept_innovation = innovation[:, keep]
     return None if keep.all() or keep.sum() < 4 else keep
 
 

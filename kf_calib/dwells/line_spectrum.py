@@ -20,10 +20,10 @@ from kf_calib.support.tail_probabilities import sidak
 _LENGTHS = np.array(sorted([4000, *(2**k for k in range(6, 12)), *(3 * 2**k for k in range(5, 11))]))
 _FIRST_BIN = 3  # in lower bins the parabola has removed the power
 _ORDER = 8
-_NEIGHBOURS, _OWN = 32, 3  # bins on either side that give the level, without those that a line may fill
+_NEIGHBOURS, _SKIPPED = 32, 3  # bins on either side that give the level, without those that a line may fill
 _MEDIAN_EFFICIENCY = 0.45  # efficiency of the median of bins that the Hann window has correlated
-_BENT, _CUBIC = 128, 3  # up to this bin a rise that no autoregression follows (1/f) is fitted
-_MOST = 5
+_RISE_BINS, _CUBIC = 128, 3  # up to this bin a rise that no autoregression follows (1/f) is fitted
+_MOST_LINES = 5
 _LEAK = 0.05  # bins into which a line leaks more than this share of the level are not searched for another
 
 
@@ -62,23 +62,23 @@ class Spectrum:
     sums: dict[int, _Sum] = field(default_factory=dict)
 
     def __add__(self, other: Spectrum) -> Spectrum:
-        both = {length: self.sums[length] + other.sums[length] for length in self.sums.keys() & other.sums.keys()}
-        return Spectrum({**self.sums, **other.sums, **both})
+        shared = {length: self.sums[length] + other.sums[length] for length in self.sums.keys() & other.sums.keys()}
+        return Spectrum({**self.sums, **other.sums, **shared})
 
     @classmethod
-    def of(cls, left: Floats, elapsed_s: Floats) -> Spectrum:
+    def of(cls, residuals: Floats, elapsed_s: Floats) -> Spectrum:
         """The spectrum of a block (3, n) without its parabola at times (n,), in segments of the longest length that
         fits."""
-        count = left.shape[1]
-        place = int(np.searchsorted(_LENGTHS, count, side="right")) - 1
-        if place < 0:
+        count = residuals.shape[1]
+        index = int(np.searchsorted(_LENGTHS, count, side="right")) - 1
+        if index < 0:
             return cls()
-        length = int(_LENGTHS[place])
+        length = int(_LENGTHS[index])
         segments = count // length
-        parts = left[:, : segments * length].reshape(3, segments, length)
-        found = np.fft.rfft(parts * _taper(length))
+        parts = residuals[:, : segments * length].reshape(3, segments, length)
+        amplitudes = np.fft.rfft(parts * _taper(length))
         duration_s = (elapsed_s[-1] - elapsed_s[0]) / (count - 1) * length * segments
-        return cls({length: _Sum((found.real**2 + found.imag**2).sum(axis=1).T, segments, float(duration_s))})
+        return cls({length: _Sum((amplitudes.real**2 + amplitudes.imag**2).sum(axis=1).T, segments, float(duration_s))})
 
 
 def lines(spectra: Iterable[Spectrum], level: float = 0.01) -> tuple[Line, ...]:
@@ -86,22 +86,22 @@ def lines(spectra: Iterable[Spectrum], level: float = 0.01) -> tuple[Line, ...]:
 
     The segment length that covers most readings is used; channels that do not vary are left out.
     """
-    length, own = _most(spectra)
-    if own is None:
+    length, segments = _best_covered(spectra)
+    if segments is None:
         return ()
-    moving = np.asarray((own.power[_FIRST_BIN:-1] > 0).all(axis=0))
-    if not moving.any():
+    varying = np.asarray((segments.power[_FIRST_BIN:-1] > 0).all(axis=0))
+    if not varying.any():
         return ()
-    return _Search(own, length, moving).lines(level)
+    return _Search(segments, length, varying).lines(level)
 
 
 def lowest_hz(spectra: Iterable[Spectrum]) -> float:
     """Lowest frequency at which ``lines`` searches; infinite if there is no spectrum."""
-    own = _most(spectra)[1]
-    return np.inf if own is None else _FIRST_BIN * own.segments / own.duration_s
+    segments = _best_covered(spectra)[1]
+    return np.inf if segments is None else _FIRST_BIN * segments.segments / segments.duration_s
 
 
-def _most(spectra: Iterable[Spectrum]) -> tuple[int, _Sum | None]:
+def _best_covered(spectra: Iterable[Spectrum]) -> tuple[int, _Sum | None]:
     """Return the segment length that covers most readings, and the sum over its segments."""
     total = reduce(Spectrum.__add__, spectra, Spectrum())
     length = max(total.sums, key=lambda each: each * total.sums[each].segments, default=0)
@@ -118,42 +118,42 @@ class _Search:
     degrees of freedom where the cubic follows single bins.
     """
 
-    def __init__(self, own: _Sum, length: int, moving: Mask) -> None:
-        self.length, self.segments, self.bin_hz = length, own.segments, own.segments / own.duration_s
-        self.power, self.moving = own.power / own.segments, moving
-        level = [_level(self.power[:, i], own.segments) if on else np.inf for i, on in enumerate(moving)]
+    def __init__(self, total: _Sum, length: int, varying: Mask) -> None:
+        self.length, self.segments, self.bin_hz = length, total.segments, total.segments / total.duration_s
+        self.power, self.varying = total.power / total.segments, varying
+        level = [_level(self.power[:, i], total.segments) if on else np.inf for i, on in enumerate(varying)]
         self.level = np.column_stack([np.broadcast_to(each, len(self.power)) for each in level])
         self.heights = self.power / self.level
-        self.height = self.heights[:, moving].mean(axis=1)
-        self.freedom = 2.0 * own.segments * independent(self.heights[_FIRST_BIN:-1, moving])
+        self.height = self.heights[:, varying].mean(axis=1)
+        self.freedom = 2.0 * total.segments * independent(self.heights[_FIRST_BIN:-1, varying])
 
     def lines(self, level: float) -> tuple[Line, ...]:
         """The lines whose p-value is below ``level``."""
-        found, open_ = list[Line](), self._peaks()
+        significant, candidates = list[Line](), self._peaks()
         bins = len(self.height) - _FIRST_BIN - 1
-        while open_.any() and len(found) < _MOST:
-            k = int(np.argmax(np.where(open_, self.height, 0.0)))
+        while candidates.any() and len(significant) < _MOST_LINES:
+            k = int(np.argmax(np.where(candidates, self.height, 0.0)))
             p_value = sidak(self._chance(k), bins)
             if p_value >= level:
                 break
-            line, place = self._line(k, p_value)
-            found.append(line)
-            open_ &= self.height[k] * _leakage(np.arange(len(open_), dtype=float) - place) < _LEAK
-        return tuple(found)
+            line, position = self._line(k, p_value)
+            significant.append(line)
+            candidates &= self.height[k] * _leakage(np.arange(len(candidates), dtype=float) - position) < _LEAK
+        return tuple(significant)
 
     def _peaks(self) -> Mask:
         """Return a mask (b,) of the bins that are at least as high as both neighbours."""
-        out = np.zeros(len(self.height), bool)
+        peaks = np.zeros(len(self.height), bool)
         inner = self.height[1:-1]
-        out[1:-1] = (inner >= self.height[:-2]) & (inner >= self.height[2:])
-        out[:_FIRST_BIN] = False
-        return out
+        peaks[1:-1] = (inner >= self.height[:-2]) & (inner >= self.height[2:])
+        peaks[:_FIRST_BIN] = False
+        return peaks
 
     def _chance(self, k: int) -> float:
         """Return the probability that noise alone makes bin ``k`` as high as it is."""
         from scipy.special import fdtrc
 
-        neighbours = max(min(2 * (_NEIGHBOURS - _OWN), len(self.height) - 2 * _OWN), 1)
+        neighbours = max(min(2 * (_NEIGHBOURS - _SKIPPED), len(self.height) - 2 * _SKIPPED), 1)
         relative = 1.0 / (_MEDIAN_EFFICIENCY * neighbours) + _leverages(len(self.height))[k]
         return float(fdtrc(self.freedom, self.freedom / relative, self.height[k]))
 
@@ -161,17 +161,17 @@ class _Search:
         """Return the line in bin ``k`` and its position between bins, from the main lobe of the Hann window, sin(pi x)
         / (pi x (1 - x^2)) / 2."""
         # heights relative to the level at one bin, since a strong line makes the level itself vary
-        near = np.maximum((self.power[k - 2 : k + 3] / self.level[k])[:, self.moving].mean(axis=1) - 1.0, 0.0)
-        at = 1 + int(np.argmax(near[1:-1]))
-        side = 1 if near[at + 1] >= near[at - 1] else -1
-        ratio = float(np.sqrt(near[at + side] / max(near[at], 1e-300)))
-        k += at - 2
+        lobe = np.maximum((self.power[k - 2 : k + 3] / self.level[k])[:, self.varying].mean(axis=1) - 1.0, 0.0)
+        centre = 1 + int(np.argmax(lobe[1:-1]))
+        side = 1 if lobe[centre + 1] >= lobe[centre - 1] else -1
+        ratio = float(np.sqrt(lobe[centre + side] / max(lobe[centre], 1e-300)))
+        k += centre - 2
         shift = float(np.clip((2.0 * ratio - 1.0) / (ratio + 1.0), 0.0, 0.5))
         gain = 0.25 * self.length * np.sinc(shift) / (1.0 - shift**2)
         excess = np.where(np.isfinite(self.level[k]), self.power[k] - self.level[k], 0.0)
         amplitude = np.sqrt(np.maximum(excess, 0.0)) / gain
-        place = k + side * shift
-        return Line(place * self.bin_hz, p_value, int(np.argmax(self.heights[k])), amplitude), place
+        position = k + side * shift
+        return Line(position * self.bin_hz, p_value, int(np.argmax(self.heights[k])), amplitude), position
 
 
 def independent(heights: Floats) -> float:
@@ -185,8 +185,8 @@ def independent(heights: Floats) -> float:
 
 def _leakage(bins: Floats) -> Floats:
     """Return an upper bound of what a line of height 1 leaks into a bin at this distance."""
-    away = np.maximum(np.abs(bins), 1.5)
-    return np.where(np.abs(bins) < _OWN, np.inf, 1.0 / (np.pi * away * (away**2 - 1.0)) ** 2)
+    distance = np.maximum(np.abs(bins), 1.5)
+    return np.where(np.abs(bins) < _SKIPPED, np.inf, 1.0 / (np.pi * distance * (distance**2 - 1.0)) ** 2)
 
 
 def _level(power: Floats, segments: int) -> Floats:
@@ -208,40 +208,40 @@ def _level(power: Floats, segments: int) -> Floats:
         slope = 1.0 / np.abs(np.fft.rfft(a, length)) ** 2
         bound = slope * np.median(power / slope)
     slope = slope * _rise(power / slope)
-    median = _running_median(power / slope, _NEIGHBOURS, _OWN)
+    median = _running_median(power / slope, _NEIGHBOURS, _SKIPPED)
     return slope * median * segments / float(gammaincinv(segments, 0.5))
 
 
 def _rise(ratio: Floats) -> Floats:
     """Return a robust cubic in logarithms through the lowest bins (b,); what stands out of it does not bend it."""
-    frame, out = _cubic(len(ratio)), np.ones(len(ratio))
-    logs = np.log(np.maximum(ratio[_FIRST_BIN : _FIRST_BIN + len(frame)], 1e-300))
+    basis, rise = _cubic(len(ratio)), np.ones(len(ratio))
+    logs = np.log(np.maximum(ratio[_FIRST_BIN : _FIRST_BIN + len(basis)], 1e-300))
     bounded = logs
     for _ in range(6):
-        away = logs - frame @ (frame.T @ bounded)
-        bound = 3.0 * float(np.median(np.abs(away)))
-        bounded = logs - away + np.clip(away, -bound, bound)
-    found = np.exp(frame @ (frame.T @ bounded))
-    out[: _FIRST_BIN + len(frame)] = np.append(np.full(_FIRST_BIN, found[0]), found)
-    out[_FIRST_BIN + len(frame) :] = found[-1]
-    return out
+        residuals = logs - basis @ (basis.T @ bounded)
+        bound = 3.0 * float(np.median(np.abs(residuals)))
+        bounded = logs - residuals + np.clip(residuals, -bound, bound)
+    curve = np.exp(basis @ (basis.T @ bounded))
+    rise[: _FIRST_BIN + len(basis)] = np.append(np.full(_FIRST_BIN, curve[0]), curve)
+    rise[_FIRST_BIN + len(basis) :] = curve[-1]
+    return rise
 
 
 def _leverages(count: int) -> Floats:
     """Return the leverage of each bin (b,) on the cubic."""
-    frame, out = _cubic(count), np.zeros(count)
-    out[_FIRST_BIN : _FIRST_BIN + len(frame)] = (frame**2).sum(axis=1)
-    return out
+    basis, leverages = _cubic(count), np.zeros(count)
+    leverages[_FIRST_BIN : _FIRST_BIN + len(basis)] = (basis**2).sum(axis=1)
+    return leverages
 
 
 @lru_cache(maxsize=16)
 def _cubic(count: int) -> Floats:
     """Return an orthonormal basis (n, 4) of 1, x, x^2, x^3, where x is the logarithm of the lowest bin numbers."""
-    x = np.log(np.arange(_FIRST_BIN, min(_BENT, count - 1)))
+    x = np.log(np.arange(_FIRST_BIN, min(_RISE_BINS, count - 1)))
     return np.linalg.qr(np.vander(x - x.mean(), _CUBIC + 1))[0]
 
 
-def _running_median(values: Floats, reach: int, own: int) -> Floats:
+def _running_median(values: Floats, reach: int, skipped: int) -> Floats:
     """Return the median (b,) of ``reach`` bins on either side without the nearest ``own``; the window is shifted at the
     ends."""
     count = len(values) - _FIRST_BIN - 1
@@ -249,8 +249,10 @@ def _running_median(values: Floats, reach: int, own: int) -> Floats:
     k = np.arange(len(values))
     first = np.clip(k - size // 2, _FIRST_BIN, _FIRST_BIN + count - size)
     window = first[:, None] + np.arange(size)
-    left = np.where(np.abs(window - k[:, None]) <= own - 1, np.nan, values[window]) if own else values[window]
-    return np.nanmedian(left, axis=1)
+    neighbours = (
+        np.where(np.abs(window - k[:, None]) <= skipped - 1, np.nan, values[window]) if skipped else values[window]
+    )
+    return np.nanmedian(neighbours, axis=1)
 
 
 @lru_cache(maxsize=16)

@@ -1,4 +1,4 @@
-"""The parabola that is taken out of readings before what is left of them counts as noise."""
+"""The parabola that is subtracted from readings so that the residuals are their noise."""
 
 from __future__ import annotations
 

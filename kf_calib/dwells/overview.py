@@ -16,11 +16,12 @@ from kf_calib.dwells.stationarity import Stillness
 
 
 @dataclass
-class DwellFound:
-    """A dwell: when it was arrived at, from the first sample on, how long its readings last, and where it is.
+class DwellSummary:
+    """A dwell in a few numbers.
 
-    pose: mean gimbal angles in rad, outer to inner, or attitude; empty without angles. norm_mps2: size of the mean of
-    its readings. up (3,): the unit vector along that mean.
+    - arrival_s: its arrival, since the first sample; lasts_s: how long its readings last.
+    - pose: mean gimbal angles in rad, outer to inner, or attitude; empty without angles.
+    - norm_mps2: length of the mean of its readings; up (3,): the unit vector along that mean.
     """
 
     number: int
@@ -32,25 +33,25 @@ class DwellFound:
     up: tuple[float, float, float]
 
 
-def dwells_found(
+def dwell_summaries(
     source: Source, stillness: Stillness | None = None, on_progress: Callable[[float], None] = lambda _: None
-) -> list[DwellFound]:
+) -> list[DwellSummary]:
     """The dwells of a source, which is read to its end; raises what reading it raises."""
-    found, totals = dict[int, DwellFound](), dict[int, Floats]()
+    dwells, totals = dict[int, DwellSummary](), dict[int, Floats]()
     segmenter = segmenter_of(source.bench, stillness)
     for block in dwell_blocks(source, segmenter):
         on_progress(source.fraction)
         if not len(block.elapsed_s) or block.curve is not None:
             continue
         pose = tuple(float(each) for each in np.asarray(block.pose)[0]) if source.bench.angles else ()
-        new = DwellFound(block.dwell, block.arrival_s, 0.0, 0, pose, math.nan, (0.0, 0.0, 0.0))
-        own = found.setdefault(block.dwell, new)
-        own.readings += len(block.elapsed_s)
-        own.lasts_s = float(block.elapsed_s[-1]) - own.arrival_s
+        new = DwellSummary(block.dwell, block.arrival_s, 0.0, 0, pose, math.nan, (0.0, 0.0, 0.0))
+        dwell = dwells.setdefault(block.dwell, new)
+        dwell.readings += len(block.elapsed_s)
+        dwell.lasts_s = float(block.elapsed_s[-1]) - dwell.arrival_s
         totals[block.dwell] = totals.get(block.dwell, np.zeros(3)) + block.accel_mps2.sum(axis=0)
-    for number, own in found.items():
-        mean = totals[number] / own.readings
-        own.norm_mps2 = float(np.linalg.norm(mean))
-        x, y, z = (mean / max(own.norm_mps2, 1e-300)).tolist()
-        own.up = x, y, z
-    return list(found.values())
+    for number, dwell in dwells.items():
+        mean = totals[number] / dwell.readings
+        dwell.norm_mps2 = float(np.linalg.norm(mean))
+        x, y, z = (mean / max(dwell.norm_mps2, 1e-300)).tolist()
+        dwell.up = x, y, z
+    return list(dwells.values())

@@ -1,8 +1,8 @@
-"""The pieces of a dwell; of one that lasts for hours they are merged, so that what is kept of it is bounded.
+"""The pieces of a dwell. In a dwell of hours neighbouring pieces are merged, so that its memory is bounded.
 
-The basis of two pieces together is a linear map of that of either, so that their triangles are merged without loss of
-a reading. What is lost is that columns were parabolas over either, and are one over both. Pieces stay as short after
-the arrival as they were, and none becomes longer than the time since then.
+The parabola over two pieces together is, on either piece, a linear combination of that piece's basis. Two triangles are
+therefore merged exactly. Only the model's columns become coarser: each was one parabola per piece and is one over both.
+Pieces shortly after the arrival stay short, since a merged piece is never longer than the time since the arrival.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from kf_calib.dwells.rows import Nodes, basis, parabola
 
 MOST_PIECES = 256
 """Pieces of a dwell, at most; at 3 kHz as many last almost six minutes."""
-_LEFT = MOST_PIECES // 4  # pieces of equal length that are left, at most twice as many
+_MERGED_PIECES = MOST_PIECES // 4  # pieces after merging; at most twice as many
 
 
 @dataclass(frozen=True)
@@ -29,20 +29,20 @@ class Piece:
     - nodes: the conditions at its three nodes.
     - count: number of readings, or of averages of them, that were folded.
     - carrier_hz: frequency of the carrier; 0 for none.
-    - taken: number of readings that ``count`` stands for.
+    - reading_count: number of readings that ``count`` stands for.
     """
 
     triangle: Floats
     nodes: Nodes
     count: int
     carrier_hz: float = 0.0
-    taken: int = 0
+    reading_count: int = 0
 
 
 def coarsened(pieces: Sequence[Piece]) -> tuple[Piece, ...]:
     """Pieces in order of time, merged to at most half of ``MOST_PIECES`` and those shortly after the arrival."""
     begin, end = pieces[0].nodes.elapsed_s[0], pieces[-1].nodes.elapsed_s[-1]
-    return tuple(merged(group) for group in _groups(pieces, float(end - begin) / _LEFT))
+    return tuple(merged(group) for group in _groups(pieces, float(end - begin) / _MERGED_PIECES))
 
 
 def _groups(pieces: Sequence[Piece], longest_s: float) -> Iterator[list[Piece]]:
@@ -65,10 +65,10 @@ def merged(pieces: Sequence[Piece]) -> Piece:
     begin, end = pieces[0].nodes.elapsed_s[0], pieces[-1].nodes.elapsed_s[-1]
     middle, half = 0.5 * (begin + end), max(0.5 * float(end - begin), 1e-9)
     width = pieces[0].triangle.shape[1] - 3
-    stacked = np.vstack([_on(piece, middle, half, width) for piece in pieces])
+    stacked = np.vstack([_on_longer_basis(piece, middle, half, width) for piece in pieces])
     return replace(
         pieces[0], triangle=triangle(stacked), nodes=_nodes(pieces, np.array([begin, middle, end])),
-        count=sum(piece.count for piece in pieces), taken=sum(piece.taken for piece in pieces),
+        count=sum(piece.count for piece in pieces), reading_count=sum(piece.reading_count for piece in pieces),
     )  # fmt: skip
 
 
@@ -77,15 +77,15 @@ def _centre(nodes: Nodes) -> tuple[float, float]:
     return float(nodes.elapsed_s[1]), max(0.5 * float(nodes.elapsed_s[-1] - nodes.elapsed_s[0]), 1e-9)
 
 
-def _on(piece: Piece, middle: float, half: float, width: int) -> Floats:
+def _on_longer_basis(piece: Piece, middle: float, half: float, width: int) -> Floats:
     """The triangle of a piece on the basis of a longer one: U = shift + share u, so 1, U, U^2 follow from 1, u, u^2."""
-    own_middle, own_half = _centre(piece.nodes)
-    shift, share = (own_middle - middle) / half, own_half / half
-    turn = np.array([[1.0, shift, shift**2], [0.0, share, 2.0 * shift * share], [0.0, 0.0, share**2]])
-    out = piece.triangle.copy()
+    piece_middle, piece_half = _centre(piece.nodes)
+    shift, share = (piece_middle - middle) / half, piece_half / half
+    change_of_basis = np.array([[1.0, shift, shift**2], [0.0, share, 2.0 * shift * share], [0.0, 0.0, share**2]])
+    lengthened = piece.triangle.copy()
     for first in range(0, width, 3):  # on a carrier its cosine and sine have the same three
-        out[:, first : first + 3] = piece.triangle[:, first : first + 3] @ turn
-    return out
+        lengthened[:, first : first + 3] = piece.triangle[:, first : first + 3] @ change_of_basis
+    return lengthened
 
 
 def _nodes(pieces: Sequence[Piece], at_s: Floats) -> Nodes:
@@ -93,17 +93,17 @@ def _nodes(pieces: Sequence[Piece], at_s: Floats) -> Nodes:
     first, last = pieces[0].nodes, pieces[-1].nodes
     amid = next(piece.nodes for piece in pieces if piece.nodes.elapsed_s[-1] >= at_s[1])
     centre, half = _centre(amid)
-    place = basis(np.array([max((at_s[1] - centre) / half, -1.0)]))[:, 0]  # -1: in a gap, the piece after it
+    functions = basis(np.array([max((at_s[1] - centre) / half, -1.0)]))[:, 0]  # -1: in a gap, the piece after it
 
-    def told(name: str) -> Floats | None:
+    def node_values(name: str) -> Floats | None:
         values = getattr(amid, name)
         if values is None:
             return None
-        between = place @ parabola(values.reshape(3, -1))
+        between = functions @ parabola(values.reshape(3, -1))
         return np.array([getattr(first, name)[0], between.reshape(values.shape[1:]), getattr(last, name)[-1]])
 
     since_s = at_s - first.elapsed_s[0] + first.since_arrival_s[0]
-    force, pose, warmth = told("force_mps2"), told("pose"), told("temperature_c")
+    force, pose, warmth = node_values("force_mps2"), node_values("pose"), node_values("temperature_c")
     assert force is not None and pose is not None and warmth is not None
-    return Nodes(at_s, since_s, force, pose, warmth, told("rate_radps"), told("rate_change_radps2"),
-                 told("variance_mps2_2"))  # fmt: skip
+    return Nodes(at_s, since_s, force, pose, warmth, node_values("rate_radps"), node_values("rate_change_radps2"),
+                 node_values("variance_mps2_2"))  # fmt: skip

@@ -29,6 +29,14 @@ def triangle(rows: NDArray[np.floating[Any]]) -> Floats:
     return cast("Floats", np.where(_upper(least, width), folded, 0.0))
 
 
+def square_triangle(stacked: Floats) -> Floats:
+    """The square triangular factor of rows (n, c), padded with zeros if there are fewer rows than columns."""
+    width = stacked.shape[1]
+    if len(stacked) < width:
+        stacked = np.vstack([stacked, np.zeros((width - len(stacked), width))])
+    return triangle(stacked)
+
+
 @lru_cache(maxsize=256)
 def _upper(count: int, width: int) -> Mask:
     """Return the mask (m, n) of an upper triangle."""
@@ -47,9 +55,9 @@ def orthonormal(rows: Floats) -> tuple[Floats, Floats]:
     parts = [slice(k, min(k + part, count)) for k in range(0, count - width, part)]
     parts[-1] = slice(parts[-1].start, count)  # so that no part has fewer rows than columns
     upper = np.empty((len(parts) * width, width))
-    for k, own in enumerate(parts):
-        rows[own], upper[k * width : (k + 1) * width] = np.linalg.qr(rows[own])
-    turned, out = orthonormal(upper)
-    for k, own in enumerate(parts):
-        rows[own] = rows[own] @ turned[k * width : (k + 1) * width]
-    return rows, out
+    for k, part_rows in enumerate(parts):
+        rows[part_rows], upper[k * width : (k + 1) * width] = np.linalg.qr(rows[part_rows])
+    small_q, factor = orthonormal(upper)
+    for k, part_rows in enumerate(parts):
+        rows[part_rows] = rows[part_rows] @ small_q[k * width : (k + 1) * width]
+    return rows, factor

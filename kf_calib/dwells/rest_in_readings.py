@@ -35,10 +35,10 @@ _FEWEST = 4  # readings of a window
 _PERIODS = 32  # intervals between the first readings, whose median tells how many readings a window has
 _LEAST_WINDOWS = 4  # of a dwell
 _REMEMBERED = 1200  # windows whose variances tell the noise: five minutes
-_ALLOWED = 1.5  # correlated noise has fewer degrees of freedom than readings
+_VARIANCE_MARGIN = 1.5  # correlated noise has fewer degrees of freedom than readings
 _SIGMAS = 6.0
 _LEAST_G, _MOST_G = 1e-5, 0.05  # scatter that is never, and always, called a motion, in g
-_UP = np.array([[0.0, 0.0, 0.0, 1.0]])  # stands for an attitude that is not known
+_ANY_ATTITUDE = np.array([[0.0, 0.0, 0.0, 1.0]])  # stands for an attitude that is not known
 
 
 class RestSegmenter(Segmenter):
@@ -47,24 +47,24 @@ class RestSegmenter(Segmenter):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._size = 0  # readings of a window; 0 while it is not known
-        self._gone = 0  # readings that were released: the place of the first one that waits
-        self._seen = 0  # place of the first reading that is in no window yet
-        self._quiet: _Quiet | None = None
-        self._run: _Run | None = None
+        self._dropped = 0  # readings that were released: the place of the first one that waits
+        self._window_begin = 0  # place of the first reading that is in no window yet
+        self._noise: _RestNoise | None = None
+        self._run: _StillRun | None = None
 
     def push(self, batch: Batch) -> Iterator[Block]:
         """Yield the blocks that are complete once this batch is known."""
         self._take(Batch(batch.accel, Stream.empty(4), batch.temperature))
-        yield from self._judged(final=False)
+        yield from self._blocks_of_windows(final=False)
 
     def finish(self) -> Iterator[Block]:
         """Yield the blocks that are still open at the end of the readings."""
         accel, _, temperature = (order.flush() for order in self._orders)
         self._take(Batch(accel, Stream.empty(4), temperature), final=True)
-        yield from self._judged(final=True)
+        yield from self._blocks_of_windows(final=True)
         if self._run is not None:
-            yield from self._closed(self._run, left=self._run.end < self._gone + len(self._accel))
-        self._pass(self._gone + len(self._accel))
+            yield from self._close(self._run, departed=self._run.end < self._dropped + len(self._accel))
+        self._skip_to(self._dropped + len(self._accel))
 
     @property
     def standing(self) -> int | None:
@@ -91,90 +91,91 @@ class RestSegmenter(Segmenter):
             return []
         aside = copy.copy(self)
         aside.tally = Tally()
-        return list(aside._closed(copy.copy(self._run), left=True))
+        return list(aside._close(copy.copy(self._run), departed=True))
 
-    def _judged(self, final: bool) -> Iterator[Block]:
+    def _blocks_of_windows(self, final: bool) -> Iterator[Block]:
         """Judge the windows that are whole by now and yield the blocks that become complete.
 
-        At the end the last window takes the readings that are left; so it waits until the one after it is whole, too.
+        The last window of a run also takes the readings that do not fill another one; therefore a window is judged only
+        when the next one is complete.
         """
         for begin, end, mean, variance in self._windows(final):
             window = _Window(begin, end, mean, variance)
-            assert self._quiet is not None
-            self._quiet.add(variance)
-            yield from self._followed(window, *self._quiet.bounds(end - begin))
+            assert self._noise is not None
+            self._noise.add(variance)
+            yield from self._add_window(window, *self._noise.bounds(end - begin))
         run = self._run
         if run is not None and run.number is not None:
             yield from self._whole_blocks(run)
-        self._pass(self._seen if run is None else min(run.begin, self._seen))
+        self._skip_to(self._window_begin if run is None else min(run.begin, self._window_begin))
         self._forget_temperatures()
 
     def _windows(self, final: bool) -> Iterator[tuple[int, int, Floats, float]]:
         """Yield place of the first reading, of the one after the last, mean (3,) and variance of each new window."""
-        if not self._size and not self._sized(final):
+        if not self._size and not self._knows_window_size(final):
             return
-        values = self._accel.values[self._seen - self._gone :]
-        size, whole = self._size, len(values) // self._size - 1
-        if whole > 0:
-            parts = values[: whole * size].reshape(whole, size, 3)
+        values = self._accel.values[self._window_begin - self._dropped :]
+        size, count = self._size, len(values) // self._size - 1
+        if count > 0:
+            parts = values[: count * size].reshape(count, size, 3)
             means, variances = parts.mean(axis=1), parts.var(axis=1, ddof=1).sum(axis=1)
-            for k in range(whole):
-                begin, self._seen = self._seen, self._seen + size
-                yield begin, self._seen, means[k], float(variances[k])
-        if final and whole >= 0:
-            rest, begin = values[whole * size :], self._seen
-            self._seen += len(rest)
-            yield begin, self._seen, rest.mean(axis=0), float(rest.var(axis=0, ddof=1).sum())
+            for k in range(count):
+                begin, self._window_begin = self._window_begin, self._window_begin + size
+                yield begin, self._window_begin, means[k], float(variances[k])
+        if final and count >= 0:
+            remainder, begin = values[count * size :], self._window_begin
+            self._window_begin += len(remainder)
+            yield begin, self._window_begin, remainder.mean(axis=0), float(remainder.var(axis=0, ddof=1).sum())
 
-    def _sized(self, final: bool) -> bool:
+    def _knows_window_size(self, final: bool) -> bool:
         """Settle how many readings a window has; tell whether that is known by now."""
         if len(self._accel) <= _PERIODS and not (final and len(self._accel) >= 2 * _FEWEST):
             return False
         period_ns = float(np.median(np.diff(self._accel.time_ns[: _PERIODS + 1])))
         self._size = max(_FEWEST, round(_WINDOW_NS / max(period_ns, 1.0)))
-        self._quiet = _Quiet(self.bench.gravity_mps2, 3 * (self._size - 1), self.stillness.tolerance_rad)
+        self._noise = _RestNoise(self.bench.gravity_mps2, 3 * (self._size - 1), self.stillness.tolerance_rad)
         return True
 
-    def _followed(self, window: _Window, most: float, allowed: float) -> Iterator[Block]:
+    def _add_window(self, window: _Window, largest_variance: float, allowed: float) -> Iterator[Block]:
         """Take one more window into the run of still windows, or end that run and yield its last blocks."""
-        run, still = self._run, window.variance <= most
+        run, still = self._run, window.variance <= largest_variance
         if run is not None and still and run.agrees(window, allowed):
             run.add(window, self._stamp(window.end - 1))
             if run.number is None and run.count >= _LEAST_WINDOWS:
-                self._begin(run, window, most)
+                self._begin(run, window, largest_variance)
         elif still or run is None or run.interrupted:
             if run is not None and run.number is not None:
-                yield from self._closed(run, left=True)
-            self._run = self._run_of(window) if still else None
+                yield from self._close(run, departed=True)
+            self._run = self._new_run(window) if still else None
         else:
             run.interrupted = True
 
-    def _begin(self, run: _Run, latest: _Window, most: float) -> None:
+    def _begin(self, run: _StillRun, latest: _Window, largest_variance: float) -> None:
         """Begin a dwell, unless its first windows are not still by what is known of the noise now."""
-        if run.loudest > most:
-            self._run = self._run_of(latest)
+        if run.loudest > largest_variance:
+            self._run = self._new_run(latest)
             return
-        self._pass(run.begin)
+        self._skip_to(run.begin)
         self.dwell_count += 1
         run.number = self.dwell_count
 
-    def _run_of(self, first: _Window) -> _Run:
+    def _new_run(self, first: _Window) -> _StillRun:
         """Return a run of one window."""
         stamps = self._stamp(first.begin), self._stamp(first.end - 1)
-        return _Run(first.begin, first.end, *stamps, first.mean, first.mean, first.variance)
+        return _StillRun(first.begin, first.end, *stamps, first.mean, first.mean, first.variance)
 
-    def _whole_blocks(self, run: _Run) -> Iterator[Block]:
+    def _whole_blocks(self, run: _StillRun) -> Iterator[Block]:
         """Yield the whole blocks of the open dwell that no departure can take back."""
         settle_ns = self.stillness.settle_ns if run.begin else 0
         if run.end_ns - run.arrival_ns < 3 * settle_ns:
             return
         self._settle(run, settle_ns)
-        end = self._place(run.end_ns - self.stillness.lead_ns)
-        while end - self._gone >= BLOCK_SAMPLES:
-            yield self._released(run, BLOCK_SAMPLES)
+        end = self._index(run.end_ns - self.stillness.lead_ns)
+        while end - self._dropped >= BLOCK_SAMPLES:
+            yield self._next_block(run, BLOCK_SAMPLES)
 
-    def _closed(self, run: _Run, left: bool) -> Iterator[Block]:
-        """Yield the blocks of a dwell that are not out yet; left: whether it was left, not cut by the end."""
+    def _close(self, run: _StillRun, departed: bool) -> Iterator[Block]:
+        """Yield the remaining blocks of a dwell; ``departed``: the platform left it, the run did not merely end."""
         self._run = None
         if run.number is None:
             return
@@ -184,49 +185,51 @@ class RestSegmenter(Segmenter):
             self.tally.short_dwells += 1
             self.tally.least_settling_s = min(self.tally.least_settling_s, settle_ns / SECOND_NS)
         self._settle(run, settle_ns)
-        end = self._place(run.end_ns - min(self.stillness.lead_ns, length_ns // 10)) if left else run.end
-        while self._gone < end:
-            yield self._released(run, min(BLOCK_SAMPLES, end - self._gone))
-        self.tally.settling += run.end - self._gone
-        self._release(run.end - self._gone)
+        end = self._index(run.end_ns - min(self.stillness.lead_ns, length_ns // 10)) if departed else run.end
+        while self._dropped < end:
+            yield self._next_block(run, min(BLOCK_SAMPLES, end - self._dropped))
+        self.tally.settling += run.end - self._dropped
+        self._release(run.end - self._dropped)
 
-    def _settle(self, run: _Run, settle_ns: int) -> None:
+    def _settle(self, run: _StillRun, settle_ns: int) -> None:
         """Release the readings of the margin after the arrival, once."""
         if run.settled:
             return
         run.settled = True
-        count = self._place(run.arrival_ns + settle_ns) - self._gone
+        count = self._index(run.arrival_ns + settle_ns) - self._dropped
         self.tally.settling += count
         self._release(count)
 
-    def _released(self, run: _Run, count: int) -> Block:
+    def _next_block(self, run: _StillRun, count: int) -> Block:
         """Make a block of the next readings of a dwell, whose attitude is not known."""
         assert run.number is not None and self.first_ns is not None
-        part = self._accel[:count]
+        readings = self._accel[:count]
         self._release(count)
         self.tally.used += count
-        elapsed_s = (part.time_ns - self.first_ns) / SECOND_NS
-        warm = carry_on(self._temperature, part.time_ns)
-        return Block(run.number, self._elapsed_s(run.arrival_ns), elapsed_s, part.values, _UP, warm)
+        elapsed_s = (readings.time_ns - self.first_ns) / SECOND_NS
+        temperature_c = carry_on(self._temperature, readings.time_ns)
+        return Block(
+            run.number, self._elapsed_s(run.arrival_ns), elapsed_s, readings.values, _ANY_ATTITUDE, temperature_c
+        )
 
-    def _pass(self, place: int) -> None:
+    def _skip_to(self, index: int) -> None:
         """Release and count the readings before a place that are in no dwell."""
         run = self._run
         if run is None or run.number is None:
-            self.tally.moving += max(place - self._gone, 0)
-            self._release(max(place - self._gone, 0))
+            self.tally.moving += max(index - self._dropped, 0)
+            self._release(max(index - self._dropped, 0))
 
     def _release(self, count: int) -> None:
         """Drop the first readings that wait."""
-        self._accel, self._gone = self._accel[count:], self._gone + count
+        self._accel, self._dropped = self._accel[count:], self._dropped + count
 
-    def _place(self, stamp_ns: int) -> int:
+    def _index(self, stamp_ns: int) -> int:
         """Return the place of the first reading at or after a stamp."""
-        return self._gone + int(np.searchsorted(self._accel.time_ns, stamp_ns))
+        return self._dropped + int(np.searchsorted(self._accel.time_ns, stamp_ns))
 
-    def _stamp(self, place: int) -> int:
+    def _stamp(self, index: int) -> int:
         """Return the stamp of a reading that waits."""
-        return int(self._accel.time_ns[place - self._gone])
+        return int(self._accel.time_ns[index - self._dropped])
 
     def _elapsed_s(self, stamp_ns: int) -> float:
         assert self.first_ns is not None
@@ -258,7 +261,7 @@ class _Window:
 
 
 @dataclass
-class _Run:
+class _StillRun:
     """A run of still windows; a dwell once it has a number.
 
     begin, end: places of its first reading and of the one after its last. last, total (3,): mean of its last window,
@@ -291,7 +294,7 @@ class _Run:
 
 
 @dataclass
-class _Quiet:
+class _RestNoise:
     """The noise of a sensor at rest, by the variances of the latest windows.
 
     freedom: degrees of freedom of a window's variance.
@@ -312,13 +315,13 @@ class _Quiet:
 
     def bounds(self, count: int) -> tuple[float, float]:
         """The largest variance of a window that is still, and by how much its mean of ``count`` readings may move."""
-        place = 0.25 * (len(self.ordered) - 1)
-        low, high = self.ordered[math.floor(place)], self.ordered[math.ceil(place)]
-        quartile = low + (place - math.floor(place)) * (high - low)
+        rank = 0.25 * (len(self.ordered) - 1)
+        low, high = self.ordered[math.floor(rank)], self.ordered[math.ceil(rank)]
+        quartile = low + (rank - math.floor(rank)) * (high - low)
         least, most = (_LEAST_G * self.gravity_mps2) ** 2, (_MOST_G * self.gravity_mps2) ** 2
         noise = min(quartile / _chi_squared(-0.674, self.freedom), most) + least
         allowed = _SIGMAS * math.sqrt(noise / count) + self.tolerance_rad * self.gravity_mps2
-        return _ALLOWED * _chi_squared(5.0, self.freedom) * noise, allowed
+        return _VARIANCE_MARGIN * _chi_squared(5.0, self.freedom) * noise, allowed
 
 
 def _chi_squared(normal: float, freedom: int) -> float:

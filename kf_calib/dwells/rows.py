@@ -53,10 +53,10 @@ def parabola(values: Floats) -> Floats:
     Equal values give coefficients of exactly zero on u and u^2, so that a constant column contributes only to the mean.
     """
     first, middle, last = values[..., 0, :], values[..., 1, :], values[..., 2, :]
-    out = np.empty(values.shape)
-    out[..., 0, :], out[..., 1, :] = middle, 0.5 * (last - first)
-    out[..., 2, :] = 0.5 * (first - middle) + 0.5 * (last - middle)
-    return out
+    coefficients = np.empty(values.shape)
+    coefficients[..., 0, :], coefficients[..., 1, :] = middle, 0.5 * (last - first)
+    coefficients[..., 2, :] = 0.5 * (first - middle) + 0.5 * (last - middle)
+    return coefficients
 
 
 def on_basis(values: Floats) -> Floats:
@@ -79,7 +79,7 @@ class Rows:
     - moving: the block belongs to the slew after the dwell.
     - gated (3, m): for each rejected reading, the channels in which it is an outlier; None if none was rejected.
     - raw: the rows before averaging, if the readings were averaged.
-    - taken: number of readings that a row stands for.
+    - readings_per_row: number of readings that a row stands for.
     - pose_sigma_rad: uncertainty of the pose due to noise of the angles.
     - turns: whole turns by which the pose goes beyond the angles as recorded.
     - along (3,): unit vector of the mean reading where no angles are used, which is the force but for scale factors and
@@ -96,13 +96,13 @@ class Rows:
     moving: bool = False
     gated: Mask | None = None
     raw: Rows | None = None
-    taken: int = 1
+    readings_per_row: int = 1
     pose_sigma_rad: float = 0.0
     turns: tuple[int, ...] = ()
     along: Floats | None = None
 
     @property
-    def felt(self) -> tuple[Floats, Floats]:
+    def without_rotations(self) -> tuple[Floats, Floats]:
         """Innovations (3, n) and readings (n, 3) as far as no rotation changes them: all of them with angles, else
         their parts along the force. A body in the hand creeps and trembles, which is no noise of its sensors."""
         if self.along is None:
@@ -131,19 +131,19 @@ def model_rows(
             standing = block.pose, bench.specific_force(np.zeros(1), block.pose)
         force = standing[1] if static and standing else None
         raw = _rows(block, bench, force)
-        means = average(block, window_s) if window_s else block
-        if means is None:
+        averaged = average(block, window_s) if window_s else block
+        if averaged is None:
             continue
-        block, rows = means, _rows(means, bench, force) if window_s else raw
+        block, rows = averaged, _rows(averaged, bench, force) if window_s else raw
         if gate_sigma is not None and (not window_s or len(rows.readings) >= _GATED):
             keep = innovation_gate.inliers(rows.columns, rows.readings, rows.innovation, static, gate_sigma)
             if keep is not None:
                 tally.gated += int((~keep).sum())
-                out = rows.innovation[:, ~keep]
+                rejected = rows.innovation[:, ~keep]
                 block = _select(block, keep)
                 rows = _rows(block, bench, force)
-                rows = replace(rows, gated=innovation_gate.channels(out, rows.innovation, gate_sigma))
-        yield replace(rows, raw=raw, taken=block.taken) if window_s else rows
+                rows = replace(rows, gated=innovation_gate.channels(rejected, rows.innovation, gate_sigma))
+        yield replace(rows, raw=raw, readings_per_row=block.readings_per_row) if window_s else rows
 
 
 def _select(block: Block, keep: Mask) -> Block:
@@ -193,17 +193,17 @@ def _slew_rows(block: Block, bench: Bench, curve: Curve) -> Rows:
 
 def _slew_piece(block: Block, part: slice, bench: Bench, curve: Curve) -> tuple[slice, Floats, Nodes]:
     """Return the slice, u and the nodes of one piece of a slew."""
-    own = block.elapsed_s[part]
-    u, at = _spread(own)
-    pose = curve.angles(at)
+    elapsed_s = block.elapsed_s[part]
+    u, node_s = _node_times(elapsed_s)
+    pose = curve.angles(node_s)
     nodes = Nodes(
-        at, at - block.arrival_s, bench.specific_force(at, pose), pose, _temperatures(u, block.temperature_c[part]),
-        curve.rate(at), curve.rate_change(at),
+        node_s, node_s - block.arrival_s, bench.specific_force(node_s, pose), pose,
+        _temperatures(u, block.temperature_c[part]), curve.rate(node_s), curve.rate_change(node_s),
     )  # fmt: skip
     return part, u, nodes
 
 
-def _spread(elapsed_s: Floats) -> tuple[Floats, Floats]:
+def _node_times(elapsed_s: Floats) -> tuple[Floats, Floats]:
     """Return u (n,) from -1 to 1 over the readings, and the times of the nodes (3,)."""
     middle, half = 0.5 * (elapsed_s[0] + elapsed_s[-1]), max(0.5 * (elapsed_s[-1] - elapsed_s[0]), 1e-9)
     return (elapsed_s - middle) / half, np.array([elapsed_s[0], middle, elapsed_s[-1]])
@@ -216,14 +216,16 @@ _EDGES_S = np.concatenate([2.0 ** np.arange(6), 60.0 * np.arange(1, 20_000)])
 
 def _piece(block: Block, part: slice, bench: Bench, force: Floats | None) -> tuple[slice, Floats, Nodes]:
     """Return the slice, u and the nodes of one piece of a dwell."""
-    own, warm = block.elapsed_s[part], block.temperature_c[part]
-    u, at = _spread(own)
+    elapsed_s, temperature_c = block.elapsed_s[part], block.temperature_c[part]
+    u, node_s = _node_times(elapsed_s)
     pose = np.repeat(block.pose, 3, axis=0) if len(block.pose) == 1 else _values_at_nodes(u, block.pose[part])
     if force is None:
-        force = bench.specific_force(at, pose)
+        force = bench.specific_force(node_s, pose)
     variance = None if block.variance_mps2_2 is None else _values_at_nodes(u, block.variance_mps2_2[part])
-    since_s = at - (block.arrival_s if block.felt_s is None else block.felt_s)
-    nodes = Nodes(at, since_s, np.broadcast_to(force, (3, 3)), pose, _temperatures(u, warm), variance_mps2_2=variance)
+    since_s = node_s - (block.arrival_s if block.arrival_felt_s is None else block.arrival_felt_s)
+    nodes = Nodes(
+        node_s, since_s, np.broadcast_to(force, (3, 3)), pose, _temperatures(u, temperature_c), variance_mps2_2=variance
+    )
     return part, u, nodes
 
 
@@ -232,8 +234,8 @@ def _temperatures(u: Floats, measured: Floats) -> Floats:
     level = measured.mean()
     if not math.isfinite(level) or measured[0] == measured[-1] == level:
         return np.full(3, level)
-    away = u - u.mean()
-    slope = (away @ measured) / max(away @ away, 1e-300)
+    centred = u - u.mean()
+    slope = (centred @ measured) / max(centred @ centred, 1e-300)
     return level + slope * (np.array([-1.0, 0.0, 1.0]) - u.mean())
 
 
@@ -243,10 +245,10 @@ def basis(u: Floats, elapsed_s: Floats | None = None, carrier_hz: float = 0.0) -
     if elapsed_s is not None and carrier_hz:
         plain, phase = basis(u), 2.0 * np.pi * carrier_hz * elapsed_s
         return np.concatenate([plain, plain * np.cos(phase), plain * np.sin(phase)])
-    out = np.empty((3, len(u)))
-    out[0], out[1] = 1.0, u
-    np.multiply(u, u, out=out[2])
-    return out
+    functions = np.empty((3, len(u)))
+    functions[0], functions[1] = 1.0, u
+    np.multiply(u, u, out=functions[2])
+    return functions
 
 
 def _values_at_nodes(u: Floats, values: Floats) -> Floats:

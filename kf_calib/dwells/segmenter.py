@@ -36,7 +36,7 @@ _HOLD_NS = SECOND_NS  # a reading up to this far outside the first or last angle
 _SLEW_READINGS = 8  # least number of readings of a slew that is used
 _REST_NS = 2 * SECOND_NS  # least length of a dwell that is recognised from readings alone
 _PENDING_SAMPLES = 1 << 22  # readings that may wait for an angle; 32 B each
-_SURE = 3  # fewer messages do not determine the noise of an encoder
+_FEWEST_FOR_NOISE = 3  # fewer messages do not determine the noise of an encoder
 
 
 @dataclass
@@ -63,8 +63,8 @@ class Segmenter:
         self._accel = Stream.empty(3)
         self._pose = Stream.empty(self.bench.pose_width)
         self._turns = np.empty((0, len(self.bench.axes) or 1))  # whole turns that were added to each recorded pose
-        self._early = list[Stream]()  # recorded poses that are later than the readings so far
-        self._before: tuple[Floats, Floats] | None = None  # the last recorded pose and its turns
+        self._early_poses = list[Stream]()  # recorded poses that are later than the readings so far
+        self._last_recorded: tuple[Floats, Floats] | None = None  # the last recorded pose and its turns
         self._temperature = Stream.empty(1)
         self._orders = (StampOrder(), StampOrder(), StampOrder())
         self._decided_ns: int | None = None  # intervals of poses before this stamp have been judged
@@ -136,31 +136,31 @@ class Segmenter:
         self._accel += accel
 
     def _take_poses(self, pose: Stream, final: bool) -> None:
-        """Add the poses up to the time of the latest reading; later ones wait in ``_early``.
+        """Add the poses up to the time of the latest reading; later ones wait in ``_early_poses``.
 
         Arrivals and departures are judged from poses and readings together, and the result must not depend on which
         stream was delivered first.
         """
         if len(pose):
-            sound, counts = self._sound(pose.values), Tally()
-            pose = self._orders[1](pose[sound], counts)
+            usable, counts = self._usable(pose.values), Tally()
+            pose = self._orders[1](pose[usable], counts)
             self.tally.poses += len(pose)
-            self.tally.poses_dropped += int((~sound).sum()) + counts.repeated + counts.backward + counts.leaping
+            self.tally.poses_dropped += int((~usable).sum()) + counts.repeated + counts.backward + counts.leaping
             if self.bench.axes:
                 self.tally.farthest_rad = max(self.tally.farthest_rad, float(np.abs(pose.values).max(initial=0.0)))
-        self._early += [pose] if len(pose) else []
+        self._early_poses += [pose] if len(pose) else []
         reached_ns = _LAST_NS if final else self._orders[0].last_ns
-        if not self._early or reached_ns is None or self._early[0].time_ns[0] > reached_ns:
+        if not self._early_poses or reached_ns is None or self._early_poses[0].time_ns[0] > reached_ns:
             return
-        pose = Stream.joined(self._early)
+        pose = Stream.joined(self._early_poses)
         reached = int(np.searchsorted(pose.time_ns, reached_ns, side="right"))
-        pose, self._early = pose[:reached], [pose[reached:]] if reached < len(pose) else []
-        continuous, turns = unwrap_pose(pose.values, not self.bench.axes, self._before)
-        self._before = pose.values[-1], turns[-1]
+        pose, self._early_poses = pose[:reached], [pose[reached:]] if reached < len(pose) else []
+        continuous, turns = unwrap_pose(pose.values, not self.bench.axes, self._last_recorded)
+        self._last_recorded = pose.values[-1], turns[-1]
         self._pose += Stream(pose.time_ns, continuous)
         self._turns = np.concatenate([self._turns, turns])
 
-    def _sound(self, poses: Floats) -> Mask:
+    def _usable(self, poses: Floats) -> Mask:
         """Return a mask (m,) of usable poses: finite angles of possible size, or quaternions of nearly unit length."""
         readable = within(poses, LARGEST_RAD)
         readable = np.ones(len(poses), bool) if readable is None else readable
@@ -172,15 +172,17 @@ class Segmenter:
         """Process the arrivals and departures that can be judged by now and yield the blocks that become complete."""
         for stamp, event, settles in self._judge(final):
             if event is DwellEvent.ARRIVE:
-                felt_ns = self._felt_ns(stamp)
+                arrival_felt_ns = self._arrival_felt_ns(stamp)
                 yield from self._slew(stamp)
                 self._discard(stamp)
                 self.dwell_count += 1
                 settling_ns = None if settles else 0
-                self._dwell = OpenDwell(self.dwell_count, stamp, felt_ns, self._next_pose_ns(stamp), settling_ns)
+                self._dwell = OpenDwell(
+                    self.dwell_count, stamp, arrival_felt_ns, self._next_pose_ns(stamp), settling_ns
+                )
             else:
                 lead_ns = min(self.stillness.lead_ns, (stamp - self._dwell.arrival_ns) // 10) if self._dwell else 0
-                yield from self._emit(stamp - lead_ns, closing=True, left=True)
+                yield from self._emit(stamp - lead_ns, closing=True, departed=True)
                 self._dwell = None
         horizon = self._horizon(final)
         if horizon is None:
@@ -206,12 +208,12 @@ class Segmenter:
         times, poses = times[start:], poses[start:]
         if len(times) < 2:
             return self._lone_pose(times) if final else []
-        known = times + self.stillness.window_ns <= times[-1]
-        count = len(times) - 1 if final else int(known[:-1].sum())
+        complete = times + self.stillness.window_ns <= times[-1]
+        count = len(times) - 1 if final else int(complete[:-1].sum())
         if count == 0:
             return []
-        known |= final
-        still, self._cover_ns = self.stillness.intervals(times, poses, not self.bench.axes, known, self._cover_ns)
+        complete |= final
+        still, self._cover_ns = self.stillness.intervals(times, poses, not self.bench.axes, complete, self._cover_ns)
         still = still[:count]
         events = self._events(times, still)
         self._decided_ns = int(times[count])
@@ -259,7 +261,7 @@ class Segmenter:
         angles."""
         return self.stillness.departure_ns(self._pose, not self.bench.axes, arrived_ns, end_ns)
 
-    def _felt_ns(self, arrival_ns: int) -> int:
+    def _arrival_felt_ns(self, arrival_ns: int) -> int:
         """Return the time of an arrival as the readings show it.
 
         The angles give the arrival only to within their sampling period, and too early if a slew ends gently.
@@ -268,7 +270,7 @@ class Segmenter:
         if last < 0:
             return arrival_ns
         since_ns = int(self._pose.time_ns[last])
-        return self.stillness.felt_ns(self._accel, since_ns, arrival_ns, self.bench.gravity_mps2)
+        return self.stillness.arrival_felt_ns(self._accel, since_ns, arrival_ns, self.bench.gravity_mps2)
 
     def _next_pose_ns(self, stamp: int) -> int:
         """Return the stamp of the first pose message at or after an arrival, with which the poses of the dwell
@@ -324,36 +326,45 @@ class Segmenter:
         if np.abs(np.diff(poses, axis=0)).max() > np.ptp(poses, axis=0).max() / 4.0:  # too few messages
             return
         curve = Curve.through(self.bench, (times - self.first_ns) / SECOND_NS, poses)
-        warm, elapsed_s = carry_on(self._temperature, accel.time_ns), (accel.time_ns - self.first_ns) / SECOND_NS
+        temperature_c, elapsed_s = (
+            carry_on(self._temperature, accel.time_ns),
+            (accel.time_ns - self.first_ns) / SECOND_NS,
+        )
         for part in np.array_split(np.arange(count), -(-count // BLOCK_SAMPLES)):
-            own = elapsed_s[part]
+            part_s = elapsed_s[part]
             yield Block(
-                self.dwell_count, float(elapsed_s[0]), own, accel.values[part], curve.angles(own), warm[part], curve
+                self.dwell_count,
+                float(elapsed_s[0]),
+                part_s,
+                accel.values[part],
+                curve.angles(part_s),
+                temperature_c[part],
+                curve,
             )
         self.tally.slewing += count
         self._accel = self._accel[count:]
 
-    def _emit(self, until_ns: int, closing: bool, left: bool = False) -> Iterator[Block]:
+    def _emit(self, until_ns: int, closing: bool, departed: bool = False) -> Iterator[Block]:
         """Yield blocks of the open dwell from its readings before ``until_ns``; the last block may be short if the
         dwell closes.
 
-        ``left`` tells that the dwell closes because the platform left. A dwell that is short because the run ends is
-        not reported as too short.
+        ``departed``: the dwell closes because the platform left. A dwell that is short because the run ends is not
+        reported as too short.
         """
         assert self._dwell is not None
         dwell, settle_ns = self._dwell, self.stillness.settle_ns
         if dwell.settling_ns is None:
-            rest_ns, judged = self.stillness.rest_ns(self._pose, not self.bench.axes, dwell.arrival_ns, until_ns)
+            rest_ns, certain = self.stillness.rest_ns(self._pose, not self.bench.axes, dwell.arrival_ns, until_ns)
             length_ns = until_ns - rest_ns
-            if not closing and (not judged or length_ns < 3 * settle_ns):
+            if not closing and (not certain or length_ns < 3 * settle_ns):
                 return
             dwell.settling_ns = rest_ns - dwell.arrival_ns + min(settle_ns, length_ns // 3)
-            if settle_ns > length_ns // 3 and left:
+            if settle_ns > length_ns // 3 and departed:
                 self.tally.short_dwells += 1
                 self.tally.least_settling_s = min(self.tally.least_settling_s, length_ns // 3 / SECOND_NS)
         count = int(np.searchsorted(self._accel.time_ns, until_ns))
         first = min(int(np.searchsorted(self._accel.time_ns, dwell.arrival_ns + dwell.settling_ns)), count)
-        if closing and dwell.pose is None and self._is_unsure(self._accel.time_ns[first:count]):
+        if closing and dwell.pose is None and self._encoder_noise_unknown(self._accel.time_ns[first:count]):
             first = count
         self.tally.settling += first
         while count - first >= BLOCK_SAMPLES or (closing and count > first):
@@ -362,24 +373,25 @@ class Segmenter:
             first += size
         self._accel = self._accel[first:]
 
-    def _is_unsure(self, times: Times) -> bool:
+    def _encoder_noise_unknown(self, times: Times) -> bool:
         """Tell whether an encoder is noisy and has so few messages during these readings that its noise cannot be
         estimated."""
         if not len(times) or self._encoder_rad <= self.stillness.rest_rad:
             return False
-        return int(np.diff(np.searchsorted(self._pose.time_ns, (times[0], times[-1])))[0]) < _SURE
+        return int(np.diff(np.searchsorted(self._pose.time_ns, (times[0], times[-1])))[0]) < _FEWEST_FOR_NOISE
 
     def _block(self, accel: Stream) -> Block:
         """Make a block of the open dwell from these readings."""
         assert self._dwell is not None and self.first_ns is not None
         self.tally.used += len(accel)
         elapsed_s = (accel.time_ns - self.first_ns) / SECOND_NS
-        arrival_s, felt_s = (
-            max((stamp - self.first_ns) / SECOND_NS, 0.0) for stamp in (self._dwell.arrival_ns, self._dwell.felt_ns)
+        arrival_s, arrival_felt_s = (
+            max((stamp - self.first_ns) / SECOND_NS, 0.0)
+            for stamp in (self._dwell.arrival_ns, self._dwell.arrival_felt_ns)
         )
-        pose, warm = self._block_pose(accel.time_ns), carry_on(self._temperature, accel.time_ns)
+        pose, temperature_c = self._block_pose(accel.time_ns), carry_on(self._temperature, accel.time_ns)
         return Block(
-            self._dwell.number, arrival_s, elapsed_s, accel.values, pose, warm, felt_s=felt_s,
+            self._dwell.number, arrival_s, elapsed_s, accel.values, pose, temperature_c, arrival_felt_s=arrival_felt_s,
             pose_sigma_rad=self._dwell.pose_sigma_rad, turns=self._dwell_turns(),
         )  # fmt: skip
 
@@ -395,18 +407,18 @@ class Segmenter:
         """Return the pose of a block: (1, k) if the platform stands still, (n, k) if it creeps."""
         assert self._dwell is not None
         times, poses = self._pose.time_ns, self._pose.values
-        own = int(np.searchsorted(times, self._dwell.first_pose_ns))
-        first = max(int(np.searchsorted(times, accel_ns[0])), own)
-        last = max(int(np.searchsorted(times, accel_ns[-1], side="right")), own)
+        first_of_dwell = int(np.searchsorted(times, self._dwell.first_pose_ns))
+        first = max(int(np.searchsorted(times, accel_ns[0])), first_of_dwell)
+        last = max(int(np.searchsorted(times, accel_ns[-1], side="right")), first_of_dwell)
         if first == last:  # no message inside the block: take the latest one before it, or the first of the dwell
-            first = max(first - 1, own)
+            first = max(first - 1, first_of_dwell)
             last = first + 1
         inside = poses[first:last]
         if not self.stillness.creeps(inside):
             return self._standing_pose(inside)
         turned_rad = float(pose_distance(inside[-1], inside[0], not self.bench.axes))
         self.tally.turned_deg = max(self.tally.turned_deg, math.degrees(turned_rad))
-        around = slice(max(first - 1, own), last + 1)
+        around = slice(max(first - 1, first_of_dwell), last + 1)
         return interpolate_pose(accel_ns, times[around], poses[around], not self.bench.axes)
 
     def _standing_pose(self, inside: Floats) -> Floats:
@@ -417,14 +429,14 @@ class Segmenter:
         """
         assert self._dwell is not None
         mean = mean_pose(inside)[None, :]
-        known = self._dwell.pose
+        dwell_pose = self._dwell.pose
         allowed = 6.0 * inside.std(axis=0) / np.sqrt(len(inside)) + 1e-9
-        if known is None or (np.abs(mean - known) > allowed).any():
+        if dwell_pose is None or (np.abs(mean - dwell_pose) > allowed).any():
             sigma = float(np.sqrt(np.mean(encoder_sigma(inside) ** 2)))
             self._dwell.pose, self._dwell.pose_sigma_rad = mean, sigma / math.sqrt(len(inside))
             self._encoder_rad = sigma or self._encoder_rad
             return mean
-        return known
+        return dwell_pose
 
     def _forget(self) -> None:
         """Drop the poses and temperatures that no waiting reading needs."""
@@ -432,8 +444,8 @@ class Segmenter:
         oldest = min(oldest, (self._decided_ns or oldest) - self.stillness.history_ns)
         if self.slews:  # the curve of a slew begins one window before the slew
             oldest -= self.stillness.window_ns + self.stillness.lead_ns
-        kept = slice(max(int(np.searchsorted(self._pose.time_ns, oldest)) - HISTORY, 0), None)
-        self._pose, self._turns = self._pose[kept], self._turns[kept]
+        needed = slice(max(int(np.searchsorted(self._pose.time_ns, oldest)) - HISTORY, 0), None)
+        self._pose, self._turns = self._pose[needed], self._turns[needed]
         self._temperature = self._temperature[max(int(np.searchsorted(self._temperature.time_ns, oldest)) - 2, 0) :]
 
 

@@ -57,8 +57,8 @@ class Curve:
         speed = np.linalg.norm(self.rate(elapsed_s), axis=1)
         steps = np.diff(elapsed_s, prepend=elapsed_s[:1])
         passed = np.cumsum(steps * (speed / PIECE_RAD + 1.0 / PIECE_S))
-        found = [0]
+        edges = [0]
         for edge in np.searchsorted(passed, np.arange(1.0, passed[-1])).tolist():
-            if edge - found[-1] >= _SHORTEST and len(elapsed_s) - edge >= _SHORTEST:
-                found.append(edge)
-        return [*found, len(elapsed_s)]
+            if edge - edges[-1] >= _SHORTEST and len(elapsed_s) - edge >= _SHORTEST:
+                edges.append(edge)
+        return [*edges, len(elapsed_s)]

@@ -19,13 +19,13 @@ from kf_calib.bench.streams import Stream
 from kf_calib.errors import InputError, check_number
 
 _SECOND_NS = 1_000_000_000
-_BEFORE = 3  # least number of messages with which one is compared
-_APART_NS = 2 * _SECOND_NS  # messages farther apart than this do not determine a departure
+_FEWEST_BEFORE = 3  # least number of messages with which one is compared
+_LONGEST_PERIOD_NS = 2 * _SECOND_NS  # messages farther apart than this do not determine a departure
 _CREEPING_NS = 10 * _SECOND_NS  # creep that lasts longer than this is taken as permanent
 _LARGEST_DEG = 5.0  # largest tolerance; at it, a platform turning at 10 deg/s would count as still
 _PARTS = 8  # number of parts of a block whose mean poses are compared
 
-HISTORY = _BEFORE + 2
+HISTORY = _FEWEST_BEFORE + 2
 """Number of messages before those of ``Stillness.history_ns`` that are needed if messages are infrequent."""
 
 
@@ -81,7 +81,7 @@ class Stillness:
         return _CREEPING_NS + 6 * self.window_ns
 
     def intervals(
-        self, times: Times, poses: Floats, is_quaternion: bool, known: Mask, covered_ns: int
+        self, times: Times, poses: Floats, is_quaternion: bool, complete: Mask, covered_ns: int
     ) -> tuple[Mask, int]:
         """Mask (m - 1,) of the intervals between consecutive messages that are still, and the end of the last still
         window.
@@ -96,7 +96,7 @@ class Stillness:
         steps = pose_distance(poses[1:], poses[:-1], is_quaternion) <= self.tolerance_rad
         broken = np.concatenate([[0], np.cumsum(~steps)])
         rest = pose_distance(poses[ends], poses, is_quaternion) <= self.tolerance_rad
-        rest &= (broken[ends] == broken) & known & (ends > np.arange(len(ends)))
+        rest &= (broken[ends] == broken) & complete & (ends > np.arange(len(ends)))
         reach = np.maximum.accumulate(np.where(rest, times[ends], covered_ns))
         return (reach[:-1] > times[:-1]) & steps, int(reach[-1])
 
@@ -105,12 +105,12 @@ class Stillness:
 
         Because the angles are sampled, it may have left up to one sampling period earlier than they show.
         """
-        away = self.creeping_from(pose, is_quaternion, arrived_ns, end_ns)
-        if away is None:
+        leaving = self.creeping_from(pose, is_quaternion, arrived_ns, end_ns)
+        if leaving is None:
             return end_ns
-        early_ns, standing_ns = pose.time_ns[max(away - 2, 0)], pose.time_ns[max(away - 1, 0)]
-        apart_ns = min(int(standing_ns - early_ns), _APART_NS)
-        return max(int(standing_ns) - max(apart_ns - self.lead_ns, 0), arrived_ns)
+        early_ns, standing_ns = pose.time_ns[max(leaving - 2, 0)], pose.time_ns[max(leaving - 1, 0)]
+        period_ns = min(int(standing_ns - early_ns), _LONGEST_PERIOD_NS)
+        return max(int(standing_ns) - max(period_ns - self.lead_ns, 0), arrived_ns)
 
     def creeping_from(self, pose: Stream, is_quaternion: bool, arrived_ns: int, until_ns: int) -> int | None:
         """Index of the message from which on the platform has been creeping until ``until_ns``, in a dwell since
@@ -121,38 +121,45 @@ class Stillness:
         arrived, last = np.searchsorted(pose.time_ns, (arrived_ns, until_ns + 1)).tolist()
         begin = last
         for span_ns in (self.window_ns, _CREEPING_NS + self.window_ns):  # the short span suffices most of the time
-            judged = max(int(np.searchsorted(pose.time_ns, until_ns - span_ns)), arrived)
+            first_judged = max(int(np.searchsorted(pose.time_ns, until_ns - span_ns)), arrived)
             first = int(np.searchsorted(pose.time_ns, until_ns - span_ns - 4 * self.window_ns))
-            first = max(min(first, judged - HISTORY), arrived)
-            if last - judged < 1 or last - first < HISTORY:
+            first = max(min(first, first_judged - HISTORY), arrived)
+            if last - first_judged < 1 or last - first < HISTORY:
                 return None
-            away = judged + np.flatnonzero(self._away(pose[first:last], is_quaternion)[judged - first :])
+            deviating = first_judged + np.flatnonzero(
+                self._deviates(pose[first:last], is_quaternion)[first_judged - first :]
+            )
             step = max(
                 1, round(self.window_ns * (last - 1 - first) / int(pose.time_ns[last - 1] - pose.time_ns[first]))
             )
-            if not away.size or last - 1 - away[-1] > step:
+            if not deviating.size or last - 1 - deviating[-1] > step:
                 return None
-            breaks = np.flatnonzero(np.diff(away) > step)
-            begin = int(away[breaks[-1] + 1 if breaks.size else 0])
+            breaks = np.flatnonzero(np.diff(deviating) > step)
+            begin = int(deviating[breaks[-1] + 1 if breaks.size else 0])
         return begin if pose.time_ns[last - 1] - pose.time_ns[begin] <= _CREEPING_NS else None
 
-    def _away(self, pose: Stream, is_quaternion: bool) -> Mask:
+    def _deviates(self, pose: Stream, is_quaternion: bool) -> Mask:
         """Return a mask (m,) of the messages that show the platform away from rest.
 
         A message is compared with the mean of those one to four windows before it, and is away if it differs by more
         than ``rest_rad`` and four sigma of the encoder. If messages are infrequent, the few before it are used. The
         first messages are not judged.
         """
-        times, own = pose.time_ns, pose.values - pose.values[0]
+        times, relative = pose.time_ns, pose.values - pose.values[0]
         ends = np.minimum(np.searchsorted(times, times - self.window_ns), np.maximum(np.arange(len(times)) - 1, 0))
-        starts = np.minimum(np.searchsorted(times, times - 4 * self.window_ns), np.maximum(ends - _BEFORE, 0))
-        sums, counts = _cumulative_sums(own), (ends - starts)[:, None]
+        starts = np.minimum(np.searchsorted(times, times - 4 * self.window_ns), np.maximum(ends - _FEWEST_BEFORE, 0))
+        sums, counts = _cumulative_sums(relative), (ends - starts)[:, None]
         means = (sums[ends] - sums[starts]) / np.maximum(counts, 1)
-        bent, bends = _cumulative_sums(np.diff(own, 2, axis=0) ** 2), np.maximum(ends - starts - 2, 0)[:, None]
-        variance = (bent[starts + bends[:, 0]] - bent[starts]) / (6.0 * np.maximum(bends, 1))
+        curvature, curvature_count = (
+            _cumulative_sums(np.diff(relative, 2, axis=0) ** 2),
+            np.maximum(ends - starts - 2, 0)[:, None],
+        )
+        variance = (curvature[starts + curvature_count[:, 0]] - curvature[starts]) / (
+            6.0 * np.maximum(curvature_count, 1)
+        )
         allowed = np.maximum(self.rest_rad, 4.0 * np.sqrt(np.maximum(variance, 0.0).max(axis=1)))
-        apart = pose_distance(pose.values, means + pose.values[0], is_quaternion)
-        return (apart > allowed) & (bends[:, 0] > 0)
+        distance = pose_distance(pose.values, means + pose.values[0], is_quaternion)
+        return (distance > allowed) & (curvature_count[:, 0] > 0)
 
     def rest_ns(self, pose: Stream, is_quaternion: bool, arrived_ns: int, until_ns: int) -> tuple[int, bool]:
         """Stamp, ns, at which the platform came to rest in a dwell since ``arrived_ns``, and whether this is certain by
@@ -164,16 +171,16 @@ class Stillness:
         """
         first, last = np.searchsorted(pose.time_ns, (arrived_ns, until_ns)).tolist()
         times, poses, span_ns = pose.time_ns[first:last], pose.values[first:last], 2 * self.settle_ns
-        for k, within in enumerate(np.searchsorted(times, times + span_ns, side="right").tolist()):
+        for k, end_index in enumerate(np.searchsorted(times, times + span_ns, side="right").tolist()):
             if times[k] > arrived_ns + _CREEPING_NS:
                 break
-            at_ns, end = int(times[k]) if k else arrived_ns, max(within, k + 1 + _BEFORE)
+            at_ns, end = int(times[k]) if k else arrived_ns, max(end_index, k + 1 + _FEWEST_BEFORE)
             if times[k] + span_ns > until_ns or end > len(times):
                 return at_ns, False
-            coming = poses[k + 1 : end]
-            allowed = max(self.rest_rad, 4.0 * float(encoder_sigma(coming).max()))
-            apart = pose_distance(poses[k], mean_pose(coming), is_quaternion)
-            if apart <= allowed or np.diff(times[k:end]).max() > span_ns:
+            following = poses[k + 1 : end]
+            allowed = max(self.rest_rad, 4.0 * float(encoder_sigma(following).max()))
+            distance = pose_distance(poses[k], mean_pose(following), is_quaternion)
+            if distance <= allowed or np.diff(times[k:end]).max() > span_ns:
                 return at_ns, True
         return arrived_ns, True
 
@@ -188,8 +195,8 @@ class Stillness:
         parts = np.array_split(poses, min(_PARTS, count))
         means = np.array([part.mean(axis=0) for part in parts])
         sigma = np.sqrt(np.mean(np.diff(poses, axis=0) ** 2, axis=0) / 2.0 * len(parts) / count)
-        apart = np.abs(means - np.median(means, axis=0))
-        return bool((apart > np.maximum(self.rest_rad, 8.0 * sigma)).any())
+        deviation = np.abs(means - np.median(means, axis=0))
+        return bool((deviation > np.maximum(self.rest_rad, 8.0 * sigma)).any())
 
     def moved_between(self, accel: Stream, begin_ns: int, end_ns: int, gravity_mps2: float) -> tuple[int, int]:
         """Stamps, ns, of the beginning and the end of a motion without angles, from the readings between two poses.
@@ -208,12 +215,15 @@ class Stillness:
         means, scatter = shaped.mean(axis=1), np.median(shaped.std(axis=1), axis=0)
         coarse = 6.0 * scatter + 1e-3 * gravity_mps2
         fine = 3.0 * scatter / math.sqrt(size) + self.rest_rad * gravity_mps2
-        old, new = _standing(means, coarse, fine), _standing(means[::-1], coarse, fine)
-        leave = begin_ns if old < 2 else int(times[(old - 1) * size])
-        arrive = end_ns if new < 2 else int(times[(count - new + 1) * size])
+        count_before, count_after = (
+            _windows_at_first_level(means, coarse, fine),
+            _windows_at_first_level(means[::-1], coarse, fine),
+        )
+        leave = begin_ns if count_before < 2 else int(times[(count_before - 1) * size])
+        arrive = end_ns if count_after < 2 else int(times[(count - count_after + 1) * size])
         return leave, max(arrive, leave)
 
-    def felt_ns(self, accel: Stream, since_ns: int, arrival_ns: int, gravity_mps2: float) -> int:
+    def arrival_felt_ns(self, accel: Stream, since_ns: int, arrival_ns: int, gravity_mps2: float) -> int:
         """Stamp, ns, at which the readings reached the level that they have just after an arrival.
 
         Only readings since ``since_ns``, the last angle before the arrival, are considered. The level is the mean over
@@ -221,16 +231,16 @@ class Stillness:
         """
         quarter_ns = self.window_ns // 4
         stamps = since_ns, arrival_ns + quarter_ns, arrival_ns + 3 * quarter_ns
-        first, there, end = np.searchsorted(accel.time_ns, stamps)
-        if there == end:
+        first, settled_from, end = np.searchsorted(accel.time_ns, stamps)
+        if settled_from == end:
             return arrival_ns
-        settled = accel.values[there:end]
+        settled = accel.values[settled_from:end]
         allowed = 6.0 * float(settled.std(axis=0).max()) + self.rest_rad * gravity_mps2
-        apart = np.abs(accel.values[first:there] - settled.mean(axis=0)).max(axis=1, initial=0.0)
-        away = np.flatnonzero(apart > allowed)
-        if not away.size:
+        deviation = np.abs(accel.values[first:settled_from] - settled.mean(axis=0)).max(axis=1, initial=0.0)
+        unsettled = np.flatnonzero(deviation > allowed)
+        if not unsettled.size:
             return arrival_ns
-        moving_ns, standing_ns = accel.time_ns[first + away[-1] :][:2].tolist()
+        moving_ns, standing_ns = accel.time_ns[first + unsettled[-1] :][:2].tolist()
         return (moving_ns + standing_ns) // 2
 
 
@@ -246,15 +256,15 @@ def _cumulative_sums(values: Floats) -> Floats:
     return np.cumsum(np.concatenate([np.zeros((1, values.shape[1])), values]), axis=0)
 
 
-def _standing(means: Floats, coarse: Floats, fine: Floats) -> int:
+def _windows_at_first_level(means: Floats, coarse: Floats, fine: Floats) -> int:
     """Return the number of windows, from the first on, in which the mean readings (n, 3) show the platform at its first
     position.
 
     It is 0 if they never leave that level and therefore cannot tell.
     """
-    near = np.all(np.abs(means - means[0]) <= coarse, axis=1)
-    if near.all():
+    at_first_level = np.all(np.abs(means - means[0]) <= coarse, axis=1)
+    if at_first_level.all():
         return 0
-    own = means[: int(np.argmin(near))]
-    still = np.flatnonzero(np.all(np.abs(own - np.median(own, axis=0)) <= fine, axis=1))
+    first_means = means[: int(np.argmin(at_first_level))]
+    still = np.flatnonzero(np.all(np.abs(first_means - np.median(first_means, axis=0)) <= fine, axis=1))
     return int(still[-1]) + 1 if still.size else 0

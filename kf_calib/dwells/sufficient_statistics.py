@@ -15,7 +15,7 @@ envelope. The number of basis functions is called K below; it is 3, or 9 on a ca
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -25,16 +25,14 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import turn_by
 from kf_calib.dwells.attitude_error import AttitudeError
-from kf_calib.dwells.coherent_tone import MOST_CELLS, Cells, Trace, tone
+from kf_calib.dwells.coherent_tone import Trace, tone
 from kf_calib.dwells.line_spectrum import Line, Spectrum, lines
-from kf_calib.dwells.orthonormal_parabola import orthonormal_parabola
-from kf_calib.dwells.pieces import MOST_PIECES, Piece, coarsened
-from kf_calib.dwells.qr import triangle
-from kf_calib.dwells.rows import Nodes, Rows, basis, parabola
+from kf_calib.dwells.pieces import Piece
+from kf_calib.dwells.qr import square_triangle
+from kf_calib.dwells.rows import Nodes, parabola
 from kf_calib.dwells.walk_path import WalkPath, walk_path_of
 
 _LAGS = 64
-_CORRELATED_SAMPLES = 8192  # first readings of a dwell over which its autocovariance is accumulated, at least
 
 
 @dataclass(frozen=True)
@@ -60,11 +58,11 @@ class Autocovariance:
         )
 
     @classmethod
-    def of(cls, left: Floats) -> Autocovariance:
+    def of(cls, residuals: Floats) -> Autocovariance:
         """The sums for one block of readings (3, n) from which the parabola has been removed."""
-        count = left.shape[1]
+        count = residuals.shape[1]
         padded = 1 << (count + _LAGS).bit_length()
-        spectrum = np.fft.rfft(left, padded, axis=1)
+        spectrum = np.fft.rfft(residuals, padded, axis=1)
         products = np.zeros((_LAGS + 1, 3))
         lags = min(_LAGS, count - 1) + 1
         products[:lags] = np.fft.irfft(np.abs(spectrum) ** 2, padded, axis=1)[:, :lags].T
@@ -116,24 +114,24 @@ class DwellFactor:
         """The number K of basis functions of a piece."""
         return self.pieces[0].triangle.shape[1] - 3
 
-    def less(self, added: Floats) -> DwellFactor:
+    def subtract(self, coefficients_of_pieces: Floats) -> DwellFactor:
         """The same dwell with readings less what was added to them, by its coefficients on the basis functions of each
         piece, (pieces, K, 3)."""
         pieces = list[Piece]()
-        for piece, own in zip(self.pieces, added, strict=True):
+        for piece, coefficients in zip(self.pieces, coefficients_of_pieces, strict=True):
             upper = piece.triangle.copy()
-            upper[: self.width, self.width :] -= upper[: self.width, : self.width] @ own
+            upper[: self.width, self.width :] -= upper[: self.width, : self.width] @ coefficients
             pieces.append(replace(piece, triangle=upper))
-        return self._with(_OF_CONDITIONS, pieces=tuple(pieces))
+        return self._replaced(_OF_CONDITIONS, pieces=tuple(pieces))
 
     def linearised(self, turned_rad: Floats | None, attitude: AttitudeError | None) -> DwellFactor:
         """The same dwell about a force that is turned otherwise."""
-        return self._with(_OF_READINGS, turned_rad=turned_rad, attitude=attitude)
+        return self._replaced(_OF_READINGS, turned_rad=turned_rad, attitude=attitude)
 
-    def _with(self, known: Collection[str], **changes: Any) -> DwellFactor:
+    def _replaced(self, unchanged: Collection[str], **changes: Any) -> DwellFactor:
         """Return the dwell with changes that leave these cached properties as they are."""
         changed = replace(self, **changes)
-        changed.__dict__.update({name: self.__dict__[name] for name in known if name in self.__dict__})
+        changed.__dict__.update({name: self.__dict__[name] for name in unchanged if name in self.__dict__})
         return changed
 
     @cached_property
@@ -144,25 +142,25 @@ class DwellFactor:
     @cached_property
     def nodes(self) -> Nodes:
         """The nodes of all pieces, in order of time."""
-        every = [piece.nodes for piece in self.pieces]
+        of_pieces = [piece.nodes for piece in self.pieces]
         return Nodes(
-            elapsed_s=np.concatenate([each.elapsed_s for each in every]),
-            since_arrival_s=np.concatenate([each.since_arrival_s for each in every]),
-            force_mps2=np.concatenate([each.force_mps2 for each in every]),
-            pose=np.concatenate([each.pose for each in every]),
-            temperature_c=np.concatenate([each.temperature_c for each in every]),
-            rate_radps=np.concatenate([rate_or_zero(each.rate_radps) for each in every]),
-            rate_change_radps2=np.concatenate([rate_or_zero(each.rate_change_radps2) for each in every]),
+            elapsed_s=np.concatenate([nodes.elapsed_s for nodes in of_pieces]),
+            since_arrival_s=np.concatenate([nodes.since_arrival_s for nodes in of_pieces]),
+            force_mps2=np.concatenate([nodes.force_mps2 for nodes in of_pieces]),
+            pose=np.concatenate([nodes.pose for nodes in of_pieces]),
+            temperature_c=np.concatenate([nodes.temperature_c for nodes in of_pieces]),
+            rate_radps=np.concatenate([rate_or_zero(nodes.rate_radps) for nodes in of_pieces]),
+            rate_change_radps2=np.concatenate([rate_or_zero(nodes.rate_change_radps2) for nodes in of_pieces]),
         )
 
     @cached_property
     def regressors(self) -> Floats:
         """The rows of the regressors 1, f_x, f_y, f_z in each piece, (pieces, K, 4)."""
-        nodes = replace(self.nodes, force_mps2=self.felt(self.nodes.force_mps2))
+        nodes = replace(self.nodes, force_mps2=self.felt_force(self.nodes.force_mps2))
         values = nodes.regressors.reshape(len(self.pieces), 3, -1)
         return self.triangles[:, : self.width, :3] @ parabola(values)
 
-    def felt(self, force_mps2: Floats) -> Floats:
+    def felt_force(self, force_mps2: Floats) -> Floats:
         """The specific force (n, 3) that is felt where the angles show this one."""
         if self.turned_rad is not None:
             force_mps2 = turn_by(force_mps2, self.turned_rad)
@@ -195,9 +193,9 @@ class DwellFactor:
     def variances(self) -> Floats:
         """Variance of the readings about their fit within each piece, (pieces, 3); short pieces have the value pooled
         over the dwell."""
-        squares, spare = self.squares, np.maximum(self.counts - float(self.width), 0.0)[:, None]
-        pooled = squares.sum(axis=0) / max(spare.sum(), 1)
-        return np.where(spare >= 8, squares / np.maximum(spare, 1), pooled)
+        squares, freedom = self.squares, np.maximum(self.counts - float(self.width), 0.0)[:, None]
+        pooled = squares.sum(axis=0) / max(freedom.sum(), 1)
+        return np.where(freedom >= 8, squares / np.maximum(freedom, 1), pooled)
 
     @cached_property
     def walk(self) -> WalkPath:
@@ -215,10 +213,10 @@ class DwellFactor:
     def shaking(self) -> tuple[Floats, Floats]:
         """Variance of the readings at the nodes of each piece, (pieces, 3, 3), and the number of readings behind it,
         (pieces,)."""
-        taken = np.array([piece.taken for piece in self.pieces], float)
+        reading_counts = np.array([piece.reading_count for piece in self.pieces], float)
         if not self.averaged:
-            return np.repeat(self.variances[:, None], 3, axis=1), taken
-        return np.array([piece.nodes.variance_mps2_2 for piece in self.pieces], float), taken
+            return np.repeat(self.variances[:, None], 3, axis=1), reading_counts
+        return np.array([piece.nodes.variance_mps2_2 for piece in self.pieces], float), reading_counts
 
     @property
     def start_s(self) -> float:
@@ -250,7 +248,7 @@ class DwellFactor:
     @cached_property
     def factor(self) -> Floats:
         """Triangular factor (7, 7) of [1 f_x f_y f_z | z1 z2 z3] over the whole dwell."""
-        return _square_factor(self.rows([piece.nodes.regressors for piece in self.pieces]))
+        return square_triangle(self.rows([piece.nodes.regressors for piece in self.pieces]))
 
     @cached_property
     def means(self) -> Floats:
@@ -258,33 +256,34 @@ class DwellFactor:
         functions = self.triangles[:, 0] / self.triangles[:, :1, 0]  # means of the basis, then of the readings
         forces = self.nodes.force_mps2.reshape(-1, 3, 3)
         regressors = np.einsum("pk,pkc->pc", functions[:, :3], parabola(forces))
-        each = np.column_stack([np.ones(len(forces)), regressors, functions[:, self.width :]])
-        return np.asarray(self.counts @ each / self.counts.sum(), float)
+        piece_means = np.column_stack([np.ones(len(forces)), regressors, functions[:, self.width :]])
+        return np.asarray(self.counts @ piece_means / self.counts.sum(), float)
 
     def rows(self, columns: Sequence[Floats]) -> Floats:
         """Rows [X | z1 z2 z3], ((K + 3) pieces, c + 3), of columns without an oscillating part, given as (3, c) at the
         nodes of each piece."""
         width = columns[0].shape[1]
-        out = np.zeros((len(self.pieces), self.width + 3, width + 3))
-        out[:, :3, :width] = self.triangles[:, :3, :3] @ parabola(np.array(columns))
-        out[:, :, width:] = self.triangles[:, :, self.width :]
-        return out.reshape(-1, width + 3)
+        rows = np.zeros((len(self.pieces), self.width + 3, width + 3))
+        rows[:, :3, :width] = self.triangles[:, :3, :3] @ parabola(np.array(columns))
+        rows[:, :, width:] = self.triangles[:, :, self.width :]
+        return rows.reshape(-1, width + 3)
 
-    def merge(self, others: Sequence[DwellFactor]) -> DwellFactor:
+    def merge(self, blocks: Sequence[DwellFactor]) -> DwellFactor:
         """This dwell merged with further blocks of its samples."""
-        pieces = (piece for each in (self, *others) for piece in each.pieces)
+        pieces = (piece for block in (self, *blocks) for piece in block.pieces)
         return replace(
             self,
             pieces=tuple(sorted(pieces, key=lambda piece: piece.nodes.elapsed_s[0])),
-            autocovariance=sum((each.autocovariance for each in others), self.autocovariance),
-            spectrum=sum((each.spectrum for each in others), self.spectrum),
-            trace=sum((each.trace for each in others), self.trace),
+            autocovariance=sum((block.autocovariance for block in blocks), self.autocovariance),
+            spectrum=sum((block.spectrum for block in blocks), self.spectrum),
+            trace=sum((block.trace for block in blocks), self.trace),
         )
 
     def repeat(self, times: float) -> DwellFactor:
         """This dwell as if each of its readings had been taken ``times`` times."""
         pieces = (
-            replace(own, triangle=own.triangle * times**0.5, count=round(own.count * times)) for own in self.pieces
+            replace(piece, triangle=piece.triangle * times**0.5, count=round(piece.count * times))
+            for piece in self.pieces
         )
         return replace(self, pieces=tuple(pieces))
 
@@ -298,38 +297,6 @@ class DwellFactor:
         yield self
 
 
-def fold(rows: Rows, carrier_hz: float = 0.0) -> tuple[Piece, ...]:
-    """Fold one block of rows into pieces."""
-    width = 9 if carrier_hz else 3
-    channels = rows.innovation if rows.static else rows.readings.T
-    level = rows.readings[0] - channels[:, 0]  # what was subtracted from the readings to give the innovation
-    pieces = list[Piece]()
-    for part, u, nodes in rows.pieces:
-        stacked = np.empty((width + 3, len(u)))  # contiguous rows are what LAPACK needs and are faster to fill
-        stacked[:width], stacked[width:] = basis(u, rows.elapsed_s[part], carrier_hz), channels[:, part]
-        folded = _square_factor(stacked.T)
-        folded[0, width:] += folded[0, 0] * level
-        pieces.append(Piece(folded, nodes, len(u), carrier_hz, len(u) * rows.taken))
-    return tuple(pieces)
-
-
-def less_curve(innovation: Floats, elapsed_s: Floats | None = None, carrier_hz: float = 0.0) -> Floats:
-    """Innovations (3, n) with their parabola removed and, on a carrier, also its oscillating basis functions."""
-    count = innovation.shape[1]
-    curve = orthonormal_parabola(count)
-    if carrier_hz:
-        curve = np.linalg.qr(basis(np.linspace(-1.0, 1.0, count), elapsed_s, carrier_hz).T)[0]
-    return innovation - (innovation @ curve) @ curve.T
-
-
-def _square_factor(stacked: Floats) -> Floats:
-    """Return the square triangular factor of rows (n, c), padded with zeros if there are fewer rows than columns."""
-    width = stacked.shape[1]
-    if len(stacked) < width:
-        stacked = np.vstack([stacked, np.zeros((width - len(stacked), width))])
-    return triangle(stacked)
-
-
 def rate_or_zero(rate: Floats | None) -> Floats:
     """Angular rate at the nodes of a piece; zeros if the platform stands."""
     return np.zeros((3, 3)) if rate is None else rate
@@ -337,17 +304,17 @@ def rate_or_zero(rate: Floats | None) -> Floats:
 
 def dwells_before(dwells: Sequence[DwellFactor]) -> list[DwellFactor]:
     """The dwell before each dwell; for the first, that dwell itself; for a slew, the dwell that it left."""
-    out, last = list[DwellFactor](), dwells[0]
+    before, last = list[DwellFactor](), dwells[0]
     for dwell in dwells:
-        out.append(dwell.came_from or last)
+        before.append(dwell.came_from or last)
         last = last if dwell.moving else dwell
-    return out
+    return before
 
 
 def dwells_without(dwells: Sequence[DwellFactor], left_out: Collection[int]) -> list[DwellFactor]:
     """The dwells without those at the indices ``left_out``; each keeps the dwell from which it was reached."""
-    told = [replace(dwell, came_from=last) for dwell, last in zip(dwells, dwells_before(dwells), strict=True)]
-    return [dwell for k, dwell in enumerate(told) if k not in left_out]
+    linked = [replace(dwell, came_from=last) for dwell, last in zip(dwells, dwells_before(dwells), strict=True)]
+    return [dwell for k, dwell in enumerate(linked) if k not in left_out]
 
 
 def lines_of(dwells: Sequence[DwellFactor], level: float = 0.01) -> tuple[Line, ...]:
@@ -356,108 +323,15 @@ def lines_of(dwells: Sequence[DwellFactor], level: float = 0.01) -> tuple[Line, 
     These are the lines of the averaged spectrum or, if there are none, a single oscillation that is too weak to appear
     there but keeps its phase from dwell to dwell. The p-values account for both tests.
     """
-    seen = lines((dwell.spectrum for dwell in dwells), 0.5 * level)
-    steady = None if seen else tone([dwell.trace for dwell in dwells], 0.5 * level)
-    found = seen or ((steady,) if steady else ())
-    return tuple(replace(line, p_value=min(1.0, 2.0 * line.p_value)) for line in found)
+    spectral_lines = lines((dwell.spectrum for dwell in dwells), 0.5 * level)
+    steady = None if spectral_lines else tone([dwell.trace for dwell in dwells], 0.5 * level)
+    oscillations = spectral_lines or ((steady,) if steady else ())
+    return tuple(replace(line, p_value=min(1.0, 2.0 * line.p_value)) for line in oscillations)
 
 
-def alike(dwells: Sequence[DwellFactor]) -> list[list[int]]:
+def groups_of_equal_shape(dwells: Sequence[DwellFactor]) -> list[list[int]]:
     """Indices of dwells, grouped by number of pieces and basis functions, so that a group's arrays can be stacked."""
-    places = dict[tuple[int, int], list[int]]()
+    indices = dict[tuple[int, int], list[int]]()
     for k, dwell in enumerate(dwells):
-        places.setdefault((len(dwell.pieces), dwell.width), []).append(k)
-    return list(places.values())
-
-
-class _Growing:
-    """A sequence of dwells, or of slews, to which blocks are added in order of time.
-
-    The blocks of the last dwell are merged only when the sequence is read; merging each as it arrives would copy the
-    whole dwell every time.
-    """
-
-    def __init__(self, folded: Iterable[DwellFactor] = ()) -> None:
-        self._folded, self._blocks = list(folded), list[DwellFactor]()
-
-    def add(self, block: DwellFactor) -> None:
-        """Add a block of the last dwell or of a new one."""
-        if self._last(block.number) is None:
-            self.folded.append(block)
-            return
-        if self._count + len(block.pieces) > MOST_PIECES and not block.moving:
-            last = self.folded[-1]
-            self._folded[-1] = replace(last, pieces=coarsened(last.pieces))
-        if block.autocovariance.count:  # merged now, since ``autocovariance_count`` reads the count from the dwell
-            self._folded[-1] = self._folded[-1].merge([block])
-        else:
-            self._blocks.append(block)
-
-    def autocovariance_count(self, number: int) -> int:
-        """Number of readings in the autocovariance of the dwell of this number, which is either the last or a new
-        one."""
-        last = self._last(number)
-        return last.autocovariance.count if last else 0
-
-    @property
-    def folded(self) -> list[DwellFactor]:
-        """All dwells, each with all its blocks."""
-        if self._blocks:
-            self._folded[-1] = self._folded[-1].merge(self._blocks)
-            self._blocks = []
-        return self._folded
-
-    @property
-    def _count(self) -> int:
-        """Number of pieces of the last dwell."""
-        return len(self._folded[-1].pieces) + sum(len(block.pieces) for block in self._blocks)
-
-    def _last(self, number: int) -> DwellFactor | None:
-        """Return the last dwell if it has this number, else None."""
-        return self._folded[-1] if self._folded and self._folded[-1].number == number else None
-
-
-class Folder:
-    """Folds rows into sequences of dwells and of slews, on a carrier if its frequency is not 0."""
-
-    def __init__(self, carrier_hz: float = 0.0) -> None:
-        self._dwells, self._slews = _Growing(), _Growing()
-        self.carrier_hz = carrier_hz
-        self._cells: Cells | None = None
-        self._traced = 0
-
-    @property
-    def dwells(self) -> list[DwellFactor]:
-        """The dwells folded so far."""
-        return self._dwells.folded
-
-    @dwells.setter
-    def dwells(self, dwells: Iterable[DwellFactor]) -> None:
-        self._dwells = _Growing(dwells)
-
-    @property
-    def slews(self) -> list[DwellFactor]:
-        """The slews folded so far."""
-        return self._slews.folded
-
-    @slews.setter
-    def slews(self, slews: Iterable[DwellFactor]) -> None:
-        self._slews = _Growing(slews)
-
-    def add(self, rows: Rows) -> None:
-        """Fold one block of rows into its dwell or slew."""
-        growing = self._slews if rows.moving else self._dwells
-        block = DwellFactor(
-            rows.dwell, fold(rows, self.carrier_hz), moving=rows.moving, pose_sigma_rad=rows.pose_sigma_rad,
-            turns=rows.turns,
-        )  # fmt: skip
-        innovation, readings = rows.felt
-        if not rows.moving and growing.autocovariance_count(rows.dwell) < _CORRELATED_SAMPLES:
-            left = less_curve(innovation, rows.elapsed_s, self.carrier_hz)
-            own, spectrum = Autocovariance.of(left), Spectrum.of(left, rows.elapsed_s)
-            block = replace(block, autocovariance=own, spectrum=spectrum)
-        self._cells = self._cells or Cells.of(rows.elapsed_s)
-        if self._cells and not rows.moving and not block.averaged and self._traced < MOST_CELLS:
-            block = replace(block, trace=Trace.of(readings, rows.elapsed_s, self._cells))
-            self._traced += len(block.trace)
-        growing.add(block)
+        indices.setdefault((len(dwell.pieces), dwell.width), []).append(k)
+    return list(indices.values())

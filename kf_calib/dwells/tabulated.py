@@ -25,8 +25,8 @@ mean."""
 _CURVE = 3  # basis functions of a piece
 
 
-class Known(Protocol):
-    """What is known of a dwell; see ``kf_calib.sources.tables.orientation.Orientation``."""
+class Orientation(Protocol):
+    """A row of a table; ``kf_calib.sources.tables.orientation.Orientation`` is one."""
 
     @property
     def mean_mps2(self) -> Floats: ...
@@ -47,54 +47,56 @@ class Known(Protocol):
     def temperature_c(self) -> float: ...
 
 
-def dwells_of(table: Sequence[Known], bench: Bench) -> list[DwellFactor]:
+def dwells_of(table: Sequence[Orientation], bench: Bench) -> list[DwellFactor]:
     """The sufficient statistics of each row of a table."""
     times = _times(table)
-    nothing = Autocovariance(), Spectrum(), Trace()  # known of any of them; the same for all, since each takes 2 kB
+    unknown = Autocovariance(), Spectrum(), Trace()  # the same objects for all dwells, since a set takes 2 kB
     return [
-        DwellFactor(k + 1, (_piece(own, nodes, bench, times),), *nothing)
-        for k, (own, nodes) in enumerate(zip(table, _nodes(table, bench), strict=True))
+        DwellFactor(k + 1, (_piece(orientation, nodes, bench, times),), *unknown)
+        for k, (orientation, nodes) in enumerate(zip(table, _nodes(table, bench), strict=True))
     ]
 
 
-def rows_of(table: Sequence[Known], bench: Bench) -> Iterator[Rows]:
+def rows_of(table: Sequence[Orientation], bench: Bench) -> Iterator[Rows]:
     """Rows of each dwell with every reading at the mean, from which any engine makes the same estimate as from the
     readings themselves."""
     times = _times(table)
-    for k, (own, nodes) in enumerate(zip(table, _nodes(table, bench), strict=True)):
-        count = own.count * times
-        readings = np.tile(own.mean_mps2, (count, 1))
+    for k, (orientation, nodes) in enumerate(zip(table, _nodes(table, bench), strict=True)):
+        count = orientation.count * times
+        readings = np.tile(orientation.mean_mps2, (count, 1))
         columns = np.tile(nodes.regressors[:1], (count, 1))
         assert columns.shape[1] == len(REGRESSORS)
         piece = slice(0, count), np.zeros(count), nodes
-        elapsed_s = np.full(count, own.elapsed_s)
+        elapsed_s = np.full(count, orientation.elapsed_s)
         yield Rows(k + 1, elapsed_s, columns, readings, np.zeros((3, count)), True, (piece,))
 
 
-def _times(table: Sequence[Known]) -> int:
+def _times(table: Sequence[Orientation]) -> int:
     """Return by how much the counts have to be multiplied."""
-    fewest = min((own.count for own in table if own.sigma_mps2 is not None), default=LEAST_COUNT)
+    fewest = min(
+        (orientation.count for orientation in table if orientation.sigma_mps2 is not None), default=LEAST_COUNT
+    )
     return math.ceil(LEAST_COUNT / fewest)
 
 
-def _nodes(table: Sequence[Known], bench: Bench) -> Iterator[Nodes]:
+def _nodes(table: Sequence[Orientation], bench: Bench) -> Iterator[Nodes]:
     """Yield the nodes of each dwell; their times are apart by a tenth of the shortest pause, the rest does not
     change."""
-    middles = np.array([own.elapsed_s for own in table])
+    middles = np.array([orientation.elapsed_s for orientation in table])
     half_s = 0.1 * float(np.diff(middles).min(initial=60.0))
-    every = bench.specific_force(middles, np.array([own.pose for own in table]))
-    for own, force in zip(table, every, strict=True):
-        at_s = own.elapsed_s + half_s * np.array([-1.0, 0.0, 1.0])
-        pose, force = np.repeat(own.pose[None], 3, axis=0), np.repeat(force[None], 3, axis=0)
-        yield Nodes(at_s, np.full(3, half_s), force, pose, np.full(3, own.temperature_c))
+    forces = bench.specific_force(middles, np.array([orientation.pose for orientation in table]))
+    for orientation, force in zip(table, forces, strict=True):
+        at_s = orientation.elapsed_s + half_s * np.array([-1.0, 0.0, 1.0])
+        pose, force = np.repeat(orientation.pose[None], 3, axis=0), np.repeat(force[None], 3, axis=0)
+        yield Nodes(at_s, np.full(3, half_s), force, pose, np.full(3, orientation.temperature_c))
 
 
-def _piece(own: Known, nodes: Nodes, bench: Bench, times: int) -> Piece:
+def _piece(orientation: Orientation, nodes: Nodes, bench: Bench, times: int) -> Piece:
     """Return the one piece of a dwell."""
-    count, mean = own.count * times, own.mean_mps2
+    count, mean = orientation.count * times, orientation.mean_mps2
     triangle = np.zeros((_CURVE + 3, _CURVE + 3))
     triangle[0, 0], triangle[0, _CURVE:] = math.sqrt(count), math.sqrt(count) * mean
-    if own.sigma_mps2 is not None:  # about a parabola, since that is what the noise model takes it for
-        sigma = own.sigma_mps2 * math.sqrt(times * (count - _CURVE))
+    if orientation.sigma_mps2 is not None:  # about a parabola, because the noise model assumes so
+        sigma = orientation.sigma_mps2 * math.sqrt(times * (count - _CURVE))
         triangle[_CURVE:, _CURVE:] = np.diag(sigma)
-    return Piece(triangle, nodes, count, 0.0, own.count)
+    return Piece(triangle, nodes, count, 0.0, orientation.count)

@@ -26,13 +26,13 @@ class WalkPath:
 
     - step (r,): the change of the rows per unit of the bias's step s over the dwell, for a given bias at its end.
     - modes (r, k), variances (k,): principal axes of the remaining covariance, given s.
-    - rest (pieces,): the contribution of W to the sums of squares about the parabolas.
+    - about_parabola (pieces,): the contribution of W to the sums of squares about the parabolas.
     """
 
     step: Floats
     modes: Floats
     variances: Floats
-    rest: Floats
+    about_parabola: Floats
 
     def whiten(self, rows: Floats, ratio: float) -> Floats:
         """Rows (r, c) of unit noise multiplied by V^(-1/2), where V = I + ``ratio``^2 sum of variances times modes
@@ -51,11 +51,11 @@ def walk_path_of(begins_s: Floats, ends_s: Floats, counts: Sequence[int], triang
     onto = (triangles[:, :, :3] @ root).reshape(-1, root.shape[2])
     total = float(end @ end)
     share = onto @ end / total if total > 0 else np.zeros(len(onto))
-    left, sizes, _ = np.linalg.svd(onto - np.outer(share, end), full_matrices=False)
-    kept = sizes**2 > _LEAST * max(float(sizes[0]) ** 2, 1e-300)
+    axes, sizes, _ = np.linalg.svd(onto - np.outer(share, end), full_matrices=False)
+    significant = sizes**2 > _LEAST * max(float(sizes[0]) ** 2, 1e-300)
     spans = np.maximum(ends_s - begins_s, 0.0)
-    rest = spans * np.array([_moments(count)[1] / max(count - 1, 1) for count in counts])
-    return WalkPath(share - triangles[:, :, 0].ravel(), left[:, kept], sizes[kept] ** 2, rest)
+    about_parabola = spans * np.array([_moments(count)[1] / max(count - 1, 1) for count in counts])
+    return WalkPath(share - triangles[:, :, 0].ravel(), axes[:, significant], sizes[significant] ** 2, about_parabola)
 
 
 def _root(begins_s: Floats, ends_s: Floats, counts: Sequence[int]) -> tuple[Floats, Floats]:
@@ -67,17 +67,17 @@ def _root(begins_s: Floats, ends_s: Floats, counts: Sequence[int]) -> tuple[Floa
     """
     size = len(counts)
     pauses = np.maximum(np.append(begins_s[1:] - ends_s[:-1], 0.0), 0.0)
-    out, level = np.zeros((size, 3, 4 * size)), np.zeros(4 * size)
+    coefficients, level = np.zeros((size, 3, 4 * size)), np.zeros(4 * size)
     for k, count in enumerate(counts):
-        own = slice(4 * k, 4 * k + 4)
+        normals = slice(4 * k, 4 * k + 4)
         joint = _moments(count)[0] * max(ends_s[k] - begins_s[k], 0.0) / max(count - 1, 1)
         joint[3, 3] += pauses[k]
         values, vectors = np.linalg.eigh(joint)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
-        out[k, 0] = level
-        out[k, :, own] = root[:3]
-        level[own] = root[3]
-    return out, level
+        coefficients[k, 0] = level
+        coefficients[k, :, normals] = root[:3]
+        level[normals] = root[3]
+    return coefficients, level
 
 
 _MANY = 1 << 14

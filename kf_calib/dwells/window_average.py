@@ -44,7 +44,7 @@ def correlations() -> Floats:
     produces."""
     weights = np.sin(np.pi * (np.arange(3000) + 0.5) / 3000.0) ** 4
     shifted = [weights[: len(weights) - k * len(weights) // _OVERLAP] for k in range(_OVERLAP)]
-    return np.array([own @ weights[-len(own) :] for own in shifted]) / (weights @ weights)
+    return np.array([part @ weights[-len(part) :] for part in shifted]) / (weights @ weights)
 
 
 @cache
@@ -72,16 +72,16 @@ def average(block: Block, length_s: float = WINDOW_S) -> Block | None:
     def means(values: Floats) -> Floats:
         return np.asarray(sliding_window_view(values, length, axis=0)[::step] @ weights)
 
-    curve = orthonormal_parabola(count)
+    parabola = orthonormal_parabola(count)
     level = block.accel_mps2.mean(axis=0)
-    left = block.accel_mps2 - level
-    shaking = left - curve @ (curve.T @ left)
+    deviation = block.accel_mps2 - level
+    shaking = deviation - parabola @ (parabola.T @ deviation)
     return replace(
         block,
         elapsed_s=means(block.elapsed_s),
-        accel_mps2=level + means(left),
+        accel_mps2=level + means(deviation),
         pose=block.pose if len(block.pose) == 1 else means(block.pose),
         temperature_c=means(block.temperature_c),
         variance_mps2_2=means(shaking**2),
-        taken=step,
+        readings_per_row=step,
     )

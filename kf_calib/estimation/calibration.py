@@ -1,6 +1,6 @@
 """The calibration of a source: twelve parameters with their covariance, the noise model and the misfit.
 
-One pass folds the recording into sufficient statistics of each dwell (``sufficient_statistics.Folder``). Everything
+One pass folds the recording into sufficient statistics of each dwell (``folding.Folder``). Everything
 after it (noise model, filter, leave-one-orientation-out) works on these. The estimate after each dwell is reported with
 the noise model of the whole run, so that the curves of a replay do not jump when the noise becomes better known.
 """

@@ -46,7 +46,7 @@ def _turned_conditions(dwells: Sequence[DwellFactor], known: dict[str, Any]) -> 
     counts, still = [3 * len(dwell.pieces) for dwell in dwells], np.zeros(3)
     turns = [still if dwell.turned_rad is None else dwell.turned_rad for dwell in dwells]
     attitudes = [still if dwell.attitude is None else dwell.attitude.rotation_rad for dwell in dwells]
-    felt = np.concatenate([dwell.felt(dwell.nodes.force_mps2) for dwell in dwells])
+    felt = np.concatenate([dwell.felt_force(dwell.nodes.force_mps2) for dwell in dwells])
     return {
         "force_mps2": felt,
         "previous_force_mps2": known["previous_force_mps2"] + felt - known["force_mps2"],
@@ -112,7 +112,7 @@ def without_known(dwells: list[DwellFactor], model: Model) -> list[DwellFactor]:
         return dwells
     effects, sizes = [each.effect for each in model.known], np.concatenate([each.coefficients for each in model.known])
     columns = candidate_columns(dwells, effects, model.bench, model.nominal_state())
-    return [dwell.less(on_basis(own @ sizes)) for dwell, own in zip(dwells, columns, strict=True)]
+    return [dwell.subtract(on_basis(own @ sizes)) for dwell, own in zip(dwells, columns, strict=True)]
 
 
 def columns_of(dwells: Sequence[DwellFactor], model: Model, state: Floats) -> list[Floats]:
@@ -261,9 +261,9 @@ def _turned(dwell: DwellFactor, rho: Floats, state: Floats) -> DwellFactor:
     dwell = dwell.linearised(rho if rho.any() else None, dwell.attitude)
     if not has_turns(dwell):
         return dwell
-    there = turning_mps2(dwell, dwell.felt(dwell.nodes.force_mps2), state).reshape(len(dwell.pieces), 3, 3)
+    there = turning_mps2(dwell, dwell.felt_force(dwell.nodes.force_mps2), state).reshape(len(dwell.pieces), 3, 3)
     nodes = np.concatenate([there, np.zeros((len(there), dwell.width - 3, 3))], axis=1)  # no part on a carrier
-    return dwell.less(-on_basis(nodes))
+    return dwell.subtract(-on_basis(nodes))
 
 
 def has_turns(dwell: DwellFactor) -> bool:

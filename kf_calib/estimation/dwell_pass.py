@@ -14,10 +14,11 @@ from kf_calib.bench.streams import Source
 from kf_calib.bench.wrong_unit import LEVELS, wrong_unit
 from kf_calib.dwells import tabulated, window_average
 from kf_calib.dwells.blocks import LARGEST_RAD, Block, Tally
+from kf_calib.dwells.folding import Folder
 from kf_calib.dwells.rest_in_readings import segmenter_of
 from kf_calib.dwells.rows import Rows, model_rows
 from kf_calib.dwells.segmenter import Segmenter, dwell_blocks
-from kf_calib.dwells.sufficient_statistics import DwellFactor, Folder, dwells_without
+from kf_calib.dwells.sufficient_statistics import DwellFactor, dwells_without
 from kf_calib.errors import InputError
 from kf_calib.estimation import setup_blunders
 from kf_calib.estimation.dwell_columns import without_known

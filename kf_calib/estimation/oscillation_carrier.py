@@ -6,8 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from kf_calib.dwells.folding import Folder
 from kf_calib.dwells.line_spectrum import Line
-from kf_calib.dwells.sufficient_statistics import DwellFactor, Folder, lines_of
+from kf_calib.dwells.sufficient_statistics import DwellFactor, lines_of
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.iterated_fit import fit

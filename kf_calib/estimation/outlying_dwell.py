@@ -96,7 +96,7 @@ def _turns(dwell: DwellFactor, means: Means, rest: Calibration) -> Iterator[Turn
         """Return the dwell's means with the specific force that the platform would have at this angle of the gimbal."""
         pose = dwell.pose.copy()
         pose[gimbal] += turn_rad
-        force, design = dwell.felt(bench.specific_force(at_s, pose[None])), means.design.copy()
+        force, design = dwell.felt_force(bench.specific_force(at_s, pose[None])), means.design.copy()
         for i in range(3):
             design[:, i, 4 * i : 4 * i + 3] = force
         return replace(means, force_mps2=force, design=design, readings=means.readings + there(force))

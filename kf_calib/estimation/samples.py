@@ -87,7 +87,7 @@ def samples_of(rows: Iterable[Rows], linearised: LinearisedDwells, noise: Noise)
             if not linearised.model.bench.angles:
                 regressors = np.tile(dwell.means[:4], (len(u), 1))
             if dwell.attitude is not None or dwell.turned_rad is not None:
-                force = dwell.felt(regressors[:, 1:])
+                force = dwell.felt_force(regressors[:, 1:])
                 regressors = np.hstack([regressors[:, :1], force])
                 if has_turns(dwell):
                     readings = readings + turning_mps2(dwell, force, linearised.state)

@@ -10,7 +10,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.rows import on_basis
-from kf_calib.dwells.sufficient_statistics import DwellFactor, alike
+from kf_calib.dwells.sufficient_statistics import DwellFactor, groups_of_equal_shape
 
 
 @dataclass(frozen=True, repr=False)

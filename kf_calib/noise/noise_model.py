@@ -153,7 +153,7 @@ def within_dwells(
         return Noise(_sigma_along(dwells, along, inflation), inflation, within_seen=any(d.count > 1 for d in dwells))
     squares, counts = (np.concatenate([getattr(each, key) for each in dwells]) for key in ("squares", "counts"))
     if walk_mps2_per_sqrt_s:
-        rest = np.concatenate([dwell.walk.rest for dwell in dwells])
+        rest = np.concatenate([dwell.walk.about_parabola for dwell in dwells])
         squares = np.maximum(squares - walk_mps2_per_sqrt_s**2 * rest[:, None], 0.0)
     on_carrier = dwells[0].width - 3
     long = counts[:, None] >= np.where(variance > 0, 40.0 * inflation, 0.0)

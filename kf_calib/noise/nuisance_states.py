@@ -54,7 +54,7 @@ def along_force(dwells: Sequence[DwellFactor], sensitivities: Floats) -> Floats:
 
     No rotation changes m . reading, which is |f| but for biases; sensitivities S are (D, 3, 3).
     """
-    force = np.array([dwell.felt(dwell.means[None, 1:4])[0] for dwell in dwells])
+    force = np.array([dwell.felt_force(dwell.means[None, 1:4])[0] for dwell in dwells])
     unit = force / np.linalg.norm(force, axis=1, keepdims=True)
     return np.asarray(np.linalg.solve(np.swapaxes(sensitivities, 1, 2), unit[:, :, None])[:, :, 0], float)
 

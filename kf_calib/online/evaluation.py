@@ -17,7 +17,8 @@ from typing import Any, Generic, TypeVar
 
 from kf_calib.bench.streams import Batch, Source
 from kf_calib.dwells.blocks import Tally
-from kf_calib.dwells.sufficient_statistics import DwellFactor, Folder
+from kf_calib.dwells.folding import Folder
+from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.estimation.dwell_pass import LEAST_READINGS, Pass
 from kf_calib.estimation.settings import Settings

@@ -11,7 +11,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from kf_calib.dwells.overview import DwellFound
+from kf_calib.dwells.overview import DwellSummary
 from kf_calib.sources.files.inventory import Inventory, Topic
 from kf_calib.views.json import clean
 from kf_calib.views.tables import Table
@@ -31,7 +31,7 @@ class Overview:
 
     inventory: Inventory
     bench: dict[str, str]
-    dwells: list[DwellFound] | None
+    dwells: list[DwellSummary] | None
     missing: list[str]
     command: str
     warnings: list[str] = field(default_factory=list[str])
@@ -103,7 +103,7 @@ def _gaps(topic: Topic) -> str:
     return ", ".join(said)
 
 
-def _dwell_parts(dwells: Sequence[DwellFound]) -> list[RenderableType]:
+def _dwell_parts(dwells: Sequence[DwellSummary]) -> list[RenderableType]:
     if not dwells:
         return [Text("No dwell was found.")]
     lasts = [dwell.lasts_s for dwell in dwells]

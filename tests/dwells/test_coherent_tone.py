@@ -121,7 +121,7 @@ def test_a_parabola_is_taken_out() -> None:
     cells = Cells.of(at_s)
     assert cells is not None
     curve = np.column_stack([9.8 + 0.1 * at_s - 0.003 * at_s**2, np.ones(300), at_s])
-    assert np.abs(Trace.of(curve, at_s, cells).left).max() < 1e-9
+    assert np.abs(Trace.of(curve, at_s, cells).residual_sums).max() < 1e-9
 
 
 @pytest.mark.parametrize("cycles", [0.5, 1.5, 2.3, 7.0])

@@ -45,7 +45,7 @@ def test_merged_pieces_are_those_that_the_readings_give_at_once(carrier_hz: floa
     np.testing.assert_allclose(one.triangle.T @ one.triangle, whole.triangle.T @ whole.triangle, rtol=1e-10, atol=1e-9)
     for name in ("elapsed_s", "since_arrival_s", "force_mps2", "pose", "temperature_c"):
         np.testing.assert_allclose(getattr(one.nodes, name), getattr(whole.nodes, name), rtol=1e-12, err_msg=name)
-    assert (one.count, one.taken, one.carrier_hz) == (150, 150, carrier_hz)
+    assert (one.count, one.reading_count, one.carrier_hz) == (150, 150, carrier_hz)
 
 
 def test_a_dwell_of_days_has_a_bounded_number_of_pieces() -> None:

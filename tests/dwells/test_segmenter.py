@@ -145,7 +145,7 @@ def test_what_comes_out_does_not_depend_on_batches(angle_hz: float, slew_s: floa
     for one, other in zip(whole, again, strict=True):
         np.testing.assert_array_equal(one.accel_mps2, other.accel_mps2)
         np.testing.assert_array_equal(one.pose, other.pose)
-        assert one.felt_s == other.felt_s
+        assert one.arrival_felt_s == other.arrival_felt_s
 
 
 @pytest.mark.parametrize("angle_hz", [2.0, 10.0, 100.0])
@@ -153,7 +153,7 @@ def test_an_arrival_is_known_to_a_reading_whatever_the_angles_say(angle_hz: floa
     """Slews end at 14 and 25 s; angles tell it to half a second."""
     pose, accel = path(*SLEWS, rate_hz=angle_hz), readings(path(*SLEWS, rate_hz=1000), 35)
     blocks = list(dwell_blocks(Given(Batch(accel, pose)), Segmenter(BENCH)))
-    arrivals = {block.dwell: block.felt_s for block in blocks}
+    arrivals = {block.dwell: block.arrival_felt_s for block in blocks}
     assert [arrivals[2], arrivals[3]] == pytest.approx([14.0, 25.0], abs=0.02)
 
 
@@ -277,7 +277,7 @@ def blocks_of(batches: list[Batch], slews: bool) -> list:
     segmenter = Segmenter(BENCH, slews=slews)
     found = list(dwell_blocks(Given(*batches), segmenter))
     return [vars(segmenter.tally)] + [
-        (each.dwell, each.arrival_s, each.felt_s, each.turns, each.pose_sigma_rad, each.elapsed_s.tobytes(),
+        (each.dwell, each.arrival_s, each.arrival_felt_s, each.turns, each.pose_sigma_rad, each.elapsed_s.tobytes(),
          each.accel_mps2.tobytes(), each.pose.tobytes()) for each in found
     ]  # fmt: skip
 

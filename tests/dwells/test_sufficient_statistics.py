@@ -10,8 +10,9 @@ import pytest
 
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.bench.streams import Batch, Stream
+from kf_calib.dwells.folding import Folder
 from kf_calib.dwells.rows import Rows
-from kf_calib.dwells.sufficient_statistics import DwellFactor, Folder
+from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.settings import Settings
 

@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.bench import Bench, axes_of
-from kf_calib.dwells.sufficient_statistics import Folder
+from kf_calib.dwells.folding import Folder
 from kf_calib.estimation.calibration import calibrate, evaluate, filterpy_estimate
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.engine_comparison import compare

@@ -14,8 +14,8 @@ from scipy.stats import binom
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
+from kf_calib.dwells.folding import detrended
 from kf_calib.dwells.line_spectrum import Line, Spectrum, lines
-from kf_calib.dwells.sufficient_statistics import less_curve
 from kf_calib.effects import checks, effect_named
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.dwell_columns import LinearisedDwells, stimulus_of
@@ -146,7 +146,7 @@ def seen_in(rng: np.random.Generator, kind: str, sizes: dict[float, float], coun
     for _ in range(20):
         phases = rng.uniform(0.0, 2.0 * np.pi, len(sizes))
         waves = sum(a * np.sin(2 * np.pi * f * time_s + p) for (f, a), p in zip(sizes.items(), phases, strict=True))
-        spectra.append(Spectrum.of(less_curve(noise_of(rng, kind, count) + waves), time_s))
+        spectra.append(Spectrum.of(detrended(noise_of(rng, kind, count) + waves), time_s))
     return lines(spectra)
 
 
@@ -194,7 +194,7 @@ def test_spectra_add_up() -> None:
     wave = np.array([[0.0], [0.3], [1.0]]) * np.sin(2 * np.pi * 20.0 * time_s)
     made = [np.diag([0.0, 1.0, 1.0]) @ rng.normal(size=(3, 1500)) + wave for _ in range(8)]
     parts = slice(700), slice(700, None)
-    apart = [Spectrum.of(less_curve(each[:, part]), time_s[part]) for each in made for part in parts]
+    apart = [Spectrum.of(detrended(each[:, part]), time_s[part]) for each in made for part in parts]
     (line,) = lines(apart)
     (same,) = lines([sum(apart[1:], apart[0])])
     assert line.frequency_hz == same.frequency_hz and line.p_value == same.p_value

@@ -12,7 +12,8 @@ from helpers.synthetic import Run, plan_of
 from scipy.signal import lfilter
 
 from kf_calib.bench.bench import Bench, axes_of
-from kf_calib.dwells.sufficient_statistics import Autocovariance, less_curve
+from kf_calib.dwells.folding import detrended
+from kf_calib.dwells.sufficient_statistics import Autocovariance
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.sources.simulation.noise_processes import TrueNoise as SimulatedNoise
 from kf_calib.sources.simulation.sensors import GRADES
@@ -22,7 +23,7 @@ from kf_calib.sources.simulation.simulator import Simulation
 def test_autocovariance_is_the_sum_of_lagged_products() -> None:
     """Of what a parabola leaves: a drift within the block is no noise."""
     noise, time = np.random.default_rng(0).normal(size=(3, 500)), np.arange(500.0)
-    got = Autocovariance.of(less_curve(noise + 3.0 * time - 0.01 * time**2))
+    got = Autocovariance.of(detrended(noise + 3.0 * time - 0.01 * time**2))
     values = np.array([row - np.polyval(np.polyfit(time, row, 2), time) for row in noise])
     for lag in (0, 1, 7, 64):
         np.testing.assert_allclose(got.products[lag], np.sum(values[:, : 500 - lag] * values[:, lag:], axis=1))

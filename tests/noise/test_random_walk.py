@@ -71,7 +71,7 @@ def test_a_path_has_the_covariance_of_its_readings() -> None:
     inside = [
         np.trace(own @ full[a:b, a:b] @ own.T) for own, (a, b) in zip(onto, ((0, 11), (11, 18), (18, 43)), strict=True)
     ]
-    np.testing.assert_allclose(path.rest, np.array(left) - inside, rtol=1e-9)
+    np.testing.assert_allclose(path.about_parabola, np.array(left) - inside, rtol=1e-9)
 
 
 @pytest.mark.parametrize("held_s", [np.inf, 1000.0, 100.0, 3.0])

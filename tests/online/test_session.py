@@ -32,8 +32,8 @@ from kf_calib.bench.streams import Batch
 from kf_calib.cli import cli
 from kf_calib.cli.echo import Printer
 from kf_calib.diagnosis.missing_effect import diagnose
+from kf_calib.dwells.folding import Folder
 from kf_calib.dwells.pieces import MOST_PIECES
-from kf_calib.dwells.sufficient_statistics import Folder
 from kf_calib.errors import InputError
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.dwell_pass import Pass
