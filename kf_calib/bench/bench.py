@@ -132,8 +132,8 @@ class Bench:
     def __post_init__(self) -> None:
         from kf_calib.bench.keys import NOTES, NUMBERS, checked
 
-        own = {key: getattr(self, key) for key in ("reference", "up", *NUMBERS)}
-        stated = {key: value for key, value in own.items() if value is not None or key == "gravity_mps2"}
+        values = {key: getattr(self, key) for key in ("reference", "up", *NUMBERS)}
+        stated = {key: value for key, value in values.items() if value is not None or key == "gravity_mps2"}
         notes = {key: value for key, value in self.notes.items() if key in NOTES}
         for key, value in {**stated, "nominal": self.nominal, "joints": " ".join(self.joints), **notes}.items():
             checked(key, value)
@@ -168,11 +168,11 @@ class Bench:
     def from_metadata(cls, metadata: Mapping[str, str], has_angles: bool = True) -> Bench:
         """The bench described by the strings of a metadata record (docs/format.md) or by options of the same names;
         raises BenchError."""
-        from kf_calib.bench.keys import NOTES, NUMBERS, known
+        from kf_calib.bench.keys import NOTES, NUMBERS, checked_keys
 
-        given = known(metadata)
-        numbers = {key: given[key] for key in NUMBERS if key in given}
-        if has_angles and not given.get("axes", "").strip():
+        values = checked_keys(metadata)
+        numbers = {key: values[key] for key in NUMBERS if key in values}
+        if has_angles and not values.get("axes", "").strip():
             raise BenchError(
                 "the gimbal axes are not stated, so the angles cannot be used: give them outer to inner, "
                 'for example --axes "y z x".'
@@ -184,13 +184,13 @@ class Bench:
                 )
             numbers["gravity_mps2"] = normal_gravity(numbers["latitude_deg"], numbers.get("height_m", 0.0))
         return cls(
-            axes=parse_axes(given["axes"]) if has_angles else (),
-            reference=given.get("reference", "base"),
-            nominal=given.get("nominal", {}),
-            joints=tuple(given.get("joints", "").replace(",", " ").split()) if has_angles else (),
-            notes={key: given[key] for key in NOTES if given.get(key)},
-            up=given.get("up", "y"),
-            input=RawInput.from_metadata(given),
+            axes=parse_axes(values["axes"]) if has_angles else (),
+            reference=values.get("reference", "base"),
+            nominal=values.get("nominal", {}),
+            joints=tuple(values.get("joints", "").replace(",", " ").split()) if has_angles else (),
+            notes={key: values[key] for key in NOTES if values.get(key)},
+            up=values.get("up", "y"),
+            input=RawInput.from_metadata(values),
             **numbers,
         )
 
@@ -304,12 +304,12 @@ def unwrap_pose(
     one before. ``before`` holds the last earlier pose as it was recorded and its turns or sign; with it, poses that
     arrive in parts give exactly the same result as all at once.
     """
-    last, made_so = (pose[0], np.ones(1) if is_quaternion else np.zeros(pose.shape[1])) if before is None else before
+    last, last_turns = (pose[0], np.ones(1) if is_quaternion else np.zeros(pose.shape[1])) if before is None else before
     stacked = np.vstack([last, pose])
     if is_quaternion:
-        signs = made_so * np.cumprod(np.where(np.einsum("ij,ij->i", stacked[1:], stacked[:-1]) < 0, -1.0, 1.0))
+        signs = last_turns * np.cumprod(np.where(np.einsum("ij,ij->i", stacked[1:], stacked[:-1]) < 0, -1.0, 1.0))
         return pose * signs[:, None], signs[:, None]
-    turns = made_so - np.cumsum(np.rint(np.diff(stacked, axis=0) / (2.0 * np.pi)), axis=0)
+    turns = last_turns - np.cumsum(np.rint(np.diff(stacked, axis=0) / (2.0 * np.pi)), axis=0)
     return pose + 2.0 * np.pi * turns, turns
 
 
@@ -334,11 +334,11 @@ def slerp(start: Floats, end: Floats, weight: Floats) -> Floats:
     # atan2 of the two chords is exact for small arcs, where acos of a dot product near 1 loses half the digits
     half = np.arctan2(np.linalg.norm(end - start, axis=-1), np.linalg.norm(end + start, axis=-1))[:, None]
     arc = 2.0 * half
-    near = arc < 1e-12
-    safe = np.where(near, 1.0, np.sin(arc))
-    left = np.where(near, 1.0 - weight, np.sin((1.0 - weight) * arc) / safe)
-    right = np.where(near, weight, np.sin(weight * arc) / safe)
-    return left * start + right * end
+    tiny = arc < 1e-12
+    safe = np.where(tiny, 1.0, np.sin(arc))
+    start_weight = np.where(tiny, 1.0 - weight, np.sin((1.0 - weight) * arc) / safe)
+    end_weight = np.where(tiny, weight, np.sin(weight * arc) / safe)
+    return start_weight * start + end_weight * end
 
 
 def pose_distance(one: Floats, other: Floats, is_quaternion: bool) -> Floats:

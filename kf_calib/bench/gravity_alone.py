@@ -13,24 +13,24 @@ from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 _SQUARE = {"theta1": 0.0, "theta3": 0.0}
 
 
-def bench_without_angles(name: str, stated: Mapping[str, str]) -> tuple[Bench, list[str]]:
+def bench_without_angles(name: str, metadata: Mapping[str, str]) -> tuple[Bench, list[str]]:
     """The bench by the keys that are stated, and what to know of it; gravity is the standard one where none is stated.
 
     name: of the source. Raises BenchError for a key that cannot be.
     """
-    gravity = {} if "latitude_deg" in stated else {"gravity_mps2": str(STANDARD_GRAVITY_MPS2)}
+    gravity = {} if "latitude_deg" in metadata else {"gravity_mps2": str(STANDARD_GRAVITY_MPS2)}
     try:
-        bench = Bench.from_metadata({**gravity, **stated}, has_angles=False)
+        bench = Bench.from_metadata({**gravity, **metadata}, has_angles=False)
     except BenchError as error:
         raise BenchError(f"{name}: {error}") from error
-    said = list[str]()
+    remarks = list[str]()
     if bench.gravity_mps2 == STANDARD_GRAVITY_MPS2:  # as also a recording made by it states
-        said.append(
+        remarks.append(
             f"gravity is taken as the standard {STANDARD_GRAVITY_MPS2} m/s^2; the local value differs by up to "
             "0.3 %, and every scale factor with it: state it by --gravity or --latitude."
         )
     square = _SQUARE | dict(bench.nominal)
-    return replace(bench, angles=False, reference="base", angle_sigma_deg=None, nominal=square), said
+    return replace(bench, angles=False, reference="base", angle_sigma_deg=None, nominal=square), remarks
 
 
 def without_poses(batch: Batch) -> Batch:

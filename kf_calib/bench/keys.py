@@ -62,14 +62,14 @@ def _text(value: Any) -> str:
 
 def _date(value: Any) -> str:
     """Return the text of a date."""
-    dates.read(_text(value))  # raises ValueError
+    dates.parse_date(_text(value))  # raises ValueError
     return value
 
 
-def _one_of(known: tuple[str, ...], value: Any) -> str:
+def _one_of(choices: tuple[str, ...], value: Any) -> str:
     """Return the value if it is one of those known."""
-    if value not in known:
-        raise ValueError(f"it must be one of {', '.join(known)}")
+    if value not in choices:
+        raise ValueError(f"it must be one of {', '.join(choices)}")
     return value
 
 
@@ -77,16 +77,16 @@ def _nominal(value: Any) -> dict[str, float]:
     """Return the values of the paper's parameters by symbol."""
     if not isinstance(value, dict):
         raise ValueError("it must be a valid dictionary")
-    out = dict[str, float]()
+    nominal = dict[str, float]()
     for symbol, size in value.items():
-        place = cut(repr(symbol)[1:-1] if isinstance(symbol, str) else str(symbol), 100)  # no line ends in it
+        label = cut(repr(symbol)[1:-1] if isinstance(symbol, str) else str(symbol), 100)  # no line ends in it
         if symbol not in paper_parameters.SYMBOLS:
-            raise ValueError(f"{place}: it is unknown")
+            raise ValueError(f"{label}: it is unknown")
         try:
-            out[symbol] = _between(*_OF_SYMBOL[symbol.rstrip("123")], size)
+            nominal[symbol] = _between(*_OF_SYMBOL[symbol.rstrip("123")], size)
         except ValueError as error:
-            raise ValueError(f"{place}: {error}") from None
-    return out
+            raise ValueError(f"{label}: {error}") from None
+    return nominal
 
 
 class Key(NamedTuple):
@@ -140,7 +140,7 @@ KEYS: Mapping[str, Key] = {
 }  # fmt: skip
 
 
-def known(metadata: Mapping[str, Any]) -> dict[str, Any]:
+def checked_keys(metadata: Mapping[str, Any]) -> dict[str, Any]:
     """The checked values of a bench's keys, without numbers that were left empty; raises BenchError, naming the key."""
     for key in metadata:
         if key not in KEYS:
@@ -156,9 +156,9 @@ def checked(key: str, value: Any) -> Any:
         return read(_plain(key, value))
     except ValueError as error:
         hint = how_to_write(value) if isinstance(value, str) and key in NUMBERS else ""
-        said = cut(repr(value) if isinstance(value, str | Real) else str(value), 60)
+        shown_value = cut(repr(value) if isinstance(value, str | Real) else str(value), 60)
         why = f" ({error})" if key == "nominal" else ""
-        raise BenchError(f"bench key {key} is {said}{why}, and must be {words}{hint}.") from None
+        raise BenchError(f"bench key {key} is {shown_value}{why}, and must be {words}{hint}.") from None
 
 
 def _plain(key: str, value: Any) -> Any:

@@ -61,70 +61,70 @@ def mountings(stated: Mounting) -> Iterator[Mounting]:
             if len({change.kind for change in chosen}) == count:
                 mounting = stated
                 for change in chosen:
-                    mounting = change.made(mounting)
+                    mounting = change.apply(mounting)
                 yield replace(mounting, words=tuple(change.words for change in chosen), changes=count)
 
 
 @dataclass(frozen=True)
-class _Change:
+class _Alternative:
     """One thing that may differ from what is stated; changes of the same kind exclude each other."""
 
     kind: str
     words: str
-    made: Callable[[Mounting], Mounting]
+    apply: Callable[[Mounting], Mounting]
 
 
-def _of_gimbals(bench: Bench) -> Iterator[_Change]:
+def _of_gimbals(bench: Bench) -> Iterator[_Alternative]:
     """Yield changes of the sense and order of the gimbals and of the order and unit of the recorded angles."""
-    every, letters = range(len(bench.axes)), bench.to_metadata()["axes"].split()
-    for k in every:
-        yield _Change(f"sense {k}", f"gimbal {letters[k]} turns the other way", _reversed_gimbals((k,)))
-    if len(every) > 1:
-        yield _Change("sense", "all angles have the opposite sign", _reversed_gimbals(every))
-    for order in itertools.permutations(every):
-        if order != tuple(every):
+    gimbals, letters = range(len(bench.axes)), bench.to_metadata()["axes"].split()
+    for k in gimbals:
+        yield _Alternative(f"sense {k}", f"gimbal {letters[k]} turns the other way", _reversed_gimbals((k,)))
+    if len(gimbals) > 1:
+        yield _Alternative("sense", "all angles have the opposite sign", _reversed_gimbals(gimbals))
+    for order in itertools.permutations(gimbals):
+        if order != tuple(gimbals):
             axes, columns = " ".join(letters[k] for k in order), ", ".join(str(k + 1) for k in order)
-            yield _Change("axes", f"the gimbal axes are, outer to inner, {axes}", _reordered_axes(order))
-            yield _Change("order", f"gimbals {' '.join(letters)} have the angles {columns}", _reordered(order))
-    yield _Change("unit", "the angles are in degrees", _with_unit(math.radians(1.0)))
-    yield _Change("unit", "the angles were turned from degrees into radians twice", _with_unit(math.degrees(1.0)))
+            yield _Alternative("axes", f"the gimbal axes are, outer to inner, {axes}", _reordered_axes(order))
+            yield _Alternative("order", f"gimbals {' '.join(letters)} have the angles {columns}", _reordered(order))
+    yield _Alternative("unit", "the angles are in degrees", _with_unit(math.radians(1.0)))
+    yield _Alternative("unit", "the angles were turned from degrees into radians twice", _with_unit(math.degrees(1.0)))
 
 
-def _of_up(bench: Bench) -> Iterator[_Change]:
+def _of_up(bench: Bench) -> Iterator[_Alternative]:
     """Yield changes of the axis that points up."""
     for up in UP:
         if up != bench.up:
-            yield _Change("up", f"{up} is up when all angles are zero", _with_up(up))
+            yield _Alternative("up", f"{up} is up when all angles are zero", _with_up(up))
 
 
-def _of_attitude() -> Iterator[_Change]:
+def _of_attitude() -> Iterator[_Alternative]:
     """Yield changes of the sense and of the order of components of attitude quaternions."""
     inverted, first = "the attitude is that of the bench in the platform", "the quaternion has its real part first"
-    yield _Change("sense", inverted, lambda mounting: replace(mounting, conjugate=True))
-    yield _Change("order", first, lambda mounting: replace(mounting, real_first=True))
+    yield _Alternative("sense", inverted, lambda mounting: replace(mounting, conjugate=True))
+    yield _Alternative("order", first, lambda mounting: replace(mounting, real_first=True))
 
 
 def _reversed_gimbals(gimbals: Collection[int]) -> Callable[[Mounting], Mounting]:
     """Return the change that reverses the sense of some gimbals."""
 
-    def made(mounting: Mounting) -> Mounting:
+    def apply(mounting: Mounting) -> Mounting:
         axes = list(mounting.bench.axes)
         for k in gimbals:
             x, y, z = axes[k]
             axes[k] = (0.0 - x, 0.0 - y, 0.0 - z)
         return replace(mounting, bench=replace(mounting.bench, axes=tuple(axes)))
 
-    return made
+    return apply
 
 
 def _reordered_axes(order: Sequence[int]) -> Callable[[Mounting], Mounting]:
     """Return the change that puts the gimbal axes into another order."""
 
-    def made(mounting: Mounting) -> Mounting:
+    def apply(mounting: Mounting) -> Mounting:
         axes = tuple(mounting.bench.axes[k] for k in order)
         return replace(mounting, bench=replace(mounting.bench, axes=axes))
 
-    return made
+    return apply
 
 
 def _reordered(order: tuple[int, ...]) -> Callable[[Mounting], Mounting]:

@@ -63,7 +63,7 @@ def parameters_of(state: Floats) -> Floats:
 
     This inverts ``state_of`` for any direction of the axes: K1 and K3 are positive, and K2 has the sign of s2y.
     """
-    out = np.empty_like(state)
+    parameters = np.empty_like(state)
     for i in range(3):
         s = state[..., 4 * i : 4 * i + 3]
         scale = np.linalg.norm(s, axis=-1)
@@ -71,15 +71,15 @@ def parameters_of(state: Floats) -> Floats:
             scale = np.copysign(scale, s[..., 1])
         x, y, z = np.moveaxis(s / scale[..., None], -1, 0)
         angles = (np.arcsin(x), -np.arcsin(z)) if i == 1 else (np.arcsin(y), np.arctan2(-z, x))
-        out[..., 4 * i], out[..., 4 * i + 1] = angles
-        out[..., 4 * i + 2], out[..., 4 * i + 3] = scale, state[..., 4 * i + 3]
-    return out
+        parameters[..., 4 * i], parameters[..., 4 * i + 1] = angles
+        parameters[..., 4 * i + 2], parameters[..., 4 * i + 3] = scale, state[..., 4 * i + 3]
+    return parameters
 
 
 def jacobian(state: Floats) -> Floats:
     """The Jacobian d parameters / d state (12, 12) at an affine state in closed form, by which covariances are
     transformed."""
-    out = np.zeros((12, 12))
+    derivatives = np.zeros((12, 12))
     for i in range(3):
         rows = slice(4 * i, 4 * i + 4)
         s = state[4 * i : 4 * i + 3]
@@ -93,8 +93,8 @@ def jacobian(state: Floats) -> Floats:
             block[0, :3] = _arcsine_gradient(axis, 1) / scale
             block[1, :3] = np.array([axis[2], 0.0, -axis[0]]) / (scale * (axis[0] ** 2 + axis[2] ** 2))
         block[2, :3] = axis
-        out[rows, rows] = block
-    return out
+        derivatives[rows, rows] = block
+    return derivatives
 
 
 def _arcsine_gradient(axis: Floats, k: int) -> Floats:
@@ -105,7 +105,7 @@ def _arcsine_gradient(axis: Floats, k: int) -> Floats:
 def sensitivity_jacobian(parameters: Floats) -> Floats:
     """The Jacobian d state / d parameters (12, 12) in closed form; its blocks are the transposes of the paper's H (see
     ``h_rows``)."""
-    out = np.zeros((12, 12))
+    derivatives = np.zeros((12, 12))
     for i, (p1, p2, scale, _) in enumerate(np.reshape(parameters, (3, 4))):
         c1, s1, c2, s2 = math.cos(p1), math.sin(p1), math.cos(p2), math.sin(p2)
         axis = _axis(i, p1, p2)
@@ -115,8 +115,8 @@ def sensitivity_jacobian(parameters: Floats) -> Floats:
             first, second = (-c2 * s1, c1, s2 * s1), (-s2 * c1, 0.0, -c2 * c1)
         block = np.eye(4)
         block[:3, :3] = np.column_stack([scale * np.array(first), scale * np.array(second), axis])
-        out[4 * i : 4 * i + 4, 4 * i : 4 * i + 4] = block
-    return out
+        derivatives[4 * i : 4 * i + 4, 4 * i : 4 * i + 4] = block
+    return derivatives
 
 
 def h_rows(parameters: Floats) -> Floats:

@@ -93,12 +93,12 @@ class RawInput:
         parse_unit(self.unit)
 
     @classmethod
-    def from_metadata(cls, stated: Mapping[str, Any]) -> RawInput:
+    def from_metadata(cls, metadata: Mapping[str, Any]) -> RawInput:
         """The raw input that bench keys state; raises BenchError."""
         return cls(
-            parse_channels(str(stated.get("channels", "1,2,3"))),
-            parse_scale(str(stated.get("accel_scale", "1"))),
-            parse_unit(str(stated.get("accel_unit", "m/s2"))),
+            parse_channels(str(metadata.get("channels", "1,2,3"))),
+            parse_scale(str(metadata.get("accel_scale", "1"))),
+            parse_unit(str(metadata.get("accel_unit", "m/s2"))),
         )
 
     @classmethod
@@ -145,10 +145,10 @@ class RawInput:
     @cached_property
     def matrix(self) -> Floats:
         """A (3, 3): readings = A raw."""
-        places = np.array(self.channels)
-        out = np.zeros((3, 3))
-        out[np.arange(3), np.abs(places) - 1] = np.sign(places) * self.factors[np.abs(places) - 1]
-        return out
+        channels = np.array(self.channels)
+        matrix = np.zeros((3, 3))
+        matrix[np.arange(3), np.abs(channels) - 1] = np.sign(channels) * self.factors[np.abs(channels) - 1]
+        return matrix
 
     def readings(self, raw: Floats) -> Floats:
         """Readings (n, 3), m/s^2, of accelerometers 1, 2, 3 from raw numbers (n, 3) of channels 1, 2, 3."""
@@ -166,10 +166,10 @@ class RawInput:
 
     def raw(self, readings: Floats) -> Floats:
         """Raw numbers (n, 3) of channels 1, 2, 3 that give these readings (n, 3): what ``readings`` inverts."""
-        out = np.empty_like(readings)
+        numbers = np.empty_like(readings)
         for accelerometer, channel in enumerate(self.channels):
-            out[:, abs(channel) - 1] = math.copysign(1.0, channel) * readings[:, accelerometer]
-        return out / self.factors
+            numbers[:, abs(channel) - 1] = math.copysign(1.0, channel) * readings[:, accelerometer]
+        return numbers / self.factors
 
     @property
     def unit_words(self) -> str:
@@ -210,10 +210,10 @@ def text_of(key: str, value: Any) -> str:
     if not isinstance(value, str):
         raise ValueError("it must be text")
     try:
-        made = RawInput.from_metadata({key: value.strip()})
+        raw_input = RawInput.from_metadata({key: value.strip()})
     except BenchError as error:
         raise ValueError(str(error)) from None
-    return {"channels": made.order, "accel_scale": made.scale, "accel_unit": made.unit}[key]
+    return {"channels": raw_input.order, "accel_scale": raw_input.scale, "accel_unit": raw_input.unit}[key]
 
 
 @dataclass(frozen=True)
@@ -234,7 +234,7 @@ class Conversion:
         return self.device.readings(numbers if self.made_by is None else self.made_by.raw(numbers))
 
 
-def merged(
+def merged_metadata(
     recorded: Mapping[str, Any], overrides: Mapping[str, Any], what: str, default: RawInput | None = None
 ) -> dict[str, Any]:
     """Bench keys of a file (``what``) with those of options over them; default: the raw input where it states none.
@@ -248,12 +248,12 @@ def merged(
     shared = () if overrides.get(RESTATE) == "true" else set(OPTIONS) & set(stated) & set(overrides)
     for key in sorted(shared):
         try:
-            there, here = text_of(key, stated[key]), text_of(key, overrides[key])
+            in_file, in_options = text_of(key, stated[key]), text_of(key, overrides[key])
         except ValueError:
             continue  # told where the bench is made of it
-        if there != here:
+        if in_file != in_options:
             raise BenchError(
-                f"{OPTIONS[key]} is {here}, and {what} states {there}: leave it out, or where what is stated is "
+                f"{OPTIONS[key]} is {in_options}, and {what} states {in_file}: leave it out, or where what is stated is "
                 "wrong, say so by --restate-input."
             )
     return {**stated, **overrides}

@@ -15,18 +15,18 @@ from kf_calib.support import units
 
 def targets_of(texts: Iterable[str]) -> dict[str, float]:
     """Sigma wanted by symbol, in SI; of several for one parameter the last counts. Raises InputError."""
-    out = dict[str, float]()
+    targets = dict[str, float]()
     for text in texts:
         name, equals, size = text.partition("=")
-        named = [k for k, symbol in enumerate(paper_parameters.SYMBOLS) if name.strip() in _names_of(symbol)]
-        if not equals or not named:
+        parameters = [k for k, symbol in enumerate(paper_parameters.SYMBOLS) if name.strip() in _names_of(symbol)]
+        if not equals or not parameters:
             raise InputError(
                 f"target {text!r} names no parameter: write NAME=SIGMA, for example K=2ppm, with NAME one of "
                 f"{', '.join(paper_parameters.SYMBOLS)}, or theta, phi, nu, K, b or angles for all of a kind."
             )
-        sigma = _sigma(text, size, paper_parameters.UNITS[named[0]])
-        out |= {paper_parameters.SYMBOLS[k]: sigma for k in named}
-    return out
+        sigma = _sigma(text, size, paper_parameters.UNITS[parameters[0]])
+        targets |= {paper_parameters.SYMBOLS[k]: sigma for k in parameters}
+    return targets
 
 
 def _names_of(symbol: str) -> set[str]:

@@ -215,7 +215,7 @@ def _deliver_bench_models(files: BenchModelFiles, outputs: Outputs, deliver: Del
     words = {path: f"saved {path}: for --bench-model" for path in files.models}
     words |= {path: f"removed {path}, which no longer holds" for path in files.outdated}
     for path, said in words.items():
-        outputs.own(path)  # which files may be replaced is seen by what is in them
+        outputs.allow_replacing(path)  # which files may be replaced is seen by what is in them
         done = deliver.keep(path, files.write if path in files.models else Path.unlink)
         if done and not quiet:
             echo(said)

@@ -174,7 +174,7 @@ def live(
                 complain(said)
             if final is not None and final.result is not None:
                 if rrd and view is not None and view.began:
-                    outputs.own(rrd)
+                    outputs.allow_replacing(rrd)
                 with delivery(outputs, as_json or run.print.lost > 0) as deliver:
                     deliver.calibration(save, final.result, run.recording() or opened)
                     deliver.model(save_model, final.result)

@@ -254,14 +254,14 @@ def overrides(options: Mapping[str, Any]) -> dict[str, str]:
 
 def _bench_from_toml(path: Path) -> dict[str, str]:
     from kf_calib.bench.bench import metadata_of
-    from kf_calib.bench.keys import known
-    from kf_calib.support.toml_files import table_of
+    from kf_calib.bench.keys import checked_keys
+    from kf_calib.support.toml_files import toml_table
 
-    content = table_of(path, "gravity_mps2 = 9.81, numbers with a point")
+    content = toml_table(path, "gravity_mps2 = 9.81, numbers with a point")
     table = content.get("bench", content) if isinstance(content.get("bench"), dict) else content
     try:
         keys = metadata_of(table)
-        known(keys)
+        checked_keys(keys)
     except BenchError as error:
         raise BenchError(f"{path}: {error}") from None
     except (ValueError, RecursionError):
@@ -318,11 +318,11 @@ def recording_kind(path: Path, options: Mapping[str, Any]) -> str:
 
 def merged_for_table(path: Path, options: Mapping[str, Any], input: RawInput) -> tuple[dict[str, str], Units]:
     """Bench keys and units of a table of what the device of a calibration sends."""
-    from kf_calib.bench.raw_input import merged
+    from kf_calib.bench.raw_input import merged_metadata
 
     keys = overrides(options)
     try:
-        order = merged({}, keys, "", input).get("channels")
+        order = merged_metadata({}, keys, "", input).get("channels")
     except BenchError as error:
         raise BenchError(f"{path}: {error}") from None
     return keys if order is None else keys | {"channels": order}, units_of(options, input)

@@ -46,7 +46,7 @@ from kf_calib.errors import InputError
 from kf_calib.estimation.results import Calibration
 from kf_calib.sources.files.bags import fingerprint
 from kf_calib.support.output_files import write_whole
-from kf_calib.support.toml_files import table_of
+from kf_calib.support.toml_files import toml_table
 from kf_calib.support.value_schema import FINITE, TEXT, Misfit, converted
 
 
@@ -178,7 +178,7 @@ def read(path: Path) -> Journal:
 
     Raises InputError, with the path, where the file cannot be read or is no journal.
     """
-    table = table_of(path, "those of improve --journal")
+    table = toml_table(path, "those of improve --journal")
     try:
         content: _Content = converted(table, _Content)
         options, sums = dict(content["options"]), content.get("sha256", {})

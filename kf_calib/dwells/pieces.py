@@ -42,7 +42,7 @@ class Piece:
 def coarsened(pieces: Sequence[Piece]) -> tuple[Piece, ...]:
     """Pieces in order of time, merged to at most half of ``MOST_PIECES`` and those shortly after the arrival."""
     begin, end = pieces[0].nodes.elapsed_s[0], pieces[-1].nodes.elapsed_s[-1]
-    return tuple(merged(group) for group in _groups(pieces, float(end - begin) / _MERGED_PIECES))
+    return tuple(merged_piece(group) for group in _groups(pieces, float(end - begin) / _MERGED_PIECES))
 
 
 def _groups(pieces: Sequence[Piece], longest_s: float) -> Iterator[list[Piece]]:
@@ -58,7 +58,7 @@ def _groups(pieces: Sequence[Piece], longest_s: float) -> Iterator[list[Piece]]:
     yield group
 
 
-def merged(pieces: Sequence[Piece]) -> Piece:
+def merged_piece(pieces: Sequence[Piece]) -> Piece:
     """One piece of consecutive ones."""
     if len(pieces) == 1:
         return pieces[0]

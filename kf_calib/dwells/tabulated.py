@@ -25,7 +25,7 @@ mean."""
 _CURVE = 3  # basis functions of a piece
 
 
-class Orientation(Protocol):
+class TabulatedDwell(Protocol):
     """A row of a table; ``kf_calib.sources.tables.orientation.Orientation`` is one."""
 
     @property
@@ -47,7 +47,7 @@ class Orientation(Protocol):
     def temperature_c(self) -> float: ...
 
 
-def dwells_of(table: Sequence[Orientation], bench: Bench) -> list[DwellFactor]:
+def dwells_of(table: Sequence[TabulatedDwell], bench: Bench) -> list[DwellFactor]:
     """The sufficient statistics of each row of a table."""
     times = _times(table)
     unknown = Autocovariance(), Spectrum(), Trace()  # the same objects for all dwells, since a set takes 2 kB
@@ -57,7 +57,7 @@ def dwells_of(table: Sequence[Orientation], bench: Bench) -> list[DwellFactor]:
     ]
 
 
-def rows_of(table: Sequence[Orientation], bench: Bench) -> Iterator[Rows]:
+def rows_of(table: Sequence[TabulatedDwell], bench: Bench) -> Iterator[Rows]:
     """Rows of each dwell with every reading at the mean, from which any engine makes the same estimate as from the
     readings themselves."""
     times = _times(table)
@@ -71,7 +71,7 @@ def rows_of(table: Sequence[Orientation], bench: Bench) -> Iterator[Rows]:
         yield Rows(k + 1, elapsed_s, columns, readings, np.zeros((3, count)), True, (piece,))
 
 
-def _times(table: Sequence[Orientation]) -> int:
+def _times(table: Sequence[TabulatedDwell]) -> int:
     """Return by how much the counts have to be multiplied."""
     fewest = min(
         (orientation.count for orientation in table if orientation.sigma_mps2 is not None), default=LEAST_COUNT
@@ -79,7 +79,7 @@ def _times(table: Sequence[Orientation]) -> int:
     return math.ceil(LEAST_COUNT / fewest)
 
 
-def _nodes(table: Sequence[Orientation], bench: Bench) -> Iterator[Nodes]:
+def _nodes(table: Sequence[TabulatedDwell], bench: Bench) -> Iterator[Nodes]:
     """Yield the nodes of each dwell; their times are apart by a tenth of the shortest pause, the rest does not
     change."""
     middles = np.array([orientation.elapsed_s for orientation in table])
@@ -91,7 +91,7 @@ def _nodes(table: Sequence[Orientation], bench: Bench) -> Iterator[Nodes]:
         yield Nodes(at_s, np.full(3, half_s), force, pose, np.full(3, orientation.temperature_c))
 
 
-def _piece(orientation: Orientation, nodes: Nodes, bench: Bench, times: int) -> Piece:
+def _piece(orientation: TabulatedDwell, nodes: Nodes, bench: Bench, times: int) -> Piece:
     """Return the one piece of a dwell."""
     count, mean = orientation.count * times, orientation.mean_mps2
     triangle = np.zeros((_CURVE + 3, _CURVE + 3))

@@ -26,7 +26,7 @@ from kf_calib.effects import effect_named
 from kf_calib.errors import InputError
 from kf_calib.estimation.known_effect import KnownEffect
 from kf_calib.support.output_files import write_whole
-from kf_calib.support.toml_files import table_of
+from kf_calib.support.toml_files import toml_table
 from kf_calib.support.value_schema import FINITE, TEXT, Misfit, converted
 
 _EXAMPLE = '[[terms]] with effect = "flexure", symbols, coefficients, covariance'
@@ -100,7 +100,7 @@ class BenchModel:
 def read(path: str | Path) -> BenchModel:
     """Read a bench model; raises InputError, with the path, if the file cannot be read or used."""
     path = Path(path)
-    table = table_of(path, _EXAMPLE)
+    table = toml_table(path, _EXAMPLE)
     try:
         content: _Content = converted(table, _Content)
         terms = tuple(_term(each) for each in content["terms"])

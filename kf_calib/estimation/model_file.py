@@ -38,7 +38,7 @@ from kf_calib.errors import InputError
 from kf_calib.estimation.results import Calibration
 from kf_calib.support.output_files import write_whole
 from kf_calib.support.plain_text import cut
-from kf_calib.support.toml_files import table_of
+from kf_calib.support.toml_files import toml_table
 from kf_calib.support.value_schema import FINITE, TEXT, Misfit, converted
 
 _EXAMPLE = 'effects = ["NAME", "mine = a*T"]'
@@ -89,7 +89,7 @@ def read(path: str | Path) -> ModelFile:
     Raises InputError, with the path, if the file cannot be read or used.
     """
     path = Path(path)
-    table = table_of(path, _EXAMPLE)
+    table = toml_table(path, _EXAMPLE)
     for key in table:
         if key not in _KEYS:
             near = difflib.get_close_matches(key, _KEYS, n=1, cutoff=0.4)

@@ -246,7 +246,7 @@ def _conditions(result: Calibration, began: datetime | None) -> SavedConditions:
     warmth = np.concatenate([dwell.nodes.temperature_c for dwell in dwells])
     known = bool(np.isfinite(warmth).any())
     return SavedConditions(
-        began=None if began is None else dates.written(began),
+        began=None if began is None else dates.format_date(began),
         duration_s=dwells[-1].end_s,
         temperature_min_c=float(np.nanmin(warmth)) if known else None,
         temperature_mean_c=float(np.nanmean(warmth)) if known else None,

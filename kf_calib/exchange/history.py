@@ -144,7 +144,7 @@ def date_of(saved: SavedCalibration) -> datetime:
     """When the run of a calibration began, or, where its file does not say that, when it was computed."""
     text = saved.conditions.began or saved.provenance.created
     try:
-        return dates.read(text)
+        return dates.parse_date(text)
     except ValueError:
         raise InputError(f"{text!r} is no date: a calibration needs one (ISO 8601).") from None
 

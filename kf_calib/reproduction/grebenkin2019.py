@@ -191,7 +191,7 @@ def per_cent(error: Floats) -> Floats:
     return 100.0 * error / DEVIATIONS
 
 
-def printed(table: dict[str, float]) -> Floats:
+def printed_column(table: dict[str, float]) -> Floats:
     """A column of Table 2 in the order of ``paper.SYMBOLS``."""
     return np.array([table[symbol] for symbol in paper_parameters.SYMBOLS])
 
@@ -260,7 +260,7 @@ class Column:
     difference_sigma: float
 
 
-def run(orientations: OrientationSet, repetitions: int, rng: np.random.Generator) -> Column:
+def run_experiment(orientations: OrientationSet, repetitions: int, rng: np.random.Generator) -> Column:
     """Readings of the deviated block with white noise, and both estimates of every repetition."""
     nominal = paper_parameters.nominal()
     truth = nominal + DEVIATIONS
@@ -331,5 +331,5 @@ class Experiment:
 def repeat(conditions: Conditions | None = None, repetitions: int = REPETITIONS, seed: int = 0) -> Experiment:
     """The paper's experiment: the optimal set with gravity fixed, the non-optimal one under inferred conditions."""
     own, rng = conditions or Conditions(), np.random.default_rng(seed)
-    best, other = run(optimal(), repetitions, rng), run(nonoptimal(own), repetitions, rng)
+    best, other = run_experiment(optimal(), repetitions, rng), run_experiment(nonoptimal(own), repetitions, rng)
     return Experiment(own, repetitions, seed, best, other, nonoptimal(own, earth_turns=False))

@@ -32,7 +32,7 @@ AZIMUTHS_DEG = np.arange(0.0, 360.0, 15.0)
 
 
 @dataclass(frozen=True)
-class Found:
+class ConditionFit:
     """Conditions, and the rms over the twelve of ln(expected / print) under them."""
 
     conditions: Conditions
@@ -48,8 +48,8 @@ class ConditionSearch:
     """
 
     tried: int
-    together: Found
-    in_turn: Found
+    together: ConditionFit
+    in_turn: ConditionFit
     floor: float
     scatter: float
     bias_excess: Floats
@@ -57,30 +57,30 @@ class ConditionSearch:
 
 def search(latitude_deg: float = Conditions.latitude_deg) -> ConditionSearch:
     """Every reading of the turns, order of sampling, azimuth in steps of 15 deg, and 48 periods from 2 to 60 s."""
-    found = [
-        each for azimuth in AZIMUTHS_DEG.tolist() for each in _nearest_periods(Conditions(1.0, latitude_deg, azimuth))
+    fits = [
+        fit for azimuth in AZIMUTHS_DEG.tolist() for fit in _nearest_periods(Conditions(1.0, latitude_deg, azimuth))
     ]
     together, in_turn = (
-        min((f for f in found if (f.conditions.sampled == TOGETHER) is kind), key=lambda f: f.log_ratio)
+        min((f for f in fits if (f.conditions.sampled == TOGETHER) is kind), key=lambda f: f.log_ratio)
         for kind in (True, False)
     )
-    excess = bias_excess(grebenkin2019.printed(grebenkin2019.NONOPTIMAL_PRINTED))
-    tried = len(found) * len(PERIODS_S)
+    excess = bias_excess(grebenkin2019.printed_column(grebenkin2019.NONOPTIMAL_PRINTED))
+    tried = len(fits) * len(PERIODS_S)
     return ConditionSearch(
         tried, together, in_turn, shared_floor(), grebenkin2019.scatter(grebenkin2019.REPETITIONS), excess
     )
 
 
-def _nearest_periods(base: Conditions) -> Iterator[Found]:
+def _nearest_periods(base: Conditions) -> Iterator[ConditionFit]:
     """The nearest period for every reading of the turns and order of sampling, by the closed form."""
-    column, vertical = grebenkin2019.printed(grebenkin2019.NONOPTIMAL_PRINTED), _vertical(base)
+    column, vertical = grebenkin2019.printed_column(grebenkin2019.NONOPTIMAL_PRINTED), _vertical(base)
     attitudes = {turns: base.bench.attitude(grebenkin2019.attitudes(turns)) for turns in TURNS}
     for turns, sampled in product(TURNS, SAMPLED):
         moments = _moments(vertical, attitudes[turns], sampled)
         figures = grebenkin2019.log_ratio(grebenkin2019.expected_of(grebenkin2019.normal_of(moments)), column)
         best = int(figures.argmin())
-        own = replace(base, period_s=float(PERIODS_S[best]), turns=turns, sampled=sampled)
-        yield Found(own, float(figures[best]))
+        conditions = replace(base, period_s=float(PERIODS_S[best]), turns=turns, sampled=sampled)
+        yield ConditionFit(conditions, float(figures[best]))
 
 
 def _vertical(base: Conditions) -> Floats:
@@ -94,12 +94,12 @@ def _vertical(base: Conditions) -> Floats:
 
 def _moments(vertical: Floats, attitudes: Floats, sampled: str) -> Floats:
     """What each accelerometer sees in the four attitudes (4, 3, 3): (P, 1 or 3, 4, 4)."""
-    turned = np.zeros((4, 4, 4))  # [f, 1] in the platform is [f, 1] in the bench times this
-    turned[:, :3, :3], turned[:, 3, 3] = attitudes, 1.0
+    rotations = np.zeros((4, 4, 4))  # [f, 1] in the platform is [f, 1] in the bench times this
+    rotations[:, :3, :3], rotations[:, 3, 3] = attitudes, 1.0
     if sampled == TOGETHER:
-        return (turned.swapaxes(1, 2) @ vertical[:, :4] @ turned).sum(axis=1)[:, None]
+        return (rotations.swapaxes(1, 2) @ vertical[:, :4] @ rotations).sum(axis=1)[:, None]
     in_turn = vertical.reshape(-1, 4, 3, 4, 4)[:, :, [sampled.index(i) for i in "123"]]
-    return (turned[:, None].swapaxes(2, 3) @ in_turn @ turned[:, None]).sum(axis=1)
+    return (rotations[:, None].swapaxes(2, 3) @ in_turn @ rotations[:, None]).sum(axis=1)
 
 
 def shared_floor() -> float:
@@ -109,7 +109,7 @@ def shared_floor() -> float:
     nominal 0.5 deg: theta1, theta3, K2 g show that along y, phi1, nu2, K3 that along z, nu1, phi3, K1 that along x,
     and the three biases have one error. The best any conditions can do is the geometric mean of each four.
     """
-    error = grebenkin2019.printed(grebenkin2019.NONOPTIMAL_PRINTED) * DEVIATIONS
+    error = grebenkin2019.printed_column(grebenkin2019.NONOPTIMAL_PRINTED) * DEVIATIONS
     groups = (("theta1", "theta3", "K2"), ("phi1", "nu2", "K3"), ("nu1", "phi3", "K1"), ("b1", "b2", "b3"))
     logs = np.log([[error[paper_parameters.SYMBOLS.index(symbol)] for symbol in group] for group in groups])
     return float(np.sqrt(np.mean((logs - logs.mean(axis=1, keepdims=True)) ** 2)))

@@ -16,6 +16,6 @@ def run_date(source: Source) -> datetime | None:
     """
     stated = source.bench.notes.get("date")
     if stated is not None:
-        return dates.read(stated)
+        return dates.parse_date(stated)
     begin_ns = getattr(source, "begin_ns", None)
     return dates.of_stamp(begin_ns() if begin_ns else None) or getattr(source, "received", None)

@@ -14,7 +14,7 @@ def of_stamp(time_ns: int | None) -> datetime | None:
     return datetime.fromtimestamp(time_ns / 1e9, UTC)
 
 
-def read(text: str) -> datetime:
+def parse_date(text: str) -> datetime:
     """The date that a text says; raises ValueError if it says none."""
     date = datetime.fromisoformat(text)
     try:
@@ -23,6 +23,6 @@ def read(text: str) -> datetime:
         raise ValueError(f"{text} is no date in UTC") from None
 
 
-def written(date: datetime) -> str:
-    """A date as text that ``read`` takes, to the millisecond."""
+def format_date(date: datetime) -> str:
+    """A date as text that ``parse_date`` takes, to the millisecond."""
     return date.isoformat(timespec="milliseconds")

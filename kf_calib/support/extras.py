@@ -1,4 +1,4 @@
-"""Packages that only some uses need: they come with extras of kf_calib, and a missing one is one sentence."""
+"""Optional packages, which come with extras of kf_calib; a missing one is reported in one sentence."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who writes a file that grows: a lock of the operating system on it, gone with the process however that ends."""
+"""Which process writes a growing file: a lock of the operating system, which ends with the process in any case."""
 
 from __future__ import annotations
 

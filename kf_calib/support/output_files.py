@@ -1,19 +1,19 @@
 """Files that are written: one rule for every output of every command, so that nothing of the user's is harmed.
 
 - Never the input: no output is a file that the command reads, under whatever name (links too), nor another output.
-- Nothing is replaced without ``--overwrite``, nor a folder, a device or a file protected from writing with it. A link
-  stays, and the file it points to is written.
-- All this, and whether the folder can be written in, is seen before the work begins.
-- A file is written beside its place and takes its name when it is whole (``whole``): who looks sees the old or the new.
-  Of two runs that write one name without ``--overwrite``, the second to be done is told so. What a killed run has left
-  beside is removed by the next one.
-- What grows for as long as a run lasts must be found if the run is killed (``Growing``). It is written under its own
-  name from the start; where it replaces an earlier file, it takes that one's name as soon as its first readings are on
-  the disk, and till then the earlier one stays. Where nothing came, nothing is left. Till it ends, no other run can
-  write it: both files are locked.
+- A file is replaced only with ``--overwrite``; a folder, a device or a write-protected file is never replaced. A link
+  stays, and the file that it points to is written.
+- All this, and whether the folder is writable, is checked before the work begins.
+- A file is written under a temporary name in the same folder and renamed when it is complete (``whole``), so that
+  others see either the old or the new content. If two runs write the same name without ``--overwrite``, the second to
+  finish gets an error. Temporary files of killed runs are removed by the next run.
+- A file that grows during the whole run (``Growing``) must survive if the run is killed. It has its final name from the
+  start; where it replaces an earlier file, it is renamed as soon as its first readings are on the disk, and until then
+  the earlier file stays. If no reading came, no file is left. Both files are locked, so that no other run can write
+  them.
 
-Commands print their result first, and then write what else was asked for. A file that cannot be written is one sentence
-and exit 2; a picture that the viewer cannot draw, for want of a graphics driver for example, is a warning and exit 0.
+Commands print their result first and then write files. A file that cannot be written is one sentence and exit 2; a
+picture that the viewer cannot draw, for example because there is no graphics driver, is a warning and exit 0.
 """
 
 from __future__ import annotations
@@ -49,50 +49,50 @@ class Outputs:
     ) -> None:
         self._files = {name: path for name, path in files.items() if path is not None}
         self._overwrite = overwrite
-        self._own = set[Path]()
+        self._written = set[Path]()
         self.spare(inputs)
-        for (name, path), (other, its) in combinations(self._files.items(), 2):
-            if _same(path, its):
+        for (name, path), (other, other_path) in combinations(self._files.items(), 2):
+            if _same(path, other_path):
                 raise InputError(f"{name} and {other} name the same file, {path}: give each a name of its own.")
         for name, path in self._files.items():
-            refuse(path, overwrite, name)
+            refuse_output(path, overwrite, name)
 
     def spare(self, inputs: Iterable[Path | None]) -> None:
         """Raise InputError where an output is one of these files, which the run reads."""
-        read = [each for path in inputs if path is not None for each in _in(path)]
+        read = [read_path for path in inputs if path is not None for read_path in _files_of(path)]
         for name, path in self._files.items():
-            for each in read:
-                if _same(path, each):
-                    alias = "" if path == each else f", the same file as {each},"
+            for read_path in read:
+                if _same(path, read_path):
+                    alias = "" if path == read_path else f", the same file as {read_path},"
                     raise InputError(f"{path}{alias} is read by this very command: give another {name}.")
             for descriptor, stream in _STREAMS.items():
                 if _is_open(path, descriptor):
                     raise InputError(f"{path} is the {stream} of this very command: give another {name}.")
 
     def write(self, path: Path, save: Callable[[Path], object]) -> None:
-        """Have ``save`` write the file; raises InputError where another one has come to be there in the meantime."""
-        if path in self._own or self._overwrite:
+        """Have ``save`` write the file; raises InputError if another process has created one there in the meantime."""
+        if path in self._written or self._overwrite:
             save(path)
         else:
-            _refuse_come(path)
+            _refuse_newcomer(path)
             with _new_names(target_of(path)):
                 save(path)
-        self._own.add(path)
+        self._written.add(path)
 
-    def own(self, path: Path) -> None:
-        """Whoever saves the file sees to it that nobody else's is replaced: this run has begun it, or it tells by what
-        is in it."""
-        self._own.add(path)
+    def allow_replacing(self, path: Path) -> None:
+        """Let this file be replaced from now on: its writer itself makes sure that nobody else's file is lost, because
+        this run has created it or because the writer recognises its content."""
+        self._written.add(path)
 
 
-def refuse(path: Path, overwrite: bool = False, name: str = "name") -> None:
+def refuse_output(path: Path, overwrite: bool = False, name: str = "name") -> None:
     """Raise InputError, which asks for another ``name``, where no file can be written at ``path``."""
     target = target_of(path)
     try:
         if not target.parent.is_dir():
             raise InputError(f"{path} cannot be created, there is no folder {target.parent}: give another {name}.")
         with suppress(FileNotFoundError):
-            _refuse_found(path, target.lstat(), overwrite, name)
+            _refuse_existing(path, target.lstat(), overwrite, name)
         remove_stale(target.parent)
         trial = beside(target)
         trial.open("xb").close()
@@ -101,20 +101,20 @@ def refuse(path: Path, overwrite: bool = False, name: str = "name") -> None:
         raise InputError(f"{path} cannot be created ({error.strerror}): give another {name}.") from None
 
 
-def _refuse_found(path: Path, found: os.stat_result, overwrite: bool, name: str) -> None:
-    if stat.S_ISDIR(found.st_mode):
+def _refuse_existing(path: Path, status: os.stat_result, overwrite: bool, name: str) -> None:
+    if stat.S_ISDIR(status.st_mode):
         raise InputError(f"{path} is a folder: give {name} a file's name in it.")
-    _refuse_device(path, found, name)
+    _refuse_device(path, status, name)
     if who := writer(path):
         raise InputError(f"{path} is being written by {who}: end that one first, or give another {name}.")
     if not overwrite:
         raise InputError(f"{path} exists already: give another name, or --overwrite to replace it.")
-    if not (found.st_mode & 0o222 and os.access(path, os.W_OK)):
+    if not (status.st_mode & 0o222 and os.access(path, os.W_OK)):
         raise InputError(f"{path} is protected from writing: give another {name}.")
 
 
-def _refuse_device(path: Path, found: os.stat_result, name: str = "name") -> None:
-    if not stat.S_ISREG(found.st_mode):
+def _refuse_device(path: Path, status: os.stat_result, name: str = "name") -> None:
+    if not stat.S_ISREG(status.st_mode):
         raise InputError(f"{path} is not a plain file but a device, a pipe or the like: give another {name}.")
 
 
@@ -138,7 +138,7 @@ def whole(path: Path) -> Iterator[Path]:
     try:
         yield part
         if target in _new.get():
-            _take(part, path, target)
+            _give_new_name(part, path, target)
         else:
             _rename(part, target)
     except OSError as error:
@@ -156,7 +156,7 @@ def write_whole(path: Path, content: bytes) -> None:
 
 
 class Growing:
-    """Where a file is written that grows: ``at``, which is the place it was asked for from ``settle`` on."""
+    """The path ``at`` of a file that grows: a temporary one until ``settle``, then the one that was asked for."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._target = path, target_of(path)
@@ -182,14 +182,14 @@ class Growing:
         return file
 
     def settle(self) -> None:
-        """What is there is worth having: it takes the place of the earlier file, if there is one."""
+        """Replace the earlier file, if there is one, now that the new one has content."""
         if not self.settled:
             _rename(self.at, self._target)
             self.at = self._target
             self._let_go()
 
     def discard(self) -> None:
-        """Nothing came: no file is left, and the earlier one stays."""
+        """Remove the file, in which nothing was written; an earlier one stays."""
         self.at.unlink(missing_ok=True)
         self._let_go()
 
@@ -213,8 +213,8 @@ def _new_names(target: Path) -> Iterator[None]:
         _new.reset(token)
 
 
-def _take(part: Path, path: Path, target: Path) -> None:
-    """Give a file a name that nobody has; raises InputError where somebody has, whoever was there first."""
+def _give_new_name(part: Path, path: Path, target: Path) -> None:
+    """Rename a file to a name that does not exist yet; raises InputError if it does by now."""
     try:
         try:
             os.link(part, target)
@@ -224,23 +224,23 @@ def _take(part: Path, path: Path, target: Path) -> None:
             target.open("xb").close()
             part.replace(target)
     except FileExistsError:
-        _refuse_come(path)
+        _refuse_newcomer(path)
         raise
 
 
-def _refuse_come(path: Path) -> None:
+def _refuse_newcomer(path: Path) -> None:
     if path.exists():
         raise InputError(f"{path} came to be during the run and was left as it is: run again with another name.")
 
 
 def _rename(part: Path, target: Path) -> None:
-    """Give a file its name; who may read and write an earlier one may this one."""
+    """Rename a file; it gets the permissions of the one that it replaces."""
     if target.exists():
         shutil.copymode(target, part)
     part.replace(target)
 
 
-def _in(path: Path) -> list[Path]:
+def _files_of(path: Path) -> list[Path]:
     return [path, *path.iterdir()] if path.is_dir() else [path]
 
 
@@ -253,9 +253,9 @@ def _same(one: Path, other: Path) -> bool:
 
 
 def _is_open(path: Path, descriptor: int) -> bool:
-    """Whether a file is what a standard stream reads or writes; nothing is lost at a device or a pipe."""
+    """Whether a standard stream reads or writes this plain file; a device or a pipe cannot be harmed."""
     try:
-        found, stream = path.stat(), os.fstat(descriptor)
+        file, stream = path.stat(), os.fstat(descriptor)
     except OSError:
         return False
-    return stat.S_ISREG(found.st_mode) and os.path.samestat(found, stream)
+    return stat.S_ISREG(file.st_mode) and os.path.samestat(file, stream)

@@ -1,7 +1,7 @@
-"""Files that are not whole yet, named after the process that writes them: what a killed one left is told by its name.
+"""Temporary files, named after the process that writes them, so that those of killed processes can be recognised.
 
-The name also says on which machine, and among which processes of it, that number means the process: a folder may be
-shared by several.
+Because several machines or containers may share a folder, the name also identifies the machine and, on Linux, the
+namespace in which the process number is valid.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ _NAME = re.compile(r"\.kf-calib-([0-9a-f]{8})-(\d{1,10})-[0-9a-f]{8}\.part")
 
 
 def beside(target: Path) -> Path:
-    """A new name in the same folder, for what is not whole yet."""
-    return target.with_name(f".kf-calib-{_here()}-{os.getpid()}-{os.urandom(4).hex()}.part")
+    """A new temporary name in the same folder."""
+    return target.with_name(f".kf-calib-{_machine()}-{os.getpid()}-{os.urandom(4).hex()}.part")
 
 
 def remove_stale(folder: Path) -> None:
-    """Remove what processes of this machine that are no more have left in a folder."""
+    """Remove the temporary files that ended processes of this machine have left in a folder."""
     with suppress(OSError), os.scandir(folder) as entries:
         names = [entry.name for entry in entries if entry.name.startswith(".kf-calib-")]
         for name in names:
-            named = _NAME.fullmatch(name)
-            if named and named[1] == _here() and not _is_alive(int(named[2])):
+            match = _NAME.fullmatch(name)
+            if match and match[1] == _machine() and not _is_alive(int(match[2])):
                 with suppress(OSError):
                     (folder / name).unlink()
 
@@ -48,8 +48,8 @@ def _is_alive(pid: int) -> bool:
 
 
 @cache
-def _here() -> str:
-    """Where numbers of processes mean what they mean here: this machine, and on Linux this space of processes."""
+def _machine() -> str:
+    """A hash of the machine's name and, on Linux, of its namespace of process numbers."""
     space = Path("/proc/self/ns/pid")
     number = space.stat().st_ino if space.exists() else 0
     return f"{zlib.crc32(f'{platform.node()} {number}'.encode()):08x}"

@@ -1,7 +1,7 @@
-"""Text from files, links and arguments, made fit for a terminal.
+"""Text from files, links and arguments, made safe for a terminal.
 
-What a recording, a stream or a file name holds may be anything, commands to the terminal included: colours, a new
-title, lines moved over others. Whatever Python does not call printable is therefore written as its code, ``\\x1b``.
+Recordings, streams and file names may contain commands to the terminal, which change colours or the title or overwrite
+lines. Characters that Python does not call printable are therefore written as their code, ``\\x1b``.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Results as text and as HTML: what shows a result knows it, and the result does not know what shows it."""
+"""Results as text and as HTML: ``views`` register how, so that results need not import them."""
 
 from __future__ import annotations
 

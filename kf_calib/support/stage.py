@@ -1,9 +1,9 @@
-"""What a long computation is doing, in a few words, for whoever shows it to a person who waits.
+"""Messages about what a long computation is doing, for a display that a waiting person watches.
 
     with stage.listener(print):
         kf_calib.diagnose(run)  # "scanning 36 effects", "refitting with hysteresis" ...
 
-How many refits a diagnosis needs is known at its end only: there is no honest fraction of it, but these words.
+There are words instead of a fraction because the number of refits of a diagnosis is known at its end only.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ def say(text: str) -> None:
 
 
 @contextmanager
-def listener(heard: Callable[[str], None]) -> Iterator[None]:
-    """``heard`` is called with each stage that begins in this context and in this thread."""
-    token = _listener.set(heard)
+def listener(on_stage: Callable[[str], None]) -> Iterator[None]:
+    """``on_stage`` is called with each stage that begins in this context and in this thread."""
+    token = _listener.set(on_stage)
     try:
         yield
     finally:

@@ -1,8 +1,7 @@
-"""The chance that an F or a chi-squared distribution exceeds a value: every run needs these two numbers. And
-what it becomes where it is the smallest of many.
+"""Tail probabilities of the F and chi-squared distributions, and the p-value of the most significant of many tests.
 
-``scipy.special.fdtrc`` gives it too, but takes longer to import than a short recording to evaluate, and of its digits
-half are lost where the noise is known to 1e9 degrees of freedom.
+``scipy.special.fdtrc`` gives the same, but importing it takes longer than evaluating a short recording, and it loses
+half of its digits when the denominator has 1e9 degrees of freedom.
 """
 
 from __future__ import annotations
@@ -14,12 +13,12 @@ import numpy as np
 LEVEL = 0.01
 """Probability of a false alarm in one run."""
 
-_ENOUGH = 4e-16
-_KNOWN = 1e18  # degrees of freedom of noise that is as good as known
+_PRECISION = 4e-16
+_INFINITE = 1e18  # degrees of freedom of noise that is as good as known
 
 
 def f_tail(freedom: float, noise_freedom: float, ratio: float) -> float:
-    """Chance that F with so many degrees of freedom, of the numerator and of the denominator, exceeds ``ratio``.
+    """Probability that F with these degrees of freedom of numerator and denominator exceeds ``ratio``.
 
     It is the incomplete beta function I_x(a, b) with a, b half of ``noise_freedom`` and ``freedom`` and x = a / (a + b
     ratio), by the continued fraction of DiDonato and Morris (1992), equation 9. The factor before it is written as
@@ -28,21 +27,21 @@ def f_tail(freedom: float, noise_freedom: float, ratio: float) -> float:
     if not 0.0 < ratio < math.inf:
         return 1.0 if ratio <= 0.0 else 0.0 if ratio > 0.0 else math.nan
     a, b = 0.5 * noise_freedom, 0.5 * freedom
-    both, beyond = a + b, a + b * ratio
-    logarithm = b * math.log(ratio) - both * math.log1p(b * (ratio - 1.0) / both)
-    logarithm += _stirling_error(both) - _stirling_error(a) - _stirling_error(b)
-    factor = math.sqrt(a * b / (2.0 * math.pi * both)) * math.exp(logarithm)
-    away = a * b * (ratio - 1.0) / beyond
+    total, beyond = a + b, a + b * ratio
+    logarithm = b * math.log(ratio) - total * math.log1p(b * (ratio - 1.0) / total)
+    logarithm += _stirling_error(total) - _stirling_error(a) - _stirling_error(b)
+    factor = math.sqrt(a * b / (2.0 * math.pi * total)) * math.exp(logarithm)
+    distance = a * b * (ratio - 1.0) / beyond
     if factor == 0.0:
         return 0.0 if ratio > 1.0 else 1.0
-    if away > 0.0:
-        return factor / _fraction(a, b, a / beyond, away)
-    return 1.0 - factor / _fraction(b, a, b * ratio / beyond, -away)
+    if distance > 0.0:
+        return factor / _fraction(a, b, a / beyond, distance)
+    return 1.0 - factor / _fraction(b, a, b * ratio / beyond, -distance)
 
 
 def chi_squared_tail(freedom: float, value: float) -> float:
-    """Chance that chi-squared with so many degrees of freedom exceeds ``value``: F of noise that is known."""
-    return f_tail(freedom, _KNOWN, value / freedom)
+    """Probability that chi-squared with these degrees of freedom exceeds ``value``: F with a known noise."""
+    return f_tail(freedom, _INFINITE, value / freedom)
 
 
 def sidak(p_value: float, tests: float) -> float:
@@ -50,16 +49,16 @@ def sidak(p_value: float, tests: float) -> float:
     return float(-np.expm1(tests * np.log1p(-min(p_value, 1.0 - 1e-16))))
 
 
-def _fraction(a: float, b: float, x: float, away: float) -> float:
-    """What divides x^a (1 - x)^b / B(a, b), by Lentz's method; away: a - (a + b) x >= 0."""
-    value = upper = a * (away + 1.0) / (a + 1.0)
+def _fraction(a: float, b: float, x: float, distance: float) -> float:
+    """The continued fraction that divides x^a (1 - x)^b / B(a, b), by Lentz's method; away: a - (a + b) x >= 0."""
+    value = upper = a * (distance + 1.0) / (a + 1.0)
     lower, m, change = 0.0, 0, 2.0
-    while abs(change - 1.0) > _ENOUGH:
+    while abs(change - 1.0) > _PRECISION:
         m += 1
         step = a + 2.0 * m - 1.0
-        top = (a + m - 1.0) * (a + b + m - 1.0) * m * (b - m) * (x / step) ** 2
-        own = m + m * (b - m) * x / step + (a + m) * (away + 1.0 + m * (2.0 - x)) / (step + 2.0)
-        lower, upper = 1.0 / (own + top * lower), own + top / upper
+        numerator = (a + m - 1.0) * (a + b + m - 1.0) * m * (b - m) * (x / step) ** 2
+        denominator = m + m * (b - m) * x / step + (a + m) * (distance + 1.0 + m * (2.0 - x)) / (step + 2.0)
+        lower, upper = 1.0 / (denominator + numerator * lower), denominator + numerator / upper
         change = upper * lower
         value *= change
     return value

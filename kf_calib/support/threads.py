@@ -10,12 +10,12 @@ from threadpoolctl import ThreadpoolController
 
 
 def one_blas_thread() -> AbstractContextManager[object]:
-    """While it is entered BLAS works in one thread: small decompositions take three times as long with several, and
-    these need not give the same bits every time."""
+    """A context in which BLAS uses one thread: with several, small decompositions take three times as long and may give
+    different bits every time."""
     return _controller("scipy.linalg" in sys.modules).limit(limits=1, user_api="blas")
 
 
 @cache
 def _controller(scipy: bool) -> ThreadpoolController:
-    """Of the libraries that are loaded, which it takes a millisecond to find; scipy brings one of its own."""
+    """The controller of the loaded libraries, cached because finding them takes a millisecond; scipy brings its own."""
     return ThreadpoolController()

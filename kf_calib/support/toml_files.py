@@ -11,7 +11,7 @@ from kf_calib.errors import InputError
 _LARGEST_BYTES = 10_000_000  # a journal of a thousand steps has two
 
 
-def table_of(path: Path, example: str) -> dict[str, Any]:
+def toml_table(path: Path, example: str) -> dict[str, Any]:
     """The content of a TOML file; raises InputError, with the path and what a line looks like, where there is none."""
     try:
         with path.open("rb") as file:

@@ -130,7 +130,7 @@ def shown_whole(unit: str, largest: float = math.inf) -> Unit:
     """
     if _system.get() == "si":
         return Unit(unit, 1.0)
-    return next((own for bound, own in _WHOLE.get(unit, ()) if largest <= bound), Unit(unit, 1.0))
+    return next((shown_unit for bound, shown_unit in _WHOLE.get(unit, ()) if largest <= bound), Unit(unit, 1.0))
 
 
 def significant(value: float, digits: int = 3) -> str:
@@ -188,16 +188,16 @@ def si(text: str) -> float:
 
 def quantity(text: str, unit: str) -> float:
     """The same where the unit must measure what the SI ``unit`` does; raises InputError, also for 4ug of an angle."""
-    value, given = _read(text)
-    if given and _measured(given) != _measured(unit):
+    value, written_unit = _read(text)
+    if written_unit and _measured(written_unit) != _measured(unit):
         raise InputError(f"{text.strip()!r} is not in a unit of this kind: use {', '.join(choices(unit))}.")
     return value
 
 
 def choices(unit: str) -> list[str]:
     """The units in which a quantity of this SI unit can be given, SI first."""
-    alike = [word for word in _FACTORS if word and _measured(word) == _measured(unit)]
-    return [unit, *(word for word in alike if word not in (unit, "mps2"))]
+    words = [word for word in _FACTORS if word and _measured(word) == _measured(unit)]
+    return [unit, *(word for word in words if word not in (unit, "mps2"))]
 
 
 def _read(text: str) -> tuple[float, str]:
@@ -236,6 +236,6 @@ def _measured(unit: str) -> dict[str, int]:
     powers = Counter[str]()
     for sign, words in zip((1, -1), _split(unit), strict=True):
         for name, power in words:
-            for base, own in _MEASURED[name].items():
-                powers[base] += sign * power * own
+            for base, exponent in _MEASURED[name].items():
+                powers[base] += sign * power * exponent
     return {base: power for base, power in powers.items() if power}

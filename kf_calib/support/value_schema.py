@@ -1,7 +1,7 @@
-"""Values of files and streams as the types they must have, with limits; what does not fit is told in words.
+"""Checks values of files and streams against types with limits; a misfit is described in words.
 
-Keys of a bench are checked without it (``bench_keys``): every run has them, and pydantic takes as long to import as a
-short recording to be evaluated.
+Keys of a bench are checked without it (``bench.keys``), because every run has them and importing pydantic takes as long
+as evaluating a short recording.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ def converted(value: Any, kind: Any) -> Any:
         return _adapter(kind).validate_python(value, strict=True)
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-        said = first["msg"].replace("Input should", "it must").replace("Field required", "it is missing")
-        said = said.replace("Extra inputs are not permitted", "it is unknown")
+        reason = first["msg"].replace("Input should", "it must").replace("Field required", "it is missing")
+        reason = reason.replace("Extra inputs are not permitted", "it is unknown")
         if first["type"] == "string_pattern_mismatch":
-            said = "it must hold no control characters"
-        place = cut(".".join(map(str, first["loc"])), 100)
-        raise Misfit(f"{place}: {said}" if place else said) from None
+            reason = "it must hold no control characters"
+        location = cut(".".join(map(str, first["loc"])), 100)
+        raise Misfit(f"{location}: {reason}" if location else reason) from None
     except (OverflowError, RecursionError, UnicodeError):
         raise Misfit("it is larger or deeper than any value, or no text") from None
 

@@ -12,7 +12,7 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.reproduction import grebenkin2019
 from kf_calib.reproduction.grebenkin2019 import NONOPTIMAL_PRINTED, OPTIMAL_PRINTED, TOGETHER, Conditions, Experiment
-from kf_calib.reproduction.grebenkin2019_conditions import AZIMUTHS_DEG, PERIODS_S, ConditionSearch, Found
+from kf_calib.reproduction.grebenkin2019_conditions import AZIMUTHS_DEG, PERIODS_S, ConditionFit, ConditionSearch
 from kf_calib.views.console import symbol
 from kf_calib.views.json import clean
 from kf_calib.views.tables import Table
@@ -70,7 +70,7 @@ def paper_object(found: Experiment, searched: ConditionSearch) -> dict[str, Any]
 
 def _paper_column(name: str) -> Floats:
     """Return the column (12,) that the paper prints for a set of orientations, in per cent."""
-    return grebenkin2019.printed(OPTIMAL_PRINTED if name == "optimal" else NONOPTIMAL_PRINTED)
+    return grebenkin2019.printed_column(OPTIMAL_PRINTED if name == "optimal" else NONOPTIMAL_PRINTED)
 
 
 def _row_object(found: Experiment, name: str) -> dict[str, Any]:
@@ -91,7 +91,7 @@ def _conditions_object(conditions: Conditions) -> dict[str, Any]:
     return {**vars(conditions), "duration_s": conditions.duration_s}
 
 
-def _found_object(found: Found) -> dict[str, Any]:
+def _found_object(found: ConditionFit) -> dict[str, Any]:
     """Return the nearest conditions of the search with their log-ratio as a JSON object."""
     return {**_conditions_object(found.conditions), "log_ratio": found.log_ratio}
 

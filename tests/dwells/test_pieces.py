@@ -9,7 +9,7 @@ import pytest
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells import walk_path
-from kf_calib.dwells.pieces import MOST_PIECES, Piece, coarsened, merged
+from kf_calib.dwells.pieces import MOST_PIECES, Piece, coarsened, merged_piece
 from kf_calib.dwells.qr import triangle
 from kf_calib.dwells.rows import Nodes, basis
 
@@ -40,7 +40,7 @@ def test_merged_pieces_are_those_that_the_readings_give_at_once(carrier_hz: floa
     time_s = np.concatenate([np.arange(100.0, 130.0), np.arange(130.0, 190.0), np.arange(200.0, 260.0)])
     readings = rng.normal(9.81, 1e-3, (len(time_s), 3))
     parts = [slice(0, 30), slice(30, 90), slice(90, 150)]
-    one = merged([piece_of(time_s[own], readings[own], 90.0, carrier_hz) for own in parts])
+    one = merged_piece([piece_of(time_s[own], readings[own], 90.0, carrier_hz) for own in parts])
     whole = piece_of(time_s, readings, 90.0, carrier_hz)
     np.testing.assert_allclose(one.triangle.T @ one.triangle, whole.triangle.T @ whole.triangle, rtol=1e-10, atol=1e-9)
     for name in ("elapsed_s", "since_arrival_s", "force_mps2", "pose", "temperature_c"):

@@ -26,7 +26,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 import kf_calib
 from kf_calib.bench.bench import Bench
-from kf_calib.bench.raw_input import UNITS, RawInput, merged
+from kf_calib.bench.raw_input import UNITS, RawInput, merged_metadata
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import BenchError
 from kf_calib.exchange.exports import exported
@@ -314,10 +314,10 @@ def test_another_order_of_channels_shows_in_the_norm_at_rest(run: Any, tmp_path:
 
 def test_what_a_later_statement_may_say() -> None:
     stated = RawInput((1, -2, 3), (3.9e-6,) * 3, "g").to_metadata()
-    assert merged(stated, {"accel_scale": "0.0000039", "accel_unit": "g"}, "it")["accel_scale"] == "0.0000039"
+    assert merged_metadata(stated, {"accel_scale": "0.0000039", "accel_unit": "g"}, "it")["accel_scale"] == "0.0000039"
     with pytest.raises(BenchError, match=r"--accel-unit is m/s2, and it states g"):
-        merged(stated, {"accel_unit": "m/s2"}, "it")
-    assert merged(stated, {"accel_unit": "m/s2", "restate_input": "true"}, "it")["accel_unit"] == "m/s2"
-    assert merged({}, {"axes": "y"}, "it", RawInput.from_metadata(stated))["channels"] == "1,-2,3"
+        merged_metadata(stated, {"accel_unit": "m/s2"}, "it")
+    assert merged_metadata(stated, {"accel_unit": "m/s2", "restate_input": "true"}, "it")["accel_unit"] == "m/s2"
+    assert merged_metadata({}, {"axes": "y"}, "it", RawInput.from_metadata(stated))["channels"] == "1,-2,3"
     with pytest.raises(BenchError, match="and the calibration states 1,-2,3"):
-        merged({}, {"channels": "1,2,3"}, "it", RawInput.from_metadata(stated))
+        merged_metadata({}, {"channels": "1,2,3"}, "it", RawInput.from_metadata(stated))

@@ -133,7 +133,7 @@ def test_optimal_expectation_is_the_closed_form_and_the_print() -> None:
     expected = np.sqrt(2 / np.pi) * np.array([angle, angle, sigma / g / np.sqrt(2 * n), sigma / np.sqrt(2 * n)] * 3)
     found = grebenkin2019.optimal().expected
     np.testing.assert_allclose(found, 100 * expected / grebenkin2019.DEVIATIONS, rtol=2e-4)
-    assert np.abs(grebenkin2019.printed(OPTIMAL_PRINTED) / found - 1).max() < 3 * grebenkin2019.scatter(200)
+    assert np.abs(grebenkin2019.printed_column(OPTIMAL_PRINTED) / found - 1).max() < 3 * grebenkin2019.scatter(200)
 
 
 def test_scatter_is_that_of_means_of_normal_sizes() -> None:
@@ -153,7 +153,7 @@ def searched() -> grebenkin2019_conditions.ConditionSearch:
 
 
 def test_optimal_column_is_the_print_within_its_scatter(found: grebenkin2019.Experiment) -> None:
-    printed = grebenkin2019.printed(OPTIMAL_PRINTED)
+    printed = grebenkin2019.printed_column(OPTIMAL_PRINTED)
     for figures in (found.optimal.least_squares, found.optimal.kalman):
         assert np.abs(figures / printed - 1).max() < 0.15
 
@@ -182,7 +182,7 @@ def test_nonoptimal_set_is_singular_with_gravity_fixed(found: grebenkin2019.Expe
 
 
 def test_nonoptimal_set_is_finite_with_the_earths_rotation(found: grebenkin2019.Experiment) -> None:
-    printed = grebenkin2019.printed(NONOPTIMAL_PRINTED)
+    printed = grebenkin2019.printed_column(NONOPTIMAL_PRINTED)
     assert found.nonoptimal.orientations.rank.tolist() == [4, 4, 4]
     assert grebenkin2019.log_ratio(found.nonoptimal.orientations.expected, printed) < 0.25
     assert grebenkin2019.log_ratio(found.nonoptimal.least_squares, printed) < 0.25
@@ -210,7 +210,7 @@ def test_vectors_are_those_of_scipys_rotations(turns, sampled: str) -> None:
 
 
 def test_search_is_the_closed_form_at_what_it_found(searched: grebenkin2019_conditions.ConditionSearch) -> None:
-    printed = grebenkin2019.printed(NONOPTIMAL_PRINTED)
+    printed = grebenkin2019.printed_column(NONOPTIMAL_PRINTED)
     for each in (searched.together, searched.in_turn):
         assert each.log_ratio == pytest.approx(
             grebenkin2019.log_ratio(grebenkin2019.nonoptimal(each.conditions).expected, printed)
@@ -222,7 +222,7 @@ def test_search_is_the_closed_form_at_what_it_found(searched: grebenkin2019_cond
 
 
 def test_nothing_read_together_comes_below_the_floor(searched: grebenkin2019_conditions.ConditionSearch) -> None:
-    rng, printed = np.random.default_rng(7), grebenkin2019.printed(NONOPTIMAL_PRINTED)
+    rng, printed = np.random.default_rng(7), grebenkin2019.printed_column(NONOPTIMAL_PRINTED)
     for _ in range(100):
         vectors = Rotation.random(400, random_state=rng).apply([0.0, 9.81, 0.0]) * [1.0, rng.uniform(0.02, 1), 1.0]
         vectors *= 9.81 / np.linalg.norm(vectors, axis=1, keepdims=True)
@@ -237,7 +237,7 @@ def test_bias_excess_is_at_most_one_for_any_vectors() -> None:
         vectors = rng.normal(size=(3, 400, 3)) * spread + rng.normal(size=3)
         vectors *= 9.81 / np.linalg.norm(vectors, axis=2, keepdims=True)
         assert (grebenkin2019_conditions.bias_excess(grebenkin2019.OrientationSet(vectors).expected) <= 1).all()
-    assert grebenkin2019_conditions.bias_excess(grebenkin2019.printed(NONOPTIMAL_PRINTED))[2] > 1.1
+    assert grebenkin2019_conditions.bias_excess(grebenkin2019.printed_column(NONOPTIMAL_PRINTED))[2] > 1.1
 
 
 def test_covariance_shrinks_from_the_prior_to_the_sets_sigma() -> None:

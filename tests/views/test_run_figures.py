@@ -31,7 +31,7 @@ from kf_calib.estimation.parameter_history import history_of
 from kf_calib.estimation.prior import PRIORS
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
-from kf_calib.reproduction.grebenkin2019 import OPTIMAL_PRINTED, Experiment, printed, repeat
+from kf_calib.reproduction.grebenkin2019 import OPTIMAL_PRINTED, Experiment, printed_column, repeat
 from kf_calib.views.figures import experiment as paper
 from kf_calib.views.figures.scales import ticks, written
 from kf_calib.views.figures.style import content_of
@@ -204,7 +204,7 @@ def test_a_plan_for_all_parameters_alike_has_no_targets() -> None:
 def test_table_2_has_the_printed_figures(experiment: Experiment) -> None:
     (axes,) = paper.table2(experiment).get_axes()
     lines = {line.get_label(): line.get_ydata() for line in axes.lines}
-    assert lines["optimal: printed in the paper"] == pytest.approx(printed(OPTIMAL_PRINTED))
+    assert lines["optimal: printed in the paper"] == pytest.approx(printed_column(OPTIMAL_PRINTED))
     assert lines["non-optimal: filter, here"] == pytest.approx(experiment.nonoptimal.kalman)
 
 

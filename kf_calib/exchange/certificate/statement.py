@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, Validation
 from kf_calib.bench.targets import targets_of
 from kf_calib.errors import InputError
 from kf_calib.support.plain_text import COMMANDS, cut
-from kf_calib.support.toml_files import table_of
+from kf_calib.support.toml_files import toml_table
 
 _NONE = rf"{COMMANDS}\ufffe\uffff"  # no control characters, and nothing that XML cannot hold
 Text = Annotated[str, StringConstraints(max_length=5000, pattern=rf"\A[^{_NONE}]*[^{_NONE}\s][^{_NONE}]*\z")]
@@ -131,7 +131,7 @@ def read(path: Path | None) -> Statement:
     if path is None:
         return Statement()
     try:
-        found = Statement.model_validate(table_of(path, 'number = "2026-0147"'))
+        found = Statement.model_validate(toml_table(path, 'number = "2026-0147"'))
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False, include_input=False)[0]
         place, said = ".".join(map(str, first["loc"])), first["msg"]

@@ -17,7 +17,7 @@ from typing import BinaryIO, Protocol
 
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.gravity_alone import bench_without_angles, without_poses
-from kf_calib.bench.raw_input import CONVERTED, PLAIN, RESTATE, RawInput, merged
+from kf_calib.bench.raw_input import CONVERTED, PLAIN, RESTATE, RawInput, merged_metadata
 from kf_calib.bench.streams import Batch, with_accel
 from kf_calib.errors import BenchError, CountsError, InputError
 from kf_calib.sources.files.csv_columns import CsvColumns
@@ -176,7 +176,7 @@ def stated_of(
     elif default is not None and default.sizes == PLAIN.sizes and reader.unit is not None:
         default = replace(default, unit=reader.unit)  # a unit, which the names state anew
     try:
-        stated = merged(reader.metadata, overrides, "the first line", default)
+        stated = merged_metadata(reader.metadata, overrides, "the first line", default)
         now = RawInput.from_metadata(stated)
     except BenchError as error:
         raise BenchError(f"{name}: {error}") from None

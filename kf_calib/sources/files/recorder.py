@@ -37,7 +37,7 @@ from kf_calib.sources.files.contents import (
 from kf_calib.sources.files.joints import Joints, gimbal_names
 from kf_calib.sources.files.mcap_file import McapFile
 from kf_calib.sources.files.mcap_messages import HEAD, MAGIC, MessageFinder
-from kf_calib.support.output_files import Growing, refuse
+from kf_calib.support.output_files import Growing, refuse_output
 
 _REPEAT_BYTES = 1 << 26
 """So far apart, at most, topics and bench are written again; a few kB each time."""
@@ -202,7 +202,7 @@ class Recorder:
             self.finish()
 
     def _create(self, overwrite: bool) -> IO[bytes]:
-        refuse(self.path, overwrite)
+        refuse_output(self.path, overwrite)
         try:
             return self._place.open()
         except OSError as error:

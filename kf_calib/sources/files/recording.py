@@ -21,7 +21,7 @@ from mcap.records import Metadata
 
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.gravity_alone import bench_without_angles
-from kf_calib.bench.raw_input import Conversion, RawInput, conversion, merged
+from kf_calib.bench.raw_input import Conversion, RawInput, conversion, merged_metadata
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.files.bags import files_of
@@ -259,7 +259,7 @@ class Recording:
     ) -> dict[str, str]:
         """The keys of the bench: those of the file, and of options over them."""
         try:
-            return merged(recorded, overrides, "the recording", default)
+            return merged_metadata(recorded, overrides, "the recording", default)
         except BenchError as error:
             raise BenchError(f"{self.path}: {error}") from None
 
@@ -323,7 +323,7 @@ class _Passage:
         """When the first reading was received; None where no record so far says it."""
         try:
             said = next((mark.metadata["received"] for mark in self._marks if mark.name == RUN_RECORD), None)
-            return None if said is None else dates.read(said)
+            return None if said is None else dates.parse_date(said)
         except (KeyError, ValueError):
             return None
 

@@ -22,7 +22,7 @@ from kf_calib.sources.live.continuity import Continuity
 from kf_calib.sources.live.feed import Feed, Lost, Regained
 from kf_calib.sources.live.status import Status
 from kf_calib.support import dates
-from kf_calib.support.output_files import refuse
+from kf_calib.support.output_files import refuse_output
 
 _FLUSH_S = 0.5  # with the time that flushing takes, less than the second that a kill may cost
 QUEUED = 200_000
@@ -95,7 +95,7 @@ class LiveSource:
 
     def __init__(self, feed: Feed, record: Path | None = None, overwrite: bool = False, queued: int = QUEUED) -> None:
         if record is not None:
-            refuse(record, overwrite)
+            refuse_output(record, overwrite)
         self.name = feed.name
         self._feed, self._record, self._overwrite = feed, record, overwrite
         self._lock = threading.Condition()  # of all that follows
@@ -292,7 +292,7 @@ class LiveSource:
             self._begin_ns = int(accel.time_ns[0])
             if dates.of_stamp(self._begin_ns) is None and not self._feed.patient:
                 self.received = datetime.now(UTC)
-                facts = {"received": dates.written(self.received)}
+                facts = {"received": dates.format_date(self.received)}
                 self._store_if_open(lambda recorder: recorder.mark(RUN_RECORD, facts))
 
     def _hand_on(self, batch: Batch, size: int) -> None:

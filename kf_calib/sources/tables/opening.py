@@ -13,7 +13,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, parse_axes
 from kf_calib.bench.gravity_alone import bench_without_angles
-from kf_calib.bench.raw_input import PLAIN, RawInput, merged
+from kf_calib.bench.raw_input import PLAIN, RawInput, merged_metadata
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.tables.columns import HOW, KNOWN, QUATERNION, READINGS, SPREADS, Columns
 from kf_calib.sources.tables.grid import grid_of
@@ -66,7 +66,7 @@ def open_table(
     given = {"accel_unit": accel_unit, "accel_scale": accel_scale}
     keys = {**overrides, **{key: str(value) for key, value in given.items() if value is not None}}
     try:
-        order = merged({}, keys, "", input).get("channels")
+        order = merged_metadata({}, keys, "", input).get("channels")
         units = Units.of(keys, angle_unit, g_unit, input)
     except BenchError as error:
         raise BenchError(f"{grid.name}: {error}") from None

@@ -14,7 +14,7 @@ from kf_calib.reproduction.grebenkin2019 import (
     Column,
     Experiment,
     falling_sigma,
-    printed,
+    printed_column,
 )
 from kf_calib.views.figures.collection import Figures, figures
 from kf_calib.views.figures.parameter_panels import parameter_panels
@@ -39,10 +39,10 @@ def draw_table2(figure: FigureBase, found: Experiment) -> None:
     every = list[np.ndarray]()
     for (name, (colour, _)), (column, table) in zip(_SETS.items(), _tables(found), strict=True):
         computed = (column.orientations.expected, column.least_squares, column.kalman)
-        every += [printed(table), *computed]
+        every += [printed_column(table), *computed]
         axes.hlines(column.orientations.expected, place - 0.38, place + 0.38, color=colour, linewidth=2.0,
                     label=f"{name}: expected, √(2/π) σ")  # fmt: skip
-        for offset, values, marker, what in ((-0.22, printed(table), "X", "printed in the paper"),
+        for offset, values, marker, what in ((-0.22, printed_column(table), "X", "printed in the paper"),
                                              (0.0, column.least_squares, "o", "least squares, here"),
                                              (0.22, column.kalman, "D", "filter, here")):  # fmt: skip
             axes.plot(place + offset, values, marker, color=colour, markersize=6.0, markeredgecolor="white",
