@@ -253,8 +253,8 @@ def merged_metadata(
             continue  # told where the bench is made of it
         if in_file != in_options:
             raise BenchError(
-                f"{OPTIONS[key]} is {in_options}, and {what} states {in_file}: leave it out, or where what is stated is "
-                "wrong, say so by --restate-input."
+                f"{OPTIONS[key]} is {in_options}, and {what} states {in_file}: leave it out, or where what is stated "
+                "is wrong, say so by --restate-input."
             )
     return {**stated, **overrides}
 
