@@ -56,7 +56,7 @@ def at_their_modes(linearised: LinearisedDwells, noise: Noise, state: Floats) ->
             left_out = dwell.came_from and facing_readings([dwell.came_from], state, float(np.linalg.norm(force)))[0]
             dwells.append(replace(with_force(dwell, force), attitude=attitude, came_from=left_out))
         else:
-            shown = without_attitude(turned).felt(dwell.means[None, 1:4])[0]
+            shown = without_attitude(turned).felt_force(dwell.means[None, 1:4])[0]
             dwells.append(dwell.linearised(None, replace(attitude, rotation_rad=rotation_between(shown, force))))
     return dwells
 

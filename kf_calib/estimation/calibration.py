@@ -132,7 +132,7 @@ def with_remarks(result: Calibration, passed: Pass) -> Calibration:
     on_outlying = [outlying_in_words(outlying)] if outlying else []
     misfit = misfit_remark(result.consistency, result.residuals_mps2, result.bench, result.noise)
     remarks = [each for each in result.warnings if each != misfit or not (outlying or readings.saturation)]
-    counted = [*passed.tally.sentences(), *passed.tally.unmet(passed.settings.stillness)]
+    counted = [*passed.tally.sentences(), *passed.tally.unmet_settings(passed.settings.stillness)]
     notes += [f"{known.sentence}." for known in result.model.known]
     warnings = [*passed.source.warnings, *counted, *readings.warnings, *on_outlying, *remarks, *notes]
     agreement = result.consistency if not outlying else _with_outlying(result.consistency, outlying)

@@ -45,7 +45,7 @@ class Means:
 def means_of(dwells: Sequence[DwellFactor], columns: Sequence[Floats]) -> Means:
     """The means of dwells with these columns."""
     design = np.zeros((len(dwells), *columns[0].shape[2:]))
-    for places in alike(dwells):
+    for places in groups_of_equal_shape(dwells):
         stacked, batch = np.array([columns[k] for k in places]), [dwells[k] for k in places]
         triangles, width = np.array([dwell.triangles for dwell in batch]), batch[0].width
         first = triangles[:, :, 0, :width] / triangles[:, :, :1, 0]  # means of the basis
@@ -53,7 +53,7 @@ def means_of(dwells: Sequence[DwellFactor], columns: Sequence[Floats]) -> Means:
         coefficients = on_basis(stacked.reshape(*stacked.shape[:3], -1))
         design[places] = np.einsum("db,dbk,dbkc->dc", weights, first, coefficients).reshape(-1, *stacked.shape[3:])
     means = np.array([dwell.means for dwell in dwells])
-    forces = np.array([dwell.felt(stacked[1:4]) for dwell, stacked in zip(dwells, means, strict=True)])
+    forces = np.array([dwell.felt_force(stacked[1:4]) for dwell, stacked in zip(dwells, means, strict=True)])
     counts = np.array([dwell.count for dwell in dwells], float)
     ends = np.array([(dwell.start_s, dwell.end_s) for dwell in dwells])
     return Means(design, means[:, 4:], forces, counts, ends, np.array([bending_of(dwell) for dwell in dwells]))
