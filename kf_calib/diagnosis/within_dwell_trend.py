@@ -20,7 +20,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.dwells.rows import on_basis
-from kf_calib.dwells.sufficient_statistics import DwellFactor, groups_of_equal_shape
+from kf_calib.dwells.sufficient_statistics import DwellFactor, alike
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.fit import Fit
 from kf_calib.noise.noise_model import Noise, flicker_sigma
@@ -147,7 +147,7 @@ def _squares(dwells: Sequence[DwellFactor], rows: Sequence[Floats]) -> tuple[Flo
     and a mask (D, degrees) of the degrees that the readings of each dwell determine.
     """
     out, seen = np.zeros((len(dwells), rows[0].shape[2], _DEGREE)), np.zeros((len(dwells), _DEGREE), bool)
-    for places in groups_of_equal_shape(dwells):
+    for places in alike(dwells):
         some, left = [dwells[k] for k in places], np.array([rows[k] for k in places])
         frame, known = _shapes_in(some, np.array([dwell.triangles for dwell in some]))
         counts = np.array([dwell.count for dwell in some])[:, None, None]

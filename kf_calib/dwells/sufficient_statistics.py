@@ -329,7 +329,7 @@ def lines_of(dwells: Sequence[DwellFactor], level: float = 0.01) -> tuple[Line, 
     return tuple(replace(line, p_value=min(1.0, 2.0 * line.p_value)) for line in oscillations)
 
 
-def groups_of_equal_shape(dwells: Sequence[DwellFactor]) -> list[list[int]]:
+def alike(dwells: Sequence[DwellFactor]) -> list[list[int]]:
     """Indices of dwells, grouped by number of pieces and basis functions, so that a group's arrays can be stacked."""
     indices = dict[tuple[int, int], list[int]]()
     for k, dwell in enumerate(dwells):

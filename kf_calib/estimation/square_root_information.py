@@ -19,7 +19,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.qr import triangle
 from kf_calib.dwells.rows import on_basis
-from kf_calib.dwells.sufficient_statistics import DwellFactor, groups_of_equal_shape
+from kf_calib.dwells.sufficient_statistics import DwellFactor, alike
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.prior import Prior
 from kf_calib.noise import random_walk
@@ -84,7 +84,7 @@ def whiten(
 def _batches(dwells: Sequence[DwellFactor], width: int) -> Iterator[list[int]]:
     """Group the indices of dwells whose rows have one shape, limited so that their ``width`` columns fit into the
     cache."""
-    for places in groups_of_equal_shape(dwells):
+    for places in alike(dwells):
         first = dwells[places[0]]
         most = max(_AT_ONCE // (3 * len(first.pieces) * first.width * (width + 1)), 1)
         yield from (places[k : k + most] for k in range(0, len(places), most))

@@ -10,7 +10,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.rows import on_basis
-from kf_calib.dwells.sufficient_statistics import DwellFactor, groups_of_equal_shape
+from kf_calib.dwells.sufficient_statistics import DwellFactor, alike
 
 
 @dataclass(frozen=True, repr=False)
@@ -45,7 +45,7 @@ class Means:
 def means_of(dwells: Sequence[DwellFactor], columns: Sequence[Floats]) -> Means:
     """The means of dwells with these columns."""
     design = np.zeros((len(dwells), *columns[0].shape[2:]))
-    for places in groups_of_equal_shape(dwells):
+    for places in alike(dwells):
         stacked, batch = np.array([columns[k] for k in places]), [dwells[k] for k in places]
         triangles, width = np.array([dwell.triangles for dwell in batch]), batch[0].width
         first = triangles[:, :, 0, :width] / triangles[:, :, :1, 0]  # means of the basis
