@@ -18,6 +18,7 @@ from kf_calib.errors import UnobservableError
 from kf_calib.exchange import calibration_file, verification
 from kf_calib.exchange.calibration_file import SavedCalibration
 from kf_calib.exchange.verification import Verification, verify
+from kf_calib.noise.noise_model import mean_covariances
 from kf_calib.sources.simulation.physics import Ambient
 from kf_calib.support.tail_probabilities import chi_squared_tail
 
@@ -164,6 +165,25 @@ def test_effects_of_the_run_are_not_compared() -> None:
     assert {move.symbol for move in found.moves} >= {"K1", "K2_1"}
     assert not {move.symbol for move in found.moves} & {"B1", "B2", "B3", "tauWarm"}
     assert found.dof == 3 * 14 - 4
+
+
+def test_the_misfit_beside_effects_of_the_run_has_none_of_the_old_ones() -> None:
+    """Normal equations of the new means, with the information of the old state without its coefficients of drift."""
+    settings = kf_calib.Settings(effects=("bias-drift", "second-order"))
+    own, new = (kf_calib.calibrate(simulated(seed, 14), settings) for seed in (0, 77))
+    old = calibration_file.saved(own)
+    found = verify(old, old.model(), simulated(77, 14))
+    kept = [k for k, symbol in enumerate(old.state.symbols) if not symbol.startswith("beta")]
+    assert found.free == ("bias-drift",) and len(kept) == 15 and found.dof == 3 * 14 - 3
+    means, before = new.linearised.means, np.array(old.state.values)
+    weights = np.linalg.inv(mean_covariances(new.noise, means, before))
+    known = np.zeros((18, 18))
+    known[np.ix_(kept, kept)] = np.linalg.inv(np.array(old.state.covariance)[np.ix_(kept, kept)])
+    left = means.readings - means.design @ before
+    information = known + np.einsum("dip,dij,djq->pq", means.design, weights, means.design)
+    score = np.einsum("dip,dij,dj->p", means.design, weights, left)
+    expected = np.einsum("di,dij,dj->", left, weights, left) - score @ np.linalg.solve(information, score)
+    assert found.statistic == pytest.approx(expected, rel=1e-4)
 
 
 def test_a_calibration_that_determined_too_little_predicts_nothing() -> None:
