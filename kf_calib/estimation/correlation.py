@@ -19,10 +19,3 @@ def correlation(estimate: Estimate) -> Floats:
     sigma = np.sqrt(np.diag(jacobian @ covariance @ jacobian.T))
     sigma[np.isnan(np.concatenate([estimate.sigma, estimate.effect_sigma]))] = np.nan
     return jacobian @ covariance @ jacobian.T / np.outer(sigma, sigma)
-
-
-def largest_correlation(estimate: Estimate) -> float:
-    """The largest absolute correlation of two different quantities that are determined; 0 if there are none."""
-    apart = np.nan_to_num(correlation(estimate))
-    np.fill_diagonal(apart, 0.0)
-    return float(np.abs(apart).max())
