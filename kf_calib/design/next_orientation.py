@@ -19,7 +19,8 @@ from kf_calib.effects import Effect
 from kf_calib.estimation.cross_validation import SAME_POSE_DEG
 from kf_calib.estimation.dwell_columns import candidate_columns
 from kf_calib.estimation.fit import Fit
-from kf_calib.estimation.square_root_information import accumulate, whiten
+from kf_calib.estimation.square_root_information import accumulate
+from kf_calib.estimation.whitened_rows import whiten
 from kf_calib.noise.noise_model import Noise, steps
 
 ENOUGH = 6.0

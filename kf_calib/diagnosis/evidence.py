@@ -25,7 +25,7 @@ from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.qr import triangle
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.fit import Fit
-from kf_calib.estimation.square_root_information import flicker_of_scatter, whiten
+from kf_calib.estimation.whitened_rows import flicker_of_scatter, whiten
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.reml import Likelihood, Part, Parts, likelihood_of, with_shared_noise

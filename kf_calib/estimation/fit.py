@@ -13,7 +13,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.sufficient_statistics import DwellFactor
-from kf_calib.estimation import free_attitude, square_root_information
+from kf_calib.estimation import free_attitude, square_root_information, whitened_rows
 from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise, flicker_sigma, slow_waves, steps
@@ -59,16 +59,16 @@ class Fit:
 
     @cached_property
     def misfit_rows(self) -> list[Floats]:
-        """Whitened rows [H | W | z] by which the misfit is judged, see ``square_root_information.misfit_rows``."""
+        """Whitened rows [H | W | z] by which the misfit is judged, see ``whitened_rows.misfit_rows``."""
         linearised = self.linearised
-        rows, _ = square_root_information.misfit_rows(
+        rows, _ = whitened_rows.misfit_rows(
             linearised.dwells_at_state,
             linearised.columns,
             self.noise.for_goodness_of_fit,
             linearised.state,
             linearised.model.count,
         )
-        return square_root_information.with_frame(rows, linearised.model, self.noise, len(rows) - len(self.dwells))
+        return whitened_rows.with_frame(rows, linearised.model, self.noise, len(rows) - len(self.dwells))
 
     @cached_property
     def following(self) -> list[Floats]:
@@ -76,9 +76,7 @@ class Fit:
         linearised, noise = self.linearised, self.noise.weights.of(moving=True)
         following = [np.zeros((0, linearised.model.count + 1))] * len(self.dwells)
         if linearised.slews:
-            whitened = square_root_information.whiten(
-                linearised.slews, linearised.slew_columns, noise, linearised.state
-            )
+            whitened = whitened_rows.whiten(linearised.slews, linearised.slew_columns, noise, linearised.state)
             numbers = [dwell.number for dwell in self.dwells]
             for slew, rows in zip(linearised.slews, whitened, strict=True):
                 before = bisect.bisect_right(numbers, slew.number) - 1
@@ -156,7 +154,7 @@ class Fit:
         1 sigma of each."""
         linearised, count = self.linearised, self.linearised.model.count
         columns = [np.concatenate(both, axis=3) for both in zip(linearised.columns, changes, strict=True)]
-        rows = square_root_information.whiten(
+        rows = whitened_rows.whiten(
             linearised.dwells_at_state,
             columns,
             self.noise.weights,
@@ -225,7 +223,7 @@ class Fit:
 
     def _whitened(self, noise: Noise) -> list[Floats]:
         linearised = self.linearised
-        rows = square_root_information.whiten(
+        rows = whitened_rows.whiten(
             linearised.dwells_at_state, linearised.columns, noise, linearised.state, flicker_mps2=noise.flicker_mps2
         )
-        return square_root_information.with_frame(rows, linearised.model, noise)
+        return whitened_rows.with_frame(rows, linearised.model, noise)

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import BIASES, STATE_COUNT
 from kf_calib.effects import Effect
-from kf_calib.estimation import square_root_information
+from kf_calib.estimation import whitened_rows
 from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns, piece_columns, stimulus_of
-from kf_calib.estimation.square_root_information import MisfitColumns
+from kf_calib.estimation.whitened_rows import MisfitColumns
 from kf_calib.noise.noise_model import Noise, steps
 
 _SEEN = 1e-6  # a column of which the model leaves less than this share counts as explained
@@ -271,7 +271,7 @@ def _waves_beside_walk(
         np.concatenate([own[..., :STATE_COUNT], more], axis=3)
         for own, more in zip(linearised.columns, waves, strict=True)
     ]
-    rows, width = square_root_information.misfit_rows(
+    rows, width = whitened_rows.misfit_rows(
         linearised.dwells_at_state, columns, noise, linearised.state, STATE_COUNT, reduced=False
     )
     rows = rows[len(rows) - len(linearised.dwells) :]

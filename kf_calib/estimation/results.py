@@ -16,7 +16,7 @@ from kf_calib.bench.bench import Bench
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.blocks import Tally
 from kf_calib.dwells.sufficient_statistics import DwellFactor
-from kf_calib.estimation import square_root_information
+from kf_calib.estimation import square_root_information, whitened_rows
 from kf_calib.estimation.correction import Corrected, Correction
 from kf_calib.estimation.cross_validation import HeldOut, held_out
 from kf_calib.estimation.dwell_columns import LinearisedDwells
@@ -377,7 +377,7 @@ class Calibration:
             before, extra_before = factor, extra
             for part in dwell.prefixes():
                 columns_so_far = [columns[: len(part.pieces)]]
-                rows = square_root_information.whiten(
+                rows = whitened_rows.whiten(
                     [part], columns_so_far, self.noise.weights, state, flicker_mps2=self.noise.flicker_mps2
                 )[0]
                 walked = np.array([pause, steps([part], self.noise)[0, 1]])
@@ -395,7 +395,7 @@ class Calibration:
         both = [last, dwell]
         linearised = LinearisedDwells(both, self.model, state)
         dwell, last_columns = linearised.dwells_at_state[-1], linearised.columns[1:]
-        rows = square_root_information.whiten(
+        rows = whitened_rows.whiten(
             [dwell], last_columns, self.noise.weights, state, flicker_mps2=self.noise.flicker_mps2
         )[0]
         factor, _ = square_root_information.update(factor, rows, steps(both, self.noise)[-1])
@@ -464,7 +464,7 @@ def consistency(fitted: Fit) -> Consistency:
 def _dof_along_force(fitted: Fit) -> int:
     """Return the degrees of freedom of the sizes of the force, which no setting error changes."""
     linearised, noise = fitted.linearised, replace(fitted.noise.for_goodness_of_fit, setting_rad=ATTITUDE_UNKNOWN_RAD)
-    rows = square_root_information.whiten(linearised.dwells_at_state, linearised.columns, noise, linearised.state)
+    rows = whitened_rows.whiten(linearised.dwells_at_state, linearised.columns, noise, linearised.state)
     known = square_root_information.rank(
         square_root_information.accumulate(rows)[:-1][:, -linearised.model.count - 1 :]
     )

@@ -25,11 +25,11 @@ from kf_calib.dwells.line_spectrum import Line
 from kf_calib.dwells.qr import orthonormal
 from kf_calib.dwells.sufficient_statistics import DwellFactor, lines_of
 from kf_calib.effects import Effect, Stimulus
-from kf_calib.estimation import square_root_information
+from kf_calib.estimation import square_root_information, whitened_rows
 from kf_calib.estimation.complement import Complement
 from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns, piece_columns, stimulus_of
 from kf_calib.estimation.periodogram import Periodogram
-from kf_calib.estimation.square_root_information import MisfitColumns
+from kf_calib.estimation.whitened_rows import MisfitColumns
 from kf_calib.noise import random_walk
 from kf_calib.noise.means import means_of
 from kf_calib.noise.noise_model import Noise, steps
@@ -405,7 +405,7 @@ def whiten_model(
     """Whitened rows [H | W | G | z] (m, c) of the model in ``linearised`` and of ``effects``, and the number of columns
     before G.
 
-    - W: columns of the slow part of a stated scatter, see ``square_root_information.misfit_rows``.
+    - W: columns of the slow part of a stated scatter, see ``whitened_rows.misfit_rows``.
     - state: where small rotations and input axes are linearised; by default at the state in ``linearised``.
     - stimulus: the stimulus of the dwells at that state, if it is already known.
     """
@@ -431,8 +431,8 @@ def batches(sizes: Sequence[int], columns: int) -> list[list[int]]:
 def _judged(
     dwells: Sequence[DwellFactor], columns: Sequence[Floats], noise: Noise, state: Floats, width: int
 ) -> tuple[list[Floats], int]:
-    """Call ``square_root_information.misfit_rows`` without reducing the rows to the rank of their columns."""
-    return square_root_information.misfit_rows(dwells, columns, noise, state, width, reduced=False)
+    """Call ``whitened_rows.misfit_rows`` without reducing the rows to the rank of their columns."""
+    return whitened_rows.misfit_rows(dwells, columns, noise, state, width, reduced=False)
 
 
 def _stacked(rows: Sequence[Floats], dwells: Sequence[DwellFactor], noise: Noise) -> Floats:

@@ -27,7 +27,7 @@ from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.qr import triangle
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects import Effect
-from kf_calib.estimation import square_root_information
+from kf_calib.estimation import square_root_information, whitened_rows
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.prior import Prior
@@ -179,4 +179,4 @@ class Running:
             [self.linearised.dwells_at_state[k] for k in chosen],
             [self.linearised.columns[k] for k in chosen],
         )
-        return square_root_information.whiten(dwells, columns, self.noise.weights, self.about, self.about)
+        return whitened_rows.whiten(dwells, columns, self.noise.weights, self.about, self.about)

@@ -20,7 +20,7 @@ from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects import Bearer, SensorEffect, Stimulus, effect_named, names
 from kf_calib.errors import InputError
-from kf_calib.estimation import square_root_information
+from kf_calib.estimation import square_root_information, whitened_rows
 from kf_calib.estimation.calibration import calibrate, evaluate
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.dwell_pass import Pass
@@ -421,7 +421,7 @@ def test_a_factor_restricted_equals_that_of_fewer_columns(navigation, name: str)
 
     def factor_of(model: Model) -> Floats:
         at = np.concatenate([state, np.zeros(model.count - 12)])
-        rows = square_root_information.whiten(dwells, LinearisedDwells(dwells, model, at).columns, noise, at, at)
+        rows = whitened_rows.whiten(dwells, LinearisedDwells(dwells, model, at).columns, noise, at, at)
         return square_root_information.accumulate(rows)[:-1]
 
     few, chosen = factor_of(small), square_root_information.restrict(factor_of(large), list(range(small.count)))

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import BlunderError, InputError, UnobservableError
-from kf_calib.estimation import square_root_information
+from kf_calib.estimation import square_root_information, whitened_rows
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.cross_validation import orientations
 from kf_calib.estimation.dwell_pass import Pass
@@ -194,11 +194,11 @@ def test_dwells_whitened_together_are_those_whitened_alone() -> None:
     fitted = fit(dwells, Model.of(Run(dwells=1).bench, ("bias-drift",)))
     columns, state = fitted.linearised.columns, fitted.linearised.state
     for noise in (fitted.noise, replace(fitted.noise, scatter_mps2=np.full(3, 1e-5), walk_mps2_per_sqrt_s=1e-5)):
-        together = square_root_information.whiten(dwells, columns, noise, state, reduced=False)
+        together = whitened_rows.whiten(dwells, columns, noise, state, reduced=False)
         for dwell, own, rows in zip(dwells, columns, together, strict=True):
-            (alone,) = square_root_information.whiten([dwell], [own], noise, state, reduced=False)
+            (alone,) = whitened_rows.whiten([dwell], [own], noise, state, reduced=False)
             np.testing.assert_array_equal(rows, alone)
-        few = square_root_information.whiten(dwells, columns, noise, state)
+        few = whitened_rows.whiten(dwells, columns, noise, state)
         for whole, rows in zip(together, few, strict=True):
             assert len(rows) < len(whole)
             left, right = rows[:, :-1].T @ rows, whole[:, :-1].T @ whole

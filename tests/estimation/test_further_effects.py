@@ -18,7 +18,7 @@ from kf_calib.estimation.further_effects import FurtherEffects
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import Frame
-from kf_calib.estimation.square_root_information import MisfitColumns, misfit_rows
+from kf_calib.estimation.whitened_rows import MisfitColumns, misfit_rows
 from kf_calib.sources.simulation.injected import parse
 from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.sensors import GRADES
