@@ -274,7 +274,7 @@ def improve(
 
     interactive = _asks(interactive, unattended, as_json)
     outputs, pictures = claimed(overwrite=overwrite), Pictures.taken_from(options)
-    earlier = selection_journal.read(from_journal) if from_journal else None
+    earlier = selection_journal.read_journal(from_journal) if from_journal else None
     origin = selection_journal.Origin.of(recording)
     if earlier is not None and from_journal is not None:
         earlier.refuse_other(origin, from_journal)
@@ -288,14 +288,14 @@ def improve(
     with delivery(outputs, as_json) as deliver:
 
         def keep(state: stepwise_selection.Improvement) -> None:
-            deliver.keep(journal_file, lambda path: selection_journal.write(path, state, origin))
+            deliver.keep(journal_file, lambda path: selection_journal.write_journal(path, state, origin))
 
         difference = None
         with progress(f"improving on {recording.name}", as_json) as tick:
             source = recording_of(recording, options)
             start, refits = calibrate(source, settings, tick), Refits(source)
             if earlier is not None:
-                state, difference = selection_journal.replayed(earlier, start, refits)
+                state, difference = selection_journal.replay_journal(earlier, start, refits)
             elif interactive:
                 state = stepwise_selection.begin(start, refits)
             else:
@@ -311,10 +311,10 @@ def improve(
             show(views.improvement_report(state, checked, difference))
         deliver.calibration(save, state.result, source)
         deliver.model(save_model, state.result)
-        deliver.file(journal_file, lambda path: selection_journal.write(path, state, origin))
+        deliver.file(journal_file, lambda path: selection_journal.write_journal(path, state, origin))
         pictures.save(deliver, state)
         save_report(deliver, report, state, measured, [views.honest_sentence(checked)] if checked else [])
-    if strict and state.found.test.consistent is False:
+    if strict and state.diagnosis.test.consistent is False:
         ctx.exit(1)
 
 

@@ -26,11 +26,11 @@ def dialogue(state: Improvement, refits: Refits, on_step: Callable[[Improvement]
     """
     shown: Improvement | None = None
     while True:
-        choices = choices_of(state.found)
+        choices = choices_of(state.diagnosis)
         if shown is not state:
             show(choices_table(state, choices))
             shown = state
-        usual = "q" if not choices else "1" if state.found.missing else None
+        usual = "q" if not choices else "1" if state.diagnosis.missing else None
         answer = click.prompt(HOW, default=usual).strip()
         if answer == "q":
             return replace(state, asked=True)

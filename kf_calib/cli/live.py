@@ -322,7 +322,7 @@ def _outcome(run: LiveRun, as_json: bool) -> Judgement | HandJudgement | None:
         parts: list[RenderableType] = [summary(final.result)]
         if isinstance(final, Judgement):
             style = {True: "bold green", False: "bold yellow", None: "bold"}[final.consistent]
-            parts.append(Text(diagnosis.verdict(final.found), style=style))
+            parts.append(Text(diagnosis.verdict(final.diagnosis), style=style))
         run.print(rendered(Group(*parts)), end=False)
     return final
 

@@ -102,9 +102,9 @@ class LiveRun:
         if self.session is None or not isinstance(judgement, Judgement):
             return
         try:
-            if not (judgement.alarm and judgement.found.missing):
+            if not (judgement.alarm and judgement.diagnosis.missing):
                 raise InputError("no effect is known to be missing: nothing to accept.")
-            self.session.accept(*judgement.found.missing)
+            self.session.accept(*judgement.diagnosis.missing)
         except InputError as error:
             self.session.say(str(error))
 

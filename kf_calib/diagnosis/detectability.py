@@ -53,26 +53,31 @@ class Unseen:
 
 def detectable(test: CandidateTests) -> list[Detectable]:
     """The smallest detectable size of every visible effect, from its columns and not from the readings."""
-    out = list[Detectable]()
-    for name, k in test.best.items():
-        candidate = test.scan.candidates[k]
-        found = None if name in test.invisible else smallest_size(candidate, SHARE * LEVEL / test.effective_tests)
-        if found is not None:
-            coefficient, minimum = found
-            out.append(Detectable(name, minimum, coefficient, candidate.effect.typical))
-    return out
+    limits = list[Detectable]()
+    for name, k in test.effects.best.items():
+        candidate = test.effects.scan.candidates[k]
+        limit = (
+            None if name in test.invisible else smallest_size(candidate, SHARE * LEVEL / test.effects.independent_tests)
+        )
+        if limit is not None:
+            coefficient, minimum = limit
+            limits.append(Detectable(name, minimum, coefficient, candidate.effect.typical))
+    return limits
 
 
 def unseen(fitted: Fit, test: CandidateTests) -> list[Unseen]:
     """The effects of which a run shows nothing, each with the reason; then frequencies that were not searched."""
     bench, dwells = fitted.linearised.model.bench, fitted.dwells
     stimulus = stimulus_of(dwells, bench, fitted.linearised.state)
-    still = [name for name in test.unseen if name not in test.in_slews_only]
-    out = [Unseen(name, _reason(test.candidate(name).effect, stimulus)) for name in still]
-    out += [Unseen(name, "shows while the platform turns, and only dwells are tested") for name in test.in_slews_only]
-    if test.between:
-        out.append(Unseen(test.between, "not among the frequencies that are searched in this run"))
-    return out
+    in_dwells = [name for name in test.effects.unseen if name not in test.effects.in_slews_only]
+    effects = [Unseen(name, _reason(test.effects.candidate(name).effect, stimulus)) for name in in_dwells]
+    effects += [
+        Unseen(name, "shows while the platform turns, and only dwells are tested")
+        for name in test.effects.in_slews_only
+    ]
+    if test.lines.untested_band:
+        effects.append(Unseen(test.lines.untested_band, "not among the frequencies that are searched in this run"))
+    return effects
 
 
 def _reason(effect: Effect, stimulus: Stimulus) -> str:

@@ -5,8 +5,8 @@ direction nor size is known; and the noise from dwell to dwell, where it was not
 All explanations of a run are weighed in the same noise within dwells and by the same priors, so that their evidence may
 be compared, however many coefficients they have.
 
-The means of the dwells have the restricted likelihood of ``reml``. What is seen within dwells adds rows of its own,
-which no noise from dwell to dwell enters.
+The means of the dwells have the restricted likelihood of ``reml``. The readings within dwells add rows of prior
+knowledge, since noise from dwell to dwell does not enter them.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _SIZES = np.exp(np.linspace(0.0, math.log(1e14), 120))  # prior variance of a co
 _RANGE = math.log(1e4)  # width of the flat prior of the logarithm of a size of noise
 _UNSTATED = 0.5  # prior probability of noise from dwell to dwell that was not stated
 _BEYOND = 0.02  # prior probability of more noise than was stated
-_FREE_MPS2 = 1e3  # scatter so large that nothing is left of a dwell's mean
+_IMMENSE_MPS2 = 1e3  # scatter so large that nothing is left of a dwell's mean
 _SEEN = 1e-6  # as in ``score_test``: the least share of a column that the model must leave
 
 
@@ -48,19 +48,24 @@ def size_evidence(dof: int, delta_chi2: Floats | float) -> Floats:
 
       B = mean over g of (1 + g)^(-k/2) exp(g / (1 + g) F / 2)
 
-    dof: number of coefficients k. delta_chi2: fall of chi-squared F with them; a number or an array. Returns ln B.
+    dof: number of coefficients k. delta_chi2: decrease F of chi-squared with them; a number or an array. Returns
+    ln B.
     """
-    parts = -0.5 * dof * np.log1p(_SIZES) + 0.5 * np.asarray(delta_chi2, float)[..., None] * (_SIZES / (1.0 + _SIZES))
-    return np.logaddexp.reduce(parts, axis=-1) - math.log(len(_SIZES))
+    log_terms = -0.5 * dof * np.log1p(_SIZES) + 0.5 * np.asarray(delta_chi2, float)[..., None] * (
+        _SIZES / (1.0 + _SIZES)
+    )
+    return np.logaddexp.reduce(log_terms, axis=-1) - math.log(len(_SIZES))
 
 
 @dataclass(frozen=True)
-class Weighed:
-    """The evidence of an explanation with certain parts of the noise free.
+class MarginalLikelihood:
+    """The evidence of an explanation where certain parts of the noise are estimated rather than stated.
 
-    - parts: the free parts but for a walk. log: logarithm of the evidence, with the prior of the parts.
-    - sizes: of the free parts, SI. delta_chi2: fall of chi-squared by the added effects, in this noise. dof: their
-      number.
+    - parts: these parts, without a random walk.
+    - log: the logarithm of the evidence, with the prior of the parts.
+    - sizes: the likeliest sizes of the parts, SI.
+    - delta_chi2: the decrease of chi-squared by the added effects, in this noise.
+    - dof: the number of their coefficients.
     """
 
     parts: Parts
@@ -71,11 +76,40 @@ class Weighed:
 
 
 @dataclass(frozen=True)
-class _Rows:
-    """Means of dwells with rows of prior knowledge, and how many of the last columns belong to added effects."""
+class _ColumnBlocks:
+    """The blocks of columns [H | G | W | z] of a likelihood.
+
+    H: the ``model`` columns of the model without the added effects. G: the coefficients of these, up to ``with_added``.
+    W: noise that dwells share, the errors of the thermometer last, up to ``count``. z: the readings, one column.
+    """
+
+    model: int
+    with_added: int
+    count: int
+
+    def spread(self, within: Floats) -> Floats:
+        """Rows (n, count + 1) from rows [effects | thermometer | z] of the readings within dwells, in which the twelve
+        parameters have no columns."""
+        effects = self.with_added - STATE_COUNT
+        thermometer_and_z = within.shape[1] - effects
+        rows = np.zeros((len(within), self.count + 1))
+        rows[:, STATE_COUNT : self.with_added] = within[:, :effects]
+        rows[:, self.count + 1 - thermometer_and_z :] = within[:, effects:]
+        return rows
+
+    def combined(self, columns: Floats, combinations: Floats) -> Floats:
+        """Columns (..., c) with combinations (q, k) of the q added columns in place of these."""
+        model, added, rest = np.split(columns, [self.model, self.with_added], axis=-1)
+        return np.concatenate([model, added @ combinations, rest], axis=-1)
+
+
+@dataclass(frozen=True)
+class _LikelihoodRows:
+    """What a likelihood is made of: the means of the dwells, rows of prior knowledge, and the number of coefficients of
+    the added effects."""
 
     means: Means
-    known: Floats
+    prior: Floats
     dof: int
 
 
@@ -93,43 +127,45 @@ class Evidence:
         )
 
     @cached_property
-    def _alone(self) -> _Rows:
+    def _without_effects(self) -> _LikelihoodRows:
         return self._rows(self._fit.linearised, self.noise)[0]
 
-    def of(self, refit: Fit | None = None, walk: bool = False) -> list[Weighed]:
+    def of(self, refit: Fit | None = None, walk: bool = False) -> list[MarginalLikelihood]:
         """The evidence of the effects that a refit has and the fit has not, for each set of free parts of the noise.
 
         refit: the fit with the effects (None: none is added). walk: whether a random walk of the biases is among them.
         """
-        noise, alone = self.noise, self._alone
+        noise, without = self.noise, self._without_effects
         if refit is not None and refit.noise.sensitivity_mps2_per_k is not None:
             noise = replace(noise, sensitivity_mps2_per_k=refit.noise.sensitivity_mps2_per_k)
-            (alone,) = self._rows(self._fit.linearised, noise)
+            (without,) = self._rows(self._fit.linearised, noise)
         averaged = noise
         if refit is not None and refit.dwells[0].averaged != self._fit.dwells[0].averaged:
             # averages have a noise of their own; by that of single readings, of which there are more, it would be small
             averaged = replace(noise, sigma_mps2=refit.noise.sigma_mps2, inflation=refit.noise.inflation)
-        own, *related = [alone] if refit is None else self._rows(refit.linearised, averaged, self._relations(refit))
-        if refit is not None and not own.dof and not walk:
-            own, related, averaged = alone, [], noise  # nothing of it is seen
-        own_length, length = (float(np.linalg.norm(each.known[:, -1])) for each in (own, alone))
-        alone = replace(alone, known=pad_residual_norm(alone.known, own_length))
+        added, *related = [without] if refit is None else self._rows(refit.linearised, averaged, self._relations(refit))
+        if refit is not None and not added.dof and not walk:  # nothing of the effects is seen
+            added, related, averaged = without, [], noise
+        norm, norm_without = (float(np.linalg.norm(rows.prior[:, -1])) for rows in (added, without))
+        without = replace(without, prior=pad_residual_norm(without.prior, norm))
         walking: Parts = ("walk",) if walk or self._walks else ()
-        every: Parts = (*walking, "setting", "common")
-        without = likelihood_of(noise, every, alone.means, self._fit.linearised.state, alone.known)
-        with_, *with_related = (
-            likelihood_of(averaged, every, rows.means, self._fit.linearised.state, rows.known)
-            for rows in (own, *related)
+        likelihood_without, likelihood, *likelihoods_related = (
+            likelihood_of(
+                noise_of_rows, (*walking, "setting", "common"), rows.means, self._fit.linearised.state, rows.prior
+            )
+            for noise_of_rows, rows in [(noise, without), *((averaged, rows) for rows in (added, *related))]
         )
-        relations = [(likelihood, rows.dof) for likelihood, rows in zip(with_related, related, strict=True)]
-        free = self._free(len(alone.means.counts))
-        found = (self._weighed(with_, without, parts + walking, own.dof, relations) for parts in free)
+        relations = [(rows.dof, likelihoods_related[k]) for k, rows in enumerate(related)]
+        marginals = [
+            self._marginal(likelihood, likelihood_without, parts + walking, added.dof, relations)
+            for parts in self._free_parts(len(without.means.counts))
+        ]
         # Readings that are folded otherwise, on a carrier or averaged, leave more or less of themselves within dwells.
         # That is no evidence for what they were folded for: it counts as noise does.
-        folded, before = (refit or self._fit).dwells[0], self._fit.dwells[0]
-        otherwise = (folded.carrier_hz, folded.averaged) != (before.carrier_hz, before.averaged)
-        more = 0.5 * (own_length**2 - length**2) if otherwise else 0.0
-        return [replace(each, log=each.log + more) for each in found if each is not None]
+        folded, folded_before = (refit or self._fit).dwells[0], self._fit.dwells[0]
+        otherwise = (folded.carrier_hz, folded.averaged) != (folded_before.carrier_hz, folded_before.averaged)
+        gain = 0.5 * (norm**2 - norm_without**2) if otherwise else 0.0
+        return [replace(marginal, log=marginal.log + gain) for marginal in marginals if marginal is not None]
 
     def _relations(self, refit: Fit) -> list[Floats]:
         """Return what the added states may be together: matrices (q, k), times k free numbers each; empty where they
@@ -137,10 +173,10 @@ class Evidence:
         added = refit.linearised.model.effects[len(self._fit.linearised.model.effects) :]
         if not any(effect.relations for effect in added):
             return []
-        of_each = [effect.relations or [np.eye(len(effect.states))] for effect in added]
-        return [np.asarray(block_diag(*chosen), float) for chosen in itertools.product(*of_each)]
+        of_effects = [effect.relations or [np.eye(len(effect.states))] for effect in added]
+        return [np.asarray(block_diag(*blocks), float) for blocks in itertools.product(*of_effects)]
 
-    def _free(self, dwells: int) -> Iterator[Parts]:
+    def _free_parts(self, dwells: int) -> Iterator[Parts]:
         """Yield the sets of parts of the noise from dwell to dwell that may be free."""
         yield ()
         if (1 if self.noise.attitude_unknown else 3) * dwells <= self._fit.linearised.model.count:
@@ -152,113 +188,117 @@ class Evidence:
         if not (self.noise.setting_stated and self.noise.scatter_stated):
             yield "setting", "common"
 
-    def _weighed(
+    def _marginal(
         self,
-        own: Likelihood,
-        alone: Likelihood,
+        likelihood: Likelihood,
+        likelihood_without: Likelihood,
         parts: Parts,
         dof: int,
-        relations: Sequence[tuple[Likelihood, int]],
-    ) -> Weighed | None:
+        relations: Sequence[tuple[int, Likelihood]],
+    ) -> MarginalLikelihood | None:
         """Return the evidence with these parts of the noise free; None where one of them is best at zero.
 
         The logarithms of the sizes of the parts are averaged out by Laplace's method. A part of no size is counted
-        where it is absent. relations: the likelihood with each possible relation of the coefficients, and how many of
-        them it leaves; they are averaged in the noise that is likeliest without a relation.
+        where it is absent. relations: for each possible relation of the coefficients, how many of them it leaves and
+        the likelihood with it; they are averaged in the noise that is likeliest without a relation.
         """
-        likelihood = own.of(parts)
-        relative, point = likelihood.most_likely() if parts else (np.zeros(0), own.without())
+        at_parts = likelihood.of(parts)
+        relative, point = at_parts.most_likely() if parts else (np.zeros(0), likelihood.without())
         if not all(size for part, size in zip(parts, relative, strict=True) if part != "walk" or not self._walks):
             return None
-        sizes = np.array([own.units[part][0] for part in parts]) * relative
+        sizes = np.array([likelihood.units[part][0] for part in parts]) * relative
 
-        def at_sizes(each: Likelihood) -> Point:
-            return each.of(parts).at((sizes / np.array([each.units[part][0] for part in parts])) ** 2)
+        def at_sizes(other: Likelihood) -> Point:
+            return other.of(parts).at((sizes / np.array([other.units[part][0] for part in parts])) ** 2)
 
-        without = at_sizes(alone)
+        without = at_sizes(likelihood_without)
         delta_chi2, log = max(without.misfit - point.misfit, 0.0), self._log_prior(parts) - without.cost
         if parts:
-            curves = np.linalg.eigvalsh(likelihood.curvature(relative))
+            curvatures = np.linalg.eigvalsh(at_parts.curvature(relative))
             log += float(
-                np.sum(0.5 * np.log(2.0 * np.pi / np.maximum(curves, 2.0 * np.pi / _RANGE**2)) - math.log(_RANGE))
+                np.sum(0.5 * np.log(2.0 * np.pi / np.maximum(curvatures, 2.0 * np.pi / _RANGE**2)) - math.log(_RANGE))
             )
         if relations:
-            falls = [(left, max(without.misfit - at_sizes(each).misfit, 0.0)) for each, left in relations]
-            log += float(np.logaddexp.reduce([size_evidence(*each) for each in falls])) - math.log(len(falls))
+            related = [
+                (left_dof, max(without.misfit - at_sizes(with_it).misfit, 0.0)) for left_dof, with_it in relations
+            ]
+            log += float(np.logaddexp.reduce([size_evidence(*each) for each in related])) - math.log(len(related))
         elif dof:
             log += float(size_evidence(dof, delta_chi2))
         beyond: Parts = tuple(part for part in parts if part != "walk")
-        return Weighed(beyond, log, tuple(sizes.tolist()), delta_chi2, dof)
+        return MarginalLikelihood(beyond, log, tuple(sizes.tolist()), delta_chi2, dof)
 
     def _log_prior(self, parts: Parts) -> float:
         """Return the logarithm of the prior probability that these parts of the noise are there and no others."""
         stated: dict[Part, bool] = {"setting": self.noise.setting_stated, "common": self.noise.scatter_stated}
-        chances = {part: _BEYOND if known else _UNSTATED for part, known in stated.items()}
-        return sum(math.log(own if part in parts else 1.0 - own) for part, own in chances.items())
+        priors = {part: _BEYOND if is_stated else _UNSTATED for part, is_stated in stated.items()}
+        return sum(math.log(prior if part in parts else 1.0 - prior) for part, prior in priors.items())
 
-    def _rows(self, linearised: LinearisedDwells, noise: Noise, relations: Sequence[Floats] = ()) -> list[_Rows]:
-        """Return what the likelihood needs, with coefficients of any values and then with each relation of them:
-        columns that the model hides are left out, and with an effect that was fitted with a constant the derivative by
-        this constant counts as a column, but as no coefficient."""
-        means, shared = with_shared_noise(linearised.dwells, noise, linearised.means)
-        first, last, count = self._fit.linearised.model.count, linearised.model.count, means.design.shape[2]
-        within = _within(linearised, noise, self._fit.linearised.state)
-        known = np.vstack([shared, np.zeros((len(within), count + 1))])
-        places = [*range(STATE_COUNT, last), *range(count + 1 - (within.shape[1] - last + STATE_COUNT), count + 1)]
-        known[len(shared) :, places] = within
-        constants, out = sum(place >= first for place in linearised.model.unknowns), list[_Rows]()
-        for relation in (np.eye(last - first), *relations):
-            turn = _visible(means, noise, known, first, last, relation)
-            design, prior = (
-                np.concatenate([own[..., :first], own[..., first:last] @ turn, own[..., last:]], axis=-1)
-                for own in (means.design, known)
-            )
-            out.append(_Rows(replace(means, design=design), prior, max(turn.shape[1] - constants, 0)))
-        return out
+    def _rows(
+        self, linearised: LinearisedDwells, noise: Noise, relations: Sequence[Floats] = ()
+    ) -> list[_LikelihoodRows]:
+        """Return what the likelihood needs, with coefficients of any values and then with each of their relations.
+
+        Columns that the model hides are left out. Where an effect was fitted with an unknown constant, the derivative
+        by this constant is one more column, but no coefficient.
+        """
+        means, shared_prior = with_shared_noise(linearised.dwells, noise, linearised.means)
+        blocks = _ColumnBlocks(self._fit.linearised.model.count, linearised.model.count, means.design.shape[2])
+        prior = np.vstack([shared_prior, blocks.spread(_within(linearised, noise, self._fit.linearised.state))])
+        constants = sum(column >= blocks.model for column in linearised.model.unknowns)
+        rows = list[_LikelihoodRows]()
+        for relation in (np.eye(blocks.with_added - blocks.model), *relations):
+            seen = _visible(means, noise, prior, blocks, relation)
+            seen_means = replace(means, design=blocks.combined(means.design, seen))
+            rows.append(_LikelihoodRows(seen_means, blocks.combined(prior, seen), max(seen.shape[1] - constants, 0)))
+        return rows
 
 
-def pad_residual_norm(known: Floats, length: float) -> Floats:
-    """Return rows of prior knowledge with another length of their last column, by what no other column explains.
+def pad_residual_norm(prior: Floats, norm: float) -> Floats:
+    """Return rows of prior knowledge whose last column, the residual, has another norm.
 
-    Where an oscillation is fitted, more of the readings within dwells is kept than elsewhere.
+    The difference is put where no other column can explain it. The statistics of dwells on a carrier hold more of the
+    readings than others. Without this, a fit that has no carrier would seem to explain what its statistics do not hold.
     """
-    out = known.copy()
-    out[-1, -1] = math.sqrt(max(out[-1, -1] ** 2 + length**2 - float(known[:, -1] @ known[:, -1]), 0.0))
-    return out
+    padded = prior.copy()
+    padded[-1, -1] = math.sqrt(max(padded[-1, -1] ** 2 + norm**2 - float(prior[:, -1] @ prior[:, -1]), 0.0))
+    return padded
 
 
 def _within(linearised: LinearisedDwells, noise: Noise, state: Floats) -> Floats:
     """Return the triangular factor [G | T | z] of what the readings within dwells say of all effects G and of the
     errors T of the temperature.
 
-    The mean of each dwell is left out: it is as if scatter had no limit. Scatter that is stated may be 1/f noise, which
-    goes on within dwells.
+    An immense scatter takes the mean of each dwell out of them. Where scatter was stated, it may be 1/f noise, which
+    shows within dwells, too.
     """
     setting_rad = noise.setting_rad if noise.attitude_unknown else 0.0
-    free = replace(noise, scatter_mps2=np.full(3, _FREE_MPS2), setting_rad=setting_rad, walk_mps2_per_sqrt_s=0.0)
-    columns = [own[..., STATE_COUNT:] for own in linearised.columns]
+    without_means = replace(
+        noise, scatter_mps2=np.full(3, _IMMENSE_MPS2), setting_rad=setting_rad, walk_mps2_per_sqrt_s=0.0
+    )
+    columns = [design[..., STATE_COUNT:] for design in linearised.columns]
     if noise.sensitivity_mps2_per_k is not None:
         errors = thermometer_errors(linearised.dwells_at_state, noise.sensitivity_mps2_per_k)
         columns = [np.concatenate(both, axis=3) for both in zip(columns, errors, strict=True)]
     flicker = flicker_of_scatter(linearised.dwells_at_state, noise)
-    rows = np.concatenate(whiten(linearised.dwells_at_state, columns, free, state, flicker_mps2=flicker, reduced=False))
+    whitened = whiten(linearised.dwells_at_state, columns, without_means, state, flicker_mps2=flicker, reduced=False)
+    rows = np.concatenate(whitened)
     lacking = max(rows.shape[1] - len(rows), 0)
     return triangle(np.vstack([rows, np.zeros((lacking, rows.shape[1]))]))
 
 
-def _visible(means: Means, noise: Noise, known: Floats, first: int, last: int, relation: Floats) -> Floats:
+def _visible(means: Means, noise: Noise, prior: Floats, blocks: _ColumnBlocks, relation: Floats) -> Floats:
     """Return combinations (q, k) of the added columns that are orthonormal beside the model's, without hidden ones.
 
-    first, last: the added columns follow those of the model, and come before those that have a prior. relation (q, r):
-    the combinations that are possible.
+    relation (q, r): the combinations that are possible.
     """
     sigma = noise.effective_sigma_mps2 / np.sqrt(means.counts[:, None])
-    columns = np.vstack([(means.design / sigma[..., None]).reshape(-1, means.design.shape[2]), known[:, :-1]])
-    model, own = _of_unit_length(columns[:, :first])[0], columns[:, first:last] @ relation
-    own, lengths = _of_unit_length(own)
+    columns = np.vstack([(means.design / sigma[..., None]).reshape(-1, means.design.shape[2]), prior[:, :-1]])
+    model, _ = _of_unit_length(columns[:, : blocks.model])
+    added, lengths = _of_unit_length(columns[:, blocks.model : blocks.with_added] @ relation)
     left, singular, _ = np.linalg.svd(model, full_matrices=False)
     basis = left[:, singular > 1e-9 * singular[0]]
-    _, singular, right = np.linalg.svd(own - basis @ (basis.T @ own), full_matrices=False)
+    _, singular, right = np.linalg.svd(added - basis @ (basis.T @ added), full_matrices=False)
     seen = singular > _SEEN
     return relation @ (right[seen].T / singular[seen] / lengths[:, None])
 

@@ -38,44 +38,46 @@ class Explanation:
     def share(self) -> float | None:
         """Part of the misfit beyond noise that it explains, 0 to 1: the decrease of chi-squared from refit to refit,
         less the degrees of freedom that it takes; None if the means of the dwells agree without it."""
-        excess, own, rest = misfit_beyond_noise(self.before), self.before.consistency, self.after.consistency
-        return _share(own.statistic - rest.statistic, own.dof - rest.dof, excess) if excess > 0.0 else None
+        excess, before, after = misfit_beyond_noise(self.before), self.before.consistency, self.after.consistency
+        return _share(before.statistic - after.statistic, before.dof - after.dof, excess) if excess > 0.0 else None
 
     @cached_property
-    def left_mps2(self) -> Floats:
+    def unexplained_mps2(self) -> Floats:
         """What it leaves of the residuals (D, 3)."""
         return unexplained_mps2(self.after)
 
     @cached_property
-    def left_ratios(self) -> Floats:
+    def unexplained_ratios(self) -> Floats:
         """The same over the sigma of the means."""
-        return self.left_mps2 / mean_sigmas(self.before)
+        return self.unexplained_mps2 / mean_sigmas(self.before)
 
     @cached_property
     def predicted_mps2(self) -> Floats:
         """What it predicts of the residuals (D, 3): the difference of the two models' predictions."""
-        return self.before.residuals_mps2 - self.left_mps2
+        return self.before.residuals_mps2 - self.unexplained_mps2
 
     @cached_property
     def contribution_mps2(self) -> Floats:
         """What its effects add to the mean readings (D, 3), before the other parameters take up a part of it."""
-        own = self._own
-        added = np.einsum("dip,p->di", self.after.linearised.means.design[:, :, own], self.after.estimate.state[own])
+        columns = self._own
+        added = np.einsum(
+            "dip,p->di", self.after.linearised.means.design[:, :, columns], self.after.estimate.state[columns]
+        )
         return added + walk_path(self.after)
 
     @cached_property
     def contribution_sigma_mps2(self) -> Floats:
         """Sigma (D, 3) of the contribution, from the covariance of its coefficients."""
-        own = self._own
-        design, covariance = self.after.linearised.means.design[:, :, own], self.after.estimate.covariance
-        return np.sqrt(np.einsum("dip,pq,diq->di", design, covariance[np.ix_(own, own)], design))
+        columns = self._own
+        design, covariance = self.after.linearised.means.design[:, :, columns], self.after.estimate.covariance
+        return np.sqrt(np.einsum("dip,pq,diq->di", design, covariance[np.ix_(columns, columns)], design))
 
     @cached_property
     def _own(self) -> NDArray[np.intp]:
         """Return the places of its coefficients in the state; a walk has none, its path is no coefficient."""
-        model, known = self.after.model, self.before.model.parts
-        added = (part for name, part in model.parts.items() if name not in known)
-        return np.array([place for part in added for place in range(*part.indices(model.count))], int)
+        model, parts_before = self.after.model, self.before.model.parts
+        added = (part for name, part in model.parts.items() if name not in parts_before)
+        return np.array([column for part in added for column in range(*part.indices(model.count))], int)
 
 
 def _share(delta_chi2: float, dof: int, excess: float) -> float:

@@ -17,13 +17,21 @@ from functools import cached_property, partial
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.candidate_tests import CandidateTests, assess_candidates, values_of
+from kf_calib.diagnosis.candidate_tests import CandidateTests, values_of
 from kf_calib.diagnosis.dwell_noise import dwell_noise_is_stated
-from kf_calib.diagnosis.evidence import Evidence, Weighed, size_evidence
-from kf_calib.diagnosis.hypothesis_table import IRREGULAR, KINDS, NOISE, NONE, NOTHING, Hypothesis, Table, table_of
+from kf_calib.diagnosis.evidence import Evidence, MarginalLikelihood, size_evidence
+from kf_calib.diagnosis.hypothesis_table import (
+    IRREGULAR,
+    KINDS,
+    NOISE,
+    NONE,
+    NOTHING,
+    Hypothesis,
+    HypothesisTable,
+    table_of,
+)
 from kf_calib.diagnosis.refits import Refits
-from kf_calib.diagnosis.unknown_effect import Family as Formulas
-from kf_calib.diagnosis.unknown_effect import one_digit_seconds
+from kf_calib.diagnosis.unknown_effect import FormulaFamily, one_digit_seconds
 from kf_calib.diagnosis.within_dwell_trend import Trend, trend
 from kf_calib.effects import FrameEffect, effect_named, walk_named
 from kf_calib.estimation.results import Calibration
@@ -31,11 +39,9 @@ from kf_calib.estimation.score_test import unweighted_left
 
 _NO_NOISE = {True: 0.4, False: 0.1}  # share of an unknown cause in more scatter, by whether noise was stated
 _SHORT = 0.01  # prior probability of irregular changes that show within dwells only
-SCREEN_LOG_BF, NONLINEARITY_MARGIN = (
-    8.0,
-    0.02,
-)  # rows further behind, in ln and as a share of the evidence, are not refitted
-_MOST = {"effect": 8, "turn": 3, "pair": 4, "walk": 3, "formula": 3}
+SCREEN_LOG_BF = 8.0  # rows further behind in log evidence are not refitted
+NONLINEARITY_MARGIN = 0.02  # share of the log evidence by which they may be further behind, as large effects bend
+_MOST = {"effect": 8, "attitude": 3, "pair": 4, "walk": 3, "formula": 3}
 
 
 def log_odds_of(p_value: float) -> float:
@@ -45,18 +51,18 @@ def log_odds_of(p_value: float) -> float:
     return -math.log(-math.e * p_value * math.log(p_value)) if p_value < 1.0 / math.e else 0.0
 
 
-def _log_odds(found: Trend | None) -> float:
+def _log_odds(trends: Trend | None) -> float:
     """Return the log odds that trends within dwells give against a model that has none."""
-    return log_odds_of(found.p_value) if found else 0.0
+    return log_odds_of(trends.p_value) if trends else 0.0
 
 
-def _sum(logs: Sequence[float]) -> float:
+def _log_sum(logs: Sequence[float]) -> float:
     """Return the log of a sum from the logs of its terms."""
     return float(np.logaddexp.reduce([-math.inf, *logs]))
 
 
-def _least(logs: Iterable[float]) -> float:
-    """Return the least evidence by the linear tests with which a row is refitted; large effects are not linear."""
+def _screening_limit(logs: Iterable[float]) -> float:
+    """Return the log evidence by the linear tests from which a row is refitted."""
     best = max(logs, default=0.0)
     return best - SCREEN_LOG_BF - NONLINEARITY_MARGIN * max(best, 0.0)
 
@@ -68,209 +74,210 @@ class Hypotheses:
     """
 
     def __init__(self, refits: Refits, before: Calibration, test: CandidateTests) -> None:
-        self.refits, self.before, self.test = refits, before, test
+        self.refits, self.before, self.test, self.effects = refits, before, test, test.effects
         self.evidence, self.inflation = Evidence(before.fit), 1.0
         self.walk = "" if before.model.walks else walk_named(before.bench)
         self.stated = dwell_noise_is_stated(before)
 
-    def table(self) -> Table:
+    def table(self) -> HypothesisTable:
         """The table with the likeliest rows refitted."""
-        best = next((name for name in self._screened() if name in self.test.best), None)
+        best = next((name for name in self._log_bayes_of_effects() if name in self.effects.best), None)
         if best is not None:  # what even the best effect leaves makes every fall less significant
-            judged = self._refit((best,)).consistency
-            self.inflation = max(1.0, judged.statistic / judged.dof) if judged.dof > 0 else 1.0
-        effects = self._screened()
+            consistency = self._refit((best,)).consistency
+            self.inflation = max(1.0, consistency.statistic / consistency.dof) if consistency.dof > 0 else 1.0
+        effects = self._log_bayes_of_effects()
         pairs = self._pairs(effects)
-        tried = [*self._without(), *self._effects(effects), *self._formulas(effects)]
-        tried += [self._row(names, self._prior("pair", math.comb(len(effects), 2), *names)) for names in pairs]
-        likeliest, known = max(tried, key=lambda row: row.log_evidence), {row.effects for row in tried}
-        tried += [self._single(name, effects) for name in likeliest.effects if (name,) not in known]
-        tried = [row for row in tried if math.isfinite(row.log_evidence)]
-        least = max(row.log_evidence for row in tried) - SCREEN_LOG_BF
-        walks = [row for row in tried if row.effects == (self.walk,) and row.log_evidence > least]
-        return table_of([*tried, *(back for walk in walks if self.stated for back in self._returning(walk))])
+        rows = [*self._without_effects(), *self._effects(effects), *self._formulas(effects)]
+        rows += [self._row(names, self._prior("pair", math.comb(len(effects), 2), *names)) for names in pairs]
+        likeliest, refitted = max(rows, key=lambda row: row.log_evidence), {row.effects for row in rows}
+        rows += [self._single(name, effects) for name in likeliest.effects if (name,) not in refitted]
+        rows = [row for row in rows if math.isfinite(row.log_evidence)]
+        least = max(row.log_evidence for row in rows) - SCREEN_LOG_BF
+        walks = [row for row in rows if row.effects == (self.walk,) and row.log_evidence > least]
+        return table_of([*rows, *(row for walk in walks if self.stated for row in self._gauss_markov(walk))])
 
-    def _returning(self, walk: Hypothesis) -> Iterator[Hypothesis]:
+    def _gauss_markov(self, walk: Hypothesis) -> Iterator[Hypothesis]:
         """Yield the row of biases that move irregularly and return to their mean after any time, from that of a random
         walk; none where no walk is likelier than none."""
         assert walk.refit is not None
         gains, times_s = walk.refit.fit.gauss_markov_gains
         driver = f"time (irregular, back within about {one_digit_seconds(float(times_s[np.argmax(gains)]))})"
-        prior = self._prior("effect", len(self.test.scores), self.walk) + math.log(KINDS["formula"] / KINDS["effect"])
-        for own in self.evidence.of(walk.refit.fit, walk=True):
-            if not own.parts:  # the gains are over a walk that nothing else explains
-                log = own.log + float(np.logaddexp.reduce(gains)) - math.log(len(gains)) + prior
-                log += self._within(walk.effects, walk.refit)
+        prior = self._prior("effect", len(self.effects.scores), self.walk)
+        prior += math.log(KINDS["formula"] / KINDS["effect"])
+        for marginal in self.evidence.of(walk.refit.fit, walk=True):
+            if not marginal.parts:  # the gains are over a walk that nothing else explains
+                log = marginal.log + float(np.logaddexp.reduce(gains)) - math.log(len(gains)) + prior
+                log += self._log_odds_within_dwells(walk.effects, walk.refit)
                 yield Hypothesis(driver=driver, families=walk.families, log_evidence=log)
 
-    def quick_table(self) -> Table:
+    def quick_table(self) -> HypothesisTable:
         """The table of nothing, noise and single effects by the linear tests alone, for a run with no misfit."""
-        rows, prior = list(self._without()), partial(self._prior, "effect", len(self.test.scores))
-        least = rows[0].log_evidence - math.log(KINDS["nothing"])
+        rows, prior = list(self._without_effects()), partial(self._prior, "effect", len(self.effects.scores))
+        log_nothing = rows[0].log_evidence - math.log(KINDS["nothing"])
         rows += [
-            Hypothesis((name,), families=self._families((name,)), log_evidence=least + own + prior(name),
-                       statistic=self._fall(name), dof=self._dof(name))
-            for name, own in self._screened().items()
+            Hypothesis((name,), families=self._families((name,)), log_evidence=log_nothing + log_bayes + prior(name),
+                       statistic=self._delta_chi2(name), dof=self._dof(name))
+            for name, log_bayes in self._log_bayes_of_effects().items()
         ]  # fmt: skip
         return table_of(rows)
 
-    def _without(self) -> Iterator[Hypothesis]:
+    def _without_effects(self) -> Iterator[Hypothesis]:
         """Yield the rows without an effect: nothing, noise that was not stated, and irregular changes."""
-        found, prior = self.evidence.of(), math.log(KINDS["nothing"])
-        still = float(next(own.log for own in found if not own.parts)) + prior
-        turned = _sum([own.log for own in found if own.parts == ("setting",)]) + prior
-        spread = _sum([own.log for own in found if "common" in own.parts]) + prior
+        marginals, prior = self.evidence.of(), math.log(KINDS["nothing"])
+        log_nothing = float(next(marginal.log for marginal in marginals if not marginal.parts)) + prior
+        log_setting = _log_sum([marginal.log for marginal in marginals if marginal.parts == ("setting",)]) + prior
+        log_scatter = _log_sum([marginal.log for marginal in marginals if "common" in marginal.parts]) + prior
         share = _NO_NOISE[self.stated]
-        either = _sum([spread + math.log(share), still + math.log(_SHORT)]) + _log_odds(self.test.trend)
-        yield Hypothesis(families=(NOTHING,), log_evidence=still)
-        yield Hypothesis(families=(NOISE,), log_evidence=_sum([turned, spread + math.log(1.0 - share)]))
-        yield Hypothesis(driver=IRREGULAR, families=(NONE,), log_evidence=either)
+        log_irregular = _log_sum([log_scatter + math.log(share), log_nothing + math.log(_SHORT)])
+        log_irregular += _log_odds(self.test.trend)
+        yield Hypothesis(families=(NOTHING,), log_evidence=log_nothing)
+        yield Hypothesis(families=(NOISE,), log_evidence=_log_sum([log_setting, log_scatter + math.log(1.0 - share)]))
+        yield Hypothesis(driver=IRREGULAR, families=(NONE,), log_evidence=log_irregular)
 
-    def _screened(self) -> dict[str, float]:
+    def _log_bayes_of_effects(self) -> dict[str, float]:
         """Return the log Bayes factor of each effect by the linear tests, the likeliest first."""
-        found = {name: self._screen(name, self._fall(name)) for name in self.test.scores}
-        return dict(sorted(found.items(), key=lambda each: -each[1]))
+        log_bayes = {name: self._log_bayes(name, self._delta_chi2(name)) for name in self.effects.scores}
+        return dict(sorted(log_bayes.items(), key=lambda each: -each[1]))
 
-    def _screen(self, name: str, delta_chi2: float) -> float:
+    def _log_bayes(self, name: str, delta_chi2: float) -> float:
         """Return the log Bayes factor of an effect from its fall of chi-squared in the linear tests."""
-        if name not in self.test.best:
+        if name not in self.effects.best:
             return 0.5 * delta_chi2 / self.inflation
         delta_chi2 = delta_chi2 / self.inflation
         return float(size_evidence(self._dof(name), delta_chi2)) + self._log_share((name,), delta_chi2)
 
-    def _fall(self, name: str) -> float:
+    def _delta_chi2(self, name: str) -> float:
         """Return the fall of chi-squared of an effect; of a random walk, twice its gain in likelihood."""
-        test = self.test
-        if name in test.best:
-            return float(test.scan.statistics[test.best[name]])
-        return 2.0 * self.before.fit.walk_gain if name == self.walk else test.scores[name]
+        if name in self.effects.best:
+            return float(self.effects.scan.statistics[self.effects.best[name]])
+        return 2.0 * self.before.fit.walk_gain if name == self.walk else self.effects.scores[name]
 
     def _dof(self, name: str) -> int:
-        return self.test.candidate(name).dof if name in self.test.best else 1
+        return self.effects.candidate(name).dof if name in self.effects.best else 1
 
     def _log_share(self, names: Sequence[str], delta_chi2: float) -> float:
         """Return the log of the mean of likelihood over the values of constants, relative to the best value."""
-        return sum(self._log_share_of(name, delta_chi2) for name in names if name in self.test.best)
+        return sum(self._log_share_of(name, delta_chi2) for name in names if name in self.effects.best)
 
     def _log_share_of(self, name: str, delta_chi2: float) -> float:
-        test = self.test
-        own = self._values[name]
-        tried = max(len(own), *(test.scan.candidates[k].tried for k in own))
-        deltas = test.scan.statistics[own]
+        scan, numbers = self.effects.scan, self._numbers[name]
+        tried = max(len(numbers), *(scan.candidates[k].tried for k in numbers))
+        deltas = scan.statistics[numbers]
         relative = min(1.0, delta_chi2 / max(float(deltas.max()), 1e-9))
         return float(np.logaddexp.reduce(0.5 * relative * (deltas - deltas.max()))) - math.log(tried)
 
     def _effects(self, screened: Mapping[str, float]) -> Iterator[Hypothesis]:
         """Yield the rows of single effects."""
         columns = {name: log for name, log in screened.items() if name != self.walk}
-        least = _least(columns.values())
-        chosen = [name for name, log in columns.items() if log > least][: _MOST["effect"]]
-        chosen += [*self._effects_that_turn(), *([self.walk] if self.walk else [])]
-        yield from (self._single(name, screened) for name in dict.fromkeys(chosen))
+        limit = _screening_limit(columns.values())
+        names = [name for name, log in columns.items() if log > limit][: _MOST["effect"]]
+        names += [*self._attitude_effects(), *([self.walk] if self.walk else [])]
+        yield from (self._single(name, screened) for name in dict.fromkeys(names))
 
     def _single(self, name: str, screened: Mapping[str, float]) -> Hypothesis:
         return self._row((name,), self._prior("effect", len(screened), name))
 
-    def _effects_that_turn(self) -> list[str]:
-        """Names of the effects that turn the platform and explain most of the misfit of the dwells' means, whatever
-        its direction.
+    def _attitude_effects(self) -> list[str]:
+        """Names of the effects of the platform's attitude that explain most of the residuals of the dwells' means, all
+        directions weighed alike.
 
-        Where the setting error was not stated, it is estimated from these turns, too, so that the linear tests give
-        them little weight; and a turn that is not small is not linear along the specific force, where readings are
-        most exact.
+        Where the setting error was not stated, it is estimated from the same residuals, so that the linear tests give
+        these effects little weight. And a rotation that is not small is not linear along the specific force, where
+        readings are most exact.
         """
-        effects = {name: self.test.candidate(name).effect for name in self.test.best}
+        effects = {name: self.effects.candidate(name).effect for name in self.effects.best}
         effects = {name: effect for name, effect in effects.items() if isinstance(effect, FrameEffect)}
         linearised = self.before.fit.linearised
-        left = unweighted_left(linearised, list(effects.values()))
-        gains = -0.5 * (3 * len(linearised.dwells) - linearised.model.count) * np.log(np.maximum(left, 1e-12))
-        likely = sorted(zip(gains.tolist(), effects, strict=True), reverse=True)[: _MOST["turn"]]
-        return [name for gain, name in likely if gain > max(SCREEN_LOG_BF, likely[0][0] - SCREEN_LOG_BF)]
+        unexplained = unweighted_left(linearised, list(effects.values()))
+        gains = -0.5 * (3 * len(linearised.dwells) - linearised.model.count) * np.log(np.maximum(unexplained, 1e-12))
+        ranked = sorted(zip(gains.tolist(), effects, strict=True), reverse=True)[: _MOST["attitude"]]
+        return [name for gain, name in ranked if gain > max(SCREEN_LOG_BF, ranked[0][0] - SCREEN_LOG_BF)]
 
     def _pairs(self, screened: Mapping[str, float]) -> list[tuple[str, str]]:
         """Return the likeliest pairs, and the likeliest effects beside a random walk."""
         if len(screened) < 2:
             return []
-        found = self._joint(screened)
-        likely = sorted(found, key=lambda names: -found[names])[: _MOST["pair"]]
-        least = _least(found.values())
-        chosen = [names for names in likely if found[names] > least]
+        log_bayes = self._log_bayes_of_pairs(screened)
+        ranked = sorted(log_bayes, key=lambda names: -log_bayes[names])[: _MOST["pair"]]
+        limit = _screening_limit(log_bayes.values())
+        pairs = [names for names in ranked if log_bayes[names] > limit]
         walk = self.walk
         if walk and self.before.fit.walk_gain > 0.0:
-            walked = self._refit((walk,))
-            frames = self.refits.frames_beside_walk
-            test = assess_candidates(walked.fit, self.test.effective_tests, frames=frames)
-            beside = Hypotheses(self.refits, walked, test)
-            own = [name for name in beside._screened() if name in beside.test.best]
-            chosen += [(name, walk) for name in own[: _MOST["walk"]]]
-        return chosen
+            with_walk = self._refit((walk,))
+            test = self.refits.assess_beside_walk(with_walk, self.effects.independent_tests)
+            beside = Hypotheses(self.refits, with_walk, test)
+            effects = [name for name in beside._log_bayes_of_effects() if name in beside.test.effects.best]
+            pairs += [(name, walk) for name in effects[: _MOST["walk"]]]
+        return pairs
 
-    def _joint(self, screened: Mapping[str, float]) -> dict[tuple[str, str], float]:
+    def _log_bayes_of_pairs(self, screened: Mapping[str, float]) -> dict[tuple[str, str], float]:
         """Return the log Bayes factors of pairs by the linear tests: each effect at the value of its constant that is
         best alone, and the other at any value."""
-        test, out = self.test, dict[tuple[str, str], float]()
-        for name in filter(test.best.__contains__, screened):
-            deltas, alone = test.scan.beside(test.best[name]) / self.inflation, self._screen(name, self._fall(name))
-            logs = self._evidence(deltas)
-            for other, own in self._values.items():
-                k = own[int(np.argmax(logs[own]))]
+        best, log_bayes = self.effects.best, dict[tuple[str, str], float]()
+        for name in filter(best.__contains__, screened):
+            alone = self._log_bayes(name, self._delta_chi2(name))
+            deltas = self.effects.scan.beside(best[name]) / self.inflation
+            logs = self._log_bayes_of_candidates(deltas)
+            for other, numbers in self._numbers.items():
+                k = numbers[int(np.argmax(logs[numbers]))]
                 if other == name or not deltas[k] > 0.0:
                     continue
-                both = (name, other) if screened[name] >= screened[other] else (other, name)
+                pair = (name, other) if screened[name] >= screened[other] else (other, name)
                 log = alone + float(logs[k]) + self._log_share_of(other, float(deltas[k]))
-                out[both] = max(out.get(both, -math.inf), log)
-        return out
+                log_bayes[pair] = max(log_bayes.get(pair, -math.inf), log)
+        return log_bayes
 
-    def _evidence(self, deltas: Floats) -> Floats:
+    def _log_bayes_of_candidates(self, deltas: Floats) -> Floats:
         """Return the log Bayes factors (n,) of all candidates of the linear tests from their falls of chi-squared."""
-        dofs, out = np.array([each.dof for each in self.test.scan.candidates]), np.full(len(deltas), -math.inf)
+        dofs = np.array([candidate.dof for candidate in self.effects.scan.candidates])
+        log_bayes = np.full(len(deltas), -math.inf)
         for dof in set(dofs[dofs > 0].tolist()):
-            out[dofs == dof] = size_evidence(dof, deltas[dofs == dof])
-        return out
+            log_bayes[dofs == dof] = size_evidence(dof, deltas[dofs == dof])
+        return log_bayes
 
     @cached_property
-    def _values(self) -> dict[str, list[int]]:
+    def _numbers(self) -> dict[str, list[int]]:
         """Numbers of the candidates of each visible effect: one for each value of its constant."""
-        return {name: own for name in self.test.best if (own := values_of(self.test.scan, name))}
+        return {name: numbers for name in self.effects.best if (numbers := values_of(self.effects.scan, name))}
 
     def _formulas(self, screened: Mapping[str, float]) -> Iterator[Hypothesis]:
         """Yield the rows of formulas that are no known effect, the likeliest of each driver."""
-        known = [self.test.candidate(name).effect for name in self.test.best]
-        taken = [effect.name for effect in self.before.model.effects]
-        drivers = dict[str, list[Formulas]]()
-        for each in self.refits.families(self.before.fit, known):
-            if each.rank and not each.known:
-                drivers.setdefault(each.driver, []).append(each)
-        logs = {driver: self._over_members(own) for driver, own in drivers.items()}
-        least = _least(log for name, log in screened.items() if name != self.walk)
-        likely = sorted(drivers, key=lambda driver: -np.logaddexp.reduce(logs[driver]))[: _MOST["formula"]]
-        for driver in likely:
-            if logs[driver].max() < least:
+        effects = [self.effects.candidate(name).effect for name in self.effects.best]
+        names_in_model = [effect.name for effect in self.before.model.effects]
+        drivers = dict[str, list[FormulaFamily]]()
+        for family in self.refits.families(self.before.fit, effects):
+            if family.rank and not family.known:
+                drivers.setdefault(family.driver, []).append(family)
+        logs = {driver: self._log_bayes_of_formulas(families) for driver, families in drivers.items()}
+        limit = _screening_limit(log for name, log in screened.items() if name != self.walk)
+        ranked = sorted(drivers, key=lambda driver: -np.logaddexp.reduce(logs[driver]))[: _MOST["formula"]]
+        for driver in ranked:
+            if logs[driver].max() < limit:
                 continue
-            first = int(np.argmax(logs[driver]))
-            share = float(np.logaddexp.reduce(logs[driver]) - logs[driver][first]) - math.log(len(logs[driver]))
-            formulas = drivers[driver][first].formulas_beside(taken)
+            best = int(np.argmax(logs[driver]))
+            share = float(np.logaddexp.reduce(logs[driver]) - logs[driver][best]) - math.log(len(logs[driver]))
+            formulas = drivers[driver][best].formulas_beside(names_in_model)
             row = self._row((), self._prior("formula", len(drivers)) + share, formulas)
-            yield replace(row, driver=driver, families=(drivers[driver][first].family or NONE,))
+            yield replace(row, driver=driver, families=(drivers[driver][best].family or NONE,))
 
-    def _over_members(self, own: Sequence[Formulas]) -> Floats:
+    def _log_bayes_of_formulas(self, families: Sequence[FormulaFamily]) -> Floats:
         """Return the log Bayes factors of the formulas of one driver by the linear tests."""
-        return np.array([float(size_evidence(each.rank, each.delta_chi2 / self.inflation)) for each in own])
+        return np.array([float(size_evidence(each.rank, each.delta_chi2 / self.inflation)) for each in families])
 
     def _row(self, effects: tuple[str, ...], log_prior: float, formulas: tuple[str, ...] = ()) -> Hypothesis:
         """Return the row of effects or formulas, refitted and weighed."""
         refit = self._refit((*effects, *formulas))
-        found = self.evidence.of(refit.fit, walk=self.walk in effects)
-        if not found:
+        marginals = self.evidence.of(refit.fit, walk=self.walk in effects)
+        if not marginals:
             return Hypothesis(effects, formulas, log_evidence=-math.inf)
-        logs = [own.log + self._log_share(effects, own.delta_chi2) for own in found]
-        best: Weighed = found[int(np.argmax(logs))]
+        logs = [marginal.log + self._log_share(effects, marginal.delta_chi2) for marginal in marginals]
+        best: MarginalLikelihood = marginals[int(np.argmax(logs))]
         walks, log = self.walk in effects, float(np.logaddexp.reduce(logs)) + log_prior
-        log += self._within(effects, refit) if walks else 0.0
+        log += self._log_odds_within_dwells(effects, refit) if walks else 0.0
         delta_chi2 = best.delta_chi2 if best.dof else 2.0 * self.before.fit.walk_gain
         return Hypothesis(effects, formulas, "", self._families(effects), log, delta_chi2, best.dof + walks, refit)
 
-    def _within(self, effects: Sequence[str], refit: Calibration) -> float:
+    def _log_odds_within_dwells(self, effects: Sequence[str], refit: Calibration) -> float:
         """Return the log odds of what a walk explains within dwells, where it goes on but has no column: trends that
         the other effects leave, less those that are left beside it."""
         if not self.test.trend:
@@ -288,5 +295,5 @@ class Hypotheses:
 
     def _prior(self, kind: str, members: int, *effects: str) -> float:
         """Return the log of the prior probability of these effects, or formulas, among so many of their kind."""
-        own = math.prod(effect_named(name, self.before.bench).prior for name in effects)
-        return math.log(own * KINDS[kind] / max(members, 1))
+        weight = math.prod(effect_named(name, self.before.bench).prior for name in effects)
+        return math.log(weight * KINDS[kind] / max(members, 1))

@@ -28,10 +28,10 @@ ALIKE = "like a known effect"
 SURE = 0.95
 """Probability from which an effect is taken for certain enough to be added without asking."""
 
-HOLDS = 0.99
+CREDIBLE = 0.99
 """Probability of the set of explanations that is told."""
 
-TOLD = 0.01
+LISTED = 0.01
 """Least probability of an explanation that has a line of its own where the table is shown."""
 
 KINDS = {"nothing": 0.4, "effect": 0.4, "pair": 0.1, "formula": 0.1}
@@ -71,7 +71,7 @@ class Hypothesis:
 
 
 @dataclass(frozen=True)
-class Table:
+class HypothesisTable:
     """All rows, the likeliest first; their probabilities sum to one."""
 
     rows: tuple[Hypothesis, ...]
@@ -79,21 +79,21 @@ class Table:
     @cached_property
     def families(self) -> dict[str, float]:
         """Probability that something of each family is missing; with two effects at once they sum to more than one."""
-        found = dict[str, float]()
+        probabilities = dict[str, float]()
         for row in self.rows:
             for family in row.families:
-                found[family] = found.get(family, 0.0) + row.probability
-        return dict(sorted(found.items(), key=lambda each: -each[1]))
+                probabilities[family] = probabilities.get(family, 0.0) + row.probability
+        return dict(sorted(probabilities.items(), key=lambda each: -each[1]))
 
     def probability(self, effects: Sequence[str]) -> float:
         """Probability that all these effects are missing, alone or with others."""
         return sum(row.probability for row in self.rows if set(effects) <= set(row.effects))
 
-    def of_any(self, families: Iterable[str]) -> float:
+    def probability_of_families(self, families: Iterable[str]) -> float:
         """Probability that something of any of these families is missing."""
         return sum(row.probability for row in self.rows if set(row.families) & set(families))
 
-    def of_added(self, text: str, name: str) -> float | None:
+    def probability_of_added(self, text: str, name: str) -> float | None:
         """Probability that what was added to a model is missing, alone or with others; None where no row has it.
 
         text: the effect as it was added, which a formula is told by. name: its name.
@@ -108,9 +108,10 @@ class Table:
         return (*(one - next_ for one, next_ in itertools.pairwise(logs)), None)
 
     @property
-    def told(self) -> tuple[Hypothesis, ...]:
-        """The rows that have a line of their own where the table is shown: those of ``TOLD`` or more, and the first."""
-        return tuple(row for row in self.rows if row.probability >= TOLD or row is self.first)
+    def listed(self) -> tuple[Hypothesis, ...]:
+        """The rows that have a line of their own where the table is shown, those of ``LISTED`` or more, and the
+        first."""
+        return tuple(row for row in self.rows if row.probability >= LISTED or row is self.first)
 
     @property
     def first(self) -> Hypothesis:
@@ -119,26 +120,27 @@ class Table:
 
     @cached_property
     def rivals(self) -> tuple[Hypothesis, ...]:
-        """The explanations other than the first that have ``HOLDS`` of the probability together with it, without those
+        """The explanations other than the first that have ``CREDIBLE`` of the probability together with it, without
+        those
         that only add to its effects or look like them."""
         first, rows = self.first, [row for row in self.rows if row.families != (NOTHING,) and row.driver != ALIKE]
         before = np.cumsum([0.0, *(row.probability for row in rows)]) / sum(row.probability for row in rows)
-        likely = [row for k, row in enumerate(rows) if before[k] < HOLDS and row is not first]
-        return tuple(row for row in likely if not (first.effects and set(first.effects) <= set(row.effects)))
+        credible = [row for k, row in enumerate(rows) if before[k] < CREDIBLE and row is not first]
+        return tuple(row for row in credible if not (first.effects and set(first.effects) <= set(row.effects)))
 
 
-def table_of(rows: Iterable[Hypothesis]) -> Table:
+def table_of(rows: Iterable[Hypothesis]) -> HypothesisTable:
     """The table of rows, of which only the evidence is known, with one for causes that look like a known effect."""
     rows = [replace(row, log_evidence=row.log_evidence + math.log1p(-_ALIKE)) if row.effects else row for row in rows]
-    if known := [row.log_evidence for row in rows if row.effects]:
-        alike = float(np.logaddexp.reduce(known)) + math.log(_ALIKE / (1.0 - _ALIKE))
+    if with_effects := [row.log_evidence for row in rows if row.effects]:
+        alike = float(np.logaddexp.reduce(with_effects)) + math.log(_ALIKE / (1.0 - _ALIKE))
         rows.append(Hypothesis(driver=ALIKE, families=(NONE,), log_evidence=alike))
     logs = np.array([row.log_evidence for row in rows])
-    found = [replace(row, probability=share) for row, share in zip(rows, weights(logs).tolist(), strict=True)]
-    return Table(tuple(sorted(found, key=lambda row: -row.probability)))
+    weighed = [replace(row, probability=share) for row, share in zip(rows, weights(logs).tolist(), strict=True)]
+    return HypothesisTable(tuple(sorted(weighed, key=lambda row: -row.probability)))
 
 
-def noise_p(table: Table) -> float:
+def noise_p(table: HypothesisTable) -> float:
     """P-value of noise alone, stated or not, against all that a table has beside it.
 
     In noise the odds of the others to it, over their odds before the readings, have the mean 1, so that they exceed 1/p

@@ -16,7 +16,16 @@ from kf_calib.bench.streams import Source
 from kf_calib.diagnosis.candidate_tests import CandidateTests, overlap_matrix
 from kf_calib.diagnosis.dwell_noise import dwell_noise_is_stated, with_noise_as_stated
 from kf_calib.diagnosis.hypotheses import Hypotheses, log_odds_of
-from kf_calib.diagnosis.hypothesis_table import ALIKE, NOISE, NOTHING, TOLD, Hypothesis, Table, noise_p, table_of
+from kf_calib.diagnosis.hypothesis_table import (
+    ALIKE,
+    LISTED,
+    NOISE,
+    NOTHING,
+    Hypothesis,
+    HypothesisTable,
+    noise_p,
+    table_of,
+)
 from kf_calib.diagnosis.refits import Refits, calibration_of
 from kf_calib.diagnosis.results import Diagnosis, Suspect
 from kf_calib.diagnosis.verdict import second_pass_in_words, verdict_in_words
@@ -53,107 +62,110 @@ def _diagnosed(refits: Refits, before: Calibration) -> Diagnosis:
         verdict = f"One dwell is wrong (p {format_p(test.p_value)}): {outlying_in_words(before.outlying)}"
         return Diagnosis(before=before, test=test, verdict=verdict, unknown=test.consistent is False)
     test = _without_vibration(refits, before, refits.assess(before))
-    found = _explained(refits, before, test)
-    if found.unknown and test.without_lines:  # the lines keep their phase through the run, but not their amplitude
+    diagnosis = _explained(refits, before, test)
+    if diagnosis.unknown and test.without_lines:  # the lines keep their phase through the run, but not their amplitude
         test = test.without_lines
-        found = _explained(refits, before, test)
-    if test.vibration and not before.fit.dwells[0].averaged:
-        averaged = refits.averaged(before, window_average.window_s(test.vibration))
+        diagnosis = _explained(refits, before, test)
+    if test.lines.vibration and not before.fit.dwells[0].averaged:
+        averaged = refits.averaged(before, window_average.window_s(test.lines.vibration))
         if averaged is not None:
-            still = refits.assess(averaged)
-            still = still.without_lines or still  # lines that are left after averaging are vibration, too
-            found = _explained(refits, averaged, replace(still, vibration=test.vibration))
-    found = replace(found, back_s=_restoring_time_s(found))
-    return replace(found, verdict=verdict_in_words(found) + second_pass_in_words(found))
+            retest = refits.assess(averaged)
+            retest = retest.without_lines or retest  # lines that are left after averaging are vibration, too
+            diagnosis = _explained(refits, averaged, retest.with_vibration(test.lines.vibration))
+    diagnosis = replace(diagnosis, restoring_time_s=_restoring_time_s(diagnosis))
+    return replace(diagnosis, verdict=verdict_in_words(diagnosis) + second_pass_in_words(diagnosis))
 
 
 def _without_vibration(refits: Refits, before: Calibration, test: CandidateTests) -> CandidateTests:
     """Return the test as it is if an oscillation of constant amplitude explains its lines, else that with vibration."""
     if test.without_lines is None:
         return test
-    refit = refits.with_effects(before, (test.oscillating,))
+    refit = refits.with_effects(before, (test.lines.oscillation,))
     # amplitude of the coherent fit over the whole run, over the amplitude seen in each stretch of readings
-    share = np.linalg.norm(refit.estimate.state[refit.model.parts[test.oscillating]]) / np.linalg.norm(
-        test.lines[0].amplitude_mps2
+    share = np.linalg.norm(refit.estimate.state[refit.model.parts[test.lines.oscillation]]) / np.linalg.norm(
+        test.lines.significant[0].amplitude_mps2
     )
     return test if share > 0.5 and _leaves_noise(refit, before) else test.without_lines
 
 
 def _leaves_noise(refit: Calibration, before: Calibration) -> bool:
     """Tell whether a fitted oscillation leaves noise in what is kept of the readings within dwells for its sake."""
-    more, less = refit.consistency, before.consistency
-    rows = more.dof - less.dof
-    return rows <= 0 or chi_squared_tail(rows, max(more.statistic - less.statistic, 0.0)) > _NOISE
+    with_oscillation, without = refit.consistency, before.consistency
+    rows = with_oscillation.dof - without.dof
+    return rows <= 0 or chi_squared_tail(rows, max(with_oscillation.statistic - without.statistic, 0.0)) > _NOISE
 
 
 def _explained(refits: Refits, before: Calibration, test: CandidateTests) -> Diagnosis:
     """Return the diagnosis by these tests."""
-    found = Diagnosis(before=before, test=test)
+    diagnosis = Diagnosis(before=before, test=test)
     if test.consistent is None:
-        return found
+        return diagnosis
     if test.consistent and dwell_noise_is_stated(before):
-        return replace(found, table=Hypotheses(refits, before, test).quick_table())
+        return replace(diagnosis, table=Hypotheses(refits, before, test).quick_table())
     if test.consistent:  # noise that is estimated from all of the misfit explains as much of it as an effect does
         table = Hypotheses(refits, before, test).table()
-        found = replace(found, test=replace(test, noise_p=noise_p(table)), table=table)
-        return found if found.test.consistent else _decided(refits, found)
-    if test.oscillating:
-        return _decided(refits, replace(found, table=_beside_lines(refits, before, test)))
-    return _decided(refits, replace(found, table=Hypotheses(refits, before, test).table()))
+        diagnosis = replace(diagnosis, test=replace(test, noise_p=noise_p(table)), table=table)
+        return diagnosis if diagnosis.test.consistent else _decided(refits, diagnosis)
+    if test.lines.oscillation:
+        return _decided(refits, replace(diagnosis, table=_beside_lines(refits, before, test)))
+    return _decided(refits, replace(diagnosis, table=Hypotheses(refits, before, test).table()))
 
 
-def _beside_lines(refits: Refits, before: Calibration, test: CandidateTests) -> Table:
+def _beside_lines(refits: Refits, before: Calibration, test: CandidateTests) -> HypothesisTable:
     """Return the table where an oscillation makes lines within dwells, which nothing else could.
 
     Every known explanation has it, too; with noise from dwell to dwell it is the oscillation that is missing.
     """
-    name, known = test.oscillating, refits.with_effects(before, (test.oscillating,))
-    rest, odds = refits.assess(known, test.effective_tests), log_odds_of(test.p_values[test.oscillating])
-    family = known.model.effects[-1].family
-    made = Hypotheses(refits, known, rest)
-    table = made.table() if rest.consistent is False else made.quick_table()
+    name, with_oscillation = test.lines.oscillation, refits.with_effects(before, (test.lines.oscillation,))
+    test_beside = refits.assess(with_oscillation, test.effects.independent_tests)
+    log_odds = log_odds_of(test.effects.p_values[test.lines.oscillation])
+    family = with_oscillation.model.effects[-1].family
+    hypotheses = Hypotheses(refits, with_oscillation, test_beside)
+    table = hypotheses.table() if test_beside.consistent is False else hypotheses.quick_table()
     rows = [row for row in table.rows if row.driver != ALIKE]
-    none = [row.log_evidence for row in rows if not row.effects and not row.driver]
+    logs_without = [row.log_evidence for row in rows if not row.effects and not row.driver]
     both = [
         _with(refits, before, row, name, family) if row.effects else row for row in rows if row.effects or row.driver
     ]
-    alone = Hypothesis((name,), families=(family,), log_evidence=float(np.logaddexp.reduce(none)), refit=known)
-    nothing = Hypothesis(families=(NOTHING,), log_evidence=max(row.log_evidence for row in [*both, alone]) - odds)
+    log_alone = float(np.logaddexp.reduce(logs_without))
+    alone = Hypothesis((name,), families=(family,), log_evidence=log_alone, refit=with_oscillation)
+    nothing = Hypothesis(families=(NOTHING,), log_evidence=max(row.log_evidence for row in [*both, alone]) - log_odds)
     return table_of([*both, alone, nothing])
 
 
 def _with(refits: Refits, before: Calibration, row: Hypothesis, name: str, family: str) -> Hypothesis:
     """Return a row with one effect more, fitted together with the others if it is likely enough to be told."""
     effects, families = (*row.effects, name), tuple(dict.fromkeys([*row.families, family]))
-    refit = refits.with_effects(before, effects) if row.probability >= TOLD else None
+    refit = refits.with_effects(before, effects) if row.probability >= LISTED else None
     return replace(row, effects=effects, families=families, refit=refit)
 
 
-def _decided(refits: Refits, found: Diagnosis) -> Diagnosis:
+def _decided(refits: Refits, diagnosis: Diagnosis) -> Diagnosis:
     """Return the diagnosis with what its table says: the likeliest row, and the set that holds most probability."""
-    before, table = found.before, found.table
+    before, table = diagnosis.before, diagnosis.table
     assert table is not None
-    first, test = table.first, found.test
+    first, test = table.first, diagnosis.test
     if not dwell_noise_is_stated(before) and first.refit is not None:
-        judged = with_noise_as_stated(refits, before, first.refit)
-        again = refits.assess(judged)
-        again = again if test.oscillating else again.without_lines or again
-        if again.consistent is False:
-            found, test = replace(found, judged=judged, test=replace(again, vibration=test.vibration)), again
-    likely = (first, *table.rivals) if first.effects else ()
-    names = tuple(dict.fromkeys(name for row in likely for name in row.effects))
-    others = [row.effects for row in likely[1:] if len(row.effects) > 1 and not set(first.effects) & set(row.effects)]
+        before_in_noise_left = with_noise_as_stated(refits, before, first.refit)
+        retest = refits.assess(before_in_noise_left)
+        retest = retest if test.lines.oscillation else retest.without_lines or retest
+        if retest.consistent is False:
+            final_test = retest.with_vibration(test.lines.vibration)
+            diagnosis, test = replace(diagnosis, before_in_noise_left=before_in_noise_left, test=final_test), retest
+    credible = (first, *table.rivals) if first.effects else ()
+    names = tuple(dict.fromkeys(name for row in credible for name in row.effects))
+    pairs = [row.effects for row in credible[1:] if len(row.effects) > 1 and not set(first.effects) & set(row.effects)]
     return replace(
-        found,
+        diagnosis,
         missing=first.effects,
         unknown=first.unknown,
         noise=first.families == (NOISE,),
         ambiguity=names,
-        overlaps=_overlaps(found.test, first.effects, names),
-        together=tuple(others),
+        overlaps=_overlaps(diagnosis.test, first.effects, names),
+        together=tuple(pairs),
         as_scatter=table.families.get(NOISE, 0.0) > _DOUBT,
         after=first.refit if first.effects else None,
-        suspects=_suspects(found, table),
+        suspects=_suspects(diagnosis, table),
     )
 
 
@@ -161,31 +173,35 @@ def _overlaps(test: CandidateTests, first: tuple[str, ...], names: tuple[str, ..
     """Return the overlap of each other effect with the one of the first row that it overlaps most."""
     matrix, rank = overlap_matrix(test, names), {name: k for k, name in enumerate(names)}
     return {
-        name: float(np.nanmax([0.0, *(matrix[rank[name], rank[own]] for own in first)]))
+        name: float(np.nanmax([0.0, *(matrix[rank[name], rank[effect]] for effect in first)]))
         for name in names
         if name not in first
     }
 
 
-def _suspects(found: Diagnosis, table: Table) -> tuple[Suspect, ...]:
+def _suspects(diagnosis: Diagnosis, table: HypothesisTable) -> tuple[Suspect, ...]:
     """Return the single effects of the table, the likeliest first, each with its test and its refit."""
-    test, out, known = found.test, list[Suspect](), tuple(found.before.parameters)[12:]
+    effects, suspects = diagnosis.test.effects, list[Suspect]()
+    symbols_before = tuple(diagnosis.before.parameters)[12:]
     for row in table.rows:
-        if len(row.effects) != 1 or row.refit is None or len(out) == _SHOWN:
+        if len(row.effects) != 1 or row.refit is None or len(suspects) == _SHOWN:
             continue
         (name,) = row.effects
-        dof = 1 if name not in test.best else test.candidate(name).dof
-        score = test.scores.get(name, 0.0)
-        statistic = float(test.scan.statistics[test.best[name]]) if name in test.best else score
+        if name in effects.best:
+            statistic, dof = float(effects.scan.statistics[effects.best[name]]), effects.candidate(name).dof
+        else:
+            statistic, dof = effects.scores.get(name, 0.0), 1
         fits = row.refit.consistency.consistent is not False
-        out.append(Suspect(name, statistic, dof, test.p_values.get(name, 1.0), fits, row.refit, known))
-    return tuple(out)
+        p_value = effects.p_values.get(name, 1.0)
+        suspects.append(Suspect(name, statistic, dof, p_value, fits, row.refit, symbols_before))
+    return tuple(suspects)
 
 
-def _restoring_time_s(found: Diagnosis) -> float | None:
+def _restoring_time_s(diagnosis: Diagnosis) -> float | None:
     """Return the time constant of a drift that returns, in s, where that explains the run better than the random walk
     named; None where no walk was named, or where 1 of 20 true random walks gains as much likelihood."""
-    if found.after is None or not found.after.noise.walk_mps2_per_sqrt_s or found.test.walking not in found.missing:
+    after, named = diagnosis.after, diagnosis.test.effects.walk in diagnosis.missing
+    if after is None or not named or not after.noise.walk_mps2_per_sqrt_s:
         return None
-    gain, back_s = found.after.fit.gauss_markov_gain
-    return back_s if gain > _RETURNS else None
+    gain, restoring_time_s = after.fit.gauss_markov_gain
+    return restoring_time_s if gain > _RETURNS else None

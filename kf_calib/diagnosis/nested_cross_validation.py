@@ -49,11 +49,13 @@ def nested_cross_validation(
     folds = min(folds, len(groups))
     errors, expected, counts = list[Floats](), list[Floats](), dict[str, int]()
     for number in range(folds):
-        left = sorted(k for group in groups[number::folds] for k in group)
+        held_out = sorted(k for group in groups[number::folds] for k in group)
         with one_blas_thread():
-            kept = evaluate(dwells_without(start.fit.dwells, left), start.bench, start.settings, start.linearised.slews)
-        result = improve(kept, accept_first=True).result
-        squares, variances = _prediction_errors(start, result, left)
+            others = evaluate(
+                dwells_without(start.fit.dwells, held_out), start.bench, start.settings, start.linearised.slews
+            )
+        result = improve(others, accept_first=True).result
+        squares, variances = _prediction_errors(start, result, held_out)
         errors.append(squares)
         expected.append(variances)
         for effect in result.model.effects:
@@ -64,7 +66,7 @@ def nested_cross_validation(
     return NestedCrossValidation(rms, floor, folds, counts)
 
 
-def _prediction_errors(start: Calibration, result: Calibration, left: list[int]) -> tuple[Floats, Floats]:
+def _prediction_errors(start: Calibration, result: Calibration, held_out: list[int]) -> tuple[Floats, Floats]:
     """Return the squared errors of the held-out dwell means and the variances that noise gives; (3 len(left),) each, or
     (len(left),) of the size of f where no angles are used."""
     if result.estimate.undetermined.size:
@@ -73,8 +75,10 @@ def _prediction_errors(start: Calibration, result: Calibration, left: list[int])
             "run of more orientations."
         )
     noise, state = result.noise.for_goodness_of_fit, result.linearised.state
-    means = linearised_at(start.fit.dwells, result.model, state, result.noise.weights).means[left]
+    means = linearised_at(start.fit.dwells, result.model, state, result.noise.weights).means[held_out]
     spread = means.design @ result.estimate.covariance @ np.swapaxes(means.design, 1, 2)
     spread = spread + mean_covariances(noise.of_readings, means, state)
-    told = told_of(means.readings - means.design @ result.estimate.state, spread, means, state, noise.attitude_unknown)
-    return (told.errors_mps2**2).ravel(), np.einsum("dii->di", told.covariance).ravel()
+    errors = told_of(
+        means.readings - means.design @ result.estimate.state, spread, means, state, noise.attitude_unknown
+    )
+    return (errors.errors_mps2**2).ravel(), np.einsum("dii->di", errors.covariance).ravel()

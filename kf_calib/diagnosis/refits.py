@@ -8,7 +8,7 @@ from os import PathLike
 
 from kf_calib.bench.streams import Source
 from kf_calib.diagnosis.candidate_tests import CandidateTests, assess_candidates, candidate_frame
-from kf_calib.diagnosis.unknown_effect import Family, families
+from kf_calib.diagnosis.unknown_effect import FormulaFamily, families
 from kf_calib.effects import Effect
 from kf_calib.errors import InputError
 from kf_calib.estimation.calibration import calibrate, evaluate_fit
@@ -37,10 +37,11 @@ class Refits:
     def __init__(self, source: Source | str | PathLike[str] | None = None) -> None:
         source = None if source is None else opened(source)
         self.source = None if isinstance(source, Table) else source
-        self.frames, self.frames_beside_walk = list[Frame](), list[Frame]()  # each keeps the last one
+        self._frame: Frame | None = None  # only the last one is kept, to save memory
+        self._frame_beside_walk: Frame | None = None
         # with each value what its key is made of, since the id of an object that is gone may be used again
         self._refits = dict[tuple[int, tuple[str, ...]], tuple[Calibration, Calibration]]()
-        self._families = dict[Hashable, tuple[Fit, list[Family]]]()
+        self._families = dict[Hashable, tuple[Fit, list[FormulaFamily]]]()
 
     def of(self, before: Calibration, effects: Sequence[str]) -> Calibration:
         """The run of a calibration with these effects in the model instead of those it had."""
@@ -59,14 +60,24 @@ class Refits:
 
     def assess(self, result: Calibration, tests: float | None = None) -> CandidateTests:
         """Score tests of all candidates against a calibration, see ``assess_candidates``."""
-        return assess_candidates(result.fit, tests, frames=self.frames)
+        return assess_candidates(result.fit, tests, frame=self._frame_of(result.fit))
 
-    def families(self, fitted: Fit, known: Sequence[Effect]) -> list[Family]:
+    def assess_beside_walk(self, result: Calibration, tests: float) -> CandidateTests:
+        """The same against a calibration with a random walk of the biases, whose frame is kept apart."""
+        self._frame_beside_walk = candidate_frame(result.fit, self._frame_beside_walk)
+        return assess_candidates(result.fit, tests, frame=self._frame_beside_walk)
+
+    def families(self, fitted: Fit, known: Sequence[Effect]) -> list[FormulaFamily]:
         """All families of formulas, each tested on what the fit leaves and compared with the effects ``known``."""
         key = id(fitted), tuple((str(effect), effect.value) for effect in known)
         if key not in self._families:
-            self._families[key] = fitted, families(fitted, known, candidate_frame(fitted, self.frames))
+            self._families[key] = fitted, families(fitted, known, self._frame_of(fitted))
         return self._families[key][1]
+
+    def _frame_of(self, fitted: Fit) -> Frame:
+        """Return the columns of all candidates in the noise of a fit: those of the last fit if they serve."""
+        self._frame = candidate_frame(fitted, self._frame)
+        return self._frame
 
     def _refit(self, before: Calibration, effects: tuple[str, ...]) -> Calibration:
         """Fit the model with these effects, and read the source again where the statistics of the dwells do not

@@ -60,17 +60,17 @@ class Driver:
 
 def drivers_of(result: Calibration) -> list[Driver]:
     """The quantities that vary in a run, those that explain most of the misfit first."""
-    fitted, known = result.fit, quantities(result.bench.axes)
     gimbals = range(1, len(result.bench.axes) + 1)
     functions = _FUNCTIONS | {f"q{k}": _WAVES for k in gimbals}
     words = _WORDS | {f"q{k}": f"angle of gimbal {k}" for k in gimbals}
-    values = {name: each for name, each in quantity_means(result, list(functions)).items() if _varies(each)}
-    falls = _falls(fitted, {name: _formulas(name, functions[name]) for name in values})
-    found = [
-        Driver(name, words[name], known[name].unit, each, *falls[name], *_beyond_chance(*falls[name], result))
-        for name, each in values.items()
+    values = {name: means for name, means in quantity_means(result, list(functions)).items() if _varies(means)}
+    gains = _delta_chi2(result.fit, {name: _formulas(name, functions[name]) for name in values})
+    units = {name: quantity.unit for name, quantity in quantities(result.bench.axes).items()}
+    drivers = [
+        Driver(name, words[name], units[name], means, *gains[name], *_beyond_chance(*gains[name], result))
+        for name, means in values.items()
     ]
-    return sorted(found, key=lambda each: (-each.share, each.p_value))
+    return sorted(drivers, key=lambda each: (-each.share, each.p_value))
 
 
 def _varies(values: Floats) -> bool:
@@ -95,10 +95,10 @@ def _beyond_chance(delta_chi2: float, dof: int, result: Calibration) -> tuple[fl
     rest = misfit.dof - dof
     if not dof or rest <= 0:
         return 0.0, 1.0
-    left = max(misfit.statistic - delta_chi2, 0.0) / rest
-    p_value = f_tail(dof, rest, delta_chi2 / dof / max(left, 1.0))
+    unexplained = max(misfit.statistic - delta_chi2, 0.0) / rest
+    p_value = f_tail(dof, rest, delta_chi2 / dof / max(unexplained, 1.0))
     excess = misfit_beyond_noise(result) / misfit.dof
-    return (float(np.clip(1.0 - (left - 1.0) / excess, 0.0, 1.0)) if excess > 0.0 else 0.0), p_value
+    return (float(np.clip(1.0 - (unexplained - 1.0) / excess, 0.0, 1.0)) if excess > 0.0 else 0.0), p_value
 
 
 def _formulas(symbol: str, functions: Sequence[str]) -> list[str]:
@@ -111,10 +111,13 @@ def _formulas(symbol: str, functions: Sequence[str]) -> list[str]:
             *(f"drr{k} = {text}" for k, text in enumerate(texts[:2]))]  # fmt: skip
 
 
-def _falls(fitted: Fit, texts: dict[str, list[str]]) -> dict[str, tuple[float, int]]:
+def _delta_chi2(fitted: Fit, texts: dict[str, list[str]]) -> dict[str, tuple[float, int]]:
     """Return for each driver the decrease of chi-squared by all its functions together, and their rank."""
     bench = fitted.linearised.model.bench
-    groups = [[formula(text, bench.axes, bench.gravity_mps2, checked=False) for text in own] for own in texts.values()]
+    groups = [
+        [formula(text, bench.axes, bench.gravity_mps2, checked=False) for text in of_driver]
+        for of_driver in texts.values()
+    ]
     with one_blas_thread():
         return dict(
             zip(texts, joint_delta_chi2(fitted.linearised, fitted.noise.for_goodness_of_fit, groups), strict=True)
@@ -134,8 +137,8 @@ def is_function_of(values: Floats, driver: Driver) -> bool:
         basis, spread = np.column_stack(columns), float(np.ptp(y))
         if len(x) <= basis.shape[1] + 2:
             return False
-        left = y - basis @ np.linalg.lstsq(basis, y, rcond=None)[0]
-        if spread > 0.0 and left.std() > _NEARLY * y.std():
+        residuals = y - basis @ np.linalg.lstsq(basis, y, rcond=None)[0]
+        if spread > 0.0 and residuals.std() > _NEARLY * y.std():
             return False
     return True
 

@@ -13,7 +13,7 @@ from kf_calib.design.next_orientation import Advice
 from kf_calib.diagnosis.candidate_tests import CandidateTests
 from kf_calib.diagnosis.detectability import Detectable, Unseen, detectable, sensor_grade, unseen
 from kf_calib.diagnosis.explanation import Explanation
-from kf_calib.diagnosis.hypothesis_table import SURE, Hypothesis, Table
+from kf_calib.diagnosis.hypothesis_table import SURE, Hypothesis, HypothesisTable
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.residual_drivers import Driver, drivers_of
 from kf_calib.diagnosis.unknown_effect import Description, channel_of, describe, explained_share
@@ -63,15 +63,15 @@ class Diagnosis:
     that was not stated has more than 1 %. after: the calibration with the missing effects. suspects: single effects
     that were refitted, the likeliest first.
 
-    back_s: time constant with which the biases may return, s, in place of the random walk that is named (None: they do
-    not). judged: the run with the noise that the likeliest explanation leaves, where noise was estimated (None: it is
-    that of ``before``).
+    restoring_time_s: time constant with which the biases may return, s, in place of the random walk that is named
+    (None: they do not). before_in_noise_left: ``before`` in the noise that the likeliest explanation leaves, where
+    noise was estimated (None: it is that of ``before``).
     """
 
     before: Calibration
     test: CandidateTests
     verdict: str = ""
-    table: Table | None = None
+    table: HypothesisTable | None = None
     suspects: tuple[Suspect, ...] = ()
     missing: tuple[str, ...] = ()
     unknown: bool = False
@@ -81,8 +81,8 @@ class Diagnosis:
     after: Calibration | None = None
     together: tuple[tuple[str, str], ...] = ()
     as_scatter: bool = False
-    back_s: float | None = None
-    judged: Calibration | None = None
+    restoring_time_s: float | None = None
+    before_in_noise_left: Calibration | None = None
 
     def __repr__(self) -> str:
         return f"<Diagnosis: {self.verdict}>"
@@ -128,15 +128,15 @@ class Diagnosis:
         """What could be added to the model, the best first: what is missing, or the formula that describes an unknown
         misfit, which is fitted here; then the other suspects, of which those that fit come first."""
         best = self._best_explanation
-        rest = [each for each in self.suspects if (each.name,) != self.missing]
-        rest.sort(key=lambda each: not each.fits)  # stable: by significance
-        others = [Explanation((each.name,), self.before, each.refit, each.fits, each.p_value) for each in rest]
+        suspects = [each for each in self.suspects if (each.name,) != self.missing]
+        suspects.sort(key=lambda each: not each.fits)  # stable: by significance
+        others = [Explanation((each.name,), self.before, each.refit, each.fits, each.p_value) for each in suspects]
         return others if best is None else [best, *others]
 
     @property
     def _best_explanation(self) -> Explanation | None:
         if self.missing and self.after is not None:
-            alone = self.test.p_values.get(self.missing[0]) if len(self.missing) == 1 else None
+            alone = self.test.effects.p_values.get(self.missing[0]) if len(self.missing) == 1 else None
             return Explanation(self.missing, self.before, self.after, True, alone)
         if self.description is None:
             return None
@@ -171,21 +171,23 @@ class Diagnosis:
     def next_orientation(self) -> tuple[Advice, str] | None:
         """Where to go next, and why: to tell equal suspects apart, to size the one there is, or to show what is
         hidden."""
-        fitted, test = (self.judged or self.before).fit, self.test
-        named = [name for name in self.ambiguity if name in test.best]
+        fitted, test = (self.before_in_noise_left or self.before).fit, self.test
+        named = [name for name in self.ambiguity if name in test.effects.best]
         if named and not self.unknown:
-            first = test.candidate(named[0])
+            first = test.effects.candidate(named[0])
             alone = [row.effects[0] for row in (self.table.rivals if self.table else ()) if len(row.effects) == 1]
-            others = [test.candidate(name).effect for name in alone if name in test.best]
+            others = [test.effects.candidate(name).effect for name in alone if name in test.effects.best]
             rivals = others[:_TOLD_APART] if len(self.missing) == 1 else []
-            advice = advise.to_tell_apart(fitted, first.effect, test.scan.coefficients(first), rivals)
+            advice = advise.to_tell_apart(fitted, first.effect, test.effects.scan.coefficients(first), rivals)
             if advice is None:
                 return None
             words = f"tells {named[0]} from {', '.join(advice.told)}" if advice.told else f"shows {named[0]} best"
             stay = "" if advice.stay_s is None else f" in {span(advice.stay_s)} there"
             return advice, f"{words}: separation {advice.before:.1f} -> {advice.after:.1f} sigma{stay}"
-        hidden = [test.candidate(name).effect for name in test.invisible if name in test.best]
-        shown = advise.to_show(fitted, hidden)
-        if shown is None or not shown[1]:
+        hidden = [test.effects.candidate(name).effect for name in test.invisible if name in test.effects.best]
+        advice_and_count = advise.to_show(fitted, hidden)
+        if advice_and_count is None or not advice_and_count[1]:
             return None
-        return shown[0], f"would show {shown[1]} of {len(hidden)} effects that these orientations cannot"
+        return advice_and_count[
+            0
+        ], f"would show {advice_and_count[1]} of {len(hidden)} effects that these orientations cannot"

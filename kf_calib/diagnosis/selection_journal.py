@@ -102,21 +102,21 @@ class Journal:
             )
 
 
-def figures(found: Diagnosis) -> dict[str, float]:
+def figures(diagnosis: Diagnosis) -> dict[str, float]:
     """The figures that are compared in a replay: the p-value, the errors, and every parameter with its sigma (SI)."""
-    result, out = found.before, dict[str, float | None]()
-    out |= {
-        "p_value": found.test.p_value,
+    result, values = diagnosis.before, dict[str, float | None]()
+    values |= {
+        "p_value": diagnosis.test.p_value,
         "residual_rms_mps2": result.residual_rms_mps2,
         "held_out_rms_mps2": result.held_out_rms_mps2,
         "held_out_floor_mps2": result.held_out_floor_mps2,
     }
     for parameter in result.parameters.values():
-        out |= {parameter.symbol: parameter.value, f"sigma {parameter.symbol}": parameter.sigma}
-    return {key: value for key, value in out.items() if value is not None}
+        values |= {parameter.symbol: parameter.value, f"sigma {parameter.symbol}": parameter.sigma}
+    return {key: value for key, value in values.items() if value is not None}
 
 
-def write(path: Path, state: Improvement, origin: Origin) -> None:
+def write_journal(path: Path, state: Improvement, origin: Origin) -> None:
     """Write a journal of the steps so far.
 
     An existing file of that name is replaced as a whole; it is never left half written.
@@ -140,10 +140,10 @@ def write(path: Path, state: Improvement, origin: Origin) -> None:
 
 def _entry(step: SelectionStep) -> dict[str, Any]:
     """Return the table of one step."""
-    out: dict[str, Any] = {} if step.added is None else {"added": step.added}
-    out |= {} if step.probability is None else {"probability": step.probability}
+    entry: dict[str, Any] = {} if step.added is None else {"added": step.added}
+    entry |= {} if step.probability is None else {"probability": step.probability}
     tests = [vars(each) for each in step.dropped]
-    return out | {"by": step.by, "undone": step.undone, "dropped": tests, "figures": figures(step.found)}
+    return entry | {"by": step.by, "undone": step.undone, "dropped": tests, "figures": figures(step.diagnosis)}
 
 
 class _Recording(TypedDict):
@@ -173,7 +173,7 @@ class _Content(TypedDict):
     sha256: NotRequired[dict[TEXT, TEXT]]
 
 
-def read(path: Path) -> Journal:
+def read_journal(path: Path) -> Journal:
     """Read a journal and check all that can be checked before the Python files that it names have run.
 
     Raises InputError, with the path, where the file cannot be read or is no journal.
@@ -198,7 +198,7 @@ def _choice(step: _Step) -> Choice:
     return Choice(step.get("added"), tuple(each["name"] for each in step["dropped"]), step["by"], step["figures"])
 
 
-def replayed(
+def replay_journal(
     journal: Journal, start: Calibration, refits: Refits, on_step: Callable[[Improvement], None] | None = None
 ) -> tuple[Improvement, float]:
     """The steps of a journal repeated, and the largest relative difference from its figures (0: equal to the last bit).
@@ -206,10 +206,10 @@ def replayed(
     start: the calibration with the first model. refits: those of the run. on_step: called after each step.
     """
     state = begin(start, refits)
-    differences = [_difference(journal.start, figures(state.found))]
+    differences = [_difference(journal.start, figures(state.diagnosis))]
     for choice in journal.choices:
         state = take_step(state, refits, choice.added, choice.dropped, choice.by)
-        differences.append(_difference(choice.figures, figures(state.found)))
+        differences.append(_difference(choice.figures, figures(state.diagnosis)))
         if on_step is not None:
             on_step(state)
     return replace(state, asked=journal.asked), max(differences)

@@ -46,14 +46,14 @@ class Difference:
 
 def differences(first: Calibration, second: Calibration, same_recording: bool) -> tuple[Difference, ...]:
     """The differences of the parameters that both models have: of the twelve, then of coefficients of effects."""
-    out, others = list[Difference](), second.parameters
-    for name, own in first.parameters.items():
+    rows, others = list[Difference](), second.parameters
+    for name, parameter in first.parameters.items():
         if name in others:
-            sigmas = own.sigma, others[name].sigma
-            known = [sigma for sigma in sigmas if sigma is not None]
-            both = max(known, default=0.0) if same_recording else float(np.hypot.reduce(known))
-            out.append(Difference(own, others[name], both if len(known) == len(sigmas) else None))
-    return tuple(out)
+            sigmas = parameter.sigma, others[name].sigma
+            determined = [sigma for sigma in sigmas if sigma is not None]
+            sigma_of_both = max(determined, default=0.0) if same_recording else float(np.hypot.reduce(determined))
+            rows.append(Difference(parameter, others[name], sigma_of_both if len(determined) == len(sigmas) else None))
+    return tuple(rows)
 
 
 @dataclass(frozen=True)
@@ -78,11 +78,11 @@ class SideBySide:
         if self.same_recording:
             return None
         one, other = self.first.before.estimate, self.second.before.estimate
-        seen: Mask = ~(one.unseen | other.unseen)
-        if not seen.any():
+        determined: Mask = ~(one.unseen | other.unseen)
+        if not determined.any():
             return None
-        differ = (other.parameters - one.parameters)[seen]
-        spread = (one.parameter_covariance + other.parameter_covariance)[np.ix_(seen, seen)]
+        differ = (other.parameters - one.parameters)[determined]
+        spread = (one.parameter_covariance + other.parameter_covariance)[np.ix_(determined, determined)]
         return chi_squared_tail(len(differ), float(differ @ np.linalg.solve(spread, differ)))
 
     @property

@@ -61,21 +61,21 @@ class SelectionStep:
     """One change of the model.
 
     added: the effect that was added, as it was written (None: no effect). dropped: effects that were taken out. by: who
-    chose the step. found: the diagnosis of the model after the step. undone: whether the user took the step back.
+    chose the step. diagnosis: that of the model after the step. undone: whether the user took the step back.
     probability: that with which the added effect was missing before the step (None: it was not weighed).
     """
 
     added: str | None
     dropped: tuple[Removal, ...]
     by: By
-    found: Diagnosis
+    diagnosis: Diagnosis
     undone: bool = False
     probability: float | None = None
 
     @property
     def result(self) -> Calibration:
         """The calibration after the step."""
-        return self.found.before
+        return self.diagnosis.before
 
     @property
     def name(self) -> str | None:
@@ -90,18 +90,17 @@ class SelectionStep:
     @cached_property
     def remarks(self) -> tuple[str, ...]:
         """Sentences of caution about the size or the significance of the effect that was added."""
-        own = [each for each in self.removals if each.name == self.name]
-        out = list[str]()
-        for each in own:
-            size = float(np.sqrt(max(each.statistic, 0.0)))
-            if each.needed and size < _NEAR_THRESHOLD:
-                out.append(
-                    f"{each.name} is {size:.1f} sigma in size, near where it could just be found: such sizes come out "
+        sentences = list[str]()
+        for test in (removal for removal in self.removals if removal.name == self.name):
+            size = float(np.sqrt(max(test.statistic, 0.0)))
+            if test.needed and size < _NEAR_THRESHOLD:
+                sentences.append(
+                    f"{test.name} is {size:.1f} sigma in size, near where it could just be found: such sizes come out "
                     "high on average; measure it on a run of its own before relying on it."
                 )
-            if not each.needed:
-                out.append(f"{each.name} explains no more than chance would (p {format_p(each.p_value)}).")
-        return tuple(out)
+            if not test.needed:
+                sentences.append(f"{test.name} explains no more than chance would (p {format_p(test.p_value)}).")
+        return tuple(sentences)
 
 
 @dataclass(frozen=True)
@@ -155,14 +154,14 @@ class Improvement:
         return tuple(step for step in self.history if not step.undone)
 
     @property
-    def found(self) -> Diagnosis:
+    def diagnosis(self) -> Diagnosis:
         """The diagnosis of the current model."""
-        return self.steps[-1].found if self.steps else self.start
+        return self.steps[-1].diagnosis if self.steps else self.start
 
     @property
     def result(self) -> Calibration:
         """The calibration with the current model."""
-        return self.found.before
+        return self.diagnosis.before
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -170,11 +169,11 @@ class Improvement:
         return tuple(self.result.settings.effects)
 
     @property
-    def kept(self) -> set[str]:
+    def protected(self) -> set[str]:
         """Effects that are never taken out automatically: those of the user, and those added again after a removal."""
         users = {step.name for step in self.steps if step.name and step.by == "user"}
-        gone = {each.name for step in self.steps for each in step.dropped}
-        return {str(effect) for effect in self.start.before.model.effects} | users | gone
+        dropped = {removal.name for step in self.steps for removal in step.dropped}
+        return {str(effect) for effect in self.start.before.model.effects} | users | dropped
 
     @cached_property
     def removals(self) -> tuple[Removal, ...]:
@@ -186,51 +185,50 @@ class Improvement:
         """What was said of the recording, and of the last model."""
         first = self.start.before
         of_models = evaluate_fit(first.fit, first.settings).warnings
-        said = [sentence for sentence in first.warnings if sentence not in of_models]
-        return list(dict.fromkeys([*said, *self.result.warnings]))
+        of_recording = [sentence for sentence in first.warnings if sentence not in of_models]
+        return list(dict.fromkeys([*of_recording, *self.result.warnings]))
 
     @property
     def because(self) -> Because:
         """Why the improvement stops with the current model."""
-        found = self.found
-        if self.asked and found.test.consistent is False:
+        diagnosis = self.diagnosis
+        if self.asked and diagnosis.test.consistent is False:
             return "asked"
-        if found.test.consistent is None:
+        if diagnosis.test.consistent is None:
             return "undetermined"
-        if found.test.consistent:
+        if diagnosis.test.consistent:
             return "consistent"
-        return "unknown" if found.unknown else "ambiguous"
+        return "unknown" if diagnosis.unknown else "ambiguous"
 
     @cached_property
     def reason(self) -> str:
         """The same in one or two sentences."""
-        verdict, names = self.found.verdict, " and ".join(each.name for each in self.alternatives)
-        far = max(self.spreads, key=lambda spread: spread.sigmas, default=None)
-        differ = f"; the twelve differ by up to {far.sigmas:.1f} sigma ({far.parameter.symbol})" if far else ""
-        rivals = _rivals(self.found)
+        verdict, names = self.diagnosis.verdict, " and ".join(each.name for each in self.alternatives)
+        widest = max(self.spreads, key=lambda spread: spread.sigmas, default=None)
+        differ = f"; the twelve differ by up to {widest.sigmas:.1f} sigma ({widest.parameter.symbol})" if widest else ""
+        rivals = _rivals(self.diagnosis)
         if rivals and self.because == "ambiguous":
-            taken = "none was added (--accept-first takes the likeliest)"
-            return f"This run cannot decide among {names}: {taken}{differ}. {verdict}"
+            addition = "none was added (--accept-first takes the likeliest)"
+            return f"This run cannot decide among {names}: {addition}{differ}. {verdict}"
         equals = f" But this run cannot decide among {names}; one was taken{differ}." if names and not rivals else ""
         if self.because == "asked":
             return f"Ended by you. {verdict}{equals}"
         if self.because == "consistent":
-            p_value = format_p(self.found.test.p_value)
-            return f"Nothing is left that noise would not leave (p {p_value}).{equals}"
-        if self.found.missing and self.because == "ambiguous":
+            return f"Nothing is left that noise would not leave (p {format_p(self.diagnosis.test.p_value)}).{equals}"
+        if self.diagnosis.missing and self.because == "ambiguous":
             return f"{verdict} No effect is sure: none was added (--accept-first takes the likeliest).{equals}"
         return f"{verdict}{equals}"
 
     @cached_property
     def spreads(self) -> tuple[Spread, ...]:
         """The range over all alternatives of each of the twelve parameters that all of them determine."""
-        out = list[Spread]()
+        spreads = list[Spread]()
         for symbol in paper_parameters.SYMBOLS if self.alternatives else ():
-            own = [each.result.parameters[symbol] for each in self.alternatives]
-            values = [p.value for p in own if p.value is not None]
-            if len(values) == len(own):
-                out.append(Spread(max(own, key=lambda p: p.sigma or 0.0), min(values), max(values)))
-        return tuple(out)
+            parameters = [each.result.parameters[symbol] for each in self.alternatives]
+            values = [p.value for p in parameters if p.value is not None]
+            if len(values) == len(parameters):
+                spreads.append(Spread(max(parameters, key=lambda p: p.sigma or 0.0), min(values), max(values)))
+        return tuple(spreads)
 
 
 def improve(
@@ -247,7 +245,7 @@ def improve(
     """
     start, refits = calibration_of(run, refits)
     state = begin(start, refits)
-    while (name := next_effect(state.found, accept_first)) is not None:
+    while (name := next_effect(state.diagnosis, accept_first)) is not None:
         state = take_step(state, refits, name, None, "diagnosis")
         if on_step is not None:
             on_step(state)
@@ -260,48 +258,40 @@ def begin(start: Calibration, refits: Refits) -> Improvement:
 
 
 def _with_alternatives(state: Improvement, refits: Refits) -> Improvement:
-    """Return the improvement with the effects among which its run cannot decide."""
-    return replace(state, alternatives=_alternatives(state, refits))
-
-
-def _alternatives(state: Improvement, refits: Refits) -> tuple[Alternative, ...]:
-    """Return the effects among which a run cannot decide: those of its diagnosis, or those of an earlier one."""
-    found, result = state.found, state.result
-    if _rivals(found) and found.table is not None:
-        rows = [(row.effects, row.refit) for row in (found.table.first, *found.table.rivals) if row.effects]
-        return tuple(Alternative(" + ".join(names), refit) for names, refit in rows if refit is not None)
-    out, inside = list[Alternative](), {str(effect): k for k, effect in enumerate(result.model.effects)}
-    for before, step in zip([state.start, *(step.found for step in state.steps)], state.steps, strict=False):
-        if step.name not in inside or step.name not in before.ambiguity:
+    """Return the improvement with the effects among which its run cannot decide: those of its diagnosis, or those of an
+    earlier one."""
+    diagnosis, result = state.diagnosis, state.result
+    if _rivals(diagnosis) and diagnosis.table is not None:
+        rows = [(row.effects, row.refit) for row in (diagnosis.table.first, *diagnosis.table.rivals) if row.effects]
+        equal = [Alternative(" + ".join(names), refit) for names, refit in rows if refit is not None]
+        return replace(state, alternatives=tuple(equal))
+    alternatives, effects = list[Alternative](), list(result.settings.effects)
+    index = {str(effect): k for k, effect in enumerate(result.model.effects)}
+    for before, step in zip([state.start, *(step.diagnosis for step in state.steps)], state.steps, strict=False):
+        if step.name not in index or step.name not in before.ambiguity:
             continue
-        others = [name for name in before.ambiguity if name not in inside]
-        own = [Alternative(name, _with_instead(result, refits, inside[step.name], name)) for name in others]
-        own = [each for each in own if each.result.consistency.consistent is not False]
-        out += [Alternative(step.name, result), *own] if own else []
-    return tuple(out)
+        k, others = index[step.name], [name for name in before.ambiguity if name not in index]
+        refitted = {name: refits.of(result, [*effects[:k], name, *effects[k + 1 :]]) for name in others}
+        replacements = [Alternative(name, refit) for name, refit in refitted.items()]
+        replacements = [each for each in replacements if each.result.consistency.consistent is not False]
+        alternatives += [Alternative(step.name, result), *replacements] if replacements else []
+    return replace(state, alternatives=tuple(alternatives))
 
 
-def _with_instead(result: Calibration, refits: Refits, place: int, name: str) -> Calibration:
-    """Return the calibration with another effect in one place of the list."""
-    effects = list(result.settings.effects)
-    effects[place] = name
-    return refits.of(result, effects)
-
-
-def next_effect(found: Diagnosis, accept_first: bool = False) -> str | None:
+def next_effect(diagnosis: Diagnosis, accept_first: bool = False) -> str | None:
     """The effect to add next: the likeliest where it is missing with 95 % probability, whether alone or with others.
 
     None where nothing is missing, or where the choice is left to a person. accept_first: take the likeliest anyway.
     """
-    if found.test.consistent is not False or not found.missing or found.table is None:
+    if diagnosis.test.consistent is not False or not diagnosis.missing or diagnosis.table is None:
         return None
-    first = max(found.missing, key=lambda name: found.table.probability((name,)) if found.table else 0.0)
-    return first if accept_first or found.table.probability((first,)) >= SURE else None
+    first = max(diagnosis.missing, key=lambda name: diagnosis.table.probability((name,)) if diagnosis.table else 0.0)
+    return first if accept_first or diagnosis.table.probability((first,)) >= SURE else None
 
 
-def _rivals(found: Diagnosis) -> list[str]:
+def _rivals(diagnosis: Diagnosis) -> list[str]:
     """Return the effects that could be missing in place of those that are named, where these are not sure."""
-    return [] if found.sure else [name for name in found.ambiguity if name not in found.missing]
+    return [] if diagnosis.sure else [name for name in diagnosis.ambiguity if name not in diagnosis.missing]
 
 
 def extend(state: Improvement, refits: Refits, names: Sequence[str], by: By) -> Improvement:
@@ -323,14 +313,14 @@ def take_step(
     if added is not None:
         _refuse(state.result, added)
     result = state.result if added is None else refits.with_effects(state.result, (added,))
-    kept = state.kept | ({_name(added, result)} if added is not None else set[str]())
-    out = list[Removal]()
-    while (weak := _next_out(result, kept, dropped, len(out))) is not None:
-        result = refits.of(result, _less(result, weak.name))
-        out.append(weak)
-    table = state.found.table
-    share = None if added is None or table is None else table.of_added(added, _name(added, result))
-    step = SelectionStep(added, tuple(out), by, diagnose(result, refits), probability=share)
+    protected = state.protected | ({_name(added, result)} if added is not None else set[str]())
+    removed = list[Removal]()
+    while (removal := _next_removal(result, protected, dropped, len(removed))) is not None:
+        result = refits.of(result, _without(result, removal.name))
+        removed.append(removal)
+    table = state.diagnosis.table
+    probability = None if added is None or table is None else table.probability_of_added(added, _name(added, result))
+    step = SelectionStep(added, tuple(removed), by, diagnose(result, refits), probability=probability)
     return _with_alternatives(replace(state, history=(*state.history, step)), refits)
 
 
@@ -357,37 +347,39 @@ def removals(fitted: Fit) -> tuple[Removal, ...]:
 
     linearised = fitted.linearised
     upper = square_root_information.accumulate(fitted.all_rows(), fitted.steps)
-    rank, least, out = square_root_information.rank(upper[:-1]), upper[-1, -1] ** 2, list[Removal]()
+    rank, misfit, tests = square_root_information.rank(upper[:-1]), upper[-1, -1] ** 2, list[Removal]()
     for effect in linearised.model.effects:
         if not effect.coefficients:  # a random walk is noise, which is judged by its likelihood
             gain = 2.0 * fitted.walk_gain
-            out.append(Removal(str(effect), gain, 1, 0.5 * float(chdtrc(1, max(gain, 0.0)))))
+            tests.append(Removal(str(effect), gain, 1, 0.5 * float(chdtrc(1, max(gain, 0.0)))))
             continue
         rest = np.delete(upper, linearised.model.parts[str(effect)], axis=1)
-        corner = square_root_information.accumulate([rest])
-        rise, dof = float(max(corner[-1, -1] ** 2 - least, 0.0)), rank - square_root_information.rank(corner[:-1])
-        out.append(Removal(str(effect), rise, dof, float(chdtrc(dof, rise)) if dof > 0 else 1.0))
-    return tuple(out)
+        reduced = square_root_information.accumulate([rest])
+        rise, dof = float(max(reduced[-1, -1] ** 2 - misfit, 0.0)), rank - square_root_information.rank(reduced[:-1])
+        tests.append(Removal(str(effect), rise, dof, float(chdtrc(dof, rise)) if dof > 0 else 1.0))
+    return tuple(tests)
 
 
-def _next_out(result: Calibration, kept: set[str], dropped: Sequence[str] | None, done: int) -> Removal | None:
-    """Return the next effect to take out: the next of ``dropped``, or else the one that is needed least."""
+def _next_removal(
+    result: Calibration, protected: set[str], dropped: Sequence[str] | None, count: int
+) -> Removal | None:
+    """Return the next effect to take out after ``count``: that of ``dropped``, or else the one that is needed least."""
     tests = {each.name: each for each in removals(result.fit)}
     if dropped is not None:
-        return _there(tests, dropped[done]) if done < len(dropped) else None
-    weak = [each for each in tests.values() if not each.needed and each.name not in kept]
-    return max(weak, key=lambda each: each.p_value, default=None)
+        return _removal_of(tests, dropped[count]) if count < len(dropped) else None
+    unneeded = [each for each in tests.values() if not each.needed and each.name not in protected]
+    return max(unneeded, key=lambda each: each.p_value, default=None)
 
 
-def _there(tests: dict[str, Removal], name: str) -> Removal:
+def _removal_of(tests: dict[str, Removal], name: str) -> Removal:
     """Return the test of an effect of the model by name."""
     if name not in tests:
-        inside = f"it has {', '.join(tests)}." if tests else "it has the twelve parameters only."
-        raise InputError(f"{name!r} is not in the model, so it cannot be dropped: {inside}")
+        what_it_has = f"it has {', '.join(tests)}." if tests else "it has the twelve parameters only."
+        raise InputError(f"{name!r} is not in the model, so it cannot be dropped: {what_it_has}")
     return tests[name]
 
 
-def _less(result: Calibration, name: str) -> tuple[str, ...]:
+def _without(result: Calibration, name: str) -> tuple[str, ...]:
     """Return the effects of a model without one of them."""
     both = zip(result.model.effects, result.settings.effects, strict=True)
     return tuple(text for effect, text in both if str(effect) != name)

@@ -36,8 +36,8 @@ JUMP = "time (a jump)"
 DECAY = "time (a decay)"
 ARRIVAL = "time since arrival"
 PERIODIC = "time (periodic)"
-IRREGULAR = "nothing that was recorded (irregular from dwell to dwell)"
-WITHIN = "time (irregular, within dwells too)"
+BETWEEN_DWELLS = "nothing that was recorded (irregular from dwell to dwell)"
+WITHIN_DWELLS = "time (irregular, within dwells too)"
 
 
 _CLASSES = (
@@ -67,7 +67,7 @@ class Description:
 
 
 @dataclass(frozen=True)
-class Family:
+class FormulaFamily:
     """Formulas of one driver, tested together as one candidate.
 
     driver: in words, what the misfit would depend on. texts: the formulas. delta_chi2: fall of chi-squared with all of
@@ -87,9 +87,9 @@ class Family:
         """The formulas as they can be added to a model, each with a name."""
         return self.formulas_beside(())
 
-    def formulas_beside(self, taken: Collection[str]) -> tuple[str, ...]:
+    def formulas_beside(self, names_in_model: Collection[str]) -> tuple[str, ...]:
         """The formulas with names that are not taken, as those of the effects of a model are."""
-        first = next(k for k in itertools.count() if not {*_names(k, len(self.texts))} & {*taken})
+        first = next(k for k in itertools.count() if not {*_names(k, len(self.texts))} & {*names_in_model})
         return tuple(_named(text, first + number) for number, text in enumerate(self.texts))
 
     @property
@@ -127,23 +127,25 @@ def describe(fitted: Fit, residuals: Floats, trend: Trend | None = None) -> Desc
     """
     from scipy.special import chdtri
 
-    found, misfit = families(fitted), consistency(fitted)
+    tested, misfit = families(fitted), consistency(fitted)
     excess = misfit.statistic - misfit.dof
-    best = max(found, key=lambda family: family.score)
+    best = max(tested, key=lambda family: family.score)
     walk, scatter = fitted.walk_gain, fitted.scatter_gain
     irregular = 2.0 * max(walk, scatter)
     name = "" if fitted.linearised.model.walks else walk_named(fitted.linearised.model.bench)
-    within = name and _goes_on(trend) and (best.score <= 0.0 or _goes_on(_trend_beside(fitted, best)))
+    within = name and _within_dwells(trend) and (best.score <= 0.0 or _within_dwells(_trend_beside(fitted, best)))
     if name and (within or irregular - float(chdtri(1, _CHANCE)) > max(best.score, 0.0)):
         share = irregular / max(excess, irregular, 1.0)
-        back_s = _back_s(fitted, name) if 2.0 * (walk - scatter) > _EQUAL else None
-        driver = f"time (irregular, back within about {one_digit_seconds(back_s)})" if back_s else IRREGULAR
-        return Description(channel_of(residuals), WITHIN if within and not back_s else driver, share, (name,))
+        restoring_time_s = _restoring_time_s(fitted, name) if 2.0 * (walk - scatter) > _EQUAL else None
+        driver = WITHIN_DWELLS if within else BETWEEN_DWELLS
+        if restoring_time_s:
+            driver = f"time (irregular, back within about {one_digit_seconds(restoring_time_s)})"
+        return Description(channel_of(residuals), driver, share, (name,))
     if best.score <= 0.0:
         return None
-    order = np.argsort(best.each_delta_chi2)[::-1]
-    enough = 1 if best.each_delta_chi2[order[0]] > 0.7 * best.delta_chi2 else len(order)
-    formulas = tuple(_named(best.texts[k], number) for number, k in enumerate(order[:enough]))
+    ranked = np.argsort(best.each_delta_chi2)[::-1]
+    count = 1 if best.each_delta_chi2[ranked[0]] > 0.7 * best.delta_chi2 else len(ranked)
+    formulas = tuple(_named(best.texts[k], number) for number, k in enumerate(ranked[:count]))
     share = min((best.delta_chi2 - best.dof) / excess, 1.0) if excess > 0.0 else 1.0
     return Description(channel_of(residuals), best.driver, share, formulas)
 
@@ -153,24 +155,24 @@ def one_digit_seconds(duration_s: float) -> str:
     return f"{float(f'{duration_s:.1g}'):g} s"
 
 
-def _back_s(fitted: Fit, walk: str) -> float | None:
+def _restoring_time_s(fitted: Fit, walk: str) -> float | None:
     """Return the time constant, s, with which an irregular drift returns, or None if it is no different from a walk."""
     model = fitted.linearised.model
-    walked = fit(
+    with_walk = fit(
         fitted.dwells, model + effect_named(walk, model.bench), 0.0, fitted.linearised.slews, must_settle=False
     )
-    if not walked.noise.walk_mps2_per_sqrt_s:
+    if not with_walk.noise.walk_mps2_per_sqrt_s:
         return None
-    gain, back_s = walked.gauss_markov_gain
-    return back_s if 2.0 * gain > _EQUAL else None
+    gain, restoring_time_s = with_walk.gauss_markov_gain
+    return restoring_time_s if 2.0 * gain > _EQUAL else None
 
 
-def _goes_on(trend: Trend | None) -> bool:
+def _within_dwells(trend: Trend | None) -> bool:
     """Tell whether the trends within dwells are significant."""
     return trend is not None and trend.p_value < _WITHIN
 
 
-def _trend_beside(fitted: Fit, family: Family) -> Trend | None:
+def _trend_beside(fitted: Fit, family: FormulaFamily) -> Trend | None:
     """Return the test of trends within dwells with the formulas of a family in the model."""
     model = fitted.linearised.model
     for text in family.formulas:
@@ -179,29 +181,29 @@ def _trend_beside(fitted: Fit, family: Family) -> Trend | None:
     return trend_of(fit(fitted.dwells, model, walk, fitted.linearised.slews, must_settle=False))
 
 
-def families(fitted: Fit, known: Sequence[Effect] = (), frame: Frame | None = None) -> list[Family]:
+def families(fitted: Fit, known: Sequence[Effect] = (), frame: Frame | None = None) -> list[FormulaFamily]:
     """All families of formulas, each tested on what the model leaves.
 
     fitted: the fit. known: effects with which the formulas are compared. frame: with the columns of most of these
     effects.
     """
     frame = frame or Frame(fitted.linearised, fitted.noise.for_goodness_of_fit, known)
-    return _tried(fitted, FurtherEffects(frame, fitted.linearised, known, _SAME))
+    return _tested(fitted, FurtherEffects(frame, fitted.linearised, known, _SAME))
 
 
-def _tried(fitted: Fit, tests: FurtherEffects) -> list[Family]:
+def _tested(fitted: Fit, tests: FurtherEffects) -> list[FormulaFamily]:
     """Return the families with their falls of chi-squared."""
-    bench, tried = fitted.linearised.model.bench, list[tuple[str, list[str], list[Effect]]]()
+    bench, groups = fitted.linearised.model.bench, list[tuple[str, list[str], list[Effect]]]()
     for driver, texts in _families(bench, fitted.dwells):
         with contextlib.suppress(InputError):  # a very late jump or fast decay does not show when a formula is checked
-            own = [formula(_named(text), bench.axes, bench.gravity_mps2, checked=False) for text in texts]
-            tried.append((driver, texts, [*own]))
-    stage.say(f"trying {sum(len(texts) for _, texts, _ in tried)} formulas")
-    out, scans = list[Family](), tests.scans([effects for _, _, effects in tried])
-    for (driver, texts, _), (scan, known) in zip(tried, scans, strict=True):
+            effects_of_texts = [formula(_named(text), bench.axes, bench.gravity_mps2, checked=False) for text in texts]
+            groups.append((driver, texts, [*effects_of_texts]))
+    stage.say(f"trying {sum(len(texts) for _, texts, _ in groups)} formulas")
+    tested, scans = list[FormulaFamily](), tests.scans([effects for _, _, effects in groups])
+    for (driver, texts, _), (scan, known) in zip(groups, scans, strict=True):
         delta_chi2, rank = scan.explained(np.concatenate([each.basis for each in scan.candidates], axis=1))
-        out.append(Family(driver, tuple(texts), delta_chi2, rank, tuple(scan.statistics.tolist()), known))
-    return out
+        tested.append(FormulaFamily(driver, tuple(texts), delta_chi2, rank, tuple(scan.statistics.tolist()), known))
+    return tested
 
 
 def _names(first: int, count: int) -> list[str]:
@@ -217,10 +219,12 @@ def _named(text: str, number: int = 0) -> str:
 
 def explained_share(fitted: Fit, refit: Fit) -> float:
     """Share of the chi-squared beyond noise that a refit with further effects explains."""
-    before, left = consistency(fitted), consistency(refit)
+    before, after = consistency(fitted), consistency(refit)
     excess = before.statistic - before.dof
     return (
-        min(max(before.statistic - left.statistic - (before.dof - left.dof), 0.0) / excess, 1.0) if excess > 0 else 1.0
+        min(max(before.statistic - after.statistic - (before.dof - after.dof), 0.0) / excess, 1.0)
+        if excess > 0
+        else 1.0
     )
 
 

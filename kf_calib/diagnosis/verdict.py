@@ -25,14 +25,15 @@ _FAMILIES = {
 """What each family of effects means, in words."""
 
 
-def verdict_in_words(found: Diagnosis) -> str:
+def verdict_in_words(diagnosis: Diagnosis) -> str:
     """The verdict of a diagnosis in one sentence, with what else it could be."""
-    test = found.test
+    test = diagnosis.test
     if test.consistent is None:
         return "The model cannot be tested: there are no more measurements than parameters. Visit more orientations."
     if test.consistent:
-        blind = f" This run cannot show {len(test.unseen)} of {test.count} effects." if test.unseen else ""
-        noise = found.before.noise
+        effects = test.effects
+        blind = f" This run cannot show {len(effects.unseen)} of {effects.count} effects." if effects.unseen else ""
+        noise = diagnosis.before.noise
         if not (noise.within_seen or noise.scatter_stated):
             return (
                 f"No effect explains a significant part of the scatter of the dwells (p {format_p(test.p_value)}), "
@@ -40,12 +41,12 @@ def verdict_in_words(found: Diagnosis) -> str:
             )
         agreed = f"The model agrees with the measurements (p {format_p(test.p_value)})"
         return f"{agreed}: no effect is missing that this run could show.{blind}"
-    start, first = f"{_what_fails(test)} (p {format_p(test.p_value)}).", found.likeliest
+    start, first = f"{_what_fails(test)} (p {format_p(test.p_value)}).", diagnosis.likeliest
     if first is None:
         return start
     if first.effects:
-        return f"{start} {_named(found, first)}{_returning(found)}.{_held_out(found)}"
-    return f"{start} {_noise(found, first) if found.noise else _unknown(found, first)}"
+        return f"{start} {_named(diagnosis, first)}{_returning(diagnosis)}.{_held_out(diagnosis)}"
+    return f"{start} {_noise(diagnosis, first) if diagnosis.noise else _unknown(diagnosis, first)}"
 
 
 def _what_fails(test: CandidateTests) -> str:
@@ -54,10 +55,10 @@ def _what_fails(test: CandidateTests) -> str:
     return "The dwells do not scatter as noise does" if scattering else "Residuals fail"
 
 
-def second_pass_in_words(found: Diagnosis) -> str:
+def second_pass_in_words(diagnosis: Diagnosis) -> str:
     """A sentence on what only a second pass over the readings could judge; "" where nothing is left to it."""
-    names = [suspect.name for suspect in found.suspects if not holds_its_oscillation(suspect.refit.fit)]
-    if found.test.vibration and not found.before.fit.dwells[0].averaged:
+    names = [suspect.name for suspect in diagnosis.suspects if not holds_its_oscillation(suspect.refit.fit)]
+    if diagnosis.test.lines.vibration and not diagnosis.before.fit.dwells[0].averaged:
         names.append("the lines in their spectrum")
     if not names:
         return ""
@@ -67,65 +68,67 @@ def second_pass_in_words(found: Diagnosis) -> str:
     )
 
 
-def _named(found: Diagnosis, first: Hypothesis) -> str:
+def _named(diagnosis: Diagnosis, first: Hypothesis) -> str:
     """Return the likeliest effects in words, with the other explanations and their probabilities."""
-    assert found.table is not None
-    share, others = found.table.probability(first.effects), _others(found)
-    named = f"{_effects_of(first)}{_size(found)} ({format_probability(share)})"
+    assert diagnosis.table is not None
+    share, others = diagnosis.table.probability(first.effects), _others(diagnosis)
+    named = f"{_effects_of(first)}{_size(diagnosis)} ({format_probability(share)})"
     if share >= SURE:
         return f"Missing: {named}{others}"
-    family, of_family = next(each for each in found.table.families.items() if each[0] not in (NOTHING, NOISE, NONE))
+    family, of_family = next(each for each in diagnosis.table.families.items() if each[0] not in (NOTHING, NOISE, NONE))
     if of_family >= SURE and first.families == (family,):
         return f"{_FAMILIES[family]} ({format_probability(of_family)}): {named}{others}"
     return f"Likeliest: {named}{others}"
 
 
-def _unknown(found: Diagnosis, first: Hypothesis) -> str:
+def _unknown(diagnosis: Diagnosis, first: Hypothesis) -> str:
     """Return a sentence on a misfit that no known effect explains."""
     what = "it changes irregularly" if first.driver == IRREGULAR else f"it goes with {first.driver}"
-    return f"Unknown: no known effect explains it, {what} ({format_probability(first.probability)}){_others(found)}."
+    return (
+        f"Unknown: no known effect explains it, {what} ({format_probability(first.probability)}){_others(diagnosis)}."
+    )
 
 
-def _noise(found: Diagnosis, first: Hypothesis) -> str:
+def _noise(diagnosis: Diagnosis, first: Hypothesis) -> str:
     """Return a sentence on noise from dwell to dwell that was not stated, and on how to be sure of it."""
-    noise = found.before.noise
+    noise = diagnosis.before.noise
     stated = ("angle_sigma_deg", noise.setting_stated), ("scatter_sigma_mps2", noise.scatter_stated)
-    keys = " and ".join(key for key, known in stated if not known)
-    what = "more than was stated" if dwell_noise_is_stated(found.before) else "by an amount that was not stated"
+    keys = " and ".join(key for key, is_stated in stated if not is_stated)
+    what = "more than was stated" if dwell_noise_is_stated(diagnosis.before) else "by an amount that was not stated"
     advice = f"state {keys} or repeat an orientation" if keys else "repeat an orientation"
     share = format_probability(first.probability)
-    return f"The dwells scatter {what} ({share}){_others(found)}. To find out, {advice}."
+    return f"The dwells scatter {what} ({share}){_others(diagnosis)}. To find out, {advice}."
 
 
-def _others(found: Diagnosis) -> str:
+def _others(diagnosis: Diagnosis) -> str:
     """Return the other explanations in words."""
-    assert found.table is not None
-    rows = found.table.rivals
-    told = [f"{_in_words(found, row)} {format_probability(row.probability)}" for row in rows[:_TOLD]]
-    told += [f"{len(rows) - _TOLD} others"] if len(rows) > _TOLD else []
-    return f"; or {', '.join(told)}" if told else ""
+    assert diagnosis.table is not None
+    rows = diagnosis.table.rivals
+    words = [f"{_in_words(diagnosis, row)} {format_probability(row.probability)}" for row in rows[:_TOLD]]
+    words += [f"{len(rows) - _TOLD} others"] if len(rows) > _TOLD else []
+    return f"; or {', '.join(words)}" if words else ""
 
 
-def explanations_in_words(found: Diagnosis) -> str:
+def explanations_in_words(diagnosis: Diagnosis) -> str:
     """The likeliest explanations with their probabilities, for a line; "" where there are none."""
-    first = found.likeliest
-    if first is None or found.table is None:
+    first = diagnosis.likeliest
+    if first is None or diagnosis.table is None:
         return ""
-    share = found.table.probability(first.effects) if first.effects else first.probability
-    if found.sure:
-        return f"missing: {' and '.join(found.missing)} {format_probability(share)}"
-    told = [(first, share), *((row, row.probability) for row in found.table.rivals[: _TOLD - 1])]
-    text = ", ".join(f"{_in_words(found, row)} {format_probability(each)}" for row, each in told)
+    share = diagnosis.table.probability(first.effects) if first.effects else first.probability
+    if diagnosis.sure:
+        return f"missing: {' and '.join(diagnosis.missing)} {format_probability(share)}"
+    likeliest = [(first, share), *((row, row.probability) for row in diagnosis.table.rivals[: _TOLD - 1])]
+    text = ", ".join(f"{_in_words(diagnosis, row)} {format_probability(probability)}" for row, probability in likeliest)
     return f"suspects {text}" if first.effects else text
 
 
-def _in_words(found: Diagnosis, row: Hypothesis) -> str:
+def _in_words(diagnosis: Diagnosis, row: Hypothesis) -> str:
     """Return an explanation in words."""
     if row.effects:
         return _effects_of(row)
     if row.driver:
         return "no known effect, irregular" if row.driver == IRREGULAR else f"no known effect, goes with {row.driver}"
-    return f"scatter from dwell to dwell{' larger than stated' if dwell_noise_is_stated(found.before) else ''}"
+    return f"scatter from dwell to dwell{' larger than stated' if dwell_noise_is_stated(diagnosis.before) else ''}"
 
 
 def _effects_of(row: Hypothesis) -> str:
@@ -141,31 +144,31 @@ def format_probability(probability: float) -> str:
     return f"{percent:.1f} %" if percent > 99.0 or percent < 1.0 else f"{percent:.0f} %"
 
 
-def _returning(found: Diagnosis) -> str:
+def _returning(diagnosis: Diagnosis) -> str:
     """Return the words for biases that return, as an alternative to a walk."""
-    if not found.back_s:
+    if not diagnosis.restoring_time_s:
         return ""
-    return f"; biases that return to their mean within about {one_digit_seconds(found.back_s)} fit better"
+    return f"; biases that return to their mean within about {one_digit_seconds(diagnosis.restoring_time_s)} fit better"
 
 
-def _size(found: Diagnosis) -> str:
+def _size(diagnosis: Diagnosis) -> str:
     """Return, as text, the most significant coefficient of the first missing effect and its constant, with sigmas."""
-    assert found.after is not None
-    parameters = found.after.parameters
-    first = next(each for each in found.after.model.effects if str(each) == found.missing[0])
+    assert diagnosis.after is not None
+    parameters = diagnosis.after.parameters
+    first = next(each for each in diagnosis.after.model.effects if str(each) == diagnosis.missing[0])
     sized = [parameters[c.symbol] for c in first.parameters]
-    told = [max(sized, key=lambda p: abs(p.value or 0.0) / (p.sigma or np.inf))]
-    told += [parameters[first.unknown.symbol]] if first.unknown else []
+    parameters_named = [max(sized, key=lambda p: abs(p.value or 0.0) / (p.sigma or np.inf))]
+    parameters_named += [parameters[first.unknown.symbol]] if first.unknown else []
     return "".join(
         f", {p.symbol} = {shown(p).number(p.value)} ± {shown(p).text(p.sigma, 2)}"
-        for p in told
+        for p in parameters_named
         if p.value is not None and p.sigma
     )
 
 
-def _held_out(found: Diagnosis) -> str:
+def _held_out(diagnosis: Diagnosis) -> str:
     """Return a sentence about the change of the held-out error, or "" where it is not known."""
-    before, after = found.before, found.after
+    before, after = diagnosis.before, diagnosis.after
     assert after is not None
     if before.held_out_rms_mps2 is None or after.held_out_rms_mps2 is None or not after.held_out_floor_mps2:
         return ""

@@ -99,19 +99,19 @@ def trend_beside(linearised: LinearisedDwells, noise: Noise, state: Floats) -> T
     if dwells[0].averaged or not noise.scatter_stated:
         return None
     sigma, lengths_s = noise.effective_sigma_mps2, np.array([dwell.end_s - dwell.start_s for dwell in dwells])
-    squares, seen = _squares(dwells, _residuals(linearised, state))
-    own = (sigma**2 / np.array([[dwell.count] for dwell in dwells]))[:, :, None]
-    by_walk, by_flicker = _of_shapes()
-    walked = noise.walk_mps2_per_sqrt_s**2 * lengths_s[:, None, None] * by_walk
-    by_noise = own + walked + flicker_sigma(noise, len(dwells))[:, None] ** 2 * by_flicker
-    allowed = by_noise + _by_thermometer(linearised, noise)
-    ratios = np.where(seen[:, None, :], squares / allowed, 0.0)
-    count = 3 * int(seen.sum())
+    squares, determined = _squares(dwells, _residuals(linearised, state))
+    by_readings = (sigma**2 / np.array([[dwell.count] for dwell in dwells]))[:, :, None]
+    walk_shapes, flicker_shapes = _of_shapes()
+    by_walk = noise.walk_mps2_per_sqrt_s**2 * lengths_s[:, None, None] * walk_shapes
+    by_noise = by_readings + by_walk + flicker_sigma(noise, len(dwells))[:, None] ** 2 * flicker_shapes
+    expected = by_noise + _by_thermometer(linearised, noise)
+    ratios = np.where(determined[:, None, :], squares / expected, 0.0)
+    count = 3 * int(determined.sum())
     if not count:
         return None
     readings = sum(dwell.count for dwell in dwells)
     unsure = float(np.mean((4.0 * noise.inflation - 2.0) / readings)) / 3.0
-    unsure += (2.0 * (noise.walk_spread or 0.0) * float(np.mean(walked / allowed))) ** 2
+    unsure += (2.0 * (noise.walk_spread or 0.0) * float(np.mean(by_walk / expected))) ** 2
     ratio = float(ratios.sum() / count)
     return Trend(ratio, float(fdtrc(count, 2.0 / unsure, ratio)), ratios.sum(axis=2))
 
@@ -146,15 +146,15 @@ def _squares(dwells: Sequence[DwellFactor], rows: Sequence[Floats]) -> tuple[Flo
     """Return the squared coefficients (D, c, degrees) of rows (pieces, K, c) on the shapes, scaled to mean square 1,
     and a mask (D, degrees) of the degrees that the readings of each dwell determine.
     """
-    out, seen = np.zeros((len(dwells), rows[0].shape[2], _DEGREE)), np.zeros((len(dwells), _DEGREE), bool)
-    for places in alike(dwells):
-        some, left = [dwells[k] for k in places], np.array([rows[k] for k in places])
-        frame, known = _shapes_in(some, np.array([dwell.triangles for dwell in some]))
-        counts = np.array([dwell.count for dwell in some])[:, None, None]
-        along = np.swapaxes(left.reshape(len(some), -1, left.shape[3]), 1, 2) @ frame
-        out[places, :, : frame.shape[2]] = along**2 / counts
-        seen[places, : frame.shape[2]] = known
-    return out, seen
+    squares, determined = np.zeros((len(dwells), rows[0].shape[2], _DEGREE)), np.zeros((len(dwells), _DEGREE), bool)
+    for numbers in alike(dwells):
+        group, group_rows = [dwells[k] for k in numbers], np.array([rows[k] for k in numbers])
+        frame, shown = _shapes_in(group, np.array([dwell.triangles for dwell in group]))
+        counts = np.array([dwell.count for dwell in group])[:, None, None]
+        along = np.swapaxes(group_rows.reshape(len(group), -1, group_rows.shape[3]), 1, 2) @ frame
+        squares[numbers, :, : frame.shape[2]] = along**2 / counts
+        determined[numbers, : frame.shape[2]] = shown
+    return squares, determined
 
 
 def _shapes_in(dwells: Sequence[DwellFactor], triangles: Floats) -> tuple[Floats, Mask]:
@@ -167,6 +167,6 @@ def _shapes_in(dwells: Sequence[DwellFactor], triangles: Floats) -> tuple[Floats
     from_start = (at - ends[:, 0, None, None]) / np.where(lengths > 0.0, lengths, 1.0)[:, None, None]
     rows = triangles[:, :, : dwells[0].width, :3] @ on_basis(shapes(2.0 * from_start - 1.0))
     frame, upper = np.linalg.qr(rows.reshape(len(dwells), -1, rows.shape[3]))
-    known = np.abs(np.einsum("dkk->dk", upper[:, :, : upper.shape[1]])) > 1e-6 * np.sqrt(counts)[:, None]
-    known &= ((counts >= _FEWEST) & (lengths > 0.0))[:, None]
-    return frame[:, :, 1:], known[:, 1:]
+    determined = np.abs(np.einsum("dkk->dk", upper[:, :, : upper.shape[1]])) > 1e-6 * np.sqrt(counts)[:, None]
+    determined &= ((counts >= _FEWEST) & (lengths > 0.0))[:, None]
+    return frame[:, :, 1:], determined[:, 1:]

@@ -171,7 +171,7 @@ class Frame:
         self._stimulus = stimulus_of(linearised.dwells_at_state, linearised.model.bench, linearised.state)
         self._whitening = None if _inside(noise) else MisfitColumns(linearised.dwells_at_state, noise, linearised.state)
         self.basis, self.coordinates = orthonormal(self.whitened(linearised, effects))
-        self._periodogram: Periodogram | None = None
+        self._periodogram: tuple[tuple[tuple[str, float], bytes], Periodogram] | None = None
         self._lines: dict[float, tuple[Line, ...]] = {}
         self._last: tuple[LinearisedDwells, Floats, Floats, int] | None = None
 
@@ -261,13 +261,12 @@ class Frame:
 
     def delta_chi2(self, linearised: LinearisedDwells, effect: Effect, values_hz: Floats) -> Floats:
         """Decrease of chi-squared (n,) if an oscillation at each frequency, alone, is added to the model in
-        ``linearised``.
-
-        The periodogram is computed at the first call, so ``values_hz`` has to be the same in every call.
+        ``linearised``; the periodogram is kept for further calls with the same frequencies.
         """
-        if self._periodogram is None:
-            self._periodogram = Periodogram(linearised, self.noise, effect, values_hz)
-        return self._periodogram.delta_chi2(*_with_and_without_walk(linearised, self.noise, self.state, STATE_COUNT))
+        key = _key(effect), values_hz.tobytes()
+        if self._periodogram is None or self._periodogram[0] != key:
+            self._periodogram = key, Periodogram(linearised, self.noise, effect, values_hz)
+        return self._periodogram[1].delta_chi2(*_with_and_without_walk(linearised, self.noise, self.state, STATE_COUNT))
 
 
 _OF_NOISE = ("sigma_mps2", "inflation", "setting_rad", "scatter_mps2", "walk_mps2_per_sqrt_s",

@@ -82,7 +82,7 @@ class Session(Evaluation[Judgement, Standing]):
         """With ``auto``, accept the missing effects once several judgements in a row were sure of them."""
         if not (self.auto and judgement.alarm and judgement.look.settled):
             return
-        found = judgement.found
+        found = judgement.diagnosis
         if not found.sure:
             return
         try:

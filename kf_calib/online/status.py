@@ -60,7 +60,7 @@ class Look:
     agreed: int = 1
 
     @cached_property
-    def found(self) -> Diagnosis:
+    def diagnosis(self) -> Diagnosis:
         """The diagnosis, or without an alarm a statement that nothing is significant so far."""
         return self.diagnosed or _not_judged(self.result, self.watch)
 
@@ -88,7 +88,7 @@ class Look:
 
     def _is_followed(self, result: Calibration) -> bool:
         """Tell whether the platform has visited the orientation that this look advised."""
-        going = self.found.next_orientation
+        going = self.diagnosis.next_orientation
         if going is None:
             return False
         poses = np.array([visit.dwell.pose for visit in result.visits[len(self.result.visits) :]])
@@ -133,27 +133,27 @@ class Judgement:
     final: bool = False
 
     @property
-    def found(self) -> Diagnosis:
+    def diagnosis(self) -> Diagnosis:
         """The diagnosis of the latest look, which may be of fewer dwells."""
-        return self.look.found
+        return self.look.diagnosis
 
     @property
     def alarm(self) -> bool:
         """Whether the sequential test, or after the end the whole run, rejects the model."""
-        return (self.final or _alarmed(self.watch)) and self.found.test.consistent is False
+        return (self.final or _alarmed(self.watch)) and self.diagnosis.test.consistent is False
 
     @property
     def consistent(self) -> bool | None:
         """Whether the model agrees with the run; None while it is not judged."""
         if self.final:
-            return self.found.test.consistent
+            return self.diagnosis.test.consistent
         return None if self.watch is None or self.watch.p_value is None else not self.alarm
 
     @property
     def p_value(self) -> float | None:
         """The p-value of the whole run where it is final, else of the latest sequential test; None if not judged."""
         if self.final:
-            return self.found.test.p_value
+            return self.diagnosis.test.p_value
         return None if self.watch is None else self.watch.p_value
 
     @property
@@ -161,13 +161,13 @@ class Judgement:
         """Names of the effects that may be missing, the likeliest first; empty without an alarm."""
         if not self.alarm:
             return ()
-        found = self.found
+        found = self.diagnosis
         return found.ambiguity or tuple(suspect.name for suspect in found.suspects if suspect.fits)
 
     @property
     def disagreeing(self) -> tuple[int, int, float]:
         """The dwell and the accelerometer (both from 1) with the largest residual in units of sigma, and that ratio."""
-        ratios = replace(self.found, before=self.result).residual_ratios
+        ratios = replace(self.diagnosis, before=self.result).residual_ratios
         dwell, channel = np.unravel_index(int(np.argmax(np.abs(ratios))), ratios.shape)
         return int(dwell) + 1, int(channel) + 1, float(ratios[dwell, channel])
 
@@ -184,13 +184,13 @@ class Judgement:
         if not self.alarm:
             return f"model consistent (p {format_p(self.p_value)}{looks})"
         dwell, channel, ratio = self.disagreeing
-        named = explanations_in_words(self.found) or "no known effect explains it"
+        named = explanations_in_words(self.diagnosis) or "no known effect explains it"
         return f"orientation {dwell} disagrees: accelerometer {channel} by {ratio:+.1f} sigma; {named}"
 
     @property
     def advice(self) -> tuple[Advice, str] | None:
         """Where to go next because of what is missing, and why; None while nothing is beyond chance."""
-        return self.found.next_orientation if self.final or self.alarm else None
+        return self.diagnosis.next_orientation if self.final or self.alarm else None
 
     @cached_property
     def next_orientation(self) -> tuple[tuple[float, ...], str] | None:

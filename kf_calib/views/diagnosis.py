@@ -12,8 +12,7 @@ from rich.text import Text
 from kf_calib.design.next_orientation import Advice
 from kf_calib.diagnosis.candidate_tests import LEVEL
 from kf_calib.diagnosis.detectability import Detectable
-from kf_calib.diagnosis.hypothesis_table import Hypothesis
-from kf_calib.diagnosis.hypothesis_table import Table as Hypotheses
+from kf_calib.diagnosis.hypothesis_table import Hypothesis, HypothesisTable
 from kf_calib.diagnosis.results import Diagnosis, Suspect
 from kf_calib.diagnosis.unknown_effect import Description
 from kf_calib.diagnosis.verdict import format_probability
@@ -56,7 +55,7 @@ def found_object(found: Diagnosis) -> dict[str, Any]:
             "together": [list(pair) for pair in found.together],
             "may_be_scatter": found.as_scatter,
             "invisible": found.test.invisible,
-            "vibration_hz": [line.frequency_hz for line in found.test.vibration],
+            "vibration_hz": [line.frequency_hz for line in found.test.lines.vibration],
             "trend": _trend_object(found.test.trend),
             "detectable": [
                 {"effect": each.name, "minimum": each.minimum, "unit": each.unit} for each in found.detectable
@@ -71,7 +70,7 @@ def found_object(found: Diagnosis) -> dict[str, Any]:
     )
 
 
-def _hypotheses_object(table: Hypotheses | None) -> list[dict[str, Any]]:
+def _hypotheses_object(table: HypothesisTable | None) -> list[dict[str, Any]]:
     """Return the rows of the table of hypotheses as JSON objects, the likeliest first."""
     rows = () if table is None else zip(table.rows, table.log10_odds, strict=True)
     return [
@@ -175,8 +174,8 @@ def diagnosis_report(found: Diagnosis) -> RenderableType:
     unknown, going = found.description, found.next_orientation
     if unknown is not None:
         parts.append(Text(description_sentence(unknown, unknown.formulas)))
-    if found.test.vibration:
-        seen = ", ".join(f"{line.frequency_hz:.4g}" for line in found.test.vibration)
+    if found.test.lines.vibration:
+        seen = ", ".join(f"{line.frequency_hz:.4g}" for line in found.test.lines.vibration)
         averaged = found.before.fit.dwells[0].averaged
         treated = "the tests use averages that suppress it" if averaged else "it counts as noise"
         parts.append(Text(f"Vibration at {seen} Hz changes its amplitude during the run, so {treated}."))
@@ -211,13 +210,13 @@ def plain_report(found: Diagnosis) -> str:
     return plain(diagnosis_report(found))
 
 
-def _hypothesis_table(table: Hypotheses) -> Table:
+def _hypothesis_table(table: HypothesisTable) -> Table:
     """Return the table of the explanations that have 1 % of the probability or more."""
     shown_ = Table(title="What it may be, and with what probability", title_justify="left")
     for heading in ("explanation", "family", "probability", "χ² / dof"):
         left = heading in ("explanation", "family")
         shown_.add_column(heading, justify="left" if left else "right", no_wrap=not left)
-    for row in table.told:
+    for row in table.listed:
         fall = f"{row.statistic:.1f} / {row.dof}" if row.dof else ""
         shown_.add_row(name_of(row), ", ".join(row.families), format_probability(row.probability), fall)
     return shown_

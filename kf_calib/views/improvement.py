@@ -38,19 +38,21 @@ def improvement_object(
     state: the improvement. honest: its nested cross-validation (None: not made). replay_difference: largest relative
     difference from the figures of the journal that was replayed (None: no replay). files: paths written, by their keys.
     """
-    unknown, going = state.found.description, state.found.next_orientation
+    unknown, going = state.diagnosis.description, state.diagnosis.next_orientation
     return clean(
         {
             "start": _figures(state.start),
             "steps": [
                 _step_object(step, before)
-                for step, before in zip(state.steps, [state.start, *(step.found for step in state.steps)], strict=False)
+                for step, before in zip(
+                    state.steps, [state.start, *(step.diagnosis for step in state.steps)], strict=False
+                )
             ],
             "model": [str(effect) for effect in state.result.model.effects],
             "stopped_because": state.because,
             "reason": state.reason,
-            "verdict": state.found.verdict,
-            **_figures(state.found),
+            "verdict": state.diagnosis.verdict,
+            **_figures(state.diagnosis),
             "parameters": _parameters(state.result),
             "tests": [_removal_object(each) for each in state.removals],
             "ambiguity_set": [each.name for each in state.alternatives],
@@ -107,9 +109,9 @@ def _step_object(step: SelectionStep, before: Diagnosis) -> dict[str, Any]:
         "added": step.added,
         "by": step.by,
         "probability": step.probability,
-        **_figures(step.found),
-        "p_value": None if step.name is None else before.test.p_values.get(step.name),
-        "p_value_after": step.found.test.p_value,
+        **_figures(step.diagnosis),
+        "p_value": None if step.name is None else before.test.effects.p_values.get(step.name),
+        "p_value_after": step.diagnosis.test.p_value,
         "dropped": [_removal_object(each) for each in step.dropped],
         "model": [str(effect) for effect in step.result.model.effects],
         "coefficients": _parameters(step.result)[12:],
@@ -143,7 +145,7 @@ def improvement_report(
     parts: list[RenderableType] = [
         progress(state), Text(f"Stopped, {state.because}: {state.reason}", style=style),
     ]  # fmt: skip
-    parts += [Text(line) for line in (*of_what_p_is(state.found), *_settling(state))]
+    parts += [Text(line) for line in (*of_what_p_is(state.diagnosis), *_settling(state))]
     if not state.spreads or state.because != "ambiguous":
         parts.append(parameter_table(state.result))
     if state.spreads:
@@ -163,7 +165,7 @@ def progress(state: Improvement) -> RenderableType:
     """The steps as a table: held-out and in-sample rms over the noise floor as numbers and bars, with remarks below."""
     floor = state.result.held_out_floor_mps2
     rows = [("start", state.start.before, None, state.start.test.p_value)]
-    rows += [(_label(step), step.result, step.probability, step.found.test.p_value) for step in state.steps]
+    rows += [(_label(step), step.result, step.probability, step.diagnosis.test.p_value) for step in state.steps]
     others = [each for each in state.alternatives if each.result is not state.result]
     word = "+" if len(others) == len(state.alternatives) else "or"  # an effect to add, or one to replace the one taken
     rows += [(f"({word} {each.name})", each.result, None, None) for each in others]
@@ -239,9 +241,9 @@ def _spread_row(each: Spread) -> tuple[str, ...]:
 
 def _settling(state: Improvement) -> list[str]:
     """Return sentences on what would settle an inconsistent run: a formula to try, an orientation to visit."""
-    if state.found.test.consistent is not False:
+    if state.diagnosis.test.consistent is not False:
         return []
-    unknown, going, out = state.found.description, state.found.next_orientation, list[str]()
+    unknown, going, out = state.diagnosis.description, state.diagnosis.next_orientation, list[str]()
     if unknown is not None:
         out.append(description_sentence(unknown, [unknown.formula]))
     if going is not None:
@@ -263,7 +265,7 @@ def honest_sentence(honest: NestedCrossValidation) -> str:
 
 def choices_table(state: Improvement, choices: Sequence[tuple[str, ...]]) -> RenderableType:
     """The steps so far, the verdict, and the effects that a user may choose by number."""
-    return Group(progress(state), Text(state.found.verdict, style="bold"), *_numbered(state.found, choices))
+    return Group(progress(state), Text(state.diagnosis.verdict, style="bold"), *_numbered(state.diagnosis, choices))
 
 
 def _numbered(found: Diagnosis, choices: Sequence[tuple[str, ...]]) -> list[RenderableType]:

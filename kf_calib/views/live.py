@@ -52,7 +52,7 @@ def live_object(judgement: Judgement, standing: Standing, status: Status | None)
         "notice": standing.notice,
         "source": source_object(status),
     }
-    return found_object(judgement.found) | replay_object(judgement.result) | clean(own)
+    return found_object(judgement.diagnosis) | replay_object(judgement.result) | clean(own)
 
 
 def _going(judgement: Judgement) -> dict[str, Any] | None:

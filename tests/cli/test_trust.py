@@ -120,7 +120,7 @@ def test_the_rest_of_a_file_is_checked_first(received: Path, line: str) -> None:
 
 def test_in_python_too(received: Path) -> None:
     found = model_file.read(received / "model.toml")
-    assert selection_journal.read(received / "journal.toml").origin.programs[0].path == received / "own.txt"
+    assert selection_journal.read_journal(received / "journal.toml").origin.programs[0].path == received / "own.txt"
     with pytest.raises(InputError, match="would run"):
         found.load()
     assert not (received / "RAN").exists()

@@ -144,7 +144,7 @@ def test_pairs_that_explain_as_much_as_a_single_effect_are_said() -> None:
 def test_what_the_run_has_no_sight_of_is_said() -> None:
     """40 readings a dwell have no spectrum: what is faster than their cells show is not seen."""
     test = assess_candidates(calibrate(Run(count=40, rate_hz=1.0)).fit)
-    assert test.between == "sinusoid above 0.38 Hz" and test.between in test.invisible
+    assert test.lines.untested_band == "sinusoid above 0.38 Hz" and test.lines.untested_band in test.invisible
     assert not assess_candidates(run().fit).between
 
 
@@ -179,16 +179,16 @@ def test_an_oscillation_and_another_effect_are_both_found() -> None:
 def test_vibration_is_no_oscillation_of_one_amplitude_and_what_it_rectifies_is_named() -> None:
     """With a line of 3 m/s^2 in the readings."""
     found = diagnose(source("vibration-rectification=15sigma", dwells=14))
-    assert found.missing == ("vibration-rectification",) and found.test.vibration, found.verdict
+    assert found.missing == ("vibration-rectification",) and found.test.lines.vibration, found.verdict
     alone = diagnose(run("vibration-rectification=15sigma", dwells=14))
-    assert alone.test.vibration and "needed to judge the lines in their spectrum" in alone.verdict
+    assert alone.test.lines.vibration and "needed to judge the lines in their spectrum" in alone.verdict
 
 
 @pytest.mark.parametrize("seeds, dwells", [(range(1), 12), *slow((range(44), 24))])
 def test_of_vibration_alone_nothing_is_said_but_that_it_is_there(seeds: range, dwells: int) -> None:
     """Averages are few in short dwells: their noise is that of white readings in windows that overlap."""
     quiet = [diagnose(source("vibration-rectification=1e-12", seed=seed, dwells=dwells)) for seed in seeds]
-    assert all(found.test.vibration for found in quiet)
+    assert all(found.test.lines.vibration for found in quiet)
     assert sum(not found.test.consistent for found in quiet) <= 0.05 * len(quiet)
 
 
@@ -344,7 +344,9 @@ def test_what_comes_back_is_described_as_such() -> None:
 def test_a_walk_that_may_come_back_is_said_to() -> None:
     """Telegraph noise that is not unlikely enough for a walk to be none."""
     found = diagnose(source("telegraph=15sigma;tau=30", seed=21, dwells=24))
-    assert found.missing == ("bias-walk",) and found.back_s is not None and 5.0 < found.back_s < 100.0
+    assert (
+        found.missing == ("bias-walk",) and found.restoring_time_s is not None and 5.0 < found.restoring_time_s < 100.0
+    )
     assert "Likeliest: bias-walk" in found.verdict and "return to their mean within about" in found.verdict
     walks = [walking(seed) for seed in range(1, 3)]
-    assert not any(each.back_s for each in walks) and any("bias-walk" in each.missing for each in walks)
+    assert not any(each.restoring_time_s for each in walks) and any("bias-walk" in each.missing for each in walks)

@@ -48,12 +48,12 @@ def test_probabilities_are_evidence_over_the_sum_of_all() -> None:
 def test_what_is_told_of_a_table() -> None:
     table = table_of([*rows(), Hypothesis(formulas=("mine = t",), driver="time", families=(NONE,),
                                           log_evidence=float(np.log(0.002)) - 900.0)])  # fmt: skip
-    assert len(table.told) == 3 and table.log10_odds[0] == pytest.approx(np.log10(80 / 15))
+    assert len(table.listed) == 3 and table.log10_odds[0] == pytest.approx(np.log10(80 / 15))
     assert table.log10_odds[-1] is None and len(table.log10_odds) == len(table.rows)
-    assert table.of_any(["memory", NONE]) == pytest.approx(0.992 / 1.002)
-    assert table.of_added("a", "a") == pytest.approx(0.995 * 0.95 / 1.002)
-    assert table.of_added("mine = t", "mine") == pytest.approx(0.002 / 1.002)
-    assert table.of_added("b2", "b2") is None
+    assert table.probability_of_families(["memory", NONE]) == pytest.approx(0.992 / 1.002)
+    assert table.probability_of_added("a", "a") == pytest.approx(0.995 * 0.95 / 1.002)
+    assert table.probability_of_added("mine = t", "mine") == pytest.approx(0.002 / 1.002)
+    assert table.probability_of_added("b2", "b2") is None
 
 
 @pytest.mark.parametrize(
@@ -143,4 +143,4 @@ def test_noise_that_nobody_stated_is_told_as_noise(seeds: range) -> None:
     found = [diagnose(noisy_source(dwells=16, states=not_stated, seed=500 + seed, **noise)) for seed in seeds]
     assert sum(each.test.consistent is False for each in found) <= 0.03 * len(found)
     tables = [each.table for each in found]
-    assert all(table and table.of_any([NOISE, NOTHING]) > 0.3 for table in tables)
+    assert all(table and table.probability_of_families([NOISE, NOTHING]) > 0.3 for table in tables)

@@ -83,7 +83,7 @@ def test_what_an_explanation_predicts_is_the_difference_of_the_predictions() -> 
         (before, best.before.estimate.state), (after, best.after.estimate.state))]  # fmt: skip
     assert best.names == ("second-order",)
     assert best.predicted_mps2 == pytest.approx(predicted[1] - predicted[0], abs=1e-12)
-    assert best.left_mps2 + best.predicted_mps2 == pytest.approx(best.before.residuals_mps2, abs=1e-15)
+    assert best.unexplained_mps2 + best.predicted_mps2 == pytest.approx(best.before.residuals_mps2, abs=1e-15)
     assert best.share is not None and best.share > 0.9 and best.fits
     driver = next(each for each in drivers_of(best.before) if each.symbol == "a")
     assert is_function_of(best.contribution_mps2, driver)
@@ -129,9 +129,9 @@ def test_the_path_of_a_walk_is_no_residual() -> None:
 
 def test_overlaps_of_several_effects_are_those_of_pairs() -> None:
     diagnosis = found("second-order=15sigma")
-    chosen = ["second-order", "scale-asymmetry", diagnosis.test.walking, "latency"]
+    chosen = ["second-order", "scale-asymmetry", diagnosis.test.effects.walk, "latency"]
     overlaps = overlap_matrix(diagnosis.test, chosen)
-    one, other = (diagnosis.test.candidate(name) for name in chosen[:2])
+    one, other = (diagnosis.test.effects.candidate(name) for name in chosen[:2])
     assert overlaps[0, 1] == pytest.approx(one.overlap(other)) and overlaps[0, 1] > 0.9
     assert overlaps[1, 0] == pytest.approx(overlaps[0, 1])
     assert overlaps[0, 0] == pytest.approx(1.0)
@@ -142,7 +142,7 @@ def test_overlaps_of_several_effects_are_those_of_pairs() -> None:
 def test_an_effect_that_is_not_seen_has_a_reason() -> None:
     diagnosis = found("second-order=15sigma")
     reasons = {each.name: each.why for each in diagnosis.unseen}
-    assert list(reasons)[: len(diagnosis.test.unseen)] == diagnosis.test.unseen
+    assert list(reasons)[: len(diagnosis.test.effects.unseen)] == diagnosis.test.effects.unseen
     assert "scale factor" in reasons["gravity-error"]
     assert "misalignment" in reasons["cross-talk"]
     assert reasons["encoder-harmonic-1:y"] == "adds nothing to a reading in these orientations"  # about the vertical

@@ -62,7 +62,7 @@ def test_the_error_falls_to_the_noise(improved: Improvement) -> None:
     assert [step.added for step in improved.steps] == ["second-order"] and improved.because == "consistent"
     assert ratio(improved.start.before) > 1.5 and ratio(improved.result) < 1.3
     assert improved.result.residual_rms_mps2 < 0.7 * improved.start.before.residual_rms_mps2
-    assert improved.steps[0].found.test.p_value > 0.01 > improved.start.test.p_value
+    assert improved.steps[0].diagnosis.test.p_value > 0.01 > improved.start.test.p_value
     assert improved.removals[0].needed and not improved.steps[0].remarks
 
 
@@ -131,11 +131,11 @@ def test_what_is_not_needed_goes_unless_it_was_asked_for(improved: Improvement) 
     assert found.effects == ("second-order",)
     gone = found.steps[-1].dropped[0]
     assert gone.name == "hysteresis" and gone.p_value > 0.01 and not gone.needed
-    assert figures(found.found) == figures(improved.found)
+    assert figures(found.diagnosis) == figures(improved.diagnosis)
 
 
 def test_a_result_shows_what_it_is_and_not_its_arrays(improved: Improvement) -> None:
-    found = improved.found
+    found = improved.diagnosis
     assert repr(found.before).startswith("<Calibration: twelve parameters + second-order, ")
     assert repr(improved) == "<Improvement: twelve parameters + second-order, consistent>"
     assert repr(found) == f"<Diagnosis: {found.verdict}>" and str(found).startswith(found.verdict[:80])
@@ -149,7 +149,7 @@ def test_undo_and_drop(improved: Improvement) -> None:
     back = undone(taken, Refits())
     assert back.effects == ("mine = fx*fz",) and len(back.history) == 2 and undone(back, Refits()).effects == ()
     dropped = take_step(taken, Refits(), None, ("mine",), "user")
-    assert dropped.effects == ("second-order",) and figures(dropped.found) == figures(improved.found)
+    assert dropped.effects == ("second-order",) and figures(dropped.diagnosis) == figures(improved.diagnosis)
     for bad, says in [
         (lambda: undone(start, Refits()), "no step to undo"),
         (lambda: take_step(taken, Refits(), None, ("hysteresis",), "user"), "it has mine, second-order"),
@@ -203,7 +203,7 @@ def test_sigmas_are_honest_after_improvement(runs: int) -> None:
         truth = np.array(list(source.sensors.parameters.values()))
         state = improve(source)
         if state.because != "consistent":
-            assert state.because == "unknown" or "second-order" in state.found.ambiguity
+            assert state.because == "unknown" or "second-order" in state.diagnosis.ambiguity
             continue
         for nees, result in ((before, state.start.before), (after, state.result)):
             error = result.estimate.parameters - truth
@@ -325,7 +325,7 @@ def test_bad_usage(run, recording: Path, tmp_path: Path) -> None:
 
 
 def test_a_figure_that_differs_is_told(improved: Improvement) -> None:
-    one = figures(improved.found)
+    one = figures(improved.diagnosis)
     other = one | {"K1": one["K1"] * (1 + 1e-12)}
     assert selection_journal._difference(one, one) == 0.0 and selection_journal._difference(
         one, other

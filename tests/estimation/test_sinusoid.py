@@ -124,6 +124,16 @@ def test_a_periodogram_gives_what_each_frequency_alone_does(scatter_mps2: float,
         np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)
 
 
+def test_a_frame_answers_for_the_frequencies_it_is_asked() -> None:
+    """As a first call with these frequencies does, whatever was asked before."""
+    fitted = calibrate(run(0.1, 1.0, dwells=10)).fit
+    effect, frames = effect_named("sinusoid", BENCH), [Frame(fitted.linearised, fitted.noise, []) for _ in range(2)]
+    values_hz = np.linspace(0.01, 0.5, 100)
+    expected = frames[0].delta_chi2(fitted.linearised, effect, values_hz[40:60])
+    frames[1].delta_chi2(fitted.linearised, effect, values_hz[:20])
+    assert np.array_equal(frames[1].delta_chi2(fitted.linearised, effect, values_hz[40:60]), expected)
+
+
 def test_columns_are_the_nearest_parabolas() -> None:
     """One and a half cycles in the longest piece, against least squares on dense instants."""
     result, effect = calibrate(run(0.1, 0.0, dwells=6)), effect_named("sinusoid", BENCH).at(0.5)

@@ -91,7 +91,7 @@ def equal(one: Judgement, settings: Settings, source: Simulation | Run) -> None:
     for name in ("state", "covariance"):
         np.testing.assert_array_equal(getattr(one.result.estimate, name), getattr(replayed.estimate, name))
     assert replay_object(one.result) == replay_object(replayed)
-    assert one.found.verdict == diagnose(replayed).verdict
+    assert one.diagnosis.verdict == diagnose(replayed).verdict
 
 
 def test_live_is_replay_to_the_bit_and_a_judgement_a_dwell() -> None:
@@ -108,7 +108,7 @@ def test_a_missing_effect_is_told_while_the_run_goes_on_and_accepted_without_a_r
     found = judgements(session)
     alarmed = next(each for each in found if each.alarm)
     assert len(alarmed.result.visits) < 10 and "disagrees: accelerometer" in alarmed.verdict
-    told = next(each for each in found if each.found.missing)
+    told = next(each for each in found if each.diagnosis.missing)
     going = told.next_orientation
     assert going is not None and len(going[0]) == 3 and "separation" in going[1]
     after = [each for each in found if each.result.model.effects]

@@ -358,7 +358,7 @@ def test_one_file_that_fails_does_not_keep_others_from_being_written(
     def refuse(*_: object) -> None:
         raise InputError("no room for the journal.")
 
-    monkeypatch.setattr("kf_calib.diagnosis.selection_journal.write", refuse)
+    monkeypatch.setattr("kf_calib.diagnosis.selection_journal.write_journal", refuse)
     code, out, err = run("improve", "run.mcap", "--journal", "j.toml", "--save-model", "m.toml", "--unattended")
     assert code == 2 and err.count("no room") == 1 and "Stopped" in out and "saved m.toml" in out
     assert Path("m.toml").exists() and "saved j.toml" not in out

@@ -102,7 +102,7 @@ def test_bars_of_probabilities_are_those_of_the_table(hidden: tuple[str, ...]) -
     widths = [patch.get_width() for patch in families.patches]  # type: ignore[attr-defined]
     assert widths[0] == pytest.approx(100.0 * next(iter(table.families.values())))
     names = [label.get_text() for label in explanations.get_yticklabels()]
-    assert len(names) == len(table.told) + 1 and names[-1].endswith(("other", "others"))
+    assert len(names) == len(table.listed) + 1 and names[-1].endswith(("other", "others"))
     area = sum(patch.get_width() * patch.get_height() for patch in explanations.patches)  # type: ignore[attr-defined]
     assert area == pytest.approx(100.0)  # the rows sum to one, whatever families they belong to
 
@@ -114,8 +114,8 @@ def test_cells_of_the_matrix_are_overlaps() -> None:
     cells = {tuple(int(x) for x in text.get_position()): text.get_text() for text in axes.texts}
     for row, one in enumerate(names):
         for column, other in enumerate(names):
-            walks = test.walking in (one, other)
-            overlap = 1.0 if walks else test.candidate(one).overlap(test.candidate(other))
+            walks = test.effects.walk in (one, other)
+            overlap = 1.0 if walks else test.effects.candidate(one).overlap(test.effects.candidate(other))
             assert cells[column, row] == f"{overlap:.2f}"
 
 

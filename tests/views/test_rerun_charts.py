@@ -125,7 +125,7 @@ def test_a_diagnosis_shows_residuals_against_what_they_go_with(found: Diagnosis,
         to_ratio[1] -= 9.5 * to_ratio[0]  # a label hangs below its point
         for rank, each in enumerate(found.explanations[:5], 1):
             points = np.array(drawn[f"/driver/{channel}/residuals"][rank])
-            readings = (each.contribution_mps2 + each.left_mps2)[:, i] / sigmas[:, i]
+            readings = (each.contribution_mps2 + each.unexplained_mps2)[:, i] / sigmas[:, i]
             np.testing.assert_allclose(np.polyval(to_ratio, points[:, 1]), readings, atol=2e-3)
             x = driver.values[:, i] * unit_of(driver).per_si
             np.testing.assert_allclose(np.polyval(to_driver, points[:, 0]), x, atol=2e-3)
@@ -141,7 +141,7 @@ def test_spheres_of_a_diagnosis_show_what_each_explanation_leaves(found: Diagnos
     left = content(path, "Points3D:radii", diagnosis.EXPLANATION)["/spheres/left/2/residuals"]
     assert np.mean(left[1]) < np.mean(before) - 0.01
     for rank, each in enumerate(found.explanations[:5], 1):
-        expected = 0.03 + 0.09 * np.minimum(np.abs(each.left_ratios[:, 1]) / 4.0, 1.0)
+        expected = 0.03 + 0.09 * np.minimum(np.abs(each.unexplained_ratios[:, 1]) / 4.0, 1.0)
         np.testing.assert_allclose(left[rank], expected, rtol=1e-5)
 
 

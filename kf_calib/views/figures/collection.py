@@ -79,7 +79,7 @@ def _(state: Improvement) -> Figures:
         "The error falls" if state.steps else "The error of the model": lambda: improvement(state),
         "Residuals of each step": lambda: residuals_of_steps(state),
         "Where the first model fails" if fails else "What the first model leaves": lambda: residuals(state.start),
-        "What could still hide": lambda: detection_limits(state.found),
+        "What could still hide": lambda: detection_limits(state.diagnosis),
     }
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 
-from kf_calib.diagnosis.hypothesis_table import NOISE, NONE, NOTHING, SURE, TOLD, Hypothesis, Table
+from kf_calib.diagnosis.hypothesis_table import LISTED, NOISE, NONE, NOTHING, SURE, Hypothesis, HypothesisTable
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.views.diagnosis import name_of
@@ -52,7 +52,7 @@ def hypotheses(found: Diagnosis) -> Figure:
     return figure
 
 
-def draw_hypotheses(figure: FigureBase, table: Table) -> None:
+def draw_hypotheses(figure: FigureBase, table: HypothesisTable) -> None:
     """The same on a part of a figure."""
     above, below = both = _bars(table)
     families, explanations = figure.subplots(
@@ -63,20 +63,20 @@ def draw_hypotheses(figure: FigureBase, table: Table) -> None:
     explanations.set_xlabel("probability, %; dashes: from 95 % on it is taken for sure", loc="left")
 
 
-def _bars(table: Table) -> tuple[list[_Bar], list[_Bar]]:
+def _bars(table: HypothesisTable) -> tuple[list[_Bar], list[_Bar]]:
     """Return the bars of families and of explanations, the likeliest first, the unlikely as one at the end."""
-    told = [family for family, share in table.families.items() if share >= TOLD]
+    told = [family for family, share in table.families.items() if share >= LISTED]
     own = iter(_FAMILIES)
     colours = {family: _NO_EFFECT.get(family) or next(own, PALE) for family in told}
     families = [_Bar(family, table.families[family], (colours[family],)) for family in told]
     others = [family for family in table.families if family not in told]
-    families += [_Bar(_others(len(others)), table.of_any(others), (PALE,))] if others else []
+    families += [_Bar(_others(len(others)), table.probability_of_families(others), (PALE,))] if others else []
     explanations = [
         _Bar(_name(row), row.probability, tuple(colours.get(each, PALE) for each in row.families),
              "" if odds is None else f"{odds:.1f}")
-        for row, odds in zip(table.rows, table.log10_odds, strict=True) if row in table.told
+        for row, odds in zip(table.rows, table.log10_odds, strict=True) if row in table.listed
     ]  # fmt: skip
-    rest = [row.probability for row in table.rows if row not in table.told]
+    rest = [row.probability for row in table.rows if row not in table.listed]
     explanations += [_Bar(_others(len(rest)), sum(rest), (PALE,))] if rest else []
     return families, explanations
 

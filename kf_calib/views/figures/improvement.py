@@ -87,7 +87,7 @@ def _points(state: Improvement) -> list[_Point]:
     """Return the models from the first to the last, undone ones where they stood, then those that are equally good."""
     out = [_Point("start", state.start.before, state.start.test.p_value)]
     for step in state.history:
-        out.append(_Point(_label(step), step.result, step.found.test.p_value, "undone" if step.undone else "step"))
+        out.append(_Point(_label(step), step.result, step.diagnosis.test.p_value, "undone" if step.undone else "step"))
     others = [each for each in state.alternatives if each.result is not state.result]
     word = "+" if len(others) == len(state.alternatives) else "or"
     return [*out, *(_Point(f"{word} {each.name}?", each.result, None, "either") for each in others)]
@@ -212,7 +212,7 @@ def residuals_of_steps(state: Improvement) -> Figure:
 
 def draw_residuals_of_steps(figure: FigureBase, state: Improvement, drivers: Sequence[Driver]) -> None:
     """The same on a part of a figure; drivers: of the residuals of the first model."""
-    steps = [("start", state.start), *((_label(step), step.found) for step in state.steps)]
+    steps = [("start", state.start), *((_label(step), step.diagnosis) for step in state.steps)]
     drawn = steps if len(steps) <= _COLUMNS else [steps[0], *steps[-(_COLUMNS - 1) :]]
     driver = driver_to_show(drivers)
     if driver is None:

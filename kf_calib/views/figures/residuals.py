@@ -71,10 +71,10 @@ def draw_residuals(figure: FigureBase, found: Diagnosis, drivers: Sequence[Drive
             best = others[0]
             for explanation, colour, marker in zip(others[:2], (BEST, RUNNER_UP), "_x", strict=False):
                 _predictions(row[0], x, explanation, i, colour, marker)
-            _points(row[1], x, best.left_mps2[:, i] + best.contribution_mps2[:, i], sigmas[:, i], i)
+            _points(row[1], x, best.unexplained_mps2[:, i] + best.contribution_mps2[:, i], sigmas[:, i], i)
             _curve(row[1], x, best, i, is_function_of(best.contribution_mps2, driver))
-            _points(row[2], x, best.left_mps2[:, i], sigmas[:, i], i)
-            _rms(row[2], best.left_mps2, i)
+            _points(row[2], x, best.unexplained_mps2[:, i], sigmas[:, i], i)
+            _rms(row[2], best.unexplained_mps2, i)
     titles = [f"Residuals of {found.before.model.sum}"]
     if others:
         name = others[0].name
@@ -161,7 +161,7 @@ def draw_drivers(figure: FigureBase, found: Diagnosis, drivers: Sequence[Driver]
     for k, driver in enumerate(drawn):
         row, column = divmod(k, wide)
         unit, scale = driver_axis(driver)
-        values = [before, *(each.left_ratios for each in others)]
+        values = [before, *(each.unexplained_ratios for each in others)]
         for below, (ratios, axes) in enumerate(zip(values, panels[row * len(values) :, column], strict=False)):
             _ratios(axes, driver.values * scale, ratios)
             axes.set_xlabel("" if below < len(values) - 1 else f"{driver.symbol}, {unit}")

@@ -37,7 +37,7 @@ def draw_on_the_sphere(figure: FigureBase, found: Diagnosis) -> None:
     force = quantity_means(found.before, ["fx", "fy", "fz"])
     directions = np.stack([force[f"f{axis}"][:, 0] for axis in "xyz"], axis=1)
     columns = {found.before.model.sum: found.before.residuals_mps2 / mean_sigmas(found.before)}
-    columns |= {f"with {each.name}": each.left_ratios for each in found.explanations[:1]}
+    columns |= {f"with {each.name}": each.unexplained_ratios for each in found.explanations[:1]}
     most = max(_LEAST, *(float(np.percentile(np.abs(ratios), 99.0)) for ratios in columns.values()))
     shape = (3, 2) if len(columns) > 1 else (1, 3)
     panels = figure.subplots(*shape, squeeze=False, subplot_kw={"projection": "mollweide"})

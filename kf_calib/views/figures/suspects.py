@@ -100,7 +100,7 @@ def _overlaps(axes: Axes, found: Diagnosis, names: Sequence[str]) -> None:
     axes.grid(visible=False)
     axes.spines[:].set_visible(False)
     axes.tick_params(length=0)
-    if found.test.walking in names:
+    if found.test.effects.walk in names:
         axes.set_xlabel("a random walk can take any path: it overlaps with all", fontsize=8.0, color=GREY)
     axes.set_title("Overlap of what they add to the readings\n(1.00: this run cannot tell them apart)")
 

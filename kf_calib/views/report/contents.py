@@ -63,9 +63,9 @@ def _(state: Improvement, measured: Sequence[Measured], commands: Sequence[str],
     stopped, *rest = in_text(improvement.improvement_report(state, None, None))[len(steps) :]
     assert isinstance(stopped, Paragraph)
     start, last = state.start.before, state.result
-    explained = {f"{last.model.sum}": Explanation(state.effects, start, last, True).left_mps2} if state.steps else {}
+    explained = {f"{last.model.sum}": Explanation(state.effects, start, last, True).unexplained_mps2} if state.steps else {}
     return Page(
-        measured[0].name, "Improvement of the model", *_standing(state.found.test.consistent),
+        measured[0].name, "Improvement of the model", *_standing(state.diagnosis.test.consistent),
         (stopped.text, *remarks), (Facts("", tuple(facts(measured[0], last))),),
         (
             Section("The error, step by step", tuple(steps)),
@@ -73,7 +73,7 @@ def _(state: Improvement, measured: Sequence[Measured], commands: Sequence[str],
             Section("Explore the residuals", (explorer(start, explained),)),
             Section("Parameters with the last model", tuple(rest)),
             figures_of("The calibration with the last model", last, "run"),
-            Section("What is left, and what this run could show", _evidence(state.found)),
+            Section("What is left, and what this run could show", _evidence(state.diagnosis)),
             warnings_of(state.warnings),
         ), tuple(commands),
     )  # fmt: skip
@@ -147,7 +147,7 @@ def figures_of(title: str, result: object, prefix: str) -> Section:
 def _explorer_of(found: Diagnosis) -> Explorer:
     """Return the explorer of a diagnosed run, with what its explanations leave."""
     offered = found.explanations[:_EXPLORED]
-    return explorer(found.before, {f"with {each.name}": each.left_mps2 for each in offered})
+    return explorer(found.before, {f"with {each.name}": each.unexplained_mps2 for each in offered})
 
 
 def in_text(drawn: RenderableType, with_notes: bool = False) -> tuple[Part, ...]:

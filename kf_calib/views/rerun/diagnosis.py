@@ -48,7 +48,7 @@ def save(diagnosis: Diagnosis, path: Path) -> Path:
             for rank, each in enumerate(explanations, 1):
                 _log_explanation(each, sigmas, charts, at_step(stream, EXPLANATION, rank))
         for rank, each in enumerate(explanations, 1):
-            log_spheres(before, each.left_ratios, "spheres/left", 1, stream, at_step(stream, EXPLANATION, rank))
+            log_spheres(before, each.unexplained_ratios, "spheres/left", 1, stream, at_step(stream, EXPLANATION, rank))
         text = rr.TextDocument(printable(_summary(diagnosis)), media_type=rr.MediaType.MARKDOWN)
         stream.log("summary", text, static=True)
     return path
@@ -56,7 +56,7 @@ def save(diagnosis: Diagnosis, path: Path) -> Path:
 
 def _readings(explanation: Explanation, sigmas: Floats) -> Floats:
     """Return the readings less all but what an explanation adds (D, 3), over their sigma."""
-    return (explanation.contribution_mps2 + explanation.left_mps2) / sigmas
+    return (explanation.contribution_mps2 + explanation.unexplained_mps2) / sigmas
 
 
 def _log_explanation(explanation: Explanation, sigmas: Floats, charts: list[DriverChart], log: Log) -> None:
@@ -112,7 +112,7 @@ def _share(driver: Driver) -> str:
 def _probabilities(table: Table) -> str:
     """Families and explanations with their probabilities, the likeliest first, without the unlikely."""
     families = [(name, share) for name, share in table.families.items() if share >= TOLD]
-    rows = [*families, ("", None), *((name_of(row), row.probability) for row in table.told)]
+    rows = [*families, ("", None), *((name_of(row), row.probability) for row in table.listed)]
     lines = ["| | |" if share is None else f"| {name} | {format_probability(share)} |" for name, share in rows]
     return "\n".join(["| it may be | probability |", "|:--|--:|", *lines])
 

@@ -40,7 +40,7 @@ class View:
     @property
     def diagnoses(self) -> list[Diagnosis]:
         """The diagnosis of the model of each step."""
-        return [self.improvement.start, *(step.found for step in self.improvement.steps)]
+        return [self.improvement.start, *(step.diagnosis for step in self.improvement.steps)]
 
     @property
     def results(self) -> list[Calibration]:
