@@ -62,7 +62,7 @@ def test_nothing_is_found_in_noise(case: dict, runs: int) -> None:
         for k in range(runs)
     ]
     assert sum(not each.consistent for each in tests) <= runs // 15
-    assert np.median([min(each.p_values.values()) for each in tests]) > 0.2
+    assert np.median([min(each.effects.p_values.values()) for each in tests]) > 0.2
 
 
 @pytest.mark.parametrize(
@@ -160,7 +160,7 @@ def test_a_hand_placed_run_claims_nothing() -> None:
 
 def test_the_p_value_of_a_run_does_not_depend_on_how_its_frame_is_turned() -> None:
     """Which way it is turned is up to rounding: draws in it would be those of the machine."""
-    found = assess_candidates(run().fit).scan
+    found = assess_candidates(run().fit).effects.scan
     turn = np.linalg.qr(np.random.default_rng(0).standard_normal((len(found.residual),) * 2))[0]
 
     def turned(each: Candidate) -> Candidate:
