@@ -60,7 +60,7 @@ class Refits:
 
     def assess(self, result: Calibration, tests: float | None = None) -> CandidateTests:
         """Score tests of all candidates against a calibration, see ``assess_candidates``."""
-        return assess_candidates(result.fit, tests, frame=self._frame_of(result.fit))
+        return assess_candidates(result.fit, tests, frame=self.frame_of(result.fit))
 
     def assess_beside_walk(self, result: Calibration, tests: float) -> CandidateTests:
         """The same against a calibration with a random walk of the biases, whose frame is kept apart."""
@@ -71,11 +71,11 @@ class Refits:
         """All families of formulas, each tested on what the fit leaves and compared with the effects ``known``."""
         key = id(fitted), tuple((str(effect), effect.value) for effect in known)
         if key not in self._families:
-            self._families[key] = fitted, families(fitted, known, self._frame_of(fitted))
+            self._families[key] = fitted, families(fitted, known, self.frame_of(fitted))
         return self._families[key][1]
 
-    def _frame_of(self, fitted: Fit) -> Frame:
-        """Return the columns of all candidates in the noise of a fit: those of the last fit if they serve."""
+    def frame_of(self, fitted: Fit) -> Frame:
+        """The columns of all candidates in the noise of a fit: those of the last fit if they serve."""
         self._frame = candidate_frame(fitted, self._frame)
         return self._frame
 

@@ -10,7 +10,7 @@ from helpers.synthetic import plan_of
 from scipy.interpolate import Akima1DInterpolator
 
 from kf_calib.bench.bench import Bench, axes_of
-from kf_calib.diagnosis.candidate_tests import candidate_frame, candidates
+from kf_calib.diagnosis.candidate_tests import candidates
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.dwells.qr import orthonormal
@@ -67,9 +67,9 @@ def test_nothing_is_fitted_twice() -> None:
     before = run("second-order=40ug/g^2")
     refits = Refits()
     assert refits.with_effects(before, ("second-order",)) is refits.with_effects(before, ("second-order",))
-    found, frame = diagnose(before, refits), candidate_frame(before.fit, refits.frames)
+    found, frame = diagnose(before, refits), refits.frame_of(before.fit)
     assert found.after is not None and found.after is refits.with_effects(before, found.missing)
-    assert candidate_frame(found.after.fit, refits.frames) is frame
+    assert refits.frame_of(found.after.fit) is frame
 
 
 @pytest.mark.parametrize("count", [5, 40, 5000])

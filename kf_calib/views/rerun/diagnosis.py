@@ -14,7 +14,7 @@ import rerun.blueprint as rrb
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.explanation import Explanation
-from kf_calib.diagnosis.hypothesis_table import TOLD, Table
+from kf_calib.diagnosis.hypothesis_table import LISTED, HypothesisTable
 from kf_calib.diagnosis.residual_drivers import Driver, is_function_of
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.verdict import format_probability
@@ -109,9 +109,9 @@ def _share(driver: Driver) -> str:
     return f"{100 * driver.share:.0f} % of the misfit"
 
 
-def _probabilities(table: Table) -> str:
+def _probabilities(table: HypothesisTable) -> str:
     """Families and explanations with their probabilities, the likeliest first, without the unlikely."""
-    families = [(name, share) for name, share in table.families.items() if share >= TOLD]
+    families = [(name, share) for name, share in table.families.items() if share >= LISTED]
     rows = [*families, ("", None), *((name_of(row), row.probability) for row in table.listed)]
     lines = ["| | |" if share is None else f"| {name} | {format_probability(share)} |" for name, share in rows]
     return "\n".join(["| it may be | probability |", "|:--|--:|", *lines])
