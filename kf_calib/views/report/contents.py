@@ -63,7 +63,8 @@ def _(state: Improvement, measured: Sequence[Measured], commands: Sequence[str],
     stopped, *rest = in_text(improvement.improvement_report(state, None, None))[len(steps) :]
     assert isinstance(stopped, Paragraph)
     start, last = state.start.before, state.result
-    explained = {f"{last.model.sum}": Explanation(state.effects, start, last, True).unexplained_mps2} if state.steps else {}
+    explanation = Explanation(state.effects, start, last, True)
+    explained = {f"{last.model.sum}": explanation.unexplained_mps2} if state.steps else {}
     return Page(
         measured[0].name, "Improvement of the model", *_standing(state.diagnosis.test.consistent),
         (stopped.text, *remarks), (Facts("", tuple(facts(measured[0], last))),),
