@@ -71,14 +71,14 @@ USABLE_SCHEMAS = frozenset(name for role in ROLES for kind in role.kinds for nam
 
 def fields_by_role(fields: Sequence[str]) -> dict[Role, Fields]:
     """Fields as they are written, by what they are of. Raises InputError."""
-    found = dict[Role, Fields]()
+    by_role = dict[Role, Fields]()
     for text in fields:
         stated = Fields.of(text)
         role = next(role for role in ROLES if stated.quantity in role.fields)
-        if role in found:
+        if role in by_role:
             raise InputError(f"--field says twice where the {role.quantity} is: say it once.")
-        found[role] = stated
-    return found
+        by_role[role] = stated
+    return by_role
 
 
 @dataclass

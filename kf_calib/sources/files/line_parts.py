@@ -50,17 +50,17 @@ class Account:
             self.unknown[short if short in self.unknown or len(self.unknown) < _NAMED else "others"] += 1
 
     def sentences(self) -> list[str]:
-        out = list[str]()
+        sentences = list[str]()
         if self.first_malformed:
             line, reason = self.first_malformed
-            out.append(
+            sentences.append(
                 f"{self.malformed} of {self.lines} {self.what} were malformed and skipped "
                 f"(first {self.what.removesuffix('s')} {line}: {reason})."
             )
         if self.unknown:
-            named = ", ".join(f"{name!r} ({count})" for name, count in dict(self.unknown).items())
-            out.append(f"names that are not known were left out, with the values under them: {named}.")
-        return out
+            names = ", ".join(f"{name!r} ({count})" for name, count in dict(self.unknown).items())
+            sentences.append(f"names that are not known were left out, with the values under them: {names}.")
+        return sentences
 
 
 class LineRows:

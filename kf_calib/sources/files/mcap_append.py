@@ -122,15 +122,15 @@ class TopicAppender:
         if any(channel.topic == topic for channel in channels):
             raise InputError(f"{source.path} has a topic {topic} already: take the one it was made from.")
         numbers = {channel.id for channel in channels}, {schema.id for schema in schemas}
-        own, schema = (next(k for k in range(1, 1 << 16) if k not in taken) for taken in numbers)
+        channel_id, schema = (next(k for k in range(1, 1 << 16) if k not in taken) for taken in numbers)
         definition = Schema(id=schema, data=kind.schema.encode(), encoding="ros2msg", name=kind.name)
-        channel = Channel(id=own, topic=topic, message_encoding="cdr", metadata={}, schema_id=schema)
+        channel = Channel(id=channel_id, topic=topic, message_encoding="cdr", metadata={}, schema_id=schema)
         self._defined = _bytes(definition), _bytes(channel)
         self._groups[Opcode.SCHEMA].append(self._defined[0])
         self._groups[Opcode.CHANNEL].append(self._defined[1])
         self._statistics.schema_count += 1
         self._statistics.channel_count += 1
-        return own
+        return channel_id
 
     def _copy(self, source: McapFile, on_progress: Callable[[float], None] | None) -> None:
         """Copy the original up to the record that ends its data section."""
@@ -193,16 +193,18 @@ class TopicAppender:
 
     def _count_in(self, times: NDArray[np.int64] | None) -> None:
         """Count a chunk and its messages in the statistics."""
-        known = self._statistics
-        known.chunk_count += 1
+        statistics = self._statistics
+        statistics.chunk_count += 1
         if times is None:
             return
-        counts = known.channel_message_counts
+        counts = statistics.channel_message_counts
         counts[self._channel] = counts.get(self._channel, 0) + len(times)
-        none = not known.message_count
-        known.message_start_time = int(times.min()) if none else min(known.message_start_time, int(times.min()))
-        known.message_end_time = max(known.message_end_time, int(times.max()))
-        known.message_count += len(times)
+        none = not statistics.message_count
+        statistics.message_start_time = (
+            int(times.min()) if none else min(statistics.message_start_time, int(times.min()))
+        )
+        statistics.message_end_time = max(statistics.message_end_time, int(times.max()))
+        statistics.message_count += len(times)
 
     def _put(self, data: bytes, section: int = 0) -> int:
         """Write bytes, keep the checksum of all so far, and return that of a section continued by them."""

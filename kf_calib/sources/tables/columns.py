@@ -80,17 +80,17 @@ class Columns:
 
         optional: whether the table would do without the column. only (n,): rows whose cells count, NaN for others.
         """
-        out = np.full(len(self.grid.rows), np.nan)
+        numbers = np.full(len(self.grid.rows), np.nan)
         for row, cell in enumerate(self.grid.column(place)):
             if only is not None and not only[row]:
                 continue
             try:
-                out[row] = self.numbers.value(cell)
+                numbers[row] = self.numbers.value(cell)
             except (ValueError, OverflowError):
                 else_ = self.to_leave_out(place) if optional else "remove the row" if cell is None else ""
                 wanted_now = f"write {wanted} such as {self.numbers.example}{f', or {else_}' if else_ else ''}"
                 raise self.grid.refuse(row, self.grid.header[place], cell, wanted_now) from None
-        return out
+        return numbers
 
     def is_number(self, cell: Cell) -> bool:
         """Whether a cell holds a number."""
@@ -110,12 +110,12 @@ class Columns:
     def _recognise_contents(self, stated: set[int]) -> None:
         """Find faces, stamps and readings by what stands in columns whose names say nothing."""
         for k in range(len(self.meanings)):
-            own, cells = self.meanings[k].ours, self.grid.column(k)
-            if k not in stated and own == "face" and not any(map(_is_face, cells)):
+            kind, cells = self.meanings[k].ours, self.grid.column(k)
+            if k not in stated and kind == "face" and not any(map(_is_face, cells)):
                 self.meanings[k] = Meaning("", "")
-            if k not in stated and own in ("", "angle") and not self.has("face") and all(map(_is_face, cells)):
+            if k not in stated and kind in ("", "angle") and not self.has("face") and all(map(_is_face, cells)):
                 self._guess(k, "face")
-            if k not in stated and own == "" and not self.has("time") and self._are_stamps(k):
+            if k not in stated and kind == "" and not self.has("time") and self._are_stamps(k):
                 self._guess(k, "time")
         if self.places(*READINGS):
             return
@@ -171,9 +171,9 @@ def _meanings(grid: Grid, stated: Mapping[str, str]) -> list[Meaning]:
             )
         if ours != "-" and not meaning_of(ours).ours:
             raise InputError(f"--column {theirs}={ours}: {cut(ours, 60)!r} is not known: use {KNOWN}, or - for none.")
-    found = [meaning_of(name) for name in grid.header]
+    meanings = [meaning_of(name) for name in grid.header]
     for k, name in enumerate(grid.header):
         if name in stated:
             own = meaning_of(stated[name])
-            found[k] = own if own.unit else own._replace(unit=found[k].unit)
-    return found
+            meanings[k] = own if own.unit else own._replace(unit=meanings[k].unit)
+    return meanings

@@ -29,18 +29,18 @@ class Numbers:
     @classmethod
     def of(cls, grid: Grid) -> Numbers:
         """How the numbers in a grid are written; raises InputError where two cells contradict each other."""
-        seen = dict[str, tuple[int, int]]()
+        cell_of_sign = dict[str, tuple[int, int]]()
         for k, row in enumerate(grid.rows):
             for j, cell in enumerate(row):
-                if not isinstance(cell, str) or not _shows_another(cell, seen):
+                if not isinstance(cell, str) or not _shows_another(cell, cell_of_sign):
                     continue
                 if _NUMBER.fullmatch(cell) and (decimal := _decimal_of(cell)):
-                    seen.setdefault(decimal, (k, j))
-        if len(seen) == 2:
-            (_, (k, j)), (other, _) = sorted(seen.items(), key=lambda item: item[1])[::-1]
+                    cell_of_sign.setdefault(decimal, (k, j))
+        if len(cell_of_sign) == 2:
+            (_, (k, j)), (other, _) = sorted(cell_of_sign.items(), key=lambda item: item[1])[::-1]
             raise grid.refuse(k, grid.header[j], grid.rows[k][j], f"other numbers of the table have decimals after "
                               f"{other!r}: write all of them in one way")  # fmt: skip
-        decimal = next(iter(seen), "")
+        decimal = next(iter(cell_of_sign), "")
         if not decimal and grid.is_semicolon:
             cells = (cell for row in grid.rows for cell in row if isinstance(cell, str) and "," in cell)
             decimal = "," if any(_NUMBER.fullmatch(cell) for cell in cells) else ""
@@ -137,15 +137,15 @@ def stamps_of(grid: Grid, name: str, cells: list[Cell], or_else: str = "") -> li
     month_first = month_comes_first([cell for cell in cells if isinstance(cell, str)])
     wanted = "write a stamp such as 2026-05-04T13:45:00+02:00 or 04.05.2026 13:45:00, or seconds"
     wanted += f", or {or_else}" if or_else else ""
-    out = list[datetime]()
+    stamps = list[datetime]()
     for row, cell in enumerate(cells):
         try:
-            out.append(cell if isinstance(cell, datetime) else stamp_of(str(cell or ""), month_first))
+            stamps.append(cell if isinstance(cell, datetime) else stamp_of(str(cell or ""), month_first))
         except ValueError:
             raise grid.refuse(row, name, cell, wanted) from None
-        if (out[row].tzinfo is None) != (out[0].tzinfo is None):
+        if (stamps[row].tzinfo is None) != (stamps[0].tzinfo is None):
             raise grid.refuse(row, name, cell, "other stamps have a time zone or have none: write all in one way")
-    return out
+    return stamps
 
 
 def month_comes_first(texts: Sequence[str]) -> bool:
@@ -161,10 +161,10 @@ def stamp_of(text: str, month_first: bool) -> datetime:
     try:
         return datetime.fromisoformat(text)
     except ValueError:
-        found = _LOCAL.fullmatch(text.strip())
-    if not found:
+        match = _LOCAL.fullmatch(text.strip())
+    if not match:
         raise ValueError
-    first, second, third, hour, minute, second_s, fraction, half, zone = found.groups()
+    first, second, third, hour, minute, second_s, fraction, half, zone = match.groups()
     year, month, day = (first, second, third) if len(first) == 4 else (third, second, first)
     if month_first and len(first) != 4:
         month, day = day, month

@@ -99,59 +99,63 @@ def survey(
     """
     units = units or Units()
     grid = grid_of(path)
-    found = Columns.of(grid, columns, Numbers.of(grid))
-    angles = angles and bool(found.orientation)
-    opening = Opening(found, _complete(overrides, len(found.angles)), units, angles=angles)
+    table_columns = Columns.of(grid, columns, Numbers.of(grid))
+    angles = angles and bool(table_columns.orientation)
+    opening = Opening(table_columns, _complete(overrides, len(table_columns.angles)), units, angles=angles)
     opening.refuse_samples()
     table, trouble = None, ""
     try:
         table = opening.table()
     except InputError as error:
         trouble = str(error)
-    kind = found.orientation if angles else ""
+    kind = table_columns.orientation if angles else ""
     has_sigma = table is not None and table.orientations[0].sigma_mps2 is not None
-    rows = _rows(table, found, angles) if table else []
-    own = _columns(found, opening.by_size, set(columns))
+    rows = _rows(table, table_columns, angles) if table else []
+    described = _columns(table_columns, opening.by_size, set(columns))
     return Survey(
-        path, own, len(grid.rows), kind, rows, has_sigma, opening.has_unit, opening.raw, trouble,
-        list(opening.warnings), len(found.angles), not found.orientation,
+        path, described, len(grid.rows), kind, rows, has_sigma, opening.has_unit, opening.raw, trouble,
+        list(opening.warnings), len(table_columns.angles), not table_columns.orientation,
     )  # fmt: skip
 
 
 def _complete(overrides: Mapping[str, str], angles: int) -> dict[str, str]:
     """The bench with any gravity and any axes where none are stated: cells are read alike on every bench."""
-    stated = dict(overrides)
-    if not {"gravity_mps2", "latitude_deg"} & stated.keys():
-        stated["gravity_mps2"] = str(STANDARD_GRAVITY_MPS2)
-    if angles and not stated.get("axes"):
-        stated["axes"] = " ".join("yzx"[k % 3] for k in range(angles))
-    return stated
+    metadata = dict(overrides)
+    if not {"gravity_mps2", "latitude_deg"} & metadata.keys():
+        metadata["gravity_mps2"] = str(STANDARD_GRAVITY_MPS2)
+    if angles and not metadata.get("axes"):
+        metadata["axes"] = " ".join("yzx"[k % 3] for k in range(angles))
+    return metadata
 
 
-def _columns(found: Columns, by_size: Mapping[int, str], stated: set[str]) -> list[ColumnFound]:
+def _columns(columns: Columns, by_size: Mapping[int, str], stated: set[str]) -> list[ColumnFound]:
     """The columns in their order; ``by_size``: units that the size of the numbers told."""
-    out = list[ColumnFound]()
-    for k, (header, own) in enumerate(zip(found.grid.header, found.meanings, strict=True)):
-        told_by = "--column" if header in stated else "content" if header in found.guessed else "name"
+    described = list[ColumnFound]()
+    for k, (header, meaning) in enumerate(zip(columns.grid.header, columns.meanings, strict=True)):
+        told_by = "--column" if header in stated else "content" if header in columns.guessed else "name"
         if k in by_size and told_by != "--column":
             told_by = {"name": "size", "content": "content and size"}[told_by]
-        number = f" {found.angles.index(k) + 1}" if own.ours == "angle" else ""
-        first = next((cell for cell in found.grid.column(k) if cell is not None), "")
-        unit = by_size.get(k) or own.unit if own.ours else ""
+        number = f" {columns.angles.index(k) + 1}" if meaning.ours == "angle" else ""
+        first = next((cell for cell in columns.grid.column(k) if cell is not None), "")
+        unit = by_size.get(k) or meaning.unit if meaning.ours else ""
         first = f"{first:.10g}" if isinstance(first, float) else str(first)
-        out.append(ColumnFound(header, first, own.ours + number, unit, told_by if own.ours else ""))
-    return out
+        described.append(ColumnFound(header, first, meaning.ours + number, unit, told_by if meaning.ours else ""))
+    return described
 
 
-def _rows(table: Table, found: Columns, angles: bool) -> list[RowFound]:
-    has_faces = angles and found.has("face")
-    faces = found.grid.column(found.places("face")[0]) if has_faces else [None] * len(found.grid.rows)
-    out = list[RowFound]()
-    for k, (row, face, own) in enumerate(zip(found.grid.numbers, faces, table.orientations, strict=True)):
-        norm = float(np.linalg.norm(own.mean_mps2))
-        x, y, z = (own.mean_mps2 / max(norm, 1e-300)).tolist()
-        pose = tuple(map(float, own.pose)) if angles else ()
-        readings = None if own.sigma_mps2 is None else own.count
+def _rows(table: Table, columns: Columns, angles: bool) -> list[RowFound]:
+    has_faces = angles and columns.has("face")
+    faces = columns.grid.column(columns.places("face")[0]) if has_faces else [None] * len(columns.grid.rows)
+    rows = list[RowFound]()
+    for k, (row, face, orientation) in enumerate(zip(columns.grid.numbers, faces, table.orientations, strict=True)):
+        norm = float(np.linalg.norm(orientation.mean_mps2))
+        x, y, z = (orientation.mean_mps2 / max(norm, 1e-300)).tolist()
+        pose = tuple(map(float, orientation.pose)) if angles else ()
+        readings = None if orientation.sigma_mps2 is None else orientation.count
         name = None if face is None else str(face)
-        out.append(RowFound(k + 1, row, own.elapsed_s, name, pose, (x, y, z), norm, readings, own.temperature_c))
-    return out
+        rows.append(
+            RowFound(
+                k + 1, row, orientation.elapsed_s, name, pose, (x, y, z), norm, readings, orientation.temperature_c
+            )
+        )
+    return rows

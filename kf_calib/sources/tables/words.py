@@ -83,12 +83,12 @@ def meaning_of(name: str) -> Meaning:
 
 
 def _meaning_of(name: str) -> Meaning:
-    own = name.strip().lower()
-    if own in ("qx", "qy", "qz", "qw", "-"):
-        return Meaning("" if own == "-" else own, "")
-    if _RATE.search(own):
+    lowered = name.strip().lower()
+    if lowered in ("qx", "qy", "qz", "qw", "-"):
+        return Meaning("" if lowered == "-" else lowered, "")
+    if _RATE.search(lowered):
         return Meaning("", "")
-    text, unit = _unit_of(own)
+    text, unit = _unit_of(lowered)
     tokens = _tokens(text)
     channel = next((each for each in tokens if each in "xyz123"), "")
     channel = channel.translate(str.maketrans("123", "xyz"))
@@ -109,17 +109,17 @@ def _meaning_of(name: str) -> Meaning:
         return Meaning(f"a{channel}", unit if unit in ACCEL else "")
     if words & _FACE:
         return Meaning("face", "")
-    if words & _COUNT or own in _COUNT:
+    if words & _COUNT or lowered in _COUNT:
         return Meaning("count", "")
     return Meaning("", unit)
 
 
 def face_of(text: str) -> tuple[int, int] | None:
     """Axis (0, 1, 2) and sign of a named face such as +x, -z, ``y up`` or ``z down``; None if it names none."""
-    found = _FACES.fullmatch(text.strip())
-    if not found:
+    match = _FACES.fullmatch(text.strip())
+    if not match:
         return None
-    before, axis, after = found.groups()
+    before, axis, after = match.groups()
     if (before and after in tuple("+-−–")) or (axis.isdigit() and not (before or after)):
         return None  # a number alone is one of a list
     reversed_by = [mark in "-−–" if len(mark) == 1 else mark.lower() in ("down", "unten")
@@ -129,13 +129,13 @@ def face_of(text: str) -> tuple[int, int] | None:
 
 def _unit_of(name: str) -> tuple[str, str]:
     """Return a name without its unit, and the unit: in brackets, or after a slash, a comma, ``in`` or an underscore."""
-    found = re.fullmatch(r"(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]", name)
-    if found and found[2] in _OF_WORD:
-        return found[1], _OF_WORD[found[2]]
+    match = re.fullmatch(r"(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]", name)
+    if match and match[2] in _OF_WORD:
+        return match[1], _OF_WORD[match[2]]
     for pattern in (r"(.+)\s+in\s+(\S+)", r"(.+?)\s*,\s*(\S+)", r"(.+)[_ ](\S+)", r"(.+?)\s*/\s*(\S+)"):
-        found = re.fullmatch(pattern, name)
-        if found and found[2] in _OF_WORD and _is_unit_of(found[2], found[1]):
-            return found[1], _OF_WORD[found[2]]
+        match = re.fullmatch(pattern, name)
+        if match and match[2] in _OF_WORD and _is_unit_of(match[2], match[1]):
+            return match[1], _OF_WORD[match[2]]
     return name, ""
 
 
@@ -147,9 +147,9 @@ def _is_unit_of(letter: str, name: str) -> bool:
 def _tokens(text: str) -> list[str]:
     """Return the words of a name, without accents; a channel that ends a known word becomes a word of its own."""
     plain = unicodedata.normalize("NFKD", text.replace("ß", "ss")).encode("ascii", "ignore").decode()
-    out = list[str]()
+    tokens = list[str]()
     for word in re.findall(r"[a-z]+|\d+", plain):
         stem, last = word[:-1], word[-1]
         known = stem in _SPREAD | _READING | {"grav"}
-        out += [stem, last] if last in "xyz" and known else [word]
-    return out
+        tokens += [stem, last] if last in "xyz" and known else [word]
+    return tokens
