@@ -78,18 +78,18 @@ class Scheme:
             return cls(repeats)
         bench, width = reach.bench, len(reach.bench.axes)
         poses = np.random.default_rng(0).uniform(-np.pi, np.pi, (32, width))
-        found = list[tuple[int, Scheme]]()
+        schemes = list[tuple[int, Scheme]]()
         for j, signs in itertools.product(range(width), itertools.product((1.0, -1.0), repeat=width)):
             scheme = cls(repeats, j, signs)
             forces = (bench.specific_force(np.zeros(32), each) for each in (poses, scheme.antipodes(poses)))
             if np.abs(sum(forces)).max() < 1e-9 * bench.gravity_mps2:
-                found.append((int(reach.allowed(scheme.antipodes(reach.candidates)).sum()), scheme))
-        if not found:
+                schemes.append((int(reach.allowed(scheme.antipodes(reach.candidates)).sum()), scheme))
+        if not schemes:
             raise InputError(
                 "no gimbal of these axes turns gravity over by half a turn, so there are no antipodal pairs: leave out "
                 "--antipodal."
             )
-        return max(found, key=lambda each: each[0])[1]
+        return max(schemes, key=lambda each: each[0])[1]
 
 
 @dataclass(frozen=True)
@@ -226,11 +226,11 @@ class Search:
 
         shape, rooms = poses.shape, self._rooms(poses)
         for power in self.aim.powers:
-            found = minimize(
+            optimum = minimize(
                 self._with_slope, poses.ravel(), (shape, power), "L-BFGS-B", jac=True, bounds=rooms.reshape(-1, 2),
                 options=_UNTIL,
             )  # fmt: skip
-            poses = found.x.reshape(shape)
+            poses = optimum.x.reshape(shape)
         return np.where(np.isfinite(rooms).any(axis=2), poses, wrap(poses))
 
     def _rooms(self, poses: Floats) -> Floats:

@@ -59,11 +59,11 @@ class Reach:
         if self.positions_deg is not None:
             poses = np.radians(np.asarray(self.positions_deg, float))
         else:
-            each = [self._values(j) for j in range(len(self.bench.axes))]
-            total = math.prod(map(len, each))
+            axis_angles = [self._values(j) for j in range(len(self.bench.axes))]
+            total = math.prod(map(len, axis_angles))
             if total > 200_000:
                 raise InputError(f"a grid of {self.grid_deg:g} deg has {total} orientations: take a coarser one.")
-            poses = np.stack(np.meshgrid(*each, indexing="ij"), axis=-1).reshape(-1, len(each))
+            poses = np.stack(np.meshgrid(*axis_angles, indexing="ij"), axis=-1).reshape(-1, len(axis_angles))
         poses = poses[self.allowed(poses)]
         if not len(poses):
             raise InputError("no orientation is left within the limits and outside the forbidden zones: widen them.")
@@ -98,15 +98,15 @@ class Reach:
     def rooms(self, poses: Floats) -> Floats:
         """A box of allowed poses about each allowed pose (n, k), as (n, k, 2); gimbals without limits may go full
         circle in it."""
-        out = np.repeat(self.bounds[None], len(poses), axis=0)
-        out[:, [j for j in range(poses.shape[1]) if j not in self.limits_deg]] = [-np.inf, np.inf]
-        for room, pose in zip(out, poses, strict=True):
+        bounds = np.repeat(self.bounds[None], len(poses), axis=0)
+        bounds[:, [j for j in range(poses.shape[1]) if j not in self.limits_deg]] = [-np.inf, np.inf]
+        for room, pose in zip(bounds, poses, strict=True):
             for zone in self.zones_deg:
                 away = {j: _aside(pose[j], np.radians(ends)) for j, ends in zone.items()}
                 j = max(away, key=lambda each: min(away[each]))
                 below, above = away[j]  # upwards to the zone's beginning, downwards to its end
                 room[j] = max(room[j, 0], pose[j] - above + 1e-9), min(room[j, 1], pose[j] + below - 1e-9)
-        return out
+        return bounds
 
     def crosses(self, start: Floats, end: Floats) -> Mask:
         """Mask of the straight ways from ``start`` (..., k) to ``end`` (..., k) that lead through a forbidden zone."""

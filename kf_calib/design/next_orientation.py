@@ -70,10 +70,10 @@ def to_tell_apart(fitted: Fit, one: Effect, coefficients: Floats, others: Sequen
     if poses is None:
         return None
     waits_s = np.array(_WAITS) * fitted.dwells[-1].end_s
-    each = {str(other): _separations(fitted, one, coefficients, [other], poses, waits_s) for other in others}
-    each = {name: own for name, own in each.items() if own[1].max() > _TOLD}
-    every = list(each.values()) or [_separations(fitted, one, coefficients, [], poses, waits_s)]
-    before, after = min(own[0] for own in every), np.min([own[1] for own in every], axis=0)
+    separations = {str(other): _separations(fitted, one, coefficients, [other], poses, waits_s) for other in others}
+    separations = {name: own for name, own in separations.items() if own[1].max() > _TOLD}
+    counted = list(separations.values()) or [_separations(fitted, one, coefficients, [], poses, waits_s)]
+    before, after = min(own[0] for own in counted), np.min([own[1] for own in counted], axis=0)
     dwell_s = _each_s(fitted)
     farthest = after.max(axis=1)
     useful = np.minimum(farthest, ENOUGH) if before < ENOUGH else farthest[:1]
@@ -81,7 +81,7 @@ def to_tell_apart(fitted: Fit, one: Effect, coefficients: Floats, others: Sequen
     best = int(np.argmax(after[wait]))
     stay_s = float(waits_s[wait] + dwell_s) if wait else None
     angles = tuple(np.degrees(poses[best]).round(1).tolist())
-    return Advice(angles, before, float(after[wait, best]), stay_s, tuple(each))
+    return Advice(angles, before, float(after[wait, best]), stay_s, tuple(separations))
 
 
 def _separations(

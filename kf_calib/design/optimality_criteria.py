@@ -138,9 +138,9 @@ def slope(aim: Score, factor: Floats, power: float) -> Floats:
     changes = np.zeros((len(rows), count, count))
     changes[np.arange(len(rows)), rows] = h * factor[columns]
     up, down = aim(factor + changes, power), aim(factor - changes, power)
-    out = np.zeros((count, count))
-    out[rows, columns] = (up - down) / (4.0 * h)
-    return out + np.triu(out, 1).T
+    gradient = np.zeros((count, count))
+    gradient[rows, columns] = (up - down) / (4.0 * h)
+    return gradient + np.triu(gradient, 1).T
 
 
 def tolerated(wanted: Mapping[str, float], gravity_mps2: float) -> Floats:

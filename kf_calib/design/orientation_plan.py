@@ -63,10 +63,10 @@ class Plan:
     @cached_property
     def factors(self) -> Floats:
         """Information factors (n + 1, p, p) before the first dwell and after each."""
-        out = [self.prospect.start]
+        factors = [self.prospect.start]
         for rows in self.prospect.rows(self.poses, self.at_s):
-            out.append(triangle(np.vstack([out[-1], rows])))
-        return np.array(out)
+            factors.append(triangle(np.vstack([factors[-1], rows])))
+        return np.array(factors)
 
     @cached_property
     def sigma(self) -> Floats:
@@ -77,10 +77,10 @@ class Plan:
     @property
     def targets(self) -> Floats:
         """Sigmas (p,) in SI that the plan aims at; infinite where none is asked for."""
-        out, asked = np.full(len(self.prospect.units), np.inf), self.search.aim.tolerated
+        targets, asked = np.full(len(self.prospect.units), np.inf), self.search.aim.tolerated
         if asked is not None:
-            out[:STATE_COUNT] = asked * self.prospect.units[:STATE_COUNT]
-        return out
+            targets[:STATE_COUNT] = asked * self.prospect.units[:STATE_COUNT]
+        return targets
 
     @cached_property
     def directions(self) -> Floats:
@@ -184,16 +184,16 @@ class Plan:
     @cached_property
     def remarks(self) -> list[str]:
         """One sentence on each thing that a reader of the plan must know."""
-        said = list[str]()
+        sentences = list[str]()
         through = int(self.search.reach.crosses(self.poses[:-1], self.poses[1:]).sum())
         if through:
-            said.append(f"{through} of the slews would lead straight through a forbidden zone: go round it.")
+            sentences.append(f"{through} of the slews would lead straight through a forbidden zone: go round it.")
         if self.correlation > self.timing.correlation + 0.005 and len(self.poses) > 1:
-            said.append(
+            sentences.append(
                 f"time goes with the direction of gravity (correlation {self.correlation:.2f}), so a drift would pass "
                 "for a change of the parameters: visit more orientations, or repeat them (--repeats 2)."
             )
-        return [*said, *self._weaknesses()]
+        return [*sentences, *self._weaknesses()]
 
     def _weaknesses(self) -> Iterator[str]:
         """Yield the weaknesses of a plan that does not continue a run."""
@@ -227,12 +227,12 @@ def plan(search: Search, count: int, timing: Timing, seed: int = 0) -> Plan:
         adaptive = count == 1 and search.prospect.last is not None
         chosen = search.next()[None] if adaptive else search.best(count // copies)
         poses = _rounded(search, search.scheme.visits(chosen))
-        made = Plan(search, _ordered(search, poses, timing, seed), timing)
+        ordered = Plan(search, _ordered(search, poses, timing, seed), timing)
         if search.reach.continuous and search.prospect.model.bench.reference == "inertial" and copies == 1:
-            sequence = replace(search, at_s=made.at_s)  # gravity turns with the Earth during the plan
-            made = Plan(search, _rounded(search, sequence.polish(made.poses)), timing)
-        _refuse_unseen(made)
-        return made
+            sequence = replace(search, at_s=ordered.at_s)  # gravity turns with the Earth during the plan
+            ordered = Plan(search, _rounded(search, sequence.polish(ordered.poses)), timing)
+        _refuse_unseen(ordered)
+        return ordered
 
 
 def fewest(search: Search, timing: Timing, seed: int = 0, on_try: Callable[[int], None] = lambda count: None) -> Plan:
@@ -272,8 +272,8 @@ def papers_covariances(prospect: Prospect) -> Floats:
     optimal set."""
     parameters = paper_parameters.nominal(prospect.model.bench.nominal)
     force = prospect.model.bench.gravity_mps2 * paper_parameters.optimal_directions(parameters)
-    made = paper_parameters.design(force, parameters)
-    inverse = np.linalg.inv(np.swapaxes(made, 1, 2) @ made)
+    design = paper_parameters.design(force, parameters)
+    inverse = np.linalg.inv(np.swapaxes(design, 1, 2) @ design)
     return inverse * (prospect.noise.effective_sigma_mps2**2 / prospect.readings)[:, None, None]
 
 
@@ -299,9 +299,9 @@ def _ordered(search: Search, poses: Floats, timing: Timing, seed: int) -> Floats
     return poses[order(poses, force, timing, search.reach, last.pose if last else None, seed)]
 
 
-def _refuse_unseen(made: Plan) -> None:
+def _refuse_unseen(plan: Plan) -> None:
     """Raise UnobservableError if the plan leaves parameters undetermined."""
-    lost = optimality_criteria.unseen(made.factors[-1])
+    lost = optimality_criteria.unseen(plan.factors[-1])
     if lost.any():
-        names = ", ".join(symbol for symbol, own in zip(made.prospect.symbols, lost, strict=True) if own)
-        raise UnobservableError(f"{len(made.poses)} dwells leave {names} undetermined: plan more of them (--count).")
+        names = ", ".join(symbol for symbol, own in zip(plan.prospect.symbols, lost, strict=True) if own)
+        raise UnobservableError(f"{len(plan.poses)} dwells leave {names} undetermined: plan more of them (--count).")

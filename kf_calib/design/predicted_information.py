@@ -112,13 +112,13 @@ class Prospect:
     @classmethod
     def after(cls, fitted: Fit, prior: Prior | None = None) -> Prospect:
         """The prospect after a run so far, with the information from it: the filter's own factor."""
-        linearised, noise, made = fitted.linearised, fitted.noise, replace(cls.following(fitted), pause_s=PAUSE_S)
+        linearised, noise, following = fitted.linearised, fitted.noise, replace(cls.following(fitted), pause_s=PAUSE_S)
         first = square_root_information.start(prior or Prior(), linearised.model)
         steps = square_root_information.run(first, fitted.rows(), fitted.steps, fitted.following)
-        waited = noise.walk_mps2_per_sqrt_s**2 * (made.pause_s + made.dwell_s / 3.0)
+        waited = noise.walk_mps2_per_sqrt_s**2 * (following.pause_s + following.dwell_s / 3.0)
         known = random_walk.predict(steps[-1].factor, waited)[:, :-1]
         more = considered_information(noise, linearised.means, linearised.state).sum(axis=0) + fitted.considered
-        return replace(made, known=_less(known, more))
+        return replace(following, known=_less(known, more))
 
     @cached_property
     def units(self) -> Floats:
@@ -129,10 +129,10 @@ class Prospect:
     @cached_property
     def transform(self) -> Floats:
         """The Jacobian d affine state / d state of the prospect, (p, p)."""
-        out = np.diag(self.units)
+        jacobian = np.diag(self.units)
         twelve = paper_parameters.sensitivity_jacobian(paper_parameters.parameters_of(self.state[:STATE_COUNT]))
-        out[:STATE_COUNT, :STATE_COUNT] = twelve * self.units[:STATE_COUNT]
-        return out
+        jacobian[:STATE_COUNT, :STATE_COUNT] = twelve * self.units[:STATE_COUNT]
+        return jacobian
 
     @cached_property
     def start(self) -> Floats:

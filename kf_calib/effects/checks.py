@@ -96,16 +96,16 @@ def check(effect: Effect, s: Stimulus | None = None) -> tuple[str, ...]:
 
 def guard(kind: type[Effect]) -> None:
     """Let the columns of a user's class fail with a sentence on measured data too, where no trial foresaw it."""
-    own = kind.columns
-    if getattr(own, "guarded", False):
+    unguarded = kind.columns
+    if getattr(unguarded, "guarded", False):
         return
 
-    @functools.wraps(own)
+    @functools.wraps(unguarded)
     def columns(self: Effect, s: Stimulus) -> Floats:
-        found = np.asarray(_call(self, "columns", own, self, s))
-        _refuse_shape(self, found, (len(s), 3, len(self.coefficients)))
-        refuse_not_finite(self, found.reshape(len(s), -1), s)
-        return found
+        values = np.asarray(_call(self, "columns", unguarded, self, s))
+        _refuse_shape(self, values, (len(s), 3, len(self.coefficients)))
+        refuse_not_finite(self, values.reshape(len(s), -1), s)
+        return values
 
     vars(columns)["guarded"] = True
     kind.columns = columns
@@ -126,11 +126,11 @@ def refuse_not_finite(effect: Effect, values: Floats, s: Stimulus) -> None:
 
 
 def _coefficients(effect: Effect) -> int:
-    found = _call(effect, "coefficients", lambda: tuple(effect.coefficients))
-    symbols = [coefficient.symbol for coefficient in found]
+    coefficients = _call(effect, "coefficients", lambda: tuple(effect.coefficients))
+    symbols = [coefficient.symbol for coefficient in coefficients]
     if len(set(symbols)) < len(symbols):
         raise InputError(f"{effect} gives two coefficients the same symbol ({' '.join(symbols)}): tell them apart.")
-    return len(found)
+    return len(coefficients)
 
 
 def _arrays(s: Stimulus) -> dict[str, Floats]:
@@ -185,10 +185,10 @@ def _rotations(effect: FrameEffect, s: Stimulus, count: int) -> Floats:
 def _refuse_wrong_derivative(effect: FrameEffect, columns: Floats, s: Stimulus) -> None:
     """Columns against (s_i . f turned by alpha - s_i . f turned by -alpha) / 2, alpha a small finite rotation."""
     rotations = _rotations(effect, s, columns.shape[2])
-    for k, own in enumerate(np.moveaxis(rotations, 1, 0)):
-        largest = max(float(np.linalg.norm(own, axis=1).max()), 1e-300)
+    for k, rotation in enumerate(np.moveaxis(rotations, 1, 0)):
+        largest = max(float(np.linalg.norm(rotation, axis=1).max()), 1e-300)
         step = _LARGEST_TURN_RAD / largest
-        turned = (_rotate(s.force_mps2, step * own) - _rotate(s.force_mps2, -step * own)) / (2.0 * step)
+        turned = (_rotate(s.force_mps2, step * rotation) - _rotate(s.force_mps2, -step * rotation)) / (2.0 * step)
         expected = turned @ s.sensitivity.T
         off = np.abs(columns[:, :, k] - expected)
         if off.max() > _DERIVATIVE_LIMIT * largest * s.bench.gravity_mps2:
@@ -225,12 +225,12 @@ def _rotate(vector: Floats, rotation: Floats) -> Floats:
 
 def _remarks(effect: Effect, columns: Floats, s: Stimulus) -> tuple[str, ...]:
     keep = np.arange(len(s)) % 3 != 1
-    own = {
+    thinned = {
         field.name: value[keep]
         for field in dataclasses.fields(s)
         if isinstance(value := getattr(s, field.name), np.ndarray) and len(value) == len(s)
     }
-    some = dataclasses.replace(s, **own)
+    some = dataclasses.replace(s, **thinned)
     vars(some)["warming"] = s.warming[keep]  # a rate is of an instant, though it is made of the readings about it
     fewer = np.asarray(_call(effect, "columns", effect.columns, some))
     if fewer.shape == columns[keep].shape and np.allclose(

@@ -113,10 +113,10 @@ class Sinusoid(Effect):
     def columns(self, s: Stimulus) -> Floats:
         at_s, shares = s.about
         sin, cos = _parts(s, (shares * self._wave(s, at_s)).sum(axis=1))
-        out = np.zeros((len(s), 3, 6))
+        columns = np.zeros((len(s), 3, 6))
         for i in range(3):
-            out[:, i, 2 * i], out[:, i, 2 * i + 1] = sin, cos
-        return out
+            columns[:, i, 2 * i], columns[:, i, 2 * i + 1] = sin, cos
+        return columns
 
     def derivative(self, s: Stimulus, coefficients: Floats) -> Floats:
         """A_i and B_i times the changes of sine and cosine per unit of ln f: d(e^(i d)) = 2 pi i f t e^(i d)."""

@@ -39,11 +39,11 @@ class LeverArm(Effect):
         return tuple(Coefficient(f"r{i}{axis}", "m", 0.1, "mm", 1e3) for i in (1, 2, 3) for axis in "xyz")
 
     def columns(self, s: Stimulus) -> Floats:
-        out, turning = np.zeros((len(s), 3, 9)), _cross(s.rate_radps)
+        columns, turning = np.zeros((len(s), 3, 9)), _cross(s.rate_radps)
         per_metre = turning @ turning + _cross(s.rate_change_radps2)  # what it does to r, (m, 3, 3)
         for i in range(3):
-            out[:, i, 3 * i : 3 * i + 3] = s.sensitivity[i] @ per_metre
-        return out
+            columns[:, i, 3 * i : 3 * i + 3] = s.sensitivity[i] @ per_metre
+        return columns
 
 
 def _cross(vector: Floats) -> Floats:

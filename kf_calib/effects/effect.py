@@ -85,12 +85,12 @@ class Unknown:
         return np.geomspace(self.low, self.high, count)
 
 
-def _complete(own: Coefficient | Unknown) -> None:
+def _complete(parameter: Coefficient | Unknown) -> None:
     """Fill in the unit of the field where none was given."""
-    if not own.shown_unit:
-        unit = field_unit(own.unit)
-        object.__setattr__(own, "shown_unit", unit.label)  # the way for a frozen dataclass
-        object.__setattr__(own, "per_si", unit.per_si)
+    if not parameter.shown_unit:
+        unit = field_unit(parameter.unit)
+        object.__setattr__(parameter, "shown_unit", unit.label)  # the way for a frozen dataclass
+        object.__setattr__(parameter, "per_si", unit.per_si)
 
 
 class Bearer(StrEnum):
@@ -175,10 +175,10 @@ class Effect(ABC):
     @property
     def states(self) -> tuple[Coefficient, ...]:
         """The coefficients that are states: its own and, where its columns have a derivative by it, its unknown."""
-        own = self.unknown
-        if own is None or not self.smooth:
+        unknown = self.unknown
+        if unknown is None or not self.smooth:
             return self.coefficients
-        return *self.coefficients, Coefficient(own.symbol, own.unit, 1.0, own.shown_unit, own.per_si)
+        return *self.coefficients, Coefficient(unknown.symbol, unknown.unit, 1.0, unknown.shown_unit, unknown.per_si)
 
     @property
     def relations(self) -> Sequence[Floats]:

@@ -100,14 +100,14 @@ def gimbal_letters(axes: tuple[Vector, ...]) -> str:
 @lru_cache(maxsize=32)
 def quantities(axes: tuple[Vector, ...]) -> dict[str, Quantity]:
     """Everything a formula may name on a bench with these gimbal axes."""
-    letters, found = gimbal_letters(axes), dict(QUANTITIES)
+    letters, named = gimbal_letters(axes), dict(QUANTITIES)
     for k, letter in enumerate(letters):
         angle = Quantity("rad", f"angle of gimbal {k + 1}", _Angle(k))
         names = [f"q{k + 1}", *([f"q_{letter}"] if letter != "?" and letters.count(letter) == 1 else [])]
         names += ["outer"] * (k == 0) + ["inner"] * (k == len(letters) - 1)
-        found |= dict.fromkeys(names, angle)
-        found[f"q{k + 1}_before"] = Quantity("rad", f"angle of gimbal {k + 1} in the dwell before", _Angle(k, True))
-    return found
+        named |= dict.fromkeys(names, angle)
+        named[f"q{k + 1}_before"] = Quantity("rad", f"angle of gimbal {k + 1} in the dwell before", _Angle(k, True))
+    return named
 
 
 def split(text: str) -> tuple[str, str]:

@@ -43,12 +43,12 @@ def coefficient_units(unit: Unit) -> tuple[str, tuple[str, float]]:
     catalogue does.
     """
     acceleration = _registry().Unit("m/s^2")
-    own = text(acceleration / unit)
+    si_unit = text(acceleration / unit)
     power = _exponents(unit).get("meter", 0.0)
     if power not in (0.0, 1.0, 2.0, 3.0, 4.0):
-        return own, (own, 1.0)
+        return si_unit, (si_unit, 1.0)
     shown = per_power_of_g(power)
-    return own, (text(acceleration**power / unit, shown.label, raised=True), shown.per_si)
+    return si_unit, (text(acceleration**power / unit, shown.label, raised=True), shown.per_si)
 
 
 def turning_units(unit: Unit) -> tuple[str, tuple[str, float]]:

@@ -136,10 +136,10 @@ class CrossTalk(Effect):
         return tuple(Coefficient(f"X{i}{j}", "1", 1e-3) for i in (1, 2, 3) for j in (1, 2, 3) if i != j)
 
     def columns(self, s: Stimulus) -> Floats:
-        readings, out = s.force_mps2 @ s.sensitivity.T, np.zeros((len(s), 3, 6))
+        readings, columns = s.force_mps2 @ s.sensitivity.T, np.zeros((len(s), 3, 6))
         for k, (i, j) in enumerate((i, j) for i in range(3) for j in range(3) if i != j):
-            out[:, i, k] = readings[:, j]
-        return out
+            columns[:, i, k] = readings[:, j]
+        return columns
 
     def degeneracy(self, bench: Bench) -> str:
         return "at rest, cross-talk is exactly a misalignment: no orientation tells the two apart"

@@ -71,10 +71,10 @@ def _refusal(origin: Path, program: Program, now: str) -> InputError:
 
 def sha256_of(path: Path) -> str:
     """Raises InputError where the file cannot be read."""
-    found = _sha256_if_there(path)
-    if not found:
+    sha256 = _sha256_if_there(path)
+    if not sha256:
         raise InputError(f"{path}: cannot be read: give a Python file of effect classes.")
-    return found
+    return sha256
 
 
 def _sha256_if_there(path: Path) -> str:

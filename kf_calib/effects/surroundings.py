@@ -36,8 +36,8 @@ class Magnetic(Effect):
         return tuple(Coefficient(f"mB{part}{i}", "m/s^2", 1e-3) for i in (1, 2, 3) for part in "NE")
 
     def columns(self, s: Stimulus) -> Floats:
-        out = np.zeros((len(s), 3, 6))
+        columns = np.zeros((len(s), 3, 6))
         along = np.stack([s.to_platform(axis) for axis in s.level_axes], axis=2)  # (m, 3, 2)
         for i in range(3):
-            out[:, i, 2 * i : 2 * i + 2] = np.einsum("x,mxk->mk", s.axes[i], along)
-        return out
+            columns[:, i, 2 * i : 2 * i + 2] = np.einsum("x,mxk->mk", s.axes[i], along)
+        return columns

@@ -78,11 +78,11 @@ class ThermalMisalignment(Effect):
         return tuple(Coefficient(f"gamma{axis}{i}", "rad/K", 1e-5) for i in (1, 2, 3) for axis in ("P", "O"))
 
     def columns(self, s: Stimulus) -> Floats:
-        out = np.zeros((len(s), 3, 6))
+        columns = np.zeros((len(s), 3, 6))
         for i in range(3):
-            out[:, i, 2 * i] = s.warmth * s.pendulous[:, i]
-            out[:, i, 2 * i + 1] = s.warmth * s.output[:, i]
-        return out
+            columns[:, i, 2 * i] = s.warmth * s.pendulous[:, i]
+            columns[:, i, 2 * i + 1] = s.warmth * s.output[:, i]
+        return columns
 
 
 class ThermalLag(SensorEffect):

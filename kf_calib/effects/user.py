@@ -60,13 +60,13 @@ def classes_in(source: bytes, path: Path) -> list[type[Effect]]:
         raise InputError(
             f"{path}{_line(error, path)}: cannot be run ({checks.words_of(error)}): mend it there."
         ) from None
-    found = effect_classes(module)
-    if not found:
+    classes = effect_classes(module)
+    if not classes:
         raise InputError(
             f"{path}: defines no effect: write a class that derives from SensorEffect, FrameEffect or Effect "
             "(from kf_calib.effects import SensorEffect)."
         )
-    return found
+    return classes
 
 
 def _line(error: BaseException, path: Path) -> str:
@@ -96,7 +96,7 @@ def classes_installed() -> list[tuple[type[Effect], str]]:
     """Effect classes that installed packages announce, each with who announces it."""
     import importlib.metadata  # as dear as the rest of this package together
 
-    found = list[tuple[type[Effect], str]]()
+    classes = list[tuple[type[Effect], str]]()
     for point in importlib.metadata.entry_points(group=GROUP):
         origin = f"entry point {point.name} = {point.value}"
         try:
@@ -111,8 +111,8 @@ def classes_installed() -> list[tuple[type[Effect], str]]:
                 raise InputError(
                     f"{origin} of {GROUP}: is no effect class: it must derive from kf_calib.effects.Effect."
                 )
-            found.append((kind, origin))
-    return found
+            classes.append((kind, origin))
+    return classes
 
 
 def completed(kind: type[Effect], origin: str) -> type[Effect]:

@@ -167,10 +167,10 @@ class Running:
         factor = square_root_information.start(self.prior, self.linearised.model)
         factor[:, -1] -= factor[:, :-1] @ self.about
         variances = steps(self.dwells, self.noise)
-        out = replace(self, factor=factor, left=0.0, rows=0)
+        running = replace(self, factor=factor, left=0.0, rows=0)
         for k, variance in enumerate(variances):  # the rows of all dwells together would take much memory
-            out = out._update(self._rows([k])[0], variance)
-        return out
+            running = running._update(self._rows([k])[0], variance)
+        return running
 
     def _rows(self, chosen: Sequence[int] | None = None) -> list[Floats]:
         """Return the whitened rows of all dwells, or of those chosen."""

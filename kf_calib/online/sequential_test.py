@@ -102,10 +102,10 @@ class Watch:
             return None
         scan = self.running.scan
         own = [float(chdtrc(c.dof, x)) for c, x in zip(scan.candidates, scan.statistics, strict=True) if c.dof]
-        found = [float(chdtrc(dof, statistic)), *([sidak(min(own), self.tests)] if own else [])]
+        p_values = [float(chdtrc(dof, statistic)), *([sidak(min(own), self.tests)] if own else [])]
         going = self.trend
-        found += [going.p_value * SHARE / REST] if going else []
-        return min(1.0, min(found) / SHARE)
+        p_values += [going.p_value * SHARE / REST] if going else []
+        return min(1.0, min(p_values) / SHARE)
 
     @cached_property
     def trend(self) -> Trend | None:

@@ -82,10 +82,10 @@ class Session(Evaluation[Judgement, Standing]):
         """With ``auto``, accept the missing effects once several judgements in a row were sure of them."""
         if not (self.auto and judgement.alarm and judgement.look.settled):
             return
-        found = judgement.diagnosis
-        if not found.sure:
+        diagnosis = judgement.diagnosis
+        if not diagnosis.sure:
             return
         try:
-            self.accept(*found.missing)
+            self.accept(*diagnosis.missing)
         except InputError as error:
             self.say(str(error))

@@ -100,15 +100,17 @@ def _look(result: Calibration, watch: Watch | None, before: Look | None = None) 
     """Return a look at the run; it counts agreement with the look before."""
     if not _alarmed(watch):
         return Look(result, watch)
-    found = diagnose(result)
-    same = before is not None and before.diagnosed is not None and _conclusion(found) == _conclusion(before.diagnosed)
-    return Look(result, watch, found, before.agreed + 1 if before and same else 1)
+    diagnosis = diagnose(result)
+    same = (
+        before is not None and before.diagnosed is not None and _conclusion(diagnosis) == _conclusion(before.diagnosed)
+    )
+    return Look(result, watch, diagnosis, before.agreed + 1 if before and same else 1)
 
 
-def _conclusion(found: Diagnosis) -> tuple[object, ...]:
+def _conclusion(diagnosis: Diagnosis) -> tuple[object, ...]:
     """Return the parts of a diagnosis that have to be equal for two diagnoses to agree."""
-    enough = found.after is not None and found.after.consistency.dof >= _FREEDOM
-    return found.test.consistent, frozenset(found.missing), frozenset(found.ambiguity), enough
+    enough = diagnosis.after is not None and diagnosis.after.consistency.dof >= _FREEDOM
+    return diagnosis.test.consistent, frozenset(diagnosis.missing), frozenset(diagnosis.ambiguity), enough
 
 
 def _alarmed(watch: Watch | None) -> bool:
