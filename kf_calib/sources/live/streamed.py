@@ -118,6 +118,8 @@ class StreamedFeed(Feed):
                 return self._converting(bench_of(self.name, reader, self._overrides))
             if ahead > _MOST_AHEAD:
                 break
+        if self._angles and (reader := self._protocol.reader) is not None and reader.pose_width:  # angles alone came
+            return self._converting(bench_of(self.name, reader, self._overrides))
         raise self._protocol.unusable(
             "no platform angles (--no-angles does without them)" if self._angles else "no readings"
         )
