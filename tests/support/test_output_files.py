@@ -464,7 +464,7 @@ def test_of_two_that_begin_at_once_one_is_refused(tmp_path: Path, monkeypatch: p
     path = tmp_path / "run.mcap"
     if there:
         path.write_bytes(MINE)
-    monkeypatch.setattr("kf_calib.sources.files.recorder.refuse", lambda *_: None)
+    monkeypatch.setattr("kf_calib.sources.files.recorder.refuse_output", lambda *_: None)
     with Recorder(path, BENCH, overwrite=True) as recorder:
         second = Growing(path) if there else None
         with pytest.raises(InputError, match="being written by another run"):
