@@ -25,7 +25,10 @@ Conventions, kept everywhere:
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
+
+from kf_calib.support.printing import shown_by
 
 if TYPE_CHECKING:
     from kf_calib.bench.bench import Bench
@@ -87,8 +90,7 @@ _HOMES = {
     "Watch": ("online.sequential_test", "Watch"),
 }
 
-_SHOWING = ("views.notebook",)
-"""What prints the results of these, and shows them in notebooks."""
+shown_by(lambda: import_module("kf_calib.views.notebook"))
 
 __all__ = [
     "Bench", "Calibration", "Corrected", "Correction", "Diagnosis", "Fleet", "Improvement", "InputError",
@@ -100,13 +102,9 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     """Public names are imported when first used: the package itself imports in milliseconds."""
-    from importlib import import_module
-
     if name == "plot":
         return import_module("kf_calib.views.figures")
     if name not in _HOMES:
         raise AttributeError(f"module 'kf_calib' has no attribute {name!r}")
-    for module in _SHOWING:
-        import_module(f"kf_calib.{module}")
     module, attribute = _HOMES[name]
     return getattr(import_module(f"kf_calib.{module}"), attribute)

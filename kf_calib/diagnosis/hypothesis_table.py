@@ -76,6 +76,9 @@ class HypothesisTable:
 
     rows: tuple[Hypothesis, ...]
 
+    def __repr__(self) -> str:
+        return "\n".join(f"{row.probability:7.2%} {' + '.join(row.effects or row.families)}" for row in self.listed)
+
     @cached_property
     def families(self) -> dict[str, float]:
         """Probability that something of each family is missing; with two effects at once they sum to more than one."""

@@ -63,11 +63,14 @@ def calibrate(
     settings: Settings | None = None,
     on_progress: Callable[[float], None] | None = None,
     plain: Fit | None = None,
+    *,
+    effects: str | Sequence[str] | None = None,
 ) -> Calibration:
     """Calibrate from a source or from the recording at a path: fold dwells, fit the noise, run the filter, judge the
     misfit.
 
     - settings: how to evaluate it.
+    - effects: names of the effects in the model, or the name of one, in place of those of the settings.
     - on_progress: called with the share of the source that has been read.
     - plain: a fit of the same model to dwells without a carrier, if it is already known that they need one.
 
@@ -75,6 +78,8 @@ def calibrate(
     parameter.
     """
     source, settings = opened(source), settings or Settings()
+    if effects is not None:
+        settings = replace(settings, effects=effects)
     with one_blas_thread():
         passed = Pass(source, settings)
         if passed.model.averages and not settings.window_s:

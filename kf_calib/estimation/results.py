@@ -22,6 +22,7 @@ from kf_calib.estimation.cross_validation import HeldOut, held_out
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import Model
+from kf_calib.estimation.parameters import Parameter, Parameters
 from kf_calib.estimation.relinearisation import at_its_mode
 from kf_calib.estimation.residual_table import residual_table, table_as
 from kf_calib.estimation.settings import Settings
@@ -35,22 +36,6 @@ from kf_calib.support.units import field_unit, shown
 
 _WEAK = 5.0  # times the size that a coefficient may well have
 _HOPELESS = {"rad": np.radians(10.0), "1": 0.2, "m/s^2": 2.0}  # larger sigmas: not determined
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """An estimated parameter and its sigma in SI units; both are None if the orientations do not determine it.
-
-    A value times ``per_si`` is in ``shown_unit``, the unit of the field (``support.units``).
-    """
-
-    symbol: str
-    value: float | None
-    sigma: float | None
-    unit: str
-    nominal: float
-    shown_unit: str
-    per_si: float
 
 
 @dataclass(frozen=True)
@@ -269,7 +254,7 @@ class Calibration:
         return self.linearised.model
 
     @property
-    def parameters(self) -> dict[str, Parameter]:
+    def parameters(self) -> Parameters:
         """The twelve parameters, then the coefficients of effects and the constants in them, by symbol."""
         estimate, nominal = self.estimate, paper_parameters.nominal(self.bench.nominal)
         coefficients, (effects, gains) = self.model.coefficients, self.model.natural(self.estimate.state)
@@ -300,8 +285,8 @@ class Calibration:
             sigma = effect.value * spread if spread < 1.0 else math.nan  # sigma over value
             rows.append((constant.symbol, effect.value, sigma, 0.0, constant.unit))
             units.append((constant.shown_unit, constant.per_si))
-        return {
-            symbol: Parameter(
+        return Parameters(
+            Parameter(
                 symbol,
                 float(value) if np.isfinite(sigma) and symbol not in self.fixed else None,
                 float(sigma) if np.isfinite(sigma) and symbol not in self.fixed else None,
@@ -310,7 +295,7 @@ class Calibration:
                 *own,
             )
             for (symbol, value, sigma, expected, unit), own in zip(rows, units, strict=True)
-        }
+        )
 
     def residuals(self, kind: Literal["numpy", "pandas", "polars"] = "numpy") -> Any:
         """The residuals as a table with a row for each dwell and accelerometer, and what the bench did there.

@@ -41,7 +41,7 @@ def test_models_of_one_recording_are_told_apart_by_the_larger_sigma() -> None:
 def test_what_one_of_them_does_not_determine_has_no_difference() -> None:
     whole = kf_calib.calibrate(HIDDEN)
     unseen = replace(whole.parameters["b2"], value=None, sigma=None)
-    other = SimpleNamespace(parameters=whole.parameters | {"b2": unseen})
+    other = SimpleNamespace(parameters={**whole.parameters, "b2": unseen})
     for two in ((whole, other), (other, whole)):
         without = [each for each in differences(*two, same_recording=False) if each.sigmas is None]
         assert [(each.symbol, each.value, each.sigma) for each in without] == [("b2", None, None)]

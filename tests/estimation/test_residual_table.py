@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import subprocess
 import sys
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -66,3 +67,48 @@ def test_notebooks_show_results_as_tables(run: kf_calib.Calibration, monkeypatch
         assert shown.count("<table>") >= 1 and says in shown and "<script" not in shown
     monkeypatch.setattr(notebook, "find_spec", lambda name: None)
     assert run._repr_html_() is None  # a notebook then shows the text
+
+
+def test_parameters_are_a_dictionary_and_rows(run: kf_calib.Calibration, monkeypatch: pytest.MonkeyPatch) -> None:
+    """pandas makes rows of an array of objects, polars of a stream that it has made of dictionaries itself."""
+    own = run.parameters
+    assert list(own) == list(own.keys()) == [each.symbol for each in own.values()] and "K1" in own and len(own) == 12
+    assert dict(own) == {**own} == dict(own.items()) and own == run.parameters and own.get("x") is None
+    assert repr(own).splitlines()[2] == f"K1 = {own['K1'].value:.9g} ± {own['K1'].sigma:.2g}"
+    assert np.asarray(own).tolist() == list(own.values())
+    made = ModuleType("polars")
+    made.DataFrame = lambda rows: SimpleNamespace(__arrow_c_stream__=lambda schema: rows)
+    made.__spec__ = importlib.machinery.ModuleSpec("polars", None)
+    monkeypatch.setitem(sys.modules, "polars", made)
+    assert [row["value"] for row in own.__arrow_c_stream__()] == [each.value for each in own.values()]
+
+
+@pytest.mark.parametrize("kind", ["pandas", "polars"])
+def test_a_dataframe_of_parameters(run: kf_calib.Calibration, kind: str) -> None:
+    frame = pytest.importorskip(kind).DataFrame(run.parameters)
+    assert list(frame["symbol"]) == list(run.parameters)
+    assert list(frame["sigma"]) == [each.sigma for each in run.parameters.values()]
+
+
+def test_a_run_is_printed_alike_whatever_was_imported(run: kf_calib.Calibration) -> None:
+    program = "from kf_calib.estimation.calibration import calibrate; import sys; print(calibrate(sys.argv[1]))"
+    printed = subprocess.run([sys.executable, "-c", program, FACES], capture_output=True, text=True, check=True).stdout
+    assert printed.splitlines() == str(run).splitlines() and "Parameters (1σ)" in printed
+
+
+def test_effects_may_be_stated_alone() -> None:
+    settings = kf_calib.Settings(gate_sigma=5.0)
+    found = kf_calib.calibrate(FACES, settings, effects="second-order")
+    assert found.settings.effects == ("second-order",) and found.settings.gate_sigma == 5.0
+    assert (
+        found.parameters
+        == kf_calib.calibrate(FACES, kf_calib.Settings(gate_sigma=5.0, effects=["second-order"])).parameters
+    )
+
+
+def test_a_table_and_the_explanations_print_themselves() -> None:
+    table = kf_calib.open_table(ROOT / "recordings" / "twelve_poses.csv", {"axes": "y z x", "gravity_mps2": "9.8123"})
+    assert repr(table).endswith("twelve_poses.csv: 12 orientations, raw readings in mg, channels in the order of the "
+                                "accelerometers>")  # fmt: skip
+    found = kf_calib.diagnose(ROOT / "recordings" / "hidden.mcap").table
+    assert found is not None and repr(found).splitlines()[0] == f" {found.first.probability:.2%} hysteresis"

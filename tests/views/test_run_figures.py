@@ -236,6 +236,11 @@ def test_odd_runs_have_all_figures(name: str) -> None:
         assert any(axes.has_data() for axes in figure.axes)
 
 
+def test_a_notebook_shows_a_figure(result: Calibration) -> None:
+    picture = imread(io.BytesIO(plot.convergence(result)._repr_png_()))
+    assert picture.shape[1] == 80 * 11 and np.ptp(picture[..., :3]) > 0.5
+
+
 def test_a_result_is_saved_as_png_svg_and_pdf_with_a_page_a_figure(run, tmp_path: Path) -> None:
     files = {kind: tmp_path / f"run.{kind}" for kind in ("png", "svg", "pdf")}
     options = [word for kind, path in files.items() for word in (f"--{kind}", path)]

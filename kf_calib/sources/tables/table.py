@@ -30,6 +30,9 @@ class Table:
         self.name, self.bench, self.orientations = name, bench, tuple(orientations)
         self.warnings, self.fraction, self._start_ns, self.path = list(warnings), 1.0, start_ns, path
 
+    def __repr__(self) -> str:
+        return f"<Table {self.name}: {len(self.orientations)} orientations, {self.bench.input}>"
+
     def begin_ns(self) -> int | None:
         """Stamp of the first row; None where the table has no date."""
         return self._start_ns

@@ -24,6 +24,7 @@ ALARM = "#b3001b"
 
 KINDS = ("png", "svg", "pdf")
 DPI = 150
+_DPI_OF_NOTEBOOKS = 80
 _RULES: Any = {
     "font.family": "DejaVu Sans",
     "font.size": 9.0,
@@ -62,9 +63,16 @@ def styled() -> Iterator[None]:
         yield
 
 
+class Picture(Figure):
+    """A figure that a notebook shows, whatever matplotlib's settings are there."""
+
+    def _repr_png_(self) -> bytes:
+        return content_of(self, "png", _DPI_OF_NOTEBOOKS)
+
+
 def blank(width_in: float = 11.0, height_in: float = 7.0) -> Figure:
     """An empty figure that arranges its panels by itself."""
-    figure = Figure(figsize=(width_in, height_in), layout="constrained", facecolor="white")
+    figure = Picture(figsize=(width_in, height_in), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
     figure.get_layout_engine().set(w_pad=0.06, h_pad=0.06)  # type: ignore[union-attr]  # given just above
     return figure
