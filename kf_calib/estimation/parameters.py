@@ -41,7 +41,7 @@ class Parameters:
     """
 
     def __init__(self, parameters: Iterable[Parameter]) -> None:
-        self._by_symbol = {own.symbol: own for own in parameters}
+        self._by_symbol = {parameter.symbol: parameter for parameter in parameters}
 
     def __getitem__(self, symbol: str) -> Parameter:
         return self._by_symbol[symbol]
@@ -60,9 +60,9 @@ class Parameters:
 
     __hash__ = None  # type: ignore[assignment]  # as of a dictionary
 
-    def get(self, symbol: str) -> Parameter | None:
-        """The parameter; None if there is none of this symbol."""
-        return self._by_symbol.get(symbol)
+    def get(self, symbol: str, default: Parameter | None = None) -> Parameter | None:
+        """The parameter; the default if there is none of this symbol."""
+        return self._by_symbol.get(symbol, default)
 
     def keys(self) -> KeysView[str]:
         """The symbols."""
