@@ -30,6 +30,7 @@ import numpy as np
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
+from kf_calib.bench.raw_input import RawInput
 from kf_calib.errors import InputError
 from kf_calib.exchange.calibration_file import SavedCalibration
 from kf_calib.support import dates
@@ -136,7 +137,7 @@ def history(calibrations: Sequence[SavedCalibration], tolerances: Mapping[str, f
         raise InputError(f"{unknown[0]} has a tolerance, but not all calibrations determine it: leave it out.")
     due, by = _due(tracks, wanted)
     date = None if due is None else begun[-1] + timedelta(days=due)
-    warnings = (*_undated(ordered), *_of_the_span(days))
+    warnings = (*_undated(ordered), *_of_other_inputs(ordered), *_of_the_span(days))
     return History(next(iter(serials), ""), begun, tracks, wanted, date, by, warnings)
 
 
@@ -160,6 +161,15 @@ def _undated(calibrations: Sequence[SavedCalibration]) -> list[str]:
         f"they were computed ({which}{', ...' * (len(those) > _NAMED)}): evaluate those runs again with --date and "
         "--save, if they are older"
     ]
+
+
+def _of_other_inputs(calibrations: Sequence[SavedCalibration]) -> list[str]:
+    """Return a sentence if the calibrations convert raw readings differently: their scale factors then differ, too."""
+    inputs = dict.fromkeys(str(RawInput.from_metadata(saved.provenance.bench)) for saved in calibrations)
+    if len(inputs) < 2:
+        return []
+    return [f"the calibrations take different raw readings ({'; '.join(inputs)}): a change of the size of a count is a "
+            "step of the scale factors, which is none of the block's"]  # fmt: skip
 
 
 def _of_the_span(days: Floats) -> list[str]:

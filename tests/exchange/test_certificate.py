@@ -7,6 +7,7 @@ import json
 import shutil
 import subprocess
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from datetime import UTC, datetime
 from importlib.util import find_spec
 from pathlib import Path
@@ -97,6 +98,16 @@ def test_the_numbers_of_the_xml_are_those_of_the_calibration(cal: Path, lab: Pat
     outcomes = [each.text for each in root.findall(".//dcc:conformity", names)]
     assert len(outcomes) == 6 and set(outcomes) == {"pass", "fail"}
     assert dcc.check(dcc.xml(own), None).startswith("all mandatory elements of DCC 3.3.0 are there")
+
+
+def test_it_says_which_raw_readings_the_results_belong_to(cal: Path) -> None:
+    own = made(cal, None)
+    assert not any("readings made of" in remark for remark in document.content(own, "")["remarks"])
+    bench = dict(own.saved.provenance.bench) | {"channels": "2, -1, 3", "accel_scale": "4e-6"}
+    saved = own.saved.model_copy(update={"provenance": own.saved.provenance.model_copy(update={"bench": bench})})
+    remarks = document.content(replace(own, saved=saved), "")["remarks"]
+    (told,) = [remark for remark in remarks if "readings made of" in remark]
+    assert "accelerometers 1, 2, 3 on channels 2, -1, 3: x = 4e-06 channel2, y = -4e-06 channel1, z = 4e-06" in told
 
 
 def test_without_a_statement_it_says_that_it_is_no_dcc(cal: Path) -> None:

@@ -213,3 +213,13 @@ def test_the_command_tells_the_date_and_draws_a_panel_a_parameter(run: Any, tmp_
     found = history([calibration_file.read(path) for path in files])
     assert len([axes for axes in kf_calib.plot.history(found).axes if axes.get_title(loc="left")]) == 12
     assert (tmp_path / "chart.svg").read_bytes().startswith(b"<?xml")
+
+
+def test_calibrations_of_other_counts_are_told() -> None:
+    """The size of a count is in the scale factors: a history of both would show a step that is none of the block's."""
+    one, two = at(0.0, 1.0, 1e-6), at(100.0, 1.0, 1e-6)
+    assert not any("raw readings" in sentence for sentence in history([one, two]).warnings)
+    bench = {"accel_scale": "4e-6"}
+    two = two.model_copy(update={"provenance": two.provenance.model_copy(update={"bench": bench})})
+    (told,) = [sentence for sentence in history([one, two]).warnings if "raw readings" in sentence]
+    assert "readings in m/s^2, in the order of the accelerometers; raw readings in" in told

@@ -256,6 +256,8 @@ def _remarks(own: Certificate, standing: str) -> list[str]:
         remarks.append("Nothing was left over to judge the agreement of model and measurements by.")
     if saved.not_seen:
         remarks.append(f"Effects that this run could not have shown: {', '.join(saved.not_seen)}.")
+    if not (raw := saved.bench.input).is_plain:
+        remarks.append(f"The results belong to readings made of {raw}: {raw.formula}, m/s².")
     remarks += [f"Of the recording: {sentence}" for sentence in saved.provenance.warnings]
     remarks += [own.statement.remarks] if own.statement.remarks else []
     origin = saved.provenance
