@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from helpers.slow_share import Share, SlowShare
+from hypothesis import settings
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: a process a core is enough
 os.environ["COLUMNS"] = ""
@@ -20,6 +21,9 @@ del os.environ["COLUMNS"]  # readline sets it behind Python's back, and a child 
 
 import kf_calib.views.diagnosis  # noqa: F401 (with it results print themselves, as with the public names)
 from kf_calib.cli import main
+
+settings.register_profile("fixed", derandomize=True)  # what is tried is the same on every machine, every day
+settings.load_profile("fixed")
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "recordings"
 

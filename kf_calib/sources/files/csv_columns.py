@@ -59,11 +59,10 @@ class Quantity:
                 raise LineError("some components of a vector are missing")
             return None
         values = [_number(cell, numbers) for cell in cells]
-        if not math.isfinite(sum(values)):
-            place, cell = next(
-                (at, cell) for at, cell, value in zip(self.at, cells, values, strict=True) if not math.isfinite(value)
-            )
-            raise LineError(f"column {cut(header[place], 40)!r} is {cut(cell, 40)!r}, which is no number")
+        if not math.isfinite(sum(values)):  # which numbers beyond 1e308 together are not, either
+            for at, cell, value in zip(self.at, cells, values, strict=True):
+                if not math.isfinite(value):
+                    raise LineError(f"column {cut(header[at], 40)!r} is {cut(cell, 40)!r}, which is no number")
         return list(map(mul, values, self.factors))
 
 
