@@ -107,15 +107,20 @@ def refuse_parameters(
     variances = np.diag(jacobian @ np.array(state.covariance)[:STATE_COUNT, :STATE_COUNT] @ jacobian.T)
     expected = zip(paper_parameters.parameters_of(affine), np.sqrt(variances), strict=True)
     nominal = [*paper_parameters.nominal(bench.nominal), *[0.0] * (len(parameters) - STATE_COUNT)]
-    for own, (value, sigma) in zip(parameters, expected, strict=False):
-        _compare(own, "its state", float(value), float(sigma), _ROUNDED_ANGLE)
-    for own, usual in zip(parameters, nominal, strict=True):
-        if not math.isclose(own.nominal, usual, rel_tol=_EXACT, abs_tol=_ROUNDED_ANGLE):
-            raise ValueError(f"parameters say that {own.symbol} is nominally {own.nominal!r}, but its bench {usual!r}")
+    for parameter, (value, sigma) in zip(parameters, expected, strict=False):
+        _compare(parameter, "its state", float(value), float(sigma), _ROUNDED_ANGLE)
+    for parameter, expected_nominal in zip(parameters, nominal, strict=True):
+        if not math.isclose(parameter.nominal, expected_nominal, rel_tol=_EXACT, abs_tol=_ROUNDED_ANGLE):
+            raise ValueError(
+                f"parameters say that {parameter.symbol} is nominally {parameter.nominal!r}, but its bench "
+                f"{expected_nominal!r}"
+            )
     unknown = {*state.undetermined, *fixed}
-    for own in parameters[: len(state.symbols)]:
-        if [own.value is None, own.sigma is None] != [own.symbol in unknown] * 2:
-            raise ValueError(f"parameters and state.undetermined do not agree whether {own.symbol} was determined")
+    for parameter in parameters[: len(state.symbols)]:
+        if [parameter.value is None, parameter.sigma is None] != [parameter.symbol in unknown] * 2:
+            raise ValueError(
+                f"parameters and state.undetermined do not agree whether {parameter.symbol} was determined"
+            )
 
 
 def refuse_coefficients(
@@ -147,14 +152,16 @@ def _beside_the_state(model: Model, noise: SavedNoise) -> Iterator[tuple[str, st
         yield effect.unknown.symbol, effect.unknown.unit, effect.value, None
 
 
-def _compare(own: SavedParameter, where: str, value: float, sigma: float | None, rounded: float = 0.0) -> None:
+def _compare(parameter: SavedParameter, where: str, value: float, sigma: float | None, rounded: float = 0.0) -> None:
     """Refuse a value or a sigma that is another one elsewhere; None where it is written nowhere else."""
-    if own.value is not None and not math.isclose(own.value, value, rel_tol=_EXACT, abs_tol=rounded):
-        raise ValueError(f"parameters say {own.symbol} = {own.value!r}, but {where} says {value!r}")
-    if own.sigma is not None and sigma is not None and not math.isclose(own.sigma, sigma, rel_tol=_ROUNDED):
-        raise ValueError(f"parameters say {own.symbol} has sigma {own.sigma!r}, but its covariance says {sigma!r}")
-    if own.sigma == 0.0:
-        raise ValueError(f"parameters say {own.symbol} has sigma 0: nothing is known exactly")
+    if parameter.value is not None and not math.isclose(parameter.value, value, rel_tol=_EXACT, abs_tol=rounded):
+        raise ValueError(f"parameters say {parameter.symbol} = {parameter.value!r}, but {where} says {value!r}")
+    if parameter.sigma is not None and sigma is not None and not math.isclose(parameter.sigma, sigma, rel_tol=_ROUNDED):
+        raise ValueError(
+            f"parameters say {parameter.symbol} has sigma {parameter.sigma!r}, but its covariance says {sigma!r}"
+        )
+    if parameter.sigma == 0.0:
+        raise ValueError(f"parameters say {parameter.symbol} has sigma 0: nothing is known exactly")
 
 
 def refuse_effects(chosen: Sequence[SavedEffect], state: SavedState) -> None:

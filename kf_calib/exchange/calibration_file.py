@@ -312,13 +312,13 @@ def read(path: str | Path) -> SavedCalibration:
 def _checked(path: Path, content: dict[str, Any]) -> SavedCalibration:
     """Return the content if all of it is as it must be; raise InputError if not."""
     try:
-        found = SavedCalibration.model_validate(content)
-        found.bench  # noqa: B018  # raises BenchError
+        saved = SavedCalibration.model_validate(content)
+        saved.bench  # noqa: B018  # raises BenchError
     except ValidationError as error:
         raise InputError(f"{path}: {_said(error)}: give a calibration as --save has written it.") from None
     except BenchError as error:
         raise InputError(f"{path}: provenance.bench: {error}") from None
-    return found
+    return saved
 
 
 def _said(error: ValidationError) -> str:

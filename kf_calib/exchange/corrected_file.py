@@ -41,12 +41,12 @@ class Applied:
 def apply_to_file(
     correction: Correction,
     recording: Recording,
-    out: Path,
+    copy: Path,
     on_progress: Callable[[float], None] | None = None,
     *,
     unchecked: bool = False,
 ) -> Applied:
-    """Write the copy to ``out``, wholly or not at all; unchecked: though the norm at rest may not be gravity.
+    """Write the ``copy``, wholly or not at all; unchecked: though the norm at rest may not be gravity.
 
     Raises InputError where the recording cannot be read, is not whole, has no temperature where an effect needs one, or
     holds other readings than it is taken for.
@@ -55,7 +55,7 @@ def apply_to_file(
     thermometer = _Thermometer(bool(correction.needs_temperature))
     count = bad = 0
     source = source_file(recording.path)
-    with whole(out) as part, part.open("wb") as file:
+    with whole(copy) as part, part.open("wb") as file:
         copied, told = _half(on_progress, 0.0), _half(on_progress, 0.5)
         appender = TopicAppender(source, file, CALIBRATED_TOPIC, cdr.IMU, _template(correction), copied)
         for readings, temperature_c in _pairs(recording, thermometer, told):

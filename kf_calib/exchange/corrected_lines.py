@@ -82,20 +82,20 @@ class CorrectedLines:
 
     def _corrected(self, lines: list[Line], ended: bool) -> bytes:
         """Return lines, corrected; the readings of all of them at once."""
-        out = dict[int, str]()
-        for number, text, end in self._started(lines, ended, out):
-            out[number] = text + end
+        corrected = dict[int, str]()
+        for number, text, end in self._started(lines, ended, corrected):
+            corrected[number] = text + end
         lines, self._waiting = self._waiting, []
         if self._reader is None:
             self._waiting = lines
-            return _bytes(out)
+            return _bytes(corrected)
         raw = list[tuple[Line, int, list[float], float]]()  # line, stamp, readings, temperature
         for line in lines:
-            for time_ns, readings in self._read(line, out):
+            for time_ns, readings in self._read(line, corrected):
                 raw.append((line, time_ns, readings, self._temperature_c))
         if raw:
-            self._put(out, raw)
-        return _bytes(out)
+            self._put(corrected, raw)
+        return _bytes(corrected)
 
     def _started(self, lines: list[Line], ended: bool, out: dict[int, str]) -> list[Line]:
         """Add lines to those that wait, and return what of them is a heading, once it is known what they are."""
@@ -120,7 +120,7 @@ class CorrectedLines:
         self._waiting, passed = told[count:], self._waiting[:blank]
         return passed + heading
 
-    def _read(self, line: Line, out: dict[int, str]) -> Iterator[tuple[int, list[float]]]:
+    def _read(self, line: Line, corrected: dict[int, str]) -> Iterator[tuple[int, list[float]]]:
         """Yield the stamp and the readings of a line; one that has none passes, one that cannot be used is left out."""
         assert self._reader is not None
         number, text, end = line
@@ -130,13 +130,13 @@ class CorrectedLines:
             self._temperature_c = float(batch.temperature.values[-1, 0])
         if not len(batch.accel):
             if self._account.malformed == before:
-                out[number] = text + end
+                corrected[number] = text + end
         elif self._needs_temperature and np.isnan(self._temperature_c):
             self._account.refuse(number, "it came before the first temperature, which the calibration needs")
         else:
             yield int(batch.accel.time_ns[0]), batch.accel.values[0].tolist()
 
-    def _put(self, out: dict[int, str], raw: Sequence[tuple[Line, int, list[float], float]]) -> None:
+    def _put(self, corrected: dict[int, str], raw: Sequence[tuple[Line, int, list[float], float]]) -> None:
         """Add corrected lines."""
         assert self._reader is not None
         if self._input is None:
@@ -149,7 +149,7 @@ class CorrectedLines:
             self._checked(final=False)
         for ((number, text, end), *_), force in zip(raw, forces, strict=True):
             if np.isfinite(force).all():
-                out[number] = self._reader.with_readings(text, force.tolist()) + end
+                corrected[number] = self._reader.with_readings(text, force.tolist()) + end
                 self.readings += 1
             else:
                 self._account.refuse(number, "no specific force gives these readings")

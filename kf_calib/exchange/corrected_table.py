@@ -31,14 +31,14 @@ _NAMES = ("ax_mps2", "ay_mps2", "az_mps2")
 def apply_to_table(
     correction: Correction,
     path: Path,
-    out: Path,
+    copy: Path,
     overrides: Mapping[str, str],
     columns: Mapping[str, str],
     units: Units,
     *,
     unchecked: bool = False,
 ) -> Applied:
-    """Write the copy to ``out``, wholly or not at all; arguments as of ``open_table`` and ``apply_to_file``."""
+    """Write the ``copy``, wholly or not at all; arguments as of ``open_table`` and ``apply_to_file``."""
     grid = grid_of(path)
     meanings = Columns.of(grid, columns, Numbers.of(grid))
     table = Opening(meanings, overrides, units, angles=False).table()
@@ -53,13 +53,13 @@ def apply_to_table(
     force = correction.of_readings(means, warmth if correction.needs_temperature else None)
     places = meanings.places(*READINGS)
     write = _to_excel if path.suffix.lower() in (".xlsx", ".xlsm") else _to_text
-    write(path, out, grid, places, force)
+    write(path, copy, grid, places, force)
     known = warmth[np.isfinite(warmth)]
     used = (float(known.min()), float(known.max())) if correction.needs_temperature else None
     return Applied(len(force), int(np.count_nonzero(~np.isfinite(force).all(axis=1))), used)
 
 
-def _to_excel(path: Path, out: Path, grid: Grid, places: list[int], force: Floats) -> None:
+def _to_excel(path: Path, copy: Path, grid: Grid, places: list[int], force: Floats) -> None:
     """Write a copy of a workbook."""
     book = workbook_of(path)
     sheet = book[next(each.name for each in sheets_of(path) if not each.hidden)]
@@ -80,10 +80,10 @@ def _to_excel(path: Path, out: Path, grid: Grid, places: list[int], force: Float
             cell.value = value
     content = io.BytesIO()
     book.save(content)
-    write_whole(out, content.getvalue())
+    write_whole(copy, content.getvalue())
 
 
-def _to_text(path: Path, out: Path, grid: Grid, places: list[int], force: Floats) -> None:
+def _to_text(path: Path, copy: Path, grid: Grid, places: list[int], force: Floats) -> None:
     """Write a copy of a text."""
     content = path.read_bytes()
     utf16 = content.startswith((b"\xff\xfe", b"\xfe\xff"))
@@ -105,4 +105,4 @@ def _to_text(path: Path, out: Path, grid: Grid, places: list[int], force: Floats
             line = line[: spans[place][0]] + text + line[spans[place][1] :]
         lines[k] = line
     joined = "".join(lines)
-    write_whole(out, joined.encode("utf-16") if utf16 else joined.encode("utf-8", errors="surrogateescape"))
+    write_whole(copy, joined.encode("utf-16") if utf16 else joined.encode("utf-8", errors="surrogateescape"))

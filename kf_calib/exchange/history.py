@@ -197,10 +197,10 @@ def _common(calibrations: Sequence[SavedCalibration]) -> list[str]:
 
 def _track(symbol: str, calibrations: Sequence[SavedCalibration], days: Floats) -> Track:
     """Return the track of one parameter."""
-    found = [next(p for p in each.parameters if p.symbol == symbol) for each in calibrations]
-    if len(units := sorted({p.unit for p in found})) > 1:
+    of_each = [next(p for p in each.parameters if p.symbol == symbol) for each in calibrations]
+    if len(units := sorted({p.unit for p in of_each})) > 1:
         raise InputError(f"{symbol} is in {' and in '.join(units)} in these calibrations: give those of one model.")
-    values, sigmas = (np.array([getattr(p, key) for p in found], float) for key in ("value", "sigma"))
+    values, sigmas = (np.array([getattr(p, key) for p in of_each], float) for key in ("value", "sigma"))
     known = 1.0 / np.maximum(sigmas, 1e-300) ** 2
     mean = float(known @ values / known.sum())
     constant_p = chi_squared_tail(len(values) - 1, float(known @ (values - mean) ** 2))
@@ -214,7 +214,7 @@ def _track(symbol: str, calibrations: Sequence[SavedCalibration], days: Floats) 
     predicted = weights @ found_by.predicted
     predicted_variance = weights @ (found_by.predicted_variances + (found_by.predicted - predicted) ** 2)
     return Track(
-        symbol, found[0].unit, values, sigmas, predicted, np.sqrt(predicted_variance), float(state[0]),
+        symbol, of_each[0].unit, values, sigmas, predicted, np.sqrt(predicted_variance), float(state[0]),
         math.sqrt(covariance[0, 0]), float(state[1]) if with_drift else None,
         math.sqrt(covariance[1, 1]) if with_drift else None, float(covariance[0, 1]) * with_drift, walk, repeatability,
         constant_p,

@@ -196,10 +196,10 @@ def _least_misfit(
 
 def _square(saved: SavedCalibration) -> Floats:
     """Return the covariance (p, p) of how square the axes are where they were taken for square."""
-    out, places = np.zeros((len(saved.state.values),) * 2), list(SQUARE)
+    covariance, places = np.zeros((len(saved.state.values),) * 2), list(SQUARE)
     if "square" in saved.fixed.values():
-        out[places, places] = saved.bench.square_rad**2
-    return out
+        covariance[places, places] = saved.bench.square_rad**2
+    return covariance
 
 
 def _root(covariance: Floats) -> Floats:
@@ -217,18 +217,18 @@ def _moves(saved: SavedCalibration, new: Calibration, free: Sequence[str]) -> tu
     off_square = saved.bench.square_rad**2 if "square" in saved.fixed.values() and not new.model.square else 0.0
     skipped = {symbol for each in new.model.effects if str(each) in free for symbol in _symbols(each)}
     before = {each.symbol: each for each in saved.parameters}
-    found = list[tuple[str, str, float, float, float]]()
+    differences = list[tuple[str, str, float, float, float]]()
     for symbol, now in new.parameters.items():
         was = before.get(symbol)
         if was is None or symbol in skipped or None in (was.value, was.sigma, now.value, now.sigma):
             continue
         assert was.value is not None and was.sigma is not None and now.value is not None and now.sigma is not None
         bent = now.value * off_square if symbol in ("K2", "K3") else 0.0  # the axis of accelerometer 1 is that of x
-        found.append((symbol, now.unit, was.value, now.value, math.hypot(was.sigma, now.sigma, bent)))
+        differences.append((symbol, now.unit, was.value, now.value, math.hypot(was.sigma, now.sigma, bent)))
     moves = [
         Move(symbol, unit, old, value, value - old, sigma,
-             sidak(math.erfc(abs(value - old) / max(sigma, 1e-300) / math.sqrt(2.0)), len(found)))
-        for symbol, unit, old, value, sigma in found
+             sidak(math.erfc(abs(value - old) / max(sigma, 1e-300) / math.sqrt(2.0)), len(differences)))
+        for symbol, unit, old, value, sigma in differences
     ]  # fmt: skip
     return tuple(sorted(moves, key=lambda move: move.p_value))
 
@@ -266,10 +266,10 @@ def _sphere(count: int) -> Floats:
 
 def _warnings(saved: SavedCalibration, source: Source, new: Calibration) -> list[str]:
     """Return what may make the two runs differ besides the sensors."""
-    out, conditions = list[str](), saved.conditions
+    warnings, conditions = list[str](), saved.conditions
     path = getattr(source, "path", None)
     if path is not None and saved.provenance.sha256 == fingerprint(path):
-        out.append("this is the recording that it was calibrated from, so it must agree: verify with another.")
+        warnings.append("this is the recording that it was calibrated from, so it must agree: verify with another.")
     warmth = np.concatenate([visit.dwell.nodes.temperature_c for visit in new.visits])
     if (
         conditions.temperature_min_c is not None
@@ -278,19 +278,19 @@ def _warnings(saved: SavedCalibration, source: Source, new: Calibration) -> list
     ):
         low, high = float(np.nanmin(warmth)), float(np.nanmax(warmth))
         if low < conditions.temperature_min_c - 1.0 or high > conditions.temperature_max_c + 1.0:
-            out.append(
+            warnings.append(
                 f"it was {low:.1f} to {high:.1f} °C, and {conditions.temperature_min_c:.1f} to "
                 f"{conditions.temperature_max_c:.1f} °C when it was calibrated: a difference may be the temperature's."
             )
     ratio = new.bench.gravity_mps2 / saved.bench.gravity_mps2 - 1.0
     if abs(ratio) > 1e-9:
-        out.append(
+        warnings.append(
             f"gravity is stated {ratio * 1e6:+.3g} ppm different: all scale factors differ by as much if it is not."
         )
     was, now = (bench.notes.get("block_serial") for bench in (saved.bench, new.bench))
     if was and now and was != now:
-        out.append(f"the block is {now}, the calibration is of {was}.")
-    return out
+        warnings.append(f"the block is {now}, the calibration is of {was}.")
+    return warnings
 
 
 def refuse_other_frame(saved: SavedCalibration, bench: Bench) -> None:

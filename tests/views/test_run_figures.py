@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
+import kf_calib
 from kf_calib import plot
 from kf_calib.bench.bench import Bench
 from kf_calib.design import optimality_criteria
@@ -101,6 +102,11 @@ def test_every_figure_has_ink_units_and_nothing_cut_off(name: str, request: pyte
         assert (pixels[[0, -1]] == 1.0).all() and (pixels[:, [0, -1]] == 1.0).all(), f"{title}: cut off at an edge"
         for axes in panels(figure):
             assert axes.has_data() or axes.texts, (title, axes.get_title("left"))
+
+
+def test_residuals_of_what_is_no_diagnosis_are_refused_in_words(result: Calibration) -> None:
+    with pytest.raises(TypeError, match="not of a Calibration: give what diagnose returns"):
+        kf_calib.plot.residuals(result)  # type: ignore[arg-type]
 
 
 def test_sigmas_are_those_of_the_run_and_the_largest_is_named(result: Calibration) -> None:

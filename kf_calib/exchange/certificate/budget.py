@@ -115,11 +115,11 @@ def budget(saved: SavedCalibration, model: Model, stated: Sequence[TypeB]) -> Bu
     changes = _gain(saved, model.columns(stimulus, np.array(saved.state.values))[:, :, kept], stimulus)
     changes = np.einsum("pq,qdi->pdi", paper_parameters.jacobian(np.array(saved.state.values[:STATE_COUNT])), changes)
     lines = [first]
-    for number, own in enumerate(stated, 1):
+    for number, uncertainty in enumerate(stated, 1):
         try:
-            lines += _type_b(own, saved, stimulus, changes)
+            lines += _type_b(uncertainty, saved, stimulus, changes)
         except InputError as error:
-            raise InputError(f"[[uncertainty]] {number}, {own.effect}: {error}") from None
+            raise InputError(f"[[uncertainty]] {number}, {uncertainty.effect}: {error}") from None
     return Budget(tuple(lines), left_out)
 
 
@@ -180,10 +180,10 @@ def _known_columns(model: Model, stimulus: Stimulus) -> tuple[list[int], tuple[s
 
 def _gain(saved: SavedCalibration, design: Floats, stimulus: Stimulus) -> Floats:
     """The change (12, D, 3) of the affine state per unit of each mean reading, by weighted least squares."""
-    own, counts = saved.noise, np.array([float(each.readings) for each in saved.conditions.dwells])
+    stated_noise, counts = saved.noise, np.array([float(each.readings) for each in saved.conditions.dwells])
     noise = Noise(
-        np.array(own.sigma_mps2), np.array(own.inflation), math.radians(own.angle_sigma_deg),
-        np.array(own.dwell_sigma_mps2), checked=own.dwell_sigma_stated,
+        np.array(stated_noise.sigma_mps2), np.array(stated_noise.inflation), math.radians(stated_noise.angle_sigma_deg),
+        np.array(stated_noise.dwell_sigma_mps2), checked=stated_noise.dwell_sigma_stated,
     )  # fmt: skip
     means = Means(design, np.zeros(design.shape[:2]), stimulus.force_mps2, counts, np.zeros((len(counts), 2)))
     covariances = lift_rounding(mean_covariances(noise.weights, means, np.array(saved.state.values)))
@@ -194,23 +194,23 @@ def _gain(saved: SavedCalibration, design: Floats, stimulus: Stimulus) -> Floats
     return np.einsum("pdj,dji->pdi", inverse.reshape(STATE_COUNT, len(counts), 3), whiten)
 
 
-def _type_b(own: TypeB, saved: SavedCalibration, stimulus: Stimulus, changes: Floats) -> list[Contribution]:
+def _type_b(uncertainty: TypeB, saved: SavedCalibration, stimulus: Stimulus, changes: Floats) -> list[Contribution]:
     """The lines of one error of the bench, one for each coefficient of its effect."""
-    effect = effects.effect_named(own.effect, saved.bench)
-    columns = _columns(effect, own, stimulus)
+    effect = effects.effect_named(uncertainty.effect, saved.bench)
+    columns = _columns(effect, uncertainty, stimulus)
     per_dwell = np.einsum("pdi,diq->qpd", changes, columns)  # q: coefficient, p: parameter, d: dwell
-    if own.varies == "run":
+    if uncertainty.varies == "run":
         sensitivity = per_dwell.sum(axis=2)
     else:
         sensitivity = np.sqrt((per_dwell**2).sum(axis=2))
-    divisor = own.k if own.distribution == "normal" else DIVISORS[own.distribution]
+    divisor = uncertainty.k if uncertainty.distribution == "normal" else DIVISORS[uncertainty.distribution]
     return [
-        _line(own, effect, coefficient, quantity(own.size, coefficient.unit) / divisor, sensitivity[q])
+        _line(uncertainty, effect, coefficient, quantity(uncertainty.size, coefficient.unit) / divisor, sensitivity[q])
         for q, coefficient in enumerate(effect.coefficients)
     ]
 
 
-def _columns(effect: Effect, own: TypeB, stimulus: Stimulus) -> Floats:
+def _columns(effect: Effect, uncertainty: TypeB, stimulus: Stimulus) -> Floats:
     """What readings change by per unit of an error; of one that goes with temperature, at the change stated."""
     if effect.no_columns or effect.oscillates:
         raise InputError(f"it {effect.no_columns or 'is an oscillation'}: name an effect that shows in dwells.")
@@ -218,16 +218,19 @@ def _columns(effect: Effect, own: TypeB, stimulus: Stimulus) -> Floats:
     cold = replace(stimulus, temperature_c=np.full(len(stimulus), REFERENCE_TEMPERATURE_C))
     if np.array_equal(effect.columns(warm), effect.columns(cold)):
         return effect.columns(stimulus)
-    if own.temperature is None:
+    if uncertainty.temperature is None:
         raise InputError('say by how much the temperature may be off, for example temperature = "0.5 K".')
-    change = quantity(own.temperature, "K")
+    change = quantity(uncertainty.temperature, "K")
     return effect.columns(replace(cold, temperature_c=cold.temperature_c + change))
 
 
-def _line(own: TypeB, effect: Effect, coefficient: Coefficient, standard: float, sensitivity: Floats) -> Contribution:
-    words = {"run": "", "dwell": ", another in each dwell"}[own.varies]
-    at = f", at {own.temperature}" if own.temperature else ""
+def _line(
+    uncertainty: TypeB, effect: Effect, coefficient: Coefficient, standard: float, sensitivity: Floats
+) -> Contribution:
+    words = {"run": "", "dwell": ", another in each dwell"}[uncertainty.varies]
+    at = f", at {uncertainty.temperature}" if uncertainty.temperature else ""
     return Contribution(
         coefficient.symbol, f"{effect.title} ({effect}){words}{at}", "B", abs(standard), coefficient.unit,
-        own.distribution, own.dof or math.inf, own.source, sensitivity, abs(standard * sensitivity),
+        uncertainty.distribution, uncertainty.dof or math.inf, uncertainty.source, sensitivity,
+        abs(standard * sensitivity),
     )  # fmt: skip

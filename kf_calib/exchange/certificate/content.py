@@ -72,21 +72,22 @@ class Certificate:
     @property
     def missing(self) -> tuple[str, ...]:
         """What a Digital Calibration Certificate must have and nobody has stated: keys of the statement."""
-        own = self.statement
+        statement = self.statement
         parties = {
             f"{name}.{key}": getattr(party, key)
-            for name, party in (("laboratory", own.laboratory), ("customer", own.customer)) for key in ("name", "city")
+            for name, party in (("laboratory", statement.laboratory), ("customer", statement.customer))
+            for key in ("name", "city")
         }  # fmt: skip
         needed = {
-            "number": own.number, "begun": self.begun, "ended": self.ended, "site": own.site,
-            "laboratory.country": own.laboratory.country, "item.name": own.item.name, "item.serial": self.serial,
-            "persons": own.persons, **parties,
+            "number": statement.number, "begun": self.begun, "ended": self.ended, "site": statement.site,
+            "laboratory.country": statement.laboratory.country, "item.name": statement.item.name,
+            "item.serial": self.serial, "persons": statement.persons, **parties,
         }  # fmt: skip
         return tuple(name for name, value in needed.items() if not value)
 
 
 def certificate(
-    saved: SavedCalibration, model: Model, own: Statement, before: tuple[SavedCalibration, Model] | None = None
+    saved: SavedCalibration, model: Model, statement: Statement, before: tuple[SavedCalibration, Model] | None = None
 ) -> Certificate:
     """The certificate of a calibration with its model, and of a statement; before: the same before an adjustment.
 
@@ -97,20 +98,21 @@ def certificate(
             "a certificate states the angles of the axes in the frame of the platform, and this calibration was made "
             "without angles, in the frame of its sensors: calibrate on a bench that records angles."
         )
-    found = budgets.budget(saved, model, own.uncertainty)
+    uncertainties = budgets.budget(saved, model, statement.uncertainty)
     begun, ended = _dates(saved)
     return Certificate(
-        saved, own, found, _results(saved, found, own, _before(before, own)), own.begun or begun, own.ended or ended,
+        saved, statement, uncertainties, _results(saved, uncertainties, statement, _before(before, statement)),
+        statement.begun or begun, statement.ended or ended,
         datetime.fromisoformat(calibration_file.now()),
     )  # fmt: skip
 
 
-def _before(before: tuple[SavedCalibration, Model] | None, own: Statement) -> list[tuple[float, float]] | None:
+def _before(before: tuple[SavedCalibration, Model] | None, statement: Statement) -> list[tuple[float, float]] | None:
     """Values and expanded uncertainties (12) before adjustment."""
     if before is None:
         return None
-    found = budgets.budget(*before, own.uncertainty)
-    return list(zip(before[0].twelve[0].tolist(), found.expanded.tolist(), strict=True))
+    of_earlier = budgets.budget(*before, statement.uncertainty)
+    return list(zip(before[0].twelve[0].tolist(), of_earlier.expanded.tolist(), strict=True))
 
 
 def _dates(saved: SavedCalibration) -> tuple[date, date] | tuple[None, None]:
@@ -122,21 +124,21 @@ def _dates(saved: SavedCalibration) -> tuple[date, date] | tuple[None, None]:
 
 
 def _results(
-    saved: SavedCalibration, found: Budget, own: Statement, before: list[tuple[float, float]] | None
+    saved: SavedCalibration, found: Budget, statement: Statement, before: list[tuple[float, float]] | None
 ) -> tuple[Result, ...]:
     combined, expanded, k, dof = (each.tolist() for each in (found.combined, found.expanded, found.k, found.dof))
-    limits, out = own.largest, list[Result]()
+    limits, results = statement.largest, list[Result]()
     for i, parameter in enumerate(saved.parameters[: len(paper_parameters.SYMBOLS)]):
         value = None if parameter.sigma is None else parameter.value
         known, limit, judged = value is not None, limits.get(parameter.symbol), None
-        if value is not None and limit is not None and own.decision_rule is not None:
-            judged = conformity(abs(value - parameter.nominal), limit, expanded[i], own.decision_rule)
-        out.append(Result(
+        if value is not None and limit is not None and statement.decision_rule is not None:
+            judged = conformity(abs(value - parameter.nominal), limit, expanded[i], statement.decision_rule)
+        results.append(Result(
             parameter.symbol, parameter.unit, parameter.nominal, value,
             combined[i] if known else None, expanded[i] if known else None, k[i], dof[i],
             before[i] if before else None, limit, judged,
         ))  # fmt: skip
-    return tuple(out)
+    return tuple(results)
 
 
 def conformity(deviation: float, limit: float, expanded: float, rule: Rule) -> Conformity:

@@ -42,7 +42,7 @@ _MANDATORY = (
 )  # fmt: skip
 
 
-def xml(own: Certificate) -> bytes:
+def xml(certificate: Certificate) -> bytes:
     """The XML of a certificate."""
     ET.register_namespace("dcc", DCC)
     ET.register_namespace("si", SI)
@@ -50,17 +50,17 @@ def xml(own: Certificate) -> bytes:
     root = ET.Element(f"{{{DCC}}}digitalCalibrationCertificate", {
         "schemaVersion": VERSION, "{http://www.w3.org/2001/XMLSchema-instance}schemaLocation": f"{DCC} {SCHEMA}",
     })  # fmt: skip
-    if own.missing:
-        root.append(ET.Comment(f" not a DCC: not stated are {', '.join(own.missing)} "))
+    if certificate.missing:
+        root.append(ET.Comment(f" not a DCC: not stated are {', '.join(certificate.missing)} "))
     data = _in(root, "administrativeData")
     _software(_in(data, "dccSoftware"))
-    _core(_in(data, "coreData"), own)
-    _item(_in(_in(data, "items"), "item"), own)
-    _contact(_in(_in(data, "calibrationLaboratory"), "contact"), own.statement.laboratory)
-    _persons(data, own)
-    _contact(_in(data, "customer"), own.statement.customer)
-    _statements(data, own)
-    _measurement(_in(_in(root, "measurementResults"), "measurementResult"), own)
+    _core(_in(data, "coreData"), certificate)
+    _item(_in(_in(data, "items"), "item"), certificate)
+    _contact(_in(_in(data, "calibrationLaboratory"), "contact"), certificate.statement.laboratory)
+    _persons(data, certificate)
+    _contact(_in(data, "customer"), certificate.statement.customer)
+    _statements(data, certificate)
+    _measurement(_in(_in(root, "measurementResults"), "measurementResult"), certificate)
     ET.indent(root, " ")
     return b'<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root, encoding="utf-8") + b"\n"
 
@@ -88,36 +88,36 @@ def _words(parent: ET.Element, name: str, *texts: str | None) -> None:
 
 
 def _software(parent: ET.Element) -> None:
-    own = _in(parent, "software")
-    _words(own, "name", "kf_calib")
-    _in(own, "release", version("kf_calib"))
-    _in(own, "type", "application")
+    software = _in(parent, "software")
+    _words(software, "name", "kf_calib")
+    _in(software, "release", version("kf_calib"))
+    _in(software, "type", "application")
 
 
-def _core(parent: ET.Element, own: Certificate) -> None:
-    stated = own.statement
+def _core(parent: ET.Element, certificate: Certificate) -> None:
+    stated = certificate.statement
     _given(parent, "countryCodeISO3166_1", stated.laboratory.country)
     _in(parent, "usedLangCodeISO639_1", "en")
     _in(parent, "mandatoryLangCodeISO639_1", "en")
     _given(parent, "uniqueIdentifier", stated.number)
     _given(parent, "receiptDate", stated.received)
-    _given(parent, "beginPerformanceDate", own.begun)
-    _given(parent, "endPerformanceDate", own.ended)
+    _given(parent, "beginPerformanceDate", certificate.begun)
+    _given(parent, "endPerformanceDate", certificate.ended)
     _given(parent, "performanceLocation", stated.site)
     _given(parent, "issueDate", stated.issued)
 
 
-def _item(parent: ET.Element, own: Certificate) -> None:
-    item = own.statement.item
+def _item(parent: ET.Element, certificate: Certificate) -> None:
+    item = certificate.statement.item
     _words(parent, "name", item.name)
     _words(parent, "description", item.state)
     if item.manufacturer:
         _words(_in(parent, "manufacturer"), "name", item.manufacturer)
     _given(parent, "model", item.model)
-    if own.serial:
+    if certificate.serial:
         identified = _in(_in(parent, "identifications"), "identification")
         _in(identified, "issuer", "manufacturer")
-        _given(identified, "value", own.serial)
+        _given(identified, "value", certificate.serial)
         _words(identified, "name", "serial number")
 
 
@@ -132,26 +132,26 @@ def _contact(parent: ET.Element, party: Party) -> None:
             _given(location, name, text)
 
 
-def _persons(parent: ET.Element, own: Certificate) -> None:
+def _persons(parent: ET.Element, certificate: Certificate) -> None:
     listed = _in(parent, "respPersons")
-    for k, each in enumerate(own.statement.persons):
+    for k, person in enumerate(certificate.statement.persons):
         responsible = _in(listed, "respPerson")
-        _words(_in(responsible, "person"), "name", each.name)
-        _given(responsible, "role", each.role)
+        _words(_in(responsible, "person"), "name", person.name)
+        _given(responsible, "role", person.role)
         _in(responsible, "mainSigner", "true" if k == 0 else "false")
 
 
-def _statements(parent: ET.Element, own: Certificate) -> None:
-    stated = {"traceability": own.statement.traceability, "remarks": own.statement.remarks}
-    if own.statement.decision_rule:
-        stated["decision rule"] = rule(own)
+def _statements(parent: ET.Element, certificate: Certificate) -> None:
+    stated = {"traceability": certificate.statement.traceability, "remarks": certificate.statement.remarks}
+    if certificate.statement.decision_rule:
+        stated["decision rule"] = rule(certificate)
     if any(stated.values()):
         listed = _in(parent, "statements")
         for name, text in stated.items():
             if text:
-                each = _in(listed, "statement")
-                _words(each, "name", name)
-                _words(each, "declaration", text)
+                element = _in(listed, "statement")
+                _words(element, "name", name)
+                _words(element, "declaration", text)
 
 
 def rule(own: Certificate) -> str:
@@ -163,8 +163,8 @@ def rule(own: Certificate) -> str:
     return "Simple acceptance: pass where the deviation from nominal is at most the limit, whatever its uncertainty."
 
 
-def _measurement(parent: ET.Element, own: Certificate) -> None:
-    stated = own.statement
+def _measurement(parent: ET.Element, certificate: Certificate) -> None:
+    stated = certificate.statement
     _words(parent, "name", "Calibration of three accelerometers")
     method = _in(_in(parent, "usedMethods"), "usedMethod")
     _words(method, "name", "Multi-position calibration on a gimballed bench")
@@ -172,11 +172,11 @@ def _measurement(parent: ET.Element, own: Certificate) -> None:
     for norm in stated.norms:
         _given(method, "norm", norm)
     _software(_in(parent, "usedSoftware"))
-    _conditions(_in(parent, "influenceConditions"), own)
+    _conditions(_in(parent, "influenceConditions"), certificate)
     result = _in(_in(parent, "results"), "result")
     _words(result, "name", "Parameters of the accelerometers")
     data = _in(result, "data")
-    for each in own.results:
+    for each in certificate.results:
         _quantity(data, each)
 
 
@@ -203,29 +203,29 @@ def _condition(parent: ET.Element, name: str) -> ET.Element:
 
 def _quantity(parent: ET.Element, result: Result) -> None:
     """One parameter, with its expanded uncertainty."""
-    own = _in(parent, "quantity")
-    _words(own, "name", result.symbol)
+    element = _in(parent, "quantity")
+    _words(element, "name", result.symbol)
     if result.value is None or result.expanded is None:
-        _words(own, "noQuantity", "not determined by this run")
+        _words(element, "noQuantity", "not determined by this run")
         return
-    real = _real(own, result.symbol, result.value, UNITS[result.unit])
+    real = _real(element, result.symbol, result.value, UNITS[result.unit])
     spread = _in(_in(real, "measurementUncertaintyUnivariate", space=SI), "expandedMU", space=SI)
     _in(spread, "valueExpandedMU", repr(result.expanded), SI)
     _in(spread, "coverageFactor", repr(result.k), SI)
     _in(spread, "coverageProbability", f"{COVERAGE:.4f}", SI)
     if result.conformity is not None:
-        judged = _in(_in(own, "measurementMetaData"), "metaData")
+        judged = _in(_in(element, "measurementMetaData"), "metaData")
         _words(judged, "name", "conformity of the deviation from nominal")
         _in(judged, "conformity", result.conformity)
 
 
 def _real(parent: ET.Element, label: str | None, value: float, unit: str) -> ET.Element:
-    own = _in(parent, "real", space=SI)
+    element = _in(parent, "real", space=SI)
     if label is not None:
-        _in(own, "label", label, SI)
-    _in(own, "value", repr(value), SI)
-    _in(own, "unit", unit, SI)
-    return own
+        _in(element, "label", label, SI)
+    _in(element, "value", repr(value), SI)
+    _in(element, "unit", unit, SI)
+    return element
 
 
 def check(content: bytes, schema: Path | None) -> str:
@@ -248,12 +248,12 @@ def _validate(content: bytes, schema: Path) -> None:
     import xmlschema
 
     try:
-        own = xmlschema.XMLSchema(str(schema), allow="local")
+        checker = xmlschema.XMLSchema(str(schema), allow="local")
     except (OSError, xmlschema.XMLSchemaException, ET.ParseError) as error:
         said = cut(" ".join(str(error).split()), 200)
         raise InputError(f"{schema}: cannot be read as an XML Schema ({said}): give dcc.xsd of DCC {VERSION}, with "
                          "the schemas that it imports where it says.") from None  # fmt: skip
-    error = next(own.iter_errors(ET.fromstring(content)), None)
+    error = next(checker.iter_errors(ET.fromstring(content)), None)
     if error is not None:
         reason = cut(" ".join((error.reason or "").split()), 300)
         raise InputError(f"{schema}: the certificate is not valid by it at {error.path} ({reason}): is it of DCC "

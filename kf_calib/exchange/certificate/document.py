@@ -31,12 +31,12 @@ _GREEK = {"theta": "θ", "phi": "φ", "nu": "ν"}
 Row = dict[str, Any]
 
 
-def pdf(own: Certificate, xml: bytes, standing: str) -> bytes:
+def pdf(certificate: Certificate, xml: bytes, standing: str) -> bytes:
     """The PDF of a certificate with its XML attached; standing: what the check of the XML found, in words."""
     need("typst", "report", "a certificate")
     import typst
 
-    inputs = {"data": json.dumps(content(own, standing)), "xml": xml.decode()}
+    inputs = {"data": json.dumps(content(certificate, standing)), "xml": xml.decode()}
     template = (files("kf_calib.exchange.certificate") / "certificate.typ").read_bytes()
     try:
         try:
@@ -60,9 +60,9 @@ def _compiled(template: bytes, inputs: dict[str, str], own_fonts_only: bool) -> 
     return made
 
 
-def content(own: Certificate, standing: str) -> Row:
+def content(certificate: Certificate, standing: str) -> Row:
     """What the template shows, as strings."""
-    stated, day = own.statement, own.created
+    stated, day = certificate.statement, certificate.created
     return {
         "title": stated.title or "Calibration certificate",
         "author": stated.laboratory.name or "not stated",
@@ -70,35 +70,37 @@ def content(own: Certificate, standing: str) -> Row:
         "number": stated.number,
         "laboratory": {"name": stated.laboratory.name},
         "attachment": ATTACHED,
-        "missing": _missing(own),
-        "facts": _facts(own),
-        "method": _method(own),
-        "results": _results(own.results),
-        "adjustment": _adjustment(own.results),
-        "rule": dcc.rule(own),
-        "conformity": _conformity(own.results),
-        "budget_words": _budget_words(own),
-        "inputs": [_input(line) for line in own.budget.contributions],
-        "names": [_name(each.symbol) for each in own.results],
-        "small_units": [field_unit(each.unit).label for each in own.results],
-        "contributions": _contributions(own),
-        "sensitivities": [_sensitivity(own, line) for line in own.budget.contributions if line.sensitivity is not None],
-        "further": [_coefficient(each.symbol, each.value, each.sigma, each.unit) for each in own.further],
-        "remarks": _remarks(own, standing),
+        "missing": _missing(certificate),
+        "facts": _facts(certificate),
+        "method": _method(certificate),
+        "results": _results(certificate.results),
+        "adjustment": _adjustment(certificate.results),
+        "rule": dcc.rule(certificate),
+        "conformity": _conformity(certificate.results),
+        "budget_words": _budget_words(certificate),
+        "inputs": [_input(line) for line in certificate.budget.contributions],
+        "names": [_name(each.symbol) for each in certificate.results],
+        "small_units": [field_unit(each.unit).label for each in certificate.results],
+        "contributions": _contributions(certificate),
+        "sensitivities": [
+            _sensitivity(certificate, line) for line in certificate.budget.contributions if line.sensitivity is not None
+        ],
+        "further": [_coefficient(each.symbol, each.value, each.sigma, each.unit) for each in certificate.further],
+        "remarks": _remarks(certificate, standing),
         "persons": [each.model_dump() for each in stated.persons],
     }
 
 
-def _missing(own: Certificate) -> str | None:
-    if not own.missing:
+def _missing(certificate: Certificate) -> str | None:
+    if not certificate.missing:
         return None
-    return (f"Incomplete: not stated are {', '.join(own.missing)}. The attached XML is not a DCC (Digital Calibration "
-            "Certificate), which must have these.")  # fmt: skip
+    return (f"Incomplete: not stated are {', '.join(certificate.missing)}. The attached XML is not a DCC (Digital "
+            "Calibration Certificate), which must have these.")  # fmt: skip
 
 
-def _facts(own: Certificate) -> list[list[str | None]]:
-    stated = own.statement
-    days = [_text(own.begun), _text(own.ended)]
+def _facts(certificate: Certificate) -> list[list[str | None]]:
+    stated = certificate.statement
+    days = [_text(certificate.begun), _text(certificate.ended)]
     performed = None if None in days else days[0] if days[0] == days[1] else f"{days[0]} to {days[1]}"
     item = stated.item
     return [
@@ -108,7 +110,7 @@ def _facts(own: Certificate) -> list[list[str | None]]:
         ["Customer", _party(stated.customer)],
         ["Item", item.name],
         ["Manufacturer, model", ", ".join(filter(None, (item.manufacturer, item.model))) or None],
-        ["Serial number", own.serial],
+        ["Serial number", certificate.serial],
         ["State of the item", item.state],
         ["Received", _text(stated.received)],
         ["Calibrated", performed],
@@ -125,20 +127,20 @@ def _text(value: object) -> str | None:
     return None if value is None else str(value)
 
 
-def _method(own: Certificate) -> list[list[str | None]]:
-    stated, saved = own.statement, own.saved
-    found, bench = saved.conditions, saved.bench
+def _method(certificate: Certificate) -> list[list[str | None]]:
+    stated, saved = certificate.statement, certificate.saved
+    conditions, bench = saved.conditions, saved.bench
     warmth = None
-    if found.temperature_min_c is not None and found.temperature_max_c is not None:
-        warmth = f"{found.temperature_min_c:.2f} °C to {found.temperature_max_c:.2f} °C"
+    if conditions.temperature_min_c is not None and conditions.temperature_max_c is not None:
+        warmth = f"{conditions.temperature_min_c:.2f} °C to {conditions.temperature_max_c:.2f} °C"
     around = stated.conditions
     named = {"Air temperature": around.temperature, "Humidity": around.humidity, "Air pressure": around.pressure}
     return [
         ["Method", f"{stated.method or dcc.METHOD}."],
         ["Standards", "; ".join(stated.norms) or None],
         ["Model", " + ".join(["twelve parameters", *(each.text for each in saved.effects)])],
-        ["Orientations", f"{len(found.dwells)} in {found.duration_s:.0f} s, "
-                         f"{sum(each.readings for each in found.dwells)} readings"],
+        ["Orientations", f"{len(conditions.dwells)} in {conditions.duration_s:.0f} s, "
+                         f"{sum(each.readings for each in conditions.dwells)} readings"],
         ["Local gravity", f"{bench.gravity_mps2:.7g} m/s², taken as exact but for the budget below"],
         ["Temperature of the block", warmth],
         *([name, text] for name, text in named.items()),
@@ -149,55 +151,56 @@ def _method(own: Certificate) -> list[list[str | None]]:
 
 def _results(results: Sequence[Result]) -> list[Row]:
     rows = list[Row]()
-    for each in results:
-        large, small = _UNITS[each.unit], field_unit(each.unit)
-        value, expanded = _pair(each.value, each.expanded, large)
+    for result in results:
+        large, small = _UNITS[result.unit], field_unit(result.unit)
+        value, expanded = _pair(result.value, result.expanded, large)
         rows.append({
-            "name": _name(each.symbol), "value": value, "expanded": expanded, "unit": large.label,
-            "small": _pair(each.value, each.expanded, small)[1], "small_unit": small.label,
-            "k": f"{each.k:.2f}", "dof": _count(each.dof),
+            "name": _name(result.symbol), "value": value, "expanded": expanded, "unit": large.label,
+            "small": _pair(result.value, result.expanded, small)[1], "small_unit": small.label,
+            "k": f"{result.k:.2f}", "dof": _count(result.dof),
         })  # fmt: skip
     return _aligned(rows, "value", "expanded", "small")
 
 
 def _adjustment(results: Sequence[Result]) -> list[Row]:
     rows = list[Row]()
-    for each in results:
-        if each.before is not None:
-            unit = _UNITS[each.unit]
-            before, before_u = _pair(*each.before, unit)
-            after, after_u = _pair(each.value, each.expanded, unit)
-            rows.append({"name": _name(each.symbol), "before": before, "before_u": before_u, "after": after,
+    for result in results:
+        if result.before is not None:
+            unit = _UNITS[result.unit]
+            before, before_u = _pair(*result.before, unit)
+            after, after_u = _pair(result.value, result.expanded, unit)
+            rows.append({"name": _name(result.symbol), "before": before, "before_u": before_u, "after": after,
                          "after_u": after_u, "unit": unit.label})  # fmt: skip
     return _aligned(rows, "before", "before_u", "after", "after_u")
 
 
 def _conformity(results: Sequence[Result]) -> list[Row]:
     rows = list[Row]()
-    for each in results:
-        if each.limit is not None:
-            unit = field_unit(each.unit)
-            deviation = None if each.value is None else each.value - each.nominal
-            shown, expanded = _pair(deviation, each.expanded, unit)
+    for result in results:
+        if result.limit is not None:
+            unit = field_unit(result.unit)
+            deviation = None if result.value is None else result.value - result.nominal
+            shown, expanded = _pair(deviation, result.expanded, unit)
             rows.append({
-                "name": _name(each.symbol), "deviation": shown, "expanded": expanded, "unit": unit.label,
-                "limit": f"{each.limit * unit.per_si:.6g}",
-                "outcome": "not determined" if each.conformity is None else OUTCOMES[each.conformity],
+                "name": _name(result.symbol), "deviation": shown, "expanded": expanded, "unit": unit.label,
+                "limit": f"{result.limit * unit.per_si:.6g}",
+                "outcome": "not determined" if result.conformity is None else OUTCOMES[result.conformity],
             })  # fmt: skip
     return _aligned(rows, "deviation", "expanded", "limit")
 
 
-def _budget_words(own: Certificate) -> str:
+def _budget_words(certificate: Certificate) -> str:
     words = (
         "Type A is the covariance of the filter. Type B carries each stated error of the bench through the weighted "
         "least squares of this run to the parameters. Contributions are taken as uncorrelated and added in quadrature; "
         "k follows from the effective degrees of freedom (Welch–Satterthwaite) for a coverage probability of 95.45 %, "
         "and is 2.00 where these are infinite."
     )
-    if len(own.budget.contributions) == 1:
+    if len(certificate.budget.contributions) == 1:
         words += " No error of the bench is stated: U covers the scatter of the readings only."
-    if own.budget.left_out:
-        words += (f" Sensitivity coefficients leave out what the model has for {', '.join(own.budget.left_out)}, whose "
+    if certificate.budget.left_out:
+        left_out = ", ".join(certificate.budget.left_out)
+        words += (f" Sensitivity coefficients leave out what the model has for {left_out}, whose "
                   "columns need more than the calibration file holds.")  # fmt: skip
     return words
 
@@ -245,13 +248,13 @@ def _coefficient(symbol: str, value: float | None, sigma: float | None, unit: st
     return {"name": _name(symbol), "value": first or "–", "sigma": second or "–", "unit": shown.label}
 
 
-def _remarks(own: Certificate, standing: str) -> list[str]:
-    saved, judged = own.saved, own.saved.consistency
+def _remarks(certificate: Certificate, standing: str) -> list[str]:
+    saved, agreement = certificate.saved, certificate.saved.consistency
     agree = {True: "agree", False: "do not agree: the uncertainties above do not hold"}
     remarks = [f"Attached file {ATTACHED}: {standing}."]
-    if judged.consistent is not None and judged.p_value is not None:
-        remarks.append(f"Model and measurements {agree[judged.consistent]} (p = {judged.p_value:.2g}, "
-                       f"{judged.dof} degrees of freedom).")  # fmt: skip
+    if agreement.consistent is not None and agreement.p_value is not None:
+        remarks.append(f"Model and measurements {agree[agreement.consistent]} (p = {agreement.p_value:.2g}, "
+                       f"{agreement.dof} degrees of freedom).")  # fmt: skip
     else:
         remarks.append("Nothing was left over to judge the agreement of model and measurements by.")
     if saved.not_seen:
@@ -259,13 +262,13 @@ def _remarks(own: Certificate, standing: str) -> list[str]:
     if not (raw := saved.bench.input).is_plain:
         remarks.append(f"The results belong to readings made of {raw}: {raw.formula}, m/s².")
     remarks += [f"Of the recording: {sentence}" for sentence in saved.provenance.warnings]
-    remarks += [own.statement.remarks] if own.statement.remarks else []
+    remarks += [certificate.statement.remarks] if certificate.statement.remarks else []
     origin = saved.provenance
     if origin.recording:
         remarks.append(f"Recording {origin.recording}, SHA-256 {origin.sha256 or 'not known'}.")
     made = origin.versions.get("kf_calib", "?")
     return [*remarks, f"Calculated by kf_calib {made} on {origin.created}; written by kf_calib "
-                      f"{version('kf_calib')} on {own.created.isoformat()}."]  # fmt: skip
+                      f"{version('kf_calib')} on {certificate.created.isoformat()}."]  # fmt: skip
 
 
 def _name(symbol: str) -> str:

@@ -115,15 +115,15 @@ class Statement(_Table):
     @property
     def largest(self) -> dict[str, float]:
         """The largest deviation from nominal allowed, by symbol, in SI; raises InputError."""
-        found = dict[str, float]()
+        largest = dict[str, float]()
         for name, size in self.limits.items():
             try:
-                found |= targets_of([f"{name}={size}"])
+                largest |= targets_of([f"{name}={size}"])
             except InputError:
                 raise InputError(f"limits: {cut(name, 50)} = {cut(size, 50)!r} is none: name a parameter (theta1, K2), "
                                  "a kind (theta, phi, nu, K, b) or angles, with a size that fits it, such as 20 ppm, "
                                  "100 ug or 5 arcsec.") from None  # fmt: skip
-        return found
+        return largest
 
 
 def read(path: Path | None) -> Statement:
@@ -131,7 +131,7 @@ def read(path: Path | None) -> Statement:
     if path is None:
         return Statement()
     try:
-        found = Statement.model_validate(toml_table(path, 'number = "2026-0147"'))
+        stated = Statement.model_validate(toml_table(path, 'number = "2026-0147"'))
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False, include_input=False)[0]
         place, said = ".".join(map(str, first["loc"])), first["msg"]
@@ -142,13 +142,13 @@ def read(path: Path | None) -> Statement:
         elif first["type"] == "string_pattern_mismatch":
             said = "must be text without control characters (of a country, two capital letters)"
         raise InputError(f"{path}: {cut(place, 100)}: {said}: see docs/certificate.md for the keys.") from None
-    if found.before is not None:
-        found = found.model_copy(update={"before": path.parent / found.before})
+    if stated.before is not None:
+        stated = stated.model_copy(update={"before": path.parent / stated.before})
     try:
-        limited = bool(found.largest)
+        limited = bool(stated.largest)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    if limited and found.decision_rule is None:
+    if limited and stated.decision_rule is None:
         raise InputError(f"{path}: limits are given without the rule by which conformity is decided: add "
                          'decision_rule = "simple acceptance" or "guard band".')  # fmt: skip
-    return found
+    return stated

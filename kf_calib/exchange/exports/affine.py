@@ -55,12 +55,14 @@ class AffineTarget(Target):
     @cached_property
     def affine(self) -> Affine:
         """The numbers that the program is given: they turn raw readings into specific force, where it folds."""
-        own = self._of_readings
+        of_readings = self._of_readings
         if self.input.is_plain:
-            return own
+            return of_readings
         a = self.input.matrix
         inverse = np.asarray(np.linalg.inv(a), float)
-        return Affine(own.matrix @ a, inverse @ own.offset, own.drift @ inverse.T, own.reference_c)
+        return Affine(
+            of_readings.matrix @ a, inverse @ of_readings.offset, of_readings.drift @ inverse.T, of_readings.reference_c
+        )
 
     @cached_property
     def _of_readings(self) -> Affine:

@@ -27,11 +27,11 @@ class Table(Target):
     title = "spreadsheets"
 
     def text(self) -> str:
-        out = io.StringIO()
-        writer = csv.writer(out, lineterminator="\n")
+        written = io.StringIO()
+        writer = csv.writer(written, lineterminator="\n")
         writer.writerow(["name", "value", "sigma", "unit"])
         writer.writerows(self._rows())
-        return out.getvalue()
+        return written.getvalue()
 
     def _rows(self) -> Iterator[tuple[str, object, object, str]]:
         for own in self.saved.parameters:

@@ -32,6 +32,7 @@ from kf_calib.bench.arrays import Floats, Times
 from kf_calib.errors import InputError
 from kf_calib.sources.simulation.injected.kinds import Hidden, NoSizeError
 from kf_calib.sources.simulation.noise_processes import TrueNoise
+from kf_calib.sources.simulation.sensors import Sensors
 from kf_calib.sources.simulation.simulator import Simulation
 
 _SETTLE_NS, _LEAD_NS = 1_000_000_000, 250_000_000
@@ -167,11 +168,20 @@ def _departures(dwell: _Moments, sigma: float) -> tuple[Floats, Floats]:
 def _mean(dwell: _Moments, sigma: float, simulation: Simulation) -> tuple[Floats, Floats]:
     """Rows of the mean of a dwell, (3, 12) and (3, k)."""
     noise, sensors = simulation.noise, simulation.sensors
-    offset = noise.dwell_sigma_mps2(len(simulation.plan)) ** 2
-    felt = dwell.mean[:3] - sensors.biases_mps2  # S f
-    turning = simulation.bench.gravity_mps2**2 * sensors.sensitivities @ sensors.sensitivities.T - np.outer(felt, felt)
-    setting = math.radians(noise.setting_sigma_deg) ** 2
-    covariance = (offset + sigma**2 / dwell.count) * np.eye(3) + setting * turning
-    rows = np.hstack([np.kron(np.eye(3), [*dwell.mean[:3], 1.0]), dwell.mean[3:].reshape(-1, 3).T])
-    whitened = np.asarray(np.linalg.solve(np.linalg.cholesky(covariance), rows), float)
+    sigma_mps2 = math.hypot(noise.dwell_sigma_mps2(len(simulation.plan)), sigma / math.sqrt(dwell.count))
+    rows = np.hstack([np.kron(np.eye(3), [*dwell.mean[:3], 1.0]), dwell.mean[3:].reshape(-1, 3).T]) / sigma_mps2
+    setting_rad = math.radians(noise.setting_sigma_deg)
+    whitened = _beside_rotations(rows, sensors, dwell.mean[:3], setting_rad, sigma_mps2) if setting_rad else rows
     return whitened[:, :12], whitened[:, 12:]
+
+
+def _beside_rotations(
+    rows: Floats, sensors: Sensors, mean_mps2: Floats, setting_rad: float, sigma_mps2: float
+) -> Floats:
+    """Return the rows (3, m) of a mean reading with its setting error, a rotation of any size, eliminated by QR."""
+    sensitivities = sensors.sensitivities
+    force_mps2 = np.linalg.solve(sensitivities, mean_mps2 - sensors.biases_mps2)
+    turning = sensitivities @ np.cross(np.eye(3), force_mps2).T / sigma_mps2
+    nuisances = np.vstack([turning, np.eye(3) / setting_rad])
+    left = np.linalg.qr(nuisances, mode="complete")[0][:, 3:]
+    return np.asarray(left[:3].T @ rows, float)

@@ -45,8 +45,12 @@ def residuals(found: Diagnosis, driver: str | None = None) -> Figure:
     From the left: the residuals of the model, with what the best explanation and the runner-up predict of them; the
     readings less all that the best explanation does not itself add, and the effect as a curve with its 1 sigma; what it
     leaves. All are means of dwells, with 1 sigma, on the same axes. driver: another quantity to draw them against, by
-    its symbol, such as ``q1`` or ``T``.
+    its symbol, such as ``q1`` or ``T``. Raises TypeError for what is no diagnosis.
     """
+    if not isinstance(found, Diagnosis):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise TypeError(
+            f"residuals are drawn of a diagnosis, not of a {type(found).__name__}: give what diagnose returns."
+        )
     with styled():
         figure = blank(11.0, 7.0)
         draw_residuals(figure, found, found.drivers, driver)

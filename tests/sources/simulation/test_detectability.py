@@ -118,6 +118,20 @@ def test_size_is_that_of_generalised_least_squares(text, noise):
     assert size(simulation(NOISES[noise]), text) == pytest.approx(expected, rel=1e-6)
 
 
+@pytest.mark.parametrize("setting_deg", [1e3, 1e6])
+def test_where_attitudes_are_not_known_the_size_is_that_along_the_force(setting_deg):
+    """Of each dwell one combination of the readings is left, m = S^-T f, which no rotation changes."""
+    firsts = np.searchsorted(DWELL, range(COUNT))
+    weights = np.linalg.solve(SENSORS.sensitivities.T, FORCE[firsts].T).T
+    scales = np.linalg.norm(weights, axis=1) * WHITE.white_mps2 / np.sqrt(np.bincount(DWELL[COUNTS]))
+    text = "second-order=1e-5,2e-5,-3e-5"
+    along = np.sum(weights * ADDED[text][firsts], axis=1) / scales
+    affine = np.column_stack([FORCE[firsts] / G, np.ones(COUNT)])
+    design = (weights[:, :, None] * affine[:, None, :]).reshape(COUNT, 12) / scales[:, None]
+    expected = np.linalg.norm(along - design @ np.linalg.lstsq(design, along, rcond=1e-12)[0])
+    assert size(simulation(replace(WHITE, setting_sigma_deg=setting_deg)), text) == pytest.approx(expected, rel=1e-5)
+
+
 @pytest.mark.parametrize("noise", NOISES)
 @pytest.mark.parametrize("name", ["second-order", "bias-drift", "encoder-harmonic-1:z", "settling", "hysteresis"])
 def test_what_is_asked_for_is_what_generalised_least_squares_finds(name, noise):
