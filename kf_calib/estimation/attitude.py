@@ -29,13 +29,18 @@ from kf_calib.noise.nuisance_states import rotation_map, tangents
 _STEP = 1e-6  # relative to g, of the differences that give the bending
 _ABRUPT = 0.5  # a bending beyond this is a jump of an effect's column, which has no derivative
 _FARTHEST_RAD = 0.3  # of one step of an attitude
+_UNTOLD = 10.0  # setting errors: where the poses spread less, the attitudes would tell as much as they
 
 
-def at_their_modes(linearised: LinearisedDwells, noise: Noise, state: Floats) -> list[DwellFactor]:
+def at_their_modes(
+    linearised: LinearisedDwells, noise: Noise, state: Floats, untold: Floats | None = None
+) -> list[DwellFactor]:
     """The dwells with attitudes at their posterior modes at ``state`` (p,), to first order about where they were.
 
     Dwells stay as they are where no setting error is allowed for. Where it is only considered (``Noise.checked``),
     attitudes stay as recorded, and the force is shorter by what the setting error takes from its mean.
+
+    untold: the ``untold_directions`` of the run, where the dwells are not all of it.
     """
     if not noise.setting_rad:
         return [without_attitude(dwell) for dwell in linearised.dwells]
@@ -45,6 +50,7 @@ def at_their_modes(linearised: LinearisedDwells, noise: Noise, state: Floats) ->
         return [d.linearised(d.turned_rad, attitude) for d, attitude in zip(linearised.dwells, known, strict=True)]
     moved, variances = _posterior_rotations(linearised.means, noise, state, bendings)
     forces = linearised.means.force_mps2 / np.array([_length(dwell) for dwell in linearised.dwells])[:, None]
+    untold = untold_directions(linearised, noise) if untold is None else untold
     dwells = list[DwellFactor]()
     for k, (dwell, turned) in enumerate(zip(linearised.dwells, linearised.dwells_at_state, strict=True)):
         before = np.zeros(3) if dwell.attitude is None else dwell.attitude.rotation_rad
@@ -56,7 +62,8 @@ def at_their_modes(linearised: LinearisedDwells, noise: Noise, state: Floats) ->
             left_out = dwell.came_from and facing_readings([dwell.came_from], state, float(np.linalg.norm(force)))[0]
             dwells.append(replace(with_force(dwell, force), attitude=attitude, came_from=left_out))
         else:
-            shown = without_attitude(turned).felt_force(dwell.means[None, 1:4])[0]
+            shown = _shown_force(turned)
+            force = force - untold.T @ (untold @ (force - shown))
             dwells.append(dwell.linearised(None, replace(attitude, rotation_rad=rotation_between(shown, force))))
     return dwells
 
@@ -64,6 +71,26 @@ def at_their_modes(linearised: LinearisedDwells, noise: Noise, state: Floats) ->
 def without_attitude(dwell: DwellFactor) -> DwellFactor:
     """The dwell linearised about the force that its pose shows."""
     return dwell.linearised(dwell.turned_rad, None) if dwell.attitude else dwell
+
+
+def untold_directions(linearised: LinearisedDwells, noise: Noise) -> Floats:
+    """The unit vectors (k, 3) along which the poses of all dwells have the force alike, to some setting errors: the
+    readings cannot tell the sensitivity to a force along them.
+
+    The attitudes must not tell it either: with a very large sensitivity, tiny rotations along such a direction would
+    explain every misfit. So the force along it stays as the poses show it.
+    """
+    if not noise.setting_rad or noise.attitude_unknown:
+        return np.zeros((0, 3))
+    units = np.array([_shown_force(turned) for turned in linearised.dwells_at_state])
+    units /= np.linalg.norm(units, axis=1, keepdims=True)
+    variances, directions = np.linalg.eigh(np.cov(units.T, bias=True))
+    return directions.T[variances < (_UNTOLD * noise.setting_rad) ** 2]
+
+
+def _shown_force(turned: DwellFactor) -> Floats:
+    """Return the mean specific force (3,) that the recorded pose of a dwell shows."""
+    return without_attitude(turned).felt_force(turned.means[None, 1:4])[0]
 
 
 def _wander_rad2(dwell: DwellFactor, noise: Noise, state: Floats, force: Floats) -> float:

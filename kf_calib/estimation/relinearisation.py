@@ -8,7 +8,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.sufficient_statistics import DwellFactor
-from kf_calib.estimation.attitude import at_their_modes, facing_readings
+from kf_calib.estimation.attitude import at_their_modes, facing_readings, untold_directions
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.noise.noise_model import Noise
@@ -23,10 +23,15 @@ _TURNS = 4  # most times that attitudes are found at a given state
 _STILL_RAD = 1e-7
 
 
-def relinearised(linearised: LinearisedDwells, noise: Noise, model: Model, state: Floats) -> LinearisedDwells:
-    """The dwells with the columns of a model at a state, and attitudes where the readings show them there."""
+def relinearised(
+    linearised: LinearisedDwells, noise: Noise, model: Model, state: Floats, untold: Floats | None = None
+) -> LinearisedDwells:
+    """The dwells with the columns of a model at a state, and attitudes where the readings show them there.
+
+    untold: as in ``at_their_modes``.
+    """
     known = state if len(state) == linearised.model.count else linearised.state
-    return LinearisedDwells(at_their_modes(linearised, noise, known), model, state, linearised.slews)
+    return LinearisedDwells(at_their_modes(linearised, noise, known, untold), model, state, linearised.slews)
 
 
 def _farthest_rad(one: LinearisedDwells, other: LinearisedDwells) -> float:
@@ -35,24 +40,30 @@ def _farthest_rad(one: LinearisedDwells, other: LinearisedDwells) -> float:
     return float(np.linalg.norm(unit - there, axis=1).max())
 
 
-def linearised_at(dwells: Sequence[DwellFactor], model: Model, state: Floats, noise: Noise) -> LinearisedDwells:
-    """Dwells with the columns of a model at a state, and attitudes where the readings show them there."""
+def linearised_at(
+    dwells: Sequence[DwellFactor], model: Model, state: Floats, noise: Noise, untold: Floats | None = None
+) -> LinearisedDwells:
+    """Dwells with the columns of a model at a state, and attitudes where the readings show them there.
+
+    untold: as in ``at_their_modes``.
+    """
     if noise.attitude_unknown:
         dwells = facing_readings(dwells, state, model.bench.gravity_mps2)
     linearised = LinearisedDwells(dwells, model, state)
     for _ in range(_TURNS if noise.setting_rad else 1):
-        before, linearised = linearised, relinearised(linearised, noise, model, state)
+        before, linearised = linearised, relinearised(linearised, noise, model, state, untold)
         if _farthest_rad(before, linearised) < _STILL_RAD:
             break
     return linearised
 
 
-def at_its_mode(dwell: DwellFactor, before: DwellFactor, model: Model, state: Floats, noise: Noise) -> DwellFactor:
-    """A dwell that follows the dwell ``before``, with its attitude where its readings show it at a state that is
-    known: the iterated update of a filter by one dwell."""
+def at_its_mode(dwell: DwellFactor, so_far: LinearisedDwells, noise: Noise) -> DwellFactor:
+    """A dwell that follows those ``so_far``, with its attitude where its readings show it at their state: the iterated
+    update of a filter by one dwell."""
     if not noise.setting_rad:
         return dwell
-    return linearised_at([before, dwell], model, state, noise).dwells[-1]
+    both, untold = [so_far.dwells[-1], dwell], untold_directions(so_far, noise)
+    return linearised_at(both, so_far.model, so_far.state, noise, untold).dwells[-1]
 
 
 def left_to_settle(state: Floats, before: Floats, sigma: Floats) -> float:

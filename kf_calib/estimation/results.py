@@ -376,7 +376,7 @@ class Calibration:
         """The estimate as if ``dwell``, which follows the run and is not yet complete, ended now."""
         fitted, (factor, extra) = self.fit, self.reached
         state, last = self.linearised.state, fitted.dwells[-1]
-        dwell = at_its_mode(dwell, last, self.model, state, self.noise.weights)
+        dwell = at_its_mode(dwell, self.linearised, self.noise.weights)
         both = [last, dwell]
         linearised = LinearisedDwells(both, self.model, state)
         dwell, last_columns = linearised.dwells_at_state[-1], linearised.columns[1:]

@@ -101,7 +101,7 @@ class Running:
         It is one update, unless the dwell changes what is known of the conditions in earlier dwells; then the factor is
         built again. exact: False leaves earlier dwells as they were known when they closed.
         """
-        dwell = at_its_mode(dwell, self.dwells[-1], self.linearised.model, self.about, self.noise.weights)
+        dwell = at_its_mode(dwell, self.linearised, self.noise.weights)
         if exact:
             linearised = LinearisedDwells([*self.dwells, dwell], self.linearised.model, self.about)
             if not all(map(np.array_equal, self.linearised.columns, linearised.columns[:-1])):

@@ -41,21 +41,22 @@ class Mean:
 
 @dataclass
 class Trial:
-    """Mean readings (D, 3) at poses (D, 3), their true parameters and noise; the bench states the setting error or
-    not."""
+    """Mean readings (D, 3) at poses (D, gimbals), their true parameters and noise; the bench states the setting error
+    or not."""
 
     seed: int
     setting_deg: float
     mean_sigma_mps2: float
     stated: bool = True
+    axes: str = "yzx"
 
     def __post_init__(self) -> None:
         rng = np.random.default_rng([11, self.seed])
-        self.bench = Bench(axes_of("yzx"), G, angle_sigma_deg=self.setting_deg if self.stated else None)
+        self.bench = Bench(axes_of(self.axes), G, angle_sigma_deg=self.setting_deg if self.stated else None)
         self.truth = NOMINAL + rng.normal(size=12) * 1e-3
         self.rows, self.biases = sensitivities(self.truth)
-        self.poses = rng.uniform(-np.pi, np.pi, (DWELLS, 3))
-        shown = Rotation.from_euler("YZX", self.poses).inv().apply([0.0, G, 0.0])
+        self.poses = rng.uniform(-np.pi, np.pi, (DWELLS, len(self.axes)))
+        shown = Rotation.from_euler(self.axes.upper(), self.poses).inv().apply([0.0, G, 0.0])
         off = Rotation.from_rotvec(rng.normal(size=(DWELLS, 3)) * np.radians(self.setting_deg))
         noise = rng.normal(size=(DWELLS, 3)) * self.mean_sigma_mps2
         self.means = off.apply(shown) @ self.rows.T + self.biases + noise
@@ -69,6 +70,27 @@ class Trial:
         ]
         with one_blas_thread():
             return evaluate(dwells_of(table, self.bench), self.bench, Settings())
+
+
+@pytest.mark.parametrize("stated", [True, False])
+@pytest.mark.parametrize("axes", ["x", "yx"])
+def test_attitudes_do_not_tell_what_the_poses_leave_untold(axes: str, stated: bool) -> None:
+    """An axis that lies flat turns the force in a plane, and one that is upright not at all: the sensitivities to a
+    force along x stay nominal, and all others are covered."""
+    ratios = list[np.ndarray]()
+    for seed in range(40):
+        trial = Trial(300 + seed, 0.05, 1e-5, stated, axes)
+        result = trial.evaluated()
+        estimate, nominal = result.estimate, result.model.nominal_state().reshape(3, 4)
+        state, sigma = estimate.state.reshape(3, 4), np.sqrt(np.diag(estimate.covariance)).reshape(3, 4)
+        assert estimate.undetermined.shape[1] == 3
+        np.testing.assert_allclose(state[:, 0], nominal[:, 0], rtol=0, atol=1e-12)
+        true = np.column_stack([trial.rows, trial.biases])
+        ratios.append((state - true)[:, 1:] / sigma[:, 1:])
+    z = np.array(ratios).reshape(len(ratios), 9)
+    low, high = binom.interval(0.9999, z.size, 0.95)
+    assert low <= np.sum(np.abs(z) < 1.96) <= high
+    assert 0.85 < np.sqrt(np.mean(z**2)) < 1.15
 
 
 def turned_apart(state: np.ndarray, frame: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

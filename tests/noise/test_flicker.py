@@ -97,9 +97,14 @@ def ratios(name: str, runs: int, flicker_ug: float, scatter_ug: float) -> np.nda
     ],
 )
 def test_coefficients_are_covered(flicker_ug: float, scatter_ug: float, name: str, runs: int) -> None:
-    """Within 2.6 standard deviations of a count of independent ones, of 95 % (runs share waves: half as many)."""
+    """Within 2.6 standard deviations of a count of independent ones, of 95 % (runs share waves: half as many).
+
+    The scatter from dwell to dwell is taken as white. That of 1/f noise is alike in neighbouring dwells, so that the
+    sigmas of what changes from each dwell to the next are larger than they need be, by at most a half.
+    """
     told = ratios(name, runs, flicker_ug, scatter_ug)
     count = 0.5 * len(told)
+    chance = 2.6 * np.sqrt(0.5 / count)
     assert count >= 0.4 * runs
-    assert abs(np.mean(np.abs(told) < 1.96) - 0.95) < 2.6 * np.sqrt(0.05 * 0.95 / count)
-    assert abs(np.sqrt(np.mean(told**2)) - 1.0) < 2.6 * np.sqrt(0.5 / count)
+    assert np.mean(np.abs(told) < 1.96) - 0.95 > -2.6 * np.sqrt(0.05 * 0.95 / count)
+    assert (2.0 / 3.0 if flicker_ug else 1.0) - chance < np.sqrt(np.mean(told**2)) < 1.0 + chance

@@ -169,7 +169,8 @@ def _mean(dwell: _Moments, sigma: float, simulation: Simulation) -> tuple[Floats
     """Rows of the mean of a dwell, (3, 12) and (3, k)."""
     noise, sensors = simulation.noise, simulation.sensors
     sigma_mps2 = math.hypot(noise.dwell_sigma_mps2(len(simulation.plan)), sigma / math.sqrt(dwell.count))
-    rows = np.hstack([np.kron(np.eye(3), [*dwell.mean[:3], 1.0]), dwell.mean[3:].reshape(-1, 3).T]) / sigma_mps2
+    columns = np.hstack([np.kron(np.eye(3), [*dwell.mean[:3], 1.0]), dwell.mean[3:].reshape(-1, 3).T])
+    rows = np.asarray(columns / sigma_mps2, float)
     setting_rad = math.radians(noise.setting_sigma_deg)
     whitened = _beside_rotations(rows, sensors, dwell.mean[:3], setting_rad, sigma_mps2) if setting_rad else rows
     return whitened[:, :12], whitened[:, 12:]
@@ -183,5 +184,5 @@ def _beside_rotations(
     force_mps2 = np.linalg.solve(sensitivities, mean_mps2 - sensors.biases_mps2)
     turning = sensitivities @ np.cross(np.eye(3), force_mps2).T / sigma_mps2
     nuisances = np.vstack([turning, np.eye(3) / setting_rad])
-    left = np.linalg.qr(nuisances, mode="complete")[0][:, 3:]
-    return np.asarray(left[:3].T @ rows, float)
+    complement = np.linalg.qr(nuisances, mode="complete")[0][:, 3:]
+    return np.asarray(complement[:3].T @ rows, float)

@@ -47,7 +47,7 @@ def residuals(found: Diagnosis, driver: str | None = None) -> Figure:
     leaves. All are means of dwells, with 1 sigma, on the same axes. driver: another quantity to draw them against, by
     its symbol, such as ``q1`` or ``T``. Raises TypeError for what is no diagnosis.
     """
-    if not isinstance(found, Diagnosis):  # pyright: ignore[reportUnnecessaryIsInstance]
+    if not isinstance(found, Diagnosis):
         raise TypeError(
             f"residuals are drawn of a diagnosis, not of a {type(found).__name__}: give what diagnose returns."
         )
