@@ -66,7 +66,7 @@ def _diagnosed(refits: Refits, before: Calibration) -> Diagnosis:
     if diagnosis.unknown and test.without_lines:  # the lines keep their phase through the run, but not their amplitude
         test = test.without_lines
         diagnosis = _explained(refits, before, test)
-    if test.lines.vibration and not before.fit.dwells[0].averaged:
+    if test.lines.vibration and before.bench.angles and not before.fit.dwells[0].averaged:
         averaged = refits.averaged(before, window_average.window_s(test.lines.vibration))
         if averaged is not None:
             retest = refits.assess(averaged)
@@ -77,9 +77,12 @@ def _diagnosed(refits: Refits, before: Calibration) -> Diagnosis:
 
 
 def _without_vibration(refits: Refits, before: Calibration, test: CandidateTests) -> CandidateTests:
-    """Return the test as it is if an oscillation of constant amplitude explains its lines, else that with vibration."""
-    if test.without_lines is None:
-        return test
+    """Return the test as it is if an oscillation of constant amplitude explains its lines, else that with vibration.
+
+    A body in the hand trembles: without angles, lines are vibration.
+    """
+    if test.without_lines is None or not before.bench.angles:
+        return test.without_lines or test
     refit = refits.with_effects(before, (test.lines.oscillation,))
     # amplitude of the coherent fit over the whole run, over the amplitude seen in each stretch of readings
     share = np.linalg.norm(refit.estimate.state[refit.model.parts[test.lines.oscillation]]) / np.linalg.norm(
