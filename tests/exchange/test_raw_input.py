@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import openpyxl
 import pytest
-from exchange.test_c_header import compiled, compiled_only
+from exchange.test_c_header import compiled_only, compiled_together
 from exchange.test_exports import READERS, ROUNDING
 from helpers.altered import short_run
 from helpers.stated_sensors import correction, samples, saved
@@ -93,18 +93,23 @@ def _done_before(said: str, raw: np.ndarray) -> np.ndarray:
 
 
 @compiled_only
-@pytest.mark.parametrize("k", range(0, 480, 61))
-def test_the_function_in_c_takes_raw_readings(k: int, tmp_path: Path) -> None:
-    channels, scale = ORDERS[k // 10], SCALES[k % 10]
-    made = RawInput(channels, (scale, scale, scale), "mg")
-    own = correction("second-order", "thermal-bias")
-    own = replace(own, bench=replace(own.bench, input=made))
-    force, temperature = samples(500)
-    raw = made.raw(own.predicted(force, temperature))
-    text = exported(saved(), own, "c").text()
-    assert f"// It takes {made}." in text
-    np.testing.assert_allclose(compiled(text, tmp_path)(raw, temperature), force, rtol=0, atol=1e-11)
-    np.testing.assert_allclose(own(raw, temperature), force, rtol=0, atol=1e-11)
+@pytest.mark.parametrize("names", [(), ("second-order", "thermal-bias")])
+def test_the_function_in_c_takes_raw_readings_of_any_wiring(names: tuple[str, ...], tmp_path: Path) -> None:
+    """Compiled into one library: all 480 wirings and sizes, and with effects, which take long to write, all 48
+    wirings with the ten sizes in turn."""
+    own = correction(*names)
+    force, temperature = samples(100)
+    readings = own.predicted(force, temperature)
+    turn_about = zip(ORDERS, itertools.cycle(SCALES), strict=False)
+    every = list(turn_about if names else itertools.product(ORDERS, SCALES))
+    devices = [RawInput(order, (size, size, size), "mg") for order, size in every]
+    wired = [replace(own, bench=replace(own.bench, input=made)) for made in devices]
+    texts = [exported(saved(), each, "c").text() for each in wired]
+    for made, by_python, text, in_c in zip(devices, wired, texts, compiled_together(texts, tmp_path), strict=True):
+        assert f"// It takes {made}." in text
+        raw = made.raw(readings)
+        np.testing.assert_allclose(in_c(raw, temperature), force, rtol=0, atol=1e-11, err_msg=str(made))
+        np.testing.assert_allclose(by_python(raw, temperature), force, rtol=0, atol=1e-11)
 
 
 @dataclass(frozen=True)
