@@ -46,16 +46,16 @@ _Reason = tuple[str, float, str]
 
 def _of_runs(rows: Sequence[Mapping[str, Any]]) -> list[_Reason]:
     """Return the runs that failed, and those that their model does not explain."""
-    out = list[_Reason]()
+    reasons = list[_Reason]()
     for row in rows:
         name = PurePosixPath(row["run"]).name
         if row["error"] is not None:
-            out.append((row["unit"], 0.0, f"{name} failed"))
+            reasons.append((row["unit"], 0.0, f"{name} failed"))
         elif row["consistent"] is False and row["p_value"] is not None:
             missing = f"shows {row['missing']}" if row["missing"] else "does not fit its model"
-            said = f"{name} {missing} (p = {row['p_value']:.1g})"
-            out.append((row["unit"], sidak(row["p_value"], len(rows)), said))
-    return out
+            reason = f"{name} {missing} (p = {row['p_value']:.1g})"
+            reasons.append((row["unit"], sidak(row["p_value"], len(rows)), reason))
+    return reasons
 
 
 def _of_parameters(units: Sequence[str], tracks: Sequence[Track]) -> list[_Reason]:
@@ -71,8 +71,8 @@ def _of_effects(pooled: PooledDiagnosis | None) -> list[_Reason]:
     """Return the units that have an effect which other units do not have."""
     findings = () if pooled is None else pooled.findings
     return [
-        (each.unit, max(1.0 - each.probability, 0.0), f"has {finding.effect}, which others have not")
+        (figures.unit, max(1.0 - figures.probability, 0.0), f"has {finding.effect}, which others have not")
         for finding in findings
         if finding.attribution is Attribution.SOME
-        for each in finding.units
+        for figures in finding.units
     ]

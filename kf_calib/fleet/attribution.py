@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from kf_calib.fleet.campaign import Campaign
-from kf_calib.fleet.hypotheses import AttributionHypothesis, AttributionTable, table
+from kf_calib.fleet.hypotheses import AttributionHypothesis, AttributionTable, attribution_table
 from kf_calib.fleet.pooled_terms import Attribution, PooledTerms, Term
 
 NONE = 0.01
@@ -31,24 +31,24 @@ class Attributed:
 def attributed(campaign: Campaign) -> Attributed:
     """Find the terms of a campaign."""
     benches, terms, tables = len(campaign.benches), list[Term](), list[AttributionTable]()
-    rest = table(campaign, PooledTerms(terms, benches))
+    rest = attribution_table(campaign, PooledTerms(terms, benches))
     while rest.none < NONE and len(terms) < _MOST:
         before = _kinds(terms)
         terms, tables = _settled(campaign, [*terms, chosen(rest).term], [*tables, rest])
-        rest = table(campaign, PooledTerms(terms, benches))
+        rest = attribution_table(campaign, PooledTerms(terms, benches))
         if _kinds(terms) == before:
             break
     return Attributed(tuple(terms), tuple(tables), rest)
 
 
-def chosen(found: AttributionTable) -> AttributionHypothesis:
+def chosen(attributions: AttributionTable) -> AttributionHypothesis:
     """The likeliest attribution of the likeliest effect: first whether it is of the bench, then how."""
-    name = next(iter(found.effects()))
-    shares = found.of(name)
+    name = next(iter(attributions.effects()))
+    shares = attributions.of(name)
     of_bench = sum(share for each, share in shares.items() if each.common)
     side = {each: share for each, share in shares.items() if each.common == (of_bench > 0.5 * sum(shares.values()))}
     best = max(side, key=lambda each: side[each])
-    return next(each for each in found.hypotheses if each.name == name and each.attribution is best)
+    return next(each for each in attributions.hypotheses if each.name == name and each.attribution is best)
 
 
 def _settled(
@@ -59,7 +59,7 @@ def _settled(
         before = _kinds(terms)
         for k in reversed(range(len(terms))):
             others = [term for n, term in enumerate(terms) if n != k]
-            tables[k] = table(campaign, PooledTerms(others, len(campaign.benches)))
+            tables[k] = attribution_table(campaign, PooledTerms(others, len(campaign.benches)))
             terms[k] = chosen(tables[k]).term
         kept = [k for k, each in enumerate(tables) if each.none < NONE]
         terms, tables = [terms[k] for k in kept], [tables[k] for k in kept]

@@ -24,10 +24,10 @@ _LONGEST = 60
 
 @dataclass(frozen=True)
 class BenchModelFiles:
-    """The files that a pooled diagnosis leads to; found: None where there is none, and then all stays as it is."""
+    """The files that a pooled diagnosis leads to; diagnosis: None where there is none, and then all stays as it is."""
 
     fleet: Path
-    found: PooledDiagnosis | None
+    diagnosis: PooledDiagnosis | None
     overwrite: bool = False
 
     @property
@@ -38,7 +38,7 @@ class BenchModelFiles:
     def models(self) -> dict[Path, BenchModel]:
         """The bench model of each bench that has errors, by its file; no two benches share one."""
         names = dict[str, Path]()
-        models = {} if self.found is None else bench_models(self.found)
+        models = {} if self.diagnosis is None else bench_models(self.diagnosis)
         for bench in models:
             name = stem = _NOT_IN_NAMES.sub("_", bench)[:_LONGEST] or "bench"
             while name.casefold() in names:
@@ -62,7 +62,7 @@ class BenchModelFiles:
     @property
     def outdated(self) -> list[Path]:
         """Files of before that no longer hold."""
-        if self.found is None:
+        if self.diagnosis is None:
             return []
         return [path for path in sorted(self.folder.glob("*.toml")) if path not in self.models and _is_own(path)]
 

@@ -41,7 +41,7 @@ class Commands(Protocol):
 
     def replay_document(self, result: Calibration) -> dict[str, Any]: ...
 
-    def diagnosis_document(self, found: Diagnosis) -> dict[str, Any]: ...
+    def diagnosis_document(self, diagnosis: Diagnosis) -> dict[str, Any]: ...
 
     def sentence(self, error: BaseException) -> str: ...
 
@@ -103,15 +103,15 @@ class Evaluation:
         row |= run_row.of_replay(self.commands.replay_document(result))
         row |= run_row.of_factor(run_factor(result.fit))
         if result.bench.angles:  # without them there is no telling what depends on the attitude
-            found = self.commands.diagnosis_document(self.commands.diagnose(source, result))
-            row |= run_row.of_diagnosis(found)
+            document = self.commands.diagnosis_document(self.commands.diagnose(source, result))
+            row |= run_row.of_diagnosis(document)
 
 
 def begun(run: Run, settings: str) -> Row:
     """The row of a run of which nothing is known yet."""
     stated = {"run": run.place, "unit": run.unit, "bench": run.bench, "date": run.date}
-    told = {"bytes": run.size, "version": run.version, "settings": settings, "host": platform.node()}
-    return dict.fromkeys(run_row.SCHEMA.names) | stated | told | {"evaluated": datetime.now(UTC)}
+    known = {"bytes": run.size, "version": run.version, "settings": settings, "host": platform.node()}
+    return dict.fromkeys(run_row.SCHEMA.names) | stated | known | {"evaluated": datetime.now(UTC)}
 
 
 def _call_by_place(row: Row, path: Path, run: Run) -> None:

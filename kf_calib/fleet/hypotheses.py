@@ -15,7 +15,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.fleet.bench_coefficient import DatedSums
 from kf_calib.fleet.campaign import Campaign, Group
-from kf_calib.fleet.own_coefficients import Own, OwnAndCommon
+from kf_calib.fleet.own_coefficients import UnitInformation, UnitsAndCommon
 from kf_calib.fleet.pooled_terms import Attribution, PooledTerms, Term
 from kf_calib.fleet.population_evidence import OwnCoefficients
 from kf_calib.fleet.some_units import SomeUnits
@@ -65,13 +65,13 @@ class AttributionTable:
 
     def effects(self) -> dict[str, float]:
         """The probability of each effect, whatever it is of, the likeliest first."""
-        found = {each.name: 0.0 for each in self.hypotheses}
+        probabilities = {each.name: 0.0 for each in self.hypotheses}
         for each, share in zip(self.hypotheses, self.probabilities.tolist(), strict=True):
-            found[each.name] += share
-        return dict(sorted(found.items(), key=lambda item: -item[1]))
+            probabilities[each.name] += share
+        return dict(sorted(probabilities.items(), key=lambda item: -item[1]))
 
 
-def table(campaign: Campaign, terms: PooledTerms) -> AttributionTable:
+def attribution_table(campaign: Campaign, terms: PooledTerms) -> AttributionTable:
     """The table of the hypotheses for one term more than ``terms``."""
     groups = [group for group in campaign.groups if group.sigma and group.name not in terms.names()]
     weighed = [*_of_units(campaign, terms, groups), *_of_runs(campaign, terms, groups)]
@@ -88,51 +88,54 @@ def table(campaign: Campaign, terms: PooledTerms) -> AttributionTable:
 def _of_runs(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) -> list[_Weighed]:
     """Return the terms of coefficients of benches and, if units were measured again, of single runs."""
     of_bench = [group for group in groups if Attribution.BENCH.possible(group.borne_by)]
-    dated, out = DatedSums(campaign, terms), list[_Weighed]()
+    dated, weighed = DatedSums(campaign, terms), list[_Weighed]()
     sums = [OwnCoefficients(group, terms) for group in groups] if campaign.repeats else []
     for blocks in campaign.runs():
         rest = terms.beside_own(blocks)
         dated.add(rest)
-        for own in sums:
-            own.add(rest)
+        for coefficients in sums:
+            coefficients.add(rest)
     for group in of_bench:
         one, two = dated.constant(group), dated.repaired(group)
-        out.append((Term(group, Attribution.BENCH, one.size), one.log_odds))
+        weighed.append((Term(group, Attribution.BENCH, one.size), one.log_odds))
         if two is not None:
             term = Term(group, Attribution.REPAIRED, two.size, repair=two.repair)
-            out.append((term, two.log_odds))
-    return [*out, *(_drawn(group, Attribution.RUN, own) for group, own in zip(groups, sums, strict=False))]
+            weighed.append((term, two.log_odds))
+    return [
+        *weighed,
+        *(_drawn(group, Attribution.RUN, coefficients) for group, coefficients in zip(groups, sums, strict=False)),
+    ]
 
 
 def _of_units(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) -> list[_Weighed]:
     """Return the terms of coefficients that units have, all of them or some."""
     groups = [group for group in groups if Attribution.SENSORS.possible(group.borne_by)]
-    sums, parts = [OwnCoefficients(group, terms) for group in groups], [list[OwnAndCommon]() for _ in groups]
+    sums, parts = [OwnCoefficients(group, terms) for group in groups], [list[UnitsAndCommon]() for _ in groups]
     for blocks in campaign.units(terms.repairs):
         rest = terms.beside_own(blocks)
-        for group, own, part in zip(groups, sums, parts, strict=True):
-            own.add(rest)
-            part.append(OwnAndCommon.of(group, terms, rest))
-    out = list[_Weighed]()
-    for group, own, part in zip(groups, sums, parts, strict=True):
-        told, (term, log_odds) = OwnAndCommon.joined(part), _drawn(group, Attribution.SENSORS, own)
-        units, too_much = told.integrated(), told.explained_by_common()
+        for group, coefficients, part in zip(groups, sums, parts, strict=True):
+            coefficients.add(rest)
+            part.append(UnitsAndCommon.of(group, terms, rest))
+    weighed = list[_Weighed]()
+    for group, coefficients, part in zip(groups, sums, parts, strict=True):
+        information, (term, log_odds) = UnitsAndCommon.joined(part), _drawn(group, Attribution.SENSORS, coefficients)
+        units, too_much = information.integrated(), information.explained_by_common()
         some = SomeUnits(group, units, with_mean=log_odds > 0.0)  # where nothing speaks for a mean of all, none
-        out.append((term, float(np.logaddexp(log_odds, some.log_odds_of_all - too_much) - np.log(2.0))))
-        out.append((_of_some(group, units, some), some.log_odds - too_much))
-    return out
+        weighed.append((term, float(np.logaddexp(log_odds, some.log_odds_of_all - too_much) - np.log(2.0))))
+        weighed.append((_of_some(group, units, some), some.log_odds - too_much))
+    return weighed
 
 
-def _of_some(group: Group, units: Own, some: SomeUnits) -> Term:
+def _of_some(group: Group, information: UnitInformation, some: SomeUnits) -> Term:
     """Return the term that some units have; which is asked only if it may be so."""
-    chances = some.probabilities.tolist() if some.log_odds > 0.0 else [0.0] * len(units.units)
-    may_have, has = (frozenset(unit for unit, chance in zip(units.units, chances, strict=True) if chance > least)
+    chances = some.probabilities.tolist() if some.log_odds > 0.0 else [0.0] * len(information.units)
+    may_have, has = (frozenset(unit for unit, chance in zip(information.units, chances, strict=True) if chance > least)
                      for least in (_MAY_HAVE_IT, _HAS_IT))  # fmt: skip
     return Term(group, Attribution.SOME, some.size, units=has, unsure=may_have - has)
 
 
-def _drawn(group: Group, attribution: Attribution, own: OwnCoefficients) -> _Weighed:
-    found = own.evidence()
+def _drawn(group: Group, attribution: Attribution, coefficients: OwnCoefficients) -> _Weighed:
+    found = coefficients.evidence()
     return Term(group, attribution, found.spread, found.mean_size), found.log_odds
 
 

@@ -53,12 +53,12 @@ def overview_of(
     rows = sorted(rows, key=lambda row: (row["date"] is None, row["date"], row["run"]))
     units = tuple(sorted({_unit(row) for row in rows if row["unit"] or row["error"] is None}))
     rows = [{**row, "unit": _unit(row)} for row in rows]
-    own, dates = tracks(rows, units, targets), [row["date"] for row in rows if row["date"] is not None]
+    followed, dates = tracks(rows, units, targets), [row["date"] for row in rows if row["date"] is not None]
     return FleetOverview(
         name, len(rows), sum(row["error"] is not None for row in rows),
         sum(row["consistent"] is False for row in rows), units,
         tuple(sorted({row["bench"] for row in rows if row["bench"]})), min(dates, default=None),
-        max(dates, default=None), own, weeks_of(rows), looks(rows, units, own, pooled), pooled, remarks,
+        max(dates, default=None), followed, weeks_of(rows), looks(rows, units, followed, pooled), pooled, remarks,
     )  # fmt: skip
 
 

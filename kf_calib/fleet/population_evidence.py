@@ -41,11 +41,11 @@ class OwnCoefficients:
 
     def add(self, blocks: Blocks) -> None:
         """Add units, of which what is their own by other terms has been eliminated."""
-        own, every = self._group.columns, [*self._terms.common, *self._more]
-        shares = shares_of(every, blocks)
-        values, along, turned = modes(blocks.info[:, own, own], blocks.score[:, own])
-        across = turned @ (blocks.info[:, own][:, :, [each.column for each in every]] * shares[:, None, :])
-        rows, scores = across.reshape(-1, len(every)), along.reshape(-1)
+        columns, commons = self._group.columns, [*self._terms.common, *self._more]
+        shares = shares_of(commons, blocks)
+        values, along, turned = modes(blocks.info[:, columns, columns], blocks.score[:, columns])
+        across = turned @ (blocks.info[:, columns][:, :, [each.column for each in commons]] * shares[:, None, :])
+        rows, scores = across.reshape(-1, len(commons)), along.reshape(-1)
         for k, spread in enumerate(self._spreads):
             gain = (spread**2 / (1.0 + spread**2 * values)).reshape(-1, 1)
             self._own[k] += log_evidence_of_modes(values, along, spread).sum()

@@ -51,11 +51,11 @@ def repair_date(campaign: Campaign, others: PooledTerms, term: Term) -> RepairDa
 
 def _near(first: list[int], chances: list[float], ranks: list[int]) -> list[int]:
     """Return the ranks of all runs in the parts on either side of each date that is likely."""
-    edges, out = [ranks[0], *first, ranks[-1] + 1], list[int]()
+    edges, nearby = [ranks[0], *first, ranks[-1] + 1], list[int]()
     for k, chance in enumerate(chances, start=1):
         if chance > _LIKELY:
-            out += [rank for rank in ranks if edges[k - 1] <= rank < edges[k + 1]]
-    return sorted(set(out))
+            nearby += [rank for rank in ranks if edges[k - 1] <= rank < edges[k + 1]]
+    return sorted(set(nearby))
 
 
 def _gap(runs: list[RunKey], place: int, probability: float) -> Gap:

@@ -77,12 +77,12 @@ class RunFactor:
     @cached_property
     def effects(self) -> dict[str, list[str]]:
         """The names of the columns of each effect, those of the model of the run first."""
-        found = dict[str, list[str]]()
+        names = dict[str, list[str]]()
         for name in self.columns:
             effect, slash, _ = name.rpartition("/")
             if slash:
-                found.setdefault(effect, []).append(name)
-        return found
+                names.setdefault(effect, []).append(name)
+        return names
 
     @property
     def states(self) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.fleet.evidence import log_evidence_of_modes, modes, sizes
-from kf_calib.fleet.own_coefficients import Own
+from kf_calib.fleet.own_coefficients import UnitInformation
 from kf_calib.fleet.population import told_of_mean
 from kf_calib.fleet.shape import SHARES, Shape
 
@@ -46,24 +46,24 @@ class _Told:
         return (chances @ self.info.reshape(len(self.info), -1)).reshape(*chances.shape[:-1], *self.info.shape[1:])
 
 
-def about_mean(own: Own) -> Shape:
+def about_mean(information: UnitInformation) -> Shape:
     """The shape of units that have an effect about a mean of their own."""
-    found, count = modes(own.info, own.score), own.score.shape[1]
+    eigenmodes, count = modes(information.info, information.score), information.score.shape[1]
     means, logs, size = list[tuple[float, Floats]](), list[Floats](), list[Floats]()
     for spread in sizes(_LEAST, _ALIKE).tolist():
-        told = _told(found, spread)
+        unit_modes = _told(eigenmodes, spread)
         for prior in (spread * _RATIOS).tolist():
-            mean = _likeliest(told, prior)
+            mean = _likeliest(unit_modes, prior)
             means.append((spread, mean))
-            logs.append(_log_volume(told, mean, prior))
+            logs.append(_log_volume(unit_modes, mean, prior))
             size.append(np.sqrt(spread**2 + np.sum(mean**2, axis=1) / count))
 
     def ratios(part: slice) -> Floats:
-        here = [each[part] for each in found]
+        here = [each[part] for each in eigenmodes]
         return np.stack([_told(here, spread).ratios(mean).T for spread, mean in means], axis=2)
 
     log_prior = np.stack(logs, axis=1) - np.log(len(SHARES) * len(means))
-    return Shape(len(own.score), ratios, log_prior, np.stack(size, axis=1))
+    return Shape(len(information.score), ratios, log_prior, np.stack(size, axis=1))
 
 
 def _told(found: Sequence[Floats], spread: float) -> _Told:

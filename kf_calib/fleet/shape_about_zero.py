@@ -13,7 +13,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.fleet.campaign import Group
 from kf_calib.fleet.evidence import modes, sizes
-from kf_calib.fleet.own_coefficients import Own
+from kf_calib.fleet.own_coefficients import UnitInformation
 from kf_calib.fleet.shape import SHARES, Shape
 
 _SEEN = 1e-6  # of the largest information of a unit: what is less counts as not seen
@@ -25,9 +25,9 @@ POWERS = tuple(_STEPS)
 _ALIKE = 64.0  # sigma of one run: the largest size that is tried where all are nearly one
 
 
-def about_zero(group: Group, own: Own, power: int) -> Shape:
+def about_zero(group: Group, information: UnitInformation, power: int) -> Shape:
     """The shape with m = ``power``."""
-    values, along, _ = modes(own.info, own.score)
+    values, along, _ = modes(information.info, information.score)
     tried = sizes(_LEAST, _ALIKE if power == max(POWERS) else group.largest, _STEPS[power])
     log_prior = np.full((len(SHARES), len(tried)), -np.log(len(SHARES) * len(tried)))
     ratios = _ratios(values, along, tried, power)[:, None]
