@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from kf_calib.fleet.bench_model_files import BenchModelFiles
     from kf_calib.fleet.evaluation import Evaluation
     from kf_calib.fleet.overview import FleetOverview
-    from kf_calib.fleet.reference_unit import ReferenceUnit
+    from kf_calib.fleet.run_factor import ReferenceUnit
     from kf_calib.fleet.run_list import Run
     from kf_calib.support.output_files import Outputs
 
@@ -197,7 +197,7 @@ def _reference(path: Path | None) -> ReferenceUnit | None:
     if path is None:
         return None
     from kf_calib.exchange import calibration_file
-    from kf_calib.fleet.reference_unit import ReferenceUnit
+    from kf_calib.fleet.run_factor import ReferenceUnit
 
     saved = calibration_file.read(path)
     unit = saved.provenance.bench.get("block_serial")
@@ -235,8 +235,7 @@ def _evaluated(
     """Evaluate the runs that are not in the table yet; where it is stopped, all that is done is kept."""
     import dask.system
 
-    from kf_calib.fleet.batch import evaluate_all
-    from kf_calib.fleet.cluster import cluster
+    from kf_calib.fleet.batch import cluster, evaluate_all
     from kf_calib.fleet.store import Store
 
     store, interrupt = Store(folder), Interrupter()

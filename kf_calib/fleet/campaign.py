@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.effects import Bearer, Effect, described
 from kf_calib.errors import InputError
-from kf_calib.fleet.reference_unit import ReferenceUnit
-from kf_calib.fleet.run_factor import RunFactor, column_name
+from kf_calib.fleet.run_factor import ReferenceUnit, RunFactor, column_name
 
 _TOGETHER = 64  # runs whose matrices are computed at once
 _SEEN = 1e-6  # of a column's norm: what is less beside the run's own parameters is rounding

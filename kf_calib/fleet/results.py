@@ -13,13 +13,11 @@ import pyarrow as pa
 import pyarrow.compute
 
 from kf_calib.errors import InputError
-from kf_calib.fleet.overview import COLUMNS, FleetOverview, overview_of
+from kf_calib.fleet.overview import COLUMNS, FleetOverview, counted, overview_of
 from kf_calib.fleet.pooled_diagnosis import PooledDiagnosis, pooled_diagnosis
-from kf_calib.fleet.reference_unit import ReferenceUnit
-from kf_calib.fleet.run_factor import RunFactor
+from kf_calib.fleet.run_factor import ReferenceUnit, RunFactor
 from kf_calib.fleet.run_row import SCHEMA, factor_of
 from kf_calib.fleet.store import AT_ONCE, Store
-from kf_calib.fleet.weeks import counted
 from kf_calib.support.extras import need
 
 pc: Any = pyarrow.compute  # its functions are made when it is imported, which no type checker sees

@@ -13,8 +13,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.fleet.campaign import Group
 from kf_calib.fleet.evidence import log_mean
 from kf_calib.fleet.own_coefficients import UnitInformation
-from kf_calib.fleet.shape_about_mean import about_mean
-from kf_calib.fleet.shape_about_zero import POWERS, about_zero
+from kf_calib.fleet.shape import POWERS, about_mean, about_zero
 from kf_calib.support.logarithms import weights
 
 _RULED_OUT = 0.025  # probability below which a shape is not asked for the share
