@@ -72,15 +72,15 @@ def info(ctx: click.Context, recording: Path, columns: tuple[str, ...], as_json:
         return
     with progress(f"reading {recording.name}", as_json) as tick:
         if kind is Kind.SAMPLES:
-            found = _of_lines(ctx, recording, renamed, options, tick)
+            overview = _of_lines(ctx, recording, renamed, options, tick)
         else:
-            found = _of_messages(ctx, recording, options, tick)
+            overview = _of_messages(ctx, recording, options, tick)
     from kf_calib.views.overview import overview_object, overview_report
 
     if as_json:
-        print_json(overview_object(found))
+        print_json(overview_object(overview))
     else:
-        show(overview_report(found))
+        show(overview_report(overview))
 
 
 def _of_messages(ctx: click.Context, path: Path, options: Mapping[str, Any], tick: Tick) -> Overview:
@@ -220,11 +220,11 @@ def _show_table(
         told, words = _with_unit({}, words, wrong)
         missing += told.values()
     command = " ".join(["kf-calib replay", _quoted(str(table.path)), *words])
-    found = TableOverview(table, bench, missing, command)
+    overview = TableOverview(table, bench, missing, command)
     if as_json:
-        print_json(table_object(found))
+        print_json(table_object(overview))
     else:
-        show(table_report(found))
+        show(table_report(overview))
 
 
 def _lacks(bench: Mapping[str, str], has_angles: bool) -> list[str]:

@@ -66,12 +66,12 @@ def parameter_table(result: Calibration) -> Table:
     return table
 
 
-def without_table(result: Calibration, found: OutlyingDwell) -> Table:
+def without_table(result: Calibration, outlying: OutlyingDwell) -> Table:
     """The table of the parameters fitted without an outlying dwell, and of their differences from those with it."""
-    table = Table(title=f"Without dwell {found.number} (1σ)", title_justify="left")
+    table = Table(title=f"Without dwell {outlying.number} (1σ)", title_justify="left")
     for heading in ("parameter", "value", "sigma", "unit", "less with it"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
-    pairs = zip(result.parameters.values(), found.without.parameters.values(), strict=True)
+    pairs = zip(result.parameters.values(), outlying.without.parameters.values(), strict=True)
     for k, (before, parameter) in enumerate(pairs):
         name, value, _, sigma, unit = _row(parameter)
         known = parameter.value is not None and before.value is not None

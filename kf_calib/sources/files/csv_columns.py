@@ -378,13 +378,13 @@ class CsvColumns:
         )
 
     def _stamps_of_rows(self, time: Stamps) -> list[int]:
-        out, numbers = list[int](), self.numbers or DECIMAL_POINT
+        stamps_ns, numbers = list[int](), self.numbers or DECIMAL_POINT
         for row in self.rows:
             try:
-                out.append(time.ns(row, self.header, numbers))
+                stamps_ns.append(time.ns(row, self.header, numbers))
             except LineError:
                 continue
-        return out
+        return stamps_ns
 
     def _quoted(self, places: Sequence[int]) -> str:
         return ", ".join(repr(cut(self.header[at], 40)) for at in places)
