@@ -59,17 +59,9 @@ def at_their_modes(
         before = np.zeros(3) if dwell.attitude is None else dwell.attitude.rotation_rad
         force = turn_by(forces[k], _limited(moved[k] - before))
         attitude = AttitudeError(np.zeros(3), float(variances[k]), bendings[k])
-        shown = without_attitude(turned).felt_force(dwell.means[None, 1:4])[0]
+        shown = _shown_force(turned)
+        force = force - untold.T @ (untold @ (force - shown))
         dwells.append(dwell.linearised(None, replace(attitude, rotation_rad=rotation_between(shown, force))))
-        if noise.attitude_unknown:
-            variance_rad2 = variances[k] + _wander_rad2(dwell, noise, state, force)
-            attitude = replace(attitude, variance_rad2=float(variance_rad2))
-            left_out = dwell.came_from and facing_readings([dwell.came_from], state, float(np.linalg.norm(force)))[0]
-            dwells.append(replace(with_force(dwell, force), attitude=attitude, came_from=left_out))
-        else:
-            shown = _shown_force(turned)
-            force = force - untold.T @ (untold @ (force - shown))
-            dwells.append(dwell.linearised(None, replace(attitude, rotation_rad=rotation_between(shown, force))))
     return dwells
 
 
@@ -89,10 +81,6 @@ def without_attitude(dwell: DwellFactor) -> DwellFactor:
     return dwell.linearised(dwell.turned_rad, None) if dwell.attitude else dwell
 
 
-def _wander_rad2(dwells: Sequence[DwellFactor], noise: Noise, state: Floats, forces: Floats) -> Floats:
-    """Return the mean square (D,) of the angle by which the force wanders about its mean within each dwell: what the
-    readings spread across it beyond their noise. A hand creeps and trembles, and a mean of directions is shorter than
-    each."""
 def untold_directions(linearised: LinearisedDwells, noise: Noise) -> Floats:
     """The unit vectors (k, 3) along which the poses of all dwells have the force alike, to some setting errors: the
     readings cannot tell the sensitivity to a force along them.
@@ -113,9 +101,10 @@ def _shown_force(turned: DwellFactor) -> Floats:
     return without_attitude(turned).felt_force(turned.means[None, 1:4])[0]
 
 
-def _wander_rad2(dwell: DwellFactor, noise: Noise, state: Floats, force: Floats) -> float:
-    """Return the mean square of the angle by which the force wanders about its mean within a dwell: what the readings
-    spread across it beyond their noise. A hand creeps and trembles, and a mean of directions is shorter than each."""
+def _wander_rad2(dwells: Sequence[DwellFactor], noise: Noise, state: Floats, forces: Floats) -> Floats:
+    """Return the mean square (D,) of the angle by which the force wanders about its mean within each dwell: what the
+    readings spread across it beyond their noise. A hand creeps and trembles, and a mean of directions is shorter than
+    each."""
     inverse = np.linalg.inv(state[:STATE_COUNT].reshape(3, 4)[:, :3])
     spreads = np.array([dwell.spread for dwell in dwells])
     beyond = inverse @ (spreads - np.diag(noise.sigma_mps2**2)) @ inverse.T

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import Floats, lengths
 from kf_calib.bench.bench import Bench, parse_axes
 from kf_calib.bench.gravity_alone import bench_without_angles
 from kf_calib.bench.raw_input import PLAIN, RawInput, merged_metadata
@@ -177,7 +177,7 @@ class Opening:
         if columns.has(*QUATERNION):
             places = columns.places(*QUATERNION)
             pose = np.column_stack([columns.values(place) for place in places])
-            norms = np.linalg.norm(pose, axis=1)
+            norms = lengths(pose)
             for row in np.flatnonzero(np.abs(norms - 1.0) > 0.01):
                 raise self.grid.refuse(
                     int(row), "qx, qy, qz, qw", ", ".join(f"{part:g}" for part in pose[row]),
@@ -250,7 +250,7 @@ class Opening:
             named = self.units.told_by([self.grid.header[place] for place in places], by_name)
         except InputError as error:
             raise InputError(f"{self.grid.name}: {error}") from None
-        norm = float(np.median(np.linalg.norm(values, axis=1)))
+        norm = float(np.median(lengths(values)))
         told = reading_units(named, norm, self.units, bench.gravity_mps2)
         self.has_unit = told.is_known
         self.raw = told.raw
