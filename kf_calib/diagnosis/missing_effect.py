@@ -77,12 +77,9 @@ def _diagnosed(refits: Refits, before: Calibration) -> Diagnosis:
 
 
 def _without_vibration(refits: Refits, before: Calibration, test: CandidateTests) -> CandidateTests:
-    """Return the test as it is if an oscillation of constant amplitude explains its lines, else that with vibration.
-
-    A body in the hand trembles: without angles, lines are vibration.
-    """
-    if test.without_lines is None or not before.bench.angles:
-        return test.without_lines or test
+    """Return the test as it is if an oscillation of constant amplitude explains its lines, else that with vibration."""
+    if test.without_lines is None:
+        return test
     refit = refits.with_effects(before, (test.lines.oscillation,))
     # amplitude of the coherent fit over the whole run, over the amplitude seen in each stretch of readings
     share = np.linalg.norm(refit.estimate.state[refit.model.parts[test.lines.oscillation]]) / np.linalg.norm(

@@ -58,7 +58,8 @@ def _what_fails(test: CandidateTests) -> str:
 def second_pass_in_words(diagnosis: Diagnosis) -> str:
     """A sentence on what only a second pass over the readings could judge; "" where nothing is left to it."""
     names = [suspect.name for suspect in diagnosis.suspects if not holds_its_oscillation(suspect.refit.fit)]
-    if diagnosis.test.lines.vibration and not diagnosis.before.fit.dwells[0].averaged:
+    before = diagnosis.before
+    if diagnosis.test.lines.vibration and before.bench.angles and not before.fit.dwells[0].averaged:
         names.append("the lines in their spectrum")
     if not names:
         return ""
