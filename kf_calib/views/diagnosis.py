@@ -36,7 +36,7 @@ def diagnosis_object(diagnosis: Diagnosis) -> dict[str, Any]:
 def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
     """The same without the next orientation."""
     named = diagnosis.missing[0] if diagnosis.missing else "noise" if diagnosis.noise else None
-    missing = "unknown" if diagnosis.unknown else named
+    missing = "unknown" if diagnosis.unknown or diagnosis.unearned else named
     return clean(
         {
             "consistent": diagnosis.test.consistent,

@@ -287,6 +287,6 @@ def _numbered(diagnosis: Diagnosis, choices: Sequence[tuple[str, ...]]) -> list[
             f"{result.held_out_rms_mps2 / result.held_out_floor_mps2:.2f}"
         )  # fmt: skip
         fits = "yes" if suspect is None or suspect.fits else "no"
-        share = "" if diagnosis.table is None else format_probability(diagnosis.table.probability(names))
+        share = "" if diagnosis.table is None else format_probability(diagnosis.table.probability_of_just(names))
         table.add_row(str(number), " + ".join(names), share, p_value, fits, ratio)
     return [table]
