@@ -161,8 +161,8 @@ class Diagnosis:
 
     @property
     def sure(self) -> bool:
-        """Whether just the effects that are named are missing with 95 % probability."""
-        return bool(self.missing) and self.table is not None and self.table.first.probability >= SURE
+        """Whether the effects that are named are missing with 95 % probability, alone or with others."""
+        return bool(self.missing) and self.table is not None and self.table.probability(self.missing) >= SURE
 
     @property
     def grade(self) -> Grade:

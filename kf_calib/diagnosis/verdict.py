@@ -74,16 +74,24 @@ def second_pass_in_words(diagnosis: Diagnosis) -> str:
 def _named(diagnosis: Diagnosis, first: Hypothesis) -> str:
     """Return the likeliest effects in words, with the other explanations and their probabilities."""
     assert diagnosis.table is not None
-    share, others = first.probability, _others(diagnosis)
-    named = f"{_effects_of(first)}{_size(diagnosis)} ({format_probability(share)})"
-    rest = _unexplained(diagnosis)
-    others += rest
+    share, rest = diagnosis.table.probability(first.effects), _unexplained(diagnosis)
+    named, others = f"{_effects_of(first)}{_size(diagnosis)} ({_share(diagnosis)})", _others(diagnosis) + rest
     if share >= SURE:
         return f"{'Part of it' if rest else 'Missing'}: {named}{others}"
     family, of_family = next(each for each in diagnosis.table.families.items() if each[0] not in (NOTHING, NOISE, NONE))
     if of_family >= SURE and first.families == (family,):
         return f"{_FAMILIES[family]} ({format_probability(of_family)}): {named}{others}"
     return f"Likeliest: {named}{others}"
+
+
+def _share(diagnosis: Diagnosis) -> str:
+    """Return the probability of the likeliest row, as the table has it, and that of its effects with others beside
+    them."""
+    assert diagnosis.table is not None
+    first = diagnosis.table.first
+    alone = format_probability(first.probability)
+    with_others = format_probability(diagnosis.table.probability(first.effects))
+    return alone if alone == with_others else f"{alone} alone, {with_others} with others"
 
 
 def _not_named(diagnosis: Diagnosis, first: Hypothesis) -> str:
@@ -135,7 +143,7 @@ def explanations_in_words(diagnosis: Diagnosis) -> str:
     if first is None or diagnosis.table is None:
         return ""
     if diagnosis.sure:
-        return f"missing: {' and '.join(diagnosis.missing)} {format_probability(first.probability)}"
+        return f"missing: {' and '.join(diagnosis.missing)} {_share(diagnosis)}"
     rows = [first, *diagnosis.table.rivals[: _TOLD - 1]]
     text = ", ".join(f"{_in_words(diagnosis, row)} {format_probability(row.probability)}" for row in rows)
     return f"suspects {text}" if first.effects else text
