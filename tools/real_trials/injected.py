@@ -16,7 +16,7 @@ _ALIKE = 0.99  # of the square of what is seen of one effect that another one ex
 
 def _since_arrival(recording: RealRecording) -> tuple[Floats, Floats]:
     """Return for each reading the time (n,) since the pose began, and the step (n, 3) of the specific force to it."""
-    begins = recording.dwells_s[:, 0]
+    begins = recording.arrivals_s
     pose = np.clip(np.searchsorted(begins, recording.time_s, side="right") - 1, 0, None)
     forces = recording.means(recording.force_mps2)
     steps = np.vstack([np.zeros(3), np.diff(forces, axis=0)])

@@ -67,10 +67,20 @@ class RealRecording:
         return np.concatenate([batch.accel.values for batch in self.batches])
 
     @cached_property
-    def dwells_s(self) -> Floats:
-        """Begin and end (D, 2) of the poses."""
+    def _poses(self) -> Floats:
         dwells = kf_calib.calibrate(self.altered(np.zeros(3))).fit.dwells
-        return np.array([(dwell.start_s, dwell.end_s) for dwell in dwells])
+        arrivals = [dwell.nodes.elapsed_s[0] - dwell.nodes.since_arrival_s[0] for dwell in dwells]
+        return np.array([(at, dwell.start_s, dwell.end_s) for at, dwell in zip(arrivals, dwells, strict=True)])
+
+    @property
+    def dwells_s(self) -> Floats:
+        """Begin and end (D, 2) of what is used of the poses."""
+        return self._poses[:, 1:]
+
+    @property
+    def arrivals_s(self) -> Floats:
+        """When the body came to rest in the poses, (D,)."""
+        return self._poses[:, 0]
 
     def altered(self, added_mps2: Floats) -> Altered:
         """The recording with something added to its readings, (n, 3) or (3,)."""
