@@ -5,6 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from helpers.long_runs import slow
 from helpers.paths import REAL
@@ -17,19 +18,24 @@ from kf_calib.effects import walk_named
 
 
 class _Effect:
-    parameters = (SimpleNamespace(symbol="k1"), SimpleNamespace(symbol="k2"))
+    parameters = coefficients = (SimpleNamespace(symbol="k1"), SimpleNamespace(symbol="k2"))
 
     def __str__(self) -> str:
         return "bent"
 
 
-def _result(ratio: float | None, held_out: float | None, walk_gain: float = 0.0) -> Any:
+def _result(ratio: float | None, held_out: float | None, walk_gain: float = 0.0, correlation: float = 0.0) -> Any:
     """A calibration with an effect of two coefficients, of which the second is ``ratio`` sigmas or not determined."""
+    covariance = np.array([[1.0, 2.0 * correlation], [2.0 * correlation, 4.0]])
     second = SimpleNamespace(value=None if ratio is None else -2.0 * ratio, sigma=None if ratio is None else 2.0)
+    state = np.array([0.1, -2.0 * (ratio or 0.0)])
     return SimpleNamespace(
-        model=SimpleNamespace(effects=[_Effect()]), fit=SimpleNamespace(walk_gain=walk_gain),
-        parameters={"k1": SimpleNamespace(value=0.1, sigma=1.0), "k2": second}, held_out_rms_mps2=held_out,
-    )  # fmt: skip
+        model=SimpleNamespace(effects=[_Effect()], parts={"bent": slice(0, 2)}),
+        estimate=SimpleNamespace(state=state, covariance=covariance),
+        fit=SimpleNamespace(walk_gain=walk_gain),
+        parameters={"k1": SimpleNamespace(value=0.1, sigma=1.0), "k2": second},
+        held_out_rms_mps2=held_out,
+    )
 
 
 @pytest.mark.parametrize(
@@ -40,13 +46,20 @@ def _result(ratio: float | None, held_out: float | None, walk_gain: float = 0.0)
         (None, (1.0, 0.9), "no coefficient of bent is beyond 3 sigma"),
         (5.0, (1.0, 1.25), "it makes the held-out error larger by 25%"),
         (5.0, (1.0, 1.01), ""),  # what shows within dwells alone
-        (5.0, (1.0, 1.05), "it makes the held-out error larger by 5%"),
+        (5.0, (1.0, 1.06), "it makes the held-out error larger by 6%"),
         (5.0, (None, 1.25), ""),
     ],
 )
 def test_what_a_name_is_earned_by(ratio: float | None, errors: tuple[float | None, float], said: str) -> None:
     row = Hypothesis(("bent",), refit=_result(ratio, errors[1]))
     assert unearned(row, _result(None, errors[0]), "bias-walk") == said
+
+
+@pytest.mark.parametrize("correlation, earned", [(0.8, False), (0.97, True)])
+def test_coefficients_that_are_alike_earn_their_name_together(correlation: float, earned: bool) -> None:
+    """Of 0.1 and -2.9 sigmas: Wald's statistic is 24.7 with a correlation of 0.8, and 150 with one of 0.97."""
+    row = Hypothesis(("bent",), refit=_result(2.9, 0.9, correlation=correlation))
+    assert (unearned(row, _result(None, 1.0), "bias-walk") == "") == earned
 
 
 @pytest.mark.parametrize("gain, said", [(4.4, "bias-walk is below 3 sigma"), (4.6, "")])
