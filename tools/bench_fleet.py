@@ -27,8 +27,7 @@ from typing import Any
 
 from kf_calib.cli.evaluate import replay
 from kf_calib.cli.fleet import SingleCommands
-from kf_calib.fleet.batch import evaluate_all
-from kf_calib.fleet.cluster import cluster
+from kf_calib.fleet.batch import cluster, evaluate_all
 from kf_calib.fleet.evaluation import Evaluation
 from kf_calib.fleet.run_list import Run, runs_of
 from kf_calib.fleet.run_row import Row

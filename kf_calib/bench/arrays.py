@@ -1,4 +1,4 @@
-"""Array types, named by what the arrays hold."""
+"""Array types, named by what the arrays hold, and the lengths of vectors."""
 
 from __future__ import annotations
 
@@ -9,3 +9,9 @@ Times = NDArray[np.int64]
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+
+
+def lengths(vectors: Floats) -> Floats:
+    """The length (n,) of each row (n, k) of numbers as they stand in a file; infinite where it is beyond a double."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.asarray(np.linalg.norm(vectors, axis=1))

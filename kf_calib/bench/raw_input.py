@@ -31,7 +31,7 @@ UNITS = {
 LABELS = {"m/s2": "m/s^2", "g": "g", "mg": "mg", "ug": "ug"}
 OPTIONS = {"channels": "--channels", "accel_scale": "--accel-scale", "accel_unit": "--accel-unit"}
 """The bench keys that state a raw input, and the options that do."""
-CONVERTED, RESTATE = "converted", "restate_input"
+CONVERTED, RESTATE, RESTATING = "converted", "restate_input", " --restate-input"
 
 
 def parse_channels(text: str) -> tuple[int, int, int]:
@@ -125,7 +125,7 @@ class RawInput:
     def restating(self, key: str) -> str:
         """The option that an advice to state another value of a bench key needs, after a blank; nothing where none is
         stated yet."""
-        return " --restate-input" if key in self.to_metadata() else ""
+        return RESTATING if key in self.to_metadata() else ""
 
     @property
     def order(self) -> str:

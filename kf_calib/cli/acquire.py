@@ -161,14 +161,14 @@ class _Recorded(NamedTuple):
         return {"samples": self.readings, "dwells": self.dwells, "duration_s": self.duration_s}
 
 
-def _record(source: Source, out: Path, overwrite: bool, tick: Callable[[float], None]) -> _Recorded:
+def _record(source: Source, path: Path, overwrite: bool, tick: Callable[[float], None]) -> _Recorded:
     """Write a source to a recording as it is, a chunk closed at the end of each dwell."""
     from kf_calib.dwells.rest_in_readings import segmenter_of
     from kf_calib.sources.files.recorder import Recorder
 
     readings, first_ns, last_ns, segmenter = 0, None, 0, segmenter_of(source.bench)
     interrupt = Interrupter()
-    with answered(interrupt), Recorder(out, source.bench, overwrite=overwrite) as recorder:
+    with answered(interrupt), Recorder(path, source.bench, overwrite=overwrite) as recorder:
         for batch in source:
             with interrupt.finished_first():
                 recorder.write(batch)
@@ -193,7 +193,7 @@ def _record(source: Source, out: Path, overwrite: bool, tick: Callable[[float], 
 @click.command(
     epilog=examples("simulate run.mcap", "simulate run.mcap --seed 3 --hide second-order=10sigma --temperature-swing 5")
 )
-@click.argument("out", type=OutputFile())
+@click.argument("output", type=OutputFile(), metavar="OUT")
 @simulation_options
 @click.option("--no-angles", is_flag=True, panel="Run", help="Record no angles, as of a board that is turned by hand.")
 @bench_options
@@ -201,36 +201,36 @@ def _record(source: Source, out: Path, overwrite: bool, tick: Callable[[float], 
 @click.option("--large", is_flag=True, panel=OUTPUT, help="Begin even where the disk would not hold the recording.")
 @json_option
 def simulate(
-    out: Path, no_angles: bool, overwrite: bool, large: bool, as_json: bool, **options: Any
+    output: Path, no_angles: bool, overwrite: bool, large: bool, as_json: bool, **options: Any
 ) -> None:  # fmt: skip
     """Record a simulated bench run to OUT; its truth goes to a side file that no estimator opens."""
     from kf_calib.sources.simulation.by_hand import ByHand
     from kf_calib.sources.simulation.options import simulation
     from kf_calib.sources.simulation.truth import truth_file, write_truth
 
-    claimed([Path(options["plan"])], {"OUT, whose truth goes there": truth_file(out)}, overwrite)
+    claimed([Path(options["plan"])], {"OUT, whose truth goes there": truth_file(output)}, overwrite)
     options["no_angles"] = no_angles
-    source = simulation(options, overrides(options), begin=partial(_foresee, out=out, large=large))
-    with progress(f"simulating {out.name}", as_json) as tick:
-        made = _record(ByHand(source) if no_angles else source, out, overwrite, tick)
-    truth = write_truth(source, out, not no_angles)
+    source = simulation(options, overrides(options), begin=partial(_foresee, path=output, large=large))
+    with progress(f"simulating {output.name}", as_json) as tick:
+        recorded = _record(ByHand(source) if no_angles else source, output, overwrite, tick)
+    truth = write_truth(source, output, not no_angles)
     if as_json:
-        print_json({"recording": str(out), "truth": str(truth), **made.keys})
+        print_json({"recording": str(output), "truth": str(truth), **recorded.keys})
     else:
-        echo(f"{out}: {made}; truth in {truth}")
+        echo(f"{output}: {recorded}; truth in {truth}")
 
 
-def _foresee(run: Simulation, out: Path, large: bool) -> None:
+def _foresee(run: Simulation, path: Path, large: bool) -> None:
     """Say how large a large run becomes, before it begins; refuse what the disk does not hold."""
-    free = shutil.disk_usage(next(folder for folder in out.absolute().parents if folder.is_dir())).free
-    told = f"{len(run):.3g} readings, {run.duration_s / 3600:.3g} h of the bench, about {_size(run.file_bytes)}"
+    free = shutil.disk_usage(next(folder for folder in path.absolute().parents if folder.is_dir())).free
+    size = f"{len(run):.3g} readings, {run.duration_s / 3600:.3g} h of the bench, about {_size(run.file_bytes)}"
     if run.file_bytes > free and not large:
         raise InputError(
-            f"{out}: {told}, and the disk has {_size(free)} left: dwell shorter (--dwell-s), visit or read less "
+            f"{path}: {size}, and the disk has {_size(free)} left: dwell shorter (--dwell-s), visit or read less "
             "(--orientations, --sample-hz), or begin nevertheless with --large."
         )
     if run.file_bytes > _LARGE_BYTES:
-        complain(f"{out}: {told}.")
+        complain(f"{path}: {size}.")
 
 
 def _size(count: int) -> str:
@@ -244,7 +244,7 @@ def _size(count: int) -> str:
         "record run.mcap counts.csv --bench bench.toml --accel-scale 3.9e-6 --accel-unit g --channels 1,-2,3",
     )
 )
-@click.argument("out", type=OutputFile())
+@click.argument("output", type=OutputFile(), metavar="OUT")
 @click.argument("lines", type=click.Path(path_type=Path, allow_dash=True), default="-")
 @no_angles_option
 @columns_option
@@ -253,7 +253,7 @@ def _size(count: int) -> str:
 @overwrite_option
 @json_option
 def record(
-    out: Path, lines: Path, no_angles: bool, columns: tuple[str, ...], overwrite: bool, as_json: bool, **options: Any
+    output: Path, lines: Path, no_angles: bool, columns: tuple[str, ...], overwrite: bool, as_json: bool, **options: Any
 ) -> None:  # fmt: skip
     """Record CSV or JSON LINES (a file, or - for standard input) to the MCAP file OUT."""
     from kf_calib.sources.files.lines import Lines
@@ -261,13 +261,13 @@ def record(
     claimed(overwrite=overwrite)
     renamed = dict(pair(text) for text in columns)
     source = Lines(sys.stdin.buffer if str(lines) == "-" else lines, overrides(options), renamed, angles=not no_angles)
-    with progress(f"recording {out.name}", as_json or str(lines) == "-") as tick, _told_if_table(lines):
-        made = _record(source, out, overwrite, tick)
-    warnings = [*source.warnings, *made.notes]
+    with progress(f"recording {output.name}", as_json or str(lines) == "-") as tick, _told_if_table(lines):
+        recorded = _record(source, output, overwrite, tick)
+    warnings = [*source.warnings, *recorded.notes]
     if as_json:
-        print_json({"recording": str(out), **made.keys, "warnings": warnings})
+        print_json({"recording": str(output), **recorded.keys, "warnings": warnings})
         return
-    echo(f"{out}: {made}")
+    echo(f"{output}: {recorded}")
     for warning in warnings:
         echo(f"Note: {sentence(warning)}")
 
@@ -281,10 +281,10 @@ def _told_if_table(path: Path) -> Iterator[None]:
     try:
         yield
     except InputError:
-        found = None
+        table = None
         with suppress(InputError):
-            found = survey(path) if kind_of(path) is Kind.TABLE else None
-        if found is not None and found.rows:
+            table = survey(path) if kind_of(path) is Kind.TABLE else None
+        if table is not None and table.rows:
             raise InputError(
                 f"{path} is a table of orientations, with a row a dwell, and is evaluated as it is: kf-calib replay "
                 f"{path}."
@@ -316,15 +316,15 @@ def _copy_recordings(folder: Path, as_json: bool) -> None:
     """The recordings that come with the package, and their truths; those that are in the folder already stay."""
     from importlib.resources import files
 
-    own = {folder / name: file.read_bytes() for name, file in _files_in(files("kf_calib").joinpath("recordings"))}
-    for path, content in own.items():
+    contents = {folder / name: file.read_bytes() for name, file in _files_in(files("kf_calib").joinpath("recordings"))}
+    for path, content in contents.items():
         if path.exists() and path.read_bytes() != content:
             raise InputError(f"{path} is there, and is not the tutorial's: move it away, or name another FOLDER.")
-    for path, content in own.items():
+    for path, content in contents.items():
         path.parent.mkdir(parents=True, exist_ok=True)
         if not path.exists():
             write_whole(path, content)
-    recordings = [str(path) for path in own if path.suffix == ".mcap"]
+    recordings = [str(path) for path in contents if path.suffix == ".mcap"]
     if as_json:
         print_json({"recordings": recordings})
     else:
@@ -383,10 +383,10 @@ def _do_main_job(folder: Path, as_json: bool) -> None:
 
 def _viewer() -> str:
     """The Rerun viewer that came with this program, as one types it in this folder."""
-    place, folder = Path(sys.executable).parent, Path.cwd()
-    if found := shutil.which("rerun", path=str(place)):
-        if place.is_relative_to(folder):
-            return str(Path(found).relative_to(folder))
-        if shutil.which("rerun") != found:
-            return found
+    programs, folder = Path(sys.executable).parent, Path.cwd()
+    if viewer := shutil.which("rerun", path=str(programs)):
+        if programs.is_relative_to(folder):
+            return str(Path(viewer).relative_to(folder))
+        if shutil.which("rerun") != viewer:
+            return viewer
     return "rerun"

@@ -34,7 +34,7 @@ statement_option = click.option("--statement", type=_path, metavar="LAB.toml", p
 
 @click.command(epilog=examples("certificate cal.json --statement lab.toml -o certificate.pdf"))
 @click.argument("calibration", type=_path, metavar="CAL")
-@output_option("-o", "--out", required=True, metavar="OUT.pdf", panel=OUTPUT,
+@output_option("-o", "--out", "output", required=True, metavar="OUT.pdf", panel=OUTPUT,
                help="The certificate: PDF/A-3b with the XML attached.")  # fmt: skip
 @output_option("--xml", metavar="OUT.xml", panel=OUTPUT, help="Save the XML as a file of its own, too.")
 @statement_option
@@ -45,7 +45,7 @@ statement_option = click.option("--statement", type=_path, metavar="LAB.toml", p
 @overwrite_option
 @json_option
 def certificate(
-    calibration: Path, out: Path, xml: Path | None, statement: Path | None, schema: Path | None,
+    calibration: Path, output: Path, xml: Path | None, statement: Path | None, schema: Path | None,
     effects_from: tuple[Path, ...], trust: bool, overwrite: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """A calibration certificate as ISO/IEC 17025 asks: results, expanded uncertainties, budget, traceability.
@@ -56,18 +56,18 @@ def certificate(
     from kf_calib.exchange.certificate import statement as statements
     from kf_calib.views import certificate as views
 
-    own = statements.read(statement)
-    outputs = claimed([] if own.before is None else [own.before], overwrite=overwrite)
-    found = []
-    for path in (calibration, own.before):
+    stated = statements.read(statement)
+    outputs = claimed([] if stated.before is None else [stated.before], overwrite=overwrite)
+    calibrations = []
+    for path in (calibration, stated.before):
         if path is not None:
             saved = calibration_file.read(path)
-            found.append((saved, saved.model(path, effects_from, trust)))
-    made, standing = write_certificate(outputs, out, own, *found, xml=xml, schema=schema)
+            calibrations.append((saved, saved.model(path, effects_from, trust)))
+    written, standing = write_certificate(outputs, output, stated, *calibrations, xml=xml, schema=schema)
     if as_json:
-        print_json(views.certificate_object(made, standing, out, xml))
+        print_json(views.certificate_object(written, standing, output, xml))
     else:
-        show(views.certificate_report(made, standing, out, xml))
+        show(views.certificate_report(written, standing, output, xml))
 
 
 def stated_in(certificate: Path | None, statement: Path | None) -> Statement | None:
@@ -84,7 +84,7 @@ def stated_in(certificate: Path | None, statement: Path | None) -> Statement | N
 
 
 def write_certificate(
-    outputs: Outputs, out: Path, own: Statement, calibrated: tuple[SavedCalibration, Model],
+    outputs: Outputs, pdf: Path, stated: Statement, calibrated: tuple[SavedCalibration, Model],
     before: tuple[SavedCalibration, Model] | None = None, xml: Path | None = None, schema: Path | None = None,
 ) -> tuple[Certificate, str]:  # fmt: skip
     """Write the certificate of a calibration with its model as ``out``; what it says, and what the check of its XML
@@ -95,11 +95,11 @@ def write_certificate(
     from kf_calib.exchange.certificate import content, dcc, document
     from kf_calib.support.output_files import write_whole
 
-    made = content.certificate(*calibrated, own, before)
-    encoded = dcc.xml(made)
+    certificate_ = content.certificate(*calibrated, stated, before)
+    encoded = dcc.xml(certificate_)
     standing = dcc.check(encoded, schema)
-    printed = document.pdf(made, encoded, standing)
-    outputs.write(out, lambda path: write_whole(path, printed))
+    printed = document.pdf(certificate_, encoded, standing)
+    outputs.write(pdf, lambda path: write_whole(path, printed))
     if xml is not None:
         outputs.write(xml, lambda path: write_whole(path, encoded))
-    return made, standing
+    return certificate_, standing

@@ -208,14 +208,14 @@ def diagnose(ctx: click.Context, recording: Path, overwrite: bool, strict: bool,
     outputs, pictures = claimed(overwrite=overwrite), Pictures.taken_from(options)
     source, settings = opened(recording, options)
     with progress(f"diagnosing {recording.name}", as_json) as tick:
-        found = run(calibrate(source, settings, tick), Refits(source))
+        diagnosis = run(calibrate(source, settings, tick), Refits(source))
     if as_json:
-        print_json(views.diagnosis_object(found))
+        print_json(views.diagnosis_object(diagnosis))
     else:
-        show(views.diagnosis_report(found))
+        show(views.diagnosis_report(diagnosis))
     with delivery(outputs, as_json) as deliver:
-        pictures.save(deliver, found)
-    if strict and found.test.consistent is False:
+        pictures.save(deliver, diagnosis)
+    if strict and diagnosis.test.consistent is False:
         ctx.exit(1)
 
 
@@ -363,24 +363,24 @@ def _of_journal(ctx: click.Context, options: Mapping[str, Any], origin: Origin, 
 
     from kf_calib.effects.programs import allowed
 
-    own = [param for param in ctx.command.params if param.name in options and param.name not in _LEAVE]
+    params = [param for param in ctx.command.params if param.name in options and param.name not in _LEAVE]
     given = [
-        param.opts[0] for param in own if ctx.get_parameter_source(param.name or "") is ParameterSource.COMMANDLINE
+        param.opts[0] for param in params if ctx.get_parameter_source(param.name or "") is ParameterSource.COMMANDLINE
     ]
     if given:
         raise click.UsageError(f"--from-journal has its options from the journal: leave out {', '.join(given)}.")
-    kept = {key: value for key, value in origin.options.items() if key not in ("bench_file", "model_file")}
-    out: dict[str, Any] = {key: None for key in _BY_CONTENT if key not in kept}
-    for param in own:
-        if (name := param.name or "") in kept:
+    journalled = {key: value for key, value in origin.options.items() if key not in ("bench_file", "model_file")}
+    values: dict[str, Any] = {key: None for key in _BY_CONTENT if key not in journalled}
+    for param in params:
+        if (name := param.name or "") in journalled:
             try:
-                if isinstance(kept[name], list | tuple) != bool(getattr(param, "multiple", False)):
+                if isinstance(journalled[name], list | tuple) != bool(getattr(param, "multiple", False)):
                     raise TypeError
-                out[name] = param.type_cast_value(ctx, kept[name])
+                values[name] = param.type_cast_value(ctx, journalled[name])
             except (click.BadParameter, TypeError, ValueError) as error:
-                why = error.message if isinstance(error, click.BadParameter) else f"{kept[name]!r}"
+                why = error.message if isinstance(error, click.BadParameter) else f"{journalled[name]!r}"
                 raise InputError(f"{path}: is no journal of improve (option {name}: {why}).") from None
-    found = allowed(path, origin.programs, options["effects_from"], options["trust"])
-    for change in found.changes:
+    programs = allowed(path, origin.programs, options["effects_from"], options["trust"])
+    for change in programs.changes:
         complain(f"{change}")
-    return out | {"effects_from": (*options["effects_from"], *found.files)}
+    return values | {"effects_from": (*options["effects_from"], *programs.files)}

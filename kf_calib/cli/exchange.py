@@ -63,7 +63,7 @@ _file = partial(click.argument, type=click.Path(path_type=Path))
 )
 @_file("calibration", metavar="CAL")
 @_file("recording", metavar="REC")
-@output_option("-o", "--out", metavar="OUT", panel=OUTPUT,
+@output_option("-o", "--out", "output", metavar="OUT", panel=OUTPUT,
                help="The copy: of a recording with /accelerometer/calibrated beside the raw topic, of a log or a table "
                "with specific force in the place of the readings.")  # fmt: skip
 @click.option("--unchecked", is_flag=True, panel=INPUT,
@@ -75,7 +75,7 @@ _file = partial(click.argument, type=click.Path(path_type=Path))
 @units_option
 @json_option
 def apply(
-    calibration: Path, recording: Path, out: Path | None, unchecked: bool, overwrite: bool, as_json: bool,
+    calibration: Path, recording: Path, output: Path | None, unchecked: bool, overwrite: bool, as_json: bool,
     **options: Any,
 ) -> None:  # fmt: skip
     """Correct the readings of a recording: specific force in the frame of the block, in a copy.
@@ -88,26 +88,28 @@ def apply(
     from kf_calib.views import exchange as views
 
     if recording == Path("-"):
-        if out is not None or as_json:
+        if output is not None or as_json:
             raise click.UsageError("lines of standard input are corrected to standard output: leave out -o and --json.")
         refuse_given(_OF_FILES, "lines of standard input are read as they come")
         return _apply_to_lines(_correction(calibration, options)[1], options, unchecked)
-    if out is None:
+    if output is None:
         raise click.UsageError("a recording is corrected to a copy: name it by -o OUT (standard input by -).")
     kind = recording_kind(recording, options)
-    if kind != "recording" and out.suffix == ".mcap":
-        raise InputError(f"{recording} holds lines of text or a table, and its copy, too: name {out} as such a file.")
+    if kind != "recording" and output.suffix == ".mcap":
+        raise InputError(
+            f"{recording} holds lines of text or a table, and its copy, too: name {output} as such a file."
+        )
     outputs = claimed(overwrite=overwrite)
     saved, correction = _correction(calibration, options)
     options["gravity_mps2"] = options["gravity_mps2"] or saved.bench.gravity_mps2
     done = list[Any]()
     with progress(f"correcting {recording.name}", as_json) as tick:
-        outputs.write(out, lambda path: done.append(_applied(correction, recording, path, options, unchecked, tick)))
-    (found, warnings), topic = done[0], kind == "recording"
+        outputs.write(output, lambda path: done.append(_applied(correction, recording, path, options, unchecked, tick)))
+    (applied, warnings), topic = done[0], kind == "recording"
     if as_json:
-        print_json(views.applied_object(correction, found, out, warnings, topic))
+        print_json(views.applied_object(correction, applied, output, warnings, topic))
     else:
-        show(views.applied_report(correction, found, out, warnings, topic))
+        show(views.applied_report(correction, applied, output, warnings, topic))
 
 
 _OF_FILES = (*OF_MESSAGES, *(key for key in BENCH_OPTIONS if key != "channels"), "angle_unit", "no_angles")
@@ -115,7 +117,7 @@ _OF_FILES = (*OF_MESSAGES, *(key for key in BENCH_OPTIONS if key != "channels"),
 
 
 def _applied(
-    correction: Correction, path: Path, out: Path, options: Mapping[str, Any], unchecked: bool,
+    correction: Correction, path: Path, copy: Path, options: Mapping[str, Any], unchecked: bool,
     tick: Callable[[float], None],
 ) -> tuple[Applied, list[str]]:  # fmt: skip
     """Write the copy of a file; what was corrected, and what is to be told."""
@@ -126,20 +128,20 @@ def _applied(
     match recording_kind(path, options):
         case "samples":
             lines = _lines(correction, options, str(path), unchecked)
-            with whole(out) as part, part.open("wb") as file, _bytes_of(path) as source:
+            with whole(copy) as part, part.open("wb") as file, _bytes_of(path) as source:
                 while block := source.read(_BLOCK_BYTES):
                     file.write(lines.push(block))
                 file.write(lines.rest())
             return Applied(lines.readings, 0, None), lines.warnings
         case "table":
             keys, units = merged_for_table(path, options, correction.input)
-            return apply_to_table(correction, path, out, keys, columns, units, unchecked=unchecked), []
+            return apply_to_table(correction, path, copy, keys, columns, units, unchecked=unchecked), []
         case _:
             if columns:
                 raise InputError(f"{path} is no log and no table, on which --column has nothing to act: leave it out.")
             source = messages_of(path, options, angles=False, input=correction.input)
-            found = apply_to_file(correction, source, out, tick, unchecked=unchecked)
-            return found, source.warnings
+            applied = apply_to_file(correction, source, copy, tick, unchecked=unchecked)
+            return applied, source.warnings
 
 
 def _bytes_of(path: Path) -> BinaryIO | TextFile:
@@ -228,12 +230,12 @@ def verify(ctx: click.Context, calibration: Path, recording: Path, strict: bool,
     source = recording_of(recording, options, saved.bench.input)
     model = saved.model(calibration, options["effects_from"], options["trust"], source.bench)
     with progress(f"verifying with {recording.name}", as_json) as tick:
-        found = verification.verify(saved, model, source, Settings(**used_of(options)), tick)
+        result = verification.verify(saved, model, source, Settings(**used_of(options)), tick)
     if as_json:
-        print_json(views.verification_object(found))
+        print_json(views.verification_object(result))
     else:
-        show(views.verification_report(found))
-    if strict and not found.holds:
+        show(views.verification_report(result))
+    if strict and not result.holds:
         ctx.exit(1)
 
 
@@ -262,10 +264,10 @@ def history(
 
     outputs, pictures = claimed(overwrite=overwrite), Pictures.taken_from(options)
     wanted = targets_of(tolerances)
-    found = found_in([calibration_file.read(path) for path in calibrations], wanted)
+    drifts = found_in([calibration_file.read(path) for path in calibrations], wanted)
     if as_json:
-        print_json(views.history_object(found))
+        print_json(views.history_object(drifts))
     else:
-        show(views.history_report(found))
+        show(views.history_report(drifts))
     with delivery(outputs, as_json) as deliver:
-        pictures.save(deliver, found)
+        pictures.save(deliver, drifts)

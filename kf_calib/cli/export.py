@@ -26,7 +26,7 @@ _NAMES = ["px4", "ardupilot", "imucal", "imu_calib", "kalibr", "openvins", "imu_
                                "export cal.json --to ardupilot --lossy -o accelerometer.param"))  # fmt: skip
 @click.argument("calibration", type=click.Path(path_type=Path), metavar="CAL")
 @click.option("--to", required=True, type=click.Choice(_NAMES), help="The program that is to take it.", panel=OUTPUT)
-@output_option("-o", "--out", required=True, metavar="FILE", panel=OUTPUT, help="The file for that program.")
+@output_option("-o", "--out", "output", required=True, metavar="FILE", panel=OUTPUT, help="The file for that program.")
 @click.option(
     "--lossy", is_flag=True, panel=OUTPUT,
     help="Export though the program cannot hold all; what is lost, and the error left, are told.",
@@ -37,7 +37,7 @@ _NAMES = ["px4", "ardupilot", "imucal", "imu_calib", "kalibr", "openvins", "imu_
 @units_option
 @json_option
 def export(
-    calibration: Path, to: str, out: Path, lossy: bool, effects_from: tuple[Path, ...], trust: bool, overwrite: bool,
+    calibration: Path, to: str, output: Path, lossy: bool, effects_from: tuple[Path, ...], trust: bool, overwrite: bool,
     as_json: bool,
 ) -> None:  # fmt: skip
     """Write a calibration as the file of an autopilot, of another calibration tool, or as a function in C.
@@ -54,8 +54,8 @@ def export(
     saved = calibration_file.read(calibration)
     target = exported(saved, saved.correction(calibration, effects_from, trust), to, lossy)
     content = target.text().encode()
-    outputs.write(out, lambda path: write_whole(path, content))
+    outputs.write(output, lambda path: write_whole(path, content))
     if as_json:
-        print_json(views.exported_object(target, to, out))
+        print_json(views.exported_object(target, to, output))
     else:
-        show(views.exported_report(target, out))
+        show(views.exported_report(target, output))

@@ -55,9 +55,9 @@ def _place(error: BaseException) -> str:
     """The innermost line of this package that was at work, as ``kf_calib/estimation/fit.py:88``."""
     package = Path(__file__).parents[1]
     frames = traceback.extract_tb(error.__traceback__)
-    own = [frame for frame in frames if package in Path(frame.filename).parents]
-    if not (own or frames):
+    in_package = [frame for frame in frames if package in Path(frame.filename).parents]
+    if not (in_package or frames):
         return "an unknown place"
-    frame = (own or frames)[-1]
+    frame = (in_package or frames)[-1]
     path = Path(frame.filename)
-    return f"{path.relative_to(package.parent) if own else path}:{frame.lineno}"
+    return f"{path.relative_to(package.parent) if in_package else path}:{frame.lineno}"

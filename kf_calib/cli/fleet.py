@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from kf_calib.fleet.bench_model_files import BenchModelFiles
     from kf_calib.fleet.evaluation import Evaluation
     from kf_calib.fleet.overview import FleetOverview
-    from kf_calib.fleet.reference_unit import ReferenceUnit
+    from kf_calib.fleet.run_factor import ReferenceUnit
     from kf_calib.fleet.run_list import Run
     from kf_calib.support.output_files import Outputs
 
@@ -80,10 +80,10 @@ class SingleCommands:
 
         return replay_object(result)
 
-    def diagnosis_document(self, found: Diagnosis) -> dict[str, Any]:
+    def diagnosis_document(self, diagnosis: Diagnosis) -> dict[str, Any]:
         from kf_calib.views.diagnosis import diagnosis_object
 
-        return diagnosis_object(found)
+        return diagnosis_object(diagnosis)
 
     def sentence(self, error: BaseException) -> str:
         return sentence(error)
@@ -105,8 +105,9 @@ def _content(value: Any) -> Any:
 
 @click.command(epilog=examples("fleet campaign/ -o fleet", "fleet s3://lab/2026/ -o fleet --scheduler tcp://host:8786"))
 @click.argument("runs", nargs=-1, required=True)
-@click.option("-o", "--out", required=True, type=click.Path(file_okay=False, path_type=Path), metavar="FOLDER",
-              panel=OUTPUT, help="The table of runs; runs that are in it already are not evaluated again.")  # fmt: skip
+@click.option("-o", "--out", "output", required=True, type=click.Path(file_okay=False, path_type=Path),
+              metavar="FOLDER", panel=OUTPUT,
+              help="The table of runs; runs that are in it already are not evaluated again.")  # fmt: skip
 @click.option("--workers", type=click.IntRange(min=1), show_default="one a core", panel=WORK,
               help="Number of processes on this machine.")  # fmt: skip
 @click.option("--scheduler", metavar="URL", panel=WORK,
@@ -128,7 +129,7 @@ def _content(value: Any) -> Any:
 @json_option
 def fleet(
     runs: tuple[str, ...],
-    out: Path,
+    output: Path,
     workers: int | None,
     scheduler: str | None,
     limit_s: float,
@@ -168,15 +169,15 @@ def fleet(
     wanted, reference = targets_of(targets), _reference(reference_unit)
     commands = _checked(options)
     evaluation = Evaluation(commands, commands.checksum, limit_s)
-    done = _evaluated(evaluation, runs_of(runs), out, workers, scheduler, as_json)
-    found = Fleet(out)
+    done = _evaluated(evaluation, runs_of(runs), output, workers, scheduler, as_json)
+    table = Fleet(output)
     with progress("diagnosing the runs together", as_json):
-        overview = found.overview(wanted, pooled=pooled, reference_unit=reference)
-    models = BenchModelFiles(out, overview.pooled, overwrite)
+        overview = table.overview(wanted, pooled=pooled, reference_unit=reference)
+    models = BenchModelFiles(output, overview.pooled, overwrite)
     if as_json:
-        print_json(views.fleet_object(found, populations(found), done, overview, list(models.models)))
+        print_json(views.fleet_object(table, populations(table), done, overview, list(models.models)))
     else:
-        show(views.fleet_report(found, populations(found), done, overview))
+        show(views.fleet_report(table, populations(table), done, overview))
     commands_again = commands_of(get_current_context())
     with delivery(outputs, as_json) as deliver, progress("drawing the pictures", as_json):
         _deliver_bench_models(models, outputs, deliver, as_json)
@@ -196,7 +197,7 @@ def _reference(path: Path | None) -> ReferenceUnit | None:
     if path is None:
         return None
     from kf_calib.exchange import calibration_file
-    from kf_calib.fleet.reference_unit import ReferenceUnit
+    from kf_calib.fleet.run_factor import ReferenceUnit
 
     saved = calibration_file.read(path)
     unit = saved.provenance.bench.get("block_serial")
@@ -229,16 +230,15 @@ def _checked(options: Mapping[str, Any]) -> SingleCommands:
 
 
 def _evaluated(
-    evaluation: Evaluation, runs: Sequence[Run], out: Path, workers: int | None, scheduler: str | None, quiet: bool
+    evaluation: Evaluation, runs: Sequence[Run], folder: Path, workers: int | None, scheduler: str | None, quiet: bool
 ) -> Progress:
     """Evaluate the runs that are not in the table yet; where it is stopped, all that is done is kept."""
     import dask.system
 
-    from kf_calib.fleet.batch import evaluate_all
-    from kf_calib.fleet.cluster import cluster
+    from kf_calib.fleet.batch import cluster, evaluate_all
     from kf_calib.fleet.store import Store
 
-    store, interrupt = Store(out), Interrupter()
+    store, interrupt = Store(folder), Interrupter()
     with store.taken(), answered(interrupt), progress(f"{len(runs)} runs", quiet) as tick:
 
         def tell(now: Progress) -> None:
@@ -250,5 +250,7 @@ def _evaluated(
             with cluster(workers or dask.system.CPU_COUNT, scheduler) as client:
                 return evaluate_all(client, evaluation, runs, store, tell)
         except KeyboardInterrupt:
-            complain(f"stopped: {out} has {len(store.known())} runs so far, and the same command goes on from there.")
+            complain(
+                f"stopped: {folder} has {len(store.known())} runs so far, and the same command goes on from there."
+            )
             raise

@@ -61,26 +61,42 @@ _BY_HAND = (
 def info(ctx: click.Context, recording: Path, columns: tuple[str, ...], as_json: bool, **options: Any) -> None:
     """What is in a recording: topics, rates, gaps, dwells, what is missing to evaluate it, and the command to try.
 
-    FILE is an MCAP file, the folder of a ROS 2 bag, a .db3 file, lines of CSV or JSON, or a table of orientations.
+    FILE is an MCAP file, the folder of a ROS 2 bag, a .db3 file, lines of CSV or JSON, a table of orientations,
+    or a calibration.
     """
     from kf_calib.sources.opening import Kind, kind_of
 
     renamed = dict(map(pair, columns))
     kind = kind_of(recording, renamed)
+    if kind is Kind.CALIBRATION:
+        _show_calibration(recording, as_json)
+        return
     if kind is Kind.TABLE:
         _show_table(ctx, recording, renamed, options, as_json)
         return
     with progress(f"reading {recording.name}", as_json) as tick:
         if kind is Kind.SAMPLES:
-            found = _of_lines(ctx, recording, renamed, options, tick)
+            overview = _of_lines(ctx, recording, renamed, options, tick)
         else:
-            found = _of_messages(ctx, recording, options, tick)
+            overview = _of_messages(ctx, recording, options, tick)
     from kf_calib.views.overview import overview_object, overview_report
 
     if as_json:
-        print_json(overview_object(found))
+        print_json(overview_object(overview))
     else:
-        show(overview_report(found))
+        show(overview_report(overview))
+
+
+def _show_calibration(path: Path, as_json: bool) -> None:
+    """Show what a calibration holds."""
+    from kf_calib.exchange.calibration_file import read
+    from kf_calib.views.calibration import calibration_object, calibration_report
+
+    saved = read(path)
+    if as_json:
+        print_json(calibration_object(saved, path))
+    else:
+        show(calibration_report(saved, path))
 
 
 def _of_messages(ctx: click.Context, path: Path, options: Mapping[str, Any], tick: Tick) -> Overview:
@@ -220,11 +236,11 @@ def _show_table(
         told, words = _with_unit({}, words, wrong)
         missing += told.values()
     command = " ".join(["kf-calib replay", _quoted(str(table.path)), *words])
-    found = TableOverview(table, bench, missing, command)
+    overview = TableOverview(table, bench, missing, command)
     if as_json:
-        print_json(table_object(found))
+        print_json(table_object(overview))
     else:
-        show(table_report(found))
+        show(table_report(overview))
 
 
 def _lacks(bench: Mapping[str, str], has_angles: bool) -> list[str]:

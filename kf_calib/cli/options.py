@@ -272,7 +272,7 @@ def _bench_from_toml(path: Path) -> dict[str, str]:
 def recording_of(path: Path, options: Mapping[str, Any], input: RawInput | None = None) -> Recording | Lines | Table:
     """The recording, log of samples or table at a path; input: what the device sends, where nothing else states it."""
     from kf_calib.sources.files.lines import Lines
-    from kf_calib.sources.opening import Kind, kind_of
+    from kf_calib.sources.opening import Kind, kind_of, no_recording
     from kf_calib.sources.tables.opening import open_table
 
     columns, angles = dict(map(pair, options["columns"])), not options["no_angles"]
@@ -287,6 +287,8 @@ def recording_of(path: Path, options: Mapping[str, Any], input: RawInput | None 
         case Kind.RECORDING:
             refuse_given(_OF_TEXT, f"{path} is no table (.csv, .xlsx) and no log in lines of text")
             return messages_of(path, options, angles, input)
+        case Kind.CALIBRATION:
+            raise no_recording(path)
 
 
 _OF_TEXT = ("columns", "g_unit")
@@ -310,7 +312,7 @@ def refuse_given(names: Sequence[str], what: str) -> None:
 
 
 def recording_kind(path: Path, options: Mapping[str, Any]) -> str:
-    """What a file is: ``recording``, ``samples`` or ``table``."""
+    """What a file is: ``recording``, ``samples``, ``table`` or ``calibration``."""
     from kf_calib.sources.opening import kind_of
 
     return kind_of(path, dict(map(pair, options["columns"]))).value

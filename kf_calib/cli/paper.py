@@ -78,12 +78,12 @@ def paper(
     outputs, pictures = claimed(overwrite=overwrite), Pictures.taken_from(options)
     conditions = Conditions(period_s, latitude, azimuth, turns, sampled)  # type: ignore[arg-type]  # click's choices
     with progress("repeating the experiment", as_json) as tick:
-        found = repeat(conditions, repetitions, seed)
+        experiment = repeat(conditions, repetitions, seed)
         tick(0.5)
         searched = search(latitude)
     if as_json:
-        print_json(views.paper_object(found, searched))
+        print_json(views.paper_object(experiment, searched))
     else:
-        show(views.paper_report(found, searched))
+        show(views.paper_report(experiment, searched))
     with delivery(outputs, as_json) as deliver:
-        pictures.save(deliver, found)
+        pictures.save(deliver, experiment)

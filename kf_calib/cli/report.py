@@ -54,7 +54,7 @@ report_option = output_option(
 @recording_options
 @filter_options
 @output_option(
-    "-o", "--out", metavar="FILE.html", default="report.html", show_default=True, panel=OUTPUT,
+    "-o", "--out", "output", metavar="FILE.html", default="report.html", show_default=True, panel=OUTPUT,
     help="Where the page is saved.",
 )  # fmt: skip
 @output_option(
@@ -71,7 +71,7 @@ def report(
     ctx: click.Context,
     recording: Path,
     against: Path | None,
-    out: Path,
+    output: Path,
     certificate: Path | None,
     statement: Path | None,
     overwrite: bool,
@@ -92,31 +92,31 @@ def report(
     if has_other_model:
         outputs.spare(_programs_of(against))
         effects_of(other_options)  # refused, as that of --model, before any reading is read
-    found, measured = _diagnosed(recording, options, as_json)
+    diagnosed, measured = _diagnosed(recording, options, as_json)
     pair, sources = None, [measured]
     if against is not None:
         other, beside = _diagnosed(recording if has_other_model else against, other_options, as_json)
-        pair, sources = SideBySide(other, found, has_other_model), [beside, measured]
-    said = diagnosis.verdict(found) if pair is None else side_by_side.verdict(pair)
+        pair, sources = SideBySide(other, diagnosed, has_other_model), [beside, measured]
+    verdict = diagnosis.verdict(diagnosed) if pair is None else side_by_side.verdict(pair)
     if as_json:
-        table = {"report": str(out), "recording": measured.name, "sha256": measured.sha256,
-                 "consistent": found.test.consistent, "p_value": found.test.p_value,
-                 "verdict": diagnosis.verdict(found)}  # fmt: skip
+        table = {"report": str(output), "recording": measured.name, "sha256": measured.sha256,
+                 "consistent": diagnosed.test.consistent, "p_value": diagnosed.test.p_value,
+                 "verdict": diagnosis.verdict(diagnosed)}  # fmt: skip
         beside_it = {"against": None, "differences": [], "differences_p_value": None}
         print_json(clean(table | (beside_it if pair is None else side_by_side.side_by_side_object(pair))))
     else:
-        show(said)
+        show(verdict)
     with delivery(outputs, as_json) as deliver, progress("drawing the page", as_json):
-        result = found if pair is None else pair
-        deliver.file(out, lambda path: save(page_of(result, sources, commands_of(ctx)), path))
+        result = diagnosed if pair is None else pair
+        deliver.file(output, lambda path: save(page_of(result, sources, commands_of(ctx)), path))
     if certificate is not None and stated is not None:
         from kf_calib.exchange import calibration_file
 
-        saved = calibration_file.saved(found.before, measured.name, measured.sha256, measured.began)
-        write_certificate(outputs, certificate, stated, (saved, found.before.model))
+        saved = calibration_file.saved(diagnosed.before, measured.name, measured.sha256, measured.began)
+        write_certificate(outputs, certificate, stated, (saved, diagnosed.before.model))
         if not as_json:
             show(f"saved {certificate}")
-    if strict and found.test.consistent is False:
+    if strict and diagnosed.test.consistent is False:
         ctx.exit(1)
 
 
@@ -165,11 +165,11 @@ _HOW_IT_ENDS = ("overwrite", "strict", "as_json")
 
 def commands_of(ctx: click.Context) -> list[str]:
     """The command that runs, as it could be typed again, and what prints its tables alone."""
-    own = [f"kf-calib {ctx.info_name} {_typed(ctx, _HOW_IT_ENDS)}"]
+    commands = [f"kf-calib {ctx.info_name} {_typed(ctx, _HOW_IT_ENDS)}"]
     if ctx.info_name == "report" and ctx.params.get("against") is None:
-        shared = _typed(ctx, ("out", *_HOW_IT_ENDS))
-        own += [f"kf-calib {name} {shared}" for name in ("replay", "diagnose")]
-    return [*own, *(f"sha256sum {shlex.quote(str(path))}" for path in _recordings(ctx))]
+        shared = _typed(ctx, ("output", *_HOW_IT_ENDS))
+        commands += [f"kf-calib {name} {shared}" for name in ("replay", "diagnose")]
+    return [*commands, *(f"sha256sum {shlex.quote(str(path))}" for path in _recordings(ctx))]
 
 
 def _recordings(ctx: click.Context) -> list[Path]:

@@ -196,10 +196,15 @@ def candidate_frame(fitted: Fit, frame: Frame | None = None) -> Frame:
 
 
 def _scanned(fitted: Fit, frame: Frame) -> Scan:
-    """Return the scan of all candidates and of slow oscillations, of which the best frequency is kept."""
+    """Return the scan of all candidates and, with angles, of slow oscillations, of which the best frequency is kept.
+
+    In a hand, few dwells would have an oscillation of some frequency by chance: whatever scatters them.
+    """
     linearised, effect = fitted.linearised, oscillation_of(fitted.linearised.model.bench)
-    frequencies_hz = np.zeros(0) if effect is None or linearised.model.oscillates else slow_hz(fitted, effect)
-    if effect is None or not len(frequencies_hz):
+    if effect is None or linearised.model.oscillates or fitted.noise.attitude_unknown:
+        return frame.scan(linearised)
+    frequencies_hz = slow_hz(fitted, effect)
+    if not len(frequencies_hz):
         return frame.scan(linearised)
     best_hz = frequencies_hz[np.argmax(frame.delta_chi2(linearised, effect, frequencies_hz))]
     tones = [effect.at(hz) for hz in best_hz + 0.125 * frequencies_hz[0] * np.arange(-3, 4)]
@@ -229,6 +234,9 @@ def _with_lines(test: CandidateTests, fitted: Fit, frame: Frame) -> CandidateTes
     effect = oscillation_of(fitted.linearised.model.bench)
     if effect is None or fitted.linearised.model.oscillates:
         return replace(test, trend=trend(fitted))
+    if fitted.noise.attitude_unknown:  # a body in the hand trembles: its lines are vibration
+        test, lines = replace(test, lines=LineTests(untested_band=str(effect))), frame.lines(LEVEL * REST)
+        return test.with_vibration(lines) if lines else replace(test, trend=trend(fitted))
     name, slow, (low_hz, high_hz, lowest_line_hz) = str(effect), slow_hz(fitted, effect), _searched_hz(fitted.dwells)
     highest_slow_hz = float(slow[-1]) if len(slow) else low_hz
     gaps_hz = (

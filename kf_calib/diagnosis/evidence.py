@@ -179,7 +179,8 @@ class Evidence:
     def _free_parts(self, dwells: int) -> Iterator[Parts]:
         """Yield the sets of parts of the noise from dwell to dwell that may be free."""
         yield ()
-        if (1 if self.noise.attitude_unknown else 3) * dwells <= self._fit.linearised.model.count:
+        model = self._fit.linearised.model
+        if (1 if self.noise.attitude_unknown else 3) * dwells <= model.count - len(model.fixed):
             return
         yield ("common",)
         if self.noise.attitude_unknown:  # a rotation of the dwells has no limit anyway

@@ -206,7 +206,9 @@ class Hypotheses:
             with_walk = self._refit((walk,))
             test = self.refits.assess_beside_walk(with_walk, self.effects.independent_tests)
             beside = Hypotheses(self.refits, with_walk, test)
-            effects = [name for name in beside._log_bayes_of_effects() if name in beside.test.effects.best]
+            # an effect may be visible beside the walk only, where the noise is another
+            visible = beside._numbers.keys() & self._numbers.keys()
+            effects = [name for name in beside._log_bayes_of_effects() if name in visible]
             pairs += [(name, walk) for name in effects[: _MOST["walk"]]]
         return pairs
 

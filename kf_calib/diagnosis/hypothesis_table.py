@@ -92,6 +92,10 @@ class HypothesisTable:
         """Probability that all these effects are missing, alone or with others."""
         return sum(row.probability for row in self.rows if set(effects) <= set(row.effects))
 
+    def probability_of_just(self, effects: Sequence[str]) -> float:
+        """Probability that these effects are missing, and no others: that of their row."""
+        return sum(row.probability for row in self.rows if set(effects) == set(row.effects))
+
     def probability_of_families(self, families: Iterable[str]) -> float:
         """Probability that something of any of these families is missing."""
         return sum(row.probability for row in self.rows if set(row.families) & set(families))

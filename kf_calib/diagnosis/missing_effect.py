@@ -15,6 +15,7 @@ import numpy as np
 from kf_calib.bench.streams import Source
 from kf_calib.diagnosis.candidate_tests import CandidateTests, overlap_matrix
 from kf_calib.diagnosis.dwell_noise import dwell_noise_is_stated, with_noise_as_stated
+from kf_calib.diagnosis.earned_name import unearned
 from kf_calib.diagnosis.hypotheses import Hypotheses, log_odds_of
 from kf_calib.diagnosis.hypothesis_table import (
     ALIKE,
@@ -66,7 +67,7 @@ def _diagnosed(refits: Refits, before: Calibration) -> Diagnosis:
     if diagnosis.unknown and test.without_lines:  # the lines keep their phase through the run, but not their amplitude
         test = test.without_lines
         diagnosis = _explained(refits, before, test)
-    if test.lines.vibration and not before.fit.dwells[0].averaged:
+    if test.lines.vibration and before.bench.angles and not before.fit.dwells[0].averaged:
         averaged = refits.averaged(before, window_average.window_s(test.lines.vibration))
         if averaged is not None:
             retest = refits.assess(averaged)
@@ -153,18 +154,21 @@ def _decided(refits: Refits, diagnosis: Diagnosis) -> Diagnosis:
             final_test = retest.with_vibration(test.lines.vibration)
             diagnosis, test = replace(diagnosis, before_in_noise_left=before_in_noise_left, test=final_test), retest
     credible = (first, *table.rivals) if first.effects else ()
+    why_not = unearned(first, before, test.effects.walk)
+    named = first if first.effects and not why_not else None
     names = tuple(dict.fromkeys(name for row in credible for name in row.effects))
     pairs = [row.effects for row in credible[1:] if len(row.effects) > 1 and not set(first.effects) & set(row.effects)]
     return replace(
         diagnosis,
-        missing=first.effects,
+        missing=named.effects if named else (),
+        unearned=why_not,
         unknown=first.unknown,
         noise=first.families == (NOISE,),
         ambiguity=names,
         overlaps=_overlaps(diagnosis.test, first.effects, names),
         together=tuple(pairs),
         as_scatter=table.families.get(NOISE, 0.0) > _DOUBT,
-        after=first.refit if first.effects else None,
+        after=named.refit if named else None,
         suspects=_suspects(diagnosis, table),
     )
 

@@ -89,7 +89,8 @@ class Refits:
         if self.source is not None and (averages or (model.dynamic and not slews)):
             return calibrate(self.source, settings)
         with one_blas_thread():
-            fitted = fit(dwells, model, settings.walk_mps2_per_sqrt_s, slews, must_settle=False)
+            beginning = before.fit.beginning
+            fitted = fit(dwells, model, settings.walk_mps2_per_sqrt_s, slews, must_settle=False, beginning=beginning)
             if self.source is not None and not holds_its_oscillation(fitted):
                 return calibrate(self.source, settings, plain=None if dwells[0].averaged else fitted)
             return replace(evaluate_fit(fitted, settings), tally=before.tally, readings=before.readings)

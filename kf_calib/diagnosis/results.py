@@ -57,7 +57,8 @@ class Diagnosis:
     probabilities (None: nothing could be tested, or one dwell is wrong). verdict: the result in a sentence.
 
     missing: names of the effects of the likeliest explanation (empty: nothing is missing, or no known effect). unknown:
-    whether the likeliest is none of the known effects. noise: whether it is noise that was not stated. ambiguity: the
+    whether the likeliest is none of the known effects. unearned: why the effects of the likeliest explanation are not
+    named (``earned_name``), in words; "" where they are. noise: whether it is noise that was not stated. ambiguity: the
     effects of the explanations that have 99 % of the probability together, those missing first. overlaps: overlap of
     each other effect with the one that it could replace. together: pairs among these explanations. as_scatter: noise
     that was not stated has more than 1 %. after: the calibration with the missing effects. suspects: single effects
@@ -74,6 +75,7 @@ class Diagnosis:
     table: HypothesisTable | None = None
     suspects: tuple[Suspect, ...] = ()
     missing: tuple[str, ...] = ()
+    unearned: str = ""
     unknown: bool = False
     noise: bool = False
     ambiguity: tuple[str, ...] = ()

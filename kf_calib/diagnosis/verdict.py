@@ -44,6 +44,8 @@ def verdict_in_words(diagnosis: Diagnosis) -> str:
     start, first = f"{_what_fails(test)} (p {format_p(test.p_value)}).", diagnosis.likeliest
     if first is None:
         return start
+    if diagnosis.unearned:
+        return f"{start} {_not_named(diagnosis, first)}."
     if first.effects:
         return f"{start} {_named(diagnosis, first)}{_returning(diagnosis)}.{_held_out(diagnosis)}"
     return f"{start} {_noise(diagnosis, first) if diagnosis.noise else _unknown(diagnosis, first)}"
@@ -58,7 +60,8 @@ def _what_fails(test: CandidateTests) -> str:
 def second_pass_in_words(diagnosis: Diagnosis) -> str:
     """A sentence on what only a second pass over the readings could judge; "" where nothing is left to it."""
     names = [suspect.name for suspect in diagnosis.suspects if not holds_its_oscillation(suspect.refit.fit)]
-    if diagnosis.test.lines.vibration and not diagnosis.before.fit.dwells[0].averaged:
+    before = diagnosis.before
+    if diagnosis.test.lines.vibration and before.bench.angles and not before.fit.dwells[0].averaged:
         names.append("the lines in their spectrum")
     if not names:
         return ""
@@ -71,14 +74,39 @@ def second_pass_in_words(diagnosis: Diagnosis) -> str:
 def _named(diagnosis: Diagnosis, first: Hypothesis) -> str:
     """Return the likeliest effects in words, with the other explanations and their probabilities."""
     assert diagnosis.table is not None
-    share, others = diagnosis.table.probability(first.effects), _others(diagnosis)
-    named = f"{_effects_of(first)}{_size(diagnosis)} ({format_probability(share)})"
+    share, rest = diagnosis.table.probability(first.effects), _unexplained(diagnosis)
+    named, others = f"{_effects_of(first)}{_size(diagnosis)} ({_share(diagnosis)})", _others(diagnosis) + rest
     if share >= SURE:
-        return f"Missing: {named}{others}"
+        return f"{'Part of it' if rest else 'Missing'}: {named}{others}"
     family, of_family = next(each for each in diagnosis.table.families.items() if each[0] not in (NOTHING, NOISE, NONE))
     if of_family >= SURE and first.families == (family,):
         return f"{_FAMILIES[family]} ({format_probability(of_family)}): {named}{others}"
     return f"Likeliest: {named}{others}"
+
+
+def _share(diagnosis: Diagnosis) -> str:
+    """Return the probability of the likeliest row, as the table has it, and that of its effects with others beside
+    them."""
+    assert diagnosis.table is not None
+    first = diagnosis.table.first
+    alone = format_probability(first.probability)
+    with_others = format_probability(diagnosis.table.probability(first.effects))
+    return alone if alone == with_others else f"{alone} alone, {with_others} with others"
+
+
+def _not_named(diagnosis: Diagnosis, first: Hypothesis) -> str:
+    """Return the likeliest effects, and why they have not earned their name."""
+    likeliest = f"{_effects_of(first)} ({format_probability(first.probability)}{_others(diagnosis)})"
+    return f"No known effect is established. The likeliest is {likeliest}, but {diagnosis.unearned}"
+
+
+def _unexplained(diagnosis: Diagnosis) -> str:
+    """Return in words what does not fit with the effects that are named; "" where all does."""
+    assert diagnosis.after is not None
+    consistency = diagnosis.after.consistency
+    if consistency.consistent is not False:
+        return ""
+    return f"; the rest is unexplained, NIS/dof {consistency.statistic / consistency.dof:.3g}"
 
 
 def _unknown(diagnosis: Diagnosis, first: Hypothesis) -> str:
@@ -114,11 +142,10 @@ def explanations_in_words(diagnosis: Diagnosis) -> str:
     first = diagnosis.likeliest
     if first is None or diagnosis.table is None:
         return ""
-    share = diagnosis.table.probability(first.effects) if first.effects else first.probability
     if diagnosis.sure:
-        return f"missing: {' and '.join(diagnosis.missing)} {format_probability(share)}"
-    likeliest = [(first, share), *((row, row.probability) for row in diagnosis.table.rivals[: _TOLD - 1])]
-    text = ", ".join(f"{_in_words(diagnosis, row)} {format_probability(probability)}" for row, probability in likeliest)
+        return f"missing: {' and '.join(diagnosis.missing)} {_share(diagnosis)}"
+    rows = [first, *diagnosis.table.rivals[: _TOLD - 1]]
+    text = ", ".join(f"{_in_words(diagnosis, row)} {format_probability(row.probability)}" for row in rows)
     return f"suspects {text}" if first.effects else text
 
 

@@ -73,6 +73,8 @@ _OF_CONDITIONS = ("nodes", "squares", "counts", "variances", "walk", "shaking", 
 """Cached properties of a dwell that stay if the means of its readings change."""
 _OF_READINGS = (*_OF_CONDITIONS, "triangles", "factor", "means")
 """Cached properties of a dwell that stay if its force is turned."""
+_OF_TRIANGLES = ("triangles", "squares", "counts", "variances", "walk", "shaking", "count", "spread")
+"""Cached properties of a dwell that stay if the force and the pose at its nodes are others."""
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -127,6 +129,18 @@ class DwellFactor:
     def linearised(self, turned_rad: Floats | None, attitude: AttitudeError | None) -> DwellFactor:
         """The same dwell about a force that is turned otherwise."""
         return self._replaced(_OF_READINGS, turned_rad=turned_rad, attitude=attitude)
+
+    def with_force(
+        self, force_mps2: Floats, pose: Floats, attitude: AttitudeError | None, came_from: DwellFactor | None
+    ) -> DwellFactor:
+        """The same dwell with one specific force (3,) and one pose (k,) at all its nodes."""
+        changes = {"force_mps2": np.tile(force_mps2, (3, 1)), "pose": np.tile(pose, (3, 1))}
+        pieces = tuple(replace(piece, nodes=replace(piece.nodes, **changes)) for piece in self.pieces)
+        changed = self._replaced(_OF_TRIANGLES, pieces=pieces, attitude=attitude, came_from=came_from)
+        changes = {name: np.tile(values, (len(pieces), 1)) for name, values in changes.items()}
+        means = np.concatenate([self.means[:1], force_mps2, self.means[4:]])
+        changed.__dict__.update(nodes=replace(self.nodes, **changes), means=means)
+        return changed
 
     def _replaced(self, unchanged: Collection[str], **changes: Any) -> DwellFactor:
         """Return the dwell with changes that leave these cached properties as they are."""

@@ -50,22 +50,30 @@ def at_their_modes(
         return [d.linearised(d.turned_rad, attitude) for d, attitude in zip(linearised.dwells, known, strict=True)]
     moved, variances = _posterior_rotations(linearised.means, noise, state, bendings)
     forces = linearised.means.force_mps2 / np.array([_length(dwell) for dwell in linearised.dwells])[:, None]
+    if noise.attitude_unknown:
+        forces = np.array([turn_by(force, _limited(step)) for force, step in zip(forces, moved, strict=True)])
+        return _facing(linearised.dwells, forces, variances, noise, state, bendings)
     untold = untold_directions(linearised, noise) if untold is None else untold
     dwells = list[DwellFactor]()
     for k, (dwell, turned) in enumerate(zip(linearised.dwells, linearised.dwells_at_state, strict=True)):
         before = np.zeros(3) if dwell.attitude is None else dwell.attitude.rotation_rad
         force = turn_by(forces[k], _limited(moved[k] - before))
         attitude = AttitudeError(np.zeros(3), float(variances[k]), bendings[k])
-        if noise.attitude_unknown:
-            variance_rad2 = variances[k] + _wander_rad2(dwell, noise, state, force)
-            attitude = replace(attitude, variance_rad2=float(variance_rad2))
-            left_out = dwell.came_from and facing_readings([dwell.came_from], state, float(np.linalg.norm(force)))[0]
-            dwells.append(replace(with_force(dwell, force), attitude=attitude, came_from=left_out))
-        else:
-            shown = _shown_force(turned)
-            force = force - untold.T @ (untold @ (force - shown))
-            dwells.append(dwell.linearised(None, replace(attitude, rotation_rad=rotation_between(shown, force))))
+        shown = _shown_force(turned)
+        force = force - untold.T @ (untold @ (force - shown))
+        dwells.append(dwell.linearised(None, replace(attitude, rotation_rad=rotation_between(shown, force))))
     return dwells
+
+
+def _facing(
+    dwells: Sequence[DwellFactor], forces: Floats, variances: Floats, noise: Noise, state: Floats, bendings: Floats
+) -> list[DwellFactor]:
+    """Return dwells of no known attitude with forces (D, 3), of components across them with ``variances`` (D,)."""
+    variances = variances + _wander_rad2(dwells, noise, state, forces)
+    facing = list[DwellFactor]()
+    for dwell, force, variance_rad2, bending in zip(dwells, forces, variances.tolist(), bendings, strict=True):
+        facing.append(with_force(dwell, force, AttitudeError(np.zeros(3), variance_rad2, bending), state))
+    return facing
 
 
 def without_attitude(dwell: DwellFactor) -> DwellFactor:
@@ -93,14 +101,16 @@ def _shown_force(turned: DwellFactor) -> Floats:
     return without_attitude(turned).felt_force(turned.means[None, 1:4])[0]
 
 
-def _wander_rad2(dwell: DwellFactor, noise: Noise, state: Floats, force: Floats) -> float:
-    """Return the mean square of the angle by which the force wanders about its mean within a dwell: what the readings
-    spread across it beyond their noise. A hand creeps and trembles, and a mean of directions is shorter than each."""
+def _wander_rad2(dwells: Sequence[DwellFactor], noise: Noise, state: Floats, forces: Floats) -> Floats:
+    """Return the mean square (D,) of the angle by which the force wanders about its mean within each dwell: what the
+    readings spread across it beyond their noise. A hand creeps and trembles, and a mean of directions is shorter than
+    each."""
     inverse = np.linalg.inv(state[:STATE_COUNT].reshape(3, 4)[:, :3])
-    size = np.linalg.norm(force)
-    beyond = inverse @ (dwell.spread - np.diag(noise.sigma_mps2**2)) @ inverse.T
-    across = np.trace(beyond) - force @ beyond @ force / size**2
-    return float(np.clip(across / size**2, 0.0, _FARTHEST_RAD**2))
+    spreads = np.array([dwell.spread for dwell in dwells])
+    beyond = inverse @ (spreads - np.diag(noise.sigma_mps2**2)) @ inverse.T
+    squares = np.sum(forces**2, axis=1)
+    across = np.einsum("dii->d", beyond) - np.einsum("di,dij,dj->d", forces, beyond, forces) / squares
+    return np.clip(across / squares, 0.0, _FARTHEST_RAD**2)
 
 
 def _length(dwell: DwellFactor) -> float:
@@ -178,14 +188,12 @@ def _limited(rotation_rad: Floats) -> Floats:
     return rotation_rad * min(1.0, _FARTHEST_RAD / angle_rad) if angle_rad else rotation_rad
 
 
-def with_force(dwell: DwellFactor, force_mps2: Floats) -> DwellFactor:
-    """The dwell with another specific force at all its nodes, and a pose that has it up, of an arbitrary heading."""
-    pose = _pose(force_mps2 / np.linalg.norm(force_mps2))
-    pieces = (
-        replace(piece, nodes=replace(piece.nodes, force_mps2=np.tile(force_mps2, (3, 1)), pose=np.tile(pose, (3, 1))))
-        for piece in dwell.pieces
-    )
-    return replace(dwell, pieces=tuple(pieces))
+def with_force(dwell: DwellFactor, force_mps2: Floats, attitude: AttitudeError | None, state: Floats) -> DwellFactor:
+    """The dwell with another specific force at all its nodes, and a pose that has it up, of an arbitrary heading. The
+    dwell before it, where that was left out, has the force that its own readings show at ``state``."""
+    size_mps2 = float(np.linalg.norm(force_mps2))
+    before = dwell.came_from and facing_readings([dwell.came_from], state, size_mps2)[0]
+    return dwell.with_force(force_mps2, _pose(force_mps2 / size_mps2), attitude, before)
 
 
 def _pose(unit: Floats) -> Floats:
@@ -206,11 +214,6 @@ def force_shown(readings: Floats, state: Floats) -> Floats:
 def facing_readings(dwells: Sequence[DwellFactor], state: Floats, gravity_mps2: float) -> list[DwellFactor]:
     """The dwells with the specific force that their mean readings alone show at ``state``, S^-1 (z - b) with the size
     of g: where the search for attitudes that are not known begins."""
-    all_facing, forces = list[DwellFactor](), force_shown(np.array([dwell.means[4:] for dwell in dwells]), state)
-    for dwell, force in zip(dwells, forces, strict=True):
-        before = dwell.came_from
-        facing = with_force(dwell, gravity_mps2 * force / np.linalg.norm(force))
-        if before is not None:
-            facing = replace(facing, came_from=facing_readings([before], state, gravity_mps2)[0])
-        all_facing.append(facing)
-    return all_facing
+    forces = force_shown(np.array([dwell.means[4:] for dwell in dwells]), state)
+    forces *= gravity_mps2 / np.linalg.norm(forces, axis=1, keepdims=True)
+    return [with_force(dwell, force, dwell.attitude, state) for dwell, force in zip(dwells, forces, strict=True)]

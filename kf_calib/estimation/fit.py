@@ -25,12 +25,14 @@ from kf_calib.noise.thermometer_error import thermometer_errors
 class Fit:
     """The dwells with the columns of the fitted model, and the noise by which they are weighted.
 
-    ``spreads`` gives, by effect, the sigma of ln(value) of each constant without a derivative.
+    - spreads: by effect, the sigma of ln(value) of each constant without a derivative.
+    - beginning: without angles, the fit of the nine parameters alone, from which that of any model begins.
     """
 
     linearised: LinearisedDwells
     noise: Noise
     spreads: Mapping[str, float] = field(default_factory=dict[str, float])
+    beginning: Fit | None = None
 
     @property
     def dwells(self) -> list[DwellFactor]:

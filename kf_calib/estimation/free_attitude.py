@@ -99,14 +99,12 @@ def tells_angles(linearised: LinearisedDwells, noise: Noise) -> bool:
 def square_changes(linearised: LinearisedDwells) -> list[Floats]:
     """Changes (pieces, nodes, 3, 3) of each dwell's readings if one of the three angles between the axes is 1 sigma
     from square."""
-    changes, affine = list[Floats](), linearised.state[:STATE_COUNT].reshape(3, 4)
-    for dwell in linearised.dwells:
-        force = np.array([piece.nodes.force_mps2 for piece in dwell.pieces])
-        change = np.zeros((*force.shape[:2], 3, len(SQUARE)))
-        for k, (channel, axis) in enumerate(divmod(place, 4) for place in SQUARE):
-            change[:, :, channel, k] = force[:, :, axis] * affine[channel, channel] * linearised.model.bench.square_rad
-        changes.append(change)
-    return changes
+    affine = linearised.state[:STATE_COUNT].reshape(3, 4)
+    force_mps2 = np.concatenate([dwell.nodes.force_mps2 for dwell in linearised.dwells])
+    changes = np.zeros((len(force_mps2), 3, len(SQUARE)))
+    for k, (channel, axis) in enumerate(divmod(place, 4) for place in SQUARE):
+        changes[:, channel, k] = force_mps2[:, axis] * affine[channel, channel] * linearised.model.bench.square_rad
+    return _by_dwell(changes, linearised)
 
 
 def triad_changes(linearised: LinearisedDwells) -> list[Floats]:
@@ -134,9 +132,15 @@ def triad_changes(linearised: LinearisedDwells) -> list[Floats]:
             )  # fmt: skip
             ends.append(added_by(bent_effects(model, state), turned, model, state))
         changes[:, :, axis] = (ends[0] - ends[1]) * (0.5 * sigma_rad / _TRIAD_STEP_RAD)
-    shaped = changes.reshape(-1, 3, 3, 3)
+    return _by_dwell(changes, linearised)
+
+
+def _by_dwell(changes: Floats, linearised: LinearisedDwells) -> list[Floats]:
+    """Split changes (m, 3, c) at the nodes of all dwells into those of each, (pieces, K nodes, 3, c); zeros on a
+    carrier."""
+    shaped = changes.reshape(-1, 3, *changes.shape[1:])
     width = linearised.columns[0].shape[1]
-    padded = np.concatenate([shaped, np.zeros((len(shaped), width - 3, 3, 3))], axis=1)
+    padded = np.concatenate([shaped, np.zeros((len(shaped), width - 3, *changes.shape[1:]))], axis=1)
     return np.split(padded, np.cumsum([len(dwell.pieces) for dwell in linearised.dwells])[:-1])
 
 

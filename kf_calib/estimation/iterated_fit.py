@@ -51,6 +51,7 @@ def fit(
     walk_mps2_per_sqrt_s: float = 0.0,
     slews: Sequence[DwellFactor] = (),
     must_settle: bool = True,
+    beginning: Fit | None = None,
 ) -> Fit:
     """Estimate the noise, the linearisation and the model's unknown constants in turn until they no longer change.
 
@@ -59,11 +60,12 @@ def fit(
     - walk_mps2_per_sqrt_s: stated intensity of the random walk of the biases, m/s^2/s^(1/2).
     - slews: the slews; used only if the model has effects that show in slews only.
     - must_settle: whether a fit that does not converge is an error; else it is returned as far as it came.
+    - beginning: that of another fit to the same dwells, where there is one: it need not be searched again.
 
     Raises UnobservableError if the poses tell too little, or if the fit does not converge.
     """
     slews = [slew for slew in slews if slew.number >= dwells[0].number] if model.dynamic else []
-    fitted = _begun(dwells, model, slews, walk_mps2_per_sqrt_s)
+    fitted = _begun(dwells, model, slews, walk_mps2_per_sqrt_s, beginning)
     within, bench = fitted.noise, model.bench
     components = VarianceComponents(_setting_deg(dwells, bench), bench.scatter_sigma_mps2, model.walks)
     left = 0.0
@@ -170,34 +172,47 @@ def _most_passes(model: Model) -> int:
     return _PASSES_WITH_UNKNOWNS
 
 
-def _begun(dwells: list[DwellFactor], model: Model, slews: Sequence[DwellFactor], walk_mps2_per_sqrt_s: float) -> Fit:
+def _begun(
+    dwells: list[DwellFactor],
+    model: Model,
+    slews: Sequence[DwellFactor],
+    walk_mps2_per_sqrt_s: float,
+    beginning: Fit | None,
+) -> Fit:
     """Return the fit from which estimation begins: with angles at the nominal state, without at that of the nine
-    parameters alone, or of six with square axes where the poses do not tell the rest.
-
-    Raises UnobservableError if the poses tell too little.
-    """
+    parameters alone."""
     if model.bench.angles:
         within = replace(within_dwells(dwells, walk_mps2_per_sqrt_s), walk_mps2_per_sqrt_s=walk_mps2_per_sqrt_s)
         dwells = [without_attitude(dwell) for dwell in dwells]
         return Fit(LinearisedDwells(dwells, model, model.nominal_state(), slews), within)
-    readings, stated = np.array([dwell.means[4:] for dwell in dwells]), model.bench.scatter_sigma_mps2
+    nine = beginning or _nine_parameters(dwells, model.bench, walk_mps2_per_sqrt_s)
+    state = np.append(nine.linearised.state, np.zeros(model.count - STATE_COUNT))
+    whole = replace(model, square=nine.linearised.model.square)
+    return Fit(LinearisedDwells(nine.dwells, whole, state), nine.noise, beginning=nine)
+
+
+def _nine_parameters(dwells: list[DwellFactor], bench: Bench, walk_mps2_per_sqrt_s: float) -> Fit:
+    """Return the fit of the nine parameters that tell themselves without angles, or of six with square axes where the
+    poses do not tell the rest.
+
+    Raises UnobservableError if the poses tell too little.
+    """
+    readings, stated = np.array([dwell.means[4:] for dwell in dwells]), bench.scatter_sigma_mps2
     facing_up = readings / np.linalg.norm(readings, axis=1, keepdims=True)
     within = within_dwells(dwells, walk_mps2_per_sqrt_s, facing_up)
     noise = replace(
         within, walk_mps2_per_sqrt_s=walk_mps2_per_sqrt_s, setting_rad=ATTITUDE_UNKNOWN_RAD, setting_stated=True,
         scatter_mps2=np.full(3, stated or 0.0), scatter_stated=stated is not None,
     )  # fmt: skip
-    bare = Model(model.bench, square=True)
+    bare = Model(bench, square=True)
     facing = facing_readings(dwells, bare.nominal_state(), bare.bench.gravity_mps2)
     begun = Fit(LinearisedDwells(facing, bare, bare.nominal_state()), noise)
     free_attitude.refuse_poses(begun.linearised, noise)
     settled = _settled(begun)
     if free_attitude.tells_angles(settled.linearised, noise):
-        bare = Model(model.bench)
+        bare = Model(bench)
         settled = _settled(Fit(relinearised(settled.linearised, noise, bare, settled.linearised.state), noise))
-    state = np.append(settled.linearised.state, np.zeros(model.count - STATE_COUNT))
-    whole = replace(model, square=settled.linearised.model.square)
-    return Fit(LinearisedDwells(settled.dwells, whole, state), noise)
+    return settled
 
 
 def _settled(fitted: Fit) -> Fit:

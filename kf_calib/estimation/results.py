@@ -35,6 +35,7 @@ from kf_calib.support.threads import one_blas_thread
 from kf_calib.support.units import field_unit, shown
 
 _WEAK = 5.0  # times the size that a coefficient may well have
+_CLEAR = 3.0  # sigmas: of a coefficient that is seen, however large it is
 _HOPELESS = {"rad": np.radians(10.0), "1": 0.2, "m/s^2": 2.0}  # larger sigmas: not determined
 
 
@@ -262,7 +263,8 @@ class Calibration:
         sigmas = np.where((gains != 1.0) & (sigmas > effects), np.nan, sigmas)  # not known: sigma over value
         if not self.bench.angles:  # |f| tells of some effects little more than that they are not absurdly large
             scales = np.array([coefficient.scale for coefficient in coefficients])
-            sigmas = np.where((gains == 1.0) & (sigmas > _WEAK * scales), np.nan, sigmas)
+            weak = (sigmas > _WEAK * scales) & (np.abs(effects) < _CLEAR * sigmas)
+            sigmas = np.where((gains == 1.0) & weak, np.nan, sigmas)
         rows = [
             *zip(
                 paper_parameters.SYMBOLS,

@@ -47,6 +47,7 @@ _MOST_CHANGES = 4  # largest number of changes of gimbals and channels together
 _MOST_NAMED = 3  # largest number of equally good changes in a message
 _ALIKE = 0.05  # three scale factors share a deviation if they differ by less than this share of it
 _LITTLE = 20e-6  # a smaller deviation of the scale factors is not reported
+_FEW_DWELLS = 8  # with more, the other dwells tell the noise, and so a dwell that does not fit
 _STUCK = 1e-9  # readings with a smaller relative difference are equal
 
 Channels = tuple[int, int, int]
@@ -136,6 +137,7 @@ def refuse(dwells: Sequence[DwellFactor], bench: Bench) -> None:
             return
         _refuse_wrong_gain(affine, bench)
     wrong = _what_is_wrong(affine, bench)
+    _refuse_one_sign(means, stated)
     _refuse_exchange(means, stated)
     mending = _mendings(means, stated, affine)
     if mending:
@@ -330,6 +332,27 @@ def _advice(stated: Bench, mending: Mending) -> str:
     if mounting.conjugate or mounting.real_first:
         words.append("quaternions of the platform in the bench, x y z w")
     return " and ".join([*([" ".join(options)] if options else []), *words])
+
+
+def _refuse_one_sign(means: Means, stated: Mounting) -> None:
+    """Refuse a run of few dwells in which all readings are near nominal but one, which has the opposite sign. With more
+    dwells an outlying one is told from its own misfit."""
+    if not 3 <= len(means.numbers) <= _FEW_DWELLS:
+        return
+    bench = stated.bench
+    expected, readings = means.force(stated) @ _nominal(bench).T, means.readings / bench.gravity_mps2
+    errors = np.abs(readings - expected)
+    k, i = np.unravel_index(int(np.argmax(errors)), errors.shape)
+    mended = errors.copy()
+    mended[k, i] = abs(readings[k, i] + expected[k, i])
+    if errors[k, i] < 1.0 or np.sqrt(np.mean(mended**2)) > _NOMINAL:
+        return
+    channel, sign = abs(bench.input.channels[i]), "+-"[int(expected[k, i] < 0.0)]
+    raise BlunderError(
+        f"dwell {means.numbers[k]} (at {means.middle_s[k]:.0f} s): channel {channel} reads {means.readings[k, i]:.5g} "
+        f"m/s^2, and {sign}{abs(means.readings[k, i]):.5g} would fit with all other readings: either the sign of this "
+        f"reading is wrong, or the pose; correct it, or leave the dwell out (--leave-out {means.numbers[k]})."
+    )
 
 
 def _refuse_exchange(means: Means, stated: Mounting) -> None:

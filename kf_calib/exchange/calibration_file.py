@@ -55,13 +55,14 @@ from kf_calib.exchange.calibration_parts import (
     Text,
 )
 from kf_calib.sources.files.bags import fingerprint
+from kf_calib.sources.files.contents import CALIBRATION_FORMAT
 from kf_calib.sources.opening import opened
 from kf_calib.sources.run_date import run_date
 from kf_calib.support import dates
 from kf_calib.support.output_files import write_whole
 from kf_calib.support.plain_text import cut, sentence
 
-FORMAT, VERSION = "kf_calib.calibration", 1
+VERSION = 1
 _LARGEST_BYTES = 20_000_000
 
 
@@ -84,6 +85,18 @@ class SavedCalibration(Part):
     conditions: SavedConditions
     provenance: SavedProvenance
     fixed: dict[Text, Literal["frame", "square"]] = Field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return f"<SavedCalibration: {self.summary}>"
+
+    __str__ = __repr__
+
+    @property
+    def summary(self) -> str:
+        """Of which recording it is, of when, and with which effects, in words."""
+        effects = ", ".join(effect.text for effect in self.effects) or "no effects"
+        day = (self.conditions.began or self.provenance.created)[:10]
+        return f"of {self.provenance.recording} of {day}, twelve parameters and {effects}"
 
     @model_validator(mode="after")
     def _agrees_with_itself(self) -> SavedCalibration:
@@ -116,7 +129,7 @@ class SavedCalibration(Part):
 
     def model_file(self, origin: Path | None = None) -> ModelFile:
         """Its effects as a model file at ``origin`` has them."""
-        origin = origin or Path(FORMAT)
+        origin = origin or Path(CALIBRATION_FORMAT)
         programs = tuple(Program(origin.parent / each.path, each.sha256) for each in self.provenance.programs)
         return ModelFile(origin, tuple(each.text for each in self.effects), programs)
 
@@ -130,7 +143,7 @@ class SavedCalibration(Part):
         of a model file. bench: another one to use it on. Raises InputError if a program may not be run, or an effect is
         not known.
         """
-        origin, bench = origin or Path(FORMAT), bench or self.bench
+        origin, bench = origin or Path(CALIBRATION_FORMAT), bench or self.bench
         self.model_file(origin).load(named, trust)
         model = Model(bench, square="square" in self.fixed.values())
         for own in self.effects:
@@ -181,7 +194,7 @@ def _saved(result: Calibration, recording: str, sha256: str | None, began: datet
     """The calibration as its parts say it."""
     estimate, noise, judged = result.estimate, result.noise, result.consistency
     return SavedCalibration(
-        format=FORMAT,
+        format=CALIBRATION_FORMAT,
         version=VERSION,
         parameters=[SavedParameter(symbol=p.symbol, value=p.value, sigma=p.sigma, unit=p.unit, nominal=p.nominal)
                     for p in result.parameters.values()],
@@ -301,8 +314,10 @@ def read(path: str | Path) -> SavedCalibration:
         raise InputError(f"{path}: cannot be read ({error.strerror}): give a file that --save has written.") from None
     except (ValueError, RecursionError):
         raise InputError(f"{path}: is no JSON: give a calibration that --save has written.") from None
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise InputError(f"{path}: is no calibration (its format is not {FORMAT}): give one that --save has written.")
+    if not isinstance(content, dict) or content.get("format") != CALIBRATION_FORMAT:
+        raise InputError(
+            f"{path}: is no calibration (its format is not {CALIBRATION_FORMAT}): give one that --save has written."
+        )
     if content.get("version") != VERSION:
         said = cut(repr(content.get("version")), 20)
         raise InputError(f"{path}: is of version {said}, this program reads version {VERSION}: update kf_calib.")

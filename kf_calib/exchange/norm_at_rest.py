@@ -13,7 +13,7 @@ import itertools
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.bench.raw_input import CHANNELS, RawInput
+from kf_calib.bench.raw_input import CHANNELS, RESTATING, RawInput
 from kf_calib.bench.streams import Stream
 from kf_calib.bench.wrong_unit import wrong_unit
 from kf_calib.estimation.correction import Correction
@@ -99,9 +99,10 @@ class NormAtRest:
         if here < max(_SIGMAS * allowed, _BETTER * scatter[best]):
             return ""
         channels = ",".join(str(int(np.sign(k)) * taken.channels[abs(k) - 1]) for k in best)
+        is_stated = bool(taken.restating("channels")) or not self._correction.input.is_plain
         return (
             f"the norm at rest changes by {here:.2g} m/s^2 over {len(kept)} directions, and by {scatter[best]:.2g} "
-            f"m/s^2 with --channels {channels}: if that is how this device is wired, add --restate-input; "
+            f"m/s^2 with --channels {channels}{RESTATING * is_stated}: add that if it is how this device is wired; "
             "--unchecked corrects it as it is"
         )
 

@@ -76,23 +76,23 @@ class DatedSums:
     @classmethod
     def of(cls, campaign: Campaign, terms: PooledTerms, parted: Sequence[tuple[int, int]] = ()) -> DatedSums:
         """The sums over all runs of a campaign."""
-        out = cls(campaign, terms, parted)
+        dated = cls(campaign, terms, parted)
         for blocks in campaign.runs():
-            out.add(terms.beside_own(blocks))
-        return out
+            dated.add(terms.beside_own(blocks))
+        return dated
 
     def estimates(self, group: Group, repair: tuple[int, int] | None = None) -> list[BenchEstimate]:
         """The coefficients of each bench beside the terms, with nothing known of them before."""
         term = Term(group, Attribution.REPAIRED if repair else Attribution.BENCH, FLAT, repair=repair)
         more = list(commons_of(term, len(self._first)))
-        found = self._terms.sums(self._slots, more)
+        sums = self._terms.sums(self._slots, more)
         prior = np.append(self._terms.prior, np.full(len(more), FLAT))
-        mean, covariance = posterior(found.info, found.score, prior)
-        count, out = len(_range(group)), list[BenchEstimate]()
+        mean, covariance = posterior(sums.info, sums.score, prior)
+        count, estimates = len(_range(group)), list[BenchEstimate]()
         for k in range(0, len(more), count):
-            own = slice(len(self._terms.prior) + k, len(self._terms.prior) + k + count)
-            out.append(BenchEstimate(more[k].bench, more[k].since, mean[own], covariance[own, own]))
-        return out
+            part = slice(len(self._terms.prior) + k, len(self._terms.prior) + k + count)
+            estimates.append(BenchEstimate(more[k].bench, more[k].since, mean[part], covariance[part, part]))
+        return estimates
 
     def over_time(self, group: Group, bench: int) -> list[BenchEstimate]:
         """The coefficients of one bench in each of a few parts of the campaign, as if it were repaired between them."""
@@ -102,21 +102,21 @@ class DatedSums:
         parts = [Common(k, FLAT, bench, since, until)
                  for since, until in zip(edges.tolist(), ends, strict=True) for k in _range(group)]  # fmt: skip
         others = [Common(k, FLAT, own) for own in range(len(self._first)) if own != bench for k in _range(group)]
-        found = self._terms.sums(self._slots, [*parts, *others])
+        sums = self._terms.sums(self._slots, [*parts, *others])
         prior = np.append(self._terms.prior, np.full(len(parts) + len(others), FLAT))
-        mean, covariance = posterior(found.info, found.score, prior)
+        mean, covariance = posterior(sums.info, sums.score, prior)
         begin, count = len(self._terms.prior), len(_range(group))
-        places = [slice(begin + k * count, begin + (k + 1) * count) for k in range(len(edges))]
+        slices = [slice(begin + k * count, begin + (k + 1) * count) for k in range(len(edges))]
         return [BenchEstimate(bench, int(since), mean[own], covariance[own, own])
-                for since, own in zip(edges, places, strict=True)]  # fmt: skip
+                for since, own in zip(edges, slices, strict=True)]  # fmt: skip
 
     def constant(self, group: Group) -> BenchEvidence:
         """The evidence that the runs of each bench have one coefficient vector."""
-        tried = self._sizes(group, STEP)
+        sizes_tried = self._sizes(group, STEP)
         more = [Common(k, 1.0, bench) for bench in range(len(self._first)) for k in _range(group)]
-        found = self._terms.sums(self._slots, more)
-        logs = log_evidence(found.info, found.score, self._priors(tried, len(more))) - self._nothing()
-        return BenchEvidence(float(log_mean(logs)), float(tried[np.argmax(logs)]))
+        sums = self._terms.sums(self._slots, more)
+        logs = log_evidence(sums.info, sums.score, self._priors(sizes_tried, len(more))) - self._nothing()
+        return BenchEvidence(float(log_mean(logs)), float(sizes_tried[np.argmax(logs)]))
 
     def repaired(self, group: Group) -> BenchEvidence | None:
         """The evidence that on one bench it is another vector from some run on; None if no bench has two runs."""
@@ -145,17 +145,17 @@ class DatedSums:
         fixed = [*self._terms.common, *others]
         whole = self._terms.sums(self._slots, others)
         part = slice(self._starts[bench], self._starts[bench + 1])
-        every = self._slots
-        slots = Blocks((), (), every.bench[part], every.rank[part], every.info[part], every.score[part])
-        own, columns, shares = list(_range(group)), [each.column for each in fixed], shares_of(fixed, slots)
-        inner = np.cumsum(slots.info[:, own][:, :, own], axis=0)
-        across = np.cumsum(slots.info[:, columns][:, :, own] * shares[:, :, None], axis=0)
-        along = np.cumsum(slots.score[:, own], axis=0)
+        of_all = self._slots
+        slots = Blocks((), (), of_all.bench[part], of_all.rank[part], of_all.info[part], of_all.score[part])
+        of_group, columns, shares = list(_range(group)), [each.column for each in fixed], shares_of(fixed, slots)
+        inner = np.cumsum(slots.info[:, of_group][:, :, of_group], axis=0)
+        across = np.cumsum(slots.info[:, columns][:, :, of_group] * shares[:, :, None], axis=0)
+        along = np.cumsum(slots.score[:, of_group], axis=0)
         before = [each[:-1] for each in (inner, across, along)]
         after = [each[-1:] - each[:-1] for each in (inner, across, along)]
         infos, scores = _joined(whole.info, whole.score, before, after)
-        kept = np.concatenate([np.ones((len(_SIDES), len(fixed))), np.repeat(_SIDES, len(own), axis=1)], axis=1)
-        priors = self._priors(tried, len(others) + 2 * len(own)) * kept[:, None]
+        present = np.concatenate([np.ones((len(_SIDES), len(fixed))), np.repeat(_SIDES, len(of_group), axis=1)], axis=1)
+        priors = self._priors(tried, len(others) + 2 * len(of_group)) * present[:, None]
         logs = log_evidence(infos[:, None, None], scores[:, None, None], priors)
         return log_mean(logs, axis=1) - self._nothing()
 
@@ -182,12 +182,12 @@ def _joined(info: Floats, score: Floats, before: Sequence[Floats], after: Sequen
 
     Each side is the information (k, q, q) of its coefficients, that with the fixed ones (k, j, q), and the score.
     """
-    many, fixed, own = before[1].shape
-    infos = np.zeros((many, fixed + 2 * own, fixed + 2 * own))
+    dates, fixed, width = before[1].shape
+    infos = np.zeros((dates, fixed + 2 * width, fixed + 2 * width))
     infos[:, :fixed, :fixed] = info
     for k, (inner, across, _) in enumerate((before, after)):
-        part = slice(fixed + k * own, fixed + (k + 1) * own)
+        part = slice(fixed + k * width, fixed + (k + 1) * width)
         infos[:, part, part], infos[:, :fixed, part] = inner, across
         infos[:, part, :fixed] = np.swapaxes(across, 1, 2)
-    scores = np.concatenate([np.broadcast_to(score, (many, fixed)), before[2], after[2]], axis=1)
+    scores = np.concatenate([np.broadcast_to(score, (dates, fixed)), before[2], after[2]], axis=1)
     return infos, scores

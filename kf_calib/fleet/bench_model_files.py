@@ -13,9 +13,8 @@ from functools import cached_property
 from pathlib import Path
 
 from kf_calib.errors import InputError
-from kf_calib.estimation.bench_model import BenchModel
-from kf_calib.fleet.bench_terms import bench_models
-from kf_calib.fleet.pooled_diagnosis import PooledDiagnosis
+from kf_calib.estimation.bench_model import BenchModel, BenchTerm
+from kf_calib.fleet.pooled_diagnosis import BenchCoefficients, PooledDiagnosis
 from kf_calib.support.output_files import write_whole
 
 _NOT_IN_NAMES = re.compile(r"[^\w.-]+|^\.+")  # of files, on any system
@@ -24,10 +23,10 @@ _LONGEST = 60
 
 @dataclass(frozen=True)
 class BenchModelFiles:
-    """The files that a pooled diagnosis leads to; found: None where there is none, and then all stays as it is."""
+    """The files that a pooled diagnosis leads to; diagnosis: None where there is none, and then all stays as it is."""
 
     fleet: Path
-    found: PooledDiagnosis | None
+    diagnosis: PooledDiagnosis | None
     overwrite: bool = False
 
     @property
@@ -38,7 +37,7 @@ class BenchModelFiles:
     def models(self) -> dict[Path, BenchModel]:
         """The bench model of each bench that has errors, by its file; no two benches share one."""
         names = dict[str, Path]()
-        models = {} if self.found is None else bench_models(self.found)
+        models = {} if self.diagnosis is None else bench_models(self.diagnosis)
         for bench in models:
             name = stem = _NOT_IN_NAMES.sub("_", bench)[:_LONGEST] or "bench"
             while name.casefold() in names:
@@ -62,7 +61,7 @@ class BenchModelFiles:
     @property
     def outdated(self) -> list[Path]:
         """Files of before that no longer hold."""
-        if self.found is None:
+        if self.diagnosis is None:
             return []
         return [path for path in sorted(self.folder.glob("*.toml")) if path not in self.models and _is_own(path)]
 
@@ -79,3 +78,45 @@ def _is_own(path: Path) -> bool:
     except (OSError, ValueError):
         return False
     return not path.is_symlink() and head + line_end == _head(path, text)
+
+
+def bench_model(diagnosis: PooledDiagnosis, bench: str) -> BenchModel:
+    """The errors of a bench as its last runs have them; those of a bench that was repaired are those since then.
+
+    Coefficients that the runs do not determine are left out: no run on that bench shows them. What the coefficients of
+    different effects have in common of their uncertainty is left out, too.
+
+    Raises InputError if the bench is not one of the runs, or if none of its errors was found.
+    """
+    if bench not in diagnosis.benches:
+        raise InputError(f"no run is of the bench {bench!r}: name one of {', '.join(map(repr, diagnosis.benches))}.")
+    terms = list[BenchTerm]()
+    for finding in diagnosis.findings:
+        coefficients = [each for each in finding.benches if each.bench == bench]
+        if coefficients and (term := _term(finding.effect, coefficients[-1])).symbols:
+            terms.append(term)
+    if not terms:
+        raise InputError(
+            f"no error of the bench {bench!r} was found in {diagnosis.runs} runs, so there is none to save."
+        )
+    return BenchModel(tuple(terms), bench, diagnosis.runs)
+
+
+def bench_models(diagnosis: PooledDiagnosis) -> dict[str, BenchModel]:
+    """The bench model of each bench that has errors which the runs determine, by its name."""
+    with_values = {
+        each.bench
+        for finding in diagnosis.findings
+        for each in finding.benches
+        if any(own.value is not None for own in each.coefficients)
+    }
+    return {bench: bench_model(diagnosis, bench) for bench in diagnosis.benches if bench in with_values}
+
+
+def _term(effect: str, estimate: BenchCoefficients) -> BenchTerm:
+    determined = [k for k, each in enumerate(estimate.coefficients) if each.value is not None]
+    values = tuple(each.value for each in estimate.coefficients if each.value is not None)
+    covariance = tuple(tuple(estimate.covariance[i][k] for k in determined) for i in determined)
+    return BenchTerm(
+        effect, tuple(estimate.coefficients[k].symbol for k in determined), values, covariance, estimate.since or ""
+    )

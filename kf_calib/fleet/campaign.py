@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.effects import Bearer, Effect, described
 from kf_calib.errors import InputError
-from kf_calib.fleet.reference_unit import ReferenceUnit
-from kf_calib.fleet.run_factor import RunFactor, column_name
+from kf_calib.fleet.run_factor import ReferenceUnit, RunFactor, column_name
 
 _TOGETHER = 64  # runs whose matrices are computed at once
 _SEEN = 1e-6  # of a column's norm: what is less beside the run's own parameters is rounding
@@ -122,7 +121,7 @@ class Campaign:
     def runs(self) -> Iterator[Blocks]:
         """Blocks of runs, in the order in which they are read."""
         part = list[_Part]()
-        for key, info, score in self._each():
+        for key, info, score in self._run_information():
             part.append((key.run, key.unit, self.benches.index(key.bench), key.rank, info, score))
             if len(part) == _TOGETHER:
                 yield _stacked(part)
@@ -137,16 +136,16 @@ class Campaign:
         Memory is small if the runs of a unit are read one after another.
         """
         part, begun = list[_Part](), dict[Hashable, _Part]()
-        left = Counter(self._unit_key(key, repairs) for key in self.keys)
-        for key, info, score in self._each():
-            own, rank = self._unit_key(key, repairs), key.rank
-            if own in begun:
-                *_, first, known, along = begun[own]
+        runs_to_come = Counter(self._unit_key(key, repairs) for key in self.keys)
+        for key, info, score in self._run_information():
+            parted, rank = self._unit_key(key, repairs), key.rank
+            if parted in begun:
+                *_, first, known, along = begun[parted]
                 rank, info, score = min(first, rank), known + info, along + score
-            begun[own] = key.unit, key.unit, self.benches.index(key.bench), rank, info, score
-            left[own] -= 1
-            if not left[own]:
-                part.append(begun.pop(own))
+            begun[parted] = key.unit, key.unit, self.benches.index(key.bench), rank, info, score
+            runs_to_come[parted] -= 1
+            if not runs_to_come[parted]:
+                part.append(begun.pop(parted))
             if len(part) == _TOGETHER:
                 yield _stacked(part)
                 part = []
@@ -157,27 +156,27 @@ class Campaign:
         bench = self.benches.index(key.bench)
         return key.unit, bench, sum(key.rank >= first for where, first in repairs if where == bench)
 
-    def _each(self) -> Iterator[tuple[RunKey, Floats, Floats]]:
+    def _run_information(self) -> Iterator[tuple[RunKey, Floats, Floats]]:
         """Yield information (q, q) and score (q,) of each run beside its own parameters."""
         for key, factor in zip(self.keys, self._read(), strict=True):
             upper = factor.factor
             if self._reference and key.unit == self._reference.unit:
                 upper = self._reference.known(factor, self._of_reference)
-            own, places = self._found(factor)
-            rows = upper[factor.width :, places] * self._units_si[own]
+            columns, places = self._effect_columns(factor)
+            rows = upper[factor.width :, places] * self._units_si[columns]
             rows[:, _hidden(upper, factor.width, places)] = 0.0
             info, score = np.zeros((len(self._columns),) * 2), np.zeros(len(self._columns))
-            info[np.ix_(own, own)] = rows.T @ rows
-            score[own] = rows.T @ upper[factor.width :, -1]
+            info[np.ix_(columns, columns)] = rows.T @ rows
+            score[columns] = rows.T @ upper[factor.width :, -1]
             yield key, info, score
 
-    def _found(self, factor: RunFactor) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    def _effect_columns(self, factor: RunFactor) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return which of the common columns a run has, and where."""
         if factor.columns not in self._places:
             places = {name: k for name, k in factor.places.items() if k >= factor.width}
-            own = [k for k, name in enumerate(self._columns) if name in places]
-            there = [places[self._columns[k]] for k in own]
-            self._places[factor.columns] = np.array(own, dtype=np.intp), np.array(there, dtype=np.intp)
+            columns = [k for k, name in enumerate(self._columns) if name in places]
+            in_factor = [places[self._columns[k]] for k in columns]
+            self._places[factor.columns] = np.array(columns, dtype=np.intp), np.array(in_factor, dtype=np.intp)
         return self._places[factor.columns]
 
     def _sized(self, symbols: Mapping[str, Sequence[str]]) -> list[Group]:
@@ -185,37 +184,37 @@ class Campaign:
         ends = np.cumsum([0, *map(len, symbols.values())]).tolist()
         parts = [slice(a, b) for a, b in itertools.pairwise(ends)]
         total, runs = np.zeros(ends[-1]), np.zeros(ends[-1])
-        for _, info, _ in self._each():
-            own = np.diag(info)
-            total, runs = total + own, runs + (own > 0.0)
+        for _, info, _ in self._run_information():
+            information = np.diag(info)
+            total, runs = total + information, runs + (information > 0.0)
         groups = list[Group]()
-        for (name, own), part in zip(symbols.items(), parts, strict=True):
+        for (name, of_effect), part in zip(symbols.items(), parts, strict=True):
             seen, effect = runs[part] > 0.0, described(name)
             sigma = float(np.mean(total[part][seen] / runs[part][seen])) ** -0.5 if seen.any() else 0.0
             largest = max(_LARGE, _usual(effect) / sigma) if sigma else _LARGE
             borne_by = Bearer.EITHER if effect is None else effect.borne_by
-            groups.append(Group(name, part, tuple(own), sigma, largest, borne_by))
+            groups.append(Group(name, part, tuple(of_effect), sigma, largest, borne_by))
         return groups
 
 
 def _catalogue(factors: Iterable[RunFactor]) -> tuple[list[RunKey], dict[str, list[str]]]:
     """Return the keys of all runs in the order of reading, and the symbols of all effects."""
-    found, symbols = list[tuple[str, str, str, str]](), dict[str, list[str]]()
+    runs, symbols = list[tuple[str, str, str, str]](), dict[str, list[str]]()
     for factor in factors:
-        found.append((factor.run, factor.unit or factor.run, factor.bench or "", factor.date or ""))
+        runs.append((factor.run, factor.unit or factor.run, factor.bench or "", factor.date or ""))
         for column in factor.columns[factor.width :]:
             name, _, symbol = column.rpartition("/")
-            own = symbols.setdefault(name, [])
-            own += [symbol] if symbol not in own else []
-    order = sorted(range(len(found)), key=lambda k: found[k][3])
+            of_effect = symbols.setdefault(name, [])
+            of_effect += [symbol] if symbol not in of_effect else []
+    order = sorted(range(len(runs)), key=lambda k: runs[k][3])
     ranks = {place: rank for rank, place in enumerate(order)}
-    return [RunKey(*own, ranks[k]) for k, own in enumerate(found)], symbols
+    return [RunKey(*run, ranks[k]) for k, run in enumerate(runs)], symbols
 
 
 def _hidden(upper: Floats, width: int, places: NDArray[np.intp]) -> Mask:
     """Return which columns the run's own parameters explain but for rounding."""
-    left, whole = np.linalg.norm(upper[width:, places], axis=0), np.linalg.norm(upper[:, places], axis=0)
-    return np.asarray(left <= _SEEN * whole)
+    rest, whole = np.linalg.norm(upper[width:, places], axis=0), np.linalg.norm(upper[:, places], axis=0)
+    return np.asarray(rest <= _SEEN * whole)
 
 
 def _usual(effect: Effect | None) -> float:

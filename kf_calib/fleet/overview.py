@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import date, datetime, timedelta
+from pathlib import PurePosixPath
 from typing import Any
 
-from kf_calib.fleet.another_look import Look, looks
 from kf_calib.fleet.pooled_diagnosis import PooledDiagnosis
+from kf_calib.fleet.pooled_terms import Attribution
 from kf_calib.fleet.track import Track, tracks
-from kf_calib.fleet.weeks import Weeks, weeks_of
+from kf_calib.support.tail_probabilities import sidak
 
 COLUMNS = ("run", "unit", "bench", "date", "error", "consistent", "p_value", "missing", "parameters")
 """Columns of the table that an overview is made from."""
+_LEVEL = 0.01
+"""Chance below which a unit is named."""
 
 
 @dataclass(frozen=True)
@@ -53,14 +57,119 @@ def overview_of(
     rows = sorted(rows, key=lambda row: (row["date"] is None, row["date"], row["run"]))
     units = tuple(sorted({_unit(row) for row in rows if row["unit"] or row["error"] is None}))
     rows = [{**row, "unit": _unit(row)} for row in rows]
-    own, dates = tracks(rows, units, targets), [row["date"] for row in rows if row["date"] is not None]
+    followed, dates = tracks(rows, units, targets), [row["date"] for row in rows if row["date"] is not None]
     return FleetOverview(
         name, len(rows), sum(row["error"] is not None for row in rows),
         sum(row["consistent"] is False for row in rows), units,
         tuple(sorted({row["bench"] for row in rows if row["bench"]})), min(dates, default=None),
-        max(dates, default=None), own, weeks_of(rows), looks(rows, units, own, pooled), pooled, remarks,
+        max(dates, default=None), followed, weeks_of(rows), looks(rows, units, followed, pooled), pooled, remarks,
     )  # fmt: skip
 
 
 def _unit(row: Mapping[str, Any]) -> str:
     return row["unit"] or row["run"]
+
+
+@dataclass(frozen=True)
+class Look:
+    """A unit to look at; chance: that the strongest of the reasons is nothing but noise, given how many were tried.
+
+    reasons: in words, the strongest first.
+    """
+
+    unit: str
+    chance: float
+    reasons: tuple[str, ...]
+
+
+def looks(
+    rows: Sequence[Mapping[str, Any]], units: Sequence[str], tracks: Sequence[Track], pooled: PooledDiagnosis | None
+) -> tuple[Look, ...]:
+    """The units that need another look, first those that need it most."""
+    reasons = dict[str, list[tuple[float, str]]]()
+    for unit, chance, said in [*_of_runs(rows), *_of_parameters(units, tracks), *_of_effects(pooled)]:
+        if chance < _LEVEL:
+            reasons.setdefault(unit, []).append((chance, said))
+    ordered = {unit: sorted(own, key=lambda each: each[0]) for unit, own in reasons.items()}
+    found = [Look(unit, own[0][0], tuple(said for _, said in own)) for unit, own in ordered.items()]
+    return tuple(sorted(found, key=lambda look: (look.chance, -len(look.reasons), look.unit)))
+
+
+_Reason = tuple[str, float, str]
+
+
+def _of_runs(rows: Sequence[Mapping[str, Any]]) -> list[_Reason]:
+    """Return the runs that failed, and those that their model does not explain."""
+    reasons = list[_Reason]()
+    for row in rows:
+        name = PurePosixPath(row["run"]).name
+        if row["error"] is not None:
+            reasons.append((row["unit"], 0.0, f"{name} failed"))
+        elif row["consistent"] is False and row["p_value"] is not None:
+            missing = f"shows {row['missing']}" if row["missing"] else "does not fit its model"
+            reason = f"{name} {missing} (p = {row['p_value']:.1g})"
+            reasons.append((row["unit"], sidak(row["p_value"], len(rows)), reason))
+    return reasons
+
+
+def _of_parameters(units: Sequence[str], tracks: Sequence[Track]) -> list[_Reason]:
+    """Return the units of which a parameter lies outside the population of the others."""
+    return [
+        (unit, chance, f"{track.symbol} is {abs(distance):.1f} spreads from the median of the units")
+        for track in tracks
+        for unit, chance, distance in zip(units, track.chances.tolist(), track.distances.tolist(), strict=True)
+    ]
+
+
+def _of_effects(pooled: PooledDiagnosis | None) -> list[_Reason]:
+    """Return the units that have an effect which other units do not have."""
+    findings = () if pooled is None else pooled.findings
+    return [
+        (figures.unit, max(1.0 - figures.probability, 0.0), f"has {finding.effect}, which others have not")
+        for finding in findings
+        if finding.attribution is Attribution.SOME
+        for figures in finding.units
+    ]
+
+
+@dataclass(frozen=True)
+class Weeks:
+    """How many runs came to what in each week, the most frequent verdict first; begins: Mondays, without gaps.
+
+    undated: runs of which nobody knows the date.
+    """
+
+    begins: tuple[date, ...]
+    counts: Mapping[str, tuple[int, ...]]
+    undated: int
+
+
+def counted(rows: Iterable[Mapping[str, Any]]) -> dict[str, int]:
+    """How many rows came to what verdict, the most frequent first."""
+    return dict(Counter(verdict_of(row) for row in rows).most_common())
+
+
+def verdict_of(row: Mapping[str, Any]) -> str:
+    """What the run of a row came to, in a word or two."""
+    if row["error"] is not None:
+        return "failed"
+    if row["consistent"] is None:
+        return "not judged"
+    return row["missing"] or ("consistent" if row["consistent"] else "inconsistent")
+
+
+def weeks_of(rows: Sequence[Mapping[str, Any]]) -> Weeks:
+    """The verdicts of the runs by week."""
+    dated = [(_monday(row["date"]), verdict_of(row)) for row in rows if row["date"] is not None]
+    mondays = sorted({monday for monday, _ in dated})
+    count = (mondays[-1] - mondays[0]).days // 7 + 1 if mondays else 0
+    begins = [mondays[0] + timedelta(weeks=k) for k in range(count)]
+    counts = dict[str, list[int]]()
+    for monday, verdict in dated:
+        counts.setdefault(verdict, [0] * count)[(monday - mondays[0]).days // 7] += 1
+    ordered = sorted(counts.items(), key=lambda item: -sum(item[1]))
+    return Weeks(tuple(begins), {name: tuple(own) for name, own in ordered}, len(rows) - len(dated))
+
+
+def _monday(when: datetime) -> date:
+    return when.date() - timedelta(days=when.weekday())

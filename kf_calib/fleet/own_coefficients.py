@@ -19,7 +19,7 @@ from kf_calib.fleet.pooled_terms import PooledTerms, Sums, shares_of
 
 
 @dataclass(frozen=True)
-class Own:
+class UnitInformation:
     """What units tell of their own coefficients of one effect, in ``Group.sigma``.
 
     units (n,): their names. info (n, q, q), score (n, q).
@@ -29,10 +29,10 @@ class Own:
     info: Floats
     score: Floats
 
-    def only(self, kept: Mask) -> Own:
+    def only(self, kept: Mask) -> UnitInformation:
         """Some of them."""
         units = [unit for unit, here in zip(self.units, kept.tolist(), strict=True) if here]
-        return Own(units, self.info[kept], self.score[kept])
+        return UnitInformation(units, self.info[kept], self.score[kept])
 
     def estimates(self) -> list[tuple[Floats, Floats]]:
         """The coefficients (q,) of each with their covariance (q, q), from what it tells itself and nothing else."""
@@ -41,56 +41,62 @@ class Own:
 
 
 @dataclass(frozen=True)
-class OwnAndCommon:
+class UnitsAndCommon:
     """The same together with the common coefficients of other terms.
 
-    - own: with all common coefficients at zero. across (n, q, j): its information in common with these.
+    - of_units: with all common coefficients at zero. across (n, q, j): its information in common with these.
     - common: what is known of the common coefficients where the own ones are free in every unit. prior (j,): of them.
     """
 
-    own: Own
+    of_units: UnitInformation
     across: Floats
     common: Sums
     prior: Floats
 
     @classmethod
-    def of(cls, group: Group, terms: PooledTerms, blocks: Blocks) -> OwnAndCommon:
+    def of(cls, group: Group, terms: PooledTerms, blocks: Blocks) -> UnitsAndCommon:
         """What blocks tell, of which what is their own by other terms has been eliminated."""
-        own, columns = group.columns, [each.column for each in terms.common]
-        info, score = blocks.info[:, own, own].copy(), blocks.score[:, own].copy()  # no views of all
-        across = blocks.info[:, own][:, :, columns] * shares_of(terms.common, blocks)[:, None, :]
+        of_group, columns = group.columns, [each.column for each in terms.common]
+        info, score = blocks.info[:, of_group, of_group].copy(), blocks.score[:, of_group].copy()  # no views of all
+        across = blocks.info[:, of_group][:, :, columns] * shares_of(terms.common, blocks)[:, None, :]
         gains = np.linalg.solve(_not_singular(info), np.concatenate([across, score[:, :, None]], axis=2))
         lost = np.einsum("nqi,nqj->ij", across, gains)
         total = terms.sums(blocks)
         common = Sums(total.info - lost[:, :-1], total.score - lost[:, -1])
-        return cls(Own(blocks.labels, info, score), across, common, terms.prior)
+        return cls(UnitInformation(blocks.labels, info, score), across, common, terms.prior)
 
     @classmethod
-    def joined(cls, parts: Sequence[OwnAndCommon]) -> OwnAndCommon:
+    def joined(cls, parts: Sequence[UnitsAndCommon]) -> UnitsAndCommon:
         """All of several parts."""
-        units = [unit for part in parts for unit in part.own.units]
-        info, score = (np.concatenate(each) for each in zip(*((p.own.info, p.own.score) for p in parts), strict=True))
-        common = sum((part.common for part in parts[1:]), parts[0].common)
-        return cls(Own(units, info, score), np.concatenate([p.across for p in parts]), common, parts[0].prior)
-
-    def by_unit(self) -> OwnAndCommon:
-        """With one entry for each unit, where a repair of the bench or another bench has parted its runs."""
-        names = list(dict.fromkeys(self.own.units))
-        numbers = {unit: k for k, unit in enumerate(names)}
-        places = [numbers[unit] for unit in self.own.units]
-        info, score, across = (
-            _added(each, places, len(names)) for each in (self.own.info, self.own.score, self.across)
+        units = [unit for part in parts for unit in part.of_units.units]
+        info, score = (
+            np.concatenate(each) for each in zip(*((p.of_units.info, p.of_units.score) for p in parts), strict=True)
         )
-        return OwnAndCommon(Own(names, info, score), across, self.common, self.prior)
+        common = sum((part.common for part in parts[1:]), parts[0].common)
+        return cls(
+            UnitInformation(units, info, score), np.concatenate([p.across for p in parts]), common, parts[0].prior
+        )
 
-    def integrated(self) -> Own:
+    def by_unit(self) -> UnitsAndCommon:
+        """With one entry for each unit, where a repair of the bench or another bench has parted its runs."""
+        names = list(dict.fromkeys(self.of_units.units))
+        numbers = {unit: k for k, unit in enumerate(names)}
+        places = [numbers[unit] for unit in self.of_units.units]
+        info, score, across = (
+            _added(each, places, len(names)) for each in (self.of_units.info, self.of_units.score, self.across)
+        )
+        return UnitsAndCommon(UnitInformation(names, info, score), across, self.common, self.prior)
+
+    def integrated(self) -> UnitInformation:
         """What each unit tells where nothing is known of the common coefficients but what all units tell of them."""
         mean, covariance = posterior(self.common.info, self.common.score, self.prior)
         unsure = self.across @ covariance @ np.swapaxes(self.across, 1, 2)
-        kept = np.linalg.solve(_not_singular(self.own.info + unsure), self.own.info)
-        score = self.own.score - self.across @ mean
-        info = self.own.info @ kept
-        return Own(self.own.units, 0.5 * (info + np.swapaxes(info, 1, 2)), np.einsum("npq,np->nq", kept, score))
+        kept = np.linalg.solve(_not_singular(self.of_units.info + unsure), self.of_units.info)
+        score = self.of_units.score - self.across @ mean
+        info = self.of_units.info @ kept
+        return UnitInformation(
+            self.of_units.units, 0.5 * (info + np.swapaxes(info, 1, 2)), np.einsum("npq,np->nq", kept, score)
+        )
 
     def explained_by_common(self) -> float:
         """By how much less all units together speak for own coefficients than each by itself: the log of likelihoods.
@@ -98,7 +104,7 @@ class OwnAndCommon:
         Without own coefficients, the common ones change to explain what they can of what is alike in units. What each
         unit by itself tells knows nothing of that.
         """
-        info, score = _not_singular(self.own.info), self.own.score
+        info, score = _not_singular(self.of_units.info), self.of_units.score
         gains = np.linalg.solve(info, np.concatenate([self.across, score[:, :, None]], axis=2))
         lost = np.einsum("nqi,nqj->ij", self.across, gains)
         without = Sums(self.common.info + lost[:, :-1], self.common.score + lost[:, -1])

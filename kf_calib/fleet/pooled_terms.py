@@ -162,15 +162,15 @@ def commons_of(term: Term, benches: int) -> Iterable[Common]:
     columns = range(term.group.columns.start, term.group.columns.stop)
     if not term.attribution.common:
         return [Common(column, term.mean_size) for column in columns if term.mean_size]
-    out = list[Common]()
+    commons = list[Common]()
     for bench in range(benches):
         whole = [Common(column, term.size, bench) for column in columns]
         if term.repair is None or term.repair[0] != bench:
-            out += whole
+            commons += whole
         else:
             first = term.repair[1]
-            out += [replace(each, until=first) for each in whole] + [replace(each, since=first) for each in whole]
-    return out
+            commons += [replace(each, until=first) for each in whole] + [replace(each, since=first) for each in whole]
+    return commons
 
 
 def _spreads(term: Term, blocks: Blocks) -> Floats:

@@ -16,7 +16,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.fleet.evidence import FLAT, STEP, log_evidence, log_evidence_of_modes, modes, sizes
-from kf_calib.fleet.own_coefficients import OwnAndCommon
+from kf_calib.fleet.own_coefficients import UnitsAndCommon
 from kf_calib.fleet.pooled_terms import Sums
 
 _NARROW, _WIDE = 0.02, 1e6  # sigma of one run: the smallest spread that is told from none, and a larger one than any
@@ -34,12 +34,12 @@ class Population:
     spread_interval: tuple[float, float]
 
 
-def population(told: OwnAndCommon, members: Mask, largest: float) -> Population | None:
+def population(information: UnitsAndCommon, members: Mask, largest: float) -> Population | None:
     """The population of some units; None where they are too few to have a spread.
 
     members (n,): who is of it; nothing is supposed of the others. largest: the largest likeliest spread.
     """
-    misfits = _Misfits(told, members)
+    misfits = _Misfits(information, members)
     if misfits.freedom < 1:
         return None
     spread = misfits.likeliest(largest)
@@ -51,12 +51,12 @@ def population(told: OwnAndCommon, members: Mask, largest: float) -> Population 
 class _Misfits:
     """How well units fit to their common mean, for every spread about it."""
 
-    def __init__(self, told: OwnAndCommon, members: Mask) -> None:
+    def __init__(self, told: UnitsAndCommon, members: Mask) -> None:
         self._common = told.common
-        self._values, self._along, self._turned = modes(told.own.info[members], told.own.score[members])
+        self._values, self._along, self._turned = modes(told.of_units.info[members], told.of_units.score[members])
         self._seen = self._values > _SEEN * self._values.max(initial=0.0)
         self._rows = self._turned @ told.across[members]
-        self._coefficients = told.own.score.shape[1]
+        self._coefficients = told.of_units.score.shape[1]
         self._prior = np.concatenate([np.full(self._coefficients, FLAT), told.prior])
 
     @cached_property

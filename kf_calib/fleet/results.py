@@ -13,13 +13,11 @@ import pyarrow as pa
 import pyarrow.compute
 
 from kf_calib.errors import InputError
-from kf_calib.fleet.overview import COLUMNS, FleetOverview, overview_of
+from kf_calib.fleet.overview import COLUMNS, FleetOverview, counted, overview_of
 from kf_calib.fleet.pooled_diagnosis import PooledDiagnosis, pooled_diagnosis
-from kf_calib.fleet.reference_unit import ReferenceUnit
-from kf_calib.fleet.run_factor import RunFactor
+from kf_calib.fleet.run_factor import ReferenceUnit, RunFactor
 from kf_calib.fleet.run_row import SCHEMA, factor_of
 from kf_calib.fleet.store import AT_ONCE, Store
-from kf_calib.fleet.weeks import counted
 from kf_calib.support.extras import need
 
 pc: Any = pyarrow.compute  # its functions are made when it is imported, which no type checker sees
@@ -123,12 +121,12 @@ class Fleet:
         if len(units) < 2:
             return None, (f"{_ALONE}: that needs two that did not fail, and there {_are(len(units))}.",)
         try:
-            found = self.pooled(reference_unit=reference)
+            diagnosis = self.pooled(reference_unit=reference)
         except InputError as error:
             if reference is not None:
                 raise
             return None, (f"{_ALONE}: {error}",)
-        return found, (_unnamed(units.null_count),) if units.null_count else ()
+        return diagnosis, (_unnamed(units.null_count),) if units.null_count else ()
 
     def _refuse_own(self, reference: ReferenceUnit) -> None:
         """Refuse scale factors that are from one of the runs, with its gravity."""
@@ -183,12 +181,12 @@ def populations(fleet: Fleet) -> list[ParameterPopulation]:
     """Each parameter over the runs that determine it, in the order of the first run."""
     table = fleet.parameters()
     table = table.filter(pc.is_valid(table["value"]))
-    out = list[ParameterPopulation]()
+    spreads = list[ParameterPopulation]()
     for symbol in dict.fromkeys(table["symbol"].to_pylist()):
-        own = table.filter(pc.equal(table["symbol"], symbol))
-        values, sigmas = own["value"].to_numpy(), own["sigma"].to_numpy()
+        rows = table.filter(pc.equal(table["symbol"], symbol))
+        values, sigmas = rows["value"].to_numpy(), rows["sigma"].to_numpy()
         low, median, high = np.quantile(values, _SIXTY_EIGHT).tolist()
-        unit, nominal = own["si_unit"][0].as_py(), own["nominal"][0].as_py()
+        unit, nominal = rows["si_unit"][0].as_py(), rows["nominal"][0].as_py()
         sigma = float(np.nanmedian(sigmas))
-        out.append(ParameterPopulation(symbol, unit, nominal, len(values), median, 0.5 * (high - low), sigma))
-    return out
+        spreads.append(ParameterPopulation(symbol, unit, nominal, len(values), median, 0.5 * (high - low), sigma))
+    return spreads

@@ -48,16 +48,16 @@ def runs_of(words: Iterable[str]) -> list[Run]:
     .txt file with one of these a line, or a .csv file with the column ``run`` and, if known, ``unit``, ``bench`` and
     ``date``. Each may be a URL such as ``s3://bucket/campaign/``. Raises InputError where a word leads to no recording.
     """
-    found = dict[str, Run]()
+    runs = dict[str, Run]()
     for word in words:
         named = list(_named_by(word))
         for run in named:
-            found.setdefault(run.place, run)
+            runs.setdefault(run.place, run)
         if not named:
             raise InputError(
                 f"{word} leads to no recording: name .mcap or .db3 files, folders of them, globs, or a list of these."
             )
-    return list(found.values())
+    return list(runs.values())
 
 
 def _named_by(word: str) -> Iterator[Run]:
@@ -163,9 +163,9 @@ def _date(word: str, line: Mapping[str, str]) -> datetime | None:
     if not (text := line.get("date")):
         return None
     try:
-        found = datetime.fromisoformat(text)
+        date = datetime.fromisoformat(text)
     except ValueError:
         raise InputError(
             f"{word}: {text!r} of {line['run']} is no date: write it as 2026-05-31 or with the time."
         ) from None
-    return found if found.tzinfo else found.replace(tzinfo=UTC)
+    return date if date.tzinfo else date.replace(tzinfo=UTC)

@@ -70,17 +70,17 @@ def of_diagnosis(document: Mapping[str, Any]) -> Row:
     return {key: document[key] for key in _OF_DIAGNOSIS if key in document} | {"diagnosis": _text(document)}
 
 
-def of_factor(found: RunFactor) -> Row:
+def of_factor(factor: RunFactor) -> Row:
     """The column of the reduced factor: its upper triangle, row by row."""
     return {
         "factor": {
-            "columns": list(found.columns),
-            "width": found.width,
-            "upper": found.factor[np.triu_indices(len(found.factor))],
-            "rows": found.rows,
-            "constants": [{"effect": name, "value": value} for name, value in found.constants.items()],
-            "nominal": found.nominal,
-            "noise_estimated": found.noise_estimated,
+            "columns": list(factor.columns),
+            "width": factor.width,
+            "upper": factor.factor[np.triu_indices(len(factor.factor))],
+            "rows": factor.rows,
+            "constants": [{"effect": name, "value": value} for name, value in factor.constants.items()],
+            "nominal": factor.nominal,
+            "noise_estimated": factor.noise_estimated,
         }
     }
 

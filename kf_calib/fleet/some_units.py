@@ -12,9 +12,8 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.fleet.campaign import Group
 from kf_calib.fleet.evidence import log_mean
-from kf_calib.fleet.own_coefficients import Own
-from kf_calib.fleet.shape_about_mean import about_mean
-from kf_calib.fleet.shape_about_zero import POWERS, about_zero
+from kf_calib.fleet.own_coefficients import UnitInformation
+from kf_calib.fleet.shape import POWERS, about_mean, about_zero
 from kf_calib.support.logarithms import weights
 
 _RULED_OUT = 0.025  # probability below which a shape is not asked for the share
@@ -23,11 +22,11 @@ _RULED_OUT = 0.025  # probability below which a shape is not asked for the share
 class SomeUnits:
     """The likelihood of who has an effect, from what each unit tells of its coefficients beside all else."""
 
-    def __init__(self, group: Group, own: Own, *, with_mean: bool = True) -> None:
+    def __init__(self, group: Group, information: UnitInformation, *, with_mean: bool = True) -> None:
         """with_mean: whether they may have a mean of their own; if not, that shape counts as impossible."""
-        zero = {power: about_zero(group, own, power) for power in POWERS}
+        zero = {power: about_zero(group, information, power) for power in POWERS}
         self._clear = [shape for power, shape in zero.items() if power]
-        self._shapes = [*zero.values(), *([about_mean(own)] if with_mean else [])]
+        self._shapes = [*zero.values(), *([about_mean(information)] if with_mean else [])]
         self._logs = np.array([shape.log_odds for shape in self._shapes]) - np.log(len(POWERS) + 1)
 
     @property

@@ -74,24 +74,24 @@ class Store:
     def taken(self) -> Iterator[None]:
         """Keep everybody else from writing in the folder. Raises InputError where somebody does, or where it cannot be
         made."""
-        held = self.folder / ".lock"
+        path = self.folder / ".lock"
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            file = held.open("ab")
+            file = path.open("ab")
         except OSError as error:
             raise InputError(f"{self.folder}: {error.strerror}: give another folder (-o).") from None
         with file:
             if not lock(file):
                 raise InputError(
-                    f"{self.folder.parent} is being written by {writer(held) or 'another run'}: wait for it."
+                    f"{self.folder.parent} is being written by {writer(path) or 'another run'}: wait for it."
                 )
             yield
 
     def append(self, rows: Sequence[Row]) -> None:
         """Write rows; when this returns they are on disk."""
         if rows:
-            with whole(self._new(_SMALL)) as part, pa.ipc.new_file(part, SCHEMA) as out:
-                out.write_table(pa.Table.from_pylist(list(rows), SCHEMA))
+            with whole(self._new(_SMALL)) as part, pa.ipc.new_file(part, SCHEMA) as file:
+                file.write_table(pa.Table.from_pylist(list(rows), SCHEMA))
         if len(small := self._files(_SMALL)) >= _MOST_SMALL:
             self._merge(small)
 
@@ -134,10 +134,10 @@ class Store:
     def _merge(self, files: Sequence[Path]) -> None:
         with (
             whole(self._new(_LARGE)) as part,
-            pq.ParquetWriter(part, SCHEMA, compression="zstd", write_page_checksum=True) as out,
+            pq.ParquetWriter(part, SCHEMA, compression="zstd", write_page_checksum=True) as writer_,
         ):
             for batch in _together(_newest(files, SCHEMA.names, AT_ONCE)):
-                out.write_table(batch)
+                writer_.write_table(batch)
         for file in files:
             file.unlink()
 
@@ -177,25 +177,25 @@ def _schema_of_small(file: Path) -> pa.Schema:
 
 def _latest(batches: Iterable[pa.RecordBatch]) -> dict[str, Known]:
     """Return what the newest row of each run says of it."""
-    out = dict[str, Known]()
+    latest = dict[str, Known]()
     for batch in batches:
         for row in batch.to_pylist():
-            if row["run"] not in out or out[row["run"]].evaluated <= row["evaluated"]:
-                out[row["run"]] = Known(row["evaluated"], row["version"], row["sha256"], row["settings"])
-    return out
+            if row["run"] not in latest or latest[row["run"]].evaluated <= row["evaluated"]:
+                latest[row["run"]] = Known(row["evaluated"], row["version"], row["sha256"], row["settings"])
+    return latest
 
 
 def _newest(files: Sequence[Path], columns: Sequence[str], rows: int) -> Iterator[pa.RecordBatch]:
     """Yield the rows of some files that no other row among them supersedes."""
-    left = dict[str, datetime]()
+    newest = dict[str, datetime]()
     for batch in _rows(files, ["run", "evaluated"], _MANY):
         for run, evaluated in zip(*(column.to_pylist() for column in batch.columns), strict=True):
-            left[run] = max(evaluated, left.get(run, evaluated))
+            newest[run] = max(evaluated, newest.get(run, evaluated))
     read = list(dict.fromkeys([*columns, "run", "evaluated"]))
     for batch in _rows(files, read, rows):
         pairs = zip(batch["run"].to_pylist(), batch["evaluated"].to_pylist(), strict=True)
-        kept = [left.get(run) == evaluated and bool(left.pop(run)) for run, evaluated in pairs]
-        yield batch.filter(pa.array(kept, pa.bool_())).select(list(columns))
+        is_newest = [newest.get(run) == evaluated and bool(newest.pop(run)) for run, evaluated in pairs]
+        yield batch.filter(pa.array(is_newest, pa.bool_())).select(list(columns))
 
 
 def _together(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Table]:
@@ -213,16 +213,16 @@ def _together(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Table]:
 
 def _sound(batch: pa.RecordBatch) -> pa.RecordBatch:
     """Return the rows of a batch that say of which run they are and when it was evaluated, and are whole."""
-    kept = np.ones(batch.num_rows, bool)
+    sound = np.ones(batch.num_rows, bool)
     for name in ("run", "evaluated"):
-        kept &= batch[name].is_valid().to_numpy(zero_copy_only=False)
+        sound &= batch[name].is_valid().to_numpy(zero_copy_only=False)
     for name in {"date", "evaluated"} & set(batch.schema.names):
-        kept &= _are_dates(batch[name])
+        sound &= _are_dates(batch[name])
     if "factor" in batch.schema.names:
-        kept &= are_whole(batch["factor"])
+        sound &= are_whole(batch["factor"])
     if "parameters" in batch.schema.names:
-        kept &= name_their_parameters(batch["parameters"])
-    return batch if kept.all() else batch.filter(pa.array(kept))
+        sound &= name_their_parameters(batch["parameters"])
+    return batch if sound.all() else batch.filter(pa.array(sound))
 
 
 def _are_dates(stamps: pa.TimestampArray) -> Mask:

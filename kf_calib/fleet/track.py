@@ -54,18 +54,18 @@ class Track:
 def tracks(rows: Sequence[Mapping[str, Any]], units: Sequence[str], targets: Mapping[str, float]) -> tuple[Track, ...]:
     """The track of each parameter that a run determines, in the order of the runs."""
     numbers = {unit: k for k, unit in enumerate(units)}
-    seen = dict[str, list[tuple[datetime | None, int, float, float]]]()
-    told = dict[str, tuple[str, float]]()
+    runs = dict[str, list[tuple[datetime | None, int, float, float]]]()
+    units_and_nominals = dict[str, tuple[str, float]]()
     for row in rows:
-        for each in row["parameters"] or ():
-            if each["value"] is not None and each["sigma"] is not None:
-                told.setdefault(each["symbol"], (each["unit"], each["nominal"]))
-                own = seen.setdefault(each["symbol"], [])
-                own.append((row["date"], numbers[row["unit"]], each["value"], each["sigma"]))
-    many = len(seen) * len(units)
+        for parameter in row["parameters"] or ():
+            if parameter["value"] is not None and parameter["sigma"] is not None:
+                units_and_nominals.setdefault(parameter["symbol"], (parameter["unit"], parameter["nominal"]))
+                of_run = (row["date"], numbers[row["unit"]], parameter["value"], parameter["sigma"])
+                runs.setdefault(parameter["symbol"], []).append(of_run)
+    many = len(runs) * len(units)
     return tuple(
-        _track(name, *told[name], targets.get(name), list(zip(*own, strict=True)), len(units), many)
-        for name, own in seen.items()
+        _track(name, *units_and_nominals[name], targets.get(name), list(zip(*of_runs, strict=True)), len(units), many)
+        for name, of_runs in runs.items()
     )
 
 

@@ -11,6 +11,7 @@ from types import MappingProxyType
 
 from kf_calib.bench.streams import Source
 from kf_calib.errors import InputError
+from kf_calib.sources.files.contents import CALIBRATION_FORMAT
 from kf_calib.sources.files.csv_columns import CsvColumns
 from kf_calib.sources.files.csv_heading import Heading
 from kf_calib.sources.files.foreign import HEAD_BYTES, is_lines
@@ -20,6 +21,7 @@ from kf_calib.sources.files.text_file import head_of
 from kf_calib.sources.tables.grid import OLD_SUFFIXES, TEXT_SUFFIXES, ZIP
 from kf_calib.sources.tables.opening import open_table
 
+_OF_CALIBRATION = 200  # first bytes of a calibration, which name its format
 _FEWEST_SAMPLES = 50
 _SLOWEST_S = 1.0
 """Rows that are closer are samples, not dwells."""
@@ -31,11 +33,13 @@ class Kind(Enum):
     - RECORDING: messages in MCAP or SQLite, or nothing that is known.
     - SAMPLES: lines of CSV or JSON, one or more for each sample.
     - TABLE: a row of means for each dwell, in CSV or a spreadsheet.
+    - CALIBRATION: the result of a run, as --save writes it.
     """
 
     RECORDING = "recording"
     SAMPLES = "samples"
     TABLE = "table"
+    CALIBRATION = "calibration"
 
 
 def kind_of(path: str | PathLike[str], columns: Mapping[str, str] = MappingProxyType({})) -> Kind:
@@ -56,6 +60,8 @@ def kind_of(path: str | PathLike[str], columns: Mapping[str, str] = MappingProxy
     first = next((k for k, line in enumerate(lines) if line.lstrip("\ufeff").strip()), None)
     if first is None:
         return Kind.TABLE
+    if CALIBRATION_FORMAT.encode() in head[:_OF_CALIBRATION]:
+        return Kind.CALIBRATION
     if is_json(lines[first]):
         return Kind.SAMPLES
     return Kind.SAMPLES if _are_samples(lines[first:-1] or lines[first:], columns) else Kind.TABLE
@@ -73,6 +79,14 @@ def _are_samples(lines: list[str], stated: Mapping[str, str]) -> bool:
     return columns.are_alike if math.isnan(step_s) else step_s < _SLOWEST_S
 
 
+def no_recording(path: str | PathLike[str]) -> InputError:
+    """The error of a calibration where a recording is needed."""
+    return InputError(
+        f"{path}: is a calibration, not a recording: info says what it holds; apply, verify, export, certificate and "
+        "history take it."
+    )
+
+
 def opened(
     source: Source | str | PathLike[str], overrides: Mapping[str, str] = MappingProxyType({}), *, angles: bool = True
 ) -> Source:
@@ -86,3 +100,5 @@ def opened(
             return Lines(source, overrides, angles=angles)
         case Kind.RECORDING:
             return Recording(source, overrides, angles=angles)
+        case Kind.CALIBRATION:
+            raise no_recording(source)

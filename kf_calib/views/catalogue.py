@@ -43,12 +43,12 @@ def overview(effects: Sequence[Effect]) -> RenderableType:
 
 def _symbols(effect: Effect) -> str:
     """Return the symbols of the coefficients of an effect, shortened where there are more than three."""
-    found = [symbol(coefficient.symbol) for coefficient in effect.coefficients]
-    stem = found[0][:-1] if found else ""
-    if found == [f"{stem}{i}" for i in (1, 2, 3)]:
-        found = [f"{found[0]}..3"]
-    found = found if len(found) <= 3 else [found[0], "...", found[-1]]
-    return " ".join([*found, *([symbol(effect.unknown.symbol)] if effect.unknown is not None else [])])
+    symbols = [symbol(coefficient.symbol) for coefficient in effect.coefficients]
+    stem = symbols[0][:-1] if symbols else ""
+    if symbols == [f"{stem}{i}" for i in (1, 2, 3)]:
+        symbols = [f"{symbols[0]}..3"]
+    symbols = symbols if len(symbols) <= 3 else [symbols[0], "...", symbols[-1]]
+    return " ".join([*symbols, *([symbol(effect.unknown.symbol)] if effect.unknown is not None else [])])
 
 
 def details(effects: Sequence[Effect]) -> RenderableType:

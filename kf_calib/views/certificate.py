@@ -17,29 +17,29 @@ from kf_calib.views.tables import Table
 from kf_calib.views.terminal import note
 
 
-def certificate_object(own: Certificate, standing: str, out: Path, xml: Path | None) -> dict[str, Any]:
+def certificate_object(certificate: Certificate, standing: str, path: Path, xml: Path | None) -> dict[str, Any]:
     """The JSON object of ``certificate``."""
     return clean(
         {
-            "out": str(out),
+            "out": str(path),
             "xml": None if xml is None else str(xml),
             "xml_check": standing,
-            "number": own.statement.number,
-            "not_stated": list(own.missing),
-            "decision_rule": own.statement.decision_rule,
-            "parameters": [_result_object(each) for each in own.results],
-            "budget": [_line_object(line) for line in own.budget.contributions],
-            "left_out": list(own.budget.left_out),
+            "number": certificate.statement.number,
+            "not_stated": list(certificate.missing),
+            "decision_rule": certificate.statement.decision_rule,
+            "parameters": [_result_object(each) for each in certificate.results],
+            "budget": [_line_object(line) for line in certificate.budget.contributions],
+            "left_out": list(certificate.budget.left_out),
         }
     )
 
 
-def _result_object(each: Result) -> dict[str, Any]:
+def _result_object(result: Result) -> dict[str, Any]:
     return {
-        "symbol": each.symbol, "value": each.value, "unit": each.unit, "nominal": each.nominal,
-        "standard": each.standard, "expanded": each.expanded, "k": each.k, "dof": each.dof,
-        "before": None if each.before is None else list(each.before),
-        "limit": each.limit, "conformity": each.conformity,
+        "symbol": result.symbol, "value": result.value, "unit": result.unit, "nominal": result.nominal,
+        "standard": result.standard, "expanded": result.expanded, "k": result.k, "dof": result.dof,
+        "before": None if result.before is None else list(result.before),
+        "limit": result.limit, "conformity": result.conformity,
     }  # fmt: skip
 
 
@@ -52,19 +52,22 @@ def _line_object(line: Contribution) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def certificate_report(own: Certificate, standing: str, out: Path, xml: Path | None) -> RenderableType:
+def certificate_report(certificate: Certificate, standing: str, pdf: Path, xml: Path | None) -> RenderableType:
     """The report of ``certificate``."""
-    judged = any(each.conformity for each in own.results)
+    with_conformity = any(result.conformity for result in certificate.results)
     table = Table(title="Uncertainty (type A and type B: standard; U = k u)", title_justify="left")
-    for heading in ("parameter", "type A", "type B", "U", "k", "unit", *(["conformity"] if judged else [])):
+    for heading in ("parameter", "type A", "type B", "U", "k", "unit", *(["conformity"] if with_conformity else [])):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit", "conformity") else "right")
-    first, combined = own.budget.contributions[0].parts, own.budget.combined
-    for i, each in enumerate(own.results):
-        unit = shown(each.unit)
+    first, combined = certificate.budget.contributions[0].parts, certificate.budget.combined
+    for i, result in enumerate(certificate.results):
+        unit = shown(result.unit)
         other = max(combined[i] ** 2 - first[i] ** 2, 0.0) ** 0.5
-        row = [symbol(each.symbol), *(unit.number(u, 2) for u in (first[i], other)),
-               "" if each.expanded is None else unit.number(each.expanded, 2), f"{each.k:.2f}", unit.label]  # fmt: skip
-        table.add_row(*row, *([OUTCOMES[each.conformity] if each.conformity else "not judged"] if judged else []))
-    lines = [note(f"not stated, and left blank: {', '.join(own.missing)}")] if own.missing else []
-    saved = [Text(f"saved {path}") for path in (out, xml) if path is not None]
+        row = [symbol(result.symbol), *(unit.number(u, 2) for u in (first[i], other)),
+               "" if result.expanded is None else unit.number(result.expanded, 2),
+               f"{result.k:.2f}", unit.label]  # fmt: skip
+        table.add_row(
+            *row, *([OUTCOMES[result.conformity] if result.conformity else "not judged"] if with_conformity else [])
+        )
+    lines = [note(f"not stated, and left blank: {', '.join(certificate.missing)}")] if certificate.missing else []
+    saved = [Text(f"saved {path}") for path in (pdf, xml) if path is not None]
     return Group(table, Text(f"XML: {standing}."), *lines, *saved)

@@ -45,7 +45,7 @@ def whole_value(parameter: Parameter) -> str:
     return f"{unit.rounded(parameter.value, parameter.sigma)[0]} {unit.label}"
 
 
-def _row(parameter: Parameter, fixed_by: str = "") -> tuple[str, str, str, str, str]:
+def parameter_row(parameter: Parameter, fixed_by: str = "") -> tuple[str, str, str, str, str]:
     """Return symbol, value, deviation from nominal, sigma and unit of a parameter, or what it is fixed by."""
     if parameter.value is None or parameter.sigma is None:
         return symbol(parameter.symbol), fixed_by or "not seen", "", "", ""
@@ -62,18 +62,18 @@ def parameter_table(result: Calibration) -> Table:
     for heading in ("parameter", "value", "less nominal", "sigma", "unit"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
     for k, parameter in enumerate(list(result.parameters.values())[:12]):
-        table.add_row(*_row(parameter, result.fixed.get(parameter.symbol, "")), end_section=k % 4 == 3)
+        table.add_row(*parameter_row(parameter, result.fixed.get(parameter.symbol, "")), end_section=k % 4 == 3)
     return table
 
 
-def without_table(result: Calibration, found: OutlyingDwell) -> Table:
+def without_table(result: Calibration, outlying: OutlyingDwell) -> Table:
     """The table of the parameters fitted without an outlying dwell, and of their differences from those with it."""
-    table = Table(title=f"Without dwell {found.number} (1σ)", title_justify="left")
+    table = Table(title=f"Without dwell {outlying.number} (1σ)", title_justify="left")
     for heading in ("parameter", "value", "sigma", "unit", "less with it"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
-    pairs = zip(result.parameters.values(), found.without.parameters.values(), strict=True)
+    pairs = zip(result.parameters.values(), outlying.without.parameters.values(), strict=True)
     for k, (before, parameter) in enumerate(pairs):
-        name, value, _, sigma, unit = _row(parameter)
+        name, value, _, sigma, unit = parameter_row(parameter)
         known = parameter.value is not None and before.value is not None
         moved = shown(parameter).number(parameter.value - before.value) if known else ""  # type: ignore[operator]
         moved = moved if not moved or moved.startswith("-") else f"+{moved}"

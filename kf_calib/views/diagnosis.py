@@ -27,45 +27,45 @@ from kf_calib.views.tables import Table
 from kf_calib.views.terminal import note
 
 
-def diagnosis_object(found: Diagnosis) -> dict[str, Any]:
+def diagnosis_object(diagnosis: Diagnosis) -> dict[str, Any]:
     """The JSON object of ``diagnose``; its p-values are family-wise."""
-    going = found.next_orientation
-    return found_object(found) | {"next_orientation": None if going is None else orientation_object(*going)}
+    going = diagnosis.next_orientation
+    return found_object(diagnosis) | {"next_orientation": None if going is None else orientation_object(*going)}
 
 
-def found_object(found: Diagnosis) -> dict[str, Any]:
+def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
     """The same without the next orientation."""
-    named = found.missing[0] if found.missing else "noise" if found.noise else None
-    missing = "unknown" if found.unknown else named
+    named = diagnosis.missing[0] if diagnosis.missing else "noise" if diagnosis.noise else None
+    missing = "unknown" if diagnosis.unknown or diagnosis.unearned else named
     return clean(
         {
-            "consistent": found.test.consistent,
-            "p_value": found.test.p_value,
-            "verdict": verdict(found),
-            "model": [str(effect) for effect in found.before.model.effects],
+            "consistent": diagnosis.test.consistent,
+            "p_value": diagnosis.test.p_value,
+            "verdict": verdict(diagnosis),
+            "model": [str(effect) for effect in diagnosis.before.model.effects],
             "missing": missing,
-            "all_missing": list(found.missing),
-            "hypotheses": _hypotheses_object(found.table),
-            "families": [{"family": name, "probability": p} for name, p in found.table.families.items()]
-            if found.table
+            "all_missing": list(diagnosis.missing),
+            "hypotheses": _hypotheses_object(diagnosis.table),
+            "families": [{"family": name, "probability": p} for name, p in diagnosis.table.families.items()]
+            if diagnosis.table
             else [],
-            "suspects": [_suspect_object(each) for each in found.suspects],
-            "ambiguity_set": list(found.ambiguity),
-            "overlaps": found.overlaps,
-            "together": [list(pair) for pair in found.together],
-            "may_be_scatter": found.as_scatter,
-            "invisible": found.test.invisible,
-            "vibration_hz": [line.frequency_hz for line in found.test.lines.vibration],
-            "trend": _trend_object(found.test.trend),
+            "suspects": [_suspect_object(each) for each in diagnosis.suspects],
+            "ambiguity_set": list(diagnosis.ambiguity),
+            "overlaps": diagnosis.overlaps,
+            "together": [list(pair) for pair in diagnosis.together],
+            "may_be_scatter": diagnosis.as_scatter,
+            "invisible": diagnosis.test.invisible,
+            "vibration_hz": [line.frequency_hz for line in diagnosis.test.lines.vibration],
+            "trend": _trend_object(diagnosis.test.trend),
             "detectable": [
-                {"effect": each.name, "minimum": each.minimum, "unit": each.unit} for each in found.detectable
+                {"effect": each.name, "minimum": each.minimum, "unit": each.unit} for each in diagnosis.detectable
             ],
-            "unknown": description_object(found.description),
-            "held_out_rms_mps2": found.before.held_out_rms_mps2,
-            "held_out_floor_mps2": found.before.held_out_floor_mps2,
-            "readings": readings_object(found.before.readings),
-            "outlying_dwells": [outlying_object(each) for each in found.before.outlying],
-            "warnings": list(found.before.warnings),
+            "unknown": description_object(diagnosis.description),
+            "held_out_rms_mps2": diagnosis.before.held_out_rms_mps2,
+            "held_out_floor_mps2": diagnosis.before.held_out_floor_mps2,
+            "readings": readings_object(diagnosis.before.readings),
+            "outlying_dwells": [outlying_object(each) for each in diagnosis.before.outlying],
+            "warnings": list(diagnosis.before.warnings),
         }
     )
 
@@ -136,34 +136,34 @@ def _suspect_object(suspect: Suspect) -> dict[str, Any]:
     }
 
 
-def verdict(found: Diagnosis) -> str:
+def verdict(diagnosis: Diagnosis) -> str:
     """The verdict in one or two sentences; if the model is rejected, faults of the readings that bias it come first."""
-    first = found.before.readings.biasing if found.test.consistent is False else []
-    return " ".join([*(sentence[0].upper() + sentence[1:] for sentence in first), found.verdict])
+    first = diagnosis.before.readings.biasing if diagnosis.test.consistent is False else []
+    return " ".join([*(sentence[0].upper() + sentence[1:] for sentence in first), diagnosis.verdict])
 
 
-def _notes(found: Diagnosis) -> list[str]:
+def _notes(diagnosis: Diagnosis) -> list[str]:
     """Return the warnings of the calibration that the verdict does not contain."""
-    said = verdict(found)
+    said = verdict(diagnosis)
     # compared without the first letter, which is a capital where the warning begins a sentence
-    return [warning for warning in found.before.warnings if warning[1:] not in said]
+    return [warning for warning in diagnosis.before.warnings if warning[1:] not in said]
 
 
-def diagnosis_report(found: Diagnosis) -> RenderableType:
+def diagnosis_report(diagnosis: Diagnosis) -> RenderableType:
     """The report that ``diagnose`` prints: the verdict, then the evidence for it."""
-    style = {True: "bold green", False: "bold yellow", None: "bold"}[found.test.consistent]
-    parts: list[RenderableType] = [Text(verdict(found), style=style), *map(Text, of_what_p_is(found))]
-    readings = found.before.readings
+    style = {True: "bold green", False: "bold yellow", None: "bold"}[diagnosis.test.consistent]
+    parts: list[RenderableType] = [Text(verdict(diagnosis), style=style), *map(Text, of_what_p_is(diagnosis))]
+    readings = diagnosis.before.readings
     if readings.findings:
         parts.append(Text(f"In the readings: {'; '.join(readings.findings)}."))
-    if found.table and found.test.consistent is False:
-        parts.append(_hypothesis_table(found.table))
-    if found.suspects:
-        parts.append(_suspect_table(found))
-    if found.test.consistent is False:
-        parts.append(_dwell_table(found))
-    trend = found.test.trend
-    if found.test.consistent is False and trend and trend.p_value < LEVEL:
+    if diagnosis.table and diagnosis.test.consistent is False:
+        parts.append(_hypothesis_table(diagnosis.table))
+    if diagnosis.suspects:
+        parts.append(_suspect_table(diagnosis))
+    if diagnosis.test.consistent is False:
+        parts.append(_dwell_table(diagnosis))
+    trend = diagnosis.test.trend
+    if diagnosis.test.consistent is False and trend and trend.p_value < LEVEL:
         dwell, channel = trend.most
         parts.append(
             Text(
@@ -171,32 +171,32 @@ def diagnosis_report(found: Diagnosis) -> RenderableType:
                 f"power of noise (p {format_p(trend.p_value)}), most in dwell {dwell}, accelerometer {channel}."
             )
         )
-    unknown, going = found.description, found.next_orientation
+    unknown, going = diagnosis.description, diagnosis.next_orientation
     if unknown is not None:
         parts.append(Text(description_sentence(unknown, unknown.formulas)))
-    if found.test.lines.vibration:
-        seen = ", ".join(f"{line.frequency_hz:.4g}" for line in found.test.lines.vibration)
-        averaged = found.before.fit.dwells[0].averaged
+    if diagnosis.test.lines.vibration:
+        seen = ", ".join(f"{line.frequency_hz:.4g}" for line in diagnosis.test.lines.vibration)
+        averaged = diagnosis.before.fit.dwells[0].averaged
         treated = "the tests use averages that suppress it" if averaged else "it counts as noise"
         parts.append(Text(f"Vibration at {seen} Hz changes its amplitude during the run, so {treated}."))
     if going is not None:
         angles = ", ".join(f"{angle:g}" for angle in going[0].gimbal_deg)
         parts.append(Text(f"Next orientation: gimbals at {angles} deg: {going[1]}."))
-    if found.test.invisible:
-        parts.append(Text(f"Effects that this run cannot show: {', '.join(found.test.invisible)}."))
-    parts.append(_detectable_table(found.detectable))
-    parts += map(note, _notes(found))
+    if diagnosis.test.invisible:
+        parts.append(Text(f"Effects that this run cannot show: {', '.join(diagnosis.test.invisible)}."))
+    parts.append(_detectable_table(diagnosis.detectable))
+    parts += map(note, _notes(diagnosis))
     return Group(*parts)
 
 
-def of_what_p_is(found: Diagnosis) -> list[str]:
+def of_what_p_is(diagnosis: Diagnosis) -> list[str]:
     """Sentences on what the p-value of a run means, and on that of the misfit as a whole, which ``replay`` prints.
 
     Empty where nothing could be tested.
     """
-    if found.test.p_value is None:
+    if diagnosis.test.p_value is None:
         return []
-    alone = found.before.consistency.p_value
+    alone = diagnosis.before.consistency.p_value
     overall = "" if alone is None else f" For the misfit as a whole, which replay prints, p {format_p(alone)}."
     return [
         "p of the run is the probability that noise alone looks as significant in any tested effect, in the misfit as "
@@ -205,9 +205,9 @@ def of_what_p_is(found: Diagnosis) -> list[str]:
 
 
 @printed.register
-def plain_report(found: Diagnosis) -> str:
+def plain_report(diagnosis: Diagnosis) -> str:
     """The text of a diagnosis that ``print`` shows."""
-    return plain(diagnosis_report(found))
+    return plain(diagnosis_report(diagnosis))
 
 
 def _hypothesis_table(table: HypothesisTable) -> Table:
@@ -229,41 +229,41 @@ def name_of(row: Hypothesis) -> str:
     return " + ".join(row.effects) or (f"{row.driver} changes" if row.driver else row.families[0])
 
 
-def _suspect_table(found: Diagnosis) -> Table:
+def _suspect_table(diagnosis: Diagnosis) -> Table:
     """Return the table of the suspects with their coefficients."""
     title = "Suspects (1σ; p: noise alone lets some effect explain as much; held out: rms over noise floor)"
     table = Table(title=title, title_justify="left")
     for heading in ("effect", "p", "χ² / dof", "fits", "symbol", "value", "sigma", "unit", "held out"):
         left = heading in ("effect", "fits", "symbol", "unit")
         table.add_column(heading, justify="left" if left else "right", no_wrap=heading == "effect")
-    for suspect in found.suspects:
+    for suspect in diagnosis.suspects:
         rms, floor = suspect.refit.held_out_rms_mps2, suspect.refit.held_out_floor_mps2
         ratio = f"{rms / floor:.2f}" if rms is not None and floor else ""
         head = [suspect.name, format_p(suspect.p_value).removeprefix("= "), f"{suspect.statistic:.1f} / {suspect.dof}",
                 "yes" if suspect.fits else "no"]  # fmt: skip
         for k, p in enumerate(suspect.coefficients):
-            own = head if k == 0 else [""] * 4
+            first_cells = head if k == 0 else [""] * 4
             if p.value is None or p.sigma is None:
-                table.add_row(*own, symbol(p.symbol), "not seen", "", "", ratio if k == 0 else "")
+                table.add_row(*first_cells, symbol(p.symbol), "not seen", "", "", ratio if k == 0 else "")
                 continue
             unit = shown(p)
             value, sigma = unit.rounded(p.value, p.sigma)
-            table.add_row(*own, symbol(p.symbol), value, f"± {sigma}", unit.label, ratio if k == 0 else "")
+            table.add_row(*first_cells, symbol(p.symbol), value, f"± {sigma}", unit.label, ratio if k == 0 else "")
         table.add_section()
     return table
 
 
-def _dwell_table(found: Diagnosis) -> Table:
+def _dwell_table(diagnosis: Diagnosis) -> Table:
     """Return the table of the dwells that disagree most: their residuals over the sigma of their means."""
     table = Table(title="Where it fails: residual / σ of the dwell's mean", title_justify="left")
-    place = "gimbals, deg" if found.before.bench.axes else "up, in its axes"
+    place = "gimbals, deg" if diagnosis.before.bench.axes else "up, in its axes"
     for heading in ("dwell", "at s", place, "1", "2", "3"):
         table.add_column(heading, justify="right")
-    ratios = found.residual_ratios
+    ratios = diagnosis.residual_ratios
     for k in np.argsort(-np.abs(ratios).max(axis=1))[:5].tolist():
-        dwell = found.before.visits[k].dwell
-        own = _place(dwell, bool(found.before.bench.axes))
-        table.add_row(str(dwell.number), f"{dwell.start_s:.0f}", own, *(f"{ratio:+.1f}" for ratio in ratios[k]))
+        dwell = diagnosis.before.visits[k].dwell
+        orientation = _place(dwell, bool(diagnosis.before.bench.axes))
+        table.add_row(str(dwell.number), f"{dwell.start_s:.0f}", orientation, *(f"{ratio:+.1f}" for ratio in ratios[k]))
     return table
 
 

@@ -26,18 +26,18 @@ _SHOWN = 12
 
 
 def applied_object(
-    correction: Correction, found: Applied, out: Path, warnings: Sequence[str], topic: bool = True
+    correction: Correction, applied: Applied, path: Path, warnings: Sequence[str], topic: bool = True
 ) -> dict[str, Any]:
     """The JSON object of ``apply``."""
     return clean(
         {
-            "out": str(out),
+            "out": str(path),
             "topic": CALIBRATED_TOPIC if topic else None,
-            "readings": found.readings,
-            "not_finite": found.not_finite,
+            "readings": applied.readings,
+            "not_finite": applied.not_finite,
             "corrected": [str(effect) for effect in correction.effects],
             "left_out": correction.left_out,
-            "temperature_c": found.temperature_c,
+            "temperature_c": applied.temperature_c,
             "sigma_mps2": correction.worst_sigma_mps2,
             "warnings": list(warnings),
         }
@@ -45,41 +45,41 @@ def applied_object(
 
 
 def applied_report(
-    correction: Correction, found: Applied, out: Path, warnings: Sequence[str], topic: bool = True
+    correction: Correction, applied: Applied, path: Path, warnings: Sequence[str], topic: bool = True
 ) -> RenderableType:
     """The report of ``apply``."""
-    place = f"{CALIBRATED_TOPIC} in {out}" if topic else str(out)
+    place = f"{CALIBRATED_TOPIC} in {path}" if topic else str(path)
     names = ", ".join(["alignment, scale factor and bias", *map(str, correction.effects)])
-    lines = [Text(f"{found.readings} readings corrected for {names}: {place}.", style="bold")]
+    lines = [Text(f"{applied.readings} readings corrected for {names}: {place}.", style="bold")]
     unit = shown("m/s^2")
     sigma = ", ".join(unit.number(each, 2) for each in correction.worst_sigma_mps2)
     lines.append(Text(f"Uncertainty by the calibration (1σ, at most, at 1 g): {sigma} {unit.label} along x, y, z."))
-    if found.temperature_c is not None:
-        low, high = found.temperature_c
+    if applied.temperature_c is not None:
+        low, high = applied.temperature_c
         lines.append(Text(f"Temperature {low:.1f} to {high:.1f} °C."))
     lines += [note(f"{name} is not corrected: {why}") for name, why in correction.left_out.items()]
-    if found.not_finite:
-        lines.append(note(f"{found.not_finite} readings are not finite, and stay so"))
+    if applied.not_finite:
+        lines.append(note(f"{applied.not_finite} readings are not finite, and stay so"))
     return Group(*lines, *map(note, warnings))
 
 
-def verification_object(found: Verification) -> dict[str, Any]:
+def verification_object(verification: Verification) -> dict[str, Any]:
     """The JSON object of ``verify``."""
     return clean(
         {
-            "holds": found.holds,
-            "p_value": found.p_value,
-            "statistic": found.statistic,
-            "dof": found.dof,
-            "dwells": found.dwells,
-            "moved": [_move_object(move) for move in found.moved],
-            "compared": [_move_object(move) for move in found.moves],
-            "residual_rms_mps2": found.residual_rms_mps2,
-            "worst_error_mps2": found.worst_mps2,
-            "worst_error_sigma_mps2": found.worst_sigma_mps2,
-            "not_compared": list(found.free),
-            "new_consistent": None if found.new is None else found.new.consistency.consistent,
-            "warnings": list(found.warnings),
+            "holds": verification.holds,
+            "p_value": verification.p_value,
+            "statistic": verification.statistic,
+            "dof": verification.dof,
+            "dwells": verification.dwells,
+            "moved": [_move_object(move) for move in verification.moved],
+            "compared": [_move_object(move) for move in verification.moves],
+            "residual_rms_mps2": verification.residual_rms_mps2,
+            "worst_error_mps2": verification.worst_mps2,
+            "worst_error_sigma_mps2": verification.worst_sigma_mps2,
+            "not_compared": list(verification.free),
+            "new_consistent": None if verification.new is None else verification.new.consistency.consistent,
+            "warnings": list(verification.warnings),
         }
     )
 
@@ -90,35 +90,35 @@ def _move_object(move: Any) -> dict[str, Any]:
             "p_value": move.p_value}  # fmt: skip
 
 
-def verification_report(found: Verification) -> RenderableType:
+def verification_report(verification: Verification) -> RenderableType:
     """The report of ``verify``."""
-    head = "The calibration still holds" if found.holds else "The calibration does NOT hold any more"
-    style = "bold green" if found.holds else "bold yellow"
-    dwells = f"{found.dwells} dwell{'s' * (found.dwells != 1)}"
-    test = f"p {format_p(found.p_value)}; {dwells}, χ² {found.statistic:.1f} of {found.dof} dof"
+    head = "The calibration still holds" if verification.holds else "The calibration does NOT hold any more"
+    style = "bold green" if verification.holds else "bold yellow"
+    dwells = f"{verification.dwells} dwell{'s' * (verification.dwells != 1)}"
+    test = f"p {format_p(verification.p_value)}; {dwells}, χ² {verification.statistic:.1f} of {verification.dof} dof"
     parts: list[RenderableType] = [Text(f"{head} ({test}).", style=style)]
     unit = shown("m/s^2")
-    parts.append(Text(f"It predicts the means of the dwells to {unit.text(found.residual_rms_mps2)} rms."))
-    if found.worst_mps2 is not None and found.worst_sigma_mps2 is not None:
-        worst, sigma = unit.rounded(found.worst_mps2, found.worst_sigma_mps2)
+    parts.append(Text(f"It predicts the means of the dwells to {unit.text(verification.residual_rms_mps2)} rms."))
+    if verification.worst_mps2 is not None and verification.worst_sigma_mps2 is not None:
+        worst, sigma = unit.rounded(verification.worst_mps2, verification.worst_sigma_mps2)
         parts.append(Text(f"Readings corrected by it are wrong by up to {worst} ± {sigma} {unit.label} now."))
-    if found.moves:
-        parts.append(_moves_table(found))
+    if verification.moves:
+        parts.append(_moves_table(verification))
     else:
         parts.append(note("the new orientations determine no parameter by themselves, so none is compared"))
-    if found.new is not None and found.new.consistency.consistent is False:
+    if verification.new is not None and verification.new.consistency.consistent is False:
         parts.append(note("the new run does not agree with the model by itself: diagnose it before you trust the rest"))
-    parts += [note(f"{name} was not compared: it belongs to the run or the platform") for name in found.free]
-    return Group(*parts, *map(note, found.warnings))
+    parts += [note(f"{name} was not compared: it belongs to the run or the platform") for name in verification.free]
+    return Group(*parts, *map(note, verification.warnings))
 
 
-def _moves_table(found: Verification) -> Table:
+def _moves_table(verification: Verification) -> Table:
     """Return the table of the parameters that were compared, the clearest changes first."""
     table = Table(title="Changes (1σ of both; p: that none of them has moved)", title_justify="left")
     for heading in ("parameter", "change", "sigma", "unit", "change / sigma", "p", ""):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit", "") else "right")
-    moved = set(found.moved)
-    for move in found.moves[:_SHOWN]:
+    moved = set(verification.moved)
+    for move in verification.moves[:_SHOWN]:
         unit = shown(move.unit)
         change, sigma = unit.rounded(move.difference, move.sigma)
         sign = "" if change.startswith("-") else "+"
@@ -129,17 +129,17 @@ def _moves_table(found: Verification) -> Table:
     return table
 
 
-def history_object(found: History) -> dict[str, Any]:
+def history_object(history: History) -> dict[str, Any]:
     """The JSON object of ``history``; drift in SI per day."""
     return clean(
         {
-            "serial": found.serial or None,
-            "dates": [date.isoformat() for date in found.dates],
-            "parameters": [_track_object(track) for track in found.tracks],
-            "tolerances": dict(found.tolerances),
-            "due": None if found.due is None else found.due.isoformat(),
-            "due_by": found.due_by or None,
-            "warnings": list(found.warnings),
+            "serial": history.serial or None,
+            "dates": [date.isoformat() for date in history.dates],
+            "parameters": [_track_object(track) for track in history.tracks],
+            "tolerances": dict(history.tolerances),
+            "due": None if history.due is None else history.due.isoformat(),
+            "due_by": history.due_by or None,
+            "warnings": list(history.warnings),
         }
     )
 
@@ -154,30 +154,30 @@ def _track_object(track: Track) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def history_report(found: History) -> RenderableType:
+def history_report(history: History) -> RenderableType:
     """The report of ``history``."""
-    of = f" of {found.serial}" if found.serial else ""
-    first, last = found.dates[0].date(), found.dates[-1].date()
-    parts: list[RenderableType] = [Text(f"{len(found.dates)} calibrations{of}, {first} to {last}.", style="bold")]
+    of = f" of {history.serial}" if history.serial else ""
+    first, last = history.dates[0].date(), history.dates[-1].date()
+    parts: list[RenderableType] = [Text(f"{len(history.dates)} calibrations{of}, {first} to {last}.", style="bold")]
     table = Table(title="Change over the calibrations (1σ; p: that a constant differs so much)", title_justify="left")
     for heading in ("parameter", "last less first", "drift a year", "repeatability", "walk in a year", "unit", "p"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
-    for track in found.tracks:
+    for track in history.tracks:
         table.add_row(*_track_row(track))
     parts.append(table)
-    if found.due is not None:
-        parts.append(Text(_next_calibration(found, found.due), style="bold"))
-    elif found.tolerances and all(track.drift is not None for track in found.tracks):
+    if history.due is not None:
+        parts.append(Text(_next_calibration(history, history.due), style="bold"))
+    elif history.tolerances and all(track.drift is not None for track in history.tracks):
         parts.append(Text("No tolerance is left within twenty years, as far as these calibrations can tell."))
-    return Group(*parts, *map(note, found.warnings))
+    return Group(*parts, *map(note, history.warnings))
 
 
-def _next_calibration(found: History, due: datetime) -> str:
+def _next_calibration(history: History, due: datetime) -> str:
     """Return when the next calibration is due, and why."""
-    what = symbol(found.due_by)
-    if due > found.dates[-1]:
+    what = symbol(history.due_by)
+    if due > history.dates[-1]:
         return f"Calibrate again by {due.date()}: {what} may leave its tolerance then (2σ)."
-    if any(track.drift is None for track in found.tracks):
+    if any(track.drift is None for track in history.tracks):
         return f"{what} may be beyond its tolerance at once (2σ): its repeatability is not better than that."
     return f"Calibrate again now: {what} may be beyond its tolerance already (2σ)."
 

@@ -14,12 +14,12 @@ from kf_calib.views.json import clean
 from kf_calib.views.terminal import note
 
 
-def exported_object(target: Target, to: str, out: Path) -> dict[str, Any]:
+def exported_object(target: Target, to: str, path: Path) -> dict[str, Any]:
     """The JSON object of ``export``."""
     left = target.error_left
     return clean(
         {
-            "out": str(out),
+            "out": str(path),
             "format": to,
             "lost": list(target.lost),
             "left_out": target.correction.left_out,

@@ -63,10 +63,10 @@ def fleet_report(
     """The report of ``fleet``."""
     failures = fleet.failures()
     counts = ", ".join(f"{count} {verdict}" for verdict, count in fleet.verdicts().items())
-    each = f", {done.cpu_s / done.evaluated:.2g} s of processor time each" if done.evaluated else ""
+    cost = f", {done.cpu_s / done.evaluated:.2g} s of processor time each" if done.evaluated else ""
     parts: list[RenderableType] = [
         Text(f"{len(fleet)} runs in {fleet.path}: {counts}.", style="bold"),
-        Text(f"{done.evaluated} evaluated now{each}; {done.kept} were there already."),
+        Text(f"{done.evaluated} evaluated now{cost}; {done.kept} were there already."),
         *([_population_table(populations)] if populations else []),
     ]
     parts += [note(said) for said in done.notes]
@@ -95,8 +95,11 @@ def _population_table(populations: Sequence[ParameterPopulation]) -> Table:
     table = Table(title="Parameters over the runs (spread, sigma: 1σ)", title_justify="left")
     for heading in ("parameter", "runs", "median less nominal", "spread", "sigma of a run", "unit"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
-    for each in populations:
-        unit = shown(each.unit)
-        cells = (unit.number(value, 3) for value in (each.median - each.nominal, each.spread, each.sigma))
-        table.add_row(symbol(each.symbol), str(each.runs), *cells, unit.label)
+    for population in populations:
+        unit = shown(population.unit)
+        cells = (
+            unit.number(value, 3)
+            for value in (population.median - population.nominal, population.spread, population.sigma)
+        )
+        table.add_row(symbol(population.symbol), str(population.runs), *cells, unit.label)
     return table

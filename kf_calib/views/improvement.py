@@ -58,24 +58,24 @@ def improvement_object(
             "ambiguity_set": [each.name for each in state.alternatives],
             "alternatives": [
                 {
-                    "effect": each.name,
-                    "residual_rms_mps2": each.result.residual_rms_mps2,
-                    "held_out_rms_mps2": each.result.held_out_rms_mps2,
-                    "held_out_floor_mps2": each.result.held_out_floor_mps2,
-                    "parameters": _parameters(each.result),
+                    "effect": alternative.name,
+                    "residual_rms_mps2": alternative.result.residual_rms_mps2,
+                    "held_out_rms_mps2": alternative.result.held_out_rms_mps2,
+                    "held_out_floor_mps2": alternative.result.held_out_floor_mps2,
+                    "parameters": _parameters(alternative.result),
                 }
-                for each in state.alternatives
+                for alternative in state.alternatives
             ],
             "spread": [
                 {
-                    "symbol": each.parameter.symbol,
-                    "lowest": each.lowest,
-                    "highest": each.highest,
-                    "sigma": each.parameter.sigma,
-                    "unit": each.parameter.unit,
-                    "sigmas": each.sigmas,
+                    "symbol": spread.parameter.symbol,
+                    "lowest": spread.lowest,
+                    "highest": spread.highest,
+                    "sigma": spread.parameter.sigma,
+                    "unit": spread.parameter.unit,
+                    "sigmas": spread.sigmas,
                 }
-                for each in state.spreads
+                for spread in state.spreads
             ],
             "unknown": description_object(unknown),
             "next_orientation": None if going is None else orientation_object(*going),
@@ -87,12 +87,12 @@ def improvement_object(
     )
 
 
-def _figures(found: Diagnosis) -> dict[str, Any]:
+def _figures(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the p-value and the errors of a diagnosed model."""
-    result = found.before
+    result = diagnosis.before
     return {
-        "p_value": found.test.p_value,
-        "consistent": found.test.consistent,
+        "p_value": diagnosis.test.p_value,
+        "consistent": diagnosis.test.consistent,
         "residual_rms_mps2": result.residual_rms_mps2,
         "held_out_rms_mps2": result.held_out_rms_mps2,
         "held_out_floor_mps2": result.held_out_floor_mps2,
@@ -119,11 +119,11 @@ def _step_object(step: SelectionStep, before: Diagnosis) -> dict[str, Any]:
     }
 
 
-def _removal_object(each: Removal) -> dict[str, Any]:
+def _removal_object(removal: Removal) -> dict[str, Any]:
     """Return the test of removing an effect as a JSON object."""
     return {
-        "effect": each.name, "statistic": each.statistic, "dof": each.dof, "p_value": each.p_value,
-        "needed": each.needed,
+        "effect": removal.name, "statistic": removal.statistic, "dof": removal.dof, "p_value": removal.p_value,
+        "needed": removal.needed,
     }  # fmt: skip
 
 
@@ -214,10 +214,11 @@ def _out(each: Removal) -> str:
     return f"{each.name} was taken out: {_test(each)}."
 
 
-def _test(each: Removal) -> str:
+def _test(removal: Removal) -> str:
     """Return the test of removing an effect in words."""
-    word = "needed" if each.needed else "not needed"
-    return f"without {each.name} χ² rises by {each.statistic:.1f}, {each.dof} dof (p {format_p(each.p_value)}): {word}"
+    word = "needed" if removal.needed else "not needed"
+    p_value = format_p(removal.p_value)
+    return f"without {removal.name} χ² rises by {removal.statistic:.1f}, {removal.dof} dof (p {p_value}): {word}"
 
 
 def _spread_table(state: Improvement) -> Table:
@@ -231,25 +232,27 @@ def _spread_table(state: Improvement) -> Table:
     return table
 
 
-def _spread_row(each: Spread) -> tuple[str, ...]:
+def _spread_row(spread: Spread) -> tuple[str, ...]:
     """Return the row of one parameter in that table."""
-    own = each.parameter
-    unit = shown(own)
-    low, high = (unit.rounded(value - own.nominal, own.sigma or 0.0) for value in (each.lowest, each.highest))
-    return symbol(own.symbol), low[0], high[0], f"± {low[1]}", unit.label, f"{each.sigmas:.1f}"
+    parameter = spread.parameter
+    unit = shown(parameter)
+    low, high = (
+        unit.rounded(value - parameter.nominal, parameter.sigma or 0.0) for value in (spread.lowest, spread.highest)
+    )
+    return symbol(parameter.symbol), low[0], high[0], f"± {low[1]}", unit.label, f"{spread.sigmas:.1f}"
 
 
 def _settling(state: Improvement) -> list[str]:
     """Return sentences on what would settle an inconsistent run: a formula to try, an orientation to visit."""
     if state.diagnosis.test.consistent is not False:
         return []
-    unknown, going, out = state.diagnosis.description, state.diagnosis.next_orientation, list[str]()
+    unknown, going, sentences = state.diagnosis.description, state.diagnosis.next_orientation, list[str]()
     if unknown is not None:
-        out.append(description_sentence(unknown, [unknown.formula]))
+        sentences.append(description_sentence(unknown, [unknown.formula]))
     if going is not None:
         angles = ", ".join(f"{angle:g}" for angle in going[0].gimbal_deg)
-        out.append(f"Next orientation: gimbals at {angles} deg: {going[1]}.")
-    return out
+        sentences.append(f"Next orientation: gimbals at {angles} deg: {going[1]}.")
+    return sentences
 
 
 def honest_sentence(honest: NestedCrossValidation) -> str:
@@ -268,22 +271,22 @@ def choices_table(state: Improvement, choices: Sequence[tuple[str, ...]]) -> Ren
     return Group(progress(state), Text(state.diagnosis.verdict, style="bold"), *_numbered(state.diagnosis, choices))
 
 
-def _numbered(found: Diagnosis, choices: Sequence[tuple[str, ...]]) -> list[RenderableType]:
+def _numbered(diagnosis: Diagnosis, choices: Sequence[tuple[str, ...]]) -> list[RenderableType]:
     """Return the table of the choices, or nothing where there are none."""
     if not choices:
         return []
-    refits = {suspect.name: suspect for suspect in found.suspects}
+    refits = {suspect.name: suspect for suspect in diagnosis.suspects}
     table = Table(box=None, pad_edge=False)
     for heading in ("", "suspect", "probability", "p of the run", "fits", "held out"):
         table.add_column(heading, justify="right" if heading in ("", "probability", "held out") else "left")
     for number, names in enumerate(choices, start=1):
         suspect = refits.get(names[0]) if len(names) == 1 else None
-        result = suspect.refit if suspect is not None else found.after
+        result = suspect.refit if suspect is not None else diagnosis.after
         p_value = "" if suspect is None else format_p(suspect.p_value).removeprefix("= ")
         ratio = "" if result is None or result.held_out_rms_mps2 is None or not result.held_out_floor_mps2 else (
             f"{result.held_out_rms_mps2 / result.held_out_floor_mps2:.2f}"
         )  # fmt: skip
         fits = "yes" if suspect is None or suspect.fits else "no"
-        share = "" if found.table is None else format_probability(found.table.probability(names))
+        share = "" if diagnosis.table is None else format_probability(diagnosis.table.probability_of_just(names))
         table.add_row(str(number), " + ".join(names), share, p_value, fits, ratio)
     return [table]

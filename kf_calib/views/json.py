@@ -74,24 +74,24 @@ def frame_object(result: Calibration) -> dict[str, Any] | None:
     }
 
 
-def outlying_object(found: OutlyingDwell) -> dict[str, Any]:
+def outlying_object(outlying: OutlyingDwell) -> dict[str, Any]:
     """A dwell that alone does not fit, the gimbal errors that would explain it, and the parameters without it."""
     return {
-        "dwell": found.number,
-        "gimbal_deg": np.degrees(found.dwell.recorded_pose) if found.without.bench.axes else None,
-        "error_mps2": found.error_mps2,
-        "p_value": found.p_value,
-        "turns": [vars(turn) | {"gimbal": turn.gimbal + 1} for turn in found.turns],
-        "without": {"p_value": found.without.consistency.p_value, "parameters": parameters_object(found.without)},
+        "dwell": outlying.number,
+        "gimbal_deg": np.degrees(outlying.dwell.recorded_pose) if outlying.without.bench.axes else None,
+        "error_mps2": outlying.error_mps2,
+        "p_value": outlying.p_value,
+        "turns": [vars(turn) | {"gimbal": turn.gimbal + 1} for turn in outlying.turns],
+        "without": {"p_value": outlying.without.consistency.p_value, "parameters": parameters_object(outlying.without)},
     }
 
 
-def readings_object(found: Readings) -> dict[str, Any]:
+def readings_object(readings: Readings) -> dict[str, Any]:
     """Quantisation, saturation and outliers of the readings."""
     return {
-        "quantisation": [{**vars(each), "rms_mps2": each.rms_mps2} for each in found.quantisation],
-        "saturation": [vars(each) for each in found.saturation],
-        "outliers": vars(found.outliers),
+        "quantisation": [{**vars(each), "rms_mps2": each.rms_mps2} for each in readings.quantisation],
+        "saturation": [vars(each) for each in readings.saturation],
+        "outliers": vars(readings.outliers),
     }
 
 

@@ -37,7 +37,7 @@ def live_object(judgement: Judgement, standing: Standing, status: Status | None)
     """
     left = dict(zip(paper_parameters.SYMBOLS, judgement.left_s, strict=True))
     wanted = dict(zip(paper_parameters.SYMBOLS, judgement.wanted, strict=True))
-    own = {
+    of_live = {
         "consistent": judgement.consistent,
         "p_value": judgement.p_value,
         "final": judgement.final,
@@ -52,7 +52,7 @@ def live_object(judgement: Judgement, standing: Standing, status: Status | None)
         "notice": standing.notice,
         "source": source_object(status),
     }
-    return found_object(judgement.diagnosis) | replay_object(judgement.result) | clean(own)
+    return found_object(judgement.diagnosis) | replay_object(judgement.result) | clean(of_live)
 
 
 def _going(judgement: Judgement) -> dict[str, Any] | None:
@@ -122,24 +122,24 @@ def link(standing: Progress, status: Status | None, name: str, recording: str) -
     """Return the lines about the source and the recording."""
     if status is None:
         return Text(f"{name}: {standing.samples} readings")
-    out = Text.assemble((name if len(name) <= _NAME else f"{name[:_NAME]}...", "bold"), " ")
-    out.append(status.link, {"live": "green", "lost": "bold red"}.get(status.link, "yellow"))
-    out.append(f"  {status.rate_hz:.0f} Hz  {status.samples} readings")
+    text = Text.assemble((name if len(name) <= _NAME else f"{name[:_NAME]}...", "bold"), " ")
+    text.append(status.link, {"live": "green", "lost": "bold red"}.get(status.link, "yellow"))
+    text.append(f"  {status.rate_hz:.0f} Hz  {status.samples} readings")
     counts = {"gaps": status.gaps, "refused": status.refused, "reconnects": status.reconnects,
               "missing": status.missing, "left out": status.left_out, "dropped": status.dropped}  # fmt: skip
     for word, count in counts.items():
         style = "red" if word in ("missing", "left out", "dropped") else "yellow"
         if count or word in ("gaps", "refused"):
-            out.append(f"  {count} {word}", style if count else "")
+            text.append(f"  {count} {word}", style if count else "")
     for trouble in (status.trouble, status.clock_trouble):
         if trouble:
-            out.append(f"\n{sentence(trouble)}", "bold red")
+            text.append(f"\n{sentence(trouble)}", "bold red")
     if status.recording_trouble:
-        out.append(f"\nRECORDING HAS STOPPED: {sentence(status.recording_trouble)}", "bold white on red")
+        text.append(f"\nRECORDING HAS STOPPED: {sentence(status.recording_trouble)}", "bold white on red")
     if recording and not status.recording_trouble:
         age = "" if status.sync_age_s is None else f", on the disk up to {status.sync_age_s:.1f} s ago"
-        out.append(f"\nrecording {recording}: {status.recorded} readings{age}")
-    return out
+        text.append(f"\nrecording {recording}: {status.recorded} readings{age}")
+    return text
 
 
 def _here(standing: Standing) -> Text:
@@ -148,12 +148,12 @@ def _here(standing: Standing) -> Text:
     if here is None:
         return Text(f"{standing.dwells} dwells in {span(standing.elapsed_s)}; moving or settling")
     angles = _angles(np.degrees(here.pose)) if len(here.pose) < 4 else "attitude"
-    out = Text(f"orientation {here.number} at {angles} deg: {span(here.seconds)}, {here.readings} readings")
+    text = Text(f"orientation {here.number} at {angles} deg: {span(here.seconds)}, {here.readings} readings")
     if here.enough:
-        out.append(": enough, go on", "bold green")
+        text.append(": enough, go on", "bold green")
     elif here.enough is False:
-        out.append(": stay, its sigmas still fall")
-    return out
+        text.append(": stay, its sigmas still fall")
+    return text
 
 
 def _sigmas(standing: Standing) -> RenderableType:

@@ -33,7 +33,7 @@ def hand_object(judgement: HandJudgement, standing: HandStanding, status: Status
     sides, result, last = judgement.sides, judgement.result, judgement.dwells[-1]
     known = {"samples": standing.samples, "dwells": len(judgement.dwells)} if result is None else replay_object(result)
     wanted = dict(zip(paper_parameters.SYMBOLS, judgement.wanted, strict=True))
-    own = {
+    of_hand = {
         "consistent": judgement.consistent,
         "p_value": None if result is None else result.consistency.p_value,
         "final": judgement.final,
@@ -48,7 +48,7 @@ def hand_object(judgement: HandJudgement, standing: HandStanding, status: Status
         "notice": standing.notice,
         "source": source_object(status),
     }
-    return known | clean(own)
+    return known | clean(of_hand)
 
 
 def hand_line(judgement: HandJudgement) -> str:

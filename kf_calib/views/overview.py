@@ -37,15 +37,16 @@ class Overview:
     warnings: list[str] = field(default_factory=list[str])
 
 
-def overview_object(found: Overview) -> dict[str, Any]:
+def overview_object(overview: Overview) -> dict[str, Any]:
     """One JSON object."""
-    own = found.inventory
+    inventory = overview.inventory
     return clean(
         {
-            "recording": str(own.path), "format": own.format, "files": [str(file) for file in own.files],
-            "bytes": own.size, "topics": [_topic_object(topic) for topic in own.topics], "bench": found.bench,
-            "dwells": None if found.dwells is None else [vars(dwell) for dwell in found.dwells],
-            "missing": found.missing, "command": found.command, "warnings": found.warnings,
+            "recording": str(inventory.path), "format": inventory.format,
+            "files": [str(file) for file in inventory.files], "bytes": inventory.size,
+            "topics": [_topic_object(topic) for topic in inventory.topics], "bench": overview.bench,
+            "dwells": None if overview.dwells is None else [vars(dwell) for dwell in overview.dwells],
+            "missing": overview.missing, "command": overview.command, "warnings": overview.warnings,
         }
     )  # fmt: skip
 
@@ -59,25 +60,26 @@ def _topic_object(topic: Topic) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def overview_report(found: Overview) -> RenderableType:
+def overview_report(overview: Overview) -> RenderableType:
     """What ``info`` prints."""
-    own = found.inventory
-    files = f"{len(own.files)} files, " if len(own.files) > 1 else ""
+    inventory = overview.inventory
+    kind = _FORMATS.get(inventory.format, inventory.format)
+    files = f"{len(inventory.files)} files, " if len(inventory.files) > 1 else ""
     parts: list[RenderableType] = [
-        Text(f"{own.path}: {_FORMATS.get(own.format, own.format)}, {files}{own.size / 1e6:.3g} MB"),
-        _topic_table(own.topics),
+        Text(f"{inventory.path}: {kind}, {files}{inventory.size / 1e6:.3g} MB"),
+        _topic_table(inventory.topics),
     ]
-    for topic in own.topics:
+    for topic in inventory.topics:
         if topic.paths:
             more = " ..." * (len(topic.paths) > _PATHS)
             parts.append(Text(f"A message of {topic.name} has {', '.join(topic.paths[:_PATHS])}{more}"))
-    bench = ", ".join(f"{key} = {value}" for key, value in found.bench.items())
+    bench = ", ".join(f"{key} = {value}" for key, value in overview.bench.items())
     parts.append(Text(f"Bench: {bench or 'nothing is said of it'}"))
-    if found.dwells is not None:
-        parts += _dwell_parts(found.dwells)
-    parts += [note(said) for said in found.warnings]
-    parts += [Text(f"Missing: {said}") for said in found.missing]
-    parts.append(Text(f"{'Then try' if found.missing else 'Try'}: {found.command}"))
+    if overview.dwells is not None:
+        parts += _dwell_parts(overview.dwells)
+    parts += [note(said) for said in overview.warnings]
+    parts += [Text(f"Missing: {said}") for said in overview.missing]
+    parts.append(Text(f"{'Then try' if overview.missing else 'Try'}: {overview.command}"))
     return Group(*parts)
 
 

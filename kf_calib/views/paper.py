@@ -26,15 +26,15 @@ _ABOUT = {
 _WORDS = {1: "one", 2: "two", 3: "three"}
 
 
-def paper_object(found: Experiment, searched: ConditionSearch) -> dict[str, Any]:
+def paper_object(experiment: Experiment, searched: ConditionSearch) -> dict[str, Any]:
     """The JSON object of ``paper``; its table2 is in per cent, with ``optimal`` and ``nonoptimal`` by least squares."""
-    sets = {"optimal": found.optimal, "nonoptimal": found.nonoptimal}
+    sets = {"optimal": experiment.optimal, "nonoptimal": experiment.nonoptimal}
     return clean(
         {
-            "table2": [_row_object(found, symbol) for symbol in paper_parameters.SYMBOLS],
-            "repetitions": found.repetitions,
-            "seed": found.seed,
-            "scatter": grebenkin2019.scatter(found.repetitions),
+            "table2": [_row_object(experiment, symbol) for symbol in paper_parameters.SYMBOLS],
+            "repetitions": experiment.repetitions,
+            "seed": experiment.seed,
+            "scatter": grebenkin2019.scatter(experiment.repetitions),
             **{
                 name: {
                     "log_ratio": float(grebenkin2019.log_ratio(column.least_squares, _paper_column(name))),
@@ -49,13 +49,15 @@ def paper_object(found: Experiment, searched: ConditionSearch) -> dict[str, Any]
                 for name, column in sets.items()
             },
             "nonoptimal_gravity_fixed": {
-                "rank": found.fixed.rank,
-                "condition_numbers": found.fixed.condition_numbers,
-                "same_vector": found.fixed.same_vector,
-                "why": rank_sentence(found),
+                "rank": experiment.fixed.rank,
+                "condition_numbers": experiment.fixed.condition_numbers,
+                "same_vector": experiment.fixed.same_vector,
+                "why": rank_sentence(experiment),
             },
-            "conditions": {**_conditions_object(found.conditions), "inferred": True},
-            "optimal_under_conditions": dict(zip(("turned_after", "turned_at_first"), _turning(found), strict=True)),
+            "conditions": {**_conditions_object(experiment.conditions), "inferred": True},
+            "optimal_under_conditions": dict(
+                zip(("turned_after", "turned_at_first"), _turning(experiment), strict=True)
+            ),
             "search": {
                 "tried": searched.tried,
                 "together": _found_object(searched.together),
@@ -73,10 +75,10 @@ def _paper_column(name: str) -> Floats:
     return grebenkin2019.printed_column(OPTIMAL_PRINTED if name == "optimal" else NONOPTIMAL_PRINTED)
 
 
-def _row_object(found: Experiment, name: str) -> dict[str, Any]:
+def _row_object(experiment: Experiment, name: str) -> dict[str, Any]:
     """Return the row of one parameter as a JSON object."""
     k, row = paper_parameters.SYMBOLS.index(name), {"parameter": name}
-    for key, column in (("optimal", found.optimal), ("nonoptimal", found.nonoptimal)):
+    for key, column in (("optimal", experiment.optimal), ("nonoptimal", experiment.nonoptimal)):
         row |= {
             key: column.least_squares[k],
             f"{key}_printed": _paper_column(key)[k],
@@ -91,36 +93,36 @@ def _conditions_object(conditions: Conditions) -> dict[str, Any]:
     return {**vars(conditions), "duration_s": conditions.duration_s}
 
 
-def _found_object(found: ConditionFit) -> dict[str, Any]:
+def _found_object(experiment: ConditionFit) -> dict[str, Any]:
     """Return the nearest conditions of the search with their log-ratio as a JSON object."""
-    return {**_conditions_object(found.conditions), "log_ratio": found.log_ratio}
+    return {**_conditions_object(experiment.conditions), "log_ratio": experiment.log_ratio}
 
 
-def _turning(found: Experiment) -> tuple[float, float]:
+def _turning(experiment: Experiment) -> tuple[float, float]:
     """Return the log-ratios of the optimal set's expectation to the print if the Earth turns gravity during the run.
 
     The first is with each orientation set by gravity on arrival, the second by gravity at the start.
     """
     column = _paper_column("optimal")
-    figures = [grebenkin2019.optimal(found.conditions, each).expected for each in (True, False)]
+    figures = [grebenkin2019.optimal(experiment.conditions, each).expected for each in (True, False)]
     return float(grebenkin2019.log_ratio(figures[0], column)), float(grebenkin2019.log_ratio(figures[1], column))
 
 
-def paper_report(found: Experiment, searched: ConditionSearch) -> RenderableType:
+def paper_report(experiment: Experiment, searched: ConditionSearch) -> RenderableType:
     """The report that ``paper`` prints."""
-    return Group(table2(found), *map(Text, sentences(found, searched)))
+    return Group(table2(experiment), *map(Text, sentences(experiment, searched)))
 
 
-def table2(found: Experiment) -> Table:
+def table2(experiment: Experiment) -> Table:
     """The table of both sets of orientations: print, expectation in closed form, least squares and filter."""
-    title = f"Table 2: mean |error| over the deviation to be found, %, {found.repetitions} repetitions"
+    title = f"Table 2: mean |error| over the deviation to be found, %, {experiment.repetitions} repetitions"
     table = Table(title=title, title_justify="left")
     table.add_column("\nparameter")
     for name in ("optimal set", "non-optimal set"):
         for k, heading in enumerate(("paper", "expected", "batch", "filter")):
             table.add_column(f"{name if k == 0 else ''}\n{heading}", justify="right")
     for k, name in enumerate(_order()):
-        table.add_row(symbol(name), *_both(found, name), end_section=k in (5, 8))
+        table.add_row(symbol(name), *_both(experiment, name), end_section=k in (5, 8))
     return table
 
 
@@ -134,54 +136,56 @@ def _of_unit(unit: str) -> list[str]:
     return [name for name, own in zip(paper_parameters.SYMBOLS, paper_parameters.UNITS, strict=True) if own == unit]
 
 
-def _both(found: Experiment, name: str) -> list[str]:
+def _both(experiment: Experiment, name: str) -> list[str]:
     """Return print, expectation, least squares and filter of a parameter for the optimal set, then the other."""
     k, cells = paper_parameters.SYMBOLS.index(name), list[str]()
-    for key, column in (("optimal", found.optimal), ("nonoptimal", found.nonoptimal)):
+    for key, column in (("optimal", experiment.optimal), ("nonoptimal", experiment.nonoptimal)):
         figures = (column.orientations.expected[k], column.least_squares[k], column.kalman[k])
         cells += [f"{_paper_column(key)[k]:.4f}", *(f"{figure:#.4g}" for figure in figures)]
     return cells
 
 
-def sentences(found: Experiment, searched: ConditionSearch) -> list[str]:
+def sentences(experiment: Experiment, searched: ConditionSearch) -> list[str]:
     """What the figures show, on which conditions they rest, and which of these were inferred; in sentences."""
     return [
-        _scatter(found), rank_sentence(found), _conditions_sentence(found), *_search_sentences(searched),
-        _earth(found), _conditioning(found), _filter(found),
+        _scatter(experiment), rank_sentence(experiment), _conditions_sentence(experiment), *_search_sentences(searched),
+        _earth(experiment), _conditioning(experiment), _filter(experiment),
     ]  # fmt: skip
 
 
-def _scatter(found: Experiment) -> str:
+def _scatter(experiment: Experiment) -> str:
     """Return a sentence on the scatter of a mean of so many repetitions."""
     column = _paper_column("optimal")
-    expected = np.abs(column / found.optimal.orientations.expected - 1).max()
-    off = np.abs(found.optimal.least_squares / column - 1).max()
+    expected = np.abs(column / experiment.optimal.orientations.expected - 1).max()
+    off = np.abs(experiment.optimal.least_squares / column - 1).max()
     return (
-        f"Expected is sqrt(2/pi) σ / deviation; a mean of {found.repetitions} runs scatters about it by "
-        f"{_percent(grebenkin2019.scatter(found.repetitions))} (1σ). Optimal set: the print is within "
+        f"Expected is sqrt(2/pi) σ / deviation; a mean of {experiment.repetitions} runs scatters about it by "
+        f"{_percent(grebenkin2019.scatter(experiment.repetitions))} (1σ). Optimal set: the print is within "
         f"{_percent(expected)} of the expectation, these runs within {_percent(off)} of the print."
     )
 
 
-def rank_sentence(found: Experiment) -> str:
+def rank_sentence(experiment: Experiment) -> str:
     """A sentence on why the non-optimal set gives no finite errors as it is printed."""
-    rank = int(found.fixed.rank.min())
-    same = " and ".join(f"orientations {one} and {other} share the vertical" for one, other in found.fixed.same_vector)
+    rank = int(experiment.fixed.rank.min())
+    same = " and ".join(
+        f"orientations {one} and {other} share the vertical" for one, other in experiment.fixed.same_vector
+    )
     return (
         f"Non-optimal set with gravity fixed: {same}, so there are {_WORDS[rank]} different vectors for four unknowns; "
         f"D has rank {rank}, and the errors would be infinite."
     )
 
 
-def _conditions_sentence(found: Experiment) -> str:
+def _conditions_sentence(experiment: Experiment) -> str:
     """Return sentences on the conditions that were inferred from the paper's table."""
-    column, hours = _paper_column("nonoptimal"), found.conditions.duration_s / 3600
-    closed = grebenkin2019.log_ratio(found.nonoptimal.orientations.expected, column)
-    ran = grebenkin2019.log_ratio(found.nonoptimal.least_squares, column)
+    column, hours = _paper_column("nonoptimal"), experiment.conditions.duration_s / 3600
+    closed = grebenkin2019.log_ratio(experiment.nonoptimal.orientations.expected, column)
+    ran = grebenkin2019.log_ratio(experiment.nonoptimal.least_squares, column)
     return (
         "They are finite where the platform is held in inertial space and the Earth turns gravity in it. Under which "
-        f"conditions the paper does not say; INFERRED from its table: {_conditions_in_words(found.conditions)} "
-        f"({hours:.1f} h in all), latitude {found.conditions.latitude_deg:g}°. "
+        f"conditions the paper does not say; INFERRED from its table: {_conditions_in_words(experiment.conditions)} "
+        f"({hours:.1f} h in all), latitude {experiment.conditions.latitude_deg:g}°. "
         f"Rms log-ratio to the print: {closed:.2f} expected, {ran:.2f} in these runs."
     )
 
@@ -213,9 +217,9 @@ def _search_sentences(searched: ConditionSearch) -> list[str]:
     ]
 
 
-def _earth(found: Experiment) -> str:
+def _earth(experiment: Experiment) -> str:
     """Return sentences on the optimal set if the Earth turned during the run."""
-    turned, left = _turning(found)
+    turned, left = _turning(experiment)
     return (
         "The optimal set above has gravity fixed. Were the Earth to turn as inferred, its expectation would be "
         f"{turned:.3f} from the print with each orientation set by gravity as it stands on arrival, {left:.3f} as it "
@@ -223,18 +227,22 @@ def _earth(found: Experiment) -> str:
     )
 
 
-def _conditioning(found: Experiment) -> str:
+def _conditioning(experiment: Experiment) -> str:
     """Return a sentence on the condition numbers of both sets."""
     parts = [
-        f"{name} {each.condition_numbers.max():.4g} ({each.condition_numbers_in_g.max():.3g} in units of g)"
-        for name, each in (("optimal", found.optimal.orientations), ("non-optimal", found.nonoptimal.orientations))
+        f"{name} {orientations.condition_numbers.max():.4g} "
+        f"({orientations.condition_numbers_in_g.max():.3g} in units of g)"
+        for name, orientations in (
+            ("optimal", experiment.optimal.orientations),
+            ("non-optimal", experiment.nonoptimal.orientations),
+        )
     ]
     return f"Condition number of D, the largest of the three: {', '.join(parts)}; with gravity fixed infinite."
 
 
-def _filter(found: Experiment) -> str:
+def _filter(experiment: Experiment) -> str:
     """Return a sentence on the difference between filter and least squares."""
-    largest = max(found.optimal.difference_sigma, found.nonoptimal.difference_sigma)
+    largest = max(experiment.optimal.difference_sigma, experiment.nonoptimal.difference_sigma)
     return (
         f"Filter and least squares differ by at most {largest:.2g} σ in any repetition: D is linear in the deviations, "
         "the filter's model is exact."

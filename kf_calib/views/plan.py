@@ -28,45 +28,45 @@ def gimbal_names(made: Plan) -> list[str]:
     return [f"{k}_{axis.replace(',', ';')}" for k, axis in enumerate(axes, 1)]
 
 
-def plan_object(made: Plan, beside_paper: bool = False) -> dict[str, Any]:
+def plan_object(plan: Plan, beside_paper: bool = False) -> dict[str, Any]:
     """The JSON object of ``plan``; angles are in deg, sigmas in SI.
 
     beside_paper: add the figures of the paper's set of orientations.
     """
-    symbols, before = made.prospect.symbols, made.prospect.last is not None
-    out = {
-        "axes": made.prospect.model.bench.to_metadata()["axes"],
-        "count": len(made.poses),
-        "gimbal_deg": made.gimbal_deg,
+    symbols, before = plan.prospect.symbols, plan.prospect.last is not None
+    document = {
+        "axes": plan.prospect.model.bench.to_metadata()["axes"],
+        "count": len(plan.poses),
+        "gimbal_deg": plan.gimbal_deg,
         "up": None,
-        "directions": made.directions,
-        "begin_s": made.at_s - 0.5 * made.timing.dwell_s,
-        "duration_s": made.duration_s,
-        "slew_s": float(made.slews_s.sum()),
-        "criterion": made.search.aim.name,
-        "cost": made.cost,
-        "sigma": dict(zip(symbols, made.sigma[-1], strict=True)),
-        "sigma_before": dict(zip(symbols, made.sigma[0], strict=True)) if before else None,
-        "sigma_balanced": _named(symbols, made.balanced_sigma),
-        "condition_number": made.condition_number,
-        "d_efficiency": made.d_efficiency,
-        "d_efficiency_within_reach": made.d_efficiency_within_reach,
-        "largest_variance": made.largest_variance,
+        "directions": plan.directions,
+        "begin_s": plan.at_s - 0.5 * plan.timing.dwell_s,
+        "duration_s": plan.duration_s,
+        "slew_s": float(plan.slews_s.sum()),
+        "criterion": plan.search.aim.name,
+        "cost": plan.cost,
+        "sigma": dict(zip(symbols, plan.sigma[-1], strict=True)),
+        "sigma_before": dict(zip(symbols, plan.sigma[0], strict=True)) if before else None,
+        "sigma_balanced": _named(symbols, plan.balanced_sigma),
+        "condition_number": plan.condition_number,
+        "d_efficiency": plan.d_efficiency,
+        "d_efficiency_within_reach": plan.d_efficiency_within_reach,
+        "largest_variance": plan.largest_variance,
         "parameters": len(symbols),
-        "time_correlation": made.correlation,
-        "remarks": made.remarks,
+        "time_correlation": plan.correlation,
+        "remarks": plan.remarks,
     }
     if beside_paper:
-        theirs = papers_sigma(made.prospect)
-        out["paper"] = {
+        theirs = papers_sigma(plan.prospect)
+        document["paper"] = {
             "sigma": dict(zip(paper_parameters.SYMBOLS, theirs, strict=True)),
             "mean_error_percent": dict(zip(paper_parameters.SYMBOLS, mean_error_percent(theirs), strict=True)),
             "plan_mean_error_percent": dict(
-                zip(paper_parameters.SYMBOLS, mean_error_percent(made.sigma[-1, :12]), strict=True)
+                zip(paper_parameters.SYMBOLS, mean_error_percent(plan.sigma[-1, :12]), strict=True)
             ),
-            "generalised_sigma_ratio": generalised_ratio(made),
+            "generalised_sigma_ratio": generalised_ratio(plan),
         }
-    return clean(out)
+    return clean(document)
 
 
 def _named(symbols: tuple[str, ...], values: Floats | None) -> dict[str, float] | None:
@@ -120,20 +120,20 @@ def _sigmas(made: Plan, beside_paper: bool) -> Table:
     return table
 
 
-def _columns(made: Plan, beside_paper: bool) -> dict[str, tuple[Floats, bool]]:
+def _columns(plan: Plan, beside_paper: bool) -> dict[str, tuple[Floats, bool]]:
     """Return for each heading of that table the values (p,) and whether they are in per cent."""
-    out = dict[str, tuple[Floats, bool]]()
-    if made.prospect.last is not None:
-        out["now"] = made.sigma[0], False
-    out["this plan"] = made.sigma[-1], False
-    if made.balanced_sigma is not None:
-        out["balanced"] = made.balanced_sigma, False
+    columns = dict[str, tuple[Floats, bool]]()
+    if plan.prospect.last is not None:
+        columns["now"] = plan.sigma[0], False
+    columns["this plan"] = plan.sigma[-1], False
+    if plan.balanced_sigma is not None:
+        columns["balanced"] = plan.balanced_sigma, False
     if beside_paper:
-        theirs, none = papers_sigma(made.prospect), np.full(len(made.prospect.symbols) - STATE_COUNT, np.nan)
-        out["paper's set"] = np.append(theirs, none), False
-        out["as in Table 2: plan"] = np.append(mean_error_percent(made.sigma[-1, :STATE_COUNT]), none), True
-        out["paper"] = np.append(mean_error_percent(theirs), none), True
-    return out
+        theirs, none = papers_sigma(plan.prospect), np.full(len(plan.prospect.symbols) - STATE_COUNT, np.nan)
+        columns["paper's set"] = np.append(theirs, none), False
+        columns["as in Table 2: plan"] = np.append(mean_error_percent(plan.sigma[-1, :STATE_COUNT]), none), True
+        columns["paper"] = np.append(mean_error_percent(theirs), none), True
+    return columns
 
 
 def _figure(value: float, percent: bool, unit: Unit) -> str:

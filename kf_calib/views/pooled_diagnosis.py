@@ -77,31 +77,33 @@ def sentences(found: PooledDiagnosis) -> list[str]:
     return [_summary(found), *map(_sentence, found.findings)]
 
 
-def _summary(found: PooledDiagnosis) -> str:
-    benches = f"{len(found.benches)} bench{'es' if len(found.benches) != 1 else ''}"
-    names = ", ".join(each.effect for each in found.findings) or "no effect"
-    other = "no other" if found.findings else "none"
+def _summary(pooled: PooledDiagnosis) -> str:
+    benches = f"{len(pooled.benches)} bench{'es' if len(pooled.benches) != 1 else ''}"
+    names = ", ".join(each.effect for each in pooled.findings) or "no effect"
+    other = "no other" if pooled.findings else "none"
     return (
-        f"{found.runs} runs of {found.units} units on {benches} show {names}; that they have {other} has probability "
-        f"{found.no_more:.2f}."
+        f"{pooled.runs} runs of {pooled.units} units on {benches} show {names}; that they have {other} has probability "
+        f"{pooled.no_more:.2f}."
     )
 
 
-def _sentence(found: Finding) -> str:
+def _sentence(finding: Finding) -> str:
     """Return what one effect is of, in a sentence."""
-    chance = found.probabilities[found.attribution]
-    said = f"{found.effect} is {_OF[found.attribution]} (probability {chance:.2f})"
-    if found.attribution is Attribution.SOME and found.share_interval is not None:
-        low, high = found.share_interval
-        having = [each.unit for each in found.units if each.probability > _HAS_IT]
-        said += f": {found.share:.0%} of the units have it ({low:.0%} to {high:.0%}), most likely {_listed(having)}"
-    if found.repair is not None:
-        gap = found.repair.gaps[0]
-        said += f": it changed between {_moment(gap.after) or gap.after_run} and "
-        said += _moment(gap.before) or gap.before_run
-        said += f" (probability {gap.probability:.2f})"
-    rivals = [f"{name} ({share:.2f})" for name, share in found.rivals.items()]
-    return f"{said}. In its place it may be {' or '.join(rivals)}." if rivals else f"{said}."
+    chance = finding.probabilities[finding.attribution]
+    sentence = f"{finding.effect} is {_OF[finding.attribution]} (probability {chance:.2f})"
+    if finding.attribution is Attribution.SOME and finding.share_interval is not None:
+        low, high = finding.share_interval
+        having = [each.unit for each in finding.units if each.probability > _HAS_IT]
+        sentence += (
+            f": {finding.share:.0%} of the units have it ({low:.0%} to {high:.0%}), most likely {_listed(having)}"
+        )
+    if finding.repair is not None:
+        gap = finding.repair.gaps[0]
+        sentence += f": it changed between {_moment(gap.after) or gap.after_run} and "
+        sentence += _moment(gap.before) or gap.before_run
+        sentence += f" (probability {gap.probability:.2f})"
+    rivals = [f"{name} ({share:.2f})" for name, share in finding.rivals.items()]
+    return f"{sentence}. In its place it may be {' or '.join(rivals)}." if rivals else f"{sentence}."
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -123,22 +125,24 @@ def _probabilities(rows: Sequence[EffectRow]) -> Table:
     return table
 
 
-def _coefficients(found: Finding) -> Table:
+def _coefficients(finding: Finding) -> Table:
     """Return the table of the coefficients of one effect."""
-    table = Table(title=f"{found.effect}, {_OF[found.attribution]} (1σ)", title_justify="left")
+    table = Table(title=f"{finding.effect}, {_OF[finding.attribution]} (1σ)", title_justify="left")
     for heading in ("of", "coefficient", "value", "sigma", "unit"):
         table.add_column(heading, justify="right" if heading in ("value", "sigma") else "left")
-    for bench in found.benches:
+    for bench in finding.benches:
         _add(table, _when(bench), bench.coefficients)
-    if not found.benches and found.population is None:
-        for own in found.units:
-            if own.probability > _HAS_IT:
-                _add(table, own.unit, own.coefficients)
-    if found.population is not None:
-        _add(table, "mean of the units", found.population.mean)
-        unit = found.population.mean[0].unit
-        low, high = (shown(unit).number(each) for each in found.population.spread_interval)
-        table.add_row("spread", "", shown(unit).number(found.population.spread), f"{low} to {high}", shown(unit).label)
+    if not finding.benches and finding.population is None:
+        for unit_figures in finding.units:
+            if unit_figures.probability > _HAS_IT:
+                _add(table, unit_figures.unit, unit_figures.coefficients)
+    if finding.population is not None:
+        _add(table, "mean of the units", finding.population.mean)
+        unit = finding.population.mean[0].unit
+        low, high = (shown(unit).number(each) for each in finding.population.spread_interval)
+        table.add_row(
+            "spread", "", shown(unit).number(finding.population.spread), f"{low} to {high}", shown(unit).label
+        )
     return table
 
 
@@ -154,9 +158,9 @@ def _moment(date: str) -> str:
 
 def _add(table: Table, name: str, values: Sequence[PooledEstimate]) -> None:
     """Add a row for each coefficient."""
-    for k, each in enumerate(values):
+    for k, coefficient in enumerate(values):
         cells = ("not seen", "")
-        if each.value is not None and each.sigma is not None:
-            value, sigma = shown(each.unit).rounded(each.value, each.sigma)
+        if coefficient.value is not None and coefficient.sigma is not None:
+            value, sigma = shown(coefficient.unit).rounded(coefficient.value, coefficient.sigma)
             cells = value, f"± {sigma}"
-        table.add_row("" if k else name, symbol(each.symbol), *cells, shown(each.unit).label)
+        table.add_row("" if k else name, symbol(coefficient.symbol), *cells, shown(coefficient.unit).label)

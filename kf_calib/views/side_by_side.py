@@ -37,19 +37,19 @@ def difference_table(differences: Sequence[Difference], first: str, second: str)
     return table
 
 
-def _row(each: Difference) -> tuple[str, ...]:
+def _row(difference: Difference) -> tuple[str, ...]:
     """Return the row of one parameter."""
-    both, moved = (*_cells(each.first), *_cells(each.second)), ("", "")
-    if each.value is not None and each.sigma is not None and each.sigmas is not None:
-        moved = shown(each.first).rounded(each.value, each.sigma)[0], f"{each.sigmas:+.1f}"
-    return symbol(each.symbol), *both, shown(each.first).label, *moved
+    both, moved = (*_cells(difference.first), *_cells(difference.second)), ("", "")
+    if difference.value is not None and difference.sigma is not None and difference.sigmas is not None:
+        moved = shown(difference.first).rounded(difference.value, difference.sigma)[0], f"{difference.sigmas:+.1f}"
+    return symbol(difference.symbol), *both, shown(difference.first).label, *moved
 
 
-def _cells(own: Parameter) -> tuple[str, str]:
+def _cells(parameter: Parameter) -> tuple[str, str]:
     """Return a parameter less its nominal value, and its sigma."""
-    if own.value is None or own.sigma is None:
+    if parameter.value is None or parameter.sigma is None:
         return "not seen", ""
-    value, sigma = shown(own).rounded(own.value - own.nominal, own.sigma)
+    value, sigma = shown(parameter).rounded(parameter.value - parameter.nominal, parameter.sigma)
     return value, f"± {sigma}"
 
 
@@ -64,13 +64,13 @@ def side_by_side_object(pair: SideBySide) -> dict[str, Any]:
             },
             "differences": [
                 {
-                    "symbol": each.symbol,
-                    "first": each.first.value,
-                    "second": each.second.value,
-                    "sigmas": each.sigmas,
-                    "unit": each.first.unit,
+                    "symbol": difference.symbol,
+                    "first": difference.first.value,
+                    "second": difference.second.value,
+                    "sigmas": difference.sigmas,
+                    "unit": difference.first.unit,
                 }
-                for each in pair.differences
+                for difference in pair.differences
             ],
             "differences_p_value": pair.p_value,
         }

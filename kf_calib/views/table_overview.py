@@ -42,15 +42,16 @@ class TableOverview:
     command: str
 
 
-def table_object(found: TableOverview) -> dict[str, Any]:
+def table_object(overview: TableOverview) -> dict[str, Any]:
     """One JSON object."""
-    own = found.survey
+    survey = overview.survey
     return clean(
         {
-            "recording": str(own.path), "format": "table", "files": [str(own.path)], "bytes": own.path.stat().st_size,
-            "topics": [], "columns": [vars(column) for column in own.columns], "orientation": own.orientation or None,
-            "bench": found.bench, "dwells": [_row_object(row) for row in own.rows], "missing": found.missing,
-            "command": found.command, "warnings": own.warnings,
+            "recording": str(survey.path), "format": "table", "files": [str(survey.path)],
+            "bytes": survey.path.stat().st_size, "topics": [], "columns": [vars(column) for column in survey.columns],
+            "orientation": survey.orientation or None, "bench": overview.bench,
+            "dwells": [_row_object(row) for row in survey.rows], "missing": overview.missing,
+            "command": overview.command, "warnings": survey.warnings,
         }
     )  # fmt: skip
 
@@ -59,29 +60,29 @@ def _row_object(row: RowFound) -> dict[str, Any]:
     return vars(row) | {"pose": list(row.pose), "up": list(row.up)}
 
 
-def table_report(found: TableOverview) -> RenderableType:
+def table_report(overview: TableOverview) -> RenderableType:
     """What ``info`` prints of a table."""
-    own = found.survey
+    survey = overview.survey
     parts: list[RenderableType] = [
-        Text(f"{own.path}: a table of orientations, {_counted(own.count, 'row')}"),
-        _column_table(own.columns),
+        Text(f"{survey.path}: a table of orientations, {_counted(survey.count, 'row')}"),
+        _column_table(survey.columns),
     ]
-    bench = ", ".join(f"{key} = {value}" for key, value in found.bench.items())
+    bench = ", ".join(f"{key} = {value}" for key, value in overview.bench.items())
     parts.append(Text(f"Bench: {bench or 'nothing is said of it'}"))
-    if own.rows:
-        parts += [Text(f"{_counted(len(own.rows), 'orientation')}:"), _row_table(own)]
-        if len(own.rows) > _SHOWN:
-            parts.append(Text(f"and {len(own.rows) - _SHOWN} more, all of them by --json"))
-    parts += [note(said) for said in own.warnings]
-    if own.rows and not own.has_sigma:
+    if survey.rows:
+        parts += [Text(f"{_counted(len(survey.rows), 'orientation')}:"), _row_table(survey)]
+        if len(survey.rows) > _SHOWN:
+            parts.append(Text(f"and {len(survey.rows) - _SHOWN} more, all of them by --json"))
+    parts += [note(said) for said in survey.warnings]
+    if survey.rows and not survey.has_sigma:
         parts.append(
             note(
                 "no standard deviation with a number of readings is given, so that the noise will be taken from the "
                 "misfit, and the misfit cannot be judged."
             )
         )
-    parts += [Text(f"Missing: {said}") for said in found.missing]
-    parts.append(Text(f"{'Then try' if found.missing else 'Try'}: {found.command}"))
+    parts += [Text(f"Missing: {said}") for said in overview.missing]
+    parts.append(Text(f"{'Then try' if overview.missing else 'Try'}: {overview.command}"))
     return Group(*parts)
 
 
@@ -93,9 +94,11 @@ def _column_table(columns: Sequence[ColumnFound]) -> Table:
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
     for heading in ("column", "first cell", "taken for", "unit", "told"):
         table.add_column(heading, justify="left")
-    for own in columns:
-        unit = _UNITS.get(own.unit, own.unit)
-        table.add_row(cut(own.header, 40), cut(own.first, 24), _quantity(own.meaning), unit, _TOLD[own.told_by])
+    for survey in columns:
+        unit = _UNITS.get(survey.unit, survey.unit)
+        table.add_row(
+            cut(survey.header, 40), cut(survey.first, 24), _quantity(survey.meaning), unit, _TOLD[survey.told_by]
+        )
     return table
 
 
@@ -116,11 +119,11 @@ def _orientation(row: RowFound) -> str:
     return row.face or pose_text(row.pose) or up_text(row.up)
 
 
-def _row_table(own: Survey) -> Table:
+def _row_table(survey: Survey) -> Table:
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    for heading in ("dwell", "row", "at s", _ORIENTATIONS[own.orientation], "norm m/s^2", "readings", "°C"):
+    for heading in ("dwell", "row", "at s", _ORIENTATIONS[survey.orientation], "norm m/s^2", "readings", "°C"):
         table.add_column(heading, justify="right")
-    for row in own.rows[:_SHOWN]:
+    for row in survey.rows[:_SHOWN]:
         table.add_row(
             str(row.number), str(row.row), f"{row.at_s:g}", _orientation(row), f"{row.norm_mps2:.4f}",
             "" if row.readings is None else str(row.readings),

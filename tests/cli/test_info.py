@@ -146,6 +146,18 @@ def test_what_cannot_be_read_is_one_sentence(run: Any, tmp_path: Path, content: 
     assert (code, out) == (2, "") and says in err and err.count("\n") == 1
 
 
+def test_a_calibration_says_what_it_holds(facts: Any, run: Any, tmp_path: Path) -> None:
+    saved = tmp_path / "cal.json"
+    run("replay", FACES, "--save", saved)
+    _, said, _ = run("info", saved)
+    assert "a calibration, of mems_faces.mcap of 2025-06-15, twelve parameters and no effects." in said
+    assert "It takes readings in m/s^2" in said and "Model and measurements agree" in said and "1.02273" in said
+    told = facts(saved)
+    assert told["kind"] == "calibration" and len(told["parameters"]) == 12
+    code, _, refused = run("replay", saved)
+    assert code == 2 and "is a calibration, not a recording" in refused
+
+
 def test_a_file_that_is_not_there(run: Any, tmp_path: Path) -> None:
     code, _, err = run("info", tmp_path / "none.mcap")
     assert code == 2 and "does not exist" in err

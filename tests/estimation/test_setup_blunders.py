@@ -174,11 +174,16 @@ def test_degrees_of_a_noisy_encoder_in_which_nothing_stands_still() -> None:
 FACES = {"+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+z": (0, 0, 1), "-z": (0, 0, -1)}
 
 
-def faces_in_order(order: Sequence[str], reversed_channel: int, seed: int) -> Table:
-    """Means of six faces by sensors of 0.3 % and 10 mg, 1 mrad from square, with one channel reversed."""
+def means_of_faces(order: Sequence[str], seed: int) -> Floats:
+    """Means (6, 3) of six faces by sensors of 0.3 % and 10 mg, 1 mrad from square."""
     rng = np.random.default_rng(seed)
     sensitivity = np.eye(3) * (1.0 + 0.003 * rng.normal(size=3)) + 1e-3 * rng.normal(size=(3, 3))
-    means = 9.81 * (np.array([FACES[name] for name in order], float) @ sensitivity.T + 0.01 * rng.normal(size=3))
+    return 9.81 * (np.array([FACES[name] for name in order], float) @ sensitivity.T + 0.01 * rng.normal(size=3))
+
+
+def faces_in_order(order: Sequence[str], reversed_channel: int, seed: int) -> Table:
+    """The table of six faces with one channel reversed."""
+    means = means_of_faces(order, seed)
     means[:, reversed_channel - 1] *= -1.0
     columns = {"face": list(order), **{f"a{axis}_mps2": means[:, k] for k, axis in enumerate("xyz")}}
     return open_table(columns, {"gravity_mps2": "9.81"})
@@ -195,6 +200,17 @@ def test_a_reversed_channel_is_told_in_whatever_order_the_faces_come(channel: in
         with pytest.raises(BlunderError) as told:
             calibrate(faces_in_order(order, channel, seed))
         assert f"channel {channel} reversed? Try --channels {','.join(channels)}." in str(told.value)
+
+
+@pytest.mark.parametrize("dwell", range(6))
+def test_one_reading_of_the_wrong_sign_is_told_by_its_dwell(dwell: int) -> None:
+    """Of a face only the reading along it is large: its sign, or the face, is wrong."""
+    means, channel = means_of_faces(list(FACES), dwell), dwell // 2
+    columns = {"face": list(FACES), **{f"a{axis}_mps2": means[:, k] for k, axis in enumerate("xyz")}}
+    calibrate(open_table(columns, {"gravity_mps2": "9.81"}))
+    means[dwell, channel] *= -1.0
+    with pytest.raises(BlunderError, match=rf"dwell {dwell + 1} .*channel {channel + 1} reads .*--leave-out"):
+        calibrate(open_table(columns, {"gravity_mps2": "9.81"}))
 
 
 @pytest.mark.parametrize("channel", [1, 2, 3])

@@ -6,6 +6,8 @@ import ctypes
 import re
 import shutil
 import subprocess
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,25 +33,42 @@ FORMULAS = [
 
 def compiled(text: str, folder: Path) -> Formula:
     """The function of the header, compiled with every warning an error."""
-    (folder / "kf_calib_correct.h").write_text(text)
-    (folder / "shim.c").write_text(
-        '#include "kf_calib_correct.h"\n'
-        "void all(long n, double *z, double *t) { for (long k = 0; k < n; k++) "
-        "kf_calib_correct(z + 3 * k, t[k], z + 3 * k); }\n"
-    )
+    return compiled_together([text], folder)[0]
+
+
+def compiled_together(texts: Sequence[str], folder: Path) -> list[Formula]:
+    """The functions of headers, in one program: compiled with every warning an error."""
+    shim = list[str]()
+    for k, text in enumerate(texts):
+        (folder / f"header_{k}.h").write_text(text)
+        names = sorted(set(re.findall(r"kf_calib_\w+(?=\()", text)))
+        shim += [
+            *(f"#define {name} {name}_{k}" for name in names), f'#include "header_{k}.h"',
+            f"void all_{k}(long n, double *z, double *t) "
+            f"{{ for (long j = 0; j < n; j++) kf_calib_correct(z + 3 * j, t[j], z + 3 * j); }}",
+            *(f"#undef {name}" for name in [*names, "KF_CALIB_CORRECT_H"]),
+        ]  # fmt: skip
+    (folder / "shim.c").write_text("\n".join([*shim, ""]))
     flags = ["-std=c99", "-O2", "-ffp-contract=off", "-Wall", "-Wextra", "-Werror", "-pedantic", "-shared", "-fPIC"]
-    words = [str(COMPILER), *flags, "shim.c", "-o", "shim.so", *(["-lm"] if "math.h" in text else [])]
+    words = [
+        str(COMPILER),
+        *flags,
+        "shim.c",
+        "-o",
+        "shim.so",
+        *(["-lm"] if any("math.h" in text for text in texts) else []),
+    ]
     done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    function = ctypes.CDLL(str(folder / "shim.so")).all
+    library = ctypes.CDLL(str(folder / "shim.so"))
+    return [partial(_corrected, getattr(library, f"all_{k}")) for k in range(len(texts))]
 
-    def corrected(readings: np.ndarray, temperature: np.ndarray) -> np.ndarray:
-        out, warmth = np.array(readings, float, order="C"), np.array(temperature, float)
-        pointer = ctypes.POINTER(ctypes.c_double)
-        function(ctypes.c_long(len(out)), out.ctypes.data_as(pointer), warmth.ctypes.data_as(pointer))
-        return out
 
-    return corrected
+def _corrected(function: Callable[..., None], readings: np.ndarray, temperature: np.ndarray) -> np.ndarray:
+    values, warmth = np.array(readings, float, order="C"), np.array(temperature, float)
+    pointer = ctypes.POINTER(ctypes.c_double)
+    function(ctypes.c_long(len(values)), values.ctypes.data_as(pointer), warmth.ctypes.data_as(pointer))
+    return values
 
 
 @compiled_only

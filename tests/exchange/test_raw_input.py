@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import openpyxl
 import pytest
-from exchange.test_c_header import compiled, compiled_only
+from exchange.test_c_header import compiled_only, compiled_together
 from exchange.test_exports import READERS, ROUNDING
 from helpers.altered import short_run
 from helpers.stated_sensors import correction, samples, saved
@@ -93,18 +93,23 @@ def _done_before(said: str, raw: np.ndarray) -> np.ndarray:
 
 
 @compiled_only
-@pytest.mark.parametrize("k", range(0, 480, 61))
-def test_the_function_in_c_takes_raw_readings(k: int, tmp_path: Path) -> None:
-    channels, scale = ORDERS[k // 10], SCALES[k % 10]
-    made = RawInput(channels, (scale, scale, scale), "mg")
-    own = correction("second-order", "thermal-bias")
-    own = replace(own, bench=replace(own.bench, input=made))
-    force, temperature = samples(500)
-    raw = made.raw(own.predicted(force, temperature))
-    text = exported(saved(), own, "c").text()
-    assert f"// It takes {made}." in text
-    np.testing.assert_allclose(compiled(text, tmp_path)(raw, temperature), force, rtol=0, atol=1e-11)
-    np.testing.assert_allclose(own(raw, temperature), force, rtol=0, atol=1e-11)
+@pytest.mark.parametrize("names", [(), ("second-order", "thermal-bias")])
+def test_the_function_in_c_takes_raw_readings_of_any_wiring(names: tuple[str, ...], tmp_path: Path) -> None:
+    """Compiled into one library: all 480 wirings and sizes, and with effects, which take long to write, all 48
+    wirings with the ten sizes in turn."""
+    own = correction(*names)
+    force, temperature = samples(100)
+    readings = own.predicted(force, temperature)
+    turn_about = zip(ORDERS, itertools.cycle(SCALES), strict=False)
+    every = list(turn_about if names else itertools.product(ORDERS, SCALES))
+    devices = [RawInput(order, (size, size, size), "mg") for order, size in every]
+    wired = [replace(own, bench=replace(own.bench, input=made)) for made in devices]
+    texts = [exported(saved(), each, "c").text() for each in wired]
+    for made, by_python, text, in_c in zip(devices, wired, texts, compiled_together(texts, tmp_path), strict=True):
+        assert f"// It takes {made}." in text
+        raw = made.raw(readings)
+        np.testing.assert_allclose(in_c(raw, temperature), force, rtol=0, atol=1e-11, err_msg=str(made))
+        np.testing.assert_allclose(by_python(raw, temperature), force, rtol=0, atol=1e-11)
 
 
 @dataclass(frozen=True)
@@ -295,21 +300,33 @@ def test_readings_of_another_unit_are_refused_with_the_likely_cause(device: Take
     assert run("apply", device.calibration, tmp_path / "other.mcap", "-o", tmp_path / "o.mcap", "--unchecked")[0] == 0
 
 
-def test_another_order_of_channels_shows_in_the_norm_at_rest(run: Any, tmp_path: Path) -> None:
+@pytest.mark.parametrize("sent", [RawInput(), RawInput(unit="g"), RawInput((2, -1, 3), (1e-4,) * 3)], ids=str)
+def test_another_order_of_channels_shows_in_the_norm_at_rest(sent: RawInput, run: Any, tmp_path: Path) -> None:
+    """What it says then does it; what is stated is restated only where something states it."""
     source = short_run(count=16, dwell_s=2.0, seed=4, grade="mems")
+    readings = Stream.joined([batch.accel for batch in source])
+    pose = Stream.joined([batch.pose for batch in source])
     with Recorder(tmp_path / "run.mcap", source.bench) as recorder:
-        batches = list(source)
-        for batch in batches:
-            recorder.write(batch)
-    assert run("replay", tmp_path / "run.mcap", "--save", tmp_path / "cal.json")[0] == 0
-    accel = Stream.joined([batch.accel for batch in batches])
-    for channels, refused in (((1, -2, 3), True), ((2, 1, 3), True), ((1, 2, 3), False)):
-        path = tmp_path / f"{channels}.mcap"
+        recorder.write(Batch(Stream(readings.time_ns, sent.raw(readings.values)), pose))
+    stated = [] if sent.is_plain else ["--channels", sent.order, "--accel-scale", sent.scale, "--accel-unit", sent.unit]
+    code, _, err = run("replay", tmp_path / "run.mcap", *stated, "--save", tmp_path / "cal.json")
+    assert code == 0, err
+    orders = ((True, (1, -2, 3)), (True, (2, 1, 3)), (False, sent.channels))
+    for refused, channels in orders:
+        path, copy = tmp_path / f"{channels}.mcap", tmp_path / f"o{channels}.mcap"
         with Recorder(path, Bench((), 9.81, angles=False)) as recorder:
-            recorder.write(Batch(Stream(accel.time_ns, RawInput(channels).raw(accel.values)), Stream.empty(4)))
-        code, _, err = run("apply", tmp_path / "cal.json", path, "-o", tmp_path / f"o{channels}.mcap")
-        assert code == (2 if refused else 0)
-        assert not refused or f"--channels {RawInput(channels).order}" in err
+            raw = replace(sent, channels=channels).raw(readings.values)
+            recorder.write(Batch(Stream(readings.time_ns, raw), Stream.empty(4)))
+        code, _, err = run("apply", tmp_path / "cal.json", path, "-o", copy)
+        assert code == (2 if refused else 0), err
+        if refused:
+            advice = re.search(r"with (--channels \S+( --restate-input)?): add that", err)
+            assert advice and f"--channels {RawInput(channels).order}" in err
+            assert bool(advice[2]) == (not sent.is_plain)
+            code, _, err = run("apply", tmp_path / "cal.json", path, "-o", copy, *advice[1].split())
+            assert code == 0, err
+            if advice[2]:
+                assert run("apply", tmp_path / "cal.json", path, "-o", copy, *advice[1].split()[:2])[0] == 2
 
 
 def test_what_a_later_statement_may_say() -> None:

@@ -25,7 +25,7 @@ from helpers.fleet_workers import evaluation, threads, used
 import kf_calib
 from kf_calib.cli.fleet import SingleCommands
 from kf_calib.errors import InputError
-from kf_calib.fleet import cluster
+from kf_calib.fleet import batch
 from kf_calib.fleet.batch import evaluate_all
 from kf_calib.fleet.evaluation import Evaluation
 from kf_calib.fleet.run_list import Run, runs_of
@@ -191,7 +191,7 @@ def test_a_run_that_ends_its_process_is_tried_again_and_stops_no_other(
     normal = evaluation()
     deadly = Evaluation(_Deadly(normal.commands.options), normal.settings)
     runs = runs_of([str(path) for path in sorted(own.rglob("*.mcap"))[:2]])
-    with cluster.cluster(1) as client:
+    with batch.cluster(1) as client:
         progress = evaluate_all(client, deadly, runs, store)
     assert (progress.evaluated, progress.failed) == (2, 1)
     ((place, said),) = kf_calib.open_fleet(tmp_path / "fleet").failures().items()

@@ -22,13 +22,12 @@ from helpers.fleet_workers import evaluation, threads, used
 
 import kf_calib
 from kf_calib.cli.fleet import SingleCommands
-from kf_calib.fleet import cluster
+from kf_calib.fleet import batch
 from kf_calib.fleet.batch import evaluate_all
-from kf_calib.fleet.evaluation import Evaluation
+from kf_calib.fleet.evaluation import Evaluation, OverTime, in_time
 from kf_calib.fleet.run_list import Run, runs_of
 from kf_calib.fleet.run_row import SCHEMA
 from kf_calib.fleet.store import Store
-from kf_calib.fleet.time_limit import OverTime, in_time
 
 pytestmark = pytest.mark.xdist_group("fleet")
 
@@ -98,7 +97,7 @@ def test_a_run_that_never_ends_is_a_row_that_says_so_and_is_tried_again(
 
 @pytest.mark.slow
 def test_a_run_that_waits_in_the_system_is_ended_with_its_process(runs: Path, store: Store, tmp_path: Path) -> None:
-    with cluster.cluster(1) as own:
+    with batch.cluster(1) as own:
         progress = evaluate_all(own, with_limit(_Deaf, 5.0), runs_of([str(runs)]), store)
     assert (progress.evaluated, progress.failed) == (2, 1)
     (said,) = kf_calib.open_fleet(tmp_path / "fleet").failures().values()

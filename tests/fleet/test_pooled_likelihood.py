@@ -11,19 +11,17 @@ from scipy.stats import chi2, multivariate_normal, norm
 
 from kf_calib.fleet.campaign import Campaign
 from kf_calib.fleet.evidence import log_evidence, log_evidence_of_modes, modes, posterior, sizes
-from kf_calib.fleet.own_coefficients import Own, OwnAndCommon
+from kf_calib.fleet.own_coefficients import UnitInformation, UnitsAndCommon
 from kf_calib.fleet.pooled_terms import Attribution, PooledTerms, Sums, Term
 from kf_calib.fleet.population import population
-from kf_calib.fleet.shape import SHARES
-from kf_calib.fleet.shape_about_mean import about_mean
-from kf_calib.fleet.shape_about_zero import POWERS, about_zero
+from kf_calib.fleet.shape import POWERS, SHARES, about_mean, about_zero
 from kf_calib.fleet.some_units import SomeUnits
 
 
-def beside_nothing(own: Own) -> OwnAndCommon:
+def beside_nothing(own: UnitInformation) -> UnitsAndCommon:
     """What units tell where nothing is common to them."""
     count, width = own.score.shape
-    return OwnAndCommon(own, np.zeros((count, width, 0)), Sums(np.zeros((0, 0)), np.zeros(0)), np.zeros(0))
+    return UnitsAndCommon(own, np.zeros((count, width, 0)), Sums(np.zeros((0, 0)), np.zeros(0)), np.zeros(0))
 
 
 def test_log_evidence_is_the_ratio_of_normal_densities() -> None:
@@ -80,7 +78,7 @@ def test_runs_of_a_unit_are_summed_however_they_are_mixed() -> None:
 def test_spread_is_that_of_an_analysis_of_variance_where_units_are_alike() -> None:
     """Balanced units of unit information: REML is the variance of the estimates less that of their noise."""
     estimates = np.random.default_rng(2).normal(0.5, 2.0, 50)
-    own = Own([""] * 50, np.ones((50, 1, 1)), estimates[:, None])
+    own = UnitInformation([""] * 50, np.ones((50, 1, 1)), estimates[:, None])
     found = population(beside_nothing(own), np.ones(50, bool), 64.0)
     assert found is not None and found.spread == pytest.approx(np.sqrt(np.var(estimates, ddof=1) - 1.0), rel=0.03)
     assert found.mean[0] == pytest.approx(estimates.mean(), rel=1e-6)
@@ -89,19 +87,19 @@ def test_spread_is_that_of_an_analysis_of_variance_where_units_are_alike() -> No
 
 def test_no_spread_is_found_in_noise() -> None:
     estimates = np.random.default_rng(3).normal(0.0, 0.9, 50)
-    own = Own([""] * 50, np.ones((50, 1, 1)), estimates[:, None])
+    own = UnitInformation([""] * 50, np.ones((50, 1, 1)), estimates[:, None])
     found = population(beside_nothing(own), np.ones(50, bool), 64.0)
     assert found is not None and found.spread < 0.1 and found.spread_interval[0] == 0.0
 
 
-def bent_units() -> tuple[OwnAndCommon, list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
+def bent_units() -> tuple[UnitsAndCommon, list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
     """What five units tell of their second-order terms beside the flexure of one bench, and the rows this is from:
     columns of the bench, of the units, and readings."""
     runs = [run_factor_of(k, lambda _: {"flexure": np.array([3.0, -2.0, 5.0])}) for k in range(5)]
     campaign = Campaign(runs)
     groups = {group.name: group for group in campaign.groups}
     terms = PooledTerms([Term(groups["flexure"], Attribution.BENCH, 1.0).free()], 1)
-    told = OwnAndCommon.joined([OwnAndCommon.of(groups["second-order"], terms, part) for part in campaign.units()])
+    told = UnitsAndCommon.joined([UnitsAndCommon.of(groups["second-order"], terms, part) for part in campaign.units()])
 
     def columns(name: str, run: int) -> np.ndarray:
         places = [runs[run].places[f"{name}/{symbol}"] for symbol in groups[name].symbols]
@@ -163,7 +161,7 @@ def test_interval_of_the_spread_holds_the_truth_however_few_the_units(units: int
     for _ in range(200):
         sigmas = rng.uniform(0.3, 2.0, units)
         values = rng.normal(3.0, np.hypot(spread, sigmas))
-        own = Own([""] * units, sigmas[:, None, None] ** -2, (values / sigmas**2)[:, None])
+        own = UnitInformation([""] * units, sigmas[:, None, None] ** -2, (values / sigmas**2)[:, None])
         found = population(beside_nothing(own), np.ones(units, bool), 64.0)
         assert found is not None
         inside += found.spread_interval[0] <= spread <= found.spread_interval[1]
@@ -171,7 +169,7 @@ def test_interval_of_the_spread_holds_the_truth_however_few_the_units(units: int
 
 
 def test_one_unit_has_no_spread() -> None:
-    own = Own(["a", "b"], np.ones((2, 1, 1)), np.ones((2, 1)))
+    own = UnitInformation(["a", "b"], np.ones((2, 1, 1)), np.ones((2, 1)))
     assert population(beside_nothing(own), np.array([True, False]), 64.0) is None
 
 
@@ -185,7 +183,7 @@ def test_posterior_without_information_is_the_prior() -> None:
 def test_evidence_of_any_direction_is_the_integral_of_likelihood_times_density(power: int) -> None:
     """Of one unit that sees one direction better than the other, on a grid of its coefficients."""
     info, score = np.diag([0.3, 1.7]), np.array([0.4, 3.0])
-    own = Own(["unit"], info[None], score[None])
+    own = UnitInformation(["unit"], info[None], score[None])
     shape = about_zero(Campaign(campaign_of(2)).groups[0], own, power)
     place, tilt = 2, power / (power + 1.0)
     size = shape.sizes[0, place] * np.sqrt(2.0)
@@ -203,7 +201,7 @@ def test_evidence_of_any_direction_is_the_integral_of_likelihood_times_density(p
 def test_evidence_about_a_mean_is_the_integral_over_the_mean() -> None:
     """Of ten units with one coefficient each, of which six have it, on a grid of the mean."""
     scores = np.random.default_rng(5).standard_normal((10, 1)) + 3.0 * (np.arange(10) < 6)[:, None]
-    own = Own([""] * 10, np.ones((10, 1, 1)), scores)
+    own = UnitInformation([""] * 10, np.ones((10, 1, 1)), scores)
     shape = about_mean(own)
     grid, logs = np.linspace(-40.0, 40.0, 641), list[float]()
     for spread in sizes(0.25, 64.0):
@@ -226,7 +224,7 @@ def test_share_covers_the_truth_where_units_hardly_tell_who_has_the_effect(alike
         norms = np.sqrt(np.einsum("ni,ij,nj->n", drawn, info, drawn))
         truth = drawn * (2.5 / norms * (rng.permutation(40) < 20))[:, None]
         scores = truth @ info + rng.standard_normal((40, 3)) * np.sqrt(np.diag(info))
-        some = SomeUnits(group, Own([""] * 40, np.tile(info, (40, 1, 1)), scores))
+        some = SomeUnits(group, UnitInformation([""] * 40, np.tile(info, (40, 1, 1)), scores))
         every = 1.0 / (1.0 + np.exp(some.log_odds - some.log_odds_of_all))
         low, high = some.share(float(every))[1]
         inside += low <= 0.5 <= high

@@ -13,7 +13,7 @@ from helpers.paths import ROOT
 
 import kf_calib
 from kf_calib.errors import InputError
-from kf_calib.fleet.reference_unit import ReferenceUnit
+from kf_calib.fleet.run_factor import ReferenceUnit
 from kf_calib.fleet.store import Store
 
 

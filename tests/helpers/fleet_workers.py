@@ -11,7 +11,7 @@ from distributed import Client, LocalCluster
 
 from kf_calib.cli.evaluate import replay
 from kf_calib.cli.fleet import SingleCommands
-from kf_calib.fleet import cluster
+from kf_calib.fleet import batch
 from kf_calib.fleet.evaluation import Evaluation
 
 
@@ -33,7 +33,7 @@ def used(client: Client) -> Iterator[None]:
         yield client
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cluster, "cluster", running)
+        patch.setattr(batch, "cluster", running)
         yield
 
 

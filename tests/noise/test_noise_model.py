@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from helpers.long_runs import slow
 from helpers.restricted import restricted_log_likelihood
 from helpers.synthetic import Run, plan_of
+from scipy.optimize import minimize
 from scipy.signal import lfilter
 
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.dwells.folding import detrended
 from kf_calib.dwells.sufficient_statistics import Autocovariance
 from kf_calib.estimation.calibration import calibrate
+from kf_calib.noise import noise_model
 from kf_calib.sources.simulation.noise_processes import TrueNoise as SimulatedNoise
 from kf_calib.sources.simulation.sensors import GRADES
 from kf_calib.sources.simulation.simulator import Simulation
@@ -104,3 +108,39 @@ def test_dwells_too_short_for_their_noise_raise_no_alarm_and_are_told(runs: int)
         low += result.consistency.p_value < 0.05
         assert "too short to tell" in " ".join(result.warnings)
     assert low <= runs / 20  # one in five would be were each channel's correlation taken as it is found
+
+
+def test_noise_along_the_force_has_the_likeliest_sizes_of_gamma_sums() -> None:
+    """Sums of squares along directions m, of variance m^2 . v and n - 3 kappa degrees of freedom, against scipy."""
+    rng = np.random.default_rng(5)
+    along = np.repeat(np.eye(3), 5, axis=0) + 0.3 * rng.normal(size=(15, 3))
+    counts, kappa = rng.integers(50, 90, (15, 4)), np.array([1.0, 2.0, 1.5])
+    truth, freedom = np.array([0.5, 1.0, 2.0]) ** 2, (counts - 3.0 * kappa.mean()).sum(axis=1)
+    squares = along**2 @ truth * rng.chisquare(freedom)
+    dwells: Any = [
+        SimpleNamespace(counts=own, count=own.sum(), squares_along=lambda _, total=total: np.array([total]))
+        for own, total in zip(counts, squares, strict=True)
+    ]
+
+    def cost(logs: np.ndarray) -> float:
+        expected = along**2 @ np.exp(logs)
+        return float(np.sum(freedom * np.log(expected) + squares / expected))
+
+    best = minimize(cost, np.zeros(3), method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-10, "maxiter": 9999})
+    sigma = noise_model._sigma_along(dwells, along, kappa)
+    np.testing.assert_allclose(sigma**2, np.exp(best.x), rtol=1e-3)
+
+
+def test_slow_waves_are_independent_of_each_other_and_their_sizes_fall_with_the_root_of_their_number() -> None:
+    """Mean products of waves over dwells at equal distances are one or zero; h / k is the variance of wave k."""
+    count = 40
+    dwells: Any = [
+        SimpleNamespace(start_s=10.0 * k, end_s=10.0 * (k + 1), pieces=[None], width=4) for k in range(count)
+    ]
+    columns, sigma = noise_model.slow_waves(dwells, np.array([2.0, 0.0, 3.0]))
+    waves = np.array(columns)[:, 0]  # (dwells, nodes, channels, waves)
+    assert not waves[:, 3].any() and not waves[:, :, 1].any()
+    first, third = waves[:, 0, 0, :6], waves[:, 1, 2, 6:]
+    np.testing.assert_allclose(first, third)
+    np.testing.assert_allclose(first.T @ first / count, np.eye(6), atol=1e-12)
+    np.testing.assert_allclose(sigma**2, np.concatenate([4.0 / np.arange(1, 7), 9.0 / np.arange(1, 7)]))

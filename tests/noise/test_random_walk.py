@@ -211,3 +211,22 @@ def test_going_back_in_time_is_going_forward_on_reversed_dwells() -> None:
     np.testing.assert_allclose(one[0][gains] / sigma, other[0][gains] / sigma, rtol=0, atol=1e-6)
     covariances = (each[1][np.ix_(gains, gains)] / np.outer(sigma, sigma) for each in (one, other))
     np.testing.assert_allclose(*covariances, rtol=0, atol=1e-6)
+
+
+def test_rows_whitened_for_a_walk_have_the_gram_matrix_of_dense_noise() -> None:
+    """W' W = X' (1 + J V J')^-1 X with J from every step of the biases to every row; one pause lasts no time."""
+    rng, dwells, count, width = np.random.default_rng(7), 5, 6, 14
+    rows = [rng.normal(size=(count, 3 + width)) for _ in range(dwells)]
+    variances = np.array([(0.5, 0.3), (0.7, 0.2), (0.0, 0.4), (1.1, 0.6), (0.2, 0.1)])  # in the pause before, within
+    later = np.zeros((dwells * count, 3 * 2 * dwells))
+    for d, of_dwell in enumerate(rows):
+        of_steps = later[d * count : (d + 1) * count].reshape(count, dwells, 2, 3)
+        of_steps[:, : d + 1] += of_dwell[:, 3:][:, [3, 7, 11]][:, None, None]
+        of_steps[:, 0, 0] = 0.0  # the path begins with the first dwell
+        of_steps[:, d, 1] += of_dwell[:, :3]
+    columns = np.concatenate(rows)[:, 3:]
+    dense = np.eye(len(columns)) + later @ np.diag(np.repeat(variances.ravel(), 3)) @ later.T
+    above = rng.normal(size=(4, width))
+    whitened = random_walk.whiten_walk([above, *rows], variances)
+    expected = columns.T @ np.linalg.solve(dense, columns) + above.T @ above
+    np.testing.assert_allclose(whitened.T @ whitened, expected, rtol=1e-10, atol=1e-10)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.long_runs import slow
-from helpers.paths import ROOT
+from helpers.paths import REAL, ROOT
 from helpers.recordings import read
 
 import kf_calib
@@ -26,7 +26,6 @@ from kf_calib.sources.opening import Kind, kind_of, opened
 from kf_calib.sources.tables.survey import survey
 
 FACES = ROOT / "recordings" / "mems_faces.mcap"
-REAL = Path("/work/shared/real")
 G = 9.80665
 BENCH = ("--axes", "y z x", "--gravity", "9.81", "--angle-sigma", "0.2", "--scatter-sigma", "0.0")
 BY_HAND = ("--gravity", "9.81", "--no-angles")

@@ -214,27 +214,27 @@ def _input(line: Contribution) -> Row:
     }  # fmt: skip
 
 
-def _contributions(own: Certificate) -> list[Row]:
+def _contributions(certificate: Certificate) -> list[Row]:
     """Rows of the matrix of contributions, each column with three significant digits of the combined uncertainty."""
-    per_si = np.array([field_unit(each.unit).per_si for each in own.results])
-    known = [each.standard is not None for each in own.results]
-    found = own.budget
-    places = [max(0, 2 - math.floor(math.log10(u))) if u > 0 else 3 for u in (found.combined * per_si).tolist()]
+    per_si = np.array([field_unit(result.unit).per_si for result in certificate.results])
+    known = [result.standard is not None for result in certificate.results]
+    budget = certificate.budget
+    places = [max(0, 2 - math.floor(math.log10(u))) if u > 0 else 3 for u in (budget.combined * per_si).tolist()]
 
     def row(symbol: str, values: Any) -> Row:
         return texts(symbol, [f"{value:.{digits}f}" for value, digits in zip(values, places, strict=True)])
 
-    def texts(symbol: str, own: list[str]) -> Row:
-        return {"symbol": symbol, "values": [text if ok else "–" for text, ok in zip(own, known, strict=True)]}
+    def texts(symbol: str, cells: list[str]) -> Row:
+        return {"symbol": symbol, "values": [text if ok else "–" for text, ok in zip(cells, known, strict=True)]}
 
-    plain = [texts("ν", [_count(v) for v in found.dof]), texts("k", [f"{v:.2f}" for v in found.k])]
-    lines = [row(_name(line.name), line.parts * per_si) for line in found.contributions]
-    return [*lines, row("u", found.combined * per_si), *plain, row("U", found.expanded * per_si)]
+    plain = [texts("ν", [_count(v) for v in budget.dof]), texts("k", [f"{v:.2f}" for v in budget.k])]
+    lines = [row(_name(line.name), line.parts * per_si) for line in budget.contributions]
+    return [*lines, row("u", budget.combined * per_si), *plain, row("U", budget.expanded * per_si)]
 
 
-def _sensitivity(own: Certificate, line: Contribution) -> Row:
+def _sensitivity(certificate: Certificate, line: Contribution) -> Row:
     assert line.sensitivity is not None
-    per_si = np.array([field_unit(each.unit).per_si for each in own.results]) / field_unit(line.unit).per_si
+    per_si = np.array([field_unit(result.unit).per_si for result in certificate.results]) / field_unit(line.unit).per_si
     values = line.sensitivity * per_si
     values[np.abs(values) < 1e-9] = 0.0  # rounding
     largest = float(np.abs(values).max())

@@ -28,6 +28,8 @@ ANGLES_TOPIC = "/platform/angles"
 ATTITUDE_TOPIC = "/platform/attitude"
 TEMPERATURE_TOPIC = "/temperature"
 CALIBRATED_TOPIC = "/accelerometer/calibrated"
+CALIBRATION_FORMAT = "kf_calib.calibration"
+"""What a saved calibration names itself in its first lines."""
 """Of corrected readings, which nobody calibrates again unless he names it."""
 
 

@@ -18,6 +18,7 @@ from operator import mul
 
 import numpy as np
 
+from kf_calib.bench.arrays import lengths
 from kf_calib.bench.raw_input import PLAIN, UNITS, RawInput
 from kf_calib.errors import CountsError, InputError
 from kf_calib.sources.files.csv_heading import Heading
@@ -200,8 +201,8 @@ class CsvColumns:
         numbers = self.numbers or DECIMAL_POINT
         values = np.array([[_told(row[at], numbers) for at in places] for row in self.rows])
         with np.errstate(invalid="ignore", divide="ignore"):
-            unit = values / np.linalg.norm(values, axis=1, keepdims=True)
-            return bool((np.linalg.norm(np.diff(unit, axis=0), axis=1) < _ALIKE_RAD).mean() > _MOST)
+            unit = values / lengths(values)[:, None]
+            return bool((lengths(np.diff(unit, axis=0)) < _ALIKE_RAD).mean() > _MOST)
 
     def time(self) -> Stamps:
         """How the time is written. Raises InputError where no column tells it, or not in which unit."""
@@ -337,7 +338,7 @@ class CsvColumns:
         """Return the median size of the readings in the first rows, NaN where there are none."""
         numbers = self.numbers or DECIMAL_POINT
         values = np.array([[_told(row[at], numbers) for at in places] for row in self.rows])
-        norms = np.linalg.norm(values, axis=1) if len(values) else np.empty(0)
+        norms = lengths(values) if len(values) else np.empty(0)
         norms = norms[np.isfinite(norms)]
         return float(np.median(norms)) if len(norms) else math.nan
 
@@ -378,13 +379,13 @@ class CsvColumns:
         )
 
     def _stamps_of_rows(self, time: Stamps) -> list[int]:
-        out, numbers = list[int](), self.numbers or DECIMAL_POINT
+        stamps_ns, numbers = list[int](), self.numbers or DECIMAL_POINT
         for row in self.rows:
             try:
-                out.append(time.ns(row, self.header, numbers))
+                stamps_ns.append(time.ns(row, self.header, numbers))
             except LineError:
                 continue
-        return out
+        return stamps_ns
 
     def _quoted(self, places: Sequence[int]) -> str:
         return ", ".join(repr(cut(self.header[at], 40)) for at in places)

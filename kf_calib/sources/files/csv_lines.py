@@ -54,14 +54,14 @@ class CsvLines(LineReader):
 
     def heading_of_forces(self, heading: Sequence[str]) -> list[str]:
         names = {at: f"a{'xyz'[self._accel.at.index(at)]}_mps2" for at in self._columns.without_unit}
-        out, is_named = list(heading), False
+        lines, is_named = list(heading), False
         for k, line in enumerate(heading):
             cells = cells_of(line.lstrip("\ufeff"), self._delimiter)
             if not names or len(cells) < len(self._header) or not cells[self._accel.at[0]]:
                 continue
-            out[k] = self._replaced(line, dict.fromkeys(names, "m/s^2") if is_named else names)
+            lines[k] = self._replaced(line, dict.fromkeys(names, "m/s^2") if is_named else names)
             is_named = True
-        return out
+        return lines
 
     def _replaced(self, line: str, texts: Mapping[int, str]) -> str:
         """A line with other texts in these cells, and all else as it stands."""
@@ -100,15 +100,15 @@ class CsvLines(LineReader):
 
 def cell_spans(line: str, delimiter: str) -> list[tuple[int, int]]:
     """Where the cells of a line stand, with their quotes and without blanks around them."""
-    out, at = list[tuple[int, int]](), 0
+    spans, at = list[tuple[int, int]](), 0
     while True:
         end = _quote_end(line, at) if line[at : at + 1] == '"' else at
         end = line.find(delimiter, end)
         end = len(line) if end < 0 else end
         cell = line[at:end]
-        out.append((at + len(cell) - len(cell.lstrip()), end - len(cell) + len(cell.rstrip())))
+        spans.append((at + len(cell) - len(cell.lstrip()), end - len(cell) + len(cell.rstrip())))
         if end == len(line):
-            return out
+            return spans
         at = end + 1
 
 

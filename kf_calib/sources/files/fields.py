@@ -54,14 +54,14 @@ class Fields:
     @classmethod
     def of(cls, text: str) -> Fields:
         """As written (see above). Raises InputError."""
-        found = _GRAMMAR.fullmatch(text.strip())
-        if not found or found["quantity"] not in QUANTITIES:
+        match = _GRAMMAR.fullmatch(text.strip())
+        if not match or match["quantity"] not in QUANTITIES:
             raise InputError(
                 f"--field {text!r} cannot be read: write QUANTITY=TOPIC:PATH,PATH,... with "
                 f"{', '.join(QUANTITIES[:-1])} or {QUANTITIES[-1]} for the quantity, for example "
                 "accel=/imu:acc.x,acc.y,acc.z."
             )
-        body, names = found["paths"].strip(), None
+        body, names = match["paths"].strip(), None
         if body.endswith("]") and "[" in body:
             body, _, names = body[:-1].partition("[")
         paths = tuple(path.strip() for path in body.split(","))
@@ -71,7 +71,7 @@ class Fields:
                 f"--field {text!r}: {(wrong or [body])[0]!r} is no path: join names by dots, and paths by commas, for "
                 "example acc.x,acc.y,acc.z, or one path to a list, position, with its names, position[name]."
             )
-        return cls(found["quantity"], found["topic"].strip(), paths, names, found["time"])
+        return cls(match["quantity"], match["topic"].strip(), paths, names, match["time"])
 
     @cached_property
     def _steps(self) -> list[list[str]]:
@@ -79,14 +79,14 @@ class Fields:
 
     def numbers(self, message: Any) -> list[float]:
         """The numbers in a message. Raises FieldError."""
-        found = list[float]()
+        numbers = list[float]()
         for path, steps in zip(self.paths, self._steps, strict=True):
             value = _at(message, steps, path)
             if type(value) is float:
-                found.append(value)
+                numbers.append(value)
             else:
-                found += [_number(each, path) for each in _flat(value)]
-        return found
+                numbers += [_number(each, path) for each in _flat(value)]
+        return numbers
 
     def labels(self, message: Any) -> tuple[str, ...]:
         """The names of the numbers; none where no path to them is known."""

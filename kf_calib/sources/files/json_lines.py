@@ -152,14 +152,14 @@ class JsonLines(LineReader):
 
 def _spans(line: str) -> dict[str, tuple[tuple[int, int], tuple[int, int]]]:
     """Where each key of an object stands in its line, with its quotes, and where its value does; the last of a name."""
-    out, at = dict[str, tuple[tuple[int, int], tuple[int, int]]](), line.index("{") + 1
+    spans, at = dict[str, tuple[tuple[int, int], tuple[int, int]]](), line.index("{") + 1
     while line[at := _skip(line, at, " \t\r\n,")] != "}":
         name, end = _value_at(line, at)
         start = _skip(line, end, " \t\r\n:")
         _, behind = _value_at(line, start)
-        out[name] = (at, end), (start, behind)
+        spans[name] = (at, end), (start, behind)
         at = behind
-    return out
+    return spans
 
 
 def _skip(line: str, at: int, passed: str) -> int:
@@ -177,9 +177,9 @@ def _numbers(values: Any, name: str) -> list[float]:
         if type(value) is not float and type(value) is not int:
             raise LineError(f"{name} holds what is not a number")
     try:
-        out = [float(value) for value in values]
+        numbers = [float(value) for value in values]
     except OverflowError:
         raise LineError(f"{name} is out of range") from None
-    if not all(map(math.isfinite, out)):
+    if not all(map(math.isfinite, numbers)):
         raise LineError(f"{name} is out of range")
-    return out
+    return numbers

@@ -52,7 +52,7 @@ class TopicAppender:
     def __init__(
         self,
         source: McapFile,
-        out: IO[bytes],
+        file: IO[bytes],
         topic: str,
         kind: cdr.MessageType,
         template: bytes,
@@ -62,7 +62,7 @@ class TopicAppender:
             raise InputError(
                 f"{source.trouble} Make a finished copy of it first: kf-calib record {source.path.name} whole.mcap."
             )
-        self._out, self._topic = out, topic
+        self._out, self._topic = file, topic
         self._layout = kind.layout(template)
         self._crc = self._position = 0
         self._groups = dict[int, list[bytes]]({opcode: [] for opcode in _GROUPS})

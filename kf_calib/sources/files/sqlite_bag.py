@@ -109,10 +109,10 @@ class SqliteBag:
         query = "SELECT CAST(data AS BLOB) FROM messages WHERE +topic_id = ? ORDER BY rowid LIMIT 1"
         try:
             with closing(connect(self._place, self._longest)) as base:
-                found = base.execute(query, (topic,)).fetchone()
+                row = base.execute(query, (topic,)).fetchone()
         except FAILURES:  # told where the messages are read
-            found = None
-        return (found[0] if found else None) or b""
+            row = None
+        return (row[0] if row else None) or b""
 
     def record_at(self, position: int, opcode: int) -> bytes:
         raise DamagedError(f"an SQLite file has no record of kind {opcode} at byte {position}")

@@ -85,12 +85,12 @@ class MessageRows:
     def _behind(self, start: int) -> tuple[int, int]:
         """Where to go on behind the next row, which cannot be read, and with how many rows at a time."""
         try:
-            found = self._query("rowid", start, 1).fetchone()
+            row = self._query("rowid", start, 1).fetchone()
         except FAILURES:
-            found = None
-        if found and found[0] >= start:
+            row = None
+        if row and row[0] >= start:
             self._on_end, self.lost = 0, self.lost + 1
-            return found[0] + 1, 1
+            return row[0] + 1, 1
         self._on_end += 1
         step = ROWS << max(self._on_end - _STEADY, 0)
         self.lost += min(step, self.last - start + 1)

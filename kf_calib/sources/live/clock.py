@@ -110,16 +110,16 @@ class Clock:
         """The new stamps and which of them follow each other, up to a reading of which the next ones have to tell."""
         raw: list[int] = stream.time_ns.tolist()
         stamps, sound = np.empty_like(stream.time_ns), np.zeros(len(raw), bool)
-        for i, own in enumerate(raw):
-            if not self._follows(own + self._shifts[-1]) and not self._repeats(stream[i : i + 1]):
+        for i, stamp_ns in enumerate(raw):
+            if not self._follows(stamp_ns + self._shifts[-1]) and not self._repeats(stream[i : i + 1]):
                 agreeing, needed = self._agreeing(raw[i : i + _PERSISTS])
                 is_last = i + agreeing == len(raw)
-                if agreeing >= needed or (final and is_last and self._is_pause(own)):
-                    self._go_on_at(own, now_s)
+                if agreeing >= needed or (final and is_last and self._is_pause(stamp_ns)):
+                    self._go_on_at(stamp_ns, now_s)
                 elif is_last and not final:
                     self._held = stream[i:]
                     return stamps[:i], sound[:i]
-            stamps[i] = own + self._shifts[-1]
+            stamps[i] = stamp_ns + self._shifts[-1]
             sound[i] = self._follows(int(stamps[i]))  # a damaged stamp stays as it is
             if sound[i]:
                 self._last_ns, self._came_s, self._is_repeating = int(stamps[i]), now_s, False

@@ -67,28 +67,28 @@ def bench(metadata: Mapping[str, Any]) -> bytes:
 
 def cobs(data: bytes) -> bytes:
     """Consistent Overhead Byte Stuffing (Cheshire and Baker, 1999): no zero byte is left."""
-    out = bytearray()
+    encoded = bytearray()
     for part in data.split(b"\0"):
         while len(part) >= 254:
-            out += b"\xff" + part[:254]
+            encoded += b"\xff" + part[:254]
             part = part[254:]
-        out.append(len(part) + 1)
-        out += part
-    return bytes(out)
+        encoded.append(len(part) + 1)
+        encoded += part
+    return bytes(encoded)
 
 
 def uncobs(data: bytes) -> bytes | None:
     """What was encoded, None where that cannot be."""
-    out, position = bytearray(), 0
+    decoded, position = bytearray(), 0
     while position < len(data):
         code = data[position]
         if not code or position + code > len(data):
             return None
-        out += data[position + 1 : position + code]
+        decoded += data[position + 1 : position + code]
         position += code
         if code < 0xFF and position < len(data):
-            out.append(0)
-    return bytes(out)
+            decoded.append(0)
+    return bytes(decoded)
 
 
 def _uncobs_alike(table: Bytes) -> tuple[Bytes, Mask]:
@@ -159,7 +159,7 @@ class FrameReader:
         if not self.pose_width:
             self._settle(frames)
         lengths = np.fromiter(map(len, frames), np.int64, len(frames))
-        found = list[_Found]()
+        samples = list[_Found]()
         for length in np.unique(lengths).tolist():
             at = np.flatnonzero(lengths == length)
             if length > _SHORT + 1:
@@ -167,11 +167,13 @@ class FrameReader:
                     self._read_long(frames[i], first + i)
             elif length > HEAD.size + _CRC.size:
                 table = np.frombuffer(b"".join([frames[i] for i in at.tolist()]), np.uint8).reshape(-1, length)
-                found += self._read_alike(table, first + at)
+                samples += self._read_alike(table, first + at)
             else:
                 self._refuse(first + at, "it is too short")
         poses = ANGLES if self.has_angles else ATTITUDE
-        return Batch(_stream(found, ACCEL, 3), _stream(found, poses, self.pose_width), _stream(found, TEMPERATURE, 1))
+        return Batch(
+            _stream(samples, ACCEL, 3), _stream(samples, poses, self.pose_width), _stream(samples, TEMPERATURE, 1)
+        )
 
     def _read_alike(self, table: Bytes, places: Places) -> Iterator[_Found]:
         """The samples in frames (n, m) of one encoded length, by kind."""
@@ -182,25 +184,25 @@ class FrameReader:
         sound &= stated == np.array([zlib.crc32(texts[k : k + size]) for k in range(0, len(texts), size)], np.uint32)
         self._refuse(places[~sound], "its checksum does not fit")
         for kind in np.unique(bodies[sound, 0]).tolist():
-            own = sound & (bodies[:, 0] == kind)
-            heads = np.frombuffer(np.ascontiguousarray(bodies[own, : HEAD.size]).tobytes(), _HEADS)
-            contents = np.ascontiguousarray(bodies[own, HEAD.size : size])
+            of_kind = sound & (bodies[:, 0] == kind)
+            heads = np.frombuffer(np.ascontiguousarray(bodies[of_kind, : HEAD.size]).tobytes(), _HEADS)
+            contents = np.ascontiguousarray(bodies[of_kind, HEAD.size : size])
             if kind == BENCH:
-                for content, place in zip(contents, places[own].tolist(), strict=True):
+                for content, place in zip(contents, places[of_kind].tolist(), strict=True):
                     self._learn(content.tobytes(), place)
             elif reason := self._misfit(kind, contents.shape[1], heads):
-                self._refuse(places[own], reason)
+                self._refuse(places[of_kind], reason)
             else:
                 values = contents.view("<f8").astype(float)
                 usable = np.isfinite(values).all(axis=1)
-                self._refuse(places[own][~usable], "a number is not finite")
+                self._refuse(places[of_kind][~usable], "a number is not finite")
                 if kind == ATTITUDE:
                     is_zero = usable & ~values.any(axis=1)
-                    self._refuse(places[own][is_zero], "the quaternion is zero")
+                    self._refuse(places[of_kind][is_zero], "the quaternion is zero")
                     usable &= ~is_zero
                 if kind == ACCEL:
                     self._follow(heads["number"].astype(np.int64))
-                yield _Found(kind, places[own][usable], heads["time_ns"][usable], values[usable])
+                yield _Found(kind, places[of_kind][usable], heads["time_ns"][usable], values[usable])
 
     def _misfit(self, kind: int, size: int, heads: NDArray[np.void]) -> str | None:
         """Why frames of this kind with so many bytes of values cannot be used."""

@@ -53,10 +53,10 @@ def sized(simulation: Simulation, effect: Hidden, sigmas: float) -> Hidden:
     logarithm, slope, before = 0.0, 1.0, (0.0, 0.0)
     for round_ in range(_ROUNDS):
         scaled = effect.scaled(math.exp(logarithm))
-        found = sizes_in_sigma(simulation, [scaled])[0]
-        if found is None:
+        size_sigma = sizes_in_sigma(simulation, [scaled])[0]
+        if size_sigma is None:
             break
-        missing = math.log(sigmas / found)
+        missing = math.log(sigmas / size_sigma)
         if abs(missing) < _TOLERANCE:
             return scaled
         if round_ and logarithm != before[0]:

@@ -64,18 +64,18 @@ class TrueNoise:
 
     def processes(self, seed: int, period_s: float, duration_s: float) -> list[Process]:
         """The processes to be added to readings every ``period_s`` over ``duration_s``, fresh from their start."""
-        found = list[Process]()
+        processes = list[Process]()
         if self.white_mps2:
             step = self.white_mps2 * math.sqrt(1.0 - self.ar1_phi**2)
-            found.append(FirstOrder(generator(seed, "white"), self.ar1_phi, step, self.white_mps2))
+            processes.append(FirstOrder(generator(seed, "white"), self.ar1_phi, step, self.white_mps2))
         if self.flicker_mps2:
-            found += flicker(seed, self.flicker_mps2, period_s, duration_s)
+            processes += flicker(seed, self.flicker_mps2, period_s, duration_s)
         if self.walk_mps2_per_sqrt_s:
             step = self.walk_mps2_per_sqrt_s * math.sqrt(period_s)
-            found.append(FirstOrder(generator(seed, "walk"), 1.0, step, 0.0))
+            processes.append(FirstOrder(generator(seed, "walk"), 1.0, step, 0.0))
         if self.outlier_rate and self.outlier_mps2:
-            found.append(Outliers(generator(seed, "outliers"), self.outlier_rate, self.outlier_mps2))
-        return found
+            processes.append(Outliers(generator(seed, "outliers"), self.outlier_rate, self.outlier_mps2))
+        return processes
 
 
 class FirstOrder:

@@ -41,13 +41,13 @@ def explicit_plan(gimbal_deg: Iterable[Sequence[float]], dwell_s: float = 60.0) 
 def stays(plan: Sequence[Visit]) -> tuple[Visit, ...]:
     """The plan with visits that follow each other at the same angles as one: a platform that is not moved is not set
     anew."""
-    out = list[Visit]()
+    visits = list[Visit]()
     for visit in plan:
-        if out and out[-1].gimbal_deg == visit.gimbal_deg:
-            out[-1] = replace(out[-1], dwell_s=out[-1].dwell_s + visit.dwell_s)
+        if visits and visits[-1].gimbal_deg == visit.gimbal_deg:
+            visits[-1] = replace(visits[-1], dwell_s=visits[-1].dwell_s + visit.dwell_s)
         else:
-            out.append(visit)
-    return tuple(out)
+            visits.append(visit)
+    return tuple(visits)
 
 
 def angles_from_csv(path: Path, width: int) -> list[list[float]]:
@@ -136,10 +136,10 @@ def _angles_towards(direction: Floats, axes: Sequence[Vector], rng: np.random.Ge
     best, cost = np.zeros(len(axes)), math.inf
     for _ in range(_STARTS):
         start = rng.uniform(-np.pi, np.pi, len(axes))
-        found = least_squares(miss, start, xtol=1e-12, args=(start,))
-        own = float(np.sum(found.fun[:3] ** 2))
-        if own < cost:
-            best, cost = found.x, own
+        solution = least_squares(miss, start, xtol=1e-12, args=(start,))
+        its_cost = float(np.sum(solution.fun[:3] ** 2))
+        if its_cost < cost:
+            best, cost = solution.x, its_cost
         if cost < _REACHED:
             break
     return (best + np.pi) % (2.0 * np.pi) - np.pi

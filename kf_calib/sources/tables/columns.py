@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats, Mask
+from kf_calib.bench.arrays import Floats, Mask, lengths
 from kf_calib.errors import InputError
 from kf_calib.sources.tables.grid import Cell, Grid
 from kf_calib.sources.tables.numbers import Numbers, stamps_of
@@ -122,7 +122,7 @@ class Columns:
         left = [k for k in range(len(self.meanings)) if not self.meanings[k].ours and k not in stated]
         if len(numeric := [k for k in left if self._are_numbers(k, _MOST)]) == 3:
             whole = np.array([all(self.is_number(row[k]) for k in numeric) for row in self.grid.rows])
-            norms = np.linalg.norm([self.values(k, only=whole)[whole] for k in numeric], axis=0)
+            norms = lengths(np.column_stack([self.values(k, only=whole)[whole] for k in numeric]))
             if norms.size and 0 < norms.max() < _ALIKE * norms.min():
                 for k, ours in zip(numeric, READINGS, strict=True):
                     self._guess(k, ours)

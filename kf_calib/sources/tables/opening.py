@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import Floats, lengths
 from kf_calib.bench.bench import Bench, parse_axes
 from kf_calib.bench.gravity_alone import bench_without_angles
 from kf_calib.bench.raw_input import PLAIN, RawInput, merged_metadata
@@ -62,7 +62,7 @@ def open_table(
     """
     grid = grid_of(table)
     numbers = Numbers.of(grid)
-    found = Columns.of(grid, columns, numbers)
+    meanings = Columns.of(grid, columns, numbers)
     given = {"accel_unit": accel_unit, "accel_scale": accel_scale}
     keys = {**overrides, **{key: str(value) for key, value in given.items() if value is not None}}
     try:
@@ -70,7 +70,7 @@ def open_table(
         units = Units.of(keys, angle_unit, g_unit, input)
     except BenchError as error:
         raise BenchError(f"{grid.name}: {error}") from None
-    return Opening(found, keys if order is None else keys | {"channels": order}, units, angles=angles).table()
+    return Opening(meanings, keys if order is None else keys | {"channels": order}, units, angles=angles).table()
 
 
 class Opening:
@@ -177,7 +177,7 @@ class Opening:
         if columns.has(*QUATERNION):
             places = columns.places(*QUATERNION)
             pose = np.column_stack([columns.values(place) for place in places])
-            norms = np.linalg.norm(pose, axis=1)
+            norms = lengths(pose)
             for row in np.flatnonzero(np.abs(norms - 1.0) > 0.01):
                 raise self.grid.refuse(
                     int(row), "qx, qy, qz, qw", ", ".join(f"{part:g}" for part in pose[row]),
@@ -190,16 +190,16 @@ class Opening:
     def _faces(self) -> Floats:
         (place,) = self.columns.places("face")
         up = self.overrides.get("up", "y").strip().lower().removeprefix("+")
-        out = list[Floats]()
+        quaternions = list[Floats]()
         for row, cell in enumerate(self.grid.column(place)):
             face = face_of(str(cell or ""))
             if face is None:
                 raise self.grid.refuse(
                     row, self.grid.header[place], cell, "write the axis that points up, one of +x, -x, +y, -y, +z, -z"
                 )
-            out.append(_attitude(*face, up))
+            quaternions.append(_attitude(*face, up))
         self.said.append(f"axis that points up from {self.columns.named([place])}")
-        return np.array(out)
+        return np.array(quaternions)
 
     def _angles(self) -> Floats:
         columns, places = self.columns, self.columns.angles
@@ -250,7 +250,7 @@ class Opening:
             named = self.units.told_by([self.grid.header[place] for place in places], by_name)
         except InputError as error:
             raise InputError(f"{self.grid.name}: {error}") from None
-        norm = float(np.median(np.linalg.norm(values, axis=1)))
+        norm = float(np.median(lengths(values)))
         told = reading_units(named, norm, self.units, bench.gravity_mps2)
         self.has_unit = told.is_known
         self.raw = told.raw
@@ -289,12 +289,12 @@ class Opening:
             place = places[int(k)]
             raise self.grid.refuse(int(row), self.grid.header[place], self.grid.rows[row][place],
                                    "a standard deviation is not negative")  # fmt: skip
-        own = [columns.meanings[place].unit for place in places]
+        units = [columns.meanings[place].unit for place in places]
         readings = columns.places(*READINGS)
         means = np.column_stack([columns.values(place) for place in readings])
         factors, _ = self._accel_factors(readings, means, bench)
-        if own[0] and own[0] != "count":
-            factors = mps2_per([unit or own[0] for unit in own], self.units, bench.gravity_mps2)
+        if units[0] and units[0] != "count":
+            factors = mps2_per([unit or units[0] for unit in units], self.units, bench.gravity_mps2)
         return values * factors, self._counts()
 
     def _counts(self) -> list[int]:
@@ -333,11 +333,11 @@ def _attitude(axis: int, sign: int, up: str) -> Floats:
 
     Of all such attitudes, that which is reached by the shortest turn; a turn about the vertical changes no reading.
     """
-    own = sign * np.eye(3)[axis]
+    upward = sign * np.eye(3)[axis]
     target = (-1.0 if up.startswith("-") else 1.0) * np.array(_UP[up.removeprefix("-")])
-    turned = np.append(np.cross(own, target), 1.0 + float(own @ target))
+    turned = np.append(np.cross(upward, target), 1.0 + float(upward @ target))
     if not turned.any():
-        turned = np.append(np.roll(np.abs(own), 1), 0.0)  # half a turn about any axis across
+        turned = np.append(np.roll(np.abs(upward), 1), 0.0)  # half a turn about any axis across
     return turned / np.linalg.norm(turned)
 
 

@@ -22,28 +22,28 @@ _ROW_IN, _LINE_IN = 0.23, 0.14
 _LINE = 150  # letters of a line below the panels
 
 
-def detection_limits(found: Diagnosis) -> Figure:
+def detection_limits(diagnosis: Diagnosis) -> Figure:
     """Usual sizes of each effect over the smallest that this run would find; below, what it cannot see, and why.
 
     The part of a bar on the left of 1 could hide in the run: it is drawn in another colour. Usual sizes are those of
     sensors of the grade that the noise of the run is of.
     """
-    half = (len(found.detectable) + 1) // 2
-    below_in = _LINE_IN * (2 + sum(len(text.splitlines()) for text in _unseen_texts(found.unseen)))
+    half = (len(diagnosis.detectable) + 1) // 2
+    below_in = _LINE_IN * (2 + sum(len(text.splitlines()) for text in _unseen_texts(diagnosis.unseen)))
     height_in = max(7.0, 1.2 + _ROW_IN * half + below_in)
     with styled():
         figure = blank(11.0, height_in)
-        draw_detection_limits(figure, found, below_in / height_in)
+        draw_detection_limits(figure, diagnosis, below_in / height_in)
     return figure
 
 
-def draw_detection_limits(figure: FigureBase, found: Diagnosis, below: float) -> None:
+def draw_detection_limits(figure: FigureBase, diagnosis: Diagnosis, below: float) -> None:
     """The same on a part of a figure; below: share of its height for what is not seen."""
-    sizes, texts = _ordered(found.detectable, found.grade), _unseen_texts(found.unseen)
+    sizes, texts = _ordered(diagnosis.detectable, diagnosis.grade), _unseen_texts(diagnosis.unseen)
     half = (len(sizes) + 1) // 2
     grid = figure.add_gridspec(2, 2, height_ratios=(1.0 - below, below))
-    for column, own in enumerate((sizes[:half], sizes[half:])):
-        _bars(figure.add_subplot(grid[0, column]), own, half, found.grade, not column)
+    for column, half_of_sizes in enumerate((sizes[:half], sizes[half:])):
+        _bars(figure.add_subplot(grid[0, column]), half_of_sizes, half, diagnosis.grade, not column)
     words = figure.add_subplot(grid[1, :])
     words.set_axis_off()
     words.set_title("Not to be seen in this run at any size" if texts else "Every effect could be seen in this run")
@@ -64,17 +64,17 @@ def _bars(axes: Axes, sizes: Sequence[Detectable], rows: int, grade: Grade, firs
     """Draw a row for each effect: usual sizes over the smallest that would be found."""
     axes.set_xscale("log")
     axes.set_xlim(_LOW, _HIGH)
-    for k, each in enumerate(sizes):
-        usual = each.typical.of(grade)
-        smallest = shown(each.coefficient).text(each.minimum)
+    for k, detectable in enumerate(sizes):
+        usual = detectable.typical.of(grade)
+        smallest = shown(detectable.coefficient).text(detectable.minimum)
         if usual is None:
             axes.text(1.4, k, "no usual size is known", va="center", color=GREY, fontsize=7.5)
         else:
-            _bar(axes, k, usual[0] / each.minimum, usual[1] / each.minimum)
-            smallest += f"  ({size_range(usual, each.coefficient)})"
+            _bar(axes, k, usual[0] / detectable.minimum, usual[1] / detectable.minimum)
+            smallest += f"  ({size_range(usual, detectable.coefficient)})"
         axes.text(1.02, k, smallest, transform=axes.get_yaxis_transform(), va="center", fontsize=7.5)
     axes.axvline(1.0, color="#222222", linewidth=1.2)
-    axes.set_yticks(range(len(sizes)), [each.name for each in sizes], fontsize=8.0)
+    axes.set_yticks(range(len(sizes)), [detectable.name for detectable in sizes], fontsize=8.0)
     axes.set_ylim(max(rows, 3) - 0.4, -0.6)
     axes.grid(visible=False, axis="y")
     label_axis(axes.xaxis, _LOW, _HIGH)

@@ -27,10 +27,10 @@ def dwell(source: Source, result: Calibration, number: int | None = None) -> Fig
 def draw_dwell(figure: FigureBase, readings: DwellReadings, model: str) -> None:
     """The same on a part of a figure; model: what the prediction is of, in words."""
     panels = figure.subplots(3, 2, sharex="col", sharey="col", squeeze=False, width_ratios=(2.2, 1.0))
-    for i, (each, near) in enumerate(panels):
-        _readings(each, readings, i)
-        _mean(near, readings, i)
-        each.set_ylabel(f"accelerometer {i + 1}\nreading − model, {shown('m/s^2').label}")
+    for i, (wide, narrow) in enumerate(panels):
+        _readings(wide, readings, i)
+        _mean(narrow, readings, i)
+        wide.set_ylabel(f"accelerometer {i + 1}\nreading − model, {shown('m/s^2').label}")
     some = "" if readings.every == 1 else f"; one of {readings.every} readings is drawn"
     panels[0, 0].set_title(f"Dwell {readings.number}, reading by reading, less the model: {model}{some}")
     panels[0, 1].set_title(f"Mean of its {readings.count} readings, ± 1σ and 2σ")

@@ -25,19 +25,19 @@ from kf_calib.views.figures.symbols import twelve
 _SETS = {"optimal": ("#0072b2", "-"), "non-optimal": ("#d55e00", "--")}
 
 
-def table2(found: Experiment) -> Figure:
+def table2(experiment: Experiment) -> Figure:
     """Mean size of the error of each parameter, of both sets: printed, expected, by least squares and by the filter."""
     with styled():
         figure = blank(11.0, 6.0)
-        draw_table2(figure, found)
+        draw_table2(figure, experiment)
     return figure
 
 
-def draw_table2(figure: FigureBase, found: Experiment) -> None:
+def draw_table2(figure: FigureBase, experiment: Experiment) -> None:
     """The same on a part of a figure."""
     axes, place = figure.subplots(), np.arange(STATE_COUNT)
     every = list[np.ndarray]()
-    for (name, (colour, _)), (column, table) in zip(_SETS.items(), _tables(found), strict=True):
+    for (name, (colour, _)), (column, table) in zip(_SETS.items(), _tables(experiment), strict=True):
         computed = (column.orientations.expected, column.least_squares, column.kalman)
         every += [printed_column(table), *computed]
         axes.hlines(column.orientations.expected, place - 0.38, place + 0.38, color=colour, linewidth=2.0,
@@ -54,23 +54,23 @@ def draw_table2(figure: FigureBase, found: Experiment) -> None:
     axes.set_xticks(place, [each.label for each in twelve()])
     axes.grid(visible=False, axis="x")
     axes.set_ylabel("mean of |error|, % of the deviation that was to be found")
-    axes.set_title(f"Table 2 of the paper and {written(found.repetitions)} repetitions: optimal orientations below, "
-                   "non-optimal ones above")  # fmt: skip
+    axes.set_title(f"Table 2 of the paper and {written(experiment.repetitions)} repetitions: optimal orientations "
+                   "below, non-optimal ones above")  # fmt: skip
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4)
 
 
-def falling(found: Experiment) -> Figure:
+def falling(experiment: Experiment) -> Figure:
     """Sigma of every parameter as readings come, in the optimal and the non-optimal set, from the same prior."""
     with styled():
         figure = blank(11.0, 7.0)
-        draw_falling(figure, found)
+        draw_falling(figure, experiment)
     return figure
 
 
-def draw_falling(figure: FigureBase, found: Experiment) -> None:
+def draw_falling(figure: FigureBase, experiment: Experiment) -> None:
     """The same on a part of a figure."""
     panels, _ = parameter_panels(figure, "σ")
-    both = [falling_sigma(column.orientations) for column, _ in _tables(found)]
+    both = [falling_sigma(column.orientations) for column, _ in _tables(experiment)]
     for k, axes in enumerate(panels):
         for (name, (colour, style)), sigmas in zip(_SETS.items(), both, strict=True):
             values = sigmas[:, k] * twelve()[k].per_si
@@ -89,14 +89,14 @@ def draw_falling(figure: FigureBase, found: Experiment) -> None:
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
 
 
-def design_matrices(found: Experiment) -> Figure:
+def design_matrices(experiment: Experiment) -> Figure:
     """The design matrices of both sets, as the paper's figure 4: a column a parameter, a row a reading."""
     with styled():
         figure = blank(11.0, 5.0)
         panels = figure.subplots(1, 6, sharey=True)
         unit = np.array([GRAVITY_MPS2, GRAVITY_MPS2, GRAVITY_MPS2, 1.0])  # of angles and scale factor, of the bias
         every = [(name, i, column.orientations.design[i] / unit)
-                 for name, (column, _) in zip(_SETS, _tables(found), strict=True) for i in range(3)]  # fmt: skip
+                 for name, (column, _) in zip(_SETS, _tables(experiment), strict=True) for i in range(3)]  # fmt: skip
         for axes, (name, i, matrix) in zip(panels, every, strict=True):
             axes.imshow(matrix, cmap="RdBu_r", vmin=-1.0, vmax=1.0, aspect="auto", interpolation="nearest")
             axes.set_xticks(range(4), [each.label for each in twelve()[4 * i : 4 * i + 4]])
@@ -108,16 +108,16 @@ def design_matrices(found: Experiment) -> Figure:
     return figure
 
 
-def _tables(found: Experiment) -> list[tuple[Column, dict[str, float]]]:
+def _tables(experiment: Experiment) -> list[tuple[Column, dict[str, float]]]:
     """Return both sets with their columns of Table 2."""
-    return [(found.optimal, OPTIMAL_PRINTED), (found.nonoptimal, NONOPTIMAL_PRINTED)]
+    return [(experiment.optimal, OPTIMAL_PRINTED), (experiment.nonoptimal, NONOPTIMAL_PRINTED)]
 
 
 @figures.register
-def experiment_figures(found: Experiment) -> Figures:
+def experiment_figures(experiment: Experiment) -> Figures:
     """The figures of the experiment by title."""
     return {
-        "Table 2 of the paper": lambda: table2(found),
-        "Sigma as readings come": lambda: falling(found),
-        "Design matrices of both sets": lambda: design_matrices(found),
+        "Table 2 of the paper": lambda: table2(experiment),
+        "Sigma as readings come": lambda: falling(experiment),
+        "Design matrices of both sets": lambda: design_matrices(experiment),
     }

@@ -44,17 +44,17 @@ _COLOURS = ("#0072b2", "#e69f00", "#cc79a7", "#009e73", "#56b4e9", "#d55e00", "#
 _KNOWN = {"consistent": PALE, "failed": ALARM, "not judged": "#e9e9e9", "inconsistent": GREY}
 
 
-def units(found: FleetOverview) -> Figure:
+def units(overview: FleetOverview) -> Figure:
     """A panel a parameter: each run and the mean of each unit, on the band of the population; outliers are named."""
     with styled():
-        figure, panels = _panels(found.tracks, sharex=True)
-        for track, axes in zip(found.tracks, panels, strict=False):
-            _population(axes, found.units, track)
-        few = len(found.units) <= _NAMED
+        figure, panels = _panels(overview.tracks, sharex=True)
+        for track, axes in zip(overview.tracks, panels, strict=False):
+            _population(axes, overview.units, track)
+        few = len(overview.units) <= _NAMED
         for axes in panels:
-            axes.set_xlim(-0.7, len(found.units) - 0.3)
+            axes.set_xlim(-0.7, len(overview.units) - 0.3)
             if few:
-                names = [short_name(name) for name in found.units]
+                names = [short_name(name) for name in overview.units]
                 axes.set_xticks(range(len(names)), names, rotation=90, fontsize=6.0)
             else:
                 axes.set_xlabel("unit")
@@ -83,13 +83,13 @@ def _population(axes: Axes, names: Sequence[str], track: Track) -> None:
     axes.set_title(f"{symbol(track.symbol)} less nominal, {unit.label}".rstrip(", "))
 
 
-def charts(found: FleetOverview) -> Figure:
+def charts(overview: FleetOverview) -> Figure:
     """A control chart a parameter: each run less the mean of its unit against its date, limits of 2 and 3 sigma."""
     with styled():
-        if all(date is None for track in found.tracks for date in track.dates):
+        if all(date is None for track in overview.tracks for date in track.dates):
             return _empty("No run has a date, so there is no control chart.")
-        figure, panels = _panels(found.tracks, sharex=True)
-        for track, axes in zip(found.tracks, panels, strict=False):
+        figure, panels = _panels(overview.tracks, sharex=True)
+        for track, axes in zip(overview.tracks, panels, strict=False):
             _chart(axes, track)
             _dated(axes)
         _legend(figure, panels)
@@ -113,13 +113,13 @@ def _chart(axes: Axes, track: Track) -> None:
     axes.set_title(f"{symbol(track.symbol)}, {unit.label}".rstrip(", "))
 
 
-def sigmas(found: FleetOverview) -> Figure:
+def sigmas(overview: FleetOverview) -> Figure:
     """The sigma that runs gave of each parameter: middle 50 and 90 % of the runs, and the target where there is one."""
     with styled():
-        kinds = list(dict.fromkeys(track.unit for track in found.tracks))
+        kinds = list(dict.fromkeys(track.unit for track in overview.tracks))
         if not kinds:
             return _empty("No run determined a parameter.")
-        groups = [[track for track in found.tracks if track.unit == kind] for kind in kinds]
+        groups = [[track for track in overview.tracks if track.unit == kind] for kind in kinds]
         figure = blank(13.0, 4.5)
         panels = figure.subplots(1, len(kinds), squeeze=False, width_ratios=[len(own) + 1 for own in groups])
         for own, axes in zip(groups, panels.flat, strict=True):
@@ -128,9 +128,9 @@ def sigmas(found: FleetOverview) -> Figure:
     return figure
 
 
-def _achieved(axes: Axes, own: Sequence[Track]) -> None:
-    unit = shown(own[0].unit)
-    for k, track in enumerate(own):
+def _achieved(axes: Axes, tracks: Sequence[Track]) -> None:
+    unit = shown(tracks[0].unit)
+    for k, track in enumerate(tracks):
         low, inner, middle, outer, high = np.quantile(track.sigmas * unit.per_si, [0.05, 0.25, 0.5, 0.75, 0.95])
         colour = _own(track.symbol)[1]
         axes.plot([k, k], [low, high], color=colour, linewidth=1.2, label="middle 90 % of the runs")
@@ -142,15 +142,15 @@ def _achieved(axes: Axes, own: Sequence[Track]) -> None:
             reached = int(np.sum(track.sigmas <= track.target))
             axes.annotate(f"{reached} of {len(track.sigmas)}", (k, wanted), xytext=(0, 3), textcoords="offset points",
                           ha="center", color=ALARM, fontsize=7.0)  # fmt: skip
-    log_scale(axes, [np.append(track.sigmas, track.target or track.sigmas[0]) * unit.per_si for track in own])
-    axes.set_xticks(range(len(own)), [symbol(track.symbol) for track in own])
-    axes.set_xlim(-0.7, len(own) - 0.3)
+    log_scale(axes, [np.append(track.sigmas, track.target or track.sigmas[0]) * unit.per_si for track in tracks])
+    axes.set_xticks(range(len(tracks)), [symbol(track.symbol) for track in tracks])
+    axes.set_xlim(-0.7, len(tracks) - 0.3)
     axes.set_title(f"σ of a run, {unit.label}".rstrip(", "))
 
 
-def verdicts(found: FleetOverview) -> Figure:
+def verdicts(overview: FleetOverview) -> Figure:
     """How many runs came to what in each week."""
-    weeks = found.weeks
+    weeks = overview.weeks
     with styled():
         if not weeks.begins:
             return _empty("No run has a date, so there are no weeks.")
@@ -158,11 +158,11 @@ def verdicts(found: FleetOverview) -> Figure:
         axes = figure.subplots()
         begins, bottom = date2num(weeks.begins), np.zeros(len(weeks.begins))
         colours = iter(_COLOURS)
-        own = dict[str, Floats]()
+        runs_by_label = dict[str, Floats]()
         for name, counts in weeks.counts.items():
-            label = name if len(own) < _TOLD or name in _KNOWN else "other"
-            own[label] = own.get(label, np.zeros(len(begins))) + np.array(counts)
-        for label, counts in own.items():
+            label = name if len(runs_by_label) < _TOLD or name in _KNOWN else "other"
+            runs_by_label[label] = runs_by_label.get(label, np.zeros(len(begins))) + np.array(counts)
+        for label, counts in runs_by_label.items():
             colour = _KNOWN.get(label) or next(colours, BEST)
             axes.bar(begins + 3.5, counts, width=6.0, bottom=bottom, color=colour, label=plain(label))
             bottom = bottom + counts
@@ -175,12 +175,12 @@ def verdicts(found: FleetOverview) -> Figure:
     return figure
 
 
-def bench_terms(found: FleetOverview) -> Figure:
+def bench_terms(overview: FleetOverview) -> Figure:
     """Each error of a bench that was found: its coefficients in parts of the campaign, and those of all of it."""
-    terms = [each for each in (found.pooled.findings if found.pooled else ()) if each.over_time]
+    terms = [each for each in (overview.pooled.findings if overview.pooled else ()) if each.over_time]
     with styled():
         if not terms:
-            return _empty(_no_terms(found))
+            return _empty(_no_terms(overview))
         pairs = [(term, bench) for term in terms for bench in dict.fromkeys(each.bench for each in term.over_time)]
         wide = min(len(pairs), 2)
         high = -(-len(pairs) // wide)
@@ -193,29 +193,29 @@ def bench_terms(found: FleetOverview) -> Figure:
     return figure
 
 
-def _no_terms(found: FleetOverview) -> str:
-    if found.pooled is None:
+def _no_terms(overview: FleetOverview) -> str:
+    if overview.pooled is None:
         return "The runs were not diagnosed together."
     return "The runs show no error of a bench."
 
 
 def _followed(axes: Axes, term: Finding, bench: str) -> None:
     """Draw the coefficients of one effect on one bench."""
-    parts = [each for each in term.over_time if each.bench == bench]
-    whole = [each for each in term.benches if each.bench == bench]
+    parts = [coefficient for coefficient in term.over_time if coefficient.bench == bench]
+    whole = [coefficient for coefficient in term.benches if coefficient.bench == bench]
     unit = shown(parts[0].coefficients[0].unit)
     axes.axhline(0.0, color=GREY, linewidth=0.7)
-    for k, each in enumerate(parts[0].coefficients):
+    for k, coefficient in enumerate(parts[0].coefficients):
         colour, marker = ACCELEROMETERS[k % 3], MARKERS[k % 3]
         dates, values, reach = _curve(parts, k, unit.per_si)
         shift = (k - 0.5 * (len(parts[0].coefficients) - 1)) * 0.06
         places = _places(dates, shift)
-        axes.errorbar(places, values, reach, fmt=marker, color=colour, elinewidth=0.9, label=symbol(each.symbol))
-        first, own, _ = _curve(whole, k, unit.per_si)
+        axes.errorbar(places, values, reach, fmt=marker, color=colour, elinewidth=0.9, label=symbol(coefficient.symbol))
+        first, constants, _ = _curve(whole, k, unit.per_si)
         first = [dates[0], *first[1:]]  # the first values hold from the first run on
-        axes.step([*first, places[-1]], [*own, own[-1]], where="post", color=colour, linewidth=1.1)
+        axes.step([*first, places[-1]], [*constants, constants[-1]], where="post", color=colour, linewidth=1.1)
     axes.set_title(f"{plain(term.effect)}, {plain(bench or 'the bench')}, {unit.label} (2σ)")
-    if all(each.since for each in parts):
+    if all(coefficient.since for coefficient in parts):
         _dated(axes)
     axes.legend(loc="best", fontsize=7.5)
 
@@ -237,9 +237,9 @@ def _places(dates: Sequence[float], shift: float) -> list[float]:
     return [0.5 * (begin + end) + shift * width for begin, end in zip(dates, ends, strict=True)]
 
 
-def another_look(found: FleetOverview) -> Figure:
+def another_look(overview: FleetOverview) -> Figure:
     """Units that need another look, those of which noise explains least first."""
-    shown_here = found.looks[:_LISTED]
+    shown_here = overview.looks[:_LISTED]
     with styled():
         if not shown_here:
             return _empty("No unit needs another look.")
@@ -256,8 +256,8 @@ def another_look(found: FleetOverview) -> Figure:
             axes.text(0.03, k, plain(short_name(look.unit)), va="center", fontweight="bold")
             axes.text(0.2, k, chance_words(look.chance), va="center")
             axes.text(0.32, k, plain(wrapped("; ".join(look.reasons[:2]) + more, 120)), va="center", fontsize=8.0)
-        if len(found.looks) > len(shown_here):
-            axes.text(0.03, len(shown_here) - 0.5, f"{len(found.looks) - len(shown_here)} more", color=GREY)
+        if len(overview.looks) > len(shown_here):
+            axes.text(0.03, len(shown_here) - 0.5, f"{len(overview.looks) - len(shown_here)} more", color=GREY)
     return figure
 
 
@@ -300,13 +300,13 @@ def _empty(text: str) -> Figure:
 
 
 @figures.register
-def fleet_figures(found: FleetOverview) -> Figures:
+def fleet_figures(overview: FleetOverview) -> Figures:
     """The figures of a fleet by title."""
     return {
-        "Parameters over the units": lambda: units(found),
-        "Units that need another look first": lambda: another_look(found),
-        "Errors of the bench over time": lambda: bench_terms(found),
-        "Verdicts by week": lambda: verdicts(found),
-        "Control charts": lambda: charts(found),
-        "Sigma achieved": lambda: sigmas(found),
+        "Parameters over the units": lambda: units(overview),
+        "Units that need another look first": lambda: another_look(overview),
+        "Errors of the bench over time": lambda: bench_terms(overview),
+        "Verdicts by week": lambda: verdicts(overview),
+        "Control charts": lambda: charts(overview),
+        "Sigma achieved": lambda: sigmas(overview),
     }

@@ -36,19 +36,19 @@ class _Bar(NamedTuple):
         return self.name.count("\n") + 1
 
 
-def hypotheses(found: Diagnosis) -> Figure:
+def hypotheses(diagnosis: Diagnosis) -> Figure:
     """The probability of each family of effects, and of each explanation in the colours of its families.
 
     Those of less than 1 % are drawn together. Beside each explanation stands the logarithm of its odds to the next.
     """
     with styled():
-        if found.table is None:
+        if diagnosis.table is None:
             figure = blank(11.0, 2.0)
-            say(figure, wrapped(found.verdict, 110))
+            say(figure, wrapped(diagnosis.verdict, 110))
             return figure
-        lines = sum(bar.lines + 0.5 for bars in _bars(found.table) for bar in bars)
+        lines = sum(bar.lines + 0.5 for bars in _bars(diagnosis.table) for bar in bars)
         figure = blank(11.0, 1.9 + _LINE_IN * lines)
-        draw_hypotheses(figure, found.table)
+        draw_hypotheses(figure, diagnosis.table)
     return figure
 
 

@@ -85,12 +85,14 @@ def _effects(points: Sequence[_Point]) -> list[str]:
 
 def _points(state: Improvement) -> list[_Point]:
     """Return the models from the first to the last, undone ones where they stood, then those that are equally good."""
-    out = [_Point("start", state.start.before, state.start.test.p_value)]
+    points = [_Point("start", state.start.before, state.start.test.p_value)]
     for step in state.history:
-        out.append(_Point(_label(step), step.result, step.diagnosis.test.p_value, "undone" if step.undone else "step"))
+        points.append(
+            _Point(_label(step), step.result, step.diagnosis.test.p_value, "undone" if step.undone else "step")
+        )
     others = [each for each in state.alternatives if each.result is not state.result]
     word = "+" if len(others) == len(state.alternatives) else "or"
-    return [*out, *(_Point(f"{word} {each.name}?", each.result, None, "either") for each in others)]
+    return [*points, *(_Point(f"{word} {each.name}?", each.result, None, "either") for each in others)]
 
 
 def _label(step: SelectionStep) -> str:
@@ -165,20 +167,33 @@ def _coefficients(figure: SubFigure, points: Sequence[_Point], effects: Sequence
 
 def _of_effect(axes: Axes, name: str, points: Sequence[_Point]) -> None:
     """Draw the coefficients of one effect over the models."""
-    having = [(x, _parameters(each.result, name)) for x, each in enumerate(points)]
-    having = [(x, own) for x, own in having if own]
-    symbols = list(dict.fromkeys(p.symbol for _, own in having for p in own))
-    unit = shown(having[0][1][0])
-    for k, each in enumerate(symbols):
+    fitted = [(x, _parameters(point.result, name)) for x, point in enumerate(points)]
+    fitted = [(x, parameters) for x, parameters in fitted if parameters]
+    symbols = list(dict.fromkeys(p.symbol for _, parameters in fitted for p in parameters))
+    unit = shown(fitted[0][1][0])
+    for k, coefficient in enumerate(symbols):
         shift = 0.5 * (k - 0.5 * (len(symbols) - 1)) / max(len(symbols), 1)
-        values = [(x + shift, p.value * unit.per_si, p.sigma * unit.per_si) for x, own in having for p in own
-                  if p.symbol == each and p.value is not None and p.sigma is not None]  # fmt: skip
+        values = [
+            (x + shift, p.value * unit.per_si, p.sigma * unit.per_si)
+            for x, parameters in fitted
+            for p in parameters
+            if p.symbol == coefficient and p.value is not None and p.sigma is not None
+        ]
         if values:
             places, middles, sigmas = zip(*values, strict=True)
-            own = _accelerometer(each, k)
-            again = own in [_accelerometer(other, j) for j, other in enumerate(symbols[:k])]
-            axes.errorbar(places, middles, sigmas, fmt=MARKERS[own], color=ACCELEROMETERS[own], capsize=2.0,
-                          markersize=5.0, markerfacecolor="white" if again else None, label=symbol(each))  # fmt: skip
+            sensor = _accelerometer(coefficient, k)
+            again = sensor in [_accelerometer(other, j) for j, other in enumerate(symbols[:k])]
+            axes.errorbar(
+                places,
+                middles,
+                sigmas,
+                fmt=MARKERS[sensor],
+                color=ACCELEROMETERS[sensor],
+                capsize=2.0,
+                markersize=5.0,
+                markerfacecolor="white" if again else None,
+                label=symbol(coefficient),
+            )
     axes.axhline(0.0, color=GREY, linewidth=0.8)
     axes.set_xlim(-0.5, len(points) - 0.5)
     axes.set_xticks(range(len(points)))
@@ -220,10 +235,10 @@ def draw_residuals_of_steps(figure: FigureBase, state: Improvement, drivers: Seq
     unit, scale = driver_axis(driver)
     sigmas = mean_sigmas(state.start.before)
     panels = figure.subplots(3, len(drawn), sharex=True, sharey=True, squeeze=False)
-    for column, (words, found) in enumerate(drawn):
-        ratios = unexplained_mps2(found.before) / sigmas
+    for column, (words, diagnosis) in enumerate(drawn):
+        ratios = unexplained_mps2(diagnosis.before) / sigmas
         panels[0, column].set_title(
-            f"{wrapped(words, 28)}\n{_fate(found, state.result.held_out_floor_mps2)}", fontsize=8.5
+            f"{wrapped(words, 28)}\n{_fate(diagnosis, state.result.held_out_floor_mps2)}", fontsize=8.5
         )
         for i, axes in enumerate(panels[:, column]):
             for bound in (-2.0, 2.0):
@@ -236,8 +251,8 @@ def draw_residuals_of_steps(figure: FigureBase, state: Improvement, drivers: Seq
         letter(panels[0, 1], f"{len(steps) - len(drawn)} steps before it are left out")
 
 
-def _fate(found: Diagnosis, floor_mps2: float | None) -> str:
+def _fate(diagnosis: Diagnosis, floor_mps2: float | None) -> str:
     """Return the held-out error over the noise floor and the p-value of a model in one line."""
-    rms = found.before.held_out_rms_mps2
+    rms = diagnosis.before.held_out_rms_mps2
     times = f"{rms / floor_mps2:.2f} × floor, " if rms is not None and floor_mps2 else ""
-    return f"{times}p {format_p(found.test.p_value)}"
+    return f"{times}p {format_p(diagnosis.test.p_value)}"

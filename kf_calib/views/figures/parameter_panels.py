@@ -29,10 +29,10 @@ def parameter_panels(figure: FigureBase, quantity: str, more: Sequence[Sequence[
     """
     rows = 4 + -(-len(more) // 3)
     panels = figure.subplots(rows, 3, sharex=True, squeeze=False)
-    own = [panels[row, column] for column in range(3) for row in range(4)]
-    for k, axes in enumerate(own):
+    twelve_panels = [panels[row, column] for column in range(3) for row in range(4)]
+    for k, axes in enumerate(twelve_panels):
         if k >= 4:
-            axes.sharey(own[k % 4])
+            axes.sharey(twelve_panels[k % 4])
             axes.tick_params(labelleft=False)
         else:
             axes.set_ylabel(f"{quantity} of {_ROWS[k]},\n{twelve()[k].unit}" if twelve()[k].unit else quantity)
@@ -41,7 +41,7 @@ def parameter_panels(figure: FigureBase, quantity: str, more: Sequence[Sequence[
     others = list(panels[4:].flat)
     for axes in others[len(more) :]:
         axes.set_axis_off()
-    return own, others[: len(more)]
+    return twelve_panels, others[: len(more)]
 
 
 def draw_sigmas(
@@ -52,12 +52,12 @@ def draw_sigmas(
     panels, others = parameter_panels(figure, "σ", groups)
     largest = _largest(sigmas[-1, :STATE_COUNT])
     for k, axes in enumerate(panels):
-        own, values = names[k], sigmas[:, k] * names[k].per_si
+        name, values = names[k], sigmas[:, k] * names[k].per_si
         _curve(axes, numbers, values, k // 4)
-        text = f"{own.label}  {_final(values[-1], own.unit)}"
+        text = f"{name.label}  {_final(values[-1], name.unit)}"
         corner(axes, text + ("\nlargest of its kind" if k in largest else ""), k in largest)
         if targets is not None and np.isfinite(targets[k]):
-            axes.axhline(targets[k] * own.per_si, color=ALARM, linewidth=1.2, linestyle="--", label="target")
+            axes.axhline(targets[k] * name.per_si, color=ALARM, linewidth=1.2, linestyle="--", label="target")
     for k in range(4):
         row = [sigmas[:, k::4][:, :3] * names[k].per_si]
         if targets is not None:
@@ -77,19 +77,19 @@ def draw_sigmas(
 
 def _by_unit(names: Sequence[Shown]) -> list[list[int]]:
     """Return the places of the coefficients of effects, those of one unit together."""
-    found = dict[str, list[int]]()
-    for k, each in enumerate(names[STATE_COUNT:], STATE_COUNT):
-        found.setdefault(each.unit, []).append(k)
-    return list(found.values())
+    groups = dict[str, list[int]]()
+    for k, name in enumerate(names[STATE_COUNT:], STATE_COUNT):
+        groups.setdefault(name.unit, []).append(k)
+    return list(groups.values())
 
 
 def _largest(sigma: Floats) -> set[int]:
     """Return the places of the largest angle's, scale factor's and bias's sigma of the twelve."""
-    units, out = np.array(paper_parameters.UNITS), set[int]()
+    units, places = np.array(paper_parameters.UNITS), set[int]()
     for unit in KINDS:
-        own = np.flatnonzero((units == unit) & np.isfinite(sigma))
-        out |= {int(own[np.argmax(sigma[own])])} if own.size else set()
-    return out
+        of_unit = np.flatnonzero((units == unit) & np.isfinite(sigma))
+        places |= {int(of_unit[np.argmax(sigma[of_unit])])} if of_unit.size else set()
+    return places
 
 
 def _curve(axes: Axes, numbers: Floats, values: Floats, i: int, style: int = 0, name: str = "") -> None:

@@ -39,7 +39,7 @@ _PANELS = 8  # drivers in small panels
 _MANY = 150  # dwells, above which markers are smaller and bars of sigma are left out
 
 
-def residuals(found: Diagnosis, driver: str | None = None) -> Figure:
+def residuals(diagnosis: Diagnosis, driver: str | None = None) -> Figure:
     """Residuals of each accelerometer against what they go with most, the best explanation, and what it leaves.
 
     From the left: the residuals of the model, with what the best explanation and the runner-up predict of them; the
@@ -47,29 +47,31 @@ def residuals(found: Diagnosis, driver: str | None = None) -> Figure:
     leaves. All are means of dwells, with 1 sigma, on the same axes. driver: another quantity to draw them against, by
     its symbol, such as ``q1`` or ``T``. Raises TypeError for what is no diagnosis.
     """
-    if not isinstance(found, Diagnosis):
+    if not isinstance(diagnosis, Diagnosis):
         raise TypeError(
-            f"residuals are drawn of a diagnosis, not of a {type(found).__name__}: give what diagnose returns."
+            f"residuals are drawn of a diagnosis, not of a {type(diagnosis).__name__}: give what diagnose returns."
         )
     with styled():
         figure = blank(11.0, 7.0)
-        draw_residuals(figure, found, found.drivers, driver)
+        draw_residuals(figure, diagnosis, diagnosis.drivers, driver)
     return figure
 
 
-def draw_residuals(figure: FigureBase, found: Diagnosis, drivers: Sequence[Driver], symbol: str | None = None) -> None:
+def draw_residuals(
+    figure: FigureBase, diagnosis: Diagnosis, drivers: Sequence[Driver], symbol: str | None = None
+) -> None:
     """The same on a part of a figure; drivers: of the residuals, the first is taken where no symbol is given."""
     driver = driver_to_show([each for each in drivers if symbol in (None, each.symbol)])
     if driver is None:
         return say(figure, f"{symbol or 'Nothing that was recorded'} does not vary in this run.")
-    others = found.explanations
+    others = diagnosis.explanations
     panels = figure.subplots(3, 3 if others else 1, sharex=True, sharey="row", squeeze=False)
     label, scale = driver_axis(driver)
-    sigmas = mean_sigmas(found.before)
+    sigmas = mean_sigmas(diagnosis.before)
     for i, row in enumerate(panels):
         x = driver.values[:, i] * scale
-        _points(row[0], x, found.before.residuals_mps2[:, i], sigmas[:, i], i)
-        _rms(row[0], found.before.residuals_mps2, i)
+        _points(row[0], x, diagnosis.before.residuals_mps2[:, i], sigmas[:, i], i)
+        _rms(row[0], diagnosis.before.residuals_mps2, i)
         row[0].set_ylabel(f"accelerometer {i + 1}, {shown('m/s^2').label}")
         if others:
             best = others[0]
@@ -79,7 +81,7 @@ def draw_residuals(figure: FigureBase, found: Diagnosis, drivers: Sequence[Drive
             _curve(row[1], x, best, i, is_function_of(best.contribution_mps2, driver))
             _points(row[2], x, best.unexplained_mps2[:, i], sigmas[:, i], i)
             _rms(row[2], best.unexplained_mps2, i)
-    titles = [f"Residuals of {found.before.model.sum}"]
+    titles = [f"Residuals of {diagnosis.before.model.sum}"]
     if others:
         name = others[0].name
         titles += [f"Readings less all but {name}", f"What {name} leaves of them"]
@@ -145,23 +147,23 @@ def _curve(axes: Axes, x: Floats, explanation: Explanation, i: int, is_function:
         axes.errorbar(x[order], middle, sigma, fmt="_", color=BEST, ecolor=BAND, elinewidth=6.0, markersize=9)
 
 
-def what_they_go_with(found: Diagnosis) -> Figure:
+def what_they_go_with(diagnosis: Diagnosis) -> Figure:
     """Residuals over their sigma against everything that varies in the run, and what the best explanation leaves."""
     with styled():
         figure = blank(11.0, 7.0)
-        draw_drivers(figure, found, found.drivers)
+        draw_drivers(figure, diagnosis, diagnosis.drivers)
     return figure
 
 
-def draw_drivers(figure: FigureBase, found: Diagnosis, drivers: Sequence[Driver]) -> None:
+def draw_drivers(figure: FigureBase, diagnosis: Diagnosis, drivers: Sequence[Driver]) -> None:
     """The same on a part of a figure: a column a driver, those that explain most first."""
-    drawn, others = drivers[:_PANELS], found.explanations[:1]
+    drawn, others = drivers[:_PANELS], diagnosis.explanations[:1]
     if not drawn:
         return say(figure, "Nothing that was recorded varies in this run.")
     wide = min(4, len(drawn))
     high = -(-len(drawn) // wide) * (1 + len(others))
     panels = figure.subplots(high, wide, sharey=True, squeeze=False)
-    before = found.before.residuals_mps2 / mean_sigmas(found.before)
+    before = diagnosis.before.residuals_mps2 / mean_sigmas(diagnosis.before)
     for k, driver in enumerate(drawn):
         row, column = divmod(k, wide)
         unit, scale = driver_axis(driver)

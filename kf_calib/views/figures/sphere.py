@@ -19,7 +19,7 @@ _LEAST = 3.0  # sigma at the ends of the colours, at least
 _MANY = 150
 
 
-def on_the_sphere(found: Diagnosis) -> Figure:
+def on_the_sphere(diagnosis: Diagnosis) -> Figure:
     """Residuals over their sigma by the direction of the specific force in the platform, a row an accelerometer.
 
     The sphere is unrolled with all areas true (Mollweide): the platform's z axis points up, its x axis out of the
@@ -27,22 +27,22 @@ def on_the_sphere(found: Diagnosis) -> Figure:
     colours.
     """
     with styled():
-        figure = blank(11.0, 7.5) if found.explanations else blank(11.0, 2.8)
-        draw_on_the_sphere(figure, found)
+        figure = blank(11.0, 7.5) if diagnosis.explanations else blank(11.0, 2.8)
+        draw_on_the_sphere(figure, diagnosis)
     return figure
 
 
-def draw_on_the_sphere(figure: FigureBase, found: Diagnosis) -> None:
+def draw_on_the_sphere(figure: FigureBase, diagnosis: Diagnosis) -> None:
     """The same on a part of a figure; the accelerometers stand side by side where there is no explanation."""
-    force = quantity_means(found.before, ["fx", "fy", "fz"])
+    force = quantity_means(diagnosis.before, ["fx", "fy", "fz"])
     directions = np.stack([force[f"f{axis}"][:, 0] for axis in "xyz"], axis=1)
-    columns = {found.before.model.sum: found.before.residuals_mps2 / mean_sigmas(found.before)}
-    columns |= {f"with {each.name}": each.unexplained_ratios for each in found.explanations[:1]}
+    columns = {diagnosis.before.model.sum: diagnosis.before.residuals_mps2 / mean_sigmas(diagnosis.before)}
+    columns |= {f"with {each.name}": each.unexplained_ratios for each in diagnosis.explanations[:1]}
     most = max(_LEAST, *(float(np.percentile(np.abs(ratios), 99.0)) for ratios in columns.values()))
     shape = (3, 2) if len(columns) > 1 else (1, 3)
     panels = figure.subplots(*shape, squeeze=False, subplot_kw={"projection": "mollweide"})
-    for own, (words, ratios) in zip(panels.T if len(columns) > 1 else panels, columns.items(), strict=True):
-        for i, axes in enumerate(own):
+    for row, (words, ratios) in zip(panels.T if len(columns) > 1 else panels, columns.items(), strict=True):
+        for i, axes in enumerate(row):
             _points(axes, directions, ratios[:, i], most)
             axes.set_title(wrapped(f"accelerometer {i + 1}: {words}", 60), fontsize=9.0, loc="center")
     bar = ScalarMappable(Normalize(-most, most), _COLOURS)

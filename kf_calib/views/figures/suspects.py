@@ -26,7 +26,7 @@ _DARK = 0.6  # overlap above which numbers are white
 _FITTING = "#56b4e9"  # of Okabe and Ito's palette
 
 
-def suspects(found: Diagnosis) -> Figure:
+def suspects(diagnosis: Diagnosis) -> Figure:
     """What each suspect explains of the misfit, how alike suspects are, and what the next orientation would tell.
 
     Above, from the left: the part of the misfit beyond noise that each explanation takes away, and whether the model
@@ -35,35 +35,37 @@ def suspects(found: Diagnosis) -> Figure:
     """
     with styled():
         figure = blank(11.0, 7.0)
-        draw_suspects(figure, found, found.drivers)
+        draw_suspects(figure, diagnosis, diagnosis.drivers)
     return figure
 
 
-def draw_suspects(figure: FigureBase, found: Diagnosis, drivers: Sequence[Driver]) -> None:
+def draw_suspects(figure: FigureBase, diagnosis: Diagnosis, drivers: Sequence[Driver]) -> None:
     """The same on a part of a figure; drivers: of the residuals."""
-    explained = found.explanations[:_MOST]
+    explained = diagnosis.explanations[:_MOST]
     if not explained:
-        return say(figure, wrapped(found.verdict, 90))
-    rows, names = figure.add_gridspec(2, 1, height_ratios=(1.5, 1.0)), _alike(found)
+        return say(figure, wrapped(diagnosis.verdict, 90))
+    rows, names = figure.add_gridspec(2, 1, height_ratios=(1.5, 1.0)), _alike(diagnosis)
     above = rows[0].subgridspec(1, 2, width_ratios=(1.15, 1.0))
     below = rows[1].subgridspec(1, 2, width_ratios=(1.15, 1.0))
     _bars(figure.add_subplot(above[0]), explained)
-    _overlaps(figure.add_subplot(above[1]), found, names)
+    _overlaps(figure.add_subplot(above[1]), diagnosis, names)
     _drivers(figure.add_subplot(below[0]), drivers[:_DRIVERS])
-    _separation(figure.add_subplot(below[1]), found)
+    _separation(figure.add_subplot(below[1]), diagnosis)
 
 
 def _bars(axes: Axes, explained: Sequence[Explanation]) -> None:
     """Draw the share of each explanation, hatched where the model with it does not fit; what is known stands beside."""
     colours = [BEST, *(RUNNER_UP if k == 0 else _FITTING for k in range(len(explained) - 1))]
-    for k, (each, colour) in enumerate(zip(explained, colours, strict=True)):
-        share = 0.0 if each.share is None else 100.0 * each.share
-        if each.fits:
+    for k, (explanation, colour) in enumerate(zip(explained, colours, strict=True)):
+        share = 0.0 if explanation.share is None else 100.0 * explanation.share
+        if explanation.fits:
             axes.barh(k, share, color=colour, height=0.62)
         else:
             axes.barh(k, share, facecolor="white", edgecolor=GREY, hatch="////", height=0.62, linewidth=0.8)
-        axes.text(103.0, k, _said(each), va="center", fontsize=8.5, color="#222222" if each.fits else GREY)
-    axes.set_yticks(range(len(explained)), [wrapped(each.name, _NAME) for each in explained])
+        axes.text(
+            103.0, k, _said(explanation), va="center", fontsize=8.5, color="#222222" if explanation.fits else GREY
+        )
+    axes.set_yticks(range(len(explained)), [wrapped(explanation.name, _NAME) for explanation in explained])
     axes.set_ylim(len(explained) - 0.4, -0.6)
     axes.grid(visible=False, axis="y")
     axes.set_xlim(0.0, 100.0)
@@ -71,22 +73,22 @@ def _bars(axes: Axes, explained: Sequence[Explanation]) -> None:
     axes.set_title("What each explains; hatched: the model with it does not fit")
 
 
-def _said(each: Explanation) -> str:
+def _said(explanation: Explanation) -> str:
     """Return whether an explanation fits and its p-value, in words."""
-    fits = "fits" if each.fits else "does not fit"
-    words = fits if each.p_value is None else f"{fits}, p {format_p(each.p_value)}"
-    return f"{words};\nseen within dwells only" if each.share is None else words
+    fits = "fits" if explanation.fits else "does not fit"
+    words = fits if explanation.p_value is None else f"{fits}, p {format_p(explanation.p_value)}"
+    return f"{words};\nseen within dwells only" if explanation.share is None else words
 
 
-def _alike(found: Diagnosis) -> list[str]:
+def _alike(diagnosis: Diagnosis) -> list[str]:
     """Return names of suspects and their look-alikes, the best first."""
-    names = dict.fromkeys([*found.missing, *found.ambiguity, *(each.name for each in found.suspects)])
+    names = dict.fromkeys([*diagnosis.missing, *diagnosis.ambiguity, *(each.name for each in diagnosis.suspects)])
     return list(names)[:_ALIKE]
 
 
-def _overlaps(axes: Axes, found: Diagnosis, names: Sequence[str]) -> None:
+def _overlaps(axes: Axes, diagnosis: Diagnosis, names: Sequence[str]) -> None:
     """Draw the matrix of overlaps with a number in each cell."""
-    values = overlap_matrix(found.test, names)
+    values = overlap_matrix(diagnosis.test, names)
     if np.isfinite(values).sum() <= 1:
         return _words(axes, "No other effect explains as much:\nthere are no overlaps to show.")
     axes.imshow(np.nan_to_num(values), cmap="Greys", vmin=0.0, vmax=1.25, aspect="auto")
@@ -100,7 +102,7 @@ def _overlaps(axes: Axes, found: Diagnosis, names: Sequence[str]) -> None:
     axes.grid(visible=False)
     axes.spines[:].set_visible(False)
     axes.tick_params(length=0)
-    if found.test.effects.walk in names:
+    if diagnosis.test.effects.walk in names:
         axes.set_xlabel("a random walk can take any path: it overlaps with all", fontsize=8.0, color=GREY)
     axes.set_title("Overlap of what they add to the readings\n(1.00: this run cannot tell them apart)")
 
@@ -120,9 +122,9 @@ def _drivers(axes: Axes, drivers: Sequence[Driver]) -> None:
     axes.set_title("What goes with each quantity, beyond what any would by chance")
 
 
-def _separation(axes: Axes, found: Diagnosis) -> None:
+def _separation(axes: Axes, diagnosis: Diagnosis) -> None:
     """Draw how far the best explanation stands out now, and would after a dwell in the advised orientation."""
-    going = found.next_orientation
+    going = diagnosis.next_orientation
     if going is None:
         return _words(axes, "There is no advice where to go next.")
     advice, why = going

@@ -39,20 +39,20 @@ def page_of(result: Any, measured: Sequence[Measured], commands: Sequence[str], 
 
 
 @page_of.register
-def _(found: Diagnosis, measured: Sequence[Measured], commands: Sequence[str], remarks: Sequence[str] = ()) -> Page:
-    drawn = figures_of("", found, "found").parts
-    likely = tuple(each for each in drawn if isinstance(each, Drawing) and each.title == PROBABILITIES)
+def _(diagnosed: Diagnosis, measured: Sequence[Measured], commands: Sequence[str], remarks: Sequence[str] = ()) -> Page:
+    drawn = figures_of("", diagnosed, "found").parts
+    probabilities = tuple(each for each in drawn if isinstance(each, Drawing) and each.title == PROBABILITIES)
     return Page(
-        measured[0].name, "Calibration report", *_standing(found.test.consistent),
-        (diagnosis.verdict(found), *remarks), (Facts("", tuple(facts(measured[0], found.before))),),
+        measured[0].name, "Calibration report", *_standing(diagnosed.test.consistent),
+        (diagnosis.verdict(diagnosed), *remarks), (Facts("", tuple(facts(measured[0], diagnosed.before))),),
         (
-            Section("", likely),
-            Section("Residuals", tuple(each for each in drawn if each not in likely)),
-            Section("Explore the residuals", (_explorer_of(found),)),
-            Section("Parameters", (*_calibrated(found.before), *_with_what_is_missing(found))),
-            figures_of("The calibration", found.before, "run"),
-            Section("Suspects, and what this run could show", _evidence(found)),
-            warnings_of(found.before.warnings),
+            Section("", probabilities),
+            Section("Residuals", tuple(each for each in drawn if each not in probabilities)),
+            Section("Explore the residuals", (_explorer_of(diagnosed),)),
+            Section("Parameters", (*_calibrated(diagnosed.before), *_with_what_is_missing(diagnosed))),
+            figures_of("The calibration", diagnosed.before, "run"),
+            Section("Suspects, and what this run could show", _evidence(diagnosed)),
+            warnings_of(diagnosed.before.warnings),
         ), tuple(commands),
     )  # fmt: skip
 
@@ -120,10 +120,10 @@ def _(pair: SideBySide, measured: Sequence[Measured], commands: Sequence[str], r
     )  # fmt: skip
 
 
-def _run(name: str, found: Diagnosis, prefix: str) -> Section:
+def _run(name: str, diagnosed: Diagnosis, prefix: str) -> Section:
     """Return all of one diagnosis as a section."""
-    parts = (*figures_of("", found, prefix).parts, _explorer_of(found), *_evidence(found))
-    return Section(name, (*parts, *warnings_of(found.before.warnings).parts))
+    parts = (*figures_of("", diagnosed, prefix).parts, _explorer_of(diagnosed), *_evidence(diagnosed))
+    return Section(name, (*parts, *warnings_of(diagnosed.before.warnings).parts))
 
 
 _HEADLINES: dict[bool | None, tuple[Standing, str]] = {
@@ -145,10 +145,10 @@ def figures_of(title: str, result: object, prefix: str) -> Section:
                                 for k, (name, draw) in enumerate(drawn.items())))  # fmt: skip
 
 
-def _explorer_of(found: Diagnosis) -> Explorer:
+def _explorer_of(diagnosed: Diagnosis) -> Explorer:
     """Return the explorer of a diagnosed run, with what its explanations leave."""
-    offered = found.explanations[:_EXPLORED]
-    return explorer(found.before, {f"with {each.name}": each.unexplained_mps2 for each in offered})
+    offered = diagnosed.explanations[:_EXPLORED]
+    return explorer(diagnosed.before, {f"with {each.name}": each.unexplained_mps2 for each in offered})
 
 
 def in_text(drawn: RenderableType, with_notes: bool = False) -> tuple[Part, ...]:
@@ -161,18 +161,18 @@ def _calibrated(result: Calibration) -> tuple[Part, ...]:
     return in_text(console.summary(result))[1:]
 
 
-def _evidence(found: Diagnosis) -> tuple[Part, ...]:
+def _evidence(diagnosed: Diagnosis) -> tuple[Part, ...]:
     """Return what the console says for a diagnosis, less the verdict, which comes first there as on the page."""
-    return in_text(diagnosis.diagnosis_report(found))[1:]
+    return in_text(diagnosis.diagnosis_report(diagnosed))[1:]
 
 
-def _with_what_is_missing(found: Diagnosis) -> tuple[Part, ...]:
+def _with_what_is_missing(diagnosed: Diagnosis) -> tuple[Part, ...]:
     """Return the parameters with the missing effects beside those without; nothing where none is missing."""
-    if found.after is None:
+    if diagnosed.after is None:
         return ()
-    both = differences(found.before, found.after, same_recording=True)
-    table = side_by_side.difference_table(both, "model as it is", f"with {' + '.join(found.missing)}")
-    return (*parts_of(table), *parts_of(console.effect_table(found.after)))
+    both = differences(diagnosed.before, diagnosed.after, same_recording=True)
+    table = side_by_side.difference_table(both, "model as it is", f"with {' + '.join(diagnosed.missing)}")
+    return (*parts_of(table), *parts_of(console.effect_table(diagnosed.after)))
 
 
 def warnings_of(said: Iterable[str], title: str = "Warnings") -> Section:

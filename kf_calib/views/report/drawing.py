@@ -78,10 +78,10 @@ class Drawing:
 def fit(drawings: Sequence[Drawing], most: int = _MOST) -> None:
     """Make pictures of points, and then of whole figures, the largest first, until all have ``most`` characters."""
     for smaller in (Drawing.with_points_as_picture, Drawing.as_picture):
-        for each in sorted(drawings, key=lambda each: -len(each.markup)):
+        for heavy in sorted(drawings, key=lambda heavy: -len(heavy.markup)):
             if sum(len(drawing.markup) for drawing in drawings) <= most:
                 return
-            smaller(each)
+            smaller(heavy)
 
 
 def _arrange(figure: Figure) -> None:
@@ -114,11 +114,11 @@ def _short(text: str) -> str:
     return _MARKS.sub(_with_one_style, _PLACES.sub(lambda found: _DECIMALS.sub(r"\1", found[0]), text))
 
 
-def _with_one_style(found: re.Match[str]) -> str:
+def _with_one_style(match: re.Match[str]) -> str:
     """Return a group of marks that look alike with their style said once."""
-    group, marks = found.groups()
+    group, marks = match.groups()
     styles = set(_STYLE.findall(marks))
-    return f"<g{group}{styles.pop()}>{_STYLE.sub('', marks)}</g>" if len(styles) == 1 else found[0]
+    return f"<g{group}{styles.pop()}>{_STYLE.sub('', marks)}</g>" if len(styles) == 1 else match[0]
 
 
 def _smaller(found: re.Match[str]) -> str:

@@ -45,12 +45,12 @@ def explorer(first: Calibration, others: Mapping[str, Floats]) -> Explorer:
     )
 
 
-def _driver(each: Driver) -> dict[str, Any]:
+def _driver(driver: Driver) -> dict[str, Any]:
     """Return a driver with its values in the unit in which people read them."""
-    unit = shown_whole(each.unit, float(np.abs(each.values).max()))
-    explains = f"explains {each.share:.0%}" if each.share >= 0.005 and each.p_value <= 0.01 else ""
-    of_all = each.values[:, 0] if np.ptp(each.values, axis=1).max() == 0.0 else each.values  # such as an angle
-    return {"name": each.words, "unit": unit.label, "explains": explains, "values": of_all * unit.per_si}
+    unit = shown_whole(driver.unit, float(np.abs(driver.values).max()))
+    explains = f"explains {driver.share:.0%}" if driver.share >= 0.005 and driver.p_value <= 0.01 else ""
+    of_all = driver.values[:, 0] if np.ptp(driver.values, axis=1).max() == 0.0 else driver.values  # such as an angle
+    return {"name": driver.words, "unit": unit.label, "explains": explains, "values": of_all * unit.per_si}
 
 
 def _short(value: Any) -> Any:

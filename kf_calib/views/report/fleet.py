@@ -12,33 +12,35 @@ from kf_calib.views.report.page import Facts, Page, Section, Standing
 from kf_calib.views.report.parts import Paragraph
 
 
-def fleet_page(found: FleetOverview, commands: Sequence[str]) -> Page:
+def fleet_page(overview: FleetOverview, commands: Sequence[str]) -> Page:
     """The page of a fleet. commands: what gives the numbers again, a line each."""
-    together = in_text(pooled_diagnosis.pooled_report(found.pooled)) if found.pooled else ()
+    together = in_text(pooled_diagnosis.pooled_report(overview.pooled)) if overview.pooled else ()
     said = [each.text for each in together if isinstance(each, Paragraph)]
-    standing, headline = _standing_of(found)
+    standing, headline = _standing_of(overview)
     return Page(
-        found.name, "Fleet report", standing, headline, tuple(said),
-        (Facts("", tuple(_facts_of(found))),),
+        overview.name, "Fleet report", standing, headline, tuple(said),
+        (Facts("", tuple(_facts_of(overview))),),
         (
-            figures_of("The runs together", found, "fleet"),
+            figures_of("The runs together", overview, "fleet"),
             Section("Effects that all runs show", tuple(each for each in together if not isinstance(each, Paragraph))),
-            warnings_of(found.remarks),
+            warnings_of(overview.remarks),
         ), tuple(commands),
     )  # fmt: skip
 
 
-def _standing_of(found: FleetOverview) -> tuple[Standing, str]:
+def _standing_of(overview: FleetOverview) -> tuple[Standing, str]:
     """Return whether models and measurements agree over a fleet, and in how many runs they do not."""
-    if not found.failed and not found.inconsistent:
-        return "agrees", f"{found.runs} runs agree with their models"
-    told = [f"{count} {word}" for count, word in ((found.inconsistent, "disagree"), (found.failed, "failed")) if count]
-    return "disagrees", f"Of {found.runs} runs {' and '.join(told)}"
+    if not overview.failed and not overview.inconsistent:
+        return "agrees", f"{overview.runs} runs agree with their models"
+    told = [
+        f"{count} {word}" for count, word in ((overview.inconsistent, "disagree"), (overview.failed, "failed")) if count
+    ]
+    return "disagrees", f"Of {overview.runs} runs {' and '.join(told)}"
 
 
-def _facts_of(found: FleetOverview) -> list[tuple[str, str]]:
+def _facts_of(overview: FleetOverview) -> list[tuple[str, str]]:
     """Return what was measured, a heading and words each."""
-    dates = f"{found.first:%Y-%m-%d} to {found.last:%Y-%m-%d}" if found.first and found.last else ""
-    every = [("Runs", str(found.runs)), ("Units", str(len(found.units))), ("Benches", ", ".join(found.benches)),
-             ("Dates", dates)]  # fmt: skip
-    return [each for each in every if each[1]]
+    dates = f"{overview.first:%Y-%m-%d} to {overview.last:%Y-%m-%d}" if overview.first and overview.last else ""
+    facts = [("Runs", str(overview.runs)), ("Units", str(len(overview.units))),
+             ("Benches", ", ".join(overview.benches)), ("Dates", dates)]  # fmt: skip
+    return [fact for fact in facts if fact[1]]

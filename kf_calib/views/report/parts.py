@@ -103,10 +103,10 @@ def _column(cells: Iterable[RenderableType], is_number: bool) -> list[Cell]:
 
 def _split(text: str) -> tuple[str, str, str]:
     """Return a number's text before its decimal point, from there to the last digit, and after it."""
-    found = _NUMBER.fullmatch(text)
-    if found is None:  # words, such as "not seen"
+    match = _NUMBER.fullmatch(text)
+    if match is None:  # words, such as "not seen"
         return text, "", ""
-    return found["whole"], (found["fraction"] or "") + (found["power"] or ""), found["rest"] or ""
+    return match["whole"], (match["fraction"] or "") + (match["power"] or ""), match["rest"] or ""
 
 
 def _said(cell: RenderableType) -> str:

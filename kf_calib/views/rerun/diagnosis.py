@@ -39,16 +39,18 @@ def save(diagnosis: Diagnosis, path: Path) -> Path:
     with rrd_file(path, _layout(diagnosis)) as stream:
         log_spheres(before, ratios, "spheres/before", 0, stream, forever(stream))
         if drivers:
-            readings = [_readings(each, sigmas) for each in explanations]
+            readings = [_readings(explanation, sigmas) for explanation in explanations]
             charts = charts_of(drivers[0], [ratios, *readings])
             for chart in charts:
                 chart.log_frame(stream)
                 if not explanations:
                     forever(stream)(f"{chart.path}/residuals", chart.points(ratios[:, chart.accelerometer]))
-            for rank, each in enumerate(explanations, 1):
-                _log_explanation(each, sigmas, charts, at_step(stream, EXPLANATION, rank))
-        for rank, each in enumerate(explanations, 1):
-            log_spheres(before, each.unexplained_ratios, "spheres/left", 1, stream, at_step(stream, EXPLANATION, rank))
+            for rank, explanation in enumerate(explanations, 1):
+                _log_explanation(explanation, sigmas, charts, at_step(stream, EXPLANATION, rank))
+        for rank, explanation in enumerate(explanations, 1):
+            log_spheres(
+                before, explanation.unexplained_ratios, "spheres/left", 1, stream, at_step(stream, EXPLANATION, rank)
+            )
         text = rr.TextDocument(printable(_summary(diagnosis)), media_type=rr.MediaType.MARKDOWN)
         stream.log("summary", text, static=True)
     return path

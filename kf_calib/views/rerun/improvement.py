@@ -112,10 +112,10 @@ def _curve(stream: rr.RecordingStream, path: str, values: Floats, *styles: rr.Se
 def _log_coefficient(stream: rr.RecordingStream, path: str, values: Sequence[Parameter | None]) -> None:
     """Send what a coefficient is in each step that has it, less and plus its sigma."""
     known = [
-        np.array([each.value, each.sigma]) * units.shown(each).per_si
-        if each is not None and each.value is not None and each.sigma is not None
+        np.array([parameter.value, parameter.sigma]) * units.shown(parameter).per_si
+        if parameter is not None and parameter.value is not None and parameter.sigma is not None
         else np.full(2, np.nan)
-        for each in values
+        for parameter in values
     ]
     value, sigma = np.array(known).T
     _curve(stream, f"{path}/value", value, *_lines_and_marks("value", MAUVE))

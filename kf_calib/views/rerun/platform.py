@@ -44,21 +44,21 @@ def magnification(final: Sequence[Ellipsoid]) -> float | None:
 
 def ellipsoids(sensitivities: Floats) -> list[Ellipsoid]:
     """Those of covariances (3, 3, 3) of the three sensitivities; NaN where one is not determined."""
-    out = list[Ellipsoid]()
+    determined = list[Ellipsoid]()
     for i, covariance in enumerate(sensitivities):
         if np.isfinite(covariance).all():
             variance, directions = np.linalg.eigh(covariance)
-            out.append((i, np.sqrt(np.maximum(variance, 0.0)), directions * np.linalg.det(directions)))
-    return out
+            determined.append((i, np.sqrt(np.maximum(variance, 0.0)), directions * np.linalg.det(directions)))
+    return determined
 
 
 def ellipsoids_of(estimate: Estimate) -> list[Ellipsoid]:
     """Return those of the sensitivities that are determined."""
-    own = np.full((3, 3, 3), np.nan)
+    covariances = np.full((3, 3, 3), np.nan)
     for i in range(3):
         if not estimate.unseen[4 * i : 4 * i + 3].any():
-            own[i] = estimate.covariance[4 * i : 4 * i + 3, 4 * i : 4 * i + 3]
-    return ellipsoids(own)
+            covariances[i] = estimate.covariance[4 * i : 4 * i + 3, 4 * i : 4 * i + 3]
+    return ellipsoids(covariances)
 
 
 def magnified(estimate: Estimate) -> str:

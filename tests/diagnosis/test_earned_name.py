@@ -1,0 +1,87 @@
+"""A name is earned by a coefficient that is seen and by an error that does not grow."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.long_runs import slow
+from helpers.paths import REAL
+
+import kf_calib
+from kf_calib.diagnosis.earned_name import SEEN, unearned
+from kf_calib.diagnosis.hypothesis_table import Hypothesis
+from kf_calib.diagnosis.missing_effect import diagnose
+from kf_calib.effects import walk_named
+
+
+class _Effect:
+    parameters = coefficients = (SimpleNamespace(symbol="k1"), SimpleNamespace(symbol="k2"))
+
+    def __str__(self) -> str:
+        return "bent"
+
+
+def _result(ratio: float | None, held_out: float | None, walk_gain: float = 0.0, correlation: float = 0.0) -> Any:
+    """A calibration with an effect of two coefficients, of which the second is ``ratio`` sigmas or not determined."""
+    covariance = np.array([[1.0, 2.0 * correlation], [2.0 * correlation, 4.0]])
+    second = SimpleNamespace(value=None if ratio is None else -2.0 * ratio, sigma=None if ratio is None else 2.0)
+    state = np.array([0.1, -2.0 * (ratio or 0.0)])
+    return SimpleNamespace(
+        model=SimpleNamespace(effects=[_Effect()], parts={"bent": slice(0, 2)}),
+        estimate=SimpleNamespace(state=state, covariance=covariance),
+        fit=SimpleNamespace(walk_gain=walk_gain),
+        parameters={"k1": SimpleNamespace(value=0.1, sigma=1.0), "k2": second},
+        held_out_rms_mps2=held_out,
+    )
+
+
+@pytest.mark.parametrize(
+    "ratio, errors, said",
+    [
+        (3.1, (1.0, 0.9), ""),
+        (2.9, (1.0, 0.9), "no coefficient of bent is beyond 3 sigma"),
+        (None, (1.0, 0.9), "no coefficient of bent is beyond 3 sigma"),
+        (5.0, (1.0, 1.25), "it makes the held-out error larger by 25%"),
+        (5.0, (1.0, 1.01), ""),  # what shows within dwells alone
+        (5.0, (1.0, 1.06), "it makes the held-out error larger by 6%"),
+        (5.0, (None, 1.25), ""),
+    ],
+)
+def test_what_a_name_is_earned_by(ratio: float | None, errors: tuple[float | None, float], said: str) -> None:
+    row = Hypothesis(("bent",), refit=_result(ratio, errors[1]))
+    assert unearned(row, _result(None, errors[0]), "bias-walk") == said
+
+
+@pytest.mark.parametrize("correlation, earned", [(0.8, False), (0.97, True)])
+def test_coefficients_that_are_alike_earn_their_name_together(correlation: float, earned: bool) -> None:
+    """Of 0.1 and -2.9 sigmas: Wald's statistic is 24.7 with a correlation of 0.8, and 150 with one of 0.97."""
+    row = Hypothesis(("bent",), refit=_result(2.9, 0.9, correlation=correlation))
+    assert (unearned(row, _result(None, 1.0), "bias-walk") == "") == earned
+
+
+@pytest.mark.parametrize("gain, said", [(4.4, "bias-walk is below 3 sigma"), (4.6, "")])
+def test_a_walk_is_earned_by_its_likelihood(gain: float, said: str) -> None:
+    row = Hypothesis(("bias-walk",), refit=_result(None, 0.9))
+    assert unearned(row, _result(None, 1.0, gain), "bias-walk") == said
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="the recordings of others are not there")
+@pytest.mark.parametrize(
+    "name", ["iPhone4S_d2", *slow("mpu6050", "mpu9150_0", "mpu9150_1", "nexus5_d1", "nexus5_d2", "xsens_mti")]
+)
+def test_what_is_named_in_a_real_recording_is_seen_in_it(name: str) -> None:
+    diagnosis = diagnose(kf_calib.open_log(REAL / f"{name}.csv.gz", {"gravity_mps2": "9.80665"}, angles=False))
+    for effect in diagnosis.missing:
+        assert diagnosis.after is not None
+        if effect == walk_named(diagnosis.before.bench):
+            continue
+        of_effect = next(each for each in diagnosis.after.model.effects if str(each) == effect)
+        known = [diagnosis.after.parameters[coefficient.symbol] for coefficient in of_effect.parameters]
+        assert max(abs(p.value) / p.sigma for p in known if p.value is not None and p.sigma) > SEEN
+    if name in ("mpu9150_0", "mpu9150_1", "nexus5_d2"):  # |f| agrees by an independent test
+        assert diagnosis.test.consistent
+    elif not diagnosis.missing and not diagnosis.noise:
+        assert diagnosis.unearned or diagnosis.unknown

@@ -1,0 +1,70 @@
+"""The smooth course of the temperature against scipy and dense matrices."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.interpolate import BSpline
+
+from kf_calib.noise import temperature_course
+from kf_calib.noise.temperature_course import _Spline
+
+
+def test_bumps_are_cubic_b_splines_and_sum_to_one() -> None:
+    places = np.linspace(0.0, 5.0, 57)
+    bumps = temperature_course._bumps(places, 8)
+    for number in range(8):
+        middle = number - 1
+        spline = BSpline.basis_element(np.arange(middle - 2.0, middle + 3.0), extrapolate=False)
+        np.testing.assert_allclose(bumps[:, number], np.nan_to_num(spline(places)), atol=1e-14)
+    np.testing.assert_allclose(bumps.sum(axis=1), 1.0)
+
+
+def test_the_scatter_within_dwells_is_what_weighted_parabolas_leave() -> None:
+    rng = np.random.default_rng(2)
+    owners = np.repeat([0, 1, 2, 3], [12, 3, 7, 20])  # three levels of one dwell are its parabola
+    middles, weights = np.sort(rng.uniform(0.0, 500.0, 42)), rng.uniform(0.5, 4.0, 42)
+    levels = 20.0 + 0.01 * middles + rng.normal(size=42)
+    squares, freedom = 0.0, 0
+    for number in (0, 2, 3):
+        t, y, w = middles[owners == number], levels[owners == number], weights[owners == number]
+        fitted = np.polyval(np.polyfit(t - t.mean(), y, 2, w=np.sqrt(w)), t - t.mean())
+        squares, freedom = squares + w @ (y - fitted) ** 2, freedom + len(t) - 3
+    variance, found_freedom = temperature_course._within_dwells(middles, levels, weights, owners)
+    assert found_freedom == freedom
+    np.testing.assert_allclose(variance, squares / freedom, rtol=1e-9)
+
+
+def test_the_spline_has_the_largest_restricted_likelihood_of_all_penalties() -> None:
+    """For each penalty l: (A + l P) c = B' W y, and the likelihood from determinants of whole matrices."""
+    rng, count = np.random.default_rng(3), 12
+    at = np.sort(rng.uniform(0.0, count - 3.0, 80))
+    basis, weights = temperature_course._bumps(at, count), rng.uniform(0.5, 2.0, 80)
+    levels = 20.0 + np.sin(at) + rng.normal(size=80) / np.sqrt(weights) * 0.2
+    spline = _Spline.through(basis, levels, weights)
+    information, away = basis.T @ (weights[:, None] * basis), levels - levels.mean()
+    along, order = basis.T @ (weights * away), temperature_course._ORDER
+    differences = np.diff(np.eye(count), order, axis=0)
+    penalty = differences.T @ differences * (np.trace(information) / count)
+    costs, fits = list[float](), list[tuple[np.ndarray, float, np.ndarray]]()
+    for size in temperature_course._PENALTIES:
+        whole = information + size * penalty
+        coefficients = np.linalg.solve(whole, along)
+        variance = (weights @ away**2 - along @ coefficients) / (len(levels) - order)
+        determinant = np.linalg.slogdet(whole)[1] - (count - order) * np.log(size)
+        costs.append((len(levels) - order) * np.log(variance) + determinant)
+        fits.append((coefficients, variance, variance * np.linalg.inv(whole)))
+    best = int(np.argmin(costs))
+    assert 0 < best < len(costs) - 1
+    coefficients, variance, covariance = fits[best]
+    np.testing.assert_allclose(spline.coefficients, coefficients, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(spline.variance, variance, rtol=1e-9)
+    np.testing.assert_allclose(spline.errors @ spline.errors.T, covariance, rtol=1e-6, atol=1e-12)
+
+
+def test_the_largest_errors_have_nearly_all_of_the_variance() -> None:
+    errors = np.random.default_rng(4).normal(size=(30, 8)) * np.logspace(0.0, -6.0, 8)
+    few = temperature_course._largest(errors)
+    share = np.sum(few**2) / np.sum(errors**2)
+    assert 1.0 - temperature_course._KEPT <= share <= 1.0 and few.shape[1] < 8
+    fewer = few[:, np.argsort(np.sum(few**2, axis=0))[1:]]
+    assert np.sum(fewer**2) / np.sum(errors**2) < share

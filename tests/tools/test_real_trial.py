@@ -1,0 +1,67 @@
+"""The trial on real noise: sizes of what is injected, by a refit; and its command."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from helpers.paths import RECORDINGS
+from real_trials import command
+from real_trials.injected import EFFECTS, alike, injected
+from real_trials.recordings import GRAVITY_MPS2, RealRecording
+from scipy.optimize import least_squares
+
+
+@cache
+def by_hand() -> RealRecording:
+    return RealRecording(RECORDINGS / "hand.mcap")
+
+
+def misfit(means: np.ndarray) -> tuple[np.ndarray, float]:
+    """Residuals (D,) of |f| beside nine free parameters, by a fit of their own: a lower triangle."""
+
+    def left(nine: np.ndarray) -> np.ndarray:
+        inverse = np.zeros((3, 3))
+        inverse[np.tril_indices(3)] = nine[:6]
+        return np.linalg.norm((means - nine[6:]) @ inverse.T, axis=1) - GRAVITY_MPS2
+
+    fitted = least_squares(left, np.array([1.0, 0.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), x_scale="jac", xtol=1e-14)
+    return fitted.fun, float(np.sqrt(fitted.fun @ fitted.fun / (len(means) - 9)))
+
+
+@pytest.mark.parametrize("name", ["bias-drift", "hysteresis"])
+def test_an_effect_of_some_sigmas_moves_the_residuals_of_a_refit_by_as_much(name: str) -> None:
+    recording = by_hand()
+    added = injected(recording, name, 10.0, 3)
+    assert added is not None
+    before, scatter = misfit(recording.means(recording.readings_mps2))
+    after, _ = misfit(recording.means(recording.readings_mps2 + added))
+    assert scatter == pytest.approx(recording.scatter_mps2, rel=1e-3)
+    assert np.linalg.norm(after - before) / scatter == pytest.approx(10.0, rel=0.1)
+    assert name in alike(recording, added)
+
+
+def test_what_is_injected_is_added_to_every_reading() -> None:
+    recording = by_hand()
+    added = EFFECTS["second-order"](recording) * 1e-3
+    altered = np.concatenate([batch.accel.values for batch in recording.altered(added)])
+    np.testing.assert_allclose(altered, recording.readings_mps2 + added, rtol=0, atol=1e-12)
+
+
+def test_outcomes_are_kept_and_counted(tmp_path: Path) -> None:
+    outcome = {"recording": "a", "sigmas": 15.0, "seed": 1, "visible": True, "p": 1e-9, "noise": False, "unearned": ""}
+    kept = tmp_path / "kept.jsonl"
+    lines = [
+        {**outcome, "effect": "", "verdict": "It agrees.", "missing": [], "first": [], "set": [], "rows": []},
+        {**outcome, "effect": "bias-drift", "missing": ["bias-drift"], "first": ["bias-drift"], "set": ["bias-drift"],
+         "verdict": "", "probability": 0.8, "rows": [[["bias-drift"], 0.8]], "alike": ["bias-drift"]},
+        {**outcome, "effect": "warm-up", "missing": ["bias-drift"], "first": ["bias-drift"], "verdict": "",
+         "set": ["bias-drift", "warm-up"], "probability": 0.1, "rows": [[["bias-drift"], 0.8]], "alike": []},
+    ]  # fmt: skip
+    kept.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    said = CliRunner().invoke(command.main, ["--folder", str(tmp_path), "--resume", str(kept)]).output
+    assert "It agrees." in said and "1 (50%)" in said and "2 (100%)" in said and "0.45" in said

@@ -1,0 +1,142 @@
+"""The command of the trial on real noise."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.table import Table
+from scipy.stats import beta
+
+import kf_calib
+from kf_calib.support.threads import one_blas_thread
+from real_trials.injected import EFFECTS, alike, injected
+from real_trials.recordings import FEWEST_POSES, RealRecording
+
+ROOT = Path(__file__).resolve().parents[2]
+FOLDERS = (ROOT.parent / "shared" / "real", ROOT.parent / "shared" / "recordings")
+
+
+@cache
+def _recording(path: str) -> RealRecording:
+    return RealRecording(Path(path))
+
+
+def play(path: str, name: str, sigmas: float, seed: int) -> dict[str, Any]:
+    """What the diagnosis says of a recording with an effect injected, or unmodified where ``name`` is empty."""
+    recording = _recording(path)
+    task = {"recording": recording.name, "effect": name, "sigmas": sigmas, "seed": seed}
+    with one_blas_thread():
+        added = injected(recording, name, sigmas, seed) if name else None
+        if name and added is None:
+            return {**task, "visible": False}
+        try:
+            diagnosis = kf_calib.diagnose(recording.altered(added if added is not None else [0.0] * 3))  # type: ignore[arg-type]
+        except kf_calib.KfCalibError as error:
+            return {**task, "visible": True, "refused": str(error)}
+    rows = diagnosis.table.rows if diagnosis.table else ()
+    return {
+        **task, "visible": True, "p": diagnosis.test.p_value, "missing": list(diagnosis.missing),
+        "first": list(diagnosis.likeliest.effects) if diagnosis.likeliest else [], "noise": diagnosis.noise,
+        "set": list(diagnosis.ambiguity), "verdict": diagnosis.verdict, "unearned": diagnosis.unearned,
+        "probability": sum(row.probability for row in rows if name in row.effects),
+        "rows": [[list(row.effects), row.probability] for row in rows if row.effects and row.probability > 0.01],
+        "alike": sorted(alike(recording, added)) if added is not None else [],
+    }  # fmt: skip
+
+
+@click.command(context_settings={"help_option_names": ["-h", "--help"]})
+@click.option("--folder", multiple=True, type=click.Path(path_type=Path), help="Folders of recordings.")
+@click.option("--sizes", multiple=True, type=float, default=(8.0, 10.0, 15.0), show_default=True, help="In sigmas.")
+@click.option("--only", multiple=True, help="Recordings to take, by name; all where none is named.")
+@click.option("--seed", type=int, default=1, show_default=True, help="Of the coefficients.")
+@click.option("--jobs", type=click.IntRange(min=1), default=2, show_default=True, help="Number of processes.")
+@click.option("--resume", type=click.Path(path_type=Path), help="Keep outcomes in this file (JSON lines).")
+def main(
+    folder: tuple[Path, ...], sizes: tuple[float, ...], only: tuple[str, ...], seed: int, jobs: int, resume: Path | None
+) -> None:
+    """Inject each visible effect into each real recording, diagnose it, and count how often the truth is named."""
+    paths = [path for place in folder or FOLDERS if place.is_dir() for path in sorted(place.iterdir())]
+    paths = [path for path in paths if path.name.endswith((".csv.gz", ".csv", ".mcap"))]
+    paths = [path for path in paths if not only or path.name.partition(".")[0] in only]
+    outcomes = _read(resume)
+    known = {(each["recording"], each["effect"], each["sigmas"], each["seed"]) for each in outcomes}
+    tasks = [(str(path), "", 0.0, 0) for path in paths]
+    many = [path for path in paths if len(_recording(str(path)).dwells_s) >= FEWEST_POSES]
+    tasks += [(str(path), name, size, seed) for size in sizes for path in many for name in EFFECTS]
+    tasks = [task for task in tasks if (Path(task[0]).name.partition(".")[0], *task[1:]) not in known]
+    with ProcessPoolExecutor(jobs) as pool:
+        for done in as_completed([pool.submit(play, *task) for task in tasks]):
+            outcomes.append(done.result())
+            if resume is not None:
+                with resume.open("a") as file:
+                    file.write(json.dumps(outcomes[-1]) + "\n")
+    console = Console(width=150)
+    console.print(_unmodified(outcomes), _counted(outcomes, "sigmas"), _counted(outcomes, "recording"))
+    console.print(_counted(outcomes, "effect"), _reliability(outcomes))
+
+
+def _read(path: Path | None) -> list[dict[str, Any]]:
+    if path is None or not path.exists():
+        return []
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def _unmodified(outcomes: Sequence[dict[str, Any]]) -> Table:
+    """Return the verdicts on recordings as they are."""
+    table = Table("recording", "p", "verdict", title="Unmodified", title_justify="left")
+    for each in outcomes:
+        if not each["effect"]:
+            table.add_row(each["recording"], f"{each.get('p') or 1:.2g}", each.get("verdict") or each["refused"])
+    return table
+
+
+def _counted(outcomes: Sequence[dict[str, Any]], key: str) -> Table:
+    """Return how often the truth is first, in the set, and named wrongly, by size, recording or effect."""
+    headings = (key, "trials", "first", "first, or alike", "in the set", "wrong name", "mean probability")
+    table = Table(*headings, title=f"Injected, by {key}", title_justify="left")
+    told = [each for each in outcomes if each["effect"] and each["visible"] and "refused" not in each]
+    for value in dict.fromkeys(each[key] for each in told):
+        own = [each for each in told if each[key] == value]
+        counts = [
+            sum(each["first"] == [each["effect"]] for each in own),
+            sum(len(each["first"]) == 1 and each["first"][0] in {each["effect"], *each["alike"]} for each in own),
+            sum(bool({each["effect"], *each["alike"]} & set(each["set"])) for each in own),
+            sum(bool(each["missing"]) and not _right(each) for each in own),
+        ]
+        mean = sum(each["probability"] for each in own) / len(own)
+        table.add_row(str(value), str(len(own)), *(f"{k} ({k / len(own):.0%})" for k in counts), f"{mean:.2f}")
+    return table
+
+
+def _right(each: dict[str, Any]) -> bool:
+    return bool({each["effect"], *each["alike"]} & set(each["missing"]))
+
+
+def _reliability(outcomes: Sequence[dict[str, Any]]) -> Table:
+    """Return how often statements of a probability are true, of all rows of one effect."""
+    table = Table("stated", "statements", "true", "95 % limits", title="Reliability of names", title_justify="left")
+    told = [each for each in outcomes if each["effect"] and each["visible"] and "refused" not in each]
+    statements = [
+        (share, bool(set(effects) & {each["effect"], *each["alike"]}))
+        for each in told
+        for effects, share in each["rows"]
+    ]
+    for low, high in ((0.01, 0.1), (0.1, 0.3), (0.3, 0.5), (0.5, 0.7), (0.7, 0.9), (0.9, 0.99), (0.99, 1.0)):
+        true = [right for share, right in statements if low <= share < high]
+        if true:
+            count, right = len(true), sum(true)
+            limits = (
+                beta.ppf(0.025, right, count - right + 1) if right else 0.0,
+                (beta.ppf(0.975, right + 1, count - right) if right < count else 1.0),
+            )
+            table.add_row(
+                f"{low:.0%} to {high:.0%}", str(count), f"{right / count:.0%}", f"{limits[0]:.0%} to {limits[1]:.0%}"
+            )
+    return table
