@@ -15,18 +15,19 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.rows import REGRESSORS
+from kf_calib.dwells.stack import DwellStack, Folded
 from kf_calib.dwells.sufficient_statistics import DwellFactor
-from kf_calib.noise.means import bending_of
 from kf_calib.noise.noise_model import FLOOR_MPS2, Noise
 
 SLOW = np.arange(1, 5)
 """Numbers of half cycles of the slow waves of 1/f noise in a dwell."""
 
 
-def flicker_waves(dwell: DwellFactor) -> Floats:
-    """sqrt(2) cos(pi k t / T) over a dwell of length T at its nodes, (pieces, nodes, k)."""
-    at = np.array([piece.nodes.elapsed_s for piece in dwell.pieces]) - dwell.start_s
-    return np.sqrt(2.0) * np.cos(np.pi * SLOW * (at / max(dwell.end_s - dwell.start_s, 1e-9))[..., None])
+def flicker_waves(folded: Folded) -> Floats:
+    """sqrt(2) cos(pi k t / T) over a dwell of length T at the nodes of all pieces, (pieces, nodes, k)."""
+    starts_s, ends_s = np.repeat(folded.ends_s, 3 * folded.piece_numbers, axis=0).T
+    share = (folded.elapsed_s - starts_s) / np.maximum(ends_s - starts_s, 1e-9)
+    return (np.sqrt(2.0) * np.cos(np.pi * SLOW * share[:, None])).reshape(-1, 3, len(SLOW))
 
 
 def flicker_sigmas(flicker_mps2: Floats) -> Floats:
@@ -54,14 +55,14 @@ def along_force(dwells: Sequence[DwellFactor], sensitivities: Floats) -> Floats:
 
     No rotation changes m . reading, which is |f| but for biases; sensitivities S are (D, 3, 3).
     """
-    force = np.array([dwell.felt_force(dwell.means[None, 1:4])[0] for dwell in dwells])
+    force = DwellStack.of(dwells).felt_means_mps2
     unit = force / np.linalg.norm(force, axis=1, keepdims=True)
     return np.asarray(np.linalg.solve(np.swapaxes(sensitivities, 1, 2), unit[:, :, None])[:, :, 0], float)
 
 
 def sensitivities_of(dwells: Sequence[DwellFactor], state: Floats) -> Floats:
     """Change (D, 3, 3) of the readings of each dwell per unit of force at ``state`` (p,), effects included."""
-    return state[:STATE_COUNT].reshape(3, 4)[:, :3] + np.array([bending_of(dwell) for dwell in dwells])
+    return state[:STATE_COUNT].reshape(3, 4)[:, :3] + DwellStack.of(dwells).bendings
 
 
 def nuisance_sigmas(noise: Noise) -> Floats:
