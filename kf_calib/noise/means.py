@@ -12,6 +12,8 @@ from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.stack import DwellStack, basis_values, of_all_pieces
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 
+_AT_ONCE = 4096  # dwells whose columns are processed together
+
 
 @dataclass(frozen=True, repr=False)
 class Means:
@@ -48,7 +50,10 @@ def means_of(dwells: Sequence[DwellFactor], columns: Sequence[Floats]) -> Means:
     folded, of_pieces = stack.folded, np.empty((len(values), values[0, 0].size))
     for shape, triangles in zip(folded.shapes, stack.triangles, strict=True):
         first = triangles[:, :, 0, : shape.width] / triangles[:, :, :1, 0]  # means of the basis
-        of_pieces[shape.pieces] = (first[:, :, None] @ basis_values(values[shape.pieces]))[:, :, 0]
+        for k in range(0, len(first), _AT_ONCE):
+            pieces = shape.pieces[k : k + _AT_ONCE]
+            coefficients = basis_values(values[pieces])
+            of_pieces[pieces] = (first[k : k + _AT_ONCE, :, None] @ coefficients)[:, :, 0]
     design = folded.weighted(of_pieces).reshape(len(stack), *values.shape[2:])
     return Means(
         design, stack.means[:, 4:], stack.felt_means_mps2, folded.counts, folded.ends_s, stack.bendings
