@@ -49,6 +49,20 @@ def _is_program(source: str) -> bool:
     return True
 
 
+def function_at(source: str, change: Change) -> str:
+    """The function or method, as ``Class.method``, in whose body a change is; empty: outside of functions."""
+    return _function_of(ast.parse(source).body, change.line, "")
+
+
+def _function_of(body: list[ast.stmt], line: int, prefix: str) -> str:
+    for node in body:
+        if isinstance(node, ast.ClassDef) and node.lineno <= line <= (node.end_lineno or 0):
+            return _function_of(node.body, line, f"{prefix}{node.name}.")
+        if isinstance(node, ast.FunctionDef) and node.body[0].lineno <= line <= (node.end_lineno or 0):
+            return f"{prefix}{node.name}"
+    return ""
+
+
 class _Finder(ast.NodeVisitor):
     def __init__(self, source: str) -> None:
         self.found = list[Change]()
