@@ -14,6 +14,7 @@ from pathlib import Path
 
 from mutation_trials.changes import Change, changes_in
 from mutation_trials.runner import Answer, Runner, content_hash, copied
+from mutation_trials.test_map import static_map
 
 ROOT = Path(__file__).resolve().parents[2]
 _ABOUT = """
@@ -67,14 +68,19 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--line", type=int, help="only changes of this line")
     parser.add_argument("--budget", type=float, default=60.0, metavar="S", help="of the tests of one change, s")
     parser.add_argument("--map", type=Path, help="which tests call what, written where it is not there")
+    words_on_unmapped = "do not run all tests once to learn what they call: take those that import the module"
+    parser.add_argument("--unmapped", action="store_true", help=words_on_unmapped)
     parser.add_argument("-o", "--out", type=Path, help="write the table here, too")
     options = parser.parse_args(words)
     tasks = drawn(modules(options.paths), options.count, options.seed, options.line)
-    map_file = (options.map or ROOT / "out" / "mutation" / f"{content_hash(ROOT)}.json").resolve()
-    map_file.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="mutation") as folder:
-        copy = copied(ROOT, Path(folder))
-        with Runner(copy, map_file, options.budget) as runner:
+        copy = copied(ROOT, Path(folder, "copy"))
+        map_file = options.map or ROOT / "out" / "mutation" / f"{content_hash(ROOT)}.json"
+        if options.unmapped:
+            map_file = Path(folder, "map.json")
+            static_map(copy).write(map_file)
+        map_file.parent.mkdir(parents=True, exist_ok=True)
+        with Runner(copy, map_file.resolve(), options.budget) as runner:
             trials = list(_tried(runner, tasks, options.out))
     print(counts(trials))
 

@@ -112,7 +112,13 @@ class Runner:
         usual_s = Counter[str]()
         for test in tests:
             usual_s[test.partition("::")[0]] += self._map.seconds[test]
-        asked = {"path": str(path), "function": function, "tests": tests, "usual_s": usual_s}
+        asked = {
+            "path": str(path),
+            "function": function,
+            "tests": tests,
+            "usual_s": usual_s,
+            "budget_s": self._budget_s,
+        }
         assert self._process.stdin is not None and self._process.stdout is not None
         print(json.dumps(asked), file=self._process.stdin, flush=True)
         said = json.loads(self._process.stdout.readline())

@@ -5,8 +5,8 @@ usage: python server.py ROOT MAP [TEST_FILE...]
 The tests are collected once, and mapped (``test_map``) where the file MAP is not there yet. Then each line of standard
 input, a request, is answered by a line: the first test that failed, "" if none did, or "time" if one took too long.
 A request is a JSON object: ``tests`` in the order to run them; ``usual_s``, the usual processor time of each of their
-files; ``path``, the module that was changed in the copy; ``function``, the one that was changed, or "" for a change
-outside of functions, for which everything is loaded anew.
+files; ``budget_s``, after how much processor time no further test is begun; ``path``, the module that was changed in the
+copy; ``function``, the one that was changed, or "" for a change outside of functions, for which all is loaded anew.
 """
 
 from __future__ import annotations
@@ -39,8 +39,9 @@ _LONGEST_S = 1200.0
 class FirstFailure:
     """A plugin of pytest: ``test`` is the first that failed, or ""; a file that takes too long ends the process."""
 
-    def __init__(self, usual_s: Mapping[str, float]) -> None:
-        self.test, self._usual_s, self._file = "", usual_s, ""
+    def __init__(self, asked: Mapping[str, Any]) -> None:
+        self.test, self._usual_s, self._file = "", asked["usual_s"], ""
+        self._end_s, self._session = time.process_time() + asked["budget_s"], None
 
     def pytest_runtest_logstart(self, nodeid: str) -> None:
         file = nodeid.partition("::")[0]
@@ -48,6 +49,16 @@ class FirstFailure:
             self._file = file
             limit_s = time.process_time() + max(_SLOWER * self._usual_s.get(file, 0.0), _LEAST_S)
             resource.setrlimit(resource.RLIMIT_CPU, (int(limit_s) + 1, resource.RLIM_INFINITY))
+
+    def pytest_sessionstart(self, session: pytest.Session) -> None:
+        self._session = session
+
+    def pytest_runtest_logfinish(self) -> None:
+        if self._session is not None and self.ended():
+            self._session.shouldstop = "a test failed, or the budget is spent"
+
+    def ended(self) -> bool:
+        return bool(self.test) or time.process_time() > self._end_s
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         if report.failed:
@@ -67,7 +78,6 @@ class Server:
         self._answers = os.fdopen(os.dup(1), "w")
 
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
-        items = {item.nodeid: item for item in session.items}
         if not self._map_file.exists():
             said = in_child(lambda _: self._map(session))
             if said:
@@ -75,8 +85,7 @@ class Server:
         print("ready", file=self._answers, flush=True)
         for line in self._requests:
             asked = json.loads(line)
-            known = [test for test in asked["tests"] if test in items]
-            work = functools.partial(self._answer, [items[test] for test in known], asked)
+            work = functools.partial(self._answer, named(asked["tests"], session.items), asked)
             print(json.dumps(in_child(work)), file=self._answers, flush=True)
         return True
 
@@ -91,10 +100,10 @@ class Server:
     def _answer(self, items: Sequence[pytest.Item], asked: Mapping[str, Any], answer: int) -> None:
         if not (asked["function"] and replace_code(self._root / asked["path"])):
             self._load_anew(asked, answer)
-        plugin = FirstFailure(asked["usual_s"])
+        plugin = FirstFailure(asked)
         if items:
             items[0].config.pluginmanager.register(plugin)
-        _run(items, lambda: bool(plugin.test))
+        _run(items, plugin.ended)
         os.write(answer, plugin.test.encode())
 
     def _load_anew(self, asked: Mapping[str, Any], answer: int) -> None:
@@ -103,6 +112,13 @@ class Server:
         told.write_text(json.dumps(dict(asked)))
         os.set_inheritable(answer, True)
         os.execv(sys.executable, [sys.executable, __file__, "--anew", str(told), str(answer)])
+
+
+def named(names: Sequence[str], items: Sequence[pytest.Item]) -> list[pytest.Item]:
+    """The tests of these names, in this order; the name of a file stands for all of its tests."""
+    places = {name: place for place, name in enumerate(names)}
+    place_of = {item: places.get(item.nodeid, places.get(item.nodeid.partition("::")[0], -1)) for item in items}
+    return sorted((item for item in items if place_of[item] >= 0), key=lambda item: place_of[item])
 
 
 def replace_code(module: Path) -> bool:
@@ -164,14 +180,13 @@ def in_child(work: Callable[[int], None]) -> str:
 def load_anew(request: Path, answer: int) -> None:
     """Answer a request in this process, which has loaded nothing yet."""
     asked = json.loads(request.read_text())
-    places = {test: place for place, test in enumerate(asked["tests"])}
 
     class Ordered:
         def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
-            items[:] = sorted((item for item in items if item.nodeid in places), key=lambda item: places[item.nodeid])
+            items[:] = named(asked["tests"], items)
 
-    plugin = FirstFailure(asked["usual_s"])
-    code = pytest.main([*QUIET, "-x", *asked["usual_s"]], plugins=[plugin, Ordered()])
+    plugin = FirstFailure(asked)
+    code = pytest.main([*QUIET, *asked["usual_s"]], plugins=[plugin, Ordered()])
     sound = code in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED)
     os.write(answer, (plugin.test or ("" if sound else "does not load")).encode())
 

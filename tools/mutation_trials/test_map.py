@@ -18,13 +18,14 @@ from typing import Any
 import pytest
 
 LOCAL = ".<locals>"
+_BYTES_PER_S = 500.0  # of a file whose tests have not been run
 
 
 @dataclass
 class TestMap:
     """Tests by the functions that they execute.
 
-    functions: of each test, ``path:name`` of functions of the program; what is defined within one counts as that one.
+    functions: of each test (or file of tests), ``path:name`` of functions of the program; what is defined within one counts as that one.
     seconds: of processor, of each test. failed: those that fail unchanged.
     """
 
@@ -64,6 +65,21 @@ class TestMap:
         numbers = {name: k for k, name in enumerate(names)}
         called = {test: [numbers[name] for name in own] for test, own in self.functions.items()}
         path.write_text(json.dumps(dict(names=names, called=called, seconds=self.seconds, failed=self.failed)))
+
+
+def static_map(root: Path) -> TestMap:
+    """Without a run: a file of tests stands for its tests, and calls what it imports and what its folder mirrors."""
+    made = TestMap()
+    for path in sorted((root / "tests").rglob("test_*.py")):
+        name = path.relative_to(root)
+        imported = {f"{one.replace('.', '/')}.py:" for one in _imported(path) if one.startswith("kf_calib")}
+        package = Path("kf_calib", *name.parts[1:-1])
+        mirrored = (
+            {f"{module.relative_to(root)}:" for module in (root / package).glob("*.py")} if name.parts[2:] else set()
+        )
+        made.functions[str(name)] = sorted(imported | mirrored)
+        made.seconds[str(name)] = path.stat().st_size / _BYTES_PER_S
+    return made
 
 
 class Mapper:
