@@ -5,8 +5,8 @@ usage: python server.py ROOT MAP [TEST_FILE...]
 The tests are collected once, and mapped (``test_map``) where the file MAP is not there yet. Then each line of standard
 input, a request, is answered by a line: the first test that failed, "" if none did, or "time" if one took too long.
 A request is a JSON object: ``tests`` in the order to run them; ``usual_s``, the usual processor time of each of their
-files; ``budget_s``, after how much processor time no further test is begun; ``path``, the module that was changed in the
-copy; ``function``, the one that was changed, or "" for a change outside of functions, for which all is loaded anew.
+files; ``budget_s``, after how much processor time no further test is begun; ``path``, the module that was changed in
+the copy; ``function``, the one that was changed, or "" for a change outside of functions: then all is loaded anew.
 """
 
 from __future__ import annotations

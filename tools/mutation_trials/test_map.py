@@ -25,7 +25,8 @@ _BYTES_PER_S = 500.0  # of a file whose tests have not been run
 class TestMap:
     """Tests by the functions that they execute.
 
-    functions: of each test (or file of tests), ``path:name`` of functions of the program; what is defined within one counts as that one.
+    functions: of each test (or file of tests), ``path:name`` of functions of the program; what is defined within one
+    counts as that one.
     seconds: of processor, of each test. failed: those that fail unchanged.
     """
 
