@@ -38,10 +38,11 @@ def changes_in(source: str) -> list[Change]:
     """All changes of a module, in their order; texts, annotations and what is raised stay as they are."""
     finder = _Finder(source)
     finder.visit(ast.parse(source))
-    return sorted(change for change in finder.found if _is_program(change.of(source)))
+    return sorted(finder.found)
 
 
-def _is_program(source: str) -> bool:
+def is_program(source: str) -> bool:
+    """Whether it can be compiled: a few changes leave nothing that can."""
     try:
         ast.parse(source)
     except SyntaxError:

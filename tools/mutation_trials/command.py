@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import random
 import sys
 import tempfile
@@ -12,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from mutation_trials.changes import Change, changes_in
+from mutation_trials.changes import Change, changes_in, is_program
 from mutation_trials.runner import Answer, Runner, content_hash, copied
 from mutation_trials.test_map import static_map
 
@@ -40,9 +41,12 @@ class Trial:
 
 def drawn(paths: Sequence[Path], count: int, seed: int, line: int | None = None) -> list[tuple[Path, Change]]:
     """Changes drawn from all that are possible in modules, in the order of the modules."""
-    every = [(path, change) for path in paths for change in changes_in((ROOT / path).read_text())
+    sources = {path: (ROOT / path).read_text() for path in paths}
+    every = [(path, change) for path, source in sources.items() for change in changes_in(source)
              if line is None or change.line == line]  # fmt: skip
-    return sorted(random.Random(seed).sample(every, min(count, len(every))))
+    random.Random(seed).shuffle(every)
+    sound = (task for task in every if is_program(task[1].of(sources[task[0]])))
+    return sorted(itertools.islice(sound, count))
 
 
 def modules(names: Sequence[str]) -> list[Path]:
@@ -80,7 +84,7 @@ def main(words: Sequence[str] | None = None) -> None:
             map_file = Path(folder, "map.json")
             static_map(copy).write(map_file)
         map_file.parent.mkdir(parents=True, exist_ok=True)
-        with Runner(copy, map_file.resolve(), options.budget) as runner:
+        with Runner(copy, {path for path, _ in tasks}, map_file.resolve(), options.budget) as runner:
             trials = list(_tried(runner, tasks, options.out))
     print(counts(trials))
 

@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -65,18 +65,19 @@ def _write(module: Path, source: str) -> None:
 
 
 class Runner:
-    """The fast tests of a copy, and the process that runs them.
+    """The fast tests of a copy that call what some modules have, and the process that runs them.
 
     map_file: which tests call which functions; made where it is not there. budget_s: usual processor time of the tests
     that are run of one change, the quickest files first.
     """
 
-    def __init__(self, copy: Path, map_file: Path, budget_s: float) -> None:
+    def __init__(self, copy: Path, modules: Iterable[Path], map_file: Path, budget_s: float) -> None:
         self._copy, self._budget_s = copy, budget_s
+        files = TestMap.read(map_file).files_of(modules) if map_file.exists() else []
         places = os.pathsep.join([str(copy), str(copy / "tools")])
         environment = os.environ | {"PYTHONPATH": places, "OPENBLAS_NUM_THREADS": "1"}
         environment.pop("PYTHONDONTWRITEBYTECODE", None)
-        words = [sys.executable, server.__file__, copy, map_file]
+        words = [sys.executable, server.__file__, copy, map_file, *files]
         self._process = subprocess.Popen(
             [*map(str, words)], cwd=copy, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )

@@ -52,6 +52,10 @@ class TestMap:
             hits, key=lambda test: (_file(test) not in early, cost[_file(test)], _file(test), self.seconds[test])
         )
 
+    def files_of(self, modules: Iterable[Path]) -> list[str]:
+        """The files whose tests call anything of modules."""
+        return sorted({_file(test) for path in modules for test in self.tests_of(path, "")})
+
     @classmethod
     def read(cls, path: Path) -> TestMap:
         """A map that was written."""
