@@ -27,7 +27,7 @@ def python_of(environment: Path) -> Path:
 
 
 def steps(job: str, environment: Path, python: str) -> list[list[str]]:
-    """The commands that make the environment of a job: locked packages, checked by their hashes, and the project itself.
+    """The commands that make the environment of a job: locked packages, checked by their hashes, and the project.
 
     Its build backend came with the lock.
     """
