@@ -377,7 +377,7 @@ class DwellStack(Sequence[DwellFactor]):
             forces[k], poses[k] = dwell.means[1:4], dwell.pose
         return forces, poses
 
-    @property
+    @cached_property
     def bendings(self) -> Floats:
         """By how much effects change the mean readings of each dwell per unit of force, (D, 3, 3)."""
         return np.zeros((len(self), 3, 3)) if self.attitudes is None else self.attitudes.bending

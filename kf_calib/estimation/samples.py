@@ -76,8 +76,9 @@ def samples_of(rows: Iterable[Rows], linearised: LinearisedDwells, noise: Noise)
         if (block.dwell, block.moving) not in known:
             continue
         dwell, pieces = known[block.dwell, block.moving]
-        along = along_force([dwell], sensitivities_of([dwell], linearised.state))[0] if noise.attitude_unknown else None
-        regressor_map = nuisance_map([dwell], noise, linearised.state)[0]
+        sensitivities = sensitivities_of([dwell], linearised.state)
+        along = along_force([dwell], sensitivities)[0] if noise.attitude_unknown else None
+        regressor_map = nuisance_map(sensitivities, noise)[0]
         for part, u, _ in block.pieces:
             at_nodes, waves = next(pieces)
             functions = basis(u, block.elapsed_s[part], linearised.carrier_hz)

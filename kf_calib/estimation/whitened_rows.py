@@ -230,7 +230,7 @@ def _channels(batch: _Batch, columns: Floats, blocks: _Blocks, about: _About, he
     shape, triangles = (many, pieces * height, -1), batch.triangles
     basis, readings = triangles[:, :, :height, :functions], triangles[:, :, :height, functions:]
     regressors = batch.stack.regressors[batch.number][batch.part][:, :, :height]
-    nuisances = nuisance_map(batch.stack, about.noise, about.state)[batch.dwells]
+    nuisances = nuisance_map(sensitivities_of(batch.stack, about.state, batch.dwells), about.noise)
     parts = np.zeros((many, 3, pieces * height, blocks.width))
     for i in range(3):
         part, design = parts[:, i], on_basis(columns[..., i, :])

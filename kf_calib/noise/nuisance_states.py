@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
@@ -25,9 +26,12 @@ SLOW = np.arange(1, 5)
 
 def flicker_waves(folded: Folded) -> Floats:
     """sqrt(2) cos(pi k t / T) over a dwell of length T at the nodes of all pieces, (pieces, nodes, k)."""
+    if "flicker_waves" in folded.known:
+        return folded.known["flicker_waves"]
     starts_s, ends_s = np.repeat(folded.ends_s, 3 * folded.piece_numbers, axis=0).T
     share = (folded.elapsed_s - starts_s) / np.maximum(ends_s - starts_s, 1e-9)
-    return (np.sqrt(2.0) * np.cos(np.pi * SLOW * share[:, None])).reshape(-1, 3, len(SLOW))
+    waves = (np.sqrt(2.0) * np.cos(np.pi * SLOW * share[:, None])).reshape(-1, 3, len(SLOW))
+    return folded.known.setdefault("flicker_waves", waves)
 
 
 def flicker_sigmas(flicker_mps2: Floats) -> Floats:
@@ -60,9 +64,13 @@ def along_force(dwells: Sequence[DwellFactor], sensitivities: Floats) -> Floats:
     return np.asarray(np.linalg.solve(np.swapaxes(sensitivities, 1, 2), unit[:, :, None])[:, :, 0], float)
 
 
-def sensitivities_of(dwells: Sequence[DwellFactor], state: Floats) -> Floats:
-    """Change (D, 3, 3) of the readings of each dwell per unit of force at ``state`` (p,), effects included."""
-    return state[:STATE_COUNT].reshape(3, 4)[:, :3] + DwellStack.of(dwells).bendings
+def sensitivities_of(dwells: Sequence[DwellFactor], state: Floats, some: NDArray[np.intp] | None = None) -> Floats:
+    """Change (D, 3, 3) of the readings of each dwell per unit of force at ``state`` (p,), effects included.
+
+    some (d,): indices of the dwells of which alone it is wanted.
+    """
+    bendings = DwellStack.of(dwells).bendings
+    return state[:STATE_COUNT].reshape(3, 4)[:, :3] + (bendings if some is None else bendings[some])
 
 
 def nuisance_sigmas(noise: Noise) -> Floats:
@@ -72,14 +80,14 @@ def nuisance_sigmas(noise: Noise) -> Floats:
     return np.concatenate([rotations[rotations > 0], noise.scatter_mps2[noise.scatter_mps2 > 0]])
 
 
-def nuisance_map(dwells: Sequence[DwellFactor], noise: Noise, state: Floats) -> Floats:
-    """The coefficients (D, 3, 4, q) of the nuisance states on the regressors 1, f_x, f_y, f_z, linearised at
-    ``state``."""
+def nuisance_map(sensitivities: Floats, noise: Noise) -> Floats:
+    """The coefficients (D, 3, 4, q) of the nuisance states on the regressors 1, f_x, f_y, f_z, for ``sensitivities_of``
+    the dwells (D, 3, 3)."""
     turning = 0.0 < noise.setting_rad < np.inf
     scattering, count = np.flatnonzero(noise.scatter_mps2 > 0), 3 if turning else 0
-    coefficients = np.zeros((len(dwells), 3, len(REGRESSORS), count + len(scattering)))
+    coefficients = np.zeros((len(sensitivities), 3, len(REGRESSORS), count + len(scattering)))
     if turning:
-        x, y, z = np.moveaxis(sensitivities_of(dwells, state), 2, 0)
+        x, y, z = np.moveaxis(sensitivities, 2, 0)
         none = np.zeros_like(x)
         crossing = np.array([[none, -z, y], [z, none, -x], [-y, x, none]])  # (f x s) = f^T [s]
         coefficients[:, :, 1:, :3] = np.moveaxis(crossing, (0, 1), (2, 3))

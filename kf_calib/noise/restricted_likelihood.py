@@ -83,7 +83,8 @@ class Restricted:
         covariance = self.fixed + wider.reshape(self.fixed.shape)
         covariance[:, :3] = lift_rounding(covariance[:, :3])
         lower, known = banded.root(covariance), len(self.prior)
-        whitened = np.concatenate([self.prior, banded.solve(lower, self.rows)])
+        whitened = banded.solve(lower, self.rows)
+        whitened = np.concatenate([self.prior, whitened]) if known else whitened
         basis, upper = orthonormal(whitened[:, :-1].copy())
         rest = whitened[:, -1] - basis @ (basis.T @ whitened[:, -1])
         cost = np.log(banded.diagonal(lower)).sum() + np.log(np.abs(np.diag(upper))).sum() + 0.5 * rest @ rest
