@@ -67,7 +67,7 @@ DRIVING = "How it is driven"
 @output_option("--record", metavar="OUT.mcap", panel=DRIVING, help="Record the run here, with all decisions.")
 @target_option(panel=DRIVING)
 @click.option("--budget-s", type=POSITIVE, default=math.inf, show_default="none", panel=DRIVING,
-              help="End the run at the end of the stay in which this time is spent.")  # fmt: skip
+              help="End the run when this time is spent.")  # fmt: skip
 @click.option("--most", type=click.IntRange(min=1), metavar="N", show_default="60; 24 without a target", panel=DRIVING,
               help="Orientations at most.")  # fmt: skip
 @click.option("--stay-s", type=POSITIVE, default=30.0, show_default=True, panel=DRIVING,

@@ -156,9 +156,11 @@ def _is_reached(outlook: Outlook, judgement: Judgement) -> bool:
 
 def _end(itinerary: Itinerary, visited: Visited, judgement: Judgement, is_reached: bool) -> Suggestion | None:
     """Return the end of the run where it has come."""
-    count, diagnosis = len(visited.stays), judgement.diagnosis
-    if judgement.alarm and judgement.look.settled and diagnosis.sure and itinerary.ends_when_named:
-        return Suggestion("end", f"the missing effect is named: {' and '.join(diagnosis.missing)}", ended="named")
+    count = len(visited.stays)
+    is_settled = judgement.alarm and judgement.look.settled and judgement.diagnosis.sure
+    if is_settled and itinerary.ends_when_named:
+        named = " and ".join(judgement.diagnosis.missing)
+        return Suggestion("end", f"the missing effect is named: {named}", ended="named")
     if is_reached and not judgement.alarm and count > itinerary.opening and _is_back(visited):
         return Suggestion("end", "every target is reached, and the model agrees", ended="targets")
     if count >= itinerary.most:

@@ -21,11 +21,10 @@ from kf_calib.online.suggestion import Itinerary, Suggestion
 from kf_calib.positioning.loop import Angles, Ask, End, Halt, Move, Rules, Seen, State, step
 from kf_calib.positioning.positioner import Positioner
 
-_TICK_S = 0.1
-
-
 class Time(Protocol):
-    """A clock that can be waited on; that of a simulated bench goes on only then."""
+    """A clock that can be waited on; that of a simulated bench goes on only then. tick_s: between two looks."""
+
+    tick_s: float
 
     def now_s(self) -> float: ...
 
@@ -34,6 +33,8 @@ class Time(Protocol):
 
 class WallTime:
     """The time of the computer."""
+
+    tick_s = 0.1
 
     def now_s(self) -> float:
         return time.monotonic()
@@ -79,7 +80,7 @@ class Drive:
     """One run of a bench that drives itself.
 
     trouble: why the run must be broken off, by the source and the recording; empty where it need not. budget_s: time
-    after which the run ends at the next occasion. decided: is told each decision.
+    after which the run ends, amid a stay or after a move. decided: is told each decision.
     """
 
     def __init__(
@@ -108,6 +109,7 @@ class Drive:
     def run(self) -> Outcome:
         """Drive the bench until the run ends; whatever happens, the table is told to stop before this returns."""
         self._began_s = self.clock.now_s()
+        self.rules = replace(self.rules, until_s=self._began_s + self._budget_s)
         try:
             self.outcome = self._run()
         except BaseException as error:
@@ -136,11 +138,11 @@ class Drive:
                     return self._outcome(last.ended, last.why, stopped=True)
                 case None:
                     pass
-            self.clock.sleep(_TICK_S)
+            self.clock.sleep(self.clock.tick_s)
 
     def _suggestion(self) -> Suggestion:
         """Return what comes next, and make it known."""
-        if self._elapsed_s > self._budget_s:
+        if self._elapsed_s >= self._budget_s:
             suggestion = Suggestion("end", f"the time of {self._budget_s:g} s is spent", ended="budget")
         else:
             suggestion = self.session.suggest(self.itinerary)
@@ -171,9 +173,9 @@ class Drive:
         """Return where the table comes to rest after a stop."""
         before = tuple(self.positioner.read())
         for _ in range(50):
-            self.clock.sleep(_TICK_S)
+            self.clock.sleep(self.clock.tick_s)
             here = tuple(self.positioner.read())
-            if np.abs(np.array(here) - np.array(before)).max() <= self.rules.watch.still_degps * _TICK_S:
+            if np.abs(np.array(here) - np.array(before)).max() <= self.rules.watch.still_degps * self.clock.tick_s:
                 return here
             before = here
         return before

@@ -11,6 +11,7 @@ more.
 from __future__ import annotations
 
 import enum
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -88,11 +89,15 @@ class Seen:
 
 @dataclass(frozen=True)
 class Rules:
-    """Limits that hold for every command and every read-back: of the bench, of its pace, and of a motion."""
+    """Limits that hold for every command and every read-back: of the bench, of its pace, and of a motion.
+
+    until_s: when the time of the run is spent, and a stay ends in any case.
+    """
 
     reach: Reach
     pace: Pace = field(default_factory=Pace)
     watch: Watchfulness = field(default_factory=Watchfulness)
+    until_s: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -136,8 +141,10 @@ def step(state: State, seen: Seen, rules: Rules) -> tuple[State, Command | None]
 
 def _noted(state: State, seen: Seen, rules: Rules) -> State:
     """Return the state with what was seen in its track."""
-    oldest_s = seen.now_s - 2.0 * rules.watch.stand_s
-    track = (*(past for past in state.track if past[0] >= oldest_s), (seen.now_s, seen.gimbal_deg))
+    window_s = seen.now_s - rules.watch.stand_s
+    before = [past for past in state.track if past[0] <= window_s][-1:]  # so that the window is covered
+    after = [past for past in state.track if past[0] > window_s]
+    track = (*before, *after, (seen.now_s, seen.gimbal_deg))
     heard = (seen.samples, seen.now_s) if seen.samples > state.heard[0] or not state.track else state.heard
     return replace(state, track=track, heard=heard)
 
@@ -166,7 +173,7 @@ def _outside(gimbal_deg: Sequence[float], rules: Rules) -> str:
     limited = [j for j in rules.reach.limits_deg if not low[j] - margin <= pose[0, j] <= high[j] + margin]
     if limited:
         return f"beyond the limits of gimbal {limited[0] + 1}"
-    inside = replace(rules.reach, limits_deg={}).allowed(pose)[0]
+    inside = replace(rules.reach, limits_deg={}).allowed(wrap(pose))[0]
     return "" if inside else "in a forbidden zone"
 
 
@@ -198,10 +205,8 @@ def _staying(state: State, seen: Seen, rules: Rules) -> tuple[State, Command | N
     """Stay until there are readings enough."""
     watch, lasted_s = rules.watch, seen.now_s - state.since_s
     wanted_s = state.suggestion.stay_s if state.suggestion else _FIRST_S
-    off = np.abs(np.array(seen.gimbal_deg) - np.array(state.target)).max()
-    if off > 3.0 * watch.tolerance_deg:
-        here = _deg(seen.gimbal_deg)
-        return _halted(state, f"the platform should stand at {_deg(state.target)} and is at {here}: it moved by itself")
+    if moved := _moved_by_itself(state, seen, rules):
+        return _halted(state, moved)
     if seen.now_s - state.heard[1] > watch.silent_s:
         return _halted(state, f"no reading came for {watch.silent_s:g} s")
     recorded = seen.stream_deg
@@ -211,14 +216,24 @@ def _staying(state: State, seen: Seen, rules: Rules) -> tuple[State, Command | N
         words = f"the positioner stands at {_deg(state.target)}, and {shown}: check signs, zeros and order"
         return _halted(state, words)
     longest_s = _LONGER * wanted_s + _GRACE_S
-    if (is_here and seen.stay_s >= wanted_s) or lasted_s > longest_s:
+    if (is_here and seen.stay_s >= wanted_s) or lasted_s > longest_s or seen.now_s >= rules.until_s:
         return replace(state, phase=Phase.ASKING, since_s=seen.now_s, suggestion=None), Ask()
     return state, None
+
+
+def _moved_by_itself(state: State, seen: Seen, rules: Rules) -> str:
+    """Return that a platform that should stand has moved, in words; empty where it has not."""
+    off = np.abs(np.array(seen.gimbal_deg) - np.array(state.target)).max()
+    if off <= 3.0 * rules.watch.tolerance_deg:
+        return ""
+    return f"the platform should stand at {_deg(state.target)} and is at {_deg(seen.gimbal_deg)}: it moved by itself"
 
 
 def _choosing(state: State, seen: Seen, rules: Rules) -> tuple[State, Command | None]:
     """Begin what is suggested."""
     suggestion = seen.suggestion
+    if moved := _moved_by_itself(state, seen, rules):
+        return _halted(state, moved)
     if suggestion is None:
         return state, None
     if suggestion.ended:
@@ -247,12 +262,11 @@ def _halted(state: State, reason: str) -> tuple[State, Command]:
 
 def _stands(state: State, watch: Watchfulness) -> bool:
     """Tell whether the read-backs of the last ``stand_s`` show no motion."""
-    now_s = state.track[-1][0]
-    recent = [past for past in state.track if past[0] >= now_s - watch.stand_s - 1e-9]
-    if now_s - state.since_s < watch.stand_s or len(recent) < 2:
+    (first_s, _), (now_s, _) = state.track[0], state.track[-1]
+    if now_s - max(first_s, state.since_s) < watch.stand_s - 1e-6:
         return False
-    angles = np.array([angles for _, angles in recent])
-    return bool(np.ptp(angles, axis=0).max() <= watch.still_degps * watch.stand_s)
+    angles = np.array([angles for _, angles in state.track])
+    return bool(np.ptp(angles, axis=0).max() <= watch.still_degps * (now_s - first_s))
 
 
 def _rate_degps(track: Sequence[tuple[float, Angles]]) -> float:

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, with_config
 from typing_extensions import TypedDict
 
 from kf_calib.errors import InputError
@@ -34,8 +34,10 @@ SHIPPED = Path(__file__).parent / "profiles"
 
 _POSITIVE = Annotated[FINITE, Field(gt=0.0)]
 _Texts = TEXT | list[TEXT]
+_ENDINGS = {"lf": "\n", "crlf": "\r\n", "cr": "\r"}
 
 
+@with_config(extra="forbid")
 class _Content(TypedDict, total=False):
     kind: Literal["lines", "command"]
     address: TEXT
@@ -51,7 +53,7 @@ class _Content(TypedDict, total=False):
     no_fault: TEXT
     fault_word: TEXT
     answers: bool
-    termination: TEXT
+    termination: Literal["lf", "crlf", "cr"]
     baud: Annotated[int, Field(gt=0)]
     timeout_s: _POSITIVE
     tolerance_deg: _POSITIVE
@@ -141,6 +143,7 @@ def _checked(path: Path, content: Mapping[str, Any], width: int) -> Profile:
             _refuse_unknown_fields(path, key, text)
     if content["kind"] == "lines" and not content.get("address"):
         raise InputError(f"{path}: lacks the address of the controller, such as TCPIP::192.168.53.1::9878::SOCKET.")
+    values["termination"] = _ENDINGS[content.get("termination", "lf")]
     watched = {key: content[key] for key in Watchfulness.__annotations__ if key in content}
     return Profile(**{**values, "gimbals": gimbals, "name": path.stem, "watch": Watchfulness(**watched)})
 

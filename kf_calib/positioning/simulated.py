@@ -87,6 +87,8 @@ class SimulatedTime:
     seconds.
     """
 
+    tick_s = 0.2
+
     def __init__(self, bench: DrivenBench, feed: DrivenFeed, speed: float = math.inf) -> None:
         self.bench, self._feed, self._speed = bench, feed, speed
         self.wait: Callable[[int, float], bool] = lambda readings, seconds: True

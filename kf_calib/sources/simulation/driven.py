@@ -32,7 +32,7 @@ read-back is wrong; the platform does not stop at its target."""
 _MOST_DWELLS = 512
 _NEVER_NS = 1 << 62
 _RINGING = 8.0  # time constants after which nothing is left of it
-_OFF_DEG, _WRONG_DEG, _RUN_ON_DEG = 0.5, 3.0, 60.0
+_OFF_DEG, _WRONG_DEG, _RUN_ON_DEG = 0.5, 8.0, 60.0
 
 
 @dataclass(frozen=True)
@@ -69,6 +69,7 @@ class _Course:
     def __init__(self, start_deg: float) -> None:
         self.knots = [(0.0, start_deg, 0.0, 0.0)]  # time, angle, rate, acceleration from there on
         self.ringing = list[tuple[float, float]]()  # from when, with which amplitude
+        self.told: tuple[float, float] | None = None  # where to go, and when it is there
 
     def at(self, time_s: Floats, ringing_s: float) -> Floats:
         begin_s, angle, rate, acceleration = np.array(self.knots).T
@@ -83,6 +84,7 @@ class _Course:
 
     def brake(self, now_s: float, acceleration: float) -> float:
         """Comes to rest as soon as it can, and forgets what it was told; when it rests."""
+        self.told = None
         time_s, angle, rate, change = max((knot for knot in self.knots if knot[0] <= now_s), key=lambda knot: knot[0])
         since_s = now_s - time_s
         angle, rate = angle + since_s * (rate + 0.5 * change * since_s), rate + change * since_s
@@ -95,7 +97,9 @@ class _Course:
         return rest_s
 
     def go(self, now_s: float, target_deg: float, servo: Servo) -> float:
-        """Goes from rest to a target; when it is there."""
+        """Goes from rest to a target, or goes on to it; when it is there."""
+        if self.told is not None and self.told[0] == target_deg and now_s < self.told[1]:
+            return self.told[1]
         start_s = self.brake(now_s, servo.acceleration_degps2)
         start_deg, rate, acceleration = self.knots[-1][1], servo.rate_degps, servo.acceleration_degps2
         way = target_deg - start_deg
@@ -113,7 +117,8 @@ class _Course:
         ]
         if servo.overshoot_deg:
             self.ringing = [(end_s, sign * servo.overshoot_deg)]
-            return end_s + _RINGING * servo.ringing_s
+            end_s += _RINGING * servo.ringing_s
+        self.told = target_deg, end_s
         return end_s
 
 
