@@ -21,6 +21,7 @@ from kf_calib.online.suggestion import Itinerary, Suggestion
 from kf_calib.positioning.loop import Angles, Ask, End, Halt, Move, Rules, Seen, State, step
 from kf_calib.positioning.positioner import Positioner
 
+
 class Time(Protocol):
     """A clock that can be waited on; that of a simulated bench goes on only then. tick_s: between two looks."""
 
