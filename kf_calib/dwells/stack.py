@@ -58,7 +58,7 @@ def of_all_pieces(columns: Sequence[Floats]) -> Floats:
     return columns.values if isinstance(columns, OfPieces) else np.concatenate(columns)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Shape:
     """Dwells with equally many pieces P and basis functions K: indices (d,) of the dwells, and (d, P) of their
     pieces."""
@@ -186,7 +186,7 @@ class Folded:
         return {}
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Attitudes:
     """What is known of the setting errors of all dwells (``AttitudeError``): rotation_rad (D, 3), variance_rad2 (D,),
     bending (D, 3, 3)."""
@@ -205,7 +205,7 @@ class Attitudes:
         return AttitudeError(self.rotation_rad[k], float(self.variance_rad2[k]), self.bending[k])
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Facing:
     """Dwells with one force (D, 3) and one pose (D, k) each at all nodes, in place of those that were folded; and the
     dwells before, by index, where these were left out."""
@@ -215,7 +215,7 @@ class Facing:
     came_from: dict[int, DwellFactor]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class DwellStack(Sequence[DwellFactor]):
     """Dwells in order of time, with what is the same for all of them in arrays.
 
@@ -231,7 +231,7 @@ class DwellStack(Sequence[DwellFactor]):
     attitudes: Attitudes | None = None
     facing: Facing | None = None
     added: Floats | None = None
-    _made: dict[int, DwellFactor] = field(default_factory=dict[int, DwellFactor], repr=False)
+    _made: dict[int, DwellFactor] = field(default_factory=dict[int, DwellFactor])
 
     @classmethod
     def of(cls, dwells: Sequence[DwellFactor]) -> DwellStack:
@@ -373,8 +373,10 @@ class DwellStack(Sequence[DwellFactor]):
     def before(self) -> tuple[Floats, Floats]:
         """Mean force (D, 3), by its pose, and mean pose (D, k) of the dwell before each dwell."""
         forces, poses = self.means[self.folded.before, 1:4], self.poses[self.folded.before]
-        for k, dwell in (self.folded.came_from if self.facing is None else self.facing.came_from).items():
-            forces[k], poses[k] = dwell.means[1:4], dwell.pose
+        came_from = self.folded.came_from if self.facing is None else self.facing.came_from
+        if came_from:
+            places, left_out = list(came_from), DwellStack.of(list(came_from.values()))
+            forces[places], poses[places] = left_out.means[:, 1:4], left_out.poses
         return forces, poses
 
     @cached_property

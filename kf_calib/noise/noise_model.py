@@ -142,14 +142,13 @@ def within_dwells(
     sigma_w is taken from the autocovariance.
     """
     stack = DwellStack.of(dwells)
-    dwells, total = stack.folded.dwells, _total_of(stack.folded.dwells)
-    within_seen = bool((stack.folded.counts > 1).any())
+    dwells, within_seen = stack.folded.dwells, bool((stack.folded.counts > 1).any())
     if walk_mps2_per_sqrt_s:
-        total = replace(total, products=total.products - walk_mps2_per_sqrt_s**2 * _walk_products(dwells))
-    known = _of_averages if dwells[0].averaged else _inflation
-    inflation, variance = np.array([known(total, i) for i in range(3)]).T
-    if not dwells[0].averaged and total.count < _SHORT * inflation.max() * total.blocks:
-        inflation, variance = _alike(total)
+        inflation, variance = _correlation(dwells, walk_mps2_per_sqrt_s)
+    else:  # the same for all fits to the dwells
+        if "correlation" not in stack.folded.known:
+            stack.folded.known["correlation"] = _correlation(dwells, 0.0)
+        inflation, variance = stack.folded.known["correlation"]
     if along is not None:
         return Noise(_sigma_along(stack, along, inflation), inflation, within_seen=within_seen)
     squares, counts = stack.folded.squares, stack.folded.piece_counts
@@ -162,6 +161,18 @@ def within_dwells(
     pooled = np.where(long, squares, 0.0).sum(axis=0) / np.maximum(freedom, 1.0)
     sigma = np.sqrt(np.where(long.any(axis=0), pooled, variance))
     return Noise(sigma, inflation, within_seen=within_seen)
+
+
+def _correlation(dwells: Sequence[DwellFactor], walk_mps2_per_sqrt_s: float) -> tuple[Floats, Floats]:
+    """Return kappa (3,) and the variances (3,) of readings within dwells, less those of a random walk."""
+    total = _total_of(dwells)
+    if walk_mps2_per_sqrt_s:
+        total = replace(total, products=total.products - walk_mps2_per_sqrt_s**2 * _walk_products(dwells))
+    known = _of_averages if dwells[0].averaged else _inflation
+    inflation, variance = np.array([known(total, i) for i in range(3)]).T
+    if not dwells[0].averaged and total.count < _SHORT * inflation.max() * total.blocks:
+        return _alike(total)
+    return inflation, variance
 
 
 def _total_of(dwells: Sequence[DwellFactor]) -> Autocovariance:
