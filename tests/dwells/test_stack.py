@@ -70,7 +70,7 @@ def test_a_dwell_of_a_stack_faces_the_force_it_is_given(dwells: list[DwellFactor
     np.testing.assert_allclose(stack.means, [dwell.means for dwell in stack], rtol=1e-13, atol=1e-13)
     np.testing.assert_array_equal(stack.means[:, 1:4], forces)
     assert stack[2].came_from is dwells[0] and stack[1].came_from is None
-    np.testing.assert_array_equal(stack.before[0][2], dwells[0].means[1:4])
+    np.testing.assert_allclose(stack.before[0][2], dwells[0].means[1:4], rtol=1e-13)
     np.testing.assert_array_equal(stack.before[1][1], poses[0])
 
 
