@@ -41,7 +41,7 @@ def _log_ratio(residuals: Floats, within: Floats, scatter: Floats) -> float:
 
 
 def _log_density(differences: Floats, covariances: Floats) -> float:
-    """Return the log density of differences (3 (n - 1),) from the first of n independent vectors, but for a constant."""
+    """Return the log density of differences (3 (n - 1),) from the first of n vectors, but for a constant."""
     count = len(covariances) - 1
     spread = np.kron(np.ones((count, count)), covariances[0])
     for k in range(count):

@@ -42,5 +42,3 @@ def subsets(scan: Scan) -> Iterator[tuple[tuple[int, ...], float, int]]:
         if scan.candidates[k].dof and scan.candidates[other].dof:
             basis = np.concatenate([scan.candidates[k].basis, scan.candidates[other].basis], axis=1)
             yield (k, other), *scan.explained(basis)
-
-

@@ -209,7 +209,9 @@ def _tested(fitted: Fit, tests: FurtherEffects) -> list[FormulaFamily]:
             tested += _subsets(driver, texts, scan, known)
             continue
         delta_chi2, rank = scan.explained(np.concatenate([each.basis for each in scan.candidates], axis=1))
-        tested.append(FormulaFamily(driver, tuple(texts), delta_chi2, rank, tuple(scan.statistics.tolist()), all(known)))
+        tested.append(
+            FormulaFamily(driver, tuple(texts), delta_chi2, rank, tuple(scan.statistics.tolist()), all(known))
+        )
     return tested
 
 
@@ -307,5 +309,7 @@ def _of_surroundings(bench: Bench) -> Iterator[tuple[str, list[str]]]:
         yield "time", [":base = t"]
     yield "rate of temperature", ["dT"]
     yield "rate of temperature", ["a*dT"]
-    for terms in (["da"], ["da*abs(da)"], ["sign(da)"], ["a-da"], ["(a-da)**2"]):
+    saturating = ([f"tanh(da/({step}*m/s**2))"] for step in (1.5, 5))
+    plays = ([f"play{width}"] for width in (1, 3, 6))
+    for terms in (["da"], ["da*abs(da)"], ["a-da"], ["(a-da)**2"], *saturating, *plays):
         yield "previous orientation", terms

@@ -60,9 +60,7 @@ def _in_set(rows: Sequence[Any]) -> bool:
 @click.option("--only", multiple=True, type=click.Choice([*HIDDEN]), help="Hide only this effect; repeatable.")
 @click.option("--jobs", type=click.IntRange(min=1), default=2, show_default=True, help="Number of processes.")
 @click.option("--resume", type=click.Path(path_type=Path), help="Keep outcomes in this file (JSON lines).")
-def main(
-    runs: int, seed: int, sizes: tuple[float, ...], only: tuple[str, ...], jobs: int, resume: Path | None
-) -> None:
+def main(runs: int, seed: int, sizes: tuple[float, ...], only: tuple[str, ...], jobs: int, resume: Path | None) -> None:
     """Hide effects of no catalogue, and count how often the diagnosis says unknown, and how often a wrong name."""
     lines = resume.read_text().splitlines() if resume and resume.exists() else []
     outcomes = [json.loads(line) for line in lines]
@@ -79,7 +77,7 @@ def main(
 
 def counted(outcomes: Sequence[dict[str, Any]]) -> Table:
     """How often a cause of no catalogue is first, or in the set, and how often a wrong name has 90 %."""
-    headings = ("hidden", "runs", "noticed", "unknown first", "unknown in the set", "called noise", "wrong name >= 90 %")
+    headings = ("hidden", "runs", "noticed", "unknown first", "unknown in the set", "noise", "wrong name >= 90 %")
     table = Table(*headings, title="Effects of no catalogue", title_justify="left")
     for name in [*dict.fromkeys(each["effect"] for each in outcomes), "all"]:
         chosen = [each for each in outcomes if name in ("all", each["effect"])]

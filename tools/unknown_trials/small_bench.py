@@ -52,7 +52,7 @@ def _forces(angles_rad: Floats) -> Floats:
 def visits(seed: int, dwells: int, repeated: int = 0) -> Visits:
     """Orientations at random, the last ``repeated`` of them those of the first, in a room whose temperature swings."""
     rng = np.random.default_rng([seed, 1])
-    attitudes = Rotation.random(dwells, random_state=int(rng.integers(1 << 31))).as_euler("YZX")
+    attitudes = Rotation.from_quat(rng.normal(size=(dwells, 4))).as_euler("YZX")
     angles = np.vstack([attitudes[: dwells - repeated], attitudes[:repeated]])
     forces, share = _forces(angles), np.linspace(0.0, 1.0, _PATH + 1)[1:, None]
     ways = [_forces(before + share * (after - before)) for before, after in itertools.pairwise(angles)]
