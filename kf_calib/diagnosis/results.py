@@ -33,7 +33,8 @@ class Suspect:
 
     name: of the effect. statistic: fall of chi-squared. dof: its degrees of freedom. p_value: family-wise p-value.
     fits: whether the model with the effect fits the run. refit: the calibration with it. known: symbols of the effects
-    that were in the model before.
+    that were in the model before. probability: of this effect and no other, as in the table of explanations;
+    probability_with_others: of it alone or with others.
     """
 
     name: str
@@ -43,6 +44,8 @@ class Suspect:
     fits: bool
     refit: Calibration
     known: tuple[str, ...]
+    probability: float
+    probability_with_others: float
 
     @property
     def coefficients(self) -> list[Parameter]:

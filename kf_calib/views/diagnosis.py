@@ -138,6 +138,8 @@ def _suspect_object(suspect: Suspect) -> dict[str, Any]:
         "statistic": suspect.statistic,
         "dof": suspect.dof,
         "p_value": suspect.p_value,
+        "probability": suspect.probability,
+        "probability_with_others": suspect.probability_with_others,
         "fits": suspect.fits,
         "coefficients": [
             {"symbol": p.symbol, "value": p.value, "sigma": p.sigma, "unit": p.unit} for p in suspect.coefficients

@@ -81,6 +81,7 @@ def test_a_half_predicts_the_other_as_least_squares_by_hand_do() -> None:
     assert tried.answer == "yes" and tried.fall > 0.5 * tried.predicted
 
 
+@pytest.mark.slow
 def test_true_effects_of_ten_sigma_replicate_and_coefficients_of_noise_do_not() -> None:
     """Of noise at most one in a hundred replicates, whatever is named: of 60 runs with more than 4, p < 0.001."""
     alike = ["second-order", "scale-asymmetry", "cross-axis-square"]
