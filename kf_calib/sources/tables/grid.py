@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -17,6 +18,7 @@ from kf_calib.support.plain_text import cut
 
 Cell = str | float | datetime | None
 """A cell as it was read; text is not interpreted yet, an empty cell is None."""
+_CYRILLIC = re.compile(rb"[\xc0-\xff]{3}")
 ZIP, MCAP = b"PK\x03\x04", b"\x89MCAP"
 TEXT_SUFFIXES = (".csv", ".tsv", ".txt")
 EXCEL_SUFFIXES = (".xlsx", ".xlsm")
@@ -96,7 +98,8 @@ def _of_text(path: Path) -> Grid:
 
 
 def _decoded(path: Path, content: bytes) -> str:
-    """Return the text of a file in UTF-8 or UTF-16 with or without a byte-order mark, or else in Windows-1252."""
+    """Return the text of a file in UTF-8 or UTF-16 with or without a byte-order mark, or else in a code page of Windows:
+    of Cyrillic (1251) where letters beyond ASCII follow each other, as no Western language has them, else 1252."""
     if content.startswith((b"\xff\xfe", b"\xfe\xff")):
         return content.decode("utf-16", errors="replace")
     if b"\0" in content:
@@ -104,7 +107,7 @@ def _decoded(path: Path, content: bytes) -> str:
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:
-        return content.decode("cp1252", errors="replace")
+        return content.decode("cp1251" if _CYRILLIC.search(content) else "cp1252", errors="replace")
 
 
 def delimiter_of(lines: Sequence[str]) -> str:
