@@ -98,8 +98,10 @@ def _of_text(path: Path) -> Grid:
 
 
 def _decoded(path: Path, content: bytes) -> str:
-    """Return the text of a file in UTF-8 or UTF-16 with or without a byte-order mark, or else in a code page of Windows:
-    of Cyrillic (1251) where letters beyond ASCII follow each other, as no Western language has them, else 1252."""
+    """Return the text of a file in UTF-8 or UTF-16 with or without a byte-order mark, or in a code page of Windows.
+
+    It is Cyrillic (1251) where three letters beyond ASCII follow each other, as in no Western language, or else 1252.
+    """
     if content.startswith((b"\xff\xfe", b"\xfe\xff")):
         return content.decode("utf-16", errors="replace")
     if b"\0" in content:

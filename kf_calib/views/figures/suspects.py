@@ -91,7 +91,7 @@ def _overlaps(axes: Axes, diagnosis: Diagnosis, names: Sequence[str]) -> None:
     """Draw the matrix of overlaps with a number in each cell."""
     values = overlap_matrix(diagnosis.test, names)
     if np.isfinite(values).sum() <= 1:
-        return _words(axes, "No other effect explains as much:\nthere are no overlaps to show.")
+        return _words(axes, "No other effect has a shape to compare:\nthere are no overlaps to show.")
     axes.imshow(np.nan_to_num(values), cmap="Greys", vmin=0.0, vmax=1.25, aspect="auto")
     for (row, column), overlap in np.ndenumerate(values):
         text = "–" if np.isnan(overlap) else f"{overlap:.2f}"
