@@ -5,7 +5,7 @@ screenshots of it and need a graphics driver. Colours are reduced to a palette, 
 
 Each picture carries a digest of what it was drawn from (``drawn_from``): a test compares it with the digest of today.
 docs/blind_trial.png is drawn by the trial, docs/conventions.png by tools/conventions_picture.py,
-docs/fleet.png by tools/fleet_picture.py.
+docs/fleet.png by tools/fleet_picture.py, docs/run.png by tools/run_picture.py.
 """
 
 from __future__ import annotations

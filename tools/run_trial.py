@@ -150,7 +150,6 @@ def one_bench(number: int) -> dict[str, Any]:
     targets = drawn_targets(number, fixed)
     wanted = np.array([targets[symbol] for symbol in paper_parameters.SYMBOLS])
     device, session = DrivenBench(run, None, [0.0] * 3), Session.fed(bench, Settings(), targets, auto=True)
-    session.look_factor = 1.3
     named = list[tuple[int, tuple[str, ...]]]()
     session.listeners.append(lambda judgement: _note(named, session, judgement.result))
     itinerary = Itinerary(bench, pace, ends_when_named=False)
