@@ -55,7 +55,7 @@ def draw(axes: Axes, force: Floats, purposes: list[str], decisions: list[Decisio
         if not any(np.allclose(place, later) for later in zip(longitude[number:], latitude[number:], strict=True)):
             axes.annotate(str(number), place, color="white", fontsize=6, ha="center", va="center", zorder=4)
     passed_s = decisions[min(count, len(decisions)) - 1].at_s
-    axes.set_title(f"{count} orientations, {passed_s / 60.0:.1f} min", fontsize=9)
+    axes.set_title(f"{count} orientations, {passed_s / 60.0:.1f} min", fontsize=9, pad=14.0)
     axes.grid(alpha=0.3)
 
 
