@@ -1,11 +1,9 @@
 """docs/run.png: the orientations of a run that drives itself, as they grow on the sphere.
 
-    .venv/bin/python tools/run_picture.py          # a simulated bench that hides a second-order term
+The bench is a simulated one that hides a second-order term. ``tools/pictures run`` draws it again.
 """
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -22,10 +20,8 @@ from kf_calib.positioning.loop import Rules
 from kf_calib.positioning.simulated import SimulatedPositioner
 from kf_calib.sources.simulation.driven import DrivenBench
 from kf_calib.sources.simulation.options import options_from_query, simulation
-from kf_calib.views import figures
 from kf_calib.views.figures.directions import on_map, sphere_map
 
-OUT = Path(__file__).resolve().parents[1] / "docs" / "run.png"
 QUERY, TARGETS = "seed=3&sample_hz=50&hide=second-order=25sigma", ("K=2ppm", "b=10ug", "angles=1arcsec")
 COLOURS = {"first": "0.45", "opening": "tab:blue", "sharpen": "tab:green", "tell apart": "tab:red",
            "repeat": "tab:purple", "return": "tab:orange"}  # fmt: skip
@@ -59,19 +55,13 @@ def draw(axes: Axes, force: Floats, purposes: list[str], decisions: list[Decisio
     axes.grid(alpha=0.3)
 
 
-def main() -> None:
+def drawn() -> Figure:
+    """The picture."""
     drive, force, purposes = driven()
     figure = Figure(figsize=(9.0, 5.6), layout="constrained")
-    counts = [4, 8, 13, len(force)]
-    for place, count in enumerate(counts, start=1):
+    for place, count in enumerate([4, 8, 13, len(force)], start=1):
         draw(sphere_map(figure, (2, 2, place)), force, purposes, drive.decisions, count)
     shown = [Line2D([], [], marker="o", linestyle="", color=colour, label=name)
              for name, colour in COLOURS.items() if name in purposes]  # fmt: skip
     figure.legend(handles=shown, loc="outside lower center", ncols=len(shown), fontsize=8)
-    figures.save(figure, OUT, width_px=1200)
-    print(drive.outcome)
-    print(drive.session.standing.model, OUT)
-
-
-if __name__ == "__main__":
-    main()
+    return figure
