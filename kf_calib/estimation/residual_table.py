@@ -67,7 +67,7 @@ def quantity_means(result: Run, names: list[str]) -> dict[str, Floats]:
     return means
 
 
-def _weights(dwells: list[DwellFactor]) -> Floats:
+def _weights(dwells: Sequence[DwellFactor]) -> Floats:
     """Return the weight of each node in the mean over its dwell."""
     return np.concatenate([np.outer(dwell.counts / dwell.count, _SIMPSON).ravel() for dwell in dwells])
 
