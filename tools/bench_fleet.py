@@ -27,10 +27,8 @@ from typing import Any
 
 from kf_calib.cli.evaluate import replay
 from kf_calib.cli.fleet import SingleCommands
-from kf_calib.fleet.batch import cluster, evaluate_all
-from kf_calib.fleet.evaluation import Evaluation
-from kf_calib.fleet.run_list import Run, runs_of
-from kf_calib.fleet.run_row import Row
+from kf_calib.fleet.batch import Evaluation, cluster, evaluate_all
+from kf_calib.fleet.run_list import Row, Run, runs_of
 from kf_calib.fleet.store import Store
 
 _OF_REPLAY_ALONE = ("recording", "overwrite", "strict", "as_json", "save", "save_model")

@@ -204,9 +204,9 @@ def simulate(
     output: Path, no_angles: bool, overwrite: bool, large: bool, as_json: bool, **options: Any
 ) -> None:  # fmt: skip
     """Record a simulated bench run to OUT; its truth goes to a side file that no estimator opens."""
-    from kf_calib.sources.simulation.by_hand import ByHand
+    from kf_calib.sources.simulation.detectability import truth_file, write_truth
     from kf_calib.sources.simulation.options import simulation
-    from kf_calib.sources.simulation.truth import truth_file, write_truth
+    from kf_calib.sources.simulation.simulator import ByHand
 
     claimed([Path(options["plan"])], {"OUT, whose truth goes there": truth_file(output)}, overwrite)
     options["no_angles"] = no_angles
@@ -347,8 +347,8 @@ def _do_main_job(folder: Path, as_json: bool) -> None:
     from kf_calib.estimation.calibration import calibrate
     from kf_calib.estimation.engine_comparison import compare as run
     from kf_calib.sources.files.recording import Recording
+    from kf_calib.sources.simulation.detectability import truth_file, write_truth
     from kf_calib.sources.simulation.options import simulation
-    from kf_calib.sources.simulation.truth import truth_file, write_truth
     from kf_calib.views.console import comparison_table, summary
     from kf_calib.views.json import compare_object, replay_object
 

@@ -121,8 +121,7 @@ def _applied(
     tick: Callable[[float], None],
 ) -> tuple[Applied, list[str]]:  # fmt: skip
     """Write the copy of a file; what was corrected, and what is to be told."""
-    from kf_calib.exchange.corrected_file import Applied, apply_to_file
-    from kf_calib.exchange.corrected_table import apply_to_table
+    from kf_calib.exchange.corrected_file import Applied, apply_to_file, apply_to_table
 
     columns = dict(map(pair, options["columns"]))
     match recording_kind(path, options):

@@ -30,9 +30,8 @@ from kf_calib.errors import BenchError, CountsError, KfCalibError
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 if TYPE_CHECKING:
-    from kf_calib.bench.raw_input import RawInput
+    from kf_calib.bench.raw_input import RawInput, WrongUnit
     from kf_calib.bench.streams import Source
-    from kf_calib.bench.wrong_unit import WrongUnit
     from kf_calib.dwells.overview import DwellSummary
     from kf_calib.sources.files.inventory import Inventory
     from kf_calib.views.overview import Overview
@@ -174,7 +173,7 @@ def _wrong_unit(norms_mps2: Sequence[float], taken: RawInput, *, are_named: bool
 
     are_named: whether names of columns tell the unit, too.
     """
-    from kf_calib.bench.wrong_unit import LEVELS, wrong_unit
+    from kf_calib.bench.raw_input import LEVELS, wrong_unit
 
     level = median(norms_mps2) / STANDARD_GRAVITY_MPS2 if norms_mps2 else 1.0
     if LEVELS[0] <= level <= LEVELS[1] or level == 0.0:

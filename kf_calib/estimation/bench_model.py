@@ -26,8 +26,7 @@ from kf_calib.effects import effect_named
 from kf_calib.errors import InputError
 from kf_calib.estimation.known_effect import KnownEffect
 from kf_calib.support.output_files import write_whole
-from kf_calib.support.toml_files import toml_table
-from kf_calib.support.value_schema import FINITE, TEXT, Misfit, converted
+from kf_calib.support.toml_files import FINITE, TEXT, Misfit, converted, toml_table
 
 _EXAMPLE = '[[terms]] with effect = "flexure", symbols, coefficients, covariance'
 _ROUNDING = 1e-9

@@ -38,8 +38,7 @@ from kf_calib.errors import InputError
 from kf_calib.estimation.results import Calibration
 from kf_calib.support.output_files import write_whole
 from kf_calib.support.plain_text import cut
-from kf_calib.support.toml_files import toml_table
-from kf_calib.support.value_schema import FINITE, TEXT, Misfit, converted
+from kf_calib.support.toml_files import FINITE, TEXT, Misfit, converted, toml_table
 
 _EXAMPLE = 'effects = ["NAME", "mine = a*T"]'
 _Path = Annotated[str, StringConstraints(min_length=1, max_length=4096, pattern=r"\A[^\x00]*\z")]

@@ -38,7 +38,7 @@ from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.model_file import ModelFile
 from kf_calib.estimation.observability import visibility_of
 from kf_calib.estimation.results import Calibration
-from kf_calib.exchange import calibration_agreement as agreement
+from kf_calib.exchange import calibration_parts as agreement
 from kf_calib.exchange.calibration_parts import (
     MOST_EFFECTS,
     Part,
@@ -54,8 +54,8 @@ from kf_calib.exchange.calibration_parts import (
     States,
     Text,
 )
-from kf_calib.sources.files.bags import fingerprint
 from kf_calib.sources.files.contents import CALIBRATION_FORMAT
+from kf_calib.sources.files.record_files import fingerprint
 from kf_calib.sources.opening import opened
 from kf_calib.sources.run_date import run_date
 from kf_calib.support import dates

@@ -38,7 +38,7 @@ from kf_calib.estimation.settings import Settings
 from kf_calib.exchange.calibration_file import SavedCalibration
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise, mean_covariances
-from kf_calib.sources.files.bags import fingerprint
+from kf_calib.sources.files.record_files import fingerprint
 from kf_calib.support.tail_probabilities import chi_squared_tail, sidak
 from kf_calib.support.threads import one_blas_thread
 

@@ -19,7 +19,7 @@ from kf_calib.fleet.own_coefficients import UnitsAndCommon
 from kf_calib.fleet.pooled_terms import Attribution, PooledTerms, Term
 from kf_calib.fleet.population import Population, population
 from kf_calib.fleet.run_factor import ReferenceUnit
-from kf_calib.fleet.some_units import SomeUnits
+from kf_calib.fleet.shape import SomeUnits
 from kf_calib.support.threads import one_blas_thread
 
 RIVAL = 0.01

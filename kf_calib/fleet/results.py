@@ -16,7 +16,7 @@ from kf_calib.errors import InputError
 from kf_calib.fleet.overview import COLUMNS, FleetOverview, counted, overview_of
 from kf_calib.fleet.pooled_diagnosis import PooledDiagnosis, pooled_diagnosis
 from kf_calib.fleet.run_factor import ReferenceUnit, RunFactor
-from kf_calib.fleet.run_row import SCHEMA, factor_of
+from kf_calib.fleet.run_list import SCHEMA, factor_of
 from kf_calib.fleet.store import AT_ONCE, Store
 from kf_calib.support.extras import need
 

@@ -22,11 +22,9 @@ from kf_calib.exchange.certificate import content, statement
 from kf_calib.exchange.exports import TARGETS, exported
 from kf_calib.exchange.history import history
 from kf_calib.exchange.verification import verify
-from kf_calib.sources.simulation.by_hand import ByHand
 from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.sensors import Sensors
-from kf_calib.sources.simulation.simulator import Simulation
-from kf_calib.sources.simulation.visit_plans import Visit
+from kf_calib.sources.simulation.simulator import ByHand, Simulation, Visit
 
 FRAME = ["theta1", "phi1", "nu2"]
 

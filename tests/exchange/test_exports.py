@@ -23,7 +23,7 @@ from kf_calib.errors import InputError, UnobservableError
 from kf_calib.exchange import calibration_file
 from kf_calib.exchange.exports import TARGETS, exported
 from kf_calib.exchange.exports.affine import AffineTarget
-from kf_calib.exchange.exports.quoting import in_cell
+from kf_calib.exchange.exports.target import in_cell
 
 
 def px4(text: str) -> Formula:

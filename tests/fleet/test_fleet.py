@@ -26,8 +26,7 @@ import kf_calib
 from kf_calib.cli.fleet import SingleCommands
 from kf_calib.errors import InputError
 from kf_calib.fleet import batch
-from kf_calib.fleet.batch import evaluate_all
-from kf_calib.fleet.evaluation import Evaluation
+from kf_calib.fleet.batch import Evaluation, evaluate_all
 from kf_calib.fleet.run_list import Run, runs_of
 from kf_calib.fleet.store import Store
 

@@ -23,10 +23,8 @@ from helpers.fleet_workers import evaluation, threads, used
 import kf_calib
 from kf_calib.cli.fleet import SingleCommands
 from kf_calib.fleet import batch
-from kf_calib.fleet.batch import evaluate_all
-from kf_calib.fleet.evaluation import Evaluation, OverTime, in_time
-from kf_calib.fleet.run_list import Run, runs_of
-from kf_calib.fleet.run_row import SCHEMA
+from kf_calib.fleet.batch import Evaluation, OverTime, evaluate_all, in_time
+from kf_calib.fleet.run_list import SCHEMA, Run, runs_of
 from kf_calib.fleet.store import Store
 
 pytestmark = pytest.mark.xdist_group("fleet")

@@ -14,8 +14,7 @@ from kf_calib.fleet.evidence import log_evidence, log_evidence_of_modes, modes, 
 from kf_calib.fleet.own_coefficients import UnitInformation, UnitsAndCommon
 from kf_calib.fleet.pooled_terms import Attribution, PooledTerms, Sums, Term
 from kf_calib.fleet.population import population
-from kf_calib.fleet.shape import POWERS, SHARES, about_mean, about_zero
-from kf_calib.fleet.some_units import SomeUnits
+from kf_calib.fleet.shape import POWERS, SHARES, SomeUnits, about_mean, about_zero
 
 
 def beside_nothing(own: UnitInformation) -> UnitsAndCommon:

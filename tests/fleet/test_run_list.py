@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from kf_calib.errors import InputError
-from kf_calib.fleet.evaluation import local_copy
+from kf_calib.fleet.batch import local_copy
 from kf_calib.fleet.run_list import Run, runs_of
 
 

@@ -12,7 +12,7 @@ from distributed import Client, LocalCluster
 from kf_calib.cli.evaluate import replay
 from kf_calib.cli.fleet import SingleCommands
 from kf_calib.fleet import batch
-from kf_calib.fleet.evaluation import Evaluation
+from kf_calib.fleet.batch import Evaluation
 
 
 @contextmanager

@@ -11,17 +11,10 @@ from __future__ import annotations
 from kf_calib.errors import InputError
 from kf_calib.estimation.correction import Correction
 from kf_calib.exchange.calibration_file import SavedCalibration
-from kf_calib.exchange.exports.ardupilot import ArduPilot
+from kf_calib.exchange.exports.autopilots import ArduPilot, Px4
 from kf_calib.exchange.exports.c_header import CHeader
-from kf_calib.exchange.exports.imu_calib import ImuCalib
-from kf_calib.exchange.exports.imu_tk import ImuTk
-from kf_calib.exchange.exports.imucal import Imucal
-from kf_calib.exchange.exports.kalibr import Kalibr
-from kf_calib.exchange.exports.openvins import OpenVins
-from kf_calib.exchange.exports.px4 import Px4
-from kf_calib.exchange.exports.table import Table
-from kf_calib.exchange.exports.target import Target
-from kf_calib.exchange.exports.vectornav import VectorNav
+from kf_calib.exchange.exports.matrices import Imucal, ImuCalib, ImuTk, Kalibr, OpenVins, VectorNav
+from kf_calib.exchange.exports.target import Table, Target
 from kf_calib.support.units import shown
 
 TARGETS: dict[str, type[Target]] = {

@@ -15,8 +15,8 @@ from kf_calib.sources.files.cdr import IMU, JOINT_STATE, QUATERNION, TEMPERATURE
 from kf_calib.sources.files.field_messages import CDR, ENCODINGS, FieldDecoder
 from kf_calib.sources.files.fields import FieldError, Fields, known_fields
 from kf_calib.sources.files.joints import Joints
-from kf_calib.sources.files.mcap_chunks import DamagedError, parse
 from kf_calib.sources.files.mcap_file import Warn
+from kf_calib.sources.files.mcap_records import DamagedError, parse
 from kf_calib.sources.files.record_files import RecordFile
 
 BENCH_RECORD = "kf_calib.bench"

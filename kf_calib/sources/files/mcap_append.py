@@ -32,9 +32,8 @@ from numpy.typing import NDArray
 from kf_calib.bench.streams import Stream
 from kf_calib.errors import InputError
 from kf_calib.sources.files import cdr
-from kf_calib.sources.files.mcap_chunks import parse
 from kf_calib.sources.files.mcap_file import McapFile
-from kf_calib.sources.files.mcap_messages import HEAD, MAGIC
+from kf_calib.sources.files.mcap_records import HEAD, MAGIC, parse
 
 _PIECE = 1 << 22
 _MESSAGES = 1 << 14  # in a chunk

@@ -20,11 +20,9 @@ from mcap.opcode import Opcode
 from mcap.records import Metadata
 
 from kf_calib.bench.bench import Bench
-from kf_calib.bench.gravity_alone import bench_without_angles
 from kf_calib.bench.raw_input import Conversion, RawInput, conversion, merged_metadata
-from kf_calib.bench.streams import Batch, Stream
+from kf_calib.bench.streams import Batch, Stream, bench_without_angles
 from kf_calib.errors import BenchError, InputError
-from kf_calib.sources.files.bags import files_of
 from kf_calib.sources.files.cdr import CdrError, Decoder
 from kf_calib.sources.files.contents import (
     BENCH_RECORD,
@@ -40,11 +38,18 @@ from kf_calib.sources.files.contents import (
 from kf_calib.sources.files.field_messages import FieldDecoder
 from kf_calib.sources.files.fields import FieldError
 from kf_calib.sources.files.joints import Joints
-from kf_calib.sources.files.mcap_chunks import MAX_CHUNK_MB, DamagedError, parse
 from kf_calib.sources.files.mcap_file import Warn
-from kf_calib.sources.files.mcap_messages import MessageFinder, Messages, RecordBlock
-from kf_calib.sources.files.packed_messages import are_packed, unpacked
-from kf_calib.sources.files.record_files import RecordFile, open_record_file
+from kf_calib.sources.files.mcap_records import (
+    MAX_CHUNK_MB,
+    DamagedError,
+    MessageFinder,
+    Messages,
+    RecordBlock,
+    are_packed,
+    parse,
+    unpacked,
+)
+from kf_calib.sources.files.record_files import RecordFile, files_of, open_record_file
 from kf_calib.support import dates
 
 _MOST_DAMAGES = 100  # told one by one; a file can be made that has a million

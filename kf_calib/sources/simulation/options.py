@@ -12,12 +12,11 @@ from urllib.parse import parse_qsl
 
 from kf_calib.bench.bench import Bench, Vector, parse_axes
 from kf_calib.errors import InputError
-from kf_calib.sources.simulation.by_hand import without_angles
 from kf_calib.sources.simulation.detectability import sized
 from kf_calib.sources.simulation.injected import parse
 from kf_calib.sources.simulation.physics import Ambient
 from kf_calib.sources.simulation.sensors import GRADES
-from kf_calib.sources.simulation.simulator import Simulation
+from kf_calib.sources.simulation.simulator import Simulation, without_angles
 from kf_calib.sources.simulation.visit_plans import Visit, angles_from_csv, explicit_plan, six_faces, spread_plan
 
 DEFAULTS: Mapping[str, Any] = MappingProxyType(
