@@ -43,7 +43,7 @@ from mcap_ros2.decoder import DecoderFactory
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import BenchError, InputError
-from kf_calib.sources.files import cdr, mcap_records, mcap_file
+from kf_calib.sources.files import cdr, mcap_file, mcap_records
 from kf_calib.sources.files.mcap_records import HEAD, MAGIC
 from kf_calib.sources.files.recorder import Recorder
 from kf_calib.sources.files.recording import Recording
