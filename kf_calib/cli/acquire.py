@@ -13,27 +13,23 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import rich_click as click
 from click import get_current_context  # rich_click declares that there may be none
 
-from kf_calib.cli.echo import complain, echo
+from kf_calib.cli.command import OUTPUT, command
+from kf_calib.cli.echo import complain, echo, print_json, progress, show
 from kf_calib.cli.files import OutputFile, claimed, delivery
 from kf_calib.cli.numbers import NUMBER, POSITIVE
 from kf_calib.cli.options import (
-    OUTPUT,
     F,
     bench_options,
     columns_option,
-    examples,
     input_options,
     json_option,
     no_angles_option,
     overrides,
     overwrite_option,
     pair,
-    print_json,
-    progress,
-    save_view,
-    show,
     units_option,
 )
+from kf_calib.cli.pictures import save_view
 from kf_calib.cli.signals import Interrupter, answered
 from kf_calib.errors import InputError
 from kf_calib.support.output_files import Outputs, write_whole
@@ -190,9 +186,11 @@ def _record(source: Source, path: Path, overwrite: bool, tick: Callable[[float],
     return _Recorded(readings, segmenter.dwell_count, duration_s, notes)
 
 
-@click.command(
-    epilog=examples("simulate run.mcap", "simulate run.mcap --seed 3 --hide second-order=10sigma --temperature-swing 5")
-)
+@command(
+    "simulate run.mcap", "simulate run.mcap --seed 3 --hide second-order=10sigma --temperature-swing 5",
+    seldom=("angle_hz", "outlier_rate", "outlier_mps2", "encoder_sigma_deg", "encoder_step_deg", "flicker_mps2",
+            "period_s", "warm_up_c", "warm_up_s", "sigma_c", "step_c", "large"),
+)  # fmt: skip
 @click.argument("output", type=OutputFile(), metavar="OUT")
 @simulation_options
 @click.option("--no-angles", is_flag=True, panel="Run", help="Record no angles, as of a board that is turned by hand.")
@@ -237,12 +235,10 @@ def _size(count: int) -> str:
     return f"{count / 1e9:.3g} GB" if count < 1e12 else f"{count / 1e12:.3g} TB"
 
 
-@click.command(
-    epilog=examples(
-        'record run.mcap bench.csv --axes "y z x" --gravity 9.8123',
-        'record run.mcap - --bench bench.toml --column "acc x [g]=ax_g" < bench.csv',
-        "record run.mcap counts.csv --bench bench.toml --accel-scale 3.9e-6 --accel-unit g --channels 1,-2,3",
-    )
+@command(
+    'record run.mcap bench.csv --axes "y z x" --gravity 9.8123',
+    'record run.mcap - --bench bench.toml --column "acc x [g]=ax_g" < bench.csv',
+    "record run.mcap counts.csv --bench bench.toml --accel-scale 3.9e-6 --accel-unit g --channels 1,-2,3",
 )
 @click.argument("output", type=OutputFile(), metavar="OUT")
 @click.argument("lines", type=click.Path(path_type=Path, allow_dash=True), default="-")
@@ -296,7 +292,7 @@ def _folder() -> str:
     return "recordings" if get_current_context().params["tutorial"] else "out"
 
 
-@click.command(epilog=examples("demo", "demo somewhere", "demo --tutorial"))
+@command("demo", "demo somewhere", "demo --tutorial")
 @click.argument("folder", type=click.Path(path_type=Path, file_okay=False), default=_folder)
 @click.option("--tutorial", is_flag=True, is_eager=True, help="Instead, copy the recordings of the tutorial to FOLDER.")
 @units_option

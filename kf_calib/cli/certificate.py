@@ -7,18 +7,10 @@ from typing import TYPE_CHECKING
 
 import rich_click as click
 
+from kf_calib.cli.command import INPUT, OUTPUT, command
+from kf_calib.cli.echo import print_json, show
 from kf_calib.cli.files import claimed, output_option
-from kf_calib.cli.options import (
-    INPUT,
-    OUTPUT,
-    effects_from_option,
-    examples,
-    json_option,
-    overwrite_option,
-    print_json,
-    show,
-    trust_option,
-)
+from kf_calib.cli.options import effects_from_option, json_option, overwrite_option, trust_option
 
 if TYPE_CHECKING:
     from kf_calib.estimation.measurement_model import Model
@@ -32,7 +24,7 @@ statement_option = click.option("--statement", type=_path, metavar="LAB.toml", p
                                 help="What the laboratory states: docs/certificate.md has the keys.")  # fmt: skip
 
 
-@click.command(epilog=examples("certificate cal.json --statement lab.toml -o certificate.pdf"))
+@command("certificate cal.json --statement lab.toml -o certificate.pdf")
 @click.argument("calibration", type=_path, metavar="CAL")
 @output_option("-o", "--out", "output", required=True, metavar="OUT.pdf", panel=OUTPUT,
                help="The certificate: PDF/A-3b with the XML attached.")  # fmt: skip

@@ -10,29 +10,24 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import rich_click as click
 
-from kf_calib.cli.echo import complain
+from kf_calib.cli.command import INPUT, OUTPUT, command
+from kf_calib.cli.echo import complain, print_json, progress, show
 from kf_calib.cli.files import claimed, delivery, output_option
 from kf_calib.cli.options import (
     BENCH_OPTIONS,
-    INPUT,
     OF_MESSAGES,
-    OUTPUT,
     dwell_options,
     effects_from_option,
-    examples,
     json_option,
     merged_for_table,
     messages_of,
     overrides,
     overwrite_option,
     pair,
-    print_json,
-    progress,
     recording_kind,
     recording_of,
     recording_options,
     refuse_given,
-    show,
     strict_option,
     trust_option,
     units_of,
@@ -54,12 +49,10 @@ _BLOCK_BYTES = 1 << 16
 _file = partial(click.argument, type=click.Path(path_type=Path))
 
 
-@click.command(
-    epilog=examples(
-        "apply cal.json flight.mcap -o flight_calibrated.mcap",
-        "apply cal.json log.csv -o log_calibrated.csv",
-        "apply cal.json - < lines.csv > out.csv",
-    )
+@command(
+    "apply cal.json flight.mcap -o flight_calibrated.mcap",
+    "apply cal.json log.csv -o log_calibrated.csv",
+    "apply cal.json - < lines.csv > out.csv",
 )
 @_file("calibration", metavar="CAL")
 @_file("recording", metavar="REC")
@@ -204,7 +197,7 @@ def _correction(path: Path, options: Mapping[str, Any]) -> tuple[SavedCalibratio
     return saved, saved.correction(path, options["effects_from"], options["trust"])
 
 
-@click.command(epilog=examples("verify cal.json check.mcap", "verify cal.json check.mcap --strict --json"))
+@command("verify cal.json check.mcap", "verify cal.json check.mcap --strict --json")
 @_file("calibration", metavar="CAL")
 @_file("recording", metavar="REC")
 @recording_options
@@ -238,7 +231,7 @@ def verify(ctx: click.Context, calibration: Path, recording: Path, strict: bool,
         ctx.exit(1)
 
 
-@click.command(epilog=examples("history cal_*.json --tolerance K=20ppm --tolerance b=100ug"))
+@command("history cal_*.json --tolerance K=20ppm --tolerance b=100ug")
 @click.argument("calibrations", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="CAL...")
 @click.option(
     "--tolerance",

@@ -6,24 +6,17 @@ from pathlib import Path
 
 import rich_click as click
 
+from kf_calib.cli.command import OUTPUT, command
+from kf_calib.cli.echo import print_json, show
 from kf_calib.cli.files import claimed, output_option
-from kf_calib.cli.options import (
-    OUTPUT,
-    effects_from_option,
-    examples,
-    json_option,
-    overwrite_option,
-    print_json,
-    show,
-    trust_option,
-    units_option,
-)
+from kf_calib.cli.options import effects_from_option, json_option, overwrite_option, trust_option, units_option
 
 _NAMES = ["px4", "ardupilot", "imucal", "imu_calib", "kalibr", "openvins", "imu_tk", "vectornav", "csv", "c"]
 
 
-@click.command(epilog=examples("export cal.json --to c -o kf_calib_correct.h",
-                               "export cal.json --to ardupilot --lossy -o accelerometer.param"))  # fmt: skip
+@command(
+    "export cal.json --to c -o kf_calib_correct.h", "export cal.json --to ardupilot --lossy -o accelerometer.param"
+)
 @click.argument("calibration", type=click.Path(path_type=Path), metavar="CAL")
 @click.option("--to", required=True, type=click.Choice(_NAMES), help="The program that is to take it.", panel=OUTPUT)
 @output_option("-o", "--out", "output", required=True, metavar="FILE", panel=OUTPUT, help="The file for that program.")

@@ -13,24 +13,19 @@ from typing import TYPE_CHECKING, Any
 import rich_click as click
 from click import get_current_context  # rich_click declares that there may be none
 
-from kf_calib.cli.echo import complain, echo
+from kf_calib.cli.command import MODEL, OUTPUT, command
+from kf_calib.cli.echo import complain, echo, print_json, progress, show
 from kf_calib.cli.failures import sentence
 from kf_calib.cli.files import Delivery, claimed, delivery
 from kf_calib.cli.numbers import POSITIVE
 from kf_calib.cli.options import (
-    MODEL,
-    OUTPUT,
-    examples,
     filter_options,
     json_option,
     opened,
     overrides,
     overwrite_option,
-    print_json,
-    progress,
     recording_options,
     settings_of,
-    show,
     target_option,
     units_option,
 )
@@ -102,7 +97,10 @@ def _content(value: Any) -> Any:
     return [_content(each) for each in value] if isinstance(value, tuple | list) else value
 
 
-@click.command(epilog=examples("fleet campaign/ -o fleet", "fleet s3://lab/2026/ -o fleet --scheduler tcp://host:8786"))
+@command(
+    "fleet campaign/ -o fleet", "fleet s3://lab/2026/ -o fleet --scheduler tcp://host:8786",
+    seldom=("reference_unit", "model_file", "left_out", "accel_unit", "angle_unit", "columns"),
+)  # fmt: skip
 @click.argument("runs", nargs=-1, required=True)
 @click.option("-o", "--out", "output", required=True, type=click.Path(file_okay=False, path_type=Path),
               metavar="FOLDER", panel=OUTPUT,

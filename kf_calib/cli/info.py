@@ -12,18 +12,16 @@ from typing import TYPE_CHECKING, Any
 import rich_click as click
 from click.core import ParameterSource
 
+from kf_calib.cli.command import command
+from kf_calib.cli.echo import print_json, progress, show
 from kf_calib.cli.options import (
     OF_DWELLS,
     OF_MESSAGES,
-    examples,
     json_option,
     messages_of,
     overrides,
     pair,
-    print_json,
-    progress,
     recording_options,
-    show,
     units_of,
 )
 from kf_calib.errors import BenchError, CountsError, KfCalibError
@@ -52,7 +50,7 @@ _BY_HAND = (
 )
 
 
-@click.command(epilog=examples("info run.mcap", "info rosbag2_2026_05_04", "info log.csv --json"))
+@command("info run.mcap", "info rosbag2_2026_05_04", "info log.csv --json")
 @click.argument("recording", type=click.Path(path_type=Path), metavar="FILE")
 @recording_options
 @json_option

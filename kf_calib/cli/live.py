@@ -12,34 +12,30 @@ from typing import TYPE_CHECKING, Any
 
 import rich_click as click
 
-from kf_calib.cli.echo import complain
+from kf_calib.cli.command import INPUT, command
+from kf_calib.cli.echo import complain, json_line, rendered
 from kf_calib.cli.files import claimed, delivery, output_option
 from kf_calib.cli.live_keys import pressed_keys
 from kf_calib.cli.live_run import LiveRun, by_hand, on_bench
 from kf_calib.cli.numbers import NOT_NEGATIVE, POSITIVE
 from kf_calib.cli.options import (
-    INPUT,
     bench_options,
     columns_option,
-    examples,
     filter_options,
     input_options,
-    json_line,
     json_option,
     no_angles_option,
     overrides,
     overwrite_option,
     pair,
-    rendered,
-    rrd_option,
     save_model_option,
     save_option,
-    save_view,
     settings_of,
     strict_option,
     target_option,
     units_option,
 )
+from kf_calib.cli.pictures import rrd_option, save_view
 from kf_calib.cli.signals import answered
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.support.plain_text import sentence
@@ -55,12 +51,21 @@ RUNNING = "While it runs"
 _REFRESH_S = 0.25
 
 
-@click.command(
-    epilog=examples(
-        "live /dev/ttyUSB0 --bench bench.toml --record run.mcap --target theta=1arcsec --target K=2ppm --rerun",
-        'live "sim://?speed=10&hide=second-order=4e-6" --target K=0.1ppm',
-        "live /dev/ttyACM0 --no-angles --record hand.mcap --target K=500ppm",
-    )
+@command(
+    "live /dev/ttyUSB0 --bench bench.toml --record run.mcap --target theta=1arcsec --target K=2ppm --rerun",
+    'live "sim://?speed=10&hide=second-order=4e-6" --target K=0.1ppm',
+    "live /dev/ttyACM0 --no-angles --record hand.mcap --target K=500ppm",
+    seldom=(
+        "rerun_port",
+        "rerun_bind",
+        "header",
+        "give_up_s",
+        "idle_s",
+        "accel_unit",
+        "model_file",
+        "left_out",
+        "save_model",
+    ),
 )
 @click.argument("source", metavar="SOURCE")
 @output_option("--record", metavar="OUT.mcap", panel=RUNNING, help="Record the run here.")

@@ -13,7 +13,7 @@ import pytest
 from helpers.run_factors import campaign_of, nothing, run_factor_of
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.cli.options import rendered
+from kf_calib.cli.echo import rendered
 from kf_calib.errors import InputError
 from kf_calib.estimation import bench_model as bench_models
 from kf_calib.fleet.bench_model_files import bench_model
