@@ -334,11 +334,13 @@ def _for_journal(options: Mapping[str, Any], effects: Sequence[str]) -> dict[str
     """Options and programs of an ``Origin``: all that numbers depend on; files of bench keys and of models by what they
     say."""
     from kf_calib.effects import loaded
-    from kf_calib.exchange import models
+    from kf_calib.exchange import calibration_file
 
     files = [*options["effects_from"]]
     if options["model_file"] is not None:
-        files += models.read(options["model_file"]).allowed(options["effects_from"], options["trust"]).files
+        files += (
+            calibration_file.read_model(options["model_file"]).allowed(options["effects_from"], options["trust"]).files
+        )
     others = (*_BY_CONTENT, *_LEAVE)
     kept = {key: value for key, value in options.items() if value is not None and key not in others}
     return {"options": kept | overrides(options) | {"effects": list(effects)}, "programs": tuple(loaded(files))}

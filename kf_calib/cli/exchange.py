@@ -1,4 +1,4 @@
-"""Commands that use calibrations: apply, verify, history."""
+"""Commands that use calibrations: apply, verify, history, export."""
 
 from __future__ import annotations
 
@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from kf_calib.exchange.corrected_file import Applied
     from kf_calib.exchange.corrected_lines import CorrectedLines
     from kf_calib.sources.files.text_file import TextFile
+
 
 _BLOCK_BYTES = 1 << 16
 _file = partial(click.argument, type=click.Path(path_type=Path))
@@ -249,7 +250,7 @@ def history(
     calibrations: tuple[Path, ...], tolerances: tuple[str, ...], overwrite: bool, as_json: bool, **options: Any
 ) -> None:
     """The calibrations of one block over time: drift, repeatability, and when to calibrate again."""
-    from kf_calib.bench.targets import targets_of
+    from kf_calib.bench.paper_parameters import targets_of
     from kf_calib.exchange import calibration_file
     from kf_calib.exchange.history import history as found_in
     from kf_calib.views import exchange as views
@@ -263,3 +264,46 @@ def history(
         show(views.history_report(drifts))
     with delivery(outputs, as_json) as deliver:
         pictures.save(deliver, drifts)
+
+
+_NAMES = ["px4", "ardupilot", "imucal", "imu_calib", "kalibr", "openvins", "imu_tk", "vectornav", "csv", "c"]
+
+
+@command(
+    "export cal.json --to c -o kf_calib_correct.h", "export cal.json --to ardupilot --lossy -o accelerometer.param"
+)
+@click.argument("calibration", type=click.Path(path_type=Path), metavar="CAL")
+@click.option("--to", required=True, type=click.Choice(_NAMES), help="The program that is to take it.", panel=OUTPUT)
+@output_option("-o", "--out", "output", required=True, metavar="FILE", panel=OUTPUT, help="The file for that program.")
+@click.option(
+    "--lossy", is_flag=True, panel=OUTPUT,
+    help="Export though the program cannot hold all; what is lost, and the error left, are told.",
+)  # fmt: skip
+@effects_from_option
+@trust_option
+@overwrite_option
+@units_option
+@json_option
+def export(
+    calibration: Path, to: str, output: Path, lossy: bool, effects_from: tuple[Path, ...], trust: bool, overwrite: bool,
+    as_json: bool,
+) -> None:  # fmt: skip
+    """Write a calibration as the file of an autopilot, of another calibration tool, or as a function in C.
+
+    Where the program cannot hold the alignment or an effect, the numbers are those with the least rms error, over all
+    directions of gravity and the temperatures of the run; how large it is is said, and --lossy is needed.
+    """
+    from kf_calib.exchange import calibration_file
+    from kf_calib.exchange.exports import exported
+    from kf_calib.support.output_files import write_whole
+    from kf_calib.views import export as views
+
+    outputs = claimed(overwrite=overwrite)
+    saved = calibration_file.read(calibration)
+    target = exported(saved, saved.correction(calibration, effects_from, trust), to, lossy)
+    content = target.text().encode()
+    outputs.write(output, lambda path: write_whole(path, content))
+    if as_json:
+        print_json(views.exported_object(target, to, output))
+    else:
+        show(views.exported_report(target, output))

@@ -51,9 +51,9 @@ def claimed(
             read += [each for each in (value if isinstance(value, tuple) else [value]) if isinstance(each, Path)]
     outputs = Outputs(files, read, overwrite)
     if ctx.params.get("model_file"):
-        from kf_calib.exchange import models
+        from kf_calib.exchange import calibration_file
 
-        outputs.spare([each.path for each in models.read(ctx.params["model_file"]).programs])
+        outputs.spare([each.path for each in calibration_file.read_model(ctx.params["model_file"]).programs])
     return outputs
 
 

@@ -41,8 +41,8 @@ if TYPE_CHECKING:
     from kf_calib.diagnosis.results import Diagnosis
     from kf_calib.estimation.results import Calibration
     from kf_calib.fleet.batch import Evaluation, Progress
-    from kf_calib.fleet.bench_model_files import BenchModelFiles
     from kf_calib.fleet.overview import FleetOverview
+    from kf_calib.fleet.results import BenchModelFiles
     from kf_calib.fleet.run_factor import ReferenceUnit
     from kf_calib.fleet.run_list import Run
     from kf_calib.support.output_files import Outputs
@@ -153,10 +153,9 @@ def fleet(
         )
     if reference_unit is not None and not pooled:
         raise click.UsageError("--reference-unit is for the diagnosis of all runs together: leave out --no-pooled.")
-    from kf_calib.bench.targets import targets_of
+    from kf_calib.bench.paper_parameters import targets_of
     from kf_calib.fleet.batch import Evaluation
-    from kf_calib.fleet.bench_model_files import BenchModelFiles
-    from kf_calib.fleet.results import Fleet, populations
+    from kf_calib.fleet.results import BenchModelFiles, Fleet, populations
     from kf_calib.fleet.run_list import runs_of
     from kf_calib.views import fleet as views
 

@@ -153,7 +153,7 @@ def live(
     With --no-angles it is a sensor in the hand, and what is shown is which side to turn up next.
     Ctrl-C ends the run: the recording is finished and the summary printed.
     """
-    from kf_calib.bench.targets import targets_of
+    from kf_calib.bench.paper_parameters import targets_of
     from kf_calib.sources.live import files_of, open_live
 
     outputs = claimed(files_of(source), overwrite=overwrite)

@@ -386,9 +386,9 @@ def effects_of(options: Mapping[str, Any]) -> tuple[str, ...]:
 
     model = None
     if options["model_file"] is not None:
-        from kf_calib.exchange import models
+        from kf_calib.exchange import calibration_file
 
-        model = models.read(options["model_file"])
+        model = calibration_file.read_model(options["model_file"])
     for path in options["effects_from"]:
         load_file(path)
     for text in options["effects"]:

@@ -254,7 +254,7 @@ def _reach(bench: Bench, options: Mapping[str, Any]) -> Reach:
 
 
 def _aim(options: Mapping[str, Any], gravity_mps2: float) -> Aim:
-    from kf_calib.bench.targets import targets_of
+    from kf_calib.bench.paper_parameters import targets_of
     from kf_calib.design import optimality_criteria
 
     if options["targets"]:

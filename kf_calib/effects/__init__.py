@@ -15,7 +15,7 @@ from functools import cache
 from pathlib import Path
 
 from kf_calib.bench.bench import Bench
-from kf_calib.effects import checks, drift, formula, frame, sensor, surroundings, user
+from kf_calib.effects import checks, formula, frame, sensor, surroundings, user
 from kf_calib.effects.effect import Bearer, Coefficient, Effect, FrameEffect, SensorEffect, Unknown
 from kf_calib.effects.programs import Program
 from kf_calib.effects.stimulus import Stimulus
@@ -33,8 +33,8 @@ _PLAIN: dict[str, type[Effect]] = {
         sensor.BiasAsymmetry, sensor.ScaleAsymmetry, sensor.SecondOrder, sensor.ThirdOrder, sensor.OddQuadratic,
         sensor.CrossCouplingIP, sensor.CrossCouplingIO, sensor.CrossCouplingPO, sensor.CrossAxisSquare,
         sensor.VibrationRectification, sensor.DeadZone,
-        drift.BiasDrift, drift.BiasWalk, drift.ScaleDrift, drift.WarmUp, drift.Settling, drift.Hysteresis,
-        drift.Sinusoid,
+        sensor.BiasDrift, sensor.BiasWalk, sensor.ScaleDrift, sensor.WarmUp, sensor.Settling, sensor.Hysteresis,
+        sensor.Sinusoid,
         surroundings.ThermalBias, surroundings.ThermalBias2, surroundings.ThermalScale, surroundings.ThermalRate,
         surroundings.ThermalMisalignment, surroundings.ThermalLag, surroundings.Magnetic,
         frame.BaseTilt, frame.BaseTiltDrift, frame.PlatformDrift, frame.GravityError,

@@ -33,6 +33,7 @@ from kf_calib.bench.raw_input import RESTATE
 from kf_calib.bench.streams import Source
 from kf_calib.effects.programs import Program
 from kf_calib.errors import BenchError, InputError
+from kf_calib.estimation import model_file
 from kf_calib.estimation.correction import Correction
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.model_file import ModelFile
@@ -348,3 +349,21 @@ def _said(error: ValidationError) -> str:
 def schema() -> dict[str, Any]:
     """The JSON Schema of calibration files, as ``calibration.schema.json`` has it."""
     return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | SavedCalibration.model_json_schema()
+
+
+def read_model(path: str | Path) -> ModelFile:
+    """Read the model of a file of either kind, told by its first character; no Python file that it names is run.
+
+    Raises InputError, with the path, if the file cannot be read or used.
+    """
+    path = Path(path)
+    return read(path).model_file(path) if _is_json(path) else model_file.read(path)
+
+
+def _is_json(path: Path) -> bool:
+    """Whether a file begins as a JSON object, which no TOML does; one that cannot be read is for others to refuse."""
+    try:
+        with path.open("rb") as file:
+            return file.read(64).lstrip().startswith(b"{")
+    except (OSError, ValueError):
+        return False

@@ -27,10 +27,8 @@ from functools import cached_property
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.fleet.campaign import Group
-from kf_calib.fleet.evidence import log_evidence_of_modes, log_mean, modes, sizes
-from kf_calib.fleet.own_coefficients import UnitInformation
-from kf_calib.fleet.population import told_of_mean
+from kf_calib.fleet.campaign import Group, log_evidence_of_modes, log_mean, modes, sizes
+from kf_calib.fleet.own_coefficients import UnitInformation, told_of_mean
 from kf_calib.support.tail_probabilities import weights
 
 SHARES = (np.arange(50) + 0.5) / 50.0

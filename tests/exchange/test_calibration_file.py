@@ -21,7 +21,7 @@ import kf_calib
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.bench import Bench
 from kf_calib.errors import InputError
-from kf_calib.exchange import calibration_file, models
+from kf_calib.exchange import calibration_file
 from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.simulator import Simulation
 from kf_calib.sources.simulation.visit_plans import Visit
@@ -101,7 +101,7 @@ def test_a_recording_gives_its_name_checksum_and_date(tmp_path: Path) -> None:
 
 def test_the_model_option_reads_its_effects(run: kf_calib.Calibration, tmp_path: Path) -> None:
     kf_calib.save_calibration(run, tmp_path / "named.toml")  # what is in it decides, not its name
-    assert models.read(tmp_path / "named.toml").effects == ("second-order", "warm-up", "mine = fx*fy")
+    assert calibration_file.read(tmp_path / "named.toml").effects == ("second-order", "warm-up", "mine = fx*fy")
 
 
 def test_programs_are_run_only_where_allowed(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from helpers.paths import RECORDINGS
 from helpers.stated_sensors import Formula, correction, samples, saved
 
 from kf_calib.bench import paper_parameters
-from kf_calib.cli.export import export as command
+from kf_calib.cli.exchange import export as command
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.exchange import calibration_file
 from kf_calib.exchange.exports import TARGETS, exported

@@ -11,8 +11,8 @@ from helpers.run_factors import run_factor_of
 
 from kf_calib.errors import InputError
 from kf_calib.estimation import bench_model
-from kf_calib.fleet.bench_model_files import BenchModelFiles
 from kf_calib.fleet.pooled_diagnosis import PooledDiagnosis, pooled_diagnosis
+from kf_calib.fleet.results import BenchModelFiles
 
 BENCHES = ("a b", "a/b")  # the same in the name of a file
 

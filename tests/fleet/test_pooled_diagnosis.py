@@ -16,9 +16,9 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.cli.echo import rendered
 from kf_calib.errors import InputError
 from kf_calib.estimation import bench_model as bench_models
-from kf_calib.fleet.bench_model_files import bench_model
 from kf_calib.fleet.pooled_diagnosis import PooledDiagnosis, pooled_diagnosis
 from kf_calib.fleet.pooled_terms import Attribution
+from kf_calib.fleet.results import bench_model
 from kf_calib.fleet.run_factor import ReferenceUnit
 from kf_calib.views.pooled_diagnosis import pooled_report
 

@@ -24,8 +24,8 @@ from kf_calib.sources.files.recording import Recording
 from kf_calib.views import rerun as view
 from kf_calib.views.rerun import diagnosis, improvement
 from kf_calib.views.rerun.driver_chart import round_numbers, unit_of
-from kf_calib.views.rerun.file import new_stream
 from kf_calib.views.rerun.growing import GrowingView
+from kf_calib.views.rerun.names import new_stream
 from kf_calib.views.rerun.series import History, predicted
 from kf_calib.views.rerun.spheres import signed
 from kf_calib.views.screenshot import screenshot, viewer

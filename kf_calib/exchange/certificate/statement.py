@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
-from kf_calib.bench.targets import targets_of
+from kf_calib.bench.paper_parameters import targets_of
 from kf_calib.errors import InputError
 from kf_calib.support.plain_text import COMMANDS, cut
 from kf_calib.support.toml_files import toml_table

@@ -11,9 +11,8 @@ from __future__ import annotations
 from kf_calib.errors import InputError
 from kf_calib.estimation.correction import Correction
 from kf_calib.exchange.calibration_file import SavedCalibration
-from kf_calib.exchange.exports.autopilots import ArduPilot, Px4
+from kf_calib.exchange.exports.affine import ArduPilot, Imucal, ImuCalib, ImuTk, Kalibr, OpenVins, Px4, VectorNav
 from kf_calib.exchange.exports.c_header import CHeader
-from kf_calib.exchange.exports.matrices import Imucal, ImuCalib, ImuTk, Kalibr, OpenVins, VectorNav
 from kf_calib.exchange.exports.target import Table, Target
 from kf_calib.support.units import shown
 

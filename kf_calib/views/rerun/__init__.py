@@ -27,10 +27,9 @@ from kf_calib.online.status import Judgement
 from kf_calib.support.plain_text import printable
 from kf_calib.views.rerun.ahead import log_next, words
 from kf_calib.views.rerun.diagnosis import save as save_diagnosis
-from kf_calib.views.rerun.file import rrd_file, strict
 from kf_calib.views.rerun.improvement import save as save_improvement
 from kf_calib.views.rerun.layout import layout
-from kf_calib.views.rerun.names import BENCH_TIME, ORIENTATION
+from kf_calib.views.rerun.names import BENCH_TIME, ORIENTATION, rrd_file, strict
 from kf_calib.views.rerun.platform import log_platform
 from kf_calib.views.rerun.series import (
     History,

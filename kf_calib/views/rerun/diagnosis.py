@@ -23,8 +23,7 @@ from kf_calib.estimation.results import format_p
 from kf_calib.support.plain_text import printable
 from kf_calib.views.diagnosis import name_of, verdict
 from kf_calib.views.rerun.driver_chart import DriverChart, charts_of, charts_view, heading, unit_of
-from kf_calib.views.rerun.file import rrd_file
-from kf_calib.views.rerun.names import GOLD, thin
+from kf_calib.views.rerun.names import GOLD, rrd_file, thin
 from kf_calib.views.rerun.spheres import Log, at_step, forever, log_spheres, spheres
 
 EXPLANATION = "explanation"
