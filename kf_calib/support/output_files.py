@@ -10,37 +10,32 @@
 - A file that grows during the whole run (``Growing``) must survive if the run is killed. It has its final name from the
   start; where it replaces an earlier file, it is renamed as soon as its first readings are on the disk, and until then
   the earlier file stays. If no reading came, no file is left. Both files are locked, so that no other run can write
-  them.
+  them. Windows renames no open file: there the earlier file is put aside first, and comes back if no reading came.
 
 Commands print their result first and then write files. A file that cannot be written is one sentence and exit 2; a
 picture that the viewer cannot draw, for example because there is no graphics driver, is a warning and exit 0.
-
-A lock is one of the operating system, and ends with the process in any case. Temporary files are named after the
-process that writes them; because several machines or containers may share a folder, the name also identifies the
-machine and, on Linux, the namespace in which the process number is valid.
 """
 
 from __future__ import annotations
 
 import os
-import platform
-import re
 import shutil
 import stat
 import sys
-import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
-from functools import cache
 from itertools import combinations
 from pathlib import Path
 from typing import IO
 
 from kf_calib.errors import InputError
+from kf_calib.support.file_lock import lock, writer
+from kf_calib.support.part_files import beside, remove_stale
 
 _new: ContextVar[frozenset[Path]] = ContextVar("_new", default=frozenset())
 """Files that must not be there before they are written."""
+_RENAMES_OPEN_FILES = sys.platform != "win32"
 _STREAMS = {0: "standard input", 1: "standard output"}
 
 
@@ -163,25 +158,35 @@ def write_whole(path: Path, content: bytes) -> None:
 
 
 class Growing:
-    """The path ``at`` of a file that grows: a temporary one until ``settle``, then the one that was asked for."""
+    """The path ``at`` of a file that grows: a temporary one until ``settle``, then the one that was asked for.
+
+    Where open files cannot be renamed (Windows) the earlier file has the temporary name until then.
+    """
 
     def __init__(self, path: Path) -> None:
         self._path, self._target = path, target_of(path)
-        self.at = beside(self._target) if self._target.exists() else self._target
+        self._temporary = beside(self._target) if self._target.exists() else None
         self._earlier: IO[bytes] | None = None
 
     @property
+    def at(self) -> Path:
+        return self._temporary if self._temporary is not None and _RENAMES_OPEN_FILES else self._target
+
+    @property
     def settled(self) -> bool:
-        return self.at == self._target
+        return self._temporary is None
 
     def open(self) -> IO[bytes]:
         """Create the file, which nobody else can write or replace while it is open. Raises InputError where another
         run has it."""
-        if not self.settled:
+        if self._temporary is not None:
             self._earlier = self._target.open("r+b")
             if not (lock(self._earlier) and os.path.samestat(os.fstat(self._earlier.fileno()), self._target.stat())):
                 self._let_go()
                 self._refuse()
+            if not _RENAMES_OPEN_FILES:
+                self._let_go()
+                self._target.replace(self._temporary)
         file = self.at.open("xb")
         if not lock(file):
             file.close()
@@ -190,14 +195,20 @@ class Growing:
 
     def settle(self) -> None:
         """Replace the earlier file, if there is one, now that the new one has content."""
-        if not self.settled:
-            _rename(self.at, self._target)
-            self.at = self._target
-            self._let_go()
+        if self._temporary is None:
+            return
+        if _RENAMES_OPEN_FILES:
+            _rename(self._temporary, self._target)
+        else:
+            self._temporary.unlink()
+        self._temporary = None
+        self._let_go()
 
     def discard(self) -> None:
-        """Remove the file, in which nothing was written; an earlier one stays."""
+        """Remove the file, in which nothing was written; an earlier one stays. It must be closed."""
         self.at.unlink(missing_ok=True)
+        if self._temporary is not None and not _RENAMES_OPEN_FILES:
+            self._temporary.replace(self._target)
         self._let_go()
 
     def _let_go(self) -> None:
@@ -266,88 +277,3 @@ def _is_open(path: Path, descriptor: int) -> bool:
     except OSError:
         return False
     return stat.S_ISREG(file.st_mode) and os.path.samestat(file, stream)
-
-
-if sys.platform == "win32":  # where a file that is open cannot be replaced anyway
-
-    def lock(file: IO[bytes]) -> bool:
-        """Take a file for this process for as long as it is open; whether nobody else has it."""
-        return True
-
-    def writer(path: Path) -> str:
-        """Who has taken a file, for a message; empty where nobody has."""
-        return ""
-
-else:
-    import fcntl
-
-    def lock(file: IO[bytes]) -> bool:
-        """Take a file for this process for as long as it is open; whether nobody else has it."""
-        return _is_free(file, fcntl.LOCK_EX)
-
-    def writer(path: Path) -> str:
-        """Who has taken a file, for a message; empty where nobody has."""
-        try:
-            with path.open("rb") as file:
-                return "" if _is_free(file, fcntl.LOCK_SH) else _holder(os.fstat(file.fileno()).st_ino)
-        except OSError:
-            return ""
-
-    def _is_free(file: IO[bytes], kind: int) -> bool:
-        try:
-            fcntl.flock(file, kind | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return False
-        except OSError:  # a file system that has no locks
-            return True
-        return True
-
-    def _holder(inode: int) -> str:
-        """The process that has the file of this number, as far as Linux tells it."""
-        pids = set[int]()
-        with suppress(OSError, ValueError, IndexError):
-            for line in Path("/proc/locks").read_text().splitlines():
-                fields = line.split()
-                if fields[1] == "FLOCK" and fields[3] == "WRITE" and int(fields[5].split(":")[2]) == inode:
-                    pids.add(int(fields[4]))
-        return f"another run (process {pids.pop()})" if len(pids) == 1 and min(pids) > 0 else "another run"
-
-
-_NAME = re.compile(r"\.kf-calib-([0-9a-f]{8})-(\d{1,10})-[0-9a-f]{8}\.part")
-
-
-def beside(target: Path) -> Path:
-    """A new temporary name in the same folder."""
-    return target.with_name(f".kf-calib-{_machine()}-{os.getpid()}-{os.urandom(4).hex()}.part")
-
-
-def remove_stale(folder: Path) -> None:
-    """Remove the temporary files that ended processes of this machine have left in a folder."""
-    with suppress(OSError), os.scandir(folder) as entries:
-        names = [entry.name for entry in entries if entry.name.startswith(".kf-calib-")]
-        for name in names:
-            match = _NAME.fullmatch(name)
-            if match and match[1] == _machine() and not _is_alive(int(match[2])):
-                with suppress(OSError):
-                    (folder / name).unlink()
-
-
-def _is_alive(pid: int) -> bool:
-    """Whether there is such a process; on Windows, where asking would end it, there always is."""
-    if sys.platform == "win32":
-        return True
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except (OSError, OverflowError):  # that of somebody else
-        return True
-    return True
-
-
-@cache
-def _machine() -> str:
-    """A hash of the machine's name and, on Linux, of its namespace of process numbers."""
-    space = Path("/proc/self/ns/pid")
-    number = space.stat().st_ino if space.exists() else 0
-    return f"{zlib.crc32(f'{platform.node()} {number}'.encode()):08x}"
