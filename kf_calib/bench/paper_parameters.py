@@ -9,9 +9,9 @@ uniquely.
 The order of the state is s1x s1y s1z b1, s2x s2y s2z b2, s3x s3y s3z b3. Angles are in rad, K has no unit, b is in
 m/s^2.
 
-The sigmas that a run is to reach are stated as targets, ``NAME=SIGMA``. NAME: a parameter (``theta1``, ``K2``), all of a
-kind (``theta``, ``phi``, ``nu``, ``K``, ``b``) or ``angles``. SIGMA: a number with a unit (``2ppm``, ``20ug``, ``0.1
-arcsec``), or in SI without one.
+The sigmas that a run is to reach are stated as targets, ``NAME=SIGMA``. NAME: a parameter (``theta1``, ``K2``), all of
+a kind (``theta``, ``phi``, ``nu``, ``K``, ``b``) or ``angles``. SIGMA: a number with a unit (``2ppm``, ``20ug``,
+``0.1 arcsec``), or in SI without one.
 """
 
 from __future__ import annotations

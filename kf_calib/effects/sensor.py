@@ -1,5 +1,5 @@
-"""What accelerometers do by themselves: nonlinearities (IEEE Std 1293: K0', K1', K2, K3, Koq, Kip, Kio, Kpo, Kpp), and what
-changes with time: drift and walk of the bias, warm-up, settling after a step, oscillation.
+"""What accelerometers do: nonlinearities (IEEE Std 1293: K0', K1', K2, K3, Koq, Kip, Kio, Kpo, Kpp), and what changes
+with time: drift and walk of the bias, warm-up, settling after a step, oscillation.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """What the panels share: timelines, colours, labels and units.
 
-They also share how an .rrd file is written, whole or not at all. Rerun's own way to a file waits for ever where the disk
-is full, and raises nothing where it could not write: here it encodes in memory (a view has a few MB), and what it
+They share how an .rrd file is written, whole or not at all, too. Rerun's own way to a file waits for ever where the
+disk is full, and raises nothing where it could not write: here it encodes in memory (a view has a few MB), and what it
 encoded is written as every other output is.
 """
 
