@@ -29,7 +29,7 @@ from kf_calib.cli.options import (
     pair,
     units_option,
 )
-from kf_calib.cli.pictures import save_view
+from kf_calib.cli.pictures import write_view
 from kf_calib.cli.signals import Interrupter, answered
 from kf_calib.errors import InputError
 from kf_calib.support.output_files import Outputs, write_whole
@@ -271,7 +271,7 @@ def record(
 @contextmanager
 def _told_if_table(path: Path) -> Iterator[None]:
     """Where lines cannot be recorded because they are a table of orientations, say so."""
-    from kf_calib.sources.opening import Kind, kind_of
+    from kf_calib.sources.opening import FileKind, kind_of
     from kf_calib.sources.tables.survey import survey
 
     try:
@@ -279,7 +279,7 @@ def _told_if_table(path: Path) -> Iterator[None]:
     except InputError:
         table = None
         with suppress(InputError):
-            table = survey(path) if kind_of(path) is Kind.TABLE else None
+            table = survey(path) if kind_of(path) is FileKind.TABLE else None
         if table is not None and table.rows:
             raise InputError(
                 f"{path} is a table of orientations, with a row a dwell, and is evaluated as it is: kf-calib replay "
@@ -372,7 +372,7 @@ def _do_main_job(folder: Path, as_json: bool) -> None:
         files = {"recording": str(recording), "truth": str(truth), "view": str(rrd)}
         print_json({**files, "replay": replay_object(result), "compare": compare_object(compared)})
     with delivery(outputs, as_json) as deliver, progress("saving the view", as_json):
-        kept = deliver.keep(rrd, lambda path: save_view(result, path))
+        kept = deliver.keep(rrd, lambda path: write_view(result, path))
     if kept:
         say(f"View: {rrd} (open it with {_viewer()} {rrd}).")
 

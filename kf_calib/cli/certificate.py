@@ -48,12 +48,12 @@ def certificate(
     from kf_calib.exchange.certificate import statement as statements
     from kf_calib.views import certificate as views
 
-    stated = statements.read(statement)
+    stated = statements.read_statement(statement)
     outputs = claimed([] if stated.before is None else [stated.before], overwrite=overwrite)
     calibrations = []
     for path in (calibration, stated.before):
         if path is not None:
-            saved = calibration_file.read(path)
+            saved = calibration_file.open_calibration(path)
             calibrations.append((saved, saved.model(path, effects_from, trust)))
     written, standing = write_certificate(outputs, output, stated, *calibrations, xml=xml, schema=schema)
     if as_json:
@@ -72,7 +72,7 @@ def stated_in(certificate: Path | None, statement: Path | None) -> Statement | N
     from kf_calib.support.extras import need
 
     need("typst", "report", "a certificate")
-    return statements.read(statement)
+    return statements.read_statement(statement)
 
 
 def write_certificate(
@@ -89,7 +89,7 @@ def write_certificate(
 
     certificate_ = content.certificate(*calibrated, stated, before)
     encoded = dcc.xml(certificate_)
-    standing = dcc.check(encoded, schema)
+    standing = dcc.check_dcc(encoded, schema)
     printed = document.pdf(certificate_, encoded, standing)
     outputs.write(pdf, lambda path: write_whole(path, printed))
     if xml is not None:

@@ -186,7 +186,7 @@ def _read(path: Path, options: Mapping[str, Any]) -> SavedCalibration:
     """The calibration of a file; the Python files that it needs are run where they may be."""
     from kf_calib.exchange import calibration_file
 
-    saved = calibration_file.read(path)
+    saved = calibration_file.open_calibration(path)
     for change in saved.model_file(path).load(options["effects_from"], options["trust"]):
         complain(change)
     return saved
@@ -257,7 +257,7 @@ def history(
 
     outputs, pictures = claimed(overwrite=overwrite), Pictures.taken_from(options)
     wanted = targets_of(tolerances)
-    drifts = found_in([calibration_file.read(path) for path in calibrations], wanted)
+    drifts = found_in([calibration_file.open_calibration(path) for path in calibrations], wanted)
     if as_json:
         print_json(views.history_object(drifts))
     else:
@@ -299,7 +299,7 @@ def export(
     from kf_calib.views import export as views
 
     outputs = claimed(overwrite=overwrite)
-    saved = calibration_file.read(calibration)
+    saved = calibration_file.open_calibration(calibration)
     target = exported(saved, saved.correction(calibration, effects_from, trust), to, lossy)
     content = target.text().encode()
     outputs.write(output, lambda path: write_whole(path, content))

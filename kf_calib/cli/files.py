@@ -86,14 +86,16 @@ class Delivery:
         if path is not None:
             from kf_calib.estimation import model_file
 
-            self.file(path, lambda path: model_file.write(path, result))
+            self.file(path, lambda path: model_file.write_model_file(path, result))
 
     def calibration(self, path: Path | None, result: Calibration, source: Source) -> None:
         """Write the calibration file of a result, if there is to be one; source: what it was made from."""
         if path is not None:
             from kf_calib.exchange import calibration_file
 
-            self.file(path, lambda path: calibration_file.write(path, calibration_file.of_source(result, source)))
+            self.file(
+                path, lambda path: calibration_file.write_calibration(path, calibration_file.of_source(result, source))
+            )
 
 
 @contextmanager

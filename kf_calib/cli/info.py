@@ -61,18 +61,18 @@ def info(ctx: click.Context, recording: Path, columns: tuple[str, ...], as_json:
     FILE is an MCAP file, the folder of a ROS 2 bag, a .db3 file, lines of CSV or JSON, a table of orientations,
     or a calibration.
     """
-    from kf_calib.sources.opening import Kind, kind_of
+    from kf_calib.sources.opening import FileKind, kind_of
 
     renamed = dict(map(pair, columns))
     kind = kind_of(recording, renamed)
-    if kind is Kind.CALIBRATION:
+    if kind is FileKind.CALIBRATION:
         _show_calibration(recording, as_json)
         return
-    if kind is Kind.TABLE:
+    if kind is FileKind.TABLE:
         _show_table(ctx, recording, renamed, options, as_json)
         return
     with progress(f"reading {recording.name}", as_json) as tick:
-        if kind is Kind.SAMPLES:
+        if kind is FileKind.SAMPLES:
             overview = _of_lines(ctx, recording, renamed, options, tick)
         else:
             overview = _of_messages(ctx, recording, options, tick)
@@ -86,10 +86,10 @@ def info(ctx: click.Context, recording: Path, columns: tuple[str, ...], as_json:
 
 def _show_calibration(path: Path, as_json: bool) -> None:
     """Show what a calibration holds."""
-    from kf_calib.exchange.calibration_file import read
+    from kf_calib.exchange.calibration_file import open_calibration
     from kf_calib.views.calibration import calibration_object, calibration_report
 
-    saved = read(path)
+    saved = open_calibration(path)
     if as_json:
         print_json(calibration_object(saved, path))
     else:

@@ -35,7 +35,7 @@ from kf_calib.cli.options import (
     target_option,
     units_option,
 )
-from kf_calib.cli.pictures import rrd_option, save_view
+from kf_calib.cli.pictures import rrd_option, write_view
 from kf_calib.cli.signals import answered
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.support.plain_text import sentence
@@ -183,7 +183,7 @@ def live(
                 with delivery(outputs, as_json or run.print.lost > 0) as deliver:
                     deliver.calibration(save, final.result, run.recording() or opened)
                     deliver.model(save_model, final.result)
-                    deliver.file(rrd, partial(save_view, final.result))  # by the noise of the whole run
+                    deliver.file(rrd, partial(write_view, final.result))  # by the noise of the whole run
     if run.troubles:
         ctx.exit(2)
     if strict and final is not None and final.consistent is False:

@@ -254,22 +254,22 @@ def _bench_from_toml(path: Path) -> dict[str, str]:
 def recording_of(path: Path, options: Mapping[str, Any], input: RawInput | None = None) -> Recording | Lines | Table:
     """The recording, log of samples or table at a path; input: what the device sends, where nothing else states it."""
     from kf_calib.sources.files.lines import Lines
-    from kf_calib.sources.opening import Kind, kind_of, no_recording
+    from kf_calib.sources.opening import FileKind, kind_of, no_recording
     from kf_calib.sources.tables.opening import open_table
 
     columns, angles = dict(map(pair, options["columns"])), not options["no_angles"]
     match kind_of(path, columns):
-        case Kind.TABLE:
+        case FileKind.TABLE:
             refuse_given(OF_MESSAGES + OF_DWELLS, f"{path} is a table of mean readings")
             stated = {name: options[name] for name in ("angle_unit", "g_unit")}
             return open_table(path, overrides(options), columns=columns, angles=angles, input=input, **stated)
-        case Kind.SAMPLES:
+        case FileKind.SAMPLES:
             refuse_given(OF_MESSAGES, f"{path} is a log in lines of text")
             return Lines(path, overrides(options), columns, units=units_of(options, input), angles=angles)
-        case Kind.RECORDING:
+        case FileKind.RECORDING:
             refuse_given(_OF_TEXT, f"{path} is no table (.csv, .xlsx) and no log in lines of text")
             return messages_of(path, options, angles, input)
-        case Kind.CALIBRATION:
+        case FileKind.CALIBRATION:
             raise no_recording(path)
 
 
@@ -356,7 +356,7 @@ def _bench_model_of(options: Mapping[str, Any]) -> BenchModel | None:
         return None
     from kf_calib.estimation import bench_model
 
-    return bench_model.read(options["bench_model"])
+    return bench_model.read_bench_model(options["bench_model"])
 
 
 def used_of(options: Mapping[str, Any]) -> dict[str, Any]:

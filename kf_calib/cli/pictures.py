@@ -42,7 +42,7 @@ class Pictures:
 
         A viewer that finds no graphics driver is a complaint; all else that fails is told as for any other file.
         """
-        deliver.file(self.rrd, lambda path: save_view(result, path))
+        deliver.file(self.rrd, lambda path: write_view(result, path))
         self._screenshot(deliver, result)
         for kind, path in (("png", self.png), ("svg", self.svg), ("pdf", self.pdf)):
             deliver.file(path, lambda path, kind=kind: _save_figures(result, path, kind))
@@ -56,7 +56,7 @@ class Pictures:
             with tempfile.TemporaryDirectory() as folder:
                 drawn = rrd or Path(folder) / "view.rrd"
                 if rrd is None:
-                    save_view(result, drawn)
+                    write_view(result, drawn)
                 screenshot(drawn, path)
 
         deliver.file(self.screenshot, draw)
@@ -88,8 +88,8 @@ def figure_options(command: F) -> F:
     return command
 
 
-def save_view(result: Calibration | Diagnosis | Improvement, path: Path) -> None:
+def write_view(result: Calibration | Diagnosis | Improvement, path: Path) -> None:
     """The Rerun view of a result; Rerun is imported when there is one to save."""
     from kf_calib.views import rerun
 
-    rerun.save(result, path)
+    rerun.save_view(result, path)

@@ -151,7 +151,7 @@ def _diagnosed(recording: Path, options: dict[str, Any], quiet: bool) -> tuple[D
 def _programs_of(model: Path | None) -> list[Path]:
     from kf_calib.estimation import model_file
 
-    return [] if model is None else [each.path for each in model_file.read(model).programs]
+    return [] if model is None else [each.path for each in model_file.read_model_file(model).programs]
 
 
 _HOW_IT_ENDS = ("overwrite", "strict", "as_json")

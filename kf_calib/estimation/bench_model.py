@@ -96,7 +96,7 @@ class BenchModel:
         return head + tomli_w.dumps(table)
 
 
-def read(path: str | Path) -> BenchModel:
+def read_bench_model(path: str | Path) -> BenchModel:
     """Read a bench model; raises InputError, with the path, if the file cannot be read or used."""
     path = Path(path)
     table = toml_table(path, _EXAMPLE)

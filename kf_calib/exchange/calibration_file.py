@@ -1,6 +1,6 @@
 """A calibration as a file: everything that is needed to apply it, to defend it, and to repeat it.
 
-    saved = calibration_file.read("cal.json")
+    saved = calibration_file.open_calibration("cal.json")
     saved.correction()(readings_mps2, temperature_c)
 
 JSON in SI units, of one version; ``calibration.schema.json`` beside this module is its JSON Schema. A file may name
@@ -42,7 +42,7 @@ from kf_calib.estimation.results import Calibration
 from kf_calib.exchange import calibration_parts as agreement
 from kf_calib.exchange.calibration_parts import (
     MOST_EFFECTS,
-    Part,
+    FilePart,
     SavedConditions,
     SavedConsistency,
     SavedDwell,
@@ -67,7 +67,7 @@ VERSION = 1
 _LARGEST_BYTES = 20_000_000
 
 
-class SavedCalibration(Part):
+class SavedCalibration(FilePart):
     """The content of a calibration file.
 
     not_seen: effects of the catalogue that the orientations could not show, and which may thus be present. fixed:
@@ -243,7 +243,7 @@ def save_calibration(
     """
     if source is not None:
         source = opened(source, result.bench.to_metadata() | {RESTATE: "true"}, angles=False)
-    write(Path(path), saved(result) if source is None else of_source(result, source))
+    write_calibration(Path(path), saved(result) if source is None else of_source(result, source))
 
 
 def _not_seen(result: Calibration) -> list[str]:
@@ -298,13 +298,13 @@ def now() -> str:
     return moment.isoformat(timespec="seconds")
 
 
-def write(path: Path, content: SavedCalibration) -> None:
+def write_calibration(path: Path, content: SavedCalibration) -> None:
     """Write a calibration file, wholly or not at all; raises InputError if it cannot be written."""
     table = content.model_dump(mode="json", exclude=None if content.fixed else {"fixed"})
     write_whole(path, (json.dumps(table, indent=1, allow_nan=False) + "\n").encode())
 
 
-def read(path: str | Path) -> SavedCalibration:
+def open_calibration(path: str | Path) -> SavedCalibration:
     """Read a calibration file and check all of it; raises InputError, with the path and the place in it."""
     path = Path(path)
     try:
@@ -357,7 +357,7 @@ def read_model(path: str | Path) -> ModelFile:
     Raises InputError, with the path, if the file cannot be read or used.
     """
     path = Path(path)
-    return read(path).model_file(path) if _is_json(path) else model_file.read(path)
+    return open_calibration(path).model_file(path) if _is_json(path) else model_file.read_model_file(path)
 
 
 def _is_json(path: Path) -> bool:

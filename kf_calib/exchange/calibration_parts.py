@@ -25,7 +25,7 @@ from kf_calib.support.plain_text import CONTROLS, LONGEST
 from kf_calib.support.tail_probabilities import LEVEL
 
 Text = Annotated[str, StringConstraints(max_length=LONGEST, pattern=rf"^[^{CONTROLS}]*$")]
-Number = Annotated[float, Field(allow_inf_nan=False)]
+FiniteNumber = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Three = Annotated[list[Positive], Field(min_length=3, max_length=3)]
 Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
@@ -38,49 +38,49 @@ States = Field(max_length=MOST_STATES)
 Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
 
 
-class Part(BaseModel):
+class FilePart(BaseModel):
     """What all parts have in common: exact types, no key that is not known."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
-class SavedParameter(Part):
+class SavedParameter(FilePart):
     """One of the twelve parameters, or a coefficient or constant of an effect; null where it was not determined."""
 
     symbol: Text
-    value: Number | None
+    value: FiniteNumber | None
     sigma: Positive | None
     unit: Text
-    nominal: Number
+    nominal: FiniteNumber
 
 
-class SavedState(Part):
+class SavedState(FilePart):
     """The state of the filter: affine, then the effects' coefficients; of a constant, ln(constant / its value).
 
     undetermined: symbols of the parameters and coefficients that the run did not determine.
     """
 
     symbols: Annotated[list[Text], States]
-    values: Annotated[list[Number], States]
-    covariance: Annotated[list[Annotated[list[Number], States]], States]
+    values: Annotated[list[FiniteNumber], States]
+    covariance: Annotated[list[Annotated[list[FiniteNumber], States]], States]
     undetermined: Annotated[list[Text], States]
 
 
-class SavedProgram(Part):
+class SavedProgram(FilePart):
     """A Python file that defines effects."""
 
     path: Text
     sha256: Sha256
 
 
-class SavedEffect(Part):
+class SavedEffect(FilePart):
     """An effect of the model: as ``--with`` takes it, with its constant where it has one."""
 
     text: Text
-    constant: Number | None = None
+    constant: FiniteNumber | None = None
 
 
-class SavedNoise(Part):
+class SavedNoise(FilePart):
     """The noise model, 1 sigma."""
 
     sigma_mps2: Three
@@ -92,7 +92,7 @@ class SavedNoise(Part):
     walk_mps2_per_sqrt_s: Positive
 
 
-class SavedConsistency(Part):
+class SavedConsistency(FilePart):
     """Whether model and measurements agree; null where nothing was left over to judge by."""
 
     consistent: bool | None
@@ -104,16 +104,16 @@ class SavedConsistency(Part):
     held_out_floor_mps2: Positive | None
 
 
-class SavedDwell(Part):
+class SavedDwell(FilePart):
     """One orientation: gimbal angles (null: attitude recorded), begin, end, readings used."""
 
-    gimbal_deg: list[Number] | None
+    gimbal_deg: list[FiniteNumber] | None
     start_s: Seconds
     end_s: Seconds
     readings: Annotated[Count, Field(ge=1)]
 
 
-class SavedConditions(Part):
+class SavedConditions(FilePart):
     """Under which conditions it holds: when, how warm, which orientations. began: of the run; null if not known."""
 
     began: Text | None
@@ -124,7 +124,7 @@ class SavedConditions(Part):
     dwells: list[SavedDwell]
 
 
-class SavedProvenance(Part):
+class SavedProvenance(FilePart):
     """Where it comes from."""
 
     recording: Text

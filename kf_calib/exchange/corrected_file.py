@@ -35,7 +35,7 @@ from kf_calib.sources.tables.spreadsheet import sheets_of, workbook_of
 from kf_calib.sources.units import Units
 from kf_calib.support.output_files import whole, write_whole
 
-FRAME = "block"
+FRAME_ID = "block"
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def _template(correction: Correction) -> bytes:
     """Return a message with the covariance of corrected readings filled in."""
     covariances = correction.covariance_of(correction.gravities, REFERENCE_TEMPERATURE_C, noise=True)
     worst = covariances[np.argmax(np.einsum("nii->n", covariances))]
-    message = bytearray(cdr.imu_message(FRAME))
+    message = bytearray(cdr.imu_message(FRAME_ID))
     message[-72:] = struct.pack("<9d", *worst.ravel())  # the last field of the message
     return bytes(message)
 

@@ -42,7 +42,7 @@ from kf_calib.sources.files.record_files import fingerprint
 from kf_calib.support.tail_probabilities import chi_squared_tail, sidak
 from kf_calib.support.threads import one_blas_thread
 
-LEVEL = 0.01
+MOVED_LEVEL = 0.01
 """A calibration that still holds is said not to in one verification of a hundred: half of them by the misfit as a
 whole, half by a parameter that seems to have moved."""
 
@@ -95,7 +95,7 @@ class Verification:
     @property
     def moved(self) -> tuple[Move, ...]:
         """The parameters that have moved significantly."""
-        return tuple(move for move in self.moves if move.p_value < 0.5 * LEVEL)
+        return tuple(move for move in self.moves if move.p_value < 0.5 * MOVED_LEVEL)
 
 
 def verify(
@@ -127,7 +127,7 @@ def verify(
     clearest = min((move.p_value for move in moves), default=1.0)
     both = min(1.0, 2.0 * min(p_value, clearest))  # two tests, of which either may say so
     return Verification(
-        both >= LEVEL, both, statistic, dof, moves, seen, len(dwells), rms, *worst, free,
+        both >= MOVED_LEVEL, both, statistic, dof, moves, seen, len(dwells), rms, *worst, free,
         (*source.warnings, *passed.tally.sentences(), *_warnings(saved, source, new)),
     )  # fmt: skip
 

@@ -39,7 +39,7 @@ from kf_calib.errors import InputError, KfCalibError
 from kf_calib.estimation.results import Calibration
 from kf_calib.fleet import run_list
 from kf_calib.fleet.run_factor import run_factor
-from kf_calib.fleet.run_list import Row, Run
+from kf_calib.fleet.run_list import ListedRun, Row
 from kf_calib.fleet.store import Known, Store
 from kf_calib.sources.files.record_files import fingerprint
 from kf_calib.sources.run_date import run_date
@@ -58,7 +58,7 @@ _CONFIG = {
 
 
 @dataclass
-class Progress:
+class BatchProgress:
     """How far a fleet has come.
 
     total: runs named. kept: of these, runs that were in the table with the same content and settings. evaluated: runs
@@ -81,11 +81,11 @@ class Progress:
 
 def evaluate_all(
     client: Client,
-    evaluation: Evaluation,
-    runs: Sequence[Run],
+    evaluation: RunEvaluation,
+    runs: Sequence[ListedRun],
     store: Store,
-    on_progress: Callable[[Progress], None] = lambda progress: None,
-) -> Progress:
+    on_progress: Callable[[BatchProgress], None] = lambda progress: None,
+) -> BatchProgress:
     """Evaluate the runs that are not in the table yet, and write their rows as they come.
 
     Runs that failed because their file could not be fetched, or because their process ended, are tried again; others
@@ -93,7 +93,7 @@ def evaluate_all(
     """
     known, notes = store.checked()
     waiting = deque(run for run in runs if not _is_done(run, known.get(run.place), evaluation))
-    progress = Progress(len(runs), kept=len(runs) - len(waiting), notes=tuple(notes))
+    progress = BatchProgress(len(runs), kept=len(runs) - len(waiting), notes=tuple(notes))
     on_progress(progress)
     for rows, kept in _evaluated(client, evaluation, waiting, known):
         store.append(rows)
@@ -106,17 +106,17 @@ def evaluate_all(
     return progress
 
 
-def _is_done(run: Run, known: Known | None, evaluation: Evaluation) -> bool:
+def _is_done(run: ListedRun, known: Known | None, evaluation: RunEvaluation) -> bool:
     """Tell without reading a run that its row in the table holds."""
     same = known and known.sha256 and run.version and known.version == run.version
     return bool(same and known and known.settings == evaluation.settings_of(run))
 
 
 def _evaluated(
-    client: Client, evaluation: Evaluation, waiting: deque[Run], known: dict[str, Known]
+    client: Client, evaluation: RunEvaluation, waiting: deque[ListedRun], known: dict[str, Known]
 ) -> Iterator[tuple[list[Row], int]]:
     """Yield rows as they come, with the number of runs whose content turned out to be the same as before."""
-    under_way, ready = dict[Future[Any], Run](), as_completed(with_results=False)
+    under_way, ready = dict[Future[Any], ListedRun](), as_completed(with_results=False)
 
     def begin() -> None:
         run = waiting.popleft()
@@ -137,7 +137,7 @@ def _evaluated(
         yield [row for row in rows if row is not None], sum(row is None for row in rows)
 
 
-def _row(future: Future[Any], run: Run, evaluation: Evaluation) -> Row | None:
+def _row(future: Future[Any], run: ListedRun, evaluation: RunEvaluation) -> Row | None:
     """Return what a worker found; where it was lost with its process, a row that says so."""
     error: Any = future.exception()
     if error is None:
@@ -213,7 +213,7 @@ class Commands(Protocol):
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class RunEvaluation:
     """How each run of a fleet is evaluated; calling it evaluates one.
 
     settings: checksum of all that the numbers depend on besides the recording. limit_s: how long a run may take.
@@ -223,14 +223,14 @@ class Evaluation:
     settings: str
     limit_s: float = LIMIT_S
 
-    def settings_of(self, run: Run) -> str:
+    def settings_of(self, run: ListedRun) -> str:
         """Checksum of all that the row of a run depends on besides its recording: what a list says of it, too."""
         stated = [run.unit, run.bench, run.date.isoformat() if run.date else None]
         if not any(stated):
             return self.settings
         return hashlib.sha256(json.dumps([self.settings, *stated]).encode()).hexdigest()
 
-    def __call__(self, run: Run, known_sha256: str | None = None) -> Row | None:
+    def __call__(self, run: ListedRun, known_sha256: str | None = None) -> Row | None:
         """The row of a run; None if its content is the one that ``known_sha256`` belongs to. Whatever goes wrong is a
         sentence in the row."""
         row, begun_s = begun(run, self.settings_of(run)), time.process_time()
@@ -243,7 +243,7 @@ class Evaluation:
             row["sha256"] = None  # with more time it may come to an end
         return row | {"cpu_s": time.process_time() - begun_s, "evaluated": datetime.now(UTC)}
 
-    def _changed(self, row: Row, run: Run, known_sha256: str | None) -> bool:
+    def _changed(self, row: Row, run: ListedRun, known_sha256: str | None) -> bool:
         """Fill in the row of a run, and tell whether its content is not the one that is known."""
         try:
             with local_copy(run) as path, one_blas_thread():
@@ -273,14 +273,14 @@ class Evaluation:
             row |= run_list.of_diagnosis(document)
 
 
-def begun(run: Run, settings: str) -> Row:
+def begun(run: ListedRun, settings: str) -> Row:
     """The row of a run of which nothing is known yet."""
     stated = {"run": run.place, "unit": run.unit, "bench": run.bench, "date": run.date}
     known = {"bytes": run.size, "version": run.version, "settings": settings, "host": platform.node()}
     return dict.fromkeys(run_list.SCHEMA.names) | stated | known | {"evaluated": datetime.now(UTC)}
 
 
-def _call_by_place(row: Row, path: Path, run: Run) -> None:
+def _call_by_place(row: Row, path: Path, run: ListedRun) -> None:
     """Have all sentences call a recording by the name that it is known by, not by that of its copy here."""
     for key in run_list.SENTENCES:
         if isinstance(row[key], str):
@@ -289,7 +289,7 @@ def _call_by_place(row: Row, path: Path, run: Run) -> None:
 
 
 @contextmanager
-def local_copy(run: Run) -> Iterator[Path]:
+def local_copy(run: ListedRun) -> Iterator[Path]:
     """The path of the recording itself, or of a copy that is gone when the block ends. Raises InputError where it
     cannot be fetched."""
     try:

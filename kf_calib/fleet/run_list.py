@@ -30,7 +30,7 @@ _CHANGING = ("size", "mtime", "ETag", "etag", "LastModified", "last_modified", "
 
 
 @dataclass(frozen=True)
-class Run:
+class ListedRun:
     """One recording, before it is read.
 
     - place: absolute path, or URL, by which it is known.
@@ -49,14 +49,14 @@ class Run:
     date: datetime | None = None
 
 
-def runs_of(words: Iterable[str]) -> list[Run]:
+def runs_of(words: Iterable[str]) -> list[ListedRun]:
     """The recordings that words name, each once, in the order of the words and then of their names.
 
     A word is a recording, the folder of a bag, a folder of recordings (with all folders in it), a glob, or a list: a
     .txt file with one of these a line, or a .csv file with the column ``run`` and, if known, ``unit``, ``bench`` and
     ``date``. Each may be a URL such as ``s3://bucket/campaign/``. Raises InputError where a word leads to no recording.
     """
-    runs = dict[str, Run]()
+    runs = dict[str, ListedRun]()
     for word in words:
         named = list(_named_by(word))
         for run in named:
@@ -68,7 +68,7 @@ def runs_of(words: Iterable[str]) -> list[Run]:
     return list(runs.values())
 
 
-def _named_by(word: str) -> Iterator[Run]:
+def _named_by(word: str) -> Iterator[ListedRun]:
     """Yield the recordings of one word."""
     try:
         files, path = url_to_fs(word)
@@ -92,7 +92,9 @@ def _in_words(error: Exception) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def _in_listing(files: Any, listing: Mapping[str, Mapping[str, Any]], recordings_only: bool = False) -> Iterator[Run]:
+def _in_listing(
+    files: Any, listing: Mapping[str, Mapping[str, Any]], recordings_only: bool = False
+) -> Iterator[ListedRun]:
     """Yield the recordings among files with their descriptions, a bag's folder as one."""
     folders = {str(PurePosixPath(name).parent) for name in listing if PurePosixPath(name).name == _BAG}
     for folder in sorted(folders):
@@ -107,13 +109,13 @@ def _in_listing(files: Any, listing: Mapping[str, Mapping[str, Any]], recordings
             yield _run(files, name, info)
 
 
-def _run(files: Any, name: str, info: Mapping[str, Any]) -> Run:
-    return Run(_place(files, name), int(info.get("size") or 0), _version(info))
+def _run(files: Any, name: str, info: Mapping[str, Any]) -> ListedRun:
+    return ListedRun(_place(files, name), int(info.get("size") or 0), _version(info))
 
 
-def _bag(files: Any, folder: str, inside: Mapping[str, Mapping[str, Any]]) -> Run:
+def _bag(files: Any, folder: str, inside: Mapping[str, Mapping[str, Any]]) -> ListedRun:
     versions = "; ".join(_version(inside[name]) for name in sorted(inside))
-    return Run(_place(files, folder), sum(int(info.get("size") or 0) for info in inside.values()), versions, True)
+    return ListedRun(_place(files, folder), sum(int(info.get("size") or 0) for info in inside.values()), versions, True)
 
 
 def _place(files: Any, name: str) -> str:
@@ -144,7 +146,7 @@ def _listed(files: Any, path: str) -> list[dict[str, str]] | None:
         return [dict(zip(columns, (str(cell or "").strip() for cell in row.values()), strict=False)) for row in table]
 
 
-def _of_list(word: str, files: Any, path: str, lines: list[dict[str, str]]) -> Iterator[Run]:
+def _of_list(word: str, files: Any, path: str, lines: list[dict[str, str]]) -> Iterator[ListedRun]:
     """Yield the recordings of a list; what one line names that is not there becomes a run, whose row will say so."""
     folder = _place(files, str(PurePosixPath(path).parent))
     for line in lines:
@@ -163,7 +165,7 @@ def _of_list(word: str, files: Any, path: str, lines: list[dict[str, str]]) -> I
         try:
             yield from (replace(run, **stated) for run in _named_by(name))
         except InputError:
-            yield Run(name, **stated)
+            yield ListedRun(name, **stated)
 
 
 def _date(word: str, line: Mapping[str, str]) -> datetime | None:

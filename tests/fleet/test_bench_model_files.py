@@ -34,7 +34,7 @@ def written(files: BenchModelFiles) -> list[Path]:
 def test_what_the_fleet_wrote_is_replaced_and_removed(found: PooledDiagnosis, tmp_path: Path) -> None:
     paths = written(BenchModelFiles(tmp_path, found))
     assert [path.name for path in paths] == ["a_b.toml", "a_b-2.toml"]
-    assert tuple(bench_model.read(path).bench for path in paths) == BENCHES
+    assert tuple(bench_model.read_bench_model(path).bench for path in paths) == BENCHES
     assert written(BenchModelFiles(tmp_path, found)) == paths
     only = replace(found, findings=(replace(found.findings[0], benches=found.findings[0].benches[:1]),))
     assert BenchModelFiles(tmp_path, only).outdated == paths[1:]

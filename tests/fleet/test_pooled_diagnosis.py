@@ -152,7 +152,7 @@ def test_two_benches_have_errors_of_their_own() -> None:
 def test_bench_model_holds_what_the_last_runs_have(both: PooledDiagnosis, tmp_path: Path) -> None:
     made = bench_model(both, "bench 1")
     made.write(tmp_path / "bench.toml")
-    assert bench_models.read(tmp_path / "bench.toml") == made
+    assert bench_models.read_bench_model(tmp_path / "bench.toml") == made
     assert [term.effect for term in made.terms] == ["flexure"] and made.terms[0].since == "2026-01-01T00:13"
     with pytest.raises(InputError, match="no run is of the bench 'other': name one of 'bench 1'"):
         bench_model(both, "other")

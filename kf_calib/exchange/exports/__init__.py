@@ -13,12 +13,12 @@ from kf_calib.estimation.correction import Correction
 from kf_calib.exchange.calibration_file import SavedCalibration
 from kf_calib.exchange.exports.affine import ArduPilot, Imucal, ImuCalib, ImuTk, Kalibr, OpenVins, Px4, VectorNav
 from kf_calib.exchange.exports.c_header import CHeader
-from kf_calib.exchange.exports.target import Table, Target
+from kf_calib.exchange.exports.target import CsvTable, Target
 from kf_calib.support.units import shown
 
 TARGETS: dict[str, type[Target]] = {
     "px4": Px4, "ardupilot": ArduPilot, "imucal": Imucal, "imu_calib": ImuCalib, "kalibr": Kalibr,
-    "openvins": OpenVins, "imu_tk": ImuTk, "vectornav": VectorNav, "csv": Table, "c": CHeader,
+    "openvins": OpenVins, "imu_tk": ImuTk, "vectornav": VectorNav, "csv": CsvTable, "c": CHeader,
 }  # fmt: skip
 
 

@@ -57,7 +57,7 @@ class CHeader(Target):
     def _body(self, sums: list[str]) -> Iterator[str]:
         correction, used = self.correction, "".join(sums)
         yield f"static const double c[3][3] = {_array(correction.matrix)};"
-        bias = ", ".join(f"{self._reading(i)} - {number(float(b))}" for i, b in enumerate(correction.bias_mps2))
+        bias = ", ".join(f"{self._reading(i)} - {text_of_number(float(b))}" for i, b in enumerate(correction.bias_mps2))
         yield f"const double z[3] = {{{bias}}};"
         if not used:
             yield "(void)temperature_c;"
@@ -83,7 +83,7 @@ class CHeader(Target):
         """The reading of accelerometer i, from 0, in m/s^2."""
         column = abs(self.input.channels[i]) - 1
         factor = float(self.input.matrix[i, column])
-        return f"reading[{column}]" if factor == 1.0 else f"{number(factor)} * reading[{column}]"
+        return f"reading[{column}]" if factor == 1.0 else f"{text_of_number(factor)} * reading[{column}]"
 
     def _matrices(self, used: str) -> dict[str, Floats]:
         """Return what the specific force is multiplied by: a along the input axes, r as it is read."""
@@ -100,11 +100,11 @@ class CHeader(Target):
             expressions = self._expressions(effect)
             values = own[i * len(expressions) : (i + 1) * len(expressions)]
             for value, expression in zip(values, expressions, strict=True):
-                constants: Mapping[str, Piece] = {"constant": effect.value} if "constant" in expression.names else {}
+                constants: Mapping[str, TextOfC] = {"constant": effect.value} if "constant" in expression.names else {}
                 every = dict.fromkeys(expression.names, 0.0) | names | constants
-                yield f"{number(float(value))} * {in_c(expression, every)}"
+                yield f"{text_of_number(float(value))} * {in_c(expression, every)}"
 
-    def _names(self, i: int) -> dict[str, Piece]:
+    def _names(self, i: int) -> dict[str, TextOfC]:
         """What the names in a formula are in C, for accelerometer i; all else is at rest."""
         constants = {name: quantity.of for name, quantity in quantities(self.correction.bench.axes).items()
                      if name in ("s", "m", "K", "rad", "deg", "pi")}  # fmt: skip
@@ -145,7 +145,7 @@ def _product(row: str, vector: str, less: str = "") -> str:
     return " + ".join(f"{row}[{k}] * {term}" for k, term in enumerate(terms))
 
 
-Piece = str | float
+TextOfC = str | float
 _LARGEST_POWER = 12
 HELPERS = {
     "kf_calib_abs": "double x) { return x < 0.0 ? -x : x; }",
@@ -161,12 +161,12 @@ MATH = {"sin": "sin", "cos": "cos", "tan": "tan", "arctan": "atan", "tanh": "tan
 _OWN = {"abs": "kf_calib_abs", "sign": "kf_calib_sign", "minimum": "kf_calib_min", "maximum": "kf_calib_max"}
 
 
-def in_c(expression: Expression, names: Mapping[str, Piece]) -> str:
+def in_c(expression: Expression, names: Mapping[str, TextOfC]) -> str:
     """The expression as a piece of C; names: what each of its names is."""
-    return number(expression(names, _OPERATORS, _FUNCTIONS))
+    return text_of_number(expression(names, _OPERATORS, _FUNCTIONS))
 
 
-def number(piece: Piece) -> str:
+def text_of_number(piece: TextOfC) -> str:
     """A piece of C as it is, a number with all its digits; raises InputError for one that C has no word for."""
     if isinstance(piece, str):
         return piece
@@ -175,13 +175,13 @@ def number(piece: Piece) -> str:
     return f"{float(piece)!r}" if piece >= 0.0 else f"({float(piece)!r})"
 
 
-def _operator(sign: str) -> Callable[..., Piece]:
+def _operator(sign: str) -> Callable[..., TextOfC]:
     """Return what an operator makes of pieces."""
 
-    def made(*pieces: Piece) -> Piece:
+    def made(*pieces: TextOfC) -> TextOfC:
         if not any(isinstance(piece, str) for piece in pieces):
             return float(OPERATORS[sign](*pieces))
-        words = [number(piece) for piece in pieces]
+        words = [text_of_number(piece) for piece in pieces]
         if sign == "**":
             return _power(words, pieces[1])
         if len(words) == 1:
@@ -192,20 +192,20 @@ def _operator(sign: str) -> Callable[..., Piece]:
     return made
 
 
-def _power(words: list[str], exponent: Piece) -> str:
+def _power(words: list[str], exponent: TextOfC) -> str:
     """Return a power: a product where the exponent is a small whole number."""
     if isinstance(exponent, float) and exponent.is_integer() and 0 < exponent <= _LARGEST_POWER:
         return f"kf_calib_power({words[0]}, {exponent:.0f})"
     return f"pow({', '.join(words)})"
 
 
-def _function(name: str) -> Callable[..., Piece]:
+def _function(name: str) -> Callable[..., TextOfC]:
     """Return what a function makes of pieces."""
 
-    def made(*pieces: Piece) -> Piece:
+    def made(*pieces: TextOfC) -> TextOfC:
         if not any(isinstance(piece, str) for piece in pieces):
             return float(FUNCTIONS[name](*pieces))
-        return f"{(MATH | _OWN)[name]}({', '.join(map(number, pieces))})"
+        return f"{(MATH | _OWN)[name]}({', '.join(map(text_of_number, pieces))})"
 
     return made
 

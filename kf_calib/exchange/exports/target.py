@@ -155,7 +155,7 @@ def in_cell(text: str) -> str:
     return f"'{text}" if begin and begin in "=+-@" else text
 
 
-class Table(Target):
+class CsvTable(Target):
     """CSV: a table of all numbers, for a spreadsheet or a program of one's own.
 
         f = C (raw - o) - E e(f, T)

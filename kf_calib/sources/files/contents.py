@@ -196,7 +196,7 @@ class Contents:
 
 
 @dataclass
-class Parts:
+class RecordingParts:
     """The files of a recording, which follow each other."""
 
     path: Path

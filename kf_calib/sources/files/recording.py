@@ -31,7 +31,7 @@ from kf_calib.sources.files.contents import (
     TEMPERATURES,
     USABLE_SCHEMAS,
     Contents,
-    Parts,
+    RecordingParts,
     Role,
     fields_by_role,
 )
@@ -104,7 +104,7 @@ class Recording:
         self._limit = int(max_chunk_mb * (1 << 20))
         usable = USABLE_SCHEMAS | {stated.topic for stated in self._stated.values()}
         files = [open_record_file(file, self._limit, usable) for file in files_of(self.path)]
-        self._parts = Parts(self.path, files)
+        self._parts = RecordingParts(self.path, files)
         self.warnings = [file.trouble for file in self._parts.files if file.trouble]
         self._parts.contents = [self._survey(file) for file in self._parts.files]
         self._accel = self._require(
@@ -280,7 +280,7 @@ def _look_up_bench(file: RecordFile, contents: Contents, position: int) -> None:
 class _Decoders:
     """What reads the messages of a recording's topics, in all of its files."""
 
-    parts: Parts
+    parts: RecordingParts
     pose_width: int
     joints: Joints
     warn: Warn

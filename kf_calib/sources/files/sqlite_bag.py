@@ -56,7 +56,7 @@ class SqliteBag:
                 first, last = base.execute(ends).fetchone()
         except (*FAILURES, NoBagError) as error:
             raise InputError(
-                f"{path} is an SQLite file but cannot be read as a ROS 2 bag ({words_of(error)}): give a bag's .db3 "
+                f"{path} is an SQLite file but cannot be read as a ROS 2 bag ({error_text(error)}): give a bag's .db3 "
                 f"file; a damaged one may be mended by `sqlite3 {path} .recover | sqlite3 mended.db3`."
             ) from None
         self._first, self._last = (0, -1) if first is None else (first, last)
@@ -103,7 +103,7 @@ class SqliteBag:
                     for channel in np.unique(table[table[:, 0] > 0, 0]).tolist():
                         yield channel, table[table[:, 0] == channel, 1]
         except FAILURES as error:
-            warn(f"{self.path} is damaged ({words_of(error)}): what lies behind that is not counted.")
+            warn(f"{self.path} is damaged ({error_text(error)}): what lies behind that is not counted.")
         if strangers:
             warn(f"{self.path}: {strangers} messages are of no topic that it lists, and left out.")
 
@@ -131,7 +131,7 @@ class SqliteBag:
         own = zip(self._topics, self.summary.schemas, self.summary.channels, strict=True)
         return [topic for topic, schema, channel in own if {schema.name, channel.topic} & self._usable]
 
-    def _block(self, rows: list[Row], after: int) -> RecordBlock:
+    def _block(self, rows: list[MessageRow], after: int) -> RecordBlock:
         records = list[bytes]()
         for _, topic, stamp, message in rows:
             time_ns = min(max(stamp or 0, 0), _LATEST)
@@ -212,7 +212,7 @@ def refuse_unreal(base: sqlite3.Connection, table: str) -> None:
         raise NoBagError(f"its table {table} has columns that are computed")
 
 
-def words_of(error: Exception) -> str:
+def error_text(error: Exception) -> str:
     """What is wrong, in words."""
     if getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_INTERRUPT:
         return "reading it takes more steps than a file of its size needs"
@@ -246,7 +246,7 @@ _FEWER = 16  # of how many times fewer the damaged one is looked for
 _BLOCK_BYTES = 1 << 26  # of messages that are given out at a time
 _MOST_FAILURES, _STEADY = 200, 8  # failures in all; on end, after which ever more is passed over
 _BYTES = "CASE WHEN typeof(data) IN ('blob', 'text') THEN CAST(data AS BLOB) END"
-Row = tuple[int, Any, int, bytes]
+MessageRow = tuple[int, Any, int, bytes]
 """Number, topic, time of receipt, message."""
 
 
@@ -268,17 +268,17 @@ class MessageRows:
     empty: int = 0
     _on_end: int = 0  # failures one after the other
 
-    def __iter__(self) -> Iterator[tuple[list[Row], int]]:
+    def __iter__(self) -> Iterator[tuple[list[MessageRow], int]]:
         start, count, read, failures = self.first, ROWS, 0, 0
         while start <= self.last and read <= self.size and failures < _MOST_FAILURES:
             try:
                 rows, is_last = self._page(start, count)
             except FAILURES as error:
                 if is_over(error):
-                    self.why = self.why or words_of(error)
+                    self.why = self.why or error_text(error)
                     break
                 if count == 1:
-                    self.why, failures = self.why or words_of(error), failures + 1
+                    self.why, failures = self.why or error_text(error), failures + 1
                     start, count = self._behind(start)
                 else:
                     count = max(count // _FEWER, 1)
@@ -293,9 +293,9 @@ class MessageRows:
             self.why = self.why or "its messages are longer than the file"
             self.lost += self.last - start + 1
 
-    def _page(self, start: int, count: int) -> tuple[list[Row], bool]:
+    def _page(self, start: int, count: int) -> tuple[list[MessageRow], bool]:
         """The next rows, some MB of them at most, and whether they are the last. Raises sqlite3.Error."""
-        rows, size = list[Row](), 0
+        rows, size = list[MessageRow](), 0
         columns = f"rowid, topic_id, CAST(timestamp AS INTEGER), {_BYTES}"
         with closing(self._query(columns, start, count)) as cursor:
             for row in cursor:

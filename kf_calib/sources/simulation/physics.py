@@ -208,5 +208,5 @@ class Disturbance:
             state.reading_mps2 = state.reading_mps2 + self.process(len(state.time_s))
 
 
-class BiasWalk(Disturbance):
+class WalkingBias(Disturbance):
     """One that moves the biases: where it ends, they are then."""

@@ -25,7 +25,6 @@ from kf_calib.sources.simulation.injected import Hidden, Rig, Stage, steps_of
 from kf_calib.sources.simulation.noise_processes import TrueNoise, generator
 from kf_calib.sources.simulation.physics import (
     Ambient,
-    BiasWalk,
     Disturbance,
     Gimbals,
     Gravity,
@@ -35,9 +34,10 @@ from kf_calib.sources.simulation.physics import (
     SettingError,
     State,
     Step,
+    WalkingBias,
 )
 from kf_calib.sources.simulation.sensors import Sensors
-from kf_calib.sources.simulation.visit_plans import YZX, Visit, stays
+from kf_calib.sources.simulation.visit_plans import YZX, PlannedVisit, stays
 
 START_NS = 1_750_000_000_000_000_000
 """Stamp of the first sample: 15 June 2025, 15:06:40 UTC."""
@@ -62,7 +62,7 @@ class Simulation:
         bench: Bench,
         sensors: Sensors,
         noise: TrueNoise,
-        plan: Sequence[Visit],
+        plan: Sequence[PlannedVisit],
         *,
         sample_hz: float = 100.0,
         angle_hz: float = 10.0,
@@ -125,7 +125,7 @@ class Simulation:
         rig, noise = self._rig, TrueNoise(walk_mps2_per_sqrt_s=self.noise.walk_mps2_per_sqrt_s)
         processes = noise.processes(self.seed, rig.period_s, rig.duration_s)
         hidden = chain.from_iterable(self._hidden_steps().values())
-        processes += [step.process for step in hidden if isinstance(step, BiasWalk)]
+        processes += [step.process for step in hidden if isinstance(step, WalkingBias)]
         if not processes:
             return None
         counts = [min(self._batch_samples, len(self) - first) for first in range(0, len(self), self._batch_samples)]
@@ -235,7 +235,12 @@ class _Clock:
 
 
 def _refuse_impossible(
-    plan: Sequence[Visit], axes: int, sample_hz: float, angle_hz: float, slew_rate_degps: float, batch_samples: int
+    plan: Sequence[PlannedVisit],
+    axes: int,
+    sample_hz: float,
+    angle_hz: float,
+    slew_rate_degps: float,
+    batch_samples: int,
 ) -> None:
     if not plan:
         raise InputError("the plan visits no orientation: give one or more.")

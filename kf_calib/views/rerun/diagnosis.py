@@ -30,7 +30,7 @@ EXPLANATION = "explanation"
 _MOST = 5  # explanations
 
 
-def save(diagnosis: Diagnosis, path: Path) -> Path:
+def save_diagnosis_view(diagnosis: Diagnosis, path: Path) -> Path:
     """Write the view of a diagnosis to an .rrd file that opens laid out, at the best explanation."""
     before, explanations = diagnosis.before, diagnosis.explanations[:_MOST]
     sigmas, drivers = mean_sigmas(before), diagnosis.drivers

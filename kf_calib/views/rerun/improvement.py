@@ -73,7 +73,7 @@ def _shown(values_mps2: Sequence[float | None]) -> Floats:
     return units.shown("m/s^2").per_si * np.array([np.nan if each is None else each for each in values_mps2])
 
 
-def save(improvement: Improvement, path: Path) -> Path:
+def save_improvement_view(improvement: Improvement, path: Path) -> Path:
     """Write the view of an improvement to an .rrd file that opens laid out."""
     view = View(improvement)
     with rrd_file(path, _layout(view)) as stream:

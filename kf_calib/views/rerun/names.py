@@ -96,7 +96,7 @@ def path_of(symbol: str) -> str:
 
 
 @dataclass(frozen=True)
-class Quantity:
+class DrawnParameter:
     """What is estimated and drawn as one curve: the SI value times ``per_si`` is in ``unit``."""
 
     label: str
@@ -106,14 +106,14 @@ class Quantity:
     path: str
 
 
-def quantities(model: Model) -> tuple[Quantity, ...]:
+def quantities(model: Model) -> tuple[DrawnParameter, ...]:
     """The twelve parameters in the units that people are shown, then the coefficients of the effects in the model."""
     parameters = [
-        Quantity(LABELS[symbol], shown(unit).label, shown(unit).per_si, colour_of(symbol), path_of(symbol))
+        DrawnParameter(LABELS[symbol], shown(unit).label, shown(unit).per_si, colour_of(symbol), path_of(symbol))
         for symbol, unit in UNIT_OF.items()
     ]
     coefficients = [
-        Quantity(printable(each.symbol), printable(shown(each).label), shown(each).per_si, MAUVE,
+        DrawnParameter(printable(each.symbol), printable(shown(each).label), shown(each).per_si, MAUVE,
                  entity("parameters", "effects", each.symbol))
         for each in model.coefficients
     ]  # fmt: skip

@@ -30,10 +30,19 @@ from __future__ import annotations
 from kf_calib.sources.simulation.injected import gimbal, sensor, outside, electronics  # noqa: F401
 
 # isort: on
-from kf_calib.sources.simulation.injected.kinds import INNER, Hidden, Kind, NoSizeError, Rig, Stage, catalogue, steps_of
+from kf_calib.sources.simulation.injected.kinds import (
+    INNER,
+    EffectKind,
+    Hidden,
+    NoSizeError,
+    Rig,
+    Stage,
+    catalogue,
+    steps_of,
+)
 from kf_calib.sources.simulation.injected.text import parse
 from kf_calib.support.units import si
 
 __all__ = [
-    "INNER", "Hidden", "Kind", "NoSizeError", "Rig", "Stage", "catalogue", "parse", "si", "steps_of",
+    "INNER", "EffectKind", "Hidden", "NoSizeError", "Rig", "Stage", "catalogue", "parse", "si", "steps_of",
 ]  # fmt: skip

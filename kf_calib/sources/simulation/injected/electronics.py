@@ -6,7 +6,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.sources.simulation.injected.kinds import Rig, made
-from kf_calib.sources.simulation.noise_processes import Outliers
+from kf_calib.sources.simulation.noise_processes import OutlierProcess
 from kf_calib.sources.simulation.physics import Disturbance, State, Step
 
 _PAIRS = ("12", "13", "21", "23", "31", "32")
@@ -28,7 +28,7 @@ def cross_talk(x: Floats, rig: Rig) -> Step:
 @made("outliers", "m/s^2", ("1mg", "100mg"), ("10mg", "1g"), stage="record", signed=False)
 def outliers(size: Floats, rig: Rig, *, rate: float = 1e-3) -> Step:
     """Outliers: single readings jump by the size, either way, with probability ``rate`` (transmission)."""
-    jumps = Outliers(rig.generator("outliers"), rate, 1.0)
+    jumps = OutlierProcess(rig.generator("outliers"), rate, 1.0)
     return Disturbance(lambda count: size * jumps(count))
 
 

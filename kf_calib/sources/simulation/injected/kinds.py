@@ -81,7 +81,7 @@ INNER: Mapping[str, Inner] = {
 
 
 @dataclass(frozen=True)
-class Kind:
+class EffectKind:
     """A kind of effect.
 
     unit: of a coefficient. coefficients: their names, one for each size. navigation, mems: typical sizes, from ... to,
@@ -122,7 +122,7 @@ class Hidden:
     axis: of the gimbals, 0 is the outer one; axis_name: as people call it.
     """
 
-    kind: Kind
+    kind: EffectKind
     sizes: tuple[float, ...]
     inner: Mapping[str, float] = field(default_factory=dict[str, float])
     axis: int = 0
@@ -165,10 +165,10 @@ class Hidden:
         return {**self.kind.inner, **self.inner}
 
 
-_KINDS: dict[str, Kind] = {}
+_KINDS: dict[str, EffectKind] = {}
 
 
-def catalogue() -> Mapping[str, Kind]:
+def catalogue() -> Mapping[str, EffectKind]:
     """Every kind by name, in the order in which they are at work."""
     return _KINDS
 
@@ -207,7 +207,7 @@ def made(
         parameters = inspect.signature(make).parameters.values()
         inner = {item.name: float(item.default) for item in parameters if item.kind is item.KEYWORD_ONLY}
         typical = navigation, mems or navigation
-        _KINDS[name] = Kind(
+        _KINDS[name] = EffectKind(
             name, unit, stage, coefficients, *typical, make, inner, title, physics, signed, per_axis, known,
             counted, driver, family,
         )  # fmt: skip

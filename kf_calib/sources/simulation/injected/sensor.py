@@ -15,7 +15,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.sources.simulation.injected.kinds import Rig, added, made
 from kf_calib.sources.simulation.injected.terms import above, adding, column, output, pendulous, sign
 from kf_calib.sources.simulation.noise_processes import FirstOrder
-from kf_calib.sources.simulation.physics import BiasWalk, State, Step
+from kf_calib.sources.simulation.physics import State, Step, WalkingBias
 
 _PENDULOUS_AND_OUTPUT = ("1p", "1o", "2p", "2o", "3p", "3o")
 
@@ -180,7 +180,7 @@ def sinusoid(k: Floats, state: State, *, frequency: float = 0.15, phase: float =
 def bias_walk(q: Floats, rig: Rig) -> Step:
     """Random walk of the bias: q times the integral of white noise, q sqrt(t) after a time t (IEEE Std 952, K)."""
     walk = FirstOrder(rig.generator("bias-walk"), 1.0, math.sqrt(rig.period_s), 0.0)
-    return BiasWalk(lambda count: q * walk(count))
+    return WalkingBias(lambda count: q * walk(count))
 
 
 def _vibration_rectification(k: Floats, rig: Rig, *, rms: float, frequency: float, period: float) -> Step:

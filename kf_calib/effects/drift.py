@@ -1,0 +1,167 @@
+"""What changes with time: drift and walk of the bias, warm-up, settling after a step, oscillation."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.effects.effect import MICRO_G, MILLI_G, Bearer, Coefficient, Effect, SensorEffect, Typical, Unknown
+from kf_calib.effects.stimulus import Stimulus
+from kf_calib.support.units import STANDARD_GRAVITY_MPS2
+
+_HELD = 2.5  # cycles in a piece, of which its parabola holds a fourteenth of the power
+
+
+class BiasDrift(SensorEffect):
+    """beta t, t since the first sample."""
+
+    family = "bias in time"
+    name, title, source = "bias-drift", "bias that drifts with time", "IEEE Std 1293, drift"
+    confused_with = "warm-up; a monotone order of poses mixes it with angle"
+    symbol, unit, scale = "beta", "m/s^3", 1e-6
+    typical = Typical((1 * MICRO_G / 3600, 10 * MICRO_G / 3600), (10 * MICRO_G / 60, MILLI_G / 60))
+
+    def terms(self, s: Stimulus) -> Floats:
+        return np.repeat(s.elapsed_s[:, None], 3, axis=1)
+
+
+class ScaleDrift(SensorEffect):
+    """kappa t a_i."""
+
+    family = "scale in time"
+    name, title, source = "scale-drift", "scale factor that drifts with time", "IEEE Std 1293, drift"
+    confused_with = "base-tilt-drift"
+    symbol, unit, scale = "kappa", "1/s", 1e-7
+    typical = Typical((1e-6 / 86400, 10e-6 / 86400))
+
+    def terms(self, s: Stimulus) -> Floats:
+        return s.elapsed_s[:, None] * s.along
+
+
+class Hysteresis(SensorEffect):
+    """h sgn(Delta a_i), Delta a_i the last step of the input."""
+
+    family = "memory"
+    name, title, source = "hysteresis", "reading that depends on the side it was come from", "IEEE Std 1293, hysteresis"
+    confused_with = "needs the same pose from two sides"
+    symbol, unit, scale = "h", "m/s^2", 1e-3
+    typical = Typical((1 * MICRO_G, 20 * MICRO_G), (0.0, 2 * MILLI_G))
+
+    def terms(self, s: Stimulus) -> Floats:
+        return np.sign(np.where(np.abs(s.step) > 1e-6 * STANDARD_GRAVITY_MPS2, s.step, 0.0))
+
+
+class _Decay(SensorEffect):
+    """Something that dies away with a time constant, common to the three accelerometers."""
+
+    def __init__(self) -> None:
+        assert self.unknown is not None
+        self.value = float(np.sqrt(self.unknown.low * self.unknown.high))
+
+
+class WarmUp(_Decay):
+    """B exp(-t / tau), t since the first sample."""
+
+    family = "bias in time"
+    name, title, source = "warm-up", "bias that settles after switching on", "IEEE Std 1293, turn-on transient"
+    confused_with = "bias-drift; needs an early long dwell"
+    symbol, unit, scale = "B", "m/s^2", 1e-2
+    unknown = Unknown("tauWarm", "s", 30.0, 10800.0, "min", 1.0 / 60.0)
+    typical = Typical((10 * MICRO_G, 200 * MICRO_G), (1 * MILLI_G, 10 * MILLI_G))
+
+    def terms(self, s: Stimulus) -> Floats:
+        return np.repeat(np.exp(-s.elapsed_s / self.value)[:, None], 3, axis=1)
+
+
+class Settling(_Decay):
+    """C Delta a_i exp(-tau / tau_0), tau since the arrival in the dwell, Delta a_i the last step of the input."""
+
+    family = "memory"
+    name, title, source = "settling", "creep after a change of the input", "IEEE Std 1293, settling"
+    confused_with = "shows in early against late samples of a dwell"
+    symbol, unit, scale = "C", "1", 1e-3
+    unknown = Unknown("tauSettle", "s", 3.0, 600.0, "s", 1.0)
+    typical = Typical((1e-6, 30e-6))
+
+    def terms(self, s: Stimulus) -> Floats:
+        return s.step * np.exp(-s.since_arrival_s / self.value)[:, None]
+
+
+class Sinusoid(Effect):
+    """A_i sin 2 pi f t + B_i cos 2 pi f t, t since the first sample; f is common to the three accelerometers.
+
+    On a carrier f0, with d = 2 pi (f - f0) t: sin 2 pi f t = sin d cos 2 pi f0 t + cos d sin 2 pi f0 t, and the cosine
+    likewise: the envelopes are slow where f is near f0, however fast the carrier.
+    In a piece of a dwell it is the parabola nearest to it, so that one of a cycle or two a piece is still seen.
+    """
+
+    family = "surroundings"
+    name, title, source = "sinusoid", "oscillation of one frequency", "Peterson, USGS OFR 93-322 (microseism); mains"
+    confused_with = "slower than a dwell: bias-drift, thermal effects"
+    unknown = Unknown("fSin", "Hz", 1e-6, 1e5, "Hz", 1.0)
+    oscillates = True
+    step = 1e-7  # the phase is thousands of rad
+    value = 0.15
+    typical = Typical((0.01 * MICRO_G, 1 * MICRO_G))
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        kinds = [f"{kind}{i}" for i in (1, 2, 3) for kind in ("As", "Ac")]
+        return tuple(Coefficient(symbol, "m/s^2", 1e-3) for symbol in kinds)
+
+    def columns(self, s: Stimulus) -> Floats:
+        at_s, shares = s.about
+        sin, cos = _parts(s, (shares * self._wave(s, at_s)).sum(axis=1))
+        columns = np.zeros((len(s), 3, 6))
+        for i in range(3):
+            columns[:, i, 2 * i], columns[:, i, 2 * i + 1] = sin, cos
+        return columns
+
+    def derivative(self, s: Stimulus, coefficients: Floats) -> Floats:
+        """A_i and B_i times the changes of sine and cosine per unit of ln f: d(e^(i d)) = 2 pi i f t e^(i d)."""
+        at_s, shares = s.about
+        changes = 2j * np.pi * self.value * (shares * at_s * self._wave(s, at_s)).sum(axis=1)
+        return (coefficients.reshape(3, 2) @ np.array(_parts(s, changes))).T[:, :, None]
+
+    def _wave(self, s: Stimulus, at_s: Floats) -> NDArray[np.complex128]:
+        """e^(i d) at instants."""
+        return np.exp(2j * np.pi * (self.value - s.carrier_hz) * at_s)
+
+    def grid(self, s: Stimulus) -> Floats:
+        """In quarters of 1/run, about the carrier; without one, as far as parabolas over the pieces hold much of it."""
+        step = 0.25 / s.span_s
+        if s.carrier_hz:
+            count = int(np.ceil(max(0.15 / s.longest_piece_s, 2.0 / s.span_s) / step))
+            found = s.carrier_hz + step * np.arange(-count, count + 1, dtype=float)
+            return found[found > 0]
+        return step * np.arange(2, int(np.clip(_HELD / s.usual_piece_s / step, 8, 4000)), dtype=float)
+
+    def reach(self, s: Stimulus) -> float:
+        return min(0.25 / s.span_s / self.value, 0.5)  # slower than the run: no step leads out of any range
+
+
+def _parts(s: Stimulus, wave: NDArray[np.complex128]) -> tuple[Floats, Floats]:
+    """Sine and cosine (m,) of a wave e^(i d), or what of them the stimulus asks for on a carrier."""
+    sin, cos = wave.imag, wave.real
+    if not s.carrier_hz:
+        return sin, cos
+    none = np.zeros_like(sin)
+    return ((none, none), (sin, cos), (cos, -sin))[s.part]
+
+
+class BiasWalk(Effect):
+    """The integral of white noise in each bias: no column, but process noise of the filter."""
+
+    family = "bias in time"
+    name, title, source = "bias-walk", "bias that walks at random", "IEEE Std 1293, annex on Allan variance"
+    borne_by = Bearer.SENSORS
+    confused_with = "bias-drift; scatter from dwell to dwell"
+    intensity = Coefficient("qb", "m/s^2/s^(1/2)", 1e-5)
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return ()
+
+    def columns(self, s: Stimulus) -> Floats:
+        return np.zeros((len(s), 3, 0))
