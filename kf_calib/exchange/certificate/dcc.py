@@ -1,8 +1,8 @@
 """The certificate as XML: a Digital Calibration Certificate (DCC 3.3.0) with quantities in D-SI 2.2.1.
 
 Elements come in the order of the schema. What is not stated is left out; where that is mandatory, the file says in a
-comment that it is no DCC. The schema (LGPL) is not part of this program: ``check_dcc`` validates against a copy where it
-is given one, and else looks for the mandatory elements.
+comment that it is no DCC. The schema (LGPL) is not part of this program: ``check_dcc`` validates against a copy where
+it is given one, and else looks for the mandatory elements.
 """
 
 from __future__ import annotations
