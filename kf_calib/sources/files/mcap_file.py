@@ -38,7 +38,7 @@ from kf_calib.sources.files.mcap_records import (
     chunk_times,
     megabytes,
     packed_start,
-    parse,
+    parse_record,
     unpack_chunk,
 )
 
@@ -342,7 +342,7 @@ def _consistent(opcode: int, content: bytes) -> bool:
     if opcode == Opcode.CHUNK:
         return bool(packed_start(content))
     try:
-        return opcode not in _PARSED or bool(parse(_PARSED[opcode], content))
+        return opcode not in _PARSED or bool(parse_record(_PARSED[opcode], content))
     except DamagedError:
         return False
 

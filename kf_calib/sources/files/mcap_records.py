@@ -40,7 +40,7 @@ class _ExactStream(ReadDataStream):
         return data
 
 
-def parse(read: Callable[[ReadDataStream], _Record], content: bytes) -> _Record:
+def parse_record(read: Callable[[ReadDataStream], _Record], content: bytes) -> _Record:
     """The record in ``content``; ``read`` is its class's reader. Raises DamagedError unless it fits exactly."""
     stream = _ExactStream(BytesIO(content))
     try:
@@ -328,15 +328,15 @@ class Summary:
             opcode, record, position = _record_at(content, position)
             match opcode:
                 case Opcode.SCHEMA:
-                    self.schemas.append(parse(Schema.read, record))
+                    self.schemas.append(parse_record(Schema.read, record))
                 case Opcode.CHANNEL:
-                    self.channels.append(parse(Channel.read, record))
+                    self.channels.append(parse_record(Channel.read, record))
                 case Opcode.CHUNK_INDEX:
-                    self.chunks.append(parse(ChunkIndex.read, record))
+                    self.chunks.append(parse_record(ChunkIndex.read, record))
                 case Opcode.METADATA_INDEX:
-                    self.metadata.append(parse(MetadataIndex.read, record))
+                    self.metadata.append(parse_record(MetadataIndex.read, record))
                 case Opcode.STATISTICS:
-                    self.message_counts = parse(Statistics.read, record).channel_message_counts
+                    self.message_counts = parse_record(Statistics.read, record).channel_message_counts
                 case _:
                     pass
         self.chunks.sort(key=lambda index: index.chunk_start_offset)

@@ -46,7 +46,7 @@ from kf_calib.sources.files.mcap_records import (
     Messages,
     RecordBlock,
     are_packed,
-    parse,
+    parse_record,
     unpacked,
 )
 from kf_calib.sources.files.record_files import RecordFile, files_of, open_record_file
@@ -395,7 +395,7 @@ def _mark(opcode: int, content: bytes) -> list[Metadata]:
     if opcode != Opcode.METADATA:
         return []
     try:
-        record = parse(Metadata.read, content)
+        record = parse_record(Metadata.read, content)
     except DamagedError:  # told already
         return []
     return [record] if record.name in (*_MARKS, RUN_RECORD) else []
