@@ -51,7 +51,7 @@ _ROUNDS = 6  # till columns and state agree; the error of each is about the squa
 
 
 @dataclass(frozen=True)
-class Move:
+class MovedParameter:
     """The change of one parameter or coefficient from the old calibration to the new run, in SI.
 
     p_value: that it did not move, corrected for the number of those tested.
@@ -83,7 +83,7 @@ class Verification:
     p_value: float
     statistic: float
     dof: int
-    moves: tuple[Move, ...]
+    moves: tuple[MovedParameter, ...]
     new: Calibration | None
     dwells: int
     residual_rms_mps2: float
@@ -93,7 +93,7 @@ class Verification:
     warnings: tuple[str, ...]
 
     @property
-    def moved(self) -> tuple[Move, ...]:
+    def moved(self) -> tuple[MovedParameter, ...]:
         """The parameters that have moved significantly."""
         return tuple(move for move in self.moves if move.p_value < 0.5 * MOVED_LEVEL)
 
@@ -209,7 +209,7 @@ def _root(covariance: Floats) -> Floats:
     return scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
 
 
-def _moves(saved: SavedCalibration, new: Calibration, free: Sequence[str]) -> tuple[Move, ...]:
+def _moves(saved: SavedCalibration, new: Calibration, free: Sequence[str]) -> tuple[MovedParameter, ...]:
     """Return the differences of all that both runs determine, the clearest first.
 
     A scale factor by axes that were taken for square is K cos(angle off square), wrong by about K angle^2 / 2.
@@ -226,7 +226,7 @@ def _moves(saved: SavedCalibration, new: Calibration, free: Sequence[str]) -> tu
         bent = now.value * off_square if symbol in ("K2", "K3") else 0.0  # the axis of accelerometer 1 is that of x
         differences.append((symbol, now.unit, was.value, now.value, math.hypot(was.sigma, now.sigma, bent)))
     moves = [
-        Move(symbol, unit, old, value, value - old, sigma,
+        MovedParameter(symbol, unit, old, value, value - old, sigma,
              sidak(math.erfc(abs(value - old) / max(sigma, 1e-300) / math.sqrt(2.0)), len(differences)))
         for symbol, unit, old, value, sigma in differences
     ]  # fmt: skip
