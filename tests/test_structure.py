@@ -156,7 +156,7 @@ def test_nothing_lies_beside_the_packages() -> None:
         assert ast.get_docstring(ast.parse(text)), package
 
 
-SEVERAL = {"Table", "Quantity", "Standing", "Cell", "Course", "Look", "Times", "Step", "Part"}
+SEVERAL = {"Table", "Quantity", "Standing", "Cell", "Course", "Look", "Times", "Part"}
 """Names of classes that stand for several things still, each in a room of its own: none may come to them."""
 VERBS = {"read", "write", "save", "save_view", "load", "open", "check", "parse"}
 

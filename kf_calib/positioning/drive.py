@@ -18,7 +18,7 @@ import numpy as np
 from kf_calib.errors import KfCalibError
 from kf_calib.online.session import Session
 from kf_calib.online.suggestion import Itinerary, Suggestion
-from kf_calib.positioning.loop import Angles, Ask, End, Halt, Move, Rules, RunState, Seen, step
+from kf_calib.positioning.loop import Angles, Ask, End, Halt, Move, Rules, Seen, State, step
 from kf_calib.positioning.positioner import Positioner
 
 
@@ -99,7 +99,7 @@ class Drive:
         self.clock, self._trouble, self._budget_s = clock or WallTime(), trouble, budget_s
         self.decided: Callable[[Decision], None] = lambda decision: None
         self.decisions = list[Decision]()
-        self.state = RunState()
+        self.state = State()
         self.outcome: Outcome | None = None
         self._broken_off, self._here, self._began_s = "", Angles(()), self.clock.now_s()
 

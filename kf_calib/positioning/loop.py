@@ -101,7 +101,7 @@ class Rules:
 
 
 @dataclass(frozen=True)
-class RunState:
+class State:
     """Where the loop stands.
 
     target, start: of the move under way, deg; way: where to go after it. since_s: when the phase began. track: the
@@ -120,7 +120,7 @@ class RunState:
     number: int = 0
 
 
-def step(state: RunState, seen: Seen, rules: Rules) -> tuple[RunState, Command | None]:
+def step(state: State, seen: Seen, rules: Rules) -> tuple[State, Command | None]:
     """One step of the loop."""
     if state.phase is Phase.ENDED:
         return state, None
@@ -139,7 +139,7 @@ def step(state: RunState, seen: Seen, rules: Rules) -> tuple[RunState, Command |
             return _choosing(state, seen, rules)
 
 
-def _noted(state: RunState, seen: Seen, rules: Rules) -> RunState:
+def _noted(state: State, seen: Seen, rules: Rules) -> State:
     """Return the state with what was seen in its track."""
     window_s = seen.now_s - rules.watch.stand_s
     before = [past for past in state.track if past[0] <= window_s][-1:]  # so that the window is covered
@@ -149,7 +149,7 @@ def _noted(state: RunState, seen: Seen, rules: Rules) -> RunState:
     return replace(state, track=track, heard=heard)
 
 
-def _harm(state: RunState, seen: Seen, rules: Rules) -> str:
+def _harm(state: State, seen: Seen, rules: Rules) -> str:
     """Return why the table must be stopped now; empty where it need not."""
     here = _deg(seen.gimbal_deg)
     if seen.fault:
@@ -177,7 +177,7 @@ def _outside(gimbal_deg: Sequence[float], rules: Rules) -> str:
     return "" if inside else "in a forbidden zone"
 
 
-def _moving(state: RunState, seen: Seen, rules: Rules) -> tuple[RunState, Command | None]:
+def _moving(state: State, seen: Seen, rules: Rules) -> tuple[State, Command | None]:
     """Watch a move until the platform stands at its target."""
     watch, lasted_s, target = rules.watch, seen.now_s - state.since_s, _deg(state.target)
     expected_s = float(rules.pace.slews_s(np.radians(state.start), np.radians(state.target)))
@@ -201,7 +201,7 @@ def _moving(state: RunState, seen: Seen, rules: Rules) -> tuple[RunState, Comman
     return state, None
 
 
-def _staying(state: RunState, seen: Seen, rules: Rules) -> tuple[RunState, Command | None]:
+def _staying(state: State, seen: Seen, rules: Rules) -> tuple[State, Command | None]:
     """Stay until there are readings enough."""
     watch, lasted_s = rules.watch, seen.now_s - state.since_s
     wanted_s = state.suggestion.stay_s if state.suggestion else _FIRST_S
@@ -221,7 +221,7 @@ def _staying(state: RunState, seen: Seen, rules: Rules) -> tuple[RunState, Comma
     return state, None
 
 
-def _moved_by_itself(state: RunState, seen: Seen, rules: Rules) -> str:
+def _moved_by_itself(state: State, seen: Seen, rules: Rules) -> str:
     """Return that a platform that should stand has moved, in words; empty where it has not."""
     off = np.abs(np.array(seen.gimbal_deg) - np.array(state.target)).max()
     if off <= 3.0 * rules.watch.tolerance_deg:
@@ -229,7 +229,7 @@ def _moved_by_itself(state: RunState, seen: Seen, rules: Rules) -> str:
     return f"the platform should stand at {_deg(state.target)} and is at {_deg(seen.gimbal_deg)}: it moved by itself"
 
 
-def _choosing(state: RunState, seen: Seen, rules: Rules) -> tuple[RunState, Command | None]:
+def _choosing(state: State, seen: Seen, rules: Rules) -> tuple[State, Command | None]:
     """Begin what is suggested."""
     suggestion = seen.suggestion
     if moved := _moved_by_itself(state, seen, rules):
@@ -246,7 +246,7 @@ def _choosing(state: RunState, seen: Seen, rules: Rules) -> tuple[RunState, Comm
     return _to_next_station(state, seen, rules)
 
 
-def _to_next_station(state: RunState, seen: Seen, rules: Rules) -> tuple[RunState, Command | None]:
+def _to_next_station(state: State, seen: Seen, rules: Rules) -> tuple[State, Command | None]:
     """Go to the next station of the way, if that is allowed from where the platform is."""
     station, start = state.way[0], np.radians(seen.gimbal_deg)
     end = np.radians([station])
@@ -256,11 +256,11 @@ def _to_next_station(state: RunState, seen: Seen, rules: Rules) -> tuple[RunStat
     return replace(state, since_s=seen.now_s), Move(station)
 
 
-def _halted(state: RunState, reason: str) -> tuple[RunState, Command]:
+def _halted(state: State, reason: str) -> tuple[State, Command]:
     return replace(state, phase=Phase.ENDED), Halt(reason)
 
 
-def _stands(state: RunState, watch: Watchfulness) -> bool:
+def _stands(state: State, watch: Watchfulness) -> bool:
     """Tell whether the read-backs of the last ``stand_s`` show no motion."""
     (first_s, _), (now_s, _) = state.track[0], state.track[-1]
     if now_s - max(first_s, state.since_s) < watch.stand_s - 1e-6:

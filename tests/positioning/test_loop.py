@@ -13,7 +13,7 @@ from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.design.gimbal_limits import Reach
 from kf_calib.design.safe_path import can_be_reached, is_free, route
 from kf_calib.online.suggestion import Suggestion
-from kf_calib.positioning.loop import Ask, End, Halt, Move, Phase, Rules, RunState, Seen, step
+from kf_calib.positioning.loop import Ask, End, Halt, Move, Phase, Rules, Seen, State, step
 from kf_calib.positioning.positioner import Watchfulness
 
 BENCH = Bench(axes_of("yzx"), 9.81, limits_deg="z=-90:90", forbidden_deg="y=30:60,x=-20:20")
@@ -22,9 +22,9 @@ GOING = Suggestion("opening", "why", (90.0, 0.0, 90.0), 5.0)
 TICK_S = 0.1
 
 
-def begun(now_s: float = 0.0, rules: Rules = RULES) -> RunState:
+def begun(now_s: float = 0.0, rules: Rules = RULES) -> State:
     """A loop that has asked for a suggestion at zero."""
-    state, command = RunState(), None
+    state, command = State(), None
     for samples in range(200):
         seen = Seen(now_s, (0.0, 0.0, 0.0), samples=samples, stay_s=samples * TICK_S, stream_deg=(0.0, 0.0, 0.0))
         state, command = step(state, seen, rules)
@@ -35,7 +35,7 @@ def begun(now_s: float = 0.0, rules: Rules = RULES) -> RunState:
     return state
 
 
-def told(state: RunState, now_s: float = 20.0) -> RunState:
+def told(state: State, now_s: float = 20.0) -> State:
     """After the suggestion to go to (90, 0, 90)."""
     state, command = step(state, Seen(now_s, (0.0, 0.0, 0.0), suggestion=GOING), RULES)
     assert isinstance(command, Move)
@@ -43,7 +43,7 @@ def told(state: RunState, now_s: float = 20.0) -> RunState:
 
 
 def test_it_waits_for_readings_before_it_asks_and_moves_nothing_till_then() -> None:
-    state, commands = RunState(), list[object]()
+    state, commands = State(), list[object]()
     for k in range(60):
         state, command = step(state, Seen(k * TICK_S, (0.0, 0.0, 0.0), samples=0), RULES)
         commands.append(command)

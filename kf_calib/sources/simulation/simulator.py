@@ -32,8 +32,8 @@ from kf_calib.sources.simulation.physics import (
     Response,
     Scatter,
     SettingError,
-    State,
-    Step,
+    TrueState,
+    TrueStep,
     WalkingBias,
 )
 from kf_calib.sources.simulation.sensors import Sensors
@@ -78,7 +78,7 @@ class Simulation:
         self.hidden = tuple(hidden)
         self.warnings = list[str]()
         self.fraction = 0.0
-        self._further: tuple[Step, ...] = ()
+        self._further: tuple[TrueStep, ...] = ()
         self._axes = bench.axes or YZX
         _refuse_impossible(self.plan, len(self._axes), sample_hz, angle_hz, slew_rate_degps, batch_samples)
         angles_rad = np.radians([visit.gimbal_deg for visit in self.plan])
@@ -133,7 +133,7 @@ class Simulation:
         """Number of the first reading at or after a time since the first one."""
         return self._accel.first_at(time_ns)
 
-    def moved_by(self, motion: Motion, most_dwells: int, platform: Step) -> Simulation:
+    def moved_by(self, motion: Motion, most_dwells: int, platform: TrueStep) -> Simulation:
         """The same bench whose platform moves otherwise, and goes through a further step before its hidden effects.
 
         motion: may go on while readings are made. most_dwells: for which what differs from dwell to dwell is drawn.
@@ -165,16 +165,16 @@ class Simulation:
             there[f"b{k}"] += walked
         return there
 
-    def _steps(self) -> list[Step]:
+    def _steps(self) -> list[TrueStep]:
         """The chain, fresh from its start."""
         hidden = self._hidden_steps()
-        turned: list[Step] = [*self._further, *hidden["angles"]]
-        platform: list[Step] = [*turned, Gimbals(self.bench.up), *hidden["attitude"], *self._setting_steps()]
-        response: list[Step] = [Inputs(self.sensors), *hidden["input"], Response(self.sensors), *hidden["reading"]]
-        force: list[Step] = [Gravity(self.bench), *hidden["force"]]
+        turned: list[TrueStep] = [*self._further, *hidden["angles"]]
+        platform: list[TrueStep] = [*turned, Gimbals(self.bench.up), *hidden["attitude"], *self._setting_steps()]
+        response: list[TrueStep] = [Inputs(self.sensors), *hidden["input"], Response(self.sensors), *hidden["reading"]]
+        force: list[TrueStep] = [Gravity(self.bench), *hidden["force"]]
         return [*platform, *force, *response, *self._noise_steps(), *hidden["record"]]
 
-    def _hidden_steps(self) -> dict[Stage, list[Step]]:
+    def _hidden_steps(self) -> dict[Stage, list[TrueStep]]:
         return steps_of(self.hidden, self._rig)
 
     @property
@@ -182,15 +182,15 @@ class Simulation:
         period_s = self._accel.period_ns * 1e-9
         return Rig(self.bench, self._axes, self.sensors, self.motion, period_s, len(self) * period_s, self.seed)
 
-    def _setting_steps(self) -> list[Step]:
+    def _setting_steps(self) -> list[TrueStep]:
         if not self.noise.setting_sigma_deg:
             return []
         return [SettingError(self._drawn_per_dwell("setting", math.radians(self.noise.setting_sigma_deg)))]
 
-    def _noise_steps(self) -> list[Step]:
+    def _noise_steps(self) -> list[TrueStep]:
         noise, period_s = self.noise, self._accel.period_ns * 1e-9
         processes = noise.processes(self.seed, period_s, len(self) * period_s)
-        steps: list[Step] = [Disturbance(process) for process in processes]
+        steps: list[TrueStep] = [Disturbance(process) for process in processes]
         if noise.scatter_mps2:
             steps.append(Scatter(self._drawn_per_dwell("scatter", noise.scatter_mps2)))
         if noise.vibration_mps2:
@@ -201,7 +201,7 @@ class Simulation:
     def _drawn_per_dwell(self, quantity: str, sigma: float) -> Floats:
         return sigma * generator(self.seed, quantity).standard_normal((len(self.plan), 3))
 
-    def _readings(self, first: int, last: int, steps: Sequence[Step]) -> Stream:
+    def _readings(self, first: int, last: int, steps: Sequence[TrueStep]) -> Stream:
         time_ns = np.arange(first, last) * self._accel.period_ns
         values = np.empty((last - first, 3))
         turning_points = np.searchsorted(time_ns, np.concatenate([self.motion.arrive_ns, self.motion.leave_ns]))
@@ -213,11 +213,11 @@ class Simulation:
             values[start:end] = state.reading_mps2
         return Stream(START_NS + time_ns, values)
 
-    def _state(self, time_ns: Times) -> State:
+    def _state(self, time_ns: Times) -> TrueState:
         dwell = int(self.motion.locate(time_ns[:1])[0][0])
         moving = bool(time_ns[0] >= self.motion.leave_ns[dwell])
         posed_ns = time_ns if moving else time_ns[:1]
-        return State(
+        return TrueState(
             time_s=np.multiply(time_ns, 1e-9),
             ambient=self.ambient,
             dwell=dwell,
