@@ -1,8 +1,8 @@
 """What is true of the simulated bench, and the steps that make it so.
 
-A ``TrueState`` goes through steps in three groups: the platform (angles -> attitude -> specific force), the response of
-the accelerometers (specific force -> input acceleration -> readings), and the recording (noise). They share no formula with
-the estimator. Hidden effects (``injected``) are further steps between these.
+A ``TrueState`` goes through steps in three groups: the platform (angles -> attitude -> specific force), the response
+of the accelerometers (specific force -> input acceleration -> readings), and the recording (noise). They share no
+formula with the estimator. Hidden effects (``injected``) are further steps between these.
 """
 
 from __future__ import annotations
