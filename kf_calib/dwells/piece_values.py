@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.rows import on_basis
 
-Places = NDArray[np.intp]
+PieceIndices = NDArray[np.intp]
 
 
 class OfPieces(Sequence[Floats]):
     """Values of the pieces of all dwells in one array (pieces, ...), as a sequence of those of each dwell."""
 
-    def __init__(self, values: Floats, ends: Places) -> None:
+    def __init__(self, values: Floats, ends: PieceIndices) -> None:
         self.values, self._ends = values, ends
 
     def __len__(self) -> int:

@@ -18,18 +18,18 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import turned
 from kf_calib.dwells.attitude_error import AttitudeError
-from kf_calib.dwells.piece_values import Places
+from kf_calib.dwells.piece_values import PieceIndices
 from kf_calib.dwells.rows import parabola
 from kf_calib.dwells.sufficient_statistics import LEAST_FREEDOM, DwellFactor, rate_or_zero
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Shape:
+class AlikeDwells:
     """Dwells with equally many pieces P and basis functions K: indices (d,) of the dwells, and (d, P) of their
     pieces."""
 
-    dwells: Places
-    pieces: Places
+    dwells: PieceIndices
+    pieces: PieceIndices
     width: int
 
 
@@ -43,14 +43,14 @@ class Folded:
         """The first piece of each dwell, and at last the number of pieces."""
 
     @cached_property
-    def shapes(self) -> list[Shape]:
+    def shapes(self) -> list[AlikeDwells]:
         """The dwells grouped by shape."""
         widths = np.fromiter((dwell.width for dwell in self.dwells), np.intp, len(self.dwells))
         kinds = dict[tuple[int, int], list[int]]()
         for k, kind in enumerate(zip(self.piece_numbers.tolist(), widths.tolist(), strict=True)):
             kinds.setdefault(kind, []).append(k)
         return [
-            Shape(np.array(places), self.ends[places][:, None] + np.arange(pieces), width)
+            AlikeDwells(np.array(places), self.ends[places][:, None] + np.arange(pieces), width)
             for (pieces, width), places in kinds.items()
         ]
 
@@ -128,7 +128,7 @@ class Folded:
         return self.of_nodes("pose")
 
     @cached_property
-    def before(self) -> Places:
+    def before(self) -> PieceIndices:
         """Index (D,) of the dwell before each dwell; of the first, its own; of a slew, of the dwell that it left."""
         moving = np.fromiter((dwell.moving for dwell in self.dwells), bool, len(self.dwells))
         last = np.maximum.accumulate(np.where(moving, 0, np.arange(len(self.dwells))))
@@ -263,7 +263,7 @@ class DwellStack(Sequence[DwellFactor]):
         return DwellStack(self.folded, self.turned_rad, self.attitudes, self.facing, added)
 
     @property
-    def piece_dwells(self) -> Places:
+    def piece_dwells(self) -> PieceIndices:
         """The index of the dwell of each piece, (pieces,)."""
         return np.repeat(np.arange(len(self)), self.folded.piece_numbers)
 
@@ -310,7 +310,7 @@ class DwellStack(Sequence[DwellFactor]):
         """Mean specific force that is felt in each dwell, (D, 3)."""
         return self.felt(self.means[:, 1:4])
 
-    def felt(self, force_mps2: Floats, times: Places | int = 1) -> Floats:
+    def felt(self, force_mps2: Floats, times: PieceIndices | int = 1) -> Floats:
         """The specific force that is felt where the angles show this one, (m, 3); ``times`` of it are of each
         dwell."""
         if self.turned_rad is not None:

@@ -17,7 +17,7 @@ from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.piece_values import OfPieces, of_all_pieces
 from kf_calib.dwells.qr import solved_by_lower, triangle
 from kf_calib.dwells.rows import on_basis
-from kf_calib.dwells.stack import DwellStack, Shape
+from kf_calib.dwells.stack import AlikeDwells, DwellStack
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.noise.noise_model import Noise, flicker_sigma, shared_noise, slow_scatter
@@ -104,7 +104,7 @@ class _Batch:
     part: slice
 
     @property
-    def shape(self) -> Shape:
+    def shape(self) -> AlikeDwells:
         """The shape."""
         return self.stack.folded.shapes[self.number]
 
