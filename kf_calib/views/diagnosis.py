@@ -12,6 +12,7 @@ from rich.text import Text
 from kf_calib.design.next_orientation import Advice
 from kf_calib.diagnosis.candidate_tests import LEVEL
 from kf_calib.diagnosis.detectability import Detectable
+from kf_calib.diagnosis.effect_shape import EffectShape
 from kf_calib.diagnosis.hypothesis_table import Hypothesis, HypothesisTable
 from kf_calib.diagnosis.results import Diagnosis, Suspect
 from kf_calib.diagnosis.unknown_effect import Description
@@ -30,7 +31,21 @@ from kf_calib.views.terminal import note
 def diagnosis_object(diagnosis: Diagnosis) -> dict[str, Any]:
     """The JSON object of ``diagnose``; its p-values are family-wise."""
     going = diagnosis.next_orientation
-    return found_object(diagnosis) | {"next_orientation": None if going is None else orientation_object(*going)}
+    shapes = diagnosis.explanations[0].shapes if diagnosis.explanations else []
+    return found_object(diagnosis) | {
+        "next_orientation": None if going is None else orientation_object(*going),
+        "shapes": [clean(shape_object(shape)) for shape in shapes],
+    }
+
+
+def shape_object(shape: EffectShape) -> dict[str, Any]:
+    """The shape of an effect as a JSON object: lists with an item a dwell, each a list of an item an accelerometer, or
+    of one for the platform."""
+    return {
+        "effect": shape.effect, "axis": shape.words, "symbol": shape.symbol or None, "unit": shape.unit,
+        "values": shape.values, "quantity_unit": shape.quantity, "readings": shape.readings, "sigma": shape.sigma,
+        "component": shape.component, "component_sigma": shape.component_sigma,
+    }  # fmt: skip
 
 
 def found_object(diagnosis: Diagnosis) -> dict[str, Any]:

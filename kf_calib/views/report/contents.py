@@ -71,7 +71,7 @@ def _(state: Improvement, measured: Sequence[Measured], commands: Sequence[str],
         (
             Section("The error, step by step", tuple(steps)),
             figures_of("Figures of the steps", state, "steps"),
-            Section("Explore the residuals", (explorer(start, explained),)),
+            Section("Explore the residuals", (explorer(start, explained, explanation.shapes),)),
             Section("Parameters with the last model", tuple(rest)),
             figures_of("The calibration with the last model", last, "run"),
             Section("What is left, and what this run could show", _evidence(state.diagnosis)),
@@ -148,7 +148,8 @@ def figures_of(title: str, result: object, prefix: str) -> Section:
 def _explorer_of(diagnosed: Diagnosis) -> Explorer:
     """Return the explorer of a diagnosed run, with what its explanations leave."""
     offered = diagnosed.explanations[:_EXPLORED]
-    return explorer(diagnosed.before, {f"with {each.name}": each.unexplained_mps2 for each in offered})
+    left = {f"with {each.name}": each.unexplained_mps2 for each in offered}
+    return explorer(diagnosed.before, left, [shape for each in offered for shape in each.shapes])
 
 
 def in_text(drawn: RenderableType, with_notes: bool = False) -> tuple[Part, ...]:
