@@ -16,7 +16,7 @@ from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.support.units import shown
 from kf_calib.views.console import effect_table, parameter_table, symbol
-from kf_calib.views.diagnosis import description_object, description_sentence, of_what_p_is, orientation_object
+from kf_calib.views.diagnosis import description_object, description_sentence, orientation_object
 from kf_calib.views.json import clean
 from kf_calib.views.tables import Bar, Table
 from kf_calib.views.terminal import note
@@ -143,9 +143,10 @@ def improvement_report(
     """
     style = "bold green" if state.because == "consistent" else "bold yellow"
     parts: list[RenderableType] = [
+        *([Text(fall, style="bold")] if (fall := fall_in_words(state)) else []),
         progress(state), Text(f"Stopped, {state.because}: {state.reason}", style=style),
     ]  # fmt: skip
-    parts += [Text(line) for line in (*of_what_p_is(state.diagnosis), *_settling(state))]
+    parts += map(Text, _settling(state))
     if not state.spreads or state.because != "ambiguous":
         parts.append(parameter_table(state.result))
     if state.spreads:
@@ -161,6 +162,19 @@ def improvement_report(
     return Group(*parts)
 
 
+def fall_in_words(state: Improvement) -> str:
+    """What was added or taken out, and by how much the error on orientations left out fell; "" where nothing was."""
+    if not state.steps:
+        return ""
+    floor, changes = state.result.held_out_floor_mps2, "; ".join(_label(step) for step in state.steps)
+    before, after = (_errors(result, floor)[0] for result in (state.start.before, state.result))
+    if before is None or after is None:
+        return f"{changes}."
+    return (
+        f"{changes}: the error on orientations left out went from {before:.2f} to {after:.2f} times what noise gives."
+    )
+
+
 def progress(state: Improvement) -> RenderableType:
     """The steps as a table: held-out and in-sample rms over the noise floor as numbers and bars, with remarks below."""
     floor = state.result.held_out_floor_mps2
@@ -174,7 +188,7 @@ def progress(state: Improvement) -> RenderableType:
     unit, alone = shown("m/s^2"), "without any one orientation the model is not determined"
     head = "over the noise floor" if floor else f"{unit.label} ({alone})"
     table = Table(title=f"Rms error, {head}", title_justify="left", box=None, pad_edge=False)
-    for heading in ("step", "p of the run", "", "", ""):
+    for heading in ("step", "p", "", "", ""):
         table.add_column(heading, no_wrap=True)
     for (label, _, probability, p_value), (held_out, fitted) in zip(rows, errors, strict=True):
         p_text = "" if p_value is None else format_p(p_value).removeprefix("= ")
@@ -277,7 +291,7 @@ def _numbered(diagnosis: Diagnosis, choices: Sequence[tuple[str, ...]]) -> list[
         return []
     refits = {suspect.name: suspect for suspect in diagnosis.suspects}
     table = Table(box=None, pad_edge=False)
-    for heading in ("", "suspect", "probability", "p of the run", "fits", "held out"):
+    for heading in ("", "suspect", "probability", "p", "fits", "held out"):
         table.add_column(heading, justify="right" if heading in ("", "probability", "held out") else "left")
     for number, names in enumerate(choices, start=1):
         suspect = refits.get(names[0]) if len(names) == 1 else None

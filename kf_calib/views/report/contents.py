@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from functools import singledispatch
 from typing import Any
 
-from rich.console import RenderableType
+from rich.console import Group, RenderableType
 
 from kf_calib.diagnosis.explanation import Explanation
 from kf_calib.diagnosis.results import Diagnosis
@@ -60,7 +60,8 @@ def _(diagnosed: Diagnosis, measured: Sequence[Measured], commands: Sequence[str
 @page_of.register
 def _(state: Improvement, measured: Sequence[Measured], commands: Sequence[str], remarks: Sequence[str] = ()) -> Page:
     steps = in_text(improvement.progress(state))
-    stopped, *rest = in_text(improvement.improvement_report(state, None, None))[len(steps) :]
+    report = in_text(improvement.improvement_report(state, None, None))
+    stopped, *rest = report[len(steps) + bool(improvement.fall_in_words(state)) :]
     assert isinstance(stopped, Paragraph)
     start, last = state.start.before, state.result
     explanation = Explanation(state.effects, start, last, True)
@@ -159,12 +160,12 @@ def in_text(drawn: RenderableType, with_notes: bool = False) -> tuple[Part, ...]
 
 def _calibrated(result: Calibration) -> tuple[Part, ...]:
     """Return the tables of a calibration, less the counts of readings, which are among what was measured."""
-    return in_text(console.summary(result))[1:]
+    return in_text(console.summary(result))[2:]
 
 
 def _evidence(diagnosed: Diagnosis) -> tuple[Part, ...]:
-    """Return what the console says for a diagnosis, less the verdict, which comes first there as on the page."""
-    return in_text(diagnosis.diagnosis_report(diagnosed))[1:]
+    """Return the evidence for a diagnosis, as the console has it."""
+    return in_text(Group(*diagnosis.details_of(diagnosed)))
 
 
 def _with_what_is_missing(diagnosed: Diagnosis) -> tuple[Part, ...]:
