@@ -225,7 +225,7 @@ class Judgement:
         symbol, factor = self.course.next_reduction(self.worst)
         if not factor > _DETERMINES:
             return self.course.gimbal_deg, f"determines {symbol} for the first time"
-        return self.course.gimbal_deg, f"lowers sigma of {symbol} by {1.0 - factor:.0%}"
+        return self.course.gimbal_deg, f"lowers sigma of {symbol} by {100.0 * (1.0 - factor):.0f} %"
 
     @cached_property
     def worst(self) -> Floats:

@@ -166,7 +166,10 @@ def fall_in_words(state: Improvement) -> str:
     """What was added or taken out, and by how much the error on orientations left out fell; "" where nothing was."""
     if not state.steps:
         return ""
-    floor, changes = state.result.held_out_floor_mps2, "; ".join(_label(step) for step in state.steps)
+    added = [f"added {step.added}" for step in state.steps if step.added]
+    dropped = [f"took out {each.name}" for step in state.steps for each in step.dropped]
+    floor, changes = state.result.held_out_floor_mps2, ", ".join([*added, *dropped])
+    changes = changes[0].upper() + changes[1:]
     before, after = (_errors(result, floor)[0] for result in (state.start.before, state.result))
     if before is None or after is None:
         return f"{changes}."

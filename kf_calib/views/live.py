@@ -175,22 +175,24 @@ def _of_risen(judgement: Judgement, name: str, factor: float) -> str:
 
 
 def _sigmas(standing: Standing) -> RenderableType:
-    """Return the table of the twelve sigmas with their targets, or half of each where none is set, and the time to
-    them."""
+    """Return the table of the twelve sigmas with what they are to come down to, in what time: their targets, or where
+    none is set half of what they were after the last orientation."""
     table = Table.grid(padding=(0, 1))
     wanted = np.full(12, np.nan) if standing.judgement is None else standing.judgement.wanted
     targets = bool(np.isfinite(wanted).any())
     for justify in ("left", "right", "left", "right", "left", "right", "left"):
         table.add_column(justify=justify, no_wrap=True)
-    table.add_row("", "1σ now", "", "target" if targets else "half of it", "", "in", "", style="dim")
+    table.add_row("", "1σ now", "", "target" if targets else "half of last", "", "in", "", style="dim")
+    last = np.full(12, np.nan) if standing.judgement is None else standing.judgement.result.estimate.sigma
     for k, name in enumerate(paper_parameters.SYMBOLS):
         unit = shown(paper_parameters.UNITS[k])
         sigma, left = standing.sigma[k], standing.left_s[k]
         if not math.isfinite(sigma):
             table.add_row(symbol(name), "-", unit.label, "not seen yet", "", "", "")
             continue
-        aim = wanted[k] if targets else 0.5 * sigma
-        aimed = (unit.number(aim), unit.label, span(left) if left else "") if math.isfinite(aim) else ("", "", "")
+        aim = wanted[k] if targets else 0.5 * last[k]
+        time = span(left) if left else "reached"
+        aimed = (unit.number(aim), unit.label, time) if math.isfinite(aim) else ("", "", "")
         table.add_row(symbol(name), unit.number(sigma), unit.label, *aimed, bar(float(sigma), float(wanted[k]), k))
     return table
 

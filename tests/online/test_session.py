@@ -316,7 +316,7 @@ def test_screen_lines_and_objects_of_a_standing() -> None:
         "12 parameters",
         "reached",
         "disagrees: accelerometer",
-        "STAY: HOLD STILL",
+        "HOLD STILL",
         "× noise",
         "orientations left out",
     ):
