@@ -106,7 +106,7 @@ def _unexplained(diagnosis: Diagnosis) -> str:
     consistency = diagnosis.after.consistency
     if consistency.consistent is not False:
         return ""
-    return f"; the rest is unexplained, NIS/dof {consistency.statistic / consistency.dof:.3g}"
+    return f"; what it leaves is still {(consistency.statistic / consistency.dof) ** 0.5:.2g} times the noise"
 
 
 def _unknown(diagnosis: Diagnosis, first: Hypothesis) -> str:

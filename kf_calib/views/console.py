@@ -193,10 +193,10 @@ def summary(result: Calibration) -> RenderableType:
         f"{len(orientations(dwells))} orientations ({tally.moving} readings moving, {tally.settling} settling)"
     )
     parts: list[RenderableType] = [
-        Text(verdict(result), style="bold green" if result.consistency.consistent else "bold yellow"),
         head, *([] if result.bench.input.is_plain else [Text(f"Made of {result.bench.input}.")]),
         parameter_table(result),
         *([effect_table(result)] if result.model.effects else []), noise_table(result),
+        Text(verdict(result), style="bold green" if result.consistency.consistent else "bold yellow"),
     ]  # fmt: skip
     parts += [note(warning) for warning in result.warnings]
     parts += [without_table(result, found) for found in result.outlying]

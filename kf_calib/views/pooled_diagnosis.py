@@ -123,11 +123,11 @@ def _listed(names: Sequence[str]) -> str:
 def _probabilities(rows: Sequence[EffectRow]) -> Table:
     """Return the table of the probabilities of each attribution."""
     tried = [each for each in Attribution if any(each in (row.probabilities or {}) for row in rows)]
-    table = Table(title="Of what each effect is: probabilities", title_justify="left")
+    table = Table(title="What has each effect, and with what probability", title_justify="left")
     table.add_column("effect")
     for each in tried:
         table.add_column(_OF[each], justify="right")
-    table.add_column("of no one", justify="right")
+    table.add_column("of nothing", justify="right")
     for row in rows:
         shares = [(row.probabilities or {}).get(each, 0.0) for each in tried]
         table.add_row(row.effect, *map(format_probability, (*shares, row.no_one or 0.0)))

@@ -160,7 +160,7 @@ def in_text(drawn: RenderableType, with_notes: bool = False) -> tuple[Part, ...]
 
 def _calibrated(result: Calibration) -> tuple[Part, ...]:
     """Return the tables of a calibration, less the counts of readings, which are among what was measured."""
-    return in_text(console.summary(result))[2:]
+    return in_text(console.summary(result))[1:]
 
 
 def _evidence(diagnosed: Diagnosis) -> tuple[Part, ...]:
