@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""All sentences that the program can say of a run, as one page: ``tools/sentences.py`` renews tests/golden/sentences.md.
+"""All sentences that the program can say of a run, as one page: this renews tests/golden/sentences.md.
 
 They are read from the source: every text of four words or more, in the order of the files; what a value is put in for
 stands in braces. Left out are docstrings, what an input is refused with, and the words of commands and their help.
@@ -19,8 +19,8 @@ _WORDS = 4
 _OF_RUNS = ("design", "diagnosis", "estimation", "fleet", "noise", "online", "dwells", "views")
 _HEAD = """# All that the program can say of a run
 
-Made by `tools/sentences.py` from the source; `tests/test_sentences.py` compares. Read it once in a while: each sentence has
-to be understood the first time. What a value is put in for stands in braces.
+Made by `tools/sentences.py` from the source; `tests/test_sentences.py` compares. Read it once in a while: each sentence
+has to be understood the first time. What a value is put in for stands in braces.
 """
 
 
@@ -37,7 +37,8 @@ def page() -> str:
 def sentences(source: str) -> Iterator[str]:
     """The sentences in the source of a module, in its order."""
     tree = ast.parse(source)
-    docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    bare = (node.value for node in ast.walk(tree) if isinstance(node, ast.Expr))
+    docstrings = {id(value) for value in bare if isinstance(value, ast.Constant)}
     found = [(node.lineno, node.col_offset, text) for node, text in _texts(tree, docstrings)]
     for _, _, text in sorted(found):
         words = re.findall(r"[A-Za-zµσ]{2,}", re.sub(r"\{[^}]*\}", "", text))
