@@ -91,6 +91,7 @@ _WHOLE = {
     "K": [(0.5, Unit("mK", 1e3))],
     "K/s": [(math.inf, Unit("K/h", 3600.0))],
     "m^2/s^4": [(math.inf, Unit("g²", 1.0 / _G**2))],
+    "m^3/s^6": [(math.inf, Unit("g³", 1.0 / _G**3))],
     "K m/s^2": [(math.inf, Unit("K·g", 1.0 / _G))],
     "m/s": [(6e3, Unit("g·s", 1.0 / _G)), (math.inf, Unit("g·h", 1.0 / _G / 3600.0))],
 }
