@@ -30,6 +30,9 @@ from kf_calib.views.tables import Table
 from kf_calib.views.terminal import note
 from kf_calib.views.text_plot import text_plot
 
+_MOST = 5
+"""Explanations in the table on one screen."""
+
 
 def diagnosis_object(diagnosis: Diagnosis) -> dict[str, Any]:
     """The JSON object of ``diagnose``; its p-values are family-wise."""
@@ -174,8 +177,11 @@ def diagnosis_report(diagnosis: Diagnosis, typed: str = "", details: bool = Fals
     """
     style = {True: "bold green", False: "bold yellow", None: "bold"}[diagnosis.test.consistent]
     parts: list[RenderableType] = [Text(verdict(diagnosis), style=style)]
-    if diagnosis.table and diagnosis.test.consistent is False:
-        parts.append(_hypothesis_table(diagnosis.table))
+    if diagnosis.table and diagnosis.test.consistent is False and not details:
+        parts.append(_hypothesis_table(diagnosis.table, _MOST))
+        if more := diagnosis.table.listed[_MOST:]:
+            share = format_probability(sum(row.probability for row in more))
+            parts.append(Text(f"{len(more)} more have {share} together: --details."))
     shapes = diagnosis.explanations[0].shapes if diagnosis.explanations else []
     parts += [Text(text_plot(shape), no_wrap=True) for shape in shapes[:1]]
     for step in next_steps(diagnosis, typed):
@@ -191,6 +197,8 @@ def details_of(diagnosis: Diagnosis) -> list[RenderableType]:
     """The evidence for the verdict, and what the run cannot show."""
     parts: list[RenderableType] = [*map(Text, of_what_p_is(diagnosis))]
     readings, trend = diagnosis.before.readings, diagnosis.test.trend
+    if diagnosis.table and diagnosis.test.consistent is False:
+        parts.append(_hypothesis_table(diagnosis.table))
     if readings.findings:
         parts.append(Text(f"In the readings: {'; '.join(readings.findings)}."))
     if diagnosis.suspects:
@@ -239,13 +247,14 @@ def plain_report(diagnosis: Diagnosis) -> str:
     return plain(diagnosis_report(diagnosis))
 
 
-def _hypothesis_table(table: HypothesisTable) -> Table:
-    """Return the table of the explanations that have 1 % of the probability or more, with what their refits say."""
+def _hypothesis_table(table: HypothesisTable, most: int | None = None) -> Table:
+    """Return the table of the explanations that have 1 % of the probability or more, at most ``most`` of them, with
+    what their refits say."""
     shown_ = Table(title="What it may be", title_justify="left")
     for heading in ("explanation", "family", "probability", "largest coefficient (1σ)", "held out / noise"):
         left = heading in ("explanation", "family")
-        shown_.add_column(heading, justify="left" if left else "right", no_wrap=not left)
-    for row in table.listed:
+        shown_.add_column(heading, justify="left" if left else "right")
+    for row in table.listed[:most]:
         share = format_probability(row.probability)
         shown_.add_row(name_of(row), ", ".join(row.families), share, _largest_coefficient(row), _held_out(row.refit))
     return shown_

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 from kf_calib.diagnosis.results import Diagnosis
 
+_TELLS = 1.0  # sigma; an orientation that separates explanations by less tells nothing
+
 
 @dataclass(frozen=True)
 class NextStep:
@@ -49,7 +51,9 @@ def _steps(diagnosis: Diagnosis, typed: str) -> Iterator[NextStep]:
 def _unsure(diagnosis: Diagnosis, typed: str) -> Iterator[NextStep]:
     """Yield what decides among several explanations, then what can be tried without it."""
     going = diagnosis.next_orientation
-    if going is not None:
+    if going is not None and going[0].told and going[0].after < _TELLS:
+        yield NextStep("No single orientation tells them apart here: measure at more, or for longer")
+    elif going is not None:
         yield NextStep(f"Measure with the gimbals at {angles_in_words(diagnosis)}: it {going[1]}")
     if diagnosis.description is not None:
         texts = " ".join(f"--with {shlex.quote(text)}" for text in diagnosis.description.formulas)
