@@ -97,9 +97,14 @@ def _sentence(finding: Finding) -> str:
     if finding.attribution is Attribution.SOME and finding.share_interval is not None:
         low, high = finding.share_interval
         having = [each.unit for each in finding.units if each.probability > _HAS_IT]
+<<<<<<< HEAD
         sentence += (
             f": {_share_in_words(finding.share or 0.0, low, high)} of the units have it, most likely {_listed(having)}"
         )
+=======
+        reach = "" if f"{low:.0%}" == f"{high:.0%}" else f" ({low:.0%} to {high:.0%})"
+        sentence += f": {finding.share:.0%} of the units have it{reach}, most likely {_listed(having)}"
+>>>>>>> main
     if finding.repair is not None:
         gap = finding.repair.gaps[0]
         sentence += f": it changed between {_moment(gap.after) or gap.after_run} and "
