@@ -143,21 +143,11 @@ def improvement_report(
     """
     style = "bold green" if state.because == "consistent" else "bold yellow"
     parts: list[RenderableType] = [
-        *([Text(fall, style="bold")] if (fall := fall_in_words(state)) else []),
+        *(Text(told) for told in story(state)[:-1]),
         progress(state), Text(f"Stopped, {state.because}: {state.reason}", style=style),
     ]  # fmt: skip
-<<<<<<< HEAD
     parts += map(Text, _settling(state))
-    if not state.spreads or state.because != "ambiguous":
-        parts.append(parameter_table(state.result))
-    if state.spreads:
-        parts.append(_spread_table(state))
-    if state.result.model.effects:
-        parts.append(effect_table(state.result))
-=======
-    parts += [Text(line) for line in (*of_what_p_is(state.diagnosis), *_settling(state))]
     parts.append(last_parameters(state))
->>>>>>> main
     if honest is not None:
         parts.append(Text(honest_sentence(honest)))
     if replay_difference is not None:
@@ -167,22 +157,6 @@ def improvement_report(
     return Group(*parts)
 
 
-<<<<<<< HEAD
-def fall_in_words(state: Improvement) -> str:
-    """What was added or taken out, and by how much the error on orientations left out fell; "" where nothing was."""
-    if not state.steps:
-        return ""
-    added = [f"added {step.added}" for step in state.steps if step.added]
-    dropped = [f"took out {each.name}" for step in state.steps for each in step.dropped]
-    floor, changes = state.result.held_out_floor_mps2, ", ".join([*added, *dropped])
-    changes = changes[0].upper() + changes[1:]
-    before, after = (_errors(result, floor)[0] for result in (state.start.before, state.result))
-    if before is None or after is None:
-        return f"{changes}."
-    return (
-        f"{changes}: the error on orientations left out went from {before:.2f} to {after:.2f} times what noise gives."
-    )
-=======
 def last_parameters(state: Improvement) -> RenderableType:
     """The tables of the last model: its parameters, their range where the run cannot decide, and its effects."""
     parts: list[RenderableType] = []
@@ -228,7 +202,6 @@ def _told(step: SelectionStep) -> str:
         size = f", {symbol(clearest.symbol)} = {value} ± {sigma} {shown(clearest).label}"
     share = "" if step.probability is None else f" (probability {format_probability(step.probability)})"
     return ", ".join([f"{step.name}{size}{share}", *told])
->>>>>>> main
 
 
 def progress(state: Improvement) -> RenderableType:

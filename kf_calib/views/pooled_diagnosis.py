@@ -97,14 +97,8 @@ def _sentence(finding: Finding) -> str:
     if finding.attribution is Attribution.SOME and finding.share_interval is not None:
         low, high = finding.share_interval
         having = [each.unit for each in finding.units if each.probability > _HAS_IT]
-<<<<<<< HEAD
-        sentence += (
-            f": {_share_in_words(finding.share or 0.0, low, high)} of the units have it, most likely {_listed(having)}"
-        )
-=======
         reach = "" if f"{low:.0%}" == f"{high:.0%}" else f" ({low:.0%} to {high:.0%})"
         sentence += f": {finding.share:.0%} of the units have it{reach}, most likely {_listed(having)}"
->>>>>>> main
     if finding.repair is not None:
         gap = finding.repair.gaps[0]
         sentence += f": it changed between {_moment(gap.after) or gap.after_run} and "
@@ -112,12 +106,6 @@ def _sentence(finding: Finding) -> str:
         sentence += f" ({format_probability(gap.probability)})"
     rivals = [f"{name} ({format_probability(share)})" for name, share in finding.rivals.items()]
     return f"{sentence}. In its place it may be {' or '.join(rivals)}." if rivals else f"{sentence}."
-
-
-def _share_in_words(share: float, low: float, high: float) -> str:
-    """Return a share with its 95 % interval, which is left out where it is no wider than the digits that are told."""
-    interval = f"{low:.0%}", f"{high:.0%}"
-    return f"{share:.0%}" if interval[0] == interval[1] else f"{share:.0%} ({interval[0]} to {interval[1]})"
 
 
 def _listed(names: Sequence[str]) -> str:

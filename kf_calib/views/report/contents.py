@@ -64,15 +64,7 @@ def _(diagnosed: Diagnosis, measured: Sequence[Measured], commands: Sequence[str
 
 @page_of.register
 def _(state: Improvement, measured: Sequence[Measured], commands: Sequence[str], remarks: Sequence[str] = ()) -> Page:
-<<<<<<< HEAD
-    steps = in_text(improvement.progress(state))
-    report = in_text(improvement.improvement_report(state, None, None))
-    stopped, *rest = report[len(steps) + bool(improvement.fall_in_words(state)) :]
-    assert isinstance(stopped, Paragraph)
-    start, last = state.start.before, state.result
-=======
     start, last, steps = state.start.before, state.result, improvement.progress(state)
->>>>>>> main
     explanation = Explanation(state.effects, start, last, True)
     explained = {f"{last.model.sum}": explanation.unexplained_mps2} if state.steps else {}
     fall = figures_of("The error, step by step", state, "fall", [FALL, NO_FALL])
@@ -80,20 +72,12 @@ def _(state: Improvement, measured: Sequence[Measured], commands: Sequence[str],
         measured[0].name, "Improvement of the model", *_standing(state.diagnosis.test.consistent),
         (*improvement.story(state), *remarks),
         (
-<<<<<<< HEAD
-            Section("The error, step by step", tuple(steps)),
-            figures_of("Figures of the steps", state, "steps"),
-            Section("Explore the residuals", (explorer(start, explained, explanation.shapes),)),
-            Section("Parameters with the last model", tuple(rest)),
-            figures_of("The calibration with the last model", last, "run"),
-=======
             Section(fall.title, (*fall.parts, *in_text(steps))),
             measured_section(facts(measured[0], last)),
             figures_of("Residuals", state, "steps", less=[FALL, NO_FALL]),
-            Section("Explore the residuals", (explorer(start, explained),)),
+            Section("Explore the residuals", (explorer(start, explained, explanation.shapes),)),
             Section("Parameters with the last model", in_text(improvement.last_parameters(state))),
             figures_of("The calibration with the last model", last, "run", less=[ON_THEIR_WAY]),
->>>>>>> main
             Section("What is left, and what this run could show", _evidence(state.diagnosis)),
             warnings_of(state.warnings),
         ), tuple(commands),
