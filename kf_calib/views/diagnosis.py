@@ -29,7 +29,7 @@ from kf_calib.views.json import clean, outlying_object, readings_object
 from kf_calib.views.next_step import angles_in_words, next_steps
 from kf_calib.views.tables import Table
 from kf_calib.views.terminal import note
-from kf_calib.views.text_plot import text_plot
+from kf_calib.views.text_plot import TextPlot
 
 _MOST = 5
 """Explanations in the table on one screen."""
@@ -198,7 +198,7 @@ def diagnosis_report(diagnosis: Diagnosis, typed: str = "", details: bool = Fals
             share = format_probability(sum(row.probability for row in more))
             parts.append(Text(f"{len(more)} more have {share} together: --details."))
     shapes = diagnosis.explanations[0].shapes if diagnosis.explanations else []
-    parts += [Text(text_plot(shape), no_wrap=True) for shape in shapes[:1]]
+    parts += map(TextPlot, shapes[:1])
     for step in next_steps(diagnosis, typed):
         parts.append(Text(f"{step.why}:" if step.command else f"{step.why}."))
         parts += [Text(f"  {step.command}", style="bold", no_wrap=True, overflow="ignore")] if step.command else []

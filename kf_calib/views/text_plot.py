@@ -2,42 +2,59 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.text import Text
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.effect_shape import EffectShape
-from kf_calib.support.units import shown, shown_whole, significant
+from kf_calib.support.units import Unit, shown, shown_whole, significant
 
 _WIDTH, _HEIGHT = 64, 8
+_LEFT = 9  # letters of the numbers beside the plot
 _READING, _FITTED, _ZERO = "●", "·", "┈"
 
 
-def text_plot(shape: EffectShape) -> str:
-    """Lines of text: a point a dwell of the channel that shows the effect most, and the effect as a dotted curve."""
-    k = shape.clearest
-    known = np.isfinite(shape.readings[:, k])
-    across = shown_whole(shape.unit, float(np.nanmax(np.abs(shape.values))))
-    upward = shown(shape.quantity)
+@dataclass(frozen=True)
+class TextPlot:
+    """A point a dwell of the channel that shows an effect most, and the effect as a dotted curve."""
+
+    shape: EffectShape
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """The plot, as wide as there is room, and its axes in words."""
+        shape, k = self.shape, self.shape.clearest
+        width = min(_WIDTH, options.max_width - _LEFT)
+        across = shown_whole(shape.unit, float(np.nanmax(np.abs(shape.values))))
+        symbol = f" ({shape.symbol})" if "·" in shape.symbol else ""
+        of = f"{shape.channels[k]}, {shown(shape.quantity).label}"
+        yield Text(f"What {shape.effect} must explain {_READING} and what it adds {_FITTED} ({of})")
+        yield Text("\n".join(_lines(shape, k, across, width)), no_wrap=True)
+        words = f"{shape.words}{symbol}, {across.label}"
+        yield Text(f"{'':{_LEFT}}{words.center(width)}".rstrip() if len(words) <= width else words)
+
+
+def _lines(shape: EffectShape, k: int, across: Unit, width: int) -> list[str]:
+    """Return the plot of a channel in so many columns, with numbers at the ends of its axes."""
+    known, upward = np.isfinite(shape.readings[:, k]), shown(shape.quantity)
     x, y = shape.values[known, k] * across.per_si, shape.readings[known, k] * upward.per_si
     at, middle = x, shape.component[known, k] * upward.per_si
     if shape.is_curve:
         at, middle = (each * unit.per_si for each, unit in zip(shape.curve(k)[:2], (across, upward), strict=True))
     low, high = min(y.min(), middle.min(), 0.0), max(y.max(), middle.max(), 0.0)
-    canvas = [[" "] * _WIDTH for _ in range(_HEIGHT)]
-    ends = (x.min(), x.max()), (low, high)
-    for mark, points in ((_ZERO, (np.linspace(*ends[0], _WIDTH), np.zeros(_WIDTH))), (_FITTED, (at, middle)),
-                         (_READING, (x, y))):  # fmt: skip
-        for column, row in zip(_cells(points[0], *ends[0], _WIDTH), _cells(points[1], *ends[1], _HEIGHT), strict=True):
+    left, right = float(x.min()), float(x.max())
+    canvas = [[" "] * width for _ in range(_HEIGHT)]
+    for mark, columns, rows in ((_ZERO, np.linspace(left, right, width), np.zeros(width)), (_FITTED, at, middle),
+                                (_READING, x, y)):  # fmt: skip
+        places = zip(_cells(columns, left, right, width), _cells(rows, low, high, _HEIGHT), strict=True)
+        for column, row in places:
             canvas[_HEIGHT - 1 - row][column] = mark
     labels = {0: significant(high, 2), _HEIGHT - 1: significant(low, 2)}
-    lines = [f"{labels.get(row, ''):>7} ┤{''.join(cells)}".rstrip() for row, cells in enumerate(canvas)]
-    of = f"{shape.channels[k]}, {upward.label}"
-    symbol = f" ({shape.symbol})" if "·" in shape.symbol else ""
-    first, last = significant(ends[0][0]), significant(ends[0][1])
-    words = f"{shape.words}{symbol}, {across.label}"
-    title = f"What {shape.effect} must explain {_READING} and what it adds {_FITTED} ({of})"
-    line, ends_text = f"{'':8}└{'─' * _WIDTH}", f"{'':9}{first}{last:>{_WIDTH - len(first)}}"
-    return "\n".join([title, *lines, line, ends_text, f"{'':9}{words.center(_WIDTH)}".rstrip()])
+    lines = [f"{labels.get(row, ''):>{_LEFT - 2}} ┤{''.join(cells)}".rstrip() for row, cells in enumerate(canvas)]
+    first, last = significant(left), significant(right)
+    return [*lines, f"{'':{_LEFT - 1}}└{'─' * width}", f"{'':{_LEFT}}{first}{last:>{width - len(first)}}"]
 
 
 def _cells(values: Floats, low: float, high: float, count: int) -> list[int]:
