@@ -13,6 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from helpers.paths import ROOT
 from helpers.synthetic import SYMBOLS
@@ -22,6 +23,7 @@ from kf_calib.errors import InputError
 from kf_calib.exchange import calibration_file
 from kf_calib.exchange.certificate import content, dcc, document, statement
 from kf_calib.support.extras import MissingExtraError
+from kf_calib.support.units import field_unit
 
 sets = pytest.mark.skipif(find_spec("typst") is None, reason="typst is not there: no PDF is made")
 reads = pytest.mark.skipif(shutil.which("pdftotext") is None, reason="pdftotext (poppler-utils) is not there")
@@ -55,7 +57,7 @@ def cal(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("cal") / "cal.json"
     own = calibrate(ROOT / "recordings" / "navigation_24.mcap")
     began = datetime(2025, 6, 15, 15, 6, 40, tzinfo=UTC)
-    calibration_file.write(path, calibration_file.saved(own, "navigation_24.mcap", "0" * 64, began))
+    calibration_file.write_calibration(path, calibration_file.saved(own, "navigation_24.mcap", "0" * 64, began))
     return path
 
 
@@ -67,8 +69,8 @@ def lab(tmp_path: Path) -> Path:
 
 
 def made(cal: Path, lab: Path | None) -> content.Certificate:
-    saved, own = calibration_file.read(cal), statement.read(lab)
-    earlier = None if own.before is None else calibration_file.read(own.before)
+    saved, own = calibration_file.open_calibration(cal), statement.read_statement(lab)
+    earlier = None if own.before is None else calibration_file.open_calibration(own.before)
     return content.certificate(saved, saved.model(), own, None if earlier is None else (earlier, earlier.model()))
 
 
@@ -97,7 +99,7 @@ def test_the_numbers_of_the_xml_are_those_of_the_calibration(cal: Path, lab: Pat
     assert spreads == own.budget.expanded.tolist() and factors == own.budget.k.tolist()
     outcomes = [each.text for each in root.findall(".//dcc:conformity", names)]
     assert len(outcomes) == 6 and set(outcomes) == {"pass", "fail"}
-    assert dcc.check(dcc.xml(own), None).startswith("all mandatory elements of DCC 3.3.0 are there")
+    assert dcc.check_dcc(dcc.xml(own), None).startswith("all mandatory elements of DCC 3.3.0 are there")
 
 
 def test_it_says_which_raw_readings_the_results_belong_to(cal: Path) -> None:
@@ -114,7 +116,7 @@ def test_without_a_statement_it_says_that_it_is_no_dcc(cal: Path) -> None:
     own = made(cal, None)
     assert "laboratory.name" in own.missing and "begun" not in own.missing
     assert dcc.xml(own).decode().splitlines()[2].startswith(" <!-- not a DCC: not stated are number, site")
-    assert dcc.check(dcc.xml(own), None) == "not a DCC: 10 mandatory elements are not stated"
+    assert dcc.check_dcc(dcc.xml(own), None) == "not a DCC: 10 mandatory elements are not stated"
 
 
 def test_a_schema_that_is_given_decides(cal: Path, lab: Path, tmp_path: Path) -> None:
@@ -126,13 +128,13 @@ def test_a_schema_that_is_given_decides(cal: Path, lab: Path, tmp_path: Path) ->
       <xs:anyAttribute namespace="##any" processContents="skip"/></xs:complexType></xs:element></xs:schema>"""
     written = dcc.xml(made(cal, lab))
     schema.write_text(form.format(2))
-    assert dcc.check(written, schema) == "valid by own.xsd"
+    assert dcc.check_dcc(written, schema) == "valid by own.xsd"
     schema.write_text(form.format(1))
     with pytest.raises(InputError, match=r"not valid by it at /.*digitalCalibrationCertificate"):
-        dcc.check(written, schema)
+        dcc.check_dcc(written, schema)
     schema.write_text("<xs:schema")
     with pytest.raises(InputError, match="cannot be read as an XML Schema"):
-        dcc.check(written, schema)
+        dcc.check_dcc(written, schema)
 
 
 @sets
@@ -154,6 +156,20 @@ def test_the_pdf_has_every_number_and_the_xml(cal: Path, lab: Path, tmp_path: Pa
     if shutil.which("pdfdetach"):
         subprocess.run(["pdfdetach", "-saveall", "-o", tmp_path, tmp_path / "made.pdf"], check=True)
         assert (tmp_path / document.ATTACHED).read_bytes() == xml
+
+
+@pytest.mark.parametrize(
+    ("largest", "shown"),
+    [(0.0, "0.0000"), (0.0099, "9.90e−03"), (0.0101, "0.0101"), (9999.0, "9999.0000"), (10001.0, "1.00e+04")],
+)
+def test_a_sensitivity_is_shown_with_three_digits_at_least(cal: Path, lab: Path, largest: float, shown: str) -> None:
+    own = made(cal, lab)
+    line = next(each for each in own.budget.contributions if each.sensitivity is not None)
+    per_si = field_unit(own.results[0].unit).per_si / field_unit(line.unit).per_si
+    values = np.zeros(12)
+    values[0] = largest / per_si
+    row = document._sensitivity(own, replace(line, sensitivity=values))
+    assert row["values"][0] == shown
 
 
 def text_of(pdf: bytes, folder: Path) -> str:
@@ -216,7 +232,7 @@ def test_a_wrong_statement_is_one_sentence(text: str, said: str, tmp_path: Path)
     path = tmp_path / "lab.toml"
     path.write_text(text)
     with pytest.raises(InputError, match=said) as error:
-        statement.read(path)
+        statement.read_statement(path)
     assert str(error.value).startswith(str(path)) and "\n" not in str(error.value)
 
 
@@ -246,7 +262,7 @@ def test_the_command_writes_both_files(run: Any, cal: Path, lab: Path, tmp_path:
 
 
 def test_what_the_run_does_not_determine_has_no_number(cal: Path) -> None:
-    saved = calibration_file.read(cal)
+    saved = calibration_file.open_calibration(cal)
     first = saved.parameters[0].model_copy(update={"value": None, "sigma": None})
     own = saved.model_copy(update={"parameters": [first, *saved.parameters[1:]]})
     made = content.certificate(

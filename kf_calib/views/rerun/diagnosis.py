@@ -25,15 +25,14 @@ from kf_calib.support.plain_text import printable
 from kf_calib.support.units import shown_whole
 from kf_calib.views.diagnosis import name_of, verdict
 from kf_calib.views.rerun.driver_chart import Chart, charts_of, charts_view, clear, heading
-from kf_calib.views.rerun.file import rrd_file
-from kf_calib.views.rerun.names import GOLD, thin
+from kf_calib.views.rerun.names import GOLD, rrd_file, thin
 from kf_calib.views.rerun.spheres import Log, at_step, forever, log_spheres, spheres
 
 EXPLANATION = "explanation"
 _MOST = 5  # explanations
 
 
-def save(diagnosis: Diagnosis, path: Path) -> Path:
+def save_diagnosis_view(diagnosis: Diagnosis, path: Path) -> Path:
     """Write the view of a diagnosis to an .rrd file that opens laid out, at the best explanation."""
     before, explanations = diagnosis.before, diagnosis.explanations[:_MOST]
     ratios = before.residuals_mps2 / mean_sigmas(before)
