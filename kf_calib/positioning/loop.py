@@ -160,9 +160,8 @@ def _harm(state: State, seen: Seen, rules: Rules) -> str:
         return f"the read-back {here} is no position"
     if left := _outside(seen.gimbal_deg, rules):
         return f"the platform is at {here}, {left}"
-    rate = _rate_degps(state.track[-2:])
-    if rate > rules.watch.late_factor * rules.pace.rate_degps + 10.0 * rules.watch.still_degps:
-        return f"the read-back leaps: it moved at {rate:.0f} deg/s, and {rules.pace.rate_degps:g} deg/s is the limit"
+    if (leap_deg := _leap_deg(state.track[-2:], rules)) > 0.0:
+        return f"the read-back leaps: by {leap_deg:.0f} deg, faster than {rules.pace.rate_degps:g} deg/s can do it"
     return ""
 
 
@@ -269,12 +268,14 @@ def _stands(state: State, watch: Watchfulness) -> bool:
     return bool(np.ptp(angles, axis=0).max() <= watch.still_degps * (now_s - first_s))
 
 
-def _rate_degps(track: Sequence[tuple[float, Angles]]) -> float:
-    """Return the rate of the fastest gimbal between two read-backs; 0 where there are not two, a moment apart."""
-    if len(track) < 2 or track[1][0] - track[0][0] < 1e-3:
+def _leap_deg(track: Sequence[tuple[float, Angles]], rules: Rules) -> float:
+    """Return by how much a gimbal moved between two read-backs, where that is more than its rate allows; else 0."""
+    if len(track) < 2 or rules.watch.late_s == math.inf:  # a person turns as fast as he can
         return 0.0
-    moved = np.abs(np.array(track[1][1]) - np.array(track[0][1])).max()
-    return float(moved / (track[1][0] - track[0][0]))
+    (before_s, before), (now_s, now) = track
+    moved = float(np.abs(np.array(now) - np.array(before)).max())
+    fastest = rules.watch.late_factor * rules.pace.rate_degps
+    return moved if moved > fastest * (now_s - before_s + rules.watch.latency_s) + rules.watch.off_path_deg else 0.0
 
 
 def _apart_deg(one: Sequence[float], other: Sequence[float]) -> float:
