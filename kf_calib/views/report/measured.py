@@ -38,7 +38,7 @@ def facts(measured: Measured, result: Calibration) -> list[tuple[str, str]]:
 
 def _facts(measured: Measured, result: Calibration) -> Iterator[tuple[str, str]]:
     bench, tally = result.bench, result.tally
-    dwells = [visit.dwell for visit in result.visits]
+    dwells = result.fit.dwells
     yield "Recording", measured.name
     yield "SHA-256", measured.sha256
     yield "Begun", measured.date
