@@ -28,10 +28,14 @@ _ROUNDING = 1.0 + 1e-9  # by which cells are larger, so that nearer ones are nev
 
 
 def orientations(dwells: Sequence[DwellFactor]) -> list[list[int]]:
-    """Indices of the dwells grouped by orientation, that is by direction of gravity in the platform and by pose."""
+    """Indices of the dwells grouped by orientation, that is by direction of gravity in the platform and by pose.
+
+    Angles that differ by whole turns are the same pose: their sines and cosines are compared.
+    """
     means = np.array([dwell.means for dwell in dwells])
     direction = means[:, 1:4] / np.linalg.norm(means[:, 1:4], axis=1, keepdims=True)
-    return grouped(np.column_stack([direction, [dwell.pose for dwell in dwells]]), math.radians(SAME_POSE_DEG))
+    poses = np.array([dwell.pose for dwell in dwells])
+    return grouped(np.column_stack([direction, np.cos(poses), np.sin(poses)]), math.radians(SAME_POSE_DEG))
 
 
 def grouped(places: Floats, apart: float) -> list[list[int]]:
