@@ -136,10 +136,14 @@ def measured_of(recording: Path, options: dict[str, Any]) -> Measured:
     """What a page says of a recording's file; raises MissingExtraError, before the work, where no page can be made."""
     import kf_calib.views.figures  # noqa: F401  # which a page needs
     from kf_calib.diagnosis.selection_journal import Origin
+    from kf_calib.sources.files.decision_records import END_RECORD, decision_records
     from kf_calib.sources.run_date import run_date
     from kf_calib.views.report.measured import Measured
 
-    return Measured(recording.name, Origin.of(recording).sha256, run_date(recording_of(recording, options)))
+    fingerprint, began = Origin.of(recording).sha256, run_date(recording_of(recording, options))
+    is_driven = recording.suffix == ".mcap" and recording.is_file()
+    decided, ends = ((decision_records(recording), decision_records(recording, END_RECORD)) if is_driven else ((), ()))
+    return Measured(recording.name, fingerprint, began, decided, ends)
 
 
 def _diagnosed(recording: Path, options: dict[str, Any], quiet: bool) -> tuple[Diagnosis, Measured]:

@@ -179,7 +179,6 @@ def _drive(device: Opened, most: int, options: Mapping[str, Any], running: Drive
 
     session = running.session
     assert isinstance(session, Session)
-    session.look_factor = 1.2
     itinerary = _itinerary(running.source.bench, most, options)
     rules = Rules(itinerary.reach, itinerary.pace, device.watch)
     if isinstance(device.clock, SimulatedTime):

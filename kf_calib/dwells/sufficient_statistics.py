@@ -32,6 +32,9 @@ from kf_calib.dwells.qr import square_triangle
 from kf_calib.dwells.rows import Nodes, parabola
 from kf_calib.dwells.walk_path import WalkPath, walk_path_of
 
+LEAST_FREEDOM = 8
+"""Degrees of freedom of a piece, with fewer of which its variance is that of its whole dwell."""
+
 _LAGS = 64
 
 
@@ -209,7 +212,7 @@ class DwellFactor:
         over the dwell."""
         squares, freedom = self.squares, np.maximum(self.counts - float(self.width), 0.0)[:, None]
         pooled = squares.sum(axis=0) / max(freedom.sum(), 1)
-        return np.where(freedom >= 8, squares / np.maximum(freedom, 1), pooled)
+        return np.where(freedom >= LEAST_FREEDOM, squares / np.maximum(freedom, 1), pooled)
 
     @cached_property
     def walk(self) -> WalkPath:

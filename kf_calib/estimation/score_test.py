@@ -223,10 +223,9 @@ class Frame:
 
     def serves(self, linearised: LinearisedDwells, noise: Noise) -> bool:
         """Tell whether the frame was made for exactly these dwells and this noise."""
-        same = len(linearised.dwells_at_state) == len(self.dwells) and all(
-            map(_is, linearised.dwells_at_state, self.dwells)
+        return linearised.dwells_at_state.is_same(self.dwells) and all(
+            np.array_equal(getattr(noise, key), getattr(self.noise, key)) for key in _OF_NOISE
         )
-        return same and all(np.array_equal(getattr(noise, key), getattr(self.noise, key)) for key in _OF_NOISE)
 
     def scan(self, linearised: LinearisedDwells, more: Sequence[Effect] = ()) -> Scan:
         """Project the frame's effects, without those that the model contains, and then the effects ``more`` off the
@@ -293,11 +292,6 @@ def slices(counts: Sequence[int]) -> list[slice]:
 def _key(effect: Effect) -> tuple[str, float]:
     """Return what identifies an effect together with the value of its constant."""
     return str(effect), effect.value
-
-
-def _is(one: object, other: object) -> bool:
-    """Tell whether both are the same object."""
-    return one is other
 
 
 def scan(linearised: LinearisedDwells, noise: Noise, effects: Sequence[Effect]) -> Scan:

@@ -255,7 +255,7 @@ def _not_seen(result: Calibration) -> list[str]:
 
 def _conditions(result: Calibration, began: datetime | None) -> SavedConditions:
     """Return when and how the run was made."""
-    dwells = [visit.dwell for visit in result.visits]
+    dwells = result.fit.dwells
     warmth = np.concatenate([dwell.nodes.temperature_c for dwell in dwells])
     known = bool(np.isfinite(warmth).any())
     return SavedConditions(

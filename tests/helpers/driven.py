@@ -39,7 +39,6 @@ def driven(
     run = simulation(options_from_query(query), keys or {})
     bench = DrivenBench(run, servo or Servo(), [0.0] * len(run.bench.axes))
     session = Session.fed(run.bench, wanted=targets_of(targets), auto=auto)
-    session.look_factor = 1.2
     pace = Pace(run.bench.rate_degps or 20.0, run.bench.acceleration_degps2 or 40.0)
     plan = replace(Itinerary(run.bench, pace), **itinerary)
     rules = Rules(plan.reach, plan.pace)

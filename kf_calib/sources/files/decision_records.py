@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -31,6 +32,14 @@ def decision_records(path: Path, name: str = DECISION_RECORD) -> list[Mapping[st
     except (KfCalibError, OSError, DamagedError):
         return records
     return records
+
+
+def number_of(record: Mapping[str, str], key: str) -> float:
+    """A number of a record; NaN where there is none."""
+    try:
+        return float(record[key])
+    except (KeyError, ValueError):
+        return math.nan
 
 
 def angles_of(text: str) -> tuple[float, ...]:
