@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from run_trial import SteppedTime
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.bench.targets import targets_of
+from kf_calib.bench.paper_parameters import targets_of
 from kf_calib.online.session import Session
 from kf_calib.online.suggestion import Itinerary
 from kf_calib.positioning.drive import Decision, Drive

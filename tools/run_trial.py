@@ -99,7 +99,7 @@ class Fixed:
         rows, factor, sigmas = prospect.rows(poses), prospect.start, list[Floats]()
         for k in order:
             factor = triangle(np.vstack([factor, rows[k]]))
-            blind = optimality_criteria.unseen(factor).any()
+            blind = optimality_criteria.is_unseen(factor).any()
             sigma = optimality_criteria.sigmas(factor) * prospect.units
             sigmas.append(np.full(12, np.inf) if blind else sigma[:12])
         way = np.vstack([np.zeros(poses.shape[1]), poses[order]])

@@ -11,8 +11,8 @@ import numpy as np
 
 from kf_calib.bench.arrays import lengths
 from kf_calib.bench.bench import Bench
+from kf_calib.bench.raw_input import LEVELS, wrong_unit
 from kf_calib.bench.streams import Source
-from kf_calib.bench.wrong_unit import LEVELS, wrong_unit
 from kf_calib.dwells import tabulated, window_average
 from kf_calib.dwells.blocks import LARGEST_RAD, Block, Tally
 from kf_calib.dwells.folding import Folder

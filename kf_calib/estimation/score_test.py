@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.bench.paper_parameters import STATE_COUNT
-from kf_calib.dwells.line_spectrum import Line
+from kf_calib.dwells.line_spectrum import SpectralLine
 from kf_calib.dwells.qr import orthonormal
 from kf_calib.dwells.sufficient_statistics import DwellFactor, lines_of
 from kf_calib.effects import Effect, Stimulus
@@ -173,7 +173,7 @@ class Frame:
         self._whitening = None if _inside(noise) else MisfitColumns(linearised.dwells_at_state, noise, linearised.state)
         self.basis, self.coordinates = orthonormal(self.whitened(linearised, effects))
         self._periodogram: tuple[tuple[tuple[str, float], bytes], Periodogram] | None = None
-        self._lines: dict[float, tuple[Line, ...]] = {}
+        self._lines: dict[float, tuple[SpectralLine, ...]] = {}
         self._last: tuple[LinearisedDwells, Floats, Floats, int] | None = None
 
     @property
@@ -214,7 +214,7 @@ class Frame:
         rows, width = _judged(linearised.dwells_at_state, both, self.noise, self.state, STATE_COUNT)
         return _stacked(rows, linearised.dwells, self.noise)[:, width:-1]
 
-    def lines(self, level: float) -> tuple[Line, ...]:
+    def lines(self, level: float) -> tuple[SpectralLine, ...]:
         """Oscillations found in the readings at the significance ``level`` (see ``sufficient_statistics.lines_of``);
         they do not depend on the model."""
         if level not in self._lines:

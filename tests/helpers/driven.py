@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from kf_calib.bench.targets import targets_of
+from kf_calib.bench.paper_parameters import targets_of
 from kf_calib.design.gain_per_second import Pace
 from kf_calib.online.session import Session
 from kf_calib.online.suggestion import Itinerary

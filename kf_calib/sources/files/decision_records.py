@@ -11,9 +11,8 @@ from mcap.opcode import Opcode
 from mcap.records import Metadata
 
 from kf_calib.errors import KfCalibError
-from kf_calib.sources.files.mcap_chunks import DamagedError, parse
 from kf_calib.sources.files.mcap_file import McapFile
-from kf_calib.sources.files.mcap_messages import MessageFinder
+from kf_calib.sources.files.mcap_records import DamagedError, MessageFinder, parse_record
 
 DECISION_RECORD = "kf_calib.decision"
 """Where something was decided: number, at_s, purpose, gimbal_deg (JSON list), stay_s, why."""
@@ -27,7 +26,7 @@ def decision_records(path: Path, name: str = DECISION_RECORD) -> list[Mapping[st
     try:
         for block in McapFile(path).blocks(lambda said: None):
             for opcode, content in find(block).others:
-                if opcode == Opcode.METADATA and (record := parse(Metadata.read, content)).name == name:
+                if opcode == Opcode.METADATA and (record := parse_record(Metadata.read, content)).name == name:
                     records.append(record.metadata)
     except (KfCalibError, OSError, DamagedError):
         return records

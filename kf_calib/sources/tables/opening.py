@@ -12,8 +12,8 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, lengths
 from kf_calib.bench.bench import Bench, parse_axes
-from kf_calib.bench.gravity_alone import bench_without_angles
 from kf_calib.bench.raw_input import PLAIN, RawInput, merged_metadata
+from kf_calib.bench.streams import bench_without_angles
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.tables.columns import HOW, KNOWN, QUATERNION, READINGS, SPREADS, Columns
 from kf_calib.sources.tables.grid import grid_of
