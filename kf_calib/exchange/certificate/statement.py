@@ -23,7 +23,7 @@ Country = Annotated[str, StringConstraints(pattern=r"\A[A-Z]{2}\z")]
 StatedPositive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Rule = Literal["simple acceptance", "guard band"]
 
-DIVISORS = {"normal": 1.0, "rectangular": math.sqrt(3.0), "triangular": math.sqrt(6.0), "arcsine": math.sqrt(2.0)}
+DIVISORS = {"rectangular": math.sqrt(3.0), "triangular": math.sqrt(6.0), "arcsine": math.sqrt(2.0)}
 """What a size, half the width of a distribution, is divided by for a standard uncertainty; a normal one has ``k``."""
 
 
