@@ -32,7 +32,7 @@ read-back is wrong; the platform does not stop at its target."""
 _MOST_DWELLS = 512
 _NEVER_NS = 1 << 62
 _RINGING = 8.0  # time constants after which nothing is left of it
-_OFF_DEG, _WRONG_DEG, _RUN_ON_DEG = 0.5, 8.0, 60.0
+_OFF_DEG, _WRONG_DEG, _RUN_ON_DEG = 0.5, 20.0, 60.0
 
 
 @dataclass(frozen=True)
