@@ -1,4 +1,4 @@
-"""Plans: which orientations the simulated bench visits, in which order, and for how long; and how its gimbals move between
+"""Plans: which orientations the simulated bench visits, in which order, and for how long; how its gimbals move between
 them: angles over time, and the attitude they make, by scipy's rotations.
 """
 

@@ -90,7 +90,7 @@ def grow(
     with strict():
         history = VisitHistory.of(result)
         target = _NO_TARGET if judgement is None else judgement.wanted
-        _log(result, history, stream, shown, "" if judgement is None else words(judgement), target)
+        _log(result, history, stream, shown, "" if judgement is None else judgement_text(judgement), target)
         if judgement is not None:
             log_next(judgement, stream)
         if lay_out:
@@ -116,7 +116,7 @@ def _log(
 NEXT: Colour = (255, 160, 205)
 
 
-def words(judgement: Judgement) -> str:
+def judgement_text(judgement: Judgement) -> str:
     """The verdict so far, what is suspected, and the next orientation, in Markdown."""
     going = judgement.next_orientation
     lines = [f"**So far**: {judgement.verdict}"]
