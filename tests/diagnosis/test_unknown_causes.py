@@ -125,3 +125,11 @@ def test_a_pose_after_a_whole_turn_is_the_same_orientation() -> None:
     turned = replace(at, angles_rad=at.angles_rad + 2.0 * np.pi * (np.arange(12)[:, None] // 5))
     groups = orientations(kf_calib.calibrate(SmallRun(turned, np.zeros((12, 240, 3)), 4)).fit.dwells)
     assert [group for group in groups if len(group) > 1] == [[0, 8], [1, 9], [2, 10], [3, 11]]
+
+
+def test_memory_in_proportion_to_the_last_step_is_not_surely_settling() -> None:
+    """With time constants far beyond the dwells it is the same: the catalogue does not hold its limit."""
+    diagnosis = diagnosed("in proportion to the last step", 15.0, 1)
+    assert diagnosis.table is not None
+    assert diagnosis.table.probability(["settling"]) < 0.95
+    assert any(row.driver == "previous orientation" and row.probability > 0.05 for row in diagnosis.table.rows)
