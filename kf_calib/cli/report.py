@@ -137,7 +137,7 @@ def measured_of(recording: Path, options: dict[str, Any]) -> Measured:
 
     fingerprint, began = Origin.of(recording).sha256, run_date(recording_of(recording, options))
     is_driven = recording.suffix == ".mcap" and recording.is_file()
-    decided, ends = ((decision_records(recording), decision_records(recording, END_RECORD)) if is_driven else ((), ()))
+    decided, ends = (decision_records(recording), decision_records(recording, END_RECORD)) if is_driven else ((), ())
     return Measured(recording.name, fingerprint, began, decided, ends)
 
 

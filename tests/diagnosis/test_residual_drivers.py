@@ -21,6 +21,7 @@ from kf_calib.diagnosis.residual_drivers import (
     is_function_of,
     unexplained_mps2,
     unexplained_rms_mps2,
+    walk_path,
 )
 from kf_calib.effects import effect_named, names
 from kf_calib.estimation.calibration import calibrate
@@ -117,6 +118,7 @@ def test_the_band_of_an_effect_covers_as_often_as_it_says(runs: int) -> None:
 
 
 def test_the_path_of_a_walk_is_no_residual() -> None:
+    """It is the best prediction from the residuals, of steps between the dwells that add up from each to the end."""
     before = noisy_run(dwells=16, walk_mps2_per_sqrt_s=3e-6, seed=4)
     after = Refits().with_effects(before, ("bias-walk",))
     assert after.noise.walk_mps2_per_sqrt_s > 0.0
@@ -125,6 +127,11 @@ def test_the_path_of_a_walk_is_no_residual() -> None:
     assert np.sqrt(np.mean(ratios**2)) < 1.5
     assert unexplained_rms_mps2(before) == before.residual_rms_mps2
     assert np.array_equal(unexplained_mps2(before), before.residuals_mps2)
+    ends_s = after.linearised.means.ends_s
+    steps_s, later = np.diff([*ends_s.mean(axis=1), ends_s[-1, 1]]), np.triu(np.ones((len(ends_s), len(ends_s))))
+    walk = after.noise.walk_mps2_per_sqrt_s**2 * later @ np.diag(steps_s) @ later.T
+    for path, residual, sigma in zip(walk_path(after).T, after.residuals_mps2.T, mean_sigmas(after).T, strict=True):
+        np.testing.assert_allclose(path, walk @ np.linalg.solve(walk + np.diag(sigma**2), residual), rtol=1e-6)
 
 
 def test_overlaps_of_several_effects_are_those_of_pairs() -> None:

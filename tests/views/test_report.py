@@ -269,6 +269,11 @@ def test_on_a_phone_the_sigmas_are_seen_and_what_is_wider_says_so(browser: Any, 
     page.close()
 
 
+def test_a_page_gives_one_verdict_and_not_that_of_the_misfit_as_a_whole_beside_it(path: Path) -> None:
+    html = path.read_text()
+    assert html.count("Residuals fail") == 1 and "noise alone gives a misfit this large" not in html
+
+
 def test_the_contents_name_every_section_of_the_page(path: Path) -> None:
     html = path.read_text()
     listed = re.findall(r'<li><a href="#(\w+)">([^<]*)</a>', html)

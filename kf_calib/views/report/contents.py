@@ -54,7 +54,7 @@ def _(diagnosed: Diagnosis, measured: Sequence[Measured], commands: Sequence[str
             measured_section(facts(measured[0], diagnosed.before)),
             drawn,
             Section("Explore the residuals", (_explorer_of(diagnosed),)),
-            Section("Parameters", (*_calibrated(diagnosed.before), *_with_what_is_missing(diagnosed))),
+            Section("Parameters", (*_tables(diagnosed.before), *_with_what_is_missing(diagnosed))),
             figures_of("The calibration", diagnosed.before, "run", less=[ON_THEIR_WAY, DIRECTIONS]),
             Section("Suspects, and what this run could show", _evidence(diagnosed)),
             Section("How the bench drove itself", _driven(measured[0])),
@@ -175,6 +175,11 @@ def in_text(drawn: RenderableType, with_notes: bool = False) -> tuple[Part, ...]
 def _calibrated(result: Calibration) -> tuple[Part, ...]:
     """Return the tables of a calibration, less the counts of readings, which are among what was measured."""
     return in_text(console.summary(result))[1:]
+
+
+def _tables(result: Calibration) -> tuple[Part, ...]:
+    """Return the tables alone: of the misfit as a whole, the page would say that it agrees where another test fails."""
+    return tuple(each for each in _calibrated(result) if each.kind == "table")
 
 
 def _evidence(diagnosed: Diagnosis) -> tuple[Part, ...]:
