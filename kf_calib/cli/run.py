@@ -254,7 +254,7 @@ def _show_dry_run(name: str, keys: Mapping[str, str], options: Mapping[str, Any]
         way = route(itinerary.reach, here, pose)
         if way is None:
             raise InputError(
-                f"no way from {views.angles_in_words(np.degrees(here))} to {views.angles_in_words(np.degrees(pose))} "
+                f"no way from {views.angles_in_words(np.degrees(here).tolist())} to {views.angles_in_words(np.degrees(pose).tolist())} "
                 "keeps out of the forbidden zones: widen what the bench file allows."
             )
         stations = [here, *way]
