@@ -132,7 +132,7 @@ def measured_of(recording: Path, options: dict[str, Any]) -> Measured:
     import kf_calib.views.figures  # noqa: F401  # which a page needs
     from kf_calib.diagnosis.selection_journal import Origin
     from kf_calib.sources.files.decision_records import END_RECORD, decision_records
-    from kf_calib.sources.run_date import run_date
+    from kf_calib.sources.opening import run_date
     from kf_calib.views.report.measured import Measured
 
     fingerprint, began = Origin.of(recording).sha256, run_date(recording_of(recording, options))
