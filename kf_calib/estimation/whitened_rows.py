@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -220,7 +221,7 @@ def _of_means(batch: _Batch, columns: Floats, about: _About) -> Floats:
         prior = np.broadcast_to(np.eye(blocks.nuisances, rows.shape[2]), (len(rows), blocks.nuisances, rows.shape[2]))
         rows = np.concatenate([np.concatenate([scaled, rows[..., blocks.nuisances :]], axis=2), prior], axis=1)
         return triangle(rows)[:, blocks.nuisances :, blocks.nuisances :]
-    lower = np.linalg.cholesky(np.eye(3) + scaled @ np.swapaxes(scaled, 1, 2))
+    lower = cast("Floats", np.linalg.cholesky(np.eye(3) + scaled @ np.swapaxes(scaled, 1, 2)))
     return solved_by_lower(lower, rows[..., blocks.nuisances :])
 
 
