@@ -78,11 +78,11 @@ def test_what_the_readings_show_of_an_effect_follows_its_axis(name: str) -> None
             assert np.all(np.abs(rough[steps]) < 0.35 * spread), (name, column)
 
 
-@pytest.mark.parametrize("first", [0.0, 9e-16, -9e-16])
-def test_a_step_at_zero_is_a_function_though_a_zero_holds_rounding(first: float) -> None:
-    """Before the first dwell there was no step: its mean is zero but for rounding, of either sign."""
-    x = np.append(first, np.delete(np.linspace(-15.0, 15.0, 17), 8))[:, None]
-    side = np.append(0.0, np.sign(x[1:, 0]))[:, None]
+@pytest.mark.parametrize("rounding", [0.0, 9e-16, -9e-16])
+def test_a_step_at_zero_is_a_function_though_a_zero_holds_rounding(rounding: float) -> None:
+    """Where a dwell repeats the one before there was no step: its mean is zero but for rounding, of either sign."""
+    x = np.append([rounding] * 4, np.outer([-1.0, 1.0], np.geomspace(0.1, 15.0, 8)))[:, None]
+    side = np.append([0.0] * 4, np.sign(x[4:, 0]))[:, None]
     assert is_function_of(side, x, "m/s^2")
     assert not is_function_of(np.roll(side, 5, axis=0), x, "m/s^2")
 
