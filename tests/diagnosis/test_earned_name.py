@@ -11,9 +11,8 @@ from helpers.long_runs import slow
 from helpers.paths import REAL
 
 import kf_calib
-from kf_calib.diagnosis.earned_name import SEEN, unearned
 from kf_calib.diagnosis.hypothesis_table import Hypothesis
-from kf_calib.diagnosis.missing_effect import diagnose
+from kf_calib.diagnosis.missing_effect import SEEN, diagnose, unearned
 from kf_calib.effects import walk_named
 
 
