@@ -254,7 +254,7 @@ def unearned(row: Hypothesis, before: Calibration, walk: str) -> str:
     if errors[0] is None or errors[1] is None or errors[1] <= _GROWN * errors[0]:
         return ""
     what = "they make" if len(row.effects) > 1 else "it makes"
-    return f"{what} the held-out error larger by {errors[1] / errors[0] - 1.0:.0%}"
+    return f"{what} the held-out error {errors[1] / errors[0]:.3g} times as large"
 
 
 def _largest_ratio(after: Calibration, name: str) -> float:
