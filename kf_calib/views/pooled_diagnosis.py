@@ -8,7 +8,7 @@ from typing import Any
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from kf_calib.diagnosis.earned_name import SEEN
+from kf_calib.diagnosis.missing_effect import SEEN
 from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.fleet.pooled_diagnosis import BenchCoefficients, EffectRow, Finding, PooledDiagnosis, PooledEstimate
 from kf_calib.fleet.pooled_terms import Attribution
