@@ -108,7 +108,7 @@ class Mapper:
             return (yield)
         finally:
             sys.setprofile(None)
-            threading.setprofile(None)  # pyright: ignore[reportArgumentType]
+            threading.setprofile(None)
             self.map.functions[item.nodeid] = sorted(self._called())
             self.map.seconds[item.nodeid] = round(_processor_s() - begun_s, 3)
 
