@@ -15,13 +15,11 @@ the noise is clearly unequal (M. Bartlett, 1937), all dwells have one.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.stack import DwellStack, Folded
-from kf_calib.dwells.sufficient_statistics import Autocovariance, DwellFactor
+from kf_calib.dwells.sufficient_statistics import Autocovariance
 from kf_calib.support.tail_probabilities import chi_squared_tail
 
 _CLEAR_P = 1e-4  # of equal noise; with p-values above it, dwells keep one noise
@@ -37,13 +35,13 @@ def with_own_noise(dwells: DwellStack, along: Floats | None = None) -> DwellStac
 
     along (D, 3): the weights of the channels in the size of the force, where nothing else is known in a dwell.
     """
-    if dwells.folded.dwells[0].averaged:
-        return dwells
     folded, free = dwells.folded, np.ones(3)
+    if folded.dwells[0].averaged or not folded.autocovariance.blocks:  # as of a table: no reading is known
+        return dwells
     if np.all(weights_of(*_variances(folded, along, free)) == 1.0):  # equal even if no reading told what the next says
         weights = np.ones(len(dwells))
     else:
-        weights = weights_of(*_variances(folded, along, _lost_to_correlation(folded.dwells)))
+        weights = weights_of(*_variances(folded, along, _lost_to_correlation(folded.autocovariance)))
     return dwells if np.array_equal(weights, folded.weights) else _with_weights(dwells, weights)
 
 
@@ -96,7 +94,7 @@ def _variances(folded: Folded, along: Floats | None, lost: Floats) -> tuple[Floa
     """Return the variances (D,) of the readings of each dwell about their course, relative to those of the run, and
     their degrees of freedom (D,), of which autocorrelation takes a part: ``lost`` (3,) as ``_lost_to_correlation``."""
     first = folded.ends[:-1]
-    widths = np.repeat([float(dwell.width) for dwell in folded.dwells], folded.piece_numbers)
+    widths = np.repeat(folded.widths, folded.piece_numbers)
     freedom = np.add.reduceat(np.maximum(folded.piece_counts - widths, 0.0), first)
     if along is not None:
         return folded.squares_along(along) / np.maximum(freedom, 1.0), freedom / lost.mean()
@@ -110,9 +108,8 @@ def _variances(folded: Folded, along: Floats | None, lost: Floats) -> tuple[Floa
     return np.sum(shares * relative, axis=1) / np.maximum(shares.sum(axis=1), 1e-300), shares.sum(axis=1)
 
 
-def _lost_to_correlation(dwells: Sequence[DwellFactor]) -> Floats:
+def _lost_to_correlation(total: Autocovariance) -> Floats:
     """Return by how much autocorrelation r_l enlarges the variance of a variance, 1 + 2 sum of r_l^2, (3,)."""
-    total = sum((dwell.autocovariance for dwell in dwells), Autocovariance())
     if not total.blocks:
         return np.ones(3)
     level = np.where(total.products[0] > 0.0, total.products[0] / total.pairs[0], 1.0)
