@@ -255,8 +255,7 @@ def _show_dry_run(name: str, keys: Mapping[str, str], options: Mapping[str, Any]
         if way is None:
             begin, end = (views.angles_in_words(np.degrees(angles).tolist()) for angles in (here, pose))
             raise InputError(
-                f"no way from {begin} to {end} "
-                "keeps out of the forbidden zones: widen what the bench file allows."
+                f"no way from {begin} to {end} keeps out of the forbidden zones: widen what the bench file allows."
             )
         stations = [here, *way]
         slews_s.append(sum(float(itinerary.pace.slews_s(a, b)) for a, b in zip(stations, way, strict=False)))

@@ -18,8 +18,8 @@ from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration, Parameter, format_p
 from kf_calib.support.units import shown
 from kf_calib.views.console import symbol
-from kf_calib.views.figures.log_axis import label_axis
 from kf_calib.views.figures.residuals import driver_axis, driver_to_show
+from kf_calib.views.figures.scales import label_axis
 from kf_calib.views.figures.style import (
     ACCELEROMETERS,
     BEST,
