@@ -104,7 +104,8 @@ def test_a_dataframe_of_parameters(run: kf_calib.Calibration, kind: str) -> None
 
 def test_a_run_is_printed_alike_whatever_was_imported(run: kf_calib.Calibration) -> None:
     program = "from kf_calib.estimation.calibration import calibrate; import sys; print(calibrate(sys.argv[1]))"
-    printed = subprocess.run([sys.executable, "-c", program, FACES], capture_output=True, text=True, check=True).stdout
+    words = [sys.executable, "-c", program, FACES]
+    printed = subprocess.run(words, capture_output=True, text=True, check=True, timeout=120).stdout
     assert printed.splitlines() == str(run).splitlines() and "Parameters (1σ)" in printed
 
 

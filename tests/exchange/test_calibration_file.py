@@ -120,7 +120,7 @@ def _called(folder: Path, *words: object) -> tuple[int, str, str]:
     """In a process of its own, which knows no effect yet."""
     done = subprocess.run(
         [sys.executable, "-m", "kf_calib", *map(str, words)], cwd=folder, capture_output=True, text=True,
-        env={"PYTHONPATH": str(ROOT), "PATH": "", "OPENBLAS_NUM_THREADS": "1"},
+        env={"PYTHONPATH": str(ROOT), "PATH": "", "OPENBLAS_NUM_THREADS": "1"}, timeout=120,
     )  # fmt: skip
     return done.returncode, done.stdout, done.stderr
 

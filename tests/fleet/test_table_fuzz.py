@@ -167,7 +167,7 @@ def test_tables_that_somebody_else_wrote_are_read_or_refused_in_a_sentence(cases
 def test_damaged_small_files_are_refused_in_a_sentence_or_read(cases: int, tmp_path: Path) -> None:
     """In a process of its own: what Arrow does not expect there ends the process."""
     words = [sys.executable, "-W", "error", "-c", _SMALL_FILES, str(tmp_path), str(cases)]
-    done = subprocess.run(words, cwd=ROOT / "tests", capture_output=True, text=True)
+    done = subprocess.run(words, cwd=ROOT / "tests", capture_output=True, text=True, timeout=500)
     assert done.returncode == 0, done.stderr
     assert 0 < int(done.stdout) < cases
 

@@ -122,7 +122,7 @@ def test_the_file_of_a_standard_stream_is_not_written(here: Path, words: str, st
     ((name, path),) = stream.items()
     command = [sys.executable, "-m", "kf_calib.cli", *words.split(), "--overwrite"]
     with Path(path).open("r+b") as file:
-        done = subprocess.run(command, **{name: file}, stderr=subprocess.PIPE)
+        done = subprocess.run(command, **{name: file}, stderr=subprocess.PIPE, timeout=120)
     assert done.returncode == 2 and b"of this very command" in done.stderr
     assert Path("lines.csv").read_bytes() == before
 
@@ -379,7 +379,7 @@ def test_files_are_written_where_nobody_reads_the_result(here: Path) -> None:
     reading, writing = os.pipe()
     os.close(reading)
     command = [sys.executable, "-m", "kf_calib.cli", "replay", "run.mcap", "--save-model", "m.toml"]
-    done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE)
+    done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, timeout=120)
     os.close(writing)
     assert (done.returncode, done.stderr) == (0, b"") and Path("m.toml").exists()
 
@@ -414,7 +414,7 @@ def test_a_live_run_without_a_reading_leaves_the_earlier_recording(run, here: Pa
 ])  # fmt: skip
 def test_a_live_run_to_which_nothing_came_says_so(here: Path, as_json: list[str], text: bytes, instead: str) -> None:
     words = ["live", "-", "--axes", "y", "--gravity", "9.81", "--record", "out.mcap", *as_json]
-    done = subprocess.run([sys.executable, "-m", "kf_calib", *words], input=text, capture_output=True)
+    done = subprocess.run([sys.executable, "-m", "kf_calib", *words], input=text, capture_output=True, timeout=120)
     said = f"kf-calib: nothing was recorded: no reading came from standard input{instead}: check that the bench is on"
     assert done.returncode == 2 and said in done.stderr.decode() and done.stderr.count(b"\n") == 1
     assert not done.stdout and not Path("out.mcap").exists()
@@ -558,5 +558,6 @@ def test_ctrl_c_is_130(run, here: Path, monkeypatch: pytest.MonkeyPatch) -> None
 @pytest.mark.parametrize("words", ["replay run.mcap --json", "replay run.mcap", "--help", "plan --count 6"])
 def test_an_output_that_takes_nothing_is_exit_2(here: Path, words: str) -> None:
     with Path("/dev/full").open("w") as full:
-        done = subprocess.run([sys.executable, "-m", "kf_calib.cli", *words.split()], stdout=full, stderr=-1)
+        start = [sys.executable, "-m", "kf_calib.cli", *words.split()]
+        done = subprocess.run(start, stdout=full, stderr=-1, timeout=120)
     assert done.returncode == 2 and done.stderr.count(b"\n") == 1 and b"No space left" in done.stderr

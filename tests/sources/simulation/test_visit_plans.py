@@ -102,7 +102,7 @@ def test_a_plan_does_not_depend_on_the_processor() -> None:
     plans = [
         subprocess.run(
             [sys.executable, "-c", code], env={**os.environ, "OPENBLAS_CORETYPE": kernel}, capture_output=True,
-            text=True, check=True,
+            text=True, check=True, timeout=120,
         ).stdout
         for kernel in ("Prescott", "Haswell")
     ]  # fmt: skip
