@@ -21,6 +21,7 @@ from helpers.long_runs import slow
 from helpers.paths import ROOT
 
 import kf_calib
+from kf_calib import effects
 from kf_calib.cli import cli
 
 README = ROOT / "README.md"
@@ -169,17 +170,17 @@ def _written() -> dict[Path, tuple[int, int]]:
 
 
 def _said(command: str) -> str:
-    """What a command line of a page prints in this folder; ours in this process, since many starts take long.
-
-    Not where it loads effects: they would stay in the catalogue of all tests that follow.
-    """
+    """What a command line of a page prints in this folder; ours in this process, since many starts take long, and
+    without the effects of a user's that others have loaded."""
     command, _, given = command.partition(" < ")
     program, *words = shlex.split(command)
-    if program == "kf-calib" and "--effects-from" not in words:
-        ours = CliRunner().invoke(cli, words, input=Path(given.strip()).read_bytes() if given else None)
+    if program == "kf-calib":
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(effects, "_registered", {})
+            ours = CliRunner().invoke(cli, words, input=Path(given.strip()).read_bytes() if given else None)
         assert ours.exit_code == 0, f"{command}: {ours.output} {ours.exception}"
         return _words(ours.stdout)
-    start = {"kf-calib": [sys.executable, "-m", "kf_calib.cli"], "python": [sys.executable]}.get(program, [program])
+    start = [sys.executable] if program == "python" else [program]
     return _words(subprocess.run([*start, *words], capture_output=True, text=True, check=True, timeout=120).stdout)
 
 

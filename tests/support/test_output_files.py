@@ -277,6 +277,7 @@ def _no_links(*_: object) -> None:
     raise OSError(errno.EPERM, "Operation not permitted")
 
 
+@pytest.mark.timeout(120)
 def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path: Path) -> None:
     """And nothing else: not what a process writes that goes on, nor one of another machine."""
     program = (
@@ -334,6 +335,7 @@ def test_a_file_that_finds_no_room_is_told_after_the_result(run, here: Path, wor
     assert Path("old").read_bytes() == MINE and not list(here.glob(".*"))
 
 
+@pytest.mark.timeout(120)
 def test_a_recording_that_finds_no_room_is_told_at_once(here: Path) -> None:
     """Though more readings would come."""
     words = ["record", "out.mcap", "-", "--axes", "y z x", "--gravity", "9.81"]
@@ -478,6 +480,7 @@ def test_of_two_that_begin_at_once_one_is_refused(tmp_path: Path, monkeypatch: p
     assert sum(len(each.accel) for each in Recording(path)) == 100 and len(list(tmp_path.iterdir())) == 1
 
 
+@pytest.mark.timeout(120)
 def test_a_killed_run_leaves_no_lock(here: Path) -> None:
     words = ["record", "out.mcap", "-", "--axes", "y z x", "--gravity", "9.81"]
     with subprocess.Popen([sys.executable, "-m", "kf_calib.cli", *words], stdin=subprocess.PIPE) as child:
@@ -502,6 +505,7 @@ def test_a_disk_without_room_for_a_reading_leaves_the_earlier_recording(tmp_path
 
 
 @pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
+@pytest.mark.timeout(120)
 def test_a_recording_that_is_ended_early_keeps_its_readings(here: Path, signal_number: int) -> None:
     Path("out.mcap").write_bytes(MINE)
     words = ["record", "out.mcap", "-", "--overwrite", "--axes", "y z x", "--gravity", "9.81"]

@@ -404,6 +404,7 @@ with open_live("-", {"axes": "y z x", "gravity_mps2": "9.81"}, Path(sys.argv[1])
 """
 
 
+@pytest.mark.timeout(120)
 def test_a_killed_process_leaves_all_but_the_end(tmp_path: Path) -> None:
     """tools/bench_live.py measures how much: here, that what is there is whole, without a gap."""
     path, count = tmp_path / "a.mcap", 0
