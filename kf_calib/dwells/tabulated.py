@@ -26,7 +26,7 @@ _CURVE = 3  # basis functions of a piece
 
 
 class TabulatedDwell(Protocol):
-    """A row of a table; ``kf_calib.sources.tables.orientation.Orientation`` is one."""
+    """A row of a table; ``kf_calib.sources.tables.table.Orientation`` is one."""
 
     @property
     def mean_mps2(self) -> Floats: ...

@@ -166,7 +166,9 @@ def within_dwells(
 
 def _correlation(dwells: Sequence[DwellFactor], walk_mps2_per_sqrt_s: float) -> tuple[Floats, Floats]:
     """Return kappa (3,) and the variances (3,) of readings within dwells, less those of a random walk."""
-    total = _total_of(dwells)
+    total = dwells[0].autocovariance
+    for dwell in dwells[1:]:
+        total = total + dwell.autocovariance if dwell.autocovariance.count else total
     if walk_mps2_per_sqrt_s:
         total = replace(total, products=total.products - walk_mps2_per_sqrt_s**2 * _walk_products(dwells))
     known = _of_averages if dwells[0].averaged else _inflation
@@ -174,14 +176,6 @@ def _correlation(dwells: Sequence[DwellFactor], walk_mps2_per_sqrt_s: float) -> 
     if not dwells[0].averaged and total.count < _SHORT * inflation.max() * total.blocks:
         return _alike(total)
     return inflation, variance
-
-
-def _total_of(dwells: Sequence[DwellFactor]) -> Autocovariance:
-    """Return the sums of lagged products of all dwells."""
-    total = dwells[0].autocovariance
-    for dwell in dwells[1:]:
-        total = total + dwell.autocovariance if dwell.autocovariance.count else total
-    return total
 
 
 def _sigma_along(stack: DwellStack, along: Floats, inflation: Floats) -> Floats:
