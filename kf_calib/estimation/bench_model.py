@@ -21,34 +21,12 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import TypedDict
 
-from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
-from kf_calib.effects import Effect, effect_named
+from kf_calib.effects import effect_named
 from kf_calib.errors import InputError
+from kf_calib.estimation.known_effect import KnownEffect
 from kf_calib.support.output_files import write_whole
 from kf_calib.support.toml_files import FINITE, TEXT, Misfit, converted, toml_table
-
-
-@dataclass(frozen=True)
-class KnownEffect:
-    """An effect with its coefficients (q,) and their covariance (q, q), SI. It is subtracted from the readings, and
-    that the coefficients are uncertain enlarges the covariance of what is estimated (Schmidt)."""
-
-    effect: Effect
-    coefficients: Floats
-    covariance: Floats
-
-    @property
-    def sentence(self) -> str:
-        """What has been done with it, in words without a full stop."""
-        return f"{self.effect} of the bench is taken from the bench model: subtracted, and its sigma considered"
-
-    @property
-    def root(self) -> Floats:
-        """A root (q, q) of the covariance: changes of the coefficients by one sigma in independent directions."""
-        values, vectors = np.linalg.eigh(self.covariance)
-        return vectors * np.sqrt(np.maximum(values, 0.0))
-
 
 _EXAMPLE = '[[terms]] with effect = "flexure", symbols, coefficients, covariance'
 _ROUNDING = 1e-9

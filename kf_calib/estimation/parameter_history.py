@@ -14,7 +14,8 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.estimation import square_root_information
-from kf_calib.estimation.results import Calibration, Estimate, Parameter, estimate_of
+from kf_calib.estimation.estimate import Estimate, estimate_of
+from kf_calib.estimation.results import Calibration, Parameter
 
 
 @dataclass(frozen=True)

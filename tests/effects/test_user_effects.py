@@ -58,11 +58,8 @@ class Bend(SensorEffect):
 
 
 @pytest.fixture(autouse=True)
-def nothing_registered(monkeypatch: pytest.MonkeyPatch):
+def nothing_registered(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(effects, "_registered", {})
-    effects._register_installed.cache_clear()
-    yield
-    effects._register_installed.cache_clear()
 
 
 def made(expression: str, bench: Bench = BENCH) -> Formula:

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure, FigureBase
 
 from kf_calib.bench.paper_parameters import STATE_COUNT
-from kf_calib.estimation.correlation import correlation
+from kf_calib.estimation.estimate import correlation
 from kf_calib.estimation.parameter_history import ParameterHistory, history_of
 from kf_calib.estimation.results import Calibration
 from kf_calib.views.figures.parameter_panels import MANY
