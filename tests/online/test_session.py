@@ -328,6 +328,18 @@ def test_screen_lines_and_objects_of_a_standing() -> None:
     assert "0 readings" in empty and len(empty.splitlines()) <= 24
 
 
+def test_a_target_is_reached_when_its_sigma_says_so_and_not_when_the_predicted_time_is_over() -> None:
+    session = Session(bench(orientations=8))
+    last = judgements(session)[-1]
+    wanted = 0.9 * last.result.estimate.sigma
+    wanted[0] = 1.1 * last.result.estimate.sigma[0]
+    late = replace(session.standing, judgement=replace(last, wanted=wanted), current=None, elapsed_s=1e6)
+    assert (late.left_s == 0.0).all()
+    rows = [line for line in plain(views.screen(late, None, "sim://"), width=80).splitlines() if line[:1] in "θφKbν"]
+    assert ["reached" in row for row in rows] == [True] + [False] * 11
+    assert ["soon" in row for row in rows] == [False] + [True] * 11
+
+
 REPLAY_KEYS = {"samples", "dwells", "model", "parameters", "noise", "consistency", "residual_rms_mps2",
                "held_out_rms_mps2", "held_out_floor_mps2", "warnings"}  # fmt: skip
 DIAGNOSE_KEYS = {"consistent", "p_value", "verdict", "missing", "suspects", "ambiguity_set", "may_be_scatter",
