@@ -105,7 +105,7 @@ def conclude(
     settings, bench = passed.settings, passed.source.bench
     dwells = DwellStack.of(passed.dwells) if plain is None else plain.dwells
     if plain is None:
-        _refuse_absent(settings.left_out, passed.folder.dwells)
+        _refuse_absent(settings.left_out, passed.folded)
         refuse_unusable(dwells, passed.tally, bench)
     stage.say("estimating")
     if again is not None and passed.model.oscillates:
@@ -232,7 +232,7 @@ def _counted(
 
 def _refuse_absent(left_out: Sequence[int], dwells: Sequence[DwellFactor]) -> None:
     """Raise InputError if a dwell that is to be left out does not exist, since another one was probably meant."""
-    absent = sorted(set(left_out) - {dwell.number for dwell in dwells})
+    absent = sorted(set(left_out) - {dwell.number for dwell in dwells}) if left_out else []
     if absent and dwells:
         raise InputError(
             f"there is no dwell {absent[0]} to leave out (--leave-out): the run has dwells {dwells[0].number} to "

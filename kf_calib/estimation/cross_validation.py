@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.dwells.qr import solved_by_lower, triangle
+from kf_calib.dwells.qr import inverse_of_lower, triangle
 from kf_calib.dwells.stack import DwellStack
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation import square_root_information
@@ -28,7 +28,7 @@ SAME_POSE_DEG = 1.0
 
 _AT_ONCE = 4096  # dwells whose covariances are computed together
 _LEAST_LEFT = 1e-3  # of the information in any direction, without an orientation; with less, digits are lost
-_ROUNDING = 1.0 + 1e-9  # by which cells are larger, so that nearer ones are never two apart
+_ROUNDING = 1.0 + 1e-9  # by which cells are larger, so that what is near is never two apart
 
 
 def orientations(dwells: Sequence[DwellFactor]) -> list[list[int]]:
@@ -50,27 +50,34 @@ def grouped(places: Floats, apart: float) -> list[list[int]]:
     """Indices of places (D, k) in groups: each joins the first group whose first place is nearer than ``apart`` in
     every coordinate.
 
-    Groups are looked up by the cell of their first place in the three coordinates that differ most.
+    Groups are looked up by the cell of their first place in the four coordinates that differ most. A cell is twice as
+    wide as ``apart``, so that what is near lies in the cell itself or in the neighbours on the nearer side.
     """
-    widest = np.argsort(-np.ptp(places, axis=0))[:3]
-    cells = np.floor((places[:, widest] - places[:, widest].min(axis=0)) / (apart * _ROUNDING)).astype(int) + 1
-    sizes = cells.max(axis=0) + 2
-    strides = np.append(1, np.cumprod(sizes[:-1]))
-    around = [int(strides @ step) for step in itertools.product((-1, 0, 1), repeat=len(widest))]
-    groups, at, values = list[list[int]](), dict[int, list[int]](), places.tolist()
-    for k, cell in enumerate((cells @ strides).tolist()):
-        nearby = [number for step in around for number in at.get(cell + step, ())]
-        joined = min((g for g in nearby if _is_near(values[groups[g][0]], values[k], apart)), default=-1)
-        if joined >= 0:
-            groups[joined].append(k)
-        else:
-            at.setdefault(cell, []).append(len(groups))
-            groups.append([k])
+    groups, at = list[list[int]](), dict[int, list[int]]()
+    widest = np.argsort(-np.ptp(places, axis=0))[:4]
+    scaled = (places[:, widest] - places[:, widest].min(axis=0)) / (2.0 * apart * _ROUNDING) + 1.0
+    cells = np.floor(scaled).astype(int)
+    strides = np.append(1, np.cumprod(cells.max(axis=0)[:-1] + 2))
+    sides, choices = (
+        np.where(scaled - cells < 0.5, -strides, strides),
+        np.array([*itertools.product((0, 1), repeat=len(widest))]),
+    )
+    for first in range(0, len(places), _AT_ONCE):
+        part = slice(first, first + _AT_ONCE)
+        around = (cells[part] @ strides)[:, None] + sides[part] @ choices.T
+        for k, (cell, *others) in enumerate(around.tolist(), first):
+            nearby = [number for near in (cell, *others) if near in at for number in at[near]]
+            joined = min((g for g in nearby if _is_near(places[groups[g][0]], places[k], apart)), default=-1)
+            if joined >= 0:
+                groups[joined].append(k)
+            else:
+                at.setdefault(cell, []).append(len(groups))
+                groups.append([k])
     return groups
 
 
-def _is_near(one: list[float], other: list[float], apart: float) -> bool:
-    return all(abs(a - b) < apart for a, b in zip(one, other, strict=True))
+def _is_near(one: Floats, other: Floats, apart: float) -> bool:
+    return bool((np.abs(one - other) < apart).all())
 
 
 @dataclass(frozen=True)
@@ -185,7 +192,7 @@ def _by_leverage(fitted: Fit, rows: Sequence[Floats], place: NDArray[np.intp]) -
         return None
     lower = cast("Floats", np.linalg.cholesky(left))
     residuals = of_groups[..., -1] - of_groups[..., :-1] @ state
-    solved = solved_by_lower(lower, np.concatenate([shares, residuals[..., None]], axis=2))
+    solved = inverse_of_lower(lower) @ np.concatenate([shares, residuals[..., None]], axis=2)
     more = np.ascontiguousarray(np.swapaxes(solved[..., :-1], 1, 2))
     states = state - (more @ solved[..., -1:])[:, :, 0] @ inverse.T
     return states, _Roots(inverse, more)

@@ -259,8 +259,7 @@ def _sensible(state: Floats) -> bool:
 def _setting_deg(dwells: Sequence[DwellFactor], bench: Bench) -> float | None:
     """Return the stated setting error, deg, combined with the uncertainty of the dwells' poses from noise of the
     angles."""
-    sigmas_rad = np.fromiter((dwell.pose_sigma_rad for dwell in DwellStack.of(dwells).folded.dwells), float)
-    pose_rad = float(np.sqrt(np.mean(sigmas_rad**2)))
+    pose_rad = float(np.sqrt(np.mean(DwellStack.of(dwells).folded.pose_sigmas_rad ** 2)))
     if bench.angle_sigma_deg is None or pose_rad < _EXACT_RAD:
         return bench.angle_sigma_deg
     return math.hypot(bench.angle_sigma_deg, math.degrees(pose_rad))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.piece_values import OfPieces, of_all_pieces
-from kf_calib.dwells.qr import solved_by_lower, triangle
+from kf_calib.dwells.qr import inverse_of_lower, triangle
 from kf_calib.dwells.rows import on_basis
 from kf_calib.dwells.stack import AlikeDwells, DwellStack
 from kf_calib.dwells.sufficient_statistics import DwellFactor
@@ -224,7 +224,7 @@ def _of_means(batch: _Batch, columns: Floats, about: _About) -> Floats:
         rows = np.concatenate([np.concatenate([scaled, rows[..., blocks.nuisances :]], axis=2), prior], axis=1)
         return triangle(rows)[:, blocks.nuisances :, blocks.nuisances :]
     lower = cast("Floats", np.linalg.cholesky(np.eye(3) + scaled @ np.swapaxes(scaled, 1, 2)))
-    return solved_by_lower(lower, rows[..., blocks.nuisances :])
+    return inverse_of_lower(lower) @ rows[..., blocks.nuisances :]
 
 
 def _channels(batch: _Batch, columns: Floats, blocks: _Blocks, about: _About, height: int) -> Floats:

@@ -18,7 +18,8 @@ from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.tables.columns import HOW, KNOWN, QUATERNION, READINGS, SPREADS, Columns
 from kf_calib.sources.tables.grid import grid_of
 from kf_calib.sources.tables.numbers import Numbers
-from kf_calib.sources.tables.table import Orientations, Table
+from kf_calib.sources.tables.orientation import Orientations
+from kf_calib.sources.tables.table import Table
 from kf_calib.sources.tables.times import Times
 from kf_calib.sources.tables.words import ANGLE, NO_HEADER, are_numbers, face_of
 from kf_calib.sources.units import Units, mps2_per, reading_units
