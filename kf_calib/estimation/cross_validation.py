@@ -186,15 +186,18 @@ def _by_leverage(fitted: Fit, rows: Sequence[Floats], place: NDArray[np.intp]) -
     inverse = cast("Floats", np.linalg.inv(factor[:, :-1]))
     state = inverse @ factor[:, -1]
     of_groups = _of_groups(rows, place)
-    shares = of_groups[..., :-1] @ inverse
-    left = np.eye(shares.shape[1]) - shares @ np.swapaxes(shares, 1, 2)
-    if np.linalg.eigvalsh(left)[:, 0].min() < _LEAST_LEFT:
-        return None
-    lower = cast("Floats", np.linalg.cholesky(left))
-    residuals = of_groups[..., -1] - of_groups[..., :-1] @ state
-    solved = inverse_of_lower(lower) @ np.concatenate([shares, residuals[..., None]], axis=2)
-    more = np.ascontiguousarray(np.swapaxes(solved[..., :-1], 1, 2))
-    states = state - (more @ solved[..., -1:])[:, :, 0] @ inverse.T
+    count, height = of_groups.shape[:2]
+    states, more = np.empty((count, width)), np.empty((count, width, height))
+    for part in (slice(k, k + _AT_ONCE) for k in range(0, count, _AT_ONCE)):
+        shares = of_groups[part, :, :-1] @ inverse
+        left = np.eye(height) - shares @ np.swapaxes(shares, 1, 2)
+        if np.linalg.eigvalsh(left)[:, 0].min() < _LEAST_LEFT:
+            return None
+        residuals = of_groups[part, :, -1:] - of_groups[part, :, :-1] @ state[:, None]
+        lower = cast("Floats", np.linalg.cholesky(left))
+        solved = inverse_of_lower(lower) @ np.concatenate([shares, residuals], axis=2)
+        more[part] = np.swapaxes(solved[..., :-1], 1, 2)
+        states[part] = state - (more[part] @ solved[..., -1:])[:, :, 0] @ inverse.T
     return states, _Roots(inverse, more)
 
 
@@ -207,10 +210,11 @@ def _of_groups(rows: Sequence[Floats], place: NDArray[np.intp]) -> Floats:
     stacked, firsts, width = np.concatenate(rows)[order], np.cumsum(sizes) - sizes, rows[0].shape[1]
     of_groups = np.zeros((len(sizes), min(int(sizes.max()), width - 1), width))
     for size in np.unique(sizes).tolist():
-        chosen = np.flatnonzero(sizes == size)
-        ours = stacked[firsts[chosen, None] + np.arange(size)]
-        ours = triangle(ours)[:, : width - 1] if size >= width else ours
-        of_groups[chosen, : ours.shape[1]] = ours
+        alike = np.flatnonzero(sizes == size)
+        for chosen in (alike[k : k + _AT_ONCE] for k in range(0, len(alike), _AT_ONCE)):
+            ours = stacked[firsts[chosen, None] + np.arange(size)]
+            ours = triangle(ours)[:, : width - 1] if size >= width else ours
+            of_groups[chosen, : ours.shape[1]] = ours
     return of_groups
 
 
