@@ -17,11 +17,12 @@ from kf_calib.dwells.coherent_tone import band_hz
 from kf_calib.dwells.line_spectrum import SpectralLine, lowest_hz
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects import Effect, effect_named, names, oscillation_of, slew_effects, walk_named
+from kf_calib.estimation.candidate_scan import Candidate, Scan
 from kf_calib.estimation.dwell_columns import stimulus_of
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.results import consistency
-from kf_calib.estimation.score_test import Candidate, Frame, Scan
+from kf_calib.estimation.score_test import Frame
 from kf_calib.support import stage
 from kf_calib.support.tail_probabilities import LEVEL, sidak
 

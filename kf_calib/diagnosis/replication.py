@@ -31,10 +31,10 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.evidence import size_evidence
 from kf_calib.dwells.qr import triangle
 from kf_calib.effects import Effect
-from kf_calib.estimation.complement import Complement
+from kf_calib.estimation.candidate_scan import Complement, Scan, scan_of, slices
 from kf_calib.estimation.cross_validation import orientations
 from kf_calib.estimation.results import Calibration, Consistency
-from kf_calib.estimation.score_test import Frame, Scan, scan_of, slices
+from kf_calib.estimation.score_test import Frame
 from kf_calib.support.tail_probabilities import LEVEL, f_tail
 
 FEWEST = 12

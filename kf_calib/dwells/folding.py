@@ -10,11 +10,11 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.coherent_tone import MOST_CELLS, Cells, Trace
 from kf_calib.dwells.line_spectrum import Spectrum
-from kf_calib.dwells.orthonormal_parabola import orthonormal_parabola
 from kf_calib.dwells.pieces import MOST_PIECES, Piece, coarsened
 from kf_calib.dwells.qr import square_triangle
 from kf_calib.dwells.rows import Rows, basis
 from kf_calib.dwells.sufficient_statistics import Autocovariance, DwellFactor
+from kf_calib.dwells.window_average import orthonormal_parabola
 
 _CORRELATED_SAMPLES = 8192  # first readings of a dwell over which its autocovariance is accumulated, at least
 

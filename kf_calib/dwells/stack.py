@@ -16,10 +16,15 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.bench.bench import turned
-from kf_calib.dwells.attitude_error import AttitudeError
 from kf_calib.dwells.piece_values import PieceIndices
 from kf_calib.dwells.rows import parabola
-from kf_calib.dwells.sufficient_statistics import LEAST_FREEDOM, Autocovariance, DwellFactor, rate_or_zero
+from kf_calib.dwells.sufficient_statistics import (
+    LEAST_FREEDOM,
+    AttitudeError,
+    Autocovariance,
+    DwellFactor,
+    rate_or_zero,
+)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

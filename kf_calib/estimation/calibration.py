@@ -30,6 +30,7 @@ from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation import kalman_filterpy, square_root_information
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.dwell_pass import Pass, refuse_unusable
+from kf_calib.estimation.estimate import Estimate, estimate_of, estimates
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.free_attitude import holding_frame
 from kf_calib.estimation.iterated_fit import fit
@@ -38,16 +39,7 @@ from kf_calib.estimation.observability import visibility_of
 from kf_calib.estimation.oscillation_carrier import fitted_to, on_carrier
 from kf_calib.estimation.outlying_dwell import outlying_dwells, outlying_in_words
 from kf_calib.estimation.remarks import misfit_remark, remarks_on
-from kf_calib.estimation.results import (
-    Calibration,
-    Consistency,
-    Estimate,
-    OutlyingDwell,
-    Visit,
-    consistency,
-    estimate_of,
-    estimates,
-)
+from kf_calib.estimation.results import Calibration, Consistency, OutlyingDwell, Visit, consistency
 from kf_calib.estimation.samples import Samples, samples_of
 from kf_calib.estimation.settings import Settings
 from kf_calib.noise.noise_model import considered_information, mean_covariances

@@ -26,8 +26,9 @@ from kf_calib.bench.streams import Source
 from kf_calib.dwells.qr import triangle
 from kf_calib.estimation.calibration import calibrate, filterpy_estimate
 from kf_calib.estimation.dwell_pass import Pass
+from kf_calib.estimation.estimate import Estimate
 from kf_calib.estimation.free_attitude import holding_frame
-from kf_calib.estimation.results import Calibration, Estimate
+from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.samples import Samples, samples_of
 from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.square_root_information import scale_columns

@@ -319,7 +319,7 @@ def placed_on_grid(fitted: Fit) -> Model:
     stimulus = stimulus_of(fitted.linearised.dwells_at_state, model.bench, fitted.linearised.state)
     for effect in model.unknowns.values():
         grid = [effect.at(value) for value in effect.grid(stimulus)]
-        model = model.with_effect(grid[_best(fitted, model - effect, grid)])
+        model = model.with_effect(grid[int(np.argmax(_delta_chi2(fitted, model - effect, grid)))])
     return model
 
 
@@ -341,12 +341,6 @@ def averaged_over_posterior(fitted: Fit) -> tuple[Model, dict[str, float]]:
         spreads[str(effect)] = float(np.sqrt(np.average((middles - mean) ** 2 + widths**2 / 12.0, weights=weights)))
         model = model.with_effect(effect.at(math.exp(mean)))
     return model, spreads
-
-
-def _best(fitted: Fit, rest: Model, grid: Sequence[Effect]) -> int:
-    """Return the index of the value in ``grid`` at which the effect lowers chi-squared most beside the ``rest`` of the
-    model."""
-    return int(np.argmax(_delta_chi2(fitted, rest, grid)))
 
 
 def _delta_chi2(fitted: Fit, rest: Model, grid: Sequence[Effect]) -> Floats:

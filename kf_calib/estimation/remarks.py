@@ -13,7 +13,8 @@ from kf_calib.dwells import window_average
 from kf_calib.effects import remarks_of
 from kf_calib.estimation import free_attitude, setup_blunders
 from kf_calib.estimation.dwell_columns import LinearisedDwells
-from kf_calib.estimation.results import Consistency, Estimate
+from kf_calib.estimation.estimate import Estimate
+from kf_calib.estimation.results import Consistency
 from kf_calib.noise.noise_model import TOO_SHORT, Noise
 from kf_calib.noise.reml import ENOUGH_DIRECTIONS, FEWEST, degrees_of_freedom, directions
 from kf_calib.noise.temperature_course import temperature_course

@@ -76,7 +76,9 @@ def whiten(
         else:
             rows, count = _weighted(batch, of_batch, noise_about)
             if informative is None:
-                whitened = _less(rows, count)
+                # rows (d, r, n) off their first ``count`` columns, without these columns
+                nuisances = np.linalg.qr(rows[..., :count])[0]
+                whitened = rows[..., count:] - nuisances @ (np.swapaxes(nuisances, 1, 2) @ rows[..., count:])
             else:
                 whitened = _informative(triangle(rows)[:, count:, count:], informative)
         for k, of_dwell in zip(batch.dwells.tolist(), whitened, strict=True):
@@ -263,12 +265,6 @@ def _unit_along(batch: _Batch, noise: Noise, state: Floats) -> Floats:
 def _combined(parts: Floats, along: Floats) -> Floats:
     """Return the rows (d, 1, r, n) of whitened channels (d, 3, r, n) along unit vectors (d, 3)."""
     return np.einsum("di,dirn->drn", along, parts)[:, None]
-
-
-def _less(rows: Floats, count: int) -> Floats:
-    """Project rows (d, r, n) off their first ``count`` columns and drop these columns."""
-    nuisances = np.linalg.qr(rows[..., :count])[0]
-    return rows[..., count:] - nuisances @ (np.swapaxes(nuisances, 1, 2) @ rows[..., count:])
 
 
 def misfit_rows(

@@ -25,11 +25,12 @@ from kf_calib.estimation.calibration import calibrate, evaluate
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.engine_comparison import compare
+from kf_calib.estimation.estimate import Estimate
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.iterated_fit import fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.prior import PRIORS
-from kf_calib.estimation.results import Calibration, Estimate
+from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
 from kf_calib.noise.noise_model import Noise as NoiseModel
 from kf_calib.noise.noise_model import within_dwells

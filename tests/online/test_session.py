@@ -622,6 +622,7 @@ def test_a_viewer_that_cannot_open_says_why(tmp_path: Path, monkeypatch: pytest.
     assert "no display" in view.trouble
 
 
+@pytest.mark.timeout(120)
 def test_a_screen_on_a_terminal() -> None:
     """A pseudo-terminal: the screen is drawn, ``q`` ends the run, the summary stays."""
     import pty

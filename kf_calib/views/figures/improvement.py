@@ -31,7 +31,7 @@ from kf_calib.views.figures.style import (
     say,
     styled,
 )
-from kf_calib.views.figures.words import wrapped
+from kf_calib.views.figures.symbols import wrapped
 
 _COLUMNS = 5  # models whose residuals are drawn
 _COEFFICIENTS, _WIDE = 6, 3  # panels of coefficients, and in a row
