@@ -63,10 +63,10 @@ class Folded:
 
     @cached_property
     def autocovariance(self) -> Autocovariance:
-        """The sums of lagged products of all dwells."""
-        total = self.dwells[0].autocovariance
+        """The sums of lagged products of all dwells, by the weights of their readings."""
+        total = self.dwells[0].autocovariance.times(self.dwells[0].weight)
         for dwell in self.dwells[1:]:
-            total = total + dwell.autocovariance if dwell.autocovariance.count else total
+            total = total + dwell.autocovariance.times(dwell.weight) if dwell.autocovariance.count else total
         return total
 
     @cached_property
@@ -110,11 +110,25 @@ class Folded:
         return np.add.reduceat(self.piece_counts, self.ends[:-1])
 
     @cached_property
+    def weights(self) -> Floats:
+        """Weights (D,) of the readings of each dwell."""
+        return np.fromiter((dwell.weight for dwell in self.dwells), float, len(self.dwells))
+
+    @cached_property
     def squares(self) -> Floats:
         """Sums of squares (pieces, 3) of the readings about their fit by the basis functions."""
         squares = np.zeros((int(self.ends[-1]), 3))
         for shape, triangles in zip(self.shapes, self.triangles, strict=True):
             squares[shape.pieces] = (triangles[:, :, shape.width :, shape.width :] ** 2).sum(axis=2)
+        return squares
+
+    def squares_along(self, along: Floats) -> Floats:
+        """Sums of squares (D,) of the readings about their fit by the basis functions, combined over the channels by
+        ``along`` (D, 3)."""
+        squares = np.empty(len(self.dwells))
+        for shape, triangles in zip(self.shapes, self.triangles, strict=True):
+            left = triangles[:, :, shape.width :, shape.width :] @ along[shape.dwells][:, None, :, None]
+            squares[shape.dwells] = (left**2).sum(axis=(1, 2, 3))
         return squares
 
     @cached_property

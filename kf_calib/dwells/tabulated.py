@@ -88,6 +88,10 @@ class FoldedTable(Folded):
         return np.full(len(self.dwells), _CURVE)
 
     @cached_property
+    def weights(self) -> Floats:
+        return np.ones(len(self.dwells))
+
+    @cached_property
     def moving(self) -> Mask:
         return np.zeros(len(self.dwells), bool)
 

@@ -183,8 +183,9 @@ def _weighted(batch: _Batch, columns: Floats, about: _About) -> tuple[Floats, in
     blocks = _blocks_of(about, columns.shape[-1])
     parts = _channels(batch, columns, blocks, about, columns.shape[2])
     sigma = noise.effective_sigma_mps2
-    parts /= sigma[:, None, None]
-    walks = np.repeat((noise.walk_mps2_per_sqrt_s / sigma)[None], many, axis=0)
+    roots = np.sqrt(batch.stack.folded.weights[batch.dwells])
+    parts /= sigma[:, None, None] / roots[:, None, None, None]
+    walks = roots[:, None] * (noise.walk_mps2_per_sqrt_s / sigma)
     if noise.attitude_unknown:
         along = _unit_along(batch, noise, about.state)
         parts, walks = _combined(parts, along), np.sqrt((along**2)[:, None] @ (walks**2)[:, :, None])[:, :, 0]
@@ -306,6 +307,7 @@ class _Alike:
     - pieces (d, pieces), rows (d, r): which of all pieces and rows are theirs.
     - triangles (d, pieces, K, K): of the basis functions. nuisances (d, r, n): orthonormal basis of nuisance states.
     - along (d, 3): by which whitened channels are combined where attitudes are not known; else None.
+    - roots (d,): of the weights of their readings.
     """
 
     pieces: NDArray[np.intp]
@@ -313,6 +315,7 @@ class _Alike:
     triangles: Floats
     nuisances: Floats
     along: Floats | None
+    roots: Floats
 
 
 class MisfitColumns:
@@ -341,6 +344,7 @@ class MisfitColumns:
                 batch.triangles[:, :, :width, :width],
                 np.linalg.qr(rows[..., :count])[0],
                 _unit_along(batch, noise, state) if noise.attitude_unknown else None,
+                np.sqrt(stack.folded.weights[batch.dwells]),
             )
             self._groups.append(group)
 
@@ -351,7 +355,8 @@ class MisfitColumns:
             stacked = columns[group.pieces]  # (d, pieces, K, 3, q)
             many, pieces, width, _, count = stacked.shape
             on_triangles = group.triangles @ on_basis(stacked.reshape(many, pieces, width, 3 * count))
-            parts = np.moveaxis(on_triangles.reshape(stacked.shape) / self._sigma[:, None], 3, 1)
+            sigma = self._sigma[:, None] / group.roots[:, None, None, None, None]
+            parts = np.moveaxis(on_triangles.reshape(stacked.shape) / sigma, 3, 1)
             parts = parts.reshape(many, 3, pieces * width, count)
             if group.along is not None:
                 parts = _combined(parts, group.along)

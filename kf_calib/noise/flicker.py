@@ -61,6 +61,7 @@ def _amplitudes(stack: DwellStack, predicted: Floats, sigma: Floats, weights: Fl
         back = np.swapaxes(waves, 1, 2)
         inverse = np.linalg.pinv(back @ waves, rcond=1e-9, hermitian=True)
         spreads = np.maximum(np.einsum("dkk->dk", inverse), 1e-300)[:, :, None] * (ours**2 @ sigma**2)[:, None]
+        spreads /= stack.folded.weights[shape.dwells, None, None]
         amplitudes[shape.dwells], variances[shape.dwells] = inverse @ (back @ left), spreads
     return amplitudes, variances
 

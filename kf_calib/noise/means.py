@@ -22,7 +22,7 @@ class Means:
 
     - design (D, 3, p): the model's columns.
     - readings (D, 3), force_mps2 (D, 3): readings and specific force.
-    - counts (D,): number of readings.
+    - counts (D,): number of readings, each as many as its weight says.
     - ends_s (D, 2): when each dwell begins and ends.
     - bending (D, 3, 3): by how much effects change the readings per unit of force (``AttitudeError``).
     """
@@ -57,7 +57,7 @@ def means_of(dwells: Sequence[DwellFactor], columns: Sequence[Floats]) -> Means:
             of_pieces[pieces] = (first[k : k + _AT_ONCE, :, None] @ coefficients)[:, :, 0]
     design = folded.weighted(of_pieces).reshape(len(stack), *values.shape[2:])
     return Means(
-        design, stack.means[:, 4:], stack.felt_means_mps2, folded.counts, folded.ends_s, stack.bendings
+        design, stack.means[:, 4:], stack.felt_means_mps2, folded.weights * folded.counts, folded.ends_s, stack.bendings
     )  # fmt: skip
 
 

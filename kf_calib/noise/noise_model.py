@@ -152,9 +152,10 @@ def within_dwells(
         inflation, variance = stack.folded.known["correlation"]
     if along is not None:
         return Noise(_sigma_along(stack, along, inflation), inflation, within_seen=within_seen)
-    squares, counts = stack.folded.squares, stack.folded.piece_counts
+    counts, of_pieces = stack.folded.piece_counts, np.repeat(stack.folded.weights, stack.folded.piece_numbers)
+    squares = of_pieces[:, None] * stack.folded.squares
     if walk_mps2_per_sqrt_s:
-        rest = np.concatenate([dwell.walk.about_parabola for dwell in dwells])
+        rest = np.concatenate([dwell.weight * dwell.walk.about_parabola for dwell in dwells])
         squares = np.maximum(squares - walk_mps2_per_sqrt_s**2 * rest[:, None], 0.0)
     on_carrier = dwells[0].width - 3
     long = counts[:, None] >= np.where(variance > 0, 40.0 * inflation, 0.0)
@@ -182,12 +183,8 @@ def _sigma_along(stack: DwellStack, along: Floats, inflation: Floats) -> Floats:
 
     The likeliest variances of such gamma distributed sums, by steps that keep them positive.
     """
-    weights = along**2
-    folded = stack.folded
-    squares = np.empty(len(stack))
-    for shape, triangles in zip(folded.shapes, folded.triangles, strict=True):
-        left = triangles[:, :, shape.width :, shape.width :] @ along[shape.dwells][:, None, :, None]
-        squares[shape.dwells] = (left**2).sum(axis=(1, 2, 3))
+    weights, folded = along**2, stack.folded
+    squares = folded.weights * folded.squares_along(along)
     freedom = np.add.reduceat(np.maximum(folded.piece_counts - 3.0 * inflation.mean(), 0.0), folded.ends[:-1])
     if not freedom.any():
         freedom = np.maximum(folded.counts - 1.0, 0.0)
@@ -207,7 +204,9 @@ def _walk_products(dwells: Sequence[DwellFactor]) -> Floats:
     for dwell in dwells:
         known, period_s = dwell.autocovariance, (dwell.end_s - dwell.start_s) / max(dwell.count - 1, 1)
         if known.blocks:
-            products += walk_path.lagged_products(period_s, max(round(known.count / known.blocks), 1), known.pairs)
+            products += dwell.weight * walk_path.lagged_products(
+                period_s, max(round(known.count / known.blocks), 1), known.pairs
+            )
     return products[:, None]
 
 

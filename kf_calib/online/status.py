@@ -8,6 +8,7 @@ result may have changed. The final judgement is that of ``diagnose``.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -310,7 +311,7 @@ def judge_so_far(passed: Pass, wanted: Floats, before: Judgement | None = None) 
         return Judgement(result, look, watch, wanted, _course(result, wanted), sigma_before=sigma_before)
 
 
-def _sequential_test(dwells: list[DwellFactor], result: Calibration, watch: Watch | None) -> Watch | None:
+def _sequential_test(dwells: Sequence[DwellFactor], result: Calibration, watch: Watch | None) -> Watch | None:
     """Return the sequential test with all dwells so far, begun again if the model has changed; None if too few."""
     bench, settings = result.bench, result.settings
     if len(dwells) < _least(result):
