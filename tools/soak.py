@@ -43,7 +43,7 @@ def live(folder: Path, hours: int, sample_hz: float) -> dict[str, Any]:
     """A bench that visits an orientation an hour."""
     recording, began_s = folder / "week.mcap", time.monotonic()
     query = f"sample_hz={sample_hz:g}&angle_hz={ANGLE_HZ:g}&dwell_s=3590&orientations={hours}&seed=7&speed=inf"
-    words = ["live", f"sim://?{query}", "--record", str(recording), "--overwrite", "--json"]
+    words = ["live", f"sim://?{query}", "--record", str(recording), "--json"]
     process = subprocess.Popen([*COMMAND, *words], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
     assert process.stdout is not None
     memory, last = dict[int, float](), dict[str, Any]()
@@ -114,7 +114,9 @@ def main() -> None:
     for one in (week, many):
         one.add_argument("folder", type=Path)
     chosen = parser.parse_args()
-    chosen.folder.mkdir(parents=True, exist_ok=True)
+    if chosen.folder.exists():
+        parser.error(f"{chosen.folder} is there already: give the name of a new folder.")
+    chosen.folder.mkdir(parents=True)
     if chosen.command == "live":
         print(json.dumps(live(chosen.folder, chosen.hours, chosen.sample_hz), indent=1))
     else:

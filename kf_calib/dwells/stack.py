@@ -7,10 +7,10 @@ dwells; a single dwell is made from them only where it is asked for.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from kf_calib.dwells.sufficient_statistics import (
     DwellFactor,
     rate_or_zero,
 )
+from kf_calib.support.computed_sequence import ComputedSequence
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -231,7 +232,7 @@ class Facing:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class DwellStack(Sequence[DwellFactor]):
+class DwellStack(ComputedSequence[DwellFactor]):
     """Dwells in order of time, with what is the same for all of them in arrays.
 
     - folded: the dwells as they were folded.
@@ -270,17 +271,8 @@ class DwellStack(Sequence[DwellFactor]):
     def __len__(self) -> int:
         return len(self.folded.dwells)
 
-    def __iter__(self) -> Iterator[DwellFactor]:
-        return (self[k] for k in range(len(self)))
-
-    @overload
-    def __getitem__(self, index: int) -> DwellFactor: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[DwellFactor]: ...
-    def __getitem__(self, index: int | slice) -> DwellFactor | list[DwellFactor]:
-        if isinstance(index, slice):
-            return [self[k] for k in range(*index.indices(len(self)))]
-        k = range(len(self))[index]
+    def item(self, k: int) -> DwellFactor:
+        """The dwell at an index, made once."""
         if k not in self._made:
             self._made[k] = self._dwell(k)
         return self._made[k]

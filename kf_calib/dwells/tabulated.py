@@ -7,9 +7,9 @@ the scatter about the mean; the rows of u and u^2 are zero, since nothing is kno
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import cached_property
-from typing import Protocol, overload
+from typing import Protocol
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from kf_calib.dwells.line_spectrum import Spectrum
 from kf_calib.dwells.rows import REGRESSORS, Nodes, Rows
 from kf_calib.dwells.stack import DwellStack, Folded
 from kf_calib.dwells.sufficient_statistics import Autocovariance, DwellFactor, Piece
+from kf_calib.support.computed_sequence import ComputedSequence
 
 LEAST_COUNT = 8
 """A standard deviation of fewer readings counts as if there were more readings of more noise: the same sigma of the
@@ -132,7 +133,7 @@ class FoldedTable(Folded):
         return DwellFactor(k + 1, (piece,), *_UNKNOWN)
 
 
-class _RowsAsDwells(Sequence[DwellFactor]):
+class _RowsAsDwells(ComputedSequence[DwellFactor]):
     """The rows of a folded table, each made into a dwell when it is asked for."""
 
     def __init__(self, folded: FoldedTable) -> None:
@@ -141,14 +142,8 @@ class _RowsAsDwells(Sequence[DwellFactor]):
     def __len__(self) -> int:
         return len(self._folded.piece_numbers)
 
-    @overload
-    def __getitem__(self, index: int) -> DwellFactor: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[DwellFactor]: ...
-    def __getitem__(self, index: int | slice) -> DwellFactor | list[DwellFactor]:
-        if isinstance(index, slice):
-            return [self._folded.dwell(k) for k in range(*index.indices(len(self)))]
-        return self._folded.dwell(range(len(self))[index])
+    def item(self, k: int) -> DwellFactor:
+        return self._folded.dwell(k)
 
 
 def _times(table: TabulatedMeans) -> int:

@@ -318,8 +318,8 @@ def _sequential_test(dwells: Sequence[DwellFactor], result: Calibration, watch: 
         return None
     if watch is None or watch.settings.effects != settings.effects:
         return Watch.over(dwells, bench, settings, 0 if watch is None else watch.looks, result.fit)
-    for dwell in dwells[len(watch.dwells) :]:
-        watch = watch.after(dwell, result.fit)
+    for k in range(len(watch.dwells), len(dwells)):
+        watch = watch.after(dwells[k], result.fit, dwells[: k + 1])
     return watch
 
 

@@ -8,7 +8,6 @@ from typing import Any
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from kf_calib.diagnosis.missing_effect import SEEN
 from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.fleet.pooled_diagnosis import EffectRow, Finding, PooledDiagnosis, PooledEstimate
 from kf_calib.fleet.pooled_terms import Attribution
@@ -93,7 +92,7 @@ def _sentence(finding: Finding) -> str:
     share = format_probability(chance)
     if finding.attribution is Attribution.RUN:
         sentence = f"{finding.effect} occurs in single runs, in each by another amount ({share})"
-        beyond_doubt = [each.unit for each in finding.units if _is_seen(each.coefficients)]
+        beyond_doubt = [each.unit for each in finding.units if each.is_seen]
         sentence += f": {_listed(beyond_doubt)}" if beyond_doubt else ""
     else:
         sentence = f"{finding.effect} is {_OF[finding.attribution]} ({share})"
@@ -109,12 +108,6 @@ def _sentence(finding: Finding) -> str:
         sentence += f" ({format_probability(gap.probability)})"
     rivals = [f"{name} ({format_probability(share)})" for name, share in finding.rivals.items()]
     return f"{sentence}. In its place it may be {' or '.join(rivals)}." if rivals else f"{sentence}."
-
-
-def _is_seen(coefficients: Sequence[PooledEstimate]) -> bool:
-    """Return whether a coefficient of a run is beyond 3 sigma."""
-    known = [(each.value, each.sigma) for each in coefficients]
-    return any(value is not None and sigma is not None and abs(value) > SEEN * sigma for value, sigma in known)
 
 
 def _listed(names: Sequence[str]) -> str:

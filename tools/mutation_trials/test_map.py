@@ -134,9 +134,7 @@ class Mapper:
         self.map.write(path)
 
     def _note(self, frame: FrameType, event: str, _: Any) -> None:
-        """Called at calls and returns alone; Python 3.11 has been seen to hang where ``sys.settrace`` follows code that
-        a long process has made and dropped.
-        """
+        """Called at calls and returns; lines, which would take many times as long, are not traced."""
         code = frame.f_code
         if id(code) not in self._now:
             self._now[id(code)] = code
