@@ -28,6 +28,7 @@ from kf_calib.views.report.drawing import Drawing, draw_all
 from kf_calib.views.report.measured import Measured
 from kf_calib.views.report.page import save
 from kf_calib.views.report.parts import PageTable, parts_of
+from kf_calib.views.tables import ConsoleTable
 
 HIDDEN = ROOT / "recordings" / "hidden.mcap"
 EVIL = "<script>document.title='evil'</script>"
@@ -198,7 +199,7 @@ def test_numbers_are_those_of_the_console_with_their_points_in_line(found: kf_ca
     ],
 )  # fmt: skip
 def test_a_number_is_split_at_its_decimal_point(text: str, parts: tuple[str, str, str]) -> None:
-    table = console.Table()
+    table = ConsoleTable()
     table.add_column("x", justify="right")
     table.add_row(text)
     (shown,) = parts_of(table)

@@ -11,8 +11,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from kf_calib.support.plain_text import printable
-from kf_calib.views.tables import Bar
-from kf_calib.views.tables import ConsoleTable as ConsoleTable
+from kf_calib.views.tables import Bar, ConsoleTable
 from kf_calib.views.terminal import Note
 
 _NUMBER = re.compile(r"(?P<whole>.*?\d)(?P<fraction>\.\d+)?(?P<power>e[-+]\d+)?(?P<rest>[^\d.].*)?", re.DOTALL)
