@@ -89,7 +89,7 @@ _HOMES = {
     "Watch": ("online.sequential_test", "Watch"),
 }
 
-shown_by(lambda: import_module("kf_calib.views.notebook"))
+shown_by(lambda: import_module("kf_calib.views.report.page"))
 
 __all__ = [
     "Bench", "Calibration", "Corrected", "Correction", "Diagnosis", "Fleet", "Improvement", "InputError",

@@ -103,7 +103,7 @@ def test_a_package_imports_from_lower_levels_only(own: str) -> None:
 
 
 LEAVES = {
-    "fleet": {"cli.fleet", "views.fleet", "views.pooled_diagnosis", "views.figures.fleet", "views.report.fleet"},
+    "fleet": {"cli.fleet", "views.fleet", "views.figures.fleet", "views.report.fleet"},
     "exchange.certificate": {"cli.certificate", "views.certificate"},
     "reproduction": {"cli.paper", "views.paper", "views.figures.experiment"},
 }

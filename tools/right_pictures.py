@@ -25,8 +25,7 @@ from kf_calib.exchange.verification import Verification, verify
 from kf_calib.support.units import shown
 from kf_calib.views.console import symbol
 from kf_calib.views.figures.convergence import draw_nis
-from kf_calib.views.figures.scales import whole_numbers
-from kf_calib.views.figures.style import ACCELEROMETERS, ALARM, BAND, BEST, GREY, MARKERS, blank, styled
+from kf_calib.views.figures.style import ACCELEROMETERS, ALARM, BAND, BEST, GREY, MARKERS, blank, styled, whole_numbers
 
 RECORDINGS = Path(__file__).resolve().parents[1] / "recordings"
 _SIZE_IN = 11.0, 3.6

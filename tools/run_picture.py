@@ -20,7 +20,7 @@ from kf_calib.positioning.loop import Rules
 from kf_calib.positioning.simulated import SimulatedPositioner
 from kf_calib.sources.simulation.driven import DrivenBench
 from kf_calib.sources.simulation.options import options_from_query, simulation
-from kf_calib.views.figures.directions import on_map, sphere_map
+from kf_calib.views.figures.orientations import on_map, sphere_map
 
 QUERY, TARGETS = "seed=3&sample_hz=50&hide=second-order=25sigma", ("K=2ppm", "b=10ug", "angles=1arcsec")
 COLOURS = {"first": "0.45", "opening": "tab:blue", "sharpen": "tab:green", "tell apart": "tab:red",

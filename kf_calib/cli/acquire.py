@@ -59,7 +59,7 @@ def _hidden_table() -> RenderableType:
     from rich.console import Group
 
     from kf_calib.sources.simulation.injected import INNER, catalogue
-    from kf_calib.views.tables import ConsoleTable
+    from kf_calib.views.terminal import ConsoleTable
 
     kinds = catalogue().values()
     table = ConsoleTable(title=f"{len(kinds)} effects to hide", title_justify="left", box=SIMPLE_HEAD, pad_edge=False)

@@ -210,7 +210,7 @@ def _show_table(
 ) -> None:
     """Print what is in a table of orientations."""
     from kf_calib.sources.tables.survey import LEAST, LEAST_WITHOUT_SIGMA, survey
-    from kf_calib.views.table_overview import TableOverview, table_object, table_report
+    from kf_calib.views.overview import TableOverview, table_object, table_report
 
     table = survey(path, overrides(options), renamed, units_of(options), angles=not options["no_angles"])
     bench = overrides(options)

@@ -238,16 +238,14 @@ def _print(run: LiveRun, judgement: Judgement | HandJudgement, as_json: bool) ->
         _echo(run, json_line(_object(judgement, run.session.standing, run.source.status) | dict(run.further_keys())))
     elif not judgement.final:
         from kf_calib.online.status import Judgement
-        from kf_calib.views.live import line
-        from kf_calib.views.live_hand import hand_line
+        from kf_calib.views.live import hand_line, line
 
         _echo(run, sentence(line(judgement) if isinstance(judgement, Judgement) else hand_line(judgement)))
 
 
 def _object(judgement: Judgement | HandJudgement, standing: Standing | HandStanding, status: Status) -> dict[str, Any]:
     from kf_calib.online.status import Judgement, Standing
-    from kf_calib.views.live import live_object
-    from kf_calib.views.live_hand import hand_object
+    from kf_calib.views.live import hand_object, live_object
 
     if isinstance(judgement, Judgement):
         assert isinstance(standing, Standing)
@@ -272,8 +270,7 @@ def _on_screen(run: LiveRun, name: str, record: Path | None) -> None:
 
     from kf_calib.online.hand_status import HandStanding
     from kf_calib.online.status import Standing
-    from kf_calib.views.live import screen
-    from kf_calib.views.live_hand import hand_screen
+    from kf_calib.views.live import hand_screen, screen
     from kf_calib.views.terminal import PlainConsole
 
     display = Live(console=PlainConsole(), auto_refresh=False, transient=True, redirect_stderr=sys.stderr.isatty())

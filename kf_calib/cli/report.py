@@ -29,7 +29,7 @@ from kf_calib.cli.options import (
 
 if TYPE_CHECKING:
     from kf_calib.diagnosis.results import Diagnosis
-    from kf_calib.views.report.measured import Measured
+    from kf_calib.views.report.contents import Measured
 
 report_option = output_option(
     "--report", metavar="FILE.html", panel=OUTPUT, help="Save a page with figures and tables here; it needs no network."
@@ -133,7 +133,7 @@ def measured_of(recording: Path, options: dict[str, Any]) -> Measured:
     from kf_calib.diagnosis.selection_journal import Origin
     from kf_calib.sources.files.decision_records import END_RECORD, decision_records
     from kf_calib.sources.opening import run_date
-    from kf_calib.views.report.measured import Measured
+    from kf_calib.views.report.contents import Measured
 
     fingerprint, began = Origin.of(recording).sha256, run_date(recording_of(recording, options))
     is_driven = recording.suffix == ".mcap" and recording.is_file()

@@ -14,7 +14,7 @@ from kf_calib.effects import Bearer, Effect, as_text, remarks_of
 from kf_calib.estimation.observability import Visibility
 from kf_calib.support.units import shown
 from kf_calib.views.console import GRADES, effect_rows, size_range, symbol
-from kf_calib.views.tables import ConsoleTable
+from kf_calib.views.terminal import ConsoleTable
 
 _BEARERS = {
     Bearer.BENCH: "the bench, never sensors",

@@ -13,8 +13,7 @@ from kf_calib.exchange.certificate.content import OUTCOMES, Certificate, Certifi
 from kf_calib.support.units import shown
 from kf_calib.views.console import symbol
 from kf_calib.views.json import clean
-from kf_calib.views.tables import ConsoleTable
-from kf_calib.views.terminal import note
+from kf_calib.views.terminal import ConsoleTable, note
 
 
 def certificate_object(certificate: Certificate, standing: str, path: Path, xml: Path | None) -> dict[str, Any]:

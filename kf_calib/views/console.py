@@ -19,8 +19,7 @@ from kf_calib.estimation.results import Calibration, OutlyingDwell, Parameter, f
 from kf_calib.noise.reml import FEWEST, degrees_of_freedom
 from kf_calib.support.printing import printed
 from kf_calib.support.units import rounded, shown, shown_whole
-from kf_calib.views.tables import ConsoleTable
-from kf_calib.views.terminal import PlainConsole, note
+from kf_calib.views.terminal import ConsoleTable, PlainConsole, note
 
 _NOT_ESTIMATED, _NOT_USED = "not estimated", "not used"
 _GREEK = {"theta": "θ", "phi": "φ", "nu": "ν"}

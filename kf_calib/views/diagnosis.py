@@ -27,9 +27,7 @@ from kf_calib.support.units import shown
 from kf_calib.views.console import plain, symbol
 from kf_calib.views.json import clean, outlying_object, readings_object
 from kf_calib.views.next_step import angles_in_words, next_steps
-from kf_calib.views.tables import ConsoleTable
-from kf_calib.views.terminal import note
-from kf_calib.views.text_plot import TextPlot
+from kf_calib.views.terminal import ConsoleTable, TextPlot, note
 
 _MOST = 5
 """Explanations in the table on one screen."""

@@ -22,8 +22,7 @@ from kf_calib.sources.files.contents import CALIBRATED_TOPIC
 from kf_calib.support.units import field_unit, shown
 from kf_calib.views.console import parameter_row, symbol
 from kf_calib.views.json import clean
-from kf_calib.views.tables import ConsoleTable
-from kf_calib.views.terminal import note
+from kf_calib.views.terminal import ConsoleTable, note
 
 _SHOWN = 12
 

@@ -1,5 +1,7 @@
 """The runs of a fleet as a summary, and as a JSON object; how units and chances of a fleet are written in tables and
 figures.
+
+The diagnosis of many runs together, in words and tables.
 """
 
 from __future__ import annotations
@@ -11,15 +13,167 @@ from typing import Any
 from rich.console import Group, RenderableType
 from rich.text import Text
 
+from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.fleet.batch import BatchProgress
 from kf_calib.fleet.overview import FleetOverview
+from kf_calib.fleet.pooled_diagnosis import EffectRow, Finding, PooledDiagnosis, PooledEstimate
+from kf_calib.fleet.pooled_terms import Attribution
 from kf_calib.fleet.results import Fleet, ParameterPopulation
 from kf_calib.support.units import shown
 from kf_calib.views.console import symbol
 from kf_calib.views.json import clean
-from kf_calib.views.pooled_diagnosis import pooled_objects, pooled_report
-from kf_calib.views.tables import ConsoleTable
-from kf_calib.views.terminal import note
+from kf_calib.views.terminal import ConsoleTable, note
+
+_OF = {
+    Attribution.BENCH: "of the bench",
+    Attribution.REPAIRED: "of the bench, changed once",
+    Attribution.SENSORS: "of the type of sensor",
+    Attribution.SOME: "of some units",
+    Attribution.RUN: "of single runs",
+}
+_LISTED = 12  # units that are named in a sentence
+_HAS_IT = 0.5  # probability above which a unit is taken to have an effect
+_LEAST_PROBABILITY = 0.01  # probability below which an effect that was not found is not shown
+
+
+_BORNE_BY = {
+    Attribution.BENCH: "bench",
+    Attribution.REPAIRED: "bench",
+    Attribution.SENSORS: "type",
+    Attribution.SOME: "units",
+    Attribution.RUN: "runs",
+}
+
+
+def pooled_objects(found: PooledDiagnosis) -> list[dict[str, Any]]:
+    """The JSON objects of a pooled diagnosis, one an effect; those that were found come first."""
+    findings = {each.effect: each for each in found.findings}
+    return [_pooled_object(row, findings.get(row.effect)) for row in found.effects]
+
+
+def _pooled_object(row: EffectRow, finding: Finding | None) -> dict[str, Any]:
+    shares, people = row.probabilities or {}, finding.population if finding else None
+    means = [("units", None, each) for each in (people.mean if people else ())]
+    own = [(each.bench, each.since, value) for each in row.benches for value in each.coefficients]
+    return {
+        "effect": row.effect,
+        "borne_by": _BORNE_BY[finding.attribution] if finding else None if row.no_one is None else "none",
+        "probability": shares[finding.attribution] if finding else row.no_one,
+        "probabilities": {each.value: share for each, share in shares.items()},
+        "rivals": dict(finding.rivals) if finding else {},
+        "coefficients": [{"of": of, "since": since, **vars(each)} for of, since, each in [*own, *means]],
+        "spread": people.spread if people else None,
+        "spread_interval": people.spread_interval if people else None,
+        "share": finding.share if finding else None,
+        "share_interval": finding.share_interval if finding else None,
+        "units": [{"unit": each.unit, "probability": each.probability,
+                   "coefficients": [vars(one) for one in each.coefficients]}
+                  for each in (finding.units if finding else ())],
+        "changed": [vars(each) for each in finding.repair.gaps] if finding and finding.repair else [],
+    }  # fmt: skip
+
+
+def pooled_report(found: PooledDiagnosis) -> RenderableType:
+    """A pooled diagnosis for a console: what was found, the probabilities, and the coefficients."""
+    parts: list[RenderableType] = [Text(sentence) for sentence in sentences(found)]
+    rows = [row for row in found.effects if row.no_one is not None and row.no_one < 1.0 - _LEAST_PROBABILITY]
+    if rows:
+        parts.append(_probabilities(rows))
+    return Group(*parts, *(_coefficients(each) for each in found.findings))
+
+
+def sentences(found: PooledDiagnosis) -> list[str]:
+    """A pooled diagnosis in sentences: what the runs show, and of what each effect is."""
+    return [_summary(found), *map(_sentence, found.findings)]
+
+
+def _summary(pooled: PooledDiagnosis) -> str:
+    benches = f"{len(pooled.benches)} bench{'es' if len(pooled.benches) != 1 else ''}"
+    names = ", ".join(each.effect for each in pooled.findings) or "no effect"
+    other = "nothing else is missing" if pooled.findings else "nothing is missing"
+    sure = format_probability(pooled.no_more)
+    return f"{pooled.runs} runs of {pooled.units} units on {benches} show {names} ({sure}: {other})."
+
+
+def _sentence(finding: Finding) -> str:
+    """Return what one effect is of, in a sentence."""
+    chance = finding.probabilities[finding.attribution]
+    share = format_probability(chance)
+    if finding.attribution is Attribution.RUN:
+        sentence = f"{finding.effect} occurs in single runs, in each by another amount ({share})"
+        beyond_doubt = [each.unit for each in finding.units if each.is_seen]
+        sentence += f": {_listed(beyond_doubt)}" if beyond_doubt else ""
+    else:
+        sentence = f"{finding.effect} is {_OF[finding.attribution]} ({share})"
+    if finding.attribution is Attribution.SOME and finding.share_interval is not None:
+        low, high = finding.share_interval
+        having = [each.unit for each in finding.units if each.probability > _HAS_IT]
+        reach = "" if f"{low:.0%}" == f"{high:.0%}" else f" ({low:.0%} to {high:.0%})"
+        sentence += f": {finding.share:.0%} of the units have it{reach}, most likely {_listed(having)}"
+    if finding.repair is not None:
+        gap = finding.repair.gaps[0]
+        sentence += f": it changed between {_moment(gap.after) or gap.after_run} and "
+        sentence += _moment(gap.before) or gap.before_run
+        sentence += f" ({format_probability(gap.probability)})"
+    rivals = [f"{name} ({format_probability(share)})" for name, share in finding.rivals.items()]
+    return f"{sentence}. In its place it may be {' or '.join(rivals)}." if rivals else f"{sentence}."
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = len(names) - _LISTED
+    return ", ".join(names[:_LISTED]) + (f" and {more} more" if more > 0 else "") if names else "none for certain"
+
+
+def _probabilities(rows: Sequence[EffectRow]) -> ConsoleTable:
+    """Return the table of the probabilities of each attribution."""
+    tried = [each for each in Attribution if any(each in (row.probabilities or {}) for row in rows)]
+    table = ConsoleTable(title="What has each effect, and with what probability", title_justify="left")
+    table.add_column("effect")
+    for each in tried:
+        table.add_column(_OF[each], justify="right")
+    table.add_column("of nothing", justify="right")
+    for row in rows:
+        shares = [(row.probabilities or {}).get(each, 0.0) for each in tried]
+        table.add_row(row.effect, *map(format_probability, (*shares, row.no_one or 0.0)))
+    return table
+
+
+def _coefficients(finding: Finding) -> ConsoleTable:
+    """Return the table of the coefficients of one effect."""
+    table = ConsoleTable(title=f"{finding.effect}, {_OF[finding.attribution]} (1σ)", title_justify="left")
+    for heading in ("of", "coefficient", "value", "sigma", "unit"):
+        table.add_column(heading, justify="right" if heading in ("value", "sigma") else "left")
+    for bench in finding.benches:
+        name = bench.bench or "the bench"
+        _add(table, f"{name}, since {_moment(bench.since)}" if bench.since else name, bench.coefficients)
+    if not finding.benches and finding.population is None:
+        for unit_figures in finding.units:
+            if unit_figures.probability > _HAS_IT:
+                _add(table, unit_figures.unit, unit_figures.coefficients)
+    if finding.population is not None:
+        _add(table, "mean of the units", finding.population.mean)
+        unit = finding.population.mean[0].unit
+        low, high = (shown(unit).number(each) for each in finding.population.spread_interval)
+        table.add_row(
+            "spread", "", shown(unit).number(finding.population.spread), f"{low} to {high}", shown(unit).label
+        )
+    return table
+
+
+def _moment(date: str) -> str:
+    """A date to the minute."""
+    return date[:16].replace("T", " ")
+
+
+def _add(table: ConsoleTable, name: str, values: Sequence[PooledEstimate]) -> None:
+    """Add a row for each coefficient."""
+    for k, coefficient in enumerate(values):
+        cells = ("not seen", "")
+        if coefficient.value is not None and coefficient.sigma is not None:
+            value, sigma = shown(coefficient.unit).rounded(coefficient.value, coefficient.sigma)
+            cells = value, f"± {sigma}"
+        table.add_row("" if k else name, symbol(coefficient.symbol), *cells, shown(coefficient.unit).label)
+
 
 _SHOWN = 6
 _REASONS = 2

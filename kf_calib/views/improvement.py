@@ -18,8 +18,7 @@ from kf_calib.support.units import shown
 from kf_calib.views.console import effect_table, parameter_table, symbol
 from kf_calib.views.diagnosis import description_object, description_sentence, orientation_object
 from kf_calib.views.json import clean
-from kf_calib.views.tables import Bar, ConsoleTable
-from kf_calib.views.terminal import note
+from kf_calib.views.terminal import Bar, ConsoleTable, note
 
 _WIDTH = 30  # length of the longest bar in characters
 _EIGHTHS = " ▏▎▍▌▋▊▉"

@@ -15,7 +15,7 @@ from kf_calib.reproduction.grebenkin2019 import NONOPTIMAL_PRINTED, OPTIMAL_PRIN
 from kf_calib.reproduction.grebenkin2019_conditions import AZIMUTHS_DEG, PERIODS_S, ConditionFit, ConditionSearch
 from kf_calib.views.console import symbol
 from kf_calib.views.json import clean
-from kf_calib.views.tables import ConsoleTable
+from kf_calib.views.terminal import ConsoleTable
 
 _ABOUT = {
     "platform": "turns about the platform's axes, the third from the start",

@@ -22,8 +22,7 @@ from kf_calib.support.output_files import write_whole
 from kf_calib.support.units import Unit, shown
 from kf_calib.views.console import symbol
 from kf_calib.views.json import clean
-from kf_calib.views.tables import ConsoleTable
-from kf_calib.views.terminal import note
+from kf_calib.views.terminal import ConsoleTable, note
 
 
 def gimbal_names(made: Plan) -> list[str]:

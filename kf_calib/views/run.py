@@ -13,7 +13,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.sources.files.decision_records import angles_of, number_of
 from kf_calib.support.units import span
 from kf_calib.views.json import clean
-from kf_calib.views.tables import ConsoleTable
+from kf_calib.views.terminal import ConsoleTable
 
 if TYPE_CHECKING:
     from kf_calib.positioning.drive import Decision, Drive, Outcome

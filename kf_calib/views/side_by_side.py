@@ -11,7 +11,7 @@ from kf_calib.support.tail_probabilities import LEVEL
 from kf_calib.support.units import shown
 from kf_calib.views.console import symbol
 from kf_calib.views.json import clean
-from kf_calib.views.tables import ConsoleTable
+from kf_calib.views.terminal import ConsoleTable
 
 
 def verdict(pair: SideBySide) -> str:

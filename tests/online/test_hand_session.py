@@ -26,7 +26,7 @@ from kf_calib.online.hand_status import HandJudgement
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.live import open_live
 from kf_calib.sources.simulation.options import simulation
-from kf_calib.views import live_hand as views
+from kf_calib.views import live as views
 from kf_calib.views.console import plain
 from kf_calib.views.json import replay_object
 

@@ -50,20 +50,20 @@ def _in_figure(module: str, name: str) -> Any:
     return getattr(import_module(f"kf_calib.views.figures.{module}"), name)
 
 
-FAMILIES, KNOWN = _in_figure("hypotheses", "_FAMILIES"), _in_figure("fleet", "_KNOWN")
+FAMILIES, KNOWN = _in_figure("explanations", "_FAMILIES"), _in_figure("fleet", "_KNOWN")
 PALETTES: dict[str, Sequence[str]] = {
     "accelerometers": style.ACCELEROMETERS,
     "accelerometers in the dark": _on_dark(style.ACCELEROMETERS),
     "explorer": _of_page(0),
     "explorer in the dark": _of_page(1),
-    "explanations": [style.BEST, style.RUNNER_UP, _in_figure("suspects", "_FITTING")],
+    "explanations": [style.BEST, style.RUNNER_UP, _in_figure("explanations", "_FITTING")],
     "families": FAMILIES,
     "families in the dark": _on_dark(FAMILIES),
     "verdicts of a fleet": [
         *_in_figure("fleet", "_COLOURS"),
         *(KNOWN[name] for name in ("consistent", "failed", "inconsistent")),
     ],
-    "detection limits": [_in_figure("detection_limits", name) for name in ("_SEEN", "_HIDDEN")],
+    "detection limits": [_in_figure("explanations", name) for name in ("_SEEN", "_HIDDEN")],
     "NIS": ["#222222", style.ALARM],
     "gimbals": _in_figure("orientations", "_GIMBALS"),
     "engines": list(_in_figure("engines", "_COLOURS").values()),

@@ -25,8 +25,7 @@ from kf_calib.errors import InputError
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.dwell_readings import readings_of, worst_dwell
 from kf_calib.support.units import shown_in
-from kf_calib.views.figures.scales import label_axis, plain
-from kf_calib.views.figures.symbols import rounded_number, wrapped
+from kf_calib.views.figures.style import label_axis, rounded_number, short_number, wrapped
 
 HIDDEN = ROOT / "recordings" / "hidden.mcap"
 MICRO_G = 9.80665e-6
@@ -263,7 +262,7 @@ def test_decades_are_labelled_with_their_values() -> None:
     label_axis(axes.yaxis, 0.03, 400.0)
     axes.figure.canvas.draw()
     assert [label.get_text() for label in axes.get_yticklabels()] == ["0.1", "1", "10", "100"]
-    assert plain(1e-7) == "1e-07" and plain(20000.0) == "20000"
+    assert short_number(1e-7) == "1e-07" and short_number(20000.0) == "20000"
 
 
 def test_words_of_effects_stay_whole() -> None:

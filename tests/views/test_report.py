@@ -23,12 +23,10 @@ import kf_calib
 from kf_calib.views import console
 from kf_calib.views.figures import style
 from kf_calib.views.report import drawing
-from kf_calib.views.report.contents import page_of
+from kf_calib.views.report.contents import Measured, page_of
 from kf_calib.views.report.drawing import Drawing, draw_all
-from kf_calib.views.report.measured import Measured
-from kf_calib.views.report.page import save
-from kf_calib.views.report.parts import PageTable, parts_of
-from kf_calib.views.tables import ConsoleTable
+from kf_calib.views.report.page import PageTable, parts_of, save
+from kf_calib.views.terminal import ConsoleTable
 
 HIDDEN = ROOT / "recordings" / "hidden.mcap"
 EVIL = "<script>document.title='evil'</script>"

@@ -34,9 +34,7 @@ from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
 from kf_calib.reproduction.grebenkin2019 import OPTIMAL_PRINTED, Experiment, printed_column, repeat
 from kf_calib.views.figures import experiment as paper
-from kf_calib.views.figures.scales import ticks, written
-from kf_calib.views.figures.style import content_of
-from kf_calib.views.figures.symbols import label
+from kf_calib.views.figures.style import content_of, label, ticks, written
 
 HIDDEN = ROOT / "recordings" / "hidden.mcap"
 MICRO_G = 1.0 / 9.80665e-6

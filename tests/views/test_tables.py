@@ -32,7 +32,7 @@ from kf_calib.reproduction.grebenkin2019 import repeat
 from kf_calib.sources.files.recording import Recording
 from kf_calib.views import catalogue, console, diagnosis, improvement, live, paper
 from kf_calib.views import plan as plans
-from kf_calib.views.tables import Bar, ConsoleTable
+from kf_calib.views.terminal import Bar, ConsoleTable
 
 HIDDEN = ROOT / "recordings" / "hidden.mcap"
 BENCH = Bench.from_metadata({"axes": "y z x", "gravity_mps2": "9.81"})

@@ -15,19 +15,19 @@ from kf_calib.support.extras import need
 need("matplotlib", "plot", "a figure")
 
 from kf_calib.views.figures.collection import Figures, figures, save  # noqa: E402  # after the check
-from kf_calib.views.figures.convergence import convergence, estimates  # noqa: E402
-from kf_calib.views.figures.detection_limits import detection_limits  # noqa: E402
-from kf_calib.views.figures.directions import directions  # noqa: E402
-from kf_calib.views.figures.dwell import dwell  # noqa: E402
+from kf_calib.views.figures.convergence import convergence, estimates, history  # noqa: E402
 from kf_calib.views.figures.engines import allan_deviation, three_ways, whiteness  # noqa: E402
-from kf_calib.views.figures.history import history  # noqa: E402
-from kf_calib.views.figures.hypotheses import hypotheses  # noqa: E402
+from kf_calib.views.figures.explanations import detection_limits, hypotheses, suspects  # noqa: E402
 from kf_calib.views.figures.improvement import improvement, residuals_of_steps  # noqa: E402
-from kf_calib.views.figures.information import correlations, information  # noqa: E402
-from kf_calib.views.figures.orientations import plan, predicted_sigmas  # noqa: E402
-from kf_calib.views.figures.residuals import residuals, what_they_go_with  # noqa: E402
-from kf_calib.views.figures.sphere import on_the_sphere  # noqa: E402
-from kf_calib.views.figures.suspects import suspects  # noqa: E402
+from kf_calib.views.figures.orientations import (  # noqa: E402
+    correlations,
+    directions,
+    information,
+    on_the_sphere,
+    plan,
+    predicted_sigmas,
+)  # fmt: skip
+from kf_calib.views.figures.residuals import dwell, residuals, what_they_go_with  # noqa: E402
 
 __all__ = [
     "Figures", "allan_deviation", "convergence", "correlations", "detection_limits", "directions",

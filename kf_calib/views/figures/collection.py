@@ -21,18 +21,19 @@ from kf_calib.estimation.results import Calibration
 from kf_calib.exchange.history import History
 from kf_calib.support.output_files import write_whole
 from kf_calib.views.figures import style
-from kf_calib.views.figures.convergence import convergence, estimates
-from kf_calib.views.figures.detection_limits import detection_limits
-from kf_calib.views.figures.directions import directions
+from kf_calib.views.figures.convergence import convergence, estimates, history
 from kf_calib.views.figures.engines import allan_deviation, three_ways, whiteness
-from kf_calib.views.figures.history import history
-from kf_calib.views.figures.hypotheses import hypotheses
+from kf_calib.views.figures.explanations import detection_limits, hypotheses, suspects
 from kf_calib.views.figures.improvement import improvement, residuals_of_steps
-from kf_calib.views.figures.information import correlations, information
-from kf_calib.views.figures.orientations import plan, predicted_sigmas
+from kf_calib.views.figures.orientations import (
+    correlations,
+    directions,
+    information,
+    on_the_sphere,
+    plan,
+    predicted_sigmas,
+)
 from kf_calib.views.figures.residuals import residuals, what_they_go_with
-from kf_calib.views.figures.sphere import on_the_sphere
-from kf_calib.views.figures.suspects import suspects
 
 Figures = Mapping[str, Callable[[], Figure]]
 """Title of each figure, and what draws it."""

@@ -14,10 +14,20 @@ from kf_calib.estimation.innovation_tests import InnovationTests, innovation_tes
 from kf_calib.estimation.results import Calibration
 from kf_calib.noise.allan import AllanDeviation
 from kf_calib.support.units import shown
-from kf_calib.views.figures.convergence import draw_nis
-from kf_calib.views.figures.parameter_panels import MANY
-from kf_calib.views.figures.scales import log_scale, whole_numbers, written
-from kf_calib.views.figures.style import ACCELEROMETERS, ALARM, GREY, MARKERS, PALE, blank, say, styled
+from kf_calib.views.figures.convergence import MANY, draw_nis
+from kf_calib.views.figures.style import (
+    ACCELEROMETERS,
+    ALARM,
+    GREY,
+    MARKERS,
+    PALE,
+    blank,
+    log_scale,
+    say,
+    styled,
+    whole_numbers,
+    written,
+)
 
 _WAYS = {"block": "block engine", "filterpy": "filterpy", "batch": "batch least squares"}
 _COLOURS = {"block": "#222222", "filterpy": "#cc79a7", "batch": "#56b4e9"}

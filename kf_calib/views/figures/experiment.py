@@ -17,10 +17,8 @@ from kf_calib.reproduction.grebenkin2019 import (
     printed_column,
 )
 from kf_calib.views.figures.collection import Figures, figures
-from kf_calib.views.figures.parameter_panels import parameter_panels
-from kf_calib.views.figures.scales import log_scale, written
-from kf_calib.views.figures.style import GREY, blank, styled
-from kf_calib.views.figures.symbols import twelve
+from kf_calib.views.figures.convergence import parameter_panels
+from kf_calib.views.figures.style import GREY, blank, log_scale, styled, twelve, written
 
 _SETS = {"optimal": ("#0072b2", "-"), "non-optimal": ("#d55e00", "--")}
 

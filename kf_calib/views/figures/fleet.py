@@ -18,7 +18,6 @@ from kf_calib.fleet.track import Track
 from kf_calib.support.units import shown
 from kf_calib.views.console import symbol
 from kf_calib.views.figures.collection import Figures, figures
-from kf_calib.views.figures.scales import log_scale
 from kf_calib.views.figures.style import (
     ACCELEROMETERS,
     ALARM,
@@ -28,10 +27,12 @@ from kf_calib.views.figures.style import (
     MARKERS,
     PALE,
     blank,
+    log_scale,
+    plain,
     say,
     styled,
+    wrapped,
 )
-from kf_calib.views.figures.symbols import plain, wrapped
 from kf_calib.views.fleet import chance_words, short_name
 
 _WIDE = 4

@@ -6,15 +6,14 @@ from collections.abc import Sequence
 
 import kf_calib.views.figures.fleet  # noqa: F401  # registers the figures of a fleet
 from kf_calib.fleet.overview import FleetOverview
-from kf_calib.views import pooled_diagnosis
+from kf_calib.views import fleet
 from kf_calib.views.report.contents import figures_of, in_text, measured_section, warnings_of
-from kf_calib.views.report.page import Agreement, Page, Section
-from kf_calib.views.report.parts import Paragraph
+from kf_calib.views.report.page import Agreement, Page, Paragraph, Section
 
 
 def fleet_page(overview: FleetOverview, commands: Sequence[str]) -> Page:
     """The page of a fleet. commands: what gives the numbers again, a line each."""
-    together = in_text(pooled_diagnosis.pooled_report(overview.pooled)) if overview.pooled else ()
+    together = in_text(fleet.pooled_report(overview.pooled)) if overview.pooled else ()
     said = [each.text for each in together if isinstance(each, Paragraph)]
     standing, headline = _standing_of(overview)
     return Page(

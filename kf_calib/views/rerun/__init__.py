@@ -33,7 +33,6 @@ from kf_calib.views.rerun.diagnosis import save_diagnosis_view as save_diagnosis
 from kf_calib.views.rerun.improvement import save_improvement_view as save_improvement
 from kf_calib.views.rerun.layout import layout
 from kf_calib.views.rerun.names import BENCH_TIME, LABELS, ORIENTATION, Colour, quantities, rrd_file, strict
-from kf_calib.views.rerun.platform import log_platform
 from kf_calib.views.rerun.series import (
     VisitHistory,
     log_bench,
@@ -43,6 +42,7 @@ from kf_calib.views.rerun.series import (
     log_residuals,
     predicted,
 )
+from kf_calib.views.rerun.spheres import log_platform
 
 __all__ = ["BENCH_TIME", "ORIENTATION", "grow", "save_view"]
 

@@ -1,17 +1,29 @@
-"""Residuals on spheres of the directions of gravity, an accelerometer each, beside its sensitive axis."""
+"""Residuals on spheres of the directions of gravity, an accelerometer each, beside its sensitive axis.
+
+The platform frame in 3-D: the sensitive axes stand still in it, gravity moves from dwell to dwell.
+
+Ellipsoids of 1 sigma sit at the tips of the axes, magnified by one factor for the whole run, with a bar that shows the
+scale; the first ones stay as wires, so that the others are seen to shrink. Along the axis they have the scale factor's
+sigma, across it the two angles' (s_i = K_i E_i, all without unit).
+"""
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Sequence
+from typing import Any, Protocol
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.estimation.estimate import Estimate
 from kf_calib.estimation.results import Calibration
-from kf_calib.views.rerun.names import ACCELEROMETERS
+from kf_calib.support.units import shown
+from kf_calib.views.rerun.names import ACCELEROMETERS, GOLD, GREY, RED, WHITE, number, thin
+from kf_calib.views.rerun.series import above, crowd, ends, nis_band, times
 
 NEGATIVE, POSITIVE, NONE = np.array([70, 140, 255]), np.array([255, 110, 50]), np.array([150, 150, 155])
 _FULL = 4.0  # sigma at which the colour of a residual is full
@@ -74,3 +86,164 @@ def signed(ratios: Floats) -> NDArray[np.uint8]:
     weight = np.clip(np.abs(ratios) / _FULL, 0.0, 1.0)[:, None]
     end = np.where(ratios[:, None] < 0.0, NEGATIVE, POSITIVE)
     return np.round(NONE + weight * (end - NONE)).astype(np.uint8)
+
+
+FINAL_SIZE = 0.16  # of the largest final ellipsoid, as a part of the axis' length
+THINNEST = 0.008  # thinner ones could not be seen
+LARGEST = 0.7  # larger ones would hide the scene
+BAR = 0.6  # at most so long is the bar that shows the scale
+FLOOR = -1.35  # height at which it lies
+
+Ellipsoid = tuple[int, Floats, Floats]
+"""Accelerometer, sigmas (3,) of its sensitivity, and their directions (3, 3) as columns."""
+
+
+def rounded(wanted: float) -> float:
+    """The largest of 1, 2 and 5 times a power of ten that is not above it."""
+    decade = 10.0 ** np.floor(np.log10(wanted))
+    return float(max(step for step in (1.0, 2.0, 5.0) if step * decade <= wanted * (1 + 1e-9)) * decade)
+
+
+def magnification(final: Sequence[Ellipsoid]) -> float | None:
+    """A round factor that makes the largest final sigma visible; None: none is determined."""
+    largest = max((float(spread.max()) for _, spread, _ in final), default=0.0)
+    return rounded(FINAL_SIZE / largest) if largest > 0.0 else None
+
+
+def ellipsoids(sensitivities: Floats) -> list[Ellipsoid]:
+    """Those of covariances (3, 3, 3) of the three sensitivities; NaN where one is not determined."""
+    determined = list[Ellipsoid]()
+    for i, covariance in enumerate(sensitivities):
+        if np.isfinite(covariance).all():
+            variance, directions = np.linalg.eigh(covariance)
+            determined.append((i, np.sqrt(np.maximum(variance, 0.0)), directions * np.linalg.det(directions)))
+    return determined
+
+
+def ellipsoids_of(estimate: Estimate) -> list[Ellipsoid]:
+    """Return those of the sensitivities that are determined."""
+    covariances = np.full((3, 3, 3), np.nan)
+    for i in range(3):
+        if not estimate.unseen[4 * i : 4 * i + 3].any():
+            covariances[i] = estimate.covariance[4 * i : 4 * i + 3, 4 * i : 4 * i + 3]
+    return ellipsoids(covariances)
+
+
+def magnified(estimate: Estimate) -> str:
+    """What the title of the view says of the ellipsoids."""
+    factor = magnification(ellipsoids_of(estimate))
+    return f", axes with 1σ ×{number(factor)}" if factor else ""
+
+
+def _axes(estimate: Estimate) -> Floats:
+    """E_i (3, 3), an axis a row."""
+    sensitivity = estimate.state[:12].reshape(3, 4)[:, :3]
+    return sensitivity / np.linalg.norm(sensitivity, axis=1, keepdims=True)
+
+
+def log_platform(result: Calibration, stream: rr.RecordingStream) -> None:
+    log_frame(stream)
+    _log_axes(result, stream)
+    numbers = ends(result.visits)[1].tolist()
+    steps = [ellipsoids_of(visit.estimate) for visit in result.visits]
+    tips = [_axes(visit.estimate) for visit in result.visits]
+    log_ellipsoids(stream, times(*ends(result.visits)), numbers, steps, tips)
+    _log_directions(result, stream)
+
+
+def log_frame(stream: rr.RecordingStream) -> None:
+    """What stands still: the sphere of directions, the platform's axes, the nominal sensitive axes."""
+    stream.log("platform", rr.ViewCoordinates.RIGHT_HAND_Y_UP, static=True)
+    turn = np.linspace(0, 2 * np.pi, 97)
+    circle = np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
+    circles = [np.roll(circle, k, axis=1) for k in range(3)]
+    stream.log("platform/sphere", rr.LineStrips3D(circles, colors=(75, 75, 80), radii=0.003), static=True)
+    stream.log("platform/frame", rr.Arrows3D(vectors=1.4 * np.eye(3), colors=GREY, radii=0.008), static=True)
+    letters = rr.Points3D(1.5 * np.eye(3), radii=0.0, colors=GREY, labels=["X", "Y", "Z"], show_labels=True)
+    stream.log("platform/frame/letters", letters, static=True)
+
+
+def _log_axes(result: Calibration, stream: rr.RecordingStream) -> None:
+    """Estimated sensitive axes after each dwell; those not yet determined are left out."""
+    seen = [[i for i, _, _ in ellipsoids_of(visit.estimate)] for visit in result.visits]
+    vectors = [_axes(visit.estimate)[own] for visit, own in zip(result.visits, seen, strict=True)]
+    which = [i for own in seen for i in own]
+    columns = rr.Arrows3D.columns(
+        vectors=np.concatenate(vectors),
+        colors=[ACCELEROMETERS[i] for i in which],
+        labels=[f"E{'₁₂₃'[i]}" for i in which],
+        radii=[0.016] * len(which),
+    ).partition([len(own) for own in seen])
+    rr.send_columns("platform/axes", times(*ends(result.visits)), columns, recording=stream)
+
+
+def log_ellipsoids(
+    stream: rr.RecordingStream, index: list[rr.TimeColumn], numbers: Sequence[int], steps: list[list[Ellipsoid]],
+    tips: list[Floats],
+) -> None:  # fmt: skip
+    """Ellipsoids at the tips (3, 3) of the axes after each step, all magnified alike, with a bar that shows the scale.
+
+    The first that are not too large to be drawn stay as wires, so that the others are seen to be smaller.
+    """
+    factor = magnification(steps[-1])
+    if factor is None:
+        return
+    shown = [[each for each in own if factor * each[1].max() < LARGEST] for own in steps]
+    fields = [_fields(own, tip, factor) for own, tip in zip(shown, tips, strict=True)]
+    flat = {name: [each for own in fields for each in own[name]] for name in fields[0]}
+    columns = rr.Ellipsoids3D.columns(**flat).partition([len(own) for own in shown])
+    rr.send_columns("platform/uncertainty", index, columns, recording=stream)
+    mode = rr.components.FillMode.TransparentFillMajorWireframe
+    stream.log("platform/uncertainty", rr.Ellipsoids3D.from_fields(fill_mode=mode, line_radii=thin(0.8)), static=True)
+    first = next((k for k, own in enumerate(shown) if len(own) == len(shown[-1])), len(shown) - 1)
+    wires = rr.Ellipsoids3D(**fields[first], fill_mode=rr.components.FillMode.MajorWireframe, line_radii=thin(0.4))
+    stream.log("platform/first", wires if first < len(shown) - 1 else rr.Clear(recursive=False), static=True)
+    _log_bar(stream, factor, f"; wires: orientation {numbers[first]}" if first < len(shown) - 1 else "")
+
+
+def _fields(own: list[Ellipsoid], tips: Floats, factor: float) -> dict[str, Any]:
+    """Return what Rerun draws ellipsoids from."""
+    return {
+        "centers": [tips[i] for i, _, _ in own],
+        "half_sizes": [np.maximum(factor * sigma, THINNEST) for _, sigma, _ in own],
+        "quaternions": [Rotation.from_matrix(turn).as_quat() for _, _, turn in own],
+        "colors": [(*ACCELEROMETERS[i], 150) for i, _, _ in own],
+    }
+
+
+def _log_bar(stream: rr.RecordingStream, factor: float, words: str) -> None:
+    """A bar of a round angle, magnified as the ellipsoids are."""
+    angle, ratio = shown("rad"), shown("1")
+    length = rounded(BAR / factor * angle.per_si)
+    half = 0.5 * factor * length / angle.per_si
+    bar = rr.LineStrips3D([[(-half, FLOOR, 0.0), (half, FLOOR, 0.0)]], colors=WHITE, radii=0.012)
+    stream.log("platform/scale", bar, static=True)
+    same = number(float(f"{length / angle.per_si * ratio.per_si:.2g}"))
+    text = f"{number(length)} {angle.label}, {same} {ratio.label if ratio.label != '1' else 'of K'}{words}"
+    place = (0.0, FLOOR - 0.04, 0.0)
+    label = rr.Points3D([place], labels=[text], radii=0.0, colors=WHITE, show_labels=True)
+    stream.log("platform/scale/label", label, static=True)
+
+
+def _log_directions(result: Calibration, stream: rr.RecordingStream) -> None:
+    """Specific force of each dwell on the unit sphere: a point that stays, and an arrow while the dwell lasts."""
+    visits = result.visits
+    force = np.array([visit.dwell.means[1:4] for visit in visits])
+    direction = force / np.linalg.norm(force, axis=1, keepdims=True)
+    done, number = ends(visits)
+    begun = np.array([visit.dwell.start_s for visit in visits])
+    count = len(visits)
+    points = rr.Points3D.columns(positions=direction, colors=_verdicts(result), radii=[0.025 * crowd(count)] * count)
+    rr.send_columns("platform/visited", times(done, number), points, recording=stream)
+    arrows = rr.Arrows3D.columns(
+        vectors=1.25 * direction, colors=[GOLD] * count, radii=[0.016] * count, labels=["up"] * count
+    )
+    rr.send_columns("platform/up", times(begun, number), arrows, recording=stream)
+
+
+def _verdicts(result: Calibration) -> list[tuple[int, int, int]]:
+    """Grey where a dwell could not be judged, red where its NIS is above chi-squared's 95 % band, else white."""
+    dof = np.array([visit.dof for visit in result.visits])
+    nis = np.array([visit.nis for visit in result.visits])
+    bad = above(nis, nis_band(np.maximum(dof, 1)))
+    return [GREY if free <= 0 else RED if out else WHITE for free, out in zip(dof, bad, strict=True)]
