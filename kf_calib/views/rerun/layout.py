@@ -10,8 +10,8 @@ from kf_calib.bench.bench import Bench, Vector
 from kf_calib.estimation.results import Calibration
 from kf_calib.support import units
 from kf_calib.views.rerun.names import BENCH_TIME, CHANNELS, GROUPS, ORIENTATION
-from kf_calib.views.rerun.platform import magnified
 from kf_calib.views.rerun.series import VisitHistory, predicted
+from kf_calib.views.rerun.spheres import magnified
 
 _ENDLESS = rr.TimeRangeBoundary.infinite()
 WHOLE_RUN = rrb.TimeAxis(view_range=rr.TimeRange(start=_ENDLESS, end=_ENDLESS))
