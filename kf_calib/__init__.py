@@ -28,7 +28,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from kf_calib.support.printing import shown_by
+from kf_calib.support.text import shown_by
 
 if TYPE_CHECKING:
     from kf_calib.bench.bench import Bench

@@ -27,8 +27,7 @@ from kf_calib.bench.streams import Batch, Stream
 from kf_calib.sources.files.recorder import Recorder
 from kf_calib.sources.simulation.detectability import sized
 from kf_calib.sources.simulation.injected import Hidden, parse
-from kf_calib.sources.simulation.noise_processes import generator
-from kf_calib.sources.simulation.sensors import GRADES
+from kf_calib.sources.simulation.sensors import GRADES, generator
 from kf_calib.sources.simulation.simulator import Simulation
 from kf_calib.sources.simulation.visit_plans import PlannedVisit, spread_plan
 from kf_calib.support.threads import one_blas_thread

@@ -33,8 +33,8 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.design import optimality_criteria, orientation_plan
 from kf_calib.design.exact_design import Scheme, Search
-from kf_calib.design.gain_per_second import Pace
 from kf_calib.design.gimbal_limits import Reach
+from kf_calib.design.next_orientation import Pace
 from kf_calib.design.predicted_information import Prospect
 from kf_calib.design.visit_order import PEAK_OVER_MEAN, Timing
 from kf_calib.dwells.qr import triangle
@@ -45,7 +45,7 @@ from kf_calib.online.suggestion import Itinerary
 from kf_calib.positioning.drive import Drive
 from kf_calib.positioning.loop import Rules
 from kf_calib.positioning.simulated import SimulatedPositioner
-from kf_calib.sources.files.decision_records import END_RECORD, decision_records
+from kf_calib.sources.files.record_files import END_RECORD, decision_records
 from kf_calib.sources.simulation.driven import FAULTS, DrivenBench
 from kf_calib.sources.simulation.options import options_from_query, simulation
 

@@ -25,10 +25,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kf_calib.bench.arrays import Floats, Times, crossed, lengths
-from kf_calib.bench.gimbal_ranges import limits_of, zones_of
+from kf_calib.bench.keys import limits_of, zones_of
 from kf_calib.bench.raw_input import PLAIN, RawInput
 from kf_calib.errors import BenchError
-from kf_calib.support.plain_text import cut
+from kf_calib.support.text import cut
 
 EARTH_RATE_RADPS = 7.292115e-5
 """Rate of the Earth's rotation in inertial space (WGS 84), rad/s: 15.041 deg/h."""

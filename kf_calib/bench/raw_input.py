@@ -20,7 +20,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.errors import BenchError
-from kf_calib.support.plain_text import cut
+from kf_calib.support.text import cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 CHANNELS = (1, 2, 3)

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import rich_click as click
 from click import get_current_context  # rich_click declares that there may be none
 
-from kf_calib.cli.command import OUTPUT, command
+from kf_calib.cli.command import NUMBER, OUTPUT, POSITIVE, command
 from kf_calib.cli.echo import complain, echo, print_json, progress, show
+from kf_calib.cli.failures import Interrupter, answered
 from kf_calib.cli.files import OutputFile, claimed, delivery
-from kf_calib.cli.numbers import NUMBER, POSITIVE
 from kf_calib.cli.options import (
     F,
     bench_options,
@@ -30,10 +30,9 @@ from kf_calib.cli.options import (
     units_option,
 )
 from kf_calib.cli.pictures import write_view
-from kf_calib.cli.signals import Interrupter, answered
 from kf_calib.errors import InputError
 from kf_calib.support.output_files import Outputs, write_whole
-from kf_calib.support.plain_text import sentence
+from kf_calib.support.text import sentence
 
 if TYPE_CHECKING:
     from importlib.resources.abc import Traversable

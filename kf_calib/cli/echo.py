@@ -14,7 +14,7 @@ from typing import Any
 import click
 
 from kf_calib.errors import KfCalibError
-from kf_calib.support.plain_text import printable, sentence
+from kf_calib.support.text import printable, sentence
 
 _SIGNS = "µσΔχ²±┃"
 

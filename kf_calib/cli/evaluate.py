@@ -371,7 +371,7 @@ def _of_journal(ctx: click.Context, options: Mapping[str, Any], origin: Origin, 
     """
     from click.core import ParameterSource
 
-    from kf_calib.effects.programs import allowed
+    from kf_calib.effects.user import allowed
 
     params = [param for param in ctx.command.params if param.name in options and param.name not in _LEAVE]
     given = [

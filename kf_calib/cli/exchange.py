@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from kf_calib.exchange.calibration_file import SavedCalibration
     from kf_calib.exchange.corrected_file import Applied
     from kf_calib.exchange.corrected_lines import CorrectedLines
-    from kf_calib.sources.files.text_file import TextFile
+    from kf_calib.sources.files.line_parts import TextFile
 
 
 _BLOCK_BYTES = 1 << 16
@@ -139,7 +139,7 @@ def _applied(
 
 def _bytes_of(path: Path) -> BinaryIO | TextFile:
     """A log as it is, byte for byte; one that is packed, or written in UTF-16, in UTF-8."""
-    from kf_calib.sources.files.text_file import TextFile
+    from kf_calib.sources.files.line_parts import TextFile
 
     try:
         with path.open("rb") as file:

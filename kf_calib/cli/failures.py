@@ -3,6 +3,10 @@
 What was not foreseen leaves a report for a maintainer, with nothing of the user's data: the kind of the error and of
 those behind it, the lines of program that were at work, versions, and the names of the options that were given. It has
 no message, no value and no name of a file: these may hold data.
+
+Signals that ask a run to end: Ctrl-C, SIGTERM, and SIGHUP, which comes when the terminal is closed.
+
+On Windows SIGBREAK stands for the last two: Ctrl-Break, and a console that is closed.
 """
 
 from __future__ import annotations
@@ -10,20 +14,23 @@ from __future__ import annotations
 import os
 import platform
 import re
+import signal
 import sys
 import tempfile
+import threading
 import traceback
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
+from types import FrameType
 
 import click
 
 from kf_calib.cli.echo import complain
 from kf_calib.errors import KfCalibError
-from kf_calib.support.plain_text import printable
+from kf_calib.support.text import printable
 
 PACKAGE = Path(__file__).parents[1]
 _PACKAGES = ("kf_calib", "numpy", "scipy", "filterpy", "mcap", "rerun-sdk", "matplotlib", "pydantic", "click")
@@ -133,3 +140,59 @@ def _version(package: str) -> str:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
         return "(not installed)"
+
+
+@contextmanager
+def answered(answer: Callable[[signal.Signals], None]) -> Iterator[None]:
+    """Have ``answer`` called for each of them; SIGHUP stays ignored where it was (nohup).
+
+    After a SIGHUP further ones are ignored for good: terminal and shell both send one, and the second must not kill
+    the process while it writes its results and ends.
+    """
+    came: set[int] = set()
+
+    def called(number: int, _: FrameType | None) -> None:
+        came.add(number)
+        answer(signal.Signals(number))
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
+    if (broken := getattr(signal, "SIGBREAK", None)) is not None:
+        numbers.append(broken)
+    before = {number: signal.signal(number, called) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            hung_up = number in came and number not in (signal.SIGINT, signal.SIGTERM)
+            signal.signal(number, signal.SIG_IGN if hung_up else handler)
+
+
+class Interrupter:
+    """An answer by which any of them is Ctrl-C: what is at work lets go of what it has open.
+
+    Within ``finished_first`` it takes effect only at the end of the block: a file that is being written stays whole.
+    """
+
+    def __init__(self) -> None:
+        self._busy = self._asked = False
+
+    def __call__(self, _: signal.Signals) -> None:
+        self._asked = True
+        if not self._busy:
+            raise KeyboardInterrupt
+
+    @contextmanager
+    def finished_first(self) -> Iterator[None]:
+        """Let the block be done before an interrupt takes effect."""
+        self._busy = True
+        try:
+            yield
+        finally:
+            self._busy = False
+        if self._asked:
+            raise KeyboardInterrupt

@@ -13,11 +13,10 @@ from typing import TYPE_CHECKING, Any
 import rich_click as click
 from click import get_current_context  # rich_click declares that there may be none
 
-from kf_calib.cli.command import MODEL, OUTPUT, command
+from kf_calib.cli.command import MODEL, OUTPUT, POSITIVE, command
 from kf_calib.cli.echo import complain, echo, print_json, progress, show
-from kf_calib.cli.failures import sentence
+from kf_calib.cli.failures import Interrupter, answered, sentence
 from kf_calib.cli.files import Delivery, claimed, delivery
-from kf_calib.cli.numbers import POSITIVE
 from kf_calib.cli.options import (
     filter_options,
     json_option,
@@ -31,7 +30,6 @@ from kf_calib.cli.options import (
 )
 from kf_calib.cli.pictures import Pictures, figure_options
 from kf_calib.cli.report import commands_of, report_option
-from kf_calib.cli.signals import Interrupter, answered
 from kf_calib.errors import InputError
 from kf_calib.support import stage
 from kf_calib.support.extras import need

@@ -13,7 +13,7 @@ from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.stepwise_selection import Improvement, extend, take_step, undone
 from kf_calib.errors import InputError
-from kf_calib.support.plain_text import sentence
+from kf_calib.support.text import sentence
 from kf_calib.views.improvement import choices_table
 
 HOW = "number: add it; a NAME, f FORMULA: add that; d NAME: drop; u: undo; q: finish"

@@ -30,7 +30,7 @@ from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 if TYPE_CHECKING:
     from kf_calib.bench.raw_input import RawInput, WrongUnit
     from kf_calib.bench.streams import Source
-    from kf_calib.dwells.overview import DwellSummary
+    from kf_calib.dwells.rest_in_readings import DwellSummary
     from kf_calib.sources.files.inventory import Inventory
     from kf_calib.views.overview import Overview
 
@@ -248,7 +248,7 @@ def _lacks(bench: Mapping[str, str], has_angles: bool) -> list[str]:
 
 
 def _dwells(source: Source, tick: Tick) -> list[DwellSummary]:
-    from kf_calib.dwells.overview import dwell_summaries
+    from kf_calib.dwells.rest_in_readings import dwell_summaries
 
     return dwell_summaries(source, on_progress=tick)
 

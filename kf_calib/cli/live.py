@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import rich_click as click
 
-from kf_calib.cli.command import INPUT, command
+from kf_calib.cli.command import INPUT, NOT_NEGATIVE, POSITIVE, command
 from kf_calib.cli.echo import complain, json_line, rendered
+from kf_calib.cli.failures import answered
 from kf_calib.cli.files import claimed, delivery, output_option
-from kf_calib.cli.live_keys import pressed_keys
-from kf_calib.cli.live_run import LiveRun, by_hand, on_bench
-from kf_calib.cli.numbers import NOT_NEGATIVE, POSITIVE
+from kf_calib.cli.live_run import LiveRun, by_hand, on_bench, pressed_keys
 from kf_calib.cli.options import (
     bench_options,
     columns_option,
@@ -36,13 +35,12 @@ from kf_calib.cli.options import (
     units_option,
 )
 from kf_calib.cli.pictures import rrd_option, write_view
-from kf_calib.cli.signals import answered
 from kf_calib.errors import InputError, KfCalibError
-from kf_calib.support.plain_text import sentence
+from kf_calib.support.text import sentence
 
 if TYPE_CHECKING:
     from kf_calib.estimation.settings import Settings
-    from kf_calib.online.hand_status import HandJudgement, HandStanding
+    from kf_calib.online.by_hand import HandJudgement, HandStanding
     from kf_calib.online.status import Judgement, Standing
     from kf_calib.sources.live import Status
     from kf_calib.views.rerun.growing import GrowingView
@@ -220,7 +218,7 @@ def follow(run: LiveRun, name: str, record: Path | None, as_json: bool) -> None:
 
 def _urgent_messages(run: LiveRun) -> dict[str, str]:
     """What a user must know at once, about what: said again where it changes."""
-    from kf_calib.online.hand_status import HandStanding
+    from kf_calib.online.by_hand import HandStanding
 
     standing, status = run.session.standing if run.session else None, run.source.status
     return {
@@ -268,7 +266,7 @@ def _echo(run: LiveRun, text: str) -> None:
 def _on_screen(run: LiveRun, name: str, record: Path | None) -> None:
     from rich.live import Live
 
-    from kf_calib.online.hand_status import HandStanding
+    from kf_calib.online.by_hand import HandStanding
     from kf_calib.online.status import Standing
     from kf_calib.views.live import hand_screen, screen
     from kf_calib.views.terminal import PlainConsole

@@ -1,11 +1,20 @@
-"""A live run in a thread of its own, beside the screen, the keys and the signals."""
+"""A live run in a thread of its own, beside the screen, the keys and the signals.
+
+Single keys pressed on the terminal of a live run.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import os
 import queue
+import select
 import signal
+import sys
 import threading
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
 from contextvars import copy_context
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,12 +25,10 @@ from kf_calib.errors import InputError, KfCalibError
 if TYPE_CHECKING:
     from kf_calib.bench.streams import Source
     from kf_calib.estimation.settings import Settings
-    from kf_calib.online.hand_session import HandSession
-    from kf_calib.online.hand_status import HandJudgement
+    from kf_calib.online.by_hand import HandJudgement, HandSession
     from kf_calib.online.session import Session
     from kf_calib.online.status import Judgement
     from kf_calib.sources.live import LiveSource
-
 
 def on_bench(settings: Settings, wanted: Mapping[str, float], auto: bool) -> Callable[..., Session]:
     """How the session of a bench is begun."""
@@ -32,7 +39,7 @@ def on_bench(settings: Settings, wanted: Mapping[str, float], auto: bool) -> Cal
 
 def by_hand(settings: Settings, wanted: Mapping[str, float]) -> Callable[..., HandSession]:
     """How the session of a sensor in the hand is begun."""
-    from kf_calib.online.hand_session import HandSession
+    from kf_calib.online.by_hand import HandSession
 
     return lambda source, every, again: HandSession(source, settings, wanted, every=every, again=again)
 
@@ -151,3 +158,55 @@ class LiveRun:
             self.judgements.put_nowait(judgement)
         except queue.Full:
             self.unshown += 1
+
+
+_LOOK_S = 0.02  # Windows can only be asked whether a key was pressed
+
+
+@contextlib.contextmanager
+def pressed_keys(use: bool) -> Iterator[Callable[[float], str]]:
+    """A function that waits for a key so long, and gives it or nothing."""
+    if not (use and sys.stdin.isatty()):
+        yield _no_key
+    elif sys.platform == "win32":
+        yield _windows_key
+    else:
+        import termios
+        import tty
+
+        before = termios.tcgetattr(sys.stdin)
+        tty.setcbreak(sys.stdin)
+        try:
+            yield _key
+        finally:
+            with contextlib.suppress(termios.error):  # the terminal is gone
+                termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+
+
+def _key(seconds: float) -> str:
+    if not select.select([0], [], [], seconds)[0]:
+        return ""
+    key = os.read(0, 1)
+    if not key:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))  # as a terminal says that is gone
+    return key.decode(errors="replace")
+
+
+def _windows_key(seconds: float) -> str:
+    assert sys.platform == "win32"
+    import msvcrt
+
+    end_s = time.monotonic() + seconds
+    while not msvcrt.kbhit():
+        if time.monotonic() >= end_s:
+            return ""
+        time.sleep(_LOOK_S)
+    key = msvcrt.getwch()
+    if key == "\x03":  # where the console hands Ctrl-C on as a key
+        raise KeyboardInterrupt
+    return key
+
+
+def _no_key(seconds: float) -> str:
+    time.sleep(seconds)
+    return ""

@@ -11,10 +11,9 @@ import rich_click as click
 from click import get_current_context  # rich_click declares that there may be none
 from click.core import ParameterSource
 
-from kf_calib.cli.command import INPUT, MODEL, OUTPUT
+from kf_calib.cli.command import INPUT, MODEL, NOT_NEGATIVE, NUMBER, OUTPUT, POSITIVE, NumberInRange
 from kf_calib.cli.echo import complain
 from kf_calib.cli.files import output_option
-from kf_calib.cli.numbers import NOT_NEGATIVE, NUMBER, POSITIVE, NumberInRange
 from kf_calib.errors import BenchError, InputError
 from kf_calib.support.units import shown_in, si
 

@@ -7,10 +7,9 @@ from typing import Any
 
 import rich_click as click
 
-from kf_calib.cli.command import command
+from kf_calib.cli.command import NumberInRange, command
 from kf_calib.cli.echo import print_json, progress, show
 from kf_calib.cli.files import claimed, delivery
-from kf_calib.cli.numbers import NumberInRange
 from kf_calib.cli.options import json_option, overwrite_option, units_option
 from kf_calib.cli.pictures import Pictures, figure_options
 

@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import rich_click as click
 
-from kf_calib.cli.command import OUTPUT, command
+from kf_calib.cli.command import OUTPUT, POSITIVE, NumberInRange, command
 from kf_calib.cli.echo import print_json, progress, show
 from kf_calib.cli.files import claimed, delivery, output_option
-from kf_calib.cli.numbers import POSITIVE, NumberInRange
 from kf_calib.cli.options import (
     F,
     filter_options,
@@ -244,7 +243,7 @@ def _with_gimbals(recording: Path, bench: Bench, options: Mapping[str, Any]) -> 
 
 def _reach(bench: Bench, options: Mapping[str, Any]) -> Reach:
     from kf_calib.bench.bench import axis_names
-    from kf_calib.bench.gimbal_ranges import ranges
+    from kf_calib.bench.keys import ranges
     from kf_calib.design.gimbal_limits import Reach
     from kf_calib.sources.simulation.visit_plans import angles_from_csv
 

@@ -131,7 +131,7 @@ def measured_of(recording: Path, options: dict[str, Any]) -> Measured:
     """What a page says of a recording's file; raises MissingExtraError, before the work, where no page can be made."""
     import kf_calib.views.figures  # noqa: F401  # which a page needs
     from kf_calib.diagnosis.selection_journal import Origin
-    from kf_calib.sources.files.decision_records import END_RECORD, decision_records
+    from kf_calib.sources.files.record_files import END_RECORD, decision_records
     from kf_calib.sources.opening import run_date
     from kf_calib.views.report.contents import Measured
 

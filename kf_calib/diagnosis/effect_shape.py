@@ -16,7 +16,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.residual_drivers import Driver, is_function_of, unexplained_mps2, walk_path
 from kf_calib.effects import Effect, FrameEffect, Stimulus
-from kf_calib.effects.axis import axis_of, is_formula, turned_about
+from kf_calib.effects.inputs import axis_of, is_formula, turned_about
 from kf_calib.effects.stimulus import smooth_between
 from kf_calib.estimation.residual_table import mean_sigmas, means_over_dwells
 from kf_calib.estimation.results import Calibration

@@ -21,7 +21,7 @@ from kf_calib.diagnosis.unknown_effect import Description, channel_of, describe,
 from kf_calib.effects.effect import Grade
 from kf_calib.estimation.results import Calibration, Parameter
 from kf_calib.noise.noise_model import mean_covariances
-from kf_calib.support.printing import as_html, printed
+from kf_calib.support.text import as_html, printed
 from kf_calib.support.units import span
 
 _TOLD_APART = 4  # most rivals that the next orientation is to tell from the likeliest effect

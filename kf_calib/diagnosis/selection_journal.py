@@ -41,7 +41,7 @@ from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.stepwise_selection import By, Improvement, SelectionStep, begin, take_step
 from kf_calib.effects import refuse_unfit
-from kf_calib.effects.programs import Program
+from kf_calib.effects.user import Program
 from kf_calib.errors import InputError
 from kf_calib.estimation.results import Calibration
 from kf_calib.sources.files.record_files import fingerprint

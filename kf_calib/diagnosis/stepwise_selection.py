@@ -32,7 +32,7 @@ from kf_calib.estimation.calibration import evaluate_fit
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.results import Calibration, Parameter, format_p
-from kf_calib.support.printing import as_html
+from kf_calib.support.text import as_html
 
 _NEEDED = 0.01  # an effect is needed where its removal raises chi-squared significantly at this level
 _NEAR_THRESHOLD = 8.0  # sigma; an effect near the threshold is found only if noise enlarges it: estimates are too large

@@ -17,8 +17,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.bench.bench import Bench
-from kf_calib.dwells.blocks import Block, Tally
-from kf_calib.dwells.slew_kinematics import Curve
+from kf_calib.dwells.blocks import Block, Curve, Tally
 from kf_calib.dwells.window_average import average
 
 REGRESSORS = ("1", "f_x", "f_y", "f_z")

@@ -16,7 +16,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.bench.bench import turned
-from kf_calib.dwells.piece_values import PieceIndices
+from kf_calib.dwells.pieces import PieceIndices
 from kf_calib.dwells.rows import parabola
 from kf_calib.dwells.sufficient_statistics import (
     LEAST_FREEDOM,

@@ -30,7 +30,7 @@ _UNKNOWN = Autocovariance(), Spectrum(), Trace()  # the same objects for all dwe
 
 
 class TabulatedMeans(Protocol):
-    """The rows of a table, as columns; ``kf_calib.sources.tables.orientation.Orientations`` is one."""
+    """The rows of a table, as columns; ``kf_calib.sources.tables.table.Orientations`` is one."""
 
     @property
     def mean_mps2(self) -> Floats: ...

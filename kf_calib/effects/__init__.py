@@ -15,10 +15,10 @@ from functools import cache
 from pathlib import Path
 
 from kf_calib.bench.bench import Bench
-from kf_calib.effects import checks, drift, formula, frame, sensor, surroundings, thermal, user
+from kf_calib.effects import checks, drift, formula, frame, sensor, surroundings, user
 from kf_calib.effects.effect import Bearer, Coefficient, Effect, FrameEffect, SensorEffect, Unknown
-from kf_calib.effects.programs import Program
 from kf_calib.effects.stimulus import Stimulus
+from kf_calib.effects.user import Program
 from kf_calib.errors import InputError
 
 __all__ = [
@@ -35,8 +35,8 @@ _PLAIN: dict[str, type[Effect]] = {
         sensor.VibrationRectification, sensor.DeadZone,
         drift.BiasDrift, drift.BiasWalk, drift.ScaleDrift, drift.WarmUp, drift.Settling, drift.Hysteresis,
         drift.Sinusoid,
-        thermal.ThermalBias, thermal.ThermalBias2, thermal.ThermalScale, thermal.ThermalRate,
-        thermal.ThermalMisalignment, thermal.ThermalLag, surroundings.Magnetic,
+        surroundings.ThermalBias, surroundings.ThermalBias2, surroundings.ThermalScale, surroundings.ThermalRate,
+        surroundings.ThermalMisalignment, surroundings.ThermalLag, surroundings.Magnetic,
         frame.BaseTilt, frame.BaseTiltDrift, frame.PlatformDrift, frame.GravityError,
         frame.EarthRotation, frame.Flexure, frame.UnevenFlexure, frame.CrossTalk, frame.Latency, frame.LeverArm,
     )

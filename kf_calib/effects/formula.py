@@ -159,7 +159,7 @@ class Reading:
     @property
     def unit(self) -> str:
         """SI unit of the formula; "" where its units do not fit, as those of one may that the program has written."""
-        from kf_calib.effects.formula_units import pint_unit_of, text
+        from kf_calib.effects.expression import pint_unit_of, text
 
         try:
             return text(pint_unit_of(self.expression, self.units))
@@ -177,7 +177,7 @@ class Reading:
 
 def _units(reading: Reading, turning: bool) -> tuple[str, tuple[str, float]]:
     """SI unit of a formula's coefficients, a unit of the field, and how many of it are one; of angles, or readings."""
-    from kf_calib.effects.formula_units import coefficient_units, pint_unit_of, turning_units
+    from kf_calib.effects.expression import coefficient_units, pint_unit_of, turning_units
 
     try:
         unit = pint_unit_of(reading.expression, reading.units)

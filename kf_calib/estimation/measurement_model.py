@@ -21,7 +21,7 @@ from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.effects import Coefficient, Effect, FrameEffect, Stimulus, effect_named
 from kf_calib.errors import InputError
 from kf_calib.estimation.known_effect import KnownEffect
-from kf_calib.support.printing import printed
+from kf_calib.support.text import printed
 
 if TYPE_CHECKING:  # a replay without a bench model does not import what reads one
     from kf_calib.estimation.bench_model import BenchModel

@@ -33,11 +33,11 @@ from pydantic import StringConstraints
 from typing_extensions import TypedDict
 
 from kf_calib import effects
-from kf_calib.effects.programs import Allowed, Program, allowed
+from kf_calib.effects.user import Allowed, Program, allowed
 from kf_calib.errors import InputError
 from kf_calib.estimation.results import Calibration
 from kf_calib.support.output_files import write_whole
-from kf_calib.support.plain_text import cut
+from kf_calib.support.text import cut
 from kf_calib.support.toml_files import FINITE, TEXT, Misfit, converted, toml_table
 
 _EXAMPLE = 'effects = ["NAME", "mine = a*T"]'

@@ -29,8 +29,8 @@ from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.signal_quality import Readings
 from kf_calib.noise.means import means_of
 from kf_calib.noise.noise_model import ATTITUDE_UNKNOWN_RAD, Noise, considered_information, steps
-from kf_calib.support.printing import as_html, printed
 from kf_calib.support.tail_probabilities import LEVEL, f_tail
+from kf_calib.support.text import as_html, printed
 from kf_calib.support.threads import one_blas_thread
 from kf_calib.support.units import field_unit, shown
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
-from kf_calib.dwells.piece_values import OfPieces, of_all_pieces
+from kf_calib.dwells.pieces import OfPieces, of_all_pieces
 from kf_calib.dwells.qr import inverse_of_lower, triangle
 from kf_calib.dwells.rows import on_basis
 from kf_calib.dwells.stack import AlikeDwells, DwellStack

@@ -31,7 +31,7 @@ from kf_calib.bench.bench import Bench
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.bench.raw_input import RESTATE
 from kf_calib.bench.streams import Source
-from kf_calib.effects.programs import Program
+from kf_calib.effects.user import Program
 from kf_calib.errors import BenchError, InputError
 from kf_calib.estimation import model_file
 from kf_calib.estimation.correction import Correction
@@ -60,7 +60,7 @@ from kf_calib.sources.files.record_files import fingerprint
 from kf_calib.sources.opening import opened, run_date
 from kf_calib.support import dates
 from kf_calib.support.output_files import write_whole
-from kf_calib.support.plain_text import cut, sentence
+from kf_calib.support.text import cut, sentence
 
 VERSION = 1
 _LARGEST_BYTES = 20_000_000

@@ -21,8 +21,8 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.estimation.measurement_model import FRAME, SQUARE, Model
-from kf_calib.support.plain_text import CONTROLS, LONGEST
 from kf_calib.support.tail_probabilities import LEVEL
+from kf_calib.support.text import CONTROLS, LONGEST
 
 Text = Annotated[str, StringConstraints(max_length=LONGEST, pattern=rf"^[^{CONTROLS}]*$")]
 FiniteNumber = Annotated[float, Field(allow_inf_nan=False)]

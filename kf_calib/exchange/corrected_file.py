@@ -21,7 +21,7 @@ from kf_calib.bench.streams import Batch, Stream
 from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C
 from kf_calib.errors import InputError
 from kf_calib.estimation.correction import Correction
-from kf_calib.exchange.norm_at_rest import NormAtRest
+from kf_calib.exchange.corrected_lines import NormAtRest
 from kf_calib.sources.files import cdr
 from kf_calib.sources.files.contents import CALIBRATED_TOPIC
 from kf_calib.sources.files.mcap_append import TopicAppender, source_file

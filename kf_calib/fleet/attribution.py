@@ -23,10 +23,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.fleet.bench_coefficient import DatedSums
 from kf_calib.fleet.campaign import Blocks, Campaign, Group, log_evidence, log_evidence_of_modes, log_mean, modes, sizes
 from kf_calib.fleet.own_coefficients import UnitInformation, UnitsAndCommon
-from kf_calib.fleet.pooled_terms import Attribution, Common, PooledTerms, Sums, Term, shares_of
+from kf_calib.fleet.pooled_terms import Attribution, Common, DatedSums, PooledTerms, Sums, Term, shares_of
 from kf_calib.fleet.shape import SomeUnits
 from kf_calib.support.tail_probabilities import weights
 

@@ -3,6 +3,8 @@
 A term is an effect with an attribution: coefficients that all runs of a bench have in common, or coefficients of each
 unit (or run) that are drawn about a common mean. The terms are eliminated from the inside out, each with its normal
 prior: first what is a unit's own, then what units have in common.
+
+Evidence of coefficients that all runs of a bench have in common, or that change once when the bench is repaired.
 """
 
 from __future__ import annotations
@@ -12,10 +14,12 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.effects import Bearer
-from kf_calib.fleet.campaign import FLAT, Blocks, Campaign, Group, posterior
+from kf_calib.fleet.campaign import FLAT, STEP, Blocks, Campaign, Group, log_evidence, log_mean, posterior, sizes
+from kf_calib.support.tail_probabilities import weights
 
 
 class Attribution(StrEnum):
@@ -179,3 +183,182 @@ def _spreads(term: Term, blocks: Blocks) -> Floats:
         return np.full((len(blocks.units), count), term.size)
     has = np.array([unit in term.units for unit in blocks.units], float)
     return np.repeat(term.size * has[:, None], count, axis=1)
+
+
+_SLOTS = 48  # at most as many parts of a campaign between which a repair is looked for at first
+_PERIODS = 12  # at most as many parts in which a coefficient is followed over time
+_LEAST = 0.5  # sigma of all runs together: the smallest size that is expected
+_SIDES = np.array([[1.0, 1.0], [1.0, 0.0], [0.0, 1.0]])  # of a repair on which there is an error: both, or only one
+_COARSE = 4.0  # ratio of the sizes of a coefficient that changes
+
+
+@dataclass(frozen=True)
+class BenchEvidence:
+    """Log evidence of a common coefficient, averaged over what is not known, and where it is largest.
+
+    - log_odds: against no such term. size: of the prior, in ``Group.sigma``.
+    - repair: number of the bench and first rank after the repair, if there is one.
+    """
+
+    log_odds: float
+    size: float
+    repair: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True)
+class BenchEstimate:
+    """Coefficients (q,) of a bench from the run of rank ``since`` on, with their covariance, in ``Group.sigma``."""
+
+    bench: int
+    since: int
+    mean: Floats
+    covariance: Floats
+
+
+class DatedSums:
+    """What runs tell, summed over parts of the campaign between dates, each of one bench: memory does not grow with
+    the number of runs."""
+
+    def __init__(self, campaign: Campaign, terms: PooledTerms, parted: Sequence[tuple[int, int]] = ()) -> None:
+        """parted: benches and first ranks of further parts."""
+        self._campaign, self._terms, self._parted = campaign, terms, [*terms.repairs, *parted]
+        self._first = [self._firsts(bench) for bench in range(len(campaign.benches))]
+        counts = [len(own) for own in self._first]
+        self._starts, slots, columns = np.cumsum([0, *counts]), sum(counts), campaign.groups[-1].columns.stop
+        self._slots = Blocks(
+            (), (), np.repeat(np.arange(len(counts)), counts), np.concatenate(self._first),
+            np.zeros((slots, columns, columns)), np.zeros((slots, columns)),
+        )  # fmt: skip
+
+    def _firsts(self, bench: int) -> NDArray[np.intp]:
+        """Return the rank of the first run of each part: equal numbers of runs, and a new part at each repair."""
+        name = self._campaign.benches[bench]
+        ranks = np.sort([key.rank for key in self._campaign.keys if key.bench == name])
+        chosen = ranks[np.unique(np.linspace(0, len(ranks), min(_SLOTS, len(ranks)), endpoint=False).astype(int))]
+        return np.unique([*chosen, *(first for where, first in self._parted if where == bench)])
+
+    def add(self, blocks: Blocks) -> None:
+        """Add runs, of which what is their own has been eliminated."""
+        for k, (bench, rank) in enumerate(zip(blocks.bench, blocks.rank, strict=True)):
+            place = self._starts[bench] + np.searchsorted(self._first[bench], rank, side="right") - 1
+            self._slots.info[place] += blocks.info[k]
+            self._slots.score[place] += blocks.score[k]
+
+    @classmethod
+    def of(cls, campaign: Campaign, terms: PooledTerms, parted: Sequence[tuple[int, int]] = ()) -> DatedSums:
+        """The sums over all runs of a campaign."""
+        dated = cls(campaign, terms, parted)
+        for blocks in campaign.runs():
+            dated.add(terms.beside_own(blocks))
+        return dated
+
+    def estimates(self, group: Group, repair: tuple[int, int] | None = None) -> list[BenchEstimate]:
+        """The coefficients of each bench beside the terms, with nothing known of them before."""
+        term = Term(group, Attribution.REPAIRED if repair else Attribution.BENCH, FLAT, repair=repair)
+        more = list(commons_of(term, len(self._first)))
+        sums = self._terms.sums(self._slots, more)
+        prior = np.append(self._terms.prior, np.full(len(more), FLAT))
+        mean, covariance = posterior(sums.info, sums.score, prior)
+        count, estimates = len(_range(group)), list[BenchEstimate]()
+        for k in range(0, len(more), count):
+            part = slice(len(self._terms.prior) + k, len(self._terms.prior) + k + count)
+            estimates.append(BenchEstimate(more[k].bench, more[k].since, mean[part], covariance[part, part]))
+        return estimates
+
+    def over_time(self, group: Group, bench: int) -> list[BenchEstimate]:
+        """The coefficients of one bench in each of a few parts of the campaign, as if it were repaired between them."""
+        first = self._first[bench]
+        edges = first[np.unique(np.linspace(0, len(first), min(_PERIODS, len(first)), endpoint=False).astype(int))]
+        ends = [*edges[1:].tolist(), Common.until]
+        parts = [Common(k, FLAT, bench, since, until)
+                 for since, until in zip(edges.tolist(), ends, strict=True) for k in _range(group)]  # fmt: skip
+        others = [Common(k, FLAT, own) for own in range(len(self._first)) if own != bench for k in _range(group)]
+        sums = self._terms.sums(self._slots, [*parts, *others])
+        prior = np.append(self._terms.prior, np.full(len(parts) + len(others), FLAT))
+        mean, covariance = posterior(sums.info, sums.score, prior)
+        begin, count = len(self._terms.prior), len(_range(group))
+        slices = [slice(begin + k * count, begin + (k + 1) * count) for k in range(len(edges))]
+        return [BenchEstimate(bench, int(since), mean[own], covariance[own, own])
+                for since, own in zip(edges, slices, strict=True)]  # fmt: skip
+
+    def constant(self, group: Group) -> BenchEvidence:
+        """The evidence that the runs of each bench have one coefficient vector."""
+        sizes_tried = self._sizes(group, STEP)
+        more = [Common(k, 1.0, bench) for bench in range(len(self._first)) for k in _range(group)]
+        sums = self._terms.sums(self._slots, more)
+        logs = log_evidence(sums.info, sums.score, self._priors(sizes_tried, len(more))) - self._nothing()
+        return BenchEvidence(float(log_mean(logs)), float(sizes_tried[np.argmax(logs)]))
+
+    def repaired(self, group: Group) -> BenchEvidence | None:
+        """The evidence that on one bench it is another vector from some run on; None if no bench has two runs."""
+        tried = self._sizes(group, _COARSE)
+        benches = [k for k, firsts in enumerate(self._first) if len(firsts) > 1]
+        if not benches:
+            return None
+        logs = {bench: self._with_repairs(group, bench, tried) for bench in benches}
+        bench = max(benches, key=lambda k: float(logs[k].max()))
+        place, size = np.unravel_index(np.argmax(logs[bench]), logs[bench].shape)
+        mean = log_mean(np.array([log_mean(own, axis=0) for own in logs.values()]))
+        return BenchEvidence(float(mean), float(tried[size]), (bench, int(self._first[bench][place + 1])))
+
+    def dates(self, group: Group, bench: int) -> tuple[NDArray[np.intp], Floats]:
+        """First ranks (k,) after a repair of a bench between its parts, and the probability of each."""
+        logs = log_mean(self._with_repairs(group, bench, self._sizes(group, _COARSE)), axis=1)
+        firsts = self._first[bench]
+        return firsts[1:], weights(logs + np.log(np.diff(firsts)))
+
+    def _with_repairs(self, group: Group, bench: int, tried: Floats) -> Floats:
+        """Return the log evidence (k, t) of a repair of one bench before each of its parts but the first.
+
+        It is as likely that there is an error before and after it as that there is none before, or none after.
+        """
+        others = [Common(k, 1.0, other) for other in range(len(self._first)) if other != bench for k in _range(group)]
+        fixed = [*self._terms.common, *others]
+        whole = self._terms.sums(self._slots, others)
+        part = slice(self._starts[bench], self._starts[bench + 1])
+        of_all = self._slots
+        slots = Blocks((), (), of_all.bench[part], of_all.rank[part], of_all.info[part], of_all.score[part])
+        of_group, columns, shares = list(_range(group)), [each.column for each in fixed], shares_of(fixed, slots)
+        inner = np.cumsum(slots.info[:, of_group][:, :, of_group], axis=0)
+        across = np.cumsum(slots.info[:, columns][:, :, of_group] * shares[:, :, None], axis=0)
+        along = np.cumsum(slots.score[:, of_group], axis=0)
+        before = [each[:-1] for each in (inner, across, along)]
+        after = [each[-1:] - each[:-1] for each in (inner, across, along)]
+        infos, scores = _joined(whole.info, whole.score, before, after)
+        present = np.concatenate([np.ones((len(_SIDES), len(fixed))), np.repeat(_SIDES, len(of_group), axis=1)], axis=1)
+        priors = self._priors(tried, len(others) + 2 * len(of_group)) * present[:, None]
+        logs = log_evidence(infos[:, None, None], scores[:, None, None], priors)
+        return log_mean(logs, axis=1) - self._nothing()
+
+    def _nothing(self) -> float:
+        """Return the log evidence of the terms alone."""
+        found = self._terms.sums(self._slots)
+        return float(log_evidence(found.info, found.score, self._terms.prior))
+
+    def _sizes(self, group: Group, step: float) -> Floats:
+        return sizes(_LEAST / np.sqrt(len(self._campaign.keys)), group.largest, step)
+
+    def _priors(self, tried: Floats, count: int) -> Floats:
+        """Return the standard deviations (t, j) of the terms' coefficients and of ``count`` more."""
+        known = np.broadcast_to(self._terms.prior, (len(tried), len(self._terms.prior)))
+        return np.concatenate([known, np.repeat(tried[:, None], count, axis=1)], axis=1)
+
+
+def _range(group: Group) -> range:
+    return range(group.columns.start, group.columns.stop)
+
+
+def _joined(info: Floats, score: Floats, before: Sequence[Floats], after: Sequence[Floats]) -> tuple[Floats, Floats]:
+    """Return information and score (k, ...) of fixed coefficients and of those before and after each possible date.
+
+    Each side is the information (k, q, q) of its coefficients, that with the fixed ones (k, j, q), and the score.
+    """
+    dates, fixed, width = before[1].shape
+    infos = np.zeros((dates, fixed + 2 * width, fixed + 2 * width))
+    infos[:, :fixed, :fixed] = info
+    for k, (inner, across, _) in enumerate((before, after)):
+        part = slice(fixed + k * width, fixed + (k + 1) * width)
+        infos[:, part, part], infos[:, :fixed, part] = inner, across
+        infos[:, part, :fixed] = np.swapaxes(across, 1, 2)
+    scores = np.concatenate([np.broadcast_to(score, (dates, fixed)), before[2], after[2]], axis=1)
+    return infos, scores

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.dwells.piece_values import of_all_pieces
+from kf_calib.dwells.pieces import of_all_pieces
 from kf_calib.dwells.rows import on_basis
 from kf_calib.dwells.stack import DwellStack
 from kf_calib.dwells.sufficient_statistics import DwellFactor

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.dwells.piece_values import OfPieces
+from kf_calib.dwells.pieces import OfPieces
 from kf_calib.dwells.stack import DwellStack
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C

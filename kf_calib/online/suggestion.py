@@ -21,10 +21,8 @@ import numpy as np
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
-from kf_calib.design.gain_per_second import Outlook, Pace
-from kf_calib.design.gimbal_limits import Reach, wrap
-from kf_calib.design.next_orientation import poses_within
-from kf_calib.design.safe_path import can_be_reached
+from kf_calib.design.gimbal_limits import Reach, can_be_reached, wrap
+from kf_calib.design.next_orientation import Outlook, Pace, poses_within
 from kf_calib.design.visit_order import PEAK_OVER_MEAN, Timing, order
 from kf_calib.errors import InputError
 from kf_calib.estimation.cross_validation import SAME_POSE_DEG

@@ -17,9 +17,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from kf_calib.design.gain_per_second import Pace
-from kf_calib.design.gimbal_limits import Reach, wrap
-from kf_calib.design.safe_path import MARGIN_DEG, is_free, route
+from kf_calib.design.gimbal_limits import MARGIN_DEG, Reach, is_free, route, wrap
+from kf_calib.design.next_orientation import Pace
 from kf_calib.online.suggestion import Suggestion
 from kf_calib.positioning.positioner import Watchfulness
 

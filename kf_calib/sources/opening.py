@@ -14,11 +14,10 @@ from kf_calib.bench.streams import Source
 from kf_calib.errors import InputError
 from kf_calib.sources.files.contents import CALIBRATION_FORMAT
 from kf_calib.sources.files.csv_columns import CsvColumns
-from kf_calib.sources.files.csv_heading import CsvHeading
+from kf_calib.sources.files.line_parts import CsvHeading, head_of
 from kf_calib.sources.files.lines import Lines, is_json
 from kf_calib.sources.files.mcap_file import HEAD_BYTES, is_lines
 from kf_calib.sources.files.recording import Recording
-from kf_calib.sources.files.text_file import head_of
 from kf_calib.sources.tables.grid import OLD_SUFFIXES, TEXT_SUFFIXES, ZIP
 from kf_calib.sources.tables.opening import open_table
 from kf_calib.support import dates

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 from pydantic import Field, StringConstraints, TypeAdapter, ValidationError
 
 from kf_calib.errors import InputError
-from kf_calib.support.plain_text import COMMANDS, LONGEST, cut
+from kf_calib.support.text import COMMANDS, LONGEST, cut
 
 _LARGEST_BYTES = 10_000_000  # a journal of a thousand steps has two
 

@@ -17,7 +17,7 @@ from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.remarks import beyond_stated
 from kf_calib.estimation.results import Calibration, OutlyingDwell, Parameter, format_p
 from kf_calib.noise.reml import FEWEST, degrees_of_freedom
-from kf_calib.support.printing import printed
+from kf_calib.support.text import printed
 from kf_calib.support.units import rounded, shown, shown_whole
 from kf_calib.views.terminal import ConsoleTable, PlainConsole, note
 

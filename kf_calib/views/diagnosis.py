@@ -22,7 +22,7 @@ from kf_calib.diagnosis.within_dwell_trend import Trend
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation.remarks import MISSING_OR_NOISE
 from kf_calib.estimation.results import Calibration, format_p
-from kf_calib.support.printing import printed
+from kf_calib.support.text import printed
 from kf_calib.support.units import shown
 from kf_calib.views.console import plain, symbol
 from kf_calib.views.json import clean, outlying_object, readings_object

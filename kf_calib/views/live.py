@@ -17,10 +17,10 @@ from rich.text import Text
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.design.sides import turn_in_words
-from kf_calib.online.hand_status import HandJudgement, HandStanding
+from kf_calib.online.by_hand import HandJudgement, HandStanding
 from kf_calib.online.progress import Progress
 from kf_calib.online.status import Judgement, Standing
-from kf_calib.support.plain_text import sentence
+from kf_calib.support.text import sentence
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2, shown, span
 from kf_calib.views.console import symbol
 from kf_calib.views.diagnosis import found_object, orientation_object

@@ -14,10 +14,10 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from kf_calib.dwells.overview import DwellSummary
+from kf_calib.dwells.rest_in_readings import DwellSummary
 from kf_calib.sources.files.inventory import Inventory, Topic
 from kf_calib.sources.tables.survey import ColumnFound, Survey
-from kf_calib.support.plain_text import cut
+from kf_calib.support.text import cut
 from kf_calib.views.json import clean
 from kf_calib.views.terminal import ConsoleTable, note
 

@@ -10,7 +10,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.sources.files.decision_records import angles_of, number_of
+from kf_calib.sources.files.record_files import angles_of, number_of
 from kf_calib.support.units import span
 from kf_calib.views.json import clean
 from kf_calib.views.terminal import ConsoleTable

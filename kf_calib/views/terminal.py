@@ -24,7 +24,7 @@ from rich.text import Text
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.effect_shape import EffectShape
-from kf_calib.support.plain_text import printable, sentence
+from kf_calib.support.text import printable, sentence
 from kf_calib.support.units import Unit, shown, shown_whole, significant
 
 

@@ -15,7 +15,7 @@ import pytest
 from helpers.full_disk import full_disk
 
 import kf_calib
-from kf_calib.sources.files.decision_records import END_RECORD, angles_of, decision_records
+from kf_calib.sources.files.record_files import END_RECORD, angles_of, decision_records
 
 SIM = "sim://?seed=4&sample_hz=20"
 

@@ -6,7 +6,7 @@ import signal
 
 import pytest
 
-from kf_calib.cli.signals import Interrupter, answered
+from kf_calib.cli.failures import Interrupter, answered
 
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM])

@@ -20,7 +20,7 @@ from kf_calib.errors import InputError
 from kf_calib.estimation import model_file
 from kf_calib.sources.files.recorder import Recorder
 from kf_calib.sources.files.recording import Recording
-from kf_calib.support.plain_text import LONGEST, cut, printable, sentence
+from kf_calib.support.text import LONGEST, cut, printable, sentence
 
 ESCAPES = "\x1b[31m\x1b]0;title\x07\x9b2J\x7f\u202e[red]"
 ALARM = """

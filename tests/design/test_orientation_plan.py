@@ -15,7 +15,7 @@ from helpers.synthetic import Run
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.bench import Bench, axes_of, axis_names
-from kf_calib.bench.gimbal_ranges import ranges
+from kf_calib.bench.keys import ranges
 from kf_calib.bench.paper_parameters import targets_of
 from kf_calib.design import optimality_criteria
 from kf_calib.design.exact_design import Scheme, Search
@@ -298,8 +298,7 @@ def test_a_plan_is_run_by_the_simulator_and_its_sigmas_hold(run, tmp_path: Path)
     dwells = calibrate_file(out).fit.dwells
     np.testing.assert_allclose(np.degrees([each.pose for each in dwells]), made["gimbal_deg"], atol=0.01)
 
-    from kf_calib.sources.simulation.noise_processes import TrueNoise
-    from kf_calib.sources.simulation.sensors import GRADES
+    from kf_calib.sources.simulation.sensors import GRADES, TrueNoise
     from kf_calib.sources.simulation.simulator import Simulation
     from kf_calib.sources.simulation.visit_plans import explicit_plan
 

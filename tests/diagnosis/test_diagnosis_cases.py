@@ -18,8 +18,7 @@ from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.unknown_effect import JUMP
 from kf_calib.estimation.calibration import calibrate
-from kf_calib.sources.simulation.noise_processes import TrueNoise
-from kf_calib.sources.simulation.sensors import GRADES
+from kf_calib.sources.simulation.sensors import GRADES, TrueNoise
 from kf_calib.sources.simulation.simulator import Simulation
 from kf_calib.sources.simulation.visit_plans import six_faces
 

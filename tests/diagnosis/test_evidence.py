@@ -19,9 +19,8 @@ from kf_calib.effects import effect_named
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.results import Calibration
 from kf_calib.noise.noise_model import mean_covariances
-from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.physics import Ambient
-from kf_calib.sources.simulation.sensors import GRADES
+from kf_calib.sources.simulation.sensors import GRADES, TrueNoise
 from kf_calib.sources.simulation.simulator import Simulation
 
 

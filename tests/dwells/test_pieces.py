@@ -17,8 +17,7 @@ from kf_calib.dwells.rows import Nodes, basis
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.results import Calibration
-from kf_calib.sources.simulation.noise_processes import TrueNoise
-from kf_calib.sources.simulation.sensors import GRADES
+from kf_calib.sources.simulation.sensors import GRADES, TrueNoise
 from kf_calib.sources.simulation.simulator import Simulation
 
 

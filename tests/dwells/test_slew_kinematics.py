@@ -10,7 +10,7 @@ from helpers.long_runs import slow
 from helpers.synthetic import plan_of
 
 from kf_calib.bench.bench import Bench, axes_of
-from kf_calib.dwells.slew_kinematics import Curve
+from kf_calib.dwells.blocks import Curve
 from kf_calib.errors import InputError
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.dwell_pass import Pass
@@ -19,8 +19,7 @@ from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
 from kf_calib.sources.simulation.injected import parse
-from kf_calib.sources.simulation.noise_processes import TrueNoise
-from kf_calib.sources.simulation.sensors import GRADES
+from kf_calib.sources.simulation.sensors import GRADES, TrueNoise
 from kf_calib.sources.simulation.simulator import Simulation
 
 BENCH = Bench(axes_of("yzx"), 9.81, latitude_deg=50.0, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)

@@ -11,13 +11,13 @@ from helpers.synthetic import Run
 
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.bench.streams import Source
-from kf_calib.dwells.piece_values import OfPieces, of_all_pieces
+from kf_calib.dwells.pieces import OfPieces, of_all_pieces
 from kf_calib.dwells.stack import Attitudes, DwellStack, Folded
 from kf_calib.dwells.sufficient_statistics import DwellFactor, dwells_before, dwells_without
 from kf_calib.dwells.tabulated import dwells_of
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.settings import Settings
-from kf_calib.sources.tables.orientation import Orientations
+from kf_calib.sources.tables.table import Orientations
 
 SOURCES = {"angles": Run(seed=3, dwells=7), "noisy_angles": Run(seed=4, dwells=6, count=700, encoder_deg=0.001)}
 

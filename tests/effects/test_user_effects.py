@@ -38,9 +38,8 @@ from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Settings
 from kf_calib.sources.simulation.injected import parse
-from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.physics import Ambient
-from kf_calib.sources.simulation.sensors import GRADES
+from kf_calib.sources.simulation.sensors import GRADES, TrueNoise
 from kf_calib.sources.simulation.simulator import Simulation
 from kf_calib.sources.simulation.visit_plans import spread_plan
 from kf_calib.views.console import model_table, plain

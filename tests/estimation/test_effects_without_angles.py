@@ -20,7 +20,7 @@ from kf_calib.errors import UnobservableError
 from kf_calib.estimation.calibration import evaluate
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
-from kf_calib.sources.tables.orientation import Orientations
+from kf_calib.sources.tables.table import Orientations
 from kf_calib.support.threads import one_blas_thread
 
 G, POSES, COUNT, SIGMA_MPS2 = 9.81, 36, 400, 2e-4

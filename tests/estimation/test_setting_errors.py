@@ -21,7 +21,7 @@ from kf_calib.estimation.calibration import calibrate, evaluate
 from kf_calib.estimation.engine_comparison import compare
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
-from kf_calib.sources.tables.orientation import Orientations
+from kf_calib.sources.tables.table import Orientations
 from kf_calib.support.threads import one_blas_thread
 
 COUNT = 1000

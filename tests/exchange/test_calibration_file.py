@@ -25,7 +25,7 @@ from kf_calib.bench.bench import Bench
 from kf_calib.cli import main
 from kf_calib.errors import InputError
 from kf_calib.exchange import calibration_file
-from kf_calib.sources.simulation.noise_processes import TrueNoise
+from kf_calib.sources.simulation.sensors import TrueNoise
 from kf_calib.sources.simulation.simulator import Simulation
 from kf_calib.sources.simulation.visit_plans import PlannedVisit
 

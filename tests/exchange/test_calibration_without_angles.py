@@ -22,8 +22,7 @@ from kf_calib.exchange.certificate import content, statement
 from kf_calib.exchange.exports import TARGETS, exported
 from kf_calib.exchange.history import history
 from kf_calib.exchange.verification import verify
-from kf_calib.sources.simulation.noise_processes import TrueNoise
-from kf_calib.sources.simulation.sensors import Sensors
+from kf_calib.sources.simulation.sensors import Sensors, TrueNoise
 from kf_calib.sources.simulation.simulator import ByHand, Simulation
 from kf_calib.sources.simulation.visit_plans import PlannedVisit
 

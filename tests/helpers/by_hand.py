@@ -8,9 +8,8 @@ from helpers.synthetic import plan_of
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.sources.simulation.detectability import sized
 from kf_calib.sources.simulation.injected import parse
-from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.physics import Ambient
-from kf_calib.sources.simulation.sensors import GRADES
+from kf_calib.sources.simulation.sensors import GRADES, TrueNoise
 from kf_calib.sources.simulation.simulator import ByHand, Simulation, without_angles
 
 

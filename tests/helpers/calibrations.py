@@ -10,8 +10,7 @@ import kf_calib
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.exchange import calibration_file
 from kf_calib.exchange.calibration_file import SavedCalibration
-from kf_calib.sources.simulation.noise_processes import TrueNoise
-from kf_calib.sources.simulation.sensors import GRADES, Sensors
+from kf_calib.sources.simulation.sensors import GRADES, Sensors, TrueNoise
 from kf_calib.sources.simulation.simulator import Simulation
 from kf_calib.sources.simulation.visit_plans import PlannedVisit
 

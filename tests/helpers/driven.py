@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from kf_calib.bench.paper_parameters import targets_of
-from kf_calib.design.gain_per_second import Pace
+from kf_calib.design.next_orientation import Pace
 from kf_calib.online.session import Session
 from kf_calib.online.suggestion import Itinerary
 from kf_calib.positioning.drive import Drive

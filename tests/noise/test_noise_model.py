@@ -20,8 +20,8 @@ from kf_calib.dwells.stack import DwellStack
 from kf_calib.dwells.sufficient_statistics import Autocovariance, DwellFactor
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.noise import noise_model
-from kf_calib.sources.simulation.noise_processes import TrueNoise as SimulatedNoise
 from kf_calib.sources.simulation.sensors import GRADES
+from kf_calib.sources.simulation.sensors import TrueNoise as SimulatedNoise
 from kf_calib.sources.simulation.simulator import Simulation
 
 

@@ -46,8 +46,7 @@ from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.live import Status
 from kf_calib.sources.simulation.detectability import sized
 from kf_calib.sources.simulation.injected import parse
-from kf_calib.sources.simulation.noise_processes import TrueNoise
-from kf_calib.sources.simulation.sensors import GRADES
+from kf_calib.sources.simulation.sensors import GRADES, TrueNoise
 from kf_calib.sources.simulation.simulator import Simulation
 from kf_calib.views import live as views
 from kf_calib.views.console import plain

@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kf_calib.bench.bench import Bench, axes_of
-from kf_calib.design.gimbal_limits import Reach
-from kf_calib.design.safe_path import can_be_reached, is_free, route
+from kf_calib.design.gimbal_limits import Reach, can_be_reached, is_free, route
 from kf_calib.online.suggestion import Suggestion
 from kf_calib.positioning.loop import Ask, End, Halt, Move, Phase, Rules, Seen, State, step
 from kf_calib.positioning.positioner import Watchfulness

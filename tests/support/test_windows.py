@@ -23,7 +23,7 @@ import pytest
 
 from kf_calib.bench.bench import Bench, parse_axes
 from kf_calib.bench.streams import Batch, Stream
-from kf_calib.cli import echo, live_keys, signals
+from kf_calib.cli import echo, failures, live_run
 from kf_calib.errors import InputError
 from kf_calib.sources.files.recorder import Recorder
 from kf_calib.sources.files.recording import Recording
@@ -151,7 +151,7 @@ def test_keys_are_asked_for_until_the_time_is_over(monkeypatch: pytest.MonkeyPat
     monkeypatch.setitem(sys.modules, "msvcrt", SimpleNamespace(kbhit=lambda: bool(keys), getwch=lambda: keys.pop(0)))
     monkeypatch.setattr(sys, "platform", "win32")
     monkeypatch.setattr(sys, "stdin", SimpleNamespace(isatty=lambda: True))
-    with live_keys.pressed_keys(True) as key:
+    with live_run.pressed_keys(True) as key:
         assert (key(0.0), key(0.05)) == ("q", "")
         keys.append("\x03")
         with pytest.raises(KeyboardInterrupt):
@@ -161,7 +161,7 @@ def test_keys_are_asked_for_until_the_time_is_over(monkeypatch: pytest.MonkeyPat
 def test_a_console_that_is_closed_ends_the_run_in_good_order(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(signal, "SIGBREAK", signal.SIGUSR1, raising=False)
     seen = list[signal.Signals]()
-    with signals.answered(seen.append):
+    with failures.answered(seen.append):
         signal.raise_signal(signal.SIGUSR1)
     assert seen == [signal.SIGUSR1]
 

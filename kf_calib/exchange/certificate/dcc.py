@@ -18,7 +18,7 @@ from kf_calib.exchange.certificate.budget import COVERAGE
 from kf_calib.exchange.certificate.content import Certificate, CertifiedResult
 from kf_calib.exchange.certificate.statement import Party
 from kf_calib.support.extras import need
-from kf_calib.support.plain_text import cut
+from kf_calib.support.text import cut
 
 DCC, SI = "https://ptb.de/dcc", "https://ptb.de/si"
 VERSION, SCHEMA = "3.3.0", f"{DCC}/v3.3.0/dcc.xsd"

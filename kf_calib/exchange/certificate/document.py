@@ -22,7 +22,7 @@ from kf_calib.exchange.certificate.budget import Contribution
 from kf_calib.exchange.certificate.content import OUTCOMES, Certificate, CertifiedResult
 from kf_calib.exchange.certificate.statement import Party
 from kf_calib.support.extras import need
-from kf_calib.support.plain_text import cut
+from kf_calib.support.text import cut
 from kf_calib.support.units import Unit, field_unit
 
 ATTACHED = "certificate.xml"

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, Validation
 
 from kf_calib.bench.paper_parameters import targets_of
 from kf_calib.errors import InputError
-from kf_calib.support.plain_text import COMMANDS, cut
+from kf_calib.support.text import COMMANDS, cut
 from kf_calib.support.toml_files import toml_table
 
 _NONE = rf"{COMMANDS}\ufffe\uffff"  # no control characters, and nothing that XML cannot hold

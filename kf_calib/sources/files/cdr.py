@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import Stream
-from kf_calib.sources.files.joints import Joints, JointsError
+from kf_calib.sources.files.fields import Joints, JointsError
 
 Offsets = NDArray[np.int64]
 

@@ -13,8 +13,7 @@ from mcap.records import Channel, Metadata, Schema
 from kf_calib.errors import InputError
 from kf_calib.sources.files.cdr import IMU, JOINT_STATE, QUATERNION, TEMPERATURE, Decoder, MessageType
 from kf_calib.sources.files.field_messages import CDR, ENCODINGS, FieldDecoder
-from kf_calib.sources.files.fields import FieldError, Fields, known_fields
-from kf_calib.sources.files.joints import Joints
+from kf_calib.sources.files.fields import FieldError, Fields, Joints, known_fields
 from kf_calib.sources.files.mcap_file import Warn
 from kf_calib.sources.files.mcap_records import DamagedError, parse_record
 from kf_calib.sources.files.record_files import RecordFile

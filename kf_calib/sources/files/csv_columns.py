@@ -21,13 +21,12 @@ import numpy as np
 from kf_calib.bench.arrays import lengths
 from kf_calib.bench.raw_input import PLAIN, UNITS, RawInput
 from kf_calib.errors import CountsError, InputError
-from kf_calib.sources.files.csv_heading import CsvHeading
-from kf_calib.sources.files.line_parts import LineError, number_of, stamp_ns
+from kf_calib.sources.files.line_parts import CsvHeading, LineError, number_of, stamp_ns
 from kf_calib.sources.tables.columns import QUATERNION, READINGS, SPREADS
 from kf_calib.sources.tables.numbers import DECIMAL_POINT, Numbers, month_comes_first, stamp_of
 from kf_calib.sources.tables.words import ANGLE, NO_HEADER, TIME, Meaning, are_numbers, meaning_of
 from kf_calib.sources.units import Units, reading_units
-from kf_calib.support.plain_text import cut
+from kf_calib.support.text import cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 EXAMPLE = "time_s,ax_mps2,ay_mps2,az_mps2,outer_deg,middle_deg,inner_deg,temperature_c"

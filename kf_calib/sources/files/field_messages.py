@@ -14,8 +14,7 @@ from mcap.records import Schema
 
 from kf_calib.bench.streams import Stream
 from kf_calib.sources.files.cdr import IMU, JOINT_STATE, QUATERNION, TEMPERATURE, Offsets
-from kf_calib.sources.files.fields import LOG_TIME, FieldError, Fields, time_ns
-from kf_calib.sources.files.joints import Joints, JointsError
+from kf_calib.sources.files.fields import LOG_TIME, FieldError, Fields, Joints, JointsError, time_ns
 from kf_calib.support.extras import MissingExtraError
 
 ENCODINGS = ("json", "protobuf")

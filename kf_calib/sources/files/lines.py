@@ -20,14 +20,12 @@ from kf_calib.bench.raw_input import CONVERTED, PLAIN, RESTATE, RawInput, merged
 from kf_calib.bench.streams import Batch, bench_without_angles, with_accel, without_poses
 from kf_calib.errors import BenchError, CountsError, InputError
 from kf_calib.sources.files.csv_columns import CsvColumns
-from kf_calib.sources.files.csv_heading import CsvHeading
-from kf_calib.sources.files.joints import as_columns
-from kf_calib.sources.files.line_parts import Account, LineReader
+from kf_calib.sources.files.fields import as_columns
+from kf_calib.sources.files.line_parts import Account, CsvHeading, Cutter, LineReader, TextFile
 from kf_calib.sources.files.sample_lines import CsvLines, JsonLines
-from kf_calib.sources.files.text_file import Cutter, TextFile
 from kf_calib.sources.tables.columns import HOW
 from kf_calib.sources.units import Units
-from kf_calib.support.plain_text import cut
+from kf_calib.support.text import cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 _BLOCK_BYTES = 1 << 18

@@ -1,28 +1,41 @@
 """The files of a recording: one, or those of a ROS 2 bag's folder in the order in which they were written.
 
 What kind of file a part is, is known by its first bytes; one that is compressed as a whole is unpacked.
+
+Decisions of a bench that drives itself, in the metadata of its recording: what was decided, when, and why.
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
+import math
 import os
 import re
 import tempfile
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from itertools import takewhile
 from pathlib import Path
 from typing import IO, Protocol
 
 import zstandard
+from mcap.opcode import Opcode
+from mcap.records import Metadata
 
-from kf_calib.errors import InputError
+from kf_calib.errors import InputError, KfCalibError
 from kf_calib.sources.files.mcap_file import McapFile, Warn
-from kf_calib.sources.files.mcap_records import RecordBlock, Summary, allowed_sizes
+from kf_calib.sources.files.mcap_records import (
+    DamagedError,
+    MessageFinder,
+    RecordBlock,
+    Summary,
+    allowed_sizes,
+    parse_record,
+)
 from kf_calib.sources.files.sqlite_bag import SqliteBag
-from kf_calib.support.plain_text import cut
+from kf_calib.support.text import cut
 
 _USUAL_RATIO = 20  # sizes of a recording unpacked and packed, at most
 _SQLITE, _ZSTD = b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
@@ -206,3 +219,38 @@ def fingerprint(path: Path) -> str:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}): name a recording.") from None
     return digest.hexdigest()
+
+
+DECISION_RECORD = "kf_calib.decision"
+"""Where something was decided: number, at_s, purpose, gimbal_deg (JSON list), stay_s, why."""
+END_RECORD = "kf_calib.drive"
+"""After the last decision: ended, why, stands_at_deg (JSON list), stopped, lasted_s."""
+
+
+def decision_records(path: Path, name: str = DECISION_RECORD) -> list[Mapping[str, str]]:
+    """The records of a name in an MCAP file, in their order; none in a file that is none or cannot be read."""
+    find, records = MessageFinder(), list[Mapping[str, str]]()
+    try:
+        for block in McapFile(path).blocks(lambda said: None):
+            for opcode, content in find(block).others:
+                if opcode == Opcode.METADATA and (record := parse_record(Metadata.read, content)).name == name:
+                    records.append(record.metadata)
+    except (KfCalibError, OSError, DamagedError):
+        return records
+    return records
+
+
+def number_of(record: Mapping[str, str], key: str) -> float:
+    """A number of a record; NaN where there is none."""
+    try:
+        return float(record[key])
+    except (KeyError, ValueError):
+        return math.nan
+
+
+def angles_of(text: str) -> tuple[float, ...]:
+    """The angles of a record, deg; none where the text is no list of numbers."""
+    try:
+        return tuple(float(angle) for angle in json.loads(text))
+    except (TypeError, ValueError):
+        return ()

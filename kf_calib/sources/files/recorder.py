@@ -34,7 +34,7 @@ from kf_calib.sources.files.contents import (
     TEMPERATURE_TOPIC,
     bench_checksum,
 )
-from kf_calib.sources.files.joints import Joints, gimbal_names
+from kf_calib.sources.files.fields import Joints, gimbal_names
 from kf_calib.sources.files.mcap_file import McapFile
 from kf_calib.sources.files.mcap_records import HEAD, MAGIC, MessageFinder
 from kf_calib.support.output_files import Growing, refuse_output

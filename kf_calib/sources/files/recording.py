@@ -36,8 +36,7 @@ from kf_calib.sources.files.contents import (
     fields_by_role,
 )
 from kf_calib.sources.files.field_messages import FieldDecoder
-from kf_calib.sources.files.fields import FieldError
-from kf_calib.sources.files.joints import Joints
+from kf_calib.sources.files.fields import FieldError, Joints
 from kf_calib.sources.files.mcap_file import Warn
 from kf_calib.sources.files.mcap_records import (
     MAX_CHUNK_MB,

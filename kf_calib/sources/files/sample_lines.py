@@ -16,7 +16,6 @@ from typing import Any
 from kf_calib.bench.bench import metadata_of
 from kf_calib.bench.raw_input import UNITS, parse_unit
 from kf_calib.sources.files.csv_columns import CsvColumns
-from kf_calib.sources.files.csv_heading import cells_of, without_empty_end
 from kf_calib.sources.files.line_parts import (
     ACCEL_UNITS,
     TIME_DECIMALS,
@@ -24,8 +23,10 @@ from kf_calib.sources.files.line_parts import (
     LineError,
     LineReader,
     LineRows,
+    cells_of,
     number_of,
     stamp_ns,
+    without_empty_end,
 )
 from kf_calib.sources.tables.numbers import DECIMAL_POINT
 

@@ -13,7 +13,7 @@ from urllib.parse import parse_qsl, urlencode, urlsplit
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, bench_without_angles, without_poses
 from kf_calib.errors import BenchError, InputError
-from kf_calib.sources.files.joints import as_columns
+from kf_calib.sources.files.fields import as_columns
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.live.feed import IDLE_S, Feed, GrowingFile, Link, SerialPort, StandardInput, Tcp, nothing
 from kf_calib.sources.live.source import QUEUED, LiveSource

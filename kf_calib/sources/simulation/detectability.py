@@ -35,8 +35,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats, Times
 from kf_calib.errors import InputError
 from kf_calib.sources.simulation.injected.kinds import Hidden, NoSizeError
-from kf_calib.sources.simulation.noise_processes import TrueNoise
-from kf_calib.sources.simulation.sensors import Sensors
+from kf_calib.sources.simulation.sensors import Sensors, TrueNoise
 from kf_calib.sources.simulation.simulator import Simulation, without_angles
 from kf_calib.support.output_files import write_whole
 

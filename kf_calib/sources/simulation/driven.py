@@ -20,8 +20,8 @@ import numpy as np
 from kf_calib.bench.arrays import Floats, Times
 from kf_calib.bench.streams import Batch
 from kf_calib.errors import InputError, check_number
-from kf_calib.sources.simulation.noise_processes import generator
 from kf_calib.sources.simulation.physics import TrueState
+from kf_calib.sources.simulation.sensors import generator
 from kf_calib.sources.simulation.simulator import Simulation
 from kf_calib.sources.simulation.visit_plans import Motion, between
 

@@ -21,7 +21,6 @@ from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import InputError
 from kf_calib.sources.simulation.injected import Hidden, Rig, Stage, steps_of
-from kf_calib.sources.simulation.noise_processes import TrueNoise, generator
 from kf_calib.sources.simulation.physics import (
     Ambient,
     Disturbance,
@@ -35,7 +34,7 @@ from kf_calib.sources.simulation.physics import (
     WalkingBias,
     set_attitudes,
 )
-from kf_calib.sources.simulation.sensors import Sensors
+from kf_calib.sources.simulation.sensors import Sensors, TrueNoise, generator
 from kf_calib.sources.simulation.visit_plans import YZX, Motion, PlannedVisit, attitude, stays
 
 START_NS = 1_750_000_000_000_000_000

@@ -14,7 +14,7 @@ from typing import Any
 from kf_calib.errors import InputError
 from kf_calib.sources.tables.spreadsheet import sheets_of
 from kf_calib.sources.tables.words import is_unit
-from kf_calib.support.plain_text import cut
+from kf_calib.support.text import cut
 
 Cell = str | float | datetime | None
 """A cell as it was read; text is not interpreted yet, an empty cell is None."""

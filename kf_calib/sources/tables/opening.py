@@ -15,15 +15,13 @@ from kf_calib.bench.bench import Bench, parse_axes
 from kf_calib.bench.raw_input import PLAIN, RawInput, merged_metadata
 from kf_calib.bench.streams import bench_without_angles
 from kf_calib.errors import BenchError, InputError
-from kf_calib.sources.tables.columns import HOW, KNOWN, QUATERNION, READINGS, SPREADS, Columns
+from kf_calib.sources.tables.columns import HOW, KNOWN, QUATERNION, READINGS, SPREADS, Columns, RowTimes
 from kf_calib.sources.tables.grid import grid_of
 from kf_calib.sources.tables.numbers import Numbers
-from kf_calib.sources.tables.orientation import Orientations
-from kf_calib.sources.tables.table import Table
-from kf_calib.sources.tables.times import RowTimes
+from kf_calib.sources.tables.table import Orientations, Table
 from kf_calib.sources.tables.words import ANGLE, NO_HEADER, are_numbers, face_of
 from kf_calib.sources.units import Units, mps2_per, reading_units
-from kf_calib.support.plain_text import cut
+from kf_calib.support.text import cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 _SAMPLES, _FAST_S = 50, 1.0

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from kf_calib.errors import InputError
 from kf_calib.support.extras import need
-from kf_calib.support.plain_text import cut
+from kf_calib.support.text import cut
 
 if TYPE_CHECKING:
     from openpyxl.worksheet._read_only import ReadOnlyWorksheet

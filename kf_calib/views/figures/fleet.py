@@ -12,9 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.fleet.overview import FleetOverview
+from kf_calib.fleet.overview import FleetOverview, Track
 from kf_calib.fleet.pooled_diagnosis import BenchCoefficients, Finding
-from kf_calib.fleet.track import Track
 from kf_calib.support.units import shown
 from kf_calib.views.console import symbol
 from kf_calib.views.figures.collection import Figures, figures

@@ -38,8 +38,7 @@ from kf_calib.diagnosis.stepwise_selection import Improvement
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration
 from kf_calib.support.output_files import write_whole
-from kf_calib.support.plain_text import printable
-from kf_calib.support.printing import as_html
+from kf_calib.support.text import as_html, printable
 from kf_calib.support.units import shown, shown_whole
 from kf_calib.views import console, diagnosis, improvement
 from kf_calib.views.json import clean

@@ -26,7 +26,7 @@ from kf_calib.diagnosis.stepwise_selection import Improvement
 from kf_calib.estimation.estimate import correlation
 from kf_calib.estimation.results import Calibration, Parameter, format_p
 from kf_calib.online.status import Judgement
-from kf_calib.support.plain_text import printable
+from kf_calib.support.text import printable
 from kf_calib.support.units import Unit, shown, significant
 from kf_calib.views.console import noise_origins, whole_value
 from kf_calib.views.rerun.diagnosis import save_diagnosis_view as save_diagnosis

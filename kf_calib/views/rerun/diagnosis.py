@@ -28,7 +28,7 @@ from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import format_p
-from kf_calib.support.plain_text import printable
+from kf_calib.support.text import printable
 from kf_calib.support.units import shown_whole
 from kf_calib.views.diagnosis import name_of, verdict
 from kf_calib.views.rerun.names import ACCELEROMETERS, CHANNELS, GOLD, GREY, MAUVE, Colour, rrd_file, thin

@@ -21,7 +21,7 @@ from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration, Parameter, format_p
 from kf_calib.support import units
-from kf_calib.support.plain_text import printable
+from kf_calib.support.text import printable
 from kf_calib.views.rerun.names import GOLD, GREY, MAUVE, RED, WHITE, Colour, entity, rrd_file
 from kf_calib.views.rerun.spheres import at_step, log_spheres, spheres
 

@@ -20,7 +20,7 @@ import rerun.blueprint as rrb
 from kf_calib.bench import paper_parameters
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.support.output_files import write_whole
-from kf_calib.support.plain_text import printable
+from kf_calib.support.text import printable
 from kf_calib.support.units import shown
 
 BENCH_TIME = "bench_time"

@@ -12,7 +12,7 @@ from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.bench.streams import Stream
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.files import cdr
-from kf_calib.sources.files.joints import Joints, JointsError
+from kf_calib.sources.files.fields import Joints, JointsError
 from kf_calib.sources.files.lines import Lines
 from kf_calib.sources.files.recorder import Recorder
 from kf_calib.sources.files.recording import Recording

@@ -17,9 +17,8 @@ from kf_calib.errors import InputError
 from kf_calib.sources.files.recorder import Recorder
 from kf_calib.sources.simulation.detectability import sized, sizes_in_sigma, truth_of, write_truth
 from kf_calib.sources.simulation.injected import Hidden, NoSizeError, catalogue, parse
-from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.physics import Ambient
-from kf_calib.sources.simulation.sensors import GRADES, Sensors
+from kf_calib.sources.simulation.sensors import GRADES, Sensors, TrueNoise
 from kf_calib.sources.simulation.simulator import Simulation
 from kf_calib.sources.simulation.visit_plans import PlannedVisit, spread_plan
 

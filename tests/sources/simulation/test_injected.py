@@ -18,9 +18,8 @@ from kf_calib.sources.files.recorder import Recorder
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.simulation.detectability import truth_of, write_truth
 from kf_calib.sources.simulation.injected import catalogue, parse, si
-from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.physics import Ambient
-from kf_calib.sources.simulation.sensors import GRADES, Sensors
+from kf_calib.sources.simulation.sensors import GRADES, Sensors, TrueNoise
 from kf_calib.sources.simulation.simulator import START_NS, Simulation
 from kf_calib.sources.simulation.visit_plans import YZX, explicit_plan, spread_plan
 

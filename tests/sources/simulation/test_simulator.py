@@ -15,8 +15,7 @@ from kf_calib.bench.bench import Bench, axes_of, parse_axes
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.sources.simulation.detectability import write_truth
-from kf_calib.sources.simulation.noise_processes import TrueNoise
-from kf_calib.sources.simulation.sensors import GRADES, NOMINAL, Sensors
+from kf_calib.sources.simulation.sensors import GRADES, NOMINAL, Sensors, TrueNoise
 from kf_calib.sources.simulation.simulator import START_NS, Ambient, Simulation
 from kf_calib.sources.simulation.visit_plans import PlannedVisit, explicit_plan, six_faces, spread_plan
 

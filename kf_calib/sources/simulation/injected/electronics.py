@@ -6,8 +6,8 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.sources.simulation.injected.kinds import Rig, made
-from kf_calib.sources.simulation.noise_processes import OutlierProcess
 from kf_calib.sources.simulation.physics import Disturbance, TrueState, TrueStep
+from kf_calib.sources.simulation.sensors import OutlierProcess
 
 _PAIRS = ("12", "13", "21", "23", "31", "32")
 

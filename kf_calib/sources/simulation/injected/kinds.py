@@ -12,9 +12,8 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, Vector
 from kf_calib.errors import InputError
-from kf_calib.sources.simulation.noise_processes import generator
 from kf_calib.sources.simulation.physics import TrueState, TrueStep
-from kf_calib.sources.simulation.sensors import Sensors
+from kf_calib.sources.simulation.sensors import Sensors, generator
 from kf_calib.sources.simulation.visit_plans import Motion
 from kf_calib.support.units import si
 

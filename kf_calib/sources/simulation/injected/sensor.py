@@ -13,8 +13,8 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.sources.simulation.injected.kinds import Rig, above, added, adding, column, made, output, pendulous, sign
-from kf_calib.sources.simulation.noise_processes import FirstOrder
 from kf_calib.sources.simulation.physics import TrueState, TrueStep, WalkingBias
+from kf_calib.sources.simulation.sensors import FirstOrder
 
 _PENDULOUS_AND_OUTPUT = ("1p", "1o", "2p", "2o", "3p", "3o")
 

@@ -13,7 +13,7 @@ import numpy as np
 from kf_calib.bench.bench import Vector
 from kf_calib.errors import InputError, how_to_write
 from kf_calib.sources.simulation.injected.kinds import INNER, EffectKind, Hidden, NoSizeError, catalogue
-from kf_calib.sources.simulation.noise_processes import generator
+from kf_calib.sources.simulation.sensors import generator
 from kf_calib.support.units import si
 
 RANDOM = {"random": (True, False), "random-known": (True,), "random-unknown": (False,)}

@@ -1,10 +1,18 @@
 """Text from files, links and arguments, made safe for a terminal.
 
 Recordings, streams and file names may contain commands to the terminal, which change colours or the title or overwrite
-lines. Characters that Python does not call printable are therefore written as their code, ``\\x1b``.
+lines. Characters that Python does not call printable are therefore written as their code, ``\x1b``.
+
+Results as text and as HTML: what shows a result knows it, and the result does not know what shows it.
+
+What shows them is loaded when the first is shown (``shown_by``), so that a result is printed alike whatever was
+imported before.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from functools import singledispatch
 
 LONGEST = 1000
 """Characters of a message, at most."""
@@ -38,3 +46,31 @@ def cut(text: str, longest: int) -> str:
 
 def _code(each: str) -> str:
     return each.encode("unicode_escape").decode()
+
+
+_loaders = list[Callable[[], object]]()
+
+
+def shown_by(load: Callable[[], object]) -> None:
+    """Have ``load`` called before the first result is shown: it imports the modules that register how."""
+    _loaders.append(load)
+
+
+@singledispatch
+def printed(value: object) -> str:
+    """The value as plain text; ``views`` register how for each kind of result."""
+    return printed(value) if _have_loaded() else repr(value)
+
+
+@singledispatch
+def as_html(value: object) -> str | None:
+    """The value as HTML for a notebook; ``views`` register how for each kind of result. None: it is shown as text."""
+    return as_html(value) if _have_loaded() else None
+
+
+def _have_loaded() -> bool:
+    """Load what shows results, and tell whether anything was left to be loaded."""
+    waiting = [_loaders.pop() for _ in list(_loaders)]
+    for load in waiting:
+        load()
+    return bool(waiting)
