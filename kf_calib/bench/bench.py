@@ -118,7 +118,7 @@ class Bench:
     - angles: whether angles or attitudes are used. Without them only the size of gravity is known (``free_attitude``).
     - square_sigma_deg: how square the axes of the accelerometers are, one standard deviation; None for 1 deg.
     - limits_deg, forbidden_deg: ranges of gimbals that must not be left, and zones that must not be entered, as text
-      (``gimbal_ranges``); rate_degps, acceleration_degps2: greatest of any gimbal; None if not stated.
+      (``bench.keys``); rate_degps, acceleration_degps2: greatest of any gimbal; None if not stated.
     """
 
     axes: tuple[Vector, ...]
