@@ -39,7 +39,7 @@ class TestMap:
     def tests_of(self, path: Path, function: str, first: Iterable[Path] = ()) -> list[str]:
         """The tests that execute a function, or, where there is none, anything of its module.
 
-        File by file, since tests of a file share what one has made: first those of the module's own name, then the files
+        File by file, since tests of a file share what one has made: first those of the module's name, then the files
         named, then those that take little.
         """
         place, module = f"{path}:{function}", f"{path}:"
