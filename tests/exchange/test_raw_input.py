@@ -141,7 +141,12 @@ class Taken:
         return "\n".join([f"time_ns,{header},outer_deg,middle_deg,inner_deg", *lines, ""])
 
 
-@pytest.fixture(scope="module", params=list(devices()), ids=lambda param: param[0])
+COUNTS, IN_G, IN_MPS2 = devices()
+
+
+@pytest.fixture(
+    scope="module", params=[COUNTS, IN_G, pytest.param(IN_MPS2, marks=pytest.mark.slow)], ids=lambda param: param[0]
+)
 def device(request: Any, tmp_path_factory: pytest.TempPathFactory, run: Any) -> Taken:
     """Recorded from lines, with what it sends stated once, and calibrated with no further word."""
     name, own = request.param
