@@ -27,6 +27,8 @@ from kf_calib.sources.simulation.injected import parse
 from kf_calib.sources.simulation.sensors import GRADES, TrueNoise
 from kf_calib.sources.simulation.simulator import Simulation
 
+pytestmark = pytest.mark.usefixtures("unmeasured")
+
 SIGMA = 5e-5
 SHARES = (1.0, -0.6, 0.8)
 WITH = Settings(effects=("sinusoid",))
