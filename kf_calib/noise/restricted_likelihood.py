@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.dwells.qr import square_triangle
 from kf_calib.noise import banded
 from kf_calib.noise.noise_model import lift_rounding
 
@@ -74,13 +75,28 @@ class Restricted:
         """The likelihood and its derivatives at ``variances`` (k,)."""
         return self._with_derivatives(self._level(variances))
 
-    def _level(self, variances: Floats) -> _Level:
-        """Return the likelihood at ``variances`` (k,), without its derivatives, which take more time."""
+    def root_of(self, variances: Floats, places: slice) -> tuple[Floats, Floats]:
+        """A root (q, q) of the information on the coefficients of some columns at ``variances`` (k,), all others
+        integrated out, and the readings (q,) in its rows: root @ x is what the readings say of them."""
+        whitened, columns = self._whitened(variances)[1], np.arange(self.rows.shape[1] - 1)
+        chosen = columns[places]
+        order = np.concatenate([np.setdiff1d(columns, chosen), chosen, [len(columns)]])
+        upper, first = square_triangle(whitened[:, order]), len(columns) - len(chosen)
+        return upper[first:-1, first:-1], upper[first:-1, -1]
+
+    def _whitened(self, variances: Floats) -> tuple[tuple[Floats, Floats], Floats]:
+        """Return the covariance V and its root at ``variances`` (k,), and the rows [A | z] whitened by it, those of
+        prior knowledge first."""
         wider = variances @ self.shapes.reshape(len(variances), self.fixed.size)
         covariance = self.fixed + wider.reshape(self.fixed.shape)
         covariance[:, :3] = lift_rounding(covariance[:, :3])
-        lower, known = banded.root(covariance), len(self.prior)
-        whitened = np.concatenate([self.prior, banded.solve(lower, self.rows)])
+        lower = banded.root(covariance)
+        return (covariance, lower), np.concatenate([self.prior, banded.solve(lower, self.rows)])
+
+    def _level(self, variances: Floats) -> _Level:
+        """Return the likelihood at ``variances`` (k,), without its derivatives, which take more time."""
+        (covariance, lower), whitened = self._whitened(variances)
+        known = len(self.prior)
         basis, upper = np.linalg.qr(whitened[:, :-1])
         rest = whitened[:, -1] - basis @ (basis.T @ whitened[:, -1])
         cost = np.log(lower[0]).sum() + np.log(np.abs(np.diag(upper))).sum() + 0.5 * rest @ rest
