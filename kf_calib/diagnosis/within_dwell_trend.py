@@ -100,7 +100,7 @@ def trend_beside(linearised: LinearisedDwells, noise: Noise, state: Floats) -> T
         return None
     sigma, lengths_s = noise.effective_sigma_mps2, np.array([dwell.end_s - dwell.start_s for dwell in dwells])
     squares, determined = _squares(dwells, _residuals(linearised, state))
-    by_readings = (sigma**2 / np.array([[dwell.count] for dwell in dwells]))[:, :, None]
+    by_readings = (sigma**2 / np.array([[dwell.weight * dwell.count] for dwell in dwells]))[:, :, None]
     walk_shapes, flicker_shapes = _of_shapes()
     by_walk = noise.walk_mps2_per_sqrt_s**2 * lengths_s[:, None, None] * walk_shapes
     by_noise = by_readings + by_walk + flicker_sigma(noise, len(dwells))[:, None] ** 2 * flicker_shapes

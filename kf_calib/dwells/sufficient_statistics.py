@@ -57,6 +57,10 @@ class Autocovariance:
             self.blocks + other.blocks,
         )
 
+    def times(self, weight: float) -> Autocovariance:
+        """The sums with products times a weight."""
+        return self if weight == 1.0 else replace(self, products=weight * self.products)
+
     @classmethod
     def of(cls, residuals: Floats) -> Autocovariance:
         """The sums for one block of readings (3, n) from which the parabola has been removed."""
@@ -73,6 +77,8 @@ _OF_CONDITIONS = ("nodes", "squares", "counts", "variances", "walk", "shaking", 
 """Cached properties of a dwell that stay if the means of its readings change."""
 _OF_READINGS = (*_OF_CONDITIONS, "triangles", "factor", "means")
 """Cached properties of a dwell that stay if its force is turned."""
+_OF_ALL = (*_OF_READINGS, "spread", "regressors")
+"""Cached properties of a dwell that stay if nothing but its weight changes."""
 _OF_TRIANGLES = ("triangles", "squares", "counts", "variances", "walk", "shaking", "count", "spread")
 """Cached properties of a dwell that stay if the force and the pose at its nodes are others."""
 
@@ -92,6 +98,7 @@ class DwellFactor:
     - turned_rad: rotation vector (3,) by which effects of a model turn the specific force that its pose shows; None
       where they do not.
     - attitude: what is known of its setting error beyond the prior; None where none is allowed for.
+    - weight: of its readings, the variance of a reading of the run over that of one of this dwell.
     """
 
     number: int
@@ -105,6 +112,7 @@ class DwellFactor:
     turns: tuple[int, ...] = ()
     turned_rad: Floats | None = None
     attitude: AttitudeError | None = None
+    weight: float = 1.0
 
     @property
     def carrier_hz(self) -> float:
@@ -129,6 +137,10 @@ class DwellFactor:
     def linearised(self, turned_rad: Floats | None, attitude: AttitudeError | None) -> DwellFactor:
         """The same dwell about a force that is turned otherwise."""
         return self._replaced(_OF_READINGS, turned_rad=turned_rad, attitude=attitude)
+
+    def weighted(self, weight: float) -> DwellFactor:
+        """The same dwell with another weight of its readings."""
+        return self._replaced(_OF_ALL, weight=weight)
 
     def with_force(
         self, force_mps2: Floats, pose: Floats, attitude: AttitudeError | None, came_from: DwellFactor | None

@@ -36,6 +36,7 @@ from kf_calib.noise.noise_model import ATTITUDE_UNKNOWN_RAD, FLOOR_MPS2, Noise, 
 from kf_calib.noise.nuisance_states import along_force, sensitivities_of
 from kf_calib.noise.reml import VarianceComponents, with_shared_noise
 from kf_calib.noise.thermometer_error import sensitivity_to_temperature
+from kf_calib.noise.unequal_noise import with_own_noise
 
 _PASSES = 3
 _PASSES_WITH_UNKNOWNS = 10
@@ -182,8 +183,8 @@ def _begun(
     """Return the fit from which estimation begins: with angles at the nominal state, without at that of the nine
     parameters alone."""
     if model.bench.angles:
+        dwells = with_own_noise([without_attitude(dwell) for dwell in dwells])
         within = replace(within_dwells(dwells, walk_mps2_per_sqrt_s), walk_mps2_per_sqrt_s=walk_mps2_per_sqrt_s)
-        dwells = [without_attitude(dwell) for dwell in dwells]
         return Fit(LinearisedDwells(dwells, model, model.nominal_state(), slews), within)
     nine = beginning or _nine_parameters(dwells, model.bench, walk_mps2_per_sqrt_s)
     state = np.append(nine.linearised.state, np.zeros(model.count - STATE_COUNT))
@@ -199,6 +200,7 @@ def _nine_parameters(dwells: list[DwellFactor], bench: Bench, walk_mps2_per_sqrt
     """
     readings, stated = np.array([dwell.means[4:] for dwell in dwells]), bench.scatter_sigma_mps2
     facing_up = readings / np.linalg.norm(readings, axis=1, keepdims=True)
+    dwells = with_own_noise(dwells, facing_up)
     within = within_dwells(dwells, walk_mps2_per_sqrt_s, facing_up)
     noise = replace(
         within, walk_mps2_per_sqrt_s=walk_mps2_per_sqrt_s, setting_rad=ATTITUDE_UNKNOWN_RAD, setting_stated=True,

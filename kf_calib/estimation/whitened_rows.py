@@ -134,9 +134,9 @@ def _weighted(
     priors, slow = nuisance_sigmas(noise), np.zeros(0) if flicker_mps2 is None else flicker_sigmas(flicker_mps2)
     blocks = _Blocks(len(priors), len(slow), 3 if noise.walk_mps2_per_sqrt_s else 0, columns.shape[-1])
     parts = _channels(dwells, columns, blocks, nuisance_map(dwells, noise, state), about)
-    sigma = noise.effective_sigma_mps2
-    parts /= sigma[:, None, None]
-    walks = np.repeat((noise.walk_mps2_per_sqrt_s / sigma)[None], len(dwells), axis=0)
+    sigma, roots = noise.effective_sigma_mps2, np.sqrt([dwell.weight for dwell in dwells])
+    parts *= roots[:, None, None, None] / sigma[:, None, None]
+    walks = roots[:, None] * (noise.walk_mps2_per_sqrt_s / sigma)
     if noise.attitude_unknown:
         along = _unit_along(dwells, noise, state)
         parts, walks = _combined(parts, along), np.sqrt((along**2)[:, None] @ (walks**2)[:, :, None])[:, :, 0]
@@ -235,6 +235,7 @@ class _Alike:
     - pieces (d, pieces), rows (d, r): which of all pieces and rows are theirs.
     - triangles (d, pieces, K, K): of the basis functions. nuisances (d, r, n): orthonormal basis of nuisance states.
     - along (d, 3): by which whitened channels are combined where attitudes are not known; else None.
+    - roots (d,): of the weights of their readings.
     """
 
     pieces: NDArray[np.intp]
@@ -242,6 +243,7 @@ class _Alike:
     triangles: Floats
     nuisances: Floats
     along: Floats | None
+    roots: Floats
 
 
 class MisfitColumns:
@@ -270,6 +272,7 @@ class MisfitColumns:
                 np.array([dwell.triangles[:, :width, :width] for dwell in some]),
                 np.linalg.qr(rows[..., :count])[0],
                 _unit_along(some, noise, state) if noise.attitude_unknown else None,
+                np.sqrt([dwell.weight for dwell in some]),
             )
             self._groups.append(group)
 
@@ -280,7 +283,8 @@ class MisfitColumns:
             stacked = columns[group.pieces]  # (d, pieces, K, 3, q)
             many, pieces, width, _, count = stacked.shape
             on_triangles = group.triangles @ on_basis(stacked.reshape(many, pieces, width, 3 * count))
-            parts = np.moveaxis(on_triangles.reshape(stacked.shape) / self._sigma[:, None], 3, 1)
+            scale = group.roots[:, None, None, None, None] / self._sigma[:, None]
+            parts = np.moveaxis(on_triangles.reshape(stacked.shape) * scale, 3, 1)
             parts = parts.reshape(many, 3, pieces * width, count)
             if group.along is not None:
                 parts = _combined(parts, group.along)

@@ -35,7 +35,7 @@ def flicker_within(dwells: Sequence[DwellFactor], columns: Sequence[Floats], sta
         along = along_force(dwells, sensitivities_of(dwells, state))
         channels = (along / np.linalg.norm(along, axis=1, keepdims=True))[:, None]
     pairs = [
-        _amplitudes(dwell, design @ state, noise.effective_sigma_mps2, weights)
+        _amplitudes(dwell, design @ state, noise.effective_sigma_mps2 / np.sqrt(dwell.weight), weights)
         for dwell, design, weights in zip(dwells, columns, channels, strict=True)
     ]
     amplitudes, variances = (np.array(values) for values in zip(*pairs, strict=True))  # (D, k, c) each

@@ -19,7 +19,7 @@ class Means:
 
     - design (D, 3, p): the model's columns.
     - readings (D, 3), force_mps2 (D, 3): readings and specific force.
-    - counts (D,): number of readings.
+    - counts (D,): number of readings, each as many as its weight says.
     - ends_s (D, 2): when each dwell begins and ends.
     - bending (D, 3, 3): by how much effects change the readings per unit of force (``AttitudeError``).
     """
@@ -54,7 +54,7 @@ def means_of(dwells: Sequence[DwellFactor], columns: Sequence[Floats]) -> Means:
         design[places] = np.einsum("db,dbk,dbkc->dc", weights, first, coefficients).reshape(-1, *stacked.shape[3:])
     means = np.array([dwell.means for dwell in dwells])
     forces = np.array([dwell.felt_force(stacked[1:4]) for dwell, stacked in zip(dwells, means, strict=True)])
-    counts = np.array([dwell.count for dwell in dwells], float)
+    counts = np.array([dwell.weight * dwell.count for dwell in dwells], float)
     ends = np.array([(dwell.start_s, dwell.end_s) for dwell in dwells])
     return Means(design, means[:, 4:], forces, counts, ends, np.array([bending_of(dwell) for dwell in dwells]))
 

@@ -140,9 +140,9 @@ def within_dwells(
     about a parabola has the expectation sigma^2 (n - 3 kappa) if n is at least 40 kappa. If there is no such piece,
     sigma_w is taken from the autocovariance.
     """
-    total = dwells[0].autocovariance
+    total = dwells[0].autocovariance.times(dwells[0].weight)
     for dwell in dwells[1:]:
-        total += dwell.autocovariance
+        total += dwell.autocovariance.times(dwell.weight)
     if walk_mps2_per_sqrt_s:
         total = replace(total, products=total.products - walk_mps2_per_sqrt_s**2 * _walk_products(dwells))
     known = _of_averages if dwells[0].averaged else _inflation
@@ -151,9 +151,10 @@ def within_dwells(
         inflation, variance = _alike(total)
     if along is not None:
         return Noise(_sigma_along(dwells, along, inflation), inflation, within_seen=any(d.count > 1 for d in dwells))
-    squares, counts = (np.concatenate([getattr(each, key) for each in dwells]) for key in ("squares", "counts"))
+    squares = np.concatenate([dwell.weight * dwell.squares for dwell in dwells])
+    counts = np.concatenate([dwell.counts for dwell in dwells])
     if walk_mps2_per_sqrt_s:
-        rest = np.concatenate([dwell.walk.about_parabola for dwell in dwells])
+        rest = np.concatenate([dwell.weight * dwell.walk.about_parabola for dwell in dwells])
         squares = np.maximum(squares - walk_mps2_per_sqrt_s**2 * rest[:, None], 0.0)
     on_carrier = dwells[0].width - 3
     long = counts[:, None] >= np.where(variance > 0, 40.0 * inflation, 0.0)
@@ -170,7 +171,7 @@ def _sigma_along(dwells: Sequence[DwellFactor], along: Floats, inflation: Floats
     The likeliest variances of such gamma distributed sums, by steps that keep them positive.
     """
     weights = along**2
-    squares = np.array([dwell.squares_along(m).sum() for dwell, m in zip(dwells, along, strict=True)])
+    squares = np.array([dwell.weight * dwell.squares_along(m).sum() for dwell, m in zip(dwells, along, strict=True)])
     freedom = np.array([np.maximum(dwell.counts - 3.0 * inflation.mean(), 0.0).sum() for dwell in dwells])
     if not freedom.any():
         freedom = np.array([max(dwell.count - 1.0, 0.0) for dwell in dwells])
@@ -190,7 +191,9 @@ def _walk_products(dwells: Sequence[DwellFactor]) -> Floats:
     for dwell in dwells:
         known, period_s = dwell.autocovariance, (dwell.end_s - dwell.start_s) / max(dwell.count - 1, 1)
         if known.blocks:
-            products += walk_path.lagged_products(period_s, max(round(known.count / known.blocks), 1), known.pairs)
+            products += dwell.weight * walk_path.lagged_products(
+                period_s, max(round(known.count / known.blocks), 1), known.pairs
+            )
     return products[:, None]
 
 

@@ -118,7 +118,7 @@ def test_noise_along_the_force_has_the_likeliest_sizes_of_gamma_sums() -> None:
     truth, freedom = np.array([0.5, 1.0, 2.0]) ** 2, (counts - 3.0 * kappa.mean()).sum(axis=1)
     squares = along**2 @ truth * rng.chisquare(freedom)
     dwells: Any = [
-        SimpleNamespace(counts=own, count=own.sum(), squares_along=lambda _, total=total: np.array([total]))
+        SimpleNamespace(counts=own, count=own.sum(), squares_along=lambda _, total=total: np.array([total]), weight=1.0)
         for own, total in zip(counts, squares, strict=True)
     ]
 

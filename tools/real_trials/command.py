@@ -16,21 +16,24 @@ from scipy.stats import beta
 
 import kf_calib
 from kf_calib.support.threads import one_blas_thread
+from real_trials.ideal import chosen, credible
 from real_trials.injected import EFFECTS, alike, injected
 from real_trials.recordings import FEWEST_POSES, RealRecording
+from real_trials.turned import TurnedRecording
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = (ROOT.parent / "shared" / "real", ROOT.parent / "shared" / "recordings")
 
 
 @cache
-def _recording(path: str) -> RealRecording:
-    return RealRecording(Path(path))
+def _recording(path: str, angles: bool) -> RealRecording:
+    return TurnedRecording(Path(path)) if angles else RealRecording(Path(path))
 
 
-def play(path: str, name: str, sigmas: float, seed: int) -> dict[str, Any]:
-    """What the diagnosis says of a recording with an effect injected, or unmodified where ``name`` is empty."""
-    recording = _recording(path)
+def play(path: str, angles: bool, name: str, sigmas: float, seed: int) -> dict[str, Any]:
+    """What the diagnosis says of a recording with an effect injected, or unmodified where ``name`` is empty, and what
+    the best chooser says."""
+    recording = _recording(path, angles)
     task = {"recording": recording.name, "effect": name, "sigmas": sigmas, "seed": seed}
     with one_blas_thread():
         added = injected(recording, name, sigmas, seed) if name else None
@@ -41,8 +44,10 @@ def play(path: str, name: str, sigmas: float, seed: int) -> dict[str, Any]:
         except kf_calib.KfCalibError as error:
             return {**task, "visible": True, "refused": str(error)}
     rows = diagnosis.table.rows if diagnosis.table else ()
+    best = chosen(recording, added, sigmas, seed) if added is not None else {}
     return {
-        **task, "visible": True, "p": diagnosis.test.p_value, "missing": list(diagnosis.missing),
+        **task, "visible": True, "best": credible(best), "best_probability": best.get(name, 0.0),
+        "p": diagnosis.test.p_value, "missing": list(diagnosis.missing),
         "first": list(diagnosis.likeliest.effects) if diagnosis.likeliest else [], "noise": diagnosis.noise,
         "set": list(diagnosis.ambiguity), "verdict": diagnosis.verdict, "unearned": diagnosis.unearned,
         "probability": sum(row.probability for row in rows if name in row.effects),
@@ -67,17 +72,22 @@ def main(
     paths = [path for path in paths if not only or path.name.partition(".")[0] in only]
     outcomes = _read(resume)
     known = {(each["recording"], each["effect"], each["sigmas"], each["seed"]) for each in outcomes}
-    tasks = [(str(path), "", 0.0, 0) for path in paths]
-    many = [path for path in paths if len(_recording(str(path)).dwells_s) >= FEWEST_POSES]
-    tasks += [(str(path), name, size, seed) for size in sizes for path in many for name in EFFECTS]
-    tasks = [task for task in tasks if (Path(task[0]).name.partition(".")[0], *task[1:]) not in known]
+    many = [path for path in paths if len(_recording(str(path), False).dwells_s) >= FEWEST_POSES]
+    turned = [path for path in many if TurnedRecording(path).still]
+    places = [*((str(path), False) for path in paths), *((str(path), True) for path in turned)]
+    tasks = [(*place, "", 0.0, 0) for place in places]
+    tasks += [
+        (*place, name, size, seed)
+        for size in sizes for place in places if Path(place[0]) in many for name in EFFECTS
+    ]  # fmt: skip
+    tasks = [task for task in tasks if (_recording(*task[:2]).name, *task[2:]) not in known]
     with ProcessPoolExecutor(jobs) as pool:
         for done in as_completed([pool.submit(play, *task) for task in tasks]):
             outcomes.append(done.result())
             if resume is not None:
                 with resume.open("a") as file:
                     file.write(json.dumps(outcomes[-1]) + "\n")
-    console = Console(width=150)
+    console = Console(width=180)
     console.print(_unmodified(outcomes), _counted(outcomes, "sigmas"), _counted(outcomes, "recording"))
     console.print(_counted(outcomes, "effect"), _reliability(outcomes))
 
@@ -99,7 +109,10 @@ def _unmodified(outcomes: Sequence[dict[str, Any]]) -> Table:
 
 def _counted(outcomes: Sequence[dict[str, Any]], key: str) -> Table:
     """Return how often the truth is first, in the set, and named wrongly, by size, recording or effect."""
-    headings = (key, "trials", "first", "first, or alike", "in the set", "wrong name", "mean probability")
+    headings = (
+        key, "trials", "first", "first, or alike", "in the set", "wrong name", "mean probability",
+        "best possible: first, or alike", "in the set", "mean probability",
+    )  # fmt: skip
     table = Table(*headings, title=f"Injected, by {key}", title_justify="left")
     told = [each for each in outcomes if each["effect"] and each["visible"] and "refused" not in each]
     for value in dict.fromkeys(each[key] for each in told):
@@ -109,9 +122,12 @@ def _counted(outcomes: Sequence[dict[str, Any]], key: str) -> Table:
             sum(len(each["first"]) == 1 and each["first"][0] in {each["effect"], *each["alike"]} for each in own),
             sum(bool({each["effect"], *each["alike"]} & set(each["set"])) for each in own),
             sum(bool(each["missing"]) and not _right(each) for each in own),
+            sum(each["best"][0] in {each["effect"], *each["alike"]} for each in own),
+            sum(bool({each["effect"], *each["alike"]} & set(each["best"])) for each in own),
         ]
-        mean = sum(each["probability"] for each in own) / len(own)
-        table.add_row(str(value), str(len(own)), *(f"{k} ({k / len(own):.0%})" for k in counts), f"{mean:.2f}")
+        mean, best = (f"{sum(each[of] for each in own) / len(own):.2f}" for of in ("probability", "best_probability"))
+        shares = [f"{k} ({k / len(own):.0%})" for k in counts]
+        table.add_row(str(value), str(len(own)), *shares[:4], mean, *shares[4:], best)
     return table
 
 

@@ -112,6 +112,11 @@ class RealRecording:
         left = _sizes(self.means(self.readings_mps2), self.nine) - GRAVITY_MPS2
         return float(np.sqrt(np.sum(left**2) / (len(left) - 9)))
 
+    @cached_property
+    def left(self) -> Floats:
+        """What the nine parameters leave of |f| of the poses as they were recorded, over the scatter, (D,)."""
+        return (_sizes(self.means(self.readings_mps2), self.nine) - GRAVITY_MPS2) / self.scatter_mps2
+
     def seen(self, added_mps2: Floats) -> Floats:
         """What a change of the readings, (n, 3), changes of |f| in each pose (D,) that the nine parameters do not
         take, over the scatter: its norm is the size of the change in sigmas."""

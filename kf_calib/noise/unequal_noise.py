@@ -1,0 +1,112 @@
+"""Dwells of unequal noise: hands tremble, tables are bumped, machines run next door.
+
+The variance of the readings of dwell d is sigma_w^2 v_d. With nu_d degrees of freedom it is estimated as s_d^2, and the
+v_d have an inverse-gamma distribution: nu_0 s_0^2 / (sigma_w^2 v_d) is chi-squared with nu_0 degrees of freedom. Then
+s_d^2 / s_0^2 is F distributed with nu_d and nu_0 degrees of freedom, from which nu_0 and s_0 are estimated by maximum
+likelihood, and each dwell has the posterior mean (G. Smyth, Stat. Appl. Genet. Mol. Biol. 3, 2004)
+
+  sigma_w^2 v_d = (nu_0 s_0^2 + nu_d s_d^2) / (nu_0 + nu_d),
+
+so that a dwell of few readings keeps to the others, and one of many to itself. Unless the noise is clearly unequal
+(M. Bartlett, 1937), all dwells have one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.special import betaln
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.dwells.sufficient_statistics import Autocovariance, DwellFactor
+from kf_calib.support.tail_probabilities import chi_squared_tail
+
+_CLEAR_P = 1e-4  # of equal noise; with p-values above it, dwells keep one noise
+_FEWEST = 4  # dwells whose noise is known
+_LEAST_FREEDOM = 2.0  # of a dwell whose own noise counts
+_SHAPES = np.geomspace(1.0, 1e4, 61)  # nu_0
+_ROUNDS = 60
+
+
+def with_own_noise(dwells: list[DwellFactor], along: Floats | None = None) -> list[DwellFactor]:
+    """The dwells, each with the weight that its own noise gives its readings, 1 where all have one noise.
+
+    along (D, 3): the weights of the channels in the size of the force, where nothing else is known in a dwell.
+    """
+    if dwells[0].averaged:
+        return dwells
+    variances, freedom = _variances(dwells, along)
+    weights = weights_of(variances, freedom)
+    if not (weights != 1.0).any() and all(dwell.weight == 1.0 for dwell in dwells):
+        return dwells
+    return [dwell.weighted(float(weight)) for dwell, weight in zip(dwells, weights, strict=True)]
+
+
+def weights_of(variances: Floats, freedom: Floats) -> Floats:
+    """The weights 1 / v_d (D,) of readings of dwells with variances s_d^2 (D,) of nu_d (D,) degrees of freedom, of mean
+    1; all 1 where the variances are equal but for chance."""
+    known = (freedom >= _LEAST_FREEDOM) & (variances > 0.0)
+    weights = np.ones(len(variances))
+    if known.sum() < _FEWEST or _equal_p(variances[known], freedom[known]) > _CLEAR_P:
+        return weights
+    shape, level = _prior(variances[known], freedom[known])
+    own = np.where(known, freedom, 0.0)
+    posterior = (shape * level + own * np.where(known, variances, 0.0)) / (shape + own)
+    return np.asarray(np.sum(freedom) / np.sum(freedom / posterior) / posterior, float)
+
+
+def _equal_p(variances: Floats, freedom: Floats) -> float:
+    """Return the p-value of Bartlett's test that all variances are equal."""
+    total, pooled = freedom.sum(), float(freedom @ variances) / freedom.sum()
+    statistic = total * np.log(pooled) - float(freedom @ np.log(variances))
+    correction = 1.0 + (np.sum(1.0 / freedom) - 1.0 / total) / (3.0 * (len(variances) - 1))
+    return chi_squared_tail(len(variances) - 1, float(statistic / correction))
+
+
+def _prior(variances: Floats, freedom: Floats) -> tuple[float, float]:
+    """Return the likeliest nu_0 and s_0^2: for each nu_0 the level by steps of an EM algorithm, all at once."""
+    shapes, levels = _SHAPES[:, None], np.full((len(_SHAPES), 1), np.median(variances))
+    for _ in range(_ROUNDS):
+        precision = np.mean((shapes + freedom) / (shapes * levels + freedom * variances), axis=1, keepdims=True)
+        levels = 1.0 / precision
+    ratios = freedom * variances / (shapes * levels)
+    logs = (
+        0.5 * freedom * np.log(ratios)
+        - 0.5 * (freedom + shapes) * np.log1p(ratios)
+        - betaln(0.5 * freedom, 0.5 * shapes)
+    )
+    best = int(np.argmax(logs.sum(axis=1)))
+    return float(_SHAPES[best]), float(levels[best, 0])
+
+
+def _variances(dwells: Sequence[DwellFactor], along: Floats | None) -> tuple[Floats, Floats]:
+    """Return the variances (D,) of the readings of each dwell about their course, relative to those of the run, and
+    their degrees of freedom (D,).
+
+    Autocorrelation makes these fewer (``_lost_to_correlation``).
+    """
+    freedom = np.array([np.maximum(dwell.counts - float(dwell.width), 0.0).sum() for dwell in dwells])
+    total = sum((dwell.autocovariance for dwell in dwells), Autocovariance())
+    lost = _lost_to_correlation(total)
+    if along is not None:
+        squares = np.array([dwell.squares_along(m).sum() for dwell, m in zip(dwells, along, strict=True)])
+        return squares / np.maximum(freedom, 1.0), freedom / lost.mean()
+    squares = np.array([dwell.squares.sum(axis=0) for dwell in dwells])
+    levels = squares.sum(axis=0) / max(freedom.sum(), 1.0)
+    varying = levels > 0.0
+    if not varying.any():
+        return np.zeros(len(dwells)), freedom
+    shares = freedom[:, None] / lost[varying]
+    relative = squares[:, varying] / np.maximum(freedom, 1.0)[:, None] / levels[varying]
+    return np.sum(shares * relative, axis=1) / np.maximum(shares.sum(axis=1), 1e-300), shares.sum(axis=1)
+
+
+def _lost_to_correlation(total: Autocovariance) -> Floats:
+    """Return by how much autocorrelation r_l enlarges the variance of a variance, 1 + 2 sum of r_l^2, (3,)."""
+    if not total.blocks:
+        return np.ones(3)
+    level = np.where(total.products[0] > 0.0, total.products[0] / total.pairs[0], 1.0)
+    correlation = total.products[1:] / np.maximum(total.pairs[1:, None], 1.0) / level
+    chance = 1.0 / np.maximum(total.pairs[1:, None], 1.0)
+    return np.maximum(1.0 + 2.0 * np.sum(correlation**2 - chance, axis=0), 1.0)
