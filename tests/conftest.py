@@ -16,6 +16,7 @@ from helpers.slow_share import Share, SlowShare
 from hypothesis import settings
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: a process a core is enough
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # the program is started often: what one start compiles, others read
 os.environ["COLUMNS"] = ""
 del os.environ["COLUMNS"]  # readline sets it behind Python's back, and a child would print tables that narrow
 
@@ -36,6 +37,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    sys.dont_write_bytecode = False
     if commit := config.getoption("slow_share"):
         share = Share.of_commit(config.rootpath, commit)
         config.pluginmanager.register(SlowShare(share, config.getoption("slow_minutes")))

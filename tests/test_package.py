@@ -13,6 +13,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
 RECORDINGS = ROOT / "recordings"
@@ -96,6 +97,25 @@ def test_what_a_page_shows_is_found_in_what_is_printed_in_its_order(consoles: Mo
     assert consoles.not_printed(shown, "a\nb x\nc\n") == ""
     assert consoles.not_printed(shown, "c a b") == "c"
     assert consoles.not_printed(shown, "a x b c") == "a b"
+
+
+def test_each_direct_requirement_has_a_lowest_version() -> None:
+    """tools/package tries the wheel with all of them."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert [wanted for wanted in project["dependencies"] if ">=" not in wanted] == []
+
+
+def test_workflows_call_scripts_that_are_there_with_the_oldest_and_the_newest_python() -> None:
+    workflows = {path.name: yaml.safe_load(path.read_text()) for path in (ROOT / ".github" / "workflows").glob("*.yml")}
+    jobs = [job for workflow in workflows.values() for job in workflow["jobs"].values()]
+    commands = [step["run"] for job in jobs for step in job["steps"] if "run" in step]
+    scripts = set(re.findall(r"(?<![\w/])(?:tools/[\w.]+|\.ci/run)", "\n".join(commands)))
+    assert scripts == {"tools/test", "tools/checkout.py", "tools/docs", "tools/package", ".ci/run"}
+    assert all((ROOT / script).exists() for script in scripts)
+    matrix = workflows["tests.yml"]["jobs"]["fast-tests"]["strategy"]["matrix"]
+    assert matrix["python"] == [PYTHONS[-1], PYTHONS[0]]
+    assert {name.partition("-")[0] for name in matrix["os"]} == {"ubuntu", "macos", "windows"}
+    assert all(job["permissions"] == {"id-token": "write"} for job in jobs if job.get("environment") == "release")
 
 
 @pytest.mark.slow

@@ -5,11 +5,14 @@ from __future__ import annotations
 import os
 import sys
 from contextlib import suppress
+from typing import Any
 
 import click
 
 from kf_calib.errors import KfCalibError
 from kf_calib.support.plain_text import printable, sentence
+
+_SIGNS = "µσΔχ²±┃"
 
 
 def echo(text: str) -> None:
@@ -80,4 +83,19 @@ def open_streams() -> None:
     """Standard streams that were closed lead nowhere: the next file that is opened would take their place."""
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115, PTH123  # for as long as the program lasts
+            null = open(os.devnull, mode, encoding="utf-8")  # noqa: SIM115, PTH123  # for as long as the program lasts
+            setattr(sys, name, null)
+    for stream in (sys.stdout, sys.stderr):
+        _print_all_signs(stream)
+
+
+def _print_all_signs(stream: Any) -> None:
+    """Have a stream take µ, σ and the lines of tables: the code pages of Windows have not all of them.
+
+    A terminal keeps its encoding and shows a question mark for what it lacks; a file or a pipe gets UTF-8.
+    """
+    try:
+        _SIGNS.encode(stream.encoding or "utf-8")
+    except UnicodeEncodeError:
+        settings = {"errors": "replace"} if stream.isatty() else {"encoding": "utf-8"}
+        stream.reconfigure(**settings)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import traceback
 from contextlib import suppress
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import click
 
 from kf_calib.cli.echo import complain
+from kf_calib.cli.error_report import PACKAGE, place, write_error_report
 from kf_calib.errors import KfCalibError
 from kf_calib.support.plain_text import printable
 
@@ -39,10 +41,10 @@ def sentence(error: BaseException) -> str:
             where = "" if error.filename is None else f"{error.filename}: "
             return f"{where}{error.strerror} ({_place(error)}): mend that, and run it again."
         case _:
-            return (
-                f"{_type_and_text(error)}, which was not foreseen, in {_place(error)}: please report it, with the "
-                f"traceback that {TRACEBACK}=1 in the environment shows."
-            )
+            what = f"{_type_and_text(error)}, which was not foreseen, in {_place(error)}"
+            if report := write_error_report(error, sys.argv[1:]):
+                return f"{what}: please report it, with {report}, which holds none of your data."
+            return f"{what}: please report it, with the traceback that {TRACEBACK}=1 in the environment shows."
 
 
 def _type_and_text(error: BaseException) -> str:
@@ -53,11 +55,9 @@ def _type_and_text(error: BaseException) -> str:
 
 def _place(error: BaseException) -> str:
     """The innermost line of this package that was at work, as ``kf_calib/estimation/fit.py:88``."""
-    package = Path(__file__).parents[1]
     frames = traceback.extract_tb(error.__traceback__)
-    in_package = [frame for frame in frames if package in Path(frame.filename).parents]
+    in_package = [frame for frame in frames if PACKAGE in Path(frame.filename).parents]
     if not (in_package or frames):
         return "an unknown place"
     frame = (in_package or frames)[-1]
-    path = Path(frame.filename)
-    return f"{path.relative_to(package.parent) if in_package else path}:{frame.lineno}"
+    return f"{place(Path(frame.filename))}:{frame.lineno}"

@@ -1,4 +1,7 @@
-"""Signals that ask a run to end: Ctrl-C, SIGTERM, and SIGHUP, which comes when the terminal is closed."""
+"""Signals that ask a run to end: Ctrl-C, SIGTERM, and SIGHUP, which comes when the terminal is closed.
+
+On Windows SIGBREAK stands for the last two: Ctrl-Break, and a console that is closed.
+"""
 
 from __future__ import annotations
 
@@ -28,6 +31,8 @@ def answered(answer: Callable[[signal.Signals], None]) -> Iterator[None]:
     numbers = [signal.SIGINT, signal.SIGTERM]
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
         numbers.append(signal.SIGHUP)
+    if (broken := getattr(signal, "SIGBREAK", None)) is not None:
+        numbers.append(broken)
     before = {number: signal.signal(number, called) for number in numbers}
     try:
         yield

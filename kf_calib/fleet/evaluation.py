@@ -14,7 +14,6 @@ import json
 import multiprocessing
 import os
 import platform
-import signal
 import stat
 import threading
 import time
@@ -209,7 +208,7 @@ class _Watch:
         waited_s, patience_s = self._limit_s, min(self._limit_s, _GRACE_S)
         while not self._ended.wait(waited_s):
             if patience_s <= 0.0 and multiprocessing.parent_process() is not None:
-                os.kill(os.getpid(), signal.SIGKILL)
+                os._exit(1)
             with self._telling:
                 if not self._ended.is_set():
                     ctypes.pythonapi.PyThreadState_SetAsyncExc(self._thread, ctypes.py_object(OverTime))

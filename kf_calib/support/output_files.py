@@ -10,7 +10,7 @@
 - A file that grows during the whole run (``Growing``) must survive if the run is killed. It has its final name from the
   start; where it replaces an earlier file, it is renamed as soon as its first readings are on the disk, and until then
   the earlier file stays. If no reading came, no file is left. Both files are locked, so that no other run can write
-  them.
+  them. Windows renames no open file: there the earlier file is put aside first, and comes back if no reading came.
 
 Commands print their result first and then write files. A file that cannot be written is one sentence and exit 2; a
 picture that the viewer cannot draw, for example because there is no graphics driver, is a warning and exit 0.
@@ -21,6 +21,7 @@ from __future__ import annotations
 import os
 import shutil
 import stat
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
@@ -34,6 +35,7 @@ from kf_calib.support.part_files import beside, remove_stale
 
 _new: ContextVar[frozenset[Path]] = ContextVar("_new", default=frozenset())
 """Files that must not be there before they are written."""
+_RENAMES_OPEN_FILES = sys.platform != "win32"
 _STREAMS = {0: "standard input", 1: "standard output"}
 
 
@@ -156,25 +158,35 @@ def write_whole(path: Path, content: bytes) -> None:
 
 
 class Growing:
-    """The path ``at`` of a file that grows: a temporary one until ``settle``, then the one that was asked for."""
+    """The path ``at`` of a file that grows: a temporary one until ``settle``, then the one that was asked for.
+
+    Where open files cannot be renamed (Windows) the earlier file has the temporary name until then.
+    """
 
     def __init__(self, path: Path) -> None:
         self._path, self._target = path, target_of(path)
-        self.at = beside(self._target) if self._target.exists() else self._target
+        self._temporary = beside(self._target) if self._target.exists() else None
         self._earlier: IO[bytes] | None = None
 
     @property
+    def at(self) -> Path:
+        return self._temporary if self._temporary is not None and _RENAMES_OPEN_FILES else self._target
+
+    @property
     def settled(self) -> bool:
-        return self.at == self._target
+        return self._temporary is None
 
     def open(self) -> IO[bytes]:
         """Create the file, which nobody else can write or replace while it is open. Raises InputError where another
         run has it."""
-        if not self.settled:
+        if self._temporary is not None:
             self._earlier = self._target.open("r+b")
             if not (lock(self._earlier) and os.path.samestat(os.fstat(self._earlier.fileno()), self._target.stat())):
                 self._let_go()
                 self._refuse()
+            if not _RENAMES_OPEN_FILES:
+                self._let_go()
+                self._target.replace(self._temporary)
         file = self.at.open("xb")
         if not lock(file):
             file.close()
@@ -183,14 +195,20 @@ class Growing:
 
     def settle(self) -> None:
         """Replace the earlier file, if there is one, now that the new one has content."""
-        if not self.settled:
-            _rename(self.at, self._target)
-            self.at = self._target
-            self._let_go()
+        if self._temporary is None:
+            return
+        if _RENAMES_OPEN_FILES:
+            _rename(self._temporary, self._target)
+        else:
+            self._temporary.unlink()
+        self._temporary = None
+        self._let_go()
 
     def discard(self) -> None:
-        """Remove the file, in which nothing was written; an earlier one stays."""
+        """Remove the file, in which nothing was written; an earlier one stays. It must be closed."""
         self.at.unlink(missing_ok=True)
+        if self._temporary is not None and not _RENAMES_OPEN_FILES:
+            self._temporary.replace(self._target)
         self._let_go()
 
     def _let_go(self) -> None:

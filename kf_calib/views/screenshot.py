@@ -100,7 +100,7 @@ def _viewer_with_file(process: subprocess.Popen[bytes], port: int, log: Path) ->
     began = idle_since = clock.monotonic()
     while clock.monotonic() < began + _PATIENCE_S:
         if process.poll() is not None:
-            raise ScreenshotError(obituary(log.read_text(errors="replace")))
+            raise ScreenshotError(obituary(log.read_text(encoding="utf-8", errors="replace")))
         clock.sleep(_POLL_S)
         try:
             client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")

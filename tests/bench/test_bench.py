@@ -7,6 +7,7 @@ import re
 
 import numpy as np
 import pytest
+from helpers.long_runs import slow
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
@@ -253,19 +254,29 @@ JSON_VALUES = st.recursive(
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=9), inner, max_size=3),
     max_leaves=6,
 )  # fmt: skip
+BENCH_VALUES = st.dictionaries(
+    st.sampled_from(sorted(KEYS)), JSON_VALUES | st.sampled_from(["y z x", "9.81", "1,2,3", "z"])
+)
 
 
-@settings(max_examples=500, deadline=None, database=None, suppress_health_check=list(HealthCheck))
-@example({"nominal": {"\n": None}})
-@given(st.dictionaries(st.sampled_from(sorted(KEYS)), JSON_VALUES | st.sampled_from(["y z x", "9.81", "1,2,3", "z"])))
-def test_whatever_values_say_is_a_bench_or_a_sentence(values: dict[str, object]) -> None:
+@pytest.mark.parametrize("examples", [100, *slow(500)])
+def test_whatever_values_say_is_a_bench_or_a_sentence(examples: int) -> None:
     """As they come in a recording (text), in JSON or TOML (made text), and from Python."""
-    for metadata in ({**values}, metadata_of({"axes": "y z x", "gravity_mps2": 9.81} | values)):
-        try:
-            bench = Bench.from_metadata(metadata)
-        except BenchError as error:
-            assert "\n" not in str(error) and len(str(error)) < 1000
-        else:
-            assert np.isfinite([*bench.nominal.values(), bench.gravity_mps2, bench.azimuth_deg]).all()
-            assert Bench.from_metadata(bench.to_metadata()) == bench
-            "".join(bench.to_metadata().values()).encode()
+
+    @settings(max_examples=examples, deadline=None, database=None, suppress_health_check=list(HealthCheck))
+    @example({"nominal": {"\n": None}})
+    @given(
+        st.dictionaries(st.sampled_from(sorted(KEYS)), JSON_VALUES | st.sampled_from(["y z x", "9.81", "1,2,3", "z"]))
+    )
+    def try_one(values: dict[str, object]) -> None:
+        for metadata in ({**values}, metadata_of({"axes": "y z x", "gravity_mps2": 9.81} | values)):
+            try:
+                bench = Bench.from_metadata(metadata)
+            except BenchError as error:
+                assert "\n" not in str(error) and len(str(error)) < 1000
+            else:
+                assert np.isfinite([*bench.nominal.values(), bench.gravity_mps2, bench.azimuth_deg]).all()
+                assert Bench.from_metadata(bench.to_metadata()) == bench
+                "".join(bench.to_metadata().values()).encode()
+
+    try_one()

@@ -97,7 +97,10 @@ def calibrated(name: str, seed: int) -> tuple[Calibration, np.ndarray]:
         return evaluate(dwells_of(table, BENCH), BENCH, Settings(effects=(name,))), truth
 
 
-@pytest.mark.parametrize("name, runs", [*((name, 8) for name in EFFECTS), *slow(*((name, 100) for name in EFFECTS))])
+FEW = dict.fromkeys(EFFECTS, 2) | {"second-order": 8, "cross-coupling-po": 8}
+
+
+@pytest.mark.parametrize("name, runs", [*FEW.items(), *slow(*((name, 100) for name in EFFECTS))])
 def test_what_is_printed_of_an_effect_is_covered_by_its_sigma(name: str, runs: int) -> None:
     """Where a coefficient has a sigma, its interval of 95 % holds the truth that often, or more where the axes of the
     triads count as uncertain; where it has none, |f| does not tell it, and nothing is printed."""

@@ -44,6 +44,12 @@ def messages(path: Path, topic: str) -> list[Any]:
         return [each.decoded_message for each in reader.iter_decoded_messages([topic])]
 
 
+def count_of(path: Path, topic: str) -> int:
+    """Of the messages that a reader comes by; to decode them takes long."""
+    with path.open("rb") as file:
+        return sum(1 for _ in make_reader(file, validate_crcs=True).iter_messages([topic]))
+
+
 def test_the_original_stays_byte_for_byte_and_one_topic_comes_to_it(folder: Path, run: Any) -> None:
     out = folder / "out.mcap"
     code, said, err = run("apply", folder / "cal.json", RECORDING, "-o", out)
@@ -70,21 +76,21 @@ def test_the_original_stays_byte_for_byte_and_one_topic_comes_to_it(folder: Path
     assert after.statistics.message_count == before.statistics.message_count + 9827
     assert after.statistics.message_start_time == before.statistics.message_start_time
     for topic in {each.topic for each in before.channels.values()}:
-        assert len(messages(out, topic)) == len(messages(RECORDING, topic)) > 0
+        assert count_of(out, topic) == count_of(RECORDING, topic) > 0
 
 
 def test_its_messages_are_the_corrected_readings_with_their_covariance(folder: Path, run: Any) -> None:
     out = folder / "values.mcap"
     assert run("apply", folder / "cal.json", RECORDING, "-o", out)[0] == 0
+    before, after = messages(out, RAW), messages(out, TOPIC)
     raw, found = (
-        np.array([(v.x, v.y, v.z) for v in (each.linear_acceleration for each in messages(out, topic))])
-        for topic in (RAW, TOPIC)
+        np.array([(v.x, v.y, v.z) for v in (each.linear_acceleration for each in own)]) for own in (before, after)
     )
     correct = kf_calib.open_calibration(folder / "cal.json").correction()
     np.testing.assert_array_equal(found, correct(raw))
     at_rest = np.linalg.norm(found, axis=1) / correct.bench.gravity_mps2 - 1.0
     assert np.median(np.abs(at_rest)) < 1e-5 < np.median(np.abs(np.linalg.norm(raw, axis=1) / 9.81 - 1.0))
-    last_raw, last = messages(out, RAW)[-1], messages(out, TOPIC)[-1]
+    last_raw, last = before[-1], after[-1]
     assert (last.header.stamp.sec, last.header.stamp.nanosec) == (
         last_raw.header.stamp.sec,
         last_raw.header.stamp.nanosec,

@@ -38,15 +38,30 @@ def changes_in(source: str) -> list[Change]:
     """All changes of a module, in their order; texts, annotations and what is raised stay as they are."""
     finder = _Finder(source)
     finder.visit(ast.parse(source))
-    return sorted(change for change in finder.found if _is_program(change.of(source)))
+    return sorted(finder.found)
 
 
-def _is_program(source: str) -> bool:
+def is_program(source: str) -> bool:
+    """Whether it can be compiled: a few changes leave nothing that can."""
     try:
         ast.parse(source)
     except SyntaxError:
         return False
     return True
+
+
+def function_at(source: str, change: Change) -> str:
+    """The function or method, as ``Class.method``, in whose body a change is; empty: outside of functions."""
+    return _function_of(ast.parse(source).body, change.line, "")
+
+
+def _function_of(body: list[ast.stmt], line: int, prefix: str) -> str:
+    for node in body:
+        if isinstance(node, ast.ClassDef) and node.lineno <= line <= (node.end_lineno or 0):
+            return _function_of(node.body, line, f"{prefix}{node.name}.")
+        if isinstance(node, ast.FunctionDef) and node.body[0].lineno <= line <= (node.end_lineno or 0):
+            return f"{prefix}{node.name}"
+    return ""
 
 
 class _Finder(ast.NodeVisitor):

@@ -3,46 +3,50 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import random
 import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from mutation_trials.changes import Change, changes_in
-from mutation_trials.runner import Runner, copied
+from mutation_trials.changes import Change, changes_in, is_program
+from mutation_trials.runner import Answer, Runner, content_hash, copied
+from mutation_trials.test_map import static_map
 
 ROOT = Path(__file__).resolve().parents[2]
 _ABOUT = """
-An operator, a comparison or a constant is changed at random in a private copy of the checkout. The fast tests of the
-package that execute its line are run until one fails, then those of other folders that import the module. A change
-at which they fail, or take ten times as long, is noticed. What survives changes no result, or shows that a test is
-missing: which of the two, a reader decides. Give --line to try the changes of a line.
+An operator, a comparison or a constant is changed at random in a private copy of the checkout. The fast tests that call
+the function are run until one fails, in a process that has everything loaded: files that import the module first, and
+quick ones before slow ones. A change at which they fail, or take ten times as long, is noticed. What survives changes
+no result, or shows that a test is missing: which of the two, a reader decides. Give --line to try those of a line.
 """
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One change of a module, and the test that noticed it; empty: none."""
+    """One change of a module, and what the tests said."""
 
     path: Path
     change: Change
     seconds: float
-    noticed_by: str
+    answer: Answer
 
     def __str__(self) -> str:
-        cells = (self.path, self.change.line, self.change, f"{self.seconds:.0f} s", self.noticed_by or "SURVIVED")
-        return "\t".join(map(str, cells))
+        return "\t".join(map(str, (self.path, self.change.line, self.change, f"{self.seconds:.0f} s", self.answer)))
 
 
 def drawn(paths: Sequence[Path], count: int, seed: int, line: int | None = None) -> list[tuple[Path, Change]]:
     """Changes drawn from all that are possible in modules, in the order of the modules."""
-    every = [(path, change) for path in paths for change in changes_in((ROOT / path).read_text())
+    sources = {path: (ROOT / path).read_text() for path in paths}
+    every = [(path, change) for path, source in sources.items() for change in changes_in(source)
              if line is None or change.line == line]  # fmt: skip
-    return sorted(random.Random(seed).sample(every, min(count, len(every))))
+    random.Random(seed).shuffle(every)
+    sound = (task for task in every if is_program(task[1].of(sources[task[0]])))
+    return sorted(itertools.islice(sound, count))
 
 
 def modules(names: Sequence[str]) -> list[Path]:
@@ -55,7 +59,7 @@ def modules(names: Sequence[str]) -> list[Path]:
 def counts(trials: Sequence[Trial]) -> str:
     """How many were noticed, by folder."""
     total = Counter(trial.path.parent for trial in trials)
-    noticed = Counter(trial.path.parent for trial in trials if trial.noticed_by)
+    noticed = Counter(trial.path.parent for trial in trials if trial.answer.noticed_by)
     return "\n".join(f"{folder}: {noticed[folder]} of {total[folder]} changes noticed" for folder in sorted(total))
 
 
@@ -66,20 +70,33 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--count", type=int, default=sys.maxsize, help="changes to draw (all, where it is left out)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--line", type=int, help="only changes of this line")
-    parser.add_argument("--own", action="store_true", help="only the tests of the package, none of other folders")
+    parser.add_argument("--budget", type=float, default=60.0, metavar="S", help="of the tests of one change, s")
+    parser.add_argument("--map", type=Path, help="which tests call what, written where it is not there")
+    words_on_unmapped = "do not run all tests once to learn what they call: take those that import the module"
+    parser.add_argument("--unmapped", action="store_true", help=words_on_unmapped)
     parser.add_argument("-o", "--out", type=Path, help="write the table here, too")
     options = parser.parse_args(words)
     tasks = drawn(modules(options.paths), options.count, options.seed, options.line)
-    trials = list[Trial]()
     with tempfile.TemporaryDirectory(prefix="mutation") as folder:
-        copy = copied(ROOT, Path(folder))
-        for package in sorted({path.parts[:2] for path, _ in tasks}):
-            with Runner(copy, Path(*package), not options.own) as runner:
-                for path, change in (task for task in tasks if task[0].parts[:2] == package):
-                    begun_s = time.monotonic()
-                    noticed_by = runner.noticed_by(path, change)
-                    trials.append(Trial(path, change, time.monotonic() - begun_s, noticed_by))
-                    print(trials[-1], flush=True)
-                    if options.out is not None:
-                        options.out.write_text("".join(f"{trial}\n" for trial in trials))
+        copy = copied(ROOT, Path(folder, "copy"))
+        map_file = options.map or ROOT / "out" / "mutation" / f"{content_hash(ROOT)}.json"
+        if options.unmapped:
+            map_file = Path(folder, "map.json")
+            static_map(copy).write(map_file)
+        map_file.parent.mkdir(parents=True, exist_ok=True)
+        with Runner(copy, {path for path, _ in tasks}, map_file.resolve(), options.budget) as runner:
+            trials = list(_tried(runner, tasks, options.out))
     print(counts(trials))
+
+
+def _tried(runner: Runner, tasks: Sequence[tuple[Path, Change]], out: Path | None) -> Iterator[Trial]:
+    lines = ""
+    for path, change in tasks:
+        begun_s = time.monotonic()
+        answer = runner.noticed_by(path, change)
+        trial = Trial(path, change, time.monotonic() - begun_s, answer)
+        print(trial, flush=True)
+        lines += f"{trial}\n"
+        if out is not None:
+            out.write_text(lines)
+        yield trial

@@ -1,31 +1,40 @@
-"""Makes one change after another in a private copy of the checkout, and runs the tests that execute its line."""
+"""Makes one change after another in a private copy of the checkout, and has the tests run that call what is changed."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
 import subprocess
 import sys
-import tempfile
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 from mutation_trials import server
-from mutation_trials.changes import Change
-from mutation_trials.test_map import TestMap, importing_tests, own_tests
+from mutation_trials.changes import Change, function_at
+from mutation_trials.test_map import TestMap, importing_tests
 
-_SLOWER, _LEAST_S = 10.0, 20.0
-_FURTHER_S = 20.0
-"""Processor time that the tests of other folders may take."""
+
+@dataclass(frozen=True)
+class Answer:
+    """noticed_by: the test that failed; empty: none of ``tried``, of ``calling`` that call what was changed."""
+
+    noticed_by: str
+    tried: int
+    calling: int
+
+    def __str__(self) -> str:
+        return self.noticed_by or f"SURVIVED {self.tried} of {self.calling} tests"
 
 
 def copied(root: Path, folder: Path) -> Path:
     """A copy of what git knows of a checkout; the environment is shared."""
-    names = subprocess.run(["git", "ls-files", "-z"], cwd=root, capture_output=True, check=True, text=True).stdout
-    for name in filter(None, names.split("\0")):
+    for name in _known_to_git(root):
         if (source := root / name).is_file():
             (target := folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(source, target, follow_symlinks=False)
@@ -34,50 +43,85 @@ def copied(root: Path, folder: Path) -> Path:
     return folder
 
 
-class Runner:
-    """The tests of one package of a copy, and the process that runs them; further: those of other folders, too."""
+def content_hash(root: Path) -> str:
+    """Of the program and its tests, as a map of tests depends on them."""
+    found = hashlib.sha256()
+    for name in _known_to_git(root):
+        if name.startswith(("kf_calib/", "tests/")) and name.endswith(".py") and (path := root / name).is_file():
+            found.update(name.encode() + path.read_bytes())
+    return found.hexdigest()[:16]
 
-    def __init__(self, root: Path, package: Path, further: bool = True) -> None:
-        self._root, self._own, self._further = root, own_tests(root, package), further
-        self._folder = tempfile.TemporaryDirectory(prefix="mutation_map")
-        place = Path(self._folder.name, "map.json")
-        places = os.pathsep.join([str(root), str(Path(server.__file__).parents[1])])
+
+def _known_to_git(root: Path) -> list[str]:
+    names = subprocess.run(["git", "ls-files", "-z"], cwd=root, capture_output=True, check=True, text=True).stdout
+    return [name for name in names.split("\0") if name]
+
+
+def _write(module: Path, source: str) -> None:
+    """Without what was compiled of it: Python tells by the second whether that is old."""
+    module.write_text(source)
+    for stale in (module.parent / "__pycache__").glob(f"{module.stem}.*.pyc"):
+        stale.unlink()
+
+
+class Runner:
+    """The fast tests of a copy that call what some modules have, and the process that runs them.
+
+    map_file: which tests call which functions; made where it is not there. budget_s: usual processor time of the tests
+    that are run of one change, the quickest files first.
+    """
+
+    def __init__(self, copy: Path, modules: Iterable[Path], map_file: Path, budget_s: float) -> None:
+        self._copy, self._budget_s = copy, budget_s
+        files = TestMap.read(map_file).files_of(modules) if map_file.exists() else []
+        places = os.pathsep.join([str(copy), str(copy / "tools")])
         environment = os.environ | {"PYTHONPATH": places, "OPENBLAS_NUM_THREADS": "1"}
-        words = [sys.executable, server.__file__, root, package, place, *self._own]
+        environment.pop("PYTHONDONTWRITEBYTECODE", None)
+        words = [sys.executable, server.__file__, copy, map_file, *files]
         self._process = subprocess.Popen(
-            [*map(str, words)], cwd=root, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            [*map(str, words)], cwd=copy, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
         assert self._process.stdout is not None
         if self._process.stdout.readline().strip() != "ready":
-            raise RuntimeError(f"the tests of {package} cannot be run")
-        self.map = TestMap.read(place)
+            raise RuntimeError("the tests cannot be run: see tools/test")
+        self._map = TestMap.read(map_file)
 
-    def noticed_by(self, path: Path, change: Change) -> str:
-        """The test that notices a change; empty if none does."""
-        place = self._root / path
+    def noticed_by(self, path: Path, change: Change) -> Answer:
+        """The test that notices a change."""
+        place = self._copy / path
         source = place.read_text()
-        place.write_text(change.of(source))
-        for stale in (place.parent / "__pycache__").glob(f"{place.stem}.*.pyc"):
-            stale.unlink()
+        function = function_at(source, change)
+        calling = self._map.tests_of(path, function, importing_tests(self._copy, path))
+        tests = self._affordable(calling)
+        _write(place, change.of(source))
         try:
-            return self._of_its_folder(path, change.line) or (self._of_others(path) if self._further else "")
+            return Answer(self._ask(path, function, tests), len(tests), len(calling))
         finally:
-            place.write_text(source)
+            _write(place, source)
 
-    def _of_its_folder(self, path: Path, line: int) -> str:
-        tests = self.map.tests_of(path, line)
-        files = sorted({test.partition("::")[0] for test in tests})
-        usual_s = sum(self.map.seconds[test] for test in tests)
-        return self._ask(files, tests, max(_SLOWER * usual_s, _LEAST_S)) if tests else ""
+    def _affordable(self, tests: Sequence[str]) -> list[str]:
+        """As many as the budget allows, and one."""
+        taken, spent_s = list[str](), 0.0
+        for test in tests:
+            if spent_s > self._budget_s:
+                break
+            taken.append(test)
+            spent_s += self._map.seconds[test]
+        return taken
 
-    def _of_others(self, path: Path) -> str:
-        files = [str(file) for file in importing_tests(self._root, path) if file not in self._own]
-        said = self._ask(files, [], _FURTHER_S) if files else ""
-        return "" if said == "time" else said
-
-    def _ask(self, files: Sequence[str], tests: Sequence[str], limit_s: float) -> str:
+    def _ask(self, path: Path, function: str, tests: Sequence[str]) -> str:
+        usual_s = Counter[str]()
+        for test in tests:
+            usual_s[test.partition("::")[0]] += self._map.seconds[test]
+        asked = {
+            "path": str(path),
+            "function": function,
+            "tests": tests,
+            "usual_s": usual_s,
+            "budget_s": self._budget_s,
+        }
         assert self._process.stdin is not None and self._process.stdout is not None
-        print(json.dumps({"files": files, "tests": tests, "limit_s": limit_s}), file=self._process.stdin, flush=True)
+        print(json.dumps(asked), file=self._process.stdin, flush=True)
         said = json.loads(self._process.stdout.readline())
         if said.startswith("the tests were not run"):
             raise RuntimeError(said)
@@ -92,4 +136,3 @@ class Runner:
         assert self._process.stdin is not None
         self._process.stdin.close()
         self._process.wait()
-        self._folder.cleanup()

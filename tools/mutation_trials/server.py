@@ -1,73 +1,161 @@
-"""Runs tests of a copy of the checkout in processes that need not load numpy and its like again.
+"""Runs tests of a copy of the checkout against changed functions, in forks of a process that has all of it loaded.
 
-usage: python server.py ROOT PACKAGE MAP TEST_FILE...
+usage: python server.py ROOT MAP [TEST_FILE...]
 
-First the tests are mapped (``test_map``). Then each line of standard input, a JSON object with ``files``, ``tests``
-(in the order to run them; empty: all) and ``limit_s`` of processor time, is answered by a line: the first test that
-failed, "" if none did, or "time" if they were not through in time.
+The tests are collected once, and mapped (``test_map``) where the file MAP is not there yet. Then each line of standard
+input, a request, is answered by a line: the first test that failed, "" if none did, or "time" if one took too long.
+A request is a JSON object: ``tests`` in the order to run them; ``usual_s``, the usual processor time of each of their
+files; ``budget_s``, after how much processor time no further test is begun; ``path``, the module that was changed in
+the copy; ``function``, the one that was changed, or "" for a change outside of functions: then all is loaded anew.
 """
 
 from __future__ import annotations
 
-import importlib
+import functools
+import gc
+import itertools
 import json
 import os
 import resource
+import select
+import signal
 import sys
+import time
 import traceback
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import CodeType, FunctionType
+from typing import Any
 
 import pytest
 
-_FRESH = ("kf_calib", "tests", "helpers", "conftest", "test_", "mutation_trials", "hypothesis", "_hypothesis", "xdist")
-"""What each run loads itself: the program, its tests, and what pytest wants to load."""
-_QUIET = ["-n", "0", "-q", "-x", "-m", "not slow", "-p", "no:cacheprovider", "--no-header", "--tb=no"]
+QUIET = ("-n", "0", "-q", "-m", "not slow", "-p", "no:cacheprovider", "--no-header", "--tb=no")
+_SLOWER, _LEAST_S = 10.0, 20.0
+"""Tests of a file that take so many times as long as usual, and at least so long, have noticed something."""
+_LONGEST_S = 1200.0
+"""By the clock; tests that wait for ever take no processor time."""
 
 
-class Ordered:
-    """A plugin of pytest: the given tests in the given order, or all; ``failed`` is the first that failed."""
+class FirstFailure:
+    """A plugin of pytest: ``test`` is the first that failed, or ""; a file that takes too long ends the process."""
 
-    def __init__(self, tests: Sequence[str]) -> None:
-        self._places, self.failed = {test: place for place, test in enumerate(tests)}, ""
+    def __init__(self, asked: Mapping[str, Any]) -> None:
+        self.test, self._usual_s, self._file = "", asked["usual_s"], ""
+        self._end_s, self._session = time.process_time() + asked["budget_s"], None
 
-    def pytest_collection_modifyitems(self, config: pytest.Config, items: list[pytest.Item]) -> None:
-        if self._places:
-            items[:] = sorted((i for i in items if i.nodeid in self._places), key=lambda i: self._places[i.nodeid])
+    def pytest_runtest_logstart(self, nodeid: str) -> None:
+        file = nodeid.partition("::")[0]
+        if file != self._file:
+            self._file = file
+            limit_s = time.process_time() + max(_SLOWER * self._usual_s.get(file, 0.0), _LEAST_S)
+            resource.setrlimit(resource.RLIMIT_CPU, (int(limit_s) + 1, resource.RLIM_INFINITY))
+
+    def pytest_sessionstart(self, session: pytest.Session) -> None:
+        self._session = session
+
+    def pytest_runtest_logfinish(self) -> None:
+        if self._session is not None and self.ended():
+            self._session.shouldstop = "a test failed, or the budget is spent"
+
+    def ended(self) -> bool:
+        return bool(self.test) or time.process_time() > self._end_s
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         if report.failed:
-            self.failed = self.failed or report.nodeid
+            self.test = self.test or report.nodeid
 
     def pytest_collectreport(self, report: pytest.CollectReport) -> None:
         if report.failed:
-            self.failed = self.failed or f"{report.nodeid} (does not load)"
+            self.test = self.test or f"{report.nodeid} (does not load)"
 
 
-def run(files: Sequence[str], tests: Sequence[str], answer: int) -> None:
-    """Run tests in this process, and write the first that failed to a pipe."""
-    plugin = Ordered(tests)
-    code = pytest.main([*_QUIET, *files], plugins=[plugin])
-    failed = plugin.failed or ("does not load" if code not in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED)
-                               else "")  # fmt: skip
-    os.write(answer, failed.encode())
+class Server:
+    """A plugin of pytest that answers requests once the tests are collected."""
+
+    def __init__(self, root: Path, map_file: Path) -> None:
+        self._root, self._map_file = root, map_file
+        self._requests = os.fdopen(os.dup(0), "r")  # pytest closes the streams to its tests
+        self._answers = os.fdopen(os.dup(1), "w")
+
+    def pytest_runtestloop(self, session: pytest.Session) -> bool:
+        if not self._map_file.exists():
+            said = in_child(lambda _: self._map(session))
+            if said:
+                raise RuntimeError(said)
+        print("ready", file=self._answers, flush=True)
+        for line in self._requests:
+            asked = json.loads(line)
+            work = functools.partial(self._answer, named(asked["tests"], session.items), asked)
+            print(json.dumps(in_child(work)), file=self._answers, flush=True)
+        return True
+
+    def _map(self, session: pytest.Session) -> None:
+        from mutation_trials.test_map import Mapper
+
+        mapper = Mapper(self._root, Path("kf_calib"))
+        session.config.pluginmanager.register(mapper)
+        _run(session.items, lambda: False)
+        mapper.write(self._map_file)
+
+    def _answer(self, items: Sequence[pytest.Item], asked: Mapping[str, Any], answer: int) -> None:
+        if not (asked["function"] and replace_code(self._root / asked["path"])):
+            self._load_anew(asked, answer)
+        plugin = FirstFailure(asked)
+        if items:
+            items[0].config.pluginmanager.register(plugin)
+        _run(items, plugin.ended)
+        os.write(answer, plugin.test.encode())
+
+    def _load_anew(self, asked: Mapping[str, Any], answer: int) -> None:
+        """In a process that takes the place of this one."""
+        told = self._map_file.with_suffix(".request")
+        told.write_text(json.dumps(dict(asked)))
+        os.set_inheritable(answer, True)
+        os.execv(sys.executable, [sys.executable, __file__, "--anew", str(told), str(answer)])
 
 
-def map_tests(root: Path, package: Path, place: Path, files: Sequence[str]) -> None:
-    """Map tests in this process, and write which other modules they load, to be loaded once for all."""
-    from mutation_trials.test_map import Mapper
-
-    mapper = Mapper(root, package)
-    pytest.main([word for word in _QUIET if word != "-x"] + [*files], plugins=[mapper])
-    sys.settrace(None)
-    mapper.write(place)
-    loaded = [name for name in sys.modules if not name.startswith(_FRESH)]
-    place.with_suffix(".modules").write_text(json.dumps(loaded))
+def named(names: Sequence[str], items: Sequence[pytest.Item]) -> list[pytest.Item]:
+    """The tests of these names, in this order; the name of a file stands for all of its tests."""
+    places = {name: place for place, name in enumerate(names)}
+    place_of = {item: places.get(item.nodeid, places.get(item.nodeid.partition("::")[0], -1)) for item in items}
+    return sorted((item for item in items if place_of[item] >= 0), key=lambda item: place_of[item])
 
 
-def in_child(work: Callable[[int], None], limit_s: float) -> str:
-    """What a child process says of some work; "time" if it took more processor time than the limit."""
+def replace_code(module: Path) -> bool:
+    """Give the functions of a loaded module the code that its file has now; False where that cannot be done.
+
+    What they have returned to caches is forgotten; what they returned when modules were loaded stays.
+    """
+    codes = dict[tuple[str, int], CodeType]()
+    for code in _codes_in(compile(module.read_bytes(), str(module), "exec")):
+        if codes.setdefault((code.co_qualname, code.co_firstlineno), code) is not code:
+            return False
+    gc.unfreeze()
+    for thing in gc.get_objects():
+        if type(thing) is FunctionType and thing.__code__.co_filename == str(module):
+            old = thing.__code__
+            thing.__code__ = codes.get((old.co_qualname, old.co_firstlineno), old)
+        elif isinstance(thing, functools._lru_cache_wrapper):  # pyright: ignore[reportPrivateUsage]
+            thing.cache_clear()
+    return True
+
+
+def _codes_in(code: CodeType) -> Iterator[CodeType]:
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield constant
+            yield from _codes_in(constant)
+
+
+def _run(items: Sequence[pytest.Item], ended: Callable[[], bool]) -> None:
+    for item, following in itertools.zip_longest(items, items[1:]):
+        item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
+        if ended():
+            return
+
+
+def in_child(work: Callable[[int], None]) -> str:
+    """What a child process writes to the pipe that some work is given; "time" if it took too long."""
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
@@ -76,32 +164,45 @@ def in_child(work: Callable[[int], None], limit_s: float) -> str:
             silent = os.open(os.devnull, os.O_RDWR)
             for stream in (0, 1, 2):
                 os.dup2(silent, stream)
-            resource.setrlimit(resource.RLIMIT_CPU, (int(limit_s) + 1, int(limit_s) + 5))
             work(writing)
         except BaseException:
             os.write(writing, f"the tests were not run: {traceback.format_exc()}".encode())
         os._exit(0)
     os.close(writing)
+    if not select.select([reading], [], [], _LONGEST_S)[0]:
+        os.kill(child, signal.SIGKILL)
     with os.fdopen(reading, "rb") as answer:
         said = answer.read().decode()
     status = os.waitpid(child, 0)[1]
     return "time" if os.WIFSIGNALED(status) and not said else said
 
 
-def main(root: Path, package: Path, place: Path, files: Sequence[str]) -> None:
-    """Map, load, and answer."""
-    in_child(lambda _: map_tests(root, package, place, files), 3600.0)
-    sys.dont_write_bytecode = True
-    for name in json.loads(place.with_suffix(".modules").read_text()):
-        if name not in sys.modules and not name.startswith("__"):
-            with suppress(BaseException):
-                importlib.import_module(name)
-    print("ready", flush=True)
-    for line in sys.stdin:
-        asked = json.loads(line)
-        said = in_child(lambda answer, asked=asked: run(asked["files"], asked["tests"], answer), asked["limit_s"])
-        print(json.dumps(said), flush=True)
+def load_anew(request: Path, answer: int) -> None:
+    """Answer a request in this process, which has loaded nothing yet."""
+    asked = json.loads(request.read_text())
+
+    class Ordered:
+        def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+            items[:] = named(asked["tests"], items)
+
+    plugin = FirstFailure(asked)
+    code = pytest.main([*QUIET, *asked["usual_s"]], plugins=[plugin, Ordered()])
+    sound = code in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED)
+    os.write(answer, (plugin.test or ("" if sound else "does not load")).encode())
+
+
+def main(root: Path, map_file: Path, files: Sequence[str]) -> None:
+    """Collect, map, and answer."""
+    sys.dont_write_bytecode = False
+    folder = map_file.parent / "tests"
+    plugin = Server(root, map_file)
+    silent = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(silent, 1)
+    pytest.main([*QUIET, "--basetemp", str(folder), *files], plugins=[plugin])
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]), Path(sys.argv[3]), sys.argv[4:])
+    if sys.argv[1] == "--anew":
+        load_anew(Path(sys.argv[2]), int(sys.argv[3]))
+    else:
+        main(Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3:])

@@ -1,83 +1,126 @@
-"""Which tests execute which lines of a package."""
+"""Which tests execute which functions of the program, and how long they take."""
 
 from __future__ import annotations
 
 import ast
+import functools
 import json
+import os
 import sys
 import threading
-import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import FrameType
+from types import CodeType, FrameType
 from typing import Any
 
 import pytest
 
+LOCAL = ".<locals>"
+_BYTES_PER_S = 500.0  # of a file whose tests have not been run
+
 
 @dataclass
 class TestMap:
-    """Tests by the lines that they execute.
+    """Tests by the functions that they execute.
 
-    lines: of each test, ``path:line`` of the package. seconds: of each test. failed: those that fail unchanged.
+    functions: of each test (or file of tests), ``path:name`` of functions of the program; what is defined within one
+    counts as that one.
+    seconds: of processor, of each test. failed: those that fail unchanged.
     """
 
     __test__ = False  # no test itself
 
-    lines: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
+    functions: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
     seconds: dict[str, float] = field(default_factory=dict[str, float])
     failed: list[str] = field(default_factory=list[str])
 
-    def tests_of(self, path: Path, line: int) -> list[str]:
-        """The tests that execute a line, and then the others of their files, which may share what one has made once;
-        files that take little time first. Of a line that is executed when its module is loaded, those of the module."""
-        place, module = f"{path}:{line}", f"{path}:"
-        hits = {test for test, places in self.lines.items() if place in places}
-        hits = hits or {test for test, places in self.lines.items() if any(one.startswith(module) for one in places)}
-        hits -= {*self.failed}
-        files = {test.partition("::")[0] for test in hits}
-        others = {test for test in self.seconds if test.partition("::")[0] in files} - hits - {*self.failed}
-        cost = {name: sum(self.seconds[t] for t in hits if t.startswith(f"{name}::")) for name in files}
-        return sorted(hits | others, key=lambda test: (test in others, cost[test.partition("::")[0]]))
+    def tests_of(self, path: Path, function: str, first: Iterable[Path] = ()) -> list[str]:
+        """The tests that execute a function, or, where there is none, anything of its module.
+
+        File by file, since tests of a file share what one has made: first the files named, then those that take little.
+        """
+        place, module = f"{path}:{function}", f"{path}:"
+        sound = {test: places for test, places in self.functions.items() if test not in self.failed}
+        hits = {test for test, places in sound.items() if place in places}
+        hits = hits or {test for test, places in sound.items() if any(one.startswith(module) for one in places)}
+        cost, early = defaultdict[str, float](float), {str(name) for name in first}
+        for test in hits:
+            cost[_file(test)] += self.seconds[test]
+        return sorted(
+            hits, key=lambda test: (_file(test) not in early, cost[_file(test)], _file(test), self.seconds[test])
+        )
+
+    def files_of(self, modules: Iterable[Path]) -> list[str]:
+        """The files whose tests call anything of modules."""
+        return sorted({_file(test) for path in modules for test in self.tests_of(path, "")})
 
     @classmethod
     def read(cls, path: Path) -> TestMap:
-        """A map that a ``Mapper`` has written."""
-        return cls(**json.loads(path.read_text()))
+        """A map that was written."""
+        read = json.loads(path.read_text())
+        names: list[str] = read.pop("names")
+        return cls({test: [names[k] for k in called] for test, called in read["called"].items()}, read["seconds"],
+                   read["failed"])  # fmt: skip
+
+    def write(self, path: Path) -> None:
+        """Each name once."""
+        names = sorted({name for called in self.functions.values() for name in called})
+        numbers = {name: k for k, name in enumerate(names)}
+        called = {test: [numbers[name] for name in own] for test, own in self.functions.items()}
+        path.write_text(json.dumps(dict(names=names, called=called, seconds=self.seconds, failed=self.failed)))
+
+
+def static_map(root: Path) -> TestMap:
+    """Without a run: a file of tests stands for its tests, and calls what it imports and what its folder mirrors."""
+    made = TestMap()
+    for path in sorted((root / "tests").rglob("test_*.py")):
+        name = path.relative_to(root)
+        imported = {f"{one.replace('.', '/')}.py:" for one in _imported(path) if one.startswith("kf_calib")}
+        package = Path("kf_calib", *name.parts[1:-1])
+        mirrored = (
+            {f"{module.relative_to(root)}:" for module in (root / package).glob("*.py")} if name.parts[2:] else set()
+        )
+        made.functions[str(name)] = sorted(imported | mirrored)
+        made.seconds[str(name)] = path.stat().st_size / _BYTES_PER_S
+    return made
 
 
 class Mapper:
-    """A plugin of pytest that notes which lines of a folder each test executes.
+    """A plugin of pytest that notes which functions of a folder each test calls, in this process.
 
-    What a fixture of a module or a class executes counts for all tests of its file.
+    What a fixture of a module or a class calls counts for all tests of its file.
     """
 
     def __init__(self, root: Path, folder: Path) -> None:
         self._root, self._prefix = f"{root}/", f"{root / folder}/"
         self.map = TestMap()
         self._shared: dict[str, set[str]] = defaultdict(set)
-        self._now: set[str] = set()
+        self._now: dict[int, CodeType] = {}
+
+    @pytest.hookimpl(wrapper=True, tryfirst=True)
+    def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[Any]:
+        self._now, begun_s = {}, _processor_s()
         threading.settrace(self._trace)
         sys.settrace(self._trace)
-
-    @pytest.hookimpl(wrapper=True)
-    def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[Any]:
-        self._now, begun_s = set(), time.process_time()
-        result = yield
-        self.map.lines[item.nodeid] = [*self._now]
-        self.map.seconds[item.nodeid] = time.process_time() - begun_s
-        return result
+        try:
+            return (yield)
+        finally:
+            sys.settrace(None)
+            threading.settrace(None)  # pyright: ignore[reportArgumentType]
+            self.map.functions[item.nodeid] = sorted(self._called())
+            self.map.seconds[item.nodeid] = round(_processor_s() - begun_s, 3)
 
     @pytest.hookimpl(wrapper=True)
     def pytest_fixture_setup(self, fixturedef: Any, request: pytest.FixtureRequest) -> Iterator[Any]:
         if fixturedef.scope == "function":
             return (yield)
-        outer, self._now = self._now, self._shared[request.node.nodeid.partition("::")[0]]
+        outer, self._now = self._now, {}
         try:
             return (yield)
         finally:
+            self._shared[_file(request.node.nodeid)] |= self._called()
             self._now = outer
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
@@ -85,31 +128,30 @@ class Mapper:
             self.map.failed.append(report.nodeid)
 
     def write(self, path: Path) -> None:
-        """The map, with what fixtures execute."""
-        for test, lines in self.map.lines.items():
-            self.map.lines[test] = sorted({*lines, *self._shared[test.partition("::")[0]]})
-        path.write_text(json.dumps(vars(self.map)))
+        """The map, with what fixtures call."""
+        for test, names in self.map.functions.items():
+            self.map.functions[test] = sorted({*names, *self._shared[_file(test)]})
+        self.map.write(path)
 
-    def _trace(self, frame: FrameType, event: str, _: Any) -> Any:
-        name = frame.f_code.co_filename
-        if not name.startswith(self._prefix):
-            return None
-        place = name.removeprefix(self._root)
-        self._now.add(f"{place}:{frame.f_lineno}")
-        return self._tracer_of(place)
+    def _trace(self, frame: FrameType, event: str, _: Any) -> None:
+        """Called at each call of a function; no line is traced, which would take many times as long."""
+        code = frame.f_code
+        if id(code) not in self._now:
+            self._now[id(code)] = code
 
-    def _tracer_of(self, place: str) -> Any:
-        def trace_line(frame: FrameType, event: str, _: Any) -> Any:
-            self._now.add(f"{place}:{frame.f_lineno}")
-            return trace_line
-
-        return trace_line
+    def _called(self) -> set[str]:
+        codes = [code for code in list(self._now.values()) if code.co_filename.startswith(self._prefix)]
+        return {f"{code.co_filename.removeprefix(self._root)}:{code.co_qualname.partition(LOCAL)[0]}" for code in codes}
 
 
-def own_tests(root: Path, package: Path) -> list[Path]:
-    """The files of tests in the folder that mirrors a package."""
-    folder = root / "tests" / package.relative_to("kf_calib")
-    return sorted(path.relative_to(root) for path in folder.rglob("test_*.py"))
+def _file(test: str) -> str:
+    return test.partition("::")[0]
+
+
+def _processor_s() -> float:
+    """Of this process and of those that it has started and waited for."""
+    taken = os.times()
+    return taken.user + taken.system + taken.children_user + taken.children_system
 
 
 def importing_tests(root: Path, module: Path) -> list[Path]:
@@ -119,6 +161,7 @@ def importing_tests(root: Path, module: Path) -> list[Path]:
     return [path.relative_to(root) for path in sorted(files, key=lambda path: path.stat().st_size)]
 
 
+@functools.cache
 def _imported(path: Path) -> set[str]:
     return {name for node in ast.walk(ast.parse(path.read_text())) for name in _names(node)}
 

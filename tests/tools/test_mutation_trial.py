@@ -1,0 +1,104 @@
+"""The mutation tester makes the change that it names, has its tests run, and tells whether one fails."""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from mutation_trials.changes import changes_in, function_at
+from mutation_trials.server import in_child, replace_code
+from mutation_trials.test_map import Mapper, TestMap
+
+SOURCE = """
+LIMIT = 3.0
+
+class Circle:
+    def __init__(self, radius=1.0):
+        self.radius = radius
+
+    def area(self):
+        return 3.0 * self.radius**2
+
+@functools.cache
+def wide(radius):
+    return [limit for limit in (1.0, LIMIT) if radius > limit]
+"""
+
+
+@pytest.fixture
+def module(tmp_path: Path) -> Iterator[ModuleType]:
+    path = tmp_path / "to_be_changed.py"
+    path.write_text(f"import functools\n{SOURCE}")
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec and spec.loader
+    loaded = sys.modules[path.stem] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(loaded)
+    yield loaded
+    del sys.modules[path.stem]
+
+
+def test_each_change_is_one_and_knows_its_function() -> None:
+    found = {f"{change} in {function_at(SOURCE, change)}" for change in changes_in(SOURCE)}
+    assert found == {
+        "3.0 -> 6.0 in ", "3.0 -> 1.5 in ", "1.0 -> 2.0 in ", "1.0 -> 0.5 in ",
+        "3.0 -> 6.0 in Circle.area", "3.0 -> 1.5 in Circle.area", "* -> / in Circle.area", "** -> * in Circle.area",
+        "2 -> 3 in Circle.area", "2 -> 1 in Circle.area", "> -> >= in wide", "> -> < in wide", "1.0 -> 2.0 in wide",
+        "1.0 -> 0.5 in wide",
+    }  # fmt: skip
+
+
+def test_functions_of_a_loaded_module_take_the_code_of_its_file(module: ModuleType) -> None:
+    """Those that others have taken from it, too, and without what they have in a cache."""
+    path, area, wide = Path(str(module.__file__)), module.Circle.area, module.wide
+    assert area(module.Circle(2.0)) == 12.0 and wide(2.0) == [1.0]
+    path.write_text(path.read_text().replace("**2", "**3").replace("radius >", "radius <"))
+    assert replace_code(path)
+    assert area(module.Circle(2.0)) == 24.0 and wide(2.0) == [3.0]
+
+
+def test_two_functions_of_one_name_and_line_cannot_be_told_apart(module: ModuleType) -> None:
+    path = Path(str(module.__file__))
+    path.write_text("one, other = lambda: 1, lambda: 2\n")
+    assert not replace_code(path)
+
+
+def test_a_child_answers_or_takes_too_long() -> None:
+    assert in_child(lambda answer: os.write(answer, b"a test") and None) == "a test"
+    assert in_child(lambda _: None) == ""
+    assert in_child(lambda _: os.kill(os.getpid(), signal.SIGKILL)) == "time"
+    assert "the tests were not run" in in_child(lambda _: 1 // 0)
+
+
+def test_the_tests_that_call_a_function_come_with_the_quick_file_first_after_those_named(tmp_path: Path) -> None:
+    called = {"a.py::slow": ["m.py:f"], "b.py::one": ["m.py:f"], "b.py::two": ["m.py:g"], "c.py::bad": ["m.py:f"],
+              "d.py::long": ["m.py:f"]}  # fmt: skip
+    seconds = {"a.py::slow": 3.0, "b.py::one": 1.0, "b.py::two": 9.0, "c.py::bad": 0.1, "d.py::long": 5.0}
+    TestMap(called, seconds, ["c.py::bad"]).write(tmp_path / "map.json")
+    tests = TestMap.read(tmp_path / "map.json")
+    assert tests == TestMap(called, seconds, ["c.py::bad"])
+    assert tests.tests_of(Path("m.py"), "f") == ["b.py::one", "a.py::slow", "d.py::long"]
+    assert tests.tests_of(Path("m.py"), "f", [Path("d.py")]) == ["d.py::long", "b.py::one", "a.py::slow"]
+    assert tests.tests_of(Path("m.py"), "no function's") == ["a.py::slow", "d.py::long", "b.py::one", "b.py::two"]
+
+
+def test_a_map_knows_what_was_called(module: ModuleType) -> None:
+    path = Path(str(module.__file__))
+    mapper = Mapper(path.parent.parent, Path(path.parent.name))
+    item = type("Item", (), {"nodeid": "a.py::test"})()
+    running = mapper.pytest_runtest_protocol(item)
+    before = sys.gettrace()
+    next(running)
+    module.Circle()
+    with pytest.raises(StopIteration):
+        running.send(True)
+    sys.settrace(before)
+    place = path.relative_to(path.parent.parent)
+    assert mapper.map.functions == {"a.py::test": [f"{place}:Circle.__init__"]}
+    assert functools.reduce(max, mapper.map.seconds.values()) >= 0.0
