@@ -16,7 +16,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import betaln
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.sufficient_statistics import Autocovariance, DwellFactor
@@ -66,6 +65,8 @@ def _equal_p(variances: Floats, freedom: Floats) -> float:
 
 def _prior(variances: Floats, freedom: Floats) -> tuple[float, float]:
     """Return the likeliest nu_0 and s_0^2: for each nu_0 the level by steps of an EM algorithm, all at once."""
+    from scipy.special import betaln  # few runs need it
+
     shapes, levels = _SHAPES[:, None], np.full((len(_SHAPES), 1), np.median(variances))
     for _ in range(_ROUNDS):
         precision = np.mean((shapes + freedom) / (shapes * levels + freedom * variances), axis=1, keepdims=True)

@@ -11,8 +11,10 @@ import pytest
 from click.testing import CliRunner
 from helpers.paths import RECORDINGS
 from real_trials import command
+from real_trials.ideal import chosen, credible
 from real_trials.injected import EFFECTS, alike, injected
 from real_trials.recordings import GRAVITY_MPS2, RealRecording
+from real_trials.turned import SETTING_DEG, TurnedRecording
 from scipy.optimize import least_squares
 
 
@@ -58,10 +60,40 @@ def test_outcomes_are_kept_and_counted(tmp_path: Path) -> None:
     lines = [
         {**outcome, "effect": "", "verdict": "It agrees.", "missing": [], "first": [], "set": [], "rows": []},
         {**outcome, "effect": "bias-drift", "missing": ["bias-drift"], "first": ["bias-drift"], "set": ["bias-drift"],
+         "best": ["bias-drift"], "best_probability": 0.9,
          "verdict": "", "probability": 0.8, "rows": [[["bias-drift"], 0.8]], "alike": ["bias-drift"]},
         {**outcome, "effect": "warm-up", "missing": ["bias-drift"], "first": ["bias-drift"], "verdict": "",
+         "best": ["bias-drift", "warm-up"], "best_probability": 0.3,
          "set": ["bias-drift", "warm-up"], "probability": 0.1, "rows": [[["bias-drift"], 0.8]], "alike": []},
     ]  # fmt: skip
     kept.write_text("".join(json.dumps(line) + "\n" for line in lines))
     said = CliRunner().invoke(command.main, ["--folder", str(tmp_path), "--resume", str(kept)]).output
-    assert "It agrees." in said and "1 (50%)" in said and "2 (100%)" in said and "0.45" in said
+    assert "It agrees." in said and "1 (50%)" in said and "2 (100%)" in said and "0.45" in said and "0.60" in said
+
+
+def test_the_best_chooser_is_sure_of_what_is_far_above_the_noise_and_not_of_what_is_below() -> None:
+    recording = by_hand()
+    for sigmas, sure in ((40.0, True), (1.0, False)):
+        added = injected(recording, "bias-drift", sigmas, 3)
+        assert added is not None
+        said = chosen(recording, added, sigmas, 3)
+        assert sum(said.values()) == pytest.approx(1.0) and set(said) <= set(EFFECTS)
+        assert (credible(said) == ["bias-drift"]) == sure
+
+
+def test_angles_are_those_at_which_a_platform_feels_the_force_but_for_the_setting_error() -> None:
+    recording = TurnedRecording(RECORDINGS / "hand.mcap")
+    altered = recording.altered(np.zeros(3))
+    pose = np.concatenate([batch.pose.values for batch in altered.batches])
+    time_s = np.concatenate([batch.pose.time_ns for batch in altered.batches]) / 1e9
+    force = altered.bench.specific_force(time_s - time_s[0], pose)
+    felt = recording.force_mps2[np.searchsorted(recording.time_s, time_s - time_s[0] - 1e-6)]
+    within = [
+        (time_s - time_s[0] > start + 1.0) & (time_s - time_s[0] < end - 1.0) for start, end in recording.dwells_s
+    ]
+    off_deg = [
+        np.degrees(np.linalg.norm(np.cross(force[inside].mean(axis=0), felt[inside].mean(axis=0)))) / GRAVITY_MPS2**2
+        for inside in within
+    ]
+    assert 0.5 * SETTING_DEG < np.sqrt(np.mean(np.square(off_deg)) / 2.0) < 1.6 * SETTING_DEG
+    assert np.sum(recording.left**2) / (3 * len(off_deg) - 12) < 2.0

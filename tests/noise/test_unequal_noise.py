@@ -1,0 +1,121 @@
+"""Dwells of unequal noise, drawn by numpy alone: weights, coverage of the sigmas, and the rate of alarms."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from helpers.long_runs import slow
+from scipy.spatial.transform import Rotation
+from scipy.stats import binom
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench
+from kf_calib.bench.streams import Batch, Stream
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.noise.unequal_noise import weights_of
+
+G_MPS2, HZ, DWELLS = 9.81, 20.0, 24
+SETTING_RAD = np.radians(0.002)
+
+
+def drawn(seed: int, shape: float, dwells: int = 2000, freedom: float = 30.0) -> tuple[Floats, Floats]:
+    """True variances (D,) of an inverse-gamma distribution, and their estimates (D,)."""
+    random = np.random.default_rng(seed)
+    true = shape / random.chisquare(shape, dwells) if np.isfinite(shape) else np.ones(dwells)
+    return true, true * random.chisquare(freedom, dwells) / freedom
+
+
+@pytest.mark.parametrize("shape", [3.0, 8.0])
+def test_weights_are_nearer_to_the_truth_than_those_of_each_dwell_alone_or_of_all(shape: float) -> None:
+    true, estimates = drawn(1, shape)
+    weights = weights_of(estimates, np.full(len(true), 30.0))
+
+    def loss(guess: Floats) -> float:
+        return float(np.var(np.log(guess * true)))
+
+    assert loss(weights) < 0.95 * min(loss(1.0 / estimates), loss(np.ones(len(true))))
+    assert np.mean(weights) == pytest.approx(1.0, rel=0.05)
+
+
+def test_a_dwell_of_few_readings_keeps_to_the_others() -> None:
+    true, estimates = drawn(2, 6.0, dwells=200)
+    freedom = np.full(200, 30.0)
+    freedom[0], estimates[0] = 2.0, 20.0 * np.median(true)
+    many = freedom.copy()
+    many[0] = 400.0
+    few_weights, many_weights = weights_of(estimates, freedom), weights_of(estimates, many)
+    assert few_weights[0] > 3.0 * many_weights[0]
+    assert many_weights[0] / np.median(many_weights) == pytest.approx(1.0 / 20.0, rel=0.2)
+
+
+@pytest.mark.parametrize("freedom", [5.0, 300.0])
+def test_equal_noise_keeps_one_noise(freedom: float) -> None:
+    unequal = sum(
+        (weights_of(drawn(k, np.inf, 24, freedom)[1], np.full(24, freedom)) != 1.0).any() for k in range(1000)
+    )
+    assert unequal <= 3  # of 1000 at a level of 1e-4
+
+
+@dataclass
+class Drawn:
+    """A run of readings with unequal noise; a source of kf_calib. shape: of the inverse-gamma distribution."""
+
+    seed: int
+    shape: float
+    angles: bool
+    warnings: list[str] = field(default_factory=list[str])
+    fraction: float = 1.0
+
+    def __post_init__(self) -> None:
+        random = np.random.default_rng(self.seed)
+        sensitivity, bias = np.eye(3) + 0.01 * random.normal(size=(3, 3)), 0.05 * random.normal(size=3)
+        self.truth = np.column_stack(
+            [sensitivity if self.angles else np.linalg.cholesky(sensitivity @ sensitivity.T), bias]
+        )
+        stops = np.stack([random.uniform(-np.pi, np.pi, DWELLS), np.arccos(random.uniform(-1, 1, DWELLS))], axis=1)
+        pose, sigma, turned = list[Floats](), list[Floats](), list[Floats]()
+        for k, stop in enumerate(stops):
+            before = stops[max(k - 1, 0)]
+            pose += [before + np.linspace(0.0, 1.0, 40)[:, None] * (stop - before), np.repeat(stop[None], 400, axis=0)]
+            sigma += [np.full(40, 1e-3), np.full(400, 1e-3 * np.sqrt(self.shape / random.chisquare(self.shape)))]
+            turned += [np.zeros((40, 3)), np.tile(SETTING_RAD * random.normal(size=3), (400, 1))]
+        self.pose = np.vstack(pose)
+        first, second = self.pose.T
+        force = G_MPS2 * np.stack(
+            [np.sin(first), np.cos(first) * np.cos(second), -np.cos(first) * np.sin(second)], axis=1
+        )
+        force = Rotation.from_rotvec(np.vstack(turned)).apply(force)
+        noise = np.concatenate(sigma)[:, None] * random.normal(size=force.shape)
+        self.readings = force @ sensitivity.T + bias + noise
+
+    @property
+    def bench(self) -> Bench:
+        axes = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0)) if self.angles else ()
+        stated_deg = float(np.degrees(SETTING_RAD)) if self.angles else None
+        return Bench(axes, G_MPS2, angle_sigma_deg=stated_deg, scatter_sigma_mps2=0.0, angles=self.angles)
+
+    def __iter__(self) -> Iterator[Batch]:
+        time_ns = (np.arange(len(self.readings)) / HZ * 1e9).astype(np.int64)
+        yield Batch(Stream(time_ns, self.readings), Stream(time_ns, self.pose) if self.angles else Stream.empty(4))
+
+
+@pytest.mark.parametrize("angles", [True, False])
+@pytest.mark.parametrize("seeds", [range(3000, 3012), *slow(range(4000, 4200))])
+def test_sigmas_cover_and_alarms_are_rare_where_dwells_tremble_unequally(seeds: range, angles: bool) -> None:
+    """93 to 97 % within 1.96 sigma, and 0.4 to 2 % of alarms, as far as so many runs can tell."""
+    inside, alarms = list[float](), 0
+    for seed in seeds:
+        run = Drawn(seed, 6.0, angles)
+        result = calibrate(run)
+        assert {dwell.weight for dwell in result.fit.dwells} != {1.0}
+        sigma = np.sqrt(np.diag(result.estimate.covariance)).reshape(3, 4)
+        known = sigma > 0.0
+        errors = (result.estimate.state.reshape(3, 4) - run.truth)[known] / sigma[known]
+        inside += [float(np.mean(np.abs(errors) < 1.96))]
+        alarms += result.consistency.consistent is False
+    spread = float(np.std(inside, ddof=1)) / len(inside) ** 0.5
+    assert 0.93 - 2.0 * spread < np.mean(inside) < 0.97 + 2.0 * spread
+    assert binom.sf(alarms - 1, len(seeds), 0.02) > 0.01
