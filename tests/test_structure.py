@@ -23,7 +23,7 @@ DATA = "recordings"  # a link: the tutorial's recordings come with the package
 CORE = {"bench", "dwells", "effects", "noise", "estimation", "design", "diagnosis", "online"}
 LEVELS = (
     {"errors"}, {"support"}, {"bench"}, {"effects", "sources"}, {"dwells"}, {"noise"}, {"estimation"},
-    {"exchange", "reproduction", "design"}, {"diagnosis"}, {"fleet", "online"}, {"views"}, {"cli"},
+    {"exchange", "reproduction", "design"}, {"diagnosis"}, {"fleet", "online"}, {"positioning"}, {"views"}, {"cli"},
 )  # fmt: skip
 """The packages from the ground up: a package imports from those of lower levels only."""
 

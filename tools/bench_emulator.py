@@ -9,6 +9,9 @@ follow at once), burst (half a second of samples at once), disconnect (the conne
 before the next client is lost), vanish (as a loss of power: nothing comes over the connection any more, which does not
 end), step (the clock jumps by up to 5 s either way), restart (the clock starts at zero again), freeze (the clock stands
 still for a while). Listens on 127.0.0.1 only.
+
+With ``--positioner PORT`` the platform goes where a controller on that port is told (``positioner_emulator``), for
+``kf-calib run --positioner``; ``--servo`` says how it moves, and what fails.
 """
 
 from __future__ import annotations
@@ -24,11 +27,14 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from urllib.parse import parse_qsl
 
 import numpy as np
+from positioner_emulator import DrivenRun, Server
 
 from kf_calib.bench.streams import Batch
 from kf_calib.sources.live import frames
+from kf_calib.sources.simulation.driven import DrivenBench, Servo
 from kf_calib.sources.simulation.options import options_from_query, simulation
 from kf_calib.sources.simulation.simulator import START_NS, Simulation
 
@@ -185,9 +191,9 @@ class Emulator:
     """
 
     def __init__(
-        self, run: Simulation, outlet: Tcp | Pty, form: str = "json", *, speed: float = 1.0, faults: Sequence[str] = (),
-        every: float = 500.0, seed: int = 0, wall: bool = False, keep: bool = False, most_faults: int = 1 << 60,
-        outage_s: float = 0.2,
+        self, run: Simulation | DrivenRun, outlet: Tcp | Pty, form: str = "json", *, speed: float = 1.0,
+        faults: Sequence[str] = (), every: float = 500.0, seed: int = 0, wall: bool = False, keep: bool = False,
+        most_faults: int = 1 << 60, outage_s: float = 0.2,
     ) -> None:  # fmt: skip
         self.ledger = Ledger()
         self.url = outlet.url
@@ -345,6 +351,14 @@ def _in_steps(batch: Batch, step_ns: int) -> Iterator[tuple[int, list[tuple[int,
         start = end
 
 
+def driven_run(run: Simulation, servo: str, port: int, lasts_s: float) -> DrivenRun:
+    """The same bench with its platform at zero, moved by a controller, whose address is printed."""
+    numbers = {key: text if key == "fault" else float(text) for key, text in parse_qsl(servo)}
+    lock, bench = threading.Lock(), DrivenBench(run, Servo(**numbers), [0.0] * len(run.bench.axes))
+    print(Server(bench, lock, port).url, flush=True)
+    return DrivenRun(bench, lock, 0.02, lasts_s)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     where = parser.add_mutually_exclusive_group()
@@ -358,11 +372,16 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--wall", action="store_true", help="stamps are the time of sending")
     parser.add_argument("--wait-s", type=float, default=600.0, help="how long the first client is waited for")
+    parser.add_argument("--positioner", type=int, metavar="PORT", help="a controller moves the platform; 0: any port")
+    parser.add_argument("--servo", default="", metavar="QUERY", help="e.g. rate_degps=60&fault=stall")
+    parser.add_argument("--lasts-s", type=float, default=86400.0, help="how long a platform that is driven measures")
     chosen = parser.parse_args()
     faults = FAULTS if chosen.faults == "all" else tuple(filter(None, chosen.faults.split(",")))
     if unknown := set(faults) - set(FAULTS):
         parser.error(f"no such fault: {', '.join(sorted(unknown))}")
     run = simulation(options_from_query(chosen.sim), {}, 2048)
+    if chosen.positioner is not None:
+        run = driven_run(run, chosen.servo, chosen.positioner, chosen.lasts_s)
     emulator = Emulator(
         run, Pty() if chosen.pty else Tcp(chosen.tcp), chosen.format, speed=chosen.speed, faults=faults,
         every=chosen.every, seed=chosen.seed, wall=chosen.wall,

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kf_calib.bench.arrays import Floats, Times
+from kf_calib.bench.gimbal_ranges import limits_of, zones_of
 from kf_calib.bench.raw_input import PLAIN, RawInput
 from kf_calib.errors import BenchError
 from kf_calib.support.plain_text import cut
@@ -91,6 +92,11 @@ def _format_axis(axis: Vector) -> str:
     return ",".join(repr(float(part)) for part in axis)
 
 
+def axis_names(axes: Iterable[Vector]) -> list[str]:
+    """The axes, each written as a letter if it is a coordinate axis, else as three numbers."""
+    return list(map(_format_axis, axes))
+
+
 @dataclass(frozen=True)
 class Bench:
     """The description of the bench that is known before the first sample (metadata record ``kf_calib.bench``).
@@ -111,6 +117,8 @@ class Bench:
     - joints: names of the gimbals' joints, outer to inner, if angles come as joint states; empty if their names tell.
     - angles: whether angles or attitudes are used. Without them only the size of gravity is known (``free_attitude``).
     - square_sigma_deg: how square the axes of the accelerometers are, one standard deviation; None for 1 deg.
+    - limits_deg, forbidden_deg: ranges of gimbals that must not be left, and zones that must not be entered, as text
+      (``gimbal_ranges``); rate_degps, acceleration_degps2: greatest of any gimbal; None if not stated.
     """
 
     axes: tuple[Vector, ...]
@@ -128,6 +136,10 @@ class Bench:
     joints: tuple[str, ...] = ()
     angles: bool = True
     square_sigma_deg: float | None = None
+    limits_deg: str = ""
+    forbidden_deg: str = ""
+    rate_degps: float | None = None
+    acceleration_degps2: float | None = None
 
     def __post_init__(self) -> None:
         from kf_calib.bench.keys import NOTES, NUMBERS, checked
@@ -137,6 +149,9 @@ class Bench:
         notes = {key: value for key, value in self.notes.items() if key in NOTES}
         for key, value in {**stated, "nominal": self.nominal, "joints": " ".join(self.joints), **notes}.items():
             checked(key, value)
+        names = axis_names(self.axes)
+        limits_of(self.limits_deg, names)  # raise BenchError
+        zones_of(self.forbidden_deg, names)
         if self.reference == "inertial" and self.latitude_deg is None:
             raise BenchError(
                 "an inertially held platform needs the latitude, because gravity turns with the Earth in it: "
@@ -191,6 +206,8 @@ class Bench:
             notes={key: values[key] for key in NOTES if values.get(key)},
             up=values.get("up", "y"),
             input=RawInput.from_metadata(values),
+            limits_deg=values.get("limits_deg", "") if has_angles else "",
+            forbidden_deg=values.get("forbidden_deg", "") if has_angles else "",
             **numbers,
         )
 
@@ -201,12 +218,14 @@ class Bench:
         numbers = {key: getattr(self, key) for key in NUMBERS}
         return {
             "format_version": FORMAT_VERSION,
-            **({"axes": " ".join(map(_format_axis, self.axes))} if self.axes else {}),
+            **({"axes": " ".join(axis_names(self.axes))} if self.axes else {}),
             **({"joints": " ".join(self.joints)} if self.joints else {}),
             "reference": self.reference,
             **{key: repr(float(value)) for key, value in numbers.items() if value is not None},
             **({"nominal": json.dumps(dict(self.nominal))} if self.nominal else {}),
             **({"up": self.up} if self.up != "y" else {}),
+            **({"limits_deg": self.limits_deg} if self.limits_deg else {}),
+            **({"forbidden_deg": self.forbidden_deg} if self.forbidden_deg else {}),
             **self.input.to_metadata(),
             **self.notes,
         }

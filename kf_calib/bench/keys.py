@@ -28,6 +28,8 @@ NUMBERS = (
     "angle_sigma_deg",
     "scatter_sigma_mps2",
     "square_sigma_deg",
+    "rate_degps",
+    "acceleration_degps2",
 )
 FREE_TEXT = ("block_serial", "bench", "operator", "note")
 NOTES = (*FREE_TEXT, "date")
@@ -130,6 +132,10 @@ KEYS: Mapping[str, Key] = {
     "scatter_sigma_mps2": _number(0, 100, "the scatter from dwell to dwell, 1 sigma, in m/s^2; leave it out where it "
                                   "is not known"),
     "square_sigma_deg": _number(1e-4, 45, "how square the axes are, 1 sigma, in deg, for runs without angles"),
+    "limits_deg": Key(_text, 'ranges of gimbals in deg, such as "outer=-170:170 z=-90:90"'),
+    "forbidden_deg": Key(_text, 'zones that gimbals must not enter, in deg, such as "z=10:40,x=-5:5; y=150:180"'),
+    "rate_degps": _number(1e-3, 1e4, "the greatest rate of a gimbal in deg/s"),
+    "acceleration_degps2": _number(1e-3, 1e5, "the greatest acceleration of a gimbal in deg/s^2"),
     "nominal": Key(
         _nominal,
         f'a JSON object such as {{"theta1": 0}} of parameters ({", ".join(paper_parameters.SYMBOLS)}) in rad, 1 or '

@@ -165,11 +165,11 @@ def live(
         if view is not None:
             run.listeners.append(partial(_offer, view))
         with answered(run.handle_signal):  # until all is written: who closes a terminal sends several
-            _follow(run, source, record, as_json)
+            follow(run, source, record, as_json)
             if view is not None:
                 view.close()
             opened.close()
-            final = _outcome(run, as_json)
+            final = outcome(run, as_json)
             for said in [*_of_the_view(view), *run.troubles]:
                 complain(said)
             if final is not None and final.result is not None:
@@ -192,7 +192,7 @@ def _offer(view: GrowingView, judgement: Judgement | HandJudgement) -> None:
         view.offer(judgement.result, judgement if isinstance(judgement, Judgement) else None)
 
 
-def _follow(run: LiveRun, name: str, record: Path | None, as_json: bool) -> None:
+def follow(run: LiveRun, name: str, record: Path | None, as_json: bool) -> None:
     """The run to its end, with a screen, lines or objects."""
     run.start()
     if not as_json and sys.stdout.isatty():
@@ -219,6 +219,7 @@ def _urgent_messages(run: LiveRun) -> dict[str, str]:
 
     standing, status = run.session.standing if run.session else None, run.source.status
     return {
+        "bench": run.doing(),
         "task": standing.task if isinstance(standing, HandStanding) else "",
         "evaluation": (standing.problem or standing.notice) if standing else "",
         "link": "the link is lost, and tried again" if status.link == "lost" else "",
@@ -229,7 +230,7 @@ def _urgent_messages(run: LiveRun) -> dict[str, str]:
 def _print(run: LiveRun, judgement: Judgement | HandJudgement, as_json: bool) -> None:
     assert run.session is not None
     if as_json:
-        _echo(run, json_line(_object(judgement, run.session.standing, run.source.status)))
+        _echo(run, json_line(_object(judgement, run.session.standing, run.source.status) | dict(run.further_keys())))
     elif not judgement.final:
         _echo(run, sentence(_line(judgement)))
 
@@ -286,7 +287,8 @@ def _on_screen(run: LiveRun, name: str, record: Path | None) -> None:
                 shown = hand_screen(standing, run.source.status, name, str(record or ""), hint)
             else:
                 hint = "ending ..." if run.stopped else "a: accept what is missing   q: end the run"
-                shown = screen(standing, run.source.status, name, str(record or ""), hint)
+                lines = "\n".join(filter(None, (run.doing(), hint)))
+                shown = screen(standing, run.source.status, name, str(record or ""), lines)
             display.update(shown, refresh=True)
             key = pressed(_REFRESH_S)
             if key == "a":
@@ -295,7 +297,7 @@ def _on_screen(run: LiveRun, name: str, record: Path | None) -> None:
                 run.stop()
 
 
-def _outcome(run: LiveRun, as_json: bool) -> Judgement | HandJudgement | None:
+def outcome(run: LiveRun, as_json: bool) -> Judgement | HandJudgement | None:
     """The last judgement, after its summary; None where a run that was ended had nothing to evaluate yet."""
     if run.error is not None:
         if said := run.nothing_came:

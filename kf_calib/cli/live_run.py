@@ -40,8 +40,12 @@ def by_hand(settings: Settings, wanted: Mapping[str, float]) -> Callable[..., Ha
 class LiveRun:
     """A session in a thread of its own: the main thread has the screen, the keys and the signals.
 
-    judgements: those not shown yet. stopped: by a key or a signal. print: to standard output.
+    judgements: those not shown yet. stopped: by a key or a signal. print: to standard output. further_keys: of every
+    JSON object. doing: what the bench is doing, for the screen.
     """
+
+    further_keys: Callable[[], Mapping[str, object]] = staticmethod(dict)
+    doing: Callable[[], str] = staticmethod(str)
 
     def __init__(
         self,

@@ -248,11 +248,14 @@ def _with_gimbals(recording: Path, bench: Bench, options: Mapping[str, Any]) -> 
 
 
 def _reach(bench: Bench, options: Mapping[str, Any]) -> Reach:
-    from kf_calib.design.gimbal_limits import Reach, ranges
+    from kf_calib.bench.bench import axis_names
+    from kf_calib.bench.gimbal_ranges import ranges
+    from kf_calib.design.gimbal_limits import Reach
     from kf_calib.sources.simulation.visit_plans import angles_from_csv
 
-    limits = {j: ends for text in options["limits"] for j, ends in ranges(text, bench).items()}
-    zones = [ranges(text, bench) for text in options["zones"]]
+    stated, names = Reach.of(bench), axis_names(bench.axes)
+    limits = {**stated.limits_deg, **{j: ends for text in options["limits"] for j, ends in ranges(text, names).items()}}
+    zones = [*stated.zones_deg, *(ranges(text, names) for text in options["zones"])]
     path = options["positions"]
     positions = angles_from_csv(path, len(bench.axes)) if path else None
     return Reach(bench, limits, zones, options["grid_deg"], positions)

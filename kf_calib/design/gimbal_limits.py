@@ -14,12 +14,11 @@ from functools import cached_property
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, Mask
-from kf_calib.bench.bench import Bench
+from kf_calib.bench.bench import Bench, axis_names
+from kf_calib.bench.gimbal_ranges import Range, limits_of, zones_of
 from kf_calib.errors import InputError
 
 _POSES = 4096
-_PLACES = ("outer", "middle", "inner")
-Range = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -37,6 +36,12 @@ class Reach:
     zones_deg: Sequence[Mapping[int, Range]] = ()
     grid_deg: float | None = None
     positions_deg: Sequence[Sequence[float]] | None = None
+
+    @classmethod
+    def of(cls, bench: Bench) -> Reach:
+        """The limits that the description of the bench states."""
+        names = axis_names(bench.axes)
+        return cls(bench, limits_of(bench.limits_deg, names), zones_of(bench.forbidden_deg, names))
 
     @property
     def continuous(self) -> bool:
@@ -144,33 +149,3 @@ def _aside(angle: float, zone: Floats) -> tuple[float, float]:
 def wrap(poses: Floats) -> Floats:
     """Angles wrapped to the range from -180 to 180 deg, rad."""
     return np.pi - (np.pi - poses) % (2.0 * np.pi)
-
-
-def gimbal_named(text: str, bench: Bench) -> int:
-    """Number of a gimbal from its number (1 is the outer one), its place (outer, middle, inner) or its axis (x, y, z);
-    raises InputError."""
-    names = bench.to_metadata()["axes"].split()
-    count = len(names)
-    places = dict(zip(_PLACES if count == 3 else ("outer", "inner")[:count], range(count), strict=False))
-    numbers = {str(j + 1): j for j in range(count)}
-    letters = {name.lstrip("-"): j for j, name in enumerate(names) if [n.lstrip("-") for n in names].count(name) == 1}
-    known = numbers | places | letters
-    if text not in known:
-        raise InputError(f"gimbal {text!r} is not known: use one of {', '.join(known)}.")
-    return known[text]
-
-
-def ranges(text: str, bench: Bench) -> dict[int, Range]:
-    """Ranges in deg by gimbal from text such as ``z=-90:90`` or ``outer=0:30,x=-10:10``; raises InputError."""
-    out = dict[int, Range]()
-    for part in text.split(","):
-        name, equals, ends = part.strip().partition("=")
-        low, colon, high = ends.partition(":")
-        try:
-            own = float(low), float(high)
-        except ValueError:
-            own = math.nan, math.nan
-        if not (equals and colon and -360.0 <= own[0] <= own[1] <= 360.0 and own[1] - own[0] <= 360.0):
-            raise InputError(f"{part.strip()!r} is no range of a gimbal: write AXIS=LOW:HIGH in deg, as in z=-90:90.")
-        out[gimbal_named(name, bench)] = own
-    return out

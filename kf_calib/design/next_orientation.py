@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kf_calib.bench import paper_parameters
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.bench.paper_parameters import STATE_COUNT
-from kf_calib.design.gimbal_limits import wrap
+from kf_calib.design.gimbal_limits import Reach, wrap
 from kf_calib.design.predicted_information import Prospect
 from kf_calib.dwells.qr import triangle
 from kf_calib.effects import Effect
@@ -165,10 +165,10 @@ def course(fitted: Fit, sizes: Floats, count: int = _STEPS) -> Course | None:
     jacobian = paper_parameters.jacobian(fitted.linearised.state[:STATE_COUNT])
     at_least = np.diag(1.0 / np.maximum(fitted.linearised.sizes, 1.0))  # keeps all sigmas finite, at the size of g
     root = np.asarray(np.linalg.inv(triangle(np.vstack([factor, at_least]))), float)
-    sigmas, first = [_sigmas(root, jacobian)], 0
+    sigmas, first = [sigmas_of(root, jacobian)], 0
     for number in range(count):
-        after = _root_after(root, rows)
-        reached = _sigmas(after, jacobian)
+        after = root_after(root, rows)
+        reached = sigmas_of(after, jacobian)
         best = int(np.argmin(((reached / sizes) ** 2).sum(axis=1)))
         first = first if number else best
         root = after[best]
@@ -184,13 +184,13 @@ def _each_s(fitted: Fit) -> float:
     return float(np.median(lengths))
 
 
-def _sigmas(roots: Floats, jacobian: Floats) -> Floats:
-    """Return the sigmas (..., 12) of the paper's parameters from roots (..., p, p) of covariances."""
+def sigmas_of(roots: Floats, jacobian: Floats) -> Floats:
+    """Sigmas (..., 12) of the paper's parameters from roots (..., p, p) of covariances."""
     return np.asarray(np.linalg.norm(jacobian @ roots[..., :STATE_COUNT, :], axis=-1))
 
 
-def _root_after(root: Floats, rows: Floats) -> Floats:
-    """Return roots S (m, p, p) of the covariance S S^T after each of m sets of whitened rows (m, r, p), from the root
+def root_after(root: Floats, rows: Floats) -> Floats:
+    """Roots S (m, p, p) of the covariance S S^T after each of m sets of whitened rows (m, r, p), from the root
     before.
 
     The new root is S - S W^T M^-T (M + I)^-1 W, where W are the rows times S and M M^T = I + W W^T (Andrews, 1968).
@@ -204,19 +204,28 @@ def _root_after(root: Floats, rows: Floats) -> Floats:
 
 
 def _poses(fitted: Fit) -> Floats | None:
-    """Return gimbal angles (m, k), rad, to choose from; None without gimbals.
-
-    They are multiples of 45 deg and random others; the present pose is excluded, since it would not be set anew.
-    """
-    count = len(fitted.linearised.model.bench.axes)
-    if not count:
+    """Return gimbal angles (m, k), rad, to choose from; None without gimbals, or where the limits leave none."""
+    bench = fitted.linearised.model.bench
+    if not bench.axes:
         return None
+    poses = poses_within(Reach.of(bench))
+    poses = poses[is_elsewhere(poses, fitted.dwells[-1].pose)]
+    return poses if len(poses) else None
+
+
+def poses_within(reach: Reach) -> Floats:
+    """Gimbal angles (m, k), rad, that a bench can take: multiples of 45 deg, and random multiples of 5 deg."""
+    count, (low, high) = len(reach.bench.axes), np.degrees(reach.bounds).T
     rng = np.random.default_rng(0)
     coarse = rng.integers(-4, 4, (_POSES // 2, count)) * 45.0
-    fine = np.round(rng.uniform(-180.0, 180.0, (_POSES // 2, count)) / _STEP_DEG) * _STEP_DEG
+    fine = np.round(rng.uniform(low, high, (_POSES // 2, count)) / _STEP_DEG) * _STEP_DEG
     poses = np.radians(np.concatenate([coarse, fine]))
-    turn = np.abs(wrap(poses - fitted.dwells[-1].pose)).max(axis=1)
-    return poses[turn > np.radians(SAME_POSE_DEG)]
+    return poses if reach.free else poses[reach.allowed(poses)]
+
+
+def is_elsewhere(poses: Floats, pose: Floats) -> Mask:
+    """Mask of the poses (m, k) that differ from ``pose`` (k,): one that is the same would not be set anew."""
+    return np.abs(wrap(poses - pose)).max(axis=1) > np.radians(SAME_POSE_DEG)
 
 
 def _with_next(
@@ -228,10 +237,20 @@ def _with_next(
 ) -> tuple[Floats, Floats]:
     """Return the triangular factor of [H | G] of the run so far, and the whitened rows (w, m, 3, p + q) of a dwell's
     mean after each wait at each pose."""
-    linearised, noise = fitted.linearised, noise or fitted.noise.for_goodness_of_fit
+    noise = noise or fitted.noise.for_goodness_of_fit
+    prospect = replace(Prospect.following(fitted), noise=noise)
+    rows = np.array([prospect.columns(effects, poses, float(wait_s)) for wait_s in waits_s])
+    return factor_of(fitted, effects, noise), rows
+
+
+def factor_of(fitted: Fit, effects: Sequence[Effect] = (), noise: Noise | None = None) -> Floats:
+    """The triangular factor (p + q, p + q) of the whitened columns [H | G] of the run so far, without a prior.
+
+    effects: whose columns G are added. noise: by which they are whitened (None: that of the fit).
+    """
+    linearised, noise = fitted.linearised, noise or fitted.noise
     model, state = linearised.model, linearised.state
     added = candidate_columns(linearised.dwells_at_state, effects, model.bench, state)
     columns = [np.concatenate([own, more], axis=3) for own, more in zip(linearised.columns, added, strict=True)]
     upper = accumulate(whiten(linearised.dwells_at_state, columns, noise, state), steps(linearised.dwells, noise))
-    prospect = replace(Prospect.following(fitted), noise=noise)
-    return upper[:-1, :-1], np.array([prospect.columns(effects, poses, float(wait_s)) for wait_s in waits_s])
+    return upper[:-1, :-1]

@@ -237,7 +237,7 @@ class Segmenter:
         for j in changes:
             begin, end = int(times[j]), int(times[j + 1])
             if still[j] and not in_dwell:
-                first = not self._begun
+                first = not self._begun and j == 0  # no: the run began amid a slew
                 arrived_ns, in_dwell = begin - (_HOLD_NS if first else 0), True
                 events.append((arrived_ns, DwellEvent.ARRIVE, not first))
             elif unresolved[j]:
@@ -254,6 +254,7 @@ class Segmenter:
                 events.append((self._departed_ns(arrived_ns, begin), DwellEvent.LEAVE, False))
                 in_dwell = False
             self._begun = True
+        self._begun |= len(still) > 0
         return events
 
     def _departed_ns(self, arrived_ns: int, end_ns: int) -> int:

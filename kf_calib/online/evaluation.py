@@ -3,6 +3,9 @@
 The thread that calls ``run`` folds the readings as they come, and looks at the open dwell after 1, 2, 4 ... s. A second
 thread judges the dwells that have closed. Nobody who shows the results holds either up. The readings are folded as a
 replay of the recording folds them.
+
+Whoever has a loop of its own does without the threads: ``ingest`` takes a batch and judges the dwells that it closes,
+``finish`` gives the final judgement.
 """
 
 from __future__ import annotations
@@ -45,8 +48,11 @@ class Evaluation(ABC, Generic[J, S]):
 
     source: of the readings. settings: of the calibration. wanted: targets of sigmas by symbol, SI. every: judge after
     each dwell, even where dwells close faster than they are judged; False: judge the newest only. again: gives the
-    readings once more when the source has ended, from its recording; None where there is none.
+    readings once more when the source has ended, from its recording; None where there is none. look_factor: by how much
+    the open dwell has to grow between two looks at it.
     """
+
+    look_factor = 2.0
 
     def __init__(
         self,
@@ -69,6 +75,7 @@ class Evaluation(ABC, Generic[J, S]):
         self._waiting, self._ended, self._hurried = deque[_Closed](), False, False
         self._last: _Closed | None = None
         self._before: J | None = None
+        self._taken, self._is_judging = 0, False
 
     @abstractmethod
     def accept(self, *names: str) -> None:
@@ -107,6 +114,7 @@ class Evaluation(ABC, Generic[J, S]):
                     try:
                         if failure is None:
                             self._take(batch)
+                            self._count_taken(batch)
                     except Exception as error:
                         failure = error
                         self.say(f"the evaluation stopped: {error}")
@@ -120,6 +128,36 @@ class Evaluation(ABC, Generic[J, S]):
             if failure is not None:
                 raise failure
             return self._conclude()
+
+    def ingest(self, batch: Batch) -> None:
+        """Fold a batch and judge the dwells that it closes, all in the calling thread; not beside ``run``.
+
+        Raises KfCalibError where the readings allow no evaluation.
+        """
+        with one_blas_thread():
+            self._take(batch)
+            self._count_taken(batch)
+            self._judge_waiting()
+
+    def finish(self) -> J:
+        """Return the final judgement of all batches that were ingested.
+
+        Raises KfCalibError where the readings allow no judgement.
+        """
+        with one_blas_thread():
+            self._finish()
+            self._judge_waiting()
+            return self._conclude()
+
+    def wait_until_judged(self, readings: int, seconds: float) -> bool:
+        """Wait until so many readings have been taken in and all dwells that closed have been judged; False if that
+        takes longer than ``seconds``, or the run has ended."""
+
+        def is_done() -> bool:
+            return self._ended or (self._taken >= readings and not self._waiting and not self._is_judging)
+
+        with self._lock:
+            return self._lock.wait_for(is_done, seconds) and not self._ended
 
     def hurry(self) -> None:
         """Skip all judgements but the final one, because the run is to end."""
@@ -155,6 +193,12 @@ class Evaluation(ABC, Generic[J, S]):
             self._publish(samples=passed.tally.read, elapsed_s=elapsed_s, **self._progress())
         self._close_next(closed, elapsed_s)
         self._look(standing, elapsed_s)
+
+    def _count_taken(self, batch: Batch) -> None:
+        """Count the readings of a batch that was taken in."""
+        with self._lock:
+            self._taken += len(batch.accel)
+            self._lock.notify_all()
 
     def _finish(self) -> None:
         """Fold the last readings and hand over the dwells that are left."""
@@ -193,7 +237,7 @@ class Evaluation(ABC, Generic[J, S]):
         folder, open_dwells = Folder(), self._passed.folder.dwells[self._closed :]
         folder.dwells = list(open_dwells[-1:])
         arrival_s = self._segmenter.arrival_s
-        if elapsed_s - arrival_s < max(2.0 * self._looked_s, _FIRST_LOOK_S):
+        if elapsed_s - arrival_s < max(self.look_factor * self._looked_s, _FIRST_LOOK_S):
             return
         aside = replace(self._passed, tally=Tally(), folder=folder)
         for rows in aside.rows_of(self._segmenter.waiting()):
@@ -208,25 +252,37 @@ class Evaluation(ABC, Generic[J, S]):
     def _judge(self) -> None:
         """Judge dwells as they close, in order; this is what the judging thread runs."""
         while (closed := self._next()) is not None:
+            self._judge_dwell(closed)
+
+    def _judge_waiting(self) -> None:
+        """Judge what waits to be judged."""
+        while self._waiting:
+            self._judge_dwell(self._waiting.popleft())
+
+    def _judge_dwell(self, closed: _Closed) -> None:
+        """Judge a state, publish the judgement, and do what it asks for."""
+        with self._lock:
+            settings = self.settings
+        try:
+            judgement = self._judged(replace(closed.passed, settings=settings), self._before)
+        except KfCalibError as error:
             with self._lock:
-                settings = self.settings
-            try:
-                judgement = self._judged(replace(closed.passed, settings=settings), self._before)
-            except KfCalibError as error:
-                with self._lock:
-                    self._publish(problem=str(error))
-                continue
-            except Exception as error:  # the run goes on; its end is judged from the start
-                self.say(f"a dwell could not be judged: {error!r}")
-                continue
-            self._before = judgement
-            self._publish_judgement(judgement, closed.elapsed_s)
-            self._judged_next(judgement)
+                self._publish(problem=str(error))
+            return
+        except Exception as error:  # the run goes on; its end is judged from the start
+            self.say(f"a dwell could not be judged: {error!r}")
+            return
+        self._before = judgement
+        self._publish_judgement(judgement, closed.elapsed_s)
+        self._judged_next(judgement)
 
     def _next(self) -> _Closed | None:
         """Wait for the next state to be judged; None after the end."""
         with self._lock:
+            self._is_judging = False
+            self._lock.notify_all()
             self._lock.wait_for(lambda: self._waiting or self._ended)
+            self._is_judging = bool(self._waiting)
             return self._waiting.popleft() if self._waiting else None
 
     def _publish_judgement(self, judgement: J, elapsed_s: float) -> None:

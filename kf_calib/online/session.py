@@ -6,14 +6,25 @@ The readings are folded as a replay of the recording folds them: the final resul
     session.listeners.append(print)     # each judgement, from the judging thread: must not block
     final = session.run()
     session.accept("second-order")      # from any thread during the run: the effect is in all later judgements
+
+A script that drives a bench of its own has no source to be read, and asks where to go:
+
+    session = Session.fed(bench, wanted={"K1": 2e-6})
+    while not (suggestion := session.suggest()).ended:
+        move(suggestion.gimbal_deg)
+        for batch in readings(suggestion.stay_s):      # readings and angles, those of the slew too
+            session.ingest(batch)
+    final = session.finish()
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 
-from kf_calib.bench.streams import Source
+from kf_calib.bench.bench import Bench
+from kf_calib.bench.streams import Batch, Source
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.errors import InputError
 from kf_calib.estimation.dwell_pass import Pass
@@ -21,6 +32,20 @@ from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Settings
 from kf_calib.online.evaluation import Evaluation
 from kf_calib.online.status import Current, Judgement, Standing, current, judge_so_far, judge_whole_run
+from kf_calib.online.suggestion import Itinerary, Suggestion, Visited, suggest
+from kf_calib.support.threads import one_blas_thread
+
+
+@dataclass(frozen=True)
+class _Fed:
+    """The source of a session that is fed: it only knows the bench."""
+
+    bench: Bench
+    warnings: list[str] = field(default_factory=list[str])
+    fraction: float = math.nan
+
+    def __iter__(self) -> Iterator[Batch]:
+        return iter(())
 
 
 class Session(Evaluation[Judgement, Standing]):
@@ -43,6 +68,34 @@ class Session(Evaluation[Judgement, Standing]):
         super().__init__(source, settings, wanted, standing, every=every, again=again)
         self.auto = auto
         self._refuse(self._passed.model)
+
+    @classmethod
+    def fed(
+        cls,
+        bench: Bench,
+        settings: Settings | None = None,
+        wanted: Mapping[str, float] | None = None,
+        *,
+        auto: bool = False,
+    ) -> Session:
+        """A session whose batches come by ``ingest``."""
+        return cls(_Fed(bench), settings, wanted, auto=auto)
+
+    def suggest(self, itinerary: Itinerary | None = None) -> Suggestion:
+        """Where to go next and for how long, or that the run is to end; to be asked at the end of a stay.
+
+        itinerary: how the run is driven (None: as the bench states its limits).
+        """
+        with self._lock:
+            standing, last = self.standing, self._last
+        itinerary = itinerary or Itinerary(self.source.bench)
+        closed = [] if last is None else last.passed.folder.dwells
+        stays = [(dwell.recorded_pose, dwell.end_s - dwell.start_s) for dwell in closed]
+        if standing.current is not None:
+            stays.append((standing.current.pose, standing.current.seconds))
+        judged = 0 if standing.judgement is None else len(standing.judgement.result.visits)
+        with one_blas_thread():
+            return suggest(itinerary, Visited(stays, min(judged, len(stays))), standing.judgement)
 
     def accept(self, *names: str) -> None:
         with self._lock:

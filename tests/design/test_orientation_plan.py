@@ -14,11 +14,12 @@ from helpers.long_runs import slow
 from helpers.synthetic import Run
 
 from kf_calib.bench import paper_parameters
-from kf_calib.bench.bench import Bench, axes_of
+from kf_calib.bench.bench import Bench, axes_of, axis_names
+from kf_calib.bench.gimbal_ranges import ranges
 from kf_calib.bench.targets import targets_of
 from kf_calib.design import optimality_criteria
 from kf_calib.design.exact_design import Scheme, Search
-from kf_calib.design.gimbal_limits import Reach, ranges
+from kf_calib.design.gimbal_limits import Reach
 from kf_calib.design.orientation_plan import fewest, papers_sigma, plan
 from kf_calib.design.predicted_information import Prospect
 from kf_calib.design.visit_order import Timing, middles_s, order, slews_s, time_correlation
@@ -231,9 +232,9 @@ def test_targets_in_the_units_of_the_field() -> None:
     assert named["theta1"] == pytest.approx(math.radians(0.1 / 3600)) and named["nu2"] == 1e-6
     assert np.isinf(named["b1"]) and np.isinf(named["theta3"])
     with pytest.raises(InputError, match="AXIS=LOW:HIGH"):
-        ranges("z=5:2", BENCH)
+        ranges("z=5:2", axis_names(BENCH.axes))
     with pytest.raises(InputError, match="not known"):
-        ranges("w=1:2", BENCH)
+        ranges("w=1:2", axis_names(BENCH.axes))
 
 
 @pytest.mark.parametrize("name", list(optimality_criteria.NAMED))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -172,6 +172,11 @@ class LiveSource:
     def begin_ns(self) -> int | None:
         """Stamp of the first reading; None where none has come yet."""
         return self._begin_ns
+
+    def mark(self, name: str, facts: Mapping[str, str]) -> None:
+        """Puts a metadata record among the samples that came so far, where the run is recorded; from any thread."""
+        with self._lock:
+            self._store_if_open(lambda recorder: recorder.mark(name, facts))
 
     def stop(self) -> None:
         """Ends the iteration after what has come; from any thread, or a signal handler."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, pairwise
 
@@ -78,6 +78,7 @@ class Simulation:
         self.hidden = tuple(hidden)
         self.warnings = list[str]()
         self.fraction = 0.0
+        self._further: tuple[Step, ...] = ()
         self._axes = bench.axes or YZX
         _refuse_impossible(self.plan, len(self._axes), sample_hz, angle_hz, slew_rate_degps, batch_samples)
         angles_rad = np.radians([visit.gimbal_deg for visit in self.plan])
@@ -100,18 +101,47 @@ class Simulation:
         return _READING_BYTES * len(self) + _POSE_BYTES * poses + _TEMPERATURE_BYTES * temperatures
 
     def __iter__(self) -> Iterator[Batch]:
-        steps = self._steps()
-        encoder_rng, thermometer_rng = generator(self.seed, "encoders"), generator(self.seed, "thermometer")
+        make = self.batch_maker()
         for first in range(0, len(self), self._batch_samples):
             last = min(first + self._batch_samples, len(self))
+            yield make(first, last, last * self._accel.period_ns if last < len(self) else self.motion.end_ns)
+            self.fraction = last / len(self)
+
+    def batch_maker(self) -> Callable[[int, int, int], Batch]:
+        """What makes the batch of readings number ``first`` to ``last``, and of all else before ``end_ns``.
+
+        It is to be asked for one stretch after the other, from the first reading on.
+        """
+        steps = self._steps()
+        encoder_rng, thermometer_rng = generator(self.seed, "encoders"), generator(self.seed, "thermometer")
+
+        def make(first: int, last: int, end_ns: int) -> Batch:
             start_ns = first * self._accel.period_ns
-            end_ns = last * self._accel.period_ns if last < len(self) else self.motion.end_ns
-            yield Batch(
+            return Batch(
                 self._readings(first, last, steps),
                 self._poses(self._pose.between(start_ns, end_ns), encoder_rng),
                 self._temperatures(self._temperature.between(start_ns, end_ns), thermometer_rng),
             )
-            self.fraction = last / len(self)
+
+        return make
+
+    @property
+    def reading_period_ns(self) -> int:
+        return self._accel.period_ns
+
+    def first_reading_at(self, time_ns: int) -> int:
+        """Number of the first reading at or after a time since the first one."""
+        return self._accel.first_at(time_ns)
+
+    def moved_by(self, motion: Motion, most_dwells: int, platform: Step) -> Simulation:
+        """The same bench whose platform moves otherwise, and goes through a further step before its hidden effects.
+
+        motion: may go on while readings are made. most_dwells: for which what differs from dwell to dwell is drawn.
+        """
+        other = copy.copy(self)
+        other.motion, other._further, other.warnings = motion, (platform,), list[str]()
+        other.plan = (*self.plan, *[self.plan[-1]] * (most_dwells - len(self.plan)))
+        return other
 
     def hiding(self, hidden: Sequence[Hidden], noise: TrueNoise | None = None) -> Simulation:
         """The same run with these hidden effects in place of its own, and with other noise where some is given."""
@@ -138,7 +168,8 @@ class Simulation:
     def _steps(self) -> list[Step]:
         """The chain, fresh from its start."""
         hidden = self._hidden_steps()
-        platform: list[Step] = [*hidden["angles"], Gimbals(self.bench.up), *hidden["attitude"], *self._setting_steps()]
+        turned: list[Step] = [*self._further, *hidden["angles"]]
+        platform: list[Step] = [*turned, Gimbals(self.bench.up), *hidden["attitude"], *self._setting_steps()]
         response: list[Step] = [Inputs(self.sensors), *hidden["input"], Response(self.sensors), *hidden["reading"]]
         force: list[Step] = [Gravity(self.bench), *hidden["force"]]
         return [*platform, *force, *response, *self._noise_steps(), *hidden["record"]]

@@ -1,0 +1,273 @@
+"""The command of the bench that drives itself: run."""
+
+from __future__ import annotations
+
+import math
+import sys
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import rich_click as click
+
+from kf_calib.cli.driven_run import DrivenRun
+from kf_calib.cli.echo import complain
+from kf_calib.cli.files import claimed, delivery, output_option
+from kf_calib.cli.live import follow, outcome
+from kf_calib.cli.live_run import on_bench
+from kf_calib.cli.numbers import POSITIVE
+from kf_calib.cli.options import (
+    bench_options,
+    examples,
+    filter_options,
+    input_options,
+    json_option,
+    overrides,
+    overwrite_option,
+    print_json,
+    rendered,
+    save_model_option,
+    save_option,
+    settings_of,
+    show,
+    strict_option,
+    target_option,
+    units_option,
+)
+from kf_calib.cli.signals import answered
+from kf_calib.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from kf_calib.bench.bench import Bench
+    from kf_calib.design.gain_per_second import Pace
+    from kf_calib.online.suggestion import Itinerary
+    from kf_calib.positioning.drive import Drive
+    from kf_calib.positioning.opening import Opened
+    from kf_calib.sources.live import LiveSource
+
+DRIVING = "How it is driven"
+
+
+@click.command(
+    epilog=examples(
+        'run --positioner "sim://?hide=second-order=20sigma&seed=3" --record run.mcap --target K=2ppm',
+        "run --positioner acutrol3000 --source socket://10.0.0.5:5000 --bench bench.toml --record run.mcap "
+        "--target K=2ppm --target angles=1arcsec --budget-s 3600",
+        "run --positioner hand --source /dev/ttyUSB0 --axes 'y z x' --gravity 9.81 --target K=2ppm",
+        "run --positioner acutrol3000 --bench bench.toml --dry-run",
+    )
+)
+@click.option("--positioner", required=True, metavar="P", panel=DRIVING,
+              help="sim://... (emulated, with its readings), hand, the name of a shipped profile (acutrol3000, lines, "
+              "command), or the path of a profile in TOML.")  # fmt: skip
+@click.option("--source", metavar="S", panel=DRIVING, help="Where readings and angles come from, as for live.")
+@output_option("--record", metavar="OUT.mcap", panel=DRIVING, help="Record the run here, with all decisions.")
+@target_option(panel=DRIVING)
+@click.option("--budget-s", type=POSITIVE, default=math.inf, show_default="none", panel=DRIVING,
+              help="End the run when this time is spent.")  # fmt: skip
+@click.option("--most", type=click.IntRange(min=1), metavar="N", show_default="60; 24 without a target", panel=DRIVING,
+              help="Orientations at most.")  # fmt: skip
+@click.option("--stay-s", type=POSITIVE, default=30.0, show_default=True, panel=DRIVING,
+              help="Seconds of readings in each orientation, where no target is set.")  # fmt: skip
+@click.option("--improve", is_flag=True, panel=DRIVING,
+              help="Add a missing effect when it is named beyond doubt, and go on to the targets.")  # fmt: skip
+@click.option("--dry-run", is_flag=True, panel=DRIVING, help="Print path and duration; nothing is moved.")
+@input_options
+@bench_options
+@filter_options
+@overwrite_option
+@save_option
+@save_model_option
+@strict_option
+@units_option
+@json_option
+@click.pass_context
+def run(
+    ctx: click.Context, positioner: str, source: str | None, record: Path | None, overwrite: bool,
+    targets: tuple[str, ...], dry_run: bool, save: Path | None, save_model: Path | None, strict: bool, as_json: bool,
+    **options: Any,
+) -> None:  # fmt: skip
+    """Let the bench run by itself: it chooses orientations, moves, records and judges until every target is reached.
+
+    It also ends when a missing effect is named beyond doubt, or when its time is spent. Limits, rates and forbidden
+    zones of the gimbals come from the bench file. Whatever goes wrong, the table is stopped first. This is no
+    substitute for interlocks and an emergency stop.
+    """
+    from kf_calib.bench.targets import targets_of
+    from kf_calib.positioning.opening import open_positioner
+    from kf_calib.sources.live import files_of
+
+    settings, wanted, keys = settings_of(options), targets_of(targets), overrides(options)
+    most = options["most"] or (60 if wanted else 24)
+    if dry_run:
+        _show_dry_run(positioner, keys, options, as_json)
+        return
+    outputs = claimed(files_of(source) if source else [], overwrite=overwrite)
+    with ExitStack() as stack:
+        live, emulated = _source(positioner, source, keys, record, overwrite)
+        opened = stack.enter_context(live)
+        device = emulated or stack.enter_context(open_positioner(positioner, opened.bench, complain))
+        make = partial(_drive, device, most, options)
+        begin = on_bench(settings, wanted, options["improve"])
+        running = DrivenRun(opened, begin, record, not sys.stdout.isatty() or as_json, make)
+        with answered(running.handle_signal):
+            _follow(running, positioner, device, record, as_json)
+            opened.close()
+            code = _code(running)
+            final = None if running.drive_error else outcome(running, as_json)
+            _tell_end(running, as_json)
+            if final is not None and final.result is not None:
+                with delivery(outputs, as_json or running.print.lost > 0) as deliver:
+                    deliver.calibration(save, final.result, running.recording() or opened)
+                    deliver.model(save_model, final.result)
+    if code:
+        ctx.exit(code)
+    if strict and final is not None and final.consistent is False:
+        ctx.exit(1)
+
+
+def _source(positioner: str, source: str | None, keys: Mapping[str, str], record: Path | None, overwrite: bool
+            ) -> tuple[LiveSource, Opened | None]:  # fmt: skip
+    """The source of readings that is named, or that of the emulated bench, and then that bench."""
+    from kf_calib.positioning.opening import open_simulation
+    from kf_calib.sources.live import open_live
+    from kf_calib.sources.live.source import LiveSource
+    from kf_calib.support.output_files import Outputs
+
+    if not positioner.startswith("sim:"):
+        if source is None:
+            raise click.UsageError("--source is missing: say where readings and angles come from, as for live.")
+        return open_live(source, keys, record, overwrite), None
+    if source is not None:
+        raise click.UsageError("the emulated bench of sim:// has its own readings: leave out --source.")
+    Outputs({"--record": record}, [], overwrite)
+    emulated = open_simulation(positioner, keys)
+    assert emulated.feed is not None
+    return LiveSource(emulated.feed, record, overwrite), emulated
+
+
+def _itinerary(bench: Bench, most: int, options: Mapping[str, Any]) -> Itinerary:
+    from kf_calib.online.suggestion import Itinerary
+
+    return Itinerary(
+        bench, _pace(bench), most=most, stay_s=options["stay_s"], ends_when_named=not options["improve"],
+    )  # fmt: skip
+
+
+def _pace(bench: Bench) -> Pace:
+    from dataclasses import replace
+
+    from kf_calib.design.gain_per_second import Pace
+
+    pace = Pace()
+    if bench.rate_degps is not None:
+        pace = replace(pace, rate_degps=bench.rate_degps)
+    if bench.acceleration_degps2 is not None:
+        pace = replace(pace, acceleration_degps2=bench.acceleration_degps2)
+    return pace
+
+
+def _drive(device: Opened, most: int, options: Mapping[str, Any], running: DrivenRun) -> Drive:
+    """The drive of a run whose session is there."""
+    from kf_calib.online.session import Session
+    from kf_calib.positioning.drive import Drive
+    from kf_calib.positioning.loop import Rules
+    from kf_calib.positioning.simulated import SimulatedTime
+
+    session = running.session
+    assert isinstance(session, Session)
+    session.look_factor = 1.2
+    itinerary = _itinerary(running.source.bench, most, options)
+    rules = Rules(itinerary.reach, itinerary.pace, device.watch)
+    if isinstance(device.clock, SimulatedTime):
+        device.clock.wait = session.wait_until_judged
+    return Drive(device.positioner, session, itinerary, rules, device.clock, trouble=partial(_trouble, running),
+                 budget_s=options["budget_s"])  # fmt: skip
+
+
+def _trouble(running: DrivenRun) -> str:
+    """Why the run must be broken off, by its source and its recording."""
+    status = running.source.status
+    if status.recording_trouble:
+        return f"nothing can be recorded any more: {status.recording_trouble.removesuffix('.')}"
+    if status.link == "lost":
+        return f"the link to the readings is lost ({status.trouble or 'it is tried again'})"
+    if status.link == "ended":
+        return f"the readings have ended{f' ({status.trouble})' if status.trouble else ''}"
+    if running.error is not None:
+        return f"the evaluation ended: {running.error}"
+    return ""
+
+
+def _follow(running: DrivenRun, name: str, device: Opened, record: Path | None, as_json: bool) -> None:
+    """The run to its end; with a person as the positioner, Enter says that the gimbals stand."""
+    from kf_calib.positioning.hand import HandPositioner
+
+    if isinstance(device.positioner, HandPositioner):
+        _read_enter(device.positioner)
+    follow(running, name, record, as_json)
+
+
+def _read_enter(hand: Any) -> None:
+    import threading
+
+    def listen() -> None:
+        for _ in sys.stdin:
+            hand.done()
+
+    threading.Thread(target=listen, name="enter", daemon=True).start()
+
+
+def _code(running: DrivenRun) -> int:
+    """The exit code, without that of --strict."""
+    if running.drive_error is not None:
+        raise running.drive_error
+    ended = running.outcome
+    for said in running.troubles:
+        complain(said)
+    if running.signalled is not None:
+        return 128 + int(running.signalled)
+    if ended is None or ended.is_halted or running.troubles:
+        return 2
+    return 0
+
+
+def _tell_end(running: DrivenRun, as_json: bool) -> None:
+    from kf_calib.views.run import ended_in_words
+
+    if running.outcome is not None and not running.outcome.is_halted and not as_json:
+        running.print(rendered(ended_in_words(running.outcome)), end=False)
+
+
+def _show_dry_run(name: str, keys: Mapping[str, str], options: Mapping[str, Any], as_json: bool) -> None:
+    """Print the opening with its ways and times; the orientations after it are decided in the run."""
+    import numpy as np
+
+    from kf_calib.bench.bench import Bench
+    from kf_calib.design.safe_path import route
+    from kf_calib.views import run as views
+
+    stated = {"axes": "y z x", "gravity_mps2": "9.81", **keys} if name.startswith("sim:") else dict(keys)
+    bench = Bench.from_metadata(stated)
+    itinerary = _itinerary(bench, 60, options)
+    poses, here = itinerary.opening_poses, np.zeros(len(bench.axes))
+    ways, slews_s = list[list[Any]](), list[float]()
+    for pose in poses:
+        way = route(itinerary.reach, here, pose)
+        if way is None:
+            raise InputError(
+                f"no way from {views.angles_in_words(np.degrees(here))} to {views.angles_in_words(np.degrees(pose))} "
+                "keeps out of the forbidden zones: widen what the bench file allows."
+            )
+        stations = [here, *way]
+        slews_s.append(sum(float(itinerary.pace.slews_s(a, b)) for a, b in zip(stations, way, strict=False)))
+        ways.append(way)
+        here = pose
+    made = poses, ways, slews_s, options["stay_s"], itinerary.pace.overhead_s
+    if as_json:
+        print_json(views.dry_run_object(*made))
+    else:
+        show(views.dry_run(*made))

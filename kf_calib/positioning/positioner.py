@@ -1,0 +1,66 @@
+"""What moves a platform: the protocol that every positioner has, and the sizes by which it is watched."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+from kf_calib.errors import KfCalibError
+
+
+class PositionerError(KfCalibError):
+    """A positioner does not answer, or not as it should; the message says what was asked and what came."""
+
+
+@runtime_checkable
+class Positioner(Protocol):
+    """Anything that turns gimbals to angles in deg, outer gimbal first, in the sense of the recorded angles.
+
+    No method waits for a motion to end. Each raises PositionerError (or OSError) where the positioner does not answer.
+    """
+
+    def move_to(self, gimbal_deg: Sequence[float]) -> None:
+        """Begin to move all gimbals to these angles."""
+        ...
+
+    def read(self) -> tuple[float, ...]:
+        """Return the present angles, deg."""
+        ...
+
+    def stop(self) -> None:
+        """Bring all gimbals to rest at once."""
+        ...
+
+    def fault(self) -> str:
+        """Return what the controller reports to be wrong; empty where nothing is."""
+        ...
+
+
+@dataclass(frozen=True)
+class Watchfulness:
+    """What a motion must be like; anything else stops the table.
+
+    tolerance_deg: between target and read-back where it stands. still_degps: rate below which it stands, over
+    stand_s. begin_s: in which a move must begin. late_s, late_factor: by which it may last longer than its way and rate
+    say. off_path_deg: how far the read-back may lie off the way. silent_s: how long no reading may come while it
+    stands. stream_deg: between read-back and the angles that are recorded.
+    """
+
+    tolerance_deg: float = 0.05
+    still_degps: float = 0.05
+    stand_s: float = 1.0
+    begin_s: float = 3.0
+    late_s: float = 5.0
+    late_factor: float = 1.5
+    off_path_deg: float = 2.0
+    silent_s: float = 10.0
+    stream_deg: float = 0.5
+
+    def by_hand(self) -> Watchfulness:
+        """The same for a person, who takes any time and sets angles less exactly."""
+        return Watchfulness(
+            tolerance_deg=max(self.tolerance_deg, 1.0), still_degps=math.inf, stand_s=self.stand_s, begin_s=math.inf,
+            late_s=math.inf, off_path_deg=math.inf, silent_s=math.inf, stream_deg=3.0,
+        )  # fmt: skip

@@ -1,0 +1,172 @@
+"""Profiles of positioners: how one is told to move, to stop, and what it answers, as a TOML file says.
+
+    kind = "lines"                                  # or "command"
+    address = "TCPIP::192.168.53.1::9878::SOCKET"   # as PyVISA names it
+    gimbals = ["1", "2"]                            # the controller's names of the gimbals, outer to inner
+    move = ":Demand:Position {axis},{deg:.4f}"      # for each gimbal
+    read = ":Read:Position? {axis}"
+    stop = ":Mode:Rate {axis};:Demand:Rate {axis},0"
+    fault = ":Interlock? {axis}"
+    fault_word = "Fault"                            # what the answer holds where something is wrong
+
+In text, ``{axis}`` is the name of a gimbal, ``{deg}`` its angle, and ``{angles}`` all angles, in the unit of the
+controller.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, with_config
+from typing_extensions import TypedDict
+
+from kf_calib.errors import InputError
+from kf_calib.positioning.positioner import Watchfulness
+from kf_calib.support.toml_files import toml_table
+from kf_calib.support.value_schema import FINITE, TEXT, Misfit, converted
+
+SHIPPED = Path(__file__).parent / "profiles"
+"""Profiles that come with the package, by the names of their files."""
+
+_POSITIVE = Annotated[FINITE, Field(gt=0.0)]
+_Texts = TEXT | list[TEXT]
+_ENDINGS = {"lf": "\n", "crlf": "\r\n", "cr": "\r"}
+
+
+@with_config(extra="forbid")
+class _Content(TypedDict, total=False):
+    kind: Literal["lines", "command"]
+    address: TEXT
+    gimbals: Annotated[list[TEXT], Field(min_length=1, max_length=6)]
+    signs: list[Literal[1, -1]]
+    zeros_deg: list[FINITE]
+    unit: Literal["deg", "rad"]
+    begin: _Texts
+    move: _Texts
+    read: _Texts
+    stop: _Texts
+    fault: _Texts
+    no_fault: TEXT
+    fault_word: TEXT
+    answers: bool
+    termination: Literal["lf", "crlf", "cr"]
+    baud: Annotated[int, Field(gt=0)]
+    timeout_s: _POSITIVE
+    tolerance_deg: _POSITIVE
+    still_degps: _POSITIVE
+    stand_s: _POSITIVE
+    begin_s: _POSITIVE
+    late_s: _POSITIVE
+
+
+@dataclass(frozen=True)
+class Profile:
+    """What a profile says.
+
+    kind: lines to a controller, or commands that are run. address: of the controller, as PyVISA names it. gimbals: its
+    names of the gimbals. signs, zeros_deg: controller's angle = sign * gimbal angle + zero. unit: of its angles. begin,
+    move, read, stop, fault: what to say, or the words of a command to run. no_fault: what the answer about faults holds
+    where there is none; fault_word: what it holds where there is one. answers: whether it answers commands that ask
+    nothing. termination: ends of lines. baud: of a serial port. timeout_s: of an answer. watch: what a motion must be
+    like.
+    """
+
+    name: str
+    kind: Literal["lines", "command"]
+    gimbals: tuple[str, ...]
+    signs: tuple[int, ...]
+    zeros_deg: tuple[float, ...]
+    move: tuple[str, ...]
+    read: tuple[str, ...]
+    stop: tuple[str, ...]
+    fault: tuple[str, ...] = ()
+    begin: tuple[str, ...] = ()
+    address: str = ""
+    unit: Literal["deg", "rad"] = "deg"
+    no_fault: str = ""
+    fault_word: str = ""
+    answers: bool = False
+    termination: str = "\n"
+    baud: int = 9600
+    timeout_s: float = 2.0
+    watch: Watchfulness = field(default_factory=Watchfulness)
+
+    def is_fault(self, answer: str) -> bool:
+        """Whether an answer tells of a fault."""
+        if self.fault_word:
+            return self.fault_word.lower() in answer.lower()
+        return self.no_fault.lower() not in answer.lower()
+
+    def to_controller(self, gimbal_deg: Sequence[float]) -> list[float]:
+        """Angles of the controller, in its unit, of gimbal angles."""
+        degrees = [s * angle + zero for s, angle, zero in zip(self.signs, gimbal_deg, self.zeros_deg, strict=True)]
+        return [math.radians(angle) if self.unit == "rad" else angle for angle in degrees]
+
+    def from_controller(self, angles: Sequence[float]) -> tuple[float, ...]:
+        """Gimbal angles, deg, of angles of the controller."""
+        degrees = [math.degrees(angle) if self.unit == "rad" else angle for angle in angles]
+        return tuple(s * (angle - zero) for s, angle, zero in zip(self.signs, degrees, self.zeros_deg, strict=True))
+
+
+def read_profile(path: Path, width: int) -> Profile:
+    """The profile of a file, or of the shipped one of this name, for so many gimbals; raises InputError."""
+    shipped = SHIPPED / f"{path}.toml"
+    path = shipped if not path.suffix and shipped.is_file() else path
+    try:
+        content = converted(toml_table(path, 'move = "MOVE {axis} {deg:.3f}"'), _Content)
+    except Misfit as error:
+        raise InputError(f"{path}: {error}: see docs/run.md for the keys of a profile.") from None
+    missing = [key for key in ("kind", "gimbals", "move", "read", "stop") if key not in content]
+    if missing:
+        raise InputError(f"{path}: lacks {missing[0]}, which every profile has: see docs/run.md.")
+    return _checked(path, content, width)
+
+
+def _checked(path: Path, content: Mapping[str, Any], width: int) -> Profile:
+    """Return the profile of these values, checked against each other."""
+    gimbals = tuple(content["gimbals"])
+    if len(gimbals) != width:
+        raise InputError(f"{path}: names {len(gimbals)} gimbals, and the bench has {width}: name each, outer to inner.")
+    values: dict[str, Any] = {key: value for key, value in content.items() if key in Profile.__annotations__}
+    for key, default in (("signs", 1), ("zeros_deg", 0.0)):
+        values[key] = tuple(content.get(key, [default] * width))
+        if len(values[key]) != width:
+            raise InputError(f"{path}: {key} has {len(values[key])} numbers for {width} gimbals.")
+    for key in ("begin", "move", "read", "stop", "fault"):
+        said = content.get(key, [])
+        values[key] = (said,) if isinstance(said, str) else tuple(said)
+        for text in values[key]:
+            _refuse_unknown_fields(path, key, text)
+    if content["kind"] == "lines" and not content.get("address"):
+        raise InputError(f"{path}: lacks the address of the controller, such as TCPIP::192.168.53.1::9878::SOCKET.")
+    values["termination"] = _ENDINGS[content.get("termination", "lf")]
+    watched = {key: content[key] for key in Watchfulness.__annotations__ if key in content}
+    return Profile(**{**values, "gimbals": gimbals, "name": path.stem, "watch": Watchfulness(**watched)})
+
+
+def _refuse_unknown_fields(path: Path, key: str, text: str) -> None:
+    """Raise InputError for what stands in braces and is not known."""
+    try:
+        text.format(axis="1", deg=0.0, angles="0", **{f"deg{k}": 0.0 for k in range(1, 7)})
+    except (ValueError, KeyError, IndexError, AttributeError):
+        raise InputError(
+            f"{path}: {key} = {text!r} has something in braces that is not known: use {{axis}}, {{deg:.4f}}, {{deg1}} "
+            "or {angles}."
+        ) from None
+
+
+def said_for(profile: Profile, text: str, angles: Sequence[float], gimbal: int) -> str:
+    """A text with its fields filled in for a gimbal; angles: of the controller."""
+    numbered = {f"deg{k}": angle for k, angle in enumerate(angles, start=1)}
+    joined = " ".join(f"{angle:.6f}" for angle in angles)
+    deg = angles[gimbal] if angles else 0.0
+    return text.format(axis=profile.gimbals[gimbal], deg=deg, angles=joined, **numbered)
+
+
+def is_for_each(text: str) -> bool:
+    """Whether a text is to be said for each gimbal, not once for all."""
+    return "{axis}" in text or "{deg}" in text or "{deg:" in text

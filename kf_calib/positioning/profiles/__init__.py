@@ -1,0 +1,1 @@
+"""Profiles of positioners that come with the package, one TOML file each."""
