@@ -3,9 +3,9 @@
 The coefficients c of one effect are normal with a common standard deviation s, and log s is uniform over the sizes that
 such coefficients usually have in sensors of the grade at hand (``Effect.typical``), with tails on both sides: the
 density falls by a factor e for each decade beyond. The prior is proper, and says what physics says: an effect that
-would have a size that it never has is an unlikely name, however well its columns fit. A coefficient whose value is
-known, as the rate of the Earth is, is normal about that value. Where no usual size is known, every size from 1 to 1e7
-sigma is equally likely.
+would have a size that it never has is an unlikely name, however well its columns fit. An effect that is too small to be
+seen is none: sizes below one sigma count as its absence. A coefficient whose value is known, as the rate of the Earth
+is, is normal about that value. Where no usual size is known, every size from 1 to 1e7 sigma is equally likely.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _TAIL = 1.0  # decades beyond the usual sizes in which the density falls by a fa
 _SHARPER = 100.0  # where only the greatest usual size is known, the least one is smaller by this factor
 _UNKNOWN_DECADES = 7.0  # above one sigma: where no usual size is known
 _STEPS = {1: 120, 2: 40, 3: 16}  # sizes that are tried, by number of effects
-_BELOW, _ABOVE = 0.05, 300.0  # times sigma, times the estimate: beyond these, sizes differ no more in evidence
+_ABOVE = 300.0  # times the estimate: beyond it, sizes differ no more in evidence
 
 
 _SIZES = np.exp(np.linspace(0.0, math.log(1e14), 120))  # prior variance of a coefficient over that of its estimate
@@ -108,14 +108,15 @@ def log_bayes_of_sizes(
 
 
 def _nodes(root: Floats, estimate: Floats, prior: SizePrior, effects: int) -> tuple[Floats, Floats]:
-    """Return sizes (n,) and their prior probabilities (n,), which cover all sizes that differ in evidence."""
-    sigmas = 1.0 / np.maximum(np.linalg.norm(root, axis=0), 1e-300)
-    least = _BELOW * float(sigmas.min())
-    most = max(_ABOVE * max(float(np.abs(estimate).max(initial=0.0)), float(sigmas.min())), 10.0 * least)
+    """Return sizes (n,) and their prior probabilities (n,), of all sizes from one sigma of the coefficient that is
+    determined best: an effect that is smaller shows nothing, and belongs to the explanation without it."""
+    if prior.value:
+        return np.array([prior.low]), np.ones(1)
+    least = best_sigma(root)
+    most = _ABOVE * max(float(np.abs(estimate).max(initial=0.0)), least)
     edges = np.geomspace(least, most, _STEPS.get(effects, 8) + 1)
     sizes = np.sqrt(edges[1:] * edges[:-1])
     weights = np.diff(prior.below(edges))
-    weights[0] += prior.below(edges[:1])[0]
     weights[-1] += 1.0 - prior.below(edges[-1:])[0]
     return sizes, np.maximum(weights, 1e-300)
 

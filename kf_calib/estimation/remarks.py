@@ -111,6 +111,12 @@ def remarks_on(
         short = not dwells[0].averaged and usual < TOO_SHORT * noise.inflation.max()
         slow = "; dwells are too short to tell how slow it is: stay longer in each" if short else ""
         yield f"the noise within a dwell is correlated: sigmas allow for it by inflating its variance by {kappa}{slow}."
+    weights = [dwell.weight for dwell in dwells]
+    if min(weights) < max(weights):
+        yield (
+            f"the noise within dwells differs, {max(weights) ** -0.5:.2g} to {min(weights) ** -0.5:.2g} times that of "
+            "the run: each dwell has the weight of its own."
+        )
     if not noise.checked and noise.scatter_mps2.any() and not noise.scatter_stated:
         known = directions(linearised.means.force_mps2)
         yield (

@@ -137,14 +137,15 @@ def test_coefficients_of_one_field_are_averaged_over_its_directions(before: Cali
 
 def _averaged(columns: Floats, added: Floats, readings: Floats, effect: Effect) -> float:
     """Log Bayes factor of normal coefficients on ``added``, by a sum over standard deviations from 1e-6 to 1e6 times
-    the usual, whose density falls by e for each decade beyond these."""
+    the usual, whose density falls by e for each decade beyond these; below one sigma they count as none."""
     beside = np.linalg.qr(columns / np.linalg.norm(columns, axis=0), mode="complete")[0][:, columns.shape[1] :]
     left, seen = beside.T @ readings, beside.T @ added
     low, high = np.log10(np.array(effect.typical.of("navigation")))
     decades = np.linspace(low - 6.0, high + 6.0, 1200)
     density = np.exp(-np.maximum(np.maximum(low - decades, decades - high), 0.0))
     logs = [_log_normal(left, 10.0**each * seen) for each in decades]
-    return float(logsumexp(logs, b=density / density.sum()) + 0.5 * left @ left)
+    density = density / density.sum() * (10.0**decades > 1.0 / np.linalg.norm(seen, axis=0).max())
+    return float(logsumexp(logs, b=density) + 0.5 * left @ left)
 
 
 def _log_normal(readings: Floats, scaled: Floats) -> float:
@@ -161,7 +162,9 @@ def test_the_rate_of_the_earth_is_one_or_it_is_not_the_rotation_of_the_earth() -
         for name, value in (("wrong", 6e-5), ("right", 1.0))
         for effect in [EarthRotation()]
     }
-    assert log_bayes["wrong"] < -10.0 and log_bayes["right"] > 0.5 * sigma**-2 - 15.0
+    of_spread = -np.log(0.1 / sigma)
+    assert log_bayes["wrong"] == pytest.approx(50.0 - 0.5 * ((1.0 - 6e-5) / 0.1) ** 2 + of_spread, abs=0.01)
+    assert log_bayes["right"] == pytest.approx(0.5 * sigma**-2 + of_spread, abs=0.01)
 
 
 def test_sizes_of_two_effects_are_averaged_each_over_its_own_prior() -> None:
@@ -176,9 +179,12 @@ def test_sizes_of_two_effects_are_averaged_each_over_its_own_prior() -> None:
         low, high = np.log10(np.array(effect.typical.of("navigation")))
         decades.append(np.linspace(low - 5.0, high + 5.0, 90))
         densities.append(np.exp(-np.maximum(np.maximum(low - decades[-1], decades[-1] - high), 0.0)))
+    for k in range(2):
+        smallest = 1.0 / np.linalg.norm(root[:, 3 * k : 3 * k + 3], axis=0).max()
+        densities[k] = densities[k] / densities[k].sum() * (10.0 ** decades[k] > smallest)
     logs, weights = list[float](), list[float]()
-    for one, a in zip(decades[0], densities[0] / densities[0].sum(), strict=True):
-        for other, b in zip(decades[1], densities[1] / densities[1].sum(), strict=True):
+    for one, a in zip(decades[0], densities[0], strict=True):
+        for other, b in zip(decades[1], densities[1], strict=True):
             logs.append(_log_normal(readings, root * 10.0 ** np.repeat([one, other], 3)))
             weights.append(a * b)
     assert found == pytest.approx(float(logsumexp(logs, b=weights)) + 0.5 * readings @ readings, abs=0.1)
