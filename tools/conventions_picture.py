@@ -1,11 +1,11 @@
 """docs/conventions.png: which way is up, which sense is positive, what each accelerometer reads.
 
-`.venv/bin/python tools/conventions_picture.py` draws it again; the readings in it are those of the program's own bench.
+`tools/pictures conventions` draws it again; the readings in it are those of the program's own bench.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
+import io
 
 import matplotlib
 
@@ -13,18 +13,19 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from PIL import Image
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, parse_axes
 
 COLOURS = {"x": "#d55e00", "y": "#009e73", "z": "#0072b2"}  # told apart by the colour-blind, too
 GIMBALS = ("outer", "middle", "inner")
-PICTURE = Path(__file__).resolve().parents[1] / "docs" / "conventions.png"
 FACES = {"y z x": [(0, 0, 0), (0, 0, 180), (0, 90, 0), (0, -90, 0), (0, 0, 90), (0, 0, -90)],
          "z y x": [(0, 0, 0), (0, 0, 180), (0, 90, 0), (0, -90, 0), (0, 0, 90), (0, 0, -90)]}  # fmt: skip
 
 
-def main() -> None:
+def drawn() -> Image.Image:
+    """The picture."""
     figure, panels = plt.subplots(2, 2, figsize=(11, 7.3), height_ratios=(1.5, 1.0))
     for column, (axes, up, words) in enumerate(
         [
@@ -37,7 +38,9 @@ def main() -> None:
         panels[0, column].set_title(words, fontsize=13, fontweight="bold")
         draw_readings(panels[1, column], bench, axes)
     figure.subplots_adjust(0.02, 0.0, 0.98, 0.98, wspace=0.05, hspace=0.0)
-    figure.savefig(PICTURE, dpi=80)
+    memory = io.BytesIO()
+    figure.savefig(memory, dpi=80)
+    return Image.open(memory).convert("RGB")
 
 
 def projected(point: Floats, up: str) -> Floats:
@@ -110,7 +113,3 @@ def draw_readings(panel: Axes, bench: Bench, axes: str) -> None:
         if row and column > 2 and "g" in cell.get_text().get_text():
             cell.set_text_props(fontweight="bold", color=COLOURS["xyz"[column - 3]])
     panel.axis("off")
-
-
-if __name__ == "__main__":
-    main()

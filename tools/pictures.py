@@ -3,9 +3,9 @@
 Figures are the program's own (``kf_calib.plot``), from recordings/hidden.mcap; pictures of the Rerun view are
 screenshots of it and need a graphics driver. Colours are reduced to a palette, so that a picture has some ten kB.
 
-Each picture carries a digest of what it was drawn from (``drawn_from``): a test compares it with the digest of today.
-docs/blind_trial.png is drawn by the trial, docs/conventions.png by tools/conventions_picture.py,
-docs/fleet.png by tools/fleet_picture.py.
+Each of them carries a digest of what it was drawn from (``drawn_from``): a test compares it with the digest of today.
+Pictures of simulated runs are drawn by scripts of their own beside this one (``OF_SCRIPTS``). Only those of the blind
+trial are not drawn here: tools/blind_trial.py draws them at the end of a trial, which takes hours.
 """
 
 from __future__ import annotations
@@ -16,10 +16,13 @@ import json
 import sys
 import tempfile
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
+import conventions_picture
+import fleet_picture
 import numpy as np
+import right_pictures
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
@@ -83,7 +86,14 @@ PICTURES: dict[str, Callable[[], Image.Image]] = {
     "replay": _view(lambda: found().before),
     "diagnose_view": _view(found),
 }
-"""Name of each picture in docs, and what draws it."""
+"""Name of each picture in docs of the recording, and what draws it."""
+
+OF_SCRIPTS: dict[str, Callable[[], Image.Image]] = {
+    "conventions": conventions_picture.drawn,
+    "fleet": fleet_picture.drawn,
+    **{name: _figure(partial(right_pictures.drawn, name)) for name in right_pictures.FIGURES},
+}
+"""Name of each other picture, and what draws it."""
 
 
 @cache
@@ -105,18 +115,20 @@ def drawn_from() -> str:
 def save(name: str) -> Path:
     """Draw one picture into docs."""
     path, content = DOCS / f"{name}.png", PngInfo()
-    content.add_text(KEY, drawn_from())
-    picture = PICTURES[name]().quantize(_PALETTE, dither=Image.Dither.NONE)
+    if name in PICTURES:
+        content.add_text(KEY, drawn_from())
+    picture = (PICTURES | OF_SCRIPTS)[name]().quantize(_PALETTE, dither=Image.Dither.NONE)
     picture.save(path, optimize=True, pnginfo=content)
     return path
 
 
 def main(names: list[str]) -> None:
     """Draw the pictures of these names, or all."""
-    unknown = sorted(set(names) - set(PICTURES))
+    known = PICTURES | OF_SCRIPTS
+    unknown = sorted(set(names) - set(known))
     if unknown:
-        sys.exit(f"tools/pictures: there is no picture {unknown[0]}: name some of {', '.join(PICTURES)}.")
-    for name in names or PICTURES:
+        sys.exit(f"tools/pictures: there is no picture {unknown[0]}: name some of {', '.join(known)}.")
+    for name in names or known:
         path = save(name)
         print(f"{path.relative_to(ROOT)}: {path.stat().st_size / 1000:.0f} kB")
 

@@ -32,6 +32,7 @@ from kf_calib.diagnosis.hypothesis_table import (
     table_of,
 )
 from kf_calib.diagnosis.refits import Refits
+from kf_calib.diagnosis.repeated_orientations import log_odds_of_repeating
 from kf_calib.diagnosis.unknown_effect import FormulaFamily, one_digit_seconds
 from kf_calib.diagnosis.within_dwell_trend import Trend, trend
 from kf_calib.dwells.qr import orthonormal
@@ -40,7 +41,8 @@ from kf_calib.estimation.dwell_columns import stimulus_of
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import unweighted_left
 
-_NO_NOISE = {True: 0.4, False: 0.1}  # share of an unknown cause in more scatter, by whether noise was stated
+_NO_NOISE = 0.1  # share of an unknown cause in scatter that was not stated
+_AGAINST_STATED = 0.5  # the same of noise that contradicts what was stated: none is likelier than the other
 _SHORT = 0.01  # prior probability of irregular changes that show within dwells only
 SCREEN_LOG_BF = 8.0  # rows further behind in log evidence are not refitted
 NONLINEARITY_MARGIN = 0.02  # share of the log evidence by which they may be further behind, as large effects bend
@@ -128,14 +130,29 @@ class Hypotheses:
         """Yield the rows without an effect: nothing, noise that was not stated, and irregular changes."""
         marginals, prior = self.evidence.of(), math.log(KINDS["nothing"])
         log_nothing = float(next(marginal.log for marginal in marginals if not marginal.parts)) + prior
-        log_setting = _log_sum([marginal.log for marginal in marginals if marginal.parts == ("setting",)]) + prior
-        log_scatter = _log_sum([marginal.log for marginal in marginals if "common" in marginal.parts]) + prior
-        share = _NO_NOISE[self.stated]
-        log_irregular = _log_sum([log_scatter + math.log(share), log_nothing + math.log(_SHORT)])
+        logs_noise, logs_irregular = list[float](), [log_nothing + math.log(_SHORT)]
+        for marginal in (each for each in marginals if each.parts):
+            share = self._share_of_unknown(marginal)
+            logs_noise.append(marginal.log + prior + math.log(1.0 - share))
+            logs_irregular += [marginal.log + prior + math.log(share)] if share else []
+        log_irregular = _log_sum(logs_irregular)
         log_irregular += _log_odds(self.test.trend)
         yield Hypothesis(families=(NOTHING,), log_evidence=log_nothing)
-        yield Hypothesis(families=(NOISE,), log_evidence=_log_sum([log_setting, log_scatter + math.log(1.0 - share)]))
+        yield Hypothesis(families=(NOISE,), log_evidence=_log_sum(logs_noise))
         yield Hypothesis(driver=IRREGULAR, families=(NONE,), log_evidence=log_irregular)
+
+    def _share_of_unknown(self, noise: MarginalLikelihood) -> float:
+        """Return the share of an unknown cause in these parts of the noise from dwell to dwell.
+
+        Where they contradict what was stated, a cause that differs from orientation to orientation explains as much,
+        unless repeated orientations tell. Half of such causes depend on the orientation alone.
+        """
+        stated = {"setting": self.before.noise.setting_stated, "common": self.before.noise.scatter_stated}
+        if not any(stated[part] for part in noise.parts if part in stated):
+            return _NO_NOISE if "common" in noise.parts else 0.0
+        repeats = math.exp(min(log_odds_of_repeating(self.before, noise), 100.0))
+        unknown = _AGAINST_STATED * 0.5 * (1.0 + repeats)
+        return unknown / (unknown + 1.0 - _AGAINST_STATED)
 
     def _log_bayes_of_effects(self) -> dict[str, float]:
         """Return the log Bayes factor of each effect by the linear tests, the likeliest first."""

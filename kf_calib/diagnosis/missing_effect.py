@@ -28,6 +28,7 @@ from kf_calib.diagnosis.hypothesis_table import (
     table_of,
 )
 from kf_calib.diagnosis.refits import Refits, calibration_of
+from kf_calib.diagnosis.replication import Replication, replication
 from kf_calib.diagnosis.results import Diagnosis, Suspect
 from kf_calib.diagnosis.verdict import second_pass_in_words, verdict_in_words
 from kf_calib.dwells import window_average
@@ -42,18 +43,31 @@ _NOISE = 1e-6  # p-value below which readings within dwells hold more than an os
 _RETURNS = 1.36  # gain in log-likelihood that 1 of 20 true random walks exceeds with a time constant to return in
 
 
-def diagnose(run: Calibration | Source | str | PathLike[str], refits: Refits | None = None) -> Diagnosis:
+def diagnose(
+    run: Calibration | Source | str | PathLike[str], refits: Refits | None = None, *, replicate: bool = True
+) -> Diagnosis:
     """Diagnosis of a calibration, or of a recording or source, which is calibrated first.
 
     It works on the dwell factors. The readings are read again only where an oscillation or vibration requires it, which
     for a calibration is possible only with ``refits``.
 
     run: what is diagnosed. refits: those of the run, with its source (None: new ones, without the source of a
-    calibration).
+    calibration). replicate: whether to try what is named on dwells that choosing it never saw (``replication``).
     """
     before, refits = calibration_of(run, refits)
     with one_blas_thread():
-        return _diagnosed(refits, before)
+        diagnosis = _diagnosed(refits, before)
+        return replace(diagnosis, replication=_replication(refits, diagnosis)) if replicate else diagnosis
+
+
+def _replication(refits: Refits, diagnosis: Diagnosis) -> Replication | None:
+    """Return the replication of what a diagnosis names; None where it names nothing."""
+    if not diagnosis.missing or diagnosis.after is None:
+        return None
+    before = diagnosis.before_in_noise_left or diagnosis.before
+    count = len({*diagnosis.missing} & {*diagnosis.test.effects.best})
+    frame, left = refits.frame_of(before.fit), diagnosis.after.consistency
+    return replication(before, frame, diagnosis.ambiguity, max(count, 1), left)
 
 
 def _diagnosed(refits: Refits, before: Calibration) -> Diagnosis:
@@ -197,7 +211,8 @@ def _suspects(diagnosis: Diagnosis, table: HypothesisTable) -> tuple[Suspect, ..
             statistic, dof = effects.scores.get(name, 0.0), 1
         fits = row.refit.consistency.consistent is not False
         p_value = effects.p_values.get(name, 1.0)
-        suspects.append(Suspect(name, statistic, dof, p_value, fits, row.refit, symbols_before))
+        shares = row.probability, table.probability(row.effects)
+        suspects.append(Suspect(name, statistic, dof, p_value, fits, row.refit, symbols_before, *shares))
     return tuple(suspects)
 
 

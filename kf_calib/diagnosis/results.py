@@ -15,6 +15,7 @@ from kf_calib.diagnosis.detectability import Detectable, Unseen, detectable, sen
 from kf_calib.diagnosis.explanation import Explanation
 from kf_calib.diagnosis.hypothesis_table import SURE, Hypothesis, HypothesisTable
 from kf_calib.diagnosis.refits import Refits
+from kf_calib.diagnosis.replication import Replication
 from kf_calib.diagnosis.residual_drivers import Driver, drivers_of
 from kf_calib.diagnosis.unknown_effect import Description, channel_of, describe, explained_share
 from kf_calib.effects.effect import Grade
@@ -32,7 +33,8 @@ class Suspect:
 
     name: of the effect. statistic: fall of chi-squared. dof: its degrees of freedom. p_value: family-wise p-value.
     fits: whether the model with the effect fits the run. refit: the calibration with it. known: symbols of the effects
-    that were in the model before.
+    that were in the model before. probability: of this effect and no other, as in the table of explanations;
+    probability_with_others: of it alone or with others.
     """
 
     name: str
@@ -42,6 +44,8 @@ class Suspect:
     fits: bool
     refit: Calibration
     known: tuple[str, ...]
+    probability: float
+    probability_with_others: float
 
     @property
     def coefficients(self) -> list[Parameter]:
@@ -66,7 +70,8 @@ class Diagnosis:
 
     restoring_time_s: time constant with which the biases may return, s, in place of the random walk that is named
     (None: they do not). before_in_noise_left: ``before`` in the noise that the likeliest explanation leaves, where
-    noise was estimated (None: it is that of ``before``).
+    noise was estimated (None: it is that of ``before``). replication: how what is named predicts dwells that choosing
+    it never saw (None: nothing is named, or it was not asked for).
     """
 
     before: Calibration
@@ -85,6 +90,7 @@ class Diagnosis:
     as_scatter: bool = False
     restoring_time_s: float | None = None
     before_in_noise_left: Calibration | None = None
+    replication: Replication | None = None
 
     def __repr__(self) -> str:
         return f"<Diagnosis: {self.verdict}>"

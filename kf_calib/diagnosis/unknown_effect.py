@@ -12,6 +12,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
+from kf_calib.diagnosis import two_drivers
 from kf_calib.diagnosis.within_dwell_trend import Trend
 from kf_calib.diagnosis.within_dwell_trend import trend as trend_of
 from kf_calib.dwells.sufficient_statistics import DwellFactor
@@ -22,7 +23,7 @@ from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.further_effects import FurtherEffects
 from kf_calib.estimation.iterated_fit import fit
 from kf_calib.estimation.results import consistency
-from kf_calib.estimation.score_test import Frame
+from kf_calib.estimation.score_test import Frame, Scan
 from kf_calib.support import stage
 
 _CHANCE = 1e-4  # significance level of one family, of which there are about a hundred
@@ -100,6 +101,8 @@ class FormulaFamily:
     @property
     def family(self) -> str:
         """The physical class of effects to which such formulas belong; "" where there is none."""
+        if self.driver.startswith("angle") and " and " in self.driver:
+            return ""
         if self.driver.startswith("angle"):
             return "gimbal and encoder" if all(text[0] == ":" for text in self.texts) else ""
         if self.driver.startswith("specific force"):
@@ -194,16 +197,31 @@ def families(fitted: Fit, known: Sequence[Effect] = (), frame: Frame | None = No
 def _tested(fitted: Fit, tests: FurtherEffects) -> list[FormulaFamily]:
     """Return the families with their falls of chi-squared."""
     bench, groups = fitted.linearised.model.bench, list[tuple[str, list[str], list[Effect]]]()
-    for driver, texts in _families(bench, fitted.dwells):
+    of_two = dict(two_drivers.bases(len(bench.axes)))
+    for driver, texts in itertools.chain(_families(bench, fitted.dwells), of_two.items()):
         with contextlib.suppress(InputError):  # a very late jump or fast decay does not show when a formula is checked
             effects_of_texts = [formula(_named(text), bench.axes, bench.gravity_mps2, checked=False) for text in texts]
             groups.append((driver, texts, [*effects_of_texts]))
     stage.say(f"trying {sum(len(texts) for _, texts, _ in groups)} formulas")
     tested, scans = list[FormulaFamily](), tests.scans([effects for _, _, effects in groups])
     for (driver, texts, _), (scan, known) in zip(groups, scans, strict=True):
+        if driver in of_two:
+            tested += _subsets(driver, texts, scan, known)
+            continue
         delta_chi2, rank = scan.explained(np.concatenate([each.basis for each in scan.candidates], axis=1))
-        tested.append(FormulaFamily(driver, tuple(texts), delta_chi2, rank, tuple(scan.statistics.tolist()), known))
+        tested.append(
+            FormulaFamily(driver, tuple(texts), delta_chi2, rank, tuple(scan.statistics.tolist()), all(known))
+        )
     return tested
+
+
+def _subsets(driver: str, texts: Sequence[str], scan: Scan, known: Sequence[bool]) -> Iterator[FormulaFamily]:
+    """Yield the subsets of the terms of two drivers that are no known effects, each as a family."""
+    for chosen, delta_chi2, rank in two_drivers.subsets(scan):
+        each = tuple(float(scan.statistics[k]) for k in chosen)
+        yield FormulaFamily(
+            driver, tuple(texts[k] for k in chosen), delta_chi2, rank, each, all(known[k] for k in chosen)
+        )
 
 
 def _names(first: int, count: int) -> list[str]:
@@ -291,5 +309,6 @@ def _of_surroundings(bench: Bench) -> Iterator[tuple[str, list[str]]]:
         yield "time", [":base = t"]
     yield "rate of temperature", ["dT"]
     yield "rate of temperature", ["a*dT"]
-    for terms in (["da"], ["da*abs(da)"], ["sign(da)"], ["a-da"], ["(a-da)**2"]):
+    plays = ([f"play{width}"] for width in (1, 3, 6))
+    for terms in (["da"], ["da*abs(da)"], ["tanh(da/(5*m/s**2))"], ["a-da"], ["(a-da)**2"], *plays):
         yield "previous orientation", terms

@@ -13,6 +13,7 @@ from kf_calib.estimation.oscillation_carrier import holds_its_oscillation
 from kf_calib.estimation.results import format_p
 from kf_calib.support.units import shown
 
+_AS_LIKELY = 0.25  # share of the likeliest from which another explanation is told together with it
 _TOLD = 4  # most other explanations that are told
 _FAMILIES = {
     "bias in time": "The bias changes with time", "scale in time": "The scale factor changes with time",
@@ -112,6 +113,14 @@ def _unexplained(diagnosis: Diagnosis) -> str:
 def _unknown(diagnosis: Diagnosis, first: Hypothesis) -> str:
     """Return a sentence on a misfit that no known effect explains."""
     what = "it changes irregularly" if first.driver == IRREGULAR else f"it goes with {first.driver}"
+    assert diagnosis.table is not None
+    share, noise = first.probability, diagnosis.table.families.get(NOISE, 0.0)
+    if first.driver == IRREGULAR and noise > _AS_LIKELY * share and dwell_noise_is_stated(diagnosis.before):
+        return (
+            "It cannot be told whether something unknown changes irregularly from dwell to dwell "
+            f"({format_probability(share)}) or the dwells scatter more than was stated ({format_probability(noise)})"
+            f"{_others(diagnosis, but=NOISE)}. To find out, repeat an orientation."
+        )
     return (
         f"Unknown: no known effect explains it, {what} ({format_probability(first.probability)}){_others(diagnosis)}."
     )
@@ -128,13 +137,38 @@ def _noise(diagnosis: Diagnosis, first: Hypothesis) -> str:
     return f"The dwells scatter {what} ({share}){_others(diagnosis)}. To find out, {advice}."
 
 
-def _others(diagnosis: Diagnosis) -> str:
-    """Return the other explanations in words."""
+def _others(diagnosis: Diagnosis, but: str = "") -> str:
+    """Return the other explanations in words, but for those of one family."""
     assert diagnosis.table is not None
-    rows = diagnosis.table.rivals
+    rows = [row for row in diagnosis.table.rivals if row.families != (but,)]
     words = [f"{_in_words(diagnosis, row)} {format_probability(row.probability)}" for row in rows[:_TOLD]]
     words += [f"{len(rows) - _TOLD} others"] if len(rows) > _TOLD else []
     return f"; or {', '.join(words)}" if words else ""
+
+
+def replication_in_words(diagnosis: Diagnosis) -> str:
+    """A sentence on how what is named predicts dwells that choosing it never saw; "" where nothing is named."""
+    tried = diagnosis.replication
+    if tried is None:
+        return ""
+    if not tried.halves:
+        return (
+            "Whether it replicates cannot be told: the dwells cannot be divided in two halves that predict each other."
+        )
+    if not tried.relevant:
+        names = " and ".join(dict.fromkeys("+".join(half.named) for half in tried.halves))
+        return f"Whether it replicates cannot be told: half of the dwells alone would name {names}."
+    fall = (
+        f"named from half of the dwells, it lowers χ² of the others by {tried.fall:.0f} ({tried.predicted:.0f} "
+        f"predicted; p {format_p(tried.p_value)})"
+    )
+    if tried.fall < 0.0:
+        fall = f"named from half of the dwells, it raises χ² of the others by {-tried.fall:.0f}"
+    if tried.answer == "yes":
+        return f"It replicates: {fall}."
+    if tried.answer == "no":
+        return f"It does not replicate: {fall}, less than its size predicts (p {format_p(tried.p_less)})."
+    return f"Whether it replicates cannot be told: {fall}."
 
 
 def explanations_in_words(diagnosis: Diagnosis) -> str:

@@ -11,6 +11,7 @@ name               unit     what it is
 fx fy fz           m/s^2    specific force in the platform frame
 a p o              m/s^2    the same along the input, pendulous and output axis of the accelerometer
 da                 m/s^2    last step of a from dwell to dwell; 0 in the first
+play1 play3 play6  m/s^2    a through a play of 1, 3 or 6 m/s^2 to either side: it follows where it is pushed
 T                  K        temperature less 25 degC; 0 where it is not measured
 dT                 K/s      rate of the temperature
 t                  s        time since the first sample
@@ -28,7 +29,7 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -66,6 +67,12 @@ QUANTITIES: dict[str, Quantity] = {
     "p": Quantity("m/s^2", "specific force along the pendulous axis", lambda s: s.pendulous),
     "o": Quantity("m/s^2", "specific force along the output axis", lambda s: s.output),
     "da": Quantity("m/s^2", "last step of a from dwell to dwell", lambda s: s.step),
+    **{
+        f"play{width:g}": Quantity(
+            "m/s^2", f"a through a play of {width:g} m/s^2", partial(Stimulus.played, half_width_mps2=width)
+        )
+        for width in (1.0, 3.0, 6.0)
+    },
     "T": Quantity("K", "temperature less 25 degC", lambda s: s.warmth[:, None]),
     "dT": Quantity("K/s", "rate of the temperature", lambda s: s.warming[:, None]),
     "t": Quantity("s", "time since the first sample", lambda s: s.elapsed_s[:, None]),

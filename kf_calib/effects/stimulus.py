@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any
@@ -148,6 +149,21 @@ class Stimulus:
     def step(self) -> Floats:
         """Delta a_i (m, 3): the last change of a_i from dwell to dwell; zero in the first."""
         return (self.force_mps2 - self.previous_force_mps2) @ self.axes.T
+
+    def played(self, half_width_mps2: float) -> Floats:
+        """a_i (m, 3) through a play of this half-width, m/s^2: it follows only where it is pushed.
+
+        The operator of Prandtl and Ishlinskii, y_n = max(a_n - r, min(a_n + r, y_(n-1))), from the orientation before.
+        """
+        if self.whole is not None:
+            return self.whole.played(half_width_mps2)[-len(self) :]
+        along, through = self.along, np.empty_like(self.along)
+        held = (along - self.step)[0]
+        moved = np.append(True, np.any(np.diff(along, axis=0) != 0.0, axis=1))
+        for first, last in itertools.pairwise([*np.flatnonzero(moved).tolist(), len(along)]):
+            held = np.maximum(along[first] - half_width_mps2, np.minimum(along[first] + half_width_mps2, held))
+            through[first:last] = held
+        return through
 
     @cached_property
     def force_rate_mps3(self) -> Floats:

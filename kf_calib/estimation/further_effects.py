@@ -62,8 +62,8 @@ class FurtherEffects:
         others = [effect for effect in known if effect not in held]
         yield others, self._frame.whitened(self._carried, others)
 
-    def scans(self, groups: Sequence[Sequence[Effect]]) -> Iterator[tuple[Scan, bool]]:
-        """Scan each group alone, and tell whether all of its effects are known."""
+    def scans(self, groups: Sequence[Sequence[Effect]]) -> Iterator[tuple[Scan, list[bool]]]:
+        """Scan each group alone, and tell of each of its effects whether it is known."""
         widths = [sum(counts_of(group)) for group in groups]
         for part in batches(widths, columns_at_once(self._carried)):
             some = [groups[k] for k in part]
@@ -72,20 +72,20 @@ class FurtherEffects:
             cosines = self._known.T @ rest
             for group, own in zip(some, slices([widths[k] for k in part]), strict=True):
                 found = self._scan(group, columns[:, own], rest[:, own])
-                yield found, self._is_known(found, cosines[:, own])
+                yield found, self._are_known(found, cosines[:, own])
 
     def _scan(self, effects: Sequence[Effect], columns: Floats, rest: Floats) -> Scan:
         """Scan effects by their columns (m, q) and what the model leaves of these."""
         upper = triangle(np.column_stack([rest, self._residual]))
         return scan_of(upper, np.linalg.norm(columns, axis=0), effects, counts_of(effects))
 
-    def _is_known(self, scan: Scan, products: Floats) -> bool:
+    def _are_known(self, scan: Scan, products: Floats) -> list[bool]:
         """Tell whether each candidate lies within a known effect; products (k, q): of the bases of these with the
         columns."""
+        known = list[bool]()
         for candidate, columns in zip(
             scan.candidates, slices(counts_of([candidate.effect for candidate in scan.candidates])), strict=True
         ):
             cosines = (products[:, columns] @ candidate.inverse).T
-            if not any(is_within(cosines[:, part], self._cosine) for part in self._parts):
-                return False
-        return True
+            known.append(any(is_within(cosines[:, part], self._cosine) for part in self._parts))
+        return known

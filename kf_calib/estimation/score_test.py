@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.bench.paper_parameters import STATE_COUNT
@@ -174,6 +175,12 @@ class Frame:
         self._periodogram: tuple[tuple[tuple[str, float], bytes], Periodogram] | None = None
         self._lines: dict[float, tuple[Line, ...]] = {}
         self._last: tuple[LinearisedDwells, Floats, Floats, int] | None = None
+
+    @property
+    def ends(self) -> NDArray[np.intp] | None:
+        """The first row of each dwell, after those of prior knowledge, and at last the number of rows; None where a
+        walk of the biases makes the rows of all dwells one."""
+        return None if self._whitening is None else self._whitening.ends
 
     def has(self, effect: Effect) -> bool:
         """Tell whether the frame contains this effect with its unknown constant at this value."""

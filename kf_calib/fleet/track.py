@@ -27,7 +27,8 @@ class Track:
       width of the middle 68 % of them.
     - chances (u,): chance that among as many units and parameters of a normal population one lies as far off.
     - deviations (n,): of each run from the mean of its unit, as large as those of single runs; where no unit was
-      measured twice, from that of all. scatter: half the width of the middle 68 % of them.
+      measured twice, from that of all. scatter: standard deviation of a run, pooled over the units: the root of
+      Σ (value − mean of its unit)² / (runs − units), over units that were measured again.
     """
 
     symbol: str
@@ -81,7 +82,7 @@ def _track(
     deviations = _deviations(values, means[places], runs[places], mean)
     return Track(
         symbol, unit, nominal, target, dates, places, values, sigmas, means, mean, spread,
-        _chances(means, mean, spread, many), deviations, _middle(deviations[np.isfinite(deviations)])[1],
+        _chances(means, mean, spread, many), deviations, _pooled(deviations, runs[places]),
     )  # fmt: skip
 
 
@@ -98,6 +99,15 @@ def _deviations(values: Floats, means: Floats, runs: NDArray[np.intp], mean: flo
     again = runs > 1
     factor = np.sqrt(np.divide(runs, runs - 1, out=np.full(len(runs), np.nan), where=again))
     return (values - means) * factor
+
+
+def _pooled(deviations: Floats, runs: NDArray[np.intp]) -> float:
+    """Return the standard deviation pooled over groups of so many runs; each deviation is larger by √(n / (n − 1))."""
+    known = np.isfinite(deviations)
+    if (runs == 1).all():  # one group of all runs
+        return float(np.std(deviations[known], ddof=1)) if known.sum() > 1 else 0.0
+    shares = (runs[known] - 1.0) / runs[known]  # a unit of n runs has n - 1 degrees of freedom
+    return float(np.sqrt(np.sum(shares * deviations[known] ** 2) / np.sum(shares)))
 
 
 def _chances(units: Floats, mean: float, spread: float, many: int) -> Floats:

@@ -13,9 +13,10 @@ from kf_calib.design.next_orientation import Advice
 from kf_calib.diagnosis.candidate_tests import LEVEL
 from kf_calib.diagnosis.detectability import Detectable
 from kf_calib.diagnosis.hypothesis_table import Hypothesis, HypothesisTable
+from kf_calib.diagnosis.replication import Replication
 from kf_calib.diagnosis.results import Diagnosis, Suspect
 from kf_calib.diagnosis.unknown_effect import Description
-from kf_calib.diagnosis.verdict import format_probability
+from kf_calib.diagnosis.verdict import format_probability, replication_in_words
 from kf_calib.diagnosis.within_dwell_trend import Trend
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation.results import format_p
@@ -52,6 +53,8 @@ def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
             "suspects": [_suspect_object(each) for each in diagnosis.suspects],
             "ambiguity_set": list(diagnosis.ambiguity),
             "overlaps": diagnosis.overlaps,
+            "replicates": diagnosis.replication.answer if diagnosis.replication else None,
+            "replication": _replication_object(diagnosis.replication),
             "together": [list(pair) for pair in diagnosis.together],
             "may_be_scatter": diagnosis.as_scatter,
             "invisible": diagnosis.test.invisible,
@@ -87,6 +90,14 @@ def _hypotheses_object(table: HypothesisTable | None) -> list[dict[str, Any]]:
         }
         for row, odds in rows
     ]
+
+
+def _replication_object(tried: Replication | None) -> dict[str, Any] | None:
+    """Return how what is named predicts dwells that choosing it never saw, or None."""
+    if tried is None:
+        return None
+    figures = {"fall": tried.fall, "predicted": tried.predicted, "p_value": tried.p_value, "p_less": tried.p_less}
+    return {**figures, "halves": [vars(half) | {"dwells": list(half.dwells)} for half in tried.halves]}
 
 
 def _trend_object(trend: Trend | None) -> dict[str, Any] | None:
@@ -127,6 +138,8 @@ def _suspect_object(suspect: Suspect) -> dict[str, Any]:
         "statistic": suspect.statistic,
         "dof": suspect.dof,
         "p_value": suspect.p_value,
+        "probability": suspect.probability,
+        "probability_with_others": suspect.probability_with_others,
         "fits": suspect.fits,
         "coefficients": [
             {"symbol": p.symbol, "value": p.value, "sigma": p.sigma, "unit": p.unit} for p in suspect.coefficients
@@ -156,6 +169,8 @@ def diagnosis_report(diagnosis: Diagnosis) -> RenderableType:
     readings = diagnosis.before.readings
     if readings.findings:
         parts.append(Text(f"In the readings: {'; '.join(readings.findings)}."))
+    if replicates := replication_in_words(diagnosis):
+        parts.append(Text(replicates))
     if diagnosis.table and diagnosis.test.consistent is False:
         parts.append(_hypothesis_table(diagnosis.table))
     if diagnosis.suspects:

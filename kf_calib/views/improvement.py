@@ -146,12 +146,7 @@ def improvement_report(
         progress(state), Text(f"Stopped, {state.because}: {state.reason}", style=style),
     ]  # fmt: skip
     parts += [Text(line) for line in (*of_what_p_is(state.diagnosis), *_settling(state))]
-    if not state.spreads or state.because != "ambiguous":
-        parts.append(parameter_table(state.result))
-    if state.spreads:
-        parts.append(_spread_table(state))
-    if state.result.model.effects:
-        parts.append(effect_table(state.result))
+    parts.append(last_parameters(state))
     if honest is not None:
         parts.append(Text(honest_sentence(honest)))
     if replay_difference is not None:
@@ -159,6 +154,53 @@ def improvement_report(
         parts.append(Text(f"The steps of the journal gave the same figures, {same}."))
     parts += map(note, state.warnings)
     return Group(*parts)
+
+
+def last_parameters(state: Improvement) -> RenderableType:
+    """The tables of the last model: its parameters, their range where the run cannot decide, and its effects."""
+    parts: list[RenderableType] = []
+    if not state.spreads or state.because != "ambiguous":
+        parts.append(parameter_table(state.result))
+    if state.spreads:
+        parts.append(_spread_table(state))
+    if state.result.model.effects:
+        parts.append(effect_table(state.result))
+    return Group(*parts)
+
+
+def story(state: Improvement) -> list[str]:
+    """What was wrong, what was added, how far the error fell where it was left out of the fit, and what is left."""
+    start, floor = state.start, state.result.held_out_floor_mps2
+    if start.test.consistent is not False:
+        return [state.reason]
+    errors = [_errors(each, floor)[0] for each in (start.before, state.result)]
+    times = "" if errors[0] is None else f". Orientations left out of the fit were off by {errors[0]:.2f} × noise"
+    p_value = format_p(start.test.p_value) if start.test.p_value is not None else "unknown"
+    said = [f"What was wrong: {start.before.model.sum} do not describe this run (p {p_value}){times}."]
+    if state.steps:
+        said.append(f"What was added: {'; '.join(map(_told, state.steps))}.")
+    if state.steps and None not in errors:
+        said.append(
+            f"What it brought: the error on orientations left out of the fit went from {errors[0]:.2f} to "
+            f"{errors[1]:.2f} times what noise alone gives."
+        )
+    return [*said, f"What is left: {state.reason}"]
+
+
+def _told(step: SelectionStep) -> str:
+    """Return what a step added, with its clearest coefficient, and what it took out."""
+    told = [f"{each.name} was taken out" for each in step.dropped]
+    if step.name is None:
+        return ", ".join(told)
+    (own,) = (effect.parameters for effect in step.result.model.effects if str(effect) == step.name)
+    sized = [step.result.parameters[each.symbol] for each in own]
+    clearest = max(sized, key=lambda each: abs(each.value or 0.0) / (each.sigma or float("inf")))
+    size = ""
+    if clearest.value is not None and clearest.sigma:
+        value, sigma = shown(clearest).rounded(clearest.value, clearest.sigma)
+        size = f", {symbol(clearest.symbol)} = {value} ± {sigma} {shown(clearest).label}"
+    share = "" if step.probability is None else f" (probability {format_probability(step.probability)})"
+    return ", ".join([f"{step.name}{size}{share}", *told])
 
 
 def progress(state: Improvement) -> RenderableType:

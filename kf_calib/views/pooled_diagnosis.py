@@ -94,9 +94,8 @@ def _sentence(finding: Finding) -> str:
     if finding.attribution is Attribution.SOME and finding.share_interval is not None:
         low, high = finding.share_interval
         having = [each.unit for each in finding.units if each.probability > _HAS_IT]
-        sentence += (
-            f": {finding.share:.0%} of the units have it ({low:.0%} to {high:.0%}), most likely {_listed(having)}"
-        )
+        reach = "" if f"{low:.0%}" == f"{high:.0%}" else f" ({low:.0%} to {high:.0%})"
+        sentence += f": {finding.share:.0%} of the units have it{reach}, most likely {_listed(having)}"
     if finding.repair is not None:
         gap = finding.repair.gaps[0]
         sentence += f": it changed between {_moment(gap.after) or gap.after_run} and "

@@ -19,8 +19,10 @@ from mcap_ros2.decoder import DecoderFactory
 
 import kf_calib
 from kf_calib.bench.streams import Batch
+from kf_calib.exchange.corrected_file import apply_to_file
 from kf_calib.exchange.corrected_lines import CorrectedLines
 from kf_calib.sources.files.recorder import Recorder
+from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.simulation.physics import Ambient
 
 RECORDING = ROOT / "recordings" / "navigation_24.mcap"
@@ -99,6 +101,13 @@ def test_its_messages_are_the_corrected_readings_with_their_covariance(folder: P
     covariance = np.reshape(last.linear_acceleration_covariance, (3, 3))
     wanted = correct.covariance_of(correct.gravities, noise=True)
     np.testing.assert_allclose(covariance, wanted[np.argmax(np.einsum("nii->n", wanted))])
+
+
+def test_progress_rises_to_the_whole_one_half_copied_and_one_half_corrected(folder: Path) -> None:
+    correction, told = kf_calib.open_calibration(folder / "cal.json").correction(), list[float]()
+    apply_to_file(correction, Recording(RECORDING), folder / "told.mcap", told.append)
+    assert told == sorted(told) and 0.0 <= told[0] and 0.99 < told[-1] <= 1.0
+    assert any(share == pytest.approx(0.5, abs=1e-3) for share in told)
 
 
 def test_the_copy_is_evaluated_as_the_original_is(folder: Path, run: Any) -> None:

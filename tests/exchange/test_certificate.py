@@ -13,6 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from helpers.paths import ROOT
 from helpers.synthetic import SYMBOLS
@@ -22,6 +23,7 @@ from kf_calib.errors import InputError
 from kf_calib.exchange import calibration_file
 from kf_calib.exchange.certificate import content, dcc, document, statement
 from kf_calib.support.extras import MissingExtraError
+from kf_calib.support.units import field_unit
 
 sets = pytest.mark.skipif(find_spec("typst") is None, reason="typst is not there: no PDF is made")
 reads = pytest.mark.skipif(shutil.which("pdftotext") is None, reason="pdftotext (poppler-utils) is not there")
@@ -154,6 +156,20 @@ def test_the_pdf_has_every_number_and_the_xml(cal: Path, lab: Path, tmp_path: Pa
     if shutil.which("pdfdetach"):
         subprocess.run(["pdfdetach", "-saveall", "-o", tmp_path, tmp_path / "made.pdf"], check=True)
         assert (tmp_path / document.ATTACHED).read_bytes() == xml
+
+
+@pytest.mark.parametrize(
+    ("largest", "shown"),
+    [(0.0, "0.0000"), (0.0099, "9.90e−03"), (0.0101, "0.0101"), (9999.0, "9999.0000"), (10001.0, "1.00e+04")],
+)
+def test_a_sensitivity_is_shown_with_three_digits_at_least(cal: Path, lab: Path, largest: float, shown: str) -> None:
+    own = made(cal, lab)
+    line = next(each for each in own.budget.contributions if each.sensitivity is not None)
+    per_si = field_unit(own.results[0].unit).per_si / field_unit(line.unit).per_si
+    values = np.zeros(12)
+    values[0] = largest / per_si
+    row = document._sensitivity(own, replace(line, sensitivity=values))
+    assert row["values"][0] == shown
 
 
 def text_of(pdf: bytes, folder: Path) -> str:

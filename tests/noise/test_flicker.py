@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 from helpers.long_runs import slow
 from helpers.synthetic import NOMINAL, G, sensitivities
+from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.bench.streams import Batch, Stream
@@ -20,6 +22,8 @@ from kf_calib.effects import effect_named, names
 from kf_calib.estimation.calibration import evaluate
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.settings import Settings
+from kf_calib.noise.flicker import _likeliest
+from kf_calib.noise.nuisance_states import SLOW
 from kf_calib.support.threads import one_blas_thread
 
 BENCH = Bench(axes_of("yzx"), G, latitude_deg=50.0, angle_sigma_deg=0.0)
@@ -108,3 +112,17 @@ def test_coefficients_are_covered(flicker_ug: float, scatter_ug: float, name: st
     assert count >= 0.4 * runs
     assert np.mean(np.abs(told) < 1.96) - 0.95 > -2.6 * np.sqrt(0.05 * 0.95 / count)
     assert (2.0 / 3.0 if flicker_ug else 1.0) - chance < np.sqrt(np.mean(told**2)) < 1.0 + chance
+
+
+@pytest.mark.parametrize("share, seen", [(0.97, False), (1.03, True)])
+def test_waves_count_where_their_likelihood_gains_what_chi2_exceeds_once_in_twenty(share: float, seen: bool) -> None:
+    """Amplitudes whose squares are their variances v + h / k gain (h / (v k) - log(1 + h / (v k))) / 2 each."""
+    dwells, v = 20, 4e-10
+
+    def gain(ratio: float) -> float:
+        return 0.5 * dwells * float(np.sum(ratio / SLOW - np.log1p(ratio / SLOW)))
+
+    limit = 0.5 * float(chi2.ppf(0.95, 1))
+    h = v * float(brentq(lambda ratio: gain(ratio) - share * limit, 1e-6, 1e3))
+    variances = np.full((dwells, len(SLOW)), v)
+    assert _likeliest(np.sqrt(variances + h / SLOW), variances) == pytest.approx(np.sqrt(h) if seen else 0.0, rel=0.06)

@@ -7,7 +7,6 @@ import importlib.util
 import os
 import signal
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
@@ -32,16 +31,19 @@ def wide(radius):
 """
 
 
-@pytest.fixture
-def module(tmp_path: Path) -> Iterator[ModuleType]:
-    path = tmp_path / "to_be_changed.py"
-    path.write_text(f"import functools\n{SOURCE}")
+def loaded(path: Path) -> ModuleType:
     spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec and spec.loader
-    loaded = sys.modules[path.stem] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(loaded)
-    yield loaded
-    del sys.modules[path.stem]
+    made = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(made)
+    return made
+
+
+@pytest.fixture
+def module(tmp_path: Path) -> ModuleType:
+    path = tmp_path / "to_be_changed.py"
+    path.write_text(f"import functools\n{SOURCE}")
+    return loaded(path)
 
 
 def test_each_change_is_one_and_knows_its_function() -> None:
@@ -63,10 +65,17 @@ def test_functions_of_a_loaded_module_take_the_code_of_its_file(module: ModuleTy
     assert area(module.Circle(2.0)) == 24.0 and wide(2.0) == [3.0]
 
 
-def test_two_functions_of_one_name_and_line_cannot_be_told_apart(module: ModuleType) -> None:
-    path = Path(str(module.__file__))
+def test_two_functions_of_one_name_and_line_cannot_be_told_apart_but_within_another(tmp_path: Path) -> None:
+    source = "def total(values):\n    return sum(v for v in values) + sum(v for v in values)\n"
+    path = tmp_path / "within.py"
+    path.write_text(source)
+    total = loaded(path).total
+    path.write_text(source.replace(") +", ") -"))
+    assert replace_code(path) and total([1, 2]) == 0
+    path = tmp_path / "twins.py"
     path.write_text("one, other = lambda: 1, lambda: 2\n")
-    assert not replace_code(path)
+    twins = loaded(path)
+    assert not replace_code(path) and twins.one() == 1
 
 
 def test_a_child_answers_or_takes_too_long() -> None:

@@ -107,15 +107,16 @@ def test_bars_of_probabilities_are_those_of_the_table(hidden: tuple[str, ...]) -
     assert area == pytest.approx(100.0)  # the rows sum to one, whatever families they belong to
 
 
-def test_cells_of_the_matrix_are_overlaps() -> None:
-    axes = axes_of(plot.suspects(hysteresis()), "Overlap")
+def test_cells_of_the_matrix_are_overlaps_and_a_walk_that_takes_any_path_has_none() -> None:
+    diagnosis = found("second-order=15sigma", "hysteresis=15sigma")
+    axes = axes_of(plot.suspects(diagnosis), "Overlap")
     names = [label.get_text() for label in axes.get_yticklabels()]
-    test = hysteresis().test
+    test = diagnosis.test
+    assert len(names) >= 2 and test.effects.walk not in names
     cells = {tuple(int(x) for x in text.get_position()): text.get_text() for text in axes.texts}
     for row, one in enumerate(names):
         for column, other in enumerate(names):
-            walks = test.effects.walk in (one, other)
-            overlap = 1.0 if walks else test.effects.candidate(one).overlap(test.effects.candidate(other))
+            overlap = test.effects.candidate(one).overlap(test.effects.candidate(other))
             assert cells[column, row] == f"{overlap:.2f}"
 
 

@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -21,8 +22,9 @@ from PIL import Image
 import kf_calib
 from kf_calib.views import console
 from kf_calib.views.figures import style
+from kf_calib.views.report import drawing
 from kf_calib.views.report.contents import page_of
-from kf_calib.views.report.drawing import Drawing, fit
+from kf_calib.views.report.drawing import Drawing, draw_all
 from kf_calib.views.report.measured import Measured
 from kf_calib.views.report.page import save
 from kf_calib.views.report.parts import Table, parts_of
@@ -98,8 +100,7 @@ def test_figures_are_light_on_dark_and_dark_on_light(shown: Any, told: list[str]
     )
     assert abs(_brightness(ground) - _brightness(ink)) > 200
     ways = shown.evaluate(
-        "[...document.querySelectorAll('.drawing:not(.card) svg g[transform*=scale]')]"
-        ".map(each => getComputedStyle(each).fill)"
+        "[...document.querySelectorAll('.drawing:not(.card) svg text')].map(each => getComputedStyle(each).fill)"
     )
     apart = [abs(_brightness(each) - _brightness(ground)) > 120 for each in ways]
     assert len(apart) > 100 and np.mean(apart) > 0.9  # numbers in a dark cell of a matrix are light
@@ -216,8 +217,8 @@ def many_points(seed: int, count: int = 20_000) -> Figure:
 def test_figures_of_many_points_stay_small_and_have_greys_of_the_page() -> None:
     few = Figure()
     few.subplots().plot([1, 2, 3], "o", color=style.ACCELEROMETERS[1])
-    drawings = [Drawing("many", many_points(1), "many"), Drawing("few", few, "few")]
-    fit(drawings)
+    drawings = [Drawing("many", lambda: many_points(1), "many"), Drawing("few", lambda: few, "few")]
+    draw_all(drawings)
     many, small = (each.markup for each in drawings)
     assert len(many) < 400_000 and "data:image/png" in many and many.startswith("<svg")
     assert "var(--ink)" in many and "stroke: #6b6b6b" not in many and 'id="many-' in many
@@ -225,11 +226,68 @@ def test_figures_of_many_points_stay_small_and_have_greys_of_the_page() -> None:
     assert "\n" not in small
 
 
-def test_what_is_still_too_large_is_a_picture() -> None:
-    drawings = [Drawing(f"{k}", many_points(k, 2_000), f"d{k}") for k in range(2)]
-    fit(drawings, 0)
+def test_what_is_still_too_large_is_a_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(drawing, "_MOST", 1_000)
+    drawings = [Drawing(f"{k}", partial(many_points, k, 2_000), f"d{k}") for k in range(2)]
+    draw_all(drawings)
     for each in drawings:
         assert each.on_white and each.markup.startswith("<img") and len(each.markup) < 250_000
+
+
+def test_copies_of_the_process_draw_what_it_would_draw_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    pages = []
+    for cores in (1, 3):
+        monkeypatch.setattr(drawing, "_cores", lambda cores=cores: cores)
+        drawings = [Drawing(f"{k}", partial(many_points, k, 40), f"d{k}") for k in range(4)]
+        draw_all(drawings)
+        pages.append([each.markup for each in drawings])
+    assert pages[0] == pages[1] and len(set(pages[0])) == 4
+
+
+def test_letters_of_a_figure_are_text_that_can_be_searched() -> None:
+    figure = Figure()
+    figure.suptitle("a < b & c")
+    (shown,) = drawings = [Drawing("letters", lambda: figure, "l")]
+    draw_all(drawings)
+    assert "a &lt; b &amp; c</text>" in shown.markup and "font-family" not in shown.markup
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_on_a_phone_the_sigmas_are_seen_and_what_is_wider_says_so(browser: Any, path: Path, scheme: Any) -> None:
+    page = browser.new_page(viewport={"width": 400, "height": 800}, color_scheme=scheme)
+    page.goto(path.as_uri())
+    assert page.evaluate("document.documentElement.scrollWidth") <= 400
+    table = page.locator("table", has=page.locator("caption", has_text="Parameters (1σ)")).first
+    sigma = table.locator("th", has_text="sigma").first.bounding_box()
+    assert sigma["x"] + sigma["width"] <= 400
+    hints = page.evaluate(
+        "[...document.querySelectorAll('.table, .drawing')].filter(each => each.scrollWidth > each.clientWidth)"
+        ".map(each => [getComputedStyle(each).backgroundAttachment,"
+        " each.matches('.table') || getComputedStyle(each, '::before').content.includes('swipe')])"
+    )
+    assert len(hints) >= 5 and all("local" in shadow and "scroll" in shadow and told for shadow, told in hints)
+    page.close()
+
+
+def test_the_contents_name_every_section_of_the_page(path: Path) -> None:
+    html = path.read_text()
+    listed = re.findall(r'<li><a href="#(\w+)">([^<]*)</a>', html)
+    assert [name for name, _ in listed] == re.findall(r'<section id="(\w+)"', html)
+    assert all(text.strip() for _, text in listed)
+
+
+def test_the_page_of_an_improvement_leads_with_the_story_and_the_picture_of_the_steps() -> None:
+    state = kf_calib.improve(HIDDEN)
+    page = page_of(state, [Measured("hidden.mcap", "6e21")], [])
+    wrong, added, brought, left = page.verdict
+    assert wrong.startswith("What was wrong: ") and "off by" in wrong
+    assert added.startswith("What was added: hysteresis, ") and "±" in added and "probability" in added
+    before, after = (state.start.before.held_out_rms_mps2, state.result.held_out_rms_mps2)
+    floor = state.result.held_out_floor_mps2
+    assert before and after and floor and f"from {before / floor:.2f} to {after / floor:.2f} times" in brought
+    assert left == f"What is left: {state.reason}"
+    first = page.sections[0].parts[0]
+    assert isinstance(first, Drawing) and first.title == "The error falls"
 
 
 def _ink(picture: Image.Image) -> float:

@@ -25,8 +25,8 @@ _BYTES_PER_S = 500.0  # of a file whose tests have not been run
 class TestMap:
     """Tests by the functions that they execute.
 
-    functions: of each test (or file of tests), ``path:name`` of functions of the program; what is defined within one
-    counts as that one.
+    functions: of each test (or file of tests), ``path:name`` of functions of the program, where what is defined within
+    one counts as that one; ``path:`` where it is not known which functions of a module.
     seconds: of processor, of each test. failed: those that fail unchanged.
     """
 
@@ -43,7 +43,7 @@ class TestMap:
         """
         place, module = f"{path}:{function}", f"{path}:"
         sound = {test: places for test, places in self.functions.items() if test not in self.failed}
-        hits = {test for test, places in sound.items() if place in places}
+        hits = {test for test, places in sound.items() if place in places or module in places}
         hits = hits or {test for test, places in sound.items() if any(one.startswith(module) for one in places)}
         cost, early = defaultdict[str, float](float), {str(name) for name in first}
         for test in hits:

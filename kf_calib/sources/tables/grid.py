@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -17,6 +18,7 @@ from kf_calib.support.plain_text import cut
 
 Cell = str | float | datetime | None
 """A cell as it was read; text is not interpreted yet, an empty cell is None."""
+_CYRILLIC = re.compile(rb"[\xc0-\xff]{3}")
 ZIP, MCAP = b"PK\x03\x04", b"\x89MCAP"
 TEXT_SUFFIXES = (".csv", ".tsv", ".txt")
 EXCEL_SUFFIXES = (".xlsx", ".xlsm")
@@ -96,7 +98,10 @@ def _of_text(path: Path) -> Grid:
 
 
 def _decoded(path: Path, content: bytes) -> str:
-    """Return the text of a file in UTF-8 or UTF-16 with or without a byte-order mark, or else in Windows-1252."""
+    """Return the text of a file in UTF-8 or UTF-16 with or without a byte-order mark, or in a code page of Windows.
+
+    It is Cyrillic (1251) where three letters beyond ASCII follow each other, as in no Western language, or else 1252.
+    """
     if content.startswith((b"\xff\xfe", b"\xfe\xff")):
         return content.decode("utf-16", errors="replace")
     if b"\0" in content:
@@ -104,7 +109,7 @@ def _decoded(path: Path, content: bytes) -> str:
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:
-        return content.decode("cp1252", errors="replace")
+        return content.decode("cp1251" if _CYRILLIC.search(content) else "cp1252", errors="replace")
 
 
 def delimiter_of(lines: Sequence[str]) -> str:

@@ -1,4 +1,4 @@
-"""What names of columns mean: quantity, channel and unit, in English and German."""
+"""What names of columns mean: quantity, channel and unit, in English, German and Russian."""
 
 from __future__ import annotations
 
@@ -15,37 +15,52 @@ ANGLE = {"rad": 1.0, "mrad": 1e-3, "deg": WORDS["rad"]["deg"]}
 TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 TEMPERATURE = ("c", "k", "f")
 _UNITS = {
-    "m/s2": "m/s2 m/s^2 m/s² m/s/s mps2 ms-2 ms^-2 m/s**2 m·s⁻² m·s-2 ms⁻²",
-    "g": "g gn g0 g_n", "mg": "mg", "ug": "ug µg μg",
+    "m/s2": "m/s2 m/s^2 m/s² m/s/s mps2 ms-2 ms^-2 m/s**2 m·s⁻² m·s-2 ms⁻² м/с2 м/с^2 м/с²",
+    "g": "g gn g0 g_n", "mg": "mg мg", "ug": "ug µg μg мкg",
     "count": "count counts lsb digit digits raw adc",
-    "rad": "rad radian radians", "mrad": "mrad", "deg": "deg degree degrees grad ° º",
-    "s": "s sec second seconds sekunden", "ms": "ms", "us": "us µs μs", "ns": "ns", "min": "min", "h": "h hours",
-    "c": "°c ºc c degc deg_c celsius ℃", "k": "k kelvin", "f": "°f f degf fahrenheit",
+    "rad": "rad radian radians рад", "mrad": "mrad мрад", "deg": "deg degree degrees grad град град. ° º",
+    "s": "s sec second seconds sekunden с сек", "ms": "ms мс", "us": "us µs μs мкс", "ns": "ns", "min": "min мин",
+    "h": "h hours ч", "c": "°c ºc c degc deg_c celsius ℃ °с", "k": "k kelvin", "f": "°f f degf fahrenheit",
 }  # fmt: skip
 
 
+def _plain(text: str) -> str:
+    """Return a text without accents, the two dots of ä and ё among them."""
+    decomposed = unicodedata.normalize("NFKD", text.replace("ß", "ss"))
+    return "".join(letter for letter in decomposed if not unicodedata.combining(letter))
+
+
 def _words(text: str) -> frozenset[str]:
-    return frozenset(text.split())
+    return frozenset(_plain(text).split())
 
 
 _OF_WORD = {word: unit for unit, words in _UNITS.items() for word in words.split()}
 _SPREAD = _words(
-    "sd std stdev stddev sigma s rms dev deviation standardabweichung streuung stabw stdabw noise rauschen"
+    "sd std stdev stddev sigma s rms dev deviation standardabweichung streuung stabw stdabw noise rauschen "
+    "ско отклонение сигма разброс шум"
 )
 _READING = _words(
     "a acc accl accel acceleration accelerometer accelerometers beschleunigung beschl f force specific reading "
     "readings imu linear mean avg average mittel mittelwert m sensor channel ch kanal messwert out output signal "
-    "value wert raw"
+    "value wert raw ускорение ускорения акселерометр среднее средние показание показания датчик канал значение сигнал"
 )
 _ANGLE = _words(
     "outer middle inner aussen mitte mittlerer innen innere innerer aeussere ausserer angle winkel gimbal roll pitch "
-    "yaw azimuth elevation tilt achse axis q phi theta psi rotation rot table rahmen"
+    "yaw azimuth elevation tilt achse axis q phi theta psi rotation rot table rahmen "
+    "угол рамка рамки ось наружный наружная внешний внешняя внутренний внутренняя крен тангаж курс азимут"
 )
-_TIME = _words("time zeit date datum stamp timestamp uhrzeit datetime elapsed zeitstempel")
-_LENGTH = _words("dwell duration dauer length lange")
-_TEMPERATURE = _words("temp temperature temperatur t")
-_COUNT = _words("count counts n samples num number anzahl messungen stichprobe readings werte")
-_FACE = _words("face side seite position pose orientation lage richtung direction flache")
+_TIME = _words("time zeit date datum stamp timestamp uhrzeit datetime elapsed zeitstempel время дата")
+_LENGTH = _words("dwell duration dauer length lange длительность")
+_TEMPERATURE = _words("temp temperature temperatur t температура темп")
+_COUNT = _words("count counts n samples num number anzahl messungen stichprobe readings werte число количество")
+_FACE = _words("face side seite position pose orientation lage richtung direction flache положение грань")
+_RANKS = (
+    _words("outer aussen aeussere ausserer наружный наружная внешний внешняя"),
+    _words("middle mitte mittlerer средний средняя"),
+    _words("inner innen innere innerer внутренний внутренняя"),
+)
+_CHANNELS = frozenset("xyz123ху")
+_AXES = str.maketrans("123ху", "xyzxy")  # the last two are Cyrillic letters
 _RATE = re.compile(r"(?:deg|degrees?|rad|radians?|°)\s*(?:/|p|per)\s*s|dps")
 _CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z])")
 _LONGEST = 300  # characters of a name: it is looked at in many ways
@@ -90,9 +105,8 @@ def _meaning_of(name: str) -> Meaning:
         return Meaning("", "")
     text, unit = _unit_of(lowered)
     tokens = _tokens(text)
-    channel = next((each for each in tokens if each in "xyz123"), "")
-    channel = channel.translate(str.maketrans("123", "xyz"))
-    words = set(tokens) - set("xyz123")
+    channel = next((each for each in tokens if each in _CHANNELS), "").translate(_AXES)
+    words = set(tokens) - _CHANNELS
     if words & _LENGTH:
         return Meaning("", unit)
     if (words & _TIME and (not unit or unit in TIME)) or (unit in TIME and not channel):
@@ -100,8 +114,7 @@ def _meaning_of(name: str) -> Meaning:
     if words & (_TEMPERATURE - {"t"}) or ("t" in words and unit in TEMPERATURE) or unit == "c":
         return Meaning("temperature", unit if unit in TEMPERATURE else "")
     if unit in ANGLE or (words & _ANGLE and unit not in ACCEL):
-        ranks = ("outer aussen aeussere ausserer", "middle mitte mittlerer", "inner innen innere innerer")
-        rank = next((k + 1 for k, known in enumerate(ranks) if words & set(known.split())), 0)
+        rank = next((k + 1 for k, known in enumerate(_RANKS) if words & known), 0)
         return Meaning("angle", unit if unit in ANGLE else "", rank)
     if words & _SPREAD or {"standard", "deviation"} <= words:
         return Meaning(f"s{channel}" if channel else "sd", unit if unit in ACCEL else "")
@@ -146,9 +159,8 @@ def _is_unit_of(letter: str, name: str) -> bool:
 
 def _tokens(text: str) -> list[str]:
     """Return the words of a name, without accents; a channel that ends a known word becomes a word of its own."""
-    plain = unicodedata.normalize("NFKD", text.replace("ß", "ss")).encode("ascii", "ignore").decode()
     tokens = list[str]()
-    for word in re.findall(r"[a-z]+|\d+", plain):
+    for word in re.findall(r"[a-zа-я]+|\d+", _plain(text)):
         stem, last = word[:-1], word[-1]
         known = stem in _SPREAD | _READING | {"grav"}
         tokens += [stem, last] if last in "xyz" and known else [word]

@@ -44,7 +44,9 @@ _OF_LEAVES = {
 """Packages that nothing else knows, and what registers the figures of their results, when one is to be drawn."""
 
 PROBABILITIES = "What it may be, and with what probability"
-"""Title of the figure that belongs to the verdict."""
+FALL, NO_FALL = "The error falls", "The error of the model"
+ON_THEIR_WAY, DIRECTIONS = "Estimates on their way", "Directions of gravity in the platform"
+"""Titles of figures that a page puts first, or leaves out where another says the same."""
 
 
 @singledispatch
@@ -76,7 +78,7 @@ def _(found: Diagnosis) -> Figures:
 def _(state: Improvement) -> Figures:
     fails = state.start.test.consistent is False
     return {
-        "The error falls" if state.steps else "The error of the model": lambda: improvement(state),
+        FALL if state.steps else NO_FALL: lambda: improvement(state),
         "Residuals of each step": lambda: residuals_of_steps(state),
         "Where the first model fails" if fails else "What the first model leaves": lambda: residuals(state.start),
         "What could still hide": lambda: detection_limits(state.diagnosis),
@@ -87,10 +89,10 @@ def _(state: Improvement) -> Figures:
 def _(result: Calibration) -> Figures:
     return {
         "Sigma after each orientation, NIS and innovations": lambda: convergence(result),
-        "Estimates on their way": lambda: estimates(result),
+        ON_THEIR_WAY: lambda: estimates(result),
         "What each orientation brought": lambda: information(result),
         "Correlations": lambda: correlations(result),
-        "Directions of gravity in the platform": lambda: directions(result),
+        DIRECTIONS: lambda: directions(result),
     }
 
 

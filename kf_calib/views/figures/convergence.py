@@ -17,6 +17,7 @@ from kf_calib.views.figures.style import ACCELEROMETERS, ALARM, BAND, GREY, MARK
 from kf_calib.views.figures.symbols import Shown, with_coefficients
 
 _LOG_FROM = 12.0  # times the upper end of the band; a larger NIS is drawn on a logarithmic axis
+_ROOM = 0.32  # of a panel, for its legend above the points
 _CUT = 12.0  # final sigmas beyond which an estimate on its way is not drawn
 
 
@@ -67,9 +68,9 @@ def draw_nis(axes: Axes, tests: InnovationTests) -> None:
             axes.plot(tests.numbers[chosen], tests.nis[chosen], marker, color=colour, markersize=size, label=name)
     axes.set_title(f"NIS: {int(tests.high[judged].sum())} of {int(judged.sum())} dwells above the band")
     if tests.nis[judged].max() > _LOG_FROM * band[:, 1].max():
-        log_scale(axes, [tests.nis[judged], band])
+        log_scale(axes, [tests.nis[judged], band], room=_ROOM)
     else:
-        axes.set_ylim(0.0, 1.25 * max(tests.nis[judged].max(), band[:, 1].max()))
+        axes.set_ylim(0.0, max(tests.nis[judged].max(), band[:, 1].max()) / (1.0 - _ROOM))
     axes.legend(loc="upper right", fontsize=7.5, labelspacing=0.25)
 
 

@@ -38,9 +38,9 @@ from kf_calib.views.fleet_words import chance_words, short_name
 _WIDE = 4
 _OUTSIDE = 0.01  # chance below which a unit is an outlier
 _NAMED = 30  # units, above which they are numbered and not named
-_TOLD = 8  # verdicts with a colour of their own
+_TOLD = 7  # verdicts with a colour of their own
 _LISTED = 20
-_COLOURS = ("#0072b2", "#e69f00", "#cc79a7", "#009e73", "#56b4e9", "#d55e00", "#f0e442", "#8a4fbf")
+_COLOURS = ("#0072b2", "#e69f00", "#cc79a7", "#009e73", "#56b4e9", "#d55e00", "#f0e442")
 _KNOWN = {"consistent": PALE, "failed": ALARM, "not judged": "#e9e9e9", "inconsistent": GREY}
 
 
@@ -84,7 +84,8 @@ def _population(axes: Axes, names: Sequence[str], track: Track) -> None:
 
 
 def charts(overview: FleetOverview) -> Figure:
-    """A control chart a parameter: each run less the mean of its unit against its date, limits of 2 and 3 sigma."""
+    """A Shewhart chart of individual runs for each parameter: each run less the mean of its unit in the order of dates,
+    with control limits at 3 sigma of a run, pooled over the units, and warning limits at 2."""
     with styled():
         if all(date is None for track in overview.tracks for date in track.dates):
             return _empty("No run has a date, so there is no control chart.")
@@ -97,19 +98,29 @@ def charts(overview: FleetOverview) -> Figure:
 
 
 def _chart(axes: Axes, track: Track) -> None:
+    """Draw one parameter, with the value of each control limit at its end."""
     unit = shown(track.unit)
     kept = np.array([date is not None for date in track.dates]) & np.isfinite(track.deviations)
     dates = date2num([date for date, here in zip(track.dates, kept, strict=True) if here and date is not None])
-    values, scatter = track.deviations[kept] * unit.per_si, track.scatter * unit.per_si
-    for sigmas, style, colour in ((2.0, "--", GREY), (3.0, "-", ALARM)):
+    order = np.argsort(dates, kind="stable")
+    dates, values = dates[order], (track.deviations[kept] * unit.per_si)[order]
+    sigma = track.scatter * unit.per_si
+    axes.axhline(0.0, color=GREY, linewidth=1.0, label="centre line")
+    for sigmas, style, colour, name in ((2.0, ":", GREY, "warning limit, 2σ"), (3.0, "-", ALARM, "control limit, 3σ")):
         for sign in (-1.0, 1.0):
-            axes.axhline(sign * sigmas * scatter, color=colour, linewidth=0.8, linestyle=style,
-                         label=f"{sigmas:.0f} sigma of the scatter")  # fmt: skip
+            axes.axhline(sign * sigmas * sigma, color=colour, linewidth=0.9, linestyle=style, label=name)
+    for sign, name in ((1.0, "UCL"), (-1.0, "LCL")):
+        axes.annotate(f"{name} {unit.number(sign * 3.0 * track.scatter)}".replace("-", "−"), (1.0, sign * 3.0 * sigma),
+                      xytext=(0, 2 if sign > 0 else -2), xycoords=("axes fraction", "data"), textcoords="offset points",
+                      ha="right", va="bottom" if sign > 0 else "top", color=ALARM, fontsize=7.0)  # fmt: skip
     marker, colour = _own(track.symbol)
-    axes.plot(dates, values, marker, color=colour, markersize=3.0, label="run less the mean of its unit")
-    outside = np.abs(values) > 3.0 * scatter
+    axes.plot(dates, values, marker=marker, color=colour, markersize=3.0, linewidth=0.6,
+              label="run less the mean of its unit")  # fmt: skip
+    outside = np.abs(values) > 3.0 * sigma
     axes.plot(dates[outside], values[outside], "o", markersize=8.0, markerfacecolor="none", markeredgecolor=ALARM,
-              label="beyond 3 sigma")  # fmt: skip
+              label="out of control")  # fmt: skip
+    largest = max(float(np.abs(values).max(initial=0.0)), 3.0 * sigma)
+    axes.set_ylim(-1.35 * largest, 1.35 * largest)
     axes.set_title(f"{symbol(track.symbol)}, {unit.label}".rstrip(", "))
 
 

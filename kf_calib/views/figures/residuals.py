@@ -35,7 +35,7 @@ from kf_calib.views.figures.words import rounded_number, wrapped
 
 _SIGNIFICANT, _SOME = 0.01, 0.005  # p-value and share above and below which a driver explains nothing
 _TITLE = 36  # letters in a line of a title
-_PANELS = 8  # drivers in small panels
+_PANELS = 4  # drivers in small panels; the explorer of the report has all
 _MANY = 150  # dwells, above which markers are smaller and bars of sigma are left out
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib
 from matplotlib.axes import Axes
@@ -78,12 +78,16 @@ def blank(width_in: float = 11.0, height_in: float = 7.0) -> Figure:
     return figure
 
 
-def content_of(figure: Figure, kind: str, dpi: float = DPI) -> bytes:
-    """A figure as the bytes of a file of this kind: png, svg or pdf; without date, program or user."""
+def content_of(figure: Figure, kind: str, dpi: float = DPI, letters_as: Literal["path", "none"] = "path") -> bytes:
+    """A figure as the bytes of a file of this kind: png, svg or pdf; without date, program or user.
+
+    letters_as: of an SVG, ``path`` draws letters as they are here, ``none`` leaves them text, in the reader's typeface.
+    """
     nothing = {"svg": {"Date": None, "Creator": None}, "pdf": {"CreationDate": None, "Creator": None, "Producer": None},
                "png": {"Software": None}}  # fmt: skip
     memory = io.BytesIO()
     with styled():
+        matplotlib.rcParams["svg.fonttype"] = letters_as
         figure.savefig(memory, format=kind, dpi=dpi, metadata=nothing[kind])
     return memory.getvalue()
 

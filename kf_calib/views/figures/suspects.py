@@ -83,6 +83,7 @@ def _said(explanation: Explanation) -> str:
 def _alike(diagnosis: Diagnosis) -> list[str]:
     """Return names of suspects and their look-alikes, the best first."""
     names = dict.fromkeys([*diagnosis.missing, *diagnosis.ambiguity, *(each.name for each in diagnosis.suspects)])
+    names.pop(diagnosis.test.effects.walk, None)  # which takes any path, and so overlaps with all
     return list(names)[:_ALIKE]
 
 
@@ -90,7 +91,7 @@ def _overlaps(axes: Axes, diagnosis: Diagnosis, names: Sequence[str]) -> None:
     """Draw the matrix of overlaps with a number in each cell."""
     values = overlap_matrix(diagnosis.test, names)
     if np.isfinite(values).sum() <= 1:
-        return _words(axes, "No other effect explains as much:\nthere are no overlaps to show.")
+        return _words(axes, "No other effect has a shape to compare:\nthere are no overlaps to show.")
     axes.imshow(np.nan_to_num(values), cmap="Greys", vmin=0.0, vmax=1.25, aspect="auto")
     for (row, column), overlap in np.ndenumerate(values):
         text = "–" if np.isnan(overlap) else f"{overlap:.2f}"
@@ -102,9 +103,7 @@ def _overlaps(axes: Axes, diagnosis: Diagnosis, names: Sequence[str]) -> None:
     axes.grid(visible=False)
     axes.spines[:].set_visible(False)
     axes.tick_params(length=0)
-    if diagnosis.test.effects.walk in names:
-        axes.set_xlabel("a random walk can take any path: it overlaps with all", fontsize=8.0, color=GREY)
-    axes.set_title("Overlap of what they add to the readings\n(1.00: this run cannot tell them apart)")
+    axes.set_title("Overlap of what they add to the readings\n(1.00: the same shape, not the same probability)")
 
 
 def _drivers(axes: Axes, drivers: Sequence[Driver]) -> None:

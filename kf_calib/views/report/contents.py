@@ -16,13 +16,15 @@ from kf_calib.estimation.engine_comparison import Comparison
 from kf_calib.estimation.results import Calibration
 from kf_calib.views import console, diagnosis, improvement, side_by_side
 from kf_calib.views.figures import figures
-from kf_calib.views.figures.collection import PROBABILITIES
+from kf_calib.views.figures.collection import DIRECTIONS, FALL, NO_FALL, ON_THEIR_WAY, PROBABILITIES
 from kf_calib.views.report.drawing import Drawing
 from kf_calib.views.report.explorer import Explorer, explorer
 from kf_calib.views.report.measured import Measured, facts
 from kf_calib.views.report.page import Facts, Page, Part, Section, Standing
 from kf_calib.views.report.parts import Paragraph, parts_of
 
+MEASURED = "What was measured"
+"""Title of the section of recordings, benches and noise."""
 _EXPLORED = 3
 """Explanations, at most, of which the explorer offers what they leave."""
 
@@ -40,17 +42,20 @@ def page_of(result: Any, measured: Sequence[Measured], commands: Sequence[str], 
 
 @page_of.register
 def _(diagnosed: Diagnosis, measured: Sequence[Measured], commands: Sequence[str], remarks: Sequence[str] = ()) -> Page:
-    drawn = figures_of("", diagnosed, "found").parts
-    probabilities = tuple(each for each in drawn if isinstance(each, Drawing) and each.title == PROBABILITIES)
+    likely, drawn = (
+        figures_of("Probabilities", diagnosed, "likely", [PROBABILITIES]),
+        figures_of("Residuals", diagnosed, "found", less=[PROBABILITIES]),
+    )
     return Page(
         measured[0].name, "Calibration report", *_standing(diagnosed.test.consistent),
-        (diagnosis.verdict(diagnosed), *remarks), (Facts("", tuple(facts(measured[0], diagnosed.before))),),
+        (diagnosis.verdict(diagnosed), *remarks),
         (
-            Section("", probabilities),
-            Section("Residuals", tuple(each for each in drawn if each not in probabilities)),
+            likely,
+            measured_section(facts(measured[0], diagnosed.before)),
+            drawn,
             Section("Explore the residuals", (_explorer_of(diagnosed),)),
             Section("Parameters", (*_calibrated(diagnosed.before), *_with_what_is_missing(diagnosed))),
-            figures_of("The calibration", diagnosed.before, "run"),
+            figures_of("The calibration", diagnosed.before, "run", less=[ON_THEIR_WAY, DIRECTIONS]),
             Section("Suspects, and what this run could show", _evidence(diagnosed)),
             warnings_of(diagnosed.before.warnings),
         ), tuple(commands),
@@ -59,21 +64,20 @@ def _(diagnosed: Diagnosis, measured: Sequence[Measured], commands: Sequence[str
 
 @page_of.register
 def _(state: Improvement, measured: Sequence[Measured], commands: Sequence[str], remarks: Sequence[str] = ()) -> Page:
-    steps = in_text(improvement.progress(state))
-    stopped, *rest = in_text(improvement.improvement_report(state, None, None))[len(steps) :]
-    assert isinstance(stopped, Paragraph)
-    start, last = state.start.before, state.result
+    start, last, steps = state.start.before, state.result, improvement.progress(state)
     explanation = Explanation(state.effects, start, last, True)
     explained = {f"{last.model.sum}": explanation.unexplained_mps2} if state.steps else {}
+    fall = figures_of("The error, step by step", state, "fall", [FALL, NO_FALL])
     return Page(
         measured[0].name, "Improvement of the model", *_standing(state.diagnosis.test.consistent),
-        (stopped.text, *remarks), (Facts("", tuple(facts(measured[0], last))),),
+        (*improvement.story(state), *remarks),
         (
-            Section("The error, step by step", tuple(steps)),
-            figures_of("Figures of the steps", state, "steps"),
+            Section(fall.title, (*fall.parts, *in_text(steps))),
+            measured_section(facts(measured[0], last)),
+            figures_of("Residuals", state, "steps", less=[FALL, NO_FALL]),
             Section("Explore the residuals", (explorer(start, explained),)),
-            Section("Parameters with the last model", tuple(rest)),
-            figures_of("The calibration with the last model", last, "run"),
+            Section("Parameters with the last model", in_text(improvement.last_parameters(state))),
+            figures_of("The calibration with the last model", last, "run", less=[ON_THEIR_WAY]),
             Section("What is left, and what this run could show", _evidence(state.diagnosis)),
             warnings_of(state.warnings),
         ), tuple(commands),
@@ -86,8 +90,9 @@ def _(compared: Comparison, measured: Sequence[Measured], commands: Sequence[str
     said = f"Filter, filterpy and batch least squares differ by at most {compared.max_difference_sigma:.1e} σ."
     return Page(
         measured[0].name, "Filter against batch", *_standing(result.consistency.consistent),
-        (said, console.verdict(result), *remarks), (Facts("", tuple(facts(measured[0], result))),),
+        (said, console.verdict(result), *remarks),
         (
+            measured_section(facts(measured[0], result)),
             Section("Time, memory and difference", in_text(console.comparison_table(compared), with_notes=True)),
             figures_of("Figures of the comparison", compared, "compared"),
             Section("Parameters", _calibrated(result)),
@@ -107,17 +112,22 @@ def _(pair: SideBySide, measured: Sequence[Measured], commands: Sequence[str], r
     told = [f"{name}: {diagnosis.verdict(each)}" for name, each in zip(names, both, strict=True)]
     table = side_by_side.difference_table(pair.differences, names[0], names[1])
     standing, headline = _standing(pair.second.test.consistent)
-    measurements = [Facts("" if pair.same_recording else name, tuple(facts(own, each.before)))
+    measurements = [("" if pair.same_recording else name, tuple(facts(own, each.before)))
                     for name, own, each in zip(names, recordings, both, strict=True)]  # fmt: skip
     return Page(
         measured[0].name if pair.same_recording else f"{names[1]} beside {names[0]}", "Side by side",
         standing, f"{names[1]}: {headline[0].lower()}{headline[1:]}", (side_by_side.verdict(pair), *told, *remarks),
-        tuple(measurements[1:] if pair.same_recording else measurements),
         (
             Section("Difference of the parameters", tuple(parts_of(table))),
+            Section(MEASURED, (Facts(tuple(measurements[1:] if pair.same_recording else measurements)),)),
             *(_run(name, each, f"found{k}-") for k, (name, each) in enumerate(zip(names, both, strict=True))),
         ), tuple(commands),
     )  # fmt: skip
+
+
+def measured_section(rows: Iterable[tuple[str, str]]) -> Section:
+    """The section of what was measured, a heading and words each."""
+    return Section(MEASURED, (Facts((("", tuple(rows)),)),))
 
 
 def _run(name: str, diagnosed: Diagnosis, prefix: str) -> Section:
@@ -137,12 +147,17 @@ def _standing(consistent: bool | None) -> tuple[Standing, str]:
     return _HEADLINES[consistent]
 
 
-def figures_of(title: str, result: object, prefix: str) -> Section:
-    """Return the section of a result's figures; it has no part where there is no figure of such a result."""
+def figures_of(title: str, result: object, prefix: str, only: Sequence[str] = (), less: Sequence[str] = ()) -> Section:
+    """Return the section of a result's figures, of those alone or but for those of some titles.
+
+    It has no part where there is no figure of such a result.
+    """
     known = figures.dispatch(type(result)) is not figures.dispatch(object)
     drawn = figures(result) if known else {}
-    return Section(title, tuple(Drawing(name, draw(), f"{prefix}{k}")
-                                for k, (name, draw) in enumerate(drawn.items())))  # fmt: skip
+    return Section(title, tuple(
+        Drawing(name, draw, f"{prefix}{k}") for k, (name, draw) in enumerate(drawn.items())
+        if name not in less and (not only or name in only)
+    ))  # fmt: skip
 
 
 def _explorer_of(diagnosed: Diagnosis) -> Explorer:

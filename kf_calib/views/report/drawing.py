@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import io
+import os
 import re
+import signal
+import sys
+import warnings
 from base64 import b64decode, b64encode
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from multiprocessing import get_context
 from typing import ClassVar
 
 import numpy as np
 from matplotlib.artist import Artist
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.collections import Collection, QuadMesh
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
@@ -20,26 +26,32 @@ from PIL import Image
 
 from kf_calib.views.figures.style import content_of, styled
 
-_MOST = 1_200_000  # characters of all figures of a page
-_MANY = 60  # points of one kind in a panel that are
+_MOST = 200_000  # characters of a figure
+_MOST_PROCESSES = 8  # that draw: no figure is so small that more would be quicker
+_MANY = 150  # points of one kind in a panel that are
 _PICTURE_DPI = 150
-_LAYOUT_DPI = 600  # letters are as wide as in SVG, not moved to whole pixels
+_POINTS = 72  # an inch, the unit of SVG
 _COLOUR = re.compile(r"\b(fill|stroke|stop-color): #([0-9a-f]{6})\b")
 _PICTURE = re.compile(r"(?<=data:image/png;base64,)[\w+/=\s]+")
 _SHADES = 64  # of a picture of points, which are few colours and their edges
 _BETWEEN = re.compile(r"<metadata>.*?</metadata>|<!--.*?-->|\s*\n\s*", re.DOTALL)
 _GROUP = re.compile(r'<g id="[^"]*"')  # nothing refers to the name of a group
 _NAME = re.compile(r'(\bid="|href="#|url\(#)')
-_PLACES = re.compile(r' (?:d|x|y)="[^"]*"')
-_LETTER = re.compile(r'(<use href="#[^"]*") transform="translate\(([-\d.]+) 0\)"')
+_PLACES = re.compile(r' (?:d|x|y|transform)="[^"]*"')
+_TYPEFACE = re.compile(r" font-family: [^;\"]*;?")  # which the page states once
+_UNTURNED = re.compile(r' transform="rotate\(-?0 [^"]*"')
 _MARKS = re.compile(r'<g([^>]*)>((?:<use [^>]* style="[^"]*"/>)+)</g>')
 _STYLE = re.compile(r' style="[^"]*"')
-_DECIMALS = re.compile(r"(\d\.\d\d)\d+")  # more than a screen or printer shows; not of scales, which multiply
+_DECIMALS = re.compile(r"(\d\.\d\d)\d+")  # more than a screen or printer shows
+
+_given = list["Drawing"]()
+"""What a copy of the process draws."""
 
 
 @dataclass(eq=False)
 class Drawing:
-    """A figure in a page, with the title that says what is to be seen; names in its SVG begin with ``prefix``.
+    """A figure in a page, with the title that says what is to be seen, and what draws it; names in its markup begin
+    with ``prefix``. Markup is there once it is drawn.
 
     A grey of the figure is mixed of the page's ``--ink`` and ``--paper``, black being ink alone; of other colours
     ``--keep`` says how much is kept beside white. On white paper with black ink, colours are those of the figure.
@@ -48,57 +60,84 @@ class Drawing:
 
     kind: ClassVar[str] = "drawing"
     title: str
-    figure: Figure
+    draw: Callable[[], Figure]
     prefix: str
-    on_white: bool = False
     markup: str = ""
-
-    def __post_init__(self) -> None:
-        self.on_white = any(isinstance(each, AxesImage | QuadMesh) for axes in self.figure.axes
-                            for each in axes.get_children())  # fmt: skip
-        for patch in (self.figure.patch, *(axes.patch for axes in self.figure.axes)):
-            patch.set_visible(False)
-        _arrange(self.figure)
-        self.markup = _element(self.figure, self.prefix, self.on_white)
-
-    def with_points_as_picture(self) -> None:
-        """Draw again, the points of each kind as a picture where there are many."""
-        for axes in self.figure.axes:
-            for artist in axes.get_children():
-                artist.set_rasterized(_is_of_many_points(artist))
-        self.markup = _element(self.figure, self.prefix, self.on_white)
-
-    def as_picture(self) -> None:
-        """Draw again, all of it as a picture, on white in the dark, too."""
-        self.figure.patch.set_visible(True)
-        content = b64encode(_of_few_shades(content_of(self.figure, "png", _PICTURE_DPI))).decode()
-        self.markup, self.on_white = f'<img alt="" src="data:image/png;base64,{content}">', True
+    on_white: bool = False
 
 
-def fit(drawings: Sequence[Drawing], most: int = _MOST) -> None:
-    """Make pictures of points, and then of whole figures, the largest first, until all have ``most`` characters."""
-    for smaller in (Drawing.with_points_as_picture, Drawing.as_picture):
-        for heavy in sorted(drawings, key=lambda heavy: -len(heavy.markup)):
-            if sum(len(drawing.markup) for drawing in drawings) <= most:
-                return
-            smaller(heavy)
+def draw_all(drawings: Sequence[Drawing]) -> None:
+    """Draw each figure once, and keep its markup alone; copies of this process draw on all cores.
+
+    Where a running process cannot be copied, as on Windows, this one draws: a new one would take as long to begin.
+    """
+    processes = min(_cores(), len(drawings))
+    if processes <= 1:
+        markups = [_markup(drawing.draw, drawing.prefix) for drawing in drawings]
+    else:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # of threads of BLAS, which is ready to be copied
+            pool = get_context("fork").Pool(processes, initializer=_be_given, initargs=(drawings,))
+        with pool:
+            markups = pool.map(_markup_of_given, range(len(drawings)), chunksize=1)
+    for drawing, (markup, on_white) in zip(drawings, markups, strict=True):
+        drawing.markup, drawing.on_white = markup, on_white
+
+
+def _cores() -> int:
+    """Return how many processes may draw at once."""
+    return min(len(os.sched_getaffinity(0)), _MOST_PROCESSES) if sys.platform == "linux" else 1
+
+
+def _be_given(drawings: Sequence[Drawing]) -> None:
+    """Take over what a copy of the process draws; Ctrl-C is for the process that waits for it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _given[:] = drawings
+
+
+def _markup_of_given(k: int) -> tuple[str, bool]:
+    return _markup(_given[k].draw, _given[k].prefix)
+
+
+def _markup(draw: Callable[[], Figure], prefix: str) -> tuple[str, bool]:
+    """Return a figure's markup, and whether it stands on white.
+
+    Points of a kind are a picture where there are many in a panel, and the whole figure is one where it would be larger
+    than ``_MOST``.
+    """
+    figure = draw()
+    artists = [each for axes in figure.axes for each in axes.get_children()]
+    for artist in artists:
+        artist.set_rasterized(_is_of_many_points(artist))
+    for patch in (figure.patch, *(axes.patch for axes in figure.axes)):
+        patch.set_visible(False)
+    _arrange(figure)
+    on_white = any(isinstance(artist, AxesImage | QuadMesh) for artist in artists)
+    markup = _element(figure, prefix, on_white)
+    return (markup, on_white) if len(markup) <= _MOST else (_picture(figure), True)
 
 
 def _arrange(figure: Figure) -> None:
-    """Give the panels their places once: else each time that it is saved, which draws all of it twice."""
+    """Give the panels their places once, with letters as wide as in SVG: savefig would draw all of it to do so."""
     engine = figure.get_layout_engine()
     with styled():
+        figure.set_dpi(_POINTS)
+        FigureCanvasSVG(figure)
         if engine is not None:
-            dpi = figure.get_dpi()
-            figure.set_dpi(_LAYOUT_DPI)
             engine.execute(figure)
-            figure.set_dpi(dpi)
         figure.set_layout_engine(None)
+
+
+def _picture(figure: Figure) -> str:
+    """Return the element of a figure that is a picture, all of it."""
+    figure.patch.set_visible(True)
+    content = b64encode(_of_few_shades(content_of(figure, "png", _PICTURE_DPI))).decode()
+    return f'<img alt="" src="data:image/png;base64,{content}">'
 
 
 def _element(figure: Figure, prefix: str, on_white: bool) -> str:
     """Return the ``svg`` element, as wide as its place, with the colours that it uses defined in its style."""
-    text = _short(content_of(figure, "svg", _PICTURE_DPI).decode())
+    text = _short(content_of(figure, "svg", _PICTURE_DPI, letters_as="none").decode())
     colours = sorted({colour for _, colour in _COLOUR.findall(text)})
     mixed = "; ".join(f"--c{colour}: {f'#{colour}' if on_white else _mixture(colour)}" for colour in colours)
     mixed += "; fill: #000000" * on_white
@@ -110,7 +149,7 @@ def _short(text: str) -> str:
     """Return the ``svg`` element of a file of matplotlib's with all that is seen, in half as many characters."""
     text = _GROUP.sub("<g", _BETWEEN.sub("", text[text.index("<svg") :]))
     text = re.sub(r' (width|height)="[\d.]+pt"', "", text, count=2).replace("xlink:href", "href")
-    text = _LETTER.sub(r'\1 x="\2"', text.replace("DejaVuSans-", ""))
+    text = _UNTURNED.sub("", _TYPEFACE.sub("", text))
     return _MARKS.sub(_with_one_style, _PLACES.sub(lambda found: _DECIMALS.sub(r"\1", found[0]), text))
 
 

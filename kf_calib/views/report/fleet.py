@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import kf_calib.views.figures.fleet  # noqa: F401  # registers the figures of a fleet
 from kf_calib.fleet.overview import FleetOverview
 from kf_calib.views import pooled_diagnosis
-from kf_calib.views.report.contents import figures_of, in_text, warnings_of
-from kf_calib.views.report.page import Facts, Page, Section, Standing
+from kf_calib.views.report.contents import figures_of, in_text, measured_section, warnings_of
+from kf_calib.views.report.page import Page, Section, Standing
 from kf_calib.views.report.parts import Paragraph
 
 
@@ -19,8 +19,8 @@ def fleet_page(overview: FleetOverview, commands: Sequence[str]) -> Page:
     standing, headline = _standing_of(overview)
     return Page(
         overview.name, "Fleet report", standing, headline, tuple(said),
-        (Facts("", tuple(_facts_of(overview))),),
         (
+            measured_section(_facts_of(overview)),
             figures_of("The runs together", overview, "fleet"),
             Section("Effects that all runs show", tuple(each for each in together if not isinstance(each, Paragraph))),
             warnings_of(overview.remarks),

@@ -7,12 +7,12 @@ from base64 import b64encode
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 from markupsafe import Markup
 
 from kf_calib.support.output_files import write_whole
-from kf_calib.views.report.drawing import Drawing, fit
+from kf_calib.views.report.drawing import Drawing, draw_all
 from kf_calib.views.report.explorer import Explorer
 from kf_calib.views.report.parts import Paragraph, Table
 from kf_calib.views.report.templates import filled_in, own_text
@@ -20,7 +20,15 @@ from kf_calib.views.report.templates import filled_in, own_text
 Standing = Literal["agrees", "disagrees", "open"]
 
 
-Part = Paragraph | Table | Drawing | Explorer
+@dataclass(frozen=True)
+class Facts:
+    """What was measured, a heading and words each, of each recording by its name; one alone needs none."""
+
+    kind: ClassVar[str] = "facts"
+    of: tuple[tuple[str, tuple[tuple[str, str], ...]], ...]
+
+
+Part = Paragraph | Table | Drawing | Explorer | Facts
 
 
 @dataclass(frozen=True)
@@ -29,14 +37,6 @@ class Section:
 
     title: str
     parts: tuple[Part, ...]
-
-
-@dataclass(frozen=True)
-class Facts:
-    """What was measured: a heading and words each; title: of which recording, where there are two."""
-
-    title: str
-    rows: tuple[tuple[str, str], ...]
 
 
 @dataclass(frozen=True)
@@ -49,14 +49,13 @@ class Page:
     standing: Standing
     headline: str
     verdict: tuple[str, ...]
-    facts: tuple[Facts, ...]
     sections: tuple[Section, ...]
     commands: tuple[str, ...]
 
     @property
     def html(self) -> str:
         """The whole page; what comes from recordings is escaped, and no script runs but the page's own."""
-        fit([part for section in self.sections for part in section.parts if isinstance(part, Drawing)])
+        draw_all([part for section in self.sections for part in section.parts if isinstance(part, Drawing)])
         scripts = [own_text("uPlot.iife.min.js"), own_text("explorer.js")]
         return filled_in(
             "page.html",

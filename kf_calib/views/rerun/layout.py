@@ -124,7 +124,7 @@ def _platform(result: Calibration) -> rrb.Spatial3DView:
     ]
     return rrb.Spatial3DView(
         origin="platform",
-        name=f"platform: E₁ E₂ E₃{magnified(result.estimate)}; up now and before",
+        name=f"platform{magnified(result.estimate)}",
         overrides={"platform/visited": rrb.VisibleTimeRanges(so_far)},
         eye_controls=eye(result.bench, (1.8, 1.2, 2.2), (0.05, 0.18, 0.0)),
         line_grid=False,

@@ -64,7 +64,7 @@ def ellipsoids_of(estimate: Estimate) -> list[Ellipsoid]:
 def magnified(estimate: Estimate) -> str:
     """What the title of the view says of the ellipsoids."""
     factor = magnification(ellipsoids_of(estimate))
-    return f" with 1σ ×{number(factor)}" if factor else ""
+    return f", axes with 1σ ×{number(factor)}" if factor else ""
 
 
 def _axes(estimate: Estimate) -> Floats:

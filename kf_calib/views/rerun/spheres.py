@@ -43,8 +43,7 @@ def spheres(origin: str, columns: int) -> rrb.Spatial3DView:
     """The view of three spheres, one below the other, in each column."""
     beside = 0.5 * (columns - 1) * _PITCH
     eye = rrb.EyeControls3D(position=(beside, -0.6 * _PITCH, 8.2), look_target=(beside, -_PITCH, 0.0), eye_up=(0, 1, 0))
-    named = "; right: what is left" if columns > 1 else ""
-    name = f"residual by direction of gravity: blue −4σ, orange +4σ{named}"
+    name = f"blue −4σ, orange +4σ{'; right: left over' if columns > 1 else ''}"  # longer titles are cut off
     return rrb.Spatial3DView(origin=origin, name=name, line_grid=False, eye_controls=eye)
 
 

@@ -100,6 +100,15 @@ def test_a_german_spreadsheet_is_understood_without_a_word() -> None:
     assert kf_calib.calibrate(table).consistency.consistent
 
 
+def test_a_spreadsheet_of_russian_windows_is_read(tmp_path: Path) -> None:
+    header = HEADER.replace("outer", "Наружный").replace("ax", "Среднее X").replace("sd", "СКО")
+    (tmp_path / "ru.csv").write_text("\n".join([header, *LINES]), encoding="cp1251")
+    (tmp_path / "plain.csv").write_text(PLAIN)
+    one, other = (kf_calib.open_table(tmp_path / name, BENCH).orientations for name in ("plain.csv", "ru.csv"))
+    assert [each.mean_mps2.tolist() for each in one] == [each.mean_mps2.tolist() for each in other]
+    np.testing.assert_array_equal([each.sigma_mps2 for each in one], [each.sigma_mps2 for each in other])
+
+
 def test_local_gravity_as_the_unit_changes_scale_and_bias_alike() -> None:
     standard, local = (
         kf_calib.calibrate(kf_calib.open_table(TWELVE, BENCH, g_unit=unit)) for unit in ("9.80665", "local")
@@ -127,6 +136,8 @@ WRITTEN = {
     "comments": "# measured on Monday\n" + PLAIN,
     "other names": PLAIN.replace(HEADER,
                                  "outer_deg,middle_deg,inner_deg,Acc1 (g),Acc2 (g),Acc3 (g),Stabw. [mg],Anzahl"),
+    "names in Russian": PLAIN.replace(HEADER, "наружный [град],средний [град],внутренний [град],Среднее X [g],"
+                                      "Среднее Y [g],Среднее Z [g],СКО [мg],Число"),
     "other order": "\n".join(",".join(line.split(",")[::-1]) for line in PLAIN.splitlines()),
     "minus of a typesetter": PLAIN.replace("-0", "−0").replace("-1", "−1"),
     "no unit at all": PLAIN.replace(" [deg]", "").replace(" [g]", ""),
@@ -283,7 +294,13 @@ def test_noise_that_nothing_shows_is_refused() -> None:
     [
         ("ax", "ax", ""), ("acc_y_g", "ay", "g"), ("Acc1 (g)", "ax", "g"), ("AccZ_mps2", "az", "m/s2"),
         ("accel_x_m/s^2", "ax", "m/s2"), ("fx in g", "ax", "g"), ("3", "az", ""), ("ax std", "sx", ""),
-        ("Std. Dev. X", "sx", ""), ("Stabw. y [mg]", "sy", "mg"), ("sd_g", "sd", "g"), ("N readings", "count", ""),
+        ("Std. Dev. X", "sx", ""), ("Stabw. y [mg]", "sy", "mg"),
+        ("Standardabweichung z [mg]", "sz", "mg"), ("Mittelwert x", "ax", ""), ("СКО X, мg", "sx", "mg"),
+        ("Стандартное отклонение у [мg]", "sy", "mg"), ("Среднее X [м/с²]", "ax", "m/s2"),
+        ("Среднее квадратическое отклонение Z", "sz", ""), ("Ускорение Х, мg", "ax", "mg"),
+        ("Показания акселерометра 2", "ay", ""), ("Температура, °С", "temperature", "c"), ("Время, с", "time", "s"),
+        ("Число измерений", "count", ""), ("Угол наружной рамки, град", "angle", "deg"), ("Положение", "face", ""),
+        ("Примечание", "", ""), ("Длительность, с", "", "s"), ("sd_g", "sd", "g"), ("N readings", "count", ""),
         ("T (°C)", "temperature", "c"), ("t [s]", "time", "s"), ("Datum", "time", ""), ("x_deg", "angle", "deg"),
         ("Winkel außen [°]", "angle", "deg"), ("acc_z_raw", "az", "count"), ("Lage", "face", ""), ("note", "", ""),
         ("gyro x", "", ""), ("dwell [s]", "", "s"),

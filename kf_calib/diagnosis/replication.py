@@ -1,0 +1,239 @@
+"""Replication: whether what one half of the dwells names lowers the error of the other half, which it never saw.
+
+The orientations are divided in two, every second one in the order of their first visit. The linear tests choose an
+effect from one half alone and estimate its coefficients c there; with these, and with the parameters of the model from
+the same half, it predicts the other. Let d be by how much the effect changes this prediction, r the innovation without
+it, and S its covariance. If the effect is taken into account, chi-squared of the unseen half falls by
+
+  2 d^T S^-1 r - d^T S^-1 d
+
+Where nothing of it is true, the score d^T S^-1 r is normal with the variance d^T S^-1 d, whatever the choosing half
+was; where the effect has the size found, this is its mean, too. With rows [H | G | z] and P the projection off H, all
+follow from one matrix, that of all rows less that of the choosing half:
+
+  [G z]^T P [G z] - [G z]_seen^T P_seen [G z]_seen
+
+Both halves choose in turn. As they then judge each other, their p-values depend on each other; e times their geometric
+mean holds for any dependence (V. Vovk and R. Wang, 2020).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.diagnosis.evidence import size_evidence
+from kf_calib.dwells.qr import triangle
+from kf_calib.effects import Effect
+from kf_calib.estimation.complement import Complement
+from kf_calib.estimation.cross_validation import orientations
+from kf_calib.estimation.results import Calibration, Consistency
+from kf_calib.estimation.score_test import Frame, Scan, scan_of, slices
+from kf_calib.support.tail_probabilities import LEVEL, f_tail
+
+FEWEST = 12
+"""Dwells that a run needs to be divided."""
+
+_SEEN = 1e-6  # as in ``score_test``: what the model leaves of a direction that is seen
+
+Answer = Literal["yes", "no", "cannot tell"]
+
+
+@dataclass(frozen=True)
+class UnseenHalf:
+    """A half of the dwells, predicted by what the other half named.
+
+    - dwells: their numbers. named: the effects that the other half chose; relevant: whether they are among those that
+      the verdict names or leaves open.
+    - fall: of chi-squared of this half by the prediction. predicted: the same as the size in the choosing half has it.
+    - p_value: that noise lets the prediction do as well. p_less: that the size found lets it do as badly.
+    """
+
+    dwells: tuple[int, ...]
+    named: tuple[str, ...]
+    relevant: bool
+    fall: float
+    predicted: float
+    p_value: float
+    p_less: float
+
+
+@dataclass(frozen=True)
+class Replication:
+    """Both halves; empty where the dwells are too few to be divided, or where no prediction can be made."""
+
+    halves: tuple[UnseenHalf, ...] = ()
+
+    @property
+    def relevant(self) -> tuple[UnseenHalf, ...]:
+        """The halves that were predicted by an effect of the verdict."""
+        return tuple(half for half in self.halves if half.relevant)
+
+    @property
+    def fall(self) -> float:
+        """Fall of chi-squared of dwells that choosing never saw, by effects of the verdict."""
+        return sum(half.fall for half in self.relevant)
+
+    @property
+    def predicted(self) -> float:
+        """The same as the sizes in the choosing halves have it."""
+        return sum(half.predicted for half in self.relevant)
+
+    @cached_property
+    def p_value(self) -> float:
+        """That noise lets predictions do as well; 1 without a prediction."""
+        return _combined([half.p_value if half.relevant else 1.0 for half in self.halves])
+
+    @cached_property
+    def p_less(self) -> float:
+        """That the sizes found let the same predictions do as badly."""
+        return _combined([half.p_less if half.relevant else 1.0 for half in self.halves])
+
+    @property
+    def answer(self) -> Answer:
+        """Whether the verdict replicates: a significant fall, or significantly less than predicted, or neither."""
+        if self.p_value < LEVEL and self.fall > 0.0:
+            return "yes"
+        return "no" if self.p_less < LEVEL else "cannot tell"
+
+
+def _combined(p_values: Sequence[float]) -> float:
+    """Return e times the geometric mean of p-values, at most 1; 1 of none."""
+    return min(1.0, math.e * math.exp(float(np.mean(np.log(np.maximum(p_values, 1e-300)))))) if p_values else 1.0
+
+
+def replication(
+    before: Calibration, frame: Frame, relevant: Sequence[str], count: int, left: Consistency
+) -> Replication:
+    """The replication of a verdict.
+
+    before: the run without what is missing, in the noise that it leaves. frame: the columns of the candidates in this
+    noise. relevant: names of the effects that the verdict names or leaves open. count: how many it names. left: the
+    test of the misfit that they leave, by which noise is enlarged.
+    """
+    groups, ends = orientations(before.fit.dwells), frame.ends
+    if len(before.fit.dwells) < FEWEST or ends is None or not {str(effect) for effect in frame.effects} & {*relevant}:
+        return Replication()
+    noise = max(1.0, left.statistic / left.dof) if left.dof > 0 else 1.0
+    halves = [sorted(k for group in groups[first::2] for k in group) for first in (0, 1)]
+    rows = _DividedRows(before, frame, halves, noise)
+    if not rows.both_determine:
+        return Replication()
+    numbers = [dwell.number for dwell in before.fit.dwells]
+    unseen = list[UnseenHalf]()
+    for seen in (0, 1):
+        choice = rows.choice(seen, count)
+        names = tuple(str(effect) for effect in choice.effects)
+        figures = rows.prediction(seen, choice, max(left.dof, 1))
+        of_verdict = bool({*names} & {*relevant})
+        unseen.append(UnseenHalf(tuple(numbers[k] for k in halves[1 - seen]), names, of_verdict, *figures))
+    return Replication(tuple(unseen))
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """What a half chose: effects, which columns of the frame they have, and their coefficients (q,) with covariance."""
+
+    effects: tuple[Effect, ...]
+    columns: Floats
+    coefficients: Floats
+    covariance: Floats
+
+
+class _DividedRows:
+    """The whitened rows [H | W | z] of a run, divided by dwells; rows of prior knowledge about W belong to both
+    halves."""
+
+    def __init__(self, before: Calibration, frame: Frame, halves: Sequence[Sequence[int]], noise: float) -> None:
+        linearised, ends = before.linearised, frame.ends
+        assert ends is not None
+        self._frame, self._in_model, self._noise = frame, linearised.model.parts, noise
+        self._rows, self._width = frame.whitened_model(linearised)
+        prior = np.arange(ends[0])
+        self._places = [np.concatenate([prior, *(np.arange(ends[k], ends[k + 1]) for k in half)]) for half in halves]
+        self._complement = Complement(self._rows, self._width)
+        self._complements = [Complement(self._rows[places], self._width) for places in self._places]
+
+    @property
+    def both_determine(self) -> bool:
+        """Whether each half determines what the whole run does."""
+        ranks = [_rank(self._rows[places][:, : self._width]) for places in (slice(None), *self._places)]
+        return min(ranks) == max(ranks)
+
+    def choice(self, seen: int, count: int) -> _Choice:
+        """The likeliest effect by the linear tests in one half alone, and those that are likeliest beside it."""
+        numbers = [k for k, effect in enumerate(self._frame.effects) if str(effect) not in self._in_model]
+        effects = [self._frame.effects[k] for k in numbers]
+        places = self._places[seen]
+        coordinates = [self._frame.coordinates[:, self._frame.parts[k]] for k in numbers]
+        columns = self._frame.basis[places] @ np.concatenate(coordinates, axis=1)
+        parts = slices([each.shape[1] for each in coordinates])
+        left = self._complements[seen].of(np.column_stack([columns, self._rows[places][:, -1]]))
+        scan = scan_of(triangle(left), np.linalg.norm(columns, axis=0), effects, [p.stop - p.start for p in parts])
+        chosen = list[int]()
+        while len(chosen) < count:
+            chosen.append(_likeliest(scan, chosen, self._noise))
+        joined = np.concatenate([np.arange(parts[k].start, parts[k].stop) for k in chosen])
+        sizes = np.linalg.norm(columns[:, joined], axis=0)
+        sizes = np.where(sizes > 0.0, sizes, 1.0)
+        basis, singular, right = np.linalg.svd(left[:, joined] / sizes, full_matrices=False)
+        determined = singular > _SEEN
+        inverse = (right[determined].T / singular[determined]) @ basis[:, determined].T / sizes[:, None]
+        whole = np.hstack([self._frame.basis @ coordinates[k] for k in chosen])
+        return _Choice(tuple(effects[k] for k in chosen), whole, inverse @ left[:, -1], inverse @ inverse.T)
+
+    def prediction(self, seen: int, choice: _Choice, dof: int) -> tuple[float, float, float, float]:
+        """Fall of chi-squared of the unseen half by a choice, the fall predicted, and the p-values of both."""
+        both = np.column_stack([choice.columns, self._rows[:, -1]])
+        of_all, of_seen = self._complement.of(both), self._complements[seen].of(both[self._places[seen]])
+        gram = of_all.T @ of_all - of_seen.T @ of_seen
+        matrix, coefficients = gram[:-1, :-1], choice.coefficients
+        pull, score = matrix @ coefficients, float(gram[-1, :-1] @ coefficients)
+        square, unsure = float(pull @ coefficients), float(pull @ choice.covariance @ pull)
+        if square <= 0.0:
+            return 0.0, 0.0, 1.0, 1.0
+        expected = square - float(np.trace(matrix @ choice.covariance))
+        more = _one_sided(score / math.sqrt(self._noise * square), dof)
+        less = _one_sided((expected - score) / math.sqrt(self._noise * (square + unsure)), dof)
+        return 2.0 * score - square, 2.0 * expected - square, more, less
+
+
+def _likeliest(scan: Scan, beside: Sequence[int], noise: float) -> int:
+    """Return the number of the likeliest candidate of the likeliest effect, beside one that was chosen.
+
+    noise: the variance of what is left, by which falls of chi-squared are divided.
+    """
+    statistics = (scan.beside(beside[-1]) if beside else scan.statistics) / noise
+    dofs = np.array([candidate.dof for candidate in scan.candidates])
+    logs = np.full(len(dofs), -np.inf)
+    for dof in set(dofs[dofs > 0].tolist()):
+        logs[dofs == dof] = size_evidence(dof, statistics[dofs == dof])
+    taken, values = {str(scan.candidates[k].effect) for k in beside}, dict[str, list[int]]()
+    for k in np.flatnonzero(np.isfinite(logs)).tolist():
+        if str(scan.candidates[k].effect) not in taken:
+            values.setdefault(str(scan.candidates[k].effect), []).append(k)
+    means = {
+        name: float(np.logaddexp.reduce(logs[own])) - math.log(len(own) / scan.candidates[own[0]].effect.prior)
+        for name, own in values.items()
+    }
+    best = values[max(means, key=lambda name: means[name])]
+    return best[int(np.argmax(logs[best]))]
+
+
+def _rank(columns: Floats) -> int:
+    """Return the number of directions that rows determine, columns of zeros left out."""
+    sizes = np.linalg.norm(columns, axis=0)
+    singular = np.linalg.svd(columns[:, sizes > 0.0] / sizes[sizes > 0.0], compute_uv=False)
+    return int(np.sum(singular > 1e-4 * singular[0]))
+
+
+def _one_sided(t: float, dof: float) -> float:
+    """Return the probability that Student's t exceeds this."""
+    tail = 0.5 * f_tail(1.0, dof, t * t)
+    return tail if t > 0.0 else 1.0 - tail
