@@ -42,8 +42,7 @@ if TYPE_CHECKING:
     from kf_calib.estimation.engine_comparison import compare
     from kf_calib.estimation.results import Calibration, Parameter
     from kf_calib.estimation.settings import Settings
-    from kf_calib.exchange.calibration_file import SavedCalibration, save_calibration
-    from kf_calib.exchange.calibration_file import read as open_calibration
+    from kf_calib.exchange.calibration_file import SavedCalibration, open_calibration, save_calibration
     from kf_calib.fleet.results import Fleet
     from kf_calib.fleet.results import Fleet as open_fleet
     from kf_calib.online.running_filter import Running
@@ -55,7 +54,7 @@ if TYPE_CHECKING:
     from kf_calib.sources.tables.opening import open_table
     from kf_calib.support.units import shown_in
     from kf_calib.views import figures as plot
-    from kf_calib.views.rerun import save as save_view
+    from kf_calib.views.rerun import save_view
 
 _HOMES = {
     "Bench": ("bench.bench", "Bench"),
@@ -67,7 +66,7 @@ _HOMES = {
     "Corrected": ("estimation.correction", "Corrected"),
     "Correction": ("estimation.correction", "Correction"),
     "SavedCalibration": ("exchange.calibration_file", "SavedCalibration"),
-    "open_calibration": ("exchange.calibration_file", "read"),
+    "open_calibration": ("exchange.calibration_file", "open_calibration"),
     "save_calibration": ("exchange.calibration_file", "save_calibration"),
     "Fleet": ("fleet.results", "Fleet"),
     "open_fleet": ("fleet.results", "Fleet"),
@@ -85,7 +84,7 @@ _HOMES = {
     "open_log": ("sources.files.lines", "Lines"),
     "open_recording": ("sources.files.recording", "Recording"),
     "open_table": ("sources.tables.opening", "open_table"),
-    "save_view": ("views.rerun", "save"),
+    "save_view": ("views.rerun", "save_view"),
     "shown_in": ("support.units", "shown_in"),
     "Watch": ("online.sequential_test", "Watch"),
 }

@@ -26,6 +26,7 @@ COMMANDS: dict[str, tuple[object, ...]] = {
     "report": (HIDDEN, "--against", HIDDEN.with_name("navigation_24.mcap")),
     "certificate": ("cal.json", "-o", "certificate.pdf"),
     "live": ("sim://?speed=500&orientations=6&dwell_s=4&slew_degps=360&sample_hz=20",),
+    "run": ("--positioner", "sim://?sample_hz=20&seed=4", "--target", "K=20ppm"),
     "live --no-angles": ("sim://?speed=500&orientations=14&dwell_s=4&slew_degps=360&sample_hz=20",),
     "simulate": ("made.mcap", *QUICK),
     "record": ("recorded.mcap", "lines.csv", "--axes", "y z x", "--gravity", "9.81"),
@@ -63,7 +64,9 @@ def test_keys_are_those_of_the_page(command: str, run: Any, tmp_path: Path, monk
     assert missing == set()
     if command == "live --no-angles":
         documented |= documented_keys("replay")
-    if command == "live":
+    if command == "run":
+        documented |= documented_keys("live")
+    if command in ("live", "run"):
         documented |= documented_keys("replay") | documented_keys("diagnose")
     assert set(printed) - {re.split(r"[.\[]", key)[0] for key in documented} == set()
 

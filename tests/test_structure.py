@@ -156,6 +156,33 @@ def test_nothing_lies_beside_the_packages() -> None:
         assert ast.get_docstring(ast.parse(text)), package
 
 
+SEVERAL = {"Table", "Quantity", "Standing", "Cell", "Course", "Look", "Times", "Part"}
+"""Names of classes that stand for several things still, each in a room of its own: none may come to them."""
+VERBS = {"read", "write", "save", "save_view", "load", "open", "check", "parse"}
+
+
+def named(node: ast.stmt) -> set[str]:
+    """The public names that a statement at the top of a module gives: classes, functions, aliases of types."""
+    if isinstance(node, ast.ClassDef | ast.FunctionDef):
+        return set() if node.name.startswith("_") else {node.name}
+    targets = node.targets if isinstance(node, ast.Assign) else []
+    names = {target.id for target in targets if isinstance(target, ast.Name)}
+    return {name for name in names if name[0].isupper() and name != name.upper()}
+
+
+def test_one_name_stands_for_one_thing() -> None:
+    """Every class in the whole package, and every verb that says nothing of its object; ``plot.save`` is public."""
+    homes: dict[str, set[str]] = {}
+    for module, path in MODULES.items():
+        for node in ast.parse(path.read_text()).body:
+            for name in named(node):
+                homes.setdefault(name, set()).add(module)
+    classes = {name for name, where in homes.items() if name[0].isupper() and len(where) > 1}
+    assert classes <= SEVERAL, {name: homes[name] for name in classes - SEVERAL}
+    verbs = {name: where for name, where in homes.items() if name in VERBS and len(where) > 1}
+    assert verbs == {"save": {"kf_calib.views.figures.collection", "kf_calib.views.report.page"}}
+
+
 def test_import_is_cheap_and_leaves_filterpy_and_rerun_alone() -> None:
     code = "import sys, kf_calib; print(*[m for m in ('filterpy', 'rerun', 'scipy', 'matplotlib') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -27,10 +27,8 @@ from typing import Any
 
 from kf_calib.cli.evaluate import replay
 from kf_calib.cli.fleet import SingleCommands
-from kf_calib.fleet.batch import cluster, evaluate_all
-from kf_calib.fleet.evaluation import Evaluation
-from kf_calib.fleet.run_list import Run, runs_of
-from kf_calib.fleet.run_row import Row
+from kf_calib.fleet.batch import RunEvaluation, cluster, evaluate_all
+from kf_calib.fleet.run_list import ListedRun, Row, runs_of
 from kf_calib.fleet.store import Store
 
 _OF_REPLAY_ALONE = ("recording", "overwrite", "strict", "as_json", "save", "save_model")
@@ -43,21 +41,21 @@ class HandedOver:
     row: Path
     settings: str = ""
 
-    def __call__(self, run: Run, known_sha256: str | None = None) -> Row:
+    def __call__(self, run: ListedRun, known_sha256: str | None = None) -> Row:
         return pickle.loads(self.row.read_bytes()) | {"run": run.place, "evaluated": datetime.now(UTC), "cpu_s": 0.0}
 
 
-def evaluation() -> Evaluation:
+def evaluation() -> RunEvaluation:
     usual = replay.make_context("replay", ["run.mcap"]).params
     commands = SingleCommands({key: value for key, value in usual.items() if key not in _OF_REPLAY_ALONE})
-    return Evaluation(commands, commands.checksum)
+    return RunEvaluation(commands, commands.checksum)
 
 
-def cost_of_a_row(runs: Sequence[Run]) -> dict[str, float]:
+def cost_of_a_row(runs: Sequence[ListedRun]) -> dict[str, float]:
     """Processor time of a run alone and as a row, s."""
     how = evaluation()
 
-    def alone(run: Run) -> None:
+    def alone(run: ListedRun) -> None:
         source, result = how.commands.replay(Path(run.place))
         found = how.commands.diagnose(source, result)
         json.dumps([how.commands.replay_document(result), how.commands.diagnosis_document(found)])
@@ -74,7 +72,7 @@ def cost_of_a_row(runs: Sequence[Run]) -> dict[str, float]:
     return {"alone_s": own, "as_a_row_s": row, "ratio": row / own}
 
 
-def on_workers(runs: Sequence[Run], workers: int) -> dict[str, float]:
+def on_workers(runs: Sequence[ListedRun], workers: int) -> dict[str, float]:
     """The runs on so many processes: processor time of a run in them, and elapsed time of all, s."""
     with tempfile.TemporaryDirectory() as folder, cluster(workers) as client:
         store, begun_s = Store(Path(folder)), time.monotonic()
@@ -83,7 +81,7 @@ def on_workers(runs: Sequence[Run], workers: int) -> dict[str, float]:
         return {"workers": workers, "cpu_s_a_run": done.cpu_s / done.evaluated, "elapsed_s": time.monotonic() - begun_s}
 
 
-def cost_of_the_client(run: Run, rows: int) -> dict[str, float]:
+def cost_of_the_client(run: ListedRun, rows: int) -> dict[str, float]:
     """What client and scheduler, which are in this process, take for rows of the usual size."""
     row = evaluation()(run)
     assert row is not None and row["error"] is None

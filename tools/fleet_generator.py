@@ -30,7 +30,7 @@ from kf_calib.sources.simulation.injected import Hidden, parse
 from kf_calib.sources.simulation.noise_processes import generator
 from kf_calib.sources.simulation.sensors import GRADES
 from kf_calib.sources.simulation.simulator import Simulation
-from kf_calib.sources.simulation.visit_plans import Visit, spread_plan
+from kf_calib.sources.simulation.visit_plans import PlannedVisit, spread_plan
 from kf_calib.support.threads import one_blas_thread
 
 _PLANS = 8  # tours that the runs of a bench share: to find one takes as long as to simulate a run
@@ -96,7 +96,7 @@ class Campaign:
 
 
 @cache
-def _tour(campaign: Campaign, bench: int, number: int) -> list[Visit]:
+def _tour(campaign: Campaign, bench: int, number: int) -> list[PlannedVisit]:
     seed = _seed(campaign.seed, "tour", bench * _PLANS + number)
     return spread_plan(campaign.dwells, dwell_s=campaign.dwell_s, seed=seed)
 

@@ -23,6 +23,7 @@ import conventions_picture
 import fleet_picture
 import numpy as np
 import right_pictures
+import run_picture
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
@@ -91,6 +92,7 @@ PICTURES: dict[str, Callable[[], Image.Image]] = {
 OF_SCRIPTS: dict[str, Callable[[], Image.Image]] = {
     "conventions": conventions_picture.drawn,
     "fleet": fleet_picture.drawn,
+    "run": _figure(run_picture.drawn),
     **{name: _figure(partial(right_pictures.drawn, name)) for name in right_pictures.FIGURES},
 }
 """Name of each other picture, and what draws it."""

@@ -99,7 +99,7 @@ class Fixed:
         rows, factor, sigmas = prospect.rows(poses), prospect.start, list[Floats]()
         for k in order:
             factor = triangle(np.vstack([factor, rows[k]]))
-            blind = optimality_criteria.unseen(factor).any()
+            blind = optimality_criteria.is_unseen(factor).any()
             sigma = optimality_criteria.sigmas(factor) * prospect.units
             sigmas.append(np.full(12, np.inf) if blind else sigma[:12])
         way = np.vstack([np.zeros(poses.shape[1]), poses[order]])
@@ -150,7 +150,6 @@ def one_bench(number: int) -> dict[str, Any]:
     targets = drawn_targets(number, fixed)
     wanted = np.array([targets[symbol] for symbol in paper_parameters.SYMBOLS])
     device, session = DrivenBench(run, None, [0.0] * 3), Session.fed(bench, Settings(), targets, auto=True)
-    session.look_factor = 1.3
     named = list[tuple[int, tuple[str, ...]]]()
     session.listeners.append(lambda judgement: _note(named, session, judgement.result))
     itinerary = Itinerary(bench, pace, ends_when_named=False)
@@ -218,14 +217,12 @@ def one_fault(number: int, folder: Path) -> Broken:
             time.sleep(0.05)
         time.sleep(at_s)
         process.send_signal(getattr(signal, fault))
-    out, said = process.communicate(timeout=900)
-    lines = [json.loads(line) for line in out.splitlines() if line.startswith("{")]
-    ran = next((line["run"] for line in reversed(lines) if "run" in line), {})
-    ends = decision_records(recording, END_RECORD)
-    stopped = bool(ran.get("stopped") or (ends and ends[-1]["stopped"] == "true"))
+    _, said = process.communicate(timeout=900)
+    ends, stopped = decision_records(recording, END_RECORD), "The table was stopped and stands at" in said
+    is_told = fault == "disk" or (len(ends) == 1 and ends[0]["stopped"] == str(stopped).lower())
     whole = _is_whole(recording, len(ends), fault)
     code = CODES.get(fault, 2)
-    right = process.returncode == code and SAYS[fault] in said and whole and (stopped or fault in ("link", "disk"))
+    right = process.returncode == code and SAYS[fault] in said and whole and is_told and stopped != (fault == "link")
     return Broken(fault, at_s, process.returncode, said.strip().splitlines()[0][:300], stopped, whole, right)
 
 

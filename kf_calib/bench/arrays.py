@@ -15,3 +15,9 @@ def lengths(vectors: Floats) -> Floats:
     """The length (n,) of each row (n, k) of numbers as they stand in a file; infinite where it is beyond a double."""
     with np.errstate(over="ignore", invalid="ignore"):
         return np.asarray(np.linalg.norm(vectors, axis=1))
+
+
+def crossed(one: Floats, other: Floats) -> Floats:
+    """The cross products (n, 3) of vectors (n, 3); ``np.cross`` takes several times as long."""
+    (a, b, c), (x, y, z) = one.T, other.T
+    return np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=1)

@@ -24,7 +24,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kf_calib.bench.arrays import Floats, Times
+from kf_calib.bench.arrays import Floats, Times, crossed, lengths
 from kf_calib.bench.gimbal_ranges import limits_of, zones_of
 from kf_calib.bench.raw_input import PLAIN, RawInput
 from kf_calib.errors import BenchError
@@ -304,6 +304,14 @@ def turn_by(vector: Floats, rotation_rad: Floats) -> Floats:
     """The vector (3,) or vectors (n, 3) turned by a rotation vector (3,); the same ones if it is zero."""
     angle_rad = float(np.linalg.norm(rotation_rad))
     return turn(vector, rotation_rad / angle_rad, angle_rad) if angle_rad else vector
+
+
+def turned(vectors: Floats, rotations_rad: Floats) -> Floats:
+    """Vectors (n, 3), each turned by its own rotation vector (n, 3); the same where that is zero."""
+    angles_rad = lengths(rotations_rad)[:, None]
+    axes = rotations_rad / np.where(angles_rad > 0.0, angles_rad, 1.0)
+    along = (vectors * axes).sum(axis=1, keepdims=True) * axes
+    return along + np.cos(angles_rad) * (vectors - along) + np.sin(angles_rad) * crossed(axes, vectors)
 
 
 def _turn_by_quaternion(vector: Floats, imaginary: Floats, real: Floats) -> Floats:

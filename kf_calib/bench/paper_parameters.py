@@ -8,17 +8,22 @@ uniquely.
 
 The order of the state is s1x s1y s1z b1, s2x s2y s2z b2, s3x s3y s3z b3. Angles are in rad, K has no unit, b is in
 m/s^2.
+
+The sigmas that a run is to reach are stated as targets, ``NAME=SIGMA``. NAME: a parameter (``theta1``, ``K2``), all of
+a kind (``theta``, ``phi``, ``nu``, ``K``, ``b``) or ``angles``. SIGMA: a number with a unit (``2ppm``, ``20ug``,
+``0.1 arcsec``), or in SI without one.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.errors import BenchError
+from kf_calib.errors import BenchError, InputError, how_to_write
+from kf_calib.support import units
 
 SYMBOLS = ("theta1", "phi1", "K1", "b1", "nu1", "nu2", "K2", "b2", "theta3", "phi3", "K3", "b3")
 STATE_COUNT = len(SYMBOLS)
@@ -157,3 +162,39 @@ def optimal_directions(parameters: Floats) -> Floats:
     along = np.stack([np.cross(h2, h3), np.cross(h1, h3), np.cross(h1, h2)], axis=1)
     along /= np.linalg.norm(along, axis=2, keepdims=True)
     return np.concatenate([along, -along[:, 2:]], axis=1)
+
+
+def targets_of(texts: Iterable[str]) -> dict[str, float]:
+    """Sigma wanted by symbol, in SI; of several for one parameter the last counts. Raises InputError."""
+    targets = dict[str, float]()
+    for text in texts:
+        name, equals, size = text.partition("=")
+        parameters = [k for k, symbol in enumerate(SYMBOLS) if name.strip() in _names_of(symbol)]
+        if not equals or not parameters:
+            raise InputError(
+                f"target {text!r} names no parameter: write NAME=SIGMA, for example K=2ppm, with NAME one of "
+                f"{', '.join(SYMBOLS)}, or theta, phi, nu, K, b or angles for all of a kind."
+            )
+        sigma = _sigma(text, size, UNITS[parameters[0]])
+        targets |= {SYMBOLS[k]: sigma for k in parameters}
+    return targets
+
+
+def _names_of(symbol: str) -> set[str]:
+    """Return the names of a parameter: its symbol, its symbol without number, and ``angles`` for an angle."""
+    kind = symbol.rstrip("123")
+    return {symbol, kind, *([] if kind in ("K", "b") else ["angles"])}
+
+
+def _sigma(text: str, size: str, unit: str) -> float:
+    """Return the size in SI of a sigma."""
+    try:
+        value = units.quantity(size, unit)
+    except InputError:
+        value = 0.0
+    if value <= 0.0:
+        raise InputError(
+            f"target {text!r} has no sigma above zero that fits: give a number in one of "
+            f"{', '.join(units.choices(unit))}{how_to_write(size)}."
+        )
+    return value

@@ -21,7 +21,7 @@ SECTIONS = {
                              "report": "report.report"},
     "Evaluate many": {"fleet": "fleet.fleet"},
     "Use a calibration": {"apply": "exchange.apply", "verify": "exchange.verify", "history": "exchange.history",
-                          "export": "export.export", "certificate": "certificate.certificate"},
+                          "export": "exchange.export", "certificate": "certificate.certificate"},
     "Run a bench": {"plan": "plan.plan", "record": "acquire.record", "live": "live.live", "run": "run.run"},
     "Try it without a bench": {"demo": "acquire.demo", "simulate": "acquire.simulate"},
     "Look up": {"info": "info.info", "effects": "evaluate.list_effects", "paper": "paper.paper"},

@@ -13,27 +13,23 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import rich_click as click
 from click import get_current_context  # rich_click declares that there may be none
 
-from kf_calib.cli.echo import complain, echo
+from kf_calib.cli.command import OUTPUT, command
+from kf_calib.cli.echo import complain, echo, print_json, progress, show
 from kf_calib.cli.files import OutputFile, claimed, delivery
 from kf_calib.cli.numbers import NUMBER, POSITIVE
 from kf_calib.cli.options import (
-    OUTPUT,
     F,
     bench_options,
     columns_option,
-    examples,
     input_options,
     json_option,
     no_angles_option,
     overrides,
     overwrite_option,
     pair,
-    print_json,
-    progress,
-    save_view,
-    show,
     units_option,
 )
+from kf_calib.cli.pictures import write_view
 from kf_calib.cli.signals import Interrupter, answered
 from kf_calib.errors import InputError
 from kf_calib.support.output_files import Outputs, write_whole
@@ -190,9 +186,11 @@ def _record(source: Source, path: Path, overwrite: bool, tick: Callable[[float],
     return _Recorded(readings, segmenter.dwell_count, duration_s, notes)
 
 
-@click.command(
-    epilog=examples("simulate run.mcap", "simulate run.mcap --seed 3 --hide second-order=10sigma --temperature-swing 5")
-)
+@command(
+    "simulate run.mcap", "simulate run.mcap --seed 3 --hide second-order=10sigma --temperature-swing 5",
+    seldom=("angle_hz", "outlier_rate", "outlier_mps2", "encoder_sigma_deg", "encoder_step_deg", "flicker_mps2",
+            "period_s", "warm_up_c", "warm_up_s", "sigma_c", "step_c", "large"),
+)  # fmt: skip
 @click.argument("output", type=OutputFile(), metavar="OUT")
 @simulation_options
 @click.option("--no-angles", is_flag=True, panel="Run", help="Record no angles, as of a board that is turned by hand.")
@@ -204,9 +202,9 @@ def simulate(
     output: Path, no_angles: bool, overwrite: bool, large: bool, as_json: bool, **options: Any
 ) -> None:  # fmt: skip
     """Record a simulated bench run to OUT; its truth goes to a side file that no estimator opens."""
-    from kf_calib.sources.simulation.by_hand import ByHand
+    from kf_calib.sources.simulation.detectability import truth_file, write_truth
     from kf_calib.sources.simulation.options import simulation
-    from kf_calib.sources.simulation.truth import truth_file, write_truth
+    from kf_calib.sources.simulation.simulator import ByHand
 
     claimed([Path(options["plan"])], {"OUT, whose truth goes there": truth_file(output)}, overwrite)
     options["no_angles"] = no_angles
@@ -237,12 +235,10 @@ def _size(count: int) -> str:
     return f"{count / 1e9:.3g} GB" if count < 1e12 else f"{count / 1e12:.3g} TB"
 
 
-@click.command(
-    epilog=examples(
-        'record run.mcap bench.csv --axes "y z x" --gravity 9.8123',
-        'record run.mcap - --bench bench.toml --column "acc x [g]=ax_g" < bench.csv',
-        "record run.mcap counts.csv --bench bench.toml --accel-scale 3.9e-6 --accel-unit g --channels 1,-2,3",
-    )
+@command(
+    'record run.mcap bench.csv --axes "y z x" --gravity 9.8123',
+    'record run.mcap - --bench bench.toml --column "acc x [g]=ax_g" < bench.csv',
+    "record run.mcap counts.csv --bench bench.toml --accel-scale 3.9e-6 --accel-unit g --channels 1,-2,3",
 )
 @click.argument("output", type=OutputFile(), metavar="OUT")
 @click.argument("lines", type=click.Path(path_type=Path, allow_dash=True), default="-")
@@ -275,7 +271,7 @@ def record(
 @contextmanager
 def _told_if_table(path: Path) -> Iterator[None]:
     """Where lines cannot be recorded because they are a table of orientations, say so."""
-    from kf_calib.sources.opening import Kind, kind_of
+    from kf_calib.sources.opening import FileKind, kind_of
     from kf_calib.sources.tables.survey import survey
 
     try:
@@ -283,7 +279,7 @@ def _told_if_table(path: Path) -> Iterator[None]:
     except InputError:
         table = None
         with suppress(InputError):
-            table = survey(path) if kind_of(path) is Kind.TABLE else None
+            table = survey(path) if kind_of(path) is FileKind.TABLE else None
         if table is not None and table.rows:
             raise InputError(
                 f"{path} is a table of orientations, with a row a dwell, and is evaluated as it is: kf-calib replay "
@@ -296,7 +292,7 @@ def _folder() -> str:
     return "recordings" if get_current_context().params["tutorial"] else "out"
 
 
-@click.command(epilog=examples("demo", "demo somewhere", "demo --tutorial"))
+@command("demo", "demo somewhere", "demo --tutorial")
 @click.argument("folder", type=click.Path(path_type=Path, file_okay=False), default=_folder)
 @click.option("--tutorial", is_flag=True, is_eager=True, help="Instead, copy the recordings of the tutorial to FOLDER.")
 @units_option
@@ -347,8 +343,8 @@ def _do_main_job(folder: Path, as_json: bool) -> None:
     from kf_calib.estimation.calibration import calibrate
     from kf_calib.estimation.engine_comparison import compare as run
     from kf_calib.sources.files.recording import Recording
+    from kf_calib.sources.simulation.detectability import truth_file, write_truth
     from kf_calib.sources.simulation.options import simulation
-    from kf_calib.sources.simulation.truth import truth_file, write_truth
     from kf_calib.views.console import comparison_table, summary
     from kf_calib.views.json import compare_object, replay_object
 
@@ -376,7 +372,7 @@ def _do_main_job(folder: Path, as_json: bool) -> None:
         files = {"recording": str(recording), "truth": str(truth), "view": str(rrd)}
         print_json({**files, "replay": replay_object(result), "compare": compare_object(compared)})
     with delivery(outputs, as_json) as deliver, progress("saving the view", as_json):
-        kept = deliver.keep(rrd, lambda path: save_view(result, path))
+        kept = deliver.keep(rrd, lambda path: write_view(result, path))
     if kept:
         say(f"View: {rrd} (open it with {_viewer()} {rrd}).")
 

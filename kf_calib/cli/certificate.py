@@ -7,18 +7,10 @@ from typing import TYPE_CHECKING
 
 import rich_click as click
 
+from kf_calib.cli.command import INPUT, OUTPUT, command
+from kf_calib.cli.echo import print_json, show
 from kf_calib.cli.files import claimed, output_option
-from kf_calib.cli.options import (
-    INPUT,
-    OUTPUT,
-    effects_from_option,
-    examples,
-    json_option,
-    overwrite_option,
-    print_json,
-    show,
-    trust_option,
-)
+from kf_calib.cli.options import effects_from_option, json_option, overwrite_option, trust_option
 
 if TYPE_CHECKING:
     from kf_calib.estimation.measurement_model import Model
@@ -32,7 +24,7 @@ statement_option = click.option("--statement", type=_path, metavar="LAB.toml", p
                                 help="What the laboratory states: docs/certificate.md has the keys.")  # fmt: skip
 
 
-@click.command(epilog=examples("certificate cal.json --statement lab.toml -o certificate.pdf"))
+@command("certificate cal.json --statement lab.toml -o certificate.pdf")
 @click.argument("calibration", type=_path, metavar="CAL")
 @output_option("-o", "--out", "output", required=True, metavar="OUT.pdf", panel=OUTPUT,
                help="The certificate: PDF/A-3b with the XML attached.")  # fmt: skip
@@ -56,12 +48,12 @@ def certificate(
     from kf_calib.exchange.certificate import statement as statements
     from kf_calib.views import certificate as views
 
-    stated = statements.read(statement)
+    stated = statements.read_statement(statement)
     outputs = claimed([] if stated.before is None else [stated.before], overwrite=overwrite)
     calibrations = []
     for path in (calibration, stated.before):
         if path is not None:
-            saved = calibration_file.read(path)
+            saved = calibration_file.open_calibration(path)
             calibrations.append((saved, saved.model(path, effects_from, trust)))
     written, standing = write_certificate(outputs, output, stated, *calibrations, xml=xml, schema=schema)
     if as_json:
@@ -80,7 +72,7 @@ def stated_in(certificate: Path | None, statement: Path | None) -> Statement | N
     from kf_calib.support.extras import need
 
     need("typst", "report", "a certificate")
-    return statements.read(statement)
+    return statements.read_statement(statement)
 
 
 def write_certificate(
@@ -97,7 +89,7 @@ def write_certificate(
 
     certificate_ = content.certificate(*calibrated, stated, before)
     encoded = dcc.xml(certificate_)
-    standing = dcc.check(encoded, schema)
+    standing = dcc.check_dcc(encoded, schema)
     printed = document.pdf(certificate_, encoded, standing)
     outputs.write(pdf, lambda path: write_whole(path, printed))
     if xml is not None:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import json
 import os
 import sys
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from typing import Any
 
@@ -99,3 +103,57 @@ def _print_all_signs(stream: Any) -> None:
     except UnicodeEncodeError:
         settings = {"errors": "replace"} if stream.isatty() else {"encoding": "utf-8"}
         stream.reconfigure(**settings)
+
+
+def print_json(content: Mapping[str, Any]) -> None:
+    echo(json_line(content))
+
+
+def json_line(content: Mapping[str, Any]) -> str:
+    """One line of JSON; what is not printable is escaped, which JSON itself asks of a part of it only."""
+    text = json.dumps(content, ensure_ascii=False, allow_nan=False)
+    return text if text.isprintable() else "".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in text)
+
+
+def show(renderable: Any) -> None:
+    echo_drawn(rendered(renderable))
+
+
+def rendered(renderable: Any) -> str:
+    """As text for standard output, its line ended; nothing is written."""
+    from kf_calib.views.terminal import PlainConsole
+
+    screen, text = sys.stdout.isatty(), io.StringIO()
+    width = None if screen or os.environ.get("COLUMNS", "").isdigit() else 110
+    PlainConsole(file=text, force_terminal=screen or None, width=width, soft_wrap=not screen).print(renderable)
+    return text.getvalue()
+
+
+@contextlib.contextmanager
+def progress(text: str, quiet: bool = False) -> Iterator[Callable[[float], None]]:
+    """What is being done, on a terminal's stderr; nothing where stderr is piped.
+
+    A bar where a fraction is told; while none is known, or all of it was read and the work goes on, the bar only
+    moves, beside the stage that the work is in.
+    """
+    if quiet or not sys.stderr.isatty():
+        yield lambda fraction: None
+        return
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+
+    from kf_calib.support import stage
+    from kf_calib.views.terminal import PlainConsole
+
+    columns = BarColumn(20), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("{task.description}", markup=False)
+    with Progress(*columns, console=PlainConsole(stderr=True), transient=True, redirect_stdout=False) as bars:
+        bars.add_task(text, total=None)
+        (task,) = bars.tasks
+
+        def tick(fraction: float) -> None:  # a task whose total is reached would stand still from then on
+            task.completed, task.total = fraction, 1.0 if fraction < 1.0 else None
+
+        def say(now: str) -> None:
+            task.description = f"{text}: {now}"
+
+        with stage.listener(say):
+            yield tick

@@ -10,28 +10,23 @@ from typing import TYPE_CHECKING, Any
 
 import rich_click as click
 
-from kf_calib.cli.echo import complain
+from kf_calib.cli.command import INPUT, OUTPUT, command
+from kf_calib.cli.echo import complain, print_json, progress, show
 from kf_calib.cli.files import claimed, delivery, output_option
 from kf_calib.cli.options import (
     BENCH_OPTIONS,
-    INPUT,
-    OUTPUT,
     bench_model_option,
     effects_of,
-    examples,
     filter_options,
     json_option,
     opened,
     overrides,
     overwrite_option,
-    print_json,
-    progress,
     recording_of,
     recording_options,
     save_model_option,
     save_option,
     settings_of,
-    show,
     strict_option,
     units_option,
 )
@@ -45,11 +40,7 @@ if TYPE_CHECKING:
 STEPS = "Steps"
 
 
-@click.command(
-    epilog=examples(
-        "replay run.mcap", 'replay bag.mcap --axes "y z x" --gravity 9.8123 --with second-order --rrd run.rrd'
-    )
-)
+@command("replay run.mcap", 'replay bag.mcap --axes "y z x" --gravity 9.8123 --with second-order --rrd run.rrd')
 @click.argument("recording", type=click.Path(path_type=Path))
 @recording_options
 @filter_options
@@ -95,7 +86,7 @@ def replay(
         ctx.exit(1)
 
 
-@click.command(epilog=examples("compare run.mcap"))
+@command("compare run.mcap")
 @click.argument("recording", type=click.Path(path_type=Path))
 @recording_options
 @filter_options
@@ -126,10 +117,7 @@ def compare(recording: Path, report: Path | None, overwrite: bool, as_json: bool
         save_report(deliver, report, compared, measured)
 
 
-@click.command(
-    "effects",
-    epilog=examples("effects", "effects hysteresis", "effects 'mine = fx*fy*T' second-order --recording run.mcap"),
-)
+@command("effects", "effects hysteresis", "effects 'mine = fx*fy*T' second-order --recording run.mcap", name="effects")
 @click.argument("names", nargs=-1, metavar="[NAME]...")
 @click.option(
     "--recording",
@@ -187,7 +175,7 @@ def _list_visible(recording: Path, names: tuple[str, ...], as_json: bool, option
         show(catalogue.sight_report(seen, title))
 
 
-@click.command(epilog=examples("diagnose run.mcap", "diagnose run.mcap --with hysteresis"))
+@command("diagnose run.mcap", "diagnose run.mcap --with hysteresis")
 @click.argument("recording", type=click.Path(path_type=Path))
 @recording_options
 @filter_options
@@ -219,8 +207,10 @@ def diagnose(ctx: click.Context, recording: Path, overwrite: bool, strict: bool,
         ctx.exit(1)
 
 
-@click.command(
-    epilog=examples("improve run.mcap --unattended --save-model found.toml", "improve run.mcap --interactive")
+@command(
+    "improve run.mcap --unattended --save-model found.toml",
+    "improve run.mcap --interactive",
+    seldom=("accel_unit", "angle_unit", "columns", "left_out"),
 )
 @click.argument("recording", type=click.Path(path_type=Path))
 @click.option("--interactive", is_flag=True, panel=STEPS, help="Ask at every step; usual on a terminal.")
@@ -344,11 +334,13 @@ def _for_journal(options: Mapping[str, Any], effects: Sequence[str]) -> dict[str
     """Options and programs of an ``Origin``: all that numbers depend on; files of bench keys and of models by what they
     say."""
     from kf_calib.effects import loaded
-    from kf_calib.exchange import models
+    from kf_calib.exchange import calibration_file
 
     files = [*options["effects_from"]]
     if options["model_file"] is not None:
-        files += models.read(options["model_file"]).allowed(options["effects_from"], options["trust"]).files
+        files += (
+            calibration_file.read_model(options["model_file"]).allowed(options["effects_from"], options["trust"]).files
+        )
     others = (*_BY_CONTENT, *_LEAVE)
     kept = {key: value for key, value in options.items() if value is not None and key not in others}
     return {"options": kept | overrides(options) | {"effects": list(effects)}, "programs": tuple(loaded(files))}

@@ -1,4 +1,4 @@
-"""Commands that use calibrations: apply, verify, history."""
+"""Commands that use calibrations: apply, verify, history, export."""
 
 from __future__ import annotations
 
@@ -10,29 +10,24 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import rich_click as click
 
-from kf_calib.cli.echo import complain
+from kf_calib.cli.command import INPUT, OUTPUT, command
+from kf_calib.cli.echo import complain, print_json, progress, show
 from kf_calib.cli.files import claimed, delivery, output_option
 from kf_calib.cli.options import (
     BENCH_OPTIONS,
-    INPUT,
     OF_MESSAGES,
-    OUTPUT,
     dwell_options,
     effects_from_option,
-    examples,
     json_option,
     merged_for_table,
     messages_of,
     overrides,
     overwrite_option,
     pair,
-    print_json,
-    progress,
     recording_kind,
     recording_of,
     recording_options,
     refuse_given,
-    show,
     strict_option,
     trust_option,
     units_of,
@@ -50,16 +45,15 @@ if TYPE_CHECKING:
     from kf_calib.exchange.corrected_lines import CorrectedLines
     from kf_calib.sources.files.text_file import TextFile
 
+
 _BLOCK_BYTES = 1 << 16
 _file = partial(click.argument, type=click.Path(path_type=Path))
 
 
-@click.command(
-    epilog=examples(
-        "apply cal.json flight.mcap -o flight_calibrated.mcap",
-        "apply cal.json log.csv -o log_calibrated.csv",
-        "apply cal.json - < lines.csv > out.csv",
-    )
+@command(
+    "apply cal.json flight.mcap -o flight_calibrated.mcap",
+    "apply cal.json log.csv -o log_calibrated.csv",
+    "apply cal.json - < lines.csv > out.csv",
 )
 @_file("calibration", metavar="CAL")
 @_file("recording", metavar="REC")
@@ -121,8 +115,7 @@ def _applied(
     tick: Callable[[float], None],
 ) -> tuple[Applied, list[str]]:  # fmt: skip
     """Write the copy of a file; what was corrected, and what is to be told."""
-    from kf_calib.exchange.corrected_file import Applied, apply_to_file
-    from kf_calib.exchange.corrected_table import apply_to_table
+    from kf_calib.exchange.corrected_file import Applied, apply_to_file, apply_to_table
 
     columns = dict(map(pair, options["columns"]))
     match recording_kind(path, options):
@@ -193,7 +186,7 @@ def _read(path: Path, options: Mapping[str, Any]) -> SavedCalibration:
     """The calibration of a file; the Python files that it needs are run where they may be."""
     from kf_calib.exchange import calibration_file
 
-    saved = calibration_file.read(path)
+    saved = calibration_file.open_calibration(path)
     for change in saved.model_file(path).load(options["effects_from"], options["trust"]):
         complain(change)
     return saved
@@ -205,7 +198,7 @@ def _correction(path: Path, options: Mapping[str, Any]) -> tuple[SavedCalibratio
     return saved, saved.correction(path, options["effects_from"], options["trust"])
 
 
-@click.command(epilog=examples("verify cal.json check.mcap", "verify cal.json check.mcap --strict --json"))
+@command("verify cal.json check.mcap", "verify cal.json check.mcap --strict --json")
 @_file("calibration", metavar="CAL")
 @_file("recording", metavar="REC")
 @recording_options
@@ -239,7 +232,7 @@ def verify(ctx: click.Context, calibration: Path, recording: Path, strict: bool,
         ctx.exit(1)
 
 
-@click.command(epilog=examples("history cal_*.json --tolerance K=20ppm --tolerance b=100ug"))
+@command("history cal_*.json --tolerance K=20ppm --tolerance b=100ug")
 @click.argument("calibrations", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="CAL...")
 @click.option(
     "--tolerance",
@@ -257,17 +250,60 @@ def history(
     calibrations: tuple[Path, ...], tolerances: tuple[str, ...], overwrite: bool, as_json: bool, **options: Any
 ) -> None:
     """The calibrations of one block over time: drift, repeatability, and when to calibrate again."""
-    from kf_calib.bench.targets import targets_of
+    from kf_calib.bench.paper_parameters import targets_of
     from kf_calib.exchange import calibration_file
     from kf_calib.exchange.history import history as found_in
     from kf_calib.views import exchange as views
 
     outputs, pictures = claimed(overwrite=overwrite), Pictures.taken_from(options)
     wanted = targets_of(tolerances)
-    drifts = found_in([calibration_file.read(path) for path in calibrations], wanted)
+    drifts = found_in([calibration_file.open_calibration(path) for path in calibrations], wanted)
     if as_json:
         print_json(views.history_object(drifts))
     else:
         show(views.history_report(drifts))
     with delivery(outputs, as_json) as deliver:
         pictures.save(deliver, drifts)
+
+
+_NAMES = ["px4", "ardupilot", "imucal", "imu_calib", "kalibr", "openvins", "imu_tk", "vectornav", "csv", "c"]
+
+
+@command(
+    "export cal.json --to c -o kf_calib_correct.h", "export cal.json --to ardupilot --lossy -o accelerometer.param"
+)
+@click.argument("calibration", type=click.Path(path_type=Path), metavar="CAL")
+@click.option("--to", required=True, type=click.Choice(_NAMES), help="The program that is to take it.", panel=OUTPUT)
+@output_option("-o", "--out", "output", required=True, metavar="FILE", panel=OUTPUT, help="The file for that program.")
+@click.option(
+    "--lossy", is_flag=True, panel=OUTPUT,
+    help="Export though the program cannot hold all; what is lost, and the error left, are told.",
+)  # fmt: skip
+@effects_from_option
+@trust_option
+@overwrite_option
+@units_option
+@json_option
+def export(
+    calibration: Path, to: str, output: Path, lossy: bool, effects_from: tuple[Path, ...], trust: bool, overwrite: bool,
+    as_json: bool,
+) -> None:  # fmt: skip
+    """Write a calibration as the file of an autopilot, of another calibration tool, or as a function in C.
+
+    Where the program cannot hold the alignment or an effect, the numbers are those with the least rms error, over all
+    directions of gravity and the temperatures of the run; how large it is is said, and --lossy is needed.
+    """
+    from kf_calib.exchange import calibration_file
+    from kf_calib.exchange.exports import exported
+    from kf_calib.support.output_files import write_whole
+    from kf_calib.views import export as views
+
+    outputs = claimed(overwrite=overwrite)
+    saved = calibration_file.open_calibration(calibration)
+    target = exported(saved, saved.correction(calibration, effects_from, trust), to, lossy)
+    content = target.text().encode()
+    outputs.write(output, lambda path: write_whole(path, content))
+    if as_json:
+        print_json(views.exported_object(target, to, output))
+    else:
+        show(views.exported_report(target, output))

@@ -51,9 +51,9 @@ def claimed(
             read += [each for each in (value if isinstance(value, tuple) else [value]) if isinstance(each, Path)]
     outputs = Outputs(files, read, overwrite)
     if ctx.params.get("model_file"):
-        from kf_calib.exchange import models
+        from kf_calib.exchange import calibration_file
 
-        outputs.spare([each.path for each in models.read(ctx.params["model_file"]).programs])
+        outputs.spare([each.path for each in calibration_file.read_model(ctx.params["model_file"]).programs])
     return outputs
 
 
@@ -86,14 +86,16 @@ class Delivery:
         if path is not None:
             from kf_calib.estimation import model_file
 
-            self.file(path, lambda path: model_file.write(path, result))
+            self.file(path, lambda path: model_file.write_model_file(path, result))
 
     def calibration(self, path: Path | None, result: Calibration, source: Source) -> None:
         """Write the calibration file of a result, if there is to be one; source: what it was made from."""
         if path is not None:
             from kf_calib.exchange import calibration_file
 
-            self.file(path, lambda path: calibration_file.write(path, calibration_file.of_source(result, source)))
+            self.file(
+                path, lambda path: calibration_file.write_calibration(path, calibration_file.of_source(result, source))
+            )
 
 
 @contextmanager

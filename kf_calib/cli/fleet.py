@@ -13,24 +13,19 @@ from typing import TYPE_CHECKING, Any
 import rich_click as click
 from click import get_current_context  # rich_click declares that there may be none
 
-from kf_calib.cli.echo import complain, echo
+from kf_calib.cli.command import MODEL, OUTPUT, command
+from kf_calib.cli.echo import complain, echo, print_json, progress, show
 from kf_calib.cli.failures import sentence
 from kf_calib.cli.files import Delivery, claimed, delivery
 from kf_calib.cli.numbers import POSITIVE
 from kf_calib.cli.options import (
-    MODEL,
-    OUTPUT,
-    examples,
     filter_options,
     json_option,
     opened,
     overrides,
     overwrite_option,
-    print_json,
-    progress,
     recording_options,
     settings_of,
-    show,
     target_option,
     units_option,
 )
@@ -45,12 +40,11 @@ if TYPE_CHECKING:
     from kf_calib.bench.streams import Source
     from kf_calib.diagnosis.results import Diagnosis
     from kf_calib.estimation.results import Calibration
-    from kf_calib.fleet.batch import Progress
-    from kf_calib.fleet.bench_model_files import BenchModelFiles
-    from kf_calib.fleet.evaluation import Evaluation
+    from kf_calib.fleet.batch import BatchProgress, RunEvaluation
     from kf_calib.fleet.overview import FleetOverview
+    from kf_calib.fleet.results import BenchModelFiles
     from kf_calib.fleet.run_factor import ReferenceUnit
-    from kf_calib.fleet.run_list import Run
+    from kf_calib.fleet.run_list import ListedRun
     from kf_calib.support.output_files import Outputs
 
 WORK = "Who does the work"
@@ -103,7 +97,10 @@ def _content(value: Any) -> Any:
     return [_content(each) for each in value] if isinstance(value, tuple | list) else value
 
 
-@click.command(epilog=examples("fleet campaign/ -o fleet", "fleet s3://lab/2026/ -o fleet --scheduler tcp://host:8786"))
+@command(
+    "fleet campaign/ -o fleet", "fleet s3://lab/2026/ -o fleet --scheduler tcp://host:8786",
+    seldom=("reference_unit", "model_file", "left_out", "accel_unit", "angle_unit", "columns"),
+)  # fmt: skip
 @click.argument("runs", nargs=-1, required=True)
 @click.option("-o", "--out", "output", required=True, type=click.Path(file_okay=False, path_type=Path),
               metavar="FOLDER", panel=OUTPUT,
@@ -156,10 +153,9 @@ def fleet(
         )
     if reference_unit is not None and not pooled:
         raise click.UsageError("--reference-unit is for the diagnosis of all runs together: leave out --no-pooled.")
-    from kf_calib.bench.targets import targets_of
-    from kf_calib.fleet.bench_model_files import BenchModelFiles
-    from kf_calib.fleet.evaluation import Evaluation
-    from kf_calib.fleet.results import Fleet, populations
+    from kf_calib.bench.paper_parameters import targets_of
+    from kf_calib.fleet.batch import RunEvaluation
+    from kf_calib.fleet.results import BenchModelFiles, Fleet, populations
     from kf_calib.fleet.run_list import runs_of
     from kf_calib.views import fleet as views
 
@@ -168,7 +164,7 @@ def fleet(
         import kf_calib.views.figures  # noqa: F401  # what is not installed is told before the work
     wanted, reference = targets_of(targets), _reference(reference_unit)
     commands = _checked(options)
-    evaluation = Evaluation(commands, commands.checksum, limit_s)
+    evaluation = RunEvaluation(commands, commands.checksum, limit_s)
     done = _evaluated(evaluation, runs_of(runs), output, workers, scheduler, as_json)
     table = Fleet(output)
     with progress("diagnosing the runs together", as_json):
@@ -199,7 +195,7 @@ def _reference(path: Path | None) -> ReferenceUnit | None:
     from kf_calib.exchange import calibration_file
     from kf_calib.fleet.run_factor import ReferenceUnit
 
-    saved = calibration_file.read(path)
+    saved = calibration_file.open_calibration(path)
     unit = saved.provenance.bench.get("block_serial")
     if not unit:
         raise InputError(f"{path} does not say of which unit it is: name one made from a run with a block_serial.")
@@ -230,8 +226,13 @@ def _checked(options: Mapping[str, Any]) -> SingleCommands:
 
 
 def _evaluated(
-    evaluation: Evaluation, runs: Sequence[Run], folder: Path, workers: int | None, scheduler: str | None, quiet: bool
-) -> Progress:
+    evaluation: RunEvaluation,
+    runs: Sequence[ListedRun],
+    folder: Path,
+    workers: int | None,
+    scheduler: str | None,
+    quiet: bool,
+) -> BatchProgress:
     """Evaluate the runs that are not in the table yet; where it is stopped, all that is done is kept."""
     import dask.system
 
@@ -241,7 +242,7 @@ def _evaluated(
     store, interrupt = Store(folder), Interrupter()
     with store.taken(), answered(interrupt), progress(f"{len(runs)} runs", quiet) as tick:
 
-        def tell(now: Progress) -> None:
+        def tell(now: BatchProgress) -> None:
             with interrupt.finished_first():  # where it takes effect, too, if it came while Python was cleaning up
                 stage.say(f"{now.done} done, {now.failed} failed")
                 tick(now.done / now.total)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import rich_click as click
 from rich.text import Text
 
-from kf_calib.cli.options import progress, show
+from kf_calib.cli.echo import progress, show
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.stepwise_selection import Improvement, extend, take_step, undone

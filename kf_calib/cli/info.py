@@ -12,27 +12,24 @@ from typing import TYPE_CHECKING, Any
 import rich_click as click
 from click.core import ParameterSource
 
+from kf_calib.cli.command import command
+from kf_calib.cli.echo import print_json, progress, show
 from kf_calib.cli.options import (
     OF_DWELLS,
     OF_MESSAGES,
-    examples,
     json_option,
     messages_of,
     overrides,
     pair,
-    print_json,
-    progress,
     recording_options,
-    show,
     units_of,
 )
 from kf_calib.errors import BenchError, CountsError, KfCalibError
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 if TYPE_CHECKING:
-    from kf_calib.bench.raw_input import RawInput
+    from kf_calib.bench.raw_input import RawInput, WrongUnit
     from kf_calib.bench.streams import Source
-    from kf_calib.bench.wrong_unit import WrongUnit
     from kf_calib.dwells.overview import DwellSummary
     from kf_calib.sources.files.inventory import Inventory
     from kf_calib.views.overview import Overview
@@ -53,7 +50,7 @@ _BY_HAND = (
 )
 
 
-@click.command(epilog=examples("info run.mcap", "info rosbag2_2026_05_04", "info log.csv --json"))
+@command("info run.mcap", "info rosbag2_2026_05_04", "info log.csv --json")
 @click.argument("recording", type=click.Path(path_type=Path), metavar="FILE")
 @recording_options
 @json_option
@@ -64,18 +61,18 @@ def info(ctx: click.Context, recording: Path, columns: tuple[str, ...], as_json:
     FILE is an MCAP file, the folder of a ROS 2 bag, a .db3 file, lines of CSV or JSON, a table of orientations,
     or a calibration.
     """
-    from kf_calib.sources.opening import Kind, kind_of
+    from kf_calib.sources.opening import FileKind, kind_of
 
     renamed = dict(map(pair, columns))
     kind = kind_of(recording, renamed)
-    if kind is Kind.CALIBRATION:
+    if kind is FileKind.CALIBRATION:
         _show_calibration(recording, as_json)
         return
-    if kind is Kind.TABLE:
+    if kind is FileKind.TABLE:
         _show_table(ctx, recording, renamed, options, as_json)
         return
     with progress(f"reading {recording.name}", as_json) as tick:
-        if kind is Kind.SAMPLES:
+        if kind is FileKind.SAMPLES:
             overview = _of_lines(ctx, recording, renamed, options, tick)
         else:
             overview = _of_messages(ctx, recording, options, tick)
@@ -89,10 +86,10 @@ def info(ctx: click.Context, recording: Path, columns: tuple[str, ...], as_json:
 
 def _show_calibration(path: Path, as_json: bool) -> None:
     """Show what a calibration holds."""
-    from kf_calib.exchange.calibration_file import read
+    from kf_calib.exchange.calibration_file import open_calibration
     from kf_calib.views.calibration import calibration_object, calibration_report
 
-    saved = read(path)
+    saved = open_calibration(path)
     if as_json:
         print_json(calibration_object(saved, path))
     else:
@@ -174,7 +171,7 @@ def _wrong_unit(norms_mps2: Sequence[float], taken: RawInput, *, are_named: bool
 
     are_named: whether names of columns tell the unit, too.
     """
-    from kf_calib.bench.wrong_unit import LEVELS, wrong_unit
+    from kf_calib.bench.raw_input import LEVELS, wrong_unit
 
     level = median(norms_mps2) / STANDARD_GRAVITY_MPS2 if norms_mps2 else 1.0
     if LEVELS[0] <= level <= LEVELS[1] or level == 0.0:

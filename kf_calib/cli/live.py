@@ -12,34 +12,30 @@ from typing import TYPE_CHECKING, Any
 
 import rich_click as click
 
-from kf_calib.cli.echo import complain
+from kf_calib.cli.command import INPUT, command
+from kf_calib.cli.echo import complain, json_line, rendered
 from kf_calib.cli.files import claimed, delivery, output_option
 from kf_calib.cli.live_keys import pressed_keys
 from kf_calib.cli.live_run import LiveRun, by_hand, on_bench
 from kf_calib.cli.numbers import NOT_NEGATIVE, POSITIVE
 from kf_calib.cli.options import (
-    INPUT,
     bench_options,
     columns_option,
-    examples,
     filter_options,
     input_options,
-    json_line,
     json_option,
     no_angles_option,
     overrides,
     overwrite_option,
     pair,
-    rendered,
-    rrd_option,
     save_model_option,
     save_option,
-    save_view,
     settings_of,
     strict_option,
     target_option,
     units_option,
 )
+from kf_calib.cli.pictures import rrd_option, write_view
 from kf_calib.cli.signals import answered
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.support.plain_text import sentence
@@ -55,12 +51,21 @@ RUNNING = "While it runs"
 _REFRESH_S = 0.25
 
 
-@click.command(
-    epilog=examples(
-        "live /dev/ttyUSB0 --bench bench.toml --record run.mcap --target theta=1arcsec --target K=2ppm --rerun",
-        'live "sim://?speed=10&hide=second-order=4e-6" --target K=0.1ppm',
-        "live /dev/ttyACM0 --no-angles --record hand.mcap --target K=500ppm",
-    )
+@command(
+    "live /dev/ttyUSB0 --bench bench.toml --record run.mcap --target theta=1arcsec --target K=2ppm --rerun",
+    'live "sim://?speed=10&hide=second-order=4e-6" --target K=0.1ppm',
+    "live /dev/ttyACM0 --no-angles --record hand.mcap --target K=500ppm",
+    seldom=(
+        "rerun_port",
+        "rerun_bind",
+        "header",
+        "give_up_s",
+        "idle_s",
+        "accel_unit",
+        "model_file",
+        "left_out",
+        "save_model",
+    ),
 )
 @click.argument("source", metavar="SOURCE")
 @output_option("--record", metavar="OUT.mcap", panel=RUNNING, help="Record the run here.")
@@ -148,7 +153,7 @@ def live(
     With --no-angles it is a sensor in the hand, and what is shown is which side to turn up next.
     Ctrl-C ends the run: the recording is finished and the summary printed.
     """
-    from kf_calib.bench.targets import targets_of
+    from kf_calib.bench.paper_parameters import targets_of
     from kf_calib.sources.live import files_of, open_live
 
     outputs = claimed(files_of(source), overwrite=overwrite)
@@ -178,7 +183,7 @@ def live(
                 with delivery(outputs, as_json or run.print.lost > 0) as deliver:
                     deliver.calibration(save, final.result, run.recording() or opened)
                     deliver.model(save_model, final.result)
-                    deliver.file(rrd, partial(save_view, final.result))  # by the noise of the whole run
+                    deliver.file(rrd, partial(write_view, final.result))  # by the noise of the whole run
     if run.troubles:
         ctx.exit(2)
     if strict and final is not None and final.consistent is False:

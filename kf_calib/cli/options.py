@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
-import json
-import os
-import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
@@ -16,7 +11,8 @@ import rich_click as click
 from click import get_current_context  # rich_click declares that there may be none
 from click.core import ParameterSource
 
-from kf_calib.cli.echo import complain, echo, echo_drawn
+from kf_calib.cli.command import INPUT, MODEL, OUTPUT
+from kf_calib.cli.echo import complain
 from kf_calib.cli.files import output_option
 from kf_calib.cli.numbers import NOT_NEGATIVE, NUMBER, POSITIVE, NumberInRange
 from kf_calib.errors import BenchError, InputError
@@ -24,10 +20,7 @@ from kf_calib.support.units import shown_in, si
 
 if TYPE_CHECKING:
     from kf_calib.bench.raw_input import RawInput
-    from kf_calib.diagnosis.results import Diagnosis
-    from kf_calib.diagnosis.stepwise_selection import Improvement
     from kf_calib.estimation.bench_model import BenchModel
-    from kf_calib.estimation.results import Calibration
     from kf_calib.estimation.settings import Settings
     from kf_calib.sources.files.lines import Lines
     from kf_calib.sources.files.recording import Recording
@@ -35,11 +28,6 @@ if TYPE_CHECKING:
     from kf_calib.sources.units import Units
 
 F = TypeVar("F", bound=Callable[..., Any])
-
-INPUT = "Input and bench"
-MODEL = "Model and evaluation"
-OUTPUT = "Output"
-"""Groups of options in ``--help``: an option joins one by ``panel=``, and stands where its decorator does."""
 
 BENCH_OPTIONS = {
     "axes": ("--axes", str, "AXES", 'Gimbal axes, outer to inner, for example "y z x".'),
@@ -87,7 +75,7 @@ def bench_options(command: F) -> F:
 
 columns_option = click.option(
     "--column", "columns", multiple=True, metavar="THEIRS=OURS", panel=INPUT,
-    help='Name of a foreign column, for example --column "acc x [g]=ax_g"; repeatable.',
+    help='Name of a foreign column: --column "acc x [g]=ax_g"; repeatable.',
 )  # fmt: skip
 
 
@@ -101,7 +89,7 @@ def pair(text: str) -> tuple[str, str]:
 
 no_angles_option = click.option(
     "--no-angles", is_flag=True, panel=INPUT,
-    help="Use no platform angles: only the size of gravity is known, nine parameters are left.",
+    help="Use no platform angles, only the size of gravity: nine parameters.",
 )  # fmt: skip
 
 
@@ -146,7 +134,6 @@ def recording_options(command: F) -> F:
     return bench_options(command)
 
 
-rrd_option = output_option("--rrd", metavar="FILE.rrd", help="Save the Rerun view here.", panel=OUTPUT)
 save_model_option = output_option(
     "--save-model", metavar="FILE.toml", help="Save the model here, for --model to read.", panel=OUTPUT
 )
@@ -228,18 +215,13 @@ def _show_in(ctx: click.Context, param: click.Parameter, system: Literal["field"
 units_option = click.option(
     "--units", type=click.Choice(["field", "si"]), default="field", show_default=True, expose_value=False,
     callback=_show_in, panel=OUTPUT,
-    help="Units of what is printed and drawn: of the field (arcsec, ppm, µg ...) or SI. Numbers in JSON are in SI.",
+    help="Units that are printed and drawn: of the field (arcsec, ppm, µg) or SI.",
 )  # fmt: skip
 target_option = partial(
     click.option, "--target", "targets", multiple=True, metavar="NAME=SIGMA",
     help="The sigma wanted of a parameter (theta1, K2), of a kind (theta, phi, nu, K, b) or of all angles, with a unit "
-    "(2ppm, 20ug, 0.1arcsec) or in SI; repeatable.",
+    "(2ppm, 20ug, 0.1arcsec); repeatable.",
 )  # fmt: skip
-
-
-def examples(*lines: str) -> str:
-    """What follows the options in ``--help``, a line each."""
-    return "\n\n".join(["Examples:", *(f"$ kf-calib {line}" for line in lines)])
 
 
 def overrides(options: Mapping[str, Any]) -> dict[str, str]:
@@ -272,22 +254,22 @@ def _bench_from_toml(path: Path) -> dict[str, str]:
 def recording_of(path: Path, options: Mapping[str, Any], input: RawInput | None = None) -> Recording | Lines | Table:
     """The recording, log of samples or table at a path; input: what the device sends, where nothing else states it."""
     from kf_calib.sources.files.lines import Lines
-    from kf_calib.sources.opening import Kind, kind_of, no_recording
+    from kf_calib.sources.opening import FileKind, kind_of, no_recording
     from kf_calib.sources.tables.opening import open_table
 
     columns, angles = dict(map(pair, options["columns"])), not options["no_angles"]
     match kind_of(path, columns):
-        case Kind.TABLE:
+        case FileKind.TABLE:
             refuse_given(OF_MESSAGES + OF_DWELLS, f"{path} is a table of mean readings")
             stated = {name: options[name] for name in ("angle_unit", "g_unit")}
             return open_table(path, overrides(options), columns=columns, angles=angles, input=input, **stated)
-        case Kind.SAMPLES:
+        case FileKind.SAMPLES:
             refuse_given(OF_MESSAGES, f"{path} is a log in lines of text")
             return Lines(path, overrides(options), columns, units=units_of(options, input), angles=angles)
-        case Kind.RECORDING:
+        case FileKind.RECORDING:
             refuse_given(_OF_TEXT, f"{path} is no table (.csv, .xlsx) and no log in lines of text")
             return messages_of(path, options, angles, input)
-        case Kind.CALIBRATION:
+        case FileKind.CALIBRATION:
             raise no_recording(path)
 
 
@@ -374,7 +356,7 @@ def _bench_model_of(options: Mapping[str, Any]) -> BenchModel | None:
         return None
     from kf_calib.estimation import bench_model
 
-    return bench_model.read(options["bench_model"])
+    return bench_model.read_bench_model(options["bench_model"])
 
 
 def used_of(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -404,9 +386,9 @@ def effects_of(options: Mapping[str, Any]) -> tuple[str, ...]:
 
     model = None
     if options["model_file"] is not None:
-        from kf_calib.exchange import models
+        from kf_calib.exchange import calibration_file
 
-        model = models.read(options["model_file"])
+        model = calibration_file.read_model(options["model_file"])
     for path in options["effects_from"]:
         load_file(path)
     for text in options["effects"]:
@@ -416,64 +398,3 @@ def effects_of(options: Mapping[str, Any]) -> tuple[str, ...]:
     for change in model.load(options["effects_from"], options["trust"]):
         complain(f"{change}")
     return merged(model.effects, options["effects"])
-
-
-def save_view(result: Calibration | Diagnosis | Improvement, path: Path) -> None:
-    """The Rerun view of a result; Rerun is imported when there is one to save."""
-    from kf_calib.views import rerun
-
-    rerun.save(result, path)
-
-
-def print_json(content: Mapping[str, Any]) -> None:
-    echo(json_line(content))
-
-
-def json_line(content: Mapping[str, Any]) -> str:
-    """One line of JSON; what is not printable is escaped, which JSON itself asks of a part of it only."""
-    text = json.dumps(content, ensure_ascii=False, allow_nan=False)
-    return text if text.isprintable() else "".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in text)
-
-
-def show(renderable: Any) -> None:
-    echo_drawn(rendered(renderable))
-
-
-def rendered(renderable: Any) -> str:
-    """As text for standard output, its line ended; nothing is written."""
-    from kf_calib.views.terminal import PlainConsole
-
-    screen, text = sys.stdout.isatty(), io.StringIO()
-    width = None if screen or os.environ.get("COLUMNS", "").isdigit() else 110
-    PlainConsole(file=text, force_terminal=screen or None, width=width, soft_wrap=not screen).print(renderable)
-    return text.getvalue()
-
-
-@contextlib.contextmanager
-def progress(text: str, quiet: bool = False) -> Iterator[Callable[[float], None]]:
-    """What is being done, on a terminal's stderr; nothing where stderr is piped.
-
-    A bar where a fraction is told; while none is known, or all of it was read and the work goes on, the bar only
-    moves, beside the stage that the work is in.
-    """
-    if quiet or not sys.stderr.isatty():
-        yield lambda fraction: None
-        return
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
-
-    from kf_calib.support import stage
-    from kf_calib.views.terminal import PlainConsole
-
-    columns = BarColumn(20), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("{task.description}", markup=False)
-    with Progress(*columns, console=PlainConsole(stderr=True), transient=True, redirect_stdout=False) as bars:
-        bars.add_task(text, total=None)
-        (task,) = bars.tasks
-
-        def tick(fraction: float) -> None:  # a task whose total is reached would stand still from then on
-            task.completed, task.total = fraction, 1.0 if fraction < 1.0 else None
-
-        def say(now: str) -> None:
-            task.description = f"{text}: {now}"
-
-        with stage.listener(say):
-            yield tick

@@ -7,24 +7,18 @@ from typing import Any
 
 import rich_click as click
 
+from kf_calib.cli.command import command
+from kf_calib.cli.echo import print_json, progress, show
 from kf_calib.cli.files import claimed, delivery
 from kf_calib.cli.numbers import NumberInRange
-from kf_calib.cli.options import (
-    examples,
-    json_option,
-    overwrite_option,
-    print_json,
-    progress,
-    show,
-    units_option,
-)
+from kf_calib.cli.options import json_option, overwrite_option, units_option
 from kf_calib.cli.pictures import Pictures, figure_options
 
 of_the_run = partial(click.option, panel="Run")
 inferred = partial(click.option, panel="Conditions that the paper does not print: inferred")
 
 
-@click.command(epilog=examples("paper", "paper --repetitions 1000 --png paper.png"))
+@command("paper", "paper --repetitions 1000 --png paper.png")
 @of_the_run(
     "--repetitions",
     type=click.IntRange(1, 20000),

@@ -6,13 +6,20 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
+from kf_calib.cli.command import OUTPUT
 from kf_calib.cli.echo import complain
 from kf_calib.cli.files import Delivery, output_option
-from kf_calib.cli.options import OUTPUT, rrd_option, save_view
+
+if TYPE_CHECKING:
+    from kf_calib.diagnosis.results import Diagnosis
+    from kf_calib.diagnosis.stepwise_selection import Improvement
+    from kf_calib.estimation.results import Calibration
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+rrd_option = output_option("--rrd", metavar="FILE.rrd", help="Save the Rerun view here.", panel=OUTPUT)
 
 
 @dataclass(frozen=True)
@@ -35,7 +42,7 @@ class Pictures:
 
         A viewer that finds no graphics driver is a complaint; all else that fails is told as for any other file.
         """
-        deliver.file(self.rrd, lambda path: save_view(result, path))
+        deliver.file(self.rrd, lambda path: write_view(result, path))
         self._screenshot(deliver, result)
         for kind, path in (("png", self.png), ("svg", self.svg), ("pdf", self.pdf)):
             deliver.file(path, lambda path, kind=kind: _save_figures(result, path, kind))
@@ -49,7 +56,7 @@ class Pictures:
             with tempfile.TemporaryDirectory() as folder:
                 drawn = rrd or Path(folder) / "view.rrd"
                 if rrd is None:
-                    save_view(result, drawn)
+                    write_view(result, drawn)
                 screenshot(drawn, path)
 
         deliver.file(self.screenshot, draw)
@@ -75,7 +82,14 @@ def picture_options(command: F) -> F:
 
 def figure_options(command: F) -> F:
     """``--png``, ``--svg``, ``--pdf`` for figures."""
-    for kind, what in (("pdf", "figures, one a page,"), ("svg", "main figure"), ("png", "main figure")):
-        text = f"Save the {what} here, drawn by matplotlib."
+    for kind, what in (("pdf", "figures, one a page"), ("svg", "main figure"), ("png", "main figure")):
+        text = f"Save the {what} here."
         command = output_option(f"--{kind}", metavar=f"FILE.{kind}", help=text, panel=OUTPUT)(command)
     return command
+
+
+def write_view(result: Calibration | Diagnosis | Improvement, path: Path) -> None:
+    """The Rerun view of a result; Rerun is imported when there is one to save."""
+    from kf_calib.views import rerun
+
+    rerun.save_view(result, path)

@@ -11,21 +11,18 @@ from typing import TYPE_CHECKING, Any
 
 import rich_click as click
 
+from kf_calib.cli.command import OUTPUT, command
+from kf_calib.cli.echo import print_json, progress, show
 from kf_calib.cli.files import claimed, delivery, output_option
 from kf_calib.cli.numbers import POSITIVE, NumberInRange
 from kf_calib.cli.options import (
-    OUTPUT,
     F,
-    examples,
     filter_options,
     json_option,
     opened,
     overrides,
     overwrite_option,
-    print_json,
-    progress,
     recording_options,
-    show,
     target_option,
     units_option,
 )
@@ -92,13 +89,11 @@ def _plan_options(command: F) -> F:
     return command
 
 
-@click.command(
-    epilog=examples(
-        "plan --count 12 --limit z=-90:90 --csv plan.csv",
-        "plan --target K=2ppm --fewest",
-        "plan --recording run.mcap",
-    )
-)
+@command(
+    "plan --count 12 --limit z=-90:90 --csv plan.csv", "plan --target K=2ppm --fewest", "plan --recording run.mcap",
+    seldom=("beside_paper", "zones", "grid_deg", "repeats", "antipodal", "time_correlation", "seed", "readings",
+            "white_mps2", "sample_hz", "accel_unit", "angle_unit", "columns", "effects", "model_file", "left_out"),
+)  # fmt: skip
 @_plan_options
 @recording_options
 @filter_options
@@ -262,7 +257,7 @@ def _reach(bench: Bench, options: Mapping[str, Any]) -> Reach:
 
 
 def _aim(options: Mapping[str, Any], gravity_mps2: float) -> Aim:
-    from kf_calib.bench.targets import targets_of
+    from kf_calib.bench.paper_parameters import targets_of
     from kf_calib.design import optimality_criteria
 
     if options["targets"]:

@@ -12,21 +12,17 @@ from click import get_current_context  # rich_click declares that there may be n
 from click.core import ParameterSource
 
 from kf_calib.cli.certificate import stated_in, statement_option, write_certificate
+from kf_calib.cli.command import INPUT, OUTPUT, command
+from kf_calib.cli.echo import print_json, progress, show
 from kf_calib.cli.files import Delivery, claimed, delivery, output_option
 from kf_calib.cli.options import (
-    INPUT,
-    OUTPUT,
     effects_of,
-    examples,
     filter_options,
     json_option,
     opened,
     overwrite_option,
-    print_json,
-    progress,
     recording_of,
     recording_options,
-    show,
     strict_option,
     units_option,
 )
@@ -40,12 +36,11 @@ report_option = output_option(
 )
 
 
-@click.command(
-    epilog=examples(
-        "report run.mcap", "report after.mcap --against before.mcap -o shift.html",
-        "report run.mcap --model after.toml --against before.toml",
-    )
-)  # fmt: skip
+@command(
+    "report run.mcap",
+    "report after.mcap --against before.mcap -o shift.html",
+    "report run.mcap --model after.toml --against before.toml",
+)
 @click.argument("recording", type=click.Path(path_type=Path))
 @click.option(
     "--against", type=click.Path(path_type=Path), metavar="PATH", panel=INPUT,
@@ -136,10 +131,14 @@ def measured_of(recording: Path, options: dict[str, Any]) -> Measured:
     """What a page says of a recording's file; raises MissingExtraError, before the work, where no page can be made."""
     import kf_calib.views.figures  # noqa: F401  # which a page needs
     from kf_calib.diagnosis.selection_journal import Origin
+    from kf_calib.sources.files.decision_records import END_RECORD, decision_records
     from kf_calib.sources.run_date import run_date
     from kf_calib.views.report.measured import Measured
 
-    return Measured(recording.name, Origin.of(recording).sha256, run_date(recording_of(recording, options)))
+    fingerprint, began = Origin.of(recording).sha256, run_date(recording_of(recording, options))
+    is_driven = recording.suffix == ".mcap" and recording.is_file()
+    decided, ends = ((decision_records(recording), decision_records(recording, END_RECORD)) if is_driven else ((), ()))
+    return Measured(recording.name, fingerprint, began, decided, ends)
 
 
 def _diagnosed(recording: Path, options: dict[str, Any], quiet: bool) -> tuple[Diagnosis, Measured]:
@@ -156,7 +155,7 @@ def _diagnosed(recording: Path, options: dict[str, Any], quiet: bool) -> tuple[D
 def _programs_of(model: Path | None) -> list[Path]:
     from kf_calib.estimation import model_file
 
-    return [] if model is None else [each.path for each in model_file.read(model).programs]
+    return [] if model is None else [each.path for each in model_file.read_model_file(model).programs]
 
 
 _HOW_IT_ENDS = ("overwrite", "strict", "as_json")

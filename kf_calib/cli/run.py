@@ -11,26 +11,23 @@ from typing import TYPE_CHECKING, Any
 
 import rich_click as click
 
+from kf_calib.cli.command import command
 from kf_calib.cli.driven_run import DrivenRun
-from kf_calib.cli.echo import complain
+from kf_calib.cli.echo import complain, print_json, rendered, show
 from kf_calib.cli.files import claimed, delivery, output_option
 from kf_calib.cli.live import follow, outcome
 from kf_calib.cli.live_run import on_bench
 from kf_calib.cli.numbers import POSITIVE
 from kf_calib.cli.options import (
     bench_options,
-    examples,
     filter_options,
     input_options,
     json_option,
     overrides,
     overwrite_option,
-    print_json,
-    rendered,
     save_model_option,
     save_option,
     settings_of,
-    show,
     strict_option,
     target_option,
     units_option,
@@ -51,14 +48,13 @@ if TYPE_CHECKING:
 DRIVING = "How it is driven"
 
 
-@click.command(
-    epilog=examples(
-        'run --positioner "sim://?hide=second-order=20sigma&seed=3" --record run.mcap --target K=2ppm',
-        "run --positioner acutrol3000 --source socket://10.0.0.5:5000 --bench bench.toml --record run.mcap "
-        "--target K=2ppm --target angles=1arcsec --budget-s 3600",
-        "run --positioner hand --source /dev/ttyUSB0 --axes 'y z x' --gravity 9.81 --target K=2ppm",
-        "run --positioner acutrol3000 --bench bench.toml --dry-run",
-    )
+@command(
+    'run --positioner "sim://?hide=second-order=20sigma&seed=3" --record run.mcap --target K=2ppm',
+    "run --positioner acutrol3000 --source socket://10.0.0.5:5000 --bench bench.toml --record run.mcap "
+    "--target K=2ppm --target angles=1arcsec --budget-s 3600",
+    "run --positioner hand --source /dev/ttyUSB0 --axes 'y z x' --gravity 9.81 --target K=2ppm",
+    "run --positioner acutrol3000 --bench bench.toml --dry-run",
+    seldom=("accel_unit", "model_file", "left_out", "save_model", "stay_s", "most"),
 )
 @click.option("--positioner", required=True, metavar="P", panel=DRIVING,
               help="sim://... (emulated, with its readings), hand, the name of a shipped profile (acutrol3000, lines, "
@@ -96,7 +92,7 @@ def run(
     zones of the gimbals come from the bench file. Whatever goes wrong, the table is stopped first. This is no
     substitute for interlocks and an emergency stop.
     """
-    from kf_calib.bench.targets import targets_of
+    from kf_calib.bench.paper_parameters import targets_of
     from kf_calib.positioning.opening import open_positioner
     from kf_calib.sources.live import files_of
 
@@ -179,7 +175,6 @@ def _drive(device: Opened, most: int, options: Mapping[str, Any], running: Drive
 
     session = running.session
     assert isinstance(session, Session)
-    session.look_factor = 1.2
     itinerary = _itinerary(running.source.bench, most, options)
     rules = Rules(itinerary.reach, itinerary.pace, device.watch)
     if isinstance(device.clock, SimulatedTime):

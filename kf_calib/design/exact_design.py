@@ -131,9 +131,9 @@ class Search:
 
     def refuse_unseen(self) -> None:
         """Raise UnobservableError if all candidates together leave parameters undetermined."""
-        if not optimality_criteria.unseen(self.prospect.start).any():
+        if not optimality_criteria.is_unseen(self.prospect.start).any():
             return
-        lost = optimality_criteria.unseen(self.factor(self.candidate_rows))
+        lost = optimality_criteria.is_unseen(self.factor(self.candidate_rows))
         if lost.any():
             names = ", ".join(symbol for symbol, own in zip(self.prospect.symbols, lost, strict=True) if own)
             raise UnobservableError(

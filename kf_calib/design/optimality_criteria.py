@@ -120,7 +120,7 @@ def sigmas(factors: Floats) -> Floats:
     return np.linalg.norm(np.linalg.inv(regular(factors)), axis=-1)
 
 
-def unseen(factor: Floats) -> Mask:
+def is_unseen(factor: Floats) -> Mask:
     """Mask (p,) of the states that a factor does not determine."""
     _, singular, right = np.linalg.svd(factor)
     lost = right[singular <= 1e-9 * max(float(singular[0]), 1e-300)]

@@ -72,7 +72,7 @@ class Plan:
     def sigma(self) -> Floats:
         """Sigmas (n + 1, p) of the parameters in SI before the first dwell and after each; NaN if not determined."""
         out = optimality_criteria.sigmas(self.factors) * self.prospect.units
-        return np.where([optimality_criteria.unseen(factor) for factor in self.factors], np.nan, out)
+        return np.where([optimality_criteria.is_unseen(factor) for factor in self.factors], np.nan, out)
 
     @property
     def targets(self) -> Floats:
@@ -246,7 +246,9 @@ def fewest(search: Search, timing: Timing, seed: int = 0, on_try: Callable[[int]
         """Return the aim of the best ``count`` orientations; infinite if they leave parameters undetermined."""
         if count not in tried:
             on_try(count * copies)
-            enough = not optimality_criteria.unseen(search.factor(search.candidate_rows[search.exchange(count)])).any()
+            enough = not optimality_criteria.is_unseen(
+                search.factor(search.candidate_rows[search.exchange(count)])
+            ).any()
             tried[count] = math.exp(search.measure(search.best(count))) if enough else math.inf
         return tried[count]
 
@@ -301,7 +303,7 @@ def _ordered(search: Search, poses: Floats, timing: Timing, seed: int) -> Floats
 
 def _refuse_unseen(plan: Plan) -> None:
     """Raise UnobservableError if the plan leaves parameters undetermined."""
-    lost = optimality_criteria.unseen(plan.factors[-1])
+    lost = optimality_criteria.is_unseen(plan.factors[-1])
     if lost.any():
         names = ", ".join(symbol for symbol, own in zip(plan.prospect.symbols, lost, strict=True) if own)
         raise UnobservableError(f"{len(plan.poses)} dwells leave {names} undetermined: plan more of them (--count).")

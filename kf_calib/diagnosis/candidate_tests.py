@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.within_dwell_trend import Trend, trend
 from kf_calib.dwells.coherent_tone import band_hz
-from kf_calib.dwells.line_spectrum import Line, lowest_hz
+from kf_calib.dwells.line_spectrum import SpectralLine, lowest_hz
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects import Effect, effect_named, names, oscillation_of, slew_effects, walk_named
 from kf_calib.estimation.dwell_columns import stimulus_of
@@ -84,9 +84,9 @@ class LineTests:
     - untested_band: in words, the frequencies of an oscillation that are too fast for the scan and too slow for a line.
     """
 
-    significant: tuple[Line, ...] = ()
+    significant: tuple[SpectralLine, ...] = ()
     oscillation: str = ""
-    vibration: tuple[Line, ...] = ()
+    vibration: tuple[SpectralLine, ...] = ()
     untested_band: str = ""
 
 
@@ -129,7 +129,7 @@ class CandidateTests:
         """Effects that the run cannot show, and oscillations at untested frequencies."""
         return [*self.effects.unseen, *([self.lines.untested_band] if self.lines.untested_band else [])]
 
-    def with_vibration(self, lines: tuple[Line, ...]) -> CandidateTests:
+    def with_vibration(self, lines: tuple[SpectralLine, ...]) -> CandidateTests:
         """The same tests, with these lines counted as vibration."""
         return replace(self, lines=replace(self.lines, vibration=lines))
 

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from kf_calib.estimation.results import Calibration
-from kf_calib.support.logarithms import weights
+from kf_calib.support.tail_probabilities import weights
 
 NOTHING, NOISE, NONE = "nothing", "unstated noise", "none of the known"
 """Families of the rows that name no effect: nothing missing, noise that was not stated, and no known effect."""

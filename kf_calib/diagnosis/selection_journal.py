@@ -44,10 +44,9 @@ from kf_calib.effects import refuse_unfit
 from kf_calib.effects.programs import Program
 from kf_calib.errors import InputError
 from kf_calib.estimation.results import Calibration
-from kf_calib.sources.files.bags import fingerprint
+from kf_calib.sources.files.record_files import fingerprint
 from kf_calib.support.output_files import write_whole
-from kf_calib.support.toml_files import toml_table
-from kf_calib.support.value_schema import FINITE, TEXT, Misfit, converted
+from kf_calib.support.toml_files import FINITE, TEXT, Misfit, converted, toml_table
 
 
 @dataclass(frozen=True)

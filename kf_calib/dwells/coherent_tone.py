@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats, Mask
-from kf_calib.dwells.line_spectrum import Line, independent
+from kf_calib.dwells.line_spectrum import SpectralLine, independent
 from kf_calib.support.tail_probabilities import sidak
 
 _CELL_S = 0.125  # largest length of a cell, unless readings are less frequent
@@ -136,7 +136,7 @@ def _median_dwell_s(traces: Sequence[Trace]) -> float:
     return float(lengths[np.searchsorted(np.cumsum(lengths), 0.5 * lengths.sum())] * traces[0].cell_s)
 
 
-def tone(traces: Sequence[Trace], level: float = 0.01) -> Line | None:
+def tone(traces: Sequence[Trace], level: float = 0.01) -> SpectralLine | None:
     """The most likely oscillation of constant frequency and phase in all dwells, or None.
 
     It is returned if its p-value over the whole band is below ``level`` and if it keeps its phase from dwell to dwell.
@@ -176,7 +176,9 @@ def tone(traces: Sequence[Trace], level: float = 0.01) -> Line | None:
     if p_value >= level or not _steady(recorded, frequency_hz[k], levels[:, k] * passed_share[k], varying):
         return None
     gain = passed_share[k] * np.sinc(frequency_hz[k] * cell_s) * sum(float(trace.counts.sum()) for trace in recorded)
-    return Line(float(frequency_hz[k]), p_value, int(np.argmax(np.abs(wave[:, k]))), 2.0 * np.abs(wave[:, k]) / gain)
+    return SpectralLine(
+        float(frequency_hz[k]), p_value, int(np.argmax(np.abs(wave[:, k]))), 2.0 * np.abs(wave[:, k]) / gain
+    )
 
 
 def _steady(traces: Sequence[Trace], frequency_hz: float, noise: Floats, varying: Mask) -> bool:

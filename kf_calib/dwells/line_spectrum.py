@@ -28,7 +28,7 @@ _LEAK = 0.05  # bins into which a line leaks more than this share of the level a
 
 
 @dataclass(frozen=True)
-class Line:
+class SpectralLine:
     """A spectral line.
 
     - p_value: the probability that noise alone has a peak as high anywhere in the spectrum.
@@ -81,7 +81,7 @@ class Spectrum:
         return cls({length: _Sum((amplitudes.real**2 + amplitudes.imag**2).sum(axis=1).T, segments, float(duration_s))})
 
 
-def lines(spectra: Iterable[Spectrum], level: float = 0.01) -> tuple[Line, ...]:
+def lines(spectra: Iterable[Spectrum], level: float = 0.01) -> tuple[SpectralLine, ...]:
     """The lines of a run whose p-value is below ``level``, the most significant first, from the spectra of its dwells.
 
     The segment length that covers most readings is used; channels that do not vary are left out.
@@ -127,9 +127,9 @@ class _Search:
         self.height = self.heights[:, varying].mean(axis=1)
         self.freedom = 2.0 * total.segments * independent(self.heights[_FIRST_BIN:-1, varying])
 
-    def lines(self, level: float) -> tuple[Line, ...]:
+    def lines(self, level: float) -> tuple[SpectralLine, ...]:
         """The lines whose p-value is below ``level``."""
-        significant, candidates = list[Line](), self._peaks()
+        significant, candidates = list[SpectralLine](), self._peaks()
         bins = len(self.height) - _FIRST_BIN - 1
         while candidates.any() and len(significant) < _MOST_LINES:
             k = int(np.argmax(np.where(candidates, self.height, 0.0)))
@@ -157,7 +157,7 @@ class _Search:
         relative = 1.0 / (_MEDIAN_EFFICIENCY * neighbours) + _leverages(len(self.height))[k]
         return float(fdtrc(self.freedom, self.freedom / relative, self.height[k]))
 
-    def _line(self, k: int, p_value: float) -> tuple[Line, float]:
+    def _line(self, k: int, p_value: float) -> tuple[SpectralLine, float]:
         """Return the line in bin ``k`` and its position between bins, from the main lobe of the Hann window, sin(pi x)
         / (pi x (1 - x^2)) / 2."""
         # heights relative to the level at one bin, since a strong line makes the level itself vary
@@ -171,7 +171,7 @@ class _Search:
         excess = np.where(np.isfinite(self.level[k]), self.power[k] - self.level[k], 0.0)
         amplitude = np.sqrt(np.maximum(excess, 0.0)) / gain
         position = k + side * shift
-        return Line(position * self.bin_hz, p_value, int(np.argmax(self.heights[k])), amplitude), position
+        return SpectralLine(position * self.bin_hz, p_value, int(np.argmax(self.heights[k])), amplitude), position
 
 
 def independent(heights: Floats) -> float:

@@ -26,11 +26,14 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import turn_by
 from kf_calib.dwells.attitude_error import AttitudeError
 from kf_calib.dwells.coherent_tone import Trace, tone
-from kf_calib.dwells.line_spectrum import Line, Spectrum, lines
+from kf_calib.dwells.line_spectrum import SpectralLine, Spectrum, lines
 from kf_calib.dwells.pieces import Piece
 from kf_calib.dwells.qr import square_triangle
 from kf_calib.dwells.rows import Nodes, parabola
 from kf_calib.dwells.walk_path import WalkPath, walk_path_of
+
+LEAST_FREEDOM = 8
+"""Degrees of freedom of a piece, with fewer of which its variance is that of its whole dwell."""
 
 _LAGS = 64
 
@@ -221,7 +224,7 @@ class DwellFactor:
         over the dwell."""
         squares, freedom = self.squares, np.maximum(self.counts - float(self.width), 0.0)[:, None]
         pooled = squares.sum(axis=0) / max(freedom.sum(), 1)
-        return np.where(freedom >= 8, squares / np.maximum(freedom, 1), pooled)
+        return np.where(freedom >= LEAST_FREEDOM, squares / np.maximum(freedom, 1), pooled)
 
     @cached_property
     def walk(self) -> WalkPath:
@@ -343,7 +346,7 @@ def dwells_without(dwells: Sequence[DwellFactor], left_out: Collection[int]) -> 
     return [dwell for k, dwell in enumerate(linked) if k not in left_out]
 
 
-def lines_of(dwells: Sequence[DwellFactor], level: float = 0.01) -> tuple[Line, ...]:
+def lines_of(dwells: Sequence[DwellFactor], level: float = 0.01) -> tuple[SpectralLine, ...]:
     """Oscillations in the readings of dwells at the significance ``level``.
 
     These are the lines of the averaged spectrum or, if there are none, a single oscillation that is too weak to appear

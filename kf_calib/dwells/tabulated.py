@@ -52,8 +52,10 @@ def dwells_of(table: Sequence[TabulatedDwell], bench: Bench) -> list[DwellFactor
     times = _times(table)
     unknown = Autocovariance(), Spectrum(), Trace()  # the same objects for all dwells, since a set takes 2 kB
     return [
-        DwellFactor(k + 1, (_piece(orientation, nodes, bench, times),), *unknown)
-        for k, (orientation, nodes) in enumerate(zip(table, _nodes(table, bench), strict=True))
+        DwellFactor(k + 1, (Piece(triangle, nodes, row.count * times, 0.0, row.count),), *unknown)
+        for k, (row, triangle, nodes) in enumerate(
+            zip(table, _triangles(table, times), _nodes(table, bench), strict=True)
+        )
     ]
 
 
@@ -82,21 +84,28 @@ def _times(table: Sequence[TabulatedDwell]) -> int:
 def _nodes(table: Sequence[TabulatedDwell], bench: Bench) -> Iterator[Nodes]:
     """Yield the nodes of each dwell; their times are apart by a tenth of the shortest pause, the rest does not
     change."""
-    middles = np.array([orientation.elapsed_s for orientation in table])
+    middles, poses = np.array([row.elapsed_s for row in table]), np.array([row.pose for row in table])
     half_s = 0.1 * float(np.diff(middles).min(initial=60.0))
-    forces = bench.specific_force(middles, np.array([orientation.pose for orientation in table]))
-    for orientation, force in zip(table, forces, strict=True):
-        at_s = orientation.elapsed_s + half_s * np.array([-1.0, 0.0, 1.0])
-        pose, force = np.repeat(orientation.pose[None], 3, axis=0), np.repeat(force[None], 3, axis=0)
-        yield Nodes(at_s, np.full(3, half_s), force, pose, np.full(3, orientation.temperature_c))
+    forces = np.repeat(bench.specific_force(middles, poses)[:, None], 3, axis=1)
+    at_s, poses = middles[:, None] + half_s * np.array([-1.0, 0.0, 1.0]), np.repeat(poses[:, None], 3, axis=1)
+    warmth, since_s = np.repeat([[row.temperature_c] for row in table], 3, axis=1), np.full(3, half_s)
+    for at, force, pose, temperature_c in zip(at_s, forces, poses, warmth, strict=True):
+        yield Nodes(at, since_s, force, pose, temperature_c)
 
 
-def _piece(orientation: TabulatedDwell, nodes: Nodes, bench: Bench, times: int) -> Piece:
-    """Return the one piece of a dwell."""
-    count, mean = orientation.count * times, orientation.mean_mps2
-    triangle = np.zeros((_CURVE + 3, _CURVE + 3))
-    triangle[0, 0], triangle[0, _CURVE:] = math.sqrt(count), math.sqrt(count) * mean
-    if orientation.sigma_mps2 is not None:  # about a parabola, because the noise model assumes so
-        sigma = orientation.sigma_mps2 * math.sqrt(times * (count - _CURVE))
-        triangle[_CURVE:, _CURVE:] = np.diag(sigma)
-    return Piece(triangle, nodes, count, 0.0, orientation.count)
+def _triangles(table: Sequence[TabulatedDwell], times: int) -> Floats:
+    """Return the triangles (D, 6, 6) of the one piece of each dwell."""
+    counts, triangles = (
+        np.array([row.count * times for row in table], float),
+        np.zeros((len(table), _CURVE + 3, _CURVE + 3)),
+    )
+    triangles[:, 0, 0] = np.sqrt(counts)
+    triangles[:, 0, _CURVE:] = np.sqrt(counts)[:, None] * np.array([row.mean_mps2 for row in table])
+    scattering = [k for k, row in enumerate(table) if row.sigma_mps2 is not None]
+    if scattering:  # about a parabola, because the noise model assumes so
+        sigmas = np.array([table[k].sigma_mps2 for k in scattering], float)
+        freedom = times * (counts[scattering, None] - _CURVE)
+        triangles[np.array(scattering)[:, None], _CURVE + np.arange(3), _CURVE + np.arange(3)] = sigmas * np.sqrt(
+            freedom
+        )
+    return triangles

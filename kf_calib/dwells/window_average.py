@@ -17,7 +17,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.blocks import Block
-from kf_calib.dwells.line_spectrum import Line
+from kf_calib.dwells.line_spectrum import SpectralLine
 from kf_calib.dwells.orthonormal_parabola import orthonormal_parabola
 
 WINDOW_S = 1.0
@@ -29,7 +29,7 @@ _OVERLAP = 3  # number of windows in which each reading lies; the squares of Han
 _SHORTEST_S = 0.5  # shorter blocks are left out, since a window in them would not cover several periods of vibration
 
 
-def window_s(lines: Iterable[Line]) -> float:
+def window_s(lines: Iterable[SpectralLine]) -> float:
     """Length of the windows that average out the strongest of the lines in the readings, s.
 
     A vibration that is sampled too slowly appears at another frequency and leaves as much as one of that frequency.

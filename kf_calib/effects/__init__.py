@@ -15,7 +15,7 @@ from functools import cache
 from pathlib import Path
 
 from kf_calib.bench.bench import Bench
-from kf_calib.effects import checks, drift, dynamic, formula, frame, sensor, surroundings, thermal, user
+from kf_calib.effects import checks, drift, formula, frame, sensor, surroundings, thermal, user
 from kf_calib.effects.effect import Bearer, Coefficient, Effect, FrameEffect, SensorEffect, Unknown
 from kf_calib.effects.programs import Program
 from kf_calib.effects.stimulus import Stimulus
@@ -38,7 +38,7 @@ _PLAIN: dict[str, type[Effect]] = {
         thermal.ThermalBias, thermal.ThermalBias2, thermal.ThermalScale, thermal.ThermalRate,
         thermal.ThermalMisalignment, thermal.ThermalLag, surroundings.Magnetic,
         frame.BaseTilt, frame.BaseTiltDrift, frame.PlatformDrift, frame.GravityError,
-        frame.EarthRotation, frame.Flexure, frame.UnevenFlexure, frame.CrossTalk, dynamic.Latency, dynamic.LeverArm,
+        frame.EarthRotation, frame.Flexure, frame.UnevenFlexure, frame.CrossTalk, frame.Latency, frame.LeverArm,
     )
 }  # fmt: skip
 _OF_A_GIMBAL = {
@@ -179,8 +179,8 @@ def register(kind: type[Effect], origin: str = "this program", program: Program 
     if known is not None:
         both = f"{origin} defines" if known.origin == origin else f"{known.origin} and {origin} both define"
         raise InputError(f"{both} an effect {name}: rename one of the two, or leave one out.")
-    effect = user.made(kind, origin)
-    said = checks.check(effect)
+    effect = user.instance_of(kind, origin)
+    said = checks.check_effect(effect)
     user.refuse_symbols(effect, _catalogue_symbols())
     _registered[name] = _Registered(kind, origin, program, said)
     return kind

@@ -67,7 +67,7 @@ def _trial_poses(axes: tuple[Any, ...], gravity_mps2: float) -> tuple[Floats, Fl
     return force, pose, 1e-6 * rng.chisquare(3.0, (_DWELLS * _NODES, 3))
 
 
-def check(effect: Effect, s: Stimulus | None = None) -> tuple[str, ...]:
+def check_effect(effect: Effect, s: Stimulus | None = None) -> tuple[str, ...]:
     """Try an effect's columns; returns what is worth knowing of it.
 
     Raises InputError, in one sentence with effect, check and values, where the columns have another shape than
@@ -147,10 +147,10 @@ def _call(effect: Effect, what: str, call: Callable[..., Any], *arguments: Any) 
     except InputError:
         raise
     except Exception as error:
-        raise InputError(f"{effect}: its {what} failed{line_of(error, type(effect))} ({words_of(error)}).") from None
+        raise InputError(f"{effect}: its {what} failed{line_of(error, type(effect))} ({error_words(error)}).") from None
 
 
-def words_of(error: BaseException) -> str:
+def error_words(error: BaseException) -> str:
     """An error of someone else's code in a line."""
     said = " ".join(str(error.msg if isinstance(error, SyntaxError) else error).split())[:200]
     return f"{type(error).__name__}: {said}" if said else type(error).__name__

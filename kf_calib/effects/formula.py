@@ -165,10 +165,10 @@ class _Reading:
 
 def _units(reading: _Reading, turning: bool) -> tuple[str, tuple[str, float]]:
     """SI unit of a formula's coefficients, a unit of the field, and how many of it are one; of angles, or readings."""
-    from kf_calib.effects.formula_units import coefficient_units, turning_units, unit_of
+    from kf_calib.effects.formula_units import coefficient_units, pint_unit_of, turning_units
 
     try:
-        unit = unit_of(reading.expression, reading.units)
+        unit = pint_unit_of(reading.expression, reading.units)
         return turning_units(unit) if turning else coefficient_units(unit)
     except InputError as error:
         raise InputError(f"{reading.name}: {error}") from None
@@ -193,7 +193,7 @@ class Formula(SensorEffect):
         vars(self).update(name=name, title=expression, symbol=symbol_stem(name), unit=unit, shown=shown, scale=1.0)
         self.text = f"{name} = {expression}"
         stimulus = _trial(bench.axes, bench.gravity_mps2)
-        self.remarks = checks.check(self, stimulus) if checked else ()
+        self.remarks = checks.check_effect(self, stimulus) if checked else ()
         vars(self).update(scale=_LARGE_MPS2 / self._values.typical(stimulus))
 
     def terms(self, s: Stimulus) -> Floats:
@@ -223,7 +223,7 @@ class FrameFormula(FrameEffect):
             raise InputError(f"{name}: an angle is one for the whole block: use fx, fy, fz in place of a, p, o and da.")
         symbols = [f"{symbol_stem(name)}{axis}" for axis in ("NE" if place == BASE else [f"_{place}"])]
         self._coefficients = tuple(Coefficient(symbol, unit, 1.0, *shown) for symbol in symbols)
-        self.remarks = checks.check(self, stimulus) if checked else ()
+        self.remarks = checks.check_effect(self, stimulus) if checked else ()
         scale = _LARGE_RAD / self._values.typical(stimulus)
         self._coefficients = tuple(replace(each, scale=scale) for each in self._coefficients)
 

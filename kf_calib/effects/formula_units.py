@@ -15,7 +15,7 @@ from kf_calib.support.units import RAISED, field_unit, per_power_of_g
 
 _ORDER = {"radian": "rad", "meter": "m", "second": "s", "kelvin": "K"}
 _POWER_LIMIT = 12.0
-Unit = Any
+PintUnit = Any
 """pint.Unit; pint is imported where a formula is used only."""
 
 
@@ -30,13 +30,13 @@ def _registry() -> Any:
     return units
 
 
-def unit_of(expression: Expression, units: Mapping[str, str]) -> Unit:
+def pint_unit_of(expression: Expression, units: Mapping[str, str]) -> PintUnit:
     """The unit of an expression over quantities of these ``units``; raises InputError where they do not fit."""
     names = {name: _registry().Unit(units[name]) for name in expression.names}
     return _unit(expression(names, _OPERATORS, _FUNCTIONS))
 
 
-def coefficient_units(unit: Unit) -> tuple[str, tuple[str, float]]:
+def coefficient_units(unit: PintUnit) -> tuple[str, tuple[str, float]]:
     """SI unit of the coefficient of an expression in ``unit``; and the unit of the field, with how many make one SI.
 
     Where the expression holds the nth power of an acceleration, the coefficient is told in µg per g^n, as the
@@ -51,13 +51,13 @@ def coefficient_units(unit: Unit) -> tuple[str, tuple[str, float]]:
     return si_unit, (text(acceleration**power / unit, shown.label, raised=True), shown.per_si)
 
 
-def turning_units(unit: Unit) -> tuple[str, tuple[str, float]]:
+def turning_units(unit: PintUnit) -> tuple[str, tuple[str, float]]:
     """The same of the coefficient of an expression that is an angle per unit of the coefficient; told in arcsec."""
     own, shown = _registry().Unit("rad") / unit, field_unit("rad")
     return text(own), (text(1 / unit, shown.label), shown.per_si)
 
 
-def text(unit: Unit, head: str = "", raised: bool = False) -> str:
+def text(unit: PintUnit, head: str = "", raised: bool = False) -> str:
     """A unit in one line, for example ``rad s^2/m``; after ``head`` if there is one, exponents ``raised`` or not."""
 
     def power(name: str, exponent: float) -> str:
@@ -71,16 +71,16 @@ def text(unit: Unit, head: str = "", raised: bool = False) -> str:
     return "".join([" ".join(above) or "1", *(f"/{power(name, -value)}" for name, value in powers if value < 0)])
 
 
-def _exponents(unit: Unit) -> dict[str, float]:
+def _exponents(unit: PintUnit) -> dict[str, float]:
     return {name: float(value) for name, value in _registry().Quantity(1.0, unit).unit_items()}
 
 
-def _unit(value: Unit | float) -> Unit:
+def _unit(value: PintUnit | float) -> PintUnit:
     return _registry().Unit("") if isinstance(value, float) else value
 
 
-def _alike(verb: str) -> Callable[..., Unit]:
-    def rule(one: Unit | float, other: Unit | float) -> Unit:
+def _alike(verb: str) -> Callable[..., PintUnit]:
+    def rule(one: PintUnit | float, other: PintUnit | float) -> PintUnit:
         if _zero(one) or _zero(other):
             return _unit(other if _zero(one) else one)
         left, right = _unit(one), _unit(other)
@@ -94,15 +94,15 @@ def _alike(verb: str) -> Callable[..., Unit]:
     return rule
 
 
-def _compared(one: Unit | float, other: Unit | float) -> Unit:
+def _compared(one: PintUnit | float, other: PintUnit | float) -> PintUnit:
     return _alike("compared")(one, other) ** 0
 
 
-def _zero(value: Unit | float) -> bool:
+def _zero(value: PintUnit | float) -> bool:
     return isinstance(value, float) and value == 0.0
 
 
-def _power(base: Unit | float, exponent: Unit | float) -> Unit:
+def _power(base: PintUnit | float, exponent: PintUnit | float) -> PintUnit:
     if not isinstance(exponent, float):
         _plain("an exponent")(exponent)
         return _plain("the base of a varying power")(base)
@@ -111,8 +111,8 @@ def _power(base: Unit | float, exponent: Unit | float) -> Unit:
     return _unit(base) ** exponent
 
 
-def _plain(what: str) -> Callable[..., Unit]:
-    def rule(value: Unit | float) -> Unit:
+def _plain(what: str) -> Callable[..., PintUnit]:
+    def rule(value: PintUnit | float) -> PintUnit:
         unit = _unit(value)
         if not unit.dimensionless:
             own = text(unit).replace("^", "**").replace(" ", "*")
@@ -125,8 +125,8 @@ def _plain(what: str) -> Callable[..., Unit]:
     return rule
 
 
-def _numbers_stay(number: Callable[..., Any], rule: Callable[..., Unit]) -> Callable[..., Unit | float]:
-    def apply(*values: Unit | float) -> Unit | float:
+def _numbers_stay(number: Callable[..., Any], rule: Callable[..., PintUnit]) -> Callable[..., PintUnit | float]:
+    def apply(*values: PintUnit | float) -> PintUnit | float:
         if all(isinstance(value, float) for value in values):
             return float(number(*values))
         return rule(*values)
@@ -134,7 +134,7 @@ def _numbers_stay(number: Callable[..., Any], rule: Callable[..., Unit]) -> Call
     return apply
 
 
-_RULES: dict[str, Callable[..., Unit]] = {
+_RULES: dict[str, Callable[..., PintUnit]] = {
     "+": _alike("added"), "-": _alike("subtracted"), **dict.fromkeys(("<", "<=", ">", ">="), _compared),
     "*": lambda a, b: _unit(a) * _unit(b), "/": lambda a, b: _unit(a) / _unit(b), "**": _power,
     "neg": _unit, "pos": _unit, "abs": _unit, "sqrt": lambda a: _unit(a) ** 0.5, "sign": lambda a: _unit(a) ** 0,

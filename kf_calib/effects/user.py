@@ -58,7 +58,7 @@ def classes_in(source: bytes, path: Path) -> list[type[Effect]]:
     except (Exception, SystemExit) as error:
         del sys.modules[module.__name__]
         raise InputError(
-            f"{path}{_line(error, path)}: cannot be run ({checks.words_of(error)}): mend it there."
+            f"{path}{_line(error, path)}: cannot be run ({checks.error_words(error)}): mend it there."
         ) from None
     classes = effect_classes(module)
     if not classes:
@@ -103,7 +103,7 @@ def classes_installed() -> list[tuple[type[Effect], str]]:
             loaded = point.load()
         except Exception as error:
             raise InputError(
-                f"{origin} of {GROUP}: cannot be loaded ({checks.words_of(error)}): mend or uninstall its package."
+                f"{origin} of {GROUP}: cannot be loaded ({checks.error_words(error)}): mend or uninstall its package."
             ) from None
         kinds = effect_classes(loaded) if isinstance(loaded, ModuleType) else [loaded]
         for kind in kinds:
@@ -139,14 +139,14 @@ def completed(kind: type[Effect], origin: str) -> type[Effect]:
     return kind
 
 
-def made(kind: type[Effect], origin: str) -> Effect:
+def instance_of(kind: type[Effect], origin: str) -> Effect:
     """An effect of the class; raises InputError where it cannot be made without arguments."""
     try:
         return kind()
     except Exception as error:
         raise InputError(
             f"class {kind.__name__} of {origin} cannot be made without arguments"
-            f"{checks.line_of(error, kind)} ({checks.words_of(error)}): give those of __init__ default values."
+            f"{checks.line_of(error, kind)} ({checks.error_words(error)}): give those of __init__ default values."
         ) from None
 
 

@@ -14,10 +14,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats
-from kf_calib.bench.bench import turn_by
+from kf_calib.bench.arrays import Floats, crossed
+from kf_calib.bench.bench import turn_by, turned
 from kf_calib.bench.paper_parameters import STATE_COUNT
-from kf_calib.dwells.attitude_error import AttitudeError
+from kf_calib.dwells.stack import Attitudes, DwellStack
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects import Effect, FrameEffect, Stimulus
 from kf_calib.estimation.dwell_columns import LinearisedDwells, stimulus_of
@@ -34,7 +34,7 @@ _UNTOLD = 10.0  # setting errors: where the poses spread less, the attitudes wou
 
 def at_their_modes(
     linearised: LinearisedDwells, noise: Noise, state: Floats, untold: Floats | None = None
-) -> list[DwellFactor]:
+) -> DwellStack:
     """The dwells with attitudes at their posterior modes at ``state`` (p,), to first order about where they were.
 
     Dwells stay as they are where no setting error is allowed for. Where it is only considered (``Noise.checked``),
@@ -42,43 +42,38 @@ def at_their_modes(
 
     untold: the ``untold_directions`` of the run, where the dwells are not all of it.
     """
+    stack = linearised.dwells
     if not noise.setting_rad:
-        return [without_attitude(dwell) for dwell in linearised.dwells]
+        return without_attitudes(stack)
     bendings = bendings_of(linearised, state)
     if not noise.checked:
-        known = [AttitudeError(np.zeros(3), 2.0 * noise.setting_rad**2, bending) for bending in bendings]
-        return [d.linearised(d.turned_rad, attitude) for d, attitude in zip(linearised.dwells, known, strict=True)]
+        variances = np.full(len(stack), 2.0 * noise.setting_rad**2)
+        return stack.linearised(stack.turned_rad, Attitudes(np.zeros((len(stack), 3)), variances, bendings))
     moved, variances = _posterior_rotations(linearised.means, noise, state, bendings)
-    forces = linearised.means.force_mps2 / np.array([_length(dwell) for dwell in linearised.dwells])[:, None]
+    forces, before = linearised.means.force_mps2, np.zeros((len(stack), 3))
+    if stack.attitudes is not None:
+        forces, before = forces / stack.attitudes.length[:, None], stack.attitudes.rotation_rad
     if noise.attitude_unknown:
-        forces = np.array([turn_by(force, _limited(step)) for force, step in zip(forces, moved, strict=True)])
-        return _facing(linearised.dwells, forces, variances, noise, state, bendings)
+        return _facing(stack, turned(forces, _limited(moved)), variances, noise, state, bendings)
     untold = untold_directions(linearised, noise) if untold is None else untold
-    dwells = list[DwellFactor]()
-    for k, (dwell, turned) in enumerate(zip(linearised.dwells, linearised.dwells_at_state, strict=True)):
-        before = np.zeros(3) if dwell.attitude is None else dwell.attitude.rotation_rad
-        force = turn_by(forces[k], _limited(moved[k] - before))
-        attitude = AttitudeError(np.zeros(3), float(variances[k]), bendings[k])
-        shown = _shown_force(turned)
-        force = force - untold.T @ (untold @ (force - shown))
-        dwells.append(dwell.linearised(None, replace(attitude, rotation_rad=rotation_between(shown, force))))
-    return dwells
+    shown = _shown_forces(linearised.dwells_at_state)
+    forces = turned(forces, _limited(moved - before))
+    forces = forces - (forces - shown) @ untold.T @ untold
+    return stack.linearised(None, Attitudes(rotations_between(shown, forces), variances, bendings))
 
 
 def _facing(
-    dwells: Sequence[DwellFactor], forces: Floats, variances: Floats, noise: Noise, state: Floats, bendings: Floats
-) -> list[DwellFactor]:
+    stack: DwellStack, forces: Floats, variances: Floats, noise: Noise, state: Floats, bendings: Floats
+) -> DwellStack:
     """Return dwells of no known attitude with forces (D, 3), of components across them with ``variances`` (D,)."""
-    variances = variances + _wander_rad2(dwells, noise, state, forces)
-    facing = list[DwellFactor]()
-    for dwell, force, variance_rad2, bending in zip(dwells, forces, variances.tolist(), bendings, strict=True):
-        facing.append(with_force(dwell, force, AttitudeError(np.zeros(3), variance_rad2, bending), state))
-    return facing
+    variances = variances + _wander_rad2(stack, noise, state, forces)
+    return with_forces(stack, forces, Attitudes(np.zeros((len(stack), 3)), variances, bendings), state)
 
 
-def without_attitude(dwell: DwellFactor) -> DwellFactor:
-    """The dwell linearised about the force that its pose shows."""
-    return dwell.linearised(dwell.turned_rad, None) if dwell.attitude else dwell
+def without_attitudes(dwells: Sequence[DwellFactor]) -> DwellStack:
+    """The dwells linearised about the forces that their poses show."""
+    stack = DwellStack.of(dwells)
+    return stack if stack.attitudes is None else stack.linearised(stack.turned_rad, None)
 
 
 def untold_directions(linearised: LinearisedDwells, noise: Noise) -> Floats:
@@ -90,31 +85,27 @@ def untold_directions(linearised: LinearisedDwells, noise: Noise) -> Floats:
     """
     if not noise.setting_rad or noise.attitude_unknown:
         return np.zeros((0, 3))
-    units = np.array([_shown_force(turned) for turned in linearised.dwells_at_state])
-    units /= np.linalg.norm(units, axis=1, keepdims=True)
+    units = _shown_forces(linearised.dwells_at_state)
+    units = units / np.linalg.norm(units, axis=1, keepdims=True)
     variances, directions = np.linalg.eigh(np.cov(units.T, bias=True))
     return directions.T[variances < (_UNTOLD * noise.setting_rad) ** 2]
 
 
-def _shown_force(turned: DwellFactor) -> Floats:
-    """Return the mean specific force (3,) that the recorded pose of a dwell shows."""
-    return without_attitude(turned).felt_force(turned.means[None, 1:4])[0]
+def _shown_forces(stack: DwellStack) -> Floats:
+    """Return the mean specific forces (D, 3) that the recorded poses show."""
+    shown = stack.means[:, 1:4]
+    return shown if stack.turned_rad is None else turned(shown, stack.turned_rad)
 
 
-def _wander_rad2(dwells: Sequence[DwellFactor], noise: Noise, state: Floats, forces: Floats) -> Floats:
+def _wander_rad2(stack: DwellStack, noise: Noise, state: Floats, forces: Floats) -> Floats:
     """Return the mean square (D,) of the angle by which the force wanders about its mean within each dwell: what the
     readings spread across it beyond their noise. A hand creeps and trembles, and a mean of directions is shorter than
     each."""
     inverse = np.linalg.inv(state[:STATE_COUNT].reshape(3, 4)[:, :3])
-    spreads = np.array([dwell.spread for dwell in dwells])
-    beyond = inverse @ (spreads - np.diag(noise.sigma_mps2**2)) @ inverse.T
+    beyond = inverse @ (stack.folded.spreads - np.diag(noise.sigma_mps2**2)) @ inverse.T
     squares = np.sum(forces**2, axis=1)
     across = np.einsum("dii->d", beyond) - np.einsum("di,dij,dj->d", forces, beyond, forces) / squares
     return np.clip(across / squares, 0.0, _FARTHEST_RAD**2)
-
-
-def _length(dwell: DwellFactor) -> float:
-    return 1.0 if dwell.attitude is None else dwell.attitude.length
 
 
 def _posterior_rotations(means: Means, noise: Noise, state: Floats, bendings: Floats) -> tuple[Floats, Floats]:
@@ -139,9 +130,9 @@ def bendings_of(linearised: LinearisedDwells, state: Floats) -> Floats:
     bendings, bent = np.zeros((len(dwells), 3, 3)), bent_effects(model, state)
     if not bent:
         return bendings
-    stimulus = stimulus_of(dwells, model.bench, state)
-    step_mps2, firsts = _STEP * model.bench.gravity_mps2, np.cumsum([0, *(3 * len(d.pieces) for d in dwells)])[:-1]
-    counts = np.array([3 * len(dwell.pieces) for dwell in dwells])[:, None]
+    stimulus, folded = stimulus_of(dwells, model.bench, state), dwells.folded
+    step_mps2, firsts = _STEP * model.bench.gravity_mps2, 3 * folded.ends[:-1]
+    counts = 3 * folded.piece_numbers[:, None]
     for axis in range(3):
         more, less = (
             added_by(bent, replace(stimulus, force_mps2=stimulus.force_mps2 + step * np.eye(3)[axis]), model, state)
@@ -175,34 +166,39 @@ def matrix_of(rotation_rad: Floats) -> Floats:
     return np.array([turn_by(axis, rotation_rad) for axis in np.eye(3)]).T
 
 
-def rotation_between(one: Floats, other: Floats) -> Floats:
-    """The rotation vector (3,) of the shortest turn from the direction of one vector (3,) to that of another."""
-    across = np.cross(one, other)
-    sine = float(np.linalg.norm(across))
-    return across * (np.arctan2(sine, one @ other) / sine) if sine else np.zeros(3)
+def rotations_between(one: Floats, other: Floats) -> Floats:
+    """The rotation vectors (D, 3) of the shortest turns from the directions of vectors (D, 3) to those of others."""
+    across = crossed(one, other)
+    sines = np.linalg.norm(across, axis=1, keepdims=True)
+    angles = np.arctan2(sines, (one * other).sum(axis=1, keepdims=True))
+    return across * np.where(sines > 0.0, angles / np.where(sines > 0.0, sines, 1.0), 0.0)
 
 
-def _limited(rotation_rad: Floats) -> Floats:
-    """Return a rotation vector no longer than a step may be."""
-    angle_rad = float(np.linalg.norm(rotation_rad))
-    return rotation_rad * min(1.0, _FARTHEST_RAD / angle_rad) if angle_rad else rotation_rad
+def _limited(rotations_rad: Floats) -> Floats:
+    """Return rotation vectors (D, 3) no longer than a step may be."""
+    angles_rad = np.linalg.norm(rotations_rad, axis=1, keepdims=True)
+    return rotations_rad * np.minimum(1.0, _FARTHEST_RAD / np.maximum(angles_rad, 1e-300))
 
 
-def with_force(dwell: DwellFactor, force_mps2: Floats, attitude: AttitudeError | None, state: Floats) -> DwellFactor:
-    """The dwell with another specific force at all its nodes, and a pose that has it up, of an arbitrary heading. The
-    dwell before it, where that was left out, has the force that its own readings show at ``state``."""
-    size_mps2 = float(np.linalg.norm(force_mps2))
-    before = dwell.came_from and facing_readings([dwell.came_from], state, size_mps2)[0]
-    return dwell.with_force(force_mps2, _pose(force_mps2 / size_mps2), attitude, before)
+def with_forces(
+    dwells: Sequence[DwellFactor], forces_mps2: Floats, attitudes: Attitudes | None, state: Floats
+) -> DwellStack:
+    """The dwells with other specific forces (D, 3), each at all nodes of its dwell, and poses that have them up, of an
+    arbitrary heading. The dwell before one, where that was left out, has the force that its own readings show at
+    ``state``."""
+    stack, sizes_mps2 = DwellStack.of(dwells), np.linalg.norm(forces_mps2, axis=1)
+    before = {
+        k: facing_readings([dwell], state, float(sizes_mps2[k]))[0] for k, dwell in stack.folded.came_from.items()
+    }
+    return stack.facing_forces(forces_mps2, _poses(forces_mps2 / sizes_mps2[:, None]), attitudes, before)
 
 
-def _pose(unit: Floats) -> Floats:
-    """Return the quaternion (x, y, z, w) of the shortest rotation that brings a direction up, that is to +y."""
-    x, y, z = unit
-    if y < -1.0 + 1e-12:
-        return np.array([1.0, 0.0, 0.0, 0.0])
-    quaternion = np.array([-z, 0.0, x, 1.0 + y])
-    return quaternion / np.linalg.norm(quaternion)
+def _poses(units: Floats) -> Floats:
+    """Return the quaternions (D, 4) x, y, z, w of the shortest rotations that bring directions (D, 3) up, to +y."""
+    x, y, z = units.T
+    quaternions = np.stack([-z, np.zeros_like(x), x, 1.0 + y], axis=1)
+    quaternions[y < -1.0 + 1e-12] = [1.0, 0.0, 0.0, 0.0]
+    return quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
 
 
 def force_shown(readings: Floats, state: Floats) -> Floats:
@@ -211,9 +207,10 @@ def force_shown(readings: Floats, state: Floats) -> Floats:
     return np.asarray(np.linalg.solve(affine[:, :3], (readings - affine[:, 3]).T).T, float)
 
 
-def facing_readings(dwells: Sequence[DwellFactor], state: Floats, gravity_mps2: float) -> list[DwellFactor]:
+def facing_readings(dwells: Sequence[DwellFactor], state: Floats, gravity_mps2: float) -> DwellStack:
     """The dwells with the specific force that their mean readings alone show at ``state``, S^-1 (z - b) with the size
     of g: where the search for attitudes that are not known begins."""
-    forces = force_shown(np.array([dwell.means[4:] for dwell in dwells]), state)
+    stack = DwellStack.of(dwells)
+    forces = force_shown(stack.means[:, 4:], state)
     forces *= gravity_mps2 / np.linalg.norm(forces, axis=1, keepdims=True)
-    return [with_force(dwell, force, dwell.attitude, state) for dwell, force in zip(dwells, forces, strict=True)]
+    return with_forces(stack, forces, stack.attitudes, state)

@@ -26,8 +26,7 @@ from kf_calib.effects import effect_named
 from kf_calib.errors import InputError
 from kf_calib.estimation.known_effect import KnownEffect
 from kf_calib.support.output_files import write_whole
-from kf_calib.support.toml_files import toml_table
-from kf_calib.support.value_schema import FINITE, TEXT, Misfit, converted
+from kf_calib.support.toml_files import FINITE, TEXT, Misfit, converted, toml_table
 
 _EXAMPLE = '[[terms]] with effect = "flexure", symbols, coefficients, covariance'
 _ROUNDING = 1e-9
@@ -97,7 +96,7 @@ class BenchModel:
         return head + tomli_w.dumps(table)
 
 
-def read(path: str | Path) -> BenchModel:
+def read_bench_model(path: str | Path) -> BenchModel:
     """Read a bench model; raises InputError, with the path, if the file cannot be read or used."""
     path = Path(path)
     table = toml_table(path, _EXAMPLE)

@@ -22,6 +22,7 @@ from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.bench.streams import Source
 from kf_calib.dwells import window_average
 from kf_calib.dwells.blocks import Tally
+from kf_calib.dwells.stack import DwellStack
 from kf_calib.dwells.sufficient_statistics import DwellFactor, lines_of
 from kf_calib.effects import of_the_users
 from kf_calib.errors import InputError, UnobservableError
@@ -41,16 +42,13 @@ from kf_calib.estimation.results import (
     Consistency,
     Estimate,
     OutlyingDwell,
-    Visit,
     consistency,
     estimate_of,
-    estimates,
 )
 from kf_calib.estimation.samples import Samples, samples_of
 from kf_calib.estimation.settings import Settings
-from kf_calib.estimation.square_root_information import FilterStep
-from kf_calib.noise.noise_model import considered_information, mean_covariances
-from kf_calib.noise.random_walk import predict, to_mean
+from kf_calib.estimation.visits import Visits
+from kf_calib.noise.noise_model import considered_information
 from kf_calib.noise.reml import FEWEST, degrees_of_freedom
 from kf_calib.sources.opening import opened
 from kf_calib.support import stage
@@ -110,7 +108,7 @@ def conclude(
     - plain: a fit that is known not to suffice; the pass has then not begun.
     """
     settings, bench = passed.settings, passed.source.bench
-    dwells = passed.dwells if plain is None else plain.dwells
+    dwells = DwellStack.of(passed.dwells) if plain is None else plain.dwells
     if plain is None:
         _refuse_absent(settings.left_out, passed.folder.dwells)
         refuse_unusable(dwells, passed.tally, bench)
@@ -141,8 +139,7 @@ def with_remarks(result: Calibration, passed: Pass) -> Calibration:
     notes += [f"{known.sentence}." for known in result.model.known]
     warnings = [*passed.source.warnings, *counted, *readings.warnings, *on_outlying, *remarks, *notes]
     agreement = result.consistency if not outlying else _with_outlying(result.consistency, outlying)
-    return replace(
-        result,
+    return result.changed(
         tally=passed.tally,
         readings=readings,
         warnings=tuple(warnings),
@@ -165,7 +162,7 @@ def _fit_again(result: Calibration, dwells: list[DwellFactor]) -> Fit:
 
 
 def evaluate(
-    dwells: list[DwellFactor], bench: Bench, settings: Settings, slews: Sequence[DwellFactor] = ()
+    dwells: Sequence[DwellFactor], bench: Bench, settings: Settings, slews: Sequence[DwellFactor] = ()
 ) -> Calibration:
     """The calibration from sufficient statistics of dwells and, if effects show in them, of slews, without a pass over
     the data."""
@@ -180,11 +177,11 @@ def evaluate_fit(fitted: Fit, settings: Settings) -> Calibration:
     """The calibration from a fit: the filter's steps with their innovations, and the test of the misfit."""
     linearised, noise, model = fitted.linearised, fitted.noise, fitted.linearised.model
     first = square_root_information.start(settings.prior, model)
-    steps = square_root_information.run(first, fitted.rows(), fitted.steps, fitted.following)
+    factor = square_root_information.accumulate([first, *fitted.all_rows()], fitted.steps)[: model.count]
     extra = considered_information(noise, linearised.means, linearised.state)
-    final = estimate_of(steps[-1].factor, model.nominal_state(), extra.sum(axis=0) + fitted.considered)
+    final = estimate_of(factor, model.nominal_state(), extra.sum(axis=0) + fitted.considered)
     residuals = linearised.means.readings - linearised.means.design @ final.state
-    visits = _visits(fitted, steps, residuals, extra, settings)
+    visits = Visits(fitted, settings, residuals)
     judged = consistency(fitted)
     return Calibration(
         model.bench, settings, fitted, visits, final, judged, float(np.sqrt(np.mean(residuals**2))),
@@ -271,33 +268,3 @@ def _refuse_without_noise(result: Calibration) -> None:
             f"to estimate the noise from ({FEWEST}): give standard deviation and number of readings in each row, "
             "state --scatter-sigma, or measure more orientations."
         )
-
-
-def _visits(
-    fitted: Fit, steps: list[FilterStep], residuals: Floats, extra: Floats, settings: Settings
-) -> tuple[Visit, ...]:
-    """Return for each dwell its innovation, its residual and the estimate after it."""
-    linearised, means, around = fitted.linearised, fitted.linearised.means, fitted.linearised.model.nominal_state()
-    noise_covariances, walked = (
-        mean_covariances(fitted.noise.of_readings, means, linearised.state),
-        to_mean(fitted.steps),
-    )
-    first, extra = (
-        square_root_information.start(settings.prior, linearised.model),
-        np.concatenate([0.0 * extra[:1], extra]),
-    )
-    factors, extra = np.array([first, *(step.factor for step in steps)]), np.cumsum(extra, axis=0)
-    reached = estimates(factors, around, extra)
-    known, visits = reached[:-1], list[Visit]()
-    if walked.any():
-        before = [predict(factor, float(step)) for factor, step in zip(factors, walked, strict=False)]
-        known = estimates(np.array(before), around, extra[:-1])
-    for k, (dwell, step) in enumerate(zip(linearised.dwells, steps, strict=True)):
-        innovation, sigma = np.full(3, np.nan), np.full(3, np.nan)
-        if not known[k].undetermined.size:
-            rows = means.design[k]
-            innovation = means.readings[k] - rows @ known[k].state
-            predicted_by = np.maximum(np.diag(rows @ known[k].covariance @ rows.T), 0.0)  # negative by rounding only
-            sigma = np.sqrt(predicted_by + np.diag(noise_covariances[k]))
-        visits.append(Visit(dwell, reached[k + 1], step.nis, step.dof, innovation, sigma, residuals[k]))
-    return tuple(visits)

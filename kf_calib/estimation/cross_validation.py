@@ -6,12 +6,13 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from operator import add
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.dwells.qr import triangle
+from kf_calib.dwells.qr import solved_by_lower, triangle
+from kf_calib.dwells.stack import DwellStack
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation import square_root_information
 from kf_calib.estimation.fit import Fit
@@ -24,14 +25,21 @@ from kf_calib.noise.noise_model import considered_information, lift_rounding, me
 SAME_POSE_DEG = 1.0
 """Dwells whose directions of gravity and poses differ by less than this are visits of one orientation."""
 
+_AT_ONCE = 4096  # dwells whose covariances are computed together
+_LEAST_LEFT = 1e-3  # of the information in any direction, without an orientation; with less, digits are lost
 _ROUNDING = 1.0 + 1e-9  # by which cells are larger, so that nearer ones are never two apart
 
 
 def orientations(dwells: Sequence[DwellFactor]) -> list[list[int]]:
     """Indices of the dwells grouped by orientation, that is by direction of gravity in the platform and by pose."""
-    means = np.array([dwell.means for dwell in dwells])
-    direction = means[:, 1:4] / np.linalg.norm(means[:, 1:4], axis=1, keepdims=True)
-    return grouped(np.column_stack([direction, [dwell.pose for dwell in dwells]]), math.radians(SAME_POSE_DEG))
+    stack = DwellStack.of(dwells)
+    direction = stack.means[:, 1:4] / np.linalg.norm(stack.means[:, 1:4], axis=1, keepdims=True)
+    places = np.column_stack([direction, stack.poses])
+    known, before = stack.folded.known.get("orientations", ([], places[:0]))
+    if not np.array_equal(places, before):
+        known = grouped(places, math.radians(SAME_POSE_DEG))
+        stack.folded.known["orientations"] = known, places
+    return known
 
 
 def grouped(places: Floats, apart: float) -> list[list[int]]:
@@ -41,20 +49,24 @@ def grouped(places: Floats, apart: float) -> list[list[int]]:
     Groups are looked up by the cell of their first place in the three coordinates that differ most.
     """
     widest = np.argsort(-np.ptp(places, axis=0))[:3]
-    cells: list[list[int]] = np.floor(places[:, widest] / (apart * _ROUNDING)).astype(int).tolist()
-    around = list(itertools.product((-1, 0, 1), repeat=len(widest)))
-    groups, at = list[list[int]](), dict[tuple[int, ...], list[int]]()
-    for k, cell in enumerate(cells):
-        nearby = (at.get(tuple(map(add, cell, step)), ()) for step in around)
-        candidates = sorted(itertools.chain.from_iterable(nearby))
-        heads = places[[groups[number][0] for number in candidates]]
-        near = np.abs(heads - places[k]).max(axis=1, initial=0.0) < apart
-        if near.any():
-            groups[candidates[int(near.argmax())]].append(k)
+    cells = np.floor((places[:, widest] - places[:, widest].min(axis=0)) / (apart * _ROUNDING)).astype(int) + 1
+    sizes = cells.max(axis=0) + 2
+    strides = np.append(1, np.cumprod(sizes[:-1]))
+    around = [int(strides @ step) for step in itertools.product((-1, 0, 1), repeat=len(widest))]
+    groups, at, values = list[list[int]](), dict[int, list[int]](), places.tolist()
+    for k, cell in enumerate((cells @ strides).tolist()):
+        nearby = [number for step in around for number in at.get(cell + step, ())]
+        joined = min((g for g in nearby if _is_near(values[groups[g][0]], values[k], apart)), default=-1)
+        if joined >= 0:
+            groups[joined].append(k)
         else:
-            at.setdefault(tuple(cell), []).append(len(groups))
+            at.setdefault(cell, []).append(len(groups))
             groups.append([k])
     return groups
+
+
+def _is_near(one: list[float], other: list[float], apart: float) -> bool:
+    return all(abs(a - b) < apart for a, b in zip(one, other, strict=True))
 
 
 @dataclass(frozen=True)
@@ -106,19 +118,95 @@ def told_of(errors_mps2: Floats, covariance: Floats, means: Means, state: Floats
 def _without(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | None:
     """Return the errors (D, 3) and their covariance (D, 3, 3) if the biases are constant.
 
-    The fit without an orientation is found by merging the factors of the orientations before it and after it.
+    The considered information of the dwells that are left out is left out, too.
     """
-    linearised, noise, around = (
-        fitted.linearised,
-        fitted.noise.for_goodness_of_fit,
-        fitted.linearised.model.nominal_state(),
-    )
-    noise = noise.of_readings
-    rows = fitted.rows(fitted.noise.for_goodness_of_fit.weights)
-    extra, noise_covariances = (
-        considered_information(noise, linearised.means, linearised.state),
-        mean_covariances(noise, linearised.means, linearised.state),
-    )
+    linearised, noise = fitted.linearised, fitted.noise.for_goodness_of_fit.of_readings
+    rows, means = fitted.rows(fitted.noise.for_goodness_of_fit.weights), linearised.means
+    place = np.empty(len(rows), np.intp)
+    for k, group in enumerate(groups):
+        place[group] = k
+    estimates = _by_leverage(fitted, rows, place) or _merged(fitted, rows, groups)
+    if estimates is None:
+        return None
+    states, roots = estimates
+    design, extra = means.design, considered_information(noise, means, linearised.state)
+    spreads = mean_covariances(noise, means, linearised.state)
+    for part in (slice(k, k + _AT_ONCE) for k in range(0, len(rows), _AT_ONCE)):  # roots are large
+        ours = design[part] @ roots.of(place[part])
+        spreads[part] += ours @ np.swapaxes(ours, 1, 2)
+    if extra.any():
+        covariances = roots.of(np.arange(len(groups)))
+        covariances = covariances @ np.swapaxes(covariances, 1, 2)
+        left_out = np.zeros_like(covariances)
+        np.add.at(left_out, place, extra)
+        gained = (covariances @ (extra.sum(axis=0) - left_out) @ covariances)[place]
+        spreads += design @ gained @ np.swapaxes(design, 1, 2)
+    return means.readings - (design @ states[place, :, None])[:, :, 0], spreads
+
+
+@dataclass(frozen=True)
+class _Roots:
+    """Roots of the covariances of the estimates without each of G orientations: ``common`` (p, p) beside ``common``
+    times ``more`` (G, p, m); or, where more is None, ``common`` (G, p, p) itself."""
+
+    common: Floats
+    more: Floats | None
+
+    def of(self, groups: NDArray[np.intp]) -> Floats:
+        """The roots (n, p, p + m) without some of the orientations."""
+        if self.more is None:
+            return self.common[groups]
+        common = np.broadcast_to(self.common, (len(groups), *self.common.shape))
+        return np.concatenate([common, self.common @ self.more[groups]], axis=2)
+
+
+def _by_leverage(fitted: Fit, rows: Sequence[Floats], place: NDArray[np.intp]) -> tuple[Floats, _Roots] | None:
+    """Return the states (G, p) without each orientation, and the roots of their covariances; None where an orientation
+    tells nearly all of a state.
+
+    The rows A = Q R of all orientations give the state x and residuals r. Without the rows Q_g of one of them
+
+      x_g = x - R^-1 Q_g^T (I - Q_g Q_g^T)^-1 r_g,   P_g = R^-1 (I + Q_g^T (I - Q_g Q_g^T)^-1 Q_g) R^-T.
+    """
+    every, width = [_frame(fitted), *fitted.following, *rows], len(_frame(fitted))
+    factor = square_root_information.accumulate([own for own in every if len(own)])[:width]
+    if square_root_information.rank(factor) < width:
+        return None
+    inverse = np.linalg.inv(factor[:, :-1])
+    state = inverse @ factor[:, -1]
+    of_groups = _of_groups(rows, place)
+    shares = of_groups[..., :-1] @ inverse
+    left = np.eye(shares.shape[1]) - shares @ np.swapaxes(shares, 1, 2)
+    if np.linalg.eigvalsh(left)[:, 0].min() < _LEAST_LEFT:
+        return None
+    lower = np.linalg.cholesky(left)
+    residuals = of_groups[..., -1] - of_groups[..., :-1] @ state
+    solved = solved_by_lower(lower, np.concatenate([shares, residuals[..., None]], axis=2))
+    more = np.ascontiguousarray(np.swapaxes(solved[..., :-1], 1, 2))
+    states = state - (more @ solved[..., -1:])[:, :, 0] @ inverse.T
+    return states, _Roots(inverse, more)
+
+
+def _of_groups(rows: Sequence[Floats], place: NDArray[np.intp]) -> Floats:
+    """Return the rows of each group of dwells, (G, m, p + 1), with no more than p of them: an orthogonal transformation
+    changes nothing. Groups of fewer rows are padded with zeros."""
+    counts = np.fromiter(map(len, rows), np.intp, len(rows))
+    order = np.argsort(np.repeat(place, counts), kind="stable")
+    sizes = np.bincount(place, weights=counts).astype(int)
+    stacked, firsts, width = np.concatenate(rows)[order], np.cumsum(sizes) - sizes, rows[0].shape[1]
+    of_groups = np.zeros((len(sizes), min(int(sizes.max()), width - 1), width))
+    for size in np.unique(sizes).tolist():
+        chosen = np.flatnonzero(sizes == size)
+        ours = stacked[firsts[chosen, None] + np.arange(size)]
+        ours = triangle(ours)[:, : width - 1] if size >= width else ours
+        of_groups[chosen, : ours.shape[1]] = ours
+    return of_groups
+
+
+def _merged(fitted: Fit, rows: Sequence[Floats], groups: list[list[int]]) -> tuple[Floats, _Roots] | None:
+    """Return the states (G, p) without each orientation, and the roots of their covariances, by merging the factors of
+    the orientations before it and after it; None if one is then undetermined."""
+    linearised, around = fitted.linearised, fitted.linearised.model.nominal_state()
     empty = _frame(fitted)
     slews = square_root_information.update(empty, np.concatenate(fitted.following))[0] if linearised.slews else empty
     heads, tails = [slews], [empty]
@@ -127,19 +215,10 @@ def _without(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | No
     for group in groups[:0:-1]:
         tails.append(square_root_information.update(tails[-1], np.concatenate([rows[k] for k in group]))[0])
     merged = triangle(np.concatenate([heads, tails[::-1]], axis=1))[:, : len(empty)]
-    states, covariances, lost = zip(*square_root_information.solve_all(merged, around), strict=True)
+    states, _, lost = zip(*square_root_information.solve_all(merged, around), strict=True)
     if any(each.size for each in lost):
         return None
-    place = np.empty(len(rows), np.intp)
-    for k, group in enumerate(groups):
-        place[group] = k
-    left_out = np.zeros_like(covariances)
-    np.add.at(left_out, place, extra)
-    covariance = np.array(covariances)
-    covariance = (covariance + covariance @ (extra.sum(axis=0) - left_out) @ covariance)[place]
-    design = linearised.means.design
-    errors = linearised.means.readings - (design @ np.array(states)[place, :, None])[:, :, 0]
-    return errors, noise_covariances + design @ covariance @ np.swapaxes(design, 1, 2)
+    return np.array(states), _Roots(np.linalg.inv(merged[..., :-1]), None)
 
 
 def _beside(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | None:

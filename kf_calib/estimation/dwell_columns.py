@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -10,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import Floats, crossed
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.rows import on_basis
-from kf_calib.dwells.sufficient_statistics import DwellFactor, dwells_before, rate_or_zero
+from kf_calib.dwells.stack import DwellStack, Folded, OfPieces
+from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects import Effect, FrameEffect, Stimulus
 from kf_calib.estimation.measurement_model import Model, effect_columns
 from kf_calib.noise.means import Means, bending_of, means_of
@@ -29,73 +29,60 @@ _VIBRATING = 15.0  # mean squared deviation of the variances in units of sigma; 
 def stimulus_of(dwells: Sequence[DwellFactor], bench: Bench, state: Floats) -> Stimulus:
     """The conditions at the nodes of all pieces of all dwells and slews, in order; rotations are linearised at
     ``state``. Poses are NaN where no angles are used."""
-    known = _conditions(dwells)
-    known = known | _turned_conditions(dwells, known)
+    stack = DwellStack.of(dwells)
+    known = _known_conditions(stack.folded) | _conditions(stack) | _turned_conditions(stack)
     if not bench.angles:
         known = known | {key: np.full_like(known[key], np.nan) for key in ("pose", "previous_pose")}
     return Stimulus(bench=bench, sensitivity=state[:12].reshape(3, 4)[:, :3], **known)
 
 
-def _turned_conditions(dwells: Sequence[DwellFactor], known: dict[str, Any]) -> dict[str, Any]:
-    """Return the specific force (m, 3) that is felt at the nodes of turned dwells, and by what it is turned there.
+def _conditions(stack: DwellStack) -> dict[str, Any]:
+    """Return the forces (m, 3) and poses (m, k) that the angles show at the nodes of the dwells, and before them.
 
     The last step stays that of the poses: where a pose changes nothing along an axis, its sign is not that of noise.
     """
-    if all(dwell.turned_rad is None and dwell.attitude is None for dwell in dwells):
-        return {}
-    counts, still = [3 * len(dwell.pieces) for dwell in dwells], np.zeros(3)
-    turns = [still if dwell.turned_rad is None else dwell.turned_rad for dwell in dwells]
-    attitudes = [still if dwell.attitude is None else dwell.attitude.rotation_rad for dwell in dwells]
-    felt = np.concatenate([dwell.felt_force(dwell.nodes.force_mps2) for dwell in dwells])
-    return {
-        "force_mps2": felt,
-        "previous_force_mps2": known["previous_force_mps2"] + felt - known["force_mps2"],
-        "turned_rad": np.repeat(turns, counts, axis=0),
-        "attitude_rad": np.repeat(attitudes, counts, axis=0),
-    }
+    (forces, poses), times = stack.before, 3 * stack.folded.piece_numbers
+    before = np.repeat(forces, times, axis=0)
+    if stack.turned_rad is not None or stack.attitudes is not None:
+        before += stack.felt_force_mps2 - stack.force_mps2
+    previous_pose = np.repeat(poses, times, axis=0)
+    return {"previous_force_mps2": before, "pose": stack.pose, "previous_pose": previous_pose}
 
 
-def _conditions(dwells: Sequence[DwellFactor]) -> dict[str, Any]:
-    """What the stimulus of a run always is; every fit asks for it several times.
-
-    Of dwells that differ in their readings and in how they are turned only, it is the same.
-    """
-    key = tuple(id(dwell.nodes) for dwell in dwells)
-    for known_key, _, known in _KNOWN:
-        if known_key == key:
-            return known
-    _KNOWN.append((key, tuple(dwells), _conditions_of(dwells)))  # the dwells are kept, so that the key stays theirs
-    return _KNOWN[-1][-1]
-
-
-_KNOWN = deque[tuple[tuple[int, ...], tuple[DwellFactor, ...], dict[str, Any]]](maxlen=2)
+def _turned_conditions(stack: DwellStack) -> dict[str, Any]:
+    """Return the specific force (m, 3) that is felt at the nodes, and by what it is turned there."""
+    conditions = dict[str, Any](force_mps2=stack.felt_force_mps2)
+    if stack.turned_rad is not None or stack.attitudes is not None:
+        still, times = np.zeros((len(stack), 3)), 3 * stack.folded.piece_numbers
+        turned_rad = still if stack.turned_rad is None else stack.turned_rad
+        attitude_rad = still if stack.attitudes is None else stack.attitudes.rotation_rad
+        conditions["turned_rad"] = np.repeat(turned_rad, times, axis=0)
+        conditions["attitude_rad"] = np.repeat(attitude_rad, times, axis=0)
+    return conditions
 
 
-def _conditions_of(dwells: Sequence[DwellFactor]) -> dict[str, Any]:
-    nodes = [dwell.nodes for dwell in dwells]
-    before = [last for dwell, last in zip(dwells, dwells_before(dwells), strict=True) for _ in dwell.pieces]
-    elapsed_s = np.concatenate([each.elapsed_s for each in nodes])
-    return {
-        "elapsed_s": elapsed_s,
-        "since_arrival_s": np.concatenate([each.since_arrival_s for each in nodes]),
-        "force_mps2": np.concatenate([each.force_mps2 for each in nodes]),
-        "previous_force_mps2": np.repeat([each.means[1:4] for each in before], 3, axis=0),
-        "pose": np.concatenate([each.pose for each in nodes]),
-        "previous_pose": np.repeat([each.pose for each in before], 3, axis=0),
-        "temperature_c": temperature_course(tuple(dwells)).temperature_c,
-        "variance_mps2_2": _varying(dwells).reshape(-1, 3),
-        "rate_radps": np.concatenate([rate_or_zero(each.rate_radps) for each in nodes]),
-        "rate_change_radps2": np.concatenate([rate_or_zero(each.rate_change_radps2) for each in nodes]),
-        "half_s": np.repeat(0.5 * (elapsed_s[2::3] - elapsed_s[::3]), 3),
-        "within": np.tile([-1.0, 0.0, 1.0], len(before)),
-        "carrier_hz": dwells[0].carrier_hz,
-    }
+def _known_conditions(folded: Folded) -> dict[str, Any]:
+    """Return the conditions that do not change if dwells are turned; every fit asks for them several times."""
+    if "conditions" not in folded.known:
+        elapsed_s = folded.elapsed_s
+        folded.known["conditions"] = {
+            "elapsed_s": elapsed_s,
+            "since_arrival_s": folded.of_nodes("since_arrival_s"),
+            "temperature_c": temperature_course(folded.dwells).temperature_c,
+            "variance_mps2_2": _varying(folded).reshape(-1, 3),
+            "rate_radps": folded.rates("rate_radps"),
+            "rate_change_radps2": folded.rates("rate_change_radps2"),
+            "half_s": np.repeat(0.5 * (elapsed_s[2::3] - elapsed_s[::3]), 3),
+            "within": np.tile([-1.0, 0.0, 1.0], int(folded.ends[-1])),
+            "carrier_hz": folded.dwells[0].carrier_hz,
+        }
+    return folded.known["conditions"]
 
 
-def _varying(dwells: Sequence[DwellFactor]) -> Floats:
+def _varying(folded: Folded) -> Floats:
     """Return the variances of the readings (pieces, nodes, 3), or their mean if they vary no more than their estimates
     scatter."""
-    at_nodes, counts = (np.concatenate(parts) for parts in zip(*(dwell.shaking for dwell in dwells), strict=True))
+    at_nodes, counts = folded.shaking
     variances = at_nodes.mean(axis=1)
     mean = np.average(variances, axis=0, weights=counts)
     excess = np.mean(0.5 * counts[:, None] * (variances / np.where(mean > 0, mean, 1.0) - 1.0) ** 2, axis=0)
@@ -112,10 +99,10 @@ def without_known(dwells: list[DwellFactor], model: Model) -> list[DwellFactor]:
         return dwells
     effects, sizes = [each.effect for each in model.known], np.concatenate([each.coefficients for each in model.known])
     columns = candidate_columns(dwells, effects, model.bench, model.nominal_state())
-    return [dwell.subtract(on_basis(own @ sizes)) for dwell, own in zip(dwells, columns, strict=True)]
+    return list(DwellStack.of(dwells).plus(-on_basis(columns.values @ sizes)))
 
 
-def columns_of(dwells: Sequence[DwellFactor], model: Model, state: Floats) -> list[Floats]:
+def columns_of(dwells: Sequence[DwellFactor], model: Model, state: Floats) -> OfPieces:
     """The model's columns at the nodes of each dwell, (pieces, K nodes, 3 channels, p)."""
     return _by_dwell(dwells, lambda s: model.columns(s, state), stimulus_of(dwells, model.bench, state))
 
@@ -126,7 +113,7 @@ def candidate_columns(
     bench: Bench,
     state: Floats,
     stimulus: Stimulus | None = None,
-) -> list[Floats]:
+) -> OfPieces:
     """The columns of effects that are not in the model, in the form of ``columns_of``; ``stimulus`` may be given if it
     is known."""
     stimulus = stimulus or stimulus_of(dwells, bench, state)
@@ -138,9 +125,9 @@ def piece_columns(effects: Sequence[Effect], stimulus: Stimulus) -> Floats:
     return _by_piece(lambda s: effect_columns(effects, s), stimulus)
 
 
-def _by_dwell(dwells: Sequence[DwellFactor], columns: Callable[[Stimulus], Floats], stimulus: Stimulus) -> list[Floats]:
-    """Split the columns of a stimulus (m, 3, p) by dwell."""
-    return np.split(_by_piece(columns, stimulus), np.cumsum([len(dwell.pieces) for dwell in dwells])[:-1])
+def _by_dwell(dwells: Sequence[DwellFactor], columns: Callable[[Stimulus], Floats], stimulus: Stimulus) -> OfPieces:
+    """Arrange the columns of a stimulus (m, 3, p) by dwell."""
+    return OfPieces(_by_piece(columns, stimulus), DwellStack.of(dwells).folded.ends)
 
 
 def _by_piece(columns: Callable[[Stimulus], Floats], stimulus: Stimulus) -> Floats:
@@ -165,13 +152,13 @@ class LinearisedDwells:
     def __init__(
         self, dwells: Sequence[DwellFactor], model: Model, state: Floats, slews: Sequence[DwellFactor] = ()
     ) -> None:
-        self.dwells, self.slews, self.model, self.state = list(dwells), list(slews), model, state
+        self.dwells, self.slews, self.model, self.state = DwellStack.of(dwells), list(slews), model, state
         self.dwells_at_state = dwells_at_state(self.dwells, model, state)
-        every = (
-            sorted((*self.dwells_at_state, *slews), key=lambda each: (each.number, each.moving))
-            if slews
-            else self.dwells_at_state
-        )
+        self.slew_columns = list[Floats]()
+        if not slews:
+            self.columns: Sequence[Floats] = columns_of(self.dwells_at_state, model, state)
+            return
+        every = sorted((*self.dwells_at_state, *slews), key=lambda each: (each.number, each.moving))
         columns = columns_of(every, model, state)
         self.columns = [own for each, own in zip(every, columns, strict=True) if not each.moving]
         self.slew_columns = [own for each, own in zip(every, columns, strict=True) if each.moving]
@@ -180,12 +167,12 @@ class LinearisedDwells:
         """The same with one more dwell; the columns of the others are not computed again."""
         longer = LinearisedDwells.__new__(LinearisedDwells)
         longer.dwells, longer.slews, longer.model, longer.state = (
-            [*self.dwells, dwell],
+            DwellStack.of([*self.dwells, dwell]),
             self.slews,
             self.model,
             self.state,
         )
-        longer.dwells_at_state = [*self.dwells_at_state, dwell]
+        longer.dwells_at_state = DwellStack.of([*self.dwells_at_state, dwell])
         last = stimulus_of(longer.dwells_at_state, self.model.bench, self.state).ending(3 * len(dwell.pieces))
         longer.columns = [*self.columns, *_by_dwell([dwell], lambda s: self.model.columns(s, self.state), last)]
         longer.slew_columns = self.slew_columns
@@ -215,8 +202,10 @@ class LinearisedDwells:
     @property
     def sizes(self) -> Floats:
         """Largest change of a reading per unit of each state, (p,); 1 for a state that changes none."""
-        largest = np.abs(self.means.design).max(axis=(0, 1))
-        seen_within = [own[:, 3:] for own in self.columns if self.carrier_hz]  # oscillations average out in a mean
+        design = self.means.design
+        largest = np.maximum(design.max(axis=(0, 1)), -design.min(axis=(0, 1)))
+        # oscillations average out in a mean
+        seen_within = [own[:, 3:] for own in self.columns] if self.carrier_hz else []
         for own in (*seen_within, *self.slew_columns):
             largest = np.maximum(largest, np.abs(own).max(axis=(0, 1, 2)))
         return np.where(largest > 0, largest, 1.0)
@@ -230,7 +219,7 @@ def change_by_temperature(linearised: LinearisedDwells) -> Floats:
     return (model.columns(warmer, state) - model.columns(stimulus, state)) @ state / _STEP_K
 
 
-def dwells_at_state(dwells: Sequence[DwellFactor], model: Model, state: Floats) -> list[DwellFactor]:
+def dwells_at_state(dwells: Sequence[DwellFactor], model: Model, state: Floats) -> DwellStack:
     """The dwells about which a model is linear in the rotations of its dwells.
 
     At ``state`` the effects of the frame turn the specific force f of a dwell by the rotation vector rho, its mean over
@@ -240,30 +229,41 @@ def dwells_at_state(dwells: Sequence[DwellFactor], model: Model, state: Floats) 
     and alpha itself, about which the prior is zero, to S (alpha x g); as S g has both rotations in it already, they
     are added to the readings. An rho below ``_LITTLE_RAD`` in all dwells, or absurd, is taken for none.
     """
-    rotations = _rotations_of_effects(dwells, model, state)
-    if rotations is None and all(dwell.attitude is None for dwell in dwells):
-        return list(dwells)
-    each = rotations if rotations is not None else [np.zeros(3)] * len(dwells)
-    return [_turned(dwell, rho, state) for dwell, rho in zip(dwells, each, strict=True)]
+    stack = DwellStack.of(dwells)
+    rotations = _rotations_of_effects(stack, model, state)
+    if rotations is None and stack.attitudes is None:
+        return stack
+    there = stack.linearised(rotations, stack.attitudes)
+    change = _turning_mps2(there, state)
+    if not change.any():
+        return there
+    nodes = np.zeros((len(change) // 3, max(shape.width for shape in stack.folded.shapes), 3))
+    nodes[:, :3] = change.reshape(-1, 3, 3)  # no part on a carrier
+    return there.plus(on_basis(nodes))
 
 
-def _rotations_of_effects(dwells: Sequence[DwellFactor], model: Model, state: Floats) -> list[Floats] | None:
-    """Return the mean rotation vector (3,) of each dwell by effects of the frame; None where they are little."""
+def _rotations_of_effects(stack: DwellStack, model: Model, state: Floats) -> Floats | None:
+    """Return the mean rotation vector (D, 3) of each dwell by effects of the frame; None where they are little."""
     if not model.bench.angles or not any(isinstance(effect, FrameEffect) for effect in model.effects):
         return None
-    rotations = model.turned_rad(stimulus_of(dwells, model.bench, state), state)
-    ends = np.cumsum([3 * len(dwell.pieces) for dwell in dwells])[:-1]
-    means = [own.mean(axis=0) for own in np.split(rotations, ends)]
+    rotations, ends = model.turned_rad(stimulus_of(stack, model.bench, state), state), 3 * stack.folded.ends
+    means = np.add.reduceat(rotations, ends[:-1], axis=0) / np.diff(ends)[:, None]
     return means if _LITTLE_RAD < np.abs(means).max() < _ABSURD_RAD else None
 
 
-def _turned(dwell: DwellFactor, rho: Floats, state: Floats) -> DwellFactor:
-    dwell = dwell.linearised(rho if rho.any() else None, dwell.attitude)
-    if not has_turns(dwell):
-        return dwell
-    there = turning_mps2(dwell, dwell.felt_force(dwell.nodes.force_mps2), state).reshape(len(dwell.pieces), 3, 3)
-    nodes = np.concatenate([there, np.zeros((len(there), dwell.width - 3, 3))], axis=1)  # no part on a carrier
-    return dwell.subtract(-on_basis(nodes))
+def _turning_mps2(stack: DwellStack, state: Floats) -> Floats:
+    """Return by how much the rotations of turned dwells change the readings (m, 3) at all nodes to first order about
+    the forces g that are felt: S (rho x g) + (S + B) (alpha x g), with B the bending by effects."""
+    sensitivity, force_mps2 = state[:STATE_COUNT].reshape(3, 4)[:, :3], stack.felt_force_mps2
+    times, change = 3 * stack.folded.piece_numbers, np.zeros_like(force_mps2)
+    alpha = np.zeros((len(stack), 3)) if stack.attitudes is None else stack.attitudes.rotation_rad
+    if stack.turned_rad is not None:
+        rho = stack.turned_rad + crossed(alpha, stack.turned_rad)
+        change += crossed(np.repeat(rho, times, axis=0), force_mps2) @ sensitivity.T
+    if alpha.any():
+        bent = np.repeat(sensitivity + stack.bendings, times, axis=0)
+        change += (bent @ crossed(np.repeat(alpha, times, axis=0), force_mps2)[:, :, None])[:, :, 0]
+    return change
 
 
 def has_turns(dwell: DwellFactor) -> bool:

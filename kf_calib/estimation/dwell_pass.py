@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 
+from kf_calib.bench.arrays import lengths
 from kf_calib.bench.bench import Bench
+from kf_calib.bench.raw_input import LEVELS, wrong_unit
 from kf_calib.bench.streams import Source
-from kf_calib.bench.wrong_unit import LEVELS, wrong_unit
 from kf_calib.dwells import tabulated, window_average
 from kf_calib.dwells.blocks import LARGEST_RAD, Block, Tally
 from kf_calib.dwells.folding import Folder
 from kf_calib.dwells.rest_in_readings import segmenter_of
 from kf_calib.dwells.rows import Rows, model_rows
 from kf_calib.dwells.segmenter import Segmenter, dwell_blocks
+from kf_calib.dwells.stack import DwellStack
 from kf_calib.dwells.sufficient_statistics import DwellFactor, dwells_without
 from kf_calib.errors import InputError
 from kf_calib.estimation import setup_blunders
@@ -96,7 +98,7 @@ class Pass:
         return without_known(dwells_without(self.folder.dwells, unused) if left_out else used, self.model)
 
 
-def refuse_unusable(dwells: list[DwellFactor], tally: Tally, bench: Bench) -> None:
+def refuse_unusable(dwells: Sequence[DwellFactor], tally: Tally, bench: Bench) -> None:
     """Raise InputError if there is nothing to calibrate from or if the readings are not in m/s^2, and BlunderError for
     a set-up that cannot be right."""
     if not tally.read:
@@ -122,7 +124,7 @@ def refuse_unusable(dwells: list[DwellFactor], tally: Tally, bench: Bench) -> No
             f"{tally.not_finite} not finite, {tally.too_large} too large, {tally.without_pose} without an angle): the "
             f"platform must stand still; if it did, raise --still-deg or lower --settle-s{unit}."
         )
-    level = float(np.median([np.linalg.norm(dwell.means[4:]) for dwell in dwells])) / bench.gravity_mps2
+    level = float(np.median(lengths(DwellStack.of(dwells).means[:, 4:]))) / bench.gravity_mps2
     if LEVELS[0] <= level <= LEVELS[1]:
         if bench.angles:
             setup_blunders.refuse(dwells, bench)
@@ -130,7 +132,7 @@ def refuse_unusable(dwells: list[DwellFactor], tally: Tally, bench: Bench) -> No
     raise InputError(f"{wrong_unit(level, bench.input, bench.gravity_mps2).sentence}.")
 
 
-def _refuse_restless(dwells: list[DwellFactor], tally: Tally) -> None:
+def _refuse_restless(dwells: Sequence[DwellFactor], tally: Tally) -> None:
     """Raise InputError if no dwell shows in the readings themselves."""
     if not dwells:
         raise InputError(

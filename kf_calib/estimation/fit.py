@@ -12,13 +12,15 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
-from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.dwells.stack import DwellStack, OfPieces, of_all_pieces
 from kf_calib.estimation import free_attitude, square_root_information, whitened_rows
 from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise, flicker_sigma, slow_waves, steps
 from kf_calib.noise.reml import Part, gain_of, gauss_markov_gains, misfit, with_shared_noise
 from kf_calib.noise.thermometer_error import thermometer_errors
+
+_DETERMINED = 1e-9  # share of a state in combinations that are not determined
 
 
 @dataclass(frozen=True, repr=False)
@@ -35,7 +37,7 @@ class Fit:
     beginning: Fit | None = None
 
     @property
-    def dwells(self) -> list[DwellFactor]:
+    def dwells(self) -> DwellStack:
         """The dwells that were fitted."""
         return self.linearised.dwells
 
@@ -53,6 +55,14 @@ class Fit:
     def sigma(self) -> Floats:
         """Sigmas (p,) of the estimate from all readings, without considered parameters and what is not determined."""
         return np.sqrt(np.diag(self._solution[1]))
+
+    @property
+    def sigma_of_determined(self) -> Floats:
+        """The same with zeros for states that are not determined, of which the covariance has no more than
+        rounding."""
+        lost = self._solution[2]
+        lost = lost / np.linalg.norm(lost, axis=0)
+        return np.where(np.linalg.norm(lost, axis=1) < _DETERMINED, self.sigma, 0.0)
 
     @cached_property
     def _solution(self) -> tuple[Floats, Floats, Floats]:
@@ -88,6 +98,8 @@ class Fit:
     def all_rows(self, noise: Noise | None = None) -> list[Floats]:
         """Whitened rows of each dwell together with those of the slews after it; within a slew the biases are
         constant."""
+        if not self.linearised.slews:
+            return self.rows(noise)
         both = list[Floats]()
         for of_dwell, of_slews in zip(self.rows(noise), self.following, strict=True):
             standing = np.zeros((len(of_slews), of_dwell.shape[1] - of_slews.shape[1]))
@@ -116,7 +128,7 @@ class Fit:
             columns = candidate_columns(
                 linearised.dwells_at_state, [known.effect], linearised.model.bench, linearised.state
             )
-            information += self._considered([of_dwell @ known.root for of_dwell in columns])
+            information += self._considered(OfPieces(columns.values @ known.root, self.dwells.folded.ends))
         for effect in linearised.model.stepped:
             spread, part = self.spreads.get(str(effect), 0.0), linearised.model.parts[str(effect)]
             ends = [effect.at(effect.value * math.exp(step)) for step in (spread, -spread)]
@@ -125,7 +137,7 @@ class Fit:
                 for end in ends
             )
             information += self._considered(
-                [0.5 * (a - b) @ linearised.state[part, None] for a, b in zip(more, less, strict=True)]
+                OfPieces(0.5 * (more.values - less.values) @ linearised.state[part, None], self.dwells.folded.ends)
             )
         if (flicker_mps2 := self.noise.flicker_mps2) is not None and linearised.model.effects:
             information += self._considered_of_effects(flicker_mps2)
@@ -141,7 +153,7 @@ class Fit:
         dwells = self.linearised.dwells_at_state
         of_scatter = np.where(flicker_mps2 > 0.0, flicker_sigma(self.noise, len(dwells)), 0.0)
         columns, sigma = slow_waves(dwells, np.maximum(of_scatter, flicker_mps2))
-        extra = self._considered([values * sigma for values in columns])
+        extra = self._considered(OfPieces(columns.values * sigma, dwells.folded.ends))
         covariance = self._solution[1]
         gained = (covariance @ extra @ covariance)[STATE_COUNT:, STATE_COUNT:]
         seen = np.zeros_like(extra)
@@ -155,7 +167,8 @@ class Fit:
         """Return B (p, p) of considered constants from the changes (pieces, K nodes, 3, c) of each dwell's readings by
         1 sigma of each."""
         linearised, count = self.linearised, self.linearised.model.count
-        columns = [np.concatenate(both, axis=3) for both in zip(linearised.columns, changes, strict=True)]
+        both = np.concatenate([of_all_pieces(linearised.columns), of_all_pieces(changes)], axis=3)
+        columns = OfPieces(both, self.dwells.folded.ends)
         rows = whitened_rows.whiten(
             linearised.dwells_at_state,
             columns,

@@ -21,6 +21,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
+from kf_calib.dwells.stack import OfPieces
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation.attitude import added_by, bent_effects, matrix_of
 from kf_calib.estimation.dwell_columns import LinearisedDwells, stimulus_of
@@ -96,18 +97,18 @@ def tells_angles(linearised: LinearisedDwells, noise: Noise) -> bool:
     return float(np.linalg.eigvalsh(spread)[-1]) < linearised.model.bench.square_rad**2
 
 
-def square_changes(linearised: LinearisedDwells) -> list[Floats]:
+def square_changes(linearised: LinearisedDwells) -> OfPieces:
     """Changes (pieces, nodes, 3, 3) of each dwell's readings if one of the three angles between the axes is 1 sigma
     from square."""
     affine = linearised.state[:STATE_COUNT].reshape(3, 4)
-    force_mps2 = np.concatenate([dwell.nodes.force_mps2 for dwell in linearised.dwells])
+    force_mps2 = linearised.dwells.force_mps2
     changes = np.zeros((len(force_mps2), 3, len(SQUARE)))
     for k, (channel, axis) in enumerate(divmod(place, 4) for place in SQUARE):
         changes[:, channel, k] = force_mps2[:, axis] * affine[channel, channel] * linearised.model.bench.square_rad
     return _by_dwell(changes, linearised)
 
 
-def triad_changes(linearised: LinearisedDwells) -> list[Floats]:
+def triad_changes(linearised: LinearisedDwells) -> OfPieces:
     """Changes (pieces, nodes, 3, 3) of each dwell's readings by the effects of the model if the pendulous and output
     axes are turned by 1 sigma about each axis of the frame.
 
@@ -135,13 +136,13 @@ def triad_changes(linearised: LinearisedDwells) -> list[Floats]:
     return _by_dwell(changes, linearised)
 
 
-def _by_dwell(changes: Floats, linearised: LinearisedDwells) -> list[Floats]:
+def _by_dwell(changes: Floats, linearised: LinearisedDwells) -> OfPieces:
     """Split changes (m, 3, c) at the nodes of all dwells into those of each, (pieces, K nodes, 3, c); zeros on a
     carrier."""
     shaped = changes.reshape(-1, 3, *changes.shape[1:])
     width = linearised.columns[0].shape[1]
     padded = np.concatenate([shaped, np.zeros((len(shaped), width - 3, *changes.shape[1:]))], axis=1)
-    return np.split(padded, np.cumsum([len(dwell.pieces) for dwell in linearised.dwells])[:-1])
+    return OfPieces(padded, linearised.dwells.folded.ends)
 
 
 def undetermined(covariance: Floats) -> list[str]:

@@ -17,10 +17,11 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.rows import on_basis
+from kf_calib.dwells.stack import DwellStack
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation import free_attitude, square_root_information
-from kf_calib.estimation.attitude import facing_readings, without_attitude
+from kf_calib.estimation.attitude import facing_readings, without_attitudes
 from kf_calib.estimation.dwell_columns import LinearisedDwells, change_by_temperature
 from kf_calib.estimation.effect_constants import (
     averaged_over_posterior,
@@ -47,7 +48,7 @@ _STILL = 2.5e-4  # the search ends when no step of ln(value) exceeds this share 
 
 
 def fit(
-    dwells: list[DwellFactor],
+    dwells: Sequence[DwellFactor],
     model: Model,
     walk_mps2_per_sqrt_s: float = 0.0,
     slews: Sequence[DwellFactor] = (),
@@ -174,7 +175,7 @@ def _most_passes(model: Model) -> int:
 
 
 def _begun(
-    dwells: list[DwellFactor],
+    dwells: Sequence[DwellFactor],
     model: Model,
     slews: Sequence[DwellFactor],
     walk_mps2_per_sqrt_s: float,
@@ -183,22 +184,23 @@ def _begun(
     """Return the fit from which estimation begins: with angles at the nominal state, without at that of the nine
     parameters alone."""
     if model.bench.angles:
-        dwells = with_own_noise([without_attitude(dwell) for dwell in dwells])
+        dwells = with_own_noise(DwellStack.of(dwells))
         within = replace(within_dwells(dwells, walk_mps2_per_sqrt_s), walk_mps2_per_sqrt_s=walk_mps2_per_sqrt_s)
-        return Fit(LinearisedDwells(dwells, model, model.nominal_state(), slews), within)
+        return Fit(LinearisedDwells(without_attitudes(dwells), model, model.nominal_state(), slews), within)
     nine = beginning or _nine_parameters(dwells, model.bench, walk_mps2_per_sqrt_s)
     state = np.append(nine.linearised.state, np.zeros(model.count - STATE_COUNT))
     whole = replace(model, square=nine.linearised.model.square)
     return Fit(LinearisedDwells(nine.dwells, whole, state), nine.noise, beginning=nine)
 
 
-def _nine_parameters(dwells: list[DwellFactor], bench: Bench, walk_mps2_per_sqrt_s: float) -> Fit:
+def _nine_parameters(dwells: Sequence[DwellFactor], bench: Bench, walk_mps2_per_sqrt_s: float) -> Fit:
     """Return the fit of the nine parameters that tell themselves without angles, or of six with square axes where the
     poses do not tell the rest.
 
     Raises UnobservableError if the poses tell too little.
     """
-    readings, stated = np.array([dwell.means[4:] for dwell in dwells]), bench.scatter_sigma_mps2
+    dwells, stated = DwellStack.of(dwells), bench.scatter_sigma_mps2
+    readings = dwells.means[:, 4:]
     facing_up = readings / np.linalg.norm(readings, axis=1, keepdims=True)
     dwells = with_own_noise(dwells, facing_up)
     within = within_dwells(dwells, walk_mps2_per_sqrt_s, facing_up)
@@ -233,7 +235,7 @@ def _settled(fitted: Fit) -> Fit:
 def _left_to_settle(fitted: Fit, state: Floats) -> float:
     """Return by how many sigmas the fit moves from its linearisation; 0 where no attitude moves with it."""
     turning = fitted.noise.weights.setting_rad > 0.0
-    return left_to_settle(state, fitted.linearised.state, fitted.sigma) if turning else 0.0
+    return left_to_settle(state, fitted.linearised.state, fitted.sigma_of_determined) if turning else 0.0
 
 
 def _moved_to(fitted: Fit, model: Model, state: Floats) -> LinearisedDwells:
@@ -259,7 +261,8 @@ def _sensible(state: Floats) -> bool:
 def _setting_deg(dwells: Sequence[DwellFactor], bench: Bench) -> float | None:
     """Return the stated setting error, deg, combined with the uncertainty of the dwells' poses from noise of the
     angles."""
-    pose_rad = float(np.sqrt(np.mean([dwell.pose_sigma_rad**2 for dwell in dwells])))
+    sigmas_rad = np.fromiter((dwell.pose_sigma_rad for dwell in DwellStack.of(dwells).folded.dwells), float)
+    pose_rad = float(np.sqrt(np.mean(sigmas_rad**2)))
     if bench.angle_sigma_deg is None or pose_rad < _EXACT_RAD:
         return bench.angle_sigma_deg
     return math.hypot(bench.angle_sigma_deg, math.degrees(pose_rad))

@@ -14,7 +14,7 @@
 
 A file under ``effects_from`` is a program. Reading a model runs none; ``ModelFile.load`` runs those that it may::
 
-    model = model_file.read("model.toml")
+    model = model_file.read_model_file("model.toml")
     model.load(named=["my_effects.py"])     # or trust=True, to run all files that the model names
     calibrate("run.mcap", Settings(effects=model.effects))
 """
@@ -38,8 +38,7 @@ from kf_calib.errors import InputError
 from kf_calib.estimation.results import Calibration
 from kf_calib.support.output_files import write_whole
 from kf_calib.support.plain_text import cut
-from kf_calib.support.toml_files import toml_table
-from kf_calib.support.value_schema import FINITE, TEXT, Misfit, converted
+from kf_calib.support.toml_files import FINITE, TEXT, Misfit, converted, toml_table
 
 _EXAMPLE = 'effects = ["NAME", "mine = a*T"]'
 _Path = Annotated[str, StringConstraints(min_length=1, max_length=4096, pattern=r"\A[^\x00]*\z")]
@@ -83,7 +82,7 @@ class ModelFile:
         return allowed.changes
 
 
-def read(path: str | Path) -> ModelFile:
+def read_model_file(path: str | Path) -> ModelFile:
     """Read a model file and check what can be checked before the Python files that it names are run.
 
     Raises InputError, with the path, if the file cannot be read or used.
@@ -117,7 +116,7 @@ def _telling(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: {error}") from None
 
 
-def write(path: Path, result: Calibration) -> None:
+def write_model_file(path: Path, result: Calibration) -> None:
     """Write the model of a result with the coefficients that were found; the file is written completely or not at all.
 
     A file of that name is replaced. Raises InputError if it cannot be written.

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from kf_calib.dwells.folding import Folder
-from kf_calib.dwells.line_spectrum import Line
+from kf_calib.dwells.line_spectrum import SpectralLine
 from kf_calib.dwells.sufficient_statistics import DwellFactor, lines_of
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.fit import Fit
@@ -44,7 +44,7 @@ def on_carrier(
     return min(on_carriers, key=lambda each: _unlikeliness(each[1]))
 
 
-def _may_leave(slow: Fit, line: Line) -> bool:
+def _may_leave(slow: Fit, line: SpectralLine) -> bool:
     """Tell whether a fitted oscillation may leave this line beside a parabola over each dwell.
 
     What is left is near it, or at one to two cycles a dwell. Otherwise the fit is no more than a drift that the

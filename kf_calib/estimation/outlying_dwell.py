@@ -18,7 +18,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.sufficient_statistics import DwellFactor, dwells_without
-from kf_calib.estimation.attitude import without_attitude
+from kf_calib.estimation.attitude import without_attitudes
 from kf_calib.estimation.dwell_columns import LinearisedDwells, turning_mps2
 from kf_calib.estimation.results import Calibration, OutlyingDwell, Turn
 from kf_calib.noise.means import Means
@@ -66,7 +66,7 @@ def _test_dwell(result: Calibration, k: int, rest: Calibration) -> OutlyingDwell
     if rest.consistency.consistent is not True:
         return None
     dwells, estimate, noise = result.fit.dwells, rest.estimate, rest.noise
-    linearised = LinearisedDwells([without_attitude(dwell) for dwell in dwells], rest.model, estimate.state)
+    linearised = LinearisedDwells(without_attitudes(dwells), rest.model, estimate.state)
     means = linearised.means[[k]]
     error, covariance = means.readings[0] - means.design[0] @ estimate.state, _covariance(rest, means)
     freedom = 1e9 if noise.setting_stated and noise.scatter_stated else max(rest.consistency.dof, 1)

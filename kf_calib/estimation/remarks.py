@@ -72,7 +72,7 @@ def remarks_on(
         )
     yield from (remark for effect in model.effects for remark in remarks_of(effect))
     if noise.sensitivity_mps2_per_k is not None:
-        left_c = np.sqrt(np.mean(np.sum(temperature_course(tuple(dwells)).errors_c ** 2, axis=1)))
+        left_c = np.sqrt(np.mean(np.sum(temperature_course(dwells.folded.dwells).errors_c ** 2, axis=1)))
         yield (
             f"the noise of the thermometer leaves the temperature uncertain by {left_c:.1g} K, which counts as noise "
             "of the readings: a quieter thermometer would show smaller effects."

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -201,7 +201,7 @@ class Calibration:
     bench: Bench
     settings: Settings
     fit: Fit
-    visits: tuple[Visit, ...]
+    visits: Sequence[Visit]
     estimate: Estimate
     consistency: Consistency
     residual_rms_mps2: float
@@ -310,7 +310,14 @@ class Calibration:
     @property
     def residuals_mps2(self) -> Floats:
         """Residuals (D, 3): mean readings of the dwells less their prediction by the final estimate."""
-        return np.array([visit.residual_mps2 for visit in self.visits])
+        means = self.linearised.means
+        return np.asarray(means.readings - means.design @ self.estimate.state, float)
+
+    def changed(self, **changes: Any) -> Calibration:
+        """The same fit with other remarks on it; what was computed of its dwells is kept."""
+        changed = replace(self, **changes)
+        changed.__dict__.update({name: self.__dict__[name] for name in ("held_out",) if name in self.__dict__})
+        return changed
 
     @cached_property
     def correction(self) -> Correction:
@@ -431,14 +438,14 @@ def consistency(fitted: Fit) -> Consistency:
     noise, dwells, rows = fitted.noise, fitted.dwells, fitted.misfit_rows
     upper = square_root_information.accumulate(rows, fitted.steps)
     statistic = float(upper[-1, -1] ** 2)
-    dof = sum(square_root_information.row_rank(own) for own in rows) - square_root_information.rank(upper[:-1])
+    dof = square_root_information.row_rank(np.concatenate(rows)) - square_root_information.rank(upper[:-1])
     estimated = not noise.setting_stated and noise.for_goodness_of_fit.setting_rad > 0
     dof -= int(estimated)
     if dof <= 0:
         return Consistency(statistic, 0, None, None)
     if not noise.within_seen and not noise.scatter_stated:  # the noise was taken from this misfit
         return Consistency(statistic, dof, None, None)
-    noise_dof = float(sum(max(dwell.count - 4, 1) for dwell in dwells) / noise.inflation.mean())
+    noise_dof = float(np.maximum(dwells.folded.counts - 4, 1).sum() / noise.inflation.mean())
     left, tested = statistic, dof
     if estimated and (along := _dof_along_force(fitted)):
         # What lies across the force has the size of the setting error that was estimated from it: it is as large as
@@ -455,7 +462,7 @@ def _dof_along_force(fitted: Fit) -> int:
     known = square_root_information.rank(
         square_root_information.accumulate(rows)[:-1][:, -linearised.model.count - 1 :]
     )
-    return max(sum(square_root_information.row_rank(dwell_rows) for dwell_rows in rows) - known, 0)
+    return max(square_root_information.row_rank(np.concatenate(rows)) - known, 0)
 
 
 def format_p(p_value: float | None) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.rows import Rows, basis, on_basis
+from kf_calib.dwells.stack import Folded
 from kf_calib.estimation.dwell_columns import LinearisedDwells, has_turns, turning_mps2
 from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.nuisance_states import (
@@ -68,7 +69,7 @@ def samples_of(rows: Iterable[Rows], linearised: LinearisedDwells, noise: Noise)
     """Yield samples from a second pass over the rows, with the columns of the first."""
     every, columns = [*linearised.dwells_at_state, *linearised.slews], [*linearised.columns, *linearised.slew_columns]
     known = {
-        (dwell.number, dwell.moving): (dwell, iter(zip(at_nodes, flicker_waves(dwell), strict=True)))
+        (dwell.number, dwell.moving): (dwell, iter(zip(at_nodes, flicker_waves(Folded([dwell])), strict=True)))
         for dwell, at_nodes in zip(every, columns, strict=True)
     }
     sigmas = all_nuisance_sigmas(noise)
@@ -76,8 +77,9 @@ def samples_of(rows: Iterable[Rows], linearised: LinearisedDwells, noise: Noise)
         if (block.dwell, block.moving) not in known:
             continue
         dwell, pieces = known[block.dwell, block.moving]
-        along = along_force([dwell], sensitivities_of([dwell], linearised.state))[0] if noise.attitude_unknown else None
-        regressor_map = nuisance_map([dwell], noise, linearised.state)[0]
+        sensitivities = sensitivities_of([dwell], linearised.state)
+        along = along_force([dwell], sensitivities)[0] if noise.attitude_unknown else None
+        regressor_map = nuisance_map(sensitivities, noise)[0]
         for part, u, _ in block.pieces:
             at_nodes, waves = next(pieces)
             functions = basis(u, block.elapsed_s[part], linearised.carrier_hz)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.bench.paper_parameters import STATE_COUNT
-from kf_calib.dwells.line_spectrum import Line
+from kf_calib.dwells.line_spectrum import SpectralLine
 from kf_calib.dwells.qr import orthonormal
 from kf_calib.dwells.sufficient_statistics import DwellFactor, lines_of
 from kf_calib.effects import Effect, Stimulus
@@ -173,7 +173,7 @@ class Frame:
         self._whitening = None if _inside(noise) else MisfitColumns(linearised.dwells_at_state, noise, linearised.state)
         self.basis, self.coordinates = orthonormal(self.whitened(linearised, effects))
         self._periodogram: tuple[tuple[tuple[str, float], bytes], Periodogram] | None = None
-        self._lines: dict[float, tuple[Line, ...]] = {}
+        self._lines: dict[float, tuple[SpectralLine, ...]] = {}
         self._last: tuple[LinearisedDwells, Floats, Floats, int] | None = None
 
     @property
@@ -214,7 +214,7 @@ class Frame:
         rows, width = _judged(linearised.dwells_at_state, both, self.noise, self.state, STATE_COUNT)
         return _stacked(rows, linearised.dwells, self.noise)[:, width:-1]
 
-    def lines(self, level: float) -> tuple[Line, ...]:
+    def lines(self, level: float) -> tuple[SpectralLine, ...]:
         """Oscillations found in the readings at the significance ``level`` (see ``sufficient_statistics.lines_of``);
         they do not depend on the model."""
         if level not in self._lines:
@@ -223,10 +223,9 @@ class Frame:
 
     def serves(self, linearised: LinearisedDwells, noise: Noise) -> bool:
         """Tell whether the frame was made for exactly these dwells and this noise."""
-        same = len(linearised.dwells_at_state) == len(self.dwells) and all(
-            map(_is, linearised.dwells_at_state, self.dwells)
+        return linearised.dwells_at_state.is_same(self.dwells) and all(
+            np.array_equal(getattr(noise, key), getattr(self.noise, key)) for key in _OF_NOISE
         )
-        return same and all(np.array_equal(getattr(noise, key), getattr(self.noise, key)) for key in _OF_NOISE)
 
     def scan(self, linearised: LinearisedDwells, more: Sequence[Effect] = ()) -> Scan:
         """Project the frame's effects, without those that the model contains, and then the effects ``more`` off the
@@ -293,11 +292,6 @@ def slices(counts: Sequence[int]) -> list[slice]:
 def _key(effect: Effect) -> tuple[str, float]:
     """Return what identifies an effect together with the value of its constant."""
     return str(effect), effect.value
-
-
-def _is(one: object, other: object) -> bool:
-    """Tell whether both are the same object."""
-    return one is other
 
 
 def scan(linearised: LinearisedDwells, noise: Noise, effects: Sequence[Effect]) -> Scan:

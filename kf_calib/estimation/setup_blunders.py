@@ -54,7 +54,7 @@ Channels = tuple[int, int, int]
 
 
 @dataclass(frozen=True)
-class Means:
+class DwellMeans:
     """Means over D dwells.
 
     - poses (D, k): poses as recorded.
@@ -69,7 +69,7 @@ class Means:
     numbers: tuple[int, ...]
 
     @classmethod
-    def of(cls, dwells: Sequence[DwellFactor]) -> Means:
+    def of(cls, dwells: Sequence[DwellFactor]) -> DwellMeans:
         """The means of these dwells."""
         return cls(
             np.array([dwell.recorded_pose for dwell in dwells]),
@@ -78,9 +78,9 @@ class Means:
             tuple(dwell.number for dwell in dwells),
         )
 
-    def __getitem__(self, part: Mask) -> Means:
+    def __getitem__(self, part: Mask) -> DwellMeans:
         numbers = tuple(itertools.compress(self.numbers, part))
-        return Means(self.poses[part], self.readings[part], self.middle_s[part], numbers)
+        return DwellMeans(self.poses[part], self.readings[part], self.middle_s[part], numbers)
 
     def force(self, mounting: Mounting) -> Floats:
         """Specific force (D, 3) in the platform in units of gravity, if the poses mean what ``mounting`` says."""
@@ -89,7 +89,7 @@ class Means:
 
 
 @dataclass(frozen=True)
-class Affine:
+class AffineFit:
     """The least-squares fit of the mean readings by the specific force.
 
     - sensitivity (3, 3): rows s_i.
@@ -127,7 +127,7 @@ def refuse(dwells: Sequence[DwellFactor], bench: Bench) -> None:
     Nothing is raised while there are too few orientations to tell.
     """
     step = -(-len(dwells) // _MOST_DWELLS)
-    means, stated = Means.of(dwells[::step]), Mounting.stated(bench)
+    means, stated = DwellMeans.of(dwells[::step]), Mounting.stated(bench)
     _refuse_silent(means, stated)
     affine = _affine(means, stated)
     if affine is None and not _shows_all(means.readings / bench.gravity_mps2):
@@ -149,7 +149,7 @@ def refuse(dwells: Sequence[DwellFactor], bench: Bench) -> None:
         )
 
 
-def _affine(means: Means, mounting: Mounting) -> Affine | None:
+def _affine(means: DwellMeans, mounting: Mounting) -> AffineFit | None:
     """Return the fit; None if the orientations do not determine all three axes."""
     force = means.force(mounting)
     if not _shows_all(force):
@@ -160,7 +160,7 @@ def _affine(means: Means, mounting: Mounting) -> Affine | None:
     solution = np.linalg.lstsq(held, np.vstack([readings, np.zeros((1, 3))]), rcond=None)[0]
     freedom = max(len(force) - 4, 1) / len(force)
     left = math.sqrt(np.mean((readings - columns @ solution) ** 2) / freedom)
-    return Affine(np.asarray(solution[:3].T, float), left, _nominal(mounting.bench))
+    return AffineFit(np.asarray(solution[:3].T, float), left, _nominal(mounting.bench))
 
 
 def _shows_all(force: Floats) -> bool:
@@ -173,7 +173,7 @@ def _nominal(bench: Bench) -> Floats:
     return paper_parameters.state_of(paper_parameters.nominal(bench.nominal)).reshape(3, 4)[:, :3]
 
 
-def _refuse_silent(means: Means, stated: Mounting) -> None:
+def _refuse_silent(means: DwellMeans, stated: Mounting) -> None:
     """Refuse a channel that is constant, or nearly so, although gravity along it should change much."""
     readings, count = means.readings, len(means.readings)
     expected = means.force(stated) @ _nominal(stated.bench).T
@@ -194,7 +194,7 @@ def _refuse_silent(means: Means, stated: Mounting) -> None:
             )
 
 
-def _refuse_wrong_gain(found: Affine, bench: Bench) -> None:
+def _refuse_wrong_gain(found: AffineFit, bench: Bench) -> None:
     """Refuse a channel that measures gravity by another factor than the others, as in another unit."""
     for i, scale in enumerate(found.scales.tolist()):
         if not _GAIN[0] < scale < _GAIN[1]:
@@ -237,7 +237,7 @@ _WIRINGS: tuple[Channels, ...] = tuple(
 """The 48 assignments of channels, with signs, to accelerometers."""
 
 
-def _mendings(means: Means, stated: Mounting, affine: Affine | None) -> list[Mending]:
+def _mendings(means: DwellMeans, stated: Mounting, affine: AffineFit | None) -> list[Mending]:
     """Return the mountings and assignments with the fewest changes that explain the readings with all axes near
     nominal."""
     left = _UNEXPLAINED if affine is None or affine.left < _UNEXPLAINED else max(_BETTER * affine.left, 0.01)
@@ -257,7 +257,7 @@ def _mendings(means: Means, stated: Mounting, affine: Affine | None) -> list[Men
     return sorted(equal, key=lambda each: each.mounting.changes > 0 and each.channels != CHANNELS)  # mixed changes last
 
 
-def _what_is_wrong(affine: Affine | None, bench: Bench) -> str:
+def _what_is_wrong(affine: AffineFit | None, bench: Bench) -> str:
     """Name the channels whose axes are far from nominal or, if there are none, say that the angles do not explain the
     readings."""
     if affine is None:
@@ -334,7 +334,7 @@ def _advice(stated: Bench, mending: Mending) -> str:
     return " and ".join([*([" ".join(options)] if options else []), *words])
 
 
-def _refuse_one_sign(means: Means, stated: Mounting) -> None:
+def _refuse_one_sign(means: DwellMeans, stated: Mounting) -> None:
     """Refuse a run of few dwells in which all readings are near nominal but one, which has the opposite sign. With more
     dwells an outlying one is told from its own misfit."""
     if not 3 <= len(means.numbers) <= _FEW_DWELLS:
@@ -355,7 +355,7 @@ def _refuse_one_sign(means: Means, stated: Mounting) -> None:
     )
 
 
-def _refuse_exchange(means: Means, stated: Mounting) -> None:
+def _refuse_exchange(means: DwellMeans, stated: Mounting) -> None:
     """Refuse a run in which the channels change their order or signs between two dwells, with both parts near nominal,
     and which no one assignment explains: a sign shows in no dwell in which gravity is across."""
     if len(means.numbers) < 6:
@@ -381,7 +381,7 @@ def _refuse_exchange(means: Means, stated: Mounting) -> None:
     )
 
 
-def _one_dwell(means: Means, stated: Mounting) -> bool:
+def _one_dwell(means: DwellMeans, stated: Mounting) -> bool:
     """Tell whether without some single dwell all axes are near nominal and the angles explain the readings."""
     for k in range(len(means.numbers)):
         found = _affine(means[np.arange(len(means.numbers)) != k], stated)

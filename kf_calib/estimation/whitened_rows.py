@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
-from kf_calib.dwells.qr import triangle
+from kf_calib.dwells.qr import solved_by_lower, triangle
 from kf_calib.dwells.rows import on_basis
-from kf_calib.dwells.sufficient_statistics import DwellFactor, alike
+from kf_calib.dwells.stack import DwellStack, OfPieces, Shape, of_all_pieces
+from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.noise.noise_model import Noise, flicker_sigma, shared_noise, slow_scatter
 from kf_calib.noise.nuisance_states import (
@@ -30,6 +31,7 @@ from kf_calib.noise.nuisance_states import (
 )
 
 _USUAL = 24  # columns of candidates that are whitened together in a long run
+_LARGE = 1e3  # nuisances, in sigmas of a mean, whose squares may be added to its variance
 _AT_ONCE = 1 << 17  # numbers that are processed together, so that they stay in the cache
 
 
@@ -61,27 +63,76 @@ def whiten(
       are many columns.
     """
     inside = 3 if noise.walk_mps2_per_sqrt_s else 0
-    informative = np.append(np.ones(inside), _units(columns)) if reduced else None
-    all_rows = list[Floats]([np.empty((0, 0))] * len(dwells))
-    for places in _batches(dwells, columns[0].shape[-1]):
-        batch, stacked = [dwells[k] for k in places], np.array([columns[k] for k in places])
-        rows, count = _weighted(batch, stacked, noise, state, about, flicker_mps2)
-        if informative is None:
-            whitened = list(_less(rows, count))
+    values = of_all_pieces(columns)
+    informative = np.append(np.ones(inside), _units(values)) if reduced else None
+    stack, noise_about = DwellStack.of(dwells), _About(noise, state, about, flicker_mps2)
+    all_rows = list[Floats]([np.empty((0, 0))] * len(stack))
+    for batch in _batches(stack, values.shape[-1]):
+        of_batch = values[batch.pieces]
+        if informative is not None and batch.shows_means_only(noise):
+            whitened = _of_means(batch, of_batch, noise_about)
         else:
-            whitened = _informative(triangle(rows)[:, count:, count:], informative)
-        for k, of_dwell in zip(places, whitened, strict=True):
+            rows, count = _weighted(batch, of_batch, noise_about)
+            if informative is None:
+                whitened = _less(rows, count)
+            else:
+                whitened = _informative(triangle(rows)[:, count:, count:], informative)
+        for k, of_dwell in zip(batch.dwells.tolist(), whitened, strict=True):
             all_rows[k] = of_dwell
     return all_rows
 
 
-def _batches(dwells: Sequence[DwellFactor], width: int) -> Iterator[list[int]]:
-    """Group the indices of dwells whose rows have one shape, limited so that their ``width`` columns fit into the
-    cache."""
-    for places in alike(dwells):
-        first = dwells[places[0]]
-        most = max(_AT_ONCE // (3 * len(first.pieces) * first.width * (width + 1)), 1)
-        yield from (places[k : k + most] for k in range(0, len(places), most))
+@dataclass(frozen=True)
+class _About:
+    """The noise by which rows are divided, the state where nuisance states are linearised, and what ``whiten`` is
+    told."""
+
+    noise: Noise
+    state: Floats
+    about: Floats | None
+    flicker_mps2: Floats | None
+
+
+@dataclass(frozen=True)
+class _Batch:
+    """Dwells of one shape, few enough for their rows to stay in the cache: the number of the shape, and which of its
+    dwells they are."""
+
+    stack: DwellStack
+    number: int
+    part: slice
+
+    @property
+    def shape(self) -> Shape:
+        """The shape."""
+        return self.stack.folded.shapes[self.number]
+
+    @property
+    def dwells(self) -> NDArray[np.intp]:
+        """Indices (d,) of the dwells."""
+        return self.shape.dwells[self.part]
+
+    @property
+    def pieces(self) -> NDArray[np.intp]:
+        """Indices (d, P) of their pieces."""
+        return self.shape.pieces[self.part]
+
+    @property
+    def triangles(self) -> Floats:
+        """Their triangles (d, P, K + 3, K + 3)."""
+        return self.stack.triangles[self.number][self.part]
+
+    def shows_means_only(self, noise: Noise) -> bool:
+        """Whether nothing but the mean of each dwell and channel is known, so that whitened rows have full rank."""
+        one = self.pieces.shape[1] == 1 and not (noise.walk_mps2_per_sqrt_s or noise.attitude_unknown)
+        return one and not self.triangles[:, 0, 1 : self.shape.width].any()
+
+
+def _batches(stack: DwellStack, width: int) -> Iterator[_Batch]:
+    """Group dwells whose rows have one shape, limited so that their ``width`` columns fit into the cache."""
+    for number, shape in enumerate(stack.folded.shapes):
+        most = max(_AT_ONCE // (3 * shape.pieces.shape[1] * shape.width * (width + 1)), 1)
+        yield from (_Batch(stack, number, slice(k, k + most)) for k in range(0, len(shape.dwells), most))
 
 
 @dataclass(frozen=True)
@@ -117,69 +168,93 @@ class _Blocks:
         return slice(first, first + self.steps // 3)
 
 
-def _weighted(
-    dwells: Sequence[DwellFactor],
-    columns: Floats,
-    noise: Noise,
-    state: Floats,
-    about: Floats | None,
-    flicker_mps2: Floats | None,
-) -> tuple[Floats, int]:
+def _weighted(batch: _Batch, columns: Floats, about: _About) -> tuple[Floats, int]:
     """Return the whitened rows [nuisances | S | H | z] (d, r, n) of dwells of one shape, and the number of nuisance
     columns.
 
     ``columns`` is (d, pieces, K, 3, p). The rows of the three channels follow one another; the rows of the priors come
     last.
     """
-    priors, slow = nuisance_sigmas(noise), np.zeros(0) if flicker_mps2 is None else flicker_sigmas(flicker_mps2)
-    blocks = _Blocks(len(priors), len(slow), 3 if noise.walk_mps2_per_sqrt_s else 0, columns.shape[-1])
-    parts = _channels(dwells, columns, blocks, nuisance_map(dwells, noise, state), about)
-    sigma, roots = noise.effective_sigma_mps2, np.sqrt([dwell.weight for dwell in dwells])
+    noise, many, priors = about.noise, len(columns), _priors(about)
+    blocks = _blocks_of(about, columns.shape[-1])
+    parts = _channels(batch, columns, blocks, about, columns.shape[2])
+    sigma = noise.effective_sigma_mps2
+    roots = np.sqrt(batch.stack.folded.weights[batch.dwells])
     parts *= roots[:, None, None, None] / sigma[:, None, None]
     walks = roots[:, None] * (noise.walk_mps2_per_sqrt_s / sigma)
     if noise.attitude_unknown:
-        along = _unit_along(dwells, noise, state)
+        along = _unit_along(batch, noise, about.state)
         parts, walks = _combined(parts, along), np.sqrt((along**2)[:, None] @ (walks**2)[:, :, None])[:, :, 0]
     if blocks.steps:
-        for dwell_parts, dwell, ratios in zip(parts, dwells, walks, strict=True):
+        dwells = batch.stack.folded.dwells
+        for dwell_parts, k, ratios in zip(parts, batch.dwells.tolist(), walks, strict=True):
             for part, ratio in zip(dwell_parts, ratios.tolist(), strict=True):
-                part[:] = dwell.walk.whiten(part, ratio)
-    measured, count = parts.reshape(len(dwells), -1, blocks.width), blocks.nuisances
-    prior = np.zeros((len(dwells), count, blocks.width))
-    prior[:, :, :count] = np.diag(1.0 / np.append(priors, slow))
+                part[:] = dwells[k].walk.whiten(part, ratio)
+    measured, count = parts.reshape(many, -1, blocks.width), blocks.nuisances
+    prior = np.zeros((many, count, blocks.width))
+    prior[:, :, :count] = np.diag(1.0 / priors)
     return np.concatenate([measured, prior], axis=1), count
 
 
-def _channels(
-    dwells: Sequence[DwellFactor], columns: Floats, blocks: _Blocks, nuisances: Floats, about: Floats | None
-) -> Floats:
-    """Return the rows (d, 3, r, n) of the three channels before they are divided by their sigma."""
+def _priors(about: _About) -> Floats:
+    """Return the prior sigmas of all nuisance states."""
+    slow = np.zeros(0) if about.flicker_mps2 is None else flicker_sigmas(about.flicker_mps2)
+    return np.append(nuisance_sigmas(about.noise), slow)
+
+
+def _blocks_of(about: _About, count: int) -> _Blocks:
+    states = len(nuisance_sigmas(about.noise))
+    return _Blocks(states, len(_priors(about)) - states, 3 if about.noise.walk_mps2_per_sqrt_s else 0, count)
+
+
+def _of_means(batch: _Batch, columns: Floats, about: _About) -> Floats:
+    """Return the whitened rows [H | z] (d, 3, p + 1) of dwells that show nothing but their means.
+
+    The nuisance states N with the priors s^2 give the three means the covariance I + N s^2 N^T in units of their own
+    noise; the rows are divided by its Cholesky factor.
+    """
+    blocks, priors = _blocks_of(about, columns.shape[-1]), _priors(about)
+    rows = _channels(batch, columns, blocks, about, 1)[:, :, 0] / about.noise.effective_sigma_mps2[:, None]
+    scaled = rows[..., : blocks.nuisances] * priors
+    if np.abs(scaled).max(initial=0.0) > _LARGE:  # squares would lose digits: eliminate by QR
+        prior = np.broadcast_to(np.eye(blocks.nuisances, rows.shape[2]), (len(rows), blocks.nuisances, rows.shape[2]))
+        rows = np.concatenate([np.concatenate([scaled, rows[..., blocks.nuisances :]], axis=2), prior], axis=1)
+        return triangle(rows)[:, blocks.nuisances :, blocks.nuisances :]
+    lower = np.linalg.cholesky(np.eye(3) + scaled @ np.swapaxes(scaled, 1, 2))
+    return solved_by_lower(lower, rows[..., blocks.nuisances :])
+
+
+def _channels(batch: _Batch, columns: Floats, blocks: _Blocks, about: _About, height: int) -> Floats:
+    """Return the first ``height`` rows of each piece (d, 3, P height, n) of the three channels before they are divided
+    by their sigma."""
     many, pieces, functions, _, _ = columns.shape
-    shape = many, pieces * functions, -1
-    triangles = np.array([dwell.triangles for dwell in dwells])
-    basis, readings = triangles[:, :, :functions, :functions], triangles[:, :, :functions, functions:]
-    regressors = np.array([dwell.regressors for dwell in dwells])
-    parts = np.zeros((many, 3, pieces * functions, blocks.width))
+    shape, triangles = (many, pieces * height, -1), batch.triangles
+    basis, readings = triangles[:, :, :height, :functions], triangles[:, :, :height, functions:]
+    regressors = batch.stack.regressors[batch.number][batch.part][:, :, :height]
+    nuisances = nuisance_map(sensitivities_of(batch.stack, about.state, batch.dwells), about.noise)
+    parts = np.zeros((many, 3, pieces * height, blocks.width))
     for i in range(3):
         part, design = parts[:, i], on_basis(columns[..., i, :])
         part[..., : blocks.states] = (regressors @ nuisances[:, i, None]).reshape(shape)
         if blocks.steps:
-            part[..., blocks.steps_of(i)] = np.array([dwell.walk.step for dwell in dwells])[..., None]
+            steps = [batch.stack.folded.dwells[k].walk.step for k in batch.dwells.tolist()]
+            part[..., blocks.steps_of(i)] = np.array(steps)[..., None]
         part[..., blocks.nuisances + blocks.steps : -1] = (basis @ design).reshape(shape)
         measured = readings[..., i, None]
-        if about is not None:
-            measured = measured - basis @ on_basis((columns[..., i, :] @ about)[..., None])
+        if about.about is not None:
+            measured = measured - basis @ on_basis((columns[..., i, :] @ about.about)[..., None])
         part[..., -1:] = measured.reshape(shape)
     if blocks.waves:
-        waves = (basis[..., :3] @ on_basis(np.array([flicker_waves(dwell) for dwell in dwells]))).reshape(shape)
+        courses = flicker_waves(batch.stack.folded)[batch.pieces]
+        waves = (basis[..., :3] @ on_basis(courses)).reshape(shape)
         for i in range(3):
             parts[:, i, :, blocks.waves_of(i)] = waves
     return parts
 
 
-def _unit_along(dwells: Sequence[DwellFactor], noise: Noise, state: Floats) -> Floats:
+def _unit_along(batch: _Batch, noise: Noise, state: Floats) -> Floats:
     """Return the unit vectors (d, 3) by which whitened channels are combined to the size of the force."""
-    along = along_force(dwells, sensitivities_of(dwells, state)) * noise.effective_sigma_mps2
+    along = along_force(batch.stack, sensitivities_of(batch.stack, state))[batch.dwells] * noise.effective_sigma_mps2
     return along / np.linalg.norm(along, axis=1, keepdims=True)
 
 
@@ -209,17 +284,16 @@ def misfit_rows(
     and the error of the temperature. Their coefficients have a prior, whose rows come first in the list. Within a dwell
     the slow components of 1/f noise are nuisance states.
     """
+    dwells, values = DwellStack.of(dwells), of_all_pieces(columns)
     shared, sigma = shared_noise(dwells, noise)
     flicker = flicker_of_scatter(dwells, noise)
     if not sigma.size:
         return whiten(dwells, columns, noise, state, reduced=reduced), width
-    count, places = columns[0].shape[3] + len(sigma) + 1, width + np.arange(len(sigma))
+    count, places = values.shape[3] + len(sigma) + 1, width + np.arange(len(sigma))
     prior = np.zeros((len(sigma), count))
     prior[np.arange(len(sigma)), places] = 1.0 / sigma
-    both = [
-        np.concatenate([own[..., :width], more, own[..., width:]], axis=3)
-        for own, more in zip(columns, shared, strict=True)
-    ]
+    ends = dwells.folded.ends
+    both = OfPieces(np.concatenate([values[..., :width], shared.values, values[..., width:]], axis=3), ends)
     return [prior, *whiten(dwells, both, noise, state, flicker_mps2=flicker, reduced=reduced)], width + len(sigma)
 
 
@@ -256,23 +330,23 @@ class MisfitColumns:
         self._sigma, shared = noise.effective_sigma_mps2, len(shared_noise(dwells, noise)[1])
         flicker = flicker_of_scatter(dwells, noise)
         priors = len(nuisance_sigmas(noise)) + (0 if flicker is None else 3 * len(SLOW))
-        counts = np.array([len(dwell.pieces) for dwell in dwells])
-        channels = 1 if noise.attitude_unknown else 3
-        lengths = channels * counts * [dwell.width for dwell in dwells] + priors
-        self._groups, self.ends = list[_Alike](), shared + np.cumsum([0, *lengths])
+        stack, about = DwellStack.of(dwells), _About(noise, state, None, flicker)
+        channels, widths = 1 if noise.attitude_unknown else 3, np.empty(len(stack), np.intp)
+        for shape in stack.folded.shapes:
+            widths[shape.dwells] = shape.width
+        lengths = channels * stack.folded.piece_numbers * widths + priors
+        self._groups, self.ends = list[_Alike](), shared + np.append(0, np.cumsum(lengths))
         """The first row of each dwell, and at last the number of rows."""
-        first_piece, first_row = np.cumsum(counts) - counts, self.ends[:-1]
-        for places in _batches(dwells, _USUAL):
-            some, pieces, width = [dwells[k] for k in places], int(counts[places[0]]), dwells[places[0]].width
-            none = np.zeros((len(some), pieces, width, 3, 0))
-            rows, count = _weighted(some, none, noise, state, None, flicker)
+        for batch in _batches(stack, _USUAL):
+            width = batch.shape.width
+            rows, count = _weighted(batch, np.zeros((*batch.pieces.shape, width, 3, 0)), about)
             group = _Alike(
-                first_piece[places, None] + np.arange(pieces),
-                first_row[places, None] + np.arange(rows.shape[1]),
-                np.array([dwell.triangles[:, :width, :width] for dwell in some]),
+                batch.pieces,
+                self.ends[batch.dwells, None] + np.arange(rows.shape[1]),
+                batch.triangles[:, :, :width, :width],
                 np.linalg.qr(rows[..., :count])[0],
-                _unit_along(some, noise, state) if noise.attitude_unknown else None,
-                np.sqrt([dwell.weight for dwell in some]),
+                _unit_along(batch, noise, state) if noise.attitude_unknown else None,
+                np.sqrt(stack.folded.weights[batch.dwells]),
             )
             self._groups.append(group)
 
@@ -308,10 +382,10 @@ def with_frame(rows: list[Floats], model: Model, noise: Noise, first: int = 0) -
     return [*rows[:first], np.vstack([fixing, rows[first]]), *rows[first + 1 :]]
 
 
-def _units(columns: Sequence[Floats]) -> Floats:
+def _units(columns: Floats) -> Floats:
     """Return the largest absolute value (p,) of each column in the run, with one common value for all sensitivities and
     1 for the biases."""
-    largest = np.max([np.abs(own).max(axis=(0, 1, 2)) for own in columns], axis=0)
+    largest = np.maximum(columns.max(axis=(0, 1, 2)), -columns.min(axis=(0, 1, 2)))
     largest[:STATE_COUNT] = np.tile([*[largest[:STATE_COUNT].max()] * 3, 1.0], 3)
     return np.where(largest > 0, largest, 1.0)
 

@@ -1,6 +1,6 @@
 """A calibration as a file: everything that is needed to apply it, to defend it, and to repeat it.
 
-    saved = calibration_file.read("cal.json")
+    saved = calibration_file.open_calibration("cal.json")
     saved.correction()(readings_mps2, temperature_c)
 
 JSON in SI units, of one version; ``calibration.schema.json`` beside this module is its JSON Schema. A file may name
@@ -33,15 +33,16 @@ from kf_calib.bench.raw_input import RESTATE
 from kf_calib.bench.streams import Source
 from kf_calib.effects.programs import Program
 from kf_calib.errors import BenchError, InputError
+from kf_calib.estimation import model_file
 from kf_calib.estimation.correction import Correction
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.model_file import ModelFile
 from kf_calib.estimation.observability import visibility_of
 from kf_calib.estimation.results import Calibration
-from kf_calib.exchange import calibration_agreement as agreement
+from kf_calib.exchange import calibration_parts as agreement
 from kf_calib.exchange.calibration_parts import (
     MOST_EFFECTS,
-    Part,
+    FilePart,
     SavedConditions,
     SavedConsistency,
     SavedDwell,
@@ -54,8 +55,8 @@ from kf_calib.exchange.calibration_parts import (
     States,
     Text,
 )
-from kf_calib.sources.files.bags import fingerprint
 from kf_calib.sources.files.contents import CALIBRATION_FORMAT
+from kf_calib.sources.files.record_files import fingerprint
 from kf_calib.sources.opening import opened
 from kf_calib.sources.run_date import run_date
 from kf_calib.support import dates
@@ -66,7 +67,7 @@ VERSION = 1
 _LARGEST_BYTES = 20_000_000
 
 
-class SavedCalibration(Part):
+class SavedCalibration(FilePart):
     """The content of a calibration file.
 
     not_seen: effects of the catalogue that the orientations could not show, and which may thus be present. fixed:
@@ -242,7 +243,7 @@ def save_calibration(
     """
     if source is not None:
         source = opened(source, result.bench.to_metadata() | {RESTATE: "true"}, angles=False)
-    write(Path(path), saved(result) if source is None else of_source(result, source))
+    write_calibration(Path(path), saved(result) if source is None else of_source(result, source))
 
 
 def _not_seen(result: Calibration) -> list[str]:
@@ -255,7 +256,7 @@ def _not_seen(result: Calibration) -> list[str]:
 
 def _conditions(result: Calibration, began: datetime | None) -> SavedConditions:
     """Return when and how the run was made."""
-    dwells = [visit.dwell for visit in result.visits]
+    dwells = result.fit.dwells
     warmth = np.concatenate([dwell.nodes.temperature_c for dwell in dwells])
     known = bool(np.isfinite(warmth).any())
     return SavedConditions(
@@ -297,13 +298,13 @@ def now() -> str:
     return moment.isoformat(timespec="seconds")
 
 
-def write(path: Path, content: SavedCalibration) -> None:
+def write_calibration(path: Path, content: SavedCalibration) -> None:
     """Write a calibration file, wholly or not at all; raises InputError if it cannot be written."""
     table = content.model_dump(mode="json", exclude=None if content.fixed else {"fixed"})
     write_whole(path, (json.dumps(table, indent=1, allow_nan=False) + "\n").encode())
 
 
-def read(path: str | Path) -> SavedCalibration:
+def open_calibration(path: str | Path) -> SavedCalibration:
     """Read a calibration file and check all of it; raises InputError, with the path and the place in it."""
     path = Path(path)
     try:
@@ -348,3 +349,21 @@ def _said(error: ValidationError) -> str:
 def schema() -> dict[str, Any]:
     """The JSON Schema of calibration files, as ``calibration.schema.json`` has it."""
     return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | SavedCalibration.model_json_schema()
+
+
+def read_model(path: str | Path) -> ModelFile:
+    """Read the model of a file of either kind, told by its first character; no Python file that it names is run.
+
+    Raises InputError, with the path, if the file cannot be read or used.
+    """
+    path = Path(path)
+    return open_calibration(path).model_file(path) if _is_json(path) else model_file.read_model_file(path)
+
+
+def _is_json(path: Path) -> bool:
+    """Whether a file begins as a JSON object, which no TOML does; one that cannot be read is for others to refuse."""
+    try:
+        with path.open("rb") as file:
+            return file.read(64).lstrip().startswith(b"{")
+    except (OSError, ValueError):
+        return False

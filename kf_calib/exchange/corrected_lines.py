@@ -19,7 +19,7 @@ from kf_calib.sources.units import Units
 
 _TELLING_LINES = 9
 """Of CSV: the heading and rows that tell what it does not."""
-Line = tuple[int, str, str]
+RawLine = tuple[int, str, str]
 """Number of a line, its text, and what ends it."""
 
 
@@ -48,7 +48,7 @@ class CorrectedLines:
         self._needs_temperature = bool(correction.needs_temperature)
         self._account, self._temperature_c = Account(), np.nan
         self._cutter = _Cutter(self._account)
-        self._waiting = list[Line]()  # while it is not known what the lines are
+        self._waiting = list[RawLine]()  # while it is not known what the lines are
         self._reader: LineReader | None = None
         self._input: RawInput | None = None
         self._norm = None if unchecked else NormAtRest(correction)
@@ -80,7 +80,7 @@ class CorrectedLines:
         """What the lines hold, as far as that is known."""
         return self._input or PLAIN
 
-    def _corrected(self, lines: list[Line], ended: bool) -> bytes:
+    def _corrected(self, lines: list[RawLine], ended: bool) -> bytes:
         """Return lines, corrected; the readings of all of them at once."""
         corrected = dict[int, str]()
         for number, text, end in self._started(lines, ended, corrected):
@@ -89,7 +89,7 @@ class CorrectedLines:
         if self._reader is None:
             self._waiting = lines
             return _bytes(corrected)
-        raw = list[tuple[Line, int, list[float], float]]()  # line, stamp, readings, temperature
+        raw = list[tuple[RawLine, int, list[float], float]]()  # line, stamp, readings, temperature
         for line in lines:
             for time_ns, readings in self._read(line, corrected):
                 raw.append((line, time_ns, readings, self._temperature_c))
@@ -97,7 +97,7 @@ class CorrectedLines:
             self._put(corrected, raw)
         return _bytes(corrected)
 
-    def _started(self, lines: list[Line], ended: bool, out: dict[int, str]) -> list[Line]:
+    def _started(self, lines: list[RawLine], ended: bool, out: dict[int, str]) -> list[RawLine]:
         """Add lines to those that wait, and return what of them is a heading, once it is known what they are."""
         self._account.lines = self._cutter.number
         self._waiting += lines
@@ -120,7 +120,7 @@ class CorrectedLines:
         self._waiting, passed = told[count:], self._waiting[:blank]
         return passed + heading
 
-    def _read(self, line: Line, corrected: dict[int, str]) -> Iterator[tuple[int, list[float]]]:
+    def _read(self, line: RawLine, corrected: dict[int, str]) -> Iterator[tuple[int, list[float]]]:
         """Yield the stamp and the readings of a line; one that has none passes, one that cannot be used is left out."""
         assert self._reader is not None
         number, text, end = line
@@ -136,7 +136,7 @@ class CorrectedLines:
         else:
             yield int(batch.accel.time_ns[0]), batch.accel.values[0].tolist()
 
-    def _put(self, corrected: dict[int, str], raw: Sequence[tuple[Line, int, list[float], float]]) -> None:
+    def _put(self, corrected: dict[int, str], raw: Sequence[tuple[RawLine, int, list[float], float]]) -> None:
         """Add corrected lines."""
         assert self._reader is not None
         if self._input is None:
@@ -169,7 +169,7 @@ class _Cutter:
         self.number = 0
         """Lines that have ended."""
 
-    def push(self, block: bytes) -> list[Line]:
+    def push(self, block: bytes) -> list[RawLine]:
         """The lines that end in ``block``."""
         first, *others = block.split(b"\n")
         if not others:
@@ -181,7 +181,7 @@ class _Cutter:
         self._keep(last)
         return [line for line in lines if line is not None]
 
-    def rest(self) -> list[Line]:
+    def rest(self) -> list[RawLine]:
         """The line without an end, if there is one."""
         last = self._line(bytes(self._tail), b"") if self._tail or self._is_cut else None
         self._tail.clear()
@@ -195,7 +195,7 @@ class _Cutter:
         else:
             self._tail += piece
 
-    def _line(self, content: bytes, end: bytes) -> Line | None:
+    def _line(self, content: bytes, end: bytes) -> RawLine | None:
         self.number += 1
         if self._is_cut or len(content) > LONGEST_LINE_BYTES:
             self._is_cut = False

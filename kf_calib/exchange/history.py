@@ -50,7 +50,7 @@ _DIFFUSE = 1e8  # variance of level and drift before the first calibration, in u
 
 
 @dataclass(frozen=True)
-class Track:
+class ParameterTrack:
     """One parameter over the calibrations, in SI and days.
 
     values (n,), sigmas (n,): as found and calibrated. level, level_sigma: what it is at the last calibration, by all of
@@ -97,7 +97,7 @@ class History:
 
     serial: str
     dates: tuple[datetime, ...]
-    tracks: tuple[Track, ...]
+    tracks: tuple[ParameterTrack, ...]
     tolerances: Mapping[str, float]
     due: datetime | None
     due_by: str
@@ -195,7 +195,7 @@ def _common(calibrations: Sequence[SavedCalibration]) -> list[str]:
     return sorted(first, key=lambda symbol: symbol not in paper_parameters.SYMBOLS)  # stable
 
 
-def _track(symbol: str, calibrations: Sequence[SavedCalibration], days: Floats) -> Track:
+def _track(symbol: str, calibrations: Sequence[SavedCalibration], days: Floats) -> ParameterTrack:
     """Return the track of one parameter."""
     of_each = [next(p for p in each.parameters if p.symbol == symbol) for each in calibrations]
     if len(units := sorted({p.unit for p in of_each})) > 1:
@@ -213,7 +213,7 @@ def _track(symbol: str, calibrations: Sequence[SavedCalibration], days: Floats) 
     covariance = np.einsum("m,mij->ij", weights, found_by.covariances + apart[:, :, None] * apart[:, None, :])
     predicted = weights @ found_by.predicted
     predicted_variance = weights @ (found_by.predicted_variances + (found_by.predicted - predicted) ** 2)
-    return Track(
+    return ParameterTrack(
         symbol, of_each[0].unit, values, sigmas, predicted, np.sqrt(predicted_variance), float(state[0]),
         math.sqrt(covariance[0, 0]), float(state[1]) if with_drift else None,
         math.sqrt(covariance[1, 1]) if with_drift else None, float(covariance[0, 1]) * with_drift, walk, repeatability,
@@ -283,7 +283,7 @@ def _filtered(
     return _Filtered(walks, repeatabilities, relative / relative.sum(), state, covariance, predicted, variances)
 
 
-def _due(tracks: Sequence[Track], tolerances: Mapping[str, float]) -> tuple[float | None, str]:
+def _due(tracks: Sequence[ParameterTrack], tolerances: Mapping[str, float]) -> tuple[float | None, str]:
     """Return after how many days the first parameter may leave its tolerance, and which; None beyond twenty years."""
     first: tuple[float | None, str] = (None, "")
     for track in tracks:
@@ -294,7 +294,7 @@ def _due(tracks: Sequence[Track], tolerances: Mapping[str, float]) -> tuple[floa
     return first
 
 
-def _within(track: Track, tolerance: float) -> float | None:
+def _within(track: ParameterTrack, tolerance: float) -> float | None:
     """Return for how many days the last calibration's value is within a tolerance of a parameter; None beyond twenty
     years.
 

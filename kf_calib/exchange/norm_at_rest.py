@@ -13,9 +13,8 @@ import itertools
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.bench.raw_input import CHANNELS, RESTATING, RawInput
+from kf_calib.bench.raw_input import CHANNELS, RESTATING, RawInput, wrong_unit
 from kf_calib.bench.streams import Stream
-from kf_calib.bench.wrong_unit import wrong_unit
 from kf_calib.estimation.correction import Correction
 
 _WINDOW_NS = 500_000_000

@@ -38,11 +38,11 @@ from kf_calib.estimation.settings import Settings
 from kf_calib.exchange.calibration_file import SavedCalibration
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise, mean_covariances
-from kf_calib.sources.files.bags import fingerprint
+from kf_calib.sources.files.record_files import fingerprint
 from kf_calib.support.tail_probabilities import chi_squared_tail, sidak
 from kf_calib.support.threads import one_blas_thread
 
-LEVEL = 0.01
+MOVED_LEVEL = 0.01
 """A calibration that still holds is said not to in one verification of a hundred: half of them by the misfit as a
 whole, half by a parameter that seems to have moved."""
 
@@ -51,7 +51,7 @@ _ROUNDS = 6  # till columns and state agree; the error of each is about the squa
 
 
 @dataclass(frozen=True)
-class Move:
+class MovedParameter:
     """The change of one parameter or coefficient from the old calibration to the new run, in SI.
 
     p_value: that it did not move, corrected for the number of those tested.
@@ -83,7 +83,7 @@ class Verification:
     p_value: float
     statistic: float
     dof: int
-    moves: tuple[Move, ...]
+    moves: tuple[MovedParameter, ...]
     new: Calibration | None
     dwells: int
     residual_rms_mps2: float
@@ -93,9 +93,9 @@ class Verification:
     warnings: tuple[str, ...]
 
     @property
-    def moved(self) -> tuple[Move, ...]:
+    def moved(self) -> tuple[MovedParameter, ...]:
         """The parameters that have moved significantly."""
-        return tuple(move for move in self.moves if move.p_value < 0.5 * LEVEL)
+        return tuple(move for move in self.moves if move.p_value < 0.5 * MOVED_LEVEL)
 
 
 def verify(
@@ -127,7 +127,7 @@ def verify(
     clearest = min((move.p_value for move in moves), default=1.0)
     both = min(1.0, 2.0 * min(p_value, clearest))  # two tests, of which either may say so
     return Verification(
-        both >= LEVEL, both, statistic, dof, moves, seen, len(dwells), rms, *worst, free,
+        both >= MOVED_LEVEL, both, statistic, dof, moves, seen, len(dwells), rms, *worst, free,
         (*source.warnings, *passed.tally.sentences(), *_warnings(saved, source, new)),
     )  # fmt: skip
 
@@ -209,7 +209,7 @@ def _root(covariance: Floats) -> Floats:
     return scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
 
 
-def _moves(saved: SavedCalibration, new: Calibration, free: Sequence[str]) -> tuple[Move, ...]:
+def _moves(saved: SavedCalibration, new: Calibration, free: Sequence[str]) -> tuple[MovedParameter, ...]:
     """Return the differences of all that both runs determine, the clearest first.
 
     A scale factor by axes that were taken for square is K cos(angle off square), wrong by about K angle^2 / 2.
@@ -226,7 +226,7 @@ def _moves(saved: SavedCalibration, new: Calibration, free: Sequence[str]) -> tu
         bent = now.value * off_square if symbol in ("K2", "K3") else 0.0  # the axis of accelerometer 1 is that of x
         differences.append((symbol, now.unit, was.value, now.value, math.hypot(was.sigma, now.sigma, bent)))
     moves = [
-        Move(symbol, unit, old, value, value - old, sigma,
+        MovedParameter(symbol, unit, old, value, value - old, sigma,
              sidak(math.erfc(abs(value - old) / max(sigma, 1e-300) / math.sqrt(2.0)), len(differences)))
         for symbol, unit, old, value, sigma in differences
     ]  # fmt: skip

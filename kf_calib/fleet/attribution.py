@@ -24,12 +24,11 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.fleet.bench_coefficient import DatedSums
-from kf_calib.fleet.campaign import Blocks, Campaign, Group
-from kf_calib.fleet.evidence import log_evidence, log_evidence_of_modes, log_mean, modes, sizes
+from kf_calib.fleet.campaign import Blocks, Campaign, Group, log_evidence, log_evidence_of_modes, log_mean, modes, sizes
 from kf_calib.fleet.own_coefficients import UnitInformation, UnitsAndCommon
 from kf_calib.fleet.pooled_terms import Attribution, Common, PooledTerms, Sums, Term, shares_of
-from kf_calib.fleet.some_units import SomeUnits
-from kf_calib.support.logarithms import weights
+from kf_calib.fleet.shape import SomeUnits
+from kf_calib.support.tail_probabilities import weights
 
 NONE = 0.01
 """Probability of no further term above which the search ends."""

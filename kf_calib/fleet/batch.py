@@ -1,23 +1,49 @@
-"""All runs of a fleet through the workers and into the table, with a bounded number of them under way."""
+"""All runs of a fleet through the workers and into the table, with a bounded number of them under way.
+
+A worker fetches a run, evaluates it by the code of the single commands, and makes it a row. A run that never ends must
+not keep the others from being evaluated: when its time is over, Python is told to stop in the thread that works, which
+reaches it between two steps of the interpreter. What does not come to such a step, as a file system that does not
+answer, is ended with its process, if this is a worker's.
+"""
 
 from __future__ import annotations
 
+import ctypes
+import hashlib
+import json
 import logging
+import multiprocessing
+import os
+import platform
 import signal
+import stat
+import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from datetime import UTC, datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Protocol, TypeVar
 
 import dask.config
 from distributed import Client, Future, KilledWorker, LocalCluster, Worker, WorkerPlugin, as_completed
+from fsspec.core import url_to_fs
+from fsspec.implementations.local import LocalFileSystem
 
+from kf_calib.bench.streams import Source
+from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.errors import InputError, KfCalibError
-from kf_calib.fleet.evaluation import Evaluation, begun
-from kf_calib.fleet.run_list import Run
-from kf_calib.fleet.run_row import Row
+from kf_calib.estimation.results import Calibration
+from kf_calib.fleet import run_list
+from kf_calib.fleet.run_factor import run_factor
+from kf_calib.fleet.run_list import ListedRun, Row
 from kf_calib.fleet.store import Known, Store
+from kf_calib.sources.files.record_files import fingerprint
+from kf_calib.sources.run_date import run_date
+from kf_calib.support.threads import one_blas_thread
 
 _AHEAD = 4
 """Runs under way for each process, so that none waits for its next one; what is under way bounds the memory."""
@@ -32,7 +58,7 @@ _CONFIG = {
 
 
 @dataclass
-class Progress:
+class BatchProgress:
     """How far a fleet has come.
 
     total: runs named. kept: of these, runs that were in the table with the same content and settings. evaluated: runs
@@ -55,11 +81,11 @@ class Progress:
 
 def evaluate_all(
     client: Client,
-    evaluation: Evaluation,
-    runs: Sequence[Run],
+    evaluation: RunEvaluation,
+    runs: Sequence[ListedRun],
     store: Store,
-    on_progress: Callable[[Progress], None] = lambda progress: None,
-) -> Progress:
+    on_progress: Callable[[BatchProgress], None] = lambda progress: None,
+) -> BatchProgress:
     """Evaluate the runs that are not in the table yet, and write their rows as they come.
 
     Runs that failed because their file could not be fetched, or because their process ended, are tried again; others
@@ -67,7 +93,7 @@ def evaluate_all(
     """
     known, notes = store.checked()
     waiting = deque(run for run in runs if not _is_done(run, known.get(run.place), evaluation))
-    progress = Progress(len(runs), kept=len(runs) - len(waiting), notes=tuple(notes))
+    progress = BatchProgress(len(runs), kept=len(runs) - len(waiting), notes=tuple(notes))
     on_progress(progress)
     for rows, kept in _evaluated(client, evaluation, waiting, known):
         store.append(rows)
@@ -80,17 +106,17 @@ def evaluate_all(
     return progress
 
 
-def _is_done(run: Run, known: Known | None, evaluation: Evaluation) -> bool:
+def _is_done(run: ListedRun, known: Known | None, evaluation: RunEvaluation) -> bool:
     """Tell without reading a run that its row in the table holds."""
     same = known and known.sha256 and run.version and known.version == run.version
     return bool(same and known and known.settings == evaluation.settings_of(run))
 
 
 def _evaluated(
-    client: Client, evaluation: Evaluation, waiting: deque[Run], known: dict[str, Known]
+    client: Client, evaluation: RunEvaluation, waiting: deque[ListedRun], known: dict[str, Known]
 ) -> Iterator[tuple[list[Row], int]]:
     """Yield rows as they come, with the number of runs whose content turned out to be the same as before."""
-    under_way, ready = dict[Future[Any], Run](), as_completed(with_results=False)
+    under_way, ready = dict[Future[Any], ListedRun](), as_completed(with_results=False)
 
     def begin() -> None:
         run = waiting.popleft()
@@ -111,7 +137,7 @@ def _evaluated(
         yield [row for row in rows if row is not None], sum(row is None for row in rows)
 
 
-def _row(future: Future[Any], run: Run, evaluation: Evaluation) -> Row | None:
+def _row(future: Future[Any], run: ListedRun, evaluation: RunEvaluation) -> Row | None:
     """Return what a worker found; where it was lost with its process, a row that says so."""
     error: Any = future.exception()
     if error is None:
@@ -156,3 +182,185 @@ def cluster(workers: int, scheduler: str | None = None) -> Iterator[Client]:
             ) from None
         with client:
             yield client
+
+
+LIMIT_S = 3600.0
+"""How long a run may take unless somebody says otherwise."""
+_KINDS = {stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device"}
+_AGAIN_S = 5.0  # what is told to stop may be caught on its way
+_GRACE_S = 60.0  # at most, before a process is ended
+
+
+T = TypeVar("T")
+
+
+class Commands(Protocol):
+    """What the single commands do with a recording, and how they say what failed.
+
+    They are given to a fleet from above, because it knows neither their options nor their documents; they are sent to
+    the workers by pickle.
+    """
+
+    def replay(self, path: Path) -> tuple[Source, Calibration]: ...
+
+    def diagnose(self, source: Source, result: Calibration) -> Diagnosis: ...
+
+    def replay_document(self, result: Calibration) -> dict[str, Any]: ...
+
+    def diagnosis_document(self, diagnosis: Diagnosis) -> dict[str, Any]: ...
+
+    def sentence(self, error: BaseException) -> str: ...
+
+
+@dataclass(frozen=True)
+class RunEvaluation:
+    """How each run of a fleet is evaluated; calling it evaluates one.
+
+    settings: checksum of all that the numbers depend on besides the recording. limit_s: how long a run may take.
+    """
+
+    commands: Commands
+    settings: str
+    limit_s: float = LIMIT_S
+
+    def settings_of(self, run: ListedRun) -> str:
+        """Checksum of all that the row of a run depends on besides its recording: what a list says of it, too."""
+        stated = [run.unit, run.bench, run.date.isoformat() if run.date else None]
+        if not any(stated):
+            return self.settings
+        return hashlib.sha256(json.dumps([self.settings, *stated]).encode()).hexdigest()
+
+    def __call__(self, run: ListedRun, known_sha256: str | None = None) -> Row | None:
+        """The row of a run; None if its content is the one that ``known_sha256`` belongs to. Whatever goes wrong is a
+        sentence in the row."""
+        row, begun_s = begun(run, self.settings_of(run)), time.process_time()
+        try:
+            if not in_time(self.limit_s, lambda: self._changed(row, run, known_sha256)):
+                return None
+        except OverTime:
+            said = f"was not evaluated in {self.limit_s:g} s, and stopped"
+            row["error"] = f"{run.place}: {said}: give it more time (--limit-s), or leave it out."
+            row["sha256"] = None  # with more time it may come to an end
+        return row | {"cpu_s": time.process_time() - begun_s, "evaluated": datetime.now(UTC)}
+
+    def _changed(self, row: Row, run: ListedRun, known_sha256: str | None) -> bool:
+        """Fill in the row of a run, and tell whether its content is not the one that is known."""
+        try:
+            with local_copy(run) as path, one_blas_thread():
+                row["sha256"] = fingerprint(path)
+                if row["sha256"] == known_sha256:
+                    return False
+                try:
+                    self._evaluate(row, path)
+                except Exception as error:
+                    row["error"] = self.commands.sentence(error)
+                _call_by_place(row, path, run)
+        except Exception as error:  # could not be fetched
+            row["error"] = self.commands.sentence(error)
+        return True
+
+    def _evaluate(self, row: Row, path: Path) -> None:
+        """Fill in the row as far as the evaluation comes."""
+        source, result = self.commands.replay(path)
+        notes = result.bench.notes
+        row["unit"] = row["unit"] or notes.get("block_serial")
+        row["bench"] = row["bench"] or notes.get("bench")
+        row["date"] = row["date"] or run_date(source)
+        row |= run_list.of_replay(self.commands.replay_document(result))
+        row |= run_list.of_factor(run_factor(result.fit))
+        if result.bench.angles:  # without them there is no telling what depends on the attitude
+            document = self.commands.diagnosis_document(self.commands.diagnose(source, result))
+            row |= run_list.of_diagnosis(document)
+
+
+def begun(run: ListedRun, settings: str) -> Row:
+    """The row of a run of which nothing is known yet."""
+    stated = {"run": run.place, "unit": run.unit, "bench": run.bench, "date": run.date}
+    known = {"bytes": run.size, "version": run.version, "settings": settings, "host": platform.node()}
+    return dict.fromkeys(run_list.SCHEMA.names) | stated | known | {"evaluated": datetime.now(UTC)}
+
+
+def _call_by_place(row: Row, path: Path, run: ListedRun) -> None:
+    """Have all sentences call a recording by the name that it is known by, not by that of its copy here."""
+    for key in run_list.SENTENCES:
+        if isinstance(row[key], str):
+            row[key] = row[key].replace(str(path), run.place)
+    row["warnings"] = [each.replace(str(path), run.place) for each in row["warnings"] or ()]
+
+
+@contextmanager
+def local_copy(run: ListedRun) -> Iterator[Path]:
+    """The path of the recording itself, or of a copy that is gone when the block ends. Raises InputError where it
+    cannot be fetched."""
+    try:
+        files, path = url_to_fs(run.place)
+    except (ValueError, ImportError) as error:
+        raise InputError(f"{run.place}: cannot be looked up ({error}): check the name and what is installed.") from None
+    if isinstance(files, LocalFileSystem):
+        yield _plain(Path(str(path)))
+        return
+    with TemporaryDirectory(prefix="kf-calib-") as folder:
+        target = Path(folder, Path(str(path)).name)
+        try:
+            files.get(str(path), str(target), recursive=run.folder)
+        except Exception as error:  # each store has errors of its own
+            said = " ".join(str(error).split()) or type(error).__name__
+            raise InputError(f"{run.place}: cannot be fetched ({said}): check the name and the access.") from None
+        yield target
+
+
+def _plain(path: Path) -> Path:
+    """The path of a file or folder; InputError for what may be read for ever, as a pipe to which nobody writes."""
+    try:
+        kind = stat.S_IFMT(path.stat().st_mode)
+    except OSError:  # whoever reads it says why it cannot be read
+        return path
+    if kind in (stat.S_IFREG, stat.S_IFDIR):
+        return path
+    raise InputError(f"{path}: is {_KINDS.get(kind, 'no file')}, which may never end: name a recording on a disk.")
+
+
+class OverTime(BaseException):
+    """The time is over; not an ``Exception``, so that nothing that goes on after a failure goes on after this."""
+
+
+def in_time(limit_s: float, work: Callable[[], T]) -> T:
+    """What ``work`` returns; raises OverTime in this thread if it takes longer. A process that does not obey is ended.
+
+    No context manager: what comes while such a one is being left would not find it there any more.
+    """
+    watch = _Watch(limit_s, threading.get_ident())
+    try:
+        try:
+            threading.Thread(target=watch.run, name="time limit", daemon=True).start()
+            return work()
+        finally:
+            watch.end()
+    except OverTime:
+        watch.end()  # if it came while that was done
+        raise
+
+
+class _Watch:
+    """Waits in a thread of its own until the block ends or its time is over."""
+
+    def __init__(self, limit_s: float, thread: int) -> None:
+        self._limit_s, self._thread = limit_s, ctypes.c_ulong(thread)
+        self._ended, self._telling = threading.Event(), threading.RLock()
+
+    def run(self) -> None:
+        waited_s, patience_s = self._limit_s, min(self._limit_s, _GRACE_S)
+        while not self._ended.wait(waited_s):
+            if patience_s <= 0.0 and multiprocessing.parent_process() is not None:
+                os._exit(1)
+            with self._telling:
+                if not self._ended.is_set():
+                    ctypes.pythonapi.PyThreadState_SetAsyncExc(self._thread, ctypes.py_object(OverTime))
+            waited_s = min(_AGAIN_S, patience_s) or _AGAIN_S
+            patience_s = max(patience_s - waited_s, 0.0)
+
+    def end(self) -> None:
+        """From now on nothing is raised, not even what was on its way."""
+        with self._telling:
+            self._ended.set()
+            ctypes.pythonapi.PyThreadState_SetAsyncExc(self._thread, None)

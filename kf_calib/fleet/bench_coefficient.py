@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.fleet.campaign import Blocks, Campaign, Group
-from kf_calib.fleet.evidence import FLAT, STEP, log_evidence, log_mean, posterior, sizes
+from kf_calib.fleet.campaign import FLAT, STEP, Blocks, Campaign, Group, log_evidence, log_mean, posterior, sizes
 from kf_calib.fleet.pooled_terms import Attribution, Common, PooledTerms, Term, commons_of, shares_of
-from kf_calib.support.logarithms import weights
+from kf_calib.support.tail_probabilities import weights
 
 _SLOTS = 48  # at most as many parts of a campaign between which a repair is looked for at first
 _PERIODS = 12  # at most as many parts in which a coefficient is followed over time

@@ -13,13 +13,11 @@ from kf_calib.effects import described
 from kf_calib.errors import InputError
 from kf_calib.fleet.attribution import Attributed, AttributionTable, attributed, chosen
 from kf_calib.fleet.bench_coefficient import BenchEstimate, DatedSums
-from kf_calib.fleet.campaign import Campaign, Factors, Group, RunKey
-from kf_calib.fleet.evidence import FLAT
-from kf_calib.fleet.own_coefficients import UnitsAndCommon
+from kf_calib.fleet.campaign import FLAT, Campaign, Factors, Group, RunKey
+from kf_calib.fleet.own_coefficients import Population, UnitsAndCommon, population
 from kf_calib.fleet.pooled_terms import Attribution, PooledTerms, Term
-from kf_calib.fleet.population import Population, population
 from kf_calib.fleet.run_factor import ReferenceUnit
-from kf_calib.fleet.some_units import SomeUnits
+from kf_calib.fleet.shape import SomeUnits
 from kf_calib.support.threads import one_blas_thread
 
 RIVAL = 0.01

@@ -15,8 +15,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.effects import Bearer
-from kf_calib.fleet.campaign import Blocks, Campaign, Group
-from kf_calib.fleet.evidence import FLAT, posterior
+from kf_calib.fleet.campaign import FLAT, Blocks, Campaign, Group, posterior
 
 
 class Attribution(StrEnum):

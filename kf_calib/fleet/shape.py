@@ -12,6 +12,10 @@ Coefficients drawn about a mean that all units have in common which have the eff
 Who has it and the mean depend on each other. The mean is the likeliest one for each share, spread and ratio of the mean
 to the spread (expectation and maximisation, A. P. Dempster, N. M. Laird and D. B. Rubin, 1977); the evidence is that of
 a normal density about it (Laplace), with the information that is left without knowing who has it (T. A. Louis, 1982).
+
+A unit has the effect with a probability p, the share, of which nothing is known before. What the share is depends on
+the shape: many units with a small effect look like few with a large one. So there are several shapes, each as likely as
+any other before the runs.
 """
 
 from __future__ import annotations
@@ -23,11 +27,9 @@ from functools import cached_property
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.fleet.campaign import Group
-from kf_calib.fleet.evidence import log_evidence_of_modes, modes, sizes
-from kf_calib.fleet.own_coefficients import UnitInformation
-from kf_calib.fleet.population import told_of_mean
-from kf_calib.support.logarithms import weights
+from kf_calib.fleet.campaign import Group, log_evidence_of_modes, log_mean, modes, sizes
+from kf_calib.fleet.own_coefficients import UnitInformation, told_of_mean
+from kf_calib.support.tail_probabilities import weights
 
 SHARES = (np.arange(50) + 0.5) / 50.0
 """Probabilities that a unit has the effect: before the runs, each is as likely as any other."""
@@ -228,3 +230,52 @@ def _chances(ratios: Floats) -> Floats:
     from scipy.special import expit
 
     return expit(_LOG_ODDS + ratios)
+
+
+_RULED_OUT = 0.025  # probability below which a shape is not asked for the share
+
+
+class SomeUnits:
+    """The likelihood of who has an effect, from what each unit tells of its coefficients beside all else."""
+
+    def __init__(self, group: Group, information: UnitInformation, *, with_mean: bool = True) -> None:
+        """with_mean: whether they may have a mean of their own; if not, that shape counts as impossible."""
+        zero = {power: about_zero(group, information, power) for power in POWERS}
+        self._clear = [shape for power, shape in zero.items() if power]
+        self._shapes = [*zero.values(), *([about_mean(information)] if with_mean else [])]
+        self._logs = np.array([shape.log_odds for shape in self._shapes]) - np.log(len(POWERS) + 1)
+
+    @property
+    def log_odds(self) -> float:
+        """Log evidence that some units have it, each its own, against that none has it."""
+        return float(np.logaddexp.reduce(self._logs))
+
+    @property
+    def log_odds_of_all(self) -> float:
+        """The same that all units have it, in any direction and clearly not zero."""
+        return float(log_mean(np.array([shape.log_odds_of_all for shape in self._clear])))
+
+    @property
+    def size(self) -> float:
+        """The likeliest size of a coefficient of a unit that has it, in ``Group.sigma``."""
+        return self._shapes[int(np.argmax(self._logs))].size
+
+    @property
+    def probabilities(self) -> Floats:
+        """The probability (n,) that each unit has it, if some have it and others do not."""
+        return weights(self._logs) @ np.array([shape.probabilities for shape in self._shapes])
+
+    def share(self, all_have_it: float) -> tuple[float, tuple[float, float]]:
+        """The share of these units that have it, with its 95 % interval.
+
+        all_have_it: probability that all have it, rather than some.
+
+        The interval reaches over those of all shapes that are not ruled out, and up to all units unless that is: how
+        likely each was before the runs often decides which is the likelier, and so must not decide what the share is.
+        """
+        chances = (1.0 - all_have_it) * weights(self._logs)
+        held = zip(self._shapes, chances.tolist(), strict=True)
+        intervals = [shape.interval() for shape, chance in held if chance > _RULED_OUT]
+        intervals += [(1.0, 1.0)] if all_have_it > _RULED_OUT else []
+        low, high = min(low for low, _ in intervals), max(high for _, high in intervals)
+        return all_have_it + (1.0 - all_have_it) * float(self.probabilities.mean()), (low, high)

@@ -27,9 +27,8 @@ import pyarrow.parquet as pq
 
 from kf_calib.bench.arrays import Mask
 from kf_calib.errors import InputError
-from kf_calib.fleet.run_row import SCHEMA, Row, are_whole, name_their_parameters
-from kf_calib.support.file_lock import lock, writer
-from kf_calib.support.output_files import whole
+from kf_calib.fleet.run_list import SCHEMA, Row, are_whole, name_their_parameters
+from kf_calib.support.output_files import lock, whole, writer
 
 pc: Any = pyarrow.compute  # its functions are made when it is imported, which no type checker sees
 _SMALL, _LARGE = "*.arrow", "*.parquet"

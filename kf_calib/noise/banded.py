@@ -1,7 +1,8 @@
 """Banded covariances of 3 D numbers, in which each three are correlated among themselves and with the next three only.
 
 All operations take time proportional to D. A matrix is stored by columns as (D, 6, 3): for each three their own
-covariance, and below it the covariance of the next three with them (zeros for the last).
+covariance, and below it the covariance of the next three with them (zeros for the last). Where no three are correlated
+with the next, only their own are stored, (D, 3, 3), and the Cholesky factor is (D, 3, 3) as well.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import Any, cast
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.dwells.qr import solved_by_lower
 
 _BELOW = np.arange(6)[:, None] - np.arange(3)  # distance of an entry from the diagonal
 _KEPT, _BAND = _BELOW >= 0, np.maximum(_BELOW, 0)
@@ -21,6 +23,8 @@ _TWICE = np.repeat([1.0, 2.0], 3)[:, None]  # blocks beside the diagonal occur o
 
 def root(columns: Floats) -> Floats:
     """The lower Cholesky factor in LAPACK's band storage: its diagonals (6, 3 D) from the main one down."""
+    if columns.shape[1] == 3:
+        return np.linalg.cholesky(columns)
     padded = np.zeros((len(columns), 8, 3))
     padded[:, :6] = columns
     bands = padded[:, np.arange(3)[:, None] + np.arange(6), np.arange(3)[:, None]].reshape(-1, 6).T
@@ -30,10 +34,17 @@ def root(columns: Floats) -> Floats:
     return cast("Floats", lower)
 
 
+def diagonal(lower: Floats) -> Floats:
+    """The main diagonal (3 D,) of a Cholesky factor."""
+    return np.einsum("dii->di", lower).ravel() if lower.ndim == 3 else lower[0]
+
+
 def solve(lower: Floats, rows: Floats, transposed: bool = False) -> Floats:
     """The inverse of the Cholesky factor, or of its transpose, times rows (3 D, c)."""
     if not rows.size:
         return rows  # scipy's wrapper would write beyond empty arrays
+    if lower.ndim == 3:
+        return solved_by_lower(lower, rows.reshape(-1, 3, rows.shape[1]), transposed).reshape(rows.shape)
     return cast("Floats", _lapack("tbtrs")(lower, rows, uplo="L", trans="T" if transposed else "N")[0])
 
 
@@ -43,6 +54,9 @@ def inverse(columns: Floats, lower: Floats) -> Floats:
 
       X_d = L_d^-T (I - M' M)^-1 L_d^-1,  M = U_{d+1}^-1 L_{d+1,d};  below it: -X_{d+1} L_{d+1,d} L_d^-1
     """
+    if lower.ndim == 3:
+        back = solved_by_lower(lower, np.broadcast_to(np.eye(3), lower.shape))
+        return np.swapaxes(back, 1, 2) @ back
     forward, within_band = _unbanded(lower), np.zeros_like(columns)
     back, beside = np.linalg.inv(forward[:, :3]), forward[:-1, 3:]
     within_band[:, :3] = np.swapaxes(back, 1, 2) @ back
@@ -55,16 +69,18 @@ def inverse(columns: Floats, lower: Floats) -> Floats:
     return within_band
 
 
-def outer(rows: Floats) -> Floats:
-    """The entries of rows rows^T within the band, for rows (3 D, c)."""
+def outer(rows: Floats, height: int = 6) -> Floats:
+    """The entries of rows rows^T within the band, for rows (3 D, c); with height 3, those of each three alone."""
     blocks = rows.reshape(-1, 3, rows.shape[1])
+    if height == 3:
+        return blocks @ np.swapaxes(blocks, 1, 2)
     later = np.concatenate([blocks[1:], np.zeros((1, *blocks.shape[1:]))])
     return np.concatenate([blocks, later], axis=1) @ np.swapaxes(blocks, 1, 2)
 
 
 def traces(one: Floats, others: Floats) -> Floats:
     """Traces (k,) of the products of one matrix with others (k, D, 6, 3)."""
-    return others.reshape(len(others), one.size) @ (_TWICE * one).ravel()
+    return others.reshape(len(others), one.size) @ (_TWICE[: one.shape[1]] * one).ravel()
 
 
 def products(columns: Floats, vector: Floats) -> Floats:
@@ -72,6 +88,8 @@ def products(columns: Floats, vector: Floats) -> Floats:
     blocks = vector.reshape(-1, 3)
     both = columns @ blocks[:, :, None]
     sums = both[:, :, :3, 0]
+    if columns.shape[2] == 3:
+        return sums.reshape(len(columns), vector.size).T
     sums[:, 1:] += both[:, :-1, 3:, 0]
     sums[:, :-1] += (blocks[1:, None, :] @ columns[:, :-1, 3:])[:, :, 0]
     return sums.reshape(len(columns), vector.size).T

@@ -13,6 +13,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.rows import on_basis
+from kf_calib.dwells.stack import DwellStack, of_all_pieces
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.nuisance_states import SLOW, along_force, flicker_waves, sensitivities_of
@@ -27,38 +28,41 @@ def flicker_within(dwells: Sequence[DwellFactor], columns: Sequence[Floats], sta
     The likeliest h of each accelerometer; one for all three where attitudes are not known. ``columns`` are those of the
     model at the nodes of each dwell, (pieces, nodes, 3, p), ``state`` (p,) its estimate.
     """
-    without = dwells[0].carrier_hz or not any(map(_shows_course, dwells))
-    if without or not noise.scatter_mps2.any() or noise.walk_mps2_per_sqrt_s:
+    stack = DwellStack.of(dwells)
+    if not noise.scatter_mps2.any() or noise.walk_mps2_per_sqrt_s or stack.folded.dwells[0].carrier_hz:
         return np.zeros(3)
+    if not any(triangles.shape[1] > 1 or triangles[:, :, 1:3].any() for triangles in stack.triangles):
+        return np.zeros(3)  # no more than the mean of a dwell is known
     channels = np.eye(3)[None].repeat(len(dwells), axis=0)
     if noise.attitude_unknown:
-        along = along_force(dwells, sensitivities_of(dwells, state))
+        along = along_force(stack, sensitivities_of(stack, state))
         channels = (along / np.linalg.norm(along, axis=1, keepdims=True))[:, None]
-    pairs = [
-        _amplitudes(dwell, design @ state, noise.effective_sigma_mps2 / np.sqrt(dwell.weight), weights)
-        for dwell, design, weights in zip(dwells, columns, channels, strict=True)
-    ]
-    amplitudes, variances = (np.array(values) for values in zip(*pairs, strict=True))  # (D, k, c) each
+    amplitudes, variances = _amplitudes(stack, of_all_pieces(columns) @ state, noise.effective_sigma_mps2, channels)
     return np.broadcast_to([_likeliest(amplitudes[..., i], variances[..., i]) for i in range(channels.shape[1])], 3)
 
 
-def _shows_course(dwell: DwellFactor) -> bool:
-    """Tell whether more than the mean of a dwell is known."""
-    return len(dwell.pieces) > 1 or bool(dwell.triangles[:, 1:3].any())
-
-
-def _amplitudes(dwell: DwellFactor, predicted: Floats, sigma: Floats, weights: Floats) -> tuple[Floats, Floats]:
-    """Return the amplitudes (k, c) of the slow waves in what a prediction (pieces, nodes, 3) leaves of a dwell beside
-    its mean, and their variances (k, c) by the noise of the readings, in channels with ``weights`` (c, 3)."""
-    upper = dwell.triangles[:, :3, :3]
-    left = (dwell.triangles[:, :3, 3:] - upper @ on_basis(predicted)) @ weights.T
-    waves = upper @ on_basis(flicker_waves(dwell))
-    level, waves, left = (part.reshape(-1, part.shape[-1]) for part in (upper[..., :1], waves, left))
-    unit = level / np.linalg.norm(level)
-    waves, left = waves - unit @ (unit.T @ waves), left - unit @ (unit.T @ left)
-    inverse = np.linalg.pinv(waves.T @ waves, rcond=1e-9, hermitian=True)
-    variances = np.outer(np.maximum(np.diag(inverse), 1e-300), weights**2 @ sigma**2)
-    return inverse @ (waves.T @ left), variances
+def _amplitudes(stack: DwellStack, predicted: Floats, sigma: Floats, weights: Floats) -> tuple[Floats, Floats]:
+    """Return the amplitudes (D, k, c) of the slow waves in what a prediction (pieces, nodes, 3) leaves of each dwell
+    beside its mean, and their variances (D, k, c) by the noise of the readings, in channels with ``weights`` (D, c,
+    3)."""
+    amplitudes, courses = np.empty((len(stack), len(SLOW), weights.shape[1])), on_basis(flicker_waves(stack.folded))
+    variances, coefficients = np.empty_like(amplitudes), on_basis(predicted)
+    for shape, triangles in zip(stack.folded.shapes, stack.triangles, strict=True):
+        upper, many = triangles[:, :, :3, :3], len(shape.dwells)
+        ours = weights[shape.dwells]
+        left = triangles[:, :, :3, 3:] - upper @ coefficients[shape.pieces]
+        level, waves, left = (part.reshape(many, -1, part.shape[-1]) for part in (
+            upper[..., :1], upper @ courses[shape.pieces], left))  # fmt: skip
+        left = left @ np.swapaxes(ours, 1, 2)
+        unit = level / np.linalg.norm(level, axis=1, keepdims=True)
+        along = np.swapaxes(unit, 1, 2)
+        waves, left = waves - unit @ (along @ waves), left - unit @ (along @ left)
+        back = np.swapaxes(waves, 1, 2)
+        inverse = np.linalg.pinv(back @ waves, rcond=1e-9, hermitian=True)
+        spreads = np.maximum(np.einsum("dkk->dk", inverse), 1e-300)[:, :, None] * (ours**2 @ sigma**2)[:, None]
+        spreads /= stack.folded.weights[shape.dwells, None, None]
+        amplitudes[shape.dwells], variances[shape.dwells] = inverse @ (back @ left), spreads
+    return amplitudes, variances
 
 
 def _likeliest(amplitudes: Floats, variances: Floats) -> float:

@@ -9,8 +9,10 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
-from kf_calib.dwells.rows import on_basis
-from kf_calib.dwells.sufficient_statistics import DwellFactor, alike
+from kf_calib.dwells.stack import DwellStack, basis_values, of_all_pieces
+from kf_calib.dwells.sufficient_statistics import DwellFactor
+
+_AT_ONCE = 4096  # dwells whose columns are processed together
 
 
 @dataclass(frozen=True, repr=False)
@@ -44,19 +46,18 @@ class Means:
 
 def means_of(dwells: Sequence[DwellFactor], columns: Sequence[Floats]) -> Means:
     """The means of dwells with these columns."""
-    design = np.zeros((len(dwells), *columns[0].shape[2:]))
-    for places in alike(dwells):
-        stacked, batch = np.array([columns[k] for k in places]), [dwells[k] for k in places]
-        triangles, width = np.array([dwell.triangles for dwell in batch]), batch[0].width
-        first = triangles[:, :, 0, :width] / triangles[:, :, :1, 0]  # means of the basis
-        weights = np.array([dwell.counts / dwell.count for dwell in batch])
-        coefficients = on_basis(stacked.reshape(*stacked.shape[:3], -1))
-        design[places] = np.einsum("db,dbk,dbkc->dc", weights, first, coefficients).reshape(-1, *stacked.shape[3:])
-    means = np.array([dwell.means for dwell in dwells])
-    forces = np.array([dwell.felt_force(stacked[1:4]) for dwell, stacked in zip(dwells, means, strict=True)])
-    counts = np.array([dwell.weight * dwell.count for dwell in dwells], float)
-    ends = np.array([(dwell.start_s, dwell.end_s) for dwell in dwells])
-    return Means(design, means[:, 4:], forces, counts, ends, np.array([bending_of(dwell) for dwell in dwells]))
+    stack, values = DwellStack.of(dwells), of_all_pieces(columns)
+    folded, of_pieces = stack.folded, np.empty((len(values), values[0, 0].size))
+    for shape, triangles in zip(folded.shapes, stack.triangles, strict=True):
+        first = triangles[:, :, 0, : shape.width] / triangles[:, :, :1, 0]  # means of the basis
+        for k in range(0, len(first), _AT_ONCE):
+            pieces = shape.pieces[k : k + _AT_ONCE]
+            coefficients = basis_values(values[pieces])
+            of_pieces[pieces] = (first[k : k + _AT_ONCE, :, None] @ coefficients)[:, :, 0]
+    design = folded.weighted(of_pieces).reshape(len(stack), *values.shape[2:])
+    return Means(
+        design, stack.means[:, 4:], stack.felt_means_mps2, folded.weights * folded.counts, folded.ends_s, stack.bendings
+    )  # fmt: skip
 
 
 def bending_of(dwell: DwellFactor) -> Floats:

@@ -19,6 +19,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells import walk_path, window_average
+from kf_calib.dwells.stack import DwellStack, OfPieces
 from kf_calib.dwells.sufficient_statistics import Autocovariance, DwellFactor
 from kf_calib.noise import random_walk
 from kf_calib.noise.autoregression import expected_products, unbiased
@@ -125,7 +126,7 @@ class Noise:
 
 def steps(dwells: Sequence[DwellFactor], noise: Noise) -> Floats:
     """Variances (D, 2) of the steps of a bias in the pause before each dwell and over the dwell."""
-    ends = np.array([(dwell.start_s, dwell.end_s) for dwell in dwells])
+    ends = DwellStack.of(dwells).folded.ends_s
     return random_walk.variances(ends[:, 0], ends[:, 1], noise.walk_mps2_per_sqrt_s)
 
 
@@ -140,19 +141,18 @@ def within_dwells(
     about a parabola has the expectation sigma^2 (n - 3 kappa) if n is at least 40 kappa. If there is no such piece,
     sigma_w is taken from the autocovariance.
     """
-    total = dwells[0].autocovariance.times(dwells[0].weight)
-    for dwell in dwells[1:]:
-        total += dwell.autocovariance.times(dwell.weight)
+    stack = DwellStack.of(dwells)
+    dwells, within_seen = stack.folded.dwells, bool((stack.folded.counts > 1).any())
     if walk_mps2_per_sqrt_s:
-        total = replace(total, products=total.products - walk_mps2_per_sqrt_s**2 * _walk_products(dwells))
-    known = _of_averages if dwells[0].averaged else _inflation
-    inflation, variance = np.array([known(total, i) for i in range(3)]).T
-    if not dwells[0].averaged and total.count < _SHORT * inflation.max() * total.blocks:
-        inflation, variance = _alike(total)
+        inflation, variance = _correlation(dwells, walk_mps2_per_sqrt_s)
+    else:  # the same for all fits to the dwells
+        if "correlation" not in stack.folded.known:
+            stack.folded.known["correlation"] = _correlation(dwells, 0.0)
+        inflation, variance = stack.folded.known["correlation"]
     if along is not None:
-        return Noise(_sigma_along(dwells, along, inflation), inflation, within_seen=any(d.count > 1 for d in dwells))
-    squares = np.concatenate([dwell.weight * dwell.squares for dwell in dwells])
-    counts = np.concatenate([dwell.counts for dwell in dwells])
+        return Noise(_sigma_along(stack, along, inflation), inflation, within_seen=within_seen)
+    counts, of_pieces = stack.folded.piece_counts, np.repeat(stack.folded.weights, stack.folded.piece_numbers)
+    squares = of_pieces[:, None] * stack.folded.squares
     if walk_mps2_per_sqrt_s:
         rest = np.concatenate([dwell.weight * dwell.walk.about_parabola for dwell in dwells])
         squares = np.maximum(squares - walk_mps2_per_sqrt_s**2 * rest[:, None], 0.0)
@@ -161,20 +161,44 @@ def within_dwells(
     freedom = np.where(long, np.maximum(counts[:, None] - 3.0 * inflation - on_carrier, 0.0), 0.0).sum(axis=0)
     pooled = np.where(long, squares, 0.0).sum(axis=0) / np.maximum(freedom, 1.0)
     sigma = np.sqrt(np.where(long.any(axis=0), pooled, variance))
-    return Noise(sigma, inflation, within_seen=any(dwell.count > 1 for dwell in dwells))
+    return Noise(sigma, inflation, within_seen=within_seen)
 
 
-def _sigma_along(dwells: Sequence[DwellFactor], along: Floats, inflation: Floats) -> Floats:
+def _correlation(dwells: Sequence[DwellFactor], walk_mps2_per_sqrt_s: float) -> tuple[Floats, Floats]:
+    """Return kappa (3,) and the variances (3,) of readings within dwells, less those of a random walk."""
+    total = _total_of(dwells)
+    if walk_mps2_per_sqrt_s:
+        total = replace(total, products=total.products - walk_mps2_per_sqrt_s**2 * _walk_products(dwells))
+    known = _of_averages if dwells[0].averaged else _inflation
+    inflation, variance = np.array([known(total, i) for i in range(3)]).T
+    if not dwells[0].averaged and total.count < _SHORT * inflation.max() * total.blocks:
+        return _alike(total)
+    return inflation, variance
+
+
+def _total_of(dwells: Sequence[DwellFactor]) -> Autocovariance:
+    """Return the sums of lagged products of all dwells."""
+    total = dwells[0].autocovariance.times(dwells[0].weight)
+    for dwell in dwells[1:]:
+        total = total + dwell.autocovariance.times(dwell.weight) if dwell.autocovariance.count else total
+    return total
+
+
+def _sigma_along(stack: DwellStack, along: Floats, inflation: Floats) -> Floats:
     """Return sigma_w (3,) of the accelerometers from the readings along the force alone, which have the variance sum of
     (m_i sigma_i)^2 with m = ``along`` (D, 3).
 
     The likeliest variances of such gamma distributed sums, by steps that keep them positive.
     """
     weights = along**2
-    squares = np.array([dwell.weight * dwell.squares_along(m).sum() for dwell, m in zip(dwells, along, strict=True)])
-    freedom = np.array([np.maximum(dwell.counts - 3.0 * inflation.mean(), 0.0).sum() for dwell in dwells])
+    folded = stack.folded
+    squares = np.empty(len(stack))
+    for shape, triangles in zip(folded.shapes, folded.triangles, strict=True):
+        left = triangles[:, :, shape.width :, shape.width :] @ along[shape.dwells][:, None, :, None]
+        squares[shape.dwells] = (left**2).sum(axis=(1, 2, 3)) * folded.weights[shape.dwells]
+    freedom = np.add.reduceat(np.maximum(folded.piece_counts - 3.0 * inflation.mean(), 0.0), folded.ends[:-1])
     if not freedom.any():
-        freedom = np.array([max(dwell.count - 1.0, 0.0) for dwell in dwells])
+        freedom = np.maximum(folded.counts - 1.0, 0.0)
     if not squares.any() or not freedom.any():
         return np.zeros(3)
     variances = np.full(3, squares.sum() / (freedom @ weights).sum())
@@ -244,7 +268,7 @@ def _of_averages(total: Autocovariance, channel: int) -> tuple[float, float]:
     return kappa, float(total.products[0, channel] / total.pairs[0] / max(kept, 1e-3))
 
 
-def slow_scatter(dwells: Sequence[DwellFactor], noise: Noise) -> tuple[list[Floats], Floats]:
+def slow_scatter(dwells: Sequence[DwellFactor], noise: Noise) -> tuple[OfPieces, Floats]:
     """Columns (pieces, nodes, 3, q) for the slow part of a stated scatter in each dwell, and the prior sigmas (q,) of
     their coefficients.
 
@@ -256,31 +280,29 @@ def slow_scatter(dwells: Sequence[DwellFactor], noise: Noise) -> tuple[list[Floa
     return slow_waves(dwells, flicker_sigma(noise, len(dwells)))
 
 
-def slow_waves(dwells: Sequence[DwellFactor], flicker_mps2: Floats) -> tuple[list[Floats], Floats]:
+def slow_waves(dwells: Sequence[DwellFactor], flicker_mps2: Floats) -> tuple[OfPieces, Floats]:
     """The same for 1/f noise with sqrt(h) = ``flicker_mps2`` (3,); none for an accelerometer without it."""
-    channels = np.flatnonzero(flicker_mps2 > 0)
+    channels, folded = np.flatnonzero(flicker_mps2 > 0), DwellStack.of(dwells).folded
+    pieces, width = folded.ends[-1], folded.dwells[0].width
     if len(dwells) < 4 or not channels.size:
-        return [np.zeros((len(dwell.pieces), dwell.width, 3, 0)) for dwell in dwells], np.zeros(0)
-    start, span = dwells[0].start_s, dwells[-1].end_s - dwells[0].start_s
-    orders, columns = np.arange(1, _WANDER + 1), list[Floats]()
-    for dwell in dwells:
-        waves = np.zeros((len(dwell.pieces), dwell.width, 3, len(channels), _WANDER))
-        at = (0.5 * (dwell.start_s + dwell.end_s) - start) / span
-        waves[:, :3, channels, np.arange(len(channels))] = np.sqrt(2.0) * np.cos(np.pi * orders * at)
-        columns.append(waves.reshape(*waves.shape[:3], -1))
+        return OfPieces(np.zeros((pieces, width, 3, 0)), folded.ends), np.zeros(0)
+    begin_s, orders = folded.ends_s[0, 0], np.arange(1, _WANDER + 1)
+    at = (folded.ends_s.mean(axis=1) - begin_s) / (folded.ends_s[-1, 1] - begin_s)
+    waves = np.zeros((pieces, width, 3, len(channels), _WANDER))
+    courses = np.sqrt(2.0) * np.cos(np.pi * orders * np.repeat(at, folded.piece_numbers)[:, None])
+    waves[:, :3, channels, np.arange(len(channels))] = courses[:, None, None]
     sigma = flicker_mps2[channels, None] / np.sqrt(orders)
-    return columns, sigma.ravel()
+    return OfPieces(waves.reshape(*waves.shape[:3], -1), folded.ends), sigma.ravel()
 
 
-def shared_noise(dwells: Sequence[DwellFactor], noise: Noise) -> tuple[list[Floats], Floats]:
+def shared_noise(dwells: Sequence[DwellFactor], noise: Noise) -> tuple[OfPieces, Floats]:
     """Columns (pieces, nodes, 3, q) of all noise that dwells have in common, the slow part of a stated scatter and the
     error of the temperature, and the prior sigmas (q,) of their coefficients."""
     slow, sigma = slow_scatter(dwells, noise)
     if noise.sensitivity_mps2_per_k is None:
         return slow, sigma
     errors = thermometer_errors(dwells, noise.sensitivity_mps2_per_k)
-    columns = [np.concatenate(both, axis=3) for both in zip(slow, errors, strict=True)]
-    return columns, np.append(sigma, np.ones(errors[0].shape[3]))
+    return slow.beside(errors), np.append(sigma, np.ones(errors.values.shape[3]))
 
 
 def flicker_sigma(noise: Noise, dwells: int) -> Floats:

@@ -11,22 +11,27 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.rows import REGRESSORS
+from kf_calib.dwells.stack import DwellStack, Folded
 from kf_calib.dwells.sufficient_statistics import DwellFactor
-from kf_calib.noise.means import bending_of
 from kf_calib.noise.noise_model import FLOOR_MPS2, Noise
 
 SLOW = np.arange(1, 5)
 """Numbers of half cycles of the slow waves of 1/f noise in a dwell."""
 
 
-def flicker_waves(dwell: DwellFactor) -> Floats:
-    """sqrt(2) cos(pi k t / T) over a dwell of length T at its nodes, (pieces, nodes, k)."""
-    at = np.array([piece.nodes.elapsed_s for piece in dwell.pieces]) - dwell.start_s
-    return np.sqrt(2.0) * np.cos(np.pi * SLOW * (at / max(dwell.end_s - dwell.start_s, 1e-9))[..., None])
+def flicker_waves(folded: Folded) -> Floats:
+    """sqrt(2) cos(pi k t / T) over a dwell of length T at the nodes of all pieces, (pieces, nodes, k)."""
+    if "flicker_waves" in folded.known:
+        return folded.known["flicker_waves"]
+    starts_s, ends_s = np.repeat(folded.ends_s, 3 * folded.piece_numbers, axis=0).T
+    share = (folded.elapsed_s - starts_s) / np.maximum(ends_s - starts_s, 1e-9)
+    waves = (np.sqrt(2.0) * np.cos(np.pi * SLOW * share[:, None])).reshape(-1, 3, len(SLOW))
+    return folded.known.setdefault("flicker_waves", waves)
 
 
 def flicker_sigmas(flicker_mps2: Floats) -> Floats:
@@ -54,14 +59,18 @@ def along_force(dwells: Sequence[DwellFactor], sensitivities: Floats) -> Floats:
 
     No rotation changes m . reading, which is |f| but for biases; sensitivities S are (D, 3, 3).
     """
-    force = np.array([dwell.felt_force(dwell.means[None, 1:4])[0] for dwell in dwells])
+    force = DwellStack.of(dwells).felt_means_mps2
     unit = force / np.linalg.norm(force, axis=1, keepdims=True)
     return np.asarray(np.linalg.solve(np.swapaxes(sensitivities, 1, 2), unit[:, :, None])[:, :, 0], float)
 
 
-def sensitivities_of(dwells: Sequence[DwellFactor], state: Floats) -> Floats:
-    """Change (D, 3, 3) of the readings of each dwell per unit of force at ``state`` (p,), effects included."""
-    return state[:STATE_COUNT].reshape(3, 4)[:, :3] + np.array([bending_of(dwell) for dwell in dwells])
+def sensitivities_of(dwells: Sequence[DwellFactor], state: Floats, some: NDArray[np.intp] | None = None) -> Floats:
+    """Change (D, 3, 3) of the readings of each dwell per unit of force at ``state`` (p,), effects included.
+
+    some (d,): indices of the dwells of which alone it is wanted.
+    """
+    bendings = DwellStack.of(dwells).bendings
+    return state[:STATE_COUNT].reshape(3, 4)[:, :3] + (bendings if some is None else bendings[some])
 
 
 def nuisance_sigmas(noise: Noise) -> Floats:
@@ -71,14 +80,14 @@ def nuisance_sigmas(noise: Noise) -> Floats:
     return np.concatenate([rotations[rotations > 0], noise.scatter_mps2[noise.scatter_mps2 > 0]])
 
 
-def nuisance_map(dwells: Sequence[DwellFactor], noise: Noise, state: Floats) -> Floats:
-    """The coefficients (D, 3, 4, q) of the nuisance states on the regressors 1, f_x, f_y, f_z, linearised at
-    ``state``."""
+def nuisance_map(sensitivities: Floats, noise: Noise) -> Floats:
+    """The coefficients (D, 3, 4, q) of the nuisance states on the regressors 1, f_x, f_y, f_z, for ``sensitivities_of``
+    the dwells (D, 3, 3)."""
     turning = 0.0 < noise.setting_rad < np.inf
     scattering, count = np.flatnonzero(noise.scatter_mps2 > 0), 3 if turning else 0
-    coefficients = np.zeros((len(dwells), 3, len(REGRESSORS), count + len(scattering)))
+    coefficients = np.zeros((len(sensitivities), 3, len(REGRESSORS), count + len(scattering)))
     if turning:
-        x, y, z = np.moveaxis(sensitivities_of(dwells, state), 2, 0)
+        x, y, z = np.moveaxis(sensitivities, 2, 0)
         none = np.zeros_like(x)
         crossing = np.array([[none, -z, y], [z, none, -x], [-y, x, none]])  # (f x s) = f^T [s]
         coefficients[:, :, 1:, :3] = np.moveaxis(crossing, (0, 1), (2, 3))

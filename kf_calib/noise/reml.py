@@ -21,6 +21,7 @@ from typing import Literal
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, Mask
+from kf_calib.dwells.qr import orthonormal
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.noise.means import Means, means_of
 from kf_calib.noise.noise_model import FLOOR_MPS2, Noise, mean_covariances, setting_covariances, shared_noise
@@ -286,8 +287,9 @@ def _reduce(means: Means, prior: Floats | None = None, apart: slice = slice(0)) 
     known[apart] = True
     free = design[:, ~known]
     scale = np.linalg.norm(free, axis=0)
-    left, singular, _ = np.linalg.svd(free / np.where(scale > 0, scale, 1.0), full_matrices=False)
-    basis = left[:, singular > 1e-9 * singular[0]]
+    basis, upper = orthonormal(free / np.where(scale > 0, scale, 1.0))
+    turn, singular, _ = np.linalg.svd(upper, full_matrices=False)
+    basis = basis @ turn[:, singular > 1e-9 * singular[0]]
     rest = means.readings.ravel() - basis @ (basis.T @ means.readings.ravel())
     columns = np.hstack([basis, design[:, known]])
     means = replace(means, design=columns.reshape(*means.readings.shape, -1), readings=rest.reshape(-1, 3))
@@ -303,13 +305,17 @@ def _likelihood(
     """
     means, count, units = reduced.means, len(reduced.means.counts), _units(reduced.means)
     standing = "walk" not in parts and not noise.walk_mps2_per_sqrt_s
-    path = Links(*(np.zeros(count - k) for k in (1, 0, 1))) if standing else mean_links(means.ends_s, held_s)
     rows = np.concatenate([means.design, means.readings[:, :, None]], axis=2)
+    fixed = mean_covariances(noise, means, state, float(units["common"][0]))
+    if standing:  # no means are correlated: only their own covariances are kept
+        shapes = {part: _shapes(part, means, state) for part in parts}
+        alone = Restricted(rows.reshape(3 * count, -1), reduced.prior, fixed, np.zeros((0, count, 3, 3)))
+        return Likelihood(alone, {part: units[part][:, None, None, None] ** 2 * shapes[part] for part in parts}, units)
+    path = mean_links(means.ends_s, held_s)
     rows[1:] -= path.share[:, None, None] * rows[:-1].copy()
     walk = np.zeros((1, count, 6, 3))
     walk[0, :, :3] = path.alone[:, None, None] * np.eye(3)
     walk[0, :-1, 3:] = path.beside[:, None, None] * np.eye(3)
-    fixed = mean_covariances(noise, means, state, float(units["common"][0]))
     alone = Restricted(
         rows.reshape(3 * count, -1),
         reduced.prior,

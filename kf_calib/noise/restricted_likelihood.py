@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.dwells.qr import square_triangle
+from kf_calib.dwells.qr import orthonormal, square_triangle
 from kf_calib.noise import banded
 from kf_calib.noise.noise_model import lift_rounding
 
@@ -45,7 +45,8 @@ class _Level:
     """The likelihood at given variances, and what its derivatives are made from.
 
     - cost, misfit: as of a point.
-    - covariance (D, 6, 3), lower (6, 3 D): V and its Cholesky factor, in the layouts of ``banded``.
+    - covariance (D, 6, 3), lower (6, 3 D), or (D, 3, 3) where no means are correlated: V and its Cholesky factor, in
+      the layouts of ``banded``.
     - basis (3 D, p), rest (3 D,): of the whitened rows, an orthonormal basis of A and what it leaves of z.
     """
 
@@ -63,7 +64,8 @@ class Restricted:
 
     - rows (3 D, p + 1): [A | z].
     - prior (q, p + 1): whitened rows of prior knowledge of x.
-    - fixed (D, 6, 3), shapes (k, D, 6, 3): V_0 and K_k, in the layout of ``banded``.
+    - fixed (D, 6, 3), shapes (k, D, 6, 3): V_0 and K_k, in the layout of ``banded``; (D, 3, 3) and (k, D, 3, 3) where
+      no means are correlated.
     """
 
     rows: Floats
@@ -91,15 +93,16 @@ class Restricted:
         covariance = self.fixed + wider.reshape(self.fixed.shape)
         covariance[:, :3] = lift_rounding(covariance[:, :3])
         lower = banded.root(covariance)
-        return (covariance, lower), np.concatenate([self.prior, banded.solve(lower, self.rows)])
+        whitened = banded.solve(lower, self.rows)
+        return (covariance, lower), np.concatenate([self.prior, whitened]) if len(self.prior) else whitened
 
     def _level(self, variances: Floats) -> _Level:
         """Return the likelihood at ``variances`` (k,), without its derivatives, which take more time."""
         (covariance, lower), whitened = self._whitened(variances)
         known = len(self.prior)
-        basis, upper = np.linalg.qr(whitened[:, :-1])
+        basis, upper = orthonormal(whitened[:, :-1].copy())
         rest = whitened[:, -1] - basis @ (basis.T @ whitened[:, -1])
-        cost = np.log(lower[0]).sum() + np.log(np.abs(np.diag(upper))).sum() + 0.5 * rest @ rest
+        cost = np.log(banded.diagonal(lower)).sum() + np.log(np.abs(np.diag(upper))).sum() + 0.5 * rest @ rest
         return _Level(float(cost), float(rest @ rest), covariance, lower, basis[known:], rest[known:])
 
     def _with_derivatives(self, level: _Level) -> Point:
@@ -111,7 +114,7 @@ class Restricted:
         """
         covariance, lower, basis, rest = level.covariance, level.lower, level.basis, level.rest
         back = banded.solve(lower, np.column_stack([basis, rest]), transposed=True)
-        inner = banded.inverse(covariance, lower) - banded.outer(back)
+        inner = banded.inverse(covariance, lower) - banded.outer(back, covariance.shape[1])
         moved = banded.solve(lower, banded.products(self.shapes, back[:, -1]))
         within = basis.T @ moved
         information = 0.5 * (moved.T @ moved - within.T @ within)

@@ -50,15 +50,20 @@ class Course:
 @lru_cache(maxsize=4)
 def temperature_course(dwells: tuple[DwellFactor, ...]) -> Course:
     """The course of the temperature over dwells, and slews between them, in order of time."""
-    read = np.concatenate([dwell.nodes.temperature_c for dwell in dwells])
+    read = _of_nodes(dwells, "temperature_c")
     exact = Course(read, np.zeros((len(read), 0)))
     standing = [dwell for dwell in dwells if not dwell.moving]
     if len(standing) < 4 or not np.isfinite(read).all():
         return exact
     if _only_scatters(dwells, read):
         return Course(np.full(len(read), _means(dwells, read).mean()), exact.errors_c)
-    at_s = np.concatenate([dwell.nodes.elapsed_s for dwell in dwells])
+    at_s = _of_nodes(dwells, "elapsed_s")
     return _smooth(standing, at_s) or exact
+
+
+def _of_nodes(dwells: Sequence[DwellFactor], name: str) -> Floats:
+    """Return one of the conditions at the nodes of all pieces, (m,)."""
+    return np.concatenate([getattr(piece.nodes, name) for dwell in dwells for piece in dwell.pieces])
 
 
 def _only_scatters(dwells: Sequence[DwellFactor], read: Floats) -> bool:

@@ -18,6 +18,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.dwells.stack import DwellStack
 from kf_calib.dwells.sufficient_statistics import Autocovariance, DwellFactor
 from kf_calib.support.tail_probabilities import chi_squared_tail
 
@@ -28,18 +29,18 @@ _SHAPES = np.geomspace(1.0, 1e4, 61)  # nu_0
 _ROUNDS = 60
 
 
-def with_own_noise(dwells: list[DwellFactor], along: Floats | None = None) -> list[DwellFactor]:
+def with_own_noise(dwells: DwellStack, along: Floats | None = None) -> DwellStack:
     """The dwells, each with the weight that its own noise gives its readings, 1 where all have one noise.
 
     along (D, 3): the weights of the channels in the size of the force, where nothing else is known in a dwell.
     """
-    if dwells[0].averaged:
+    if dwells.folded.dwells[0].averaged:
         return dwells
-    variances, freedom = _variances(dwells, along)
+    variances, freedom = _variances(dwells.folded.dwells, along)
     weights = weights_of(variances, freedom)
-    if not (weights != 1.0).any() and all(dwell.weight == 1.0 for dwell in dwells):
+    if np.array_equal(weights, dwells.folded.weights):
         return dwells
-    return [dwell.weighted(float(weight)) for dwell, weight in zip(dwells, weights, strict=True)]
+    return DwellStack.of([dwell.weighted(float(weight)) for dwell, weight in zip(dwells, weights, strict=True)])
 
 
 def weights_of(variances: Floats, freedom: Floats) -> Floats:

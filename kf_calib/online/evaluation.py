@@ -48,11 +48,8 @@ class Evaluation(ABC, Generic[J, S]):
 
     source: of the readings. settings: of the calibration. wanted: targets of sigmas by symbol, SI. every: judge after
     each dwell, even where dwells close faster than they are judged; False: judge the newest only. again: gives the
-    readings once more when the source has ended, from its recording; None where there is none. look_factor: by how much
-    the open dwell has to grow between two looks at it.
+    readings once more when the source has ended, from its recording; None where there is none.
     """
-
-    look_factor = 2.0
 
     def __init__(
         self,
@@ -237,7 +234,7 @@ class Evaluation(ABC, Generic[J, S]):
         folder, open_dwells = Folder(), self._passed.folder.dwells[self._closed :]
         folder.dwells = list(open_dwells[-1:])
         arrival_s = self._segmenter.arrival_s
-        if elapsed_s - arrival_s < max(self.look_factor * self._looked_s, _FIRST_LOOK_S):
+        if elapsed_s - arrival_s < max(2.0 * self._looked_s, _FIRST_LOOK_S):
             return
         aside = replace(self._passed, tally=Tally(), folder=folder)
         for rows in aside.rows_of(self._segmenter.waiting()):
@@ -247,7 +244,7 @@ class Evaluation(ABC, Generic[J, S]):
         self._looked_s = elapsed_s - arrival_s
         here = self._seen(folder.dwells[-1])
         with self._lock:
-            self._publish(current=here)
+            self._publish(current=here, looked_s=elapsed_s)
 
     def _judge(self) -> None:
         """Judge dwells as they close, in order; this is what the judging thread runs."""

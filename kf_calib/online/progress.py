@@ -15,15 +15,16 @@ from kf_calib.bench.arrays import Floats
 class Progress:
     """What is known of a run at a moment.
 
-    samples: number of readings. elapsed_s: time of the last of them. dwells: number of closed dwells. judged_s: time of
-    the latest judgement. problem: why there is none. notice: the latest action, such as an effect that was accepted or
-    refused. model: effects in the model.
+    samples: number of readings. elapsed_s: time of the last of them. dwells: number of closed dwells. judged_s,
+    looked_s: times of the latest judgement, and of the latest look at the open dwell. problem: why there is no
+    judgement. notice: the latest action, such as an effect that was accepted or refused. model: effects in the model.
     """
 
     samples: int = 0
     elapsed_s: float = 0.0
     dwells: int = 0
     judged_s: float = 0.0
+    looked_s: float = 0.0
     problem: str = ""
     notice: str = ""
     model: Sequence[str] = ()

@@ -80,7 +80,7 @@ class Running:
         return cls(LinearisedDwells(attitudes, every, at), inside, noise, prior or Prior(), empty)._rebuild()
 
     @property
-    def dwells(self) -> list[DwellFactor]:
+    def dwells(self) -> Sequence[DwellFactor]:
         """The dwells so far."""
         return self.linearised.dwells
 

@@ -92,7 +92,7 @@ class Session(Evaluation[Judgement, Standing]):
         closed = [] if last is None else last.passed.folder.dwells
         stays = [(dwell.recorded_pose, dwell.end_s - dwell.start_s) for dwell in closed]
         if standing.current is not None:
-            stays.append((standing.current.pose, standing.current.seconds))
+            stays.append((standing.current.pose, standing.stayed_s))
         judged = 0 if standing.judgement is None else len(standing.judgement.result.visits)
         with one_blas_thread():
             return suggest(itinerary, Visited(stays, min(judged, len(stays))), standing.judgement)

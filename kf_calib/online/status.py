@@ -254,6 +254,11 @@ class Standing(Progress):
     judgement: Judgement | None = None
 
     @property
+    def stayed_s(self) -> float:
+        """Duration of the readings of the open dwell by now, s: those of the latest look, and what came since."""
+        return 0.0 if self.current is None else self.current.seconds + self.elapsed_s - self.looked_s
+
+    @property
     def sigma(self) -> Floats:
         """One sigma (12,) of the parameters with the open dwell included, SI; NaN where not determined."""
         if self.current is not None and np.isfinite(self.current.sigma).any():

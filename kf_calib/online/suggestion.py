@@ -12,7 +12,7 @@ judged yet will bring to the sigmas, and takes no verdict from them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
@@ -59,6 +59,13 @@ class Itinerary:
     def reach(self) -> Reach:
         """What the bench can take, by its description."""
         return Reach.of(self.bench)
+
+    def getting_there_s(self, here: Floats, pose: Floats) -> float:
+        """What going from one pose (k,) to another, rad, takes beside the readings that count, s.
+
+        A stay that is to tell effects apart lasts no less: where white noise is left, half of the time is then used.
+        """
+        return float(self.pace.slews_s(here, pose)) + self.pace.overhead_s
 
     @cached_property
     def opening_poses(self) -> Floats:
@@ -198,18 +205,19 @@ def _telling_apart(itinerary: Itinerary, visited: Visited, judgement: Judgement,
     again = _to_repeat(visited, judgement) if diagnosis.noise or diagnosis.as_scatter else None
     if again is not None and can_be_reached(itinerary.reach, here, again[None])[0]:
         why = "again where the model disagrees most: noise will not repeat, an effect will"
-        return Suggestion("repeat", why, _in_deg(again), usual_s)
+        return Suggestion("repeat", why, _in_deg(again), max(usual_s, itinerary.getting_there_s(here, again)))
     if judgement.advice is not None:
         advice, why = judgement.advice
         pose = np.radians(advice.gimbal_deg)
         is_new = not any(_same(pose, other) for other, _ in pending)
         if is_new and can_be_reached(itinerary.reach, here, pose[None])[0]:
-            stay_s = min(max(usual_s, advice.stay_s or 0.0), itinerary.longest_s)
-            return Suggestion("tell apart", why, _in_deg(pose), stay_s)
+            stay_s = max(usual_s, itinerary.getting_there_s(here, pose), advice.stay_s or 0.0)
+            return Suggestion("tell apart", why, _in_deg(pose), min(stay_s, itinerary.longest_s))
     further = _sharpening(itinerary, outlook, judgement)
-    if further.gimbal_deg and further.stay_s < usual_s:
-        return Suggestion("tell apart", further.why, further.gimbal_deg, usual_s, further.sigma)
-    return further
+    if not further.gimbal_deg:
+        return further
+    stay_s = max(further.stay_s, usual_s, itinerary.getting_there_s(here, np.radians(further.gimbal_deg)))
+    return replace(further, purpose="tell apart", stay_s=min(stay_s, itinerary.longest_s))
 
 
 def _to_repeat(visited: Visited, judgement: Judgement) -> Floats | None:

@@ -155,11 +155,10 @@ class Drive:
 
     def _look(self) -> Seen:
         self._here = tuple(self.positioner.read())
-        current, samples = self.session.standing.current, self.session.standing.samples
-        pose = None if current is None else tuple(np.degrees(current.pose).tolist())
-        trouble = self._broken_off or self._trouble()
-        stay_s = 0.0 if current is None else current.seconds
-        return Seen(self.clock.now_s(), self._here, self.positioner.fault(), trouble, samples, stay_s, pose)
+        standing = self.session.standing
+        pose = None if standing.current is None else tuple(np.degrees(standing.current.pose).tolist())
+        trouble, fault = self._broken_off or self._trouble(), self.positioner.fault()
+        return Seen(self.clock.now_s(), self._here, fault, trouble, standing.samples, standing.stayed_s, pose)
 
     def _stop(self) -> bool:
         """Tell the table to stop, twice if need be; whether it took the command."""

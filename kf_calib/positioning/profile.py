@@ -26,8 +26,7 @@ from typing_extensions import TypedDict
 
 from kf_calib.errors import InputError
 from kf_calib.positioning.positioner import Watchfulness
-from kf_calib.support.toml_files import toml_table
-from kf_calib.support.value_schema import FINITE, TEXT, Misfit, converted
+from kf_calib.support.toml_files import FINITE, TEXT, Misfit, converted, toml_table
 
 SHIPPED = Path(__file__).parent / "profiles"
 """Profiles that come with the package, by the names of their files."""

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 GRAVITY_MPS2 = 9.81
 NOISE_MPS2 = 1e-4
-READINGS = 100
+READINGS_PER_DWELL = 100
 """Of each accelerometer in each orientation."""
 REPETITIONS = 200
 OPTIMAL_PRINTED = {
@@ -87,15 +87,15 @@ class Conditions:
     @property
     def duration_s(self) -> float:
         """From the first reading to the end of the last."""
-        return 4 * READINGS * self.period_s * (1 if self.sampled == TOGETHER else 3)
+        return 4 * READINGS_PER_DWELL * self.period_s * (1 if self.sampled == TOGETHER else 3)
 
     def elapsed_s(self) -> Floats:
         """When each accelerometer's readings are taken, (3, n)."""
         if self.sampled == TOGETHER:
-            return np.tile(np.asarray(np.arange(4 * READINGS) * self.period_s, dtype=np.float64), (3, 1))
+            return np.tile(np.asarray(np.arange(4 * READINGS_PER_DWELL) * self.period_s, dtype=np.float64), (3, 1))
         place = np.array([self.sampled.index(i) for i in "123"])
         block = 3 * np.arange(4) + place[:, None]
-        count = block[..., None] * READINGS + np.arange(READINGS)
+        count = block[..., None] * READINGS_PER_DWELL + np.arange(READINGS_PER_DWELL)
         return np.asarray(self.period_s * count.reshape(3, -1), dtype=np.float64)
 
 
@@ -153,12 +153,12 @@ class OrientationSet:
     @property
     def directions(self) -> Floats:
         """Specific force of the first reading in each orientation, in g (3, 4, 3)."""
-        return self.force_mps2[:, ::READINGS] / GRAVITY_MPS2
+        return self.force_mps2[:, ::READINGS_PER_DWELL] / GRAVITY_MPS2
 
     @property
     def same_vector(self) -> list[tuple[int, int]]:
         """Pairs of orientations, counted from 1, in which all accelerometers see the same vector."""
-        by_orientation = self.force_mps2.reshape(3, 4, READINGS, 3)
+        by_orientation = self.force_mps2.reshape(3, 4, READINGS_PER_DWELL, 3)
         return [
             (one + 1, other + 1)
             for one, other in combinations(range(4), 2)
@@ -209,7 +209,7 @@ def scatter(repetitions: int) -> float:
 def nonoptimal(conditions: Conditions, earth_turns: bool = True) -> OrientationSet:
     """The paper's first set; without the Earth's rotation: as printed."""
     bench = conditions.bench if earth_turns else FIXED
-    pose = np.repeat(attitudes(conditions.turns), READINGS, axis=0)
+    pose = np.repeat(attitudes(conditions.turns), READINGS_PER_DWELL, axis=0)
     return OrientationSet(np.array([bench.specific_force(each, pose) for each in conditions.elapsed_s()]))
 
 
@@ -231,12 +231,12 @@ def optimal(conditions: Conditions | None = None, turned_after: bool = True) -> 
     bench, period_s, carried = FIXED, 0.0, Rotation.identity(4)
     if conditions is not None:
         bench, period_s = conditions.bench, conditions.period_s
-    elapsed_s = period_s * np.arange(4.0 * READINGS)
+    elapsed_s = period_s * np.arange(4.0 * READINGS_PER_DWELL)
     if conditions is not None and turned_after:
-        carried = Rotation.from_rotvec(np.outer(elapsed_s[::READINGS], bench.earth_rate_radps))
+        carried = Rotation.from_rotvec(np.outer(elapsed_s[::READINGS_PER_DWELL], bench.earth_rate_radps))
     poses = [(carried * _pointing(directions)).as_quat() for directions in along]
     return OrientationSet(
-        np.array([bench.specific_force(elapsed_s, np.repeat(pose, READINGS, axis=0)) for pose in poses])
+        np.array([bench.specific_force(elapsed_s, np.repeat(pose, READINGS_PER_DWELL, axis=0)) for pose in poses])
     )
 
 
@@ -304,7 +304,7 @@ def _filtered(force_mps2: Floats, readings: Floats, root: Floats) -> tuple[Float
 
 def shrinking(orientations: OrientationSet, prior: Floats) -> Floats:
     """Covariance of the affine state (n + 1, 12, 12): that of the ``prior`` (12, 12), and after every reading."""
-    none, root = np.empty((3, 4 * READINGS, 0)), np.linalg.cholesky(prior).astype(float)
+    none, root = np.empty((3, 4 * READINGS_PER_DWELL, 0)), np.linalg.cholesky(prior).astype(float)
     return np.stack([prior, *_filtered(orientations.force_mps2, none, root)[1]])
 
 

@@ -20,7 +20,7 @@ from kf_calib.reproduction import grebenkin2019
 from kf_calib.reproduction.grebenkin2019 import (
     GRAVITY_MPS2,
     NOISE_MPS2,
-    READINGS,
+    READINGS_PER_DWELL,
     SAMPLED,
     TOGETHER,
     TURNS,
@@ -85,10 +85,10 @@ def _nearest_periods(base: Conditions) -> Iterator[ConditionFit]:
 
 def _vertical(base: Conditions) -> Floats:
     """Sums of [f, 1][f, 1]^T over stretches of 100 readings, the platform at zero: (P, 12 stretches, 4, 4)."""
-    elapsed_s = np.outer(PERIODS_S, np.arange(12 * READINGS))
+    elapsed_s = np.outer(PERIODS_S, np.arange(12 * READINGS_PER_DWELL))
     still = np.tile([0.0, 0.0, 0.0, 1.0], (elapsed_s.size, 1))
     force = base.bench.specific_force(elapsed_s.ravel(), still)
-    rows = np.column_stack([force, np.ones(len(force))]).reshape(len(PERIODS_S), 12, READINGS, 4)
+    rows = np.column_stack([force, np.ones(len(force))]).reshape(len(PERIODS_S), 12, READINGS_PER_DWELL, 4)
     return rows.swapaxes(-1, -2) @ rows
 
 
@@ -122,5 +122,5 @@ def bias_excess(column: Floats) -> Floats:
     sigma_b <= g |sigma_s| + 2 sigma / sqrt(n), whatever the vectors f_j of length g; |sigma_s|: of K and both angles.
     """
     sigma = (column / 100 * DEVIATIONS * math.sqrt(math.pi / 2)).reshape(3, 4)
-    most = GRAVITY_MPS2 * np.linalg.norm(sigma[:, :3], axis=1) + 2 * NOISE_MPS2 / math.sqrt(4 * READINGS)
+    most = GRAVITY_MPS2 * np.linalg.norm(sigma[:, :3], axis=1) + 2 * NOISE_MPS2 / math.sqrt(4 * READINGS_PER_DWELL)
     return sigma[:, 3] / most

@@ -13,9 +13,9 @@ from kf_calib.bench.streams import Source
 from kf_calib.errors import InputError
 from kf_calib.sources.files.contents import CALIBRATION_FORMAT
 from kf_calib.sources.files.csv_columns import CsvColumns
-from kf_calib.sources.files.csv_heading import Heading
-from kf_calib.sources.files.foreign import HEAD_BYTES, is_lines
+from kf_calib.sources.files.csv_heading import CsvHeading
 from kf_calib.sources.files.lines import Lines, is_json
+from kf_calib.sources.files.mcap_file import HEAD_BYTES, is_lines
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.files.text_file import head_of
 from kf_calib.sources.tables.grid import OLD_SUFFIXES, TEXT_SUFFIXES, ZIP
@@ -27,7 +27,7 @@ _SLOWEST_S = 1.0
 """Rows that are closer are samples, not dwells."""
 
 
-class Kind(Enum):
+class FileKind(Enum):
     """What a file holds.
 
     - RECORDING: messages in MCAP or SQLite, or nothing that is known.
@@ -42,35 +42,35 @@ class Kind(Enum):
     CALIBRATION = "calibration"
 
 
-def kind_of(path: str | PathLike[str], columns: Mapping[str, str] = MappingProxyType({})) -> Kind:
+def kind_of(path: str | PathLike[str], columns: Mapping[str, str] = MappingProxyType({})) -> FileKind:
     """What a file is, by its beginning; columns: our names of foreign ones, as far as they are stated."""
     file = Path(path)
     if not file.is_file():
-        return Kind.RECORDING
+        return FileKind.RECORDING
     try:
         head = head_of(file)
     except OSError:  # said where the file is opened to be read
-        return Kind.RECORDING
+        return FileKind.RECORDING
     suffix = Path(file.stem if file.suffix.lower() == ".gz" else file).suffix.lower()
     if head.startswith(ZIP) or suffix in OLD_SUFFIXES:
-        return Kind.TABLE
+        return FileKind.TABLE
     if not (suffix in TEXT_SUFFIXES or is_lines(head[:HEAD_BYTES])):
-        return Kind.RECORDING
+        return FileKind.RECORDING
     lines = head.decode("utf-8", errors="replace").splitlines()
     first = next((k for k, line in enumerate(lines) if line.lstrip("\ufeff").strip()), None)
     if first is None:
-        return Kind.TABLE
+        return FileKind.TABLE
     if CALIBRATION_FORMAT.encode() in head[:_OF_CALIBRATION]:
-        return Kind.CALIBRATION
+        return FileKind.CALIBRATION
     if is_json(lines[first]):
-        return Kind.SAMPLES
-    return Kind.SAMPLES if _are_samples(lines[first:-1] or lines[first:], columns) else Kind.TABLE
+        return FileKind.SAMPLES
+    return FileKind.SAMPLES if _are_samples(lines[first:-1] or lines[first:], columns) else FileKind.TABLE
 
 
 def _are_samples(lines: list[str], stated: Mapping[str, str]) -> bool:
     """Whether the rows under a header are a time series: many, and close in time."""
     try:
-        columns = CsvColumns.of(Heading.of(lines), stated)
+        columns = CsvColumns.of(CsvHeading.of(lines), stated)
     except InputError:
         return False
     if columns.marks_of_a_table or len(columns.rows) <= _FEWEST_SAMPLES:
@@ -94,11 +94,11 @@ def opened(
     if not isinstance(source, str | PathLike):
         return source
     match kind_of(source):
-        case Kind.TABLE:
+        case FileKind.TABLE:
             return open_table(source, overrides, angles=angles)
-        case Kind.SAMPLES:
+        case FileKind.SAMPLES:
             return Lines(source, overrides, angles=angles)
-        case Kind.RECORDING:
+        case FileKind.RECORDING:
             return Recording(source, overrides, angles=angles)
-        case Kind.CALIBRATION:
+        case FileKind.CALIBRATION:
             raise no_recording(source)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 LEVEL = 0.01
 """Probability of a false alarm in one run."""
@@ -70,3 +71,8 @@ def _stirling_error(z: float) -> float:
         return math.lgamma(z) - (z - 0.5) * math.log(z) + z - 0.5 * math.log(2.0 * math.pi)
     square = 1.0 / z**2
     return (1 / 12 - square * (1 / 360 - square * (1 / 1260 - square * (1 / 1680 - square / 1188)))) / z
+
+
+def weights(logarithms: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Numbers that sum to 1 and are in proportion to those given by their logarithms."""
+    return np.exp(logarithms - np.logaddexp.reduce(logarithms, axis=None))

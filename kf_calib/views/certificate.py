@@ -9,7 +9,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from kf_calib.exchange.certificate.budget import Contribution
-from kf_calib.exchange.certificate.content import OUTCOMES, Certificate, Result
+from kf_calib.exchange.certificate.content import OUTCOMES, Certificate, CertifiedResult
 from kf_calib.support.units import shown
 from kf_calib.views.console import symbol
 from kf_calib.views.json import clean
@@ -34,7 +34,7 @@ def certificate_object(certificate: Certificate, standing: str, path: Path, xml:
     )
 
 
-def _result_object(result: Result) -> dict[str, Any]:
+def _result_object(result: CertifiedResult) -> dict[str, Any]:
     return {
         "symbol": result.symbol, "value": result.value, "unit": result.unit, "nominal": result.nominal,
         "standard": result.standard, "expanded": result.expanded, "k": result.k, "dof": result.dof,

@@ -187,7 +187,7 @@ def verdict(result: Calibration) -> str:
 
 def summary(result: Calibration) -> RenderableType:
     """The report that ``replay`` prints."""
-    tally, dwells = result.tally, [visit.dwell for visit in result.visits]
+    tally, dwells = result.tally, result.fit.dwells
     head = (
         f"{tally.used - tally.gated} of {tally.read} readings used, {len(dwells)} dwells in "
         f"{len(orientations(dwells))} orientations ({tally.moving} readings moving, {tally.settling} settling)"

@@ -13,7 +13,7 @@ from rich.text import Text
 from kf_calib.estimation.correction import Correction
 from kf_calib.estimation.results import format_p
 from kf_calib.exchange.corrected_file import Applied
-from kf_calib.exchange.history import History, Track
+from kf_calib.exchange.history import History, ParameterTrack
 from kf_calib.exchange.verification import Verification
 from kf_calib.sources.files.contents import CALIBRATED_TOPIC
 from kf_calib.support.units import shown
@@ -144,7 +144,7 @@ def history_object(history: History) -> dict[str, Any]:
     )
 
 
-def _track_object(track: Track) -> dict[str, Any]:
+def _track_object(track: ParameterTrack) -> dict[str, Any]:
     """Return one parameter over the calibrations as a JSON object."""
     return {
         "symbol": track.symbol, "unit": track.unit, "values": track.values, "sigmas": track.sigmas,
@@ -182,7 +182,7 @@ def _next_calibration(history: History, due: datetime) -> str:
     return f"Calibrate again now: {what} may be beyond its tolerance already (2σ)."
 
 
-def _track_row(track: Track) -> list[str]:
+def _track_row(track: ParameterTrack) -> list[str]:
     """Return the row of one parameter."""
     unit, year = shown(track.unit), 365.25
     drift = "not seen"

@@ -9,7 +9,7 @@ from typing import Any
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from kf_calib.fleet.batch import Progress
+from kf_calib.fleet.batch import BatchProgress
 from kf_calib.fleet.overview import FleetOverview
 from kf_calib.fleet.results import Fleet, ParameterPopulation
 from kf_calib.support.units import shown
@@ -27,7 +27,7 @@ _REASONS = 2
 def fleet_object(
     fleet: Fleet,
     populations: Sequence[ParameterPopulation],
-    done: Progress,
+    done: BatchProgress,
     overview: FleetOverview,
     bench_models: Sequence[Path],
 ) -> dict[str, Any]:
@@ -57,7 +57,7 @@ def fleet_object(
 def fleet_report(
     fleet: Fleet,
     populations: Sequence[ParameterPopulation],
-    done: Progress,
+    done: BatchProgress,
     overview: FleetOverview,
 ) -> RenderableType:
     """The report of ``fleet``."""

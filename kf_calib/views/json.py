@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def replay_object(result: Calibration) -> dict[str, Any]:
     """The JSON object of ``replay``."""
-    judged, noise, dwells = result.consistency, result.noise, [visit.dwell for visit in result.visits]
+    judged, noise, dwells = result.consistency, result.noise, result.fit.dwells
     return clean(
         {
             "samples": result.tally.read,

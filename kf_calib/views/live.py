@@ -46,7 +46,7 @@ def live_object(judgement: Judgement, standing: Standing, status: Status | None)
         "standing": judgement.verdict,
         "alarm": judgement.alarm,
         "looks": judgement.watch.looks if judgement.watch else 0,
-        "elapsed_s": judgement.result.visits[-1].dwell.end_s,
+        "elapsed_s": judgement.result.fit.dwells[-1].end_s,
         "targets": {name: value for name, value in wanted.items() if math.isfinite(value)},
         "time_left_s": left,
         "notice": standing.notice,
@@ -71,7 +71,7 @@ def source_object(status: Status | None) -> dict[str, Any] | None:
 def line(judgement: Judgement) -> str:
     """The state of a run after a dwell in one line of text."""
     result = judgement.result
-    dwell, sigma = result.visits[-1].dwell, result.estimate.sigma
+    dwell, sigma = result.fit.dwells[-1], result.estimate.sigma
     seen = "sigmas not determined yet"
     if np.isfinite(sigma).any():
         k = int(np.nanargmax(sigma / np.where(np.isfinite(judgement.worst), judgement.worst, np.inf)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,6 +10,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.sources.files.decision_records import angles_of, number_of
 from kf_calib.support.units import span
 from kf_calib.views.json import clean
 from kf_calib.views.tables import Table
@@ -60,6 +61,27 @@ def ended_in_words(outcome: Outcome) -> RenderableType:
     stays = sum(1 for decision in outcome.decisions if decision.gimbal_deg) + 1
     where = f"; the table stands at {angles_in_words(outcome.stands_at)}" if outcome.stands_at else ""
     return Text(f"The run ended after {span(outcome.lasted_s)} and {stays} orientations: {outcome.why}{where}.")
+
+
+def decided(decisions: Sequence[Mapping[str, str]], ends: Sequence[Mapping[str, str]]) -> RenderableType | None:
+    """The decisions in the records of a recording as a table, and how the run ended; None where there are none."""
+    if not decisions:
+        return None
+    table = Table("", "after", "gimbals, deg", "stay", "why")
+    for record in decisions:
+        angles = angles_of(record.get("gimbal_deg", ""))
+        where = ", ".join(f"{angle:g}" for angle in angles)
+        stay = span(number_of(record, "stay_s")) if angles else ""
+        table.add_row(record.get("number", ""), span(number_of(record, "at_s")), where, stay, record.get("why", ""))
+    return Group(table, *(Text(_end_in_words(record)) for record in ends[-1:]))
+
+
+def _end_in_words(record: Mapping[str, str]) -> str:
+    """Return how a run ended, by its record."""
+    ended, why = record.get("ended", ""), record.get("why", "")
+    where = angles_in_words(angles_of(record.get("stands_at_deg", "")))
+    lasted = span(number_of(record, "lasted_s"))
+    return f"The run ended ({ended}) after {lasted}: {why}. The table stands at {where}."
 
 
 def angles_in_words(gimbal_deg: Sequence[float]) -> str:

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from kf_calib.bench.targets import targets_of
+from kf_calib.bench.paper_parameters import targets_of
 from kf_calib.errors import InputError
 
 

@@ -8,11 +8,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 
 from kf_calib.bench.streams import Batch, Stream
-from kf_calib.cli import main
+from kf_calib.cli import cli, main
 from kf_calib.sources.files.recorder import Recorder
 from kf_calib.sources.files.recording import Recording
 
@@ -251,7 +252,20 @@ def test_help_groups_options_with_what_is_usual_first(run, command: str) -> None
     groups = [line.rstrip(": ") for line in out.splitlines() if line[:1].isupper() and line.rstrip().endswith(":")]
     assert {"Input and bench", "Output", "Examples"} <= set(groups)
     left = out[out.index("Options:") : out.index("Examples:")]
-    assert left.count("--") == 1, "an option without a group: give it panel="
+    assert left.count("--") == 2 and "--help-all" in left, "an option without a group: give it panel="
+
+
+@pytest.mark.parametrize("name", cli.list_commands(click.Context(cli)))
+def test_help_fits_two_screens_and_help_all_has_every_option(run, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
+    code, out, _ = run(name, "--help")
+    assert code == 0 and len(out.splitlines()) <= 50
+    command = cli.get_command(click.Context(cli), name)
+    assert command is not None
+    options = {param.opts[-1] for param in command.params if isinstance(param, click.Option) and not param.hidden}
+    code, everything, _ = run(name, "--help-all")
+    assert code == 0 and not {option for option in options if option not in everything}
+    assert ("--help-all" in out) == any(option not in out for option in options)
 
 
 def test_a_plan_from_a_file_is_visited(run, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from helpers.synthetic import Run
 
 from kf_calib.cli import cli
-from kf_calib.cli.options import progress
+from kf_calib.cli.echo import progress
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.stepwise_selection import improve

@@ -11,7 +11,7 @@ from helpers.paths import RECORDINGS, ROOT
 
 import kf_calib
 from kf_calib.bench.raw_input import RawInput
-from kf_calib.sources.files.bags import fingerprint
+from kf_calib.sources.files.record_files import fingerprint
 
 TWELVE = ROOT / "recordings" / "twelve_poses.csv"
 OPTIONS = (TWELVE, "--axes", "y z x", "--gravity", "9.8123")

@@ -114,12 +114,12 @@ def test_the_rest_of_a_file_is_checked_first(received: Path, line: str) -> None:
     path = received / "model.toml"
     path.write_text(f"{line}\neffects_from = ['own.txt']\n")
     with pytest.raises(InputError):
-        model_file.read(path).load(trust=True)
+        model_file.read_model_file(path).load(trust=True)
     assert not (received / "RAN").exists()
 
 
 def test_in_python_too(received: Path) -> None:
-    found = model_file.read(received / "model.toml")
+    found = model_file.read_model_file(received / "model.toml")
     assert selection_journal.read_journal(received / "journal.toml").origin.programs[0].path == received / "own.txt"
     with pytest.raises(InputError, match="would run"):
         found.load()

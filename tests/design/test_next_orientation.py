@@ -11,7 +11,7 @@ from kf_calib.design.next_orientation import ENOUGH, Advice, _separations, to_te
 from kf_calib.effects import Effect, effect_named
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import scan
-from kf_calib.sources.simulation.visit_plans import Visit, spread_plan
+from kf_calib.sources.simulation.visit_plans import PlannedVisit, spread_plan
 
 PLAN = spread_plan(12, dwell_s=8.0, seed=5)
 
@@ -53,7 +53,7 @@ def test_the_separation_predicted_is_that_of_the_run_that_goes_there(
         for name, value in zip(names, values, strict=True)
     )
     result, size, found = advised(one, other)
-    after = run(plan=[*PLAN, Visit(found.gimbal_deg, found.stay_s or 8.0)])
+    after = run(plan=[*PLAN, PlannedVisit(found.gimbal_deg, found.stay_s or 8.0)])
     assert found.before == pytest.approx(separation(result, one, size, other), rel=0.02)
     reached = separation(after, one, size, other)
     assert (found.stay_s is not None) == stays
@@ -61,7 +61,7 @@ def test_the_separation_predicted_is_that_of_the_run_that_goes_there(
         assert 0.9 * found.after < reached
     else:
         assert found.after == pytest.approx(reached, rel=0.05)
-    elsewhere = run(plan=[*PLAN, Visit((0.0, 0.0, 0.0), 8.0)])
+    elsewhere = run(plan=[*PLAN, PlannedVisit((0.0, 0.0, 0.0), 8.0)])
     assert reached >= separation(elsewhere, one, size, other)
 
 
@@ -90,7 +90,7 @@ def test_where_the_platform_is_already_is_no_next_orientation(names: tuple[str, 
     size = np.full(len(one.coefficients), 1e-4)
     first = to_tell_apart(run(plan=PLAN, setting_sigma_deg=1e-3).fit, one, size, [other])
     assert first is not None
-    going_on = run(plan=[*PLAN, Visit(first.gimbal_deg, 8.0)], setting_sigma_deg=1e-3)
+    going_on = run(plan=[*PLAN, PlannedVisit(first.gimbal_deg, 8.0)], setting_sigma_deg=1e-3)
     then = to_tell_apart(going_on.fit, one, size, [other])
     assert then is not None
     turn = np.subtract(then.gimbal_deg, first.gimbal_deg)

@@ -16,7 +16,7 @@ from helpers.synthetic import Run
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.bench import Bench, axes_of, axis_names
 from kf_calib.bench.gimbal_ranges import ranges
-from kf_calib.bench.targets import targets_of
+from kf_calib.bench.paper_parameters import targets_of
 from kf_calib.design import optimality_criteria
 from kf_calib.design.exact_design import Scheme, Search
 from kf_calib.design.gimbal_limits import Reach

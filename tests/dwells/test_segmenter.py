@@ -243,7 +243,10 @@ def test_a_gentle_start_of_a_slew_is_not_in_the_dwell() -> None:
     from kf_calib.sources.simulation.simulator import Simulation
     from kf_calib.sources.simulation.visit_plans import spread_plan
 
-    grade, bench = GRADES["navigation"], Bench(axes_of("yzx"), 9.81, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
+    grade, bench = (
+        GRADES["navigation"],
+        Bench(axes_of("yzx"), 9.81, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0),
+    )
     p_values = []
     for seed in range(3):
         run = Simulation(

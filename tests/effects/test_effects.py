@@ -40,7 +40,7 @@ from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.physics import Ambient
 from kf_calib.sources.simulation.sensors import GRADES
 from kf_calib.sources.simulation.simulator import Simulation
-from kf_calib.sources.simulation.visit_plans import Visit, explicit_plan
+from kf_calib.sources.simulation.visit_plans import PlannedVisit, explicit_plan
 
 BENCH = Bench(axes_of("yzx"), 9.81, latitude_deg=50.0, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
 PLAN = plan_of(30, dwell_s=6.0, seed=4)
@@ -87,7 +87,7 @@ SIZES = {
 
 
 def run(
-    hidden: list[str], white_mps2: float = 0.0, seed: int = 5, plan: list[Visit] = PLAN, sample_hz: float = 20.0,
+    hidden: list[str], white_mps2: float = 0.0, seed: int = 5, plan: list[PlannedVisit] = PLAN, sample_hz: float = 20.0,
     period_s: float = 150.0, angle_hz: float = 10.0, slew_degps: float = 90.0,
 ) -> Simulation:  # fmt: skip
     made = Simulation(
@@ -220,7 +220,7 @@ def test_averages_of_still_readings_say_the_same_with_hardly_less_information() 
     assert compare(run([], 5e-5, plan=CHEAP), Settings(window_s=1.0)).max_difference_sigma <= 1e-6
 
 
-def sweep_plan(source: Simulation, step_rad: float = 2e-4) -> list[Visit]:
+def sweep_plan(source: Simulation, step_rad: float = 2e-4) -> list[PlannedVisit]:
     """Orientations spread over the sphere, and 16 about the zero of each accelerometer.
 
     The three in turn: a pose and the next about the same zero would pass for one, standing still.

@@ -362,7 +362,7 @@ def test_register_is_a_decorator() -> None:
 @pytest.mark.parametrize("name", names(BENCH))
 def test_the_catalogue_passes_the_checks(name: str) -> None:
     effect = effect_named(name, BENCH)
-    checks.check(effect)
+    checks.check_effect(effect)
     if isinstance(effect, FrameEffect):
         assert checks.trial(BENCH).force_mps2.shape == (300, 3)
 
@@ -473,7 +473,7 @@ def test_a_model_that_cannot_be_saved_leaves_the_old_one(run, recording: Path, t
 def test_bad_model_files_are_one_sentence(tmp_path: Path, text: str | None, says: str) -> None:
     path = tmp_path / "model.toml" if text is None else written(tmp_path, text, "model.toml")
     with pytest.raises(InputError) as raised:
-        model_file.read(path).load(trust=True)
+        model_file.read_model_file(path).load(trust=True)
     said = str(raised.value)
     assert says in said and str(path) in said and "\n" not in said and len(said) < 1000
 

@@ -57,7 +57,7 @@ def _with(*sizes: float) -> Estimate:
 def test_commands_take_a_bench_model_and_say_so(run: Any, tmp_path: Path) -> None:
     path = tmp_path / "bench.toml"
     MODEL.write(path)
-    assert bench_model.read(path) == MODEL
+    assert bench_model.read_bench_model(path) == MODEL
     code, out, _ = run("replay", RECORDING, "--bench-model", path, "--json")
     said = json.loads(out)["warnings"]
     assert code == 0 and any("encoder-harmonic-1:z of the bench is taken from the bench model" in each for each in said)
@@ -81,7 +81,7 @@ def test_what_is_no_bench_model_is_refused_in_words(text: str, said: str, tmp_pa
     path = tmp_path / "bench.toml"
     path.write_text(text)
     with pytest.raises(InputError, match=said):
-        bench_model.read(path)
+        bench_model.read_bench_model(path)
 
 
 def test_a_term_that_the_bench_cannot_have_is_refused(run: Any, tmp_path: Path) -> None:

@@ -1,4 +1,5 @@
-"""Dwells are grouped by orientation as a comparison of each with all groups would, and in a time that is linear."""
+"""Dwells are grouped by orientation as a comparison of each with all groups would, and in a time that is linear; left
+out by leverage, they are predicted as by a fit to all others."""
 
 from __future__ import annotations
 
@@ -6,8 +7,12 @@ import time
 
 import numpy as np
 import pytest
+from helpers.by_hand import by_hand
+from helpers.synthetic import Run
 
-from kf_calib.estimation.cross_validation import grouped
+from kf_calib.estimation import cross_validation
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.cross_validation import grouped, held_out
 
 
 def by_comparing_all(places: np.ndarray, apart: float) -> list[list[int]]:
@@ -42,3 +47,38 @@ def test_time_grows_with_the_number_of_orientations() -> None:
 
     lasting_s(500)
     assert lasting_s(8000) < 8.0 * lasting_s(2000)  # four times as many; each compared with all would be sixteen
+
+
+RUNS = {
+    "setting_error": (Run(seed=1, setting_deg=0.002, stated=False), ()),
+    "scatter": (Run(seed=2, scatter_mps2=2e-5), ()),
+    "effect": (Run(seed=3), ("second-order",)),
+    "few_poses_considered": (Run(seed=4, dwells=12, setting_deg=0.01), ()),
+    "visits_of_one_pose": (
+        Run(seed=5, poses=np.repeat(np.random.default_rng(5).uniform(-3, 3, (12, 3)), 2, axis=0)),
+        (),
+    ),
+    "by_hand": (by_hand(poses=24), ()),
+}
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_leaving_out_by_leverage_equals_merging_the_other_orientations(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, effects = RUNS[name]
+    fitted, direct = calibrate(source, effects=effects).fit, list[object]()
+    monkeypatch.setattr(cross_validation, "_merged", lambda *_: direct.append("merged"))
+    by_leverage = held_out(fitted)
+    monkeypatch.undo()
+    monkeypatch.setattr(cross_validation, "_by_leverage", lambda *_: direct.append("leverage"))
+    merged = held_out(fitted)
+    assert direct == ["leverage"] and by_leverage is not None and merged is not None
+    np.testing.assert_allclose(by_leverage.errors_mps2, merged.errors_mps2, rtol=1e-7, atol=1e-12)
+    np.testing.assert_allclose(by_leverage.covariance, merged.covariance, rtol=1e-7, atol=1e-20)
+    np.testing.assert_allclose(by_leverage.statistics, merged.statistics, rtol=1e-6)
+
+
+def test_an_orientation_that_tells_nearly_all_of_a_state_is_left_out_directly() -> None:
+    """Four poses tell twelve states: without one of them there is no prediction, and none by leverage."""
+    assert held_out(calibrate(Run(seed=6, dwells=4)).fit) is None

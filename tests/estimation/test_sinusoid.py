@@ -15,7 +15,7 @@ from scipy.stats import binom
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.dwells.folding import detrended
-from kf_calib.dwells.line_spectrum import Line, Spectrum, lines
+from kf_calib.dwells.line_spectrum import SpectralLine, Spectrum, lines
 from kf_calib.effects import checks, effect_named
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.dwell_columns import LinearisedDwells, stimulus_of
@@ -147,10 +147,12 @@ def test_columns_are_the_nearest_parabolas() -> None:
 
 
 def test_columns_pass_the_checks() -> None:
-    assert checks.check(effect_named("sinusoid", BENCH)) == ()
+    assert checks.check_effect(effect_named("sinusoid", BENCH)) == ()
 
 
-def seen_in(rng: np.random.Generator, kind: str, sizes: dict[float, float], count: int = 600) -> tuple[Line, ...]:
+def seen_in(
+    rng: np.random.Generator, kind: str, sizes: dict[float, float], count: int = 600
+) -> tuple[SpectralLine, ...]:
     """Lines in 20 dwells of ``count`` readings at 100 Hz with oscillations {frequency: amplitude} in all channels."""
     spectra, time_s = [], np.arange(count) / 100.0
     for _ in range(20):

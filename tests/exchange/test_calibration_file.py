@@ -21,10 +21,10 @@ import kf_calib
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.bench import Bench
 from kf_calib.errors import InputError
-from kf_calib.exchange import calibration_file, models
+from kf_calib.exchange import calibration_file
 from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.simulator import Simulation
-from kf_calib.sources.simulation.visit_plans import Visit
+from kf_calib.sources.simulation.visit_plans import PlannedVisit
 
 SCHEMA = ROOT / "kf_calib" / "exchange" / "calibration.schema.json"
 OWN = '''
@@ -83,7 +83,7 @@ def test_what_is_saved_is_read_again(run: kf_calib.Calibration, tmp_path: Path) 
 def test_any_bench_is_kept(axes: str) -> None:
     bench = Bench.from_metadata({"axes": axes, "gravity_mps2": "9.8012345678901234", "up": "z", "block_serial": "A 7"})
     rng = np.random.default_rng(0)
-    plan = [Visit(tuple(rng.uniform(-180, 180, len(bench.axes))), 3.0) for _ in range(8)]
+    plan = [PlannedVisit(tuple(rng.uniform(-180, 180, len(bench.axes))), 3.0) for _ in range(8)]
     source = Simulation(bench, SENSORS, TrueNoise(white_mps2=5e-5), plan, sample_hz=20.0, slew_rate_degps=np.inf)
     saved = calibration_file.saved(kf_calib.calibrate(source))
     assert saved.bench == bench and saved.bench.notes["block_serial"] == "A 7"
@@ -101,7 +101,11 @@ def test_a_recording_gives_its_name_checksum_and_date(tmp_path: Path) -> None:
 
 def test_the_model_option_reads_its_effects(run: kf_calib.Calibration, tmp_path: Path) -> None:
     kf_calib.save_calibration(run, tmp_path / "named.toml")  # what is in it decides, not its name
-    assert models.read(tmp_path / "named.toml").effects == ("second-order", "warm-up", "mine = fx*fy")
+    assert calibration_file.open_calibration(tmp_path / "named.toml").effects == (
+        "second-order",
+        "warm-up",
+        "mine = fx*fy",
+    )
 
 
 def test_programs_are_run_only_where_allowed(tmp_path: Path) -> None:

@@ -22,11 +22,10 @@ from kf_calib.exchange.certificate import content, statement
 from kf_calib.exchange.exports import TARGETS, exported
 from kf_calib.exchange.history import history
 from kf_calib.exchange.verification import verify
-from kf_calib.sources.simulation.by_hand import ByHand
 from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.sensors import Sensors
-from kf_calib.sources.simulation.simulator import Simulation
-from kf_calib.sources.simulation.visit_plans import Visit
+from kf_calib.sources.simulation.simulator import ByHand, Simulation
+from kf_calib.sources.simulation.visit_plans import PlannedVisit
 
 FRAME = ["theta1", "phi1", "nu2"]
 
@@ -39,12 +38,12 @@ def result() -> kf_calib.Calibration:
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("saved") / "cal.json"
-    calibration_file.write(out, calibration_file.saved(result()))
+    calibration_file.write_calibration(out, calibration_file.saved(result()))
     return out
 
 
 def test_it_is_saved_with_its_frame_and_read_as_it_was(path: Path) -> None:
-    saved = calibration_file.read(path)
+    saved = calibration_file.open_calibration(path)
     assert saved.fixed == dict.fromkeys(FRAME, "frame")
     assert saved.state.undetermined == [] and not saved.bench.angles
     assert [p.symbol for p in saved.parameters if p.value is None] == FRAME
@@ -53,7 +52,7 @@ def test_it_is_saved_with_its_frame_and_read_as_it_was(path: Path) -> None:
 
 
 def test_it_corrects_readings_to_the_size_of_gravity(path: Path) -> None:
-    correction, means = calibration_file.read(path).correction(path), result().linearised.means
+    correction, means = calibration_file.open_calibration(path).correction(path), result().linearised.means
     warmth = np.array([np.mean(dwell.nodes.temperature_c) for dwell in result().fit.dwells])
     found = correction(means.readings, warmth)
     sigma = np.sqrt(np.mean(result().noise.sigma_mps2 ** 2) / means.counts.min())
@@ -62,7 +61,7 @@ def test_it_corrects_readings_to_the_size_of_gravity(path: Path) -> None:
 
 
 def test_it_holds_for_a_run_of_the_same_block_and_not_for_another(path: Path) -> None:
-    saved = calibration_file.read(path)
+    saved = calibration_file.open_calibration(path)
     same = by_hand("thermal-bias=0.4mg/K", poses=16)
     found = verify(saved, saved.model(path, bench=same.bench), same)
     assert found.holds and found.dof == 16 and {move.symbol for move in found.moves}.isdisjoint(FRAME)
@@ -71,7 +70,7 @@ def test_it_holds_for_a_run_of_the_same_block_and_not_for_another(path: Path) ->
 
 
 def test_it_is_not_mixed_with_calibrations_in_the_frame_of_a_platform(path: Path) -> None:
-    saved, recording = calibration_file.read(path), kf_calib.open_recording(RECORDINGS / "mems_faces.mcap")
+    saved, recording = calibration_file.open_calibration(path), kf_calib.open_recording(RECORDINGS / "mems_faces.mcap")
     with pytest.raises(InputError, match="without angles, in the frame of its sensors: verify it without them"):
         verify(saved, saved.model(path), recording)
     platform = calibration_file.saved(kf_calib.calibrate(recording))
@@ -80,18 +79,18 @@ def test_it_is_not_mixed_with_calibrations_in_the_frame_of_a_platform(path: Path
     with pytest.raises(InputError, match="give those of one kind"):
         history([saved, platform])
     with pytest.raises(InputError, match="calibrate on a bench that records angles"):
-        content.certificate(saved, saved.model(path), statement.read(None))
+        content.certificate(saved, saved.model(path), statement.read_statement(None))
 
 
 def test_six_faces_are_saved_with_axes_taken_for_square(tmp_path: Path) -> None:
     six = kf_calib.calibrate(kf_calib.open_recording(RECORDINGS / "mems_faces.mcap", angles=False))
-    calibration_file.write(tmp_path / "six.json", calibration_file.saved(six))
-    saved = calibration_file.read(tmp_path / "six.json")
+    calibration_file.write_calibration(tmp_path / "six.json", calibration_file.saved(six))
+    saved = calibration_file.open_calibration(tmp_path / "six.json")
     assert set(saved.fixed.values()) == {"frame", "square"} and saved.model().square
     assert np.isfinite(saved.correction()(np.array([[0.0, 9.81, 0.0]]), 25.0)).all()
 
 
-def _with_axis_3_off_square(off_deg: float, seed: int, plan: list[Visit]) -> ByHand:
+def _with_axis_3_off_square(off_deg: float, seed: int, plan: list[PlannedVisit]) -> ByHand:
     """A run of a board whose axes are square but for one."""
     bench = Bench(axes_of("yzx"), 9.81, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
     square = dict.fromkeys(SYMBOLS, 0.0) | dict.fromkeys(("K1", "K2", "K3"), 1.0)
@@ -103,7 +102,7 @@ def _with_axis_3_off_square(off_deg: float, seed: int, plan: list[Visit]) -> ByH
 @pytest.mark.parametrize(("off_deg", "holds"), [(0.0, True), (1.0, True), (2.0, True), (6.0, False)])
 def test_axes_that_were_taken_for_square_may_be_a_degree_or_two_off(off_deg: float, holds: bool) -> None:
     """With means sure to 2 ug, which a degree off square changes by 17 mg."""
-    six = [Visit(each, 4.0) for each in ((0.0, 0.0, 0.0), (0.0, 180.0, 0.0), (0.0, 90.0, 0.0), (0.0, -90.0, 0.0),
+    six = [PlannedVisit(each, 4.0) for each in ((0.0, 0.0, 0.0), (0.0, 180.0, 0.0), (0.0, 90.0, 0.0), (0.0, -90.0, 0.0),
                                          (0.0, 0.0, 90.0), (0.0, 0.0, -90.0))]  # fmt: skip
     saved = calibration_file.saved(kf_calib.calibrate(_with_axis_3_off_square(off_deg, 1, six)))
     assert "square" in saved.fixed.values()
@@ -116,7 +115,7 @@ def test_axes_that_were_taken_for_square_may_be_a_degree_or_two_off(off_deg: flo
 
 @pytest.mark.parametrize("to", sorted(TARGETS))
 def test_it_is_exported_to_every_program(path: Path, to: str) -> None:
-    saved = calibration_file.read(path)
+    saved = calibration_file.open_calibration(path)
     target = exported(saved, saved.correction(path), to, lossy=True)
     numbers = [float(each) for each in re.findall(r"-?\d+\.\d+(?:e[-+]\d+)?", target.text())]
     assert len(numbers) >= 6 and np.isfinite(numbers).all()

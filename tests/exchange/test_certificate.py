@@ -57,7 +57,7 @@ def cal(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("cal") / "cal.json"
     own = calibrate(ROOT / "recordings" / "navigation_24.mcap")
     began = datetime(2025, 6, 15, 15, 6, 40, tzinfo=UTC)
-    calibration_file.write(path, calibration_file.saved(own, "navigation_24.mcap", "0" * 64, began))
+    calibration_file.write_calibration(path, calibration_file.saved(own, "navigation_24.mcap", "0" * 64, began))
     return path
 
 
@@ -69,8 +69,8 @@ def lab(tmp_path: Path) -> Path:
 
 
 def made(cal: Path, lab: Path | None) -> content.Certificate:
-    saved, own = calibration_file.read(cal), statement.read(lab)
-    earlier = None if own.before is None else calibration_file.read(own.before)
+    saved, own = calibration_file.open_calibration(cal), statement.read_statement(lab)
+    earlier = None if own.before is None else calibration_file.open_calibration(own.before)
     return content.certificate(saved, saved.model(), own, None if earlier is None else (earlier, earlier.model()))
 
 
@@ -99,7 +99,7 @@ def test_the_numbers_of_the_xml_are_those_of_the_calibration(cal: Path, lab: Pat
     assert spreads == own.budget.expanded.tolist() and factors == own.budget.k.tolist()
     outcomes = [each.text for each in root.findall(".//dcc:conformity", names)]
     assert len(outcomes) == 6 and set(outcomes) == {"pass", "fail"}
-    assert dcc.check(dcc.xml(own), None).startswith("all mandatory elements of DCC 3.3.0 are there")
+    assert dcc.check_dcc(dcc.xml(own), None).startswith("all mandatory elements of DCC 3.3.0 are there")
 
 
 def test_it_says_which_raw_readings_the_results_belong_to(cal: Path) -> None:
@@ -116,7 +116,7 @@ def test_without_a_statement_it_says_that_it_is_no_dcc(cal: Path) -> None:
     own = made(cal, None)
     assert "laboratory.name" in own.missing and "begun" not in own.missing
     assert dcc.xml(own).decode().splitlines()[2].startswith(" <!-- not a DCC: not stated are number, site")
-    assert dcc.check(dcc.xml(own), None) == "not a DCC: 10 mandatory elements are not stated"
+    assert dcc.check_dcc(dcc.xml(own), None) == "not a DCC: 10 mandatory elements are not stated"
 
 
 def test_a_schema_that_is_given_decides(cal: Path, lab: Path, tmp_path: Path) -> None:
@@ -128,13 +128,13 @@ def test_a_schema_that_is_given_decides(cal: Path, lab: Path, tmp_path: Path) ->
       <xs:anyAttribute namespace="##any" processContents="skip"/></xs:complexType></xs:element></xs:schema>"""
     written = dcc.xml(made(cal, lab))
     schema.write_text(form.format(2))
-    assert dcc.check(written, schema) == "valid by own.xsd"
+    assert dcc.check_dcc(written, schema) == "valid by own.xsd"
     schema.write_text(form.format(1))
     with pytest.raises(InputError, match=r"not valid by it at /.*digitalCalibrationCertificate"):
-        dcc.check(written, schema)
+        dcc.check_dcc(written, schema)
     schema.write_text("<xs:schema")
     with pytest.raises(InputError, match="cannot be read as an XML Schema"):
-        dcc.check(written, schema)
+        dcc.check_dcc(written, schema)
 
 
 @sets
@@ -232,7 +232,7 @@ def test_a_wrong_statement_is_one_sentence(text: str, said: str, tmp_path: Path)
     path = tmp_path / "lab.toml"
     path.write_text(text)
     with pytest.raises(InputError, match=said) as error:
-        statement.read(path)
+        statement.read_statement(path)
     assert str(error.value).startswith(str(path)) and "\n" not in str(error.value)
 
 
@@ -262,7 +262,7 @@ def test_the_command_writes_both_files(run: Any, cal: Path, lab: Path, tmp_path:
 
 
 def test_what_the_run_does_not_determine_has_no_number(cal: Path) -> None:
-    saved = calibration_file.read(cal)
+    saved = calibration_file.open_calibration(cal)
     first = saved.parameters[0].model_copy(update={"value": None, "sigma": None})
     own = saved.model_copy(update={"parameters": [first, *saved.parameters[1:]]})
     made = content.certificate(

@@ -18,12 +18,12 @@ from helpers.paths import RECORDINGS
 from helpers.stated_sensors import Formula, correction, samples, saved
 
 from kf_calib.bench import paper_parameters
-from kf_calib.cli.export import export as command
+from kf_calib.cli.exchange import export as command
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.exchange import calibration_file
 from kf_calib.exchange.exports import TARGETS, exported
 from kf_calib.exchange.exports.affine import AffineTarget
-from kf_calib.exchange.exports.quoting import in_cell
+from kf_calib.exchange.exports.target import in_cell
 
 
 def px4(text: str) -> Formula:
@@ -305,12 +305,12 @@ def test_parameters_that_the_run_did_not_determine_are_refused(run: Any, tmp_pat
         assert (code, out) == (2, "") and "did not determine phi1" in err and err.count("\n") == 1
     assert not (tmp_path / "out").exists()
     with pytest.raises(UnobservableError):
-        calibration_file.read(tmp_path / "cal.json").correction()
+        calibration_file.open_calibration(tmp_path / "cal.json").correction()
 
 
 def test_the_command_says_what_is_lost_and_needs_leave_for_it(run: Any, tmp_path: Path) -> None:
     cal, out = tmp_path / "cal.json", tmp_path / "out.param"
-    calibration_file.write(cal, saved())
+    calibration_file.write_calibration(cal, saved())
     code, printed, err = run("export", cal, "--to", "px4", "-o", out, "--units", "si")
     assert (code, printed) == (2, "") and not out.exists()
     rms, worst = map(float, re.findall(r"([\d.]+) m/s\^2", err))
@@ -341,5 +341,5 @@ def test_the_table_has_every_parameter_coefficient_and_constant(run: Any, tmp_pa
     expected |= {f"{name}{i}" for name in ("channel", "count", "o") for i in (1, 2, 3)}
     assert rows.keys() == expected | {f"{name}{i}{j}" for name in "CE" for i in (1, 2, 3) for j in (1, 2, 3)}
     assert "dZone,0.0001,,m/s^2" in exported(saved(), correction("dead-zone"), "csv").text().splitlines()
-    for own in calibration_file.read(cal).parameters:
+    for own in calibration_file.open_calibration(cal).parameters:
         assert float(rows[own.symbol]["value"]) == own.value and rows[own.symbol]["unit"] == own.unit

@@ -16,7 +16,7 @@ import kf_calib
 from kf_calib.errors import InputError
 from kf_calib.exchange import calibration_file
 from kf_calib.exchange.calibration_file import SavedCalibration
-from kf_calib.exchange.history import Track, history
+from kf_calib.exchange.history import ParameterTrack, history
 
 REPETITIONS = 200
 START = datetime(2024, 1, 1, tzinfo=UTC)
@@ -39,7 +39,9 @@ def at(day: float, value: float, sigma: float, serial: str = "") -> SavedCalibra
     )
 
 
-def track(count: int, drift: float, walk: float, repeatability: float, sigma: float, seed: int) -> tuple[Track, float]:
+def track(
+    count: int, drift: float, walk: float, repeatability: float, sigma: float, seed: int
+) -> tuple[ParameterTrack, float]:
     """A parameter found every 30 days, and where it is in the end."""
     rng = np.random.default_rng(seed)
     days = 30.0 * np.arange(count)
@@ -207,10 +209,10 @@ def test_the_command_tells_the_date_and_draws_a_panel_a_parameter(run: Any, tmp_
     for k, path in enumerate(files):
         own = at(30.0 * k, 1.0, 1e-6)
         whole = own.model_copy(update={"parameters": TEMPLATE[0].parameters, "provenance": TEMPLATE[0].provenance})
-        calibration_file.write(path, whole)
+        calibration_file.write_calibration(path, whole)
     code, out, err = run("history", *files, "--tolerance", "K=1ppm", "--svg", tmp_path / "chart.svg")
     assert code == 0 and err == "" and "4 calibrations, 2024-01-01 to 2024-03-31" in out and "Calibrate again" in out
-    found = history([calibration_file.read(path) for path in files])
+    found = history([calibration_file.open_calibration(path) for path in files])
     assert len([axes for axes in kf_calib.plot.history(found).axes if axes.get_title(loc="left")]) == 12
     assert (tmp_path / "chart.svg").read_bytes().startswith(b"<?xml")
 

@@ -44,7 +44,7 @@ def test_p_values_are_uniform_where_nothing_has_moved(count: int, runs: int) -> 
     if scores:
         assert 0.95 < float(np.std(scores)) < 1.05
     false_alarms = sum(not each.holds for each in found)
-    assert false_alarms <= stats.binom.ppf(0.999, runs, verification.LEVEL)
+    assert false_alarms <= stats.binom.ppf(0.999, runs, verification.MOVED_LEVEL)
 
 
 def test_the_misfit_is_that_of_the_new_run_by_itself_and_that_of_the_two_states_together() -> None:

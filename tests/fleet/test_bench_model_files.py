@@ -11,8 +11,8 @@ from helpers.run_factors import run_factor_of
 
 from kf_calib.errors import InputError
 from kf_calib.estimation import bench_model
-from kf_calib.fleet.bench_model_files import BenchModelFiles
 from kf_calib.fleet.pooled_diagnosis import PooledDiagnosis, pooled_diagnosis
+from kf_calib.fleet.results import BenchModelFiles
 
 BENCHES = ("a b", "a/b")  # the same in the name of a file
 
@@ -34,7 +34,7 @@ def written(files: BenchModelFiles) -> list[Path]:
 def test_what_the_fleet_wrote_is_replaced_and_removed(found: PooledDiagnosis, tmp_path: Path) -> None:
     paths = written(BenchModelFiles(tmp_path, found))
     assert [path.name for path in paths] == ["a_b.toml", "a_b-2.toml"]
-    assert tuple(bench_model.read(path).bench for path in paths) == BENCHES
+    assert tuple(bench_model.read_bench_model(path).bench for path in paths) == BENCHES
     assert written(BenchModelFiles(tmp_path, found)) == paths
     only = replace(found, findings=(replace(found.findings[0], benches=found.findings[0].benches[:1]),))
     assert BenchModelFiles(tmp_path, only).outdated == paths[1:]

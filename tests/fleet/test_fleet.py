@@ -26,9 +26,8 @@ import kf_calib
 from kf_calib.cli.fleet import SingleCommands
 from kf_calib.errors import InputError
 from kf_calib.fleet import batch
-from kf_calib.fleet.batch import evaluate_all
-from kf_calib.fleet.evaluation import Evaluation
-from kf_calib.fleet.run_list import Run, runs_of
+from kf_calib.fleet.batch import RunEvaluation, evaluate_all
+from kf_calib.fleet.run_list import ListedRun, runs_of
 from kf_calib.fleet.store import Store
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "fleet.md"
@@ -108,7 +107,7 @@ def test_a_run_is_evaluated_again_only_if_it_or_the_settings_changed(
 
 
 def test_what_could_not_be_fetched_is_tried_again(campaign: Path, client: Client, store: Store, tmp_path: Path) -> None:
-    gone = Run(str(tmp_path / "gone.mcap"))
+    gone = ListedRun(str(tmp_path / "gone.mcap"))
     progress = evaluate_all(client, evaluation(), [gone], store)
     assert progress.failed == 1
     assert "cannot be read" in kf_calib.open_fleet(tmp_path / "fleet").failures()[gone.place]
@@ -189,7 +188,7 @@ def test_a_run_that_ends_its_process_is_tried_again_and_stops_no_other(
 ) -> None:
     own = shutil.copytree(campaign, tmp_path / "runs")
     normal = evaluation()
-    deadly = Evaluation(_Deadly(normal.commands.options), normal.settings)
+    deadly = RunEvaluation(_Deadly(normal.commands.options), normal.settings)
     runs = runs_of([str(path) for path in sorted(own.rglob("*.mcap"))[:2]])
     with batch.cluster(1) as client:
         progress = evaluate_all(client, deadly, runs, store)

@@ -23,10 +23,8 @@ from helpers.fleet_workers import evaluation, threads, used
 import kf_calib
 from kf_calib.cli.fleet import SingleCommands
 from kf_calib.fleet import batch
-from kf_calib.fleet.batch import evaluate_all
-from kf_calib.fleet.evaluation import Evaluation, OverTime, in_time
-from kf_calib.fleet.run_list import Run, runs_of
-from kf_calib.fleet.run_row import SCHEMA
+from kf_calib.fleet.batch import OverTime, RunEvaluation, evaluate_all, in_time
+from kf_calib.fleet.run_list import SCHEMA, ListedRun, runs_of
 from kf_calib.fleet.store import Store
 
 pytestmark = pytest.mark.xdist_group("fleet")
@@ -77,9 +75,9 @@ class _Deaf(SingleCommands):
         return super().replay(path)
 
 
-def with_limit(kind: type[SingleCommands], limit_s: float) -> Evaluation:
+def with_limit(kind: type[SingleCommands], limit_s: float) -> RunEvaluation:
     usual = evaluation()
-    return Evaluation(kind(usual.commands.options), usual.settings, limit_s)
+    return RunEvaluation(kind(usual.commands.options), usual.settings, limit_s)
 
 
 def test_a_run_that_never_ends_is_a_row_that_says_so_and_is_tried_again(
@@ -218,4 +216,4 @@ def test_a_row_of_another_run_without_a_factor_counts(store: Store, tmp_path: Pa
     row = dict.fromkeys(SCHEMA.names) | {"run": "gone.mcap", "evaluated": datetime.now(UTC) - timedelta(days=1)}
     store.append([row | {"error": "gone"}])
     known, notes = store.checked()
-    assert set(known) == {"gone.mcap"} and notes == [] and Run("gone.mcap").place in known
+    assert set(known) == {"gone.mcap"} and notes == [] and ListedRun("gone.mcap").place in known

@@ -56,7 +56,7 @@ def test_the_command_ends_with_what_all_runs_show_together(bent: Path, run: Any,
     assert [each["of"] for each in first["coefficients"]] == ["bench-1"] * 3
     assert {each["borne_by"] for each in others} <= {"none", None} and printed["remarks"] == []
     (model,) = printed["bench_models"]
-    known = bench_model.read(model)
+    known = bench_model.read_bench_model(model)
     assert (known.bench, known.runs, known.terms[0].effect) == ("bench-1", 4, "flexure")
     one = next(bent.rglob("*.mcap"))
     _, alone, _ = run("diagnose", one, "--json")

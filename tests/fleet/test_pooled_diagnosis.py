@@ -13,12 +13,12 @@ import pytest
 from helpers.run_factors import campaign_of, nothing, run_factor_of
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.cli.options import rendered
+from kf_calib.cli.echo import rendered
 from kf_calib.errors import InputError
 from kf_calib.estimation import bench_model as bench_models
-from kf_calib.fleet.bench_model_files import bench_model
 from kf_calib.fleet.pooled_diagnosis import PooledDiagnosis, pooled_diagnosis
 from kf_calib.fleet.pooled_terms import Attribution
+from kf_calib.fleet.results import bench_model
 from kf_calib.fleet.run_factor import ReferenceUnit
 from kf_calib.views.pooled_diagnosis import pooled_report
 
@@ -152,7 +152,7 @@ def test_two_benches_have_errors_of_their_own() -> None:
 def test_bench_model_holds_what_the_last_runs_have(both: PooledDiagnosis, tmp_path: Path) -> None:
     made = bench_model(both, "bench 1")
     made.write(tmp_path / "bench.toml")
-    assert bench_models.read(tmp_path / "bench.toml") == made
+    assert bench_models.read_bench_model(tmp_path / "bench.toml") == made
     assert [term.effect for term in made.terms] == ["flexure"] and made.terms[0].since == "2026-01-01T00:13"
     with pytest.raises(InputError, match="no run is of the bench 'other': name one of 'bench 1'"):
         bench_model(both, "other")

@@ -9,13 +9,10 @@ from scipy.linalg import block_diag
 from scipy.special import logsumexp
 from scipy.stats import chi2, multivariate_normal, norm
 
-from kf_calib.fleet.campaign import Campaign
-from kf_calib.fleet.evidence import log_evidence, log_evidence_of_modes, modes, posterior, sizes
-from kf_calib.fleet.own_coefficients import UnitInformation, UnitsAndCommon
+from kf_calib.fleet.campaign import Campaign, log_evidence, log_evidence_of_modes, modes, posterior, sizes
+from kf_calib.fleet.own_coefficients import UnitInformation, UnitsAndCommon, population
 from kf_calib.fleet.pooled_terms import Attribution, PooledTerms, Sums, Term
-from kf_calib.fleet.population import population
-from kf_calib.fleet.shape import POWERS, SHARES, about_mean, about_zero
-from kf_calib.fleet.some_units import SomeUnits
+from kf_calib.fleet.shape import POWERS, SHARES, SomeUnits, about_mean, about_zero
 
 
 def beside_nothing(own: UnitInformation) -> UnitsAndCommon:

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from kf_calib.errors import InputError
-from kf_calib.fleet.evaluation import local_copy
-from kf_calib.fleet.run_list import Run, runs_of
+from kf_calib.fleet.batch import local_copy
+from kf_calib.fleet.run_list import ListedRun, runs_of
 
 
 @pytest.fixture
@@ -22,7 +22,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def names(runs: list[Run], folder: Path) -> list[str]:
+def names(runs: list[ListedRun], folder: Path) -> list[str]:
     return [run.place.removeprefix(f"{folder}/") for run in runs]
 
 
@@ -93,6 +93,6 @@ def test_an_object_store_is_read_as_a_folder_is(bucket: str, folder: Path) -> No
     assert not file.exists()
     with (
         pytest.raises(InputError, match=r"^s3://lab/2026/gone\.mcap: cannot be fetched"),
-        local_copy(Run(f"{bucket}/gone.mcap")),
+        local_copy(ListedRun(f"{bucket}/gone.mcap")),
     ):
         pass

@@ -26,7 +26,7 @@ from helpers.run_factors import run_factor_of
 
 import kf_calib
 from kf_calib.errors import KfCalibError
-from kf_calib.fleet.run_row import SCHEMA, Row, of_factor
+from kf_calib.fleet.run_list import SCHEMA, Row, of_factor
 from kf_calib.fleet.store import Store
 
 RUNS = 12

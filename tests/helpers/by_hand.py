@@ -6,13 +6,12 @@ from functools import partial
 
 from helpers.synthetic import plan_of
 from kf_calib.bench.bench import Bench, axes_of
-from kf_calib.sources.simulation.by_hand import ByHand, without_angles
 from kf_calib.sources.simulation.detectability import sized
 from kf_calib.sources.simulation.injected import parse
 from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.physics import Ambient
 from kf_calib.sources.simulation.sensors import GRADES
-from kf_calib.sources.simulation.simulator import Simulation
+from kf_calib.sources.simulation.simulator import ByHand, Simulation, without_angles
 
 
 def by_hand(*hidden: str, seed: int = 1, poses: int = 24, stated: bool = True, white_mps2: float = 2e-3) -> ByHand:

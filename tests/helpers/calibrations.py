@@ -13,17 +13,17 @@ from kf_calib.exchange.calibration_file import SavedCalibration
 from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.sensors import GRADES, Sensors
 from kf_calib.sources.simulation.simulator import Simulation
-from kf_calib.sources.simulation.visit_plans import Visit
+from kf_calib.sources.simulation.visit_plans import PlannedVisit
 
 BENCH = Bench(axes_of("yzx"), 9.81, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
 SENSORS = GRADES["navigation"].sensors(1)
 NOISE = TrueNoise(white_mps2=5e-5)
 
 
-def visits(count: int, seed: int) -> list[Visit]:
+def visits(count: int, seed: int) -> list[PlannedVisit]:
     """Orientations drawn at random."""
     rng = np.random.default_rng(seed)
-    return [Visit(tuple(rng.uniform(-180.0, 180.0, 3)), 3.0) for _ in range(count)]
+    return [PlannedVisit(tuple(rng.uniform(-180.0, 180.0, 3)), 3.0) for _ in range(count)]
 
 
 def simulated(

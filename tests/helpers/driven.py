@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from kf_calib.bench.targets import targets_of
+from kf_calib.bench.paper_parameters import targets_of
 from kf_calib.design.gain_per_second import Pace
 from kf_calib.online.session import Session
 from kf_calib.online.suggestion import Itinerary
@@ -39,7 +39,6 @@ def driven(
     run = simulation(options_from_query(query), keys or {})
     bench = DrivenBench(run, servo or Servo(), [0.0] * len(run.bench.axes))
     session = Session.fed(run.bench, wanted=targets_of(targets), auto=auto)
-    session.look_factor = 1.2
     pace = Pace(run.bench.rate_degps or 20.0, run.bench.acceleration_degps2 or 40.0)
     plan = replace(Itinerary(run.bench, pace), **itinerary)
     rules = Rules(plan.reach, plan.pace)

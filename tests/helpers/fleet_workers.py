@@ -12,7 +12,7 @@ from distributed import Client, LocalCluster
 from kf_calib.cli.evaluate import replay
 from kf_calib.cli.fleet import SingleCommands
 from kf_calib.fleet import batch
-from kf_calib.fleet.evaluation import Evaluation
+from kf_calib.fleet.batch import RunEvaluation
 
 
 @contextmanager
@@ -37,9 +37,9 @@ def used(client: Client) -> Iterator[None]:
         yield
 
 
-def evaluation(**given: Any) -> Evaluation:
+def evaluation(**given: Any) -> RunEvaluation:
     """What ``kf-calib fleet`` does with each run, with some options."""
     usual = replay.make_context("replay", ["run.mcap"]).params
     own = ("recording", "overwrite", "strict", "as_json", "save", "save_model")
     commands = SingleCommands({key: value for key, value in usual.items() if key not in own} | given)
-    return Evaluation(commands, commands.checksum)
+    return RunEvaluation(commands, commands.checksum)

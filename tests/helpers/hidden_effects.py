@@ -16,7 +16,7 @@ from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.physics import Ambient
 from kf_calib.sources.simulation.sensors import GRADES
 from kf_calib.sources.simulation.simulator import Simulation
-from kf_calib.sources.simulation.visit_plans import Visit
+from kf_calib.sources.simulation.visit_plans import PlannedVisit
 
 BENCH = Bench(axes_of("yzx"), 9.81, latitude_deg=50.0, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
 
@@ -46,7 +46,7 @@ def noisy_run(*hidden: str, **options: Any) -> Calibration:
 
 
 def noisy_source(
-    *hidden: str, seed: int = 5, dwells: int = 16, plan: list[Visit] | None = None,
+    *hidden: str, seed: int = 5, dwells: int = 16, plan: list[PlannedVisit] | None = None,
     states: dict[str, float | None] | None = None, **noise: float,
 ) -> Simulation:  # fmt: skip
     """A simulated run with hidden effects, on a bench that states its noise, or ``states``.

@@ -178,3 +178,20 @@ def test_scatter_is_found_beside_a_walk_that_is_stated(walked: Calibration, walk
         return restricted_log_likelihood(replace(noise, scatter_mps2=size * noise.scatter_mps2), means, state)
 
     assert max(likelihood(size) for size in (0.9, 0.99, 1.01, 1.1)) < likelihood(1.0)
+
+
+def test_threes_that_are_alone_are_those_of_a_band_without_neighbours() -> None:
+    rng = np.random.default_rng(7)
+    band, rows = covariance(rng, 9, beside=0.0), rng.normal(size=(27, 4))
+    alone = band[:, :3].copy()
+    lower, of_band = banded.root(alone), banded.root(band)
+    np.testing.assert_allclose(banded.diagonal(lower), banded.diagonal(of_band), rtol=1e-12)
+    for transposed in (False, True):
+        expected = banded.solve(of_band, rows, transposed)
+        np.testing.assert_allclose(banded.solve(lower, rows, transposed), expected, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(banded.inverse(alone, lower), banded.inverse(band, of_band)[:, :3], rtol=1e-10)
+    np.testing.assert_allclose(banded.outer(rows, 3), banded.outer(rows)[:, :3], rtol=1e-13)
+    shapes = np.array([band, covariance(rng, 9, beside=0.0)])
+    np.testing.assert_allclose(banded.traces(alone, shapes[:, :, :3]), banded.traces(band, shapes), rtol=1e-13)
+    vector = rng.normal(size=27)
+    np.testing.assert_allclose(banded.products(shapes[:, :, :3], vector), banded.products(shapes, vector), rtol=1e-12)

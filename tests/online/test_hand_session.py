@@ -17,8 +17,7 @@ from helpers.synthetic import Run
 from scipy.spatial.transform import Rotation
 
 from kf_calib.bench.bench import Bench
-from kf_calib.bench.gravity_alone import bench_without_angles, without_poses
-from kf_calib.bench.streams import Batch, Stream
+from kf_calib.bench.streams import Batch, Stream, bench_without_angles, without_poses
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.settings import Settings

@@ -119,7 +119,7 @@ def test_5_repeats_the_expected_reading() -> None:
 
 def test_optimal_set_excites_one_parameter_at_a_time() -> None:
     found = grebenkin2019.optimal()
-    blocks = found.design[:, :: grebenkin2019.READINGS, :3] / grebenkin2019.GRAVITY_MPS2
+    blocks = found.design[:, :: grebenkin2019.READINGS_PER_DWELL, :3] / grebenkin2019.GRAVITY_MPS2
     off = blocks[:, :3] - np.einsum("iaa,ab->iab", blocks[:, :3], np.eye(3))
     assert np.abs(off).max() < 1e-12
     np.testing.assert_allclose(blocks[:, 3], -blocks[:, 2], atol=1e-12)
@@ -128,7 +128,7 @@ def test_optimal_set_excites_one_parameter_at_a_time() -> None:
 
 
 def test_optimal_expectation_is_the_closed_form_and_the_print() -> None:
-    n, sigma, g = grebenkin2019.READINGS, 1e-4, 9.81
+    n, sigma, g = grebenkin2019.READINGS_PER_DWELL, 1e-4, 9.81
     angle = np.sqrt(1 / n + 1 / (2 * n)) * sigma / g
     expected = np.sqrt(2 / np.pi) * np.array([angle, angle, sigma / g / np.sqrt(2 * n), sigma / np.sqrt(2 * n)] * 3)
     found = grebenkin2019.optimal().expected

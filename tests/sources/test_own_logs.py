@@ -22,7 +22,7 @@ import kf_calib
 from kf_calib.errors import InputError
 from kf_calib.sources.files.lines import Lines
 from kf_calib.sources.files.recording import Recording
-from kf_calib.sources.opening import Kind, kind_of, opened
+from kf_calib.sources.opening import FileKind, kind_of, opened
 from kf_calib.sources.tables.survey import survey
 
 FACES = ROOT / "recordings" / "mems_faces.mcap"
@@ -238,22 +238,22 @@ def test_numbers_of_two_kinds_are_not_mixed(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "content", "kind"),
     [
-        ("run.mcap", FACES.read_bytes(), Kind.RECORDING),
-        ("a.csv", german().encode("utf-16"), Kind.SAMPLES),
-        ("a.log", titled().encode(), Kind.SAMPLES),
-        ("a.json", b'\xef\xbb\xbf\n{"time_s": 1}\n', Kind.SAMPLES),
-        ("twelve.csv", (ROOT / "recordings" / "twelve_poses.csv").read_bytes(), Kind.TABLE),
-        ("twelve.csv.gz", gzip.compress((ROOT / "recordings" / "twelve_poses.csv").read_bytes()), Kind.TABLE),
-        ("bursts.csv", ("time_s,ax_g,ay_g,az_g,n\n" + rows(lambda t, f, _: (t, *f, "9"))).encode(), Kind.TABLE),
-        ("slow.csv", ("time_s,ax_g,ay_g,az_g\n" + rows(lambda t, f, _: (100 * t, *f))).encode(), Kind.TABLE),
-        ("empty.csv", b"", Kind.TABLE),
-        ("book.xlsx", b"PK\x03\x04", Kind.TABLE),
-        ("bag.db3", b"SQLite format 3\0" + bytes(2000), Kind.RECORDING),
-        ("noise", np.random.default_rng(1).bytes(5000), Kind.RECORDING),
+        ("run.mcap", FACES.read_bytes(), FileKind.RECORDING),
+        ("a.csv", german().encode("utf-16"), FileKind.SAMPLES),
+        ("a.log", titled().encode(), FileKind.SAMPLES),
+        ("a.json", b'\xef\xbb\xbf\n{"time_s": 1}\n', FileKind.SAMPLES),
+        ("twelve.csv", (ROOT / "recordings" / "twelve_poses.csv").read_bytes(), FileKind.TABLE),
+        ("twelve.csv.gz", gzip.compress((ROOT / "recordings" / "twelve_poses.csv").read_bytes()), FileKind.TABLE),
+        ("bursts.csv", ("time_s,ax_g,ay_g,az_g,n\n" + rows(lambda t, f, _: (t, *f, "9"))).encode(), FileKind.TABLE),
+        ("slow.csv", ("time_s,ax_g,ay_g,az_g\n" + rows(lambda t, f, _: (100 * t, *f))).encode(), FileKind.TABLE),
+        ("empty.csv", b"", FileKind.TABLE),
+        ("book.xlsx", b"PK\x03\x04", FileKind.TABLE),
+        ("bag.db3", b"SQLite format 3\0" + bytes(2000), FileKind.RECORDING),
+        ("noise", np.random.default_rng(1).bytes(5000), FileKind.RECORDING),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_a_file_is_told_by_what_is_in_it(name: str, content: bytes, kind: Kind, tmp_path: Path) -> None:
+def test_a_file_is_told_by_what_is_in_it(name: str, content: bytes, kind: FileKind, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(content)
     assert kind_of(tmp_path / name) is kind
 
@@ -407,7 +407,7 @@ def test_a_damaged_log_or_table_raises_nothing_but_input_errors(seed: int, tmp_p
     rng, path = random.Random(seed), tmp_path / "damaged.csv"
     plain = [content[:6000] for content, _ in (WITH_ANGLES | BY_READINGS).values() if not content.startswith(b"\x1f")]
     plain += [gzip.compress(plain[0]), (ROOT / "recordings" / "twelve_poses.csv").read_bytes()]
-    kinds = set[Kind]()
+    kinds = set[FileKind]()
     for _ in range(100):
         path.write_bytes(damaged(rng.choice(plain), rng))
         kind = kind_of(path)
@@ -415,10 +415,10 @@ def test_a_damaged_log_or_table_raises_nothing_but_input_errors(seed: int, tmp_p
         for angles in (True, False):
             bench = {"axes": "y z x", "gravity_mps2": "9.81"}
             try:
-                if kind is Kind.SAMPLES:
+                if kind is FileKind.SAMPLES:
                     list(Lines(path, bench, angles=angles))
-                elif kind is Kind.TABLE:
+                elif kind is FileKind.TABLE:
                     survey(path, bench, angles=angles)
             except InputError as error:
                 assert "\n" not in str(error) and len(str(error)) < 1200
-    assert {Kind.SAMPLES, Kind.TABLE} <= kinds
+    assert {FileKind.SAMPLES, FileKind.TABLE} <= kinds

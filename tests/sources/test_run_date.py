@@ -78,6 +78,6 @@ def test_a_calibration_carries_the_date_of_its_run(run, tmp_path: Path) -> None:
     ):
         words = ("replay", RECORDINGS / "mems_faces.mcap", *options, "--save", tmp_path / "cal.json", "--overwrite")
         assert run(*words)[0] == 0
-        began = calibration_file.read(tmp_path / "cal.json").conditions.began
+        began = calibration_file.open_calibration(tmp_path / "cal.json").conditions.began
         assert began is not None and began.startswith(date)
     assert calibration_file.of_source(kf_calib.calibrate(simulated(0)), simulated(0)).conditions.began is None

@@ -25,7 +25,7 @@ from kf_calib.views import rerun as view
 from kf_calib.views.rerun.names import number, path_of
 from kf_calib.views.rerun.platform import FINAL_SIZE, ellipsoids_of, magnification
 from kf_calib.views.rerun.series import nis_band
-from kf_calib.views.rerun.summary import summary
+from kf_calib.views.rerun.summary import markdown_summary
 from kf_calib.views.screenshot import ScreenshotError, screenshot
 
 STEP_NS = 10_000_000
@@ -80,7 +80,7 @@ def result() -> Calibration:
 
 @pytest.fixture(scope="module")
 def recording(result: Calibration, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return view.save(result, tmp_path_factory.mktemp("view") / "run.rrd")
+    return view.save_view(result, tmp_path_factory.mktemp("view") / "run.rrd")
 
 
 Rows = list[tuple[float | None, int | None, list]]
@@ -167,7 +167,7 @@ def test_axes_point_where_the_estimate_says(result: Calibration, recording: Path
 
 
 def test_summary_holds_every_parameter_and_every_warning(result: Calibration) -> None:
-    text = summary(result)
+    text = markdown_summary(result)
     for parameter in result.parameters.values():
         assert parameter.value is not None and parameter.sigma is not None
         if parameter.unit == "1":
@@ -184,20 +184,20 @@ def test_numbers_as_they_are_printed() -> None:
 
 @pytest.mark.parametrize("bench", [ATTITUDE, INERTIAL], ids=["attitude", "inertial"])
 def test_other_benches(bench: Bench, tmp_path: Path) -> None:
-    path = view.save(calibrate(Dwells(8, bench)), tmp_path / "run.rrd")
+    path = view.save_view(calibrate(Dwells(8, bench)), tmp_path / "run.rrd")
     assert "/parameters/a3/b3/log10_sigma" in rows_of(path)
 
 
 def test_a_prior_is_orientation_zero_and_one_dwell_is_enough(tmp_path: Path) -> None:
     result = calibrate(Dwells(1, GIMBALS), Settings(prior=PRIORS["navigation"]))
-    path = view.save(result, tmp_path / "run.rrd")
+    path = view.save_view(result, tmp_path / "run.rrd")
     sigma = by_orientation(rows_of(path)["/parameters/a2/b2/log10_sigma"])
     assert list(sigma) == [0, 1]
     assert 10.0 ** sigma[0][0] == pytest.approx(2e-2 * 1e6 / 9.80665)
 
 
 def test_four_orientations_leave_nothing_to_judge(tmp_path: Path) -> None:
-    path = view.save(calibrate(Dwells(4, GIMBALS)), tmp_path / "run.rrd")
+    path = view.save_view(calibrate(Dwells(4, GIMBALS)), tmp_path / "run.rrd")
     assert not any("/nis/" in entity for entity in rows_of(path))
 
 
@@ -207,20 +207,20 @@ def test_diagnoses_and_improvements_of_odd_runs(tmp_path: Path, dwells: int) -> 
     bench = GIMBALS if dwells < 9 else ATTITUDE
     found = diagnose(calibrate(Dwells(dwells, bench), Settings(prior=PRIORS["navigation"])))
     for made in (found, Improvement(found)):
-        assert view.save(made, tmp_path / "odd.rrd").stat().st_size > 10_000
+        assert view.save_view(made, tmp_path / "odd.rrd").stat().st_size > 10_000
 
 
 def test_strict_mode_of_the_caller_is_given_back(result: Calibration, tmp_path: Path) -> None:
     import rerun
 
     before = rerun.strict_mode()
-    view.save(result, tmp_path / "run.rrd")
+    view.save_view(result, tmp_path / "run.rrd")
     assert rerun.strict_mode() is before
 
 
 def test_a_folder_that_is_not_there(result: Calibration, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="there is no folder"):
-        view.save(result, tmp_path / "nowhere" / "run.rrd")
+        view.save_view(result, tmp_path / "nowhere" / "run.rrd")
 
 
 def _drawn(recording: Path, picture: Path, **options) -> np.ndarray:

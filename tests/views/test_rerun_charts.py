@@ -24,9 +24,9 @@ from kf_calib.sources.files.recording import Recording
 from kf_calib.views import rerun as view
 from kf_calib.views.rerun import diagnosis, improvement
 from kf_calib.views.rerun.driver_chart import round_numbers, unit_of
-from kf_calib.views.rerun.file import new_stream
 from kf_calib.views.rerun.growing import GrowingView
-from kf_calib.views.rerun.series import History, predicted
+from kf_calib.views.rerun.names import new_stream
+from kf_calib.views.rerun.series import VisitHistory, predicted
 from kf_calib.views.rerun.spheres import signed
 from kf_calib.views.screenshot import screenshot, viewer
 
@@ -66,7 +66,7 @@ def content(path: Path, component: str, timeline: str = "") -> dict[str, dict[in
 
 
 def test_curves_of_a_run_hold_the_coefficients_of_its_effects(hidden: Calibration, tmp_path: Path) -> None:
-    path = view.save(hidden, tmp_path / "run.rrd")
+    path = view.save_view(hidden, tmp_path / "run.rrd")
     curves = content(path, "Scalars:scalars", view.ORIENTATION)
     sigma = curves["/parameters/effects/h2/log10_sigma"][24]
     assert 10.0 ** sigma[0] == pytest.approx(hidden.estimate.effect_sigma[1] * 1e6 / 9.80665)
@@ -77,7 +77,7 @@ def test_curves_of_a_run_hold_the_coefficients_of_its_effects(hidden: Calibratio
 
 
 def test_the_range_of_a_panel_holds_the_bands_of_the_last_two_thirds(hidden: Calibration) -> None:
-    history = History.of(hidden)
+    history = VisitHistory.of(hidden)
     for k in range(15):
         span = history.late_range(k)
         assert span is not None
@@ -91,7 +91,7 @@ def test_the_range_of_a_panel_holds_the_bands_of_the_last_two_thirds(hidden: Cal
 def test_runs_with_little_to_judge_by_show_residuals(hidden: Calibration, tmp_path: Path) -> None:
     faces = run("mems_faces")
     assert predicted(hidden) and not predicted(faces)
-    drawn = content(view.save(faces, tmp_path / "run.rrd"), "Scalars:scalars", view.ORIENTATION)
+    drawn = content(view.save_view(faces, tmp_path / "run.rrd"), "Scalars:scalars", view.ORIENTATION)
     ratios = faces.residuals_mps2 / mean_sigmas(faces)
     for i in range(3):
         values = drawn[f"/residual/a{i + 1}"]
@@ -112,7 +112,7 @@ def test_numbers_at_an_axis_are_round(low: float, high: float, numbers: list[flo
 
 def test_a_diagnosis_shows_residuals_against_what_they_go_with(found: Diagnosis, tmp_path: Path) -> None:
     """Places in the view are values: the numbers written at the axes say which."""
-    path, sigmas, driver = view.save(found, tmp_path / "found.rrd"), mean_sigmas(found.before), found.drivers[0]
+    path, sigmas, driver = view.save_view(found, tmp_path / "found.rrd"), mean_sigmas(found.before), found.drivers[0]
     assert driver.symbol == "da" and found.explanations[0].name == "hysteresis"
     texts, at = (content(path, f"Points2D:{what}") for what in ("labels", "positions"))
     drawn = content(path, "Points2D:positions", diagnosis.EXPLANATION)
@@ -134,7 +134,7 @@ def test_a_diagnosis_shows_residuals_against_what_they_go_with(found: Diagnosis,
 
 
 def test_spheres_of_a_diagnosis_show_what_each_explanation_leaves(found: Diagnosis, tmp_path: Path) -> None:
-    path = view.save(found, tmp_path / "found.rrd")
+    path = view.save_view(found, tmp_path / "found.rrd")
     before = content(path, "Points3D:radii")["/spheres/before/2/residuals"][None]
     ratios = np.abs(found.before.residuals_mps2 / mean_sigmas(found.before))[:, 1]
     np.testing.assert_allclose(before, 0.03 + 0.09 * np.minimum(ratios / 4.0, 1.0), rtol=1e-5)
@@ -151,7 +151,7 @@ def test_colours_of_residuals_tell_their_sign() -> None:
 
 
 def test_an_improvement_is_a_timeline_of_steps(improved: Improvement, tmp_path: Path) -> None:
-    path = view.save(improved, tmp_path / "improved.rrd")
+    path = view.save_view(improved, tmp_path / "improved.rrd")
     results = [improved.start.before, improved.result]
     curves = content(path, "Scalars:scalars", improvement.STEP)
     micro_g = 1e6 / 9.80665
@@ -180,7 +180,7 @@ def test_p_that_underflows_is_a_bound(found: Diagnosis) -> None:
 
 def test_what_has_no_view_is_refused(tmp_path: Path) -> None:
     with pytest.raises(TypeError, match="no Rerun view of int"):
-        view.save(3, tmp_path / "x.rrd")
+        view.save_view(3, tmp_path / "x.rrd")
 
 
 def test_a_live_run_shows_targets_and_where_to_go(tmp_path: Path) -> None:
@@ -228,7 +228,7 @@ def test_the_file_of_a_run_that_goes_on_opens(tmp_path: Path) -> None:
 @pytest.mark.draws
 def test_no_panel_complains(found: Diagnosis, improved: Improvement, tmp_path: Path) -> None:
     for result in (found, improved):
-        with viewer(view.save(result, tmp_path / "x.rrd"), (1200, 700)) as client:
+        with viewer(view.save_view(result, tmp_path / "x.rrd"), (1200, 700)) as client:
             client.take_screenshot()
             state = client.get_state()
         assert [(each.name, report.summary) for each in state.views for report in each.reports] == []

@@ -27,7 +27,7 @@ OUTCOMES: dict[Conformity, str] = {
 
 
 @dataclass(frozen=True)
-class Result:
+class CertifiedResult:
     """One parameter: value, standard and expanded uncertainty, coverage factor, effective degrees of freedom, in SI.
 
     before: value and expanded uncertainty before adjustment. limit: largest deviation from nominal that is allowed.
@@ -54,7 +54,7 @@ class Certificate:
     saved: SavedCalibration
     statement: Statement
     budget: Budget
-    results: tuple[Result, ...]
+    results: tuple[CertifiedResult, ...]
     begun: date | None
     ended: date | None
     created: datetime
@@ -125,15 +125,15 @@ def _dates(saved: SavedCalibration) -> tuple[date, date] | tuple[None, None]:
 
 def _results(
     saved: SavedCalibration, found: Budget, statement: Statement, before: list[tuple[float, float]] | None
-) -> tuple[Result, ...]:
+) -> tuple[CertifiedResult, ...]:
     combined, expanded, k, dof = (each.tolist() for each in (found.combined, found.expanded, found.k, found.dof))
-    limits, results = statement.largest, list[Result]()
+    limits, results = statement.largest, list[CertifiedResult]()
     for i, parameter in enumerate(saved.parameters[: len(paper_parameters.SYMBOLS)]):
         value = None if parameter.sigma is None else parameter.value
         known, limit, judged = value is not None, limits.get(parameter.symbol), None
         if value is not None and limit is not None and statement.decision_rule is not None:
             judged = conformity(abs(value - parameter.nominal), limit, expanded[i], statement.decision_rule)
-        results.append(Result(
+        results.append(CertifiedResult(
             parameter.symbol, parameter.unit, parameter.nominal, value,
             combined[i] if known else None, expanded[i] if known else None, k[i], dof[i],
             before[i] if before else None, limit, judged,

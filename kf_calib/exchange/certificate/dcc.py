@@ -1,8 +1,8 @@
 """The certificate as XML: a Digital Calibration Certificate (DCC 3.3.0) with quantities in D-SI 2.2.1.
 
 Elements come in the order of the schema. What is not stated is left out; where that is mandatory, the file says in a
-comment that it is no DCC. The schema (LGPL) is not part of this program: ``check`` validates against a copy where it is
-given one, and else looks for the mandatory elements.
+comment that it is no DCC. The schema (LGPL) is not part of this program: ``check_dcc`` validates against a copy where
+it is given one, and else looks for the mandatory elements.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 
 from kf_calib.errors import InputError
 from kf_calib.exchange.certificate.budget import COVERAGE
-from kf_calib.exchange.certificate.content import Certificate, Result
+from kf_calib.exchange.certificate.content import Certificate, CertifiedResult
 from kf_calib.exchange.certificate.statement import Party
 from kf_calib.support.extras import need
 from kf_calib.support.plain_text import cut
@@ -201,7 +201,7 @@ def _condition(parent: ET.Element, name: str) -> ET.Element:
     return _in(own, "data")
 
 
-def _quantity(parent: ET.Element, result: Result) -> None:
+def _quantity(parent: ET.Element, result: CertifiedResult) -> None:
     """One parameter, with its expanded uncertainty."""
     element = _in(parent, "quantity")
     _words(element, "name", result.symbol)
@@ -228,7 +228,7 @@ def _real(parent: ET.Element, label: str | None, value: float, unit: str) -> ET.
     return element
 
 
-def check(content: bytes, schema: Path | None) -> str:
+def check_dcc(content: bytes, schema: Path | None) -> str:
     """Check the XML and return which check that was, in words; raises InputError with the first thing that is wrong.
 
     schema: a copy of ``dcc.xsd`` with what it imports beside it; nothing is fetched.

@@ -18,7 +18,7 @@ import numpy as np
 from kf_calib.errors import InputError
 from kf_calib.exchange.certificate import dcc
 from kf_calib.exchange.certificate.budget import Contribution
-from kf_calib.exchange.certificate.content import OUTCOMES, Certificate, Result
+from kf_calib.exchange.certificate.content import OUTCOMES, Certificate, CertifiedResult
 from kf_calib.exchange.certificate.statement import Party
 from kf_calib.support.extras import need
 from kf_calib.support.plain_text import cut
@@ -28,7 +28,7 @@ ATTACHED = "certificate.xml"
 _UNITS = {"rad": Unit("°", math.degrees(1.0)), "1": Unit("1", 1.0), "m/s^2": Unit("m/s²", 1.0)}
 _GREEK = {"theta": "θ", "phi": "φ", "nu": "ν"}
 
-Row = dict[str, Any]
+TableRow = dict[str, Any]
 
 
 def pdf(certificate: Certificate, xml: bytes, standing: str) -> bytes:
@@ -60,7 +60,7 @@ def _compiled(template: bytes, inputs: dict[str, str], own_fonts_only: bool) -> 
     return made
 
 
-def content(certificate: Certificate, standing: str) -> Row:
+def content(certificate: Certificate, standing: str) -> TableRow:
     """What the template shows, as strings."""
     stated, day = certificate.statement, certificate.created
     return {
@@ -149,8 +149,8 @@ def _method(certificate: Certificate) -> list[list[str | None]]:
     ]  # fmt: skip
 
 
-def _results(results: Sequence[Result]) -> list[Row]:
-    rows = list[Row]()
+def _results(results: Sequence[CertifiedResult]) -> list[TableRow]:
+    rows = list[TableRow]()
     for result in results:
         large, small = _UNITS[result.unit], field_unit(result.unit)
         value, expanded = _pair(result.value, result.expanded, large)
@@ -162,8 +162,8 @@ def _results(results: Sequence[Result]) -> list[Row]:
     return _aligned(rows, "value", "expanded", "small")
 
 
-def _adjustment(results: Sequence[Result]) -> list[Row]:
-    rows = list[Row]()
+def _adjustment(results: Sequence[CertifiedResult]) -> list[TableRow]:
+    rows = list[TableRow]()
     for result in results:
         if result.before is not None:
             unit = _UNITS[result.unit]
@@ -174,8 +174,8 @@ def _adjustment(results: Sequence[Result]) -> list[Row]:
     return _aligned(rows, "before", "before_u", "after", "after_u")
 
 
-def _conformity(results: Sequence[Result]) -> list[Row]:
-    rows = list[Row]()
+def _conformity(results: Sequence[CertifiedResult]) -> list[TableRow]:
+    rows = list[TableRow]()
     for result in results:
         if result.limit is not None:
             unit = field_unit(result.unit)
@@ -205,7 +205,7 @@ def _budget_words(certificate: Certificate) -> str:
     return words
 
 
-def _input(line: Contribution) -> Row:
+def _input(line: Contribution) -> TableRow:
     unit = field_unit(line.unit)
     standard = "–" if line.standard is None else f"{line.standard * unit.per_si:.3g}"
     return {
@@ -214,17 +214,17 @@ def _input(line: Contribution) -> Row:
     }  # fmt: skip
 
 
-def _contributions(certificate: Certificate) -> list[Row]:
+def _contributions(certificate: Certificate) -> list[TableRow]:
     """Rows of the matrix of contributions, each column with three significant digits of the combined uncertainty."""
     per_si = np.array([field_unit(result.unit).per_si for result in certificate.results])
     known = [result.standard is not None for result in certificate.results]
     budget = certificate.budget
     places = [max(0, 2 - math.floor(math.log10(u))) if u > 0 else 3 for u in (budget.combined * per_si).tolist()]
 
-    def row(symbol: str, values: Any) -> Row:
+    def row(symbol: str, values: Any) -> TableRow:
         return texts(symbol, [f"{value:.{digits}f}" for value, digits in zip(values, places, strict=True)])
 
-    def texts(symbol: str, cells: list[str]) -> Row:
+    def texts(symbol: str, cells: list[str]) -> TableRow:
         return {"symbol": symbol, "values": [text if ok else "–" for text, ok in zip(cells, known, strict=True)]}
 
     plain = [texts("ν", [_count(v) for v in budget.dof]), texts("k", [f"{v:.2f}" for v in budget.k])]
@@ -232,7 +232,7 @@ def _contributions(certificate: Certificate) -> list[Row]:
     return [*lines, row("u", budget.combined * per_si), *plain, row("U", budget.expanded * per_si)]
 
 
-def _sensitivity(certificate: Certificate, line: Contribution) -> Row:
+def _sensitivity(certificate: Certificate, line: Contribution) -> TableRow:
     assert line.sensitivity is not None
     per_si = np.array([field_unit(result.unit).per_si for result in certificate.results]) / field_unit(line.unit).per_si
     values = line.sensitivity * per_si
@@ -242,7 +242,7 @@ def _sensitivity(certificate: Certificate, line: Contribution) -> Row:
     return {"symbol": _name(line.name), "values": [_minus(form.format(value)) for value in values.tolist()]}
 
 
-def _coefficient(symbol: str, value: float | None, sigma: float | None, unit: str) -> Row:
+def _coefficient(symbol: str, value: float | None, sigma: float | None, unit: str) -> TableRow:
     shown = field_unit(unit)
     first, second = _pair(value, sigma, shown)
     return {"name": _name(symbol), "value": first or "–", "sigma": second or "–", "unit": shown.label}
@@ -295,7 +295,7 @@ def _pair(value: float | None, sigma: float | None, unit: Unit) -> tuple[str | N
     return _minus(first), second if float(second) < 100.0 else unit.number(sigma, 2)
 
 
-def _aligned(rows: list[Row], *keys: str) -> list[Row]:
+def _aligned(rows: list[TableRow], *keys: str) -> list[TableRow]:
     """The rows with the texts of these columns padded to as many decimals as the longest has."""
     for key in keys:
         longest = max((_behind(row[key]) for row in rows if row[key] is not None), default=0)

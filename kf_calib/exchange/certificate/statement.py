@@ -12,18 +12,18 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
-from kf_calib.bench.targets import targets_of
+from kf_calib.bench.paper_parameters import targets_of
 from kf_calib.errors import InputError
 from kf_calib.support.plain_text import COMMANDS, cut
 from kf_calib.support.toml_files import toml_table
 
 _NONE = rf"{COMMANDS}\ufffe\uffff"  # no control characters, and nothing that XML cannot hold
-Text = Annotated[str, StringConstraints(max_length=5000, pattern=rf"\A[^{_NONE}]*[^{_NONE}\s][^{_NONE}]*\z")]
+StatedText = Annotated[str, StringConstraints(max_length=5000, pattern=rf"\A[^{_NONE}]*[^{_NONE}\s][^{_NONE}]*\z")]
 Country = Annotated[str, StringConstraints(pattern=r"\A[A-Z]{2}\z")]
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+StatedPositive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Rule = Literal["simple acceptance", "guard band"]
 
-DIVISORS = {"normal": 1.0, "rectangular": math.sqrt(3.0), "triangular": math.sqrt(6.0), "arcsine": math.sqrt(2.0)}
+DIVISORS = {"rectangular": math.sqrt(3.0), "triangular": math.sqrt(6.0), "arcsine": math.sqrt(2.0)}
 """What a size, half the width of a distribution, is divided by for a standard uncertainty; a normal one has ``k``."""
 
 
@@ -34,39 +34,39 @@ class _Table(BaseModel):
 class Party(_Table):
     """A laboratory or a customer; country: two letters of ISO 3166-1."""
 
-    name: Text | None = None
-    street: Text | None = None
-    postcode: Text | None = None
-    city: Text | None = None
+    name: StatedText | None = None
+    street: StatedText | None = None
+    postcode: StatedText | None = None
+    city: StatedText | None = None
     country: Country | None = None
-    email: Text | None = None
-    phone: Text | None = None
+    email: StatedText | None = None
+    phone: StatedText | None = None
 
 
 class Item(_Table):
     """What was calibrated."""
 
-    name: Text | None = None
-    manufacturer: Text | None = None
-    model: Text | None = None
-    serial: Text | None = None
-    state: Text | None = None
+    name: StatedText | None = None
+    manufacturer: StatedText | None = None
+    model: StatedText | None = None
+    serial: StatedText | None = None
+    state: StatedText | None = None
 
 
 class Person(_Table):
     """Who is responsible for the certificate."""
 
-    name: Text
-    role: Text | None = None
+    name: StatedText
+    role: StatedText | None = None
 
 
-class Conditions(_Table):
+class StatedConditions(_Table):
     """Conditions of the surroundings, in words with units."""
 
-    temperature: Text | None = None
-    humidity: Text | None = None
-    pressure: Text | None = None
-    note: Text | None = None
+    temperature: StatedText | None = None
+    humidity: StatedText | None = None
+    pressure: StatedText | None = None
+    note: StatedText | None = None
 
 
 class TypeB(_Table):
@@ -77,39 +77,39 @@ class TypeB(_Table):
     temperature: by how much it may be off, for effects of it. dof: degrees of freedom of the size; None: exact.
     """
 
-    effect: Text
-    size: Text
+    effect: StatedText
+    size: StatedText
     distribution: Literal["normal", "rectangular", "triangular", "arcsine"] = "normal"
-    k: Positive = 1.0
+    k: StatedPositive = 1.0
     varies: Literal["run", "dwell"] = "run"
-    temperature: Text | None = None
-    dof: Positive | None = None
-    source: Text | None = None
+    temperature: StatedText | None = None
+    dof: StatedPositive | None = None
+    source: StatedText | None = None
 
 
 class Statement(_Table):
     """The content of the file; before: a calibration file from before an adjustment."""
 
-    title: Text | None = None
-    number: Text | None = None
+    title: StatedText | None = None
+    number: StatedText | None = None
     issued: date | None = None
     received: date | None = None
     begun: date | None = None
     ended: date | None = None
     site: Literal["laboratory", "customer", "laboratoryBranch", "customerBranch", "other"] | None = None
-    location: Text | None = None
-    method: Text | None = None
-    norms: list[Text] = []
-    traceability: Text | None = None
-    remarks: Text | None = None
+    location: StatedText | None = None
+    method: StatedText | None = None
+    norms: list[StatedText] = []
+    traceability: StatedText | None = None
+    remarks: StatedText | None = None
     decision_rule: Rule | None = None
     before: Annotated[Path, Field(strict=False)] | None = None
     laboratory: Party = Party()
     customer: Party = Party()
     item: Item = Item()
-    conditions: Conditions = Conditions()
+    conditions: StatedConditions = StatedConditions()
     persons: list[Person] = []
-    limits: dict[str, Text] = {}
+    limits: dict[str, StatedText] = {}
     uncertainty: list[TypeB] = []
 
     @property
@@ -126,7 +126,7 @@ class Statement(_Table):
         return largest
 
 
-def read(path: Path | None) -> Statement:
+def read_statement(path: Path | None) -> Statement:
     """Read a statement and check all of it; raises InputError, with the place in it. None: nothing is stated."""
     if path is None:
         return Statement()

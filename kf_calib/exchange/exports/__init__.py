@@ -11,22 +11,14 @@ from __future__ import annotations
 from kf_calib.errors import InputError
 from kf_calib.estimation.correction import Correction
 from kf_calib.exchange.calibration_file import SavedCalibration
-from kf_calib.exchange.exports.ardupilot import ArduPilot
+from kf_calib.exchange.exports.affine import ArduPilot, Imucal, ImuCalib, ImuTk, Kalibr, OpenVins, Px4, VectorNav
 from kf_calib.exchange.exports.c_header import CHeader
-from kf_calib.exchange.exports.imu_calib import ImuCalib
-from kf_calib.exchange.exports.imu_tk import ImuTk
-from kf_calib.exchange.exports.imucal import Imucal
-from kf_calib.exchange.exports.kalibr import Kalibr
-from kf_calib.exchange.exports.openvins import OpenVins
-from kf_calib.exchange.exports.px4 import Px4
-from kf_calib.exchange.exports.table import Table
-from kf_calib.exchange.exports.target import Target
-from kf_calib.exchange.exports.vectornav import VectorNav
+from kf_calib.exchange.exports.target import CsvTable, Target
 from kf_calib.support.units import shown
 
 TARGETS: dict[str, type[Target]] = {
     "px4": Px4, "ardupilot": ArduPilot, "imucal": Imucal, "imu_calib": ImuCalib, "kalibr": Kalibr,
-    "openvins": OpenVins, "imu_tk": ImuTk, "vectornav": VectorNav, "csv": Table, "c": CHeader,
+    "openvins": OpenVins, "imu_tk": ImuTk, "vectornav": VectorNav, "csv": CsvTable, "c": CHeader,
 }  # fmt: skip
 
 

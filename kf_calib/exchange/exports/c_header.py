@@ -11,19 +11,18 @@ temperature in degC, NaN where it is not known.
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.effects import Effect
-from kf_calib.effects.expression import Expression
+from kf_calib.effects.expression import FUNCTIONS, OPERATORS, Expression
 from kf_calib.effects.formula import Formula, quantities
 from kf_calib.errors import InputError
-from kf_calib.exchange.exports.c_expression import HELPERS, MATH, Piece, in_c, number
-from kf_calib.exchange.exports.quoting import in_comment
-from kf_calib.exchange.exports.target import Target
+from kf_calib.exchange.exports.target import Target, in_comment
 
 _OWN_NAMES = ("a", "p", "o", "T", "constant", "before", "after")
 _SIZES = (1e-8, 1e-5, 1e-3, 1.0, 2.0)
@@ -58,7 +57,7 @@ class CHeader(Target):
     def _body(self, sums: list[str]) -> Iterator[str]:
         correction, used = self.correction, "".join(sums)
         yield f"static const double c[3][3] = {_array(correction.matrix)};"
-        bias = ", ".join(f"{self._reading(i)} - {number(float(b))}" for i, b in enumerate(correction.bias_mps2))
+        bias = ", ".join(f"{self._reading(i)} - {text_of_number(float(b))}" for i, b in enumerate(correction.bias_mps2))
         yield f"const double z[3] = {{{bias}}};"
         if not used:
             yield "(void)temperature_c;"
@@ -84,7 +83,7 @@ class CHeader(Target):
         """The reading of accelerometer i, from 0, in m/s^2."""
         column = abs(self.input.channels[i]) - 1
         factor = float(self.input.matrix[i, column])
-        return f"reading[{column}]" if factor == 1.0 else f"{number(factor)} * reading[{column}]"
+        return f"reading[{column}]" if factor == 1.0 else f"{text_of_number(factor)} * reading[{column}]"
 
     def _matrices(self, used: str) -> dict[str, Floats]:
         """Return what the specific force is multiplied by: a along the input axes, r as it is read."""
@@ -101,11 +100,11 @@ class CHeader(Target):
             expressions = self._expressions(effect)
             values = own[i * len(expressions) : (i + 1) * len(expressions)]
             for value, expression in zip(values, expressions, strict=True):
-                constants: Mapping[str, Piece] = {"constant": effect.value} if "constant" in expression.names else {}
+                constants: Mapping[str, TextOfC] = {"constant": effect.value} if "constant" in expression.names else {}
                 every = dict.fromkeys(expression.names, 0.0) | names | constants
-                yield f"{number(float(value))} * {in_c(expression, every)}"
+                yield f"{text_of_number(float(value))} * {in_c(expression, every)}"
 
-    def _names(self, i: int) -> dict[str, Piece]:
+    def _names(self, i: int) -> dict[str, TextOfC]:
         """What the names in a formula are in C, for accelerometer i; all else is at rest."""
         constants = {name: quantity.of for name, quantity in quantities(self.correction.bench.axes).items()
                      if name in ("s", "m", "K", "rad", "deg", "pi")}  # fmt: skip
@@ -144,3 +143,72 @@ def _product(row: str, vector: str, less: str = "") -> str:
     """A row of a matrix times a vector, or times the difference of two."""
     terms: Iterable[str] = (f"({vector}[{k}] - {less}[{k}])" if less else f"{vector}[{k}]" for k in range(3))
     return " + ".join(f"{row}[{k}] * {term}" for k, term in enumerate(terms))
+
+
+TextOfC = str | float
+_LARGEST_POWER = 12
+HELPERS = {
+    "kf_calib_abs": "double x) { return x < 0.0 ? -x : x; }",
+    "kf_calib_sign": "double x) { return (x > 0.0) - (x < 0.0); }",
+    "kf_calib_min": "double x, double y) { return y < x ? y : x; }",
+    "kf_calib_max": "double x, double y) { return y > x ? y : x; }",
+    "kf_calib_power": "double x, int n) { double y = 1.0; while (n-- > 0) y *= x; return y; }",
+}
+"""Functions that a piece of C may call, from their parameters on."""
+MATH = {"sin": "sin", "cos": "cos", "tan": "tan", "arctan": "atan", "tanh": "tanh", "exp": "exp", "log": "log",
+        "sqrt": "sqrt"}  # fmt: skip
+"""Functions of formulas that C has in <math.h>."""
+_OWN = {"abs": "kf_calib_abs", "sign": "kf_calib_sign", "minimum": "kf_calib_min", "maximum": "kf_calib_max"}
+
+
+def in_c(expression: Expression, names: Mapping[str, TextOfC]) -> str:
+    """The expression as a piece of C; names: what each of its names is."""
+    return text_of_number(expression(names, _OPERATORS, _FUNCTIONS))
+
+
+def text_of_number(piece: TextOfC) -> str:
+    """A piece of C as it is, a number with all its digits; raises InputError for one that C has no word for."""
+    if isinstance(piece, str):
+        return piece
+    if not math.isfinite(piece):
+        raise InputError("a constant in a formula is too large for C: write the formula with smaller numbers.")
+    return f"{float(piece)!r}" if piece >= 0.0 else f"({float(piece)!r})"
+
+
+def _operator(sign: str) -> Callable[..., TextOfC]:
+    """Return what an operator makes of pieces."""
+
+    def made(*pieces: TextOfC) -> TextOfC:
+        if not any(isinstance(piece, str) for piece in pieces):
+            return float(OPERATORS[sign](*pieces))
+        words = [text_of_number(piece) for piece in pieces]
+        if sign == "**":
+            return _power(words, pieces[1])
+        if len(words) == 1:
+            return f"(-{words[0]})" if sign == "neg" else words[0]
+        joined = f"({words[0]} {sign} {words[1]})"
+        return f"(double){joined}" if sign[0] in "<>" else joined
+
+    return made
+
+
+def _power(words: list[str], exponent: TextOfC) -> str:
+    """Return a power: a product where the exponent is a small whole number."""
+    if isinstance(exponent, float) and exponent.is_integer() and 0 < exponent <= _LARGEST_POWER:
+        return f"kf_calib_power({words[0]}, {exponent:.0f})"
+    return f"pow({', '.join(words)})"
+
+
+def _function(name: str) -> Callable[..., TextOfC]:
+    """Return what a function makes of pieces."""
+
+    def made(*pieces: TextOfC) -> TextOfC:
+        if not any(isinstance(piece, str) for piece in pieces):
+            return float(FUNCTIONS[name](*pieces))
+        return f"{(MATH | _OWN)[name]}({', '.join(map(text_of_number, pieces))})"
+
+    return made
+
+
+_OPERATORS = {sign: _operator(sign) for sign in OPERATORS}
+_FUNCTIONS = {name: _function(name) for name in FUNCTIONS}

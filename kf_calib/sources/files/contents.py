@@ -15,8 +15,8 @@ from kf_calib.sources.files.cdr import IMU, JOINT_STATE, QUATERNION, TEMPERATURE
 from kf_calib.sources.files.field_messages import CDR, ENCODINGS, FieldDecoder
 from kf_calib.sources.files.fields import FieldError, Fields, known_fields
 from kf_calib.sources.files.joints import Joints
-from kf_calib.sources.files.mcap_chunks import DamagedError, parse
 from kf_calib.sources.files.mcap_file import Warn
+from kf_calib.sources.files.mcap_records import DamagedError, parse_record
 from kf_calib.sources.files.record_files import RecordFile
 
 BENCH_RECORD = "kf_calib.bench"
@@ -100,10 +100,10 @@ class Contents:
         try:
             match opcode:
                 case Opcode.SCHEMA:
-                    schema = parse(Schema.read, content)
+                    schema = parse_record(Schema.read, content)
                     self.schemas.setdefault(schema.id, schema)
                 case Opcode.CHANNEL:
-                    channel = parse(Channel.read, content)
+                    channel = parse_record(Channel.read, content)
                     self.channels.setdefault(channel.id, channel)
                 case Opcode.METADATA:
                     self._add_metadata(content)
@@ -114,7 +114,7 @@ class Contents:
 
     def _add_metadata(self, content: bytes) -> None:
         try:
-            record = parse(Metadata.read, content)
+            record = parse_record(Metadata.read, content)
         except DamagedError:
             self.bench_damaged |= self.bench is None
             raise
@@ -196,7 +196,7 @@ class Contents:
 
 
 @dataclass
-class Parts:
+class RecordingParts:
     """The files of a recording, which follow each other."""
 
     path: Path

@@ -21,7 +21,7 @@ import numpy as np
 from kf_calib.bench.arrays import lengths
 from kf_calib.bench.raw_input import PLAIN, UNITS, RawInput
 from kf_calib.errors import CountsError, InputError
-from kf_calib.sources.files.csv_heading import Heading
+from kf_calib.sources.files.csv_heading import CsvHeading
 from kf_calib.sources.files.line_parts import LineError, number_of, stamp_ns
 from kf_calib.sources.tables.columns import QUATERNION, READINGS, SPREADS
 from kf_calib.sources.tables.numbers import DECIMAL_POINT, Numbers, month_comes_first, stamp_of
@@ -42,17 +42,17 @@ _FASTEST_TABLE_S = 1.0
 _MANY, _ALIKE_RAD, _MOST = 500, 0.1, 0.9
 _MARKS_OF_TABLES = ("count", "face", "sd", *SPREADS)
 
-Row = Sequence[str]
+CsvRow = Sequence[str]
 
 
 @dataclass(frozen=True)
-class Quantity:
+class QuantityColumns:
     """Where a quantity stands in a row, and the factors that bring it to our units."""
 
     at: tuple[int, ...] = ()
     factors: tuple[float, ...] = ()
 
-    def values(self, row: Row, header: Sequence[str], numbers: Numbers) -> list[float] | None:
+    def values(self, row: CsvRow, header: Sequence[str], numbers: Numbers) -> list[float] | None:
         """The quantity, None where it is not measured. Raises LineError where it cannot be used."""
         cells = [row[at] for at in self.at]
         if not all(cells):
@@ -102,7 +102,7 @@ class Stamps:
     is_date: bool = False
     month_first: bool = False
 
-    def ns(self, row: Row, header: Sequence[str], numbers: Numbers) -> int:
+    def ns(self, row: CsvRow, header: Sequence[str], numbers: Numbers) -> int:
         """The stamp of a row in nanoseconds. Raises LineError where it has none."""
         cell = row[self.at[0]] if len(self.at) == 1 else " ".join(row[at] for at in self.at)
         try:
@@ -134,7 +134,7 @@ class CsvColumns:
     header: Sequence[str]
     names: Sequence[str]
     delimiter: str
-    rows: Sequence[Row]
+    rows: Sequence[CsvRow]
     units: Units
     local_mps2: float
     said: list[str] = field(default_factory=list[str])
@@ -146,7 +146,7 @@ class CsvColumns:
     @classmethod
     def of(
         cls,
-        heading: Heading,
+        heading: CsvHeading,
         stated: Mapping[str, str],
         units: Units | None = None,
         local_mps2: float = STANDARD_GRAVITY_MPS2,
@@ -175,7 +175,7 @@ class CsvColumns:
         """How the numbers are written; None where no row tells yet."""
         return self.numbers_in(self.rows)
 
-    def numbers_in(self, rows: Sequence[Row]) -> Numbers | None:
+    def numbers_in(self, rows: Sequence[CsvRow]) -> Numbers | None:
         """How the numbers in rows are written; None where these do not tell."""
         used = [at for at, own in enumerate(self._meanings) if own.ours]
         cells = (row[at] for row in rows if len(row) == len(self.names) for at in used)
@@ -224,7 +224,7 @@ class CsvColumns:
             self.said.append(f"time from {self._quoted([place])} in {unit}")
         return Stamps((place,), decimals, round(TIME[unit]) if decimals == 9 else 1)
 
-    def accel(self) -> Quantity:
+    def accel(self) -> QuantityColumns:
         """The three readings as they are written; ``raw`` tells then what in.
 
         Raises InputError where their columns or their units are not told."""
@@ -257,14 +257,14 @@ class CsvColumns:
         self.written_mps2 = (written[0], written[1], written[2])
         bare = [at for at, unit in zip(places, by_name, strict=True) if unit not in UNITS]
         self.without_unit = tuple(bare) if is_rewritten else ()
-        return Quantity(tuple(places), (1.0, 1.0, 1.0))
+        return QuantityColumns(tuple(places), (1.0, 1.0, 1.0))
 
     @property
     def has_usual_gimbals(self) -> bool:
         """Whether a column is named as a gimbal or in a unit of angles, so that it goes before an attitude."""
         return any(own.ours == "angle" and (own.rank or own.unit) for own in self._meanings)
 
-    def gimbals(self, *, needed: bool) -> Quantity:
+    def gimbals(self, *, needed: bool) -> QuantityColumns:
         """The angles by the usual names, else every column of an angle in the order of the header; none where there is
         none. Raises InputError where their unit is not told and they are needed."""
         places = [at for at, own in enumerate(self._meanings) if own.ours == "angle"]
@@ -276,7 +276,7 @@ class CsvColumns:
         if "" in units:
             unit = self.units.angle or self._unit_of_angles(places)
             if not unit and not needed:
-                return Quantity()
+                return QuantityColumns()
             if not unit:
                 raise self.without_angles()
             units = [own or unit for own in units]
@@ -288,21 +288,25 @@ class CsvColumns:
             )
         elif not all(_EXACT.fullmatch(self.names[at]) for at in places):
             self.said.append(f"gimbal angles, outer to inner, from {self._quoted(places)}")
-        return Quantity(tuple(places), tuple(ANGLE[unit] for unit in units))
+        return QuantityColumns(tuple(places), tuple(ANGLE[unit] for unit in units))
 
-    def quaternion(self) -> Quantity:
+    def quaternion(self) -> QuantityColumns:
         """The attitude; nothing where its four columns are not there."""
         places = [self._one(ours) for ours in QUATERNION]
-        return Quantity() if None in places else Quantity(tuple(at for at in places if at is not None), (1.0,) * 4)
+        return (
+            QuantityColumns()
+            if None in places
+            else QuantityColumns(tuple(at for at in places if at is not None), (1.0,) * 4)
+        )
 
-    def temperature(self) -> tuple[Quantity, str]:
+    def temperature(self) -> tuple[QuantityColumns, str]:
         """The temperature, if there is one, and its unit: ``c``, ``k`` or ``f``."""
         at = self._one("temperature")
         if at is None:
-            return Quantity(), "c"
+            return QuantityColumns(), "c"
         if not _EXACT.fullmatch(self.names[at]):
             self.said.append(f"temperature from {self._quoted([at])} in {(self._meanings[at].unit or 'c').upper()}")
-        return Quantity((at,), (1.0,)), self._meanings[at].unit or "c"
+        return QuantityColumns((at,), (1.0,)), self._meanings[at].unit or "c"
 
     @property
     def wanted(self) -> str:

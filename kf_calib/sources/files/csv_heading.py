@@ -14,7 +14,7 @@ _FEWEST_CELLS = 3
 _ROWS = 1000  # that are looked at
 
 
-class Heading(NamedTuple):
+class CsvHeading(NamedTuple):
     """The names of the columns, what is between cells, how many lines go before the first row, and the first rows."""
 
     header: Sequence[str]
@@ -23,7 +23,7 @@ class Heading(NamedTuple):
     rows: Sequence[Sequence[str]]
 
     @classmethod
-    def of(cls, lines: Sequence[str]) -> Heading:
+    def of(cls, lines: Sequence[str]) -> CsvHeading:
         """The heading of lines from the beginning of a file or a stream, of which there is at least one."""
         first = lines[0].lstrip("\ufeff").strip()
         stated = first[-1] if first.lower().startswith("sep=") and len(first) == 5 else ""

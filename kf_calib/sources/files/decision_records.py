@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -10,9 +11,8 @@ from mcap.opcode import Opcode
 from mcap.records import Metadata
 
 from kf_calib.errors import KfCalibError
-from kf_calib.sources.files.mcap_chunks import DamagedError, parse
 from kf_calib.sources.files.mcap_file import McapFile
-from kf_calib.sources.files.mcap_messages import MessageFinder
+from kf_calib.sources.files.mcap_records import DamagedError, MessageFinder, parse_record
 
 DECISION_RECORD = "kf_calib.decision"
 """Where something was decided: number, at_s, purpose, gimbal_deg (JSON list), stay_s, why."""
@@ -26,11 +26,19 @@ def decision_records(path: Path, name: str = DECISION_RECORD) -> list[Mapping[st
     try:
         for block in McapFile(path).blocks(lambda said: None):
             for opcode, content in find(block).others:
-                if opcode == Opcode.METADATA and (record := parse(Metadata.read, content)).name == name:
+                if opcode == Opcode.METADATA and (record := parse_record(Metadata.read, content)).name == name:
                     records.append(record.metadata)
     except (KfCalibError, OSError, DamagedError):
         return records
     return records
+
+
+def number_of(record: Mapping[str, str], key: str) -> float:
+    """A number of a record; NaN where there is none."""
+    try:
+        return float(record[key])
+    except (KeyError, ValueError):
+        return math.nan
 
 
 def angles_of(text: str) -> tuple[float, ...]:

@@ -11,20 +11,18 @@ import numpy as np
 from mcap.records import Channel
 from numpy.typing import NDArray
 
-from kf_calib.sources.files.bags import files_of
 from kf_calib.sources.files.contents import POSES, READINGS, USABLE_SCHEMAS, Contents, fields_by_role
 from kf_calib.sources.files.field_messages import CDR, ENCODINGS, parser_of
 from kf_calib.sources.files.fields import FieldError, paths_of
 from kf_calib.sources.files.lines import Lines
-from kf_calib.sources.files.mcap_chunks import MAX_CHUNK_MB
 from kf_calib.sources.files.mcap_file import McapFile, Warn
-from kf_calib.sources.files.mcap_messages import MessageFinder
-from kf_calib.sources.files.record_files import RecordFile, open_record_file
+from kf_calib.sources.files.mcap_records import MAX_CHUNK_MB, MessageFinder
+from kf_calib.sources.files.record_files import RecordFile, files_of, open_record_file
 from kf_calib.sources.files.sqlite_bag import SqliteBag
 from kf_calib.sources.units import Units
 from kf_calib.support.extras import MissingExtraError
 
-Times = NDArray[np.int64]
+TopicTimes = NDArray[np.int64]
 _GAP = 5  # times the usual interval
 _USUAL = 1000  # intervals from which the usual one is taken
 _LEAST = 10  # intervals, for one to be usual
@@ -54,7 +52,7 @@ class Topic:
     backward: int = 0
     paths: tuple[str, ...] = ()
     is_looked_into: bool = False
-    _waiting: list[Times] = field(default_factory=list[Times])  # until it is known what is usual
+    _waiting: list[TopicTimes] = field(default_factory=list[TopicTimes])  # until it is known what is usual
     _latest_ns: int | None = None  # of those that were looked at
     _usual_ns: float = 0.0
 
@@ -65,7 +63,7 @@ class Topic:
             return None
         return (self.count - 1) / (self.last_ns - self.first_ns) * 1e9
 
-    def add(self, times: Times) -> None:
+    def add(self, times: TopicTimes) -> None:
         if not len(times):
             return
         first, last = int(times.min()), int(times.max())
@@ -195,7 +193,7 @@ def _topic(channel: Channel, contents: Contents, topics: dict[str, Topic]) -> To
 
 def _receipts(
     file: RecordFile, contents: Contents, topics: dict[str, Topic], warn: Warn
-) -> Iterable[tuple[int, Times]]:
+) -> Iterable[tuple[int, TopicTimes]]:
     """Channel and times of receipt of messages of it, some thousands at a time."""
     if isinstance(file, SqliteBag):
         return file.receipts(warn)
@@ -205,7 +203,7 @@ def _receipts(
 
 def _from_blocks(
     file: McapFile, contents: Contents, topics: dict[str, Topic], warn: Warn
-) -> Iterator[tuple[int, Times]]:
+) -> Iterator[tuple[int, TopicTimes]]:
     find = MessageFinder()
     for block in file.blocks(warn):
         messages = find(block)

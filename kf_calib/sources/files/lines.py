@@ -16,16 +16,14 @@ from types import MappingProxyType
 from typing import BinaryIO, Protocol
 
 from kf_calib.bench.bench import Bench
-from kf_calib.bench.gravity_alone import bench_without_angles, without_poses
 from kf_calib.bench.raw_input import CONVERTED, PLAIN, RESTATE, RawInput, merged_metadata
-from kf_calib.bench.streams import Batch, with_accel
+from kf_calib.bench.streams import Batch, bench_without_angles, with_accel, without_poses
 from kf_calib.errors import BenchError, CountsError, InputError
 from kf_calib.sources.files.csv_columns import CsvColumns
-from kf_calib.sources.files.csv_heading import Heading
-from kf_calib.sources.files.csv_lines import CsvLines
+from kf_calib.sources.files.csv_heading import CsvHeading
 from kf_calib.sources.files.joints import as_columns
-from kf_calib.sources.files.json_lines import JsonLines
 from kf_calib.sources.files.line_parts import Account, LineReader
+from kf_calib.sources.files.sample_lines import CsvLines, JsonLines
 from kf_calib.sources.files.text_file import TextFile
 from kf_calib.sources.tables.columns import HOW
 from kf_calib.sources.units import Units
@@ -136,7 +134,7 @@ class Lines:
 
     def _open_reader(self, lines: Sequence[str], account: Account) -> tuple[LineReader, int]:
         if self._stated and not is_json(lines[0]):
-            _refuse_absent(self._stated, Heading.of(lines).header)
+            _refuse_absent(self._stated, CsvHeading.of(lines).header)
         local_mps2 = STANDARD_GRAVITY_MPS2
         if self._units.g == "local":
             local_mps2 = bench_without_angles(self.name, self._overrides)[0].gravity_mps2
@@ -264,7 +262,7 @@ def reader_for(
     """
     if is_json(lines[0]):
         return JsonLines(columns, account), 0
-    heading = Heading.of(lines)
+    heading = CsvHeading.of(lines)
     return CsvLines(CsvColumns.of(heading, columns, units, local_mps2), account, angles), heading.lines
 
 

@@ -32,9 +32,8 @@ from numpy.typing import NDArray
 from kf_calib.bench.streams import Stream
 from kf_calib.errors import InputError
 from kf_calib.sources.files import cdr
-from kf_calib.sources.files.mcap_chunks import parse
 from kf_calib.sources.files.mcap_file import McapFile
-from kf_calib.sources.files.mcap_messages import HEAD, MAGIC
+from kf_calib.sources.files.mcap_records import HEAD, MAGIC, parse_record
 
 _PIECE = 1 << 22
 _MESSAGES = 1 << 14  # in a chunk
@@ -111,7 +110,7 @@ class TopicAppender:
             if opcode in (Opcode.FOOTER, Opcode.SUMMARY_OFFSET):
                 continue
             if opcode == Opcode.STATISTICS:
-                self._statistics = parse(Statistics.read, record[HEAD.size :])
+                self._statistics = parse_record(Statistics.read, record[HEAD.size :])
             elif opcode in self._groups:
                 self._groups[opcode].append(record)
 

@@ -1,23 +1,28 @@
-"""What kind of file a part of a recording is, by its first bytes; one that is compressed as a whole is unpacked."""
+"""The files of a recording: one, or those of a ROS 2 bag's folder in the order in which they were written.
+
+What kind of file a part is, is known by its first bytes; one that is compressed as a whole is unpacked.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import os
+import re
 import tempfile
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from itertools import takewhile
 from pathlib import Path
 from typing import IO, Protocol
 
 import zstandard
 
 from kf_calib.errors import InputError
-from kf_calib.sources.files.mcap_chunks import allowed_sizes
 from kf_calib.sources.files.mcap_file import McapFile, Warn
-from kf_calib.sources.files.mcap_messages import RecordBlock
-from kf_calib.sources.files.mcap_summary import Summary
+from kf_calib.sources.files.mcap_records import RecordBlock, Summary, allowed_sizes
 from kf_calib.sources.files.sqlite_bag import SqliteBag
+from kf_calib.support.plain_text import cut
 
 _USUAL_RATIO = 20  # sizes of a recording unpacked and packed, at most
 _SQLITE, _ZSTD = b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
@@ -121,3 +126,83 @@ def _unpacked(path: Path, max_chunk: int) -> Path:
             ) from None
         raise
     return Path(name)
+
+
+_NUMBERED = re.compile(r"(.*)_(\d+)")
+_SHOWN, _LONGEST_NAME = 6, 100  # names in a message, characters of one
+_LISTED, _LARGEST_METADATA = "relative_file_paths:", 10_000_000
+
+
+def files_of(path: Path) -> list[Path]:
+    """The MCAP or .db3 files at ``path``, in order of time. Raises InputError where a folder is not one bag of such."""
+    if not path.is_dir():
+        return [path]
+    listed = _files_in_metadata(path / "metadata.yaml")
+    lost = [cut(name, _LONGEST_NAME) for name in listed if not _is_file(path / name)]
+    if lost:
+        names = ", ".join(lost[:_SHOWN]) + " ..." * (len(lost) > _SHOWN)
+        raise InputError(
+            f"{path} lacks {names}, which its metadata.yaml names: bring the whole bag, or give one of its files."
+        )
+    files = [path / name for name in listed if _is_part(name)] or _lying_in(path)
+    if not files:
+        raise InputError(
+            f"{path} holds no .mcap and no .db3 file: give the folder of a ROS 2 bag, or one of its files."
+        )
+    if not listed and len({_place(file)[0] for file in files}) > 1:
+        raise InputError(
+            f"{path} holds several recordings ({', '.join(file.name for file in files[:_SHOWN])}"
+            f"{' ...' * (len(files) > _SHOWN)}) and no metadata.yaml that makes them one: give one of them."
+        )
+    return files
+
+
+def _is_file(path: Path) -> bool:
+    """Whether there is such a file; a name that no file system allows is of none."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
+
+
+def _lying_in(path: Path) -> list[Path]:
+    """The files of a folder without metadata.yaml; of a file and its compressed copy, the file."""
+    files = {file.name: file for file in path.iterdir() if _is_part(file.name) and file.is_file()}
+    return sorted((file for name, file in files.items() if name.removesuffix(".zstd") == name
+                   or name.removesuffix(".zstd") not in files), key=_place)  # fmt: skip
+
+
+def _is_part(name: str) -> bool:
+    return name.removesuffix(".zstd").endswith((".mcap", ".db3"))
+
+
+def _place(file: Path) -> tuple[str, int]:
+    """The name of the bag that a file is part of, and its number in it."""
+    numbered = _NUMBERED.fullmatch(stem := file.name.partition(".")[0])
+    return (numbered[1], int(numbered[2])) if numbered else (stem, 0)
+
+
+def _files_in_metadata(metadata: Path) -> list[str]:
+    """The files that a bag's metadata.yaml lists, in order; none where there is no such file."""
+    try:
+        if not metadata.is_file():
+            return []
+        with metadata.open(encoding="utf-8", errors="replace") as file:
+            lines = file.read(_LARGEST_METADATA).split("\n")
+    except OSError:
+        return []
+    begin = next((k for k, line in enumerate(lines) if line.strip() == _LISTED), len(lines))
+    items = takewhile(lambda line: line.startswith("- "), (line.strip() for line in lines[begin + 1 :]))
+    return [Path(item[2:].strip().strip("'\"")).name for item in items]
+
+
+def fingerprint(path: Path) -> str:
+    """SHA-256 of a recording, all files of a bag one after the other; raises InputError if it cannot be read."""
+    digest = hashlib.sha256()
+    try:
+        for each in files_of(path):
+            with each.open("rb") as file:
+                hashlib.file_digest(file, lambda: digest)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}): name a recording.") from None
+    return digest.hexdigest()

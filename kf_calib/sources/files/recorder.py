@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import struct
 import time
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
@@ -16,7 +17,7 @@ from typing import IO, Self
 
 import numpy as np
 from mcap.opcode import Opcode
-from mcap.records import Channel, Schema
+from mcap.records import Channel, ChunkIndex, Schema
 from mcap.writer import Writer
 
 from kf_calib.bench.bench import Bench
@@ -24,7 +25,6 @@ from kf_calib.bench.raw_input import CONVERTED
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.sources.files import cdr
-from kf_calib.sources.files.chunk_indexes import keep_packed
 from kf_calib.sources.files.contents import (
     ACCEL_TOPIC,
     ANGLES_TOPIC,
@@ -36,7 +36,7 @@ from kf_calib.sources.files.contents import (
 )
 from kf_calib.sources.files.joints import Joints, gimbal_names
 from kf_calib.sources.files.mcap_file import McapFile
-from kf_calib.sources.files.mcap_messages import HEAD, MAGIC, MessageFinder
+from kf_calib.sources.files.mcap_records import HEAD, MAGIC, MessageFinder
 from kf_calib.support.output_files import Growing, refuse_output
 
 _REPEAT_BYTES = 1 << 26
@@ -335,3 +335,42 @@ class _Channel:
             chunk = vars(writer)["_Writer__chunk_builder"]
             chunk.add_schema(Schema(self.schema, self.kind.schema.encode(), "ros2msg", self.kind.name))
             chunk.add_channel(Channel(self.id, self.topic, "cdr", {}, self.schema))
+
+
+_FIXED, _OFFSET = struct.Struct("<7QB"), struct.Struct("<HQ")
+
+
+class ChunkIndexes:
+    """A sequence of chunk indexes of one compression, as far as the writer uses one: ``append`` and iteration."""
+
+    def __init__(self) -> None:
+        self._packed, self._compression = bytearray(), ""
+
+    def append(self, index: ChunkIndex) -> None:
+        self._compression = index.compression
+        self._packed += _FIXED.pack(
+            index.message_start_time, index.message_end_time, index.chunk_start_offset, index.chunk_length,
+            index.message_index_length, index.compressed_size, index.uncompressed_size,
+            len(index.message_index_offsets),
+        )  # fmt: skip
+        for channel, offset in index.message_index_offsets.items():
+            self._packed += _OFFSET.pack(channel, offset)
+
+    def __iter__(self) -> Iterator[ChunkIndex]:
+        at = 0
+        while at < len(self._packed):
+            start, end, offset, length, indexed, compressed, size, count = _FIXED.unpack_from(self._packed, at)
+            at += _FIXED.size
+            offsets = dict(_OFFSET.unpack_from(self._packed, at + k * _OFFSET.size) for k in range(count))
+            at += count * _OFFSET.size
+            yield ChunkIndex(
+                chunk_length=length, chunk_start_offset=offset, compression=self._compression,
+                compressed_size=compressed, message_end_time=end, message_index_length=indexed,
+                message_index_offsets=offsets, message_start_time=start, uncompressed_size=size,
+            )  # fmt: skip
+
+
+def keep_packed(writer: Writer) -> None:
+    """Have a writer keep its chunk indexes so."""
+    assert not vars(writer)["_Writer__chunk_indices"]
+    vars(writer)["_Writer__chunk_indices"] = ChunkIndexes()  # the writer has no call for this

@@ -20,11 +20,9 @@ from mcap.opcode import Opcode
 from mcap.records import Metadata
 
 from kf_calib.bench.bench import Bench
-from kf_calib.bench.gravity_alone import bench_without_angles
 from kf_calib.bench.raw_input import Conversion, RawInput, conversion, merged_metadata
-from kf_calib.bench.streams import Batch, Stream
+from kf_calib.bench.streams import Batch, Stream, bench_without_angles
 from kf_calib.errors import BenchError, InputError
-from kf_calib.sources.files.bags import files_of
 from kf_calib.sources.files.cdr import CdrError, Decoder
 from kf_calib.sources.files.contents import (
     BENCH_RECORD,
@@ -33,18 +31,25 @@ from kf_calib.sources.files.contents import (
     TEMPERATURES,
     USABLE_SCHEMAS,
     Contents,
-    Parts,
+    RecordingParts,
     Role,
     fields_by_role,
 )
 from kf_calib.sources.files.field_messages import FieldDecoder
 from kf_calib.sources.files.fields import FieldError
 from kf_calib.sources.files.joints import Joints
-from kf_calib.sources.files.mcap_chunks import MAX_CHUNK_MB, DamagedError, parse
 from kf_calib.sources.files.mcap_file import Warn
-from kf_calib.sources.files.mcap_messages import MessageFinder, Messages, RecordBlock
-from kf_calib.sources.files.packed_messages import are_packed, unpacked
-from kf_calib.sources.files.record_files import RecordFile, open_record_file
+from kf_calib.sources.files.mcap_records import (
+    MAX_CHUNK_MB,
+    DamagedError,
+    MessageFinder,
+    Messages,
+    RecordBlock,
+    are_packed,
+    parse_record,
+    unpacked,
+)
+from kf_calib.sources.files.record_files import RecordFile, files_of, open_record_file
 from kf_calib.support import dates
 
 _MOST_DAMAGES = 100  # told one by one; a file can be made that has a million
@@ -99,7 +104,7 @@ class Recording:
         self._limit = int(max_chunk_mb * (1 << 20))
         usable = USABLE_SCHEMAS | {stated.topic for stated in self._stated.values()}
         files = [open_record_file(file, self._limit, usable) for file in files_of(self.path)]
-        self._parts = Parts(self.path, files)
+        self._parts = RecordingParts(self.path, files)
         self.warnings = [file.trouble for file in self._parts.files if file.trouble]
         self._parts.contents = [self._survey(file) for file in self._parts.files]
         self._accel = self._require(
@@ -275,7 +280,7 @@ def _look_up_bench(file: RecordFile, contents: Contents, position: int) -> None:
 class _Decoders:
     """What reads the messages of a recording's topics, in all of its files."""
 
-    parts: Parts
+    parts: RecordingParts
     pose_width: int
     joints: Joints
     warn: Warn
@@ -390,7 +395,7 @@ def _mark(opcode: int, content: bytes) -> list[Metadata]:
     if opcode != Opcode.METADATA:
         return []
     try:
-        record = parse(Metadata.read, content)
+        record = parse_record(Metadata.read, content)
     except DamagedError:  # told already
         return []
     return [record] if record.name in (*_MARKS, RUN_RECORD) else []

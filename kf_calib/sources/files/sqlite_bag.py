@@ -1,14 +1,22 @@
 """A file of a ROS 2 bag in SQLite (.db3), given out as blocks of MCAP records.
 
 It has two tables: topics (name, type) and messages (topic, time of receipt, bytes). Messages are taken in the order in
-which they were written. Where the file is damaged, the messages around the damage are lost and told, the rest is used.
+which they were written. Where the file is damaged, the messages around the damage are lost and told, the rest is used:
+where a query fails, fewer rows are fetched, until it is one that fails, and that one is passed over. Where not even its
+number can be read, as many are passed over as are fetched at a time, and ever more if that goes on: numbers may reach
+to 2^63, and reading has to end.
+
+Anybody may have made the file, and a few kB can hold a view that never ends, a column that is computed and fills the
+memory, or pages that lead to each other. So only real tables are read, no value is longer than the file, and the steps
+of the queries are counted.
 """
 
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +26,8 @@ from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
 from kf_calib.errors import InputError
-from kf_calib.sources.files.mcap_chunks import DamagedError
 from kf_calib.sources.files.mcap_file import Warn
-from kf_calib.sources.files.mcap_messages import MESSAGE_FIELDS, MESSAGE_RECORD, RecordBlock
-from kf_calib.sources.files.mcap_summary import Summary
-from kf_calib.sources.files.sqlite_base import FAILURES, NoBagError, connect, refuse_unreal, size_of, words_of
-from kf_calib.sources.files.sqlite_rows import ROWS, MessageRows, Row
+from kf_calib.sources.files.mcap_records import MESSAGE_FIELDS, MESSAGE_RECORD, DamagedError, RecordBlock, Summary
 
 _MOST_TOPICS, _MOST_DEFINITION_BYTES = 2000, 1 << 24
 _LATEST = (1 << 63) - 1
@@ -52,7 +56,7 @@ class SqliteBag:
                 first, last = base.execute(ends).fetchone()
         except (*FAILURES, NoBagError) as error:
             raise InputError(
-                f"{path} is an SQLite file but cannot be read as a ROS 2 bag ({words_of(error)}): give a bag's .db3 "
+                f"{path} is an SQLite file but cannot be read as a ROS 2 bag ({error_text(error)}): give a bag's .db3 "
                 f"file; a damaged one may be mended by `sqlite3 {path} .recover | sqlite3 mended.db3`."
             ) from None
         self._first, self._last = (0, -1) if first is None else (first, last)
@@ -99,7 +103,7 @@ class SqliteBag:
                     for channel in np.unique(table[table[:, 0] > 0, 0]).tolist():
                         yield channel, table[table[:, 0] == channel, 1]
         except FAILURES as error:
-            warn(f"{self.path} is damaged ({words_of(error)}): what lies behind that is not counted.")
+            warn(f"{self.path} is damaged ({error_text(error)}): what lies behind that is not counted.")
         if strangers:
             warn(f"{self.path}: {strangers} messages are of no topic that it lists, and left out.")
 
@@ -127,7 +131,7 @@ class SqliteBag:
         own = zip(self._topics, self.summary.schemas, self.summary.channels, strict=True)
         return [topic for topic, schema, channel in own if {schema.name, channel.topic} & self._usable]
 
-    def _block(self, rows: list[Row], after: int) -> RecordBlock:
+    def _block(self, rows: list[MessageRow], after: int) -> RecordBlock:
         records = list[bytes]()
         for _, topic, stamp, message in rows:
             time_ns = min(max(stamp or 0, 0), _LATEST)
@@ -160,3 +164,166 @@ def _within(cursor: sqlite3.Cursor) -> Iterator[tuple[Any, ...]]:
         if size > _MOST_DEFINITION_BYTES:
             raise sqlite3.DatabaseError("its topics are longer than those of any bag")
         yield row
+
+
+_STEPS, _STEPS_PER_BYTE = 100_000_000, 20  # of SQLite's machine; a row takes some ten, and at least some bytes
+_COUNTED = 10_000  # steps at a time
+
+
+FAILURES = (sqlite3.Error, UnicodeError, MemoryError)
+"""What a damaged file makes queries raise; a message that quotes it may be no text, and a size of it anything."""
+
+
+class NoBagError(Exception):
+    """The file has not the tables that are sought."""
+
+
+def size_of(place: Path) -> int:
+    """Bytes of the file, and of what was written to it last and lies beside it."""
+    beside = _log_of(place)
+    return place.stat().st_size + (beside.stat().st_size if beside.exists() else 0)
+
+
+def connect(place: Path, longest: int) -> sqlite3.Connection:
+    """The file, read-only; longest: bytes of one value, and more is an error."""
+    # A bag that was closed has no journal, and is then read without one: the folder may be write-protected.
+    closed = not _log_of(place).exists()
+    base = sqlite3.connect(
+        f"{place.absolute().as_uri()}?mode=ro{'&immutable=1' * closed}", uri=True, check_same_thread=False
+    )
+    base.text_factory = lambda text: text.decode(errors="replace")
+    base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(min(longest, size_of(place)), 4096))
+    base.set_progress_handler(_Steps(_STEPS + _STEPS_PER_BYTE * size_of(place)), _COUNTED)
+    base.execute("PRAGMA trusted_schema = OFF")
+    return base
+
+
+def refuse_unreal(base: sqlite3.Connection, table: str) -> None:
+    """Raise NoBagError unless a table holds rows of its own: it may be a view, or compute what it gives."""
+    kinds = base.execute(
+        "SELECT type, lower(substr(sql, 1, 14)) FROM sqlite_master WHERE lower(name) = ?", (table,)
+    ).fetchall()
+    if not kinds:
+        raise NoBagError(f"it has no table {table}")
+    if [kind for kind, _ in kinds] != ["table"] or kinds[0][1] == "create virtual":
+        raise NoBagError(f"its {table} are no table but computed")
+    columns = base.execute("SELECT lower(name), hidden FROM pragma_table_xinfo(?)", (table,)).fetchall()
+    if any(hidden for _, hidden in columns) or "rowid" in dict(columns):
+        raise NoBagError(f"its table {table} has columns that are computed")
+
+
+def error_text(error: Exception) -> str:
+    """What is wrong, in words."""
+    if getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_INTERRUPT:
+        return "reading it takes more steps than a file of its size needs"
+    return str(error)
+
+
+def is_over(error: Exception) -> bool:
+    """Whether nothing more can be read after this error, as all steps are used up."""
+    return getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_INTERRUPT
+
+
+class _Steps:
+    """Counts steps down; SQLite ends a query where the answer is 1."""
+
+    def __init__(self, steps: int) -> None:
+        self._left = steps
+
+    def __call__(self) -> int:
+        self._left -= _COUNTED
+        return int(self._left < 0)
+
+
+def _log_of(place: Path) -> Path:
+    """Where SQLite writes before it writes to the file."""
+    return place.with_name(f"{place.name}-wal")
+
+
+ROWS = 4096
+"""Messages fetched at a time."""
+_FEWER = 16  # of how many times fewer the damaged one is looked for
+_BLOCK_BYTES = 1 << 26  # of messages that are given out at a time
+_MOST_FAILURES, _STEADY = 200, 8  # failures in all; on end, after which ever more is passed over
+_BYTES = "CASE WHEN typeof(data) IN ('blob', 'text') THEN CAST(data AS BLOB) END"
+MessageRow = tuple[int, Any, int, bytes]
+"""Number, topic, time of receipt, message."""
+
+
+@dataclass
+class MessageRows:
+    """Iterating gives rows of the topics ``wanted``, and the number up to which the table has been read then.
+
+    first, last: numbers of the first and the last message. size: bytes of the file. why: the first thing that failed.
+    lost: messages that could not be read, at most. empty: messages without content, which are left out.
+    """
+
+    base: sqlite3.Connection
+    wanted: Sequence[Any]
+    first: int
+    last: int
+    size: int
+    why: str = ""
+    lost: int = 0
+    empty: int = 0
+    _on_end: int = 0  # failures one after the other
+
+    def __iter__(self) -> Iterator[tuple[list[MessageRow], int]]:
+        start, count, read, failures = self.first, ROWS, 0, 0
+        while start <= self.last and read <= self.size and failures < _MOST_FAILURES:
+            try:
+                rows, is_last = self._page(start, count)
+            except FAILURES as error:
+                if is_over(error):
+                    self.why = self.why or error_text(error)
+                    break
+                if count == 1:
+                    self.why, failures = self.why or error_text(error), failures + 1
+                    start, count = self._behind(start)
+                else:
+                    count = max(count // _FEWER, 1)
+                continue
+            full = [row for row in rows if row[3]]
+            self.empty += len(rows) - len(full)
+            read += sum(len(row[3]) for row in full)
+            start = self.last + 1 if is_last else rows[-1][0] + 1
+            count, self._on_end = min(count * _FEWER, ROWS), 0
+            yield full, start - 1
+        if start <= self.last:
+            self.why = self.why or "its messages are longer than the file"
+            self.lost += self.last - start + 1
+
+    def _page(self, start: int, count: int) -> tuple[list[MessageRow], bool]:
+        """The next rows, some MB of them at most, and whether they are the last. Raises sqlite3.Error."""
+        rows, size = list[MessageRow](), 0
+        columns = f"rowid, topic_id, CAST(timestamp AS INTEGER), {_BYTES}"
+        with closing(self._query(columns, start, count)) as cursor:
+            for row in cursor:
+                if row[0] < (rows[-1][0] + 1 if rows else start):
+                    raise sqlite3.DatabaseError("its rows are out of order")
+                rows.append(row)
+                size += len(row[3] or b"")
+                if size > _BLOCK_BYTES:
+                    return rows, False
+        return rows, len(rows) < count
+
+    def _behind(self, start: int) -> tuple[int, int]:
+        """Where to go on behind the next row, which cannot be read, and with how many rows at a time."""
+        try:
+            row = self._query("rowid", start, 1).fetchone()
+        except FAILURES:
+            row = None
+        if row and row[0] >= start:
+            self._on_end, self.lost = 0, self.lost + 1
+            return row[0] + 1, 1
+        self._on_end += 1
+        step = ROWS << max(self._on_end - _STEADY, 0)
+        self.lost += min(step, self.last - start + 1)
+        return start + step, ROWS
+
+    def _query(self, columns: str, start: int, count: int) -> sqlite3.Cursor:
+        places = ",".join("?" * len(self.wanted))  # +: by number, never by an index, after which they would be sorted
+        return self.base.execute(
+            f"SELECT {columns} FROM messages WHERE rowid >= ? AND +topic_id IN ({places}) ORDER BY rowid LIMIT {count}",
+            (start, *self.wanted),
+        )

@@ -8,8 +8,8 @@ Reader and worker are threads of their own, so that neither a slow consumer nor 
 taken in. See docs/live.md for the URLs and what a bench has to send.
 """
 
+from kf_calib.sources.live.feed import Status
 from kf_calib.sources.live.opening import files_of, open_live
 from kf_calib.sources.live.source import LiveSource
-from kf_calib.sources.live.status import Status
 
 __all__ = ["LiveSource", "Status", "files_of", "open_live"]

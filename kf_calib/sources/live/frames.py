@@ -27,9 +27,9 @@ from kf_calib.bench.raw_input import RawInput
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.sources.files.line_parts import Account
 
-VERSION = 1
+FRAME_VERSION = 1
 BENCH, ACCEL, ANGLES, ATTITUDE, TEMPERATURE = b"BAGQT"
-HEAD = struct.Struct("<BBHIq")  # kind, version, reserved, number, time_ns
+FRAME_HEAD = struct.Struct("<BBHIq")  # kind, version, reserved, number, time_ns
 _CRC = struct.Struct("<I")
 _LONGEST = 1 << 16  # bytes of a frame; one of samples has 254 at most
 _SHORT = 254  # up to this many bytes COBS adds one byte and no more
@@ -51,7 +51,7 @@ class _Found:
 
 def encode(kind: int, number: int, time_ns: int, content: bytes) -> bytes:
     """One frame, with the zero byte that ends it."""
-    body = HEAD.pack(kind, VERSION, 0, number & 0xFFFFFFFF, time_ns) + content
+    body = FRAME_HEAD.pack(kind, FRAME_VERSION, 0, number & 0xFFFFFFFF, time_ns) + content
     return cobs(body + _CRC.pack(zlib.crc32(body))) + b"\0"
 
 
@@ -147,11 +147,11 @@ class FrameReader:
     def _settle(self, frames: list[bytes]) -> None:
         """Learns from the first pose of all what poses are: below, frames are read by their lengths."""
         for frame in frames:
-            if not (HEAD.size < len(frame) <= _SHORT + 1 and frame[0] > 1 and frame[1] in (ANGLES, ATTITUDE)):
+            if not (FRAME_HEAD.size < len(frame) <= _SHORT + 1 and frame[0] > 1 and frame[1] in (ANGLES, ATTITUDE)):
                 continue
             body = _sound_body(frame)
-            size = len(body) - HEAD.size - _CRC.size if body else 0
-            if body and body[1] == VERSION and size and size % 8 == 0 and (frame[1] == ANGLES or size == 32):
+            size = len(body) - FRAME_HEAD.size - _CRC.size if body else 0
+            if body and body[1] == FRAME_VERSION and size and size % 8 == 0 and (frame[1] == ANGLES or size == 32):
                 self.has_angles, self.pose_width = frame[1] == ANGLES, size // 8
                 return
 
@@ -165,7 +165,7 @@ class FrameReader:
             if length > _SHORT + 1:
                 for i in at.tolist():
                     self._read_long(frames[i], first + i)
-            elif length > HEAD.size + _CRC.size:
+            elif length > FRAME_HEAD.size + _CRC.size:
                 table = np.frombuffer(b"".join([frames[i] for i in at.tolist()]), np.uint8).reshape(-1, length)
                 samples += self._read_alike(table, first + at)
             else:
@@ -185,8 +185,8 @@ class FrameReader:
         self._refuse(places[~sound], "its checksum does not fit")
         for kind in np.unique(bodies[sound, 0]).tolist():
             of_kind = sound & (bodies[:, 0] == kind)
-            heads = np.frombuffer(np.ascontiguousarray(bodies[of_kind, : HEAD.size]).tobytes(), _HEADS)
-            contents = np.ascontiguousarray(bodies[of_kind, HEAD.size : size])
+            heads = np.frombuffer(np.ascontiguousarray(bodies[of_kind, : FRAME_HEAD.size]).tobytes(), _HEADS)
+            contents = np.ascontiguousarray(bodies[of_kind, FRAME_HEAD.size : size])
             if kind == BENCH:
                 for content, place in zip(contents, places[of_kind].tolist(), strict=True):
                     self._learn(content.tobytes(), place)
@@ -206,8 +206,8 @@ class FrameReader:
 
     def _misfit(self, kind: int, size: int, heads: NDArray[np.void]) -> str | None:
         """Why frames of this kind with so many bytes of values cannot be used."""
-        if (heads["version"] != VERSION).any():
-            return f"it is not of version {VERSION}"
+        if (heads["version"] != FRAME_VERSION).any():
+            return f"it is not of version {FRAME_VERSION}"
         if not size:
             return "it has no values"
         if kind == ATTITUDE and size != 32:
@@ -222,9 +222,9 @@ class FrameReader:
         if body is None:
             self._account.refuse(place, "its checksum does not fit")
         elif body[0] != BENCH:
-            self._account.refuse(place, f"it has {len(body) - HEAD.size - 4} bytes of values")
+            self._account.refuse(place, f"it has {len(body) - FRAME_HEAD.size - 4} bytes of values")
         else:
-            self._learn(body[HEAD.size : -4], place)
+            self._learn(body[FRAME_HEAD.size : -4], place)
 
     def _learn(self, text: bytes, place: int) -> None:
         try:
@@ -251,7 +251,7 @@ class FrameReader:
 def _sound_body(frame: bytes) -> bytes | None:
     """A frame decoded, with its checksum; None where that does not fit."""
     body = uncobs(frame)
-    if body is None or len(body) < HEAD.size + _CRC.size or _CRC.unpack(body[-4:])[0] != zlib.crc32(body[:-4]):
+    if body is None or len(body) < FRAME_HEAD.size + _CRC.size or _CRC.unpack(body[-4:])[0] != zlib.crc32(body[:-4]):
         return None
     return body
 

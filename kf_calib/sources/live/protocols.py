@@ -8,11 +8,10 @@ from collections.abc import Mapping
 from kf_calib.bench.streams import Batch
 from kf_calib.errors import InputError
 from kf_calib.sources.files.csv_columns import CsvColumns
-from kf_calib.sources.files.csv_heading import Heading
-from kf_calib.sources.files.csv_lines import CsvLines
-from kf_calib.sources.files.json_lines import JsonLines
+from kf_calib.sources.files.csv_heading import CsvHeading
 from kf_calib.sources.files.line_parts import Account, LineReader
 from kf_calib.sources.files.lines import Cutter
+from kf_calib.sources.files.sample_lines import CsvLines, JsonLines
 from kf_calib.sources.live.feed import nothing
 from kf_calib.sources.live.frames import FrameReader
 from kf_calib.sources.units import Units
@@ -93,7 +92,7 @@ class LineProtocol:
         return []
 
     def _csv(self, header: str, account: Account, angles: bool) -> CsvLines:
-        return CsvLines(CsvColumns.of(Heading.of([header]), self._columns, self._units), account, angles)
+        return CsvLines(CsvColumns.of(CsvHeading.of([header]), self._columns, self._units), account, angles)
 
     def _has_readings(self, header: str) -> bool:
         """Whether a header lacks nothing but angles."""

@@ -7,8 +7,7 @@ import time
 from collections.abc import Iterator
 
 from kf_calib.bench.bench import Bench
-from kf_calib.bench.gravity_alone import bench_without_angles, without_poses
-from kf_calib.bench.streams import Batch
+from kf_calib.bench.streams import Batch, bench_without_angles, without_poses
 from kf_calib.sources.live.feed import Feed, nothing
 from kf_calib.sources.simulation.simulator import Simulation
 

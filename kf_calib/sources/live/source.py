@@ -17,10 +17,8 @@ from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.sources.files.recorder import Recorder
 from kf_calib.sources.files.recording import CLOCK_RECORD, GAP_RECORD, RUN_RECORD
-from kf_calib.sources.live.clock import Clock, Restart
-from kf_calib.sources.live.continuity import Continuity
-from kf_calib.sources.live.feed import Feed, Lost, Regained
-from kf_calib.sources.live.status import Status
+from kf_calib.sources.live.clock import Clock, Continuity, Restart
+from kf_calib.sources.live.feed import Feed, Lost, Regained, Status
 from kf_calib.support import dates
 from kf_calib.support.output_files import refuse_output
 

@@ -11,9 +11,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from kf_calib.bench.bench import Bench
-from kf_calib.bench.gravity_alone import bench_without_angles, without_poses
 from kf_calib.bench.raw_input import PLAIN
-from kf_calib.bench.streams import Batch, Stream, with_accel
+from kf_calib.bench.streams import Batch, Stream, bench_without_angles, with_accel, without_poses
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.files.lines import Described, bench_of, stated_of
 from kf_calib.sources.live.feed import IDLE_S, Feed, Lost, Regained, nothing

@@ -22,9 +22,13 @@ at twice its frequency, where no reading tells it from a vibration that is not q
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +37,8 @@ from kf_calib.errors import InputError
 from kf_calib.sources.simulation.injected.kinds import Hidden, NoSizeError
 from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.sensors import Sensors
-from kf_calib.sources.simulation.simulator import Simulation
+from kf_calib.sources.simulation.simulator import Simulation, without_angles
+from kf_calib.support.output_files import write_whole
 
 _SETTLE_NS, _LEAD_NS = 1_000_000_000, 250_000_000
 _SEEN = 1e-6  # of the effect before projection; below it is what absorbing leaves by rounding
@@ -186,3 +191,34 @@ def _beside_rotations(
     nuisances = np.vstack([turning, np.eye(3) / setting_rad])
     complement = np.linalg.qr(nuisances, mode="complete")[0][:, 3:]
     return np.asarray(complement[:3].T @ rows, float)
+
+
+def truth_file(recording: Path) -> Path:
+    """The side file with the truth of ``NAME.mcap``: ``NAME.truth.json``."""
+    return recording.parent / f"{recording.stem}.truth.json"
+
+
+def truth_of(simulation: Simulation, angles: bool = True) -> dict[str, Any]:
+    """Parameters by symbol (rad, 1, m/s^2), noise, seed, effects.
+
+    ``size_sigma`` of an effect is worked out by further runs (``detectability``), for a recording with ``angles`` or
+    without; None where it is not seen.
+    """
+    sizes = sizes_in_sigma(simulation if angles else without_angles(simulation), simulation.hidden)
+    at_end = simulation.parameters_at_end()
+    return {
+        "grade": simulation.grade,
+        "seed": simulation.seed,
+        "parameters": dict(simulation.sensors.parameters),
+        **({} if at_end is None else {"parameters_at_end": at_end}),
+        "noise": asdict(simulation.noise),
+        "ambient": asdict(simulation.ambient),
+        "effects": [effect.truth | {"size_sigma": n} for effect, n in zip(simulation.hidden, sizes, strict=True)],
+    }
+
+
+def write_truth(simulation: Simulation, recording: str | PathLike[str], angles: bool = True) -> Path:
+    """Writes ``NAME.truth.json`` beside the recording ``NAME.mcap``; returns its path. Raises InputError."""
+    path = truth_file(Path(recording))
+    write_whole(path, (json.dumps(truth_of(simulation, angles), indent=2) + "\n").encode())
+    return path

@@ -22,7 +22,7 @@ from kf_calib.bench.streams import Batch
 from kf_calib.errors import InputError, check_number
 from kf_calib.sources.simulation.gimbal_motion import Motion, between
 from kf_calib.sources.simulation.noise_processes import generator
-from kf_calib.sources.simulation.physics import State
+from kf_calib.sources.simulation.physics import TrueState
 from kf_calib.sources.simulation.simulator import Simulation
 
 FAULTS = ("stuck", "stall", "off", "drive", "link", "readback", "runaway")
@@ -184,7 +184,7 @@ class DrivenMotion(Motion):
         self.play_deg[-1] = play_deg
         self.angles_rad[-1] = self.angles_at(np.array([end_ns]))[0]
 
-    def trail(self, state: State) -> None:
+    def trail(self, state: TrueState) -> None:
         """The step that lets the platform trail behind the encoders."""
         if self.servo.backlash_deg:
             play = np.radians(self.play_deg)

@@ -74,7 +74,7 @@ class TrueNoise:
             step = self.walk_mps2_per_sqrt_s * math.sqrt(period_s)
             processes.append(FirstOrder(generator(seed, "walk"), 1.0, step, 0.0))
         if self.outlier_rate and self.outlier_mps2:
-            processes.append(Outliers(generator(seed, "outliers"), self.outlier_rate, self.outlier_mps2))
+            processes.append(OutlierProcess(generator(seed, "outliers"), self.outlier_rate, self.outlier_mps2))
         return processes
 
 
@@ -95,7 +95,7 @@ class FirstOrder:
         return values
 
 
-class Outliers:
+class OutlierProcess:
     """Jumps by ``size_mps2``, either sign, of single readings with probability ``rate``."""
 
     def __init__(self, rng: np.random.Generator, rate: float, size_mps2: float) -> None:

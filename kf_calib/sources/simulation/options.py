@@ -12,13 +12,12 @@ from urllib.parse import parse_qsl
 
 from kf_calib.bench.bench import Bench, Vector, parse_axes
 from kf_calib.errors import InputError
-from kf_calib.sources.simulation.by_hand import without_angles
 from kf_calib.sources.simulation.detectability import sized
 from kf_calib.sources.simulation.injected import parse
 from kf_calib.sources.simulation.physics import Ambient
 from kf_calib.sources.simulation.sensors import GRADES
-from kf_calib.sources.simulation.simulator import Simulation
-from kf_calib.sources.simulation.visit_plans import Visit, angles_from_csv, explicit_plan, six_faces, spread_plan
+from kf_calib.sources.simulation.simulator import Simulation, without_angles
+from kf_calib.sources.simulation.visit_plans import PlannedVisit, angles_from_csv, explicit_plan, six_faces, spread_plan
 
 DEFAULTS: Mapping[str, Any] = MappingProxyType(
     {
@@ -87,7 +86,7 @@ def simulation(
     )
 
 
-def _visits(options: Mapping[str, Any], axes: tuple[Vector, ...], up: str) -> list[Visit]:
+def _visits(options: Mapping[str, Any], axes: tuple[Vector, ...], up: str) -> list[PlannedVisit]:
     if options["plan"] == "spread":
         return spread_plan(options["count"], axes, options["dwell_s"], options["seed"], up)
     if options["plan"] == "faces":

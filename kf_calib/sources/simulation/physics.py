@@ -1,8 +1,8 @@
 """What is true of the simulated bench, and the steps that make it so.
 
-A ``State`` goes through steps in three groups: the platform (angles -> attitude -> specific force), the response of the
-accelerometers (specific force -> input acceleration -> readings), and the recording (noise). They share no formula with
-the estimator. Hidden effects (``injected``) are further steps between these.
+A ``TrueState`` goes through steps in three groups: the platform (angles -> attitude -> specific force), the response
+of the accelerometers (specific force -> input acceleration -> readings), and the recording (noise). They share no
+formula with the estimator. Hidden effects (``injected``) are further steps between these.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Ambient:
 
 
 @dataclass
-class State:
+class TrueState:
     """What is true of n consecutive samples that lie within one dwell, or within one slew.
 
     Arrays have n rows, or one where a quantity is constant over the stretch: they broadcast. ``dwell`` is the one the
@@ -96,8 +96,8 @@ class State:
         return between(values, np.full(len(self.share), self.dwell), self.share)
 
 
-Step = Callable[[State], None]
-"""One part of the bench: changes what is true in a ``State``. It may remember what went before."""
+TrueStep = Callable[[TrueState], None]
+"""One part of the bench: changes what is true in a ``TrueState``. It may remember what went before."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Gimbals:
 
     up: str
 
-    def __call__(self, state: State) -> None:
+    def __call__(self, state: TrueState) -> None:
         state.attitude = attitude(state.axes, state.angles_rad, self.up)
 
 
@@ -116,7 +116,7 @@ class SettingError:
 
     rotation_rad: Floats
 
-    def __call__(self, state: State) -> None:
+    def __call__(self, state: TrueState) -> None:
         state.attitude = state.attitude * Rotation.from_rotvec(state.of_dwells(self.rotation_rad))
 
 
@@ -127,7 +127,7 @@ class Gravity:
 
     bench: Bench
 
-    def __call__(self, state: State) -> None:
+    def __call__(self, state: TrueState) -> None:
         up = carried_by_earth(self.bench, np.array([[0.0, self.bench.gravity_mps2, 0.0]]), state.time_s)
         state.force_mps2 = rotate(state.attitude.inv(), up)
 
@@ -159,7 +159,7 @@ class Inputs:
 
     sensors: Sensors
 
-    def __call__(self, state: State) -> None:
+    def __call__(self, state: TrueState) -> None:
         state.input_mps2 = along(state.force_mps2, self.sensors.input_axes)
 
 
@@ -182,7 +182,7 @@ class Response:
 
     sensors: Sensors
 
-    def __call__(self, state: State) -> None:
+    def __call__(self, state: TrueState) -> None:
         state.reading_mps2 = self.sensors.scales * state.input_mps2 + self.sensors.biases_mps2
 
 
@@ -192,7 +192,7 @@ class Scatter:
 
     offset_mps2: Floats
 
-    def __call__(self, state: State) -> None:
+    def __call__(self, state: TrueState) -> None:
         state.reading_mps2 = state.reading_mps2 + state.of_dwells(self.offset_mps2)
 
 
@@ -203,10 +203,10 @@ class Disturbance:
     process: Process
     when_moving: bool = False
 
-    def __call__(self, state: State) -> None:
+    def __call__(self, state: TrueState) -> None:
         if state.moving or not self.when_moving:
             state.reading_mps2 = state.reading_mps2 + self.process(len(state.time_s))
 
 
-class BiasWalk(Disturbance):
+class WalkingBias(Disturbance):
     """One that moves the biases: where it ends, they are then."""

@@ -17,7 +17,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.errors import InputError
 from kf_calib.sources.simulation.noise_processes import TrueNoise, generator
 
-SYMBOLS = ("theta1", "phi1", "K1", "b1", "nu1", "nu2", "K2", "b2", "theta3", "phi3", "K3", "b3")
+SENSOR_SYMBOLS = ("theta1", "phi1", "K1", "b1", "nu1", "nu2", "K2", "b2", "theta3", "phi3", "K3", "b3")
 NOMINAL: Mapping[str, float] = {
     "theta1": math.radians(0.5), "phi1": 0.0, "K1": 1.0, "b1": 0.0,
     "nu1": 0.0, "nu2": 0.0, "K2": 1.0, "b2": 0.0,
@@ -33,9 +33,9 @@ class Sensors:
     parameters: Mapping[str, float] = field(default_factory=dict[str, float])
 
     def __post_init__(self) -> None:
-        unknown = sorted(set(self.parameters) - set(SYMBOLS))
+        unknown = sorted(set(self.parameters) - set(SENSOR_SYMBOLS))
         if unknown:
-            raise InputError(f"{unknown[0]!r} is no parameter of the accelerometers: use {', '.join(SYMBOLS)}.")
+            raise InputError(f"{unknown[0]!r} is no parameter of the accelerometers: use {', '.join(SENSOR_SYMBOLS)}.")
         object.__setattr__(self, "parameters", {**NOMINAL, **self.parameters})
 
     @property
@@ -71,7 +71,7 @@ def _raised_and_turned(theta_rad: float, phi_rad: float) -> Floats:
 
 
 @dataclass(frozen=True)
-class Grade:
+class SimulatedGrade:
     """What sensors of one grade are like: deviations from nominal, 1 sigma of a normal law, and noise.
 
     fixed: every deviation is exactly the figure given, as in the paper's Table 1.
@@ -87,14 +87,14 @@ class Grade:
         """The sensors of this grade drawn with ``seed``."""
         draws = np.ones(12) if self.fixed else generator(seed, "sensors").standard_normal(12)
         sizes = (self.angle_rad, self.angle_rad, self.scale, self.bias_mps2) * 3
-        pairs = zip(SYMBOLS, sizes * draws, strict=True)
+        pairs = zip(SENSOR_SYMBOLS, sizes * draws, strict=True)
         return Sensors({symbol: NOMINAL[symbol] + float(deviation) for symbol, deviation in pairs})
 
 
-GRADES: Mapping[str, Grade] = {
-    "paper": Grade(math.radians(30 / 3600), 5e-5, 5e-5, TrueNoise(white_mps2=1e-4), fixed=True),
-    "navigation": Grade(1e-3, 3e-4, 1e-3, TrueNoise(white_mps2=5e-5, vibration_mps2=5e-3)),
-    "mems": Grade(math.radians(3.0), 0.05, 0.5, TrueNoise(white_mps2=0.02, vibration_mps2=0.05)),
+GRADES: Mapping[str, SimulatedGrade] = {
+    "paper": SimulatedGrade(math.radians(30 / 3600), 5e-5, 5e-5, TrueNoise(white_mps2=1e-4), fixed=True),
+    "navigation": SimulatedGrade(1e-3, 3e-4, 1e-3, TrueNoise(white_mps2=5e-5, vibration_mps2=5e-3)),
+    "mems": SimulatedGrade(math.radians(3.0), 0.05, 0.5, TrueNoise(white_mps2=0.02, vibration_mps2=0.05)),
 }
 """The paper's Table 1; a quartz-flexure accelerometer (100 ug, 300 ppm, 1 mrad); a consumer chip (50 mg, 5 %, 3 deg).
 The noise is what every reading has; flicker, scatter and the positioner's errors are a run's: ``replace`` adds them.

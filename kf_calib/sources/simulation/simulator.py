@@ -11,7 +11,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, pairwise
 
 import numpy as np
@@ -25,7 +25,6 @@ from kf_calib.sources.simulation.injected import Hidden, Rig, Stage, steps_of
 from kf_calib.sources.simulation.noise_processes import TrueNoise, generator
 from kf_calib.sources.simulation.physics import (
     Ambient,
-    BiasWalk,
     Disturbance,
     Gimbals,
     Gravity,
@@ -33,11 +32,12 @@ from kf_calib.sources.simulation.physics import (
     Response,
     Scatter,
     SettingError,
-    State,
-    Step,
+    TrueState,
+    TrueStep,
+    WalkingBias,
 )
 from kf_calib.sources.simulation.sensors import Sensors
-from kf_calib.sources.simulation.visit_plans import YZX, Visit, stays
+from kf_calib.sources.simulation.visit_plans import YZX, PlannedVisit, stays
 
 START_NS = 1_750_000_000_000_000_000
 """Stamp of the first sample: 15 June 2025, 15:06:40 UTC."""
@@ -62,7 +62,7 @@ class Simulation:
         bench: Bench,
         sensors: Sensors,
         noise: TrueNoise,
-        plan: Sequence[Visit],
+        plan: Sequence[PlannedVisit],
         *,
         sample_hz: float = 100.0,
         angle_hz: float = 10.0,
@@ -78,7 +78,7 @@ class Simulation:
         self.hidden = tuple(hidden)
         self.warnings = list[str]()
         self.fraction = 0.0
-        self._further: tuple[Step, ...] = ()
+        self._further: tuple[TrueStep, ...] = ()
         self._axes = bench.axes or YZX
         _refuse_impossible(self.plan, len(self._axes), sample_hz, angle_hz, slew_rate_degps, batch_samples)
         angles_rad = np.radians([visit.gimbal_deg for visit in self.plan])
@@ -133,7 +133,7 @@ class Simulation:
         """Number of the first reading at or after a time since the first one."""
         return self._accel.first_at(time_ns)
 
-    def moved_by(self, motion: Motion, most_dwells: int, platform: Step) -> Simulation:
+    def moved_by(self, motion: Motion, most_dwells: int, platform: TrueStep) -> Simulation:
         """The same bench whose platform moves otherwise, and goes through a further step before its hidden effects.
 
         motion: may go on while readings are made. most_dwells: for which what differs from dwell to dwell is drawn.
@@ -155,7 +155,7 @@ class Simulation:
         rig, noise = self._rig, TrueNoise(walk_mps2_per_sqrt_s=self.noise.walk_mps2_per_sqrt_s)
         processes = noise.processes(self.seed, rig.period_s, rig.duration_s)
         hidden = chain.from_iterable(self._hidden_steps().values())
-        processes += [step.process for step in hidden if isinstance(step, BiasWalk)]
+        processes += [step.process for step in hidden if isinstance(step, WalkingBias)]
         if not processes:
             return None
         counts = [min(self._batch_samples, len(self) - first) for first in range(0, len(self), self._batch_samples)]
@@ -165,16 +165,16 @@ class Simulation:
             there[f"b{k}"] += walked
         return there
 
-    def _steps(self) -> list[Step]:
+    def _steps(self) -> list[TrueStep]:
         """The chain, fresh from its start."""
         hidden = self._hidden_steps()
-        turned: list[Step] = [*self._further, *hidden["angles"]]
-        platform: list[Step] = [*turned, Gimbals(self.bench.up), *hidden["attitude"], *self._setting_steps()]
-        response: list[Step] = [Inputs(self.sensors), *hidden["input"], Response(self.sensors), *hidden["reading"]]
-        force: list[Step] = [Gravity(self.bench), *hidden["force"]]
+        turned: list[TrueStep] = [*self._further, *hidden["angles"]]
+        platform: list[TrueStep] = [*turned, Gimbals(self.bench.up), *hidden["attitude"], *self._setting_steps()]
+        response: list[TrueStep] = [Inputs(self.sensors), *hidden["input"], Response(self.sensors), *hidden["reading"]]
+        force: list[TrueStep] = [Gravity(self.bench), *hidden["force"]]
         return [*platform, *force, *response, *self._noise_steps(), *hidden["record"]]
 
-    def _hidden_steps(self) -> dict[Stage, list[Step]]:
+    def _hidden_steps(self) -> dict[Stage, list[TrueStep]]:
         return steps_of(self.hidden, self._rig)
 
     @property
@@ -182,15 +182,15 @@ class Simulation:
         period_s = self._accel.period_ns * 1e-9
         return Rig(self.bench, self._axes, self.sensors, self.motion, period_s, len(self) * period_s, self.seed)
 
-    def _setting_steps(self) -> list[Step]:
+    def _setting_steps(self) -> list[TrueStep]:
         if not self.noise.setting_sigma_deg:
             return []
         return [SettingError(self._drawn_per_dwell("setting", math.radians(self.noise.setting_sigma_deg)))]
 
-    def _noise_steps(self) -> list[Step]:
+    def _noise_steps(self) -> list[TrueStep]:
         noise, period_s = self.noise, self._accel.period_ns * 1e-9
         processes = noise.processes(self.seed, period_s, len(self) * period_s)
-        steps: list[Step] = [Disturbance(process) for process in processes]
+        steps: list[TrueStep] = [Disturbance(process) for process in processes]
         if noise.scatter_mps2:
             steps.append(Scatter(self._drawn_per_dwell("scatter", noise.scatter_mps2)))
         if noise.vibration_mps2:
@@ -201,7 +201,7 @@ class Simulation:
     def _drawn_per_dwell(self, quantity: str, sigma: float) -> Floats:
         return sigma * generator(self.seed, quantity).standard_normal((len(self.plan), 3))
 
-    def _readings(self, first: int, last: int, steps: Sequence[Step]) -> Stream:
+    def _readings(self, first: int, last: int, steps: Sequence[TrueStep]) -> Stream:
         time_ns = np.arange(first, last) * self._accel.period_ns
         values = np.empty((last - first, 3))
         turning_points = np.searchsorted(time_ns, np.concatenate([self.motion.arrive_ns, self.motion.leave_ns]))
@@ -213,11 +213,11 @@ class Simulation:
             values[start:end] = state.reading_mps2
         return Stream(START_NS + time_ns, values)
 
-    def _state(self, time_ns: Times) -> State:
+    def _state(self, time_ns: Times) -> TrueState:
         dwell = int(self.motion.locate(time_ns[:1])[0][0])
         moving = bool(time_ns[0] >= self.motion.leave_ns[dwell])
         posed_ns = time_ns if moving else time_ns[:1]
-        return State(
+        return TrueState(
             time_s=np.multiply(time_ns, 1e-9),
             ambient=self.ambient,
             dwell=dwell,
@@ -266,7 +266,12 @@ class _Clock:
 
 
 def _refuse_impossible(
-    plan: Sequence[Visit], axes: int, sample_hz: float, angle_hz: float, slew_rate_degps: float, batch_samples: int
+    plan: Sequence[PlannedVisit],
+    axes: int,
+    sample_hz: float,
+    angle_hz: float,
+    slew_rate_degps: float,
+    batch_samples: int,
 ) -> None:
     if not plan:
         raise InputError("the plan visits no orientation: give one or more.")
@@ -286,3 +291,33 @@ def _refuse_impossible(
             raise InputError(f"{name} is {rate_hz:g}: give a rate above 0 and up to 1e6 Hz.")
     if not slew_rate_degps > 0.0 or batch_samples < 1:
         raise InputError("slew_rate_degps and batch_samples must be positive: give them so.")
+
+
+_ANY_DEG = 1e3  # a setting error that leaves the size of f alone, and rounding far below the noise
+
+
+def without_angles(run: Simulation) -> Simulation:
+    """The run as an evaluation without angles sees it, for sizes in sigma: every orientation may be any."""
+    return run.hiding(run.hidden, replace(run.noise, setting_sigma_deg=_ANY_DEG))
+
+
+class ByHand:
+    """The readings and temperatures of a simulated run, without its angles and without its gimbals.
+
+    - bench: what is known without them.
+    - warnings, fraction: as of every source.
+    """
+
+    def __init__(self, run: Simulation) -> None:
+        self._run, self.warnings = run, list[str]()
+        square = {"theta1": 0.0, "theta3": 0.0}
+        self.bench: Bench = replace(run.bench, axes=(), angles=False, angle_sigma_deg=None, nominal=square)
+
+    @property
+    def fraction(self) -> float:
+        """The share of the run that has passed."""
+        return self._run.fraction
+
+    def __iter__(self) -> Iterator[Batch]:
+        for batch in self._run:
+            yield Batch(batch.accel, Stream.empty(4), batch.temperature)

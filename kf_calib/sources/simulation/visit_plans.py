@@ -26,22 +26,22 @@ _PULL = 1e-4  # towards the start of a search, per rad, against a miss of 1
 
 
 @dataclass(frozen=True)
-class Visit:
+class PlannedVisit:
     """One orientation: gimbal angles, outer axis first, held for ``dwell_s``."""
 
     gimbal_deg: tuple[float, ...]
     dwell_s: float
 
 
-def explicit_plan(gimbal_deg: Iterable[Sequence[float]], dwell_s: float = 60.0) -> list[Visit]:
+def explicit_plan(gimbal_deg: Iterable[Sequence[float]], dwell_s: float = 60.0) -> list[PlannedVisit]:
     """The orientations given, one row of gimbal angles each, in that order."""
-    return [Visit(tuple(float(angle) for angle in row), dwell_s) for row in gimbal_deg]
+    return [PlannedVisit(tuple(float(angle) for angle in row), dwell_s) for row in gimbal_deg]
 
 
-def stays(plan: Sequence[Visit]) -> tuple[Visit, ...]:
+def stays(plan: Sequence[PlannedVisit]) -> tuple[PlannedVisit, ...]:
     """The plan with visits that follow each other at the same angles as one: a platform that is not moved is not set
     anew."""
-    visits = list[Visit]()
+    visits = list[PlannedVisit]()
     for visit in plan:
         if visits and visits[-1].gimbal_deg == visit.gimbal_deg:
             visits[-1] = replace(visits[-1], dwell_s=visits[-1].dwell_s + visit.dwell_s)
@@ -73,25 +73,25 @@ def angles_from_csv(path: Path, width: int) -> list[list[float]]:
     return rows
 
 
-def six_faces(axes: Sequence[Vector] = YZX, dwell_s: float = 60.0, up: str = "y") -> list[Visit]:
+def six_faces(axes: Sequence[Vector] = YZX, dwell_s: float = 60.0, up: str = "y") -> list[PlannedVisit]:
     """Each platform axis up and down (+x, -x, +y, -y, +z, -z), by the fewest quarter turns of the gimbals.
 
     Raises InputError where quarter turns of these axes do not show all six faces to gravity.
     """
     quarters = sorted(itertools.product((0.0, 90.0, -90.0, 180.0), repeat=len(axes)), key=_total_turn)
     seen = up_directions(axes, np.radians(quarters), up)
-    plan = list[Visit]()
+    plan = list[PlannedVisit]()
     for face in np.vstack([np.eye(3), -np.eye(3)])[[0, 3, 1, 4, 2, 5]]:
         fitting = np.flatnonzero(seen @ face > 1 - _REACHED)
         if not len(fitting):
             raise InputError(f"quarter turns of these gimbal axes cannot bring face {face} up: use a spread plan.")
-        plan.append(Visit(quarters[fitting[0]], dwell_s))
+        plan.append(PlannedVisit(quarters[fitting[0]], dwell_s))
     return plan
 
 
 def spread_plan(
     count: int, axes: Sequence[Vector] = YZX, dwell_s: float = 60.0, seed: int = 0, up: str = "y"
-) -> list[Visit]:
+) -> list[PlannedVisit]:
     """``count`` orientations whose directions of gravity are spread evenly over the sphere, in random order.
 
     The directions are a Fibonacci lattice turned at random; angles that do not move gravity are random, so that what

@@ -80,8 +80,11 @@ class Columns:
 
         optional: whether the table would do without the column. only (n,): rows whose cells count, NaN for others.
         """
-        numbers = np.full(len(self.grid.rows), np.nan)
-        for row, cell in enumerate(self.grid.column(place)):
+        cells = self.grid.column(place)
+        if only is None and (plain := self.numbers.values(cells)) is not None:
+            return np.array(plain)
+        numbers = np.full(len(cells), np.nan)
+        for row, cell in enumerate(cells):
             if only is not None and not only[row]:
                 continue
             try:
@@ -143,6 +146,8 @@ class Columns:
     def _are_numbers(self, place: int, share: float = 1.0) -> bool:
         """Whether at least this share of the cells of a column are numbers."""
         cells = self.grid.column(place)
+        if self.numbers.values(cells) is not None:
+            return True
         return sum(map(self.is_number, cells)) >= share * len(cells)
 
     def _refuse_doubles(self) -> None:

@@ -190,7 +190,8 @@ def _cell(value: Any) -> Cell:
 
 def _text(cell: str) -> str | None:
     """Return the text of a cell, None where it is blank; of bounded length, as it is looked at in many ways."""
-    return cut(cell.strip(), _LONGEST_CELL) or None
+    text = cell.strip()
+    return (text if len(text) <= _LONGEST_CELL else cut(text, _LONGEST_CELL)) or None
 
 
 def _headed(name: str, lines: Sequence[tuple[int, Sequence[Cell]]]) -> Grid:

@@ -7,6 +7,7 @@ import re
 from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from typing import cast
 
 from kf_calib.sources.tables.grid import Cell, Grid
 
@@ -88,6 +89,17 @@ class Numbers:
         if not isinstance(cell, float) or not math.isfinite(cell):
             raise ValueError
         return cell
+
+    def values(self, cells: Sequence[Cell]) -> list[float] | None:
+        """The numbers in cells that are all written as programs write them; None where one is not."""
+        texts = cast("Sequence[str]", cells)
+        try:
+            if self.decimal != "." or not _is_plain("".join(texts)):
+                return None
+            numbers = list(map(float, texts))
+        except (TypeError, ValueError):  # a cell of a spreadsheet, or of no number
+            return None
+        return numbers if all(map(math.isfinite, numbers)) else None
 
     @property
     def example(self) -> str:

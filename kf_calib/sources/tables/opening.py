@@ -12,13 +12,13 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, lengths
 from kf_calib.bench.bench import Bench, parse_axes
-from kf_calib.bench.gravity_alone import bench_without_angles
 from kf_calib.bench.raw_input import PLAIN, RawInput, merged_metadata
+from kf_calib.bench.streams import bench_without_angles
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.tables.columns import HOW, KNOWN, QUATERNION, READINGS, SPREADS, Columns
 from kf_calib.sources.tables.grid import grid_of
 from kf_calib.sources.tables.numbers import Numbers
-from kf_calib.sources.tables.orientation import Orientation
+from kf_calib.sources.tables.orientation import Orientations
 from kf_calib.sources.tables.table import Table
 from kf_calib.sources.tables.times import Times
 from kf_calib.sources.tables.words import ANGLE, NO_HEADER, are_numbers, face_of
@@ -98,10 +98,7 @@ class Opening:
         means = bench.input.ordered(means)
         sigmas = None if sigmas is None else np.abs(bench.input.ordered(sigmas))
         warmth = self._temperatures()
-        rows = [
-            Orientation(mean, own, at_s, None if sigmas is None else sigmas[k], count, float(warmth[k]))
-            for k, (mean, own, at_s, count) in enumerate(zip(means, pose, elapsed_s, counts, strict=True))
-        ]
+        rows = Orientations(means, pose, elapsed_s, sigmas, np.array(counts, np.int64), warmth)
         if unused := self.columns.unused:
             self.said.append(f"not used: {self.columns.named(unused)}")
         by = f" ({self._quoted(self.columns.guessed)} by what stands there)" if self.columns.guessed else ""

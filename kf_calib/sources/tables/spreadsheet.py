@@ -22,7 +22,7 @@ from kf_calib.support.plain_text import cut
 if TYPE_CHECKING:
     from openpyxl.worksheet._read_only import ReadOnlyWorksheet
 
-Line = tuple[int, list[Any]]
+SheetRow = tuple[int, list[Any]]
 """Number of a row in its sheet, from 1, and its cells up to the last that is filled."""
 _MOST_ROWS = 1 << 20  # of a sheet of Excel
 _MOST_VISITED = 20_000_000  # cells of a sheet, empty ones too
@@ -49,7 +49,7 @@ class Sheet:
 
     name: str
     hidden: bool
-    lines: list[Line]
+    lines: list[SheetRow]
     left_out: list[int]
 
 
@@ -162,10 +162,10 @@ def _sheet(sheet: ReadOnlyWorksheet, hidden_rows: set[int]) -> Sheet:
     return Sheet(sheet.title, sheet.sheet_state != "visible", seen, left_out)
 
 
-def _lines(sheet: ReadOnlyWorksheet) -> list[Line]:
+def _lines(sheet: ReadOnlyWorksheet) -> list[SheetRow]:
     """Return the rows of a sheet that hold anything."""
     sheet.reset_dimensions()  # what the file says of its size may be wrong
-    lines, visited, filled = list[Line](), 0, 0
+    lines, visited, filled = list[SheetRow](), 0, 0
     for number, row in enumerate(sheet.iter_rows(values_only=True), 1):
         visited += 1 + len(row)
         last = max((k for k, cell in enumerate(row, 1) if cell is not None), default=0) if row else 0

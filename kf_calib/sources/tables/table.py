@@ -27,7 +27,7 @@ class Table:
         start_ns: int | None = None,
         path: Path | None = None,
     ) -> None:
-        self.name, self.bench, self.orientations = name, bench, tuple(orientations)
+        self.name, self.bench, self.orientations = name, bench, orientations
         self.warnings, self.fraction, self._start_ns, self.path = list(warnings), 1.0, start_ns, path
 
     def __repr__(self) -> str:

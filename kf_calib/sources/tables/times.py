@@ -36,7 +36,9 @@ class Times:
             return cls(_USUAL_PAUSE_S * np.arange(count, dtype=np.float64), None, "")
         unit, cells = columns.meanings[places[0]].unit, columns.grid.column(places[0])
         said, start_ns = f"time from {columns.named(places)}", None
-        are_numbers = len(places) == 1 and all(cell is None or columns.is_number(cell) for cell in cells)
+        are_numbers = len(places) == 1 and (
+            columns.numbers.values(cells) is not None or all(cell is None or columns.is_number(cell) for cell in cells)
+        )
         if are_numbers or (len(places) == 1 and unit in TIME):
             said += f" in {unit or 's'}"
             elapsed_s = TIME[unit or "s"] * columns.values(places[0], "a time", optional=True)

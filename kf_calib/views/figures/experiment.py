@@ -10,7 +10,7 @@ from kf_calib.reproduction.grebenkin2019 import (
     GRAVITY_MPS2,
     NONOPTIMAL_PRINTED,
     OPTIMAL_PRINTED,
-    READINGS,
+    READINGS_PER_DWELL,
     Column,
     Experiment,
     falling_sigma,
@@ -79,13 +79,13 @@ def draw_falling(figure: FigureBase, experiment: Experiment) -> None:
             axes.annotate(last, (len(values) - 1, values[-1]), xytext=(3, 0), textcoords="offset points", fontsize=7.5,
                           color=colour, va="center", annotation_clip=False)  # fmt: skip
         axes.text(0.985, 0.97, twelve()[k].label, transform=axes.transAxes, ha="right", va="top", fontweight="bold")
-        axes.set_xticks(range(0, len(both[0]), READINGS))
+        axes.set_xticks(range(0, len(both[0]), READINGS_PER_DWELL))
         axes.set_xlim(0, 1.16 * len(both[0]))
     for k in range(4):
         shown = np.array(both)[:, :, k::4] * twelve()[k].per_si
         log_scale(panels[k], [0.7 * shown, shown])
     for axes in panels[3::4]:
-        axes.set_xlabel(f"readings ({READINGS} in each orientation)")
+        axes.set_xlabel(f"readings ({READINGS_PER_DWELL} in each orientation)")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
 
 
@@ -100,10 +100,10 @@ def design_matrices(experiment: Experiment) -> Figure:
         for axes, (name, i, matrix) in zip(panels, every, strict=True):
             axes.imshow(matrix, cmap="RdBu_r", vmin=-1.0, vmax=1.0, aspect="auto", interpolation="nearest")
             axes.set_xticks(range(4), [each.label for each in twelve()[4 * i : 4 * i + 4]])
-            axes.set_yticks(range(0, 4 * READINGS + 1, READINGS))
+            axes.set_yticks(range(0, 4 * READINGS_PER_DWELL + 1, READINGS_PER_DWELL))
             axes.grid(visible=False)
             axes.set_title(f"{name} set" if i == 0 else "")
-        panels[0].set_ylabel(f"reading ({READINGS} in each orientation)")
+        panels[0].set_ylabel(f"reading ({READINGS_PER_DWELL} in each orientation)")
         figure.colorbar(panels[0].get_images()[0], ax=panels, label="element of D, g (bias: 1)")
     return figure
 

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
 from matplotlib.figure import Figure
 
-from kf_calib.exchange.history import History, Track
+from kf_calib.exchange.history import History, ParameterTrack
 from kf_calib.support.units import shown
 from kf_calib.views.console import symbol
 from kf_calib.views.figures.style import ACCELEROMETERS, ALARM, BAND, BEST, GREY, MARKERS, PALE, blank, styled
@@ -42,7 +42,7 @@ def history(calibrations: History) -> Figure:
     return figure
 
 
-def _chart(axes: Axes, calibrations: History, track: Track) -> None:
+def _chart(axes: Axes, calibrations: History, track: ParameterTrack) -> None:
     """Draw one parameter."""
     unit = shown(track.unit)
     zero, scale = float(track.values[-1]), unit.per_si

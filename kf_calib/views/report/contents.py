@@ -14,7 +14,7 @@ from kf_calib.diagnosis.side_by_side import SideBySide, differences
 from kf_calib.diagnosis.stepwise_selection import Improvement
 from kf_calib.estimation.engine_comparison import Comparison
 from kf_calib.estimation.results import Calibration
-from kf_calib.views import console, diagnosis, improvement, side_by_side
+from kf_calib.views import console, diagnosis, improvement, run, side_by_side
 from kf_calib.views.figures import figures
 from kf_calib.views.figures.collection import DIRECTIONS, FALL, NO_FALL, ON_THEIR_WAY, PROBABILITIES
 from kf_calib.views.report.drawing import Drawing
@@ -57,6 +57,7 @@ def _(diagnosed: Diagnosis, measured: Sequence[Measured], commands: Sequence[str
             Section("Parameters", (*_calibrated(diagnosed.before), *_with_what_is_missing(diagnosed))),
             figures_of("The calibration", diagnosed.before, "run", less=[ON_THEIR_WAY, DIRECTIONS]),
             Section("Suspects, and what this run could show", _evidence(diagnosed)),
+            Section("How the bench drove itself", _driven(measured[0])),
             warnings_of(diagnosed.before.warnings),
         ), tuple(commands),
     )  # fmt: skip
@@ -179,6 +180,12 @@ def _calibrated(result: Calibration) -> tuple[Part, ...]:
 def _evidence(diagnosed: Diagnosis) -> tuple[Part, ...]:
     """Return what the console says for a diagnosis, less the verdict, which comes first there as on the page."""
     return in_text(diagnosis.diagnosis_report(diagnosed))[1:]
+
+
+def _driven(measured: Measured) -> tuple[Part, ...]:
+    """Return the decisions of a bench that drove itself; nothing where a person chose."""
+    drawn = run.decided(measured.decisions, measured.ends)
+    return () if drawn is None else in_text(drawn)
 
 
 def _with_what_is_missing(diagnosed: Diagnosis) -> tuple[Part, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 
@@ -14,11 +14,16 @@ _NOTES = {"block_serial": "Sensor block", "bench": "Bench", "operator": "Operato
 
 @dataclass(frozen=True)
 class Measured:
-    """The recording of a result. began: when its run did, where that is known."""
+    """The recording of a result.
+
+    began: when its run did, where that is known. decisions, ends: records of a bench that drove itself.
+    """
 
     name: str
     sha256: str
     began: datetime | None = None
+    decisions: Sequence[Mapping[str, str]] = ()
+    ends: Sequence[Mapping[str, str]] = ()
 
     @property
     def date(self) -> str:
@@ -33,7 +38,7 @@ def facts(measured: Measured, result: Calibration) -> list[tuple[str, str]]:
 
 def _facts(measured: Measured, result: Calibration) -> Iterator[tuple[str, str]]:
     bench, tally = result.bench, result.tally
-    dwells = [visit.dwell for visit in result.visits]
+    dwells = result.fit.dwells
     yield "Recording", measured.name
     yield "SHA-256", measured.sha256
     yield "Begun", measured.date

@@ -26,14 +26,13 @@ from kf_calib.estimation.results import Calibration
 from kf_calib.online.status import Judgement
 from kf_calib.support.plain_text import printable
 from kf_calib.views.rerun.ahead import log_next, words
-from kf_calib.views.rerun.diagnosis import save as save_diagnosis
-from kf_calib.views.rerun.file import rrd_file, strict
-from kf_calib.views.rerun.improvement import save as save_improvement
+from kf_calib.views.rerun.diagnosis import save_diagnosis_view as save_diagnosis
+from kf_calib.views.rerun.improvement import save_improvement_view as save_improvement
 from kf_calib.views.rerun.layout import layout
-from kf_calib.views.rerun.names import BENCH_TIME, ORIENTATION
+from kf_calib.views.rerun.names import BENCH_TIME, ORIENTATION, rrd_file, strict
 from kf_calib.views.rerun.platform import log_platform
 from kf_calib.views.rerun.series import (
-    History,
+    VisitHistory,
     log_bench,
     log_innovations,
     log_nis,
@@ -41,7 +40,7 @@ from kf_calib.views.rerun.series import (
     log_residuals,
     predicted,
 )
-from kf_calib.views.rerun.summary import summary
+from kf_calib.views.rerun.summary import markdown_summary
 
 __all__ = ["BENCH_TIME", "ORIENTATION", "grow", "save"]
 
@@ -49,7 +48,7 @@ _NO_TARGET = np.full(12, np.nan)
 
 
 @singledispatch
-def save(result: Any, path: str | Path) -> Path:
+def save_view(result: Any, path: str | Path) -> Path:
     """Write the view of a result to an .rrd file that opens laid out, and return its path.
 
     Raises InputError where the file cannot be written.
@@ -58,9 +57,9 @@ def save(result: Any, path: str | Path) -> Path:
                     "improve; kf_calib.plot draws figures of the others.")  # fmt: skip
 
 
-@save.register
+@save_view.register
 def _(result: Calibration, path: str | Path) -> Path:
-    history = History.of(result)
+    history = VisitHistory.of(result)
     with rrd_file(Path(path), layout(result, history)) as stream:
         _log(result, history, stream)
         if not predicted(result):
@@ -68,12 +67,12 @@ def _(result: Calibration, path: str | Path) -> Path:
     return Path(path)
 
 
-@save.register
+@save_view.register
 def _(result: Diagnosis, path: str | Path) -> Path:
     return save_diagnosis(result, Path(path))
 
 
-@save.register
+@save_view.register
 def _(result: Improvement, path: str | Path) -> Path:
     return save_improvement(result, Path(path))
 
@@ -87,7 +86,7 @@ def grow(
     judgement: of the run so far, for its targets, its verdict and the next orientation.
     """
     with strict():
-        history = History.of(result)
+        history = VisitHistory.of(result)
         target = _NO_TARGET if judgement is None else judgement.wanted
         _log(result, history, stream, shown, "" if judgement is None else words(judgement), target)
         if judgement is not None:
@@ -97,7 +96,7 @@ def grow(
 
 
 def _log(
-    result: Calibration, history: History, stream: rr.RecordingStream, shown: int = 0, heading: str = "",
+    result: Calibration, history: VisitHistory, stream: rr.RecordingStream, shown: int = 0, heading: str = "",
     target: Floats = _NO_TARGET,
 ) -> None:  # fmt: skip
     """Send what a run shows beyond its first ``shown`` dwells; ``heading``: what stands above its page of text."""
@@ -108,5 +107,5 @@ def _log(
         log_innovations(fresh, stream, shown)
         log_nis(fresh, stream, shown)
         log_bench(result, stream, shown)
-    text = "\n\n".join([*([heading] if heading else []), summary(result)])
+    text = "\n\n".join([*([heading] if heading else []), markdown_summary(result)])
     stream.log("summary", rr.TextDocument(printable(text), media_type=rr.MediaType.MARKDOWN), static=True)

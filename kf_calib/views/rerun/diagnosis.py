@@ -23,15 +23,14 @@ from kf_calib.estimation.results import format_p
 from kf_calib.support.plain_text import printable
 from kf_calib.views.diagnosis import name_of, verdict
 from kf_calib.views.rerun.driver_chart import DriverChart, charts_of, charts_view, heading, unit_of
-from kf_calib.views.rerun.file import rrd_file
-from kf_calib.views.rerun.names import GOLD, thin
+from kf_calib.views.rerun.names import GOLD, rrd_file, thin
 from kf_calib.views.rerun.spheres import Log, at_step, forever, log_spheres, spheres
 
 EXPLANATION = "explanation"
 _MOST = 5  # explanations
 
 
-def save(diagnosis: Diagnosis, path: Path) -> Path:
+def save_diagnosis_view(diagnosis: Diagnosis, path: Path) -> Path:
     """Write the view of a diagnosis to an .rrd file that opens laid out, at the best explanation."""
     before, explanations = diagnosis.before, diagnosis.explanations[:_MOST]
     sigmas, drivers = mean_sigmas(before), diagnosis.drivers

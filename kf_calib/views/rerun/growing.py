@@ -24,7 +24,7 @@ from kf_calib.estimation.results import Calibration
 from kf_calib.online.status import Judgement
 from kf_calib.support.output_files import Growing
 from kf_calib.views.rerun import grow
-from kf_calib.views.rerun.file import new_stream
+from kf_calib.views.rerun.names import new_stream
 from kf_calib.views.screenshot import binary, obituary
 
 PORT = 9876

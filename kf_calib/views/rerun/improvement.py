@@ -22,8 +22,7 @@ from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration, Parameter, format_p
 from kf_calib.support import units
 from kf_calib.support.plain_text import printable
-from kf_calib.views.rerun.file import rrd_file
-from kf_calib.views.rerun.names import GOLD, GREY, MAUVE, RED, WHITE, Colour, entity
+from kf_calib.views.rerun.names import GOLD, GREY, MAUVE, RED, WHITE, Colour, entity, rrd_file
 from kf_calib.views.rerun.spheres import at_step, log_spheres, spheres
 
 STEP = "step"
@@ -74,7 +73,7 @@ def _shown(values_mps2: Sequence[float | None]) -> Floats:
     return units.shown("m/s^2").per_si * np.array([np.nan if each is None else each for each in values_mps2])
 
 
-def save(improvement: Improvement, path: Path) -> Path:
+def save_improvement_view(improvement: Improvement, path: Path) -> Path:
     """Write the view of an improvement to an .rrd file that opens laid out."""
     view = View(improvement)
     with rrd_file(path, _layout(view)) as stream:

@@ -11,14 +11,14 @@ from kf_calib.estimation.results import Calibration
 from kf_calib.support import units
 from kf_calib.views.rerun.names import BENCH_TIME, CHANNELS, GROUPS, ORIENTATION
 from kf_calib.views.rerun.platform import magnified
-from kf_calib.views.rerun.series import History, predicted
+from kf_calib.views.rerun.series import VisitHistory, predicted
 
 _ENDLESS = rr.TimeRangeBoundary.infinite()
 WHOLE_RUN = rrb.TimeAxis(view_range=rr.TimeRange(start=_ENDLESS, end=_ENDLESS))
 """The same stretch of time in all panels: left to themselves they begin where their own data do."""
 
 
-def layout(result: Calibration, history: History, goes_on: bool = False) -> rrb.Blueprint:
+def layout(result: Calibration, history: VisitHistory, goes_on: bool = False) -> rrb.Blueprint:
     """The blueprint for a window of about 1600 x 1000, the overview in front; ``goes_on``: more dwells are to come."""
     tabs = [_overview(result, history, predicted(result) or goes_on), _parameters(history)]
     tabs += [_innovations(result)] if predicted(result) else []
@@ -30,7 +30,7 @@ def layout(result: Calibration, history: History, goes_on: bool = False) -> rrb.
     )
 
 
-def _overview(result: Calibration, history: History, is_predicted: bool) -> rrb.Horizontal:
+def _overview(result: Calibration, history: VisitHistory, is_predicted: bool) -> rrb.Horizontal:
     return rrb.Horizontal(
         rrb.Vertical(*_sigmas(history), _pose(result)),
         rrb.Vertical(_platform(result), *_fit(is_predicted), row_shares=[2, 1, 1] if is_predicted else [1, 1]),
@@ -40,7 +40,7 @@ def _overview(result: Calibration, history: History, is_predicted: bool) -> rrb.
     )
 
 
-def _sigmas(history: History) -> list[rrb.TimeSeriesView]:
+def _sigmas(history: VisitHistory) -> list[rrb.TimeSeriesView]:
     """A panel a kind of parameter, one for the coefficients of effects if there are any."""
     corner = rrb.Corner2D.RightTop
     kinds = [(f"{group.title}, {units.shown(group.unit).label}",
@@ -66,7 +66,7 @@ def _fit(is_predicted: bool) -> list[rrb.TimeSeriesView]:
     ]
 
 
-def _parameters(history: History) -> rrb.Grid:
+def _parameters(history: VisitHistory) -> rrb.Grid:
     """A panel for each parameter and coefficient: what is estimated, with 1 sigma."""
     panels = [
         _series([f"{shown.path}/deviation", f"{shown.path}/band"],

@@ -1,14 +1,25 @@
-"""What the panels share: timelines, colours, labels and units."""
+"""What the panels share: timelines, colours, labels and units.
+
+They share how an .rrd file is written, whole or not at all, too. Rerun's own way to a file waits for ever where the
+disk is full, and raises nothing where it could not write: here it encodes in memory (a view has a few MB), and what it
+encoded is written as every other output is.
+"""
 
 from __future__ import annotations
 
 import math
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 import rerun as rr
+import rerun.blueprint as rrb
 
 from kf_calib.bench import paper_parameters
 from kf_calib.estimation.measurement_model import Model
+from kf_calib.support.output_files import write_whole
 from kf_calib.support.plain_text import printable
 from kf_calib.support.units import shown
 
@@ -85,7 +96,7 @@ def path_of(symbol: str) -> str:
 
 
 @dataclass(frozen=True)
-class Quantity:
+class DrawnParameter:
     """What is estimated and drawn as one curve: the SI value times ``per_si`` is in ``unit``."""
 
     label: str
@@ -95,15 +106,43 @@ class Quantity:
     path: str
 
 
-def quantities(model: Model) -> tuple[Quantity, ...]:
+def quantities(model: Model) -> tuple[DrawnParameter, ...]:
     """The twelve parameters in the units that people are shown, then the coefficients of the effects in the model."""
     parameters = [
-        Quantity(LABELS[symbol], shown(unit).label, shown(unit).per_si, colour_of(symbol), path_of(symbol))
+        DrawnParameter(LABELS[symbol], shown(unit).label, shown(unit).per_si, colour_of(symbol), path_of(symbol))
         for symbol, unit in UNIT_OF.items()
     ]
     coefficients = [
-        Quantity(printable(each.symbol), printable(shown(each).label), shown(each).per_si, MAUVE,
+        DrawnParameter(printable(each.symbol), printable(shown(each).label), shown(each).per_si, MAUVE,
                  entity("parameters", "effects", each.symbol))
         for each in model.coefficients
     ]  # fmt: skip
     return (*parameters, *coefficients)
+
+
+def new_stream() -> rr.RecordingStream:
+    """A stream with an identity of its own: two views written by one process would else be merged by the viewer."""
+    return rr.RecordingStream("kf_calib", recording_id=uuid.uuid4())
+
+
+@contextmanager
+def strict() -> Iterator[None]:
+    """Mistakes in what is logged raise, rather than leave a hole in the view; the caller's mode is given back."""
+    before = rr.strict_mode()
+    rr.set_strict_mode(True)
+    try:
+        yield
+    finally:
+        rr.set_strict_mode(before)
+
+
+@contextmanager
+def rrd_file(path: Path, blueprint: rrb.Blueprint) -> Iterator[rr.RecordingStream]:
+    """A stream whose content is the file when the block has ended. Raises InputError where it cannot be written."""
+    with strict(), new_stream() as stream:
+        memory = stream.memory_recording()
+        stream.send_blueprint(blueprint)
+        yield stream
+        content = memory.drain_as_bytes()
+        stream.disconnect()
+    write_whole(path, content)

@@ -30,7 +30,7 @@ from kf_calib.views.rerun.names import (
     RED,
     WHITE,
     Colour,
-    Quantity,
+    DrawnParameter,
     quantities,
 )
 
@@ -38,14 +38,14 @@ Counts = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class History:
+class VisitHistory:
     """What is estimated along the run, in shown units: deviation from nominal and sigma (n, 12 + q).
 
     NaN where not determined. ``shown``: what the columns are, the q coefficients of effects last. ``orientation`` (n,)
     is the number of the dwell, the prior has 0; ``whole`` (n,) tells the rows at which a dwell is complete.
     """
 
-    shown: tuple[Quantity, ...]
+    shown: tuple[DrawnParameter, ...]
     elapsed_s: Floats
     orientation: Counts
     whole: NDArray[np.bool_]
@@ -62,21 +62,21 @@ class History:
         margin = max(0.1 * (high - low), 1e-9 * max(abs(low), abs(high)), 1e-12)
         return low - margin, high + margin
 
-    def _only(self, rows: NDArray[np.bool_]) -> History:
+    def _only(self, rows: NDArray[np.bool_]) -> VisitHistory:
         """Return the same with these rows only."""
-        return History(self.shown, *(getattr(self, each.name)[rows] for each in fields(self)[1:]))
+        return VisitHistory(self.shown, *(getattr(self, each.name)[rows] for each in fields(self)[1:]))
 
-    def after(self, visits: Sequence[Visit]) -> History:
+    def after(self, visits: Sequence[Visit]) -> VisitHistory:
         """What came after these visits; the prior only where there were none."""
         return self._only(self.orientation > (visits[-1].dwell.number if visits else -1))
 
     @property
-    def by_orientation(self) -> History:
+    def by_orientation(self) -> VisitHistory:
         """The ends of the dwells only."""
         return self._only(self.whole)
 
     @classmethod
-    def of(cls, result: Calibration) -> History:
+    def of(cls, result: Calibration) -> VisitHistory:
         steps = [(0.0, 0, prior_estimate(result)), *result.trace()]
         orientation = np.array([number for _, number, _ in steps])
         shown, gains = quantities(result.model), result.model.natural(result.estimate.state)[1]
@@ -110,7 +110,7 @@ def ends(visits: Sequence[Visit]) -> tuple[Floats, Counts]:
     return np.array([dwell.end_s for dwell in dwells]), np.array([dwell.number for dwell in dwells])
 
 
-def log_parameters(history: History, stream: rr.RecordingStream, target: Floats, styled: bool) -> None:
+def log_parameters(history: VisitHistory, stream: rr.RecordingStream, target: Floats, styled: bool) -> None:
     """Sigma, deviation from nominal, and the deviation less and plus one sigma; ``styled``: how they look was sent.
 
     target (12,): sigmas that are wanted, in SI, NaN where there is none.
@@ -133,7 +133,7 @@ def log_parameters(history: History, stream: rr.RecordingStream, target: Floats,
         _style(stream, f"{path}/band", rr.SeriesLines(names=["−σ", "+σ"], colors=[GREY] * 2, widths=[1.0] * 2))
 
 
-def _log_curve(stream: rr.RecordingStream, path: str, history: History, values: Floats) -> None:
+def _log_curve(stream: rr.RecordingStream, path: str, history: VisitHistory, values: Floats) -> None:
     """Complete dwells on both timelines, points within a dwell in bench time only: one point an orientation."""
     whole, elapsed_s = history.whole, history.elapsed_s
     _send(stream, path, elapsed_s[whole], history.orientation[whole], values[whole])

@@ -14,7 +14,7 @@ from kf_calib.views.console import noise_origins, whole_value
 from kf_calib.views.rerun.names import LABELS, quantities
 
 
-def summary(result: Calibration) -> str:
+def markdown_summary(result: Calibration) -> str:
     """The page in Markdown, in the units that people are shown."""
     blocks = [_head(result), _table(result), _verdict(result), *_warnings(result), _noise(result), *_ties(result)]
     return "\n\n".join(blocks) + "\n"

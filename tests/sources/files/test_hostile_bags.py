@@ -14,9 +14,9 @@ from helpers.long_runs import slow
 from helpers.recordings import ACCEL, ANGLES, BATCH, BENCH, HEAT, assert_equal, read, write_db3
 
 from kf_calib.errors import InputError, KfCalibError
-from kf_calib.sources.files.bags import files_of
 from kf_calib.sources.files.fields import paths_of
 from kf_calib.sources.files.inventory import inventory_of
+from kf_calib.sources.files.record_files import files_of
 from kf_calib.sources.files.recording import Recording
 
 KEYS = BENCH.to_metadata()

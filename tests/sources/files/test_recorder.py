@@ -31,7 +31,7 @@ from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import BenchError, InputError, KfCalibError
 from kf_calib.sources.files import recorder as recorder_module
 from kf_calib.sources.files.contents import BENCH_RECORD, CHECKSUM_KEY
-from kf_calib.sources.files.mcap_messages import HEAD, MAGIC
+from kf_calib.sources.files.mcap_records import HEAD, MAGIC
 from kf_calib.sources.files.recorder import Recorder
 from kf_calib.sources.files.recording import Recording
 

@@ -43,8 +43,8 @@ from mcap_ros2.decoder import DecoderFactory
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import BenchError, InputError
-from kf_calib.sources.files import cdr, mcap_file, mcap_messages
-from kf_calib.sources.files.mcap_messages import HEAD, MAGIC
+from kf_calib.sources.files import cdr, mcap_file, mcap_records
+from kf_calib.sources.files.mcap_records import HEAD, MAGIC
 from kf_calib.sources.files.recorder import Recorder
 from kf_calib.sources.files.recording import Recording
 
@@ -564,9 +564,9 @@ def test_a_wrong_message_index_changes_nothing(tmp_path: Path, damage: Callable[
 def test_only_the_first_block_is_walked_through(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, index_types: IndexType
 ) -> None:
-    walk, walked = mcap_messages.MessageFinder._walk, []
+    walk, walked = mcap_records.MessageFinder._walk, []
     monkeypatch.setattr(
-        mcap_messages.MessageFinder, "_walk", lambda self, *block: walked.append(block) or walk(self, *block)
+        mcap_records.MessageFinder, "_walk", lambda self, *block: walked.append(block) or walk(self, *block)
     )
     recording = Recording(write_officially(tmp_path / "a.mcap", index_types=index_types | IndexType.METADATA))
     walked.clear()

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from kf_calib.bench.streams import Batch
 from kf_calib.sources.live import frames
-from kf_calib.sources.live.clock import Clock
-from kf_calib.sources.live.continuity import Continuity
+from kf_calib.sources.live.clock import Clock, Continuity
 from kf_calib.sources.live.protocols import Protocol
 
 START_NS = 1_750_000_000_000_000_000

@@ -46,7 +46,7 @@ from kf_calib.sources.files.line_parts import Account
 from kf_calib.sources.files.recorder import Recorder
 from kf_calib.sources.files.recording import GAP_RECORD, Recording
 from kf_calib.sources.live import LiveSource, Status, frames, open_live
-from kf_calib.sources.live.continuity import Continuity
+from kf_calib.sources.live.clock import Continuity
 from kf_calib.sources.live.feed import Lost, Regained
 from kf_calib.sources.live.protocols import Protocol
 from kf_calib.sources.live.streamed import StreamedFeed

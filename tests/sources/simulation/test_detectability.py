@@ -15,14 +15,13 @@ from helpers.long_runs import slow
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.errors import InputError
 from kf_calib.sources.files.recorder import Recorder
-from kf_calib.sources.simulation.detectability import sized, sizes_in_sigma
+from kf_calib.sources.simulation.detectability import sized, sizes_in_sigma, truth_of, write_truth
 from kf_calib.sources.simulation.injected import Hidden, NoSizeError, catalogue, parse
 from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.physics import Ambient
 from kf_calib.sources.simulation.sensors import GRADES, Sensors
 from kf_calib.sources.simulation.simulator import Simulation
-from kf_calib.sources.simulation.truth import truth_of, write_truth
-from kf_calib.sources.simulation.visit_plans import Visit, spread_plan
+from kf_calib.sources.simulation.visit_plans import PlannedVisit, spread_plan
 
 G = 9.81
 BENCH = Bench(axes=axes_of("yzx"), gravity_mps2=G, latitude_deg=50.0)
@@ -147,7 +146,7 @@ def test_what_is_asked_for_is_what_generalised_least_squares_finds(name, noise):
 def test_on_a_stabilised_platform_the_force_turns_within_a_dwell():
     bench = replace(BENCH, reference="inertial")
     noise, nominal = NOISES["all"], Sensors({"theta1": 0.0, "theta3": 0.0})  # whose readings are the specific force
-    run = simulation(noise, bench, plan=[Visit(visit.gimbal_deg, 60.0) for visit in PLAN], sample_hz=0.5)
+    run = simulation(noise, bench, plan=[PlannedVisit(visit.gimbal_deg, 60.0) for visit in PLAN], sample_hz=0.5)
     felt, without, with_effect = (
         np.concatenate([batch.accel.values for batch in some])
         for some in (
@@ -224,7 +223,7 @@ def test_temperature_that_does_not_change_shows_nothing():
 
 def test_an_odd_nonlinearity_does_not_show_on_six_faces():
     poses = [(0, 90, 0), (0, -90, 0), (0, 0, 0), (0, 180, 0), (0, 0, -90), (0, 0, 90)]
-    run = simulation(plan=[Visit(pose, 10.0) for pose in poses])
+    run = simulation(plan=[PlannedVisit(pose, 10.0) for pose in poses])
     assert size(run, "third-order=1e-4") is None and size(run, "second-order=1e-4") is not None
 
 
@@ -236,7 +235,7 @@ def test_vibration_itself_does_not_count_to_its_rectification():
 
 def test_of_a_rectified_vibration_its_mean_over_a_cycle_counts():
     """K2 rms^2 sin^4(pi t / T), beside what a bias absorbs; as much is at twice its frequency."""
-    run = simulation(sample_hz=100.0, plan=[Visit((0, 0, 0), 400.0)])
+    run = simulation(sample_hz=100.0, plan=[PlannedVisit((0, 0, 0), 400.0)])
     found = size(run, "vibration-rectification=1e-6,0,0;rms=2;period=20")
     t = np.arange(100.0, 39_975.0) / 100.0
     mean = 1e-6 * 4.0 * np.sin(np.pi * t / 20.0) ** 4
@@ -335,7 +334,7 @@ def test_random_draws_what_can_be_seen():
 
 
 def test_nothing_to_draw():
-    run = simulation(plan=[Visit((0, 0, 0), 6.0)], ambient=Ambient(), sensors=Sensors(), sample_hz=0.1)
+    run = simulation(plan=[PlannedVisit((0, 0, 0), 6.0)], ambient=Ambient(), sensors=Sensors(), sample_hz=0.1)
     with pytest.raises(InputError, match="no effect that was drawn can be seen"):
         asked(run, "random-known=10sigma")
 

@@ -14,11 +14,11 @@ from scipy.signal import welch
 from kf_calib.bench.bench import Bench, axes_of, parse_axes
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import InputError, KfCalibError
+from kf_calib.sources.simulation.detectability import write_truth
 from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.sensors import GRADES, NOMINAL, Sensors
 from kf_calib.sources.simulation.simulator import START_NS, Ambient, Simulation
-from kf_calib.sources.simulation.truth import write_truth
-from kf_calib.sources.simulation.visit_plans import Visit, explicit_plan, six_faces, spread_plan
+from kf_calib.sources.simulation.visit_plans import PlannedVisit, explicit_plan, six_faces, spread_plan
 
 G = 9.81
 BENCH = Bench(axes=axes_of("yzx"), gravity_mps2=G)
@@ -225,7 +225,9 @@ def test_flicker_has_a_flat_allan_deviation_and_goes_on_over_dwells():
         assert allan == pytest.approx(1e-4, rel=0.12)
     plan = explicit_plan([(0, 0, 0)] * 20, dwell_s=100.0)
     same = read(Simulation(BENCH, ORTHOGONAL, TrueNoise(flicker_mps2=1e-4), plan, seed=1)).accel.values - [0, G, 0]
-    once = read(Simulation(BENCH, ORTHOGONAL, TrueNoise(flicker_mps2=1e-4), [Visit((0, 0, 0), 2000.0)], seed=1)).accel
+    once = read(
+        Simulation(BENCH, ORTHOGONAL, TrueNoise(flicker_mps2=1e-4), [PlannedVisit((0, 0, 0), 2000.0)], seed=1)
+    ).accel
     np.testing.assert_array_equal(same, once.values - [0, G, 0])
 
 
@@ -275,7 +277,8 @@ def test_a_platform_that_is_not_moved_is_not_set_anew():
     rows, settings = [(0, 0, 0), (0, 90, 0), (0, 90, 0), (0, 90, 0), (0, 0, 0)], {"sample_hz": 2.0, "seed": 2}
     again = Simulation(BENCH, ORTHOGONAL, noise, explicit_plan(rows, dwell_s=5.0), **settings)
     once = [
-        Visit(tuple(map(float, row)), dwell_s) for row, dwell_s in ((rows[0], 5.0), (rows[1], 15.0), (rows[0], 5.0))
+        PlannedVisit(tuple(map(float, row)), dwell_s)
+        for row, dwell_s in ((rows[0], 5.0), (rows[1], 15.0), (rows[0], 5.0))
     ]
     np.testing.assert_array_equal(
         read(again).accel.values, read(Simulation(BENCH, ORTHOGONAL, noise, once, **settings)).accel.values
@@ -348,9 +351,9 @@ def test_truth_goes_into_a_file_beside_the_recording(tmp_path):
     ("change", "words"),
     [
         ({"plan": []}, "no orientation"),
-        ({"plan": [Visit((0, 0), 1.0)]}, "one number for each of 3 axes"),
-        ({"plan": [Visit((0, 0, math.nan), 1.0)]}, "one number"),
-        ({"plan": [Visit((0, 0, 0), -1.0)]}, "positive time"),
+        ({"plan": [PlannedVisit((0, 0), 1.0)]}, "one number for each of 3 axes"),
+        ({"plan": [PlannedVisit((0, 0, math.nan), 1.0)]}, "one number"),
+        ({"plan": [PlannedVisit((0, 0, 0), -1.0)]}, "positive time"),
         ({"sample_hz": 0.0}, "sample_hz"),
         ({"angle_hz": math.nan}, "angle_hz"),
         ({"slew_rate_degps": 0.0}, "positive"),

@@ -19,7 +19,7 @@ from helpers.paths import ROOT
 
 import kf_calib
 from kf_calib.errors import InputError, KfCalibError
-from kf_calib.sources.opening import Kind, kind_of
+from kf_calib.sources.opening import FileKind, kind_of
 from kf_calib.sources.tables.table import Table
 from kf_calib.sources.tables.words import meaning_of
 
@@ -148,7 +148,7 @@ def test_a_log_with_a_long_name_takes_no_time(name: str, tmp_path: Path) -> None
     rows = "".join(f"{k / 100},0,9.81,0,0,1\n" for k in range(2000))
     path.write_text(f'time_s,ax_mps2,ay_mps2,az_mps2,outer_deg,"{name}"\n{rows}')
     with bounded(seconds=5.0):
-        assert kind_of(path) in Kind
+        assert kind_of(path) in FileKind
         assert meaning_of(name).ours == ""
 
 

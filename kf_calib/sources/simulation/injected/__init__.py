@@ -19,24 +19,30 @@ Conventions, the same for every effect:
   the twelve parameters absorb (``detectability``); ``parse`` then needs ``sized``, which knows the run.
 * Size zero: the effect is absent, and the samples are bit for bit those of a run without it.
 
-One file a family: ``sensor``, ``thermal``, ``drift``, ``history``, ``gimbal``, ``surroundings``, ``electronics`` hold
-the effects of the catalogue, ``outside`` those that no catalogue knows. Nothing here is shared with an estimator.
+``gimbal`` (with surroundings), ``sensor`` (with temperature, time and history) and ``electronics`` hold the effects of
+the catalogue, ``outside`` those that no catalogue knows. Nothing here is shared with an estimator.
 """
 
 from __future__ import annotations
 
-# Families register their effects when they are imported; their steps stand in the chain in this order.
+# Effects are registered when their module is imported; their steps stand in the chain in this order.
 # isort: off
-from kf_calib.sources.simulation.injected import surroundings, gimbal, thermal, sensor
-from kf_calib.sources.simulation.injected import drift, history, outside, electronics
+from kf_calib.sources.simulation.injected import gimbal, sensor, outside, electronics  # noqa: F401
 
 # isort: on
-from kf_calib.sources.simulation.injected.kinds import INNER, Hidden, Kind, NoSizeError, Rig, Stage, catalogue, steps_of
+from kf_calib.sources.simulation.injected.kinds import (
+    INNER,
+    EffectKind,
+    Hidden,
+    NoSizeError,
+    Rig,
+    Stage,
+    catalogue,
+    steps_of,
+)
 from kf_calib.sources.simulation.injected.text import parse
 from kf_calib.support.units import si
 
-FAMILIES = (surroundings, gimbal, sensor, thermal, drift, history, outside, electronics)
-
 __all__ = [
-    "FAMILIES", "INNER", "Hidden", "Kind", "NoSizeError", "Rig", "Stage", "catalogue", "parse", "si", "steps_of",
+    "INNER", "EffectKind", "Hidden", "NoSizeError", "Rig", "Stage", "catalogue", "parse", "si", "steps_of",
 ]  # fmt: skip

@@ -6,19 +6,19 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.sources.simulation.injected.kinds import Rig, made
-from kf_calib.sources.simulation.noise_processes import Outliers
-from kf_calib.sources.simulation.physics import Disturbance, State, Step
+from kf_calib.sources.simulation.noise_processes import OutlierProcess
+from kf_calib.sources.simulation.physics import Disturbance, TrueState, TrueStep
 
 _PAIRS = ("12", "13", "21", "23", "31", "32")
 
 
 @made("cross-talk", "1", ("1ppm", "100ppm"), ("0.1permille", "2permille"), coefficients=_PAIRS)
-def cross_talk(x: Floats, rig: Rig) -> Step:
+def cross_talk(x: Floats, rig: Rig) -> TrueStep:
     """Cross-talk: X_ij A_j of the other two readings, without their noise (acquisition chain)."""
     mixing = np.zeros((3, 3))
     mixing[~np.eye(3, dtype=bool)] = x
 
-    def step(state: State) -> None:
+    def step(state: TrueState) -> None:
         a1, a2, a3 = (state.reading_mps2[:, [j]] for j in range(3))
         state.reading_mps2 = state.reading_mps2 + (a1 * mixing[:, 0] + a2 * mixing[:, 1] + a3 * mixing[:, 2])
 
@@ -26,30 +26,30 @@ def cross_talk(x: Floats, rig: Rig) -> Step:
 
 
 @made("outliers", "m/s^2", ("1mg", "100mg"), ("10mg", "1g"), stage="record", signed=False)
-def outliers(size: Floats, rig: Rig, *, rate: float = 1e-3) -> Step:
+def outliers(size: Floats, rig: Rig, *, rate: float = 1e-3) -> TrueStep:
     """Outliers: single readings jump by the size, either way, with probability ``rate`` (transmission)."""
-    jumps = Outliers(rig.generator("outliers"), rate, 1.0)
+    jumps = OutlierProcess(rig.generator("outliers"), rate, 1.0)
     return Disturbance(lambda count: size * jumps(count))
 
 
 @made("saturation", "m/s^2", ("0.7g", "0.98g"), ("0.7g", "0.98g"), stage="record", signed=False)
-def saturation(limit: Floats, rig: Rig) -> Step:
+def saturation(limit: Floats, rig: Rig) -> TrueStep:
     """Saturation: readings stop at -limit and +limit; 0 is no limit (IEEE Std 528, full range)."""
     least = np.where(limit > 0.0, limit, np.inf)
 
-    def step(state: State) -> None:
+    def step(state: TrueState) -> None:
         state.reading_mps2 = np.clip(state.reading_mps2, -least, least)
 
     return step
 
 
 @made("quantisation", "m/s^2", ("10ug", "1mg"), ("1mg", "50mg"), stage="record", signed=False)
-def quantisation(step_size: Floats, rig: Rig) -> Step:
+def quantisation(step_size: Floats, rig: Rig) -> TrueStep:
     """Quantisation: readings are whole multiples of the step (IEEE Std 952, Q)."""
     coarse = step_size > 0.0
     width = np.where(coarse, step_size, 1.0)
 
-    def step(state: State) -> None:
+    def step(state: TrueState) -> None:
         state.reading_mps2 = np.where(coarse, width * np.rint(state.reading_mps2 / width), state.reading_mps2)
 
     return step

@@ -1,10 +1,12 @@
-"""Errors of the positioner: encoders, axes, base, platform. All are solved as rotations.
+"""Errors of the bench: surroundings (gravity, Earth's rotation, magnetic field, clock), encoders, axes, base, platform.
 
-Encoders: recorded is the reading q, true is q + error(q). Turns of a rotation vector follow the right-hand rule.
+Errors of the positioner are all solved as rotations. Encoders: recorded is the reading q, true is q + error(q). Turns
+of a rotation vector follow the right-hand rule.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -14,17 +16,76 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Vector
 from kf_calib.sources.simulation.gimbal_motion import attitude
 from kf_calib.sources.simulation.injected.kinds import Rig, made
-from kf_calib.sources.simulation.injected.terms import column
-from kf_calib.sources.simulation.physics import State, Step, rotate, to_bench
+from kf_calib.sources.simulation.injected.terms import adding, column
+from kf_calib.sources.simulation.physics import (
+    TrueState,
+    TrueStep,
+    along,
+    carried_by_earth,
+    earth_rate_radps,
+    rotate,
+    to_bench,
+)
+
+_LATITUDE_RAD = math.radians(50.0)
+
+
+@made("latency", "s", ("0.1ms", "5ms"), ("0.1ms", "5ms"), stage="angles", coefficients=("tau_d",), signed=False)
+def latency(delay: Floats, rig: Rig) -> TrueStep:
+    """Latency: the reading stamped t is what was true at t - tau_d, for the block as a whole (acquisition chain)."""
+
+    def step(state: TrueState) -> None:
+        state.time_s = np.maximum(state.time_s - delay[0], 0.0)
+        state.angles_rad = rig.motion.angles_at(np.rint(state.time_s * 1e9).astype(np.int64))
+
+    return step
+
+
+@made("earth-rotation", "1", ("1", "1"), ("1", "1"), stage="attitude", coefficients=("share",))
+def earth_rotation(share: Floats, rig: Rig, *, latitude: float = _LATITUDE_RAD) -> TrueStep:
+    """Rotation of the Earth: the platform is held in inertial space, so that gravity turns in it by share times
+    15.041 deg/h more than is stated; ``latitude`` counts where the bench states none (WGS 84)."""
+    stated_deg = rig.bench.latitude_deg
+    latitude_deg = math.degrees(latitude) if stated_deg is None else stated_deg
+    rate_radps = share[0] * earth_rate_radps(latitude_deg, rig.bench.azimuth_deg)
+
+    def step(state: TrueState) -> None:
+        state.attitude = Rotation.from_rotvec(-column(state.time_s) * rate_radps) * state.attitude
+
+    return step
+
+
+@made("gravity-error", "1", ("10ppm", "700ppm"), ("10ppm", "700ppm"), stage="force", coefficients=("epsilon",))
+def gravity_error(epsilon: Floats, rig: Rig) -> TrueStep:
+    """Wrong gravity: true is g (1 + epsilon), g is stated (gravimetry)."""
+
+    def step(state: TrueState) -> None:
+        state.force_mps2 = state.force_mps2 * (1.0 + epsilon[0])
+
+    return step
+
+
+@made("magnetic", "m/s^2/T", ("1ug/G", "20ug/G"), ("20ug/G", "400ug/G"))
+def magnetic(m: Floats, rig: Rig, *, north: float = 2e-5, up: float = -4.5e-5, east: float = 0.0) -> TrueStep:
+    """Magnetic sensitivity: m B along the input axis, E_i . B_p, of the local field, which is fixed to the Earth
+    and given by its parts toward North, up and East (IEEE Std 1293)."""
+    field = to_bench([north, up, east], rig.bench.azimuth_deg)[None]
+
+    def contribution(state: TrueState) -> Floats:
+        in_platform = rotate(state.attitude.inv(), carried_by_earth(rig.bench, field, state.time_s))
+        return m * along(in_platform, rig.sensors.input_axes)
+
+    return adding(contribution)
+
 
 _ROUNDS = 6  # of the flexure's fixed point; each gains the digits of its angle
 _PROBE_S = 2e-4  # of the second difference that makes an acceleration
 
 
-def encoder_error(axis: int, error: Callable[[Floats], Floats]) -> Step:
+def encoder_error(axis: int, error: Callable[[Floats], Floats]) -> TrueStep:
     """The step that makes the true angle of one gimbal differ from its reading."""
 
-    def step(state: State) -> None:
+    def step(state: TrueState) -> None:
         angles_rad = state.angles_rad.copy()
         angles_rad[:, axis] += error(angles_rad[:, axis])
         state.angles_rad = angles_rad
@@ -36,7 +97,7 @@ def encoder_error(axis: int, error: Callable[[Floats], Floats]) -> Step:
     "encoder-offset", "rad", ("1arcsec", "20arcsec"), ("0.02deg", "0.5deg"),
     stage="angles", coefficients=("epsilon",), per_axis=True,
 )  # fmt: skip
-def encoder_offset(epsilon: Floats, rig: Rig, axis: int) -> Step:
+def encoder_offset(epsilon: Floats, rig: Rig, axis: int) -> TrueStep:
     """Zero of an encoder: the true angle is q + epsilon."""
     return encoder_error(axis, lambda q: np.full_like(q, epsilon[0]))
 
@@ -45,13 +106,13 @@ def encoder_offset(epsilon: Floats, rig: Rig, axis: int) -> Step:
     "encoder-scale", "1", ("1ppm", "20ppm"), ("0.1permille", "2permille"),
     stage="angles", coefficients=("epsilon",), per_axis=True,
 )  # fmt: skip
-def encoder_scale(epsilon: Floats, rig: Rig, axis: int) -> Step:
+def encoder_scale(epsilon: Floats, rig: Rig, axis: int) -> TrueStep:
     """Scale of an encoder: the true angle is q (1 + epsilon), q as it was commanded, whole turns included."""
     return encoder_error(axis, lambda q: epsilon[0] * q)
 
 
-def harmonic(order: int) -> Callable[..., Step]:
-    def make(size: Floats, rig: Rig, axis: int) -> Step:
+def harmonic(order: int) -> Callable[..., TrueStep]:
+    def make(size: Floats, rig: Rig, axis: int) -> TrueStep:
         return encoder_error(axis, lambda q: size[0] * np.sin(order * q) + size[1] * np.cos(order * q))
 
     multiple = "q" if order == 1 else f"{order}q"
@@ -73,13 +134,13 @@ for _order in (1, 2):
     "axis-nonorthogonality", "rad", ("5urad", "50urad"), ("0.1mrad", "5mrad"),
     stage="angles", coefficients=("u", "v"), per_axis=True,
 )  # fmt: skip
-def axis_nonorthogonality(tilt: Floats, rig: Rig, axis: int) -> Step:
+def axis_nonorthogonality(tilt: Floats, rig: Rig, axis: int) -> TrueStep:
     """Nonorthogonality of a gimbal axis: it is tilted in its parent by u and v about the two axes that follow it in
     cyclic order, for y about z and x; at zero angles the frames coincide."""
     nominal = rig.axes[axis]
     true = tuple(Rotation.from_rotvec(tilt @ across(nominal)).apply(nominal).tolist())
 
-    def step(state: State) -> None:
+    def step(state: TrueState) -> None:
         state.axes = [true if number == axis else other for number, other in enumerate(state.axes)]
 
     return step
@@ -95,7 +156,7 @@ def across(axis: Vector) -> Floats:
 
 
 @made("base-tilt", "rad", ("5urad", "500urad"), ("0.1mrad", "10mrad"), stage="attitude", coefficients=("N", "E"))
-def base_tilt(delta: Floats, rig: Rig) -> Step:
+def base_tilt(delta: Floats, rig: Rig) -> TrueStep:
     """Tilt of the base: it is turned by the rotation vector (delta N about North, delta E about East)."""
     return base_turning(delta, rig, lambda state: np.ones(1))
 
@@ -104,16 +165,16 @@ def base_tilt(delta: Floats, rig: Rig) -> Step:
     "base-tilt-drift", "rad/s", ("1urad/day", "50urad/day"), ("1urad/h", "100urad/h"),
     stage="attitude", coefficients=("N", "E"),
 )  # fmt: skip
-def base_tilt_drift(rate: Floats, rig: Rig) -> Step:
+def base_tilt_drift(rate: Floats, rig: Rig) -> TrueStep:
     """Drift of the base's tilt: turned by t (rate N about North, rate E about East)."""
     return base_turning(rate, rig, lambda state: state.time_s)
 
 
-def base_turning(delta: Floats, rig: Rig, multiple: Callable[[State], Floats]) -> Step:
+def base_turning(delta: Floats, rig: Rig, multiple: Callable[[TrueState], Floats]) -> TrueStep:
     """The step that turns the base about horizontal axes by (delta N, delta E) times something (n,)."""
     vector = to_bench([delta[0], 0.0, delta[1]], rig.bench.azimuth_deg)
 
-    def step(state: State) -> None:
+    def step(state: TrueState) -> None:
         state.attitude = Rotation.from_rotvec(column(multiple(state)) * vector) * state.attitude
 
     return step
@@ -123,10 +184,10 @@ def base_turning(delta: Floats, rig: Rig, multiple: Callable[[State], Floats]) -
     "platform-drift", "rad/s", ("0.01deg/h", "1deg/h"), ("1deg/h", "30deg/h"),
     stage="attitude", coefficients=("x", "y", "z"),
 )  # fmt: skip
-def platform_drift(rate: Floats, rig: Rig) -> Step:
+def platform_drift(rate: Floats, rig: Rig) -> TrueStep:
     """Drift of the platform: turned in its own axes by the rotation vector omega_d t, from its gyros (IEEE Std 813)."""
 
-    def step(state: State) -> None:
+    def step(state: TrueState) -> None:
         state.attitude = state.attitude * Rotation.from_rotvec(column(state.time_s) * rate)
 
     return step
@@ -136,7 +197,7 @@ def platform_drift(rate: Floats, rig: Rig) -> Step:
     "flexure", "rad/(m/s^2)", ("5urad/g", "100urad/g"), ("0.1mrad/g", "3mrad/g"),
     stage="force", coefficients=("x", "y", "z"),
 )  # fmt: skip
-def flexure(offset: Floats, rig: Rig) -> Step:
+def flexure(offset: Floats, rig: Rig) -> TrueStep:
     """Flexure: the platform gives way by the rotation vector f x d, the torque of gravity on a mass off the centre
     times compliance; d is compliance x mass x offset, and f is felt by the bent platform (Hooke's law)."""
     return bending(offset, np.ones(3))
@@ -146,16 +207,16 @@ def flexure(offset: Floats, rig: Rig) -> Step:
     "uneven-flexure", "rad/(m/s^2)", ("5urad/g", "100urad/g"), ("0.1mrad/g", "3mrad/g"),
     stage="force", coefficients=("x", "y", "z"),
 )  # fmt: skip
-def uneven_flexure(offset: Floats, rig: Rig, *, cx: float = 2.0, cy: float = 0.1, cz: float = 0.7) -> Step:
+def uneven_flexure(offset: Floats, rig: Rig, *, cx: float = 2.0, cy: float = 0.1, cz: float = 0.7) -> TrueStep:
     """Flexure of different stiffness about each axis: the platform gives way by (cx, cy, cz) times the three parts of
     f x d, its compliances about its axes, each of them as part of the mean one (Hooke's law)."""
     return bending(offset, np.array([cx, cy, cz]))
 
 
-def bending(offset: Floats, compliance: Floats) -> Step:
+def bending(offset: Floats, compliance: Floats) -> TrueStep:
     """The step that turns the platform by f x offset, each part times the compliance (3,) about its axis."""
 
-    def step(state: State) -> None:
+    def step(state: TrueState) -> None:
         bent = Rotation.identity()
         for _ in range(_ROUNDS):
             bent = Rotation.from_rotvec(compliance * np.cross(rotate(bent.inv(), state.force_mps2), offset))
@@ -168,12 +229,12 @@ def bending(offset: Floats, compliance: Floats) -> Step:
     "lever-arm", "m", ("5mm", "3cm"),
     stage="input", coefficients=tuple(number + axis for number in "123" for axis in "xyz"),
 )  # fmt: skip
-def lever_arm(arm: Floats, rig: Rig) -> Step:
+def lever_arm(arm: Floats, rig: Rig) -> TrueStep:
     """Lever arm: accelerometer i sits at r_i in the platform, whose origin does not move, and feels in slews the
     acceleration of its place along its input axis, R E_i . d2(R r_i)/dt2 (kinematics)."""
     arms, shifts_s = arm.reshape(3, 3), (-_PROBE_S, 0.0, _PROBE_S)
 
-    def step(state: State) -> None:
+    def step(state: TrueState) -> None:
         if state.moving:
             before, now, after = (_into_bench(rig, state.time_s + shift_s) for shift_s in shifts_s)
             felt = (after(arms) - 2.0 * now(arms) + before(arms)) / _PROBE_S**2

@@ -15,7 +15,7 @@ from kf_calib.errors import InputError
 from kf_calib.sources.simulation.gimbal_motion import Motion
 from kf_calib.sources.simulation.injected.terms import adding
 from kf_calib.sources.simulation.noise_processes import generator
-from kf_calib.sources.simulation.physics import Step
+from kf_calib.sources.simulation.physics import TrueStep
 from kf_calib.sources.simulation.sensors import Sensors
 from kf_calib.support.units import si
 
@@ -81,7 +81,7 @@ INNER: Mapping[str, Inner] = {
 
 
 @dataclass(frozen=True)
-class Kind:
+class EffectKind:
     """A kind of effect.
 
     unit: of a coefficient. coefficients: their names, one for each size. navigation, mems: typical sizes, from ... to,
@@ -98,14 +98,14 @@ class Kind:
     coefficients: tuple[str, ...]
     navigation: tuple[str, str]
     mems: tuple[str, str]
-    make: Callable[..., Step] = field(repr=False)
+    make: Callable[..., TrueStep] = field(repr=False)
     inner: Mapping[str, float]
     title: str
     physics: str
     signed: bool = True
     per_axis: bool = False
     known: bool = True
-    counted: Callable[..., Step] | None = field(default=None, repr=False)
+    counted: Callable[..., TrueStep] | None = field(default=None, repr=False)
     driver: str = ""
     family: str = ""
 
@@ -122,7 +122,7 @@ class Hidden:
     axis: of the gimbals, 0 is the outer one; axis_name: as people call it.
     """
 
-    kind: Kind
+    kind: EffectKind
     sizes: tuple[float, ...]
     inner: Mapping[str, float] = field(default_factory=dict[str, float])
     axis: int = 0
@@ -150,7 +150,7 @@ class Hidden:
         """The same with every coefficient times a number."""
         return replace(self, sizes=tuple(factor * size for size in self.sizes))
 
-    def step(self, rig: Rig) -> Step:
+    def step(self, rig: Rig) -> TrueStep:
         """The step in the chain, fresh from its start."""
         axis = (self.axis,) if self.kind.per_axis else ()
         return self.kind.make(np.array(self.sizes), rig, *axis, **self._inner)
@@ -165,19 +165,19 @@ class Hidden:
         return {**self.kind.inner, **self.inner}
 
 
-_KINDS: dict[str, Kind] = {}
+_KINDS: dict[str, EffectKind] = {}
 
 
-def catalogue() -> Mapping[str, Kind]:
+def catalogue() -> Mapping[str, EffectKind]:
     """Every kind by name, in the order in which they are at work."""
     return _KINDS
 
 
-def steps_of(effects: Iterable[Hidden], rig: Rig) -> dict[Stage, list[Step]]:
+def steps_of(effects: Iterable[Hidden], rig: Rig) -> dict[Stage, list[TrueStep]]:
     """The steps of those effects that are not of size zero, by stage, in the order of the catalogue."""
     order = list(_KINDS)
     present = [effect for effect in effects if any(effect.sizes)]
-    steps: dict[Stage, list[Step]] = {stage: [] for stage in get_args(Stage)}
+    steps: dict[Stage, list[TrueStep]] = {stage: [] for stage in get_args(Stage)}
     for effect in sorted(present, key=lambda effect: order.index(effect.kind.name)):
         steps[effect.kind.stage].append(effect.step(rig))
     return steps
@@ -194,20 +194,20 @@ def made(
     signed: bool = True,
     per_axis: bool = False,
     known: bool = True,
-    counted: Callable[..., Step] | None = None,
+    counted: Callable[..., TrueStep] | None = None,
     driver: str = "",
     family: str = "",
-) -> Callable[[Callable[..., Step]], Callable[..., Step]]:
+) -> Callable[[Callable[..., TrueStep]], Callable[..., TrueStep]]:
     """Registers a maker of steps. Its docstring is "Title: physics (source)."; its keyword-only arguments are the inner
     constants with their usual values."""
 
-    def register(make: Callable[..., Step]) -> Callable[..., Step]:
+    def register(make: Callable[..., TrueStep]) -> Callable[..., TrueStep]:
         assert name not in _KINDS, name
         title, _, physics = " ".join((make.__doc__ or "").split()).partition(": ")
         parameters = inspect.signature(make).parameters.values()
         inner = {item.name: float(item.default) for item in parameters if item.kind is item.KEYWORD_ONLY}
         typical = navigation, mems or navigation
-        _KINDS[name] = Kind(
+        _KINDS[name] = EffectKind(
             name, unit, stage, coefficients, *typical, make, inner, title, physics, signed, per_axis, known,
             counted, driver, family,
         )  # fmt: skip
@@ -229,7 +229,7 @@ def added(
     """Registers what adds to each reading, a function of three coefficients, the state and inner constants."""
 
     def register(contribution: Callable[..., Floats]) -> Callable[..., Floats]:
-        def make(k: Floats, rig: Rig, **inner: float) -> Step:
+        def make(k: Floats, rig: Rig, **inner: float) -> TrueStep:
             return adding(lambda state: contribution(k, state, **inner))
 
         make.__doc__ = contribution.__doc__

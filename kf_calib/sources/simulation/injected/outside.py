@@ -13,7 +13,7 @@ from kf_calib.sources.simulation.injected.gimbal import axis_nonorthogonality, b
 from kf_calib.sources.simulation.injected.kinds import Rig, added, made
 from kf_calib.sources.simulation.injected.terms import above, adding, column, output, pendulous
 from kf_calib.sources.simulation.noise_processes import FirstOrder
-from kf_calib.sources.simulation.physics import SettingError, State, Step, carried_by_earth, rotate
+from kf_calib.sources.simulation.physics import SettingError, TrueState, TrueStep, carried_by_earth, rotate
 
 NO_FAMILY = "none of the known"
 """The family of what belongs to no physical class of the catalogue's effects."""
@@ -28,7 +28,7 @@ made(
     "thermal-tilt", "rad/K", ("5urad/K", "50urad/K"), ("0.1mrad/K", "1mrad/K"),
     stage="attitude", coefficients=("N", "E"), known=False, driver="temperature", family="temperature",
 )  # fmt: skip
-def thermal_tilt(delta: Floats, rig: Rig, *, reference: float = 25.0) -> Step:
+def thermal_tilt(delta: Floats, rig: Rig, *, reference: float = 25.0) -> TrueStep:
     """Thermal tilt of the pier: the base is turned by T (delta N about North, delta E about East)."""
     return base_turning(delta, rig, lambda state: above(state, reference)[:, 0])
 
@@ -42,7 +42,7 @@ def thermal_tilt(delta: Floats, rig: Rig, *, reference: float = 25.0) -> Step:
     driver="specific force",
     family="nonlinearity",
 )
-def fifth_order(k: Floats, state: State) -> Floats:
+def fifth_order(k: Floats, state: TrueState) -> Floats:
     """Fifth-order nonlinearity: K5 a_i^5."""
     return k * state.input_mps2**5
 
@@ -56,7 +56,7 @@ def fifth_order(k: Floats, state: State) -> Floats:
     driver="specific force",
     family="cross-axis",
 )
-def triple_product(k: Floats, state: State) -> Floats:
+def triple_product(k: Floats, state: TrueState) -> Floats:
     """Triple product: K_ipo a_i a_p a_o."""
     return k * state.input_mps2 * pendulous(state) * output(state)
 
@@ -70,7 +70,7 @@ def triple_product(k: Floats, state: State) -> Floats:
     driver="specific force",
     family="nonlinearity",
 )
-def fourth_harmonic(k: Floats, state: State) -> Floats:
+def fourth_harmonic(k: Floats, state: TrueState) -> Floats:
     """Spherical harmonic of degree 4: H (35 u^4 - 30 u^2 + 3) / 8, u the cosine of input axis and specific force."""
     squares = (state.input_mps2 / np.linalg.norm(state.force_mps2, axis=1, keepdims=True)) ** 2
     return k * (35.0 * squares**2 - 30.0 * squares + 3.0) / 8.0
@@ -85,7 +85,7 @@ def fourth_harmonic(k: Floats, state: State) -> Floats:
     driver="specific force",
     family="nonlinearity",
 )
-def third_cosine(k: Floats, state: State) -> Floats:
+def third_cosine(k: Floats, state: TrueState) -> Floats:
     """Cosine of thrice the direction: H s^3 cos(3 psi), psi and s the angle about the output axis and the sine of the
     angle from it of the specific force (spherical harmonic of degree 3)."""
     across = (state.input_mps2 + 1j * pendulous(state)) / np.linalg.norm(state.force_mps2, axis=1, keepdims=True)
@@ -101,38 +101,38 @@ def third_cosine(k: Floats, state: State) -> Floats:
     driver="temperature",
     family="temperature",
 )
-def thermal_scale_2(k: Floats, state: State, *, reference: float = 25.0) -> Floats:
+def thermal_scale_2(k: Floats, state: TrueState, *, reference: float = 25.0) -> Floats:
     """Thermal curvature of the scale factor: alpha_s2 T^2 a_i."""
     return k * above(state, reference) ** 2 * state.input_mps2
 
 
 @made("bias-jump", "m/s^2", ("5ug", "100ug"), ("2mg", "20mg"), known=False, driver="time", family="bias in time")
-def bias_jump(k: Floats, rig: Rig, *, share: float = 0.4) -> Step:
+def bias_jump(k: Floats, rig: Rig, *, share: float = 0.4) -> TrueStep:
     """Jump of the bias: constant from ``share`` of the run on, where something in the sensor has given way."""
     start_s = share * rig.duration_s
     return adding(lambda state: k * column(np.where(state.time_s >= start_s, 1.0, 0.0)))
 
 
 @added("power-warm-up", "m/s^2", ("20ug", "200ug"), ("2mg", "20mg"), known=False, driver="time", family="bias in time")
-def power_warm_up(k: Floats, state: State, *, tau: float = 120.0) -> Floats:
+def power_warm_up(k: Floats, state: TrueState, *, tau: float = 120.0) -> Floats:
     """Warm-up by a power law: B / sqrt(1 + t / tau), as heat spreads into a thick base (diffusion)."""
     return k / np.sqrt(1.0 + column(state.time_s) / tau)
 
 
 @added("chirp", "m/s^2", ("5ug", "100ug"), ("2mg", "20mg"), known=False, driver="time", family=NO_FAMILY)
-def chirp(k: Floats, state: State, *, frequency: float = 2e-3, chirp: float = 1e-5) -> Floats:
+def chirp(k: Floats, state: TrueState, *, frequency: float = 2e-3, chirp: float = 1e-5) -> Floats:
     """Periodic bias of rising frequency: A sin(2 pi (f t + chirp t^2 / 2)), as from a fan that speeds up."""
     t = column(state.time_s)
     return k * np.sin(2.0 * np.pi * (frequency * t + 0.5 * chirp * t**2))
 
 
 @made("telegraph", "m/s^2", ("5ug", "100ug"), ("2mg", "20mg"), known=False, driver="time", family="bias in time")
-def telegraph(k: Floats, rig: Rig, *, tau: float = 200.0) -> Step:
+def telegraph(k: Floats, rig: Rig, *, tau: float = 200.0) -> TrueStep:
     """Telegraph noise: each bias switches between -k and +k, staying tau on average (burst or popcorn noise)."""
     chance = -0.5 * np.expm1(-2.0 * rig.period_s / tau)
     rng, level = rig.generator("telegraph"), np.ones((1, 3))
 
-    def contribution(state: State) -> Floats:
+    def contribution(state: TrueState) -> Floats:
         nonlocal level
         flips = np.where(rng.random((len(state.time_s), 3)) < chance, -1.0, 1.0)
         levels = level * np.cumprod(flips, axis=0)
@@ -151,14 +151,14 @@ def telegraph(k: Floats, rig: Rig, *, tau: float = 200.0) -> Step:
     driver="previous orientation",
     family="memory",
 )
-def previous_pose(k: Floats, rig: Rig) -> Step:
+def previous_pose(k: Floats, rig: Rig) -> TrueStep:
     """Memory of the previous pose: k sin of the innermost angle of the dwell before; zero in the first dwell."""
     sines = np.concatenate([[0.0], np.sin(rig.motion.angles_rad[:-1, -1])])
     return adding(lambda state: k * sines[state.dwell])
 
 
 @made("cable-torque", "m/s^2", ("5ug", "100ug"), ("2mg", "20mg"), known=False, driver="angle", family=NO_FAMILY)
-def cable_torque(k: Floats, rig: Rig) -> Step:
+def cable_torque(k: Floats, rig: Rig) -> TrueStep:
     """Torque of a wound-up cable: k times the square of the innermost angle, as it was commanded, in half turns."""
     return adding(lambda state: k * (state.angles_rad[:, -1:] / np.pi) ** 2)
 
@@ -167,7 +167,9 @@ def cable_torque(k: Floats, rig: Rig) -> Step:
 
 
 @added("double-warm-up", "m/s^2", ("10ug", "200ug"), ("1mg", "10mg"), known=False, driver="time", family="bias in time")
-def double_warm_up(k: Floats, state: State, *, tau: float = 120.0, slow: float = 1500.0, share: float = 0.4) -> Floats:
+def double_warm_up(
+    k: Floats, state: TrueState, *, tau: float = 120.0, slow: float = 1500.0, share: float = 0.4
+) -> Floats:
     """Warm-up of two time constants: B ((1 - share) exp(-t / tau) + share exp(-t / slow)), as the electronics and then
     the block come to their temperatures."""
     t = column(state.time_s)
@@ -175,7 +177,7 @@ def double_warm_up(k: Floats, state: State, *, tau: float = 120.0, slow: float =
 
 
 @made("creep-and-walk", "m/s^2", ("5ug", "100ug"), ("1mg", "10mg"), known=False, driver="time", family="bias in time")
-def creep_and_walk(k: Floats, rig: Rig, *, tau: float = 60.0, share: float = 0.3) -> Step:
+def creep_and_walk(k: Floats, rig: Rig, *, tau: float = 60.0, share: float = 0.3) -> TrueStep:
     """Creep of the bias after power-on, then a random walk: k (ln(1 + t / tau) + share W), W a random walk whose
     variance is t / tau; the creep is the faster at first, the walk later on."""
     walk = FirstOrder(rig.generator("creep-and-walk"), 1.0, math.sqrt(rig.period_s / tau), 0.0)
@@ -184,7 +186,7 @@ def creep_and_walk(k: Floats, rig: Rig, *, tau: float = 60.0, share: float = 0.3
 
 @made("output-step", "m/s^2", ("5ug", "100ug"), ("2mg", "20mg"), coefficients=("step",), known=False, driver="time",
       family="bias in time")  # fmt: skip
-def output_step(size: Floats, rig: Rig) -> Step:
+def output_step(size: Floats, rig: Rig) -> TrueStep:
     """Step of one accelerometer's output: constant from an instant on; which one, and when between a fifth and four
     fifths of the run, is drawn from the seed."""
     rng = rig.generator("output-step")
@@ -194,12 +196,12 @@ def output_step(size: Floats, rig: Rig) -> Step:
 
 @made("thermal-hysteresis", "m/s^2/K", ("5ug/K", "30ug/K"), ("0.15mg/K", "1mg/K"), known=False, driver="temperature",
       family="temperature")  # fmt: skip
-def thermal_hysteresis(alpha: Floats, rig: Rig, *, play: float = 2.0, reference: float = 25.0) -> Step:
+def thermal_hysteresis(alpha: Floats, rig: Rig, *, play: float = 2.0, reference: float = 25.0) -> TrueStep:
     """Temperature sensitivity with hysteresis: alpha times a temperature that follows the true one with a play of so
     many K, up and down each, as glued and clamped parts do (Prandtl's play operator); without history at first."""
     followed_c: float | None = None
 
-    def contribution(state: State) -> Floats:
+    def contribution(state: TrueState) -> Floats:
         nonlocal followed_c
         true_c = state.temperature_c.tolist()
         start_c = true_c[0] if followed_c is None else followed_c
@@ -212,7 +214,7 @@ def thermal_hysteresis(alpha: Floats, rig: Rig, *, play: float = 2.0, reference:
 
 @made("loose-mount", "rad", ("2urad", "50urad"), ("0.1mrad", "5mrad"), stage="attitude", coefficients=("x", "y", "z"),
       signed=False, known=False, driver="specific force", family="unstated noise")  # fmt: skip
-def loose_mount(play: Floats, rig: Rig) -> Step:
+def loose_mount(play: Floats, rig: Rig) -> TrueStep:
     """Loose mount: in each dwell the platform is turned in itself by play_j clip(u_k + z, -1, 1) about axis j, u_k
     the part of gravity's direction along the axis that follows j, z a standard normal number, the friction: it rests
     between two stops, mostly near the one that gravity pulls it to."""
@@ -225,12 +227,12 @@ def loose_mount(play: Floats, rig: Rig) -> Step:
 
 @made("eccentric-bearing", "rad", ("5urad", "50urad"), ("0.1mrad", "5mrad"), stage="angles", coefficients=("s", "c"),
       per_axis=True, known=False, driver="angle", family="gimbal and encoder")  # fmt: skip
-def eccentric_bearing(size: Floats, rig: Rig, axis: int, *, share: float = 1.0) -> Step:
+def eccentric_bearing(size: Floats, rig: Rig, axis: int, *, share: float = 1.0) -> TrueStep:
     """Eccentric bearing of a gimbal: its encoder errs by s sin q + c cos q, and its axis is tilted in its parent by
     share s and share c, as with encoder-harmonic-1 and axis-nonorthogonality, because its shaft is off its centre."""
     parts = harmonic(1)(size, rig, axis), axis_nonorthogonality(share * size, rig, axis)
 
-    def step(state: State) -> None:
+    def step(state: TrueState) -> None:
         for part in parts:
             part(state)
 

@@ -7,23 +7,23 @@ from collections.abc import Callable
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.sources.simulation.physics import State, Step
+from kf_calib.sources.simulation.physics import TrueState, TrueStep
 
 _NO_SIGN_MPS2 = 1e-9
 """Below this an acceleration is rounding noise and has no sign."""
 
 
-def pendulous(state: State) -> Floats:
+def pendulous(state: TrueState) -> Floats:
     """a_p of the three accelerometers: platform y, z, x."""
     return state.force_mps2[:, [1, 2, 0]]
 
 
-def output(state: State) -> Floats:
+def output(state: TrueState) -> Floats:
     """a_o of the three accelerometers: platform z, x, y."""
     return state.force_mps2[:, [2, 0, 1]]
 
 
-def above(state: State, reference_c: float) -> Floats:
+def above(state: TrueState, reference_c: float) -> Floats:
     """T (n, 1), the true temperature above the reference."""
     return column(state.temperature_c - reference_c)
 
@@ -38,10 +38,10 @@ def column(values: Floats) -> Floats:
     return values[:, None]
 
 
-def adding(contribution: Callable[[State], Floats]) -> Step:
+def adding(contribution: Callable[[TrueState], Floats]) -> TrueStep:
     """The step that adds to the readings."""
 
-    def step(state: State) -> None:
+    def step(state: TrueState) -> None:
         state.reading_mps2 = state.reading_mps2 + contribution(state)
 
     return step

@@ -12,7 +12,7 @@ import numpy as np
 
 from kf_calib.bench.bench import Vector
 from kf_calib.errors import InputError, how_to_write
-from kf_calib.sources.simulation.injected.kinds import INNER, Hidden, Kind, NoSizeError, catalogue
+from kf_calib.sources.simulation.injected.kinds import INNER, EffectKind, Hidden, NoSizeError, catalogue
 from kf_calib.sources.simulation.noise_processes import generator
 from kf_calib.support.units import si
 
@@ -122,7 +122,7 @@ def _given(text: str) -> list[float]:
     return sizes
 
 
-def _kind(name: str) -> Kind:
+def _kind(name: str) -> EffectKind:
     if name in catalogue():
         return catalogue()[name]
     near = difflib.get_close_matches(name, [*catalogue(), *RANDOM], n=3, cutoff=0.4)
@@ -130,7 +130,7 @@ def _kind(name: str) -> Kind:
     raise InputError(f"hidden effect {name!r} is not known: {advice}")
 
 
-def _sizes(kind: Kind, given: Sequence[float], seed: int, quantity: str) -> tuple[float, ...]:
+def _sizes(kind: EffectKind, given: Sequence[float], seed: int, quantity: str) -> tuple[float, ...]:
     """Sizes of all coefficients; one number stands for all, with signs drawn where they matter."""
     count = len(kind.coefficients)
     if not kind.signed and min(given) < 0.0:
@@ -146,7 +146,7 @@ def _sizes(kind: Kind, given: Sequence[float], seed: int, quantity: str) -> tupl
     return tuple((given[0] * signs + 0.0).tolist())
 
 
-def _inner(kind: Kind, texts: Iterable[str]) -> dict[str, float]:
+def _inner(kind: EffectKind, texts: Iterable[str]) -> dict[str, float]:
     values = dict[str, float]()
     for text in texts:
         name, _, value = (part.strip() for part in text.partition("="))

@@ -1,0 +1,414 @@
+"""Dwells as arrays: what a fit does with thousands of dwells, it does with all of them at once.
+
+A fit turns the specific force of each dwell, allows for its setting error and subtracts what is known from its
+readings, again and again. A ``DwellStack`` holds the dwells as they were folded and these changes as arrays over
+dwells; a single dwell is made from them only where it is asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from operator import is_
+from typing import Any, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import turned
+from kf_calib.dwells.attitude_error import AttitudeError
+from kf_calib.dwells.rows import on_basis, parabola
+from kf_calib.dwells.sufficient_statistics import LEAST_FREEDOM, DwellFactor, rate_or_zero
+
+Places = NDArray[np.intp]
+
+
+class OfPieces(Sequence[Floats]):
+    """Values of the pieces of all dwells in one array (pieces, ...), as a sequence of those of each dwell."""
+
+    def __init__(self, values: Floats, ends: Places) -> None:
+        self.values, self._ends = values, ends
+
+    def __len__(self) -> int:
+        return len(self._ends) - 1
+
+    @overload
+    def __getitem__(self, index: int) -> Floats: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Floats]: ...
+    def __getitem__(self, index: int | slice) -> Floats | list[Floats]:
+        if isinstance(index, slice):
+            return [self[k] for k in range(*index.indices(len(self)))]
+        k = range(len(self))[index]
+        return self.values[self._ends[k] : self._ends[k + 1]]
+
+    def beside(self, *others: Sequence[Floats]) -> OfPieces:
+        """The same columns (pieces, K, 3, c) with others behind them."""
+        return OfPieces(np.concatenate([self.values, *map(of_all_pieces, others)], axis=3), self._ends)
+
+    def first(self, count: int) -> OfPieces:
+        """The first columns alone."""
+        return OfPieces(self.values[..., :count], self._ends)
+
+
+def of_all_pieces(columns: Sequence[Floats]) -> Floats:
+    """The values of the pieces of all dwells in one array (pieces, ...)."""
+    return columns.values if isinstance(columns, OfPieces) else np.concatenate(columns)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Shape:
+    """Dwells with equally many pieces P and basis functions K: indices (d,) of the dwells, and (d, P) of their
+    pieces."""
+
+    dwells: Places
+    pieces: Places
+    width: int
+
+
+class Folded:
+    """What of some dwells depends neither on the force that is felt nor on what is subtracted from their readings."""
+
+    def __init__(self, dwells: Sequence[DwellFactor]) -> None:
+        self.dwells = tuple(dwells)
+        self.piece_numbers = np.fromiter((len(dwell.pieces) for dwell in self.dwells), np.intp, len(self.dwells))
+        self.ends = np.append(0, np.cumsum(self.piece_numbers))
+        """The first piece of each dwell, and at last the number of pieces."""
+
+    @cached_property
+    def shapes(self) -> list[Shape]:
+        """The dwells grouped by shape."""
+        widths = np.fromiter((dwell.width for dwell in self.dwells), np.intp, len(self.dwells))
+        kinds = dict[tuple[int, int], list[int]]()
+        for k, kind in enumerate(zip(self.piece_numbers.tolist(), widths.tolist(), strict=True)):
+            kinds.setdefault(kind, []).append(k)
+        return [
+            Shape(np.array(places), self.ends[places][:, None] + np.arange(pieces), width)
+            for (pieces, width), places in kinds.items()
+        ]
+
+    @cached_property
+    def triangles(self) -> list[Floats]:
+        """The triangles (d, P, K + 3, K + 3) of the dwells of each shape."""
+        return [np.array([[piece.triangle for piece in self.dwells[k].pieces] for k in shape.dwells.tolist()])
+                for shape in self.shapes]  # fmt: skip
+
+    @cached_property
+    def piece_counts(self) -> Floats:
+        """Number of readings of each piece, (pieces,)."""
+        return np.array([piece.count for dwell in self.dwells for piece in dwell.pieces], float)
+
+    @cached_property
+    def counts(self) -> Floats:
+        """Number of readings of each dwell, (D,)."""
+        return np.add.reduceat(self.piece_counts, self.ends[:-1])
+
+    @cached_property
+    def weights(self) -> Floats:
+        """Weights (D,) of the readings of each dwell."""
+        return np.fromiter((dwell.weight for dwell in self.dwells), float, len(self.dwells))
+
+    @cached_property
+    def squares(self) -> Floats:
+        """Sums of squares (pieces, 3) of the readings about their fit by the basis functions."""
+        squares = np.zeros((int(self.ends[-1]), 3))
+        for shape, triangles in zip(self.shapes, self.triangles, strict=True):
+            squares[shape.pieces] = (triangles[:, :, shape.width :, shape.width :] ** 2).sum(axis=2)
+        return squares
+
+    @cached_property
+    def shaking(self) -> tuple[Floats, Floats]:
+        """Variance of the readings at the nodes of all pieces, (pieces, 3, 3), and the number of readings behind it,
+        (pieces,)."""
+        pieces = [piece for dwell in self.dwells for piece in dwell.pieces]
+        counts = np.array([piece.reading_count for piece in pieces], float)
+        if self.dwells[0].averaged:
+            return np.array([piece.nodes.variance_mps2_2 for piece in pieces], float), counts
+        widths = np.repeat([dwell.width for dwell in self.dwells], self.piece_numbers)
+        freedom = np.maximum(self.piece_counts - widths, 0.0)[:, None]
+        squares, firsts = self.squares, self.ends[:-1]
+        pooled = np.add.reduceat(squares, firsts) / np.maximum(np.add.reduceat(freedom, firsts), 1.0)
+        of_pieces = squares / np.maximum(freedom, 1.0)
+        variances = np.where(freedom >= LEAST_FREEDOM, of_pieces, np.repeat(pooled, self.piece_numbers, axis=0))
+        return np.repeat(variances[:, None], 3, axis=1), counts
+
+    @cached_property
+    def spreads(self) -> Floats:
+        """Covariances (D, 3, 3) of the readings about their mean, courses and noise within a dwell alike."""
+        return np.array([dwell.spread for dwell in self.dwells])
+
+    def of_nodes(self, name: str) -> Floats:
+        """One of the conditions at the nodes of all pieces, (m, ...)."""
+        return np.concatenate([getattr(piece.nodes, name) for dwell in self.dwells for piece in dwell.pieces])
+
+    def rates(self, name: str) -> Floats:
+        """Angular rate, or its derivative, at the nodes of all pieces, (m, 3); zeros where the platform stands."""
+        return np.concatenate([rate_or_zero(getattr(p.nodes, name)) for dwell in self.dwells for p in dwell.pieces])
+
+    @cached_property
+    def elapsed_s(self) -> Floats:
+        """Time at the nodes of all pieces, (m,)."""
+        return self.of_nodes("elapsed_s")
+
+    @cached_property
+    def ends_s(self) -> Floats:
+        """When each dwell begins and ends, (D, 2)."""
+        return np.column_stack([self.elapsed_s[3 * self.ends[:-1]], self.elapsed_s[3 * self.ends[1:] - 1]])
+
+    @cached_property
+    def force_mps2(self) -> Floats:
+        """Specific force at the nodes of all pieces by their poses, (m, 3)."""
+        return self.of_nodes("force_mps2")
+
+    @cached_property
+    def pose(self) -> Floats:
+        """Pose at the nodes of all pieces, (m, k)."""
+        return self.of_nodes("pose")
+
+    @cached_property
+    def before(self) -> Places:
+        """Index (D,) of the dwell before each dwell; of the first, its own; of a slew, of the dwell that it left."""
+        moving = np.fromiter((dwell.moving for dwell in self.dwells), bool, len(self.dwells))
+        last = np.maximum.accumulate(np.where(moving, 0, np.arange(len(self.dwells))))
+        return np.append(0, last[:-1])
+
+    @cached_property
+    def came_from(self) -> dict[int, DwellFactor]:
+        """The dwell before, by index, where that one has been left out of the fit."""
+        return {k: dwell.came_from for k, dwell in enumerate(self.dwells) if dwell.came_from is not None}
+
+    def weighted(self, of_pieces: Floats) -> Floats:
+        """Means (D, ...) over each dwell of values of its pieces, (pieces, ...)."""
+        counts = self.piece_counts.reshape(-1, *[1] * (of_pieces.ndim - 1))
+        sums = np.add.reduceat(counts * of_pieces, self.ends[:-1], axis=0)
+        return sums / self.counts.reshape(-1, *[1] * (of_pieces.ndim - 1))
+
+    @cached_property
+    def known(self) -> dict[str, Any]:
+        """What others have computed from these dwells, by name."""
+        return {}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Attitudes:
+    """What is known of the setting errors of all dwells (``AttitudeError``): rotation_rad (D, 3), variance_rad2 (D,),
+    bending (D, 3, 3)."""
+
+    rotation_rad: Floats
+    variance_rad2: Floats
+    bending: Floats
+
+    @property
+    def length(self) -> Floats:
+        """Length (D,) of the mean force over that of the force."""
+        return 1.0 - 0.5 * self.variance_rad2
+
+    def of(self, k: int) -> AttitudeError:
+        """That of one dwell."""
+        return AttitudeError(self.rotation_rad[k], float(self.variance_rad2[k]), self.bending[k])
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Facing:
+    """Dwells with one force (D, 3) and one pose (D, k) each at all nodes, in place of those that were folded; and the
+    dwells before, by index, where these were left out."""
+
+    force_mps2: Floats
+    pose: Floats
+    came_from: dict[int, DwellFactor]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class DwellStack(Sequence[DwellFactor]):
+    """Dwells in order of time, with what is the same for all of them in arrays.
+
+    - folded: the dwells as they were folded.
+    - turned_rad (D, 3), attitudes: as of ``DwellFactor``; None if none is turned, or no setting error allowed for.
+    - facing: forces and poses in place of those that were folded; None for those.
+    - added (pieces, K, 3): what has been added to the readings, by coefficients on the basis functions; None for
+      nothing.
+    """
+
+    folded: Folded
+    turned_rad: Floats | None = None
+    attitudes: Attitudes | None = None
+    facing: Facing | None = None
+    added: Floats | None = None
+    _made: dict[int, DwellFactor] = field(default_factory=dict[int, DwellFactor])
+
+    @classmethod
+    def of(cls, dwells: Sequence[DwellFactor]) -> DwellStack:
+        """Any dwells as a stack; a stack as it is."""
+        if isinstance(dwells, DwellStack):
+            return dwells
+        still, folded = np.zeros(3), Folded(dwells)
+        turned_rad, attitudes = None, None
+        if any(dwell.turned_rad is not None for dwell in dwells):
+            turned_rad = np.array([still if dwell.turned_rad is None else dwell.turned_rad for dwell in dwells])
+        if any(dwell.attitude is not None for dwell in dwells):
+            errors = [dwell.attitude or AttitudeError(still) for dwell in dwells]
+            none = np.zeros((3, 3))
+            attitudes = Attitudes(
+                np.array([error.rotation_rad for error in errors]),
+                np.array([error.variance_rad2 for error in errors]),
+                np.array([none if error.bending is None else error.bending for error in errors]),
+            )
+        return cls(folded, turned_rad, attitudes, _made=dict(enumerate(folded.dwells)))
+
+    def __len__(self) -> int:
+        return len(self.folded.dwells)
+
+    def __iter__(self) -> Iterator[DwellFactor]:
+        return (self[k] for k in range(len(self)))
+
+    @overload
+    def __getitem__(self, index: int) -> DwellFactor: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[DwellFactor]: ...
+    def __getitem__(self, index: int | slice) -> DwellFactor | list[DwellFactor]:
+        if isinstance(index, slice):
+            return [self[k] for k in range(*index.indices(len(self)))]
+        k = range(len(self))[index]
+        if k not in self._made:
+            self._made[k] = self._dwell(k)
+        return self._made[k]
+
+    def _dwell(self, k: int) -> DwellFactor:
+        dwell, facing = self.folded.dwells[k], self.facing
+        turned_rad = None if self.turned_rad is None or not self.turned_rad[k].any() else self.turned_rad[k]
+        attitude = None if self.attitudes is None else self.attitudes.of(k)
+        if facing is not None:
+            dwell = dwell.with_force(facing.force_mps2[k], facing.pose[k], attitude, facing.came_from.get(k))
+        dwell = dwell.linearised(turned_rad, attitude)
+        if self.added is not None:
+            first, end = self.folded.ends[k : k + 2]
+            dwell = dwell.subtract(-self.added[first:end, : dwell.width])
+        return dwell
+
+    def linearised(self, turned_rad: Floats | None, attitudes: Attitudes | None) -> DwellStack:
+        """The same dwells about forces that are turned otherwise."""
+        return DwellStack(self.folded, turned_rad, attitudes, self.facing, self.added)
+
+    def facing_forces(
+        self, force_mps2: Floats, pose: Floats, attitudes: Attitudes | None, came_from: dict[int, DwellFactor]
+    ) -> DwellStack:
+        """The same dwells, of no known attitude, with one force (D, 3) and one pose (D, k) each."""
+        return DwellStack(self.folded, self.turned_rad, attitudes, Facing(force_mps2, pose, came_from), self.added)
+
+    def plus(self, coefficients: Floats) -> DwellStack:
+        """The same dwells with readings plus what has these coefficients on their basis functions, (pieces, K, 3)."""
+        added = coefficients if self.added is None else self.added + coefficients
+        return DwellStack(self.folded, self.turned_rad, self.attitudes, self.facing, added)
+
+    @property
+    def piece_dwells(self) -> Places:
+        """The index of the dwell of each piece, (pieces,)."""
+        return np.repeat(np.arange(len(self)), self.folded.piece_numbers)
+
+    @cached_property
+    def triangles(self) -> list[Floats]:
+        """The triangles (d, P, K + 3, K + 3) of the dwells of each shape."""
+        if self.added is None:
+            return self.folded.triangles
+        changed = list[Floats]()
+        for shape, triangles in zip(self.folded.shapes, self.folded.triangles, strict=True):
+            width, triangles = shape.width, triangles.copy()
+            coefficients = self.added[shape.pieces][:, :, :width]
+            triangles[:, :, :width, width:] += triangles[:, :, :width, :width] @ coefficients
+            changed.append(triangles)
+        return changed
+
+    @cached_property
+    def force_mps2(self) -> Floats:
+        """Specific force at the nodes of all pieces that the poses show, (m, 3)."""
+        return self._at_nodes(self.folded.force_mps2 if self.facing is None else self.facing.force_mps2)
+
+    @cached_property
+    def pose(self) -> Floats:
+        """Pose at the nodes of all pieces, (m, k)."""
+        return self._at_nodes(self.folded.pose if self.facing is None else self.facing.pose)
+
+    def _at_nodes(self, values: Floats) -> Floats:
+        return values if self.facing is None else np.repeat(values, 3 * self.folded.piece_numbers, axis=0)
+
+    @cached_property
+    def poses(self) -> Floats:
+        """Mean pose of each dwell, (D, k)."""
+        if self.facing is not None:
+            return self.facing.pose
+        return self.folded.weighted(self.pose.reshape(-1, 3, self.pose.shape[1]).mean(axis=1))
+
+    @cached_property
+    def felt_force_mps2(self) -> Floats:
+        """Specific force that is felt at the nodes of all pieces, (m, 3)."""
+        return self.felt(self.force_mps2, 3 * self.folded.piece_numbers)
+
+    @cached_property
+    def felt_means_mps2(self) -> Floats:
+        """Mean specific force that is felt in each dwell, (D, 3)."""
+        return self.felt(self.means[:, 1:4])
+
+    def felt(self, force_mps2: Floats, times: Places | int = 1) -> Floats:
+        """The specific force that is felt where the angles show this one, (m, 3); ``times`` of it are of each
+        dwell."""
+        if self.turned_rad is not None:
+            force_mps2 = turned(force_mps2, np.repeat(self.turned_rad, times, axis=0))
+        if self.attitudes is not None:
+            force_mps2 = turned(force_mps2, np.repeat(self.attitudes.rotation_rad, times, axis=0))
+            force_mps2 = np.repeat(self.attitudes.length, times)[:, None] * force_mps2
+        return force_mps2
+
+    @cached_property
+    def means(self) -> Floats:
+        """Means (D, 7) of the regressors 1, f_x, f_y, f_z and of the three readings."""
+        forces = parabola(self.force_mps2.reshape(-1, 3, 3))
+        of_pieces = np.ones((len(forces), 7))
+        for shape, triangles in zip(self.folded.shapes, self.triangles, strict=True):
+            functions = triangles[:, :, 0] / triangles[:, :, :1, 0]  # means of the basis, then of the readings
+            of_pieces[shape.pieces, 1:4] = (functions[:, :, None, :3] @ forces[shape.pieces])[:, :, 0]
+            of_pieces[shape.pieces, 4:] = functions[:, :, shape.width :]
+        means = self.folded.weighted(of_pieces)
+        if self.facing is not None:
+            means[:, 1:4] = self.facing.force_mps2
+        return means
+
+    @cached_property
+    def before(self) -> tuple[Floats, Floats]:
+        """Mean force (D, 3), by its pose, and mean pose (D, k) of the dwell before each dwell."""
+        forces, poses = self.means[self.folded.before, 1:4], self.poses[self.folded.before]
+        came_from = self.folded.came_from if self.facing is None else self.facing.came_from
+        if came_from:
+            places, left_out = list(came_from), DwellStack.of(list(came_from.values()))
+            forces[places], poses[places] = left_out.means[:, 1:4], left_out.poses
+        return forces, poses
+
+    @cached_property
+    def bendings(self) -> Floats:
+        """By how much effects change the mean readings of each dwell per unit of force, (D, 3, 3)."""
+        return np.zeros((len(self), 3, 3)) if self.attitudes is None else self.attitudes.bending
+
+    @cached_property
+    def regressors(self) -> list[Floats]:
+        """The rows of the regressors 1, f_x, f_y, f_z that are felt in each piece of the dwells of each shape, (d, P,
+        K, 4)."""
+        forces, rows = self.felt_force_mps2.reshape(-1, 3, 3), list[Floats]()
+        for shape, triangles in zip(self.folded.shapes, self.triangles, strict=True):
+            values = np.ones((*shape.pieces.shape, 3, 4))
+            values[..., 1:] = forces[shape.pieces]
+            rows.append(triangles[:, :, : shape.width, :3] @ parabola(values))
+        return rows
+
+    def is_same(self, other: DwellStack) -> bool:
+        """Whether the other stack has the same dwells with the same changes."""
+        same = self.folded is other.folded or (
+            len(self) == len(other) and all(map(is_, self.folded.dwells, other.folded.dwells))
+        )
+        changes = ("turned_rad", "attitudes", "facing", "added")
+        return same and all(getattr(self, name) is getattr(other, name) for name in changes)
+
+
+def basis_values(columns: Floats) -> Floats:
+    """Coefficients (..., K, 3 c) on the basis functions of columns (..., K, 3, c) given at the nodes."""
+    return on_basis(columns.reshape(*columns.shape[:-2], -1))
