@@ -36,7 +36,7 @@ from kf_calib.online.session import Session
 from kf_calib.online.status import judge_so_far
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.live import LiveSource, frames, open_live
-from kf_calib.sources.live.links import Link
+from kf_calib.sources.live.feed import Link
 from kf_calib.sources.live.streamed import StreamedFeed
 from kf_calib.sources.simulation.options import options_from_query, simulation
 from kf_calib.views.live import line

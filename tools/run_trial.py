@@ -22,7 +22,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +38,7 @@ from kf_calib.design.gimbal_limits import Reach
 from kf_calib.design.predicted_information import Prospect
 from kf_calib.design.visit_order import PEAK_OVER_MEAN, Timing
 from kf_calib.dwells.qr import triangle
+from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Settings
 from kf_calib.online.session import Session
 from kf_calib.online.suggestion import Itinerary
@@ -92,9 +93,12 @@ class Fixed:
     sigma: Floats
 
     @classmethod
-    def of(cls, bench: Bench, white_mps2: float, poses: Floats, pace: Pace) -> Fixed:
-        readings = SAMPLE_HZ * (DWELL_S - 1.25)
-        prospect = Prospect.of_bench(bench, white_mps2, readings, DWELL_S)
+    def of(cls, bench: Bench, white_mps2: float, poses: Floats, pace: Pace, effect: str) -> Fixed:
+        """With the effect in the model that has to be estimated beside the twelve; empty for none."""
+        prospect = Prospect.of_bench(bench, white_mps2, SAMPLE_HZ * (DWELL_S - 1.25), DWELL_S)
+        model = Model.of(bench, (effect,) if effect else ())
+        nothing = np.zeros((model.count, model.count))
+        prospect = replace(prospect, model=model, state=model.nominal_state(), known=nothing)
         order = np.resize(np.arange(len(poses)), MOST)
         rows, factor, sigmas = prospect.rows(poses), prospect.start, list[Floats]()
         for k in order:
@@ -130,6 +134,7 @@ def papers_poses(bench: Bench) -> Floats:
 def drawn_targets(number: int, fixed: Fixed) -> dict[str, float]:
     """Targets by symbol, by kind: what the plan reaches in one of its last orientations."""
     at = int(np.random.default_rng([42, number]).integers(11, 24))
+    at += int(np.argmax(np.isfinite(fixed.sigma[at:]).all(axis=1)))  # what an effect leaves blind, takes longer
     kinds = [symbol.rstrip("123") for symbol in paper_parameters.SYMBOLS]
     by_kind = {kind: max(fixed.sigma[at, k] for k in range(12) if _alike(kinds[k], kind)) for kind in KINDS}
     return {symbol: float(by_kind[next(kind for kind in KINDS if _alike(symbol.rstrip("123"), kind))])
@@ -145,8 +150,8 @@ def one_bench(number: int) -> dict[str, Any]:
     query, effect = query_of(number)
     run, began_s = simulation(options_from_query(query), {}), time.process_time()
     bench, pace, white = run.bench, Pace(), run.noise.white_mps2
-    fixed = Fixed.of(bench, white, planned_poses(bench, white, pace), pace)
-    paper = Fixed.of(bench, white, papers_poses(bench), pace)
+    fixed = Fixed.of(bench, white, planned_poses(bench, white, pace), pace, effect)
+    paper = Fixed.of(bench, white, papers_poses(bench), pace, effect)
     targets = drawn_targets(number, fixed)
     wanted = np.array([targets[symbol] for symbol in paper_parameters.SYMBOLS])
     device, session = DrivenBench(run, None, [0.0] * 3), Session.fed(bench, Settings(), targets, auto=True)

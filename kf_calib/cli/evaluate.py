@@ -31,13 +31,25 @@ from kf_calib.cli.options import (
     units_option,
 )
 from kf_calib.cli.pictures import Pictures, figure_options, picture_options
-from kf_calib.cli.report import measured_of, report_option, save_report
+from kf_calib.cli.report import measured_of, report_option, save_report, typed
 from kf_calib.errors import InputError
 
 if TYPE_CHECKING:
     from kf_calib.diagnosis.selection_journal import Origin
 
 STEPS = "Steps"
+_OF_DIAGNOSE_ALONE = (
+    "details",
+    "rrd",
+    "screenshot",
+    "png",
+    "svg",
+    "pdf",
+    "overwrite",
+    "strict",
+    "as_json",
+    "bench_model",
+)
 
 
 @command("replay run.mcap", 'replay bag.mcap --axes "y z x" --gravity 9.8123 --with second-order --rrd run.rrd')
@@ -180,14 +192,20 @@ def _list_visible(recording: Path, names: tuple[str, ...], as_json: bool, option
 @recording_options
 @filter_options
 @bench_model_option
+@click.option(
+    "--details", is_flag=True, panel=OUTPUT,
+    help="Print the evidence, too: all suspects, where it fails, what this run cannot show, smallest sizes.",
+)  # fmt: skip
 @picture_options
 @overwrite_option
 @strict_option
 @units_option
 @json_option
 @click.pass_context
-def diagnose(ctx: click.Context, recording: Path, overwrite: bool, strict: bool, as_json: bool, **options: Any) -> None:
-    """Which physical effect is missing in the model: verdict, suspects, what this run cannot see, where to go next."""
+def diagnose(
+    ctx: click.Context, recording: Path, details: bool, overwrite: bool, strict: bool, as_json: bool, **options: Any
+) -> None:
+    """Which physical effect is missing in the model: verdict, probabilities, the shape of it, and what to do next."""
     from kf_calib.diagnosis.missing_effect import diagnose as run
     from kf_calib.diagnosis.refits import Refits
     from kf_calib.estimation.calibration import calibrate
@@ -200,7 +218,7 @@ def diagnose(ctx: click.Context, recording: Path, overwrite: bool, strict: bool,
     if as_json:
         print_json(views.diagnosis_object(diagnosis))
     else:
-        show(views.diagnosis_report(diagnosis))
+        show(views.diagnosis_report(diagnosis, typed(ctx, _OF_DIAGNOSE_ALONE), details))
     with delivery(outputs, as_json) as deliver:
         pictures.save(deliver, diagnosis)
     if strict and diagnosis.test.consistent is False:

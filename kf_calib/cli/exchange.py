@@ -296,7 +296,7 @@ def export(
     from kf_calib.exchange import calibration_file
     from kf_calib.exchange.exports import exported
     from kf_calib.support.output_files import write_whole
-    from kf_calib.views import export as views
+    from kf_calib.views import exchange as views
 
     outputs = claimed(overwrite=overwrite)
     saved = calibration_file.open_calibration(calibration)

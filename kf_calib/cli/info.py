@@ -87,7 +87,7 @@ def info(ctx: click.Context, recording: Path, columns: tuple[str, ...], as_json:
 def _show_calibration(path: Path, as_json: bool) -> None:
     """Show what a calibration holds."""
     from kf_calib.exchange.calibration_file import open_calibration
-    from kf_calib.views.calibration import calibration_object, calibration_report
+    from kf_calib.views.exchange import calibration_object, calibration_report
 
     saved = open_calibration(path)
     if as_json:

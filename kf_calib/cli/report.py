@@ -132,12 +132,12 @@ def measured_of(recording: Path, options: dict[str, Any]) -> Measured:
     import kf_calib.views.figures  # noqa: F401  # which a page needs
     from kf_calib.diagnosis.selection_journal import Origin
     from kf_calib.sources.files.decision_records import END_RECORD, decision_records
-    from kf_calib.sources.run_date import run_date
+    from kf_calib.sources.opening import run_date
     from kf_calib.views.report.measured import Measured
 
     fingerprint, began = Origin.of(recording).sha256, run_date(recording_of(recording, options))
     is_driven = recording.suffix == ".mcap" and recording.is_file()
-    decided, ends = ((decision_records(recording), decision_records(recording, END_RECORD)) if is_driven else ((), ()))
+    decided, ends = (decision_records(recording), decision_records(recording, END_RECORD)) if is_driven else ((), ())
     return Measured(recording.name, fingerprint, began, decided, ends)
 
 
@@ -164,9 +164,9 @@ _HOW_IT_ENDS = ("overwrite", "strict", "as_json")
 
 def commands_of(ctx: click.Context) -> list[str]:
     """The command that runs, as it could be typed again, and what prints its tables alone."""
-    commands = [f"kf-calib {ctx.info_name} {_typed(ctx, _HOW_IT_ENDS)}"]
+    commands = [f"kf-calib {ctx.info_name} {typed(ctx, _HOW_IT_ENDS)}"]
     if ctx.info_name == "report" and ctx.params.get("against") is None:
-        shared = _typed(ctx, ("output", *_HOW_IT_ENDS))
+        shared = typed(ctx, ("output", *_HOW_IT_ENDS))
         commands += [f"kf-calib {name} {shared}" for name in ("replay", "diagnose")]
     return [*commands, *(f"sha256sum {shlex.quote(str(path))}" for path in _recordings(ctx))]
 
@@ -178,7 +178,7 @@ def _recordings(ctx: click.Context) -> list[Path]:
     return [path for path in [*named, *others] if path.is_file()]
 
 
-def _typed(ctx: click.Context, less: Sequence[str]) -> str:
+def typed(ctx: click.Context, less: Sequence[str]) -> str:
     """Return the arguments and options that were given, but for some, as words of a shell."""
     words = list[str]()
     for param in ctx.command.params:

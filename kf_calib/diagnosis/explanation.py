@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.residual_drivers import misfit_beyond_noise, unexplained_mps2, walk_path
+from kf_calib.diagnosis.effect_shape import EffectShape, shape_over, shapes_of
+from kf_calib.diagnosis.residual_drivers import Driver, misfit_beyond_noise, unexplained_mps2
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration
 
@@ -42,6 +42,15 @@ class Explanation:
         return _share(before.statistic - after.statistic, before.dof - after.dof, excess) if excess > 0.0 else None
 
     @cached_property
+    def shapes(self) -> list[EffectShape]:
+        """What the readings show of each of its effects, over the quantity that the effect goes with."""
+        return shapes_of(self.before, self.after)
+
+    def over(self, driver: Driver) -> EffectShape:
+        """The same of all its effects together, over a quantity of the bench."""
+        return shape_over(self.before, self.after, driver, self.name)
+
+    @cached_property
     def unexplained_mps2(self) -> Floats:
         """What it leaves of the residuals (D, 3)."""
         return unexplained_mps2(self.after)
@@ -55,29 +64,6 @@ class Explanation:
     def predicted_mps2(self) -> Floats:
         """What it predicts of the residuals (D, 3): the difference of the two models' predictions."""
         return self.before.residuals_mps2 - self.unexplained_mps2
-
-    @cached_property
-    def contribution_mps2(self) -> Floats:
-        """What its effects add to the mean readings (D, 3), before the other parameters take up a part of it."""
-        columns = self._own
-        added = np.einsum(
-            "dip,p->di", self.after.linearised.means.design[:, :, columns], self.after.estimate.state[columns]
-        )
-        return added + walk_path(self.after)
-
-    @cached_property
-    def contribution_sigma_mps2(self) -> Floats:
-        """Sigma (D, 3) of the contribution, from the covariance of its coefficients."""
-        columns = self._own
-        design, covariance = self.after.linearised.means.design[:, :, columns], self.after.estimate.covariance
-        return np.sqrt(np.einsum("dip,pq,diq->di", design, covariance[np.ix_(columns, columns)], design))
-
-    @cached_property
-    def _own(self) -> NDArray[np.intp]:
-        """Return the places of its coefficients in the state; a walk has none, its path is no coefficient."""
-        model, parts_before = self.after.model, self.before.model.parts
-        added = (part for name, part in model.parts.items() if name not in parts_before)
-        return np.array([column for part in added for column in range(*part.indices(model.count))], int)
 
 
 def _share(delta_chi2: float, dof: int, excess: float) -> float:

@@ -43,7 +43,9 @@ from kf_calib.estimation.score_test import unweighted_left
 
 _NO_NOISE = 0.1  # share of an unknown cause in scatter that was not stated
 _AGAINST_STATED = 0.5  # the same of noise that contradicts what was stated: none is likelier than the other
+_OF_ORIENTATION = 0.8  # share of such causes that depend on the orientation alone, and come back with it
 _SHORT = 0.01  # prior probability of irregular changes that show within dwells only
+_END = 0.99  # of the range of a constant
 SCREEN_LOG_BF = 8.0  # rows further behind in log evidence are not refitted
 NONLINEARITY_MARGIN = 0.02  # share of the log evidence by which they may be further behind, as large effects bend
 _MOST = {"effect": 8, "attitude": 3, "pair": 4, "walk": 3, "formula": 3}
@@ -145,13 +147,13 @@ class Hypotheses:
         """Return the share of an unknown cause in these parts of the noise from dwell to dwell.
 
         Where they contradict what was stated, a cause that differs from orientation to orientation explains as much,
-        unless repeated orientations tell. Half of such causes depend on the orientation alone.
+        unless repeated orientations tell. Four of five such causes depend on the orientation alone.
         """
         stated = {"setting": self.before.noise.setting_stated, "common": self.before.noise.scatter_stated}
         if not any(stated[part] for part in noise.parts if part in stated):
             return _NO_NOISE if "common" in noise.parts else 0.0
         repeats = math.exp(min(log_odds_of_repeating(self.before, noise), 100.0))
-        unknown = _AGAINST_STATED * 0.5 * (1.0 + repeats)
+        unknown = _AGAINST_STATED * (1.0 - _OF_ORIENTATION + _OF_ORIENTATION * repeats)
         return unknown / (unknown + 1.0 - _AGAINST_STATED)
 
     def _log_bayes_of_effects(self) -> dict[str, float]:
@@ -284,6 +286,8 @@ class Hypotheses:
     def _formulas(self, screened: Mapping[str, float]) -> Iterator[Hypothesis]:
         """Yield the rows of formulas that are no known effect, the likeliest of each driver."""
         effects = [self.effects.candidate(name).effect for name in self.effects.best]
+        # at the end of the range of its constant an effect is the limit of another one, which may be a formula
+        effects = [each for each in effects if each.unknown is None or each.value < _END * each.unknown.high]
         names_in_model = [effect.name for effect in self.before.model.effects]
         drivers = dict[str, list[FormulaFamily]]()
         for family in self.refits.families(self.before.fit, effects):

@@ -124,33 +124,34 @@ def _delta_chi2(fitted: Fit, texts: dict[str, list[str]]) -> dict[str, tuple[flo
         )
 
 
-def is_function_of(values: Floats, driver: Driver) -> bool:
-    """Tell whether values (D, 3) are, for each accelerometer, nearly a smooth function of a driver, or a step at 0."""
-    for x, y in zip(driver.values.T, values.T, strict=True):
-        angle = driver.unit == "rad"
-        columns = [np.ones_like(x)]
-        if angle:
-            columns += [wave(turns * x) for turns in (1, 2, 3, 4) for wave in (np.sin, np.cos)]
-        else:
-            unit = x / max(np.abs(x).max(), 1e-300)
-            columns += [np.sign(x), np.abs(unit), *(unit**power for power in (1, 2, 3, 4))]
-        basis, spread = np.column_stack(columns), float(np.ptp(y))
-        if len(x) <= basis.shape[1] + 2:
-            return False
-        residuals = y - basis @ np.linalg.lstsq(basis, y, rcond=None)[0]
-        if spread > 0.0 and residuals.std() > _NEARLY * y.std():
-            return False
-    return True
+def is_function_of(values: Floats, quantity: Floats, unit: str) -> bool:
+    """Tell whether values (D, C) are, in each column, nearly a smooth function of a quantity (D, C), or a step at 0.
+
+    unit: SI unit of the quantity; an angle goes round.
+    """
+    return all(_is_function(x, y, unit == "rad") for x, y in zip(quantity.T, values.T, strict=True))
+
+
+def _is_function(x: Floats, y: Floats, of_an_angle: bool) -> bool:
+    """The same of one column (D,); instants where it is not known do not count."""
+    known = np.isfinite(x) & np.isfinite(y)
+    x, y = x[known], y[known]
+    columns = [np.ones_like(x), x]
+    if of_an_angle:
+        columns += [wave(turns * x) for turns in (1, 2, 3, 4) for wave in (np.sin, np.cos)]
+    else:
+        unit = x / max(np.abs(x).max(initial=0.0), 1e-300)
+        columns += [np.sign(x), np.abs(unit), *(unit**power for power in (2, 3, 4))]
+    basis = np.column_stack(columns)
+    if len(x) <= basis.shape[1] + 2:
+        return False
+    residuals = y - basis @ np.linalg.lstsq(basis, y, rcond=None)[0]
+    return not (np.ptp(y) > 0.0 and residuals.std() > _NEARLY * y.std())
 
 
 def unexplained_mps2(result: Calibration) -> Floats:
     """Residuals (D, 3) less the path of the biases where these walk, m/s^2."""
     return result.residuals_mps2 - walk_path(result)
-
-
-def channel_rms_mps2(residuals_mps2: Floats) -> Floats:
-    """The rms (3,) of residuals (D, 3) of each accelerometer, m/s^2."""
-    return np.sqrt(np.mean(residuals_mps2**2, axis=0))
 
 
 def unexplained_rms_mps2(result: Calibration) -> float:

@@ -189,9 +189,9 @@ class Diagnosis:
             advice = advise.to_tell_apart(fitted, first.effect, test.effects.scan.coefficients(first), rivals)
             if advice is None:
                 return None
-            words = f"tells {named[0]} from {', '.join(advice.told)}" if advice.told else f"shows {named[0]} best"
-            stay = "" if advice.stay_s is None else f" in {span(advice.stay_s)} there"
-            return advice, f"{words}: separation {advice.before:.1f} -> {advice.after:.1f} sigma{stay}"
+            words = f"tells {named[0]} from {' and '.join(advice.told)}" if advice.told else f"shows {named[0]} best"
+            stay = "" if advice.stay_s is None else f" after {span(advice.stay_s)} there"
+            return advice, f"{words}: by {advice.after:.1f} sigma{stay}, {advice.before:.1f} without it"
         hidden = [test.effects.candidate(name).effect for name in test.invisible if name in test.effects.best]
         advice_and_count = advise.to_show(fitted, hidden)
         if advice_and_count is None or not advice_and_count[1]:

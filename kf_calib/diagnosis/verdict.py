@@ -92,7 +92,7 @@ def _share(diagnosis: Diagnosis) -> str:
     first = diagnosis.table.first
     alone = format_probability(first.probability)
     with_others = format_probability(diagnosis.table.probability(first.effects))
-    return alone if alone == with_others else f"{alone} alone, {with_others} with others"
+    return alone if alone == with_others else f"{alone} by itself, {with_others} with others beside it"
 
 
 def _not_named(diagnosis: Diagnosis, first: Hypothesis) -> str:
@@ -107,7 +107,7 @@ def _unexplained(diagnosis: Diagnosis) -> str:
     consistency = diagnosis.after.consistency
     if consistency.consistent is not False:
         return ""
-    return f"; the rest is unexplained, NIS/dof {consistency.statistic / consistency.dof:.3g}"
+    return f"; what it leaves is still {(consistency.statistic / consistency.dof) ** 0.5:.2g} times the noise"
 
 
 def _unknown(diagnosis: Diagnosis, first: Hypothesis) -> str:
@@ -235,6 +235,6 @@ def _held_out(diagnosis: Diagnosis) -> str:
         return ""
     floor = after.held_out_floor_mps2
     return (
-        f" Adding it changes the held-out rms from {before.held_out_rms_mps2 / floor:.2f} to "
-        f"{after.held_out_rms_mps2 / floor:.2f} of the noise floor."
+        f" Adding it takes the error on orientations left out from {before.held_out_rms_mps2 / floor:.2f} to "
+        f"{after.held_out_rms_mps2 / floor:.2f} times what noise gives."
     )

@@ -6,10 +6,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.effects.effect import MICRO_G, MILLI_G, Bearer, Coefficient, Effect, SensorEffect, Typical, Unknown
+from kf_calib.effects.effect import (
+    MICRO_G,
+    MILLI_G,
+    Bearer,
+    Coefficient,
+    Effect,
+    Regressor,
+    SensorEffect,
+    Typical,
+    Unknown,
+)
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
+_TIME, _STEP = Regressor("t", "time", "s"), Regressor("da", "last step along the input axis", "m/s^2")
 _HELD = 2.5  # cycles in a piece, of which its parabola holds a fourteenth of the power
 
 
@@ -18,6 +29,7 @@ class BiasDrift(SensorEffect):
 
     family = "bias in time"
     name, title, source = "bias-drift", "bias that drifts with time", "IEEE Std 1293, drift"
+    drawn_against = _TIME
     confused_with = "warm-up; a monotone order of poses mixes it with angle"
     symbol, unit, scale = "beta", "m/s^3", 1e-6
     typical = Typical((1 * MICRO_G / 3600, 10 * MICRO_G / 3600), (10 * MICRO_G / 60, MILLI_G / 60))
@@ -31,6 +43,7 @@ class ScaleDrift(SensorEffect):
 
     family = "scale in time"
     name, title, source = "scale-drift", "scale factor that drifts with time", "IEEE Std 1293, drift"
+    drawn_against = Regressor("t*a", "time times force along the input axis", "m/s")
     confused_with = "base-tilt-drift"
     symbol, unit, scale = "kappa", "1/s", 1e-7
     typical = Typical((1e-6 / 86400, 10e-6 / 86400))
@@ -44,6 +57,7 @@ class Hysteresis(SensorEffect):
 
     family = "memory"
     name, title, source = "hysteresis", "reading that depends on the side it was come from", "IEEE Std 1293, hysteresis"
+    drawn_against = _STEP
     confused_with = "needs the same pose from two sides"
     symbol, unit, scale = "h", "m/s^2", 1e-3
     typical = Typical((1 * MICRO_G, 20 * MICRO_G), (0.0, 2 * MILLI_G))
@@ -65,6 +79,7 @@ class WarmUp(_Decay):
 
     family = "bias in time"
     name, title, source = "warm-up", "bias that settles after switching on", "IEEE Std 1293, turn-on transient"
+    drawn_against = _TIME
     confused_with = "bias-drift; needs an early long dwell"
     symbol, unit, scale = "B", "m/s^2", 1e-2
     unknown = Unknown("tauWarm", "s", 30.0, 10800.0, "min", 1.0 / 60.0)
@@ -82,6 +97,7 @@ class Settling(_Decay):
 
     family = "memory"
     name, title, source = "settling", "creep after a change of the input", "IEEE Std 1293, settling"
+    drawn_against = _STEP
     confused_with = "shows in early against late samples of a dwell"
     symbol, unit, scale = "C", "1", 1e-3
     unknown = Unknown("tauSettle", "s", 3.0, 600.0, "s", 1.0)
@@ -104,6 +120,7 @@ class Sinusoid(Effect):
 
     family = "surroundings"
     name, title, source = "sinusoid", "oscillation of one frequency", "Peterson, USGS OFR 93-322 (microseism); mains"
+    drawn_against = _TIME
     confused_with = "slower than a dwell: bias-drift, thermal effects"
     unknown = Unknown("fSin", "Hz", 1e-6, 1e5, "Hz", 1.0)
     oscillates = True
@@ -161,6 +178,7 @@ class BiasWalk(Effect):
 
     family = "bias in time"
     name, title, source = "bias-walk", "bias that walks at random", "IEEE Std 1293, annex on Allan variance"
+    drawn_against = _TIME
     borne_by = Bearer.SENSORS
     confused_with = "bias-drift; scatter from dwell to dwell"
     intensity = Coefficient("qb", "m/s^2/s^(1/2)", 1e-5)

@@ -93,6 +93,19 @@ def _complete(parameter: Coefficient | Unknown) -> None:
         object.__setattr__(parameter, "per_si", unit.per_si)
 
 
+@dataclass(frozen=True)
+class Regressor:
+    """A quantity that an effect is drawn against: an expression over the quantities of formulas, such as ``a*p``.
+
+    words: what it is. unit: SI. Both are left out for a single quantity, which has them. Without an expression it is
+    what a sensor effect adds per unit of its coefficient.
+    """
+
+    expression: str
+    words: str = ""
+    unit: str = ""
+
+
 class Bearer(StrEnum):
     """What can have an effect, by its physics.
 
@@ -124,6 +137,7 @@ class Effect(ABC):
     it (sigma); None where nature does not say. family: the physical class to which it belongs.
     prior: how much likelier it is than another effect before anything is measured, 1 for most.
     borne_by: what can have it at all; what nobody knows, as of a user's effect, may be of either.
+    drawn_against: the quantity over which what it adds to readings has a shape (``effects.axis``); None: what it adds.
     """
 
     name: ClassVar[str]
@@ -143,6 +157,7 @@ class Effect(ABC):
     family: ClassVar[str] = "none of the known"
     prior: ClassVar[float] = 1.0
     borne_by: ClassVar[Bearer] = Bearer.EITHER
+    drawn_against: Regressor | None = None
     variant: str = ""
     """The axis of an axis-wise effect (``encoder-harmonic-2:z``)."""
     value: float = 0.0
@@ -282,15 +297,22 @@ class FrameEffect(Effect):
     already, a little more of each coefficient turns it by J(rho) alpha x f, J the left Jacobian of rotations, and
     reading i changes by s_i times that. Where no angles are used, nothing is said of how the platform stands, and it
     has no columns.
+    gimbal: number from 0 of the one whose angle is wrong; None of any other error, which may turn about any axis.
     """
 
     borne_by = Bearer.BENCH
+    gimbal: int | None = None
 
     def shows_in(self, s: Stimulus) -> bool:
         return s.bench.angles and super().shows_in(s)
 
     @abstractmethod
     def rotations(self, s: Stimulus) -> Floats: ...
+
+    def about(self, s: Stimulus) -> Floats:
+        """The axis (m, 3), of unit length, about which an error of its gimbal's angle turns the specific force."""
+        assert self.gimbal is not None
+        return -s.inner(np.array(s.bench.axes[self.gimbal]), self.gimbal)
 
     def turned_rad(self, s: Stimulus, coefficients: Floats) -> Floats:
         """The rotation vector (m, 3) with these ``coefficients`` (q,), rad."""

@@ -38,7 +38,7 @@ from kf_calib.bench.bench import Bench, Vector
 from kf_calib.effects import checks
 from kf_calib.effects.effect import Bearer, Coefficient, FrameEffect, SensorEffect
 from kf_calib.effects.expression import Expression
-from kf_calib.effects.frame import about_axis, gimbal_number
+from kf_calib.effects.frame import gimbal_number
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.errors import InputError
 
@@ -134,7 +134,7 @@ def symbol_stem(name: str) -> str:
     return f"{name}_" if name[-1].isdigit() else name
 
 
-class _Reading:
+class Reading:
     """A formula read: its expression over the quantities of the bench."""
 
     def __init__(self, name: str, expression: str, bench: Bench) -> None:
@@ -154,6 +154,16 @@ class _Reading:
         """Of the quantities, by name."""
         return {key: quantity.unit for key, quantity in self._known.items()}
 
+    @property
+    def unit(self) -> str:
+        """SI unit of the formula; "" where its units do not fit, as those of one may that the program has written."""
+        from kf_calib.effects.formula_units import pint_unit_of, text
+
+        try:
+            return text(pint_unit_of(self.expression, self.units))
+        except InputError:
+            return ""
+
     def typical(self, stimulus: Stimulus) -> float:
         """Rms on a trial run, to a power of ten."""
         size = np.abs(self(stimulus))
@@ -163,7 +173,7 @@ class _Reading:
         return 10.0 ** round(math.log10(largest * np.sqrt(np.mean((size / largest) ** 2))))
 
 
-def _units(reading: _Reading, turning: bool) -> tuple[str, tuple[str, float]]:
+def _units(reading: Reading, turning: bool) -> tuple[str, tuple[str, float]]:
     """SI unit of a formula's coefficients, a unit of the field, and how many of it are one; of angles, or readings."""
     from kf_calib.effects.formula_units import coefficient_units, pint_unit_of, turning_units
 
@@ -186,18 +196,18 @@ class Formula(SensorEffect):
     borne_by = Bearer.EITHER
 
     def __init__(self, name: str, expression: str, bench: Bench, checked: bool = True) -> None:
-        self._values, unit, shown = _Reading(name, expression, bench), "", ("", 1.0)
+        self.reading, unit, shown = Reading(name, expression, bench), "", ("", 1.0)
         if checked:
-            unit, shown = _units(self._values, turning=False)
+            unit, shown = _units(self.reading, turning=False)
         # of the class in the catalogue; here each formula has its own
         vars(self).update(name=name, title=expression, symbol=symbol_stem(name), unit=unit, shown=shown, scale=1.0)
         self.text = f"{name} = {expression}"
         stimulus = _trial(bench.axes, bench.gravity_mps2)
         self.remarks = checks.check_effect(self, stimulus) if checked else ()
-        vars(self).update(scale=_LARGE_MPS2 / self._values.typical(stimulus))
+        vars(self).update(scale=_LARGE_MPS2 / self.reading.typical(stimulus))
 
     def terms(self, s: Stimulus) -> Floats:
-        terms = np.array(np.broadcast_to(self._values(s), (len(s), 3)), dtype=float)
+        terms = np.array(np.broadcast_to(self.reading(s), (len(s), 3)), dtype=float)
         checks.refuse_not_finite(self, terms, s)
         return terms
 
@@ -212,19 +222,19 @@ class FrameFormula(FrameEffect):
     borne_by = Bearer.EITHER
 
     def __init__(self, name: str, place: str, expression: str, bench: Bench, checked: bool = True) -> None:
-        self._values, unit, shown = _Reading(name, expression, bench), "", ("", 1.0)
-        self._gimbal = None if place == BASE else gimbal_number(place, gimbal_letters(bench.axes))
+        self.reading, unit, shown = Reading(name, expression, bench), "", ("", 1.0)
+        self.gimbal = None if place == BASE else gimbal_number(place, gimbal_letters(bench.axes))
         if checked:
-            unit, shown = _units(self._values, turning=True)
+            unit, shown = _units(self.reading, turning=True)
         vars(self).update(name=name, variant=place, title=expression)
         self.text = f"{name}:{place} = {expression}"
         stimulus = _trial(bench.axes, bench.gravity_mps2)
-        if self._values(stimulus).shape[1] != 1:
+        if self.reading(stimulus).shape[1] != 1:
             raise InputError(f"{name}: an angle is one for the whole block: use fx, fy, fz in place of a, p, o and da.")
         symbols = [f"{symbol_stem(name)}{axis}" for axis in ("NE" if place == BASE else [f"_{place}"])]
         self._coefficients = tuple(Coefficient(symbol, unit, 1.0, *shown) for symbol in symbols)
         self.remarks = checks.check_effect(self, stimulus) if checked else ()
-        scale = _LARGE_RAD / self._values.typical(stimulus)
+        scale = _LARGE_RAD / self.reading.typical(stimulus)
         self._coefficients = tuple(replace(each, scale=scale) for each in self._coefficients)
 
     @property
@@ -232,9 +242,9 @@ class FrameFormula(FrameEffect):
         return self._coefficients
 
     def rotations(self, s: Stimulus) -> Floats:
-        values = self._values(s)
+        values = self.reading(s)
         checks.refuse_not_finite(self, values, s)
-        axes = [about_axis(s, self._gimbal)] if self._gimbal is not None else [-s.to_platform(n) for n in s.level_axes]
+        axes = [self.about(s)] if self.gimbal is not None else [-s.to_platform(n) for n in s.level_axes]
         return values[:, :, None] * np.stack(axes, axis=1)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
-from kf_calib.effects.effect import Bearer, Coefficient, Effect, FrameEffect, Typical
+from kf_calib.effects.effect import Bearer, Coefficient, Effect, FrameEffect, Regressor, Typical
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.errors import InputError
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
@@ -148,11 +148,6 @@ class CrossTalk(Effect):
         return "at rest, cross-talk is exactly a misalignment: no orientation tells the two apart"
 
 
-def about_axis(s: Stimulus, gimbal: int) -> Floats:
-    """What a positive error of a gimbal's angle turns the specific force by, rad/rad, (m, 3)."""
-    return -s.inner(np.array(s.bench.axes[gimbal]), gimbal)
-
-
 class _GimbalEffect(FrameEffect):
     """An effect of one gimbal, named by its letter or number after the colon."""
 
@@ -161,10 +156,8 @@ class _GimbalEffect(FrameEffect):
     def __init__(self, gimbal: int, variant: str) -> None:
         self.gimbal, self.variant = gimbal, variant
 
-    def _about_axis(self, s: Stimulus) -> Floats:
-        return about_axis(s, self.gimbal)
-
     def _angle(self, s: Stimulus) -> Floats:
+        assert self.gimbal is not None
         return s.pose[:, self.gimbal]
 
 
@@ -179,7 +172,7 @@ class EncoderOffset(_GimbalEffect):
         return (Coefficient(f"eps_{self.variant}", "rad", 1e-2),)
 
     def rotations(self, s: Stimulus) -> Floats:
-        return self._about_axis(s)[:, None, :]
+        return self.about(s)[:, None, :]
 
     def degeneracy(self, bench: Bench) -> str:
         if self.gimbal == len(bench.axes) - 1:
@@ -187,7 +180,15 @@ class EncoderOffset(_GimbalEffect):
         return "the zero of the outer encoder is exactly a tilt of the base about its axis" if self.gimbal == 0 else ""
 
 
-class EncoderScale(_GimbalEffect):
+class _OfItsAngle(_GimbalEffect):
+    """An error of a gimbal's angle that depends on this angle."""
+
+    def __init__(self, gimbal: int, variant: str) -> None:
+        super().__init__(gimbal, variant)
+        self.drawn_against = Regressor(f"q{gimbal + 1}")
+
+
+class EncoderScale(_OfItsAngle):
     """q_k (1 + epsilon_k)."""
 
     name, title, source = "encoder-scale", "scale of an encoder", "geometry of the bench"
@@ -197,10 +198,10 @@ class EncoderScale(_GimbalEffect):
         return (Coefficient(f"epsS_{self.variant}", "1", 1e-3),)
 
     def rotations(self, s: Stimulus) -> Floats:
-        return (self._angle(s)[:, None] * self._about_axis(s))[:, None, :]
+        return (self._angle(s)[:, None] * self.about(s))[:, None, :]
 
 
-class EncoderHarmonic1(_GimbalEffect):
+class EncoderHarmonic1(_OfItsAngle):
     """s sin q_k + c cos q_k on the angle."""
 
     name, title, source = "encoder-harmonic-1", "eccentricity of an encoder", "geometry of the bench"
@@ -213,7 +214,7 @@ class EncoderHarmonic1(_GimbalEffect):
 
     def rotations(self, s: Stimulus) -> Floats:
         angle = self.order * self._angle(s)
-        return np.stack([np.sin(angle), np.cos(angle)], axis=1)[:, :, None] * self._about_axis(s)[:, None, :]
+        return np.stack([np.sin(angle), np.cos(angle)], axis=1)[:, :, None] * self.about(s)[:, None, :]
 
 
 class EncoderHarmonic2(EncoderHarmonic1):
@@ -237,6 +238,7 @@ class AxisNonorthogonality(_GimbalEffect):
     def rotations(self, s: Stimulus) -> Floats:
         from kf_calib.bench.bench import turn
 
+        assert self.gimbal is not None
         axis = np.array(s.bench.axes[self.gimbal])
         tilts = np.linalg.svd(axis[None])[2][1:]  # two directions across the axis
         return np.stack([s.inner(tilt - turn(tilt, axis, -self._angle(s)), self.gimbal) for tilt in tilts], axis=1)

@@ -5,12 +5,22 @@ from __future__ import annotations
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.effects.effect import MICRO_G, MICRO_PER_G, MILLI_PER_G, Bearer, SensorEffect, Typical, Unknown
+from kf_calib.effects.effect import (
+    MICRO_G,
+    MICRO_PER_G,
+    MILLI_PER_G,
+    Bearer,
+    Regressor,
+    SensorEffect,
+    Typical,
+    Unknown,
+)
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 IEEE = "IEEE Std 1293, model equation"
 _EDGES = 500
+_INPUT = Regressor("a", "force along the input axis", "m/s^2")
 
 
 class BiasAsymmetry(SensorEffect):
@@ -18,6 +28,7 @@ class BiasAsymmetry(SensorEffect):
 
     family = "nonlinearity"
     name, title, source = "bias-asymmetry", "bias that changes sign with the input", IEEE
+    drawn_against = _INPUT
     formulas = ("0.5*sign(a)",)
     confused_with = "odd-quadratic; invisible in six faces"
     symbol, unit, scale = "K0'", "m/s^2", 1e-3
@@ -32,6 +43,7 @@ class ScaleAsymmetry(SensorEffect):
 
     family = "nonlinearity"
     name, title, source = "scale-asymmetry", "scale factor that differs with the sign of the input", IEEE
+    drawn_against = _INPUT
     formulas = ("0.5*abs(a)",)
     confused_with = "second-order"
     symbol, unit, scale = "K1'", "1", 1e-3
@@ -46,6 +58,7 @@ class SecondOrder(SensorEffect):
 
     family = "nonlinearity"
     name, title, source = "second-order", "second-order nonlinearity", IEEE
+    drawn_against = _INPUT
     formulas = ("a**2",)
     confused_with = "scale-asymmetry"
     symbol, unit, scale = "K2_", "s^2/m", 1e-4
@@ -60,6 +73,7 @@ class ThirdOrder(SensorEffect):
 
     family = "nonlinearity"
     name, title, source = "third-order", "third-order nonlinearity", IEEE
+    drawn_against = _INPUT
     formulas = ("a**3",)
     confused_with = "odd-quadratic; invisible in six faces"
     symbol, unit, scale = "K3_", "s^4/m^2", 1e-5
@@ -80,6 +94,7 @@ class OddQuadratic(SensorEffect):
 
     family = "nonlinearity"
     name, title, source = "odd-quadratic", "odd quadratic nonlinearity", IEEE
+    drawn_against = _INPUT
     formulas = ("a*abs(a)",)
     confused_with = "third-order; invisible in six faces"
     symbol, unit, scale = "Koq", "s^2/m", 1e-4
@@ -100,6 +115,7 @@ class CrossCouplingIP(_CrossCoupling):
     """Kip a_i a_p."""
 
     name, title, symbol = "cross-coupling-ip", "input-pendulous cross-coupling", "Kip"
+    drawn_against = Regressor("a*p", "force along the input axis times that along the pendulous axis", "m^2/s^4")
     formulas = ("a*p",)
 
     def terms(self, s: Stimulus) -> Floats:
@@ -110,6 +126,7 @@ class CrossCouplingIO(_CrossCoupling):
     """Kio a_i a_o."""
 
     name, title, symbol = "cross-coupling-io", "input-output cross-coupling", "Kio"
+    drawn_against = Regressor("a*o", "force along the input axis times that along the output axis", "m^2/s^4")
     formulas = ("a*o",)
 
     def terms(self, s: Stimulus) -> Floats:
@@ -120,6 +137,7 @@ class CrossCouplingPO(_CrossCoupling):
     """Kpo a_p a_o."""
 
     name, title, symbol = "cross-coupling-po", "pendulous-output cross-coupling", "Kpo"
+    drawn_against = Regressor("p*o", "force along the pendulous axis times that along the output axis", "m^2/s^4")
     formulas = ("p*o",)
 
     def terms(self, s: Stimulus) -> Floats:
@@ -130,6 +148,7 @@ class CrossAxisSquare(_CrossCoupling):
     """Kpp a_p^2; Koo a_o^2 is then redundant, because the squares sum to g^2."""
 
     name, title, symbol = "cross-axis-square", "square of the pendulous acceleration", "Kpp"
+    drawn_against = Regressor("p", "force along the pendulous axis", "m/s^2")
     formulas = ("p**2",)
     confused_with = "second-order, bias"
     typical = Typical((1 * MICRO_PER_G, 20 * MICRO_PER_G), (0.0, MILLI_PER_G))
@@ -143,6 +162,7 @@ class VibrationRectification(SensorEffect):
 
     family = "surroundings"
     name, title, source = "vibration-rectification", "shift of the bias under vibration", IEEE
+    drawn_against = Regressor("", "variance of the readings", "m^2/s^4")
     borne_by = Bearer.EITHER  # the sensor rectifies what the bench shakes
     confused_with = "needs vibration that varies"
     averages = True
@@ -158,6 +178,7 @@ class DeadZone(SensorEffect):
 
     family = "nonlinearity"
     name, title, source = "dead-zone", "no response to small inputs", IEEE
+    drawn_against = _INPUT
     formulas = ("-a*(abs(a) < constant)",)
     confused_with = "needs poses that sweep through zero"
     symbol, unit, scale, shown = "Dz", "1", 1.0, ("of the input", 1.0)

@@ -5,10 +5,21 @@ from __future__ import annotations
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.effects.effect import MICRO_G, MILLI_G, Bearer, Coefficient, Effect, SensorEffect, Typical, Unknown
+from kf_calib.effects.effect import (
+    MICRO_G,
+    MILLI_G,
+    Bearer,
+    Coefficient,
+    Effect,
+    Regressor,
+    SensorEffect,
+    Typical,
+    Unknown,
+)
 from kf_calib.effects.stimulus import Stimulus
 
 IEEE = "IEEE Std 1293, environmental sensitivities"
+_TEMPERATURE = Regressor("T", "temperature less 25 °C", "K")
 
 
 class ThermalBias(SensorEffect):
@@ -16,6 +27,7 @@ class ThermalBias(SensorEffect):
 
     family = "temperature"
     name, title, source = "thermal-bias", "bias that follows the temperature", IEEE
+    drawn_against = _TEMPERATURE
     formulas = ("T",)
     confused_with = "needs a temperature swing"
     symbol, unit, scale = "alpha", "m/s^2/K", 1e-3
@@ -30,6 +42,7 @@ class ThermalBias2(SensorEffect):
 
     family = "temperature"
     name, title, source = "thermal-bias-2", "bias that follows the square of the temperature", IEEE
+    drawn_against = _TEMPERATURE
     formulas = ("T**2",)
     symbol, unit, scale = "alpha2_", "m/s^2/K^2", 1e-4
 
@@ -42,6 +55,7 @@ class ThermalScale(SensorEffect):
 
     family = "temperature"
     name, title, source = "thermal-scale", "scale factor that follows the temperature", IEEE
+    drawn_against = Regressor("T*a", "temperature less 25 °C, times force along the input axis", "K m/s^2")
     formulas = ("T*a",)
     confused_with = "needs both signs of the input at two temperatures"
     symbol, unit, scale = "alphaS", "1/K", 1e-4
@@ -56,6 +70,7 @@ class ThermalRate(SensorEffect):
 
     family = "temperature"
     name, title, source = "thermal-rate", "bias that follows the rate of the temperature", IEEE
+    drawn_against = Regressor("dT")
     confused_with = "warm-up"
     symbol, unit, scale = "kappaT", "m s^-1/K", 1e-1
     typical = Typical((1 * 60 * MICRO_G, 50 * 60 * MICRO_G))
@@ -90,6 +105,7 @@ class ThermalLag(SensorEffect):
 
     family = "temperature"
     name, title, source = "thermal-lag", "bias that follows the temperature late", IEEE
+    drawn_against = _TEMPERATURE
     confused_with = "thermal-bias and thermal-rate together"
     symbol, unit, scale = "alphaL", "m/s^2/K", 1e-3
     unknown = Unknown("tauLag", "s", 30.0, 7200.0, "min", 1.0 / 60.0)

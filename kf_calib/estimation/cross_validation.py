@@ -31,10 +31,13 @@ _ROUNDING = 1.0 + 1e-9  # by which cells are larger, so that nearer ones are nev
 
 
 def orientations(dwells: Sequence[DwellFactor]) -> list[list[int]]:
-    """Indices of the dwells grouped by orientation, that is by direction of gravity in the platform and by pose."""
+    """Indices of the dwells grouped by orientation, that is by direction of gravity in the platform and by pose.
+
+    Angles that differ by whole turns are the same pose: their sines and cosines are compared.
+    """
     stack = DwellStack.of(dwells)
     direction = stack.means[:, 1:4] / np.linalg.norm(stack.means[:, 1:4], axis=1, keepdims=True)
-    places = np.column_stack([direction, stack.poses])
+    places = np.column_stack([direction, np.cos(stack.poses), np.sin(stack.poses)])
     known, before = stack.folded.known.get("orientations", ([], places[:0]))
     if not np.array_equal(places, before):
         known = grouped(places, math.radians(SAME_POSE_DEG))

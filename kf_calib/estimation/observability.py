@@ -58,8 +58,8 @@ class Visibility:
         """The visibility in one sentence."""
         if self.share is None:
             return f"{self.effect}: {self.why}"
-        seen = f"visible, {self.share:.2g} of its column is left beside the rest of the model"
-        parts = [seen if self.visible else "invisible in this run: it adds nothing, or what the rest of the model adds"]
+        seen = f"visible: {_in_per_cent(self.share)} of it cannot be imitated by the other parameters"
+        parts = [seen if self.visible else "invisible in this run: it adds nothing, or what the other parameters add"]
         if self.unseen and self.visible:
             parts.append(f"not determined: {' '.join(self.unseen)}")
         if self.smallest is not None:
@@ -82,6 +82,11 @@ class Visibility:
         if unknown is None:
             return ""
         return f" with {unknown.symbol} at {shown(unknown).text(self.effect.value)}"
+
+
+def _in_per_cent(share: float) -> str:
+    """Return a share in per cent, to two digits where it is small."""
+    return f"{100.0 * share:.2g} %" if share < 0.1 else f"{100.0 * share:.0f} %"
 
 
 def visibility_of(fitted: Fit, effects: Sequence[Effect]) -> list[Visibility]:

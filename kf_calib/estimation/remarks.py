@@ -19,6 +19,9 @@ from kf_calib.noise.reml import ENOUGH_DIRECTIONS, FEWEST, degrees_of_freedom, d
 from kf_calib.noise.temperature_course import temperature_course
 from kf_calib.support.units import shown
 
+MISSING_OR_NOISE = "the dwells scatter about the model by more than the noise: an effect is missing in the model, or "
+"""How the sentence begins on a misfit of which no more is known."""
+
 
 def misfit_remark(judged: Consistency, residuals: Floats, bench: Bench, noise: Noise) -> str:
     """A sentence on what may be wrong if the dwells do not fit the model, from residuals (D, 3); '' if they fit."""
@@ -34,10 +37,7 @@ def misfit_remark(judged: Consistency, residuals: Floats, bench: Bench, noise: N
             "check the order and sign of the axes, the unit of the angles, and which channel is which."
         )
     if judged.consistent is False:
-        return (
-            "the dwells scatter about the model by more than the noise: an effect is missing in the model, or "
-            f"{_beyond_noise(noise)}."
-        )
+        return f"{MISSING_OR_NOISE}{_beyond_noise(noise)}."
     return ""
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import Any, Protocol
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.effects import Stimulus
 from kf_calib.effects.formula import quantities
 from kf_calib.errors import InputError
 from kf_calib.estimation.dwell_columns import LinearisedDwells, stimulus_of
@@ -57,14 +58,18 @@ def mean_sigmas(result: Run) -> Floats:
 
 def quantity_means(result: Run, names: list[str]) -> dict[str, Floats]:
     """Means (D, 3) over each dwell of quantities that formulas may name, in SI units, for each accelerometer."""
-    dwells, known = result.linearised.dwells, quantities(result.bench.axes)
+    known = quantities(result.bench.axes)
+    means = means_over_dwells(result, [known[name].of for name in names])
+    return dict(zip(names, means, strict=True))
+
+
+def means_over_dwells(result: Run, functions: Sequence[Callable[[Stimulus], Floats | float]]) -> list[Floats]:
+    """Means (D, 3) over each dwell of functions of what the bench does, a number or values (m, 1) or (m, 3) each."""
+    dwells = result.linearised.dwells
     stimulus, weights = stimulus_of(dwells, result.bench, result.linearised.state), _weights(dwells)
     firsts = np.cumsum([0, *(3 * len(dwell.pieces) for dwell in dwells[:-1])])
-    means = dict[str, Floats]()
-    for name in names:
-        values = np.broadcast_to(known[name].of(stimulus), (len(stimulus), 3))
-        means[name] = np.add.reduceat(values * weights[:, None], firsts)
-    return means
+    values = [np.broadcast_to(function(stimulus), (len(stimulus), 3)) for function in functions]
+    return [np.add.reduceat(each * weights[:, None], firsts) for each in values]
 
 
 def _weights(dwells: list[DwellFactor]) -> Floats:

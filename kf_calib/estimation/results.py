@@ -190,7 +190,7 @@ class OutlyingDwell:
         elif axes:
             told += ", which no turn of one gimbal explains"
         p_value = self.without.consistency.p_value
-        agrees = "" if p_value is None else f" (p = {p_value:.2g})"
+        agrees = "" if p_value is None else f" (p {format_p(p_value)})"
         return f"{told}; without it model and measurements agree{agrees}: --leave-out {self.number}."
 
 

@@ -57,8 +57,7 @@ from kf_calib.exchange.calibration_parts import (
 )
 from kf_calib.sources.files.contents import CALIBRATION_FORMAT
 from kf_calib.sources.files.record_files import fingerprint
-from kf_calib.sources.opening import opened
-from kf_calib.sources.run_date import run_date
+from kf_calib.sources.opening import opened, run_date
 from kf_calib.support import dates
 from kf_calib.support.output_files import write_whole
 from kf_calib.support.plain_text import cut, sentence

@@ -42,7 +42,7 @@ from kf_calib.fleet.run_factor import run_factor
 from kf_calib.fleet.run_list import ListedRun, Row
 from kf_calib.fleet.store import Known, Store
 from kf_calib.sources.files.record_files import fingerprint
-from kf_calib.sources.run_date import run_date
+from kf_calib.sources.opening import run_date
 from kf_calib.support.threads import one_blas_thread
 
 _AHEAD = 4

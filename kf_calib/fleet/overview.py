@@ -9,6 +9,7 @@ from datetime import date, datetime, timedelta
 from pathlib import PurePosixPath
 from typing import Any
 
+from kf_calib.estimation.results import format_p
 from kf_calib.fleet.pooled_diagnosis import PooledDiagnosis
 from kf_calib.fleet.pooled_terms import Attribution
 from kf_calib.fleet.track import Track, tracks
@@ -107,7 +108,7 @@ def _of_runs(rows: Sequence[Mapping[str, Any]]) -> list[_Reason]:
             reasons.append((row["unit"], 0.0, f"{name} failed"))
         elif row["consistent"] is False and row["p_value"] is not None:
             missing = f"shows {row['missing']}" if row["missing"] else "does not fit its model"
-            reason = f"{name} {missing} (p = {row['p_value']:.1g})"
+            reason = f"{name} {missing} (p {format_p(row['p_value'])})"
             reasons.append((row["unit"], sidak(row["p_value"], len(rows)), reason))
     return reasons
 

@@ -51,7 +51,7 @@ _LOG_ODDS = np.log(SHARES / (1.0 - SHARES))[:, None]
 
 
 @dataclass(frozen=True)
-class Shape:
+class CoefficientShape:
     """One supposition, for each share of a grid and each size of another.
 
     - units: their number. ratios: of a few of them, the log of the likelihood of each with the effect against that
@@ -114,13 +114,13 @@ class Shape:
         return low, high
 
 
-def about_zero(group: Group, information: UnitInformation, power: int) -> Shape:
+def about_zero(group: Group, information: UnitInformation, power: int) -> CoefficientShape:
     """The shape with m = ``power``."""
     values, along, _ = modes(information.info, information.score)
     tried = sizes(_LEAST_OF_UNIT, _LARGEST_ALIKE if power == max(POWERS) else group.largest, _STEPS[power])
     log_prior = np.full((len(SHARES), len(tried)), -np.log(len(SHARES) * len(tried)))
     ratios = _ratios(values, along, tried, power)[:, None]
-    return Shape(len(values), ratios.__getitem__, log_prior, tried[None] / np.sqrt(values.shape[1]))
+    return CoefficientShape(len(values), ratios.__getitem__, log_prior, tried[None] / np.sqrt(values.shape[1]))
 
 
 def _ratios(values: Floats, along: Floats, tried: Floats, power: int) -> Floats:
@@ -176,7 +176,7 @@ class _Told:
         return (chances @ self.info.reshape(len(self.info), -1)).reshape(*chances.shape[:-1], *self.info.shape[1:])
 
 
-def about_mean(information: UnitInformation) -> Shape:
+def about_mean(information: UnitInformation) -> CoefficientShape:
     """The shape of units that have an effect about a mean of their own."""
     eigenmodes, count = modes(information.info, information.score), information.score.shape[1]
     means, logs, size = list[tuple[float, Floats]](), list[Floats](), list[Floats]()
@@ -193,7 +193,7 @@ def about_mean(information: UnitInformation) -> Shape:
         return np.stack([_told(here, spread).ratios(mean).T for spread, mean in means], axis=2)
 
     log_prior = np.stack(logs, axis=1) - np.log(len(SHARES) * len(means))
-    return Shape(len(information.score), ratios, log_prior, np.stack(size, axis=1))
+    return CoefficientShape(len(information.score), ratios, log_prior, np.stack(size, axis=1))
 
 
 def _told(found: Sequence[Floats], spread: float) -> _Told:

@@ -34,6 +34,8 @@ from kf_calib.online.progress import Progress
 from kf_calib.online.sequential_test import Watch
 from kf_calib.support.threads import one_blas_thread
 
+_DETERMINES = 1e-3  # share of its sigma to which a parameter comes down that was not determined at all
+_RISEN = 1.5  # times a sigma that the next dwell may take it up by before that is told
 _FEWEST = 5  # dwells before the model is judged: fewer leave no degrees of freedom
 _FEWEST_UNSTATED = 12  # the same where the noise from dwell to dwell has to be estimated, too
 _QUIET = 0.1  # share of the variance from dwell to dwell below which the noise of a mean no longer matters
@@ -125,6 +127,7 @@ class Judgement:
     result: the calibration. look: the latest test of all candidates, which may be a few dwells old. watch: the
     sequential test (None: too few dwells). wanted (12,): target of each sigma, SI; NaN where there is none. course:
     predicted sigmas if the run goes on (None: not determined yet). final: whether the run has ended.
+    sigma_before (12,): the sigmas a dwell before (None: there were none).
     """
 
     result: Calibration
@@ -133,6 +136,20 @@ class Judgement:
     wanted: Floats
     course: Course | None = None
     final: bool = False
+    sigma_before: Floats | None = None
+
+    @property
+    def risen(self) -> tuple[str, float] | None:
+        """The parameter whose sigma has risen most with the last dwell, and how many times; None if none has by much.
+
+        More readings raise no sigma: what does is noise that is estimated anew, or an effect that was added.
+        """
+        if self.sigma_before is None:
+            return None
+        with np.errstate(invalid="ignore"):
+            factors = np.nan_to_num(self.result.estimate.sigma / self.sigma_before)
+        k = int(np.argmax(factors))
+        return (paper_parameters.SYMBOLS[k], float(factors[k])) if factors[k] > _RISEN else None
 
     @property
     def diagnosis(self) -> Diagnosis:
@@ -177,10 +194,11 @@ class Judgement:
     def verdict(self) -> str:
         """The verdict in a few words, for a screen."""
         if self.consistent is None:
+            seen, least = len(self.result.visits), _least(self.result)
             return (
-                f"not judged before {_least(self.result)} dwells"
-                if self.watch is None
-                else "too few measurements to test the model"
+                f"too early to judge the model: {seen} of at least {least} orientations"
+                if self.watch is None and seen < least
+                else "too few measurements to judge the model"
             )
         looks = f", look {self.watch.looks}" if self.watch is not None and not self.final else ""
         if not self.alarm:
@@ -205,7 +223,9 @@ class Judgement:
         if self.course is None:
             return None
         symbol, factor = self.course.next_reduction(self.worst)
-        return self.course.gimbal_deg, f"lowers sigma of {symbol} to {factor:.2f} of its value"
+        if not factor > _DETERMINES:
+            return self.course.gimbal_deg, f"determines {symbol} for the first time"
+        return self.course.gimbal_deg, f"lowers sigma of {symbol} by {100.0 * (1.0 - factor):.0f} %"
 
     @cached_property
     def worst(self) -> Floats:
@@ -286,7 +306,8 @@ def judge_so_far(passed: Pass, wanted: Floats, before: Judgement | None = None) 
         result = with_remarks(evaluate_fit(fitted_to(passed, dwells), passed.settings), passed)
         watch = _sequential_test(dwells, result, None if before is None else before.watch)
         look = _look(result, watch) if before is None else before.look.again(result, watch)
-        return Judgement(result, look, watch, wanted, _course(result, wanted))
+        sigma_before = None if before is None else before.result.estimate.sigma
+        return Judgement(result, look, watch, wanted, _course(result, wanted), sigma_before=sigma_before)
 
 
 def _sequential_test(dwells: list[DwellFactor], result: Calibration, watch: Watch | None) -> Watch | None:

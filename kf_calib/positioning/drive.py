@@ -154,11 +154,14 @@ class Drive:
         return suggestion
 
     def _look(self) -> Seen:
+        asked_s = self.clock.now_s()
         self._here = tuple(self.positioner.read())
+        now_s = self.clock.now_s()
         standing = self.session.standing
         pose = None if standing.current is None else tuple(np.degrees(standing.current.pose).tolist())
         trouble, fault = self._broken_off or self._trouble(), self.positioner.fault()
-        return Seen(self.clock.now_s(), self._here, fault, trouble, standing.samples, standing.stayed_s, pose)
+        seen = Seen(now_s, self._here, fault, trouble, standing.samples, standing.stayed_s, pose)
+        return replace(seen, held_up_s=now_s - asked_s)
 
     def _stop(self) -> bool:
         """Tell the table to stop, twice if need be; whether it took the command."""

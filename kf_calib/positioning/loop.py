@@ -72,9 +72,10 @@ Command = Move | Ask | Halt | End
 class Seen:
     """What is known at a moment.
 
-    now_s: time. gimbal_deg: read-back. fault: of the controller. trouble: of the source, the recording or the user, why
-    the run is to be broken off. samples: readings in all. stay_s: seconds of readings that count in the open dwell.
-    stream_deg: angles of the open dwell as they are recorded; None where there is none. suggestion: the one asked for.
+    now_s: time when the read-back gimbal_deg had come; held_up_s: how long after it was asked for. fault: of the
+    controller. trouble: of the source, the recording or the user, why the run is to be broken off. samples: readings in
+    all. stay_s: seconds of readings that count in the open dwell. stream_deg: angles of the open dwell as they are
+    recorded; None where there is none. suggestion: the one asked for.
     """
 
     now_s: float
@@ -85,6 +86,7 @@ class Seen:
     stay_s: float = 0.0
     stream_deg: Angles | None = None
     suggestion: Suggestion | None = None
+    held_up_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,7 @@ class State:
 
     target, start: of the move under way, deg; way: where to go after it. since_s: when the phase began. track: the
     latest read-backs with their times. suggestion: the one that is carried out. heard: number of readings, and when it
-    grew last. number: of the stay.
+    grew last. held_up_s: how long the read-back before the latest was under way. number: of the stay.
     """
 
     phase: Phase = Phase.BEGINNING
@@ -117,6 +119,7 @@ class State:
     track: tuple[tuple[float, Angles], ...] = ()
     suggestion: Suggestion | None = None
     heard: tuple[int, float] = (0, 0.0)
+    held_up_s: float = 0.0
     number: int = 0
 
 
@@ -126,6 +129,7 @@ def step(state: State, seen: Seen, rules: Rules) -> tuple[State, Command | None]
         return state, None
     state = _noted(state, seen, rules)
     harm = _harm(state, seen, rules)
+    state = replace(state, held_up_s=seen.held_up_s)
     if harm:
         return replace(state, phase=Phase.ENDED), Halt(harm)
     match state.phase:
@@ -160,9 +164,8 @@ def _harm(state: State, seen: Seen, rules: Rules) -> str:
         return f"the read-back {here} is no position"
     if left := _outside(seen.gimbal_deg, rules):
         return f"the platform is at {here}, {left}"
-    rate = _rate_degps(state.track[-2:])
-    if rate > rules.watch.late_factor * rules.pace.rate_degps + 10.0 * rules.watch.still_degps:
-        return f"the read-back leaps: it moved at {rate:.0f} deg/s, and {rules.pace.rate_degps:g} deg/s is the limit"
+    if (leap_deg := _leap_deg(state, rules)) > 0.0:
+        return f"the read-back leaps: by {leap_deg:.0f} deg, faster than {rules.pace.rate_degps:g} deg/s can do it"
     return ""
 
 
@@ -269,12 +272,16 @@ def _stands(state: State, watch: Watchfulness) -> bool:
     return bool(np.ptp(angles, axis=0).max() <= watch.still_degps * (now_s - first_s))
 
 
-def _rate_degps(track: Sequence[tuple[float, Angles]]) -> float:
-    """Return the rate of the fastest gimbal between two read-backs; 0 where there are not two, a moment apart."""
-    if len(track) < 2 or track[1][0] - track[0][0] < 1e-3:
+def _leap_deg(state: State, rules: Rules) -> float:
+    """Return by how much a gimbal moved between two read-backs, where that is more than its rate allows; else 0."""
+    track = state.track[-2:]
+    if len(track) < 2 or rules.watch.late_s == math.inf:  # a person turns as fast as he can
         return 0.0
-    moved = np.abs(np.array(track[1][1]) - np.array(track[0][1])).max()
-    return float(moved / (track[1][0] - track[0][0]))
+    (before_s, before), (now_s, now) = track
+    moved = float(np.abs(np.array(now) - np.array(before)).max())
+    fastest = rules.watch.late_factor * rules.pace.rate_degps
+    at_most_s = now_s - before_s + state.held_up_s + rules.watch.latency_s
+    return moved if moved > fastest * at_most_s + rules.watch.off_path_deg else 0.0
 
 
 def _apart_deg(one: Sequence[float], other: Sequence[float]) -> float:

@@ -44,8 +44,9 @@ class Watchfulness:
 
     tolerance_deg: between target and read-back where it stands. still_degps: rate below which it stands, over
     stand_s. begin_s: in which a move must begin. late_s, late_factor: by which it may last longer than its way and rate
-    say. off_path_deg: how far the read-back may lie off the way. silent_s: how long no reading may come while it
-    stands. stream_deg: between read-back and the angles that are recorded.
+    say. off_path_deg: how far the read-back may lie off the way. latency_s: by which the time of a read-back may be
+    wrong. silent_s: how long no reading may come while it stands. stream_deg: between read-back and the angles that are
+    recorded.
     """
 
     tolerance_deg: float = 0.05
@@ -55,6 +56,7 @@ class Watchfulness:
     late_s: float = 5.0
     late_factor: float = 1.5
     off_path_deg: float = 2.0
+    latency_s: float = 0.25
     silent_s: float = 10.0
     stream_deg: float = 0.5
 

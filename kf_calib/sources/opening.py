@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from datetime import datetime
 from enum import Enum
 from os import PathLike
 from pathlib import Path
@@ -20,6 +21,7 @@ from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.files.text_file import head_of
 from kf_calib.sources.tables.grid import OLD_SUFFIXES, TEXT_SUFFIXES, ZIP
 from kf_calib.sources.tables.opening import open_table
+from kf_calib.support import dates
 
 _OF_CALIBRATION = 200  # first bytes of a calibration, which name its format
 _FEWEST_SAMPLES = 50
@@ -102,3 +104,16 @@ def opened(
             return Recording(source, overrides, angles=angles)
         case FileKind.CALIBRATION:
             raise no_recording(source)
+
+
+def run_date(source: Source) -> datetime | None:
+    """When the run of a source began; None where nothing tells.
+
+    As its bench states it (``date``), by the stamp of its first reading, or, where stamps count from the start of the
+    board's clock, by the clock of the computer that received it.
+    """
+    stated = source.bench.notes.get("date")
+    if stated is not None:
+        return dates.parse_date(stated)
+    begin_ns = getattr(source, "begin_ns", None)
+    return dates.of_stamp(begin_ns() if begin_ns else None) or getattr(source, "received", None)

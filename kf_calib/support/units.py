@@ -85,11 +85,15 @@ _FIELD = {
 """SI unit -> unit of the field. One unit for all sizes: a bias is in µg, be it of a quartz accelerometer or a chip."""
 
 _WHOLE = {
-    "rad": [(math.inf, Unit("deg", math.degrees(1.0)))],
-    "m/s^2": [(math.inf, Unit("g", 1.0 / _G))],
+    "rad": [(0.01, _FIELD["rad"]), (math.inf, Unit("deg", math.degrees(1.0)))],
+    "m/s^2": [(0.01, _FIELD["m/s^2"]), (math.inf, Unit("g", 1.0 / _G))],
     "s": [(300.0, Unit("s", 1.0)), (math.inf, Unit("min", 1.0 / 60.0))],
     "K": [(0.5, Unit("mK", 1e3))],
     "K/s": [(math.inf, Unit("K/h", 3600.0))],
+    "m^2/s^4": [(math.inf, Unit("g²", 1.0 / _G**2))],
+    "m^3/s^6": [(math.inf, Unit("g³", 1.0 / _G**3))],
+    "K m/s^2": [(math.inf, Unit("K·g", 1.0 / _G))],
+    "m/s": [(6e3, Unit("g·s", 1.0 / _G)), (math.inf, Unit("g·h", 1.0 / _G / 3600.0))],
 }
 """SI unit -> units of quantities themselves, each for what is up to a size in SI."""
 

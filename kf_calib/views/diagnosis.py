@@ -12,6 +12,7 @@ from rich.text import Text
 from kf_calib.design.next_orientation import Advice
 from kf_calib.diagnosis.candidate_tests import LEVEL
 from kf_calib.diagnosis.detectability import Detectable
+from kf_calib.diagnosis.effect_shape import EffectShape
 from kf_calib.diagnosis.hypothesis_table import Hypothesis, HypothesisTable
 from kf_calib.diagnosis.replication import Replication
 from kf_calib.diagnosis.results import Diagnosis, Suspect
@@ -19,19 +20,39 @@ from kf_calib.diagnosis.unknown_effect import Description
 from kf_calib.diagnosis.verdict import format_probability, replication_in_words
 from kf_calib.diagnosis.within_dwell_trend import Trend
 from kf_calib.dwells.sufficient_statistics import DwellFactor
-from kf_calib.estimation.results import format_p
+from kf_calib.estimation.remarks import MISSING_OR_NOISE
+from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.support.printing import printed
 from kf_calib.support.units import shown
 from kf_calib.views.console import plain, symbol
 from kf_calib.views.json import clean, outlying_object, readings_object
+from kf_calib.views.next_step import angles_in_words, next_steps
 from kf_calib.views.tables import Table
 from kf_calib.views.terminal import note
+from kf_calib.views.text_plot import TextPlot
+
+_MOST = 5
+"""Explanations in the table on one screen."""
 
 
 def diagnosis_object(diagnosis: Diagnosis) -> dict[str, Any]:
     """The JSON object of ``diagnose``; its p-values are family-wise."""
     going = diagnosis.next_orientation
-    return found_object(diagnosis) | {"next_orientation": None if going is None else orientation_object(*going)}
+    shapes = diagnosis.explanations[0].shapes if diagnosis.explanations else []
+    return found_object(diagnosis) | {
+        "next_orientation": None if going is None else orientation_object(*going),
+        "shapes": [clean(shape_object(shape)) for shape in shapes],
+    }
+
+
+def shape_object(shape: EffectShape) -> dict[str, Any]:
+    """The shape of an effect as a JSON object: lists with an item a dwell, each a list of an item an accelerometer, or
+    of one for the platform."""
+    return {
+        "effect": shape.effect, "axis": shape.words, "symbol": shape.symbol or None, "unit": shape.unit,
+        "values": shape.values, "quantity_unit": shape.quantity, "readings": shape.readings, "sigma": shape.sigma,
+        "component": shape.component, "component_sigma": shape.component_sigma,
+    }  # fmt: skip
 
 
 def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
@@ -162,22 +183,43 @@ def _notes(diagnosis: Diagnosis) -> list[str]:
     return [warning for warning in diagnosis.before.warnings if warning[1:] not in said]
 
 
-def diagnosis_report(diagnosis: Diagnosis) -> RenderableType:
-    """The report that ``diagnose`` prints: the verdict, then the evidence for it."""
+def diagnosis_report(diagnosis: Diagnosis, typed: str = "", details: bool = False) -> RenderableType:
+    """What ``diagnose`` prints, on one screen: the verdict, what it may be, the shape of it, and what to do.
+
+    typed: recording and options of the command, which the next ones have, too. details: with the evidence below.
+    """
     style = {True: "bold green", False: "bold yellow", None: "bold"}[diagnosis.test.consistent]
-    parts: list[RenderableType] = [Text(verdict(diagnosis), style=style), *map(Text, of_what_p_is(diagnosis))]
-    readings = diagnosis.before.readings
-    if readings.findings:
-        parts.append(Text(f"In the readings: {'; '.join(readings.findings)}."))
+    parts: list[RenderableType] = [Text(verdict(diagnosis), style=style)]
     if replicates := replication_in_words(diagnosis):
         parts.append(Text(replicates))
+    if diagnosis.table and diagnosis.test.consistent is False and not details:
+        parts.append(_hypothesis_table(diagnosis.table, _MOST))
+        if more := diagnosis.table.listed[_MOST:]:
+            share = format_probability(sum(row.probability for row in more))
+            parts.append(Text(f"{len(more)} more have {share} together: --details."))
+    shapes = diagnosis.explanations[0].shapes if diagnosis.explanations else []
+    parts += map(TextPlot, shapes[:1])
+    for step in next_steps(diagnosis, typed):
+        parts.append(Text(f"{step.why}:" if step.command else f"{step.why}."))
+        parts += [Text(f"  {step.command}", style="bold", no_wrap=True, overflow="ignore")] if step.command else []
+    told = diagnosis.missing or diagnosis.unknown or diagnosis.noise  # what a misfit may come from is said by then
+    notes = [each for each in _notes(diagnosis) if not (told and each.startswith(MISSING_OR_NOISE))]
+    parts += map(note, notes)
+    return Group(*parts, *(details_of(diagnosis) if details else []))
+
+
+def details_of(diagnosis: Diagnosis) -> list[RenderableType]:
+    """The evidence for the verdict, and what the run cannot show."""
+    parts: list[RenderableType] = [*map(Text, of_what_p_is(diagnosis))]
+    readings, trend = diagnosis.before.readings, diagnosis.test.trend
     if diagnosis.table and diagnosis.test.consistent is False:
         parts.append(_hypothesis_table(diagnosis.table))
+    if readings.findings:
+        parts.append(Text(f"In the readings: {'; '.join(readings.findings)}."))
     if diagnosis.suspects:
         parts.append(_suspect_table(diagnosis))
     if diagnosis.test.consistent is False:
         parts.append(_dwell_table(diagnosis))
-    trend = diagnosis.test.trend
     if diagnosis.test.consistent is False and trend and trend.p_value < LEVEL:
         dwell, channel = trend.most
         parts.append(
@@ -195,13 +237,11 @@ def diagnosis_report(diagnosis: Diagnosis) -> RenderableType:
         treated = "the tests use averages that suppress it" if averaged else "it counts as noise"
         parts.append(Text(f"Vibration at {seen} Hz changes its amplitude during the run, so {treated}."))
     if going is not None:
-        angles = ", ".join(f"{angle:g}" for angle in going[0].gimbal_deg)
-        parts.append(Text(f"Next orientation: gimbals at {angles} deg: {going[1]}."))
+        parts.append(Text(f"Next orientation: gimbals at {angles_in_words(diagnosis)}: {going[1]}."))
     if diagnosis.test.invisible:
         parts.append(Text(f"Effects that this run cannot show: {', '.join(diagnosis.test.invisible)}."))
     parts.append(_detectable_table(diagnosis.detectable))
-    parts += map(note, _notes(diagnosis))
-    return Group(*parts)
+    return parts
 
 
 def of_what_p_is(diagnosis: Diagnosis) -> list[str]:
@@ -212,11 +252,8 @@ def of_what_p_is(diagnosis: Diagnosis) -> list[str]:
     if diagnosis.test.p_value is None:
         return []
     alone = diagnosis.before.consistency.p_value
-    overall = "" if alone is None else f" For the misfit as a whole, which replay prints, p {format_p(alone)}."
-    return [
-        "p of the run is the probability that noise alone looks as significant in any tested effect, in the misfit as "
-        f"a whole, or within dwells.{overall}"
-    ]
+    overall = "" if alone is None else f" By the size of the misfit alone, as replay says, p {format_p(alone)}."
+    return [f"p is the chance that pure noise would look this bad in any of our tests.{overall}"]
 
 
 @printed.register
@@ -225,16 +262,38 @@ def plain_report(diagnosis: Diagnosis) -> str:
     return plain(diagnosis_report(diagnosis))
 
 
-def _hypothesis_table(table: HypothesisTable) -> Table:
-    """Return the table of the explanations that have 1 % of the probability or more."""
-    shown_ = Table(title="What it may be, and with what probability", title_justify="left")
-    for heading in ("explanation", "family", "probability", "χ² / dof"):
+def _hypothesis_table(table: HypothesisTable, most: int | None = None) -> Table:
+    """Return the table of the explanations that have 1 % of the probability or more, at most ``most`` of them, with
+    what their refits say."""
+    shown_ = Table(title="What it may be", title_justify="left")
+    for heading in ("explanation", "family", "probability", "largest coefficient (1σ)", "held out / noise"):
         left = heading in ("explanation", "family")
-        shown_.add_column(heading, justify="left" if left else "right", no_wrap=not left)
-    for row in table.listed:
-        fall = f"{row.statistic:.1f} / {row.dof}" if row.dof else ""
-        shown_.add_row(name_of(row), ", ".join(row.families), format_probability(row.probability), fall)
+        shown_.add_column(heading, justify="left" if left else "right")
+    for row in table.listed[:most]:
+        share = format_probability(row.probability)
+        shown_.add_row(name_of(row), ", ".join(row.families), share, _largest_coefficient(row), _held_out(row.refit))
     return shown_
+
+
+def _largest_coefficient(row: Hypothesis) -> str:
+    """Return the coefficient of an explanation that stands out most from its sigma; "" where nothing was fitted."""
+    names = [*row.effects, *(text.partition("=")[0].strip() for text in row.formulas)]
+    added = [each for each in row.refit.model.effects if str(each) in names] if row.refit is not None else []
+    known = [row.refit.parameters[c.symbol] for each in added for c in each.parameters] if row.refit else []
+    sized = [p for p in known if p.value is not None and p.sigma]
+    if not sized:
+        return ""
+    largest = max(sized, key=lambda p: abs(p.value or 0.0) / (p.sigma or 1.0))
+    unit = shown(largest)
+    value, sigma = unit.rounded(largest.value or 0.0, largest.sigma or 0.0)
+    return f"{symbol(largest.symbol)} = {value} ± {sigma} {unit.label}"
+
+
+def _held_out(refit: Calibration | None) -> str:
+    """Return the held-out rms over the noise floor; "" where it is not known."""
+    if refit is None or refit.held_out_rms_mps2 is None or not refit.held_out_floor_mps2:
+        return ""
+    return f"{refit.held_out_rms_mps2 / refit.held_out_floor_mps2:.2f}"
 
 
 def name_of(row: Hypothesis) -> str:
@@ -252,8 +311,7 @@ def _suspect_table(diagnosis: Diagnosis) -> Table:
         left = heading in ("effect", "fits", "symbol", "unit")
         table.add_column(heading, justify="left" if left else "right", no_wrap=heading == "effect")
     for suspect in diagnosis.suspects:
-        rms, floor = suspect.refit.held_out_rms_mps2, suspect.refit.held_out_floor_mps2
-        ratio = f"{rms / floor:.2f}" if rms is not None and floor else ""
+        ratio = _held_out(suspect.refit)
         head = [suspect.name, format_p(suspect.p_value).removeprefix("= "), f"{suspect.statistic:.1f} / {suspect.dof}",
                 "yes" if suspect.fits else "no"]  # fmt: skip
         for k, p in enumerate(suspect.coefficients):

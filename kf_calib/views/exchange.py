@@ -1,4 +1,4 @@
-"""What the commands that use calibrations say: as reports, and as JSON objects."""
+"""What commands say that use calibrations, export them, or show one that was saved: as reports, and as JSON objects."""
 
 from __future__ import annotations
 
@@ -11,13 +11,16 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from kf_calib.estimation.correction import Correction
+from kf_calib.estimation.parameters import Parameter
 from kf_calib.estimation.results import format_p
+from kf_calib.exchange.calibration_file import SavedCalibration
 from kf_calib.exchange.corrected_file import Applied
+from kf_calib.exchange.exports.target import Target
 from kf_calib.exchange.history import History, ParameterTrack
 from kf_calib.exchange.verification import Verification
 from kf_calib.sources.files.contents import CALIBRATED_TOPIC
-from kf_calib.support.units import shown
-from kf_calib.views.console import symbol
+from kf_calib.support.units import field_unit, shown
+from kf_calib.views.console import parameter_row, symbol
 from kf_calib.views.json import clean
 from kf_calib.views.tables import Table
 from kf_calib.views.terminal import note
@@ -195,3 +198,73 @@ def _track_row(track: ParameterTrack) -> list[str]:
         unit.number(track.repeatability, 2), unit.number(track.walk * year**0.5, 2), unit.label,
         format_p(track.constant_p).removeprefix("= "),
     ]  # fmt: skip
+
+
+def exported_object(target: Target, to: str, path: Path) -> dict[str, Any]:
+    """The JSON object of ``export``."""
+    left = target.error_left
+    return clean(
+        {
+            "out": str(path),
+            "format": to,
+            "lost": list(target.lost),
+            "left_out": target.correction.left_out,
+            "takes": str(target.input),
+            "to_be_done_before": target.to_be_done_before or None,
+            "error_left_rms_mps2": None if left is None else left.rms_mps2,
+            "error_left_worst_mps2": None if left is None else left.worst_mps2,
+            "warnings": list(target.remarks),
+        }
+    )
+
+
+def exported_report(target: Target, out: Path) -> RenderableType:
+    """The report of ``export``."""
+    lines = [Text(f"{out} is the calibration for {target.title}.", style="bold")]
+    if not target.correction.input.is_plain:
+        lines.append(Text(f"It takes {target.input}."))
+    if target.to_be_done_before:
+        lines.append(note(f"to be made before of what the device sends: {target.to_be_done_before}"))
+    if target.error_left is None:
+        lines.append(Text("It holds all of it."))
+    else:
+        unit, (rms, worst) = shown("m/s^2"), target.error_left
+        lines.append(note(f"it does not hold {', '.join(target.lost)}: corrected readings are wrong by "
+                          f"{unit.text(rms)} rms, {unit.text(worst)} at worst"))  # fmt: skip
+    lines += [note(f"{name} is not corrected: {why}") for name, why in target.correction.left_out.items()]
+    return Group(*lines, *map(note, target.remarks))
+
+
+def calibration_object(saved: SavedCalibration, path: Path) -> dict[str, Any]:
+    """The JSON object of ``info`` of a calibration: what the file holds, and what it takes."""
+    return clean({"file": str(path), "kind": "calibration", "input": str(saved.bench.input), **saved.model_dump()})
+
+
+def calibration_report(saved: SavedCalibration, path: Path) -> RenderableType:
+    """The report of ``info`` of a calibration."""
+    table = Table(title="Parameters (1σ)", title_justify="left")
+    for heading in ("parameter", "value", "less nominal", "sigma", "unit"):
+        table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
+    for k, parameter in enumerate(saved.parameters):
+        field = field_unit(parameter.unit)
+        row = Parameter(**parameter.model_dump(), shown_unit=field.label, per_si=field.per_si)
+        table.add_row(*parameter_row(row, saved.fixed.get(parameter.symbol, "")), end_section=k in (3, 7, 11))
+    lines = [Text(f"{path}: a calibration, {saved.summary}.", style="bold"), Text(f"It takes {saved.bench.input}.")]
+    return Group(*lines, table, Text(_agreement(saved)), *map(note, saved.provenance.warnings), _commands(path))
+
+
+def _agreement(saved: SavedCalibration) -> str:
+    """Return in words whether model and measurements agreed."""
+    consistency = saved.consistency
+    if consistency.consistent is None or consistency.p_value is None or consistency.nis_per_dof is None:
+        return "Whether model and measurements agree could not be judged: nothing was left over."
+    agree = "agree" if consistency.consistent else "disagree"
+    return (
+        f"Model and measurements {agree} (p {format_p(consistency.p_value)}, NIS/dof {consistency.nis_per_dof:.3g}, "
+        f"{consistency.dof} degrees of freedom)."
+    )
+
+
+def _commands(path: Path) -> Text:
+    """Return what can be done with the calibration."""
+    return Text(f"Try: kf-calib apply {path} RECORDING -o OUT, or certificate, export, verify, history.")

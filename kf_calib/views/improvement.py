@@ -16,7 +16,7 @@ from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.support.units import shown
 from kf_calib.views.console import effect_table, parameter_table, symbol
-from kf_calib.views.diagnosis import description_object, description_sentence, of_what_p_is, orientation_object
+from kf_calib.views.diagnosis import description_object, description_sentence, orientation_object
 from kf_calib.views.json import clean
 from kf_calib.views.tables import Bar, Table
 from kf_calib.views.terminal import note
@@ -143,9 +143,10 @@ def improvement_report(
     """
     style = "bold green" if state.because == "consistent" else "bold yellow"
     parts: list[RenderableType] = [
+        *(Text(told) for told in story(state)[:-1]),
         progress(state), Text(f"Stopped, {state.because}: {state.reason}", style=style),
     ]  # fmt: skip
-    parts += [Text(line) for line in (*of_what_p_is(state.diagnosis), *_settling(state))]
+    parts += map(Text, _settling(state))
     parts.append(last_parameters(state))
     if honest is not None:
         parts.append(Text(honest_sentence(honest)))
@@ -216,7 +217,7 @@ def progress(state: Improvement) -> RenderableType:
     unit, alone = shown("m/s^2"), "without any one orientation the model is not determined"
     head = "over the noise floor" if floor else f"{unit.label} ({alone})"
     table = Table(title=f"Rms error, {head}", title_justify="left", box=None, pad_edge=False)
-    for heading in ("step", "p of the run", "", "", ""):
+    for heading in ("step", "p", "", "", ""):
         table.add_column(heading, no_wrap=True)
     for (label, _, probability, p_value), (held_out, fitted) in zip(rows, errors, strict=True):
         p_text = "" if p_value is None else format_p(p_value).removeprefix("= ")
@@ -319,7 +320,7 @@ def _numbered(diagnosis: Diagnosis, choices: Sequence[tuple[str, ...]]) -> list[
         return []
     refits = {suspect.name: suspect for suspect in diagnosis.suspects}
     table = Table(box=None, pad_edge=False)
-    for heading in ("", "suspect", "probability", "p of the run", "fits", "held out"):
+    for heading in ("", "suspect", "probability", "p", "fits", "held out"):
         table.add_column(heading, justify="right" if heading in ("", "probability", "held out") else "left")
     for number, names in enumerate(choices, start=1):
         suspect = refits.get(names[0]) if len(names) == 1 else None

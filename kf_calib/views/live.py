@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Group, RenderableType
+from rich.panel import Panel
 from rich.text import Text
 
 from kf_calib.bench import paper_parameters
-from kf_calib.bench.arrays import Floats, Mask
+from kf_calib.bench.arrays import Floats
 from kf_calib.online.progress import Progress
 from kf_calib.online.status import Judgement, Standing
 from kf_calib.support.plain_text import sentence
@@ -80,7 +81,7 @@ def line(judgement: Judgement) -> str:
     going = judgement.next_orientation
     following = f"; next {_angles(going[0])} deg ({going[1]})" if going else ""
     per_dof = result.consistency.nis_per_dof
-    nis = "" if per_dof is None else f"; NIS/dof {per_dof:.3g}"
+    nis = "" if per_dof is None else f"; misfit {math.sqrt(per_dof):.2g} × noise"
     return (
         f"dwell {dwell.number} to {dwell.end_s:.0f} s: {result.tally.read} readings; {seen}{nis}; "
         f"{judgement.verdict}{following}"
@@ -94,23 +95,15 @@ def screen(standing: Standing, status: Status | None, name: str, recording: str 
     that is written. hint: line at the bottom.
     """
     judgement = standing.judgement
-    parts: list[RenderableType] = [link(standing, status, name, recording), _here(standing), _sigmas(standing)]
+    parts: list[RenderableType] = [_to_do(standing), link(standing, status, name, recording), _sigmas(standing)]
     if judgement is not None:
         parts += [_fit(judgement), Text(judgement.verdict, style=_style(judgement))]
-        if _set(judgement).any() and (standing.sigma <= judgement.wanted)[_set(judgement)].all():
-            parts.append(Text("every target is reached", style="bold green"))
-        going = judgement.next_orientation
-        if going is not None:
-            parts.append(Text(f"next: gimbals at {_angles(going[0])} deg: {going[1]}", style="bold"))
+        if judgement.risen is not None:
+            parts.append(Text(_of_risen(judgement, *judgement.risen), style="yellow"))
     parts += [Text(sentence(text), style="yellow") for text in (standing.problem, standing.notice) if text]
     if hint:
         parts.append(Text(hint, style="dim"))
     return Group(*parts)
-
-
-def _set(judgement: Judgement) -> Mask:
-    """Return a mask (12,) of the parameters that have a target."""
-    return np.isfinite(judgement.wanted)
 
 
 def _style(judgement: Judgement) -> str:
@@ -142,42 +135,65 @@ def link(standing: Progress, status: Status | None, name: str, recording: str) -
     return text
 
 
-def _here(standing: Standing) -> Text:
-    """Return the line about the open dwell."""
-    here = standing.current
+def _to_do(standing: Standing) -> Panel:
+    """Return what to do now in a frame, in capitals, and below it where the platform stands and where it goes next."""
+    judgement, here = standing.judgement, standing.current
+    going = None if judgement is None else judgement.next_orientation
+    there = "the next orientation of your plan" if going is None else f"{_angles(going[0])} deg"
+    then = "" if going is None else f": {going[1]}"
+    if judgement is not None and _all_reached(standing, judgement):
+        return _frame("STOP: EVERY TARGET IS REACHED", f"going on to {there} {then.lstrip(': ')}".strip(), "green")
     if here is None:
-        return Text(f"{standing.dwells} dwells in {span(standing.elapsed_s)}; moving or settling")
-    angles = _angles(np.degrees(here.pose)) if len(here.pose) < 4 else "attitude"
-    text = Text(f"orientation {here.number} at {angles} deg: {span(here.seconds)}, {here.readings} readings")
+        moved = f"{standing.dwells} orientations in {span(standing.elapsed_s)}; the platform moves or settles"
+        return _frame(f"TURN TO {there.upper() if going is None else there}, THEN HOLD STILL", f"{moved}{then}", "cyan")
+    angles = f"{_angles(np.degrees(here.pose))} deg" if len(here.pose) < 4 else "this attitude"
+    at = f"orientation {here.number} at {angles}: {span(here.seconds)}, {here.readings} readings"
     if here.enough:
-        text.append(": enough, go on", "bold green")
-    elif here.enough is False:
-        text.append(": stay, its sigmas still fall")
-    return text
+        return _frame(
+            f"GO ON: TURN TO {there.upper() if going is None else there}", f"{at}; enough here{then}", "green"
+        )
+    return _frame("STAY: HOLD STILL", f"{at}; then to {there}{then}", "yellow")
+
+
+def _frame(what: str, below: str, colour: str) -> Panel:
+    text = Text.assemble((what, f"bold {colour}"), *([f"\n{below}"] if below else []))
+    return Panel(text, border_style=colour, padding=(0, 1))
+
+
+def _all_reached(standing: Standing, judgement: Judgement) -> bool:
+    """Tell whether there are targets, and every one is reached."""
+    given = np.isfinite(judgement.wanted)
+    return bool(given.any() and (standing.sigma <= judgement.wanted)[given].all())
+
+
+def _of_risen(judgement: Judgement, name: str, factor: float) -> str:
+    """Return a sentence on sigmas that the last dwell has taken up."""
+    return (
+        f"σ of {symbol(name)} rose {factor:.1f} times with the last orientation: the orientations scatter more than "
+        "was known before, or the model has more to determine."
+    )
 
 
 def _sigmas(standing: Standing) -> RenderableType:
-    """Return the table of the twelve sigmas with their targets, the time to them (or to half the sigma), and bars."""
+    """Return the table of the twelve sigmas with what they are to come down to, in what time: their targets, or where
+    none is set half of what they were after the last orientation."""
     table = Table.grid(padding=(0, 1))
     wanted = np.full(12, np.nan) if standing.judgement is None else standing.judgement.wanted
-    for justify in ("left", "right", "left", "right", "right", "left"):
+    targets = bool(np.isfinite(wanted).any())
+    for justify in ("left", "right", "left", "right", "left", "right", "left"):
         table.add_column(justify=justify, no_wrap=True)
-    table.add_row("", "σ", "", "target", "left", "", style="dim")
+    table.add_row("", "1σ now", "", "target" if targets else "half of last", "", "in", "", style="dim")
+    last = np.full(12, np.nan) if standing.judgement is None else standing.judgement.result.estimate.sigma
     for k, name in enumerate(paper_parameters.SYMBOLS):
         unit = shown(paper_parameters.UNITS[k])
         sigma, left = standing.sigma[k], standing.left_s[k]
         if not math.isfinite(sigma):
-            table.add_row(symbol(name), "-", unit.label, "", "", "")
+            table.add_row(symbol(name), "-", unit.label, "not seen yet", "", "", "")
             continue
-        target = unit.number(wanted[k]) if math.isfinite(wanted[k]) else "half"
-        table.add_row(
-            symbol(name),
-            unit.number(sigma),
-            unit.label,
-            target,
-            span(left) if left else "",
-            bar(float(sigma), float(wanted[k]), k),
-        )
+        aim = wanted[k] if targets else 0.5 * last[k]
+        time = span(left) if left else "reached"
+        aimed = (unit.number(aim), unit.label, time) if math.isfinite(aim) else ("", "", "")
+        table.add_row(symbol(name), unit.number(sigma), unit.label, *aimed, bar(float(sigma), float(wanted[k]), k))
     return table
 
 
@@ -195,14 +211,17 @@ def bar(sigma: float, wanted: float, k: int) -> Bar:
 
 
 def _fit(judgement: Judgement) -> Text:
-    """Return the line about the model, its NIS and its held-out error."""
+    """Return the line about the model: how well it fits, and its held-out error."""
     result = judgement.result
     judged = result.consistency
     text = f"12 parameters{''.join(f' + {effect}' for effect in result.model.effects)}; "
-    text += "NIS: nothing to judge by" if judged.nis_per_dof is None else f"NIS/dof {judged.nis_per_dof:.3g}"
+    if judged.nis_per_dof is None:
+        text += "nothing to judge the fit by yet"
+    else:
+        text += f"misfit {math.sqrt(judged.nis_per_dof):.2g} × noise"
     if result.held_out_rms_mps2 is not None and result.held_out_floor_mps2:
         rms, floor, unit = result.held_out_rms_mps2, result.held_out_floor_mps2, shown("m/s^2")
-        text += f"; held out {unit.text(rms, 2)} rms, noise alone {unit.number(floor, 2)}"
+        text += f"; orientations left out: {unit.text(rms, 2)} off, noise alone {unit.number(floor, 2)}"
     return Text(text)
 
 

@@ -8,6 +8,7 @@ from typing import Any
 from rich.console import Group, RenderableType
 from rich.text import Text
 
+from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.fleet.pooled_diagnosis import BenchCoefficients, EffectRow, Finding, PooledDiagnosis, PooledEstimate
 from kf_calib.fleet.pooled_terms import Attribution
 from kf_calib.support.units import shown
@@ -19,7 +20,7 @@ _OF = {
     Attribution.REPAIRED: "of the bench, changed once",
     Attribution.SENSORS: "of the type of sensor",
     Attribution.SOME: "of some units",
-    Attribution.RUN: "of each run",
+    Attribution.RUN: "of single runs",
 }
 _LISTED = 12  # units that are named in a sentence
 _HAS_IT = 0.5  # probability above which a unit is taken to have an effect
@@ -80,17 +81,19 @@ def sentences(found: PooledDiagnosis) -> list[str]:
 def _summary(pooled: PooledDiagnosis) -> str:
     benches = f"{len(pooled.benches)} bench{'es' if len(pooled.benches) != 1 else ''}"
     names = ", ".join(each.effect for each in pooled.findings) or "no effect"
-    other = "no other" if pooled.findings else "none"
-    return (
-        f"{pooled.runs} runs of {pooled.units} units on {benches} show {names}; that they have {other} has probability "
-        f"{pooled.no_more:.2f}."
-    )
+    other = "nothing else is missing" if pooled.findings else "nothing is missing"
+    sure = format_probability(pooled.no_more)
+    return f"{pooled.runs} runs of {pooled.units} units on {benches} show {names} ({sure}: {other})."
 
 
 def _sentence(finding: Finding) -> str:
     """Return what one effect is of, in a sentence."""
     chance = finding.probabilities[finding.attribution]
-    sentence = f"{finding.effect} is {_OF[finding.attribution]} (probability {chance:.2f})"
+    share = format_probability(chance)
+    if finding.attribution is Attribution.RUN:
+        sentence = f"{finding.effect} occurs in single runs, in each by another amount ({share})"
+    else:
+        sentence = f"{finding.effect} is {_OF[finding.attribution]} ({share})"
     if finding.attribution is Attribution.SOME and finding.share_interval is not None:
         low, high = finding.share_interval
         having = [each.unit for each in finding.units if each.probability > _HAS_IT]
@@ -100,8 +103,8 @@ def _sentence(finding: Finding) -> str:
         gap = finding.repair.gaps[0]
         sentence += f": it changed between {_moment(gap.after) or gap.after_run} and "
         sentence += _moment(gap.before) or gap.before_run
-        sentence += f" (probability {gap.probability:.2f})"
-    rivals = [f"{name} ({share:.2f})" for name, share in finding.rivals.items()]
+        sentence += f" ({format_probability(gap.probability)})"
+    rivals = [f"{name} ({format_probability(share)})" for name, share in finding.rivals.items()]
     return f"{sentence}. In its place it may be {' or '.join(rivals)}." if rivals else f"{sentence}."
 
 
@@ -113,14 +116,14 @@ def _listed(names: Sequence[str]) -> str:
 def _probabilities(rows: Sequence[EffectRow]) -> Table:
     """Return the table of the probabilities of each attribution."""
     tried = [each for each in Attribution if any(each in (row.probabilities or {}) for row in rows)]
-    table = Table(title="Of what each effect is: probabilities", title_justify="left")
+    table = Table(title="What has each effect, and with what probability", title_justify="left")
     table.add_column("effect")
     for each in tried:
         table.add_column(_OF[each], justify="right")
-    table.add_column("of no one", justify="right")
+    table.add_column("of nothing", justify="right")
     for row in rows:
         shares = [(row.probabilities or {}).get(each, 0.0) for each in tried]
-        table.add_row(row.effect, *(f"{share:.2f}" for share in (*shares, row.no_one or 0.0)))
+        table.add_row(row.effect, *map(format_probability, (*shares, row.no_one or 0.0)))
     return table
 
 

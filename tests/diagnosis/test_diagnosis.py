@@ -86,11 +86,11 @@ def test_views_work_nothing_out(monkeypatch: pytest.MonkeyPatch) -> None:
     from kf_calib.views.diagnosis import diagnosis_object, diagnosis_report
 
     found = unlisted("encoder-harmonic-3:z")
-    shown, printed = diagnosis_object(found), plain(diagnosis_report(found))
+    shown, printed = diagnosis_object(found), plain(diagnosis_report(found, details=True))
     assert shown["unknown"] and shown["detectable"] and "To try:" in printed
     for name in ("describe", "detectable", "advise", "mean_covariances"):
         monkeypatch.delattr(results, name)
-    assert diagnosis_object(found) == shown and plain(diagnosis_report(found)) == printed
+    assert diagnosis_object(found) == shown and plain(diagnosis_report(found, details=True)) == printed
 
 
 def test_a_formula_that_explains_more_than_a_known_effect_speaks_against_it() -> None:

@@ -21,6 +21,7 @@ from kf_calib.diagnosis.residual_drivers import (
     is_function_of,
     unexplained_mps2,
     unexplained_rms_mps2,
+    walk_path,
 )
 from kf_calib.effects import effect_named, names
 from kf_calib.estimation.calibration import calibrate
@@ -85,29 +86,31 @@ def test_what_an_explanation_predicts_is_the_difference_of_the_predictions() -> 
     assert best.predicted_mps2 == pytest.approx(predicted[1] - predicted[0], abs=1e-12)
     assert best.unexplained_mps2 + best.predicted_mps2 == pytest.approx(best.before.residuals_mps2, abs=1e-15)
     assert best.share is not None and best.share > 0.9 and best.fits
-    driver = next(each for each in drivers_of(best.before) if each.symbol == "a")
-    assert is_function_of(best.contribution_mps2, driver)
-    other = next(each for each in drivers_of(best.before) if each.symbol == "t")
-    assert not is_function_of(best.contribution_mps2, other)
+    (shape,) = best.shapes
+    assert shape.symbol == "a" and shape.is_curve
+    for driver in drivers_of(best.before):
+        over = best.over(driver)
+        assert is_function_of(over.component, driver.values, driver.unit) == over.is_curve
+        assert over.is_curve == (driver.symbol == "a")
 
 
 @pytest.mark.parametrize("runs", [12, *slow(100)])
 def test_the_band_of_an_effect_covers_as_often_as_it_says(runs: int) -> None:
-    """Of runs of other noise: 1 sigma of the contribution covers the truth in 68 % of the runs, accelerometer by
-    accelerometer."""
+    """Of runs of other noise: 1 sigma of the component, less its mean over the dwells, covers the truth in 68 % of the
+    runs, accelerometer by accelerometer."""
     inside, seen = 0, 0
     truth = 2e-6 / 9.80665  # 2 ug/g^2 in s^2/m
     offsets = list[float]()
     for seed in range(runs):
         before = noisy_run("second-order=2ug/g^2,2ug/g^2,2ug/g^2", seed=300 + seed, plan=PLAN)
         after = Refits().with_effects(before, ("second-order",))
-        best = Explanation(("second-order",), before, after, True)
-        size, own = best.contribution_mps2, best.contribution_sigma_mps2
+        (shape,) = Explanation(("second-order",), before, after, True).shapes
+        size, own = shape.component - shape.component.mean(axis=0), shape.component_sigma
         force = before.linearised.means.force_mps2
         for i in range(3):
             k = int(np.argmax(own[:, i]))
-            along = np.sum(before.linearised.state[:12].reshape(3, 4)[i, :3] * force[k])
-            error = size[k, i] - truth * along**2
+            squares = (force @ before.linearised.state[:12].reshape(3, 4)[i, :3]) ** 2
+            error = size[k, i] - truth * (squares[k] - squares.mean())
             offsets.append(error / own[k, i])
             inside += abs(error) < own[k, i]
             seen += 1
@@ -117,6 +120,7 @@ def test_the_band_of_an_effect_covers_as_often_as_it_says(runs: int) -> None:
 
 
 def test_the_path_of_a_walk_is_no_residual() -> None:
+    """It is the best prediction from the residuals, of steps between the dwells that add up from each to the end."""
     before = noisy_run(dwells=16, walk_mps2_per_sqrt_s=3e-6, seed=4)
     after = Refits().with_effects(before, ("bias-walk",))
     assert after.noise.walk_mps2_per_sqrt_s > 0.0
@@ -125,6 +129,11 @@ def test_the_path_of_a_walk_is_no_residual() -> None:
     assert np.sqrt(np.mean(ratios**2)) < 1.5
     assert unexplained_rms_mps2(before) == before.residual_rms_mps2
     assert np.array_equal(unexplained_mps2(before), before.residuals_mps2)
+    ends_s = after.linearised.means.ends_s
+    steps_s, later = np.diff([*ends_s.mean(axis=1), ends_s[-1, 1]]), np.triu(np.ones((len(ends_s), len(ends_s))))
+    walk = after.noise.walk_mps2_per_sqrt_s**2 * later @ np.diag(steps_s) @ later.T
+    for path, residual, sigma in zip(walk_path(after).T, after.residuals_mps2.T, mean_sigmas(after).T, strict=True):
+        np.testing.assert_allclose(path, walk @ np.linalg.solve(walk + np.diag(sigma**2), residual), rtol=1e-6)
 
 
 def test_overlaps_of_several_effects_are_those_of_pairs() -> None:

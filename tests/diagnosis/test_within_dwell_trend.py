@@ -94,7 +94,8 @@ def test_what_dwells_hide_shows_within_them() -> None:
     assert diagnosis_object(found)["trend"] == {
         "ratio": found.test.trend.ratio, "p_value": found.test.trend.p_value, "dwell": dwell, "channel": channel,
     }  # fmt: skip
-    assert f"most in dwell {dwell}, accelerometer {channel}" in " ".join(plain(diagnosis_report(found)).split())
+    told = " ".join(plain(diagnosis_report(found, details=True)).split())
+    assert f"most in dwell {dwell}, accelerometer {channel}" in told
 
 
 def test_a_watch_sees_it_while_the_run_goes_on() -> None:

@@ -61,7 +61,7 @@ def test_the_table_of_a_diagnosis_names_dwells_by_these_numbers() -> None:
     spoilt = run()
     at = slice(6 * COUNT - COUNT + 9, 7 * COUNT - COUNT + 9)  # of the seventh dwell
     spoilt.accel.values[at] += 1e-3
-    shown = console.plain(diagnosis_report(diagnose(calibrate(spoilt))))
+    shown = console.plain(diagnosis_report(diagnose(calibrate(spoilt)), details=True))
     first = shown[shown.index("Where it fails") :].splitlines()[4]
     assert first.split("│")[1].strip() == "7"
 

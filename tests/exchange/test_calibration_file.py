@@ -101,11 +101,7 @@ def test_a_recording_gives_its_name_checksum_and_date(tmp_path: Path) -> None:
 
 def test_the_model_option_reads_its_effects(run: kf_calib.Calibration, tmp_path: Path) -> None:
     kf_calib.save_calibration(run, tmp_path / "named.toml")  # what is in it decides, not its name
-    assert calibration_file.open_calibration(tmp_path / "named.toml").effects == (
-        "second-order",
-        "warm-up",
-        "mine = fx*fy",
-    )
+    assert calibration_file.read_model(tmp_path / "named.toml").effects == ("second-order", "warm-up", "mine = fx*fy")
 
 
 def test_programs_are_run_only_where_allowed(tmp_path: Path) -> None:

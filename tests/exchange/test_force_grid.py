@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from kf_calib.exchange.exports.force_grid import force_grid
+from kf_calib.exchange.exports.target import force_grid
 
 G = 9.81
 

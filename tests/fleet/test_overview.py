@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 from fleet_generator import Campaign, record
-from helpers.fleet_overviews import BENT, overview_with
+from helpers.fleet_overviews import BENT, overview_with, rows_of
 from helpers.fleet_workers import threads, used
 from helpers.run_factors import run_factor_of
 
 import kf_calib
 from kf_calib.estimation import bench_model
+from kf_calib.fleet.overview import overview_of
 from kf_calib.fleet.pooled_diagnosis import pooled_diagnosis
 from kf_calib.views.figures import figures
 from kf_calib.views.fleet_words import short_name
@@ -107,6 +108,30 @@ def test_units_of_a_bench_that_was_repaired_are_counted_once() -> None:
     runs = [run_factor_of(k, hidden, unit=f"unit{k % 10}") for k in range(30)]
     some = next(each for each in pooled_diagnosis(runs).findings if each.effect == "second-order")
     assert sorted(each.unit for each in some.units) == [f"unit{k}" for k in range(10)]
+
+
+def test_a_control_chart_has_shewharts_limits_from_the_standard_deviation_pooled_over_the_units() -> None:
+    rows = rows_of(20, outlying=3)
+    rows[5]["parameters"][0]["value"] += 2e-5
+    chart = figures(overview_of("fleet", rows, {}, None, ()))["Control charts"]().axes[0]
+    values = np.array([row["parameters"][0]["value"] for row in rows]).reshape(2, 20)  # a unit a column
+    pooled = np.sqrt(np.mean(np.var(values, axis=0, ddof=1)))
+    micro_g = 9.80665e-6
+    heights = {line.get_label(): abs(line.get_ydata()[0]) for line in chart.lines}  # type: ignore[index]
+    assert heights["control limit, 3σ"] == pytest.approx(3.0 * pooled / micro_g, rel=1e-9)
+    assert heights["warning limit, 2σ"] == pytest.approx(2.0 * pooled / micro_g, rel=1e-9)
+    limits = sorted(text.get_text().replace("−", "-").split() for text in chart.texts)
+    assert [name for name, _ in limits] == ["LCL", "UCL"]
+    assert [float(value) for _, value in limits] == pytest.approx(
+        [s * 3.0 * pooled / micro_g for s in (-1, 1)], rel=5e-3
+    )
+    (outside,) = (line for line in chart.lines if line.get_label() == "out of control")
+    assert len(outside.get_xdata()) == 2  # type: ignore[arg-type]  # both runs of the unit that moved, one on each side
+
+
+def test_runs_of_units_that_were_measured_once_scatter_about_the_mean_of_all() -> None:
+    (track,) = overview_of("fleet", rows_of(12)[:12], {}, None, ()).tracks
+    assert track.scatter == pytest.approx(np.std(track.values, ddof=1), rel=1e-9)
 
 
 def test_every_figure_and_the_page_are_drawn() -> None:

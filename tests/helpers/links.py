@@ -12,8 +12,7 @@ from helpers.recordings import BENCH, START_NS, streams_of
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch
 from kf_calib.sources.live import LiveSource, frames
-from kf_calib.sources.live.feed import Feed, Lost, Regained
-from kf_calib.sources.live.links import Link
+from kf_calib.sources.live.feed import Feed, Link, Lost, Regained
 from kf_calib.sources.live.streamed import StreamedFeed
 
 KEYS = {"axes": "y z x", "gravity_mps2": "9.81"}

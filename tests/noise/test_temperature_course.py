@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
+import pytest
 from scipy.interpolate import BSpline
 
 from kf_calib.noise import temperature_course
@@ -68,3 +72,26 @@ def test_the_largest_errors_have_nearly_all_of_the_variance() -> None:
     assert 1.0 - temperature_course._KEPT <= share <= 1.0 and few.shape[1] < 8
     fewer = few[:, np.argsort(np.sum(few**2, axis=0))[1:]]
     assert np.sum(fewer**2) / np.sum(errors**2) < share
+
+
+def test_a_piece_weighs_as_the_mean_over_its_whole_length_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    """White noise of 1 K in a reading of 1 s, each carried on for a time c: (l + c) / l² is its variance."""
+    begins, lengths = np.array([0.0, 5.0, 60.0, 62.0, 90.0]), np.array([5.0, 20.0, 2.0, 13.0, 0.0])
+    pieces: list[Any] = [
+        SimpleNamespace(nodes=SimpleNamespace(
+            elapsed_s=begin + np.array([0.0, 0.5, 1.0]) * length,
+            temperature_c=begin + np.array([0.0, 1.0, 5.0]),
+        ))
+        for begin, length in zip(begins, lengths, strict=True)
+    ]  # fmt: skip
+    told = list[tuple[np.ndarray, ...]]()
+    monkeypatch.setattr(temperature_course, "_within_dwells", lambda *given: (told.append(given), (1.0, 0))[1])
+    dwells: list[Any] = [SimpleNamespace(pieces=pieces[:2]), SimpleNamespace(pieces=pieces[2:])]
+    assert temperature_course._smooth(dwells, begins) is None  # too few degrees of freedom
+    ((middles, levels, weights, owners),) = told
+    np.testing.assert_allclose(middles, (begins + 0.5 * lengths)[:4])
+    np.testing.assert_allclose(levels, begins[:4] + 1.0)
+    np.testing.assert_allclose(
+        1.0 / weights, ((lengths + temperature_course._CARRIED_S) / np.maximum(lengths, 1e-9) ** 2)[:4]
+    )
+    assert owners.tolist() == [0, 0, 1, 1]

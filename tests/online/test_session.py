@@ -312,7 +312,14 @@ def test_screen_lines_and_objects_of_a_standing() -> None:
     session = Session(bench("second-order=25sigma", orientations=8), wanted={"theta1": 1e-6, "K1": 1e-9})
     found = judgements(session)
     shown = plain(views.screen(session.standing, None, "sim://", hint="q: end"), width=80)
-    for part in ("12 parameters", "reached", "disagrees: accelerometer", "next: gimbals at", "NIS/dof", "held out"):
+    for part in (
+        "12 parameters",
+        "reached",
+        "disagrees: accelerometer",
+        "HOLD STILL",
+        "× noise",
+        "orientations left out",
+    ):
         assert part in shown
     assert len(shown.splitlines()) <= 24
     told = views.line(found[-1])

@@ -108,6 +108,18 @@ def test_a_move_has_to_begin_and_to_end_in_time() -> None:
     assert k * TICK_S < 1.5 * 5.0 + 5.0 + 0.2
 
 
+def test_a_read_back_that_was_held_up_on_its_way_is_no_leap() -> None:
+    """By a busy computer: 4 deg lie between two that come 20 ms apart, at 20 deg/s, because one of them came late."""
+    state = told(begun())
+    for now_s, angle in ((20.1, 0.5), (20.5, 5.0), (20.52, 9.0), (20.7, 13.0)):
+        state, command = step(state, Seen(now_s, (0.0, 0.0, angle)), RULES)
+        assert command is None
+    held_up, command = step(state, replace(Seen(20.72, (0.0, 0.0, 13.5)), held_up_s=1.2), RULES)
+    assert command is None and step(held_up, Seen(20.8, (0.0, 0.0, 38.0)), RULES)[1] is None
+    _, command = step(state, Seen(20.72, (0.0, 0.0, 40.0)), RULES)
+    assert isinstance(command, Halt) and "leaps" in command.reason
+
+
 def test_a_person_may_take_any_time() -> None:
     rules = replace(RULES, watch=Watchfulness().by_hand())
     state = told(begun(rules=rules))

@@ -19,7 +19,7 @@ from kf_calib.exchange import calibration_file
 from kf_calib.sources.files.recorder import Recorder
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.live import LiveSource
-from kf_calib.sources.run_date import run_date
+from kf_calib.sources.opening import run_date
 
 SINCE_START_NS = 5_000_000_000
 

@@ -142,6 +142,7 @@ WRITING = [
     ("plan", ["--csv", *FIGURES]),
     ("paper --repetitions 1", FIGURES),
     ("live sim://?speed=100", ["--record", "--rrd", "--save-model", "--save"]),
+    ("run --positioner sim://", ["--record", "--save-model", "--save"]),
     ("history cal.json", FIGURES),
     ("fleet run.mcap -o fleet", [*FIGURES, "--report"]),
     ("record", [""]),

@@ -22,10 +22,10 @@ from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
 from kf_calib.support.units import rounded, shown
 from kf_calib.views import rerun as view
+from kf_calib.views.rerun import markdown_summary
 from kf_calib.views.rerun.names import number, path_of
 from kf_calib.views.rerun.platform import FINAL_SIZE, ellipsoids_of, magnification
 from kf_calib.views.rerun.series import nis_band
-from kf_calib.views.rerun.summary import markdown_summary
 from kf_calib.views.screenshot import ScreenshotError, screenshot
 
 STEP_NS = 10_000_000

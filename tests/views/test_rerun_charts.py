@@ -21,9 +21,10 @@ from kf_calib.estimation.settings import Settings
 from kf_calib.online.session import Session
 from kf_calib.online.status import Judgement
 from kf_calib.sources.files.recording import Recording
+from kf_calib.support.units import shown_whole
 from kf_calib.views import rerun as view
 from kf_calib.views.rerun import diagnosis, improvement
-from kf_calib.views.rerun.driver_chart import round_numbers, unit_of
+from kf_calib.views.rerun.driver_chart import round_numbers
 from kf_calib.views.rerun.growing import GrowingView
 from kf_calib.views.rerun.names import new_stream
 from kf_calib.views.rerun.series import VisitHistory, predicted
@@ -110,27 +111,29 @@ def test_numbers_at_an_axis_are_round(low: float, high: float, numbers: list[flo
     np.testing.assert_allclose(round_numbers(low, high, 8), numbers, rtol=1e-12)
 
 
-def test_a_diagnosis_shows_residuals_against_what_they_go_with(found: Diagnosis, tmp_path: Path) -> None:
+def test_a_diagnosis_shows_what_each_effect_must_explain_over_its_own_axis(found: Diagnosis, tmp_path: Path) -> None:
     """Places in the view are values: the numbers written at the axes say which."""
-    path, sigmas, driver = view.save_view(found, tmp_path / "found.rrd"), mean_sigmas(found.before), found.drivers[0]
-    assert driver.symbol == "da" and found.explanations[0].name == "hysteresis"
-    texts, at = (content(path, f"Points2D:{what}") for what in ("labels", "positions"))
-    drawn = content(path, "Points2D:positions", diagnosis.EXPLANATION)
-    for i, channel in enumerate(("a1", "a2", "a3")):
-        places = np.array(at[f"/driver/{channel}/numbers"][None])[:-1]
-        values = np.array([float(text.replace("−", "-")) for text in texts[f"/driver/{channel}/numbers"][None][:-1]])
-        upward = places[:, 0] < 0.0
-        to_driver, to_ratio = (np.polyfit(places[side, axis], values[side], 1)
-                               for side, axis in ((~upward, 0), (upward, 1)))  # fmt: skip
-        to_ratio[1] -= 9.5 * to_ratio[0]  # a label hangs below its point
-        for rank, each in enumerate(found.explanations[:5], 1):
-            points = np.array(drawn[f"/driver/{channel}/residuals"][rank])
-            readings = (each.contribution_mps2 + each.unexplained_mps2)[:, i] / sigmas[:, i]
+    path = view.save_view(found, tmp_path / "found.rrd")
+    assert found.explanations[0].name == "hysteresis" and found.explanations[0].shapes[0].symbol == "da"
+    texts, at = (content(path, f"Points2D:{what}", diagnosis.EXPLANATION) for what in ("labels", "positions"))
+    for rank, each in enumerate(found.explanations[:5], 1):
+        shape = each.shapes[0]
+        per_si = shown_whole(shape.unit, float(np.nanmax(np.abs(shape.values)))).per_si
+        for i, channel in enumerate(("a1", "a2", "a3")[: len(shape.channels)]):
+            places = np.array(at[f"/driver/{channel}/numbers"][rank])[:-1]
+            numbers = texts[f"/driver/{channel}/numbers"][rank][:-1]
+            values = np.array([float(text.replace("−", "-")) for text in numbers])
+            upward = places[:, 0] < 0.0
+            to_axis, to_ratio = (np.polyfit(places[side, axis], values[side], 1)
+                                 for side, axis in ((~upward, 0), (upward, 1)))  # fmt: skip
+            to_ratio[1] -= 9.5 * to_ratio[0]  # a label hangs below its point
+            points = np.array(at[f"/driver/{channel}/residuals"][rank])
+            known = np.isfinite(shape.readings[:, i])
+            readings, x = (shape.readings / shape.sigma)[known, i], shape.values[known, i] * per_si
             np.testing.assert_allclose(np.polyval(to_ratio, points[:, 1]), readings, atol=2e-3)
-            x = driver.values[:, i] * unit_of(driver).per_si
-            np.testing.assert_allclose(np.polyval(to_driver, points[:, 0]), x, atol=2e-3)
+            np.testing.assert_allclose(np.polyval(to_axis, points[:, 0]), x, atol=2e-3 * np.ptp(x))
     curve = content(path, "LineStrips2D:strips", diagnosis.EXPLANATION)["/driver/a2/curve"][1]
-    assert len(curve) == 3 and len(curve[0]) == len(found.before.visits)  # the effect, less and plus its sigma
+    assert len(curve) == 3 and len(curve[0]) == 200  # the effect, less and plus its sigma
 
 
 def test_spheres_of_a_diagnosis_show_what_each_explanation_leaves(found: Diagnosis, tmp_path: Path) -> None:

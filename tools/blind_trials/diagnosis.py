@@ -44,6 +44,7 @@ def diagnose_trial(task: Task) -> Outcome:
             "verdict": said["verdict"],
             "driver": (said["unknown"] or {}).get("driver"),
             "may_be_scatter": said["may_be_scatter"],
+            "replicates": said.get("replicates"),
             "true_drivers": [effect["driver"] for effect in effects],
             "sizes": [effect["size_sigma"] for effect in effects],
         },

@@ -67,6 +67,9 @@ def _name(which: str, own: list[Outcome]) -> Iterator[Figure]:
         size, (low, high) = float(np.median(sizes)), np.percentile(sizes, [2.5, 97.5])
         yield Figure(f"median size of the set, n = {which}{stated}", size, low, high, len(sizes), "1", size == 1.0)
     yield rate(f"wrong name, n = {which}{stated}", [each.wrong for each in own])
+    answers = [each.extra["replicates"] for each in own if each.extra.get("replicates")]
+    for answer in ("yes", "no") if answers else ():
+        yield rate(f"replicates, n = {which}{stated}: {answer}", [each == answer for each in answers])
     if any(each.families for each in own):
         yield rate(f"family right, n = {which}{stated}", [each.family_right for each in own], 0.98)
     if any(each.hypotheses for each in own):

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from kf_calib.errors import InputError
+from kf_calib.estimation.results import format_p
 from kf_calib.exchange.certificate import dcc
 from kf_calib.exchange.certificate.budget import Contribution
 from kf_calib.exchange.certificate.content import OUTCOMES, Certificate, CertifiedResult
@@ -253,7 +254,7 @@ def _remarks(certificate: Certificate, standing: str) -> list[str]:
     agree = {True: "agree", False: "do not agree: the uncertainties above do not hold"}
     remarks = [f"Attached file {ATTACHED}: {standing}."]
     if agreement.consistent is not None and agreement.p_value is not None:
-        remarks.append(f"Model and measurements {agree[agreement.consistent]} (p = {agreement.p_value:.2g}, "
+        remarks.append(f"Model and measurements {agree[agreement.consistent]} (p {format_p(agreement.p_value)}, "
                        f"{agreement.dof} degrees of freedom).")  # fmt: skip
     else:
         remarks.append("Nothing was left over to judge the agreement of model and measurements by.")

@@ -1,11 +1,24 @@
-"""Where a live source gets its samples from: what every kind of feed has, and how the source stands at one moment."""
+"""Where a live source gets its samples from: what every kind of feed has, and how the source stands at one moment.
+
+Bytes come over links: TCP, serial ports, standard input, a file that grows. A link is opened, read and closed by one
+thread. ``read`` gives what has come, b"" where nothing comes for a moment, and raises OSError where the link broke,
+EOFError where it ended.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import math
+import os
+import select
+import socket
+import sys
+import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Stream
@@ -127,3 +140,161 @@ class Status:
             (self.trouble, self.trouble.removesuffix(".")),
         ]
         return [f"{text}." for condition, text in said if condition]
+
+
+_BLOCK_BYTES = 1 << 18
+_WAIT_S = 0.1
+_CONNECT_S = 5.0
+_SILENT_S = 5  # before the other side is asked whether it is still there
+_ASKED = (2, 3)  # every so many seconds, and so many times
+
+
+class Link(ABC):
+    """reopens: it may come back after it broke. patient: what is not read yet stays where it is. breaks_unseen: the
+    other side may be gone without a sign."""
+
+    reopens = True
+    patient = False
+    breaks_unseen = False
+    starts_amid = False
+    """What is read first after opening may be the end of a line."""
+
+    @abstractmethod
+    def open(self) -> None: ...
+
+    @abstractmethod
+    def read(self) -> bytes: ...
+
+    @abstractmethod
+    def close(self) -> None: ...
+
+
+class Tcp(Link):
+    """A TCP server. (pyserial's socket:// drops what came before it was first read, and what came before the end.)"""
+
+    breaks_unseen = True
+
+    def __init__(self, host: str, port: int) -> None:
+        self._address = (host, port)
+        self._socket: socket.socket | None = None
+
+    def open(self) -> None:
+        try:
+            self._socket = socket.create_connection(self._address, timeout=_CONNECT_S)
+        except UnicodeError as error:  # a name that cannot be one
+            raise OSError(str(error)) from None
+        _ask_when_silent(self._socket)
+        self._socket.settimeout(_WAIT_S)
+
+    def read(self) -> bytes:
+        assert self._socket is not None
+        try:
+            block = self._socket.recv(_BLOCK_BYTES)
+        except TimeoutError:
+            return b""
+        if not block:
+            raise ConnectionError("the other side closed the connection")
+        return block
+
+    def close(self) -> None:
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+
+def _ask_when_silent(connection: socket.socket) -> None:
+    """Has the system ask the other side, when it is silent, whether it is still there: one that lost its power, or
+    its cable, says nothing. It is then known after 11 s, where the system lets this be set (else hours)."""
+    every_s, times = _ASKED
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    settings = {
+        "TCP_KEEPIDLE": _SILENT_S,
+        "TCP_KEEPALIVE": _SILENT_S,  # its name on macOS
+        "TCP_KEEPINTVL": every_s,
+        "TCP_KEEPCNT": times,
+        "TCP_USER_TIMEOUT": 1000 * (_SILENT_S + every_s * times),
+    }
+    for name, value in settings.items():
+        if (option := getattr(socket, name, None)) is not None:
+            with contextlib.suppress(OSError):  # a system may know the name and not the option
+                connection.setsockopt(socket.IPPROTO_TCP, option, value)
+
+
+class SerialPort(Link):
+    """Whatever pyserial opens: /dev/ttyUSB0, COM3, rfc2217://host:port, loop://."""
+
+    starts_amid = True
+
+    def __init__(self, url: str, settings: Mapping[str, Any]) -> None:
+        self._url, self._settings = url, settings
+        self.breaks_unseen = url.startswith(("rfc2217://", "socket://"))
+        self.port: Any = None
+
+    def open(self) -> None:
+        import serial
+
+        try:
+            self.port = serial.serial_for_url(self._url, timeout=_WAIT_S, **self._settings)
+        except ValueError as error:  # settings that the port does not know
+            raise OSError(str(error)) from None
+
+    def read(self) -> bytes:
+        try:
+            return self.port.read(min(max(self.port.in_waiting, 1), _BLOCK_BYTES))
+        except OSError:
+            raise
+        except Exception as error:  # pyserial lets TypeError, termios.error ... through where a port is pulled out
+            raise OSError(str(error) or type(error).__name__) from error
+
+    def close(self) -> None:
+        if self.port is not None:
+            self.port.close()
+            self.port = None
+
+
+class StandardInput(Link):
+    """Bytes piped in; their end is the end."""
+
+    reopens = False
+    patient = True
+
+    def open(self) -> None:
+        self._descriptor = sys.stdin.fileno()
+
+    def read(self) -> bytes:
+        if sys.platform != "win32" and not select.select([self._descriptor], [], [], _WAIT_S)[0]:
+            return b""  # elsewhere pipes cannot be waited for, and stopping waits for the next bytes
+        block = os.read(self._descriptor, _BLOCK_BYTES)
+        if not block:
+            raise EOFError
+        return block
+
+    def close(self) -> None:
+        """It is not ours."""
+
+
+class GrowingFile(Link):
+    """A text file that a logger appends to, from its start; a file that was cut or replaced is begun anew."""
+
+    patient = True
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._file: Any = None
+
+    def open(self) -> None:
+        self._file = self._path.open("rb", buffering=0)
+
+    def read(self) -> bytes:
+        block = self._file.read(_BLOCK_BYTES)
+        if not block:
+            here, now = os.fstat(self._file.fileno()), self._path.stat()
+            if now.st_size < self._file.tell() or (here.st_ino, here.st_dev) != (now.st_ino, now.st_dev):
+                raise OSError("the file was cut or replaced")
+            time.sleep(IDLE_S)
+        return block
+
+    def close(self) -> None:
+        if self._file is not None:
+            self._file.close()
+            self._file = None

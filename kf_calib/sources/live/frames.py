@@ -36,7 +36,7 @@ _SHORT = 254  # up to this many bytes COBS adds one byte and no more
 _PLAUSIBLE = 1 << 20  # frames lost at once; more is a bench that counts anew
 _HEADS = np.dtype([("kind", "u1"), ("version", "u1"), ("reserved", "<u2"), ("number", "<u4"), ("time_ns", "<i8")])
 Bytes = NDArray[np.uint8]
-Places = NDArray[np.int64]
+FramePlaces = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class _Found:
     """Samples of one kind, and the numbers of the frames they came in."""
 
     kind: int
-    places: Places
+    places: FramePlaces
     time_ns: Times
     values: Floats
 
@@ -175,7 +175,7 @@ class FrameReader:
             _stream(samples, ACCEL, 3), _stream(samples, poses, self.pose_width), _stream(samples, TEMPERATURE, 1)
         )
 
-    def _read_alike(self, table: Bytes, places: Places) -> Iterator[_Found]:
+    def _read_alike(self, table: Bytes, places: FramePlaces) -> Iterator[_Found]:
         """The samples in frames (n, m) of one encoded length, by kind."""
         bodies, sound = _uncobs_alike(table)
         size = bodies.shape[1] - _CRC.size
@@ -243,7 +243,7 @@ class FrameReader:
         self.lost += int(passed[passed < _PLAUSIBLE].sum())
         self._number = int(numbers[-1])
 
-    def _refuse(self, places: Places, reason: str) -> None:
+    def _refuse(self, places: FramePlaces, reason: str) -> None:
         for place in places.tolist():
             self._account.refuse(place, reason)
 

@@ -15,8 +15,7 @@ from kf_calib.bench.streams import Batch
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.files.joints import as_columns
 from kf_calib.sources.files.recording import Recording
-from kf_calib.sources.live.feed import IDLE_S, Feed
-from kf_calib.sources.live.links import GrowingFile, Link, SerialPort, StandardInput, Tcp
+from kf_calib.sources.live.feed import IDLE_S, Feed, GrowingFile, Link, SerialPort, StandardInput, Tcp
 from kf_calib.sources.live.source import QUEUED, LiveSource
 from kf_calib.sources.live.streamed import StreamedFeed
 from kf_calib.sources.tables.grid import EXCEL_SUFFIXES

@@ -15,8 +15,7 @@ from kf_calib.bench.raw_input import PLAIN
 from kf_calib.bench.streams import Batch, Stream, bench_without_angles, with_accel, without_poses
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.files.lines import Described, bench_of, stated_of
-from kf_calib.sources.live.feed import IDLE_S, Feed, Lost, Regained, nothing
-from kf_calib.sources.live.links import Link
+from kf_calib.sources.live.feed import IDLE_S, Feed, Link, Lost, Regained, nothing
 from kf_calib.sources.live.protocols import Protocol
 from kf_calib.sources.units import Units
 

@@ -20,10 +20,10 @@ import numpy as np
 from kf_calib.bench.arrays import Floats, Times
 from kf_calib.bench.streams import Batch
 from kf_calib.errors import InputError, check_number
-from kf_calib.sources.simulation.gimbal_motion import Motion, between
 from kf_calib.sources.simulation.noise_processes import generator
 from kf_calib.sources.simulation.physics import TrueState
 from kf_calib.sources.simulation.simulator import Simulation
+from kf_calib.sources.simulation.visit_plans import Motion, between
 
 FAULTS = ("stuck", "stall", "off", "drive", "link", "readback", "runaway")
 """What can fail: a move does not begin; it ends half-way; it ends off its target; the drive trips; the link breaks; the
@@ -32,7 +32,7 @@ read-back is wrong; the platform does not stop at its target."""
 _MOST_DWELLS = 512
 _NEVER_NS = 1 << 62
 _RINGING = 8.0  # time constants after which nothing is left of it
-_OFF_DEG, _WRONG_DEG, _RUN_ON_DEG = 0.5, 8.0, 60.0
+_OFF_DEG, _WRONG_DEG, _RUN_ON_DEG = 0.5, 20.0, 60.0
 
 
 @dataclass(frozen=True)

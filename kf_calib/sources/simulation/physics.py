@@ -18,9 +18,9 @@ from scipy.spatial.transform import Rotation
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, Vector
 from kf_calib.errors import InputError
-from kf_calib.sources.simulation.gimbal_motion import attitude, between
 from kf_calib.sources.simulation.noise_processes import Process
 from kf_calib.sources.simulation.sensors import Sensors
+from kf_calib.sources.simulation.visit_plans import attitude, between
 
 SIDEREAL_DAY_S = 86164.0905
 """One turn of the Earth in inertial space."""

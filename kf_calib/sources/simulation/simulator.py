@@ -20,7 +20,6 @@ from kf_calib.bench.arrays import Floats, Times
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import InputError
-from kf_calib.sources.simulation.gimbal_motion import Motion, attitude
 from kf_calib.sources.simulation.injected import Hidden, Rig, Stage, steps_of
 from kf_calib.sources.simulation.noise_processes import TrueNoise, generator
 from kf_calib.sources.simulation.physics import (
@@ -37,7 +36,7 @@ from kf_calib.sources.simulation.physics import (
     WalkingBias,
 )
 from kf_calib.sources.simulation.sensors import Sensors
-from kf_calib.sources.simulation.visit_plans import YZX, PlannedVisit, stays
+from kf_calib.sources.simulation.visit_plans import YZX, Motion, PlannedVisit, attitude, stays
 
 START_NS = 1_750_000_000_000_000_000
 """Stamp of the first sample: 15 June 2025, 15:06:40 UTC."""

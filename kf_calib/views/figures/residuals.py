@@ -10,12 +10,8 @@ from matplotlib.figure import Figure, FigureBase
 from matplotlib.ticker import MaxNLocator
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.explanation import Explanation
-from kf_calib.diagnosis.residual_drivers import (
-    Driver,
-    channel_rms_mps2,
-    is_function_of,
-)
+from kf_calib.diagnosis.effect_shape import EffectShape
+from kf_calib.diagnosis.residual_drivers import Driver
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import format_p
@@ -26,7 +22,7 @@ from kf_calib.views.figures.style import (
     BEST,
     GREY,
     MARKERS,
-    RUNNER_UP,
+    PLATFORM,
     blank,
     say,
     styled,
@@ -40,12 +36,12 @@ _MANY = 150  # dwells, above which markers are smaller and bars of sigma are lef
 
 
 def residuals(diagnosis: Diagnosis, driver: str | None = None) -> Figure:
-    """Residuals of each accelerometer against what they go with most, the best explanation, and what it leaves.
+    """What the readings show of the best explanation, over the quantity that it goes with.
 
-    From the left: the residuals of the model, with what the best explanation and the runner-up predict of them; the
-    readings less all that the best explanation does not itself add, and the effect as a curve with its 1 sigma; what it
-    leaves. All are means of dwells, with 1 sigma, on the same axes. driver: another quantity to draw them against, by
-    its symbol, such as ``q1`` or ``T``. Raises TypeError for what is no diagnosis.
+    From the left: the residuals of the model, with what the explanation predicts of them; what the effect must explain,
+    which is the readings less all else, and the effect as a curve with its 1 sigma; what it leaves. All are means of
+    dwells, with 1 sigma. driver: another quantity to draw them over, by its symbol, such as ``q1`` or ``T``. Where
+    there is no explanation, residuals alone. Raises TypeError for what is no diagnosis.
     """
     if not isinstance(diagnosis, Diagnosis):
         raise TypeError(
@@ -60,37 +56,61 @@ def residuals(diagnosis: Diagnosis, driver: str | None = None) -> Figure:
 def draw_residuals(
     figure: FigureBase, diagnosis: Diagnosis, drivers: Sequence[Driver], symbol: str | None = None
 ) -> None:
-    """The same on a part of a figure; drivers: of the residuals, the first is taken where no symbol is given."""
+    """The same on a part of a figure; drivers: of the residuals."""
+    others = diagnosis.explanations
+    if others and symbol is None and others[0].shapes:
+        return draw_shape(figure, others[0].shapes[0])
     driver = driver_to_show([each for each in drivers if symbol in (None, each.symbol)])
     if driver is None:
         return say(figure, f"{symbol or 'Nothing that was recorded'} does not vary in this run.")
-    others = diagnosis.explanations
-    panels = figure.subplots(3, 3 if others else 1, sharex=True, sharey="row", squeeze=False)
-    label, scale = driver_axis(driver)
-    sigmas = mean_sigmas(diagnosis.before)
-    for i, row in enumerate(panels):
-        x = driver.values[:, i] * scale
-        _points(row[0], x, diagnosis.before.residuals_mps2[:, i], sigmas[:, i], i)
-        _rms(row[0], diagnosis.before.residuals_mps2, i)
-        row[0].set_ylabel(f"accelerometer {i + 1}, {shown('m/s^2').label}")
-        if others:
-            best = others[0]
-            for explanation, colour, marker in zip(others[:2], (BEST, RUNNER_UP), "_x", strict=False):
-                _predictions(row[0], x, explanation, i, colour, marker)
-            _points(row[1], x, best.unexplained_mps2[:, i] + best.contribution_mps2[:, i], sigmas[:, i], i)
-            _curve(row[1], x, best, i, is_function_of(best.contribution_mps2, driver))
-            _points(row[2], x, best.unexplained_mps2[:, i], sigmas[:, i], i)
-            _rms(row[2], best.unexplained_mps2, i)
-    titles = [f"Residuals of {diagnosis.before.model.sum}"]
     if others:
-        name = others[0].name
-        titles += [f"Readings less all but {name}", f"What {name} leaves of them"]
-        figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower left", ncols=3)
+        return draw_shape(figure, others[0].over(driver))
+    _draw_alone(figure, diagnosis, driver)
+
+
+def _draw_alone(figure: FigureBase, diagnosis: Diagnosis, driver: Driver) -> None:
+    """Draw the residuals of each accelerometer over a quantity."""
+    unit, sigmas, panels = driver_axis(driver), mean_sigmas(diagnosis.before), figure.subplots(3, 1, sharex=True)
+    for i, axes in enumerate(panels):
+        _points(axes, driver.values[:, i] * unit.per_si, diagnosis.before.residuals_mps2[:, i], sigmas[:, i], i)
+        _rms(axes, diagnosis.before.residuals_mps2[:, i])
+        axes.set_ylabel(f"accelerometer {i + 1}, {shown('m/s^2').label}")
+    panels[0].set_title(wrapped(f"Residuals of {diagnosis.before.model.sum}", 3 * _TITLE))
+    _say_quantity(panels[-1], driver.words, unit)
+
+
+def draw_shape(figure: FigureBase, shape: EffectShape) -> None:
+    """Draw residuals, what the effect must explain of the readings, and what it leaves: a row a channel."""
+    panels = figure.subplots(len(shape.channels), 3, sharex=True, sharey="row", squeeze=False)
+    across = shown_whole(shape.unit, float(np.nanmax(np.abs(shape.values))))
+    for i, row in enumerate(panels):
+        x, colour = shape.values[:, i] * across.per_si, i if len(panels) > 1 else None
+        for axes, values in zip(row, (shape.residuals, shape.readings, shape.left), strict=True):
+            _points(axes, x, values[:, i], shape.sigma[:, i], colour, shape.quantity)
+        _rms(row[0], shape.residuals[:, i], shape.quantity)
+        _rms(row[2], shape.left[:, i], shape.quantity)
+        row[0].plot(x, (shape.residuals - shape.left)[:, i] * shown(shape.quantity).per_si, marker="_", markersize=9,
+                    linestyle="none", color=BEST, label=f"what {shape.effect} predicts of it")  # fmt: skip
+        _curve(row[1], across.per_si, shape, i)
+        row[0].set_ylabel(f"{shape.channels[i]}, {shown(shape.quantity).label}")
+        _say_quantity(row[1], "", across)
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower left")
+    titles = ["Residuals without it", f"What {shape.effect} must explain", "What it leaves"]
     for axes, title in zip(panels[0], titles, strict=True):
-        axes.set_title(wrapped(title, _TITLE if others else 3 * _TITLE))
+        axes.set_title(wrapped(title, _TITLE))
     for axes in panels[-1]:
-        axes.set_xlabel(f"{driver.words}, {label}")
-        axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
+        _say_quantity(axes, wrapped(_of_quantity(shape), 44), across)
+
+
+def _of_quantity(shape: EffectShape) -> str:
+    """Return what a shape is drawn over, in words and letters."""
+    return f"{shape.words} ({shape.symbol})" if "·" in shape.symbol or "²" in shape.symbol else shape.words
+
+
+def _say_quantity(axes: Axes, words: str, unit: Unit) -> None:
+    """Write below a panel what is across, and set few round numbers there."""
+    axes.set_xlabel(f"{words}, {unit.label}" if words else "")
+    axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
 
 
 def driver_to_show(drivers: Sequence[Driver]) -> Driver | None:
@@ -110,41 +130,34 @@ def _explains(driver: Driver) -> bool:
     return driver.p_value <= _SIGNIFICANT and driver.share >= _SOME
 
 
-def _points(axes: Axes, x: Floats, values_mps2: Floats, sigmas_mps2: Floats, i: int) -> None:
-    """Draw means of dwells with their sigma and the line at zero."""
-    many = len(x) > _MANY
+def _points(axes: Axes, x: Floats, values: Floats, sigmas: Floats, i: int | None, quantity: str = "m/s^2") -> None:
+    """Draw means of dwells of accelerometer i, or of the platform, with their sigma and the line at zero."""
+    many, per_si = len(x) > _MANY, shown(quantity).per_si
     axes.axhline(0.0, color=GREY, linewidth=0.8)
-    per_si = shown("m/s^2").per_si
-    bars = None if many else sigmas_mps2 * per_si
-    axes.errorbar(x, values_mps2 * per_si, bars, fmt=MARKERS[i], color=ACCELEROMETERS[i], zorder=3, elinewidth=0.9,
-                  markersize=2.0 if many else 4.5, markeredgewidth=0.0)  # fmt: skip
+    mark, colour = ("D", PLATFORM) if i is None else (MARKERS[i], ACCELEROMETERS[i])
+    axes.errorbar(x, values * per_si, None if many else sigmas * per_si, fmt=mark, color=colour, zorder=3,
+                  elinewidth=0.9, markersize=2.0 if many else 4.5, markeredgewidth=0.0)  # fmt: skip
 
 
-def _rms(axes: Axes, residuals_mps2: Floats, i: int) -> None:
-    """Write the rms of the residuals of one accelerometer above its panel: on axes of large ones small ones cannot be
-    read."""
-    unit = shown("m/s^2")
-    rms = rounded_number(channel_rms_mps2(residuals_mps2)[i] * unit.per_si, 2)
+def _rms(axes: Axes, residuals: Floats, quantity: str = "m/s^2") -> None:
+    """Write the rms of residuals above their panel: on axes of large ones small ones cannot be read."""
+    unit = shown(quantity)
+    rms = rounded_number(float(np.sqrt(np.nanmean(residuals**2))) * unit.per_si, 2)
     axes.set_title(f"rms {rms} {unit.label}", loc="right", fontsize=8.0, color=GREY)
 
 
-def _predictions(axes: Axes, x: Floats, explanation: Explanation, i: int, colour: str, marker: str) -> None:
-    """Draw what an explanation predicts of the residual of each dwell."""
-    predicted = explanation.predicted_mps2[:, i] * shown("m/s^2").per_si
-    axes.plot(x, predicted, marker=marker, markersize=9 if marker == "_" else 4,
-              linestyle="none", color=colour, label=f"what {explanation.name} predicts of it")  # fmt: skip
-
-
-def _curve(axes: Axes, x: Floats, explanation: Explanation, i: int, is_function: bool) -> None:
-    """Draw what an explanation adds to the readings, with its 1 sigma: a curve if it depends on this quantity alone."""
-    order, per_si = np.argsort(x), shown("m/s^2").per_si
-    middle = explanation.contribution_mps2[order, i] * per_si
-    sigma = explanation.contribution_sigma_mps2[order, i] * per_si
-    if is_function:
-        axes.plot(x[order], middle, color=BEST)
-        axes.fill_between(x[order], middle - sigma, middle + sigma, color=BAND, linewidth=0.0)
+def _curve(axes: Axes, scale: float, shape: EffectShape, i: int) -> None:
+    """Draw what an effect adds to the readings, with its 1 sigma: a curve if it depends on this quantity alone."""
+    per_si = shown(shape.quantity).per_si
+    if shape.is_curve:
+        at, middle, sigma = shape.curve(i)
+        at, middle, sigma = at * scale, middle * per_si, sigma * per_si
+        axes.plot(at, middle, color=BEST)
+        axes.fill_between(at, middle - sigma, middle + sigma, color=BAND, linewidth=0.0)
     else:
-        axes.errorbar(x[order], middle, sigma, fmt="_", color=BEST, ecolor=BAND, elinewidth=6.0, markersize=9)
+        middle, sigma = shape.component[:, i] * per_si, shape.component_sigma[:, i] * per_si
+        x = shape.values[:, i] * scale
+        axes.errorbar(x, middle, sigma, fmt="_", color=BEST, ecolor=BAND, elinewidth=6.0, markersize=9)
 
 
 def what_they_go_with(diagnosis: Diagnosis) -> Figure:

@@ -19,6 +19,8 @@ ACCELEROMETERS = ("#d55e00", "#009e73", "#0072b2")
 """One colour an accelerometer, from Okabe and Ito's palette; markers differ, too."""
 MARKERS = ("o", "s", "^")
 BEST, RUNNER_UP = "#111111", "#8a4fbf"
+PLATFORM = "#5b3f9e"
+"""What is of the three accelerometers together."""
 GREY, PALE, BAND = "#6b6b6b", "#c9c9c9", "#00000018"
 ALARM = "#b3001b"
 

@@ -21,6 +21,7 @@ from kf_calib.views.figures.words import wrapped
 
 _MOST, _ALIKE = 7, 8  # explanations that are drawn, effects in the matrix of overlaps
 _DRIVERS = 6
+_NO_MISFIT = "The misfit as a whole is no larger than noise"
 _NAME = 24  # letters of a name in a line
 _DARK = 0.6  # overlap above which numbers are white
 _FITTING = "#56b4e9"  # of Okabe and Ito's palette
@@ -70,14 +71,15 @@ def _bars(axes: Axes, explained: Sequence[Explanation]) -> None:
     axes.grid(visible=False, axis="y")
     axes.set_xlim(0.0, 100.0)
     axes.set_xlabel("explained part of the misfit beyond noise, %")
+    if all(explanation.share is None for explanation in explained):
+        axes.text(50.0, 0.5 * (len(explained) - 1.0), _NO_MISFIT, color=GREY, ha="center", va="center")
     axes.set_title("What each explains; hatched: the model with it does not fit")
 
 
 def _said(explanation: Explanation) -> str:
     """Return whether an explanation fits and its p-value, in words."""
     fits = "fits" if explanation.fits else "does not fit"
-    words = fits if explanation.p_value is None else f"{fits}, p {format_p(explanation.p_value)}"
-    return f"{words};\nseen within dwells only" if explanation.share is None else words
+    return fits if explanation.p_value is None else f"{fits}, p {format_p(explanation.p_value)}"
 
 
 def _alike(diagnosis: Diagnosis) -> list[str]:
@@ -109,7 +111,7 @@ def _overlaps(axes: Axes, diagnosis: Diagnosis, names: Sequence[str]) -> None:
 def _drivers(axes: Axes, drivers: Sequence[Driver]) -> None:
     """Draw the share of the misfit that goes with each quantity of the bench."""
     if not any(driver.share for driver in drivers):
-        return _words(axes, "The means of the dwells agree with the model:\nnothing of them goes with any quantity.")
+        return _words(axes, f"{_NO_MISFIT}:\nno part of it is left to go with a quantity.")
     for k, driver in enumerate(drivers):
         axes.barh(k, 100.0 * driver.share, color=PALE, height=0.62)
         axes.text(103.0, k, f"p {format_p(driver.p_value)}", va="center", fontsize=8.5, color=GREY)

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from functools import singledispatch
 from typing import Any
 
-from rich.console import RenderableType
+from rich.console import Group, RenderableType
 
 from kf_calib.diagnosis.explanation import Explanation
 from kf_calib.diagnosis.results import Diagnosis
@@ -54,7 +54,7 @@ def _(diagnosed: Diagnosis, measured: Sequence[Measured], commands: Sequence[str
             measured_section(facts(measured[0], diagnosed.before)),
             drawn,
             Section("Explore the residuals", (_explorer_of(diagnosed),)),
-            Section("Parameters", (*_calibrated(diagnosed.before), *_with_what_is_missing(diagnosed))),
+            Section("Parameters", (*_tables(diagnosed.before), *_with_what_is_missing(diagnosed))),
             figures_of("The calibration", diagnosed.before, "run", less=[ON_THEIR_WAY, DIRECTIONS]),
             Section("Suspects, and what this run could show", _evidence(diagnosed)),
             Section("How the bench drove itself", _driven(measured[0])),
@@ -76,7 +76,7 @@ def _(state: Improvement, measured: Sequence[Measured], commands: Sequence[str],
             Section(fall.title, (*fall.parts, *in_text(steps))),
             measured_section(facts(measured[0], last)),
             figures_of("Residuals", state, "steps", less=[FALL, NO_FALL]),
-            Section("Explore the residuals", (explorer(start, explained),)),
+            Section("Explore the residuals", (explorer(start, explained, explanation.shapes),)),
             Section("Parameters with the last model", in_text(improvement.last_parameters(state))),
             figures_of("The calibration with the last model", last, "run", less=[ON_THEIR_WAY]),
             Section("What is left, and what this run could show", _evidence(state.diagnosis)),
@@ -164,7 +164,8 @@ def figures_of(title: str, result: object, prefix: str, only: Sequence[str] = ()
 def _explorer_of(diagnosed: Diagnosis) -> Explorer:
     """Return the explorer of a diagnosed run, with what its explanations leave."""
     offered = diagnosed.explanations[:_EXPLORED]
-    return explorer(diagnosed.before, {f"with {each.name}": each.unexplained_mps2 for each in offered})
+    left = {f"with {each.name}": each.unexplained_mps2 for each in offered}
+    return explorer(diagnosed.before, left, [shape for each in offered for shape in each.shapes])
 
 
 def in_text(drawn: RenderableType, with_notes: bool = False) -> tuple[Part, ...]:
@@ -177,9 +178,14 @@ def _calibrated(result: Calibration) -> tuple[Part, ...]:
     return in_text(console.summary(result))[1:]
 
 
+def _tables(result: Calibration) -> tuple[Part, ...]:
+    """Return the tables alone: of the misfit as a whole, the page would say that it agrees where another test fails."""
+    return tuple(each for each in _calibrated(result) if each.kind == "table")
+
+
 def _evidence(diagnosed: Diagnosis) -> tuple[Part, ...]:
-    """Return what the console says for a diagnosis, less the verdict, which comes first there as on the page."""
-    return in_text(diagnosis.diagnosis_report(diagnosed))[1:]
+    """Return the evidence for a diagnosis, as the console has it."""
+    return in_text(Group(*diagnosis.details_of(diagnosed)))
 
 
 def _driven(measured: Measured) -> tuple[Part, ...]:

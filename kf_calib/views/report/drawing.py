@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import io
 import os
 import re
@@ -92,6 +93,7 @@ def _cores() -> int:
 def _be_given(drawings: Sequence[Drawing]) -> None:
     """Take over what a copy of the process draws; Ctrl-C is for the process that waits for it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    gc.disable()  # a copy ends after a few figures
     _given[:] = drawings
 
 

@@ -14,7 +14,7 @@ function explore(root) {
     return;
   }
   run.drivers.forEach((each, k) => form.driver.add(
-    new Option(each.name + (each.explains ? " (" + each.explains + ")" : ""), k)));
+    new Option(each.shown ? each.shown + ", against " + each.name : each.name + (each.explains ? " (" + each.explains + ")" : ""), k)));
   form.unit.options[0].text = run.unit;
   run.models.forEach((each, k) => form.model.add(new Option(each.name, k)));
   for (let i = 0; i < 3; i++) {
@@ -26,15 +26,19 @@ function explore(root) {
     form.querySelector("fieldset").append(label);
   }
 
+  function ownUnit(driver) { return driver.shown_unit || run.unit; }
+
   function colour(name) { return getComputedStyle(document.documentElement).getPropertyValue(name).trim(); }
 
   function collect() {
     const driver = run.drivers[form.driver.value], model = run.models[form.model.value];
     const inSigma = form.unit.value === "sigma", found = [];
     for (let i = 0; i < 3; i++) if (form["a" + (i + 1)].checked) run.dwells.forEach((number, d) => {
-      const sigma = run.sigma[d][i], left = model.residual[d][i], x = Array.isArray(driver.values[d]) ? driver.values[d][i] : driver.values[d];
-      if (left === null || x === null || !(sigma > 0)) return;
-      found.push({x, y: inSigma ? left / sigma : left, bar: inSigma ? 1 : sigma, left, sigma, d, i});
+      const sigma = (driver.sigma || run.sigma)[d][i], left = (driver.readings || model.residual)[d][i];
+      const x = Array.isArray(driver.values[d]) ? driver.values[d][i] : driver.values[d];
+      if (left == null || x == null || !(sigma > 0)) return;
+      const fit = driver.component ? driver.component[d][i] : null, unit = inSigma ? sigma : 1;
+      found.push({x, y: left / unit, bar: sigma / unit, fit: fit === null ? null : fit / unit, left, sigma, d, i});
     });
     return found.sort((one, other) => one.x - other.x);
   }
@@ -48,6 +52,9 @@ function explore(root) {
     const driver = run.drivers[form.driver.value], inSigma = form.unit.value === "sigma";
     const ink = colour("--quiet"), line = colour("--line");
     points = collect(); chosen = null; readout.textContent = welcome;
+    form.model.disabled = Boolean(driver.shown);
+    form.unit.options[0].text = ownUnit(driver);
+    for (let i = 1; i < 3; i++) form["a" + (i + 1)].disabled = Boolean(driver.channels) && i >= driver.channels.length;
     if (plot) plot.destroy();
     const axis = {values: (u, marks) => marks.map(each => each === null ? "" : number(each)), stroke: ink, grid: {stroke: line, width: 1}, ticks: {stroke: line}, font: "13px system-ui, sans-serif",
                   labelFont: "13px system-ui, sans-serif"};
@@ -59,7 +66,7 @@ function explore(root) {
       scales: {x: {time: false, range: (u, low, high) => low === xs[0] && high === xs.at(-1) ? across : [low, high]}, y: {range: () => along}},
       legend: {show: false}, cursor: {points: {show: false}, drag: {x: true, y: false}},
       axes: [{...axis, label: driver.name + ", " + driver.unit, size: 46},
-             {...axis, label: inSigma ? "residual / σ" : "residual, " + run.unit, size: 66}],
+             {...axis, label: (driver.shown || "residual") + (inSigma ? " / σ" : ", " + ownUnit(driver)), size: 66}],
       series: [{}, {paths: () => null, points: {show: false}}],
       hooks: {draw: [paint], setCursor: [point]},
     }, [xs, ys], place);
@@ -86,6 +93,12 @@ function explore(root) {
         c.lineTo(x, u.valToPos(each.y + each.bar, "y", true)); c.stroke();
       }
       mark(c, each.i, x, y, (many ? 2 : 3.6) * dpr);
+      if (each.fit !== null) {
+        const fitted = u.valToPos(each.fit, "y", true);
+        c.strokeStyle = colour("--text"); c.lineWidth = 2 * dpr;
+        c.beginPath(); c.moveTo(x - 7 * dpr, fitted); c.lineTo(x + 7 * dpr, fitted); c.stroke();
+        c.lineWidth = dpr;
+      }
       if (each === chosen) { c.strokeStyle = colour("--text"); c.beginPath(); c.arc(x, y, 8 * dpr, 0, 7); c.stroke(); }
     }
     c.restore();
@@ -118,9 +131,9 @@ function explore(root) {
     const said = ["begun at " + number(run.begin_s[each.d]) + " s"];
     if (run.gimbals_deg) said.push("gimbals at " + run.gimbals_deg[each.d].map(a => number(a)).join(", ") + " deg");
     said.push(driver.name + " " + number(each.x) + " " + driver.unit);
-    said.push("residual " + number(each.left) + " ± " + number(each.sigma) + " " + run.unit + " (" + (each.left / each.sigma).toFixed(1) + " σ)");
+    said.push((driver.shown || "residual") + " " + number(each.left) + " ± " + number(each.sigma) + " " + ownUnit(driver) + " (" + (each.left / each.sigma).toFixed(1) + " σ)");
     const head = document.createElement("strong");
-    head.textContent = "Dwell " + run.dwells[each.d] + ", accelerometer " + (each.i + 1);
+    head.textContent = "Dwell " + run.dwells[each.d] + ", " + (driver.channels ? driver.channels[each.i] : "accelerometer " + (each.i + 1));
     readout.replaceChildren(head, ": " + said.join("; "));
   }
 

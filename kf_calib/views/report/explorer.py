@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.diagnosis.effect_shape import EffectShape
 from kf_calib.diagnosis.residual_drivers import Driver, drivers_of
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration
@@ -26,8 +27,12 @@ class Explorer:
     content: dict[str, Any]
 
 
-def explorer(first: Calibration, others: Mapping[str, Floats]) -> Explorer:
-    """The explorer of a run; others: residuals (D, 3) that other models leave, m/s^2, by what each is called."""
+def explorer(first: Calibration, others: Mapping[str, Floats], shapes: Sequence[EffectShape] = ()) -> Explorer:
+    """The explorer of a run.
+
+    others: residuals (D, 3) that other models leave, m/s^2, by what each is called. shapes: of effects; they come
+    first.
+    """
     dwells = first.linearised.dwells
     models, unit = {f"{first.model.sum}": first.residuals_mps2, **others}, shown("m/s^2")
     return Explorer(
@@ -38,11 +43,22 @@ def explorer(first: Calibration, others: Mapping[str, Floats]) -> Explorer:
                 "gimbals_deg": np.degrees([dwell.recorded_pose for dwell in dwells]) if first.bench.axes else None,
                 "unit": unit.label,
                 "sigma": mean_sigmas(first) * unit.per_si,
-                "drivers": [_driver(each) for each in drivers_of(first)],
+                "drivers": [*map(_shape, shapes), *map(_driver, drivers_of(first))],
                 "models": [{"name": name, "residual": left_mps2 * unit.per_si} for name, left_mps2 in models.items()],
             }
         )
     )
+
+
+def _shape(shape: EffectShape) -> dict[str, Any]:
+    """Return what an effect must explain, over the quantity that it goes with, in the units of people."""
+    across, unit = shown_whole(shape.unit, float(np.nanmax(np.abs(shape.values)))), shown(shape.quantity)
+    return {
+        "name": shape.words, "unit": across.label, "explains": "", "values": shape.values * across.per_si,
+        "shown": f"what {shape.effect} must explain", "shown_unit": unit.label, "channels": shape.channels,
+        "readings": shape.readings * unit.per_si, "sigma": shape.sigma * unit.per_si,
+        "component": shape.component * unit.per_si,
+    }  # fmt: skip
 
 
 def _driver(driver: Driver) -> dict[str, Any]:
@@ -57,7 +73,7 @@ def _short(value: Any) -> Any:
     """Return what JSON can hold, with numbers of a few digits."""
     if isinstance(value, dict):
         return {key: _short(each) for key, each in value.items()}
-    if isinstance(value, list | np.ndarray):
+    if isinstance(value, list | tuple | np.ndarray):
         return [_short(each) for each in value]
     value = clean(value)
     return float(f"{value:.{_DIGITS}g}") if isinstance(value, float) else value

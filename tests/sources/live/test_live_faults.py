@@ -27,7 +27,7 @@ from kf_calib.estimation.calibration import calibrate
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.live import LiveSource, open_live
 from kf_calib.sources.live.clock import Clock
-from kf_calib.sources.live.links import Tcp
+from kf_calib.sources.live.feed import Tcp
 from kf_calib.sources.live.streamed import StreamedFeed
 from kf_calib.sources.simulation.options import options_from_query, simulation
 

@@ -14,9 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Vector
-from kf_calib.sources.simulation.gimbal_motion import attitude
-from kf_calib.sources.simulation.injected.kinds import Rig, made
-from kf_calib.sources.simulation.injected.terms import adding, column
+from kf_calib.sources.simulation.injected.kinds import Rig, adding, column, made
 from kf_calib.sources.simulation.physics import (
     TrueState,
     TrueStep,
@@ -26,6 +24,7 @@ from kf_calib.sources.simulation.physics import (
     rotate,
     to_bench,
 )
+from kf_calib.sources.simulation.visit_plans import attitude
 
 _LATITUDE_RAD = math.radians(50.0)
 

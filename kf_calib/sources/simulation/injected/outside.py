@@ -8,12 +8,11 @@ from itertools import accumulate
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.sources.simulation.gimbal_motion import attitude
 from kf_calib.sources.simulation.injected.gimbal import axis_nonorthogonality, base_turning, harmonic
-from kf_calib.sources.simulation.injected.kinds import Rig, added, made
-from kf_calib.sources.simulation.injected.terms import above, adding, column, output, pendulous
+from kf_calib.sources.simulation.injected.kinds import Rig, above, added, adding, column, made, output, pendulous
 from kf_calib.sources.simulation.noise_processes import FirstOrder
 from kf_calib.sources.simulation.physics import SettingError, TrueState, TrueStep, carried_by_earth, rotate
+from kf_calib.sources.simulation.visit_plans import attitude
 
 NO_FAMILY = "none of the known"
 """The family of what belongs to no physical class of the catalogue's effects."""

@@ -12,8 +12,7 @@ import math
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.sources.simulation.injected.kinds import Rig, added, made
-from kf_calib.sources.simulation.injected.terms import above, adding, column, output, pendulous, sign
+from kf_calib.sources.simulation.injected.kinds import Rig, above, added, adding, column, made, output, pendulous, sign
 from kf_calib.sources.simulation.noise_processes import FirstOrder
 from kf_calib.sources.simulation.physics import TrueState, TrueStep, WalkingBias
 

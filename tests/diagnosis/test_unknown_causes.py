@@ -1,0 +1,135 @@
+"""Causes of no catalogue: functions of two drivers, memory, and what repeated orientations tell."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.synthetic import Run
+from scipy.stats import multivariate_normal
+from unknown_trials.hidden import HIDDEN
+from unknown_trials.small_bench import WHITE_MPS2, SmallRun, hidden_run, visits
+
+import kf_calib
+from kf_calib.diagnosis.evidence import MarginalLikelihood
+from kf_calib.diagnosis.hypothesis_table import IRREGULAR, NOISE
+from kf_calib.diagnosis.repeated_orientations import log_odds_of_repeating
+from kf_calib.diagnosis.results import Diagnosis
+from kf_calib.diagnosis.two_drivers import bases
+from kf_calib.estimation.cross_validation import orientations
+from kf_calib.estimation.dwell_columns import stimulus_of
+
+
+def diagnosed(name: str, sigmas: float = 12.0, seed: int = 2) -> Diagnosis:
+    return kf_calib.diagnose(hidden_run(HIDDEN[name], sigmas, seed), replicate=False)
+
+
+@pytest.mark.parametrize(
+    ("name", "drivers"),
+    [
+        ("temperature x two forces", {"temperature and specific force"}),
+        ("last step x force", {"previous orientation and specific force"}),
+        ("play", {"previous orientation"}),
+    ],
+)
+def test_what_depends_on_two_drivers_or_on_the_past_is_unknown_and_goes_with_them(name: str, drivers: set[str]) -> None:
+    diagnosis = diagnosed(name)
+    assert diagnosis.unknown and diagnosis.likeliest is not None and diagnosis.likeliest.driver in drivers
+    assert diagnosis.description is not None and diagnosis.description.share > 0.7
+
+
+@pytest.mark.parametrize("gimbals", [0, 3])
+def test_pairs_of_drivers_have_terms_that_are_all_different(gimbals: int) -> None:
+    every = [term for _, terms in bases(gimbals) for term in terms]
+    assert len(every) == len(set(every)) and len(dict(bases(gimbals))) == 3 + 2 * gimbals
+
+
+def test_a_play_follows_where_it_is_pushed() -> None:
+    before = kf_calib.calibrate(SmallRun(visits(3, 12), np.zeros((12, 240, 3)), 3))
+    stimulus = stimulus_of(before.fit.dwells, before.bench, before.fit.state)
+    held, expected = stimulus.along[0], list[np.ndarray]()
+    for along in stimulus.along:
+        held = np.clip(held, along - 3.0, along + 3.0)
+        expected.append(held)
+    np.testing.assert_allclose(stimulus.played(3.0), expected, atol=1e-12)
+    np.testing.assert_allclose(stimulus.played(0.0), stimulus.along, atol=1e-12)
+    np.testing.assert_array_equal(stimulus.ending(6).played(3.0), stimulus.played(3.0)[-6:])
+
+
+def scattered(repeated: int, with_orientation: bool) -> Diagnosis:
+    """Twenty dwells that scatter by six times what is stated, of which some repeat an orientation; what they scatter by
+    is new with each dwell or comes back with the orientation."""
+    at, rng = visits(5, 20, repeated), np.random.default_rng(9)
+    by_dwell = rng.normal(size=(20, 3)) * 6.0 * WHITE_MPS2 / np.sqrt(240)
+    if with_orientation and repeated:
+        by_dwell[-repeated:] = by_dwell[:repeated]
+    return kf_calib.diagnose(SmallRun(at, np.repeat(by_dwell[:, None], 240, axis=1), 5))
+
+
+def shares(diagnosis: Diagnosis) -> tuple[float, float]:
+    """Probabilities of noise beyond what was stated, and of irregular changes of an unknown cause."""
+    assert diagnosis.table is not None
+    noise = diagnosis.table.families.get(NOISE, 0.0)
+    return noise, sum(row.probability for row in diagnosis.table.rows if row.driver == IRREGULAR)
+
+
+def test_without_a_repeated_orientation_scatter_and_an_unknown_cause_cannot_be_told_apart() -> None:
+    diagnosis = scattered(0, False)
+    noise, irregular = shares(diagnosis)
+    assert 0.25 * irregular < noise <= irregular and diagnosis.unknown and diagnosis.as_scatter
+    assert "cannot be told" in diagnosis.verdict and "repeat an orientation" in diagnosis.verdict
+
+
+def test_repeated_orientations_tell() -> None:
+    new, comes_back = scattered(6, False), scattered(6, True)
+    assert shares(new)[0] > shares(new)[1] and new.noise
+    assert shares(comes_back)[0] < 0.05 * shares(comes_back)[1] and comes_back.unknown
+
+
+def test_odds_of_repeating_are_those_of_the_differences_between_visits() -> None:
+    """Against normal densities of scipy: three visits of one orientation, two of another."""
+    at = visits(5, 14, 0)
+    order = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 0, 10, 0, 1]
+    angles, forces = at.angles_rad[order], at.force_mps2[order]
+    before = kf_calib.calibrate(SmallRun(replace(at, angles_rad=angles, force_mps2=forces), np.zeros((14, 240, 3)), 4))
+    size = 3e-5
+    noise = MarginalLikelihood(("common",), 0.0, (size,), 0.0, 0)
+    expected = 0.0
+    variances = before.noise.effective_sigma_mps2**2 / np.array([[d.count] for d in before.fit.dwells])
+    for group in ([0, 10, 12], [1, 13]):
+        for channel in range(3):
+            values = before.residuals_mps2[group, channel]
+            signs = np.hstack([-np.ones((len(group) - 1, 1)), np.eye(len(group) - 1)])
+            logs = [
+                multivariate_normal(cov=signs @ np.diag(variances[group, channel] + more) @ signs.T).logpdf(
+                    signs @ values
+                )
+                for more in (0.0, size**2)
+            ]
+            expected += logs[0] - logs[1]
+    assert log_odds_of_repeating(before, noise) == pytest.approx(expected, rel=1e-6)
+    assert log_odds_of_repeating(kf_calib.calibrate(Run(1, 14)), noise) == 0.0
+
+
+def test_a_hidden_effect_has_the_size_that_was_asked_for() -> None:
+    """What least squares by numpy leave of the means, over the noise of a mean."""
+    run = hidden_run(HIDDEN["play"], 12.0, 3)
+    columns, means = np.column_stack([run.at.force_mps2, np.ones(24)]), run.hidden_mps2.mean(axis=1)
+    left = means - columns @ np.linalg.lstsq(columns, means, rcond=None)[0]
+    assert np.linalg.norm(left) / WHITE_MPS2 * np.sqrt(240) == pytest.approx(12.0)
+
+
+def test_a_pose_after_a_whole_turn_is_the_same_orientation() -> None:
+    at = visits(5, 12, 4)
+    turned = replace(at, angles_rad=at.angles_rad + 2.0 * np.pi * (np.arange(12)[:, None] // 5))
+    groups = orientations(kf_calib.calibrate(SmallRun(turned, np.zeros((12, 240, 3)), 4)).fit.dwells)
+    assert [group for group in groups if len(group) > 1] == [[0, 8], [1, 9], [2, 10], [3, 11]]
+
+
+def test_memory_in_proportion_to_the_last_step_is_not_surely_settling() -> None:
+    """With time constants far beyond the dwells it is the same: the catalogue does not hold its limit."""
+    diagnosis = diagnosed("in proportion to the last step", 15.0, 1)
+    assert diagnosis.table is not None
+    assert diagnosis.table.probability(["settling"]) < 0.95
+    assert any(row.driver == "previous orientation" and row.probability > 0.05 for row in diagnosis.table.rows)
