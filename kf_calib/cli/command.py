@@ -39,7 +39,7 @@ class _Command(click.RichCommand):
         )  # fmt: skip
         self.params, self._usual = [*self.params, help_all], [*self._usual, help_all]
 
-    def get_help(self, ctx: click.Context) -> str:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def get_help(self, ctx: click.Context) -> str:
         everything = self.params
         self.params = everything if ctx.meta.get(_ALL) else self._usual
         try:

@@ -253,8 +253,9 @@ def _show_dry_run(name: str, keys: Mapping[str, str], options: Mapping[str, Any]
     for pose in poses:
         way = route(itinerary.reach, here, pose)
         if way is None:
+            begin, end = (views.angles_in_words(np.degrees(angles).tolist()) for angles in (here, pose))
             raise InputError(
-                f"no way from {views.angles_in_words(np.degrees(here))} to {views.angles_in_words(np.degrees(pose))} "
+                f"no way from {begin} to {end} "
                 "keeps out of the forbidden zones: widen what the bench file allows."
             )
         stations = [here, *way]

@@ -14,57 +14,22 @@ from operator import is_
 from typing import Any, overload
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import turned
 from kf_calib.dwells.attitude_error import AttitudeError
-from kf_calib.dwells.rows import on_basis, parabola
+from kf_calib.dwells.piece_values import PieceIndices
+from kf_calib.dwells.rows import parabola
 from kf_calib.dwells.sufficient_statistics import LEAST_FREEDOM, DwellFactor, rate_or_zero
-
-Places = NDArray[np.intp]
-
-
-class OfPieces(Sequence[Floats]):
-    """Values of the pieces of all dwells in one array (pieces, ...), as a sequence of those of each dwell."""
-
-    def __init__(self, values: Floats, ends: Places) -> None:
-        self.values, self._ends = values, ends
-
-    def __len__(self) -> int:
-        return len(self._ends) - 1
-
-    @overload
-    def __getitem__(self, index: int) -> Floats: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[Floats]: ...
-    def __getitem__(self, index: int | slice) -> Floats | list[Floats]:
-        if isinstance(index, slice):
-            return [self[k] for k in range(*index.indices(len(self)))]
-        k = range(len(self))[index]
-        return self.values[self._ends[k] : self._ends[k + 1]]
-
-    def beside(self, *others: Sequence[Floats]) -> OfPieces:
-        """The same columns (pieces, K, 3, c) with others behind them."""
-        return OfPieces(np.concatenate([self.values, *map(of_all_pieces, others)], axis=3), self._ends)
-
-    def first(self, count: int) -> OfPieces:
-        """The first columns alone."""
-        return OfPieces(self.values[..., :count], self._ends)
-
-
-def of_all_pieces(columns: Sequence[Floats]) -> Floats:
-    """The values of the pieces of all dwells in one array (pieces, ...)."""
-    return columns.values if isinstance(columns, OfPieces) else np.concatenate(columns)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Shape:
+class AlikeDwells:
     """Dwells with equally many pieces P and basis functions K: indices (d,) of the dwells, and (d, P) of their
     pieces."""
 
-    dwells: Places
-    pieces: Places
+    dwells: PieceIndices
+    pieces: PieceIndices
     width: int
 
 
@@ -78,14 +43,14 @@ class Folded:
         """The first piece of each dwell, and at last the number of pieces."""
 
     @cached_property
-    def shapes(self) -> list[Shape]:
+    def shapes(self) -> list[AlikeDwells]:
         """The dwells grouped by shape."""
         widths = np.fromiter((dwell.width for dwell in self.dwells), np.intp, len(self.dwells))
         kinds = dict[tuple[int, int], list[int]]()
         for k, kind in enumerate(zip(self.piece_numbers.tolist(), widths.tolist(), strict=True)):
             kinds.setdefault(kind, []).append(k)
         return [
-            Shape(np.array(places), self.ends[places][:, None] + np.arange(pieces), width)
+            AlikeDwells(np.array(places), self.ends[places][:, None] + np.arange(pieces), width)
             for (pieces, width), places in kinds.items()
         ]
 
@@ -168,7 +133,7 @@ class Folded:
         return self.of_nodes("pose")
 
     @cached_property
-    def before(self) -> Places:
+    def before(self) -> PieceIndices:
         """Index (D,) of the dwell before each dwell; of the first, its own; of a slew, of the dwell that it left."""
         moving = np.fromiter((dwell.moving for dwell in self.dwells), bool, len(self.dwells))
         last = np.maximum.accumulate(np.where(moving, 0, np.arange(len(self.dwells))))
@@ -303,7 +268,7 @@ class DwellStack(Sequence[DwellFactor]):
         return DwellStack(self.folded, self.turned_rad, self.attitudes, self.facing, added)
 
     @property
-    def piece_dwells(self) -> Places:
+    def piece_dwells(self) -> PieceIndices:
         """The index of the dwell of each piece, (pieces,)."""
         return np.repeat(np.arange(len(self)), self.folded.piece_numbers)
 
@@ -350,7 +315,7 @@ class DwellStack(Sequence[DwellFactor]):
         """Mean specific force that is felt in each dwell, (D, 3)."""
         return self.felt(self.means[:, 1:4])
 
-    def felt(self, force_mps2: Floats, times: Places | int = 1) -> Floats:
+    def felt(self, force_mps2: Floats, times: PieceIndices | int = 1) -> Floats:
         """The specific force that is felt where the angles show this one, (m, 3); ``times`` of it are of each
         dwell."""
         if self.turned_rad is not None:
@@ -407,8 +372,3 @@ class DwellStack(Sequence[DwellFactor]):
         )
         changes = ("turned_rad", "attitudes", "facing", "added")
         return same and all(getattr(self, name) is getattr(other, name) for name in changes)
-
-
-def basis_values(columns: Floats) -> Floats:
-    """Coefficients (..., K, 3 c) on the basis functions of columns (..., K, 3, c) given at the nodes."""
-    return on_basis(columns.reshape(*columns.shape[:-2], -1))

@@ -202,10 +202,6 @@ class DwellFactor:
         """Sums of squares (pieces, 3) of the readings about their fit by the basis functions."""
         return (self.triangles[:, self.width :, self.width :] ** 2).sum(axis=1)
 
-    def squares_along(self, weights: Floats) -> Floats:
-        """The same (pieces,) of one combination of the channels with weights (3,)."""
-        return np.asarray(((self.triangles[:, self.width :, self.width :] @ weights) ** 2).sum(axis=1), float)
-
     @cached_property
     def spread(self) -> Floats:
         """Covariance (3, 3) of the readings about their mean, courses and noise within the dwell alike."""

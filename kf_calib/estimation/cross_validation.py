@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -175,14 +176,14 @@ def _by_leverage(fitted: Fit, rows: Sequence[Floats], place: NDArray[np.intp]) -
     factor = square_root_information.accumulate([own for own in every if len(own)])[:width]
     if square_root_information.rank(factor) < width:
         return None
-    inverse = np.linalg.inv(factor[:, :-1])
+    inverse = cast("Floats", np.linalg.inv(factor[:, :-1]))
     state = inverse @ factor[:, -1]
     of_groups = _of_groups(rows, place)
     shares = of_groups[..., :-1] @ inverse
     left = np.eye(shares.shape[1]) - shares @ np.swapaxes(shares, 1, 2)
     if np.linalg.eigvalsh(left)[:, 0].min() < _LEAST_LEFT:
         return None
-    lower = np.linalg.cholesky(left)
+    lower = cast("Floats", np.linalg.cholesky(left))
     residuals = of_groups[..., -1] - of_groups[..., :-1] @ state
     solved = solved_by_lower(lower, np.concatenate([shares, residuals[..., None]], axis=2))
     more = np.ascontiguousarray(np.swapaxes(solved[..., :-1], 1, 2))
@@ -221,7 +222,7 @@ def _merged(fitted: Fit, rows: Sequence[Floats], groups: list[list[int]]) -> tup
     states, _, lost = zip(*square_root_information.solve_all(merged, around), strict=True)
     if any(each.size for each in lost):
         return None
-    return np.array(states), _Roots(np.linalg.inv(merged[..., :-1]), None)
+    return np.array(states), _Roots(cast("Floats", np.linalg.inv(merged[..., :-1])), None)
 
 
 def _beside(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | None:

@@ -12,8 +12,9 @@ import numpy as np
 from kf_calib.bench.arrays import Floats, crossed
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.paper_parameters import STATE_COUNT
+from kf_calib.dwells.piece_values import OfPieces
 from kf_calib.dwells.rows import on_basis
-from kf_calib.dwells.stack import DwellStack, Folded, OfPieces
+from kf_calib.dwells.stack import DwellStack, Folded
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects import Effect, FrameEffect, Stimulus
 from kf_calib.estimation.measurement_model import Model, effect_columns

@@ -12,7 +12,8 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
-from kf_calib.dwells.stack import DwellStack, OfPieces, of_all_pieces
+from kf_calib.dwells.piece_values import OfPieces, of_all_pieces
+from kf_calib.dwells.stack import DwellStack
 from kf_calib.estimation import free_attitude, square_root_information, whitened_rows
 from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns
 from kf_calib.noise.means import Means

@@ -89,7 +89,7 @@ def _ratios(result: Calibration) -> Floats:
     ratios = np.array([visit.innovation_mps2 / visit.innovation_sigma_mps2 for visit in result.visits])
     means, visits = result.linearised.means, result.visits
     noise_covariances = mean_covariances(result.noise.of_readings, means, result.linearised.state)
-    for k in np.flatnonzero(np.isnan(ratios).any(axis=1) & (np.arange(len(ratios)) > 0)):
+    for k in np.flatnonzero(np.isnan(ratios).any(axis=1) & (np.arange(len(ratios)) > 0)).tolist():
         before, rows = visits[k - 1].estimate, means.design[k]
         lost = before.undetermined / np.linalg.norm(before.undetermined, axis=0)
         seen = np.linalg.norm(rows @ lost, axis=1) < _ROUNDING * np.linalg.norm(rows, axis=1)

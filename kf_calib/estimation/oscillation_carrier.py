@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -23,7 +23,7 @@ _NEAR = 0.06  # cycles by which oscillation and carrier may differ in a piece; a
 
 
 def on_carrier(
-    passed: Pass, dwells: list[DwellFactor], plain: Fit | None, on_progress: Callable[[float], None] | None
+    passed: Pass, dwells: Sequence[DwellFactor], plain: Fit | None, on_progress: Callable[[float], None] | None
 ) -> tuple[Pass, Fit]:
     """The source folded again on a carrier near the frequency of the model's oscillation, and the fit to it.
 
@@ -95,7 +95,7 @@ def _nearer(passed: Pass, carrier: float | Fit, on_progress: Callable[[float], N
     raise AssertionError("unreachable: the last of the carriers is taken as it is")
 
 
-def fitted_to(passed: Pass, dwells: list[DwellFactor]) -> Fit:
+def fitted_to(passed: Pass, dwells: Sequence[DwellFactor]) -> Fit:
     """The fit of the settings' model to these dwells."""
     return fit(dwells, passed.model, passed.settings.walk_mps2_per_sqrt_s, passed.folder.slews)
 

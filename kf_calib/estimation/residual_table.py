@@ -72,7 +72,7 @@ def means_over_dwells(result: Run, functions: Sequence[Callable[[Stimulus], Floa
     return [np.add.reduceat(each * weights[:, None], firsts) for each in values]
 
 
-def _weights(dwells: list[DwellFactor]) -> Floats:
+def _weights(dwells: Sequence[DwellFactor]) -> Floats:
     """Return the weight of each node in the mean over its dwell."""
     return np.concatenate([np.outer(dwell.counts / dwell.count, _SIMPSON).ravel() for dwell in dwells])
 

@@ -8,15 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
+from kf_calib.dwells.piece_values import OfPieces, of_all_pieces
 from kf_calib.dwells.qr import solved_by_lower, triangle
 from kf_calib.dwells.rows import on_basis
-from kf_calib.dwells.stack import DwellStack, OfPieces, Shape, of_all_pieces
+from kf_calib.dwells.stack import AlikeDwells, DwellStack
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.noise.noise_model import Noise, flicker_sigma, shared_noise, slow_scatter
@@ -103,7 +105,7 @@ class _Batch:
     part: slice
 
     @property
-    def shape(self) -> Shape:
+    def shape(self) -> AlikeDwells:
         """The shape."""
         return self.stack.folded.shapes[self.number]
 
@@ -220,7 +222,7 @@ def _of_means(batch: _Batch, columns: Floats, about: _About) -> Floats:
         prior = np.broadcast_to(np.eye(blocks.nuisances, rows.shape[2]), (len(rows), blocks.nuisances, rows.shape[2]))
         rows = np.concatenate([np.concatenate([scaled, rows[..., blocks.nuisances :]], axis=2), prior], axis=1)
         return triangle(rows)[:, blocks.nuisances :, blocks.nuisances :]
-    lower = np.linalg.cholesky(np.eye(3) + scaled @ np.swapaxes(scaled, 1, 2))
+    lower = cast("Floats", np.linalg.cholesky(np.eye(3) + scaled @ np.swapaxes(scaled, 1, 2)))
     return solved_by_lower(lower, rows[..., blocks.nuisances :])
 
 

@@ -24,7 +24,7 @@ _TWICE = np.repeat([1.0, 2.0], 3)[:, None]  # blocks beside the diagonal occur o
 def root(columns: Floats) -> Floats:
     """The lower Cholesky factor in LAPACK's band storage: its diagonals (6, 3 D) from the main one down."""
     if columns.shape[1] == 3:
-        return np.linalg.cholesky(columns)
+        return cast("Floats", np.linalg.cholesky(columns))
     padded = np.zeros((len(columns), 8, 3))
     padded[:, :6] = columns
     bands = padded[:, np.arange(3)[:, None] + np.arange(6), np.arange(3)[:, None]].reshape(-1, 6).T

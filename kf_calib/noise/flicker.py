@@ -12,8 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.dwells.piece_values import of_all_pieces
 from kf_calib.dwells.rows import on_basis
-from kf_calib.dwells.stack import DwellStack, of_all_pieces
+from kf_calib.dwells.stack import DwellStack
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.nuisance_states import SLOW, along_force, flicker_waves, sensitivities_of

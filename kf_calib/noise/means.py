@@ -9,7 +9,8 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
-from kf_calib.dwells.stack import DwellStack, basis_values, of_all_pieces
+from kf_calib.dwells.piece_values import basis_values, of_all_pieces
+from kf_calib.dwells.stack import DwellStack
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 
 _AT_ONCE = 4096  # dwells whose columns are processed together

@@ -19,7 +19,8 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells import walk_path, window_average
-from kf_calib.dwells.stack import DwellStack, OfPieces
+from kf_calib.dwells.piece_values import OfPieces
+from kf_calib.dwells.stack import DwellStack
 from kf_calib.dwells.sufficient_statistics import Autocovariance, DwellFactor
 from kf_calib.noise import random_walk
 from kf_calib.noise.autoregression import expected_products, unbiased

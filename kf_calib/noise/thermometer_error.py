@@ -12,7 +12,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.dwells.stack import DwellStack, OfPieces
+from kf_calib.dwells.piece_values import OfPieces
+from kf_calib.dwells.stack import DwellStack
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C
 from kf_calib.noise.temperature_course import temperature_course

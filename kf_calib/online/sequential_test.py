@@ -85,7 +85,7 @@ class Watch:
             return replace(self, running=running, fitted_at=fitted_at, tests=tests)._look()
 
     @property
-    def dwells(self) -> list[DwellFactor]:
+    def dwells(self) -> Sequence[DwellFactor]:
         """The dwells so far."""
         return self.running.dwells
 

@@ -144,7 +144,8 @@ def _checked(path: Path, content: Mapping[str, Any], width: int) -> Profile:
         raise InputError(f"{path}: lacks the address of the controller, such as TCPIP::192.168.53.1::9878::SOCKET.")
     values["termination"] = _ENDINGS[content.get("termination", "lf")]
     watched = {key: content[key] for key in Watchfulness.__annotations__ if key in content}
-    return Profile(**{**values, "gimbals": gimbals, "name": path.stem, "watch": Watchfulness(**watched)})
+    values |= {"gimbals": gimbals, "name": path.stem, "watch": Watchfulness(**watched)}
+    return Profile(**values)
 
 
 def _refuse_unknown_fields(path: Path, key: str, text: str) -> None:

@@ -7,6 +7,7 @@ import queue
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields
+from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
 from kf_calib.bench.bench import Bench
@@ -113,8 +114,9 @@ def open_simulated(url: str, keys: Mapping[str, str]) -> tuple[DrivenBench, floa
     Beside the settings of the simulator it takes those of ``Servo``, and ``speed``. Raises InputError.
     """
     pairs = parse_qsl(url.partition("?")[2], keep_blank_values=True)
-    servo = {key: _number(key, text) for key, text in pairs if key in _OF_SERVO and key != "fault"}
-    faults = {key: text for key, text in pairs if key == "fault"}
+    servo: dict[str, Any] = {
+        key: text if key == "fault" else _number(key, text) for key, text in pairs if key in _OF_SERVO
+    }
     speeds = [_number(key, text) for key, text in pairs if key == "speed"]
     if speeds and not speeds[-1] > 0.0:
         raise InputError(f"speed={speeds[-1]:g} is not positive: write for example speed=20.")
@@ -124,7 +126,7 @@ def open_simulated(url: str, keys: Mapping[str, str]) -> tuple[DrivenBench, floa
             servo.setdefault(name, float(keys[name]))
     run = simulation(options_from_query(urlencode(rest)), keys)
     start_deg = [0.0] * len(run.bench.axes)
-    return DrivenBench(run, Servo(**servo, **faults), start_deg), speeds[-1] if speeds else math.inf
+    return DrivenBench(run, Servo(**servo), start_deg), speeds[-1] if speeds else math.inf
 
 
 def _number(name: str, text: str) -> float:

@@ -8,7 +8,8 @@ from helpers.by_hand import by_hand
 from helpers.synthetic import Run
 
 from kf_calib.bench.streams import Source
-from kf_calib.dwells.stack import Attitudes, DwellStack, OfPieces, of_all_pieces
+from kf_calib.dwells.piece_values import OfPieces, of_all_pieces
+from kf_calib.dwells.stack import Attitudes, DwellStack
 from kf_calib.dwells.sufficient_statistics import DwellFactor, dwells_before, dwells_without
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.settings import Settings

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +14,10 @@ from scipy.signal import lfilter
 
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.dwells.folding import detrended
-from kf_calib.dwells.sufficient_statistics import Autocovariance
+from kf_calib.dwells.pieces import Piece
+from kf_calib.dwells.rows import Nodes
+from kf_calib.dwells.stack import DwellStack
+from kf_calib.dwells.sufficient_statistics import Autocovariance, DwellFactor
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.noise import noise_model
 from kf_calib.sources.simulation.noise_processes import TrueNoise as SimulatedNoise
@@ -110,6 +111,15 @@ def test_dwells_too_short_for_their_noise_raise_no_alarm_and_are_told(runs: int)
     assert low <= runs / 20  # one in five would be were each channel's correlation taken as it is found
 
 
+def piece_of(start_s: float, lasting_s: float, count: int, residual: np.ndarray | float = 0.0, width: int = 3) -> Piece:
+    """A piece of readings that leave ``residual`` (3,) about their parabola, in one row of its triangle."""
+    triangle = np.eye(width + 3)
+    triangle[width:, width:] = 0.0
+    triangle[width, width:] = residual
+    at_s = start_s + lasting_s * np.array([0.0, 0.5, 1.0])
+    return Piece(triangle, Nodes(at_s, at_s, np.ones((3, 3)), np.zeros((3, 1)), np.full(3, np.nan)), count)
+
+
 def test_noise_along_the_force_has_the_likeliest_sizes_of_gamma_sums() -> None:
     """Sums of squares along directions m, of variance m^2 . v and n - 3 kappa degrees of freedom, against scipy."""
     rng = np.random.default_rng(5)
@@ -117,9 +127,10 @@ def test_noise_along_the_force_has_the_likeliest_sizes_of_gamma_sums() -> None:
     counts, kappa = rng.integers(50, 90, (15, 4)), np.array([1.0, 2.0, 1.5])
     truth, freedom = np.array([0.5, 1.0, 2.0]) ** 2, (counts - 3.0 * kappa.mean()).sum(axis=1)
     squares = along**2 @ truth * rng.chisquare(freedom)
-    dwells: Any = [
-        SimpleNamespace(counts=own, count=own.sum(), squares_along=lambda _, total=total: np.array([total]), weight=1.0)
-        for own, total in zip(counts, squares, strict=True)
+    residuals = along * np.sqrt(squares / np.sum(along**2, axis=1) ** 2)[:, None]  # whose part along m has that square
+    dwells = [
+        DwellFactor(k + 1, tuple(piece_of(60.0 * k, 60.0, count, own / 2.0) for count in counts[k].tolist()))
+        for k, own in enumerate(residuals)
     ]
 
     def cost(logs: np.ndarray) -> float:
@@ -127,16 +138,14 @@ def test_noise_along_the_force_has_the_likeliest_sizes_of_gamma_sums() -> None:
         return float(np.sum(freedom * np.log(expected) + squares / expected))
 
     best = minimize(cost, np.zeros(3), method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-10, "maxiter": 9999})
-    sigma = noise_model._sigma_along(dwells, along, kappa)
+    sigma = noise_model._sigma_along(DwellStack.of(dwells), along, kappa)
     np.testing.assert_allclose(sigma**2, np.exp(best.x), rtol=1e-3)
 
 
 def test_slow_waves_are_independent_of_each_other_and_their_sizes_fall_with_the_root_of_their_number() -> None:
     """Mean products of waves over dwells at equal distances are one or zero; h / k is the variance of wave k."""
     count = 40
-    dwells: Any = [
-        SimpleNamespace(start_s=10.0 * k, end_s=10.0 * (k + 1), pieces=[None], width=4) for k in range(count)
-    ]
+    dwells = [DwellFactor(k + 1, (piece_of(10.0 * k, 10.0, 9, width=4),)) for k in range(count)]
     columns, sigma = noise_model.slow_waves(dwells, np.array([2.0, 0.0, 3.0]))
     waves = np.array(columns)[:, 0]  # (dwells, nodes, channels, waves)
     assert not waves[:, 3].any() and not waves[:, :, 1].any()

@@ -44,7 +44,7 @@ from kf_calib.views.rerun.series import (
     predicted,
 )
 
-__all__ = ["BENCH_TIME", "ORIENTATION", "grow", "save"]
+__all__ = ["BENCH_TIME", "ORIENTATION", "grow", "save_view"]
 
 _NO_TARGET = np.full(12, np.nan)
 
