@@ -34,6 +34,9 @@ _WORDS = {"a": "force along the input axis", "p": "force along the pendulous axi
 _NEARLY = 0.2
 """What may be left, of the standard deviation, of values that are said to be a function of a driver."""
 
+_ROUNDING = 1e-9
+"""Share of the largest value below which a driver is zero: a mean over a dwell holds rounding, which has a sign."""
+
 _CONSTANT = 1e-6
 """A quantity that varies by less than this share of its size, or of a typical size, drives nothing."""
 
@@ -141,7 +144,8 @@ def _is_function(x: Floats, y: Floats, of_an_angle: bool) -> bool:
         columns += [wave(turns * x) for turns in (1, 2, 3, 4) for wave in (np.sin, np.cos)]
     else:
         unit = x / max(np.abs(x).max(initial=0.0), 1e-300)
-        columns += [np.sign(x), np.abs(unit), *(unit**power for power in (2, 3, 4))]
+        side = np.where(np.abs(unit) > _ROUNDING, np.sign(x), 0.0)
+        columns += [side, np.abs(unit), *(unit**power for power in (2, 3, 4))]
     basis = np.column_stack(columns)
     if len(x) <= basis.shape[1] + 2:
         return False

@@ -438,7 +438,7 @@ def consistency(fitted: Fit) -> Consistency:
     noise, dwells, rows = fitted.noise, fitted.dwells, fitted.misfit_rows
     upper = square_root_information.accumulate(rows, fitted.steps)
     statistic = float(upper[-1, -1] ** 2)
-    dof = square_root_information.row_rank(np.concatenate(rows)) - square_root_information.rank(upper[:-1])
+    dof = square_root_information.row_ranks(rows) - square_root_information.rank(upper[:-1])
     estimated = not noise.setting_stated and noise.for_goodness_of_fit.setting_rad > 0
     dof -= int(estimated)
     if dof <= 0:
@@ -462,7 +462,7 @@ def _dof_along_force(fitted: Fit) -> int:
     known = square_root_information.rank(
         square_root_information.accumulate(rows)[:-1][:, -linearised.model.count - 1 :]
     )
-    return max(square_root_information.row_rank(np.concatenate(rows)) - known, 0)
+    return max(square_root_information.row_ranks(rows) - known, 0)
 
 
 def format_p(p_value: float | None) -> str:

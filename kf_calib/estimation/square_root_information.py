@@ -8,6 +8,7 @@ such factors (G. J. Bierman, Factorization Methods for Discrete Sequential Estim
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -81,6 +82,12 @@ def restrict(factor: Floats, kept: Sequence[int]) -> Floats:
 def row_rank(rows: Floats) -> int:
     """Number of rows [H | z] of a dwell that depend on the states."""
     return int(rows[:, :-1].any(axis=1).sum())
+
+
+def row_ranks(rows: Sequence[Floats]) -> int:
+    """Number of all rows that depend on the states; rows of a prior, which come first, lack the columns of steps that
+    those of the dwells have where the biases walk."""
+    return sum(row_rank(np.concatenate(list(alike))) for _, alike in itertools.groupby(rows, lambda own: own.shape[1]))
 
 
 def run(

@@ -38,11 +38,7 @@ _MOST = 5
 def diagnosis_object(diagnosis: Diagnosis) -> dict[str, Any]:
     """The JSON object of ``diagnose``; its p-values are family-wise."""
     going = diagnosis.next_orientation
-    shapes = diagnosis.explanations[0].shapes if diagnosis.explanations else []
-    return found_object(diagnosis) | {
-        "next_orientation": None if going is None else orientation_object(*going),
-        "shapes": [clean(shape_object(shape)) for shape in shapes],
-    }
+    return found_object(diagnosis) | {"next_orientation": None if going is None else orientation_object(*going)}
 
 
 def shape_object(shape: EffectShape) -> dict[str, Any]:
@@ -59,6 +55,7 @@ def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
     """The same without the next orientation."""
     named = diagnosis.missing[0] if diagnosis.missing else "noise" if diagnosis.noise else None
     missing = "unknown" if diagnosis.unknown or diagnosis.unearned else named
+    shapes = diagnosis.explanations[0].shapes if diagnosis.explanations else []
     return clean(
         {
             "consistent": diagnosis.test.consistent,
@@ -76,6 +73,7 @@ def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
             "overlaps": diagnosis.overlaps,
             "replicates": diagnosis.replication.answer if diagnosis.replication else None,
             "replication": _replication_object(diagnosis.replication),
+            "shapes": [shape_object(shape) for shape in shapes],
             "together": [list(pair) for pair in diagnosis.together],
             "may_be_scatter": diagnosis.as_scatter,
             "invisible": diagnosis.test.invisible,

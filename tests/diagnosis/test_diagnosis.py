@@ -50,7 +50,7 @@ def test_a_hidden_effect_is_named(name: str) -> None:
     assert found.after is not None and found.after.held_out_floor_mps2 is not None
     assert found.after.held_out_rms_mps2 <= 1.3 * found.after.held_out_floor_mps2
     assert found.before.held_out_rms_mps2 > 1.5 * found.before.held_out_floor_mps2
-    assert name in found.verdict and "held-out" in found.verdict
+    assert f"Missing: {name}, " in found.verdict and "the error on orientations left out from" in found.verdict
 
 
 @pytest.mark.parametrize("case", [{}, {"phi": 0.9, "count": 500}, {"setting_deg": 0.01}])

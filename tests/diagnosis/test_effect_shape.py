@@ -12,6 +12,7 @@ from scipy.stats import binom
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.effect_shape import EffectShape, shapes_of
 from kf_calib.diagnosis.refits import Refits
+from kf_calib.diagnosis.residual_drivers import is_function_of
 from kf_calib.effects import effect_named, names
 from kf_calib.errors import InputError
 from kf_calib.estimation.calibration import calibrate
@@ -75,6 +76,15 @@ def test_what_the_readings_show_of_an_effect_follows_its_axis(name: str) -> None
         steps = np.diff(x[order]) < 0.02 * np.ptp(x)  # dwells that are alike on the axis are alike in the component
         if "hysteresis" not in name and "asymmetry" not in name:  # these jump at zero
             assert np.all(np.abs(rough[steps]) < 0.35 * spread), (name, column)
+
+
+@pytest.mark.parametrize("rounding", [0.0, 9e-16, -9e-16])
+def test_a_step_at_zero_is_a_function_though_a_zero_holds_rounding(rounding: float) -> None:
+    """Where a dwell repeats the one before there was no step: its mean is zero but for rounding, of either sign."""
+    x = np.append([rounding] * 4, np.outer([-1.0, 1.0], np.geomspace(0.1, 15.0, 8)))[:, None]
+    side = np.append([0.0] * 4, np.sign(x[4:, 0]))[:, None]
+    assert is_function_of(side, x, "m/s^2")
+    assert not is_function_of(np.roll(side, 5, axis=0), x, "m/s^2")
 
 
 @pytest.mark.parametrize(("name", "symbol", "unit"), [

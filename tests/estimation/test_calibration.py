@@ -7,11 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.hidden_effects import noisy_run
 from helpers.synthetic import G, Run, sensitivities
+from scipy.linalg import lstsq
 from scipy.spatial.transform import Rotation
 
 from kf_calib.bench.bench import Bench, axes_of
+from kf_calib.bench.paper_parameters import BIASES
 from kf_calib.bench.streams import Batch, Stream
+from kf_calib.diagnosis.refits import Refits
 from kf_calib.errors import BlunderError, InputError, UnobservableError
 from kf_calib.estimation import square_root_information, whitened_rows
 from kf_calib.estimation.calibration import calibrate
@@ -19,6 +23,7 @@ from kf_calib.estimation.cross_validation import orientations
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.iterated_fit import fit
 from kf_calib.estimation.measurement_model import Model
+from kf_calib.estimation.results import consistency
 from kf_calib.estimation.settings import Settings
 from kf_calib.sources.files.recording import Recording
 
@@ -47,6 +52,30 @@ def test_an_effect_that_is_missing_shows_as_misfit() -> None:
     assert result.consistency.consistent is False
     assert result.held_out_rms_mps2 > 3 * result.held_out_floor_mps2
     assert any("an effect is missing" in warning for warning in result.warnings)
+
+
+def test_misfit_beside_a_walk_and_a_stated_scatter_is_that_of_all_steps_solved_together() -> None:
+    """The rows of what dwells have in common know nothing of steps within dwells, and count all the same."""
+    before = noisy_run(seed=40, dwells=24, states={"scatter_sigma_mps2": 2.5e-6}, scatter_mps2=6e-6)
+    fitted = Refits().with_effects(before, ("bias-walk",)).fit
+    rows, count = fitted.misfit_rows, len(fitted.dwells)
+    prior, dwells = np.vstack(rows[:-count]), rows[-count:]
+    assert len(prior) and fitted.noise.walk_mps2_per_sqrt_s > 0.0 and prior.shape[1] == dwells[0].shape[1] - 3
+    steps = fitted.steps.ravel()  # in the pause before each dwell, and within it
+    joint = [np.hstack([np.zeros((len(prior), 3 * len(steps))), prior])]
+    for k, own in enumerate(dwells):
+        later = np.zeros((len(own), len(steps), 3))
+        later[:, 2 * k + 2 :] = -own[:, 3:][:, None, BIASES]  # the state has the biases at the end of the run
+        later[:, 2 * k + 1] = own[:, :3]
+        joint.append(np.hstack([(later * np.sqrt(steps)[:, None]).reshape(len(own), -1), own[:, 3:]]))
+    joint.append(np.eye(3 * len(steps), joint[0].shape[1]))
+    design = np.vstack(joint)
+    columns = design[:, :-1] / np.linalg.norm(design[:, :-1], axis=0)
+    left = design[:, -1] - columns @ lstsq(columns, design[:, -1])[0]
+    found = consistency(fitted)
+    each = 2 * 3  # of each channel a dwell shows its mean and its slope
+    assert found.dof == len(design) - np.linalg.matrix_rank(columns) == each * count - 12
+    assert found.statistic == pytest.approx(left @ left, rel=1e-6)
 
 
 def test_held_out_equals_refits_without_the_orientation() -> None:

@@ -201,7 +201,7 @@ def test_a_track_is_replaced_whole() -> None:
     own = track(5, 0.0, 0.0, 1e-6, 1e-6, 0)[0]
     still = replace(own, drift=0.0, drift_sigma=0.0, level_drift_covariance=0.0, walk=0.0)
     sigma = still.known_after(np.array([0.0, 5000.0]))[1]
-    assert sigma[0] == sigma[1] == np.hypot(own.level_sigma, own.repeatability)
+    assert sigma[0] == sigma[1] == pytest.approx(np.hypot(own.level_sigma, own.repeatability), rel=1e-14)
 
 
 def test_the_command_tells_the_date_and_draws_a_panel_a_parameter(run: Any, tmp_path: Path) -> None:

@@ -145,7 +145,7 @@ def test_damaged_tables_are_refused_in_a_sentence_or_read_as_they_were(cases: in
         for run, factor in (factors or {}).items():
             np.testing.assert_array_equal(factor[np.triu_indices(len(factor))], whole[run])
         read += factors is not None
-    assert 0 < read < 0.5 * cases
+    assert read < 0.5 * cases and (read > 0 or cases < 100)  # some five in a hundred harm nothing
 
 
 @pytest.mark.parametrize("cases", [40, *slow(1000)])

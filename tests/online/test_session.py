@@ -110,7 +110,7 @@ def test_a_missing_effect_is_told_while_the_run_goes_on_and_accepted_without_a_r
     assert len(alarmed.result.visits) < 10 and "disagrees: accelerometer" in alarmed.verdict
     told = next(each for each in found if each.diagnosis.missing)
     going = told.next_orientation
-    assert going is not None and len(going[0]) == 3 and "separation" in going[1]
+    assert going is not None and len(going[0]) == 3 and "shows hysteresis best: by " in going[1]
     after = [each for each in found if each.result.model.effects]
     assert after and not after[0].final and all(each.consistent for each in after)
     assert after == found[-len(after) :], "once in, in all that follows"
