@@ -109,7 +109,10 @@ def log_bayes_of_sizes(
 
 def _nodes(root: Floats, estimate: Floats, prior: SizePrior, effects: int) -> tuple[Floats, Floats]:
     """Return sizes (n,) and their prior probabilities (n,), of all sizes from one sigma of the coefficient that is
-    determined best: an effect that is smaller shows nothing, and belongs to the explanation without it."""
+    determined best: an effect that is smaller shows nothing, and belongs to the explanation without it. One of which
+    nothing is seen beside the others changes nothing: its size is zero."""
+    if not root.any():
+        return np.zeros(1), np.ones(1)
     if prior.value:
         return np.array([prior.low]), np.ones(1)
     least = best_sigma(root)

@@ -198,9 +198,9 @@ class Hypotheses:
         return log_sum - log_mean - math.log(tried)
 
     def _log_prior_of_constant(self, effect: Effect) -> float:
-        """Return the log of the prior of an effect's constant, 0 but for time constants that are longer than the effect
-        goes on in this run: these fall with the square."""
-        return -2.0 * math.log(max(effect.value / effect.acts_for_s(self._stimulus), 1.0))
+        """Return the log of the prior of an effect's constant, 0 but for time constants longer than the effect goes on
+        in this run: the density falls by as much as they are longer."""
+        return -math.log(max(effect.value / effect.acts_for_s(self._stimulus), 1.0))
 
     @cached_property
     def _stimulus(self) -> Stimulus:

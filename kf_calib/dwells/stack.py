@@ -83,6 +83,15 @@ class Folded:
             squares[shape.pieces] = (triangles[:, :, shape.width :, shape.width :] ** 2).sum(axis=2)
         return squares
 
+    def squares_along(self, along: Floats) -> Floats:
+        """Sums of squares (D,) of the readings about their fit by the basis functions, combined over the channels by
+        ``along`` (D, 3)."""
+        squares = np.empty(len(self.dwells))
+        for shape, triangles in zip(self.shapes, self.triangles, strict=True):
+            left = triangles[:, :, shape.width :, shape.width :] @ along[shape.dwells][:, None, :, None]
+            squares[shape.dwells] = (left**2).sum(axis=(1, 2, 3))
+        return squares
+
     @cached_property
     def shaking(self) -> tuple[Floats, Floats]:
         """Variance of the readings at the nodes of all pieces, (pieces, 3, 3), and the number of readings behind it,

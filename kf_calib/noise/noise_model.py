@@ -191,12 +191,8 @@ def _sigma_along(stack: DwellStack, along: Floats, inflation: Floats) -> Floats:
 
     The likeliest variances of such gamma distributed sums, by steps that keep them positive.
     """
-    weights = along**2
-    folded = stack.folded
-    squares = np.empty(len(stack))
-    for shape, triangles in zip(folded.shapes, folded.triangles, strict=True):
-        left = triangles[:, :, shape.width :, shape.width :] @ along[shape.dwells][:, None, :, None]
-        squares[shape.dwells] = (left**2).sum(axis=(1, 2, 3)) * folded.weights[shape.dwells]
+    weights, folded = along**2, stack.folded
+    squares = folded.weights * folded.squares_along(along)
     freedom = np.add.reduceat(np.maximum(folded.piece_counts - 3.0 * inflation.mean(), 0.0), folded.ends[:-1])
     if not freedom.any():
         freedom = np.maximum(folded.counts - 1.0, 0.0)

@@ -7,19 +7,19 @@ likelihood, and each dwell has the posterior mean (G. Smyth, Stat. Appl. Genet. 
 
   sigma_w^2 v_d = (nu_0 s_0^2 + nu_d s_d^2) / (nu_0 + nu_d),
 
-so that a dwell of few readings keeps to the others, and one of many to itself. Unless the noise is clearly unequal
-(M. Bartlett, 1937), all dwells have one.
+so that a dwell of few readings keeps to the others, and one of many to itself. A dwell may tremble more than the
+others, but not be much quieter: the noise of the sensors is in all of them, and a dwell that seems to have little may
+have its readings on one step of a coarse converter. So no variance counts as less than a quarter of the median. Unless
+the noise is clearly unequal (M. Bartlett, 1937), all dwells have one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.dwells.stack import DwellStack
-from kf_calib.dwells.sufficient_statistics import Autocovariance, DwellFactor
+from kf_calib.dwells.stack import DwellStack, Folded
+from kf_calib.dwells.sufficient_statistics import Autocovariance
 from kf_calib.support.tail_probabilities import chi_squared_tail
 
 _CLEAR_P = 1e-4  # of equal noise; with p-values above it, dwells keep one noise
@@ -27,6 +27,7 @@ _FEWEST = 4  # dwells whose noise is known
 _LEAST_FREEDOM = 2.0  # of a dwell whose own noise counts
 _SHAPES = np.geomspace(1.0, 1e4, 61)  # nu_0
 _ROUNDS = 60
+_QUIETEST = 0.25  # variance of a dwell, in the median of all
 
 
 def with_own_noise(dwells: DwellStack, along: Floats | None = None) -> DwellStack:
@@ -36,7 +37,7 @@ def with_own_noise(dwells: DwellStack, along: Floats | None = None) -> DwellStac
     """
     if dwells.folded.dwells[0].averaged:
         return dwells
-    variances, freedom = _variances(dwells.folded.dwells, along)
+    variances, freedom = _variances(dwells.folded, along)
     weights = weights_of(variances, freedom)
     if np.array_equal(weights, dwells.folded.weights):
         return dwells
@@ -46,13 +47,15 @@ def with_own_noise(dwells: DwellStack, along: Floats | None = None) -> DwellStac
 def weights_of(variances: Floats, freedom: Floats) -> Floats:
     """The weights 1 / v_d (D,) of readings of dwells with variances s_d^2 (D,) of nu_d (D,) degrees of freedom, of mean
     1; all 1 where the variances are equal but for chance."""
-    known = (freedom >= _LEAST_FREEDOM) & (variances > 0.0)
-    weights = np.ones(len(variances))
-    if known.sum() < _FEWEST or _equal_p(variances[known], freedom[known]) > _CLEAR_P:
+    known, weights = freedom >= _LEAST_FREEDOM, np.ones(len(variances))
+    if known.sum() < _FEWEST or np.median(variances[known]) <= 0.0:
+        return weights
+    variances = np.maximum(variances, _QUIETEST * np.median(variances[known]))
+    if _equal_p(variances[known], freedom[known]) > _CLEAR_P:
         return weights
     shape, level = _prior(variances[known], freedom[known])
     own = np.where(known, freedom, 0.0)
-    posterior = (shape * level + own * np.where(known, variances, 0.0)) / (shape + own)
+    posterior = (shape * level + own * variances) / (shape + own)
     return np.asarray(np.sum(freedom) / np.sum(freedom / posterior) / posterior, float)
 
 
@@ -82,23 +85,24 @@ def _prior(variances: Floats, freedom: Floats) -> tuple[float, float]:
     return float(_SHAPES[best]), float(levels[best, 0])
 
 
-def _variances(dwells: Sequence[DwellFactor], along: Floats | None) -> tuple[Floats, Floats]:
+def _variances(folded: Folded, along: Floats | None) -> tuple[Floats, Floats]:
     """Return the variances (D,) of the readings of each dwell about their course, relative to those of the run, and
     their degrees of freedom (D,).
 
     Autocorrelation makes these fewer (``_lost_to_correlation``).
     """
-    freedom = np.array([np.maximum(dwell.counts - float(dwell.width), 0.0).sum() for dwell in dwells])
+    first, dwells = folded.ends[:-1], folded.dwells
+    widths = np.repeat([float(dwell.width) for dwell in dwells], folded.piece_numbers)
+    freedom = np.add.reduceat(np.maximum(folded.piece_counts - widths, 0.0), first)
     total = sum((dwell.autocovariance for dwell in dwells), Autocovariance())
     lost = _lost_to_correlation(total)
     if along is not None:
-        squares = np.array([dwell.squares_along(m).sum() for dwell, m in zip(dwells, along, strict=True)])
-        return squares / np.maximum(freedom, 1.0), freedom / lost.mean()
-    squares = np.array([dwell.squares.sum(axis=0) for dwell in dwells])
+        return folded.squares_along(along) / np.maximum(freedom, 1.0), freedom / lost.mean()
+    squares = np.add.reduceat(folded.squares, first)
     levels = squares.sum(axis=0) / max(freedom.sum(), 1.0)
     varying = levels > 0.0
     if not varying.any():
-        return np.zeros(len(dwells)), freedom
+        return np.zeros(len(freedom)), freedom
     shares = freedom[:, None] / lost[varying]
     relative = squares[:, varying] / np.maximum(freedom, 1.0)[:, None] / levels[varying]
     return np.sum(shares * relative, axis=1) / np.maximum(shares.sum(axis=1), 1e-300), shares.sum(axis=1)
