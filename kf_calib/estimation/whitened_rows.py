@@ -182,7 +182,7 @@ def _weighted(batch: _Batch, columns: Floats, about: _About) -> tuple[Floats, in
     parts = _channels(batch, columns, blocks, about, columns.shape[2])
     sigma = noise.effective_sigma_mps2
     roots = np.sqrt(batch.stack.folded.weights[batch.dwells])
-    parts *= roots[:, None, None, None] / sigma[:, None, None]
+    parts /= sigma[:, None, None] / roots[:, None, None, None]
     walks = roots[:, None] * (noise.walk_mps2_per_sqrt_s / sigma)
     if noise.attitude_unknown:
         along = _unit_along(batch, noise, about.state)
@@ -359,8 +359,8 @@ class MisfitColumns:
             stacked = columns[group.pieces]  # (d, pieces, K, 3, q)
             many, pieces, width, _, count = stacked.shape
             on_triangles = group.triangles @ on_basis(stacked.reshape(many, pieces, width, 3 * count))
-            scale = group.roots[:, None, None, None, None] / self._sigma[:, None]
-            parts = np.moveaxis(on_triangles.reshape(stacked.shape) * scale, 3, 1)
+            sigma = self._sigma[:, None] / group.roots[:, None, None, None, None]
+            parts = np.moveaxis(on_triangles.reshape(stacked.shape) / sigma, 3, 1)
             parts = parts.reshape(many, 3, pieces * width, count)
             if group.along is not None:
                 parts = _combined(parts, group.along)

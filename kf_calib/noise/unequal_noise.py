@@ -9,7 +9,7 @@ likelihood, and each dwell has the posterior mean (G. Smyth, Stat. Appl. Genet. 
 
 so that a dwell of few readings keeps to the others, and one of many to itself. A dwell may tremble more than the
 others, but not be much quieter: the noise of the sensors is in all of them, and a dwell that seems to have little may
-have its readings on one step of a coarse converter. So no variance counts as less than a quarter of the median. Unless
+have its readings on one step of a coarse converter. So no variance counts as less than a tenth of the median. Unless
 the noise is clearly unequal (M. Bartlett, 1937), all dwells have one.
 """
 
@@ -27,7 +27,7 @@ _FEWEST = 4  # dwells whose noise is known
 _LEAST_FREEDOM = 2.0  # of a dwell whose own noise counts
 _SHAPES = np.geomspace(1.0, 1e4, 61)  # nu_0
 _ROUNDS = 60
-_QUIETEST = 0.25  # variance of a dwell, in the median of all
+_QUIETEST = 0.1  # variance of a dwell, in the median of all
 
 
 def with_own_noise(dwells: DwellStack, along: Floats | None = None) -> DwellStack:
