@@ -124,4 +124,4 @@ def _leads_somewhere(page: Path, link: str, pages: dict[Path, Page]) -> bool:
 
 def _printed(*words: str) -> str:
     command = [sys.executable, "-m", "kf_calib.cli", *words]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout

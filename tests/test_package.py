@@ -35,7 +35,7 @@ def consoles(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 def test_the_package_runs_as_a_module(tmp_path: Path) -> None:
     words = [sys.executable, "-m", "kf_calib", "--version"]
-    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True)
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=300)
     assert done.stdout.strip().endswith(f"version {metadata.version('kf_calib')}")
 
 
@@ -144,4 +144,4 @@ def _lookup(python: str, folder: Path, packages: list[str]) -> subprocess.Comple
     (asked := folder / "packages.txt").write_text("\n".join(packages))
     words = ["--dry-run", "--no-deps", "--only-binary", ":all:", "--python-version", python, "--ignore-installed",
              "--target", folder / "none", "--requirement", asked]  # fmt: skip
-    return subprocess.run([sys.executable, "-m", "pip", "install", *words], capture_output=True, text=True)
+    return subprocess.run([sys.executable, "-m", "pip", "install", *words], capture_output=True, text=True, timeout=900)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import shlex
@@ -20,6 +21,7 @@ from helpers.long_runs import slow
 from helpers.paths import ROOT
 
 import kf_calib
+from kf_calib import effects
 from kf_calib.cli import cli
 
 README = ROOT / "README.md"
@@ -80,7 +82,7 @@ def test_the_commands_of_a_page_print_what_is_shown(
     with _workers_at_once() if "kf-calib fleet" in text else nullcontext():
         for command, shown in consoles(text):
             if not (in_short and any(option in command for option in OF_OTHER_TESTS)):
-                _assert_shown(shown, _said(command), f"{page.name}: {command!r}")
+                _assert_shown(shown, _said_once(command), f"{page.name}: {command!r}")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -142,18 +144,43 @@ def files(text: str) -> list[tuple[str, str]]:
     return [(each[1], each[2]) for each in found if each]
 
 
-def _said(command: str) -> str:
-    """What a command line of a page prints in this folder; ours in this process, since many starts take long.
+def _said_once(command: str) -> str:
+    """The same as ``_said``; what another page has had of the same command and the same files is not run again."""
+    named = [Path(word).read_bytes() for word in shlex.split(command) if Path(word).is_file()]
+    key = command, hashlib.sha256(b"".join(named)).hexdigest()
+    if key not in _RUN:
+        before = _written()
+        printed = _said(command)
+        changed = [path for path, state in _written().items() if before.get(path) != state]
+        _RUN[key] = printed, {path: path.read_bytes() for path in changed}
+    printed, files_made = _RUN[key]
+    for path, content in files_made.items():
+        path.write_bytes(content)
+    return printed
 
-    Not where it loads effects: they would stay in the catalogue of all tests that follow.
-    """
+
+_RUN = dict[tuple[str, str], tuple[str, dict[Path, bytes]]]()
+"""What commands have printed, and the files that they have made, by the command and the files that it names."""
+
+
+def _written() -> dict[Path, tuple[int, int]]:
+    """The files in this folder, each with its size and the time of its last change."""
+    stats = {path: path.stat() for path in Path().iterdir() if path.is_file()}
+    return {path: (stat.st_size, stat.st_mtime_ns) for path, stat in stats.items()}
+
+
+def _said(command: str) -> str:
+    """What a command line of a page prints in this folder; ours in this process, since many starts take long, and
+    without the effects of a user's that others have loaded."""
     command, _, given = command.partition(" < ")
     program, *words = shlex.split(command)
-    if program == "kf-calib" and "--effects-from" not in words:
-        ours = CliRunner().invoke(cli, words, input=Path(given.strip()).read_bytes() if given else None)
+    if program == "kf-calib":
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(effects, "_registered", {})
+            ours = CliRunner().invoke(cli, words, input=Path(given.strip()).read_bytes() if given else None)
         assert ours.exit_code == 0, f"{command}: {ours.output} {ours.exception}"
         return _words(ours.stdout)
-    start = {"kf-calib": [sys.executable, "-m", "kf_calib.cli"], "python": [sys.executable]}.get(program, [program])
+    start = [sys.executable] if program == "python" else [program]
     return _words(subprocess.run([*start, *words], capture_output=True, text=True, check=True, timeout=120).stdout)
 
 

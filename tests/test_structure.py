@@ -144,7 +144,7 @@ for name in {others}:
 import pytest
 sys.exit(pytest.main(["--collect-only", "-qq", "-n", "0", "-p", "no:cacheprovider", *{folders}]))
 """
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
 
 
@@ -185,7 +185,7 @@ def test_one_name_stands_for_one_thing() -> None:
 
 def test_import_is_cheap_and_leaves_filterpy_and_rerun_alone() -> None:
     code = "import sys, kf_calib; print(*[m for m in ('filterpy', 'rerun', 'scipy', 'matplotlib') if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=300)
     assert done.stdout.strip() == ""
 
 
@@ -203,6 +203,6 @@ def test_a_replay_imports_nothing_that_it_does_not_need() -> None:
     )
     recording = PACKAGE.parent / "recordings" / "navigation_24.mcap"
     command = [sys.executable, "-c", code, "replay", str(recording), "--json"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
     assert json.loads(done.stdout)["dwells"] == 24
     assert done.stderr.strip() == ""

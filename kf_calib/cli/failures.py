@@ -1,19 +1,35 @@
-"""What a command that failed says: one sentence, whatever went wrong."""
+"""What a command that failed says: one sentence, whatever went wrong.
+
+What was not foreseen leaves a report for a maintainer, with nothing of the user's data: the kind of the error and of
+those behind it, the lines of program that were at work, versions, and the names of the options that were given. It has
+no message, no value and no name of a file: these may hold data.
+"""
 
 from __future__ import annotations
 
 import os
+import platform
+import re
 import sys
+import tempfile
 import traceback
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from datetime import UTC, datetime
+from importlib import metadata
 from pathlib import Path
 
 import click
 
 from kf_calib.cli.echo import complain
-from kf_calib.cli.error_report import PACKAGE, place, write_error_report
 from kf_calib.errors import KfCalibError
 from kf_calib.support.plain_text import printable
+
+PACKAGE = Path(__file__).parents[1]
+_PACKAGES = ("kf_calib", "numpy", "scipy", "filterpy", "mcap", "rerun-sdk", "matplotlib", "pydantic", "click")
+
+_COMMAND = re.compile(r"[a-z]+")
+_OPTION = re.compile(r"--[a-z][a-z-]*|-[A-Za-z]")
 
 TRACEBACK = "KF_CALIB_TRACEBACK"
 
@@ -61,3 +77,59 @@ def _place(error: BaseException) -> str:
         return "an unknown place"
     frame = (in_package or frames)[-1]
     return f"{place(Path(frame.filename))}:{frame.lineno}"
+
+
+def write_error_report(error: BaseException, words: Sequence[str]) -> Path | None:
+    """The file, among the temporary ones; None where it cannot be written. words: of the command line."""
+    name = f"kf-calib-error-{datetime.now(UTC):%Y%m%dT%H%M%S}-"
+    try:
+        with tempfile.NamedTemporaryFile(
+            "w", prefix=name, suffix=".txt", delete=False, encoding="utf-8", errors="replace"
+        ) as file:
+            file.writelines(f"{line}\n" for line in error_report(error, words))
+            return Path(file.name)
+    except OSError:
+        return None
+
+
+def error_report(error: BaseException, words: Sequence[str]) -> Iterator[str]:
+    """The lines of the report."""
+    yield "Error report of kf-calib. It holds no readings, no messages, no values and no names of files."
+    yield f"command: {' '.join(without_values(words))}"
+    yield f"Python {platform.python_version()}, {platform.system()} {platform.machine()}"
+    yield ", ".join(f"{name} {_version(name)}" for name in _PACKAGES)
+    yield f"standard output: {getattr(sys.stdout, 'encoding', None)}"
+    for cause in _causes(error):
+        yield ""
+        yield type(cause).__name__
+        for frame in traceback.extract_tb(cause.__traceback__):
+            yield f"  {place(Path(frame.filename))}:{frame.lineno} in {frame.name}"
+
+
+def without_values(words: Sequence[str]) -> list[str]:
+    """The command and the names of its options; what else was typed is a dot."""
+    names = [_OPTION.match(word) or (_COMMAND.fullmatch(word) if k == 0 else None) for k, word in enumerate(words)]
+    return [name[0] if name else "·" for name in names]
+
+
+def place(path: Path) -> Path:
+    """The path of a module, without what lies above its package."""
+    if PACKAGE in path.parents:
+        return path.relative_to(PACKAGE.parent)
+    parts = path.parts
+    return Path(*parts[parts.index("site-packages") + 1 :]) if "site-packages" in parts else Path(path.name)
+
+
+def _causes(error: BaseException) -> Iterator[BaseException]:
+    """The error, and those in whose handling it arose."""
+    cause: BaseException | None = error
+    while cause is not None:
+        yield cause
+        cause = cause.__cause__ or cause.__context__
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "(not installed)"

@@ -237,7 +237,11 @@ def _print(run: LiveRun, judgement: Judgement | HandJudgement, as_json: bool) ->
     if as_json:
         _echo(run, json_line(_object(judgement, run.session.standing, run.source.status) | dict(run.further_keys())))
     elif not judgement.final:
-        _echo(run, sentence(_line(judgement)))
+        from kf_calib.online.status import Judgement
+        from kf_calib.views.live import line
+        from kf_calib.views.live_hand import hand_line
+
+        _echo(run, sentence(line(judgement) if isinstance(judgement, Judgement) else hand_line(judgement)))
 
 
 def _object(judgement: Judgement | HandJudgement, standing: Standing | HandStanding, status: Status) -> dict[str, Any]:
@@ -250,14 +254,6 @@ def _object(judgement: Judgement | HandJudgement, standing: Standing | HandStand
         return live_object(judgement, standing, status)
     assert not isinstance(standing, Standing)
     return hand_object(judgement, standing, status)
-
-
-def _line(judgement: Judgement | HandJudgement) -> str:
-    from kf_calib.online.status import Judgement
-    from kf_calib.views.live import line
-    from kf_calib.views.live_hand import hand_line
-
-    return line(judgement) if isinstance(judgement, Judgement) else hand_line(judgement)
 
 
 def _echo(run: LiveRun, text: str) -> None:

@@ -169,10 +169,10 @@ def _refuse_contradictions(options: Mapping[str, Any]) -> None:
 def _plan_by_hand(options: Mapping[str, Any], as_json: bool) -> None:
     """Print which sides to turn up where there are no angles."""
     from kf_calib.bench.bench import Bench
-    from kf_calib.design.hand_poses import HandPlan
+    from kf_calib.design.sides import HandPlan
     from kf_calib.estimation.calibration import calibrate
     from kf_calib.estimation.measurement_model import Model
-    from kf_calib.views import hand_poses as views
+    from kf_calib.views import plan as views
 
     if options["recording"] is not None:
         source, settings = opened(options["recording"], options)

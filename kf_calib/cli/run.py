@@ -199,21 +199,18 @@ def _trouble(running: DrivenRun) -> str:
 
 def _follow(running: DrivenRun, name: str, device: Opened, record: Path | None, as_json: bool) -> None:
     """The run to its end; with a person as the positioner, Enter says that the gimbals stand."""
-    from kf_calib.positioning.hand import HandPositioner
+    from kf_calib.positioning.positioner import HandPositioner
 
-    if isinstance(device.positioner, HandPositioner):
-        _read_enter(device.positioner)
+    hand = device.positioner
+    if isinstance(hand, HandPositioner):
+        import threading
+
+        def listen() -> None:
+            for _ in sys.stdin:
+                hand.done()
+
+        threading.Thread(target=listen, name="enter", daemon=True).start()
     follow(running, name, record, as_json)
-
-
-def _read_enter(hand: Any) -> None:
-    import threading
-
-    def listen() -> None:
-        for _ in sys.stdin:
-            hand.done()
-
-    threading.Thread(target=listen, name="enter", daemon=True).start()
 
 
 def _code(running: DrivenRun) -> int:
@@ -255,8 +252,7 @@ def _show_dry_run(name: str, keys: Mapping[str, str], options: Mapping[str, Any]
         if way is None:
             begin, end = (views.angles_in_words(np.degrees(angles).tolist()) for angles in (here, pose))
             raise InputError(
-                f"no way from {begin} to {end} "
-                "keeps out of the forbidden zones: widen what the bench file allows."
+                f"no way from {begin} to {end} keeps out of the forbidden zones: widen what the bench file allows."
             )
         stations = [here, *way]
         slews_s.append(sum(float(itinerary.pace.slews_s(a, b)) for a, b in zip(stations, way, strict=False)))

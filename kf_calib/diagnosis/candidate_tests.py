@@ -17,11 +17,12 @@ from kf_calib.dwells.coherent_tone import band_hz
 from kf_calib.dwells.line_spectrum import SpectralLine, lowest_hz
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects import Effect, effect_named, names, oscillation_of, slew_effects, walk_named
+from kf_calib.estimation.candidate_scan import Candidate, Scan
 from kf_calib.estimation.dwell_columns import stimulus_of
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.results import consistency
-from kf_calib.estimation.score_test import Candidate, Frame, Scan
+from kf_calib.estimation.score_test import Frame
 from kf_calib.support import stage
 from kf_calib.support.tail_probabilities import LEVEL, sidak
 
@@ -31,6 +32,7 @@ SHARE = 0.4
 REST = 0.5 * (1.0 - 2.0 * SHARE)
 """Share that is given to the test of spectral lines, and as much to that of trends within dwells."""
 
+_TIE = 1e-6  # of chi-squared: of values of a constant that explain as much, the first is taken, whatever rounding does
 _DRAWS = 4000
 _FEWEST_WALKED = 8  # dwells that are needed before a random walk of the biases is tested
 
@@ -169,7 +171,7 @@ def assess_candidates(
     for k, candidate in enumerate(scan.candidates):
         name = str(candidate.effect)
         score = float(statistics[k]) - critical_delta_chi2(candidate, tests) if candidate.dof else -np.inf
-        if name not in best or score > scores.get(name, -np.inf):
+        if name not in best or score > scores.get(name, -np.inf) + _TIE:
             best[name] = k
             if candidate.dof:
                 p_alone = sidak(float(chdtrc(candidate.dof, statistics[k])), candidate.tried)

@@ -24,6 +24,7 @@ from kf_calib.diagnosis.coefficient_sizes import AddedEffects
 from kf_calib.diagnosis.detectability import sensor_grade
 from kf_calib.dwells.qr import triangle
 from kf_calib.effects.effect import Grade
+from kf_calib.estimation.candidate_scan import SEEN
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.whitened_rows import flicker_of_scatter, whiten
@@ -37,7 +38,6 @@ _RANGE = math.log(1e4)  # width of the flat prior of the logarithm of a size of 
 _UNSTATED = 0.5  # prior probability of noise from dwell to dwell that was not stated
 _BEYOND = 0.02  # prior probability of more noise than was stated
 _IMMENSE_MPS2 = 1e3  # scatter so large that nothing is left of a dwell's mean
-_SEEN = 1e-6  # as in ``score_test``: the least share of a column that the model must leave
 
 
 @dataclass(frozen=True)
@@ -290,7 +290,7 @@ def _visible(means: Means, noise: Noise, prior: Floats, blocks: _ColumnBlocks) -
     left, singular, _ = np.linalg.svd(model, full_matrices=False)
     basis = left[:, singular > 1e-9 * singular[0]]
     _, singular, right = np.linalg.svd(added - basis @ (basis.T @ added), full_matrices=False)
-    seen = singular > _SEEN
+    seen = singular > SEEN
     right, singular = right[seen], singular[seen]
     return right.T / singular / lengths[:, None], singular[:, None] * right * lengths
 

@@ -31,16 +31,15 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.coefficient_sizes import size_evidence
 from kf_calib.dwells.qr import triangle
 from kf_calib.effects import Effect
-from kf_calib.estimation.complement import Complement
+from kf_calib.estimation.candidate_scan import SEEN, Complement, Scan, scan_of, slices
 from kf_calib.estimation.cross_validation import orientations
 from kf_calib.estimation.results import Calibration, Consistency
-from kf_calib.estimation.score_test import Frame, Scan, scan_of, slices
+from kf_calib.estimation.score_test import Frame
 from kf_calib.support.tail_probabilities import LEVEL, f_tail
 
 FEWEST = 12
 """Dwells that a run needs to be divided."""
 
-_SEEN = 1e-6  # as in ``score_test``: what the model leaves of a direction that is seen
 
 Answer = Literal["yes", "no", "cannot tell"]
 
@@ -183,7 +182,7 @@ class _DividedRows:
         sizes = np.linalg.norm(columns[:, joined], axis=0)
         sizes = np.where(sizes > 0.0, sizes, 1.0)
         basis, singular, right = np.linalg.svd(left[:, joined] / sizes, full_matrices=False)
-        determined = singular > _SEEN
+        determined = singular > SEEN
         inverse = (right[determined].T / singular[determined]) @ basis[:, determined].T / sizes[:, None]
         whole = np.hstack([self._frame.basis @ coordinates[k] for k in chosen])
         return _Choice(tuple(effects[k] for k in chosen), whole, inverse @ left[:, -1], inverse @ inverse.T)

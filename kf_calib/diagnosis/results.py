@@ -62,7 +62,7 @@ class Diagnosis:
 
     missing: names of the effects of the likeliest explanation (empty: nothing is missing, or no known effect). unknown:
     whether the likeliest is none of the known effects. unearned: why the effects of the likeliest explanation are not
-    named (``earned_name``), in words; "" where they are. noise: whether it is noise that was not stated. ambiguity: the
+    named, in words; "" where they are. noise: whether it is noise that was not stated. ambiguity: the
     effects of the explanations that have 99 % of the probability together, those missing first. overlaps: overlap of
     each other effect with the one that it could replace. together: pairs among these explanations. as_scatter: noise
     that was not stated has more than 1 %. after: the calibration with the missing effects. suspects: single effects

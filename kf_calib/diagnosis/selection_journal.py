@@ -120,10 +120,12 @@ def write_journal(path: Path, state: Improvement, origin: Origin) -> None:
 
     An existing file of that name is replaced as a whole; it is never left half written.
     """
+    from importlib.metadata import version
+
     import tomli_w
 
     table: dict[str, Any] = {
-        "version": _version(),
+        "version": version("kf_calib"),
         "stopped_because": state.because,
         "reason": state.reason,
         "model": list(state.effects),
@@ -219,10 +221,3 @@ def _difference(one: Mapping[str, float], other: Mapping[str, float]) -> float:
     if one.keys() != other.keys():
         return float("inf")
     return max(abs(one[key] - other[key]) / max(abs(one[key]), abs(other[key]), 1e-300) for key in one)
-
-
-def _version() -> str:
-    """Return the version of this program."""
-    from importlib.metadata import version
-
-    return version("kf_calib")

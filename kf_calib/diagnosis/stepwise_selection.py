@@ -316,7 +316,8 @@ def take_step(
     protected = state.protected | ({_name(added, result)} if added is not None else set[str]())
     removed = list[Removal]()
     while (removal := _next_removal(result, protected, dropped, len(removed))) is not None:
-        result = refits.of(result, _without(result, removal.name))
+        both = zip(result.model.effects, result.settings.effects, strict=True)
+        result = refits.of(result, tuple(text for effect, text in both if str(effect) != removal.name))
         removed.append(removal)
     table = state.diagnosis.table
     probability = None if added is None or table is None else table.probability_of_added(added, _name(added, result))
@@ -377,12 +378,6 @@ def _removal_of(tests: dict[str, Removal], name: str) -> Removal:
         what_it_has = f"it has {', '.join(tests)}." if tests else "it has the twelve parameters only."
         raise InputError(f"{name!r} is not in the model, so it cannot be dropped: {what_it_has}")
     return tests[name]
-
-
-def _without(result: Calibration, name: str) -> tuple[str, ...]:
-    """Return the effects of a model without one of them."""
-    both = zip(result.model.effects, result.settings.effects, strict=True)
-    return tuple(text for effect, text in both if str(effect) != name)
 
 
 def _name(text: str, result: Calibration) -> str:

@@ -1,4 +1,9 @@
-"""Description of a misfit that no known effect explains: where it shows, what it depends on, and formulas to try."""
+"""Description of a misfit that no known effect explains: where it shows, what it depends on, and formulas to try.
+
+It may depend on two quantities at once, as temperature times force: each pair of drivers has a sparse basis. The
+evidence of a pair is the mean over all its subsets of one or two terms, as of a prior by which few terms of the basis
+are there (spike and slab). So its price is that of what it needs, and not that of the whole basis.
+"""
 
 from __future__ import annotations
 
@@ -12,18 +17,18 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
-from kf_calib.diagnosis import two_drivers
 from kf_calib.diagnosis.within_dwell_trend import Trend
 from kf_calib.diagnosis.within_dwell_trend import trend as trend_of
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects import Effect, effect_named, walk_named
 from kf_calib.effects.formula import formula
 from kf_calib.errors import InputError
+from kf_calib.estimation.candidate_scan import Scan
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.further_effects import FurtherEffects
 from kf_calib.estimation.iterated_fit import fit
 from kf_calib.estimation.results import consistency
-from kf_calib.estimation.score_test import Frame, Scan
+from kf_calib.estimation.score_test import Frame
 from kf_calib.support import stage
 
 _CHANCE = 1e-4  # significance level of one family, of which there are about a hundred
@@ -197,7 +202,7 @@ def families(fitted: Fit, known: Sequence[Effect] = (), frame: Frame | None = No
 def _tested(fitted: Fit, tests: FurtherEffects) -> list[FormulaFamily]:
     """Return the families with their falls of chi-squared."""
     bench, groups = fitted.linearised.model.bench, list[tuple[str, list[str], list[Effect]]]()
-    of_two = dict(two_drivers.bases(len(bench.axes)))
+    of_two = dict(bases_of_pairs(len(bench.axes)))
     for driver, texts in itertools.chain(_families(bench, fitted.dwells), of_two.items()):
         with contextlib.suppress(InputError):  # a very late jump or fast decay does not show when a formula is checked
             effects_of_texts = [formula(_named(text), bench.axes, bench.gravity_mps2, checked=False) for text in texts]
@@ -217,7 +222,7 @@ def _tested(fitted: Fit, tests: FurtherEffects) -> list[FormulaFamily]:
 
 def _subsets(driver: str, texts: Sequence[str], scan: Scan, known: Sequence[bool]) -> Iterator[FormulaFamily]:
     """Yield the subsets of the terms of two drivers that are no known effects, each as a family."""
-    for chosen, delta_chi2, rank in two_drivers.subsets(scan):
+    for chosen, delta_chi2, rank in sparse_subsets(scan):
         each = tuple(float(scan.statistics[k]) for k in chosen)
         yield FormulaFamily(
             driver, tuple(texts[k] for k in chosen), delta_chi2, rank, each, all(known[k] for k in chosen)
@@ -312,3 +317,34 @@ def _of_surroundings(bench: Bench) -> Iterator[tuple[str, list[str]]]:
     plays = ([f"play{width}"] for width in (3, 6))  # one of 1 m/s^2 is hysteresis
     for terms in (["da"], ["da*abs(da)"], ["tanh(da/(5*m/s**2))"], ["a-da"], ["(a-da)**2"], *plays):
         yield "previous orientation", terms
+
+
+_FORCES = ("a", "p", "o", "a*a", "p*p", "a*p", "a*o", "p*o")
+_LINEAR = _FORCES[:3]
+
+
+def bases_of_pairs(gimbals: int) -> Iterator[tuple[str, list[str]]]:
+    """Yield the pairs of drivers in words, each with the terms of its basis.
+
+    gimbals: number of gimbal axes.
+    """
+    for words, symbol in (("temperature", "T"), ("time", "t")):
+        terms = [f"{symbol}*{force}" for force in _FORCES]
+        yield f"{words} and specific force", [*terms, *(f"{symbol}*{symbol}*{force}" for force in _LINEAR)]
+    for k in range(1, gimbals + 1):
+        waves = [f"{wave}({times}q{k})" for times in ("", "2*") for wave in ("sin", "cos")]
+        yield f"angle of gimbal {k} and specific force", [f"{wave}*{force}" for wave in waves for force in _LINEAR]
+        yield f"angle of gimbal {k} and temperature", [f"{wave}*T" for wave in waves[:2]]
+    steps = [f"{step}*{force}" for step in ("da", "abs(da)") for force in _LINEAR]
+    yield "previous orientation and specific force", steps
+
+
+def sparse_subsets(scan: Scan) -> Iterator[tuple[tuple[int, ...], float, int]]:
+    """Yield all subsets of one or two candidates of a scan, with their falls of chi-squared and ranks."""
+    alone = scan.statistics
+    for k, candidate in enumerate(scan.candidates):
+        yield (k,), float(alone[k]), candidate.dof
+    for k, other in itertools.combinations(range(len(scan.candidates)), 2):
+        if scan.candidates[k].dof and scan.candidates[other].dof:
+            basis = np.concatenate([scan.candidates[k].basis, scan.candidates[other].basis], axis=1)
+            yield (k, other), *scan.explained(basis)

@@ -163,7 +163,7 @@ def _shapes_in(dwells: Sequence[DwellFactor], triangles: Floats) -> tuple[Floats
     """
     ends = np.array([(dwell.start_s, dwell.end_s) for dwell in dwells])
     counts, lengths = np.array([dwell.count for dwell in dwells]), ends[:, 1] - ends[:, 0]
-    at = np.array([dwell.nodes.elapsed_s for dwell in dwells]).reshape(*triangles.shape[:2], 3)
+    at = np.array([[piece.nodes.elapsed_s for piece in dwell.pieces] for dwell in dwells])
     from_start = (at - ends[:, 0, None, None]) / np.where(lengths > 0.0, lengths, 1.0)[:, None, None]
     rows = triangles[:, :, : dwells[0].width, :3] @ on_basis(shapes(2.0 * from_start - 1.0))
     frame, upper = np.linalg.qr(rows.reshape(len(dwells), -1, rows.shape[3]))

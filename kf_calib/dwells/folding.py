@@ -10,11 +10,11 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.coherent_tone import MOST_CELLS, Cells, Trace
 from kf_calib.dwells.line_spectrum import Spectrum
-from kf_calib.dwells.orthonormal_parabola import orthonormal_parabola
-from kf_calib.dwells.pieces import MOST_PIECES, Piece, coarsened
+from kf_calib.dwells.pieces import FEWEST_PIECES, MOST_PIECES, MOST_RUN_PIECES, Piece, coarsened
 from kf_calib.dwells.qr import square_triangle
 from kf_calib.dwells.rows import Rows, basis
 from kf_calib.dwells.sufficient_statistics import Autocovariance, DwellFactor
+from kf_calib.dwells.window_average import orthonormal_parabola
 
 _CORRELATED_SAMPLES = 8192  # first readings of a dwell over which its autocovariance is accumulated, at least
 
@@ -47,15 +47,18 @@ class _DwellSequence:
     """A sequence of dwells, or of slews, to which blocks are added in order of time.
 
     The blocks of the last dwell are merged only when the sequence is read; merging each as it arrives would copy the
-    whole dwell every time.
+    whole dwell every time. In a run of very many pieces those of its closed dwells are merged, too.
     """
 
     def __init__(self, folded: Iterable[DwellFactor] = ()) -> None:
         self._folded, self._blocks = list(folded), list[DwellFactor]()
+        self._closed_pieces, self._most_closed = 0, MOST_RUN_PIECES
 
     def add(self, block: DwellFactor) -> None:
         """Add a block of the last dwell or of a new one."""
         if self._last(block.number) is None:
+            if self._folded and not block.moving:
+                self._bound_closed()
             self.folded.append(block)
             return
         if self._count + len(block.pieces) > MOST_PIECES and not block.moving:
@@ -80,6 +83,15 @@ class _DwellSequence:
             self._blocks = []
         return self._folded
 
+    def _bound_closed(self) -> None:
+        """Count the pieces of the dwell that closes; where the run has too many, halve those of its long dwells."""
+        self._closed_pieces += self._count
+        if self._closed_pieces <= self._most_closed:
+            return
+        self._folded = [_with_half_the_pieces(dwell) for dwell in self.folded]
+        self._closed_pieces = sum(len(dwell.pieces) for dwell in self._folded)
+        self._most_closed = max(MOST_RUN_PIECES, 5 * self._closed_pieces // 4)
+
     @property
     def _count(self) -> int:
         """Number of pieces of the last dwell."""
@@ -88,6 +100,12 @@ class _DwellSequence:
     def _last(self, number: int) -> DwellFactor | None:
         """Return the last dwell if it has this number, else None."""
         return self._folded[-1] if self._folded and self._folded[-1].number == number else None
+
+
+def _with_half_the_pieces(dwell: DwellFactor) -> DwellFactor:
+    """The dwell with its pieces merged two by two, if it has many: only three fit into a third of its length."""
+    count = len(dwell.pieces)
+    return dwell if count <= FEWEST_PIECES else replace(dwell, pieces=coarsened(dwell.pieces, count // 3))
 
 
 class Folder:

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.rows import on_basis
+from kf_calib.support.computed_sequence import ComputedSequence
 
 PieceIndices = NDArray[np.intp]
 
 
-class OfPieces(Sequence[Floats]):
+class OfPieces(ComputedSequence[Floats]):
     """Values of the pieces of all dwells in one array (pieces, ...), as a sequence of those of each dwell."""
 
     def __init__(self, values: Floats, ends: PieceIndices) -> None:
@@ -23,14 +23,8 @@ class OfPieces(Sequence[Floats]):
     def __len__(self) -> int:
         return len(self._ends) - 1
 
-    @overload
-    def __getitem__(self, index: int) -> Floats: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[Floats]: ...
-    def __getitem__(self, index: int | slice) -> Floats | list[Floats]:
-        if isinstance(index, slice):
-            return [self[k] for k in range(*index.indices(len(self)))]
-        k = range(len(self))[index]
+    def item(self, k: int) -> Floats:
+        """The values of the pieces of one dwell."""
         return self.values[self._ends[k] : self._ends[k + 1]]
 
     def beside(self, *others: Sequence[Floats]) -> OfPieces:

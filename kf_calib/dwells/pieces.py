@@ -1,4 +1,5 @@
-"""The pieces of a dwell. In a dwell of hours neighbouring pieces are merged, so that its memory is bounded.
+"""The pieces of a dwell. In a dwell of hours neighbouring pieces are merged, and in a run of days those of its closed
+dwells, so that memory is bounded.
 
 The parabola over two pieces together is, on either piece, a linear combination of that piece's basis. Two triangles are
 therefore merged exactly. Only the model's columns become coarser: each was one parabola per piece and is one over both.
@@ -19,6 +20,10 @@ from kf_calib.dwells.rows import Nodes, basis, parabola
 MOST_PIECES = 256
 """Pieces of a dwell, at most; at 3 kHz as many last almost six minutes."""
 _MERGED_PIECES = MOST_PIECES // 4  # pieces after merging; at most twice as many
+MOST_RUN_PIECES = 2048
+"""Pieces of all dwells of a run, beyond which those of long dwells are merged; dwells of an hour have 70 each."""
+FEWEST_PIECES = 16
+"""Dwells of no more pieces are left as they are: so many have lengths that double from 1 s to hours."""
 
 
 @dataclass(frozen=True)
@@ -39,10 +44,10 @@ class Piece:
     reading_count: int = 0
 
 
-def coarsened(pieces: Sequence[Piece]) -> tuple[Piece, ...]:
-    """Pieces in order of time, merged to at most half of ``MOST_PIECES`` and those shortly after the arrival."""
+def coarsened(pieces: Sequence[Piece], count: int = _MERGED_PIECES) -> tuple[Piece, ...]:
+    """Pieces in order of time, merged to at most twice ``count`` and those shortly after the arrival."""
     begin, end = pieces[0].nodes.elapsed_s[0], pieces[-1].nodes.elapsed_s[-1]
-    return tuple(merged_piece(group) for group in _groups(pieces, float(end - begin) / _MERGED_PIECES))
+    return tuple(merged_piece(group) for group in _groups(pieces, float(end - begin) / count))
 
 
 def _groups(pieces: Sequence[Piece], longest_s: float) -> Iterator[list[Piece]]:

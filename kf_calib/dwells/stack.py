@@ -7,20 +7,25 @@ dwells; a single dwell is made from them only where it is asked for.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from operator import is_
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.bench.bench import turned
-from kf_calib.dwells.attitude_error import AttitudeError
 from kf_calib.dwells.piece_values import PieceIndices
 from kf_calib.dwells.rows import parabola
-from kf_calib.dwells.sufficient_statistics import LEAST_FREEDOM, DwellFactor, rate_or_zero
+from kf_calib.dwells.sufficient_statistics import (
+    LEAST_FREEDOM,
+    AttitudeError,
+    Autocovariance,
+    DwellFactor,
+    rate_or_zero,
+)
+from kf_calib.support.computed_sequence import ComputedSequence
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -37,17 +42,39 @@ class Folded:
     """What of some dwells depends neither on the force that is felt nor on what is subtracted from their readings."""
 
     def __init__(self, dwells: Sequence[DwellFactor]) -> None:
-        self.dwells = tuple(dwells)
+        self.dwells: Sequence[DwellFactor] = tuple(dwells)
         self.piece_numbers = np.fromiter((len(dwell.pieces) for dwell in self.dwells), np.intp, len(self.dwells))
         self.ends = np.append(0, np.cumsum(self.piece_numbers))
         """The first piece of each dwell, and at last the number of pieces."""
 
     @cached_property
+    def widths(self) -> PieceIndices:
+        """The number K of basis functions of the pieces of each dwell, (D,)."""
+        return np.fromiter((dwell.width for dwell in self.dwells), np.intp, len(self.dwells))
+
+    @cached_property
+    def moving(self) -> Mask:
+        """Which are slews, (D,)."""
+        return np.fromiter((dwell.moving for dwell in self.dwells), bool, len(self.dwells))
+
+    @cached_property
+    def pose_sigmas_rad(self) -> Floats:
+        """Uncertainty (D,) of the pose of each dwell due to noise of the angles."""
+        return np.fromiter((dwell.pose_sigma_rad for dwell in self.dwells), float, len(self.dwells))
+
+    @cached_property
+    def autocovariance(self) -> Autocovariance:
+        """The sums of lagged products of all dwells, by the weights of their readings."""
+        total = self.dwells[0].autocovariance.times(self.dwells[0].weight)
+        for dwell in self.dwells[1:]:
+            total = total + dwell.autocovariance.times(dwell.weight) if dwell.autocovariance.count else total
+        return total
+
+    @cached_property
     def shapes(self) -> list[AlikeDwells]:
         """The dwells grouped by shape."""
-        widths = np.fromiter((dwell.width for dwell in self.dwells), np.intp, len(self.dwells))
         kinds = dict[tuple[int, int], list[int]]()
-        for k, kind in enumerate(zip(self.piece_numbers.tolist(), widths.tolist(), strict=True)):
+        for k, kind in enumerate(zip(self.piece_numbers.tolist(), self.widths.tolist(), strict=True)):
             kinds.setdefault(kind, []).append(k)
         return [
             AlikeDwells(np.array(places), self.ends[places][:, None] + np.arange(pieces), width)
@@ -61,9 +88,22 @@ class Folded:
                 for shape in self.shapes]  # fmt: skip
 
     @cached_property
+    def shows_means_only(self) -> bool:
+        """Whether nothing but the mean of each dwell is known, so that columns count at the middle of it alone."""
+        return all(
+            triangles.shape[1] == 1 and not triangles[:, 0, 1 : shape.width].any()
+            for shape, triangles in zip(self.shapes, self.triangles, strict=True)
+        )
+
+    @cached_property
     def piece_counts(self) -> Floats:
         """Number of readings of each piece, (pieces,)."""
         return np.array([piece.count for dwell in self.dwells for piece in dwell.pieces], float)
+
+    @cached_property
+    def reading_counts(self) -> Floats:
+        """Number of readings of each piece, of which averages may have been folded, (pieces,)."""
+        return np.array([piece.reading_count for dwell in self.dwells for piece in dwell.pieces], float)
 
     @cached_property
     def counts(self) -> Floats:
@@ -96,17 +136,15 @@ class Folded:
     def shaking(self) -> tuple[Floats, Floats]:
         """Variance of the readings at the nodes of all pieces, (pieces, 3, 3), and the number of readings behind it,
         (pieces,)."""
-        pieces = [piece for dwell in self.dwells for piece in dwell.pieces]
-        counts = np.array([piece.reading_count for piece in pieces], float)
         if self.dwells[0].averaged:
-            return np.array([piece.nodes.variance_mps2_2 for piece in pieces], float), counts
-        widths = np.repeat([dwell.width for dwell in self.dwells], self.piece_numbers)
-        freedom = np.maximum(self.piece_counts - widths, 0.0)[:, None]
+            pieces = [piece for dwell in self.dwells for piece in dwell.pieces]
+            return np.array([piece.nodes.variance_mps2_2 for piece in pieces], float), self.reading_counts
+        freedom = np.maximum(self.piece_counts - np.repeat(self.widths, self.piece_numbers), 0.0)[:, None]
         squares, firsts = self.squares, self.ends[:-1]
         pooled = np.add.reduceat(squares, firsts) / np.maximum(np.add.reduceat(freedom, firsts), 1.0)
         of_pieces = squares / np.maximum(freedom, 1.0)
         variances = np.where(freedom >= LEAST_FREEDOM, of_pieces, np.repeat(pooled, self.piece_numbers, axis=0))
-        return np.repeat(variances[:, None], 3, axis=1), counts
+        return np.repeat(variances[:, None], 3, axis=1), self.reading_counts
 
     @cached_property
     def spreads(self) -> Floats:
@@ -144,8 +182,7 @@ class Folded:
     @cached_property
     def before(self) -> PieceIndices:
         """Index (D,) of the dwell before each dwell; of the first, its own; of a slew, of the dwell that it left."""
-        moving = np.fromiter((dwell.moving for dwell in self.dwells), bool, len(self.dwells))
-        last = np.maximum.accumulate(np.where(moving, 0, np.arange(len(self.dwells))))
+        last = np.maximum.accumulate(np.where(self.moving, 0, np.arange(len(self.dwells))))
         return np.append(0, last[:-1])
 
     @cached_property
@@ -195,7 +232,7 @@ class Facing:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class DwellStack(Sequence[DwellFactor]):
+class DwellStack(ComputedSequence[DwellFactor]):
     """Dwells in order of time, with what is the same for all of them in arrays.
 
     - folded: the dwells as they were folded.
@@ -234,17 +271,8 @@ class DwellStack(Sequence[DwellFactor]):
     def __len__(self) -> int:
         return len(self.folded.dwells)
 
-    def __iter__(self) -> Iterator[DwellFactor]:
-        return (self[k] for k in range(len(self)))
-
-    @overload
-    def __getitem__(self, index: int) -> DwellFactor: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[DwellFactor]: ...
-    def __getitem__(self, index: int | slice) -> DwellFactor | list[DwellFactor]:
-        if isinstance(index, slice):
-            return [self[k] for k in range(*index.indices(len(self)))]
-        k = range(len(self))[index]
+    def item(self, k: int) -> DwellFactor:
+        """The dwell at an index, made once."""
         if k not in self._made:
             self._made[k] = self._dwell(k)
         return self._made[k]
@@ -376,8 +404,6 @@ class DwellStack(Sequence[DwellFactor]):
 
     def is_same(self, other: DwellStack) -> bool:
         """Whether the other stack has the same dwells with the same changes."""
-        same = self.folded is other.folded or (
-            len(self) == len(other) and all(map(is_, self.folded.dwells, other.folded.dwells))
-        )
+        same = self.folded is other.folded or self.folded.dwells == other.folded.dwells  # the same objects
         changes = ("turned_rad", "attitudes", "facing", "added")
         return same and all(getattr(self, name) is getattr(other, name) for name in changes)

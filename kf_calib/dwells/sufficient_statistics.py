@@ -24,13 +24,35 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import turn_by
-from kf_calib.dwells.attitude_error import AttitudeError
 from kf_calib.dwells.coherent_tone import Trace, tone
 from kf_calib.dwells.line_spectrum import SpectralLine, Spectrum, lines
 from kf_calib.dwells.pieces import Piece
 from kf_calib.dwells.qr import square_triangle
 from kf_calib.dwells.rows import Nodes, parabola
 from kf_calib.dwells.walk_path import WalkPath, walk_path_of
+
+
+@dataclass(frozen=True)
+class AttitudeError:
+    """What the readings show of a dwell's setting error: the small rotation alpha from its recorded pose to its true
+    one.
+
+    - rotation_rad (3,): the rotation vector across the force at which the dwell is linearised.
+    - variance_rad2: sum of the variances of its two components across the force, which shorten the mean of the force:
+      E[R(alpha) f] = (1 - variance / 2) R(mode) f.
+    - bending (3, 3): derivative of the mean readings by the force that is due to the model's effects, m/s^2 per m/s^2;
+      it adds to the sensitivities through which a small rotation changes the readings.
+    """
+
+    rotation_rad: Floats
+    variance_rad2: float = 0.0
+    bending: Floats | None = None
+
+    @property
+    def length(self) -> float:
+        """Length of the mean force over that of the force."""
+        return 1.0 - 0.5 * self.variance_rad2
+
 
 LEAST_FREEDOM = 8
 """Degrees of freedom of a piece, with fewer of which its variance is that of its whole dwell."""
@@ -279,7 +301,7 @@ class DwellFactor:
     def means(self) -> Floats:
         """Means (7,) of the regressors 1, f_x, f_y, f_z and of the three readings."""
         functions = self.triangles[:, 0] / self.triangles[:, :1, 0]  # means of the basis, then of the readings
-        forces = self.nodes.force_mps2.reshape(-1, 3, 3)
+        forces = np.array([piece.nodes.force_mps2 for piece in self.pieces])  # ``nodes`` would be kept: 25 kB an hour
         regressors = np.einsum("pk,pkc->pc", functions[:, :3], parabola(forces))
         piece_means = np.column_stack([np.ones(len(forces)), regressors, functions[:, self.width :]])
         return np.asarray(self.counts @ piece_means / self.counts.sum(), float)

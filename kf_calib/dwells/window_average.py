@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import replace
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -18,7 +18,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.blocks import Block
 from kf_calib.dwells.line_spectrum import SpectralLine
-from kf_calib.dwells.orthonormal_parabola import orthonormal_parabola
 
 WINDOW_S = 1.0
 """Default length of a window, s."""
@@ -85,3 +84,10 @@ def average(block: Block, length_s: float = WINDOW_S) -> Block | None:
         variance_mps2_2=means(shaking**2),
         readings_per_row=step,
     )
+
+
+@lru_cache(maxsize=4)  # blocks are mostly of one length
+def orthonormal_parabola(count: int) -> Floats:
+    """1, u, u^2 at ``count`` instants evenly from u = -1 to 1, made orthonormal, (n, 3)."""
+    u = np.linspace(-1.0, 1.0, count)
+    return np.linalg.qr(np.column_stack([np.ones(count), u, u * u]))[0]

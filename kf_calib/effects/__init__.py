@@ -69,7 +69,6 @@ def names(bench: Bench) -> list[str]:
     letters = formula.gimbal_letters(bench.axes)
     variants = [letter if letters.count(letter) == 1 else str(k + 1) for k, letter in enumerate(letters)]
     plain = [name for name in _PLAIN if name != frame.EarthRotation.name or bench.latitude_deg is not None]
-    _register_installed()
     return [*plain, *(f"{name}:{variant}" for name in _OF_A_GIMBAL for variant in variants), *_registered]
 
 
@@ -99,8 +98,6 @@ def effect_named(text: str, bench: Bench) -> Effect:
     if name in _OF_A_GIMBAL and variant:
         letters = formula.gimbal_letters(bench.axes)
         return _OF_A_GIMBAL[name](frame.gimbal_number(variant, letters), variant)
-    if text not in _registered:
-        _register_installed()
     if text in _registered:
         return _registered[text].kind()
     raise _unknown(text, names(bench))
@@ -110,7 +107,6 @@ def described(text: str) -> Effect | None:
     """The effect of that name without a bench: its coefficients, units and usual sizes hold on every bench, its columns
     on none. None where no effect is known by that name, as for a formula."""
     name, _, variant = text.partition(":")
-    _register_installed()
     if name in _OF_A_GIMBAL:
         return _OF_A_GIMBAL[name](0, variant)
     return _PLAIN[name]() if name in _PLAIN else _registered[text].kind() if text in _registered else None
@@ -121,7 +117,6 @@ def refuse_unknown(text: str) -> None:
     if "=" in text:
         formula.split(text)
         return
-    _register_installed()
     known = [*_PLAIN, *_OF_A_GIMBAL, *_registered]
     if text.partition(":")[0] not in known:
         raise _unknown(text, known)
@@ -208,12 +203,6 @@ def load_file(path: Path) -> list[str]:
 def _forget(file: Path) -> None:
     for name in [name for name, known in _registered.items() if known.program and known.program.path == file]:
         del _registered[name]
-
-
-@cache
-def _register_installed() -> None:
-    for kind, origin in user.classes_installed():
-        register(kind, origin)
 
 
 def remarks_of(effect: Effect) -> tuple[str, ...]:

@@ -75,7 +75,11 @@ def check_effect(effect: Effect, s: Stimulus | None = None) -> tuple[str, ...]:
     turned specific force by a FrameEffect, for its unknown by any) that differences do not give.
     """
     s = trial(EXAMPLE) if s is None else s
-    count, before = _coefficients(effect), _arrays(s)
+    coefficients = _call(effect, "coefficients", lambda: tuple(effect.coefficients))
+    symbols = [coefficient.symbol for coefficient in coefficients]
+    if len(set(symbols)) < len(symbols):
+        raise InputError(f"{effect} gives two coefficients the same symbol ({' '.join(symbols)}): tell them apart.")
+    count, before = len(coefficients), _arrays(s)
     before = {name: values.copy() for name, values in before.items()}
     if isinstance(effect, FrameEffect):
         _rotations(effect, s, count)
@@ -123,14 +127,6 @@ def refuse_not_finite(effect: Effect, values: Floats, s: Stimulus) -> None:
         f"tau = {s.since_arrival_s[row]:.3g} s: keep it from dividing by zero, and from roots and logarithms of "
         "negative values."
     )
-
-
-def _coefficients(effect: Effect) -> int:
-    coefficients = _call(effect, "coefficients", lambda: tuple(effect.coefficients))
-    symbols = [coefficient.symbol for coefficient in coefficients]
-    if len(set(symbols)) < len(symbols):
-        raise InputError(f"{effect} gives two coefficients the same symbol ({' '.join(symbols)}): tell them apart.")
-    return len(coefficients)
 
 
 def _arrays(s: Stimulus) -> dict[str, Floats]:

@@ -1,4 +1,4 @@
-"""Effects from outside: classes in a Python file of the user's, or in a package that announces them.
+"""Effects from outside: classes in a Python file of the user's.
 
 A file needs no more than this (ten lines at most)::
 
@@ -11,8 +11,7 @@ A file needs no more than this (ten lines at most)::
             return s.along**2 * s.warmth[:, None]
 
 What a class leaves out is filled in: name ``mine``, title, source ``user``, symbols ``mine1 mine2 mine3``, scale 1, and
-the unit of the field that it is shown in (``support.units``). A package announces a class, or a module of classes, as
-an entry point of the group ``kf_calib.effects``. Reading such a file runs it, as Python runs any module.
+the unit of the field that it is shown in (``support.units``). Reading such a file runs it, as Python runs any module.
 """
 
 from __future__ import annotations
@@ -30,7 +29,6 @@ from kf_calib.effects.effect import Bearer, Effect, FrameEffect, SensorEffect
 from kf_calib.effects.formula import NAME_RULE, is_name, symbol_stem
 from kf_calib.errors import InputError
 
-GROUP = "kf_calib.effects"
 TWELVE = frozenset(f"{stem}{i}" for stem in ("theta", "phi", "nu", "K", "b") for i in (1, 2, 3))
 """Symbols of the paper's parameters, one or two of them never used: no effect may have them."""
 
@@ -90,29 +88,6 @@ def effect_classes(module: ModuleType) -> list[type[Effect]]:
         and kind.__module__ == module.__name__
         and not name.startswith("_")
     ]
-
-
-def classes_installed() -> list[tuple[type[Effect], str]]:
-    """Effect classes that installed packages announce, each with who announces it."""
-    import importlib.metadata  # as dear as the rest of this package together
-
-    classes = list[tuple[type[Effect], str]]()
-    for point in importlib.metadata.entry_points(group=GROUP):
-        origin = f"entry point {point.name} = {point.value}"
-        try:
-            loaded = point.load()
-        except Exception as error:
-            raise InputError(
-                f"{origin} of {GROUP}: cannot be loaded ({checks.error_words(error)}): mend or uninstall its package."
-            ) from None
-        kinds = effect_classes(loaded) if isinstance(loaded, ModuleType) else [loaded]
-        for kind in kinds:
-            if not (inspect.isclass(kind) and issubclass(kind, Effect)):
-                raise InputError(
-                    f"{origin} of {GROUP}: is no effect class: it must derive from kf_calib.effects.Effect."
-                )
-            classes.append((kind, origin))
-    return classes
 
 
 def completed(kind: type[Effect], origin: str) -> type[Effect]:

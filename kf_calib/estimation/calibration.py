@@ -10,8 +10,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import cached_property
 from os import PathLike
-from typing import Literal
+from typing import Literal, overload
 
 import numpy as np
 
@@ -29,6 +30,7 @@ from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation import kalman_filterpy, square_root_information
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.dwell_pass import Pass, refuse_unusable
+from kf_calib.estimation.estimate import Estimate, estimate_of, estimates
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.free_attitude import holding_frame
 from kf_calib.estimation.iterated_fit import fit
@@ -37,18 +39,11 @@ from kf_calib.estimation.observability import visibility_of
 from kf_calib.estimation.oscillation_carrier import fitted_to, on_carrier
 from kf_calib.estimation.outlying_dwell import outlying_dwells, outlying_in_words
 from kf_calib.estimation.remarks import misfit_remark, remarks_on
-from kf_calib.estimation.results import (
-    Calibration,
-    Consistency,
-    Estimate,
-    OutlyingDwell,
-    consistency,
-    estimate_of,
-)
+from kf_calib.estimation.results import Calibration, Consistency, OutlyingDwell, Visit, consistency
 from kf_calib.estimation.samples import Samples, samples_of
 from kf_calib.estimation.settings import Settings
-from kf_calib.estimation.visits import Visits
-from kf_calib.noise.noise_model import considered_information
+from kf_calib.noise.noise_model import considered_information, mean_covariances
+from kf_calib.noise.random_walk import predict, to_mean
 from kf_calib.noise.reml import FEWEST, degrees_of_freedom
 from kf_calib.sources.opening import opened
 from kf_calib.support import stage
@@ -110,7 +105,7 @@ def conclude(
     settings, bench = passed.settings, passed.source.bench
     dwells = DwellStack.of(passed.dwells) if plain is None else plain.dwells
     if plain is None:
-        _refuse_absent(settings.left_out, passed.folder.dwells)
+        _refuse_absent(settings.left_out, passed.folded)
         refuse_unusable(dwells, passed.tally, bench)
     stage.say("estimating")
     if again is not None and passed.model.oscillates:
@@ -237,7 +232,7 @@ def _counted(
 
 def _refuse_absent(left_out: Sequence[int], dwells: Sequence[DwellFactor]) -> None:
     """Raise InputError if a dwell that is to be left out does not exist, since another one was probably meant."""
-    absent = sorted(set(left_out) - {dwell.number for dwell in dwells})
+    absent = sorted(set(left_out) - {dwell.number for dwell in dwells}) if left_out else []
     if absent and dwells:
         raise InputError(
             f"there is no dwell {absent[0]} to leave out (--leave-out): the run has dwells {dwells[0].number} to "
@@ -268,3 +263,53 @@ def _refuse_without_noise(result: Calibration) -> None:
             f"to estimate the noise from ({FEWEST}): give standard deviation and number of readings in each row, "
             "state --scatter-sigma, or measure more orientations."
         )
+
+
+class Visits(Sequence[Visit]):
+    """The visits of all dwells of a fit; ``residuals_mps2`` (D, 3) are those about the final estimate.
+
+    The estimates after 100 000 dwells take minutes and gigabytes, and most questions need the last one alone.
+    """
+
+    def __init__(self, fitted: Fit, settings: Settings, residuals_mps2: Floats) -> None:
+        self._fit, self._settings, self._residuals_mps2 = fitted, settings, residuals_mps2
+
+    def __len__(self) -> int:
+        return len(self._residuals_mps2)
+
+    @overload
+    def __getitem__(self, index: int) -> Visit: ...
+    @overload
+    def __getitem__(self, index: slice) -> tuple[Visit, ...]: ...
+    def __getitem__(self, index: int | slice) -> Visit | tuple[Visit, ...]:
+        return self._visits[index]
+
+    @cached_property
+    def _visits(self) -> tuple[Visit, ...]:
+        with one_blas_thread():
+            return self._computed()
+
+    def _computed(self) -> tuple[Visit, ...]:
+        """Return for each dwell its innovation, its residual and the estimate after it."""
+        fitted, linearised = self._fit, self._fit.linearised
+        means, around, walked = linearised.means, linearised.model.nominal_state(), to_mean(fitted.steps)
+        noise_covariances = mean_covariances(fitted.noise.of_readings, means, linearised.state)
+        extra = considered_information(fitted.noise, means, linearised.state)
+        extra = np.cumsum(np.concatenate([0.0 * extra[:1], extra]), axis=0)
+        first = square_root_information.start(self._settings.prior, linearised.model)
+        steps = square_root_information.run(first, fitted.rows(), fitted.steps, fitted.following)
+        factors = np.array([first, *(step.factor for step in steps)])
+        reached = estimates(factors, around, extra)
+        known, visits = reached[:-1], list[Visit]()
+        if walked.any():
+            before = [predict(factor, float(step)) for factor, step in zip(factors, walked, strict=False)]
+            known = estimates(np.array(before), around, extra[:-1])
+        for k, (dwell, step) in enumerate(zip(linearised.dwells, steps, strict=True)):
+            innovation, sigma = np.full(3, np.nan), np.full(3, np.nan)
+            if not known[k].undetermined.size:
+                rows = means.design[k]
+                innovation = means.readings[k] - rows @ known[k].state
+                predicted_by = np.maximum(np.diag(rows @ known[k].covariance @ rows.T), 0.0)  # negative by rounding
+                sigma = np.sqrt(predicted_by + np.diag(noise_covariances[k]))
+            visits.append(Visit(dwell, reached[k + 1], step.nis, step.dof, innovation, sigma, self._residuals_mps2[k]))
+        return tuple(visits)

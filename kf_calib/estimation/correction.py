@@ -239,14 +239,10 @@ class Correction:
         good = np.flatnonzero(np.isfinite(force).all(axis=1) & np.isfinite(temperature))
         for first in range(0, len(good), _BLOCK):
             part = good[first : first + _BLOCK]
-            design = self.matrix @ self._design(force[part], temperature[part])
+            stimulus = stimulus_of(force[part], temperature[part], self.bench, self.sensitivity)
+            design = self.matrix @ Model(self.bench, self.effects).columns(stimulus, self.state[self._kept])
             covariances[part] = design @ self._covariance @ np.swapaxes(design, 1, 2)
         return covariances + self.matrix @ np.diag(self.noise_mps2**2) @ self.matrix.T if noise else covariances
-
-    def _design(self, force: Floats, temperature_c: Floats) -> Floats:
-        """Return what a reading changes by the states that are corrected, (n, 3, p)."""
-        stimulus = stimulus_of(force, temperature_c, self.bench, self.sensitivity)
-        return Model(self.bench, self.effects).columns(stimulus, self.state[self._kept])
 
     @cached_property
     def _kept(self) -> list[int]:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.dwells.qr import solved_by_lower, triangle
+from kf_calib.dwells.qr import inverse_of_lower, triangle
 from kf_calib.dwells.stack import DwellStack
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation import square_root_information
@@ -28,7 +28,7 @@ SAME_POSE_DEG = 1.0
 
 _AT_ONCE = 4096  # dwells whose covariances are computed together
 _LEAST_LEFT = 1e-3  # of the information in any direction, without an orientation; with less, digits are lost
-_ROUNDING = 1.0 + 1e-9  # by which cells are larger, so that nearer ones are never two apart
+_ROUNDING = 1.0 + 1e-9  # by which cells are larger, so that what is near is never two apart
 
 
 def orientations(dwells: Sequence[DwellFactor]) -> list[list[int]]:
@@ -50,27 +50,34 @@ def grouped(places: Floats, apart: float) -> list[list[int]]:
     """Indices of places (D, k) in groups: each joins the first group whose first place is nearer than ``apart`` in
     every coordinate.
 
-    Groups are looked up by the cell of their first place in the three coordinates that differ most.
+    Groups are looked up by the cell of their first place in the four coordinates that differ most. A cell is twice as
+    wide as ``apart``, so that what is near lies in the cell itself or in the neighbours on the nearer side.
     """
-    widest = np.argsort(-np.ptp(places, axis=0))[:3]
-    cells = np.floor((places[:, widest] - places[:, widest].min(axis=0)) / (apart * _ROUNDING)).astype(int) + 1
-    sizes = cells.max(axis=0) + 2
-    strides = np.append(1, np.cumprod(sizes[:-1]))
-    around = [int(strides @ step) for step in itertools.product((-1, 0, 1), repeat=len(widest))]
-    groups, at, values = list[list[int]](), dict[int, list[int]](), places.tolist()
-    for k, cell in enumerate((cells @ strides).tolist()):
-        nearby = [number for step in around for number in at.get(cell + step, ())]
-        joined = min((g for g in nearby if _is_near(values[groups[g][0]], values[k], apart)), default=-1)
-        if joined >= 0:
-            groups[joined].append(k)
-        else:
-            at.setdefault(cell, []).append(len(groups))
-            groups.append([k])
+    groups, at = list[list[int]](), dict[int, list[int]]()
+    widest = np.argsort(-np.ptp(places, axis=0))[:4]
+    scaled = (places[:, widest] - places[:, widest].min(axis=0)) / (2.0 * apart * _ROUNDING) + 1.0
+    cells = np.floor(scaled).astype(int)
+    strides = np.append(1, np.cumprod(cells.max(axis=0)[:-1] + 2))
+    sides, choices = (
+        np.where(scaled - cells < 0.5, -strides, strides),
+        np.array([*itertools.product((0, 1), repeat=len(widest))]),
+    )
+    for first in range(0, len(places), _AT_ONCE):
+        part = slice(first, first + _AT_ONCE)
+        around = (cells[part] @ strides)[:, None] + sides[part] @ choices.T
+        for k, (cell, *others) in enumerate(around.tolist(), first):
+            nearby = [number for near in (cell, *others) if near in at for number in at[near]]
+            joined = min((g for g in nearby if _is_near(places[groups[g][0]], places[k], apart)), default=-1)
+            if joined >= 0:
+                groups[joined].append(k)
+            else:
+                at.setdefault(cell, []).append(len(groups))
+                groups.append([k])
     return groups
 
 
-def _is_near(one: list[float], other: list[float], apart: float) -> bool:
-    return all(abs(a - b) < apart for a, b in zip(one, other, strict=True))
+def _is_near(one: Floats, other: Floats, apart: float) -> bool:
+    return bool((np.abs(one - other) < apart).all())
 
 
 @dataclass(frozen=True)
@@ -179,15 +186,18 @@ def _by_leverage(fitted: Fit, rows: Sequence[Floats], place: NDArray[np.intp]) -
     inverse = cast("Floats", np.linalg.inv(factor[:, :-1]))
     state = inverse @ factor[:, -1]
     of_groups = _of_groups(rows, place)
-    shares = of_groups[..., :-1] @ inverse
-    left = np.eye(shares.shape[1]) - shares @ np.swapaxes(shares, 1, 2)
-    if np.linalg.eigvalsh(left)[:, 0].min() < _LEAST_LEFT:
-        return None
-    lower = cast("Floats", np.linalg.cholesky(left))
-    residuals = of_groups[..., -1] - of_groups[..., :-1] @ state
-    solved = solved_by_lower(lower, np.concatenate([shares, residuals[..., None]], axis=2))
-    more = np.ascontiguousarray(np.swapaxes(solved[..., :-1], 1, 2))
-    states = state - (more @ solved[..., -1:])[:, :, 0] @ inverse.T
+    count, height = of_groups.shape[:2]
+    states, more = np.empty((count, width)), np.empty((count, width, height))
+    for part in (slice(k, k + _AT_ONCE) for k in range(0, count, _AT_ONCE)):
+        shares = of_groups[part, :, :-1] @ inverse
+        left = np.eye(height) - shares @ np.swapaxes(shares, 1, 2)
+        if np.linalg.eigvalsh(left)[:, 0].min() < _LEAST_LEFT:
+            return None
+        residuals = of_groups[part, :, -1:] - of_groups[part, :, :-1] @ state[:, None]
+        lower = cast("Floats", np.linalg.cholesky(left))
+        solved = inverse_of_lower(lower) @ np.concatenate([shares, residuals], axis=2)
+        more[part] = np.swapaxes(solved[..., :-1], 1, 2)
+        states[part] = state - (more[part] @ solved[..., -1:])[:, :, 0] @ inverse.T
     return states, _Roots(inverse, more)
 
 
@@ -200,10 +210,11 @@ def _of_groups(rows: Sequence[Floats], place: NDArray[np.intp]) -> Floats:
     stacked, firsts, width = np.concatenate(rows)[order], np.cumsum(sizes) - sizes, rows[0].shape[1]
     of_groups = np.zeros((len(sizes), min(int(sizes.max()), width - 1), width))
     for size in np.unique(sizes).tolist():
-        chosen = np.flatnonzero(sizes == size)
-        ours = stacked[firsts[chosen, None] + np.arange(size)]
-        ours = triangle(ours)[:, : width - 1] if size >= width else ours
-        of_groups[chosen, : ours.shape[1]] = ours
+        alike = np.flatnonzero(sizes == size)
+        for chosen in (alike[k : k + _AT_ONCE] for k in range(0, len(alike), _AT_ONCE)):
+            ours = stacked[firsts[chosen, None] + np.arange(size)]
+            ours = triangle(ours)[:, : width - 1] if size >= width else ours
+            of_groups[chosen, : ours.shape[1]] = ours
     return of_groups
 
 

@@ -69,7 +69,7 @@ def _known_conditions(folded: Folded) -> dict[str, Any]:
         folded.known["conditions"] = {
             "elapsed_s": elapsed_s,
             "since_arrival_s": folded.of_nodes("since_arrival_s"),
-            "temperature_c": temperature_course(folded.dwells).temperature_c,
+            "temperature_c": temperature_course(folded).temperature_c,
             "variance_mps2_2": _varying(folded).reshape(-1, 3),
             "rate_radps": folded.rates("rate_radps"),
             "rate_change_radps2": folded.rates("rate_change_radps2"),
@@ -90,7 +90,7 @@ def _varying(folded: Folded) -> Floats:
     return np.where(excess > _VIBRATING, at_nodes, mean)
 
 
-def without_known(dwells: list[DwellFactor], model: Model) -> list[DwellFactor]:
+def without_known(dwells: Sequence[DwellFactor], model: Model) -> Sequence[DwellFactor]:
     """The dwells with readings that no longer contain the known effects of a model.
 
     A triangle [1 u u^2 ... | z] with z less the columns times the coefficients is the triangle times a unit matrix with
@@ -100,7 +100,7 @@ def without_known(dwells: list[DwellFactor], model: Model) -> list[DwellFactor]:
         return dwells
     effects, sizes = [each.effect for each in model.known], np.concatenate([each.coefficients for each in model.known])
     columns = candidate_columns(dwells, effects, model.bench, model.nominal_state())
-    return list(DwellStack.of(dwells).plus(-on_basis(columns.values @ sizes)))
+    return DwellStack.of(dwells).plus(-on_basis(columns.values @ sizes))
 
 
 def columns_of(dwells: Sequence[DwellFactor], model: Model, state: Floats) -> OfPieces:
@@ -127,8 +127,12 @@ def piece_columns(effects: Sequence[Effect], stimulus: Stimulus) -> Floats:
 
 
 def _by_dwell(dwells: Sequence[DwellFactor], columns: Callable[[Stimulus], Floats], stimulus: Stimulus) -> OfPieces:
-    """Arrange the columns of a stimulus (m, 3, p) by dwell."""
-    return OfPieces(_by_piece(columns, stimulus), DwellStack.of(dwells).folded.ends)
+    """Arrange the columns of a stimulus (m, 3, p) by dwell; those of dwells of which only the mean is known are kept
+    at the middle node alone."""
+    folded, values = DwellStack.of(dwells).folded, _by_piece(columns, stimulus)
+    if folded.shows_means_only:
+        values = np.broadcast_to(values[:, 1:2].copy(), values.shape)
+    return OfPieces(values, folded.ends)
 
 
 def _by_piece(columns: Callable[[Stimulus], Floats], stimulus: Stimulus) -> Floats:

@@ -42,6 +42,8 @@ class Pass:
     tally: Tally = field(default_factory=Tally)
     folder: Folder = field(default_factory=Folder)
     watch: ReadingsMonitor = field(default_factory=ReadingsMonitor)
+    tabulated: DwellStack | None = None
+    """The dwells of a table, which are taken as they are; None for a source of readings."""
 
     @cached_property
     def model(self) -> Model:
@@ -69,7 +71,7 @@ class Pass:
         self.folder.add(rows)
         self.watch.add(rows.raw or rows)
 
-    def fold(self, on_progress: Callable[[float], None] | None = None) -> list[DwellFactor]:
+    def fold(self, on_progress: Callable[[float], None] | None = None) -> Sequence[DwellFactor]:
         """Read the whole source and return its usable dwells."""
         if isinstance(self.source, Table):
             self._take(self.source)
@@ -84,18 +86,26 @@ class Pass:
         """Take the dwells of a table as they are; raises InputError if the model needs more than their means."""
         if self.folder.carrier_hz or self.settings.window_s:
             table.refuse(" and ".join(map(str, self.model.effects)) or "an average over windows")
-        self.folder.dwells = tabulated.dwells_of(table.orientations, table.bench)
-        read = sum(row.count for row in table.orientations)
+        self.tabulated = tabulated.dwells_of(table.orientations, table.bench)
+        read = int(table.orientations.counts.sum())
         self.tally.read, self.tally.used, self.tally.poses = read, read, len(table.orientations)
 
     @property
-    def dwells(self) -> list[DwellFactor]:
+    def folded(self) -> Sequence[DwellFactor]:
+        """All dwells so far, usable or not."""
+        return self.folder.dwells if self.tabulated is None else self.tabulated
+
+    @property
+    def dwells(self) -> Sequence[DwellFactor]:
         """The usable dwells so far: not left out by the settings and, but for those of a table, of at least 8 readings,
         since fewer do not show their own noise. Known errors of the bench are subtracted from their readings."""
-        left_out, least = self.settings.left_out, 1 if isinstance(self.source, Table) else LEAST_READINGS
-        unused = {k for k, each in enumerate(self.folder.dwells) if each.count < least or each.number in left_out}
-        used = [dwell for k, dwell in enumerate(self.folder.dwells) if k not in unused]
-        return without_known(dwells_without(self.folder.dwells, unused) if left_out else used, self.model)
+        dwells, left_out = self.folded, self.settings.left_out
+        if self.tabulated is not None and not left_out:
+            return without_known(dwells, self.model)
+        least = LEAST_READINGS if self.tabulated is None else 1
+        unused = {k for k, each in enumerate(dwells) if each.count < least or each.number in left_out}
+        used = [dwell for k, dwell in enumerate(dwells) if k not in unused]
+        return without_known(dwells_without(dwells, unused) if left_out else used, self.model)
 
 
 def refuse_unusable(dwells: Sequence[DwellFactor], tally: Tally, bench: Bench) -> None:

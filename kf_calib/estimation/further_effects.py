@@ -15,18 +15,9 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.qr import triangle
 from kf_calib.effects import Effect
-from kf_calib.estimation.complement import Complement
+from kf_calib.estimation.candidate_scan import Complement, Scan, counts_of, is_within, scan_of, slices
 from kf_calib.estimation.dwell_columns import LinearisedDwells
-from kf_calib.estimation.score_test import (
-    Frame,
-    Scan,
-    batches,
-    columns_at_once,
-    counts_of,
-    is_within,
-    scan_of,
-    slices,
-)
+from kf_calib.estimation.score_test import Frame, batches, columns_at_once
 
 
 class FurtherEffects:

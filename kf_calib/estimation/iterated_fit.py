@@ -1,8 +1,12 @@
 """The iterated fit of the model and the noise model to the dwells; the filter runs on its result.
 
-Small rotations and input axes are linearised at the current estimate, unknown constants of effects are moved
-(``effect_constants``), and the setting error, the scatter and the random walk of the biases are estimated by restricted
+Small rotations and input axes are linearised at the current estimate, unknown constants of effects are moved,
+and the setting error, the scatter and the random walk of the biases are estimated by restricted
 likelihood, in turn until nothing changes any more.
+
+The constants inside effects' formulas (time constants, frequencies, widths) are searched on a grid and refined by
+Gauss-Newton steps, in which the derivative with respect to the constant is one more column. A constant without a
+derivative is averaged over its posterior.
 """
 
 from __future__ import annotations
@@ -19,19 +23,15 @@ from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.rows import on_basis
 from kf_calib.dwells.stack import DwellStack
 from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.effects import Effect
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation import free_attitude, square_root_information
 from kf_calib.estimation.attitude import facing_readings, without_attitudes
-from kf_calib.estimation.dwell_columns import LinearisedDwells, change_by_temperature
-from kf_calib.estimation.effect_constants import (
-    averaged_over_posterior,
-    estimate_and_steps,
-    largest_steps,
-    placed_on_grid,
-)
+from kf_calib.estimation.dwell_columns import LinearisedDwells, change_by_temperature, stimulus_of
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.relinearisation import SETTLED, UNSETTLED, descended, left_to_settle, relinearised
+from kf_calib.estimation.score_test import delta_chi2
 from kf_calib.noise.flicker import flicker_within
 from kf_calib.noise.noise_model import ATTITUDE_UNKNOWN_RAD, FLOOR_MPS2, Noise, within_dwells
 from kf_calib.noise.nuisance_states import along_force, sensitivities_of
@@ -261,8 +261,7 @@ def _sensible(state: Floats) -> bool:
 def _setting_deg(dwells: Sequence[DwellFactor], bench: Bench) -> float | None:
     """Return the stated setting error, deg, combined with the uncertainty of the dwells' poses from noise of the
     angles."""
-    sigmas_rad = np.fromiter((dwell.pose_sigma_rad for dwell in DwellStack.of(dwells).folded.dwells), float)
-    pose_rad = float(np.sqrt(np.mean(sigmas_rad**2)))
+    pose_rad = float(np.sqrt(np.mean(DwellStack.of(dwells).folded.pose_sigmas_rad ** 2)))
     if bench.angle_sigma_deg is None or pose_rad < _EXACT_RAD:
         return bench.angle_sigma_deg
     return math.hypot(bench.angle_sigma_deg, math.degrees(pose_rad))
@@ -291,3 +290,62 @@ def _slew_sigma(fitted: Fit, state: Floats) -> Floats:
     level = np.linalg.norm(rows[:, -1] - rows[:, :-1] @ state) / np.sqrt(max(freedom, 1.0))
     before = fitted.noise.of(moving=True).effective_sigma_mps2
     return np.maximum(level * sizes * np.exp(np.mean(np.log(before / sizes))), FLOOR_MPS2)
+
+
+def estimate_and_steps(fitted: Fit) -> tuple[Floats, Floats]:
+    """The estimate (p,) with the unknown constants at zero, and the steps (p,) of these constants, zeros
+    elsewhere."""
+    state = fitted.state.copy()
+    moved = np.zeros_like(state)
+    places = list(fitted.linearised.model.unknowns)
+    moved[places], state[places] = state[places], 0.0
+    return state, moved
+
+
+def largest_steps(fitted: Fit) -> Floats:
+    """The largest allowed step (p,) of each state: for an unknown constant by its kind, 1 for the others, which
+    are not moved."""
+    model, reach = fitted.linearised.model, np.ones(fitted.linearised.model.count)
+    if model.unknowns:
+        stimulus = stimulus_of(fitted.linearised.dwells_at_state, model.bench, fitted.linearised.state)
+        for k, effect in model.unknowns.items():
+            reach[k] = effect.reach(stimulus)
+    return reach
+
+
+def placed_on_grid(fitted: Fit) -> Model:
+    """The model with each unknown constant at the grid value at which its effect lowers chi-squared most."""
+    model = fitted.linearised.model
+    stimulus = stimulus_of(fitted.linearised.dwells_at_state, model.bench, fitted.linearised.state)
+    for effect in model.unknowns.values():
+        grid = [effect.at(value) for value in effect.grid(stimulus)]
+        model = model.with_effect(grid[int(np.argmax(_delta_chi2(fitted, model - effect, grid)))])
+    return model
+
+
+def averaged_over_posterior(fitted: Fit) -> tuple[Model, dict[str, float]]:
+    """The model with each constant without a derivative at its posterior mean, and the sigma of each constant's
+    logarithm.
+
+    The likelihood is exp(decrease of chi^2 / 2) and the prior is flat in ln(value). The likelihood is constant between
+    values at which the columns step.
+    """
+    model, spreads = fitted.linearised.model, dict[str, float]()
+    stimulus = stimulus_of(fitted.linearised.dwells_at_state, model.bench, fitted.linearised.state)
+    for effect in model.stepped:
+        edges = np.log(effect.edges(stimulus))
+        middles, widths = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
+        deltas = _delta_chi2(fitted, model - effect, [effect.at(value) for value in np.exp(middles)])
+        weights = np.exp(0.5 * (deltas - deltas.max())) * widths
+        mean = float(np.average(middles, weights=weights))
+        spreads[str(effect)] = float(np.sqrt(np.average((middles - mean) ** 2 + widths**2 / 12.0, weights=weights)))
+        model = model.with_effect(effect.at(math.exp(mean)))
+    return model, spreads
+
+
+def _delta_chi2(fitted: Fit, rest: Model, grid: Sequence[Effect]) -> Floats:
+    """Return the decrease of chi-squared for the same effect at several values, each added to the ``rest`` of the
+    model."""
+    parts, state = fitted.linearised.model.parts, fitted.linearised.state
+    state = np.concatenate([state[:STATE_COUNT], *(state[parts[str(effect)]] for effect in rest.effects)])
+    return delta_chi2(LinearisedDwells(fitted.dwells, rest, state), fitted.noise.weights, grid)

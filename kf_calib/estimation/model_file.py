@@ -127,14 +127,11 @@ def write_model_file(path: Path, result: Calibration) -> None:
         table |= {"effects_from": list(programs), "sha256": programs}
     if found := list(_coefficients(result)):
         table["coefficients"] = found
-    write_whole(path, _toml(table))
-
-
-def _toml(table: dict[str, Any]) -> bytes:
-    """Return the bytes of the file."""
     import tomli_w
 
-    return ("# Model of kf_calib: kf-calib replay RECORDING --model THIS_FILE\n" + tomli_w.dumps(table)).encode()
+    write_whole(
+        path, ("# Model of kf_calib: kf-calib replay RECORDING --model THIS_FILE\n" + tomli_w.dumps(table)).encode()
+    )
 
 
 def _coefficients(result: Calibration) -> Iterable[dict[str, Any]]:

@@ -15,10 +15,11 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.effects import Coefficient, Effect, effect_named, names
+from kf_calib.estimation.candidate_scan import Candidate, Scan
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import Model
-from kf_calib.estimation.score_test import Candidate, Scan, scan
+from kf_calib.estimation.score_test import scan
 from kf_calib.support.tail_probabilities import LEVEL
 from kf_calib.support.threads import one_blas_thread
 from kf_calib.support.units import shown

@@ -1,4 +1,6 @@
-"""The parameters along a run: estimate and sigma after each dwell, and what each dwell brought."""
+"""The parameters along a run: estimate and sigma after each dwell, and what each dwell brought of the information about
+each.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +14,8 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.estimation import square_root_information
-from kf_calib.estimation.information_share import shares_of
-from kf_calib.estimation.results import Calibration, Estimate, Parameter, estimate_of
+from kf_calib.estimation.estimate import Estimate, estimate_of
+from kf_calib.estimation.results import Calibration, Parameter
 
 
 @dataclass(frozen=True)
@@ -71,3 +73,22 @@ def _shown(result: Calibration, estimate: Estimate) -> tuple[Floats, Floats]:
     values = np.append(estimate.parameters, coefficients)
     sigmas = np.append(estimate.sigma, gains * estimate.effect_sigma)
     return np.where(np.isfinite(sigmas), values, np.nan), sigmas
+
+
+def prior_estimate(result: Calibration) -> Estimate:
+    """The estimate before the first dwell; nothing is determined in it where the prior is diffuse."""
+    factor = square_root_information.start(result.settings.prior, result.model)
+    return Estimate(*square_root_information.solve(factor, result.model.nominal_state()))
+
+
+def shares_of(sigmas: Floats) -> Floats:
+    """Shares (n, k): by how much each dwell raised 1 / sigma^2 of each parameter, over its final value.
+
+    sigmas (n + 1, k): before the first dwell and after each, NaN where not determined. The shares are those of the
+    dwells in their order, beside what was known before each: a parameter that is not yet determined has no information,
+    and the dwell that determines it brings all there then is. With what a stated prior brings they sum to 1. A share is
+    negative where biases that walk were lost faster than a dwell found them; a parameter that the run does not
+    determine, or that the prior holds exact, has none (NaN).
+    """
+    known = np.where(sigmas[-1] > 0.0, sigmas, np.nan)
+    return np.diff(np.nan_to_num(known**-2), axis=0) * known[-1] ** 2

@@ -13,7 +13,8 @@ from kf_calib.dwells import window_average
 from kf_calib.effects import remarks_of
 from kf_calib.estimation import free_attitude, setup_blunders
 from kf_calib.estimation.dwell_columns import LinearisedDwells
-from kf_calib.estimation.results import Consistency, Estimate
+from kf_calib.estimation.estimate import Estimate
+from kf_calib.estimation.results import Consistency
 from kf_calib.noise.noise_model import TOO_SHORT, Noise
 from kf_calib.noise.reml import ENOUGH_DIRECTIONS, FEWEST, degrees_of_freedom, directions
 from kf_calib.noise.temperature_course import temperature_course
@@ -72,7 +73,7 @@ def remarks_on(
         )
     yield from (remark for effect in model.effects for remark in remarks_of(effect))
     if noise.sensitivity_mps2_per_k is not None:
-        left_c = np.sqrt(np.mean(np.sum(temperature_course(dwells.folded.dwells).errors_c ** 2, axis=1)))
+        left_c = np.sqrt(np.mean(np.sum(temperature_course(dwells.folded).errors_c ** 2, axis=1)))
         yield (
             f"the noise of the thermometer leaves the temperature uncertain by {left_c:.1g} K, which counts as noise "
             "of the readings: a quieter thermometer would show smaller effects."

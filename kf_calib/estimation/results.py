@@ -11,15 +11,15 @@ from typing import Any, Literal
 import numpy as np
 
 from kf_calib.bench import paper_parameters
-from kf_calib.bench.arrays import Floats, Mask
+from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
-from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.blocks import Tally
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation import square_root_information, whitened_rows
 from kf_calib.estimation.correction import Corrected, Correction
 from kf_calib.estimation.cross_validation import HeldOut, held_out
 from kf_calib.estimation.dwell_columns import LinearisedDwells
+from kf_calib.estimation.estimate import Estimate, enlarged, estimate_of
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.parameters import Parameter, Parameters
@@ -36,72 +36,6 @@ from kf_calib.support.units import field_unit, shown
 
 _WEAK = 5.0  # times the size that a coefficient may well have
 _CLEAR = 3.0  # sigmas: of a coefficient that is seen, however large it is
-_HOPELESS = {"rad": np.radians(10.0), "1": 0.2, "m/s^2": 2.0}  # larger sigmas: not determined
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """An estimate of the state.
-
-    - state (p,): the twelve affine states, then the coefficients of effects.
-    - covariance (p, p): its covariance.
-    - undetermined (p, q): a basis of the combinations of states that are not determined.
-    """
-
-    state: Floats
-    covariance: Floats
-    undetermined: Floats
-
-    @cached_property
-    def parameters(self) -> Floats:
-        """The paper's twelve parameters (12,)."""
-        return paper_parameters.parameters_of(self.state[:STATE_COUNT])
-
-    @cached_property
-    def parameter_covariance(self) -> Floats:
-        """Covariance (12, 12) of the twelve parameters, J P J^T with the closed-form Jacobian J."""
-        jacobian = paper_parameters.jacobian(self.state[:STATE_COUNT])
-        return jacobian @ self.covariance[:STATE_COUNT, :STATE_COUNT] @ jacobian.T
-
-    @cached_property
-    def unseen(self) -> Mask:
-        """Mask (12,) of the parameters that the orientations do not determine."""
-        sigma = np.sqrt(np.diag(self.parameter_covariance))
-        unseen = sigma > np.array([_HOPELESS[unit] for unit in paper_parameters.UNITS])
-        if self.undetermined.size:
-            jacobian = paper_parameters.jacobian(self.state[:STATE_COUNT])
-            unseen |= np.linalg.norm(jacobian @ self._lost[:STATE_COUNT], axis=1) > 1e-6
-        return np.asarray(unseen)
-
-    @cached_property
-    def _lost(self) -> Floats:
-        """Return the basis of undetermined combinations with each column scaled to length 1."""
-        return self.undetermined / np.linalg.norm(self.undetermined, axis=0)
-
-    @cached_property
-    def determined(self) -> Mask:
-        """Mask (p,) of the states that the orientations determine."""
-        return np.asarray(np.linalg.norm(self._lost, axis=1) < 1e-9)
-
-    @cached_property
-    def sigma(self) -> Floats:
-        """Sigmas (12,) of the twelve parameters; NaN where not determined."""
-        return np.where(self.unseen, np.nan, np.sqrt(np.diag(self.parameter_covariance)))
-
-    @cached_property
-    def effects(self) -> Floats:
-        """Coefficients (q,) of the effects."""
-        return self.state[STATE_COUNT:]
-
-    @cached_property
-    def effect_sigma(self) -> Floats:
-        """Sigmas (q,) of the coefficients of effects; NaN where not determined."""
-        sigma = np.sqrt(np.diag(self.covariance)[STATE_COUNT:])
-        if self.undetermined.size:
-            lost = np.abs(self.undetermined[STATE_COUNT:]).max(axis=1)
-            largest = np.abs(self.undetermined).max()
-            sigma = np.where(lost > 1e-9 * largest, np.nan, sigma)
-        return sigma
 
 
 @dataclass(frozen=True)
@@ -403,34 +337,6 @@ class Calibration:
         last = square_root_information.run(first, fitted.rows(), fitted.steps, fitted.following)[-1]
         extra = considered_information(self.noise, self.linearised.means, self.linearised.state)
         return last.factor, extra.sum(axis=0) + fitted.considered
-
-
-def estimate_of(factor: Floats, nominal_state: Floats, extra: Floats) -> Estimate:
-    """The estimate from a factor [R | z], with the covariance P enlarged to P + P B P by considered parameters, B =
-    ``extra`` (p, p)."""
-    return estimates(factor[None], nominal_state, extra)[0]
-
-
-def estimates(factors: Floats, nominal_state: Floats, extra: Floats) -> list[Estimate]:
-    """The estimates from many factors (n, p, p + 1), as ``estimate_of``; ``extra`` is (p, p) or (n, p, p)."""
-    states, covariances, undetermined = zip(*square_root_information.solve_all(factors, nominal_state), strict=True)
-    covariance = enlarged(np.array(covariances), extra)
-    return [Estimate(*each) for each in zip(states, covariance, undetermined, strict=True)]
-
-
-def enlarged(covariance: Floats, extra: Floats) -> Floats:
-    """P + P B P for covariances P (..., p, p) and contributions B = ``extra`` (..., p, p) of considered parameters.
-
-    By a root of B, so that no variance is negative whatever the rounding of large ones is.
-    """
-    if not extra.any():
-        return covariance
-    sizes = np.sqrt(np.maximum(np.einsum("...ii->...i", extra), 0.0))
-    sizes = np.where(sizes > 0.0, sizes, 1.0)
-    values, vectors = np.linalg.eigh(extra / (sizes[..., :, None] * sizes[..., None, :]))
-    root = sizes[..., :, None] * vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
-    gained = covariance @ root
-    return np.asarray(covariance + gained @ np.swapaxes(gained, -1, -2), float)
 
 
 def consistency(fitted: Fit) -> Consistency:

@@ -12,22 +12,19 @@ be whitened; the projection is then done on a small matrix.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kf_calib.bench.arrays import Floats, Mask
+from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.line_spectrum import SpectralLine
 from kf_calib.dwells.qr import orthonormal
 from kf_calib.dwells.sufficient_statistics import DwellFactor, lines_of
 from kf_calib.effects import Effect, Stimulus
 from kf_calib.estimation import square_root_information, whitened_rows
-from kf_calib.estimation.complement import Complement
+from kf_calib.estimation.candidate_scan import SEEN, Complement, Scan, counts_of, project, slices
 from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns, piece_columns, stimulus_of
 from kf_calib.estimation.periodogram import Periodogram
 from kf_calib.estimation.whitened_rows import MisfitColumns
@@ -35,121 +32,10 @@ from kf_calib.noise import random_walk
 from kf_calib.noise.means import means_of
 from kf_calib.noise.noise_model import Noise, steps
 
-_SEEN = 1e-6
-"""A candidate is invisible if the model leaves less than this share of its columns."""
-
-_SAME = 1.0 - 1e-6
-"""Two directions count as equal if the cosine of the angle between them is above this."""
-
 _TOGETHER = 24  # least number of columns that are whitened at a time; more would take more memory
 _CELLS = 10_000  # columns times dwells that are whitened at a time, if this allows more columns
 _OF_ONE_KIND = 400  # columns whitened at a time if there are many effects of one kind
 _MANY = 100  # above this number of oscillations, a periodogram is faster
-
-
-@dataclass(frozen=True, repr=False)
-class Candidate:
-    """One candidate effect, with any unknown constant at one value, after projection off the model.
-
-    - effect: the candidate.
-    - columns (d, q): the projected columns, per unit of each coefficient.
-    - basis (d, k): an orthonormal basis of the span of ``columns``; k is the degrees of freedom of the test.
-    - directions (d, q): the vectors in that span that are nearest to the columns; they do not depend on the choice of
-      ``basis``.
-    - inverse (q, k): maps a residual r to coefficients, ``inverse @ basis.T @ r``.
-    - hidden (q,): True for each coefficient that the run does not determine.
-    - visibility: the largest share of a column's norm that the projection leaves, 0 to 1.
-    - tried: the number of values of the unknown constant of which this is the best; each counts as a separate test.
-    """
-
-    effect: Effect
-    columns: Floats
-    basis: Floats
-    directions: Floats
-    inverse: Floats
-    hidden: Mask
-    visibility: float
-    tried: int = 1
-
-    @property
-    def dof(self) -> int:
-        """Degrees of freedom of the test: the rank of the projected columns."""
-        return self.basis.shape[1]
-
-    @cached_property
-    def sigma(self) -> Floats:
-        """Sigmas (q,) of the coefficients if only this effect is added; infinite where a coefficient is not
-        determined."""
-        return np.where(self.hidden, np.inf, np.linalg.norm(self.inverse, axis=1))
-
-    def within(self, other: Candidate, cosine: float = _SAME) -> bool:
-        """Tell whether the span of this candidate lies inside the span of the other.
-
-        The criterion is the cosine of the largest principal angle. If it holds, the other explains whatever this one
-        explains, so that no readings can favour this candidate over the other.
-        """
-        return is_within(self.basis.T @ other.basis, cosine)
-
-    def overlap(self, other: Candidate) -> float:
-        """Cosine of the smallest principal angle between the two spans; 1 if they share a direction, so that the run
-        cannot tell some combination of the one from one of the other."""
-        if not (self.dof and other.dof):
-            return 0.0
-        return float(np.linalg.svd(self.basis.T @ other.basis, compute_uv=False)[0])
-
-
-@dataclass(frozen=True, repr=False)
-class Scan:
-    """The candidates and the whitened residual (d,) of the model, in a common orthonormal basis of d dimensions."""
-
-    candidates: tuple[Candidate, ...]
-    residual: Floats
-
-    @cached_property
-    def statistics(self) -> Floats:
-        """Score statistics (n,): the decrease of chi-squared if each candidate alone is added, |basis^T r|^2.
-
-        Each is chi-squared distributed with the candidate's degrees of freedom if the model is complete.
-        """
-        return np.array([np.sum((each.basis.T @ self.residual) ** 2) for each in self.candidates])
-
-    def explained(self, columns: Floats) -> tuple[float, int]:
-        """Decrease of chi-squared if all of these columns (d, q) are added together, and the rank of the columns."""
-        left, singular, _ = np.linalg.svd(columns, full_matrices=False)
-        spanned = left[:, singular > 1e-6]
-        return float(np.sum((spanned.T @ self.residual) ** 2)), spanned.shape[1]
-
-    def beside(self, k: int) -> Floats:
-        """Decrease of chi-squared (n,) if each candidate is added beside candidate ``k``; zero for ``k`` itself."""
-        basis, deltas = self.candidates[k].basis, np.zeros(len(self.candidates))
-        rest = self.residual - basis @ (basis.T @ self.residual)
-        for places, bases in self._stacked:
-            left = bases - basis @ (basis.T @ bases)
-            along, gram = rest @ left, np.swapaxes(left, 1, 2) @ left
-            values, vectors = np.linalg.eigh(gram)  # squared cosines, of which those near zero are seen no more
-            turned = np.einsum("ni,nij->nj", along, vectors)
-            deltas[places] = np.sum(np.where(values > _SEEN, turned**2 / np.maximum(values, _SEEN), 0.0), axis=1)
-        return deltas
-
-    @cached_property
-    def _stacked(self) -> list[tuple[list[int], Floats]]:
-        """Numbers of the candidates of equal degrees of freedom, and their bases (n, d, k)."""
-        found = dict[int, list[int]]()
-        for k, each in enumerate(self.candidates):
-            found.setdefault(each.dof, []).append(k)
-        return [(own, np.array([self.candidates[k].basis for k in own])) for dof, own in found.items() if dof]
-
-    def coefficients(self, candidate: Candidate) -> Floats:
-        """Estimated coefficients (q,) of a candidate if only this effect is added."""
-        return candidate.inverse @ (candidate.basis.T @ self.residual)
-
-
-def is_within(cosines: Floats, cosine: float) -> bool:
-    """``Candidate.within`` from the products (k, l) of the two bases."""
-    dof, others = cosines.shape
-    if not 0 < dof <= others or np.vdot(cosines, cosines) <= dof * cosine**2:
-        return False  # the smallest cosine is no larger than their root mean square
-    return float(np.linalg.svd(cosines, compute_uv=False)[-1]) > cosine
 
 
 class Frame:
@@ -279,16 +165,6 @@ _OF_NOISE = ("sigma_mps2", "inflation", "setting_rad", "scatter_mps2", "walk_mps
              "sensitivity_mps2_per_k")  # fmt: skip
 
 
-def counts_of(effects: Sequence[Effect]) -> list[int]:
-    """Return the number of columns of each effect."""
-    return [len(effect.coefficients) for effect in effects]
-
-
-def slices(counts: Sequence[int]) -> list[slice]:
-    """Return the slice of columns that belongs to each effect, for effects of so many columns."""
-    return [slice(a, b) for a, b in itertools.pairwise(itertools.accumulate(counts, initial=0))]
-
-
 def _key(effect: Effect) -> tuple[str, float]:
     """Return what identifies an effect together with the value of its constant."""
     return str(effect), effect.value
@@ -298,38 +174,6 @@ def scan(linearised: LinearisedDwells, noise: Noise, effects: Sequence[Effect]) 
     """Project ``effects`` off the model in ``linearised`` without a frame."""
     rows, width = whiten_model(linearised, noise, effects)
     return project(square_root_information.accumulate([rows]), width, effects, counts_of(effects))
-
-
-def project(upper: Floats, width: int, effects: Sequence[Effect], counts: Sequence[int]) -> Scan:
-    """Make the scan from a triangular factor [H | G | z].
-
-    - upper: the factor.
-    - width: number of columns H of the model.
-    - effects: the candidates; counts: number of columns of each in G.
-    """
-    rest = Complement(upper, width).of(upper[:, width:])
-    return scan_of(rest, np.linalg.norm(upper[:, width:-1], axis=0), effects, counts)
-
-
-def scan_of(rest: Floats, sizes: Floats, effects: Sequence[Effect], counts: Sequence[int]) -> Scan:
-    """Make the scan from what a model leaves of a triangular factor [G | z], and the norms of G before."""
-    units = np.where(sizes > 0, sizes, 1.0)
-    columns, residual = rest[:-1, :-1] / units, rest[:-1, -1]
-    candidates = list[Candidate]()
-    for effect, part, factors in zip(effects, slices(counts), _factors(columns, counts), strict=True):
-        candidates.append(_candidate(effect, columns[:, part], units[part], *factors))
-    return Scan(tuple(candidates), residual)
-
-
-def _factors(columns: Floats, counts: Sequence[int]) -> list[tuple[Floats, Floats, Floats]]:
-    """Return the singular value decomposition of the columns of each effect, those of as many columns in one call."""
-    parts, factors_of_each = slices(counts), [(columns, columns, columns)] * len(counts)
-    for count in dict.fromkeys(counts):
-        places = [k for k, own in enumerate(counts) if own == count]
-        stacked = np.array([columns[:, parts[k]] for k in places])
-        for k, *factors in zip(places, *np.linalg.svd(stacked, full_matrices=False), strict=True):
-            factors_of_each[k] = factors[0], factors[1], factors[2]
-    return factors_of_each
 
 
 def delta_chi2(linearised: LinearisedDwells, noise: Noise, effects: Sequence[Effect]) -> Floats:
@@ -348,7 +192,7 @@ def delta_chi2(linearised: LinearisedDwells, noise: Noise, effects: Sequence[Eff
         columns = rest[:, :-1] / np.where(sizes > 0, sizes, 1.0)
         columns = columns.T.reshape(len(part), -1, len(rest))
         along, gram = columns @ rest[:, -1], columns @ columns.swapaxes(1, 2)
-        inverse = np.linalg.pinv(gram, rcond=_SEEN, hermitian=True)
+        inverse = np.linalg.pinv(gram, rcond=SEEN, hermitian=True)
         deltas.append(np.einsum("ni,nij,nj->n", along, inverse, along))
     return np.concatenate(deltas)
 
@@ -373,7 +217,7 @@ def unweighted_left(linearised: LinearisedDwells, effects: Sequence[Effect]) -> 
 def _spanned(columns: Floats) -> Floats:
     """Return an orthonormal basis of columns of about unit length, without directions that are rounding."""
     left, singular, _ = np.linalg.svd(columns, full_matrices=False)
-    return left[:, singular > _SEEN]
+    return left[:, singular > SEEN]
 
 
 def joint_delta_chi2(
@@ -390,7 +234,7 @@ def joint_delta_chi2(
     joint = list[tuple[float, int]]()
     for part in slices([sum(counts_of(group)) for group in groups]):
         left, singular, _ = np.linalg.svd(columns[:, part], full_matrices=False)
-        spanned = left[:, singular > _SEEN]
+        spanned = left[:, singular > SEEN]
         joint.append((float(np.sum((spanned.T @ rest[:, -1]) ** 2)), spanned.shape[1]))
     return joint
 
@@ -454,17 +298,3 @@ def _with_and_without_walk(
 def _inside(noise: Noise) -> int:
     """Number of leading columns of a dwell's rows that belong to the steps of the biases within the dwell."""
     return 3 if noise.walk_mps2_per_sqrt_s else 0
-
-
-def _candidate(
-    effect: Effect, columns: Floats, units: Floats, left: Floats, singular: Floats, right: Floats
-) -> Candidate:
-    """Make a candidate from its projected ``columns`` (d, q), each divided by its norm before the projection, ``units``
-    (q,), and the singular value decomposition of these."""
-    seen = singular > _SEEN
-    lost = np.eye(len(units)) - right[seen].T @ right[seen]
-    inverse = (right[seen].T / singular[seen]) / units[:, None]
-    hidden, basis = np.asarray(np.diag(lost) > 1e-6), left[:, seen]
-    return Candidate(
-        effect, columns * units, basis, basis @ right[seen], inverse, hidden, float(singular.max(initial=0.0))
-    )

@@ -18,28 +18,32 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
-from kf_calib.bench import paper_parameters
-from kf_calib.bench.arrays import Floats, Mask
+from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.mountings import Mounting, mountings
 from kf_calib.bench.raw_input import CHANNELS
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.errors import BlunderError
+from kf_calib.estimation.affine_fit import (
+    _FARTHEST,
+    GAIN_RANGE,
+    AffineFit,
+    Channels,
+    DwellMeans,
+    determines_axes,
+    fit_affine,
+    nominal_sensitivity,
+)
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
-_FARTHEST = math.cos(math.radians(45.0))  # largest angle of an axis from nominal
-_GAIN = (0.5, 2.0)  # range of a scale factor over nominal; outside it is another unit or no accelerometer
 _DEAD = 0.05  # g; a channel whose means vary by less is dead
 _TURNED = 1.0  # g; if gravity along it should have changed by more
 _CHANGED = 0.1  # g; a constant reading is stuck if gravity along it should have changed by more
 _UNEXPLAINED = 0.05  # g; if the residual rms is larger, the angles do not explain the mean readings
 _BETTER = 0.2  # a change explains the readings if it leaves less than this share of the residual
-_SPREAD = 0.2  # least singular value of the directions over sqrt(D); 0.577 if they are spread evenly
-_BIAS = 0.3  # g; prior sigma of a bias, which matters if the orientations do not determine it
 _NOMINAL = 0.15  # g; largest rms deviation from nominal without a mistake, from biases, scale factors and mounting
 _INDISTINCT = 0.25  # g^2; assignments whose sums of squares differ by less explain the readings alike
 _MOST_DWELLS = 96  # so many dwells are used at most, spread over the run
@@ -50,76 +54,6 @@ _LITTLE = 20e-6  # a smaller deviation of the scale factors is not reported
 _FEW_DWELLS = 8  # with more, the other dwells tell the noise, and so a dwell that does not fit
 _STUCK = 1e-9  # readings with a smaller relative difference are equal
 
-Channels = tuple[int, int, int]
-
-
-@dataclass(frozen=True)
-class DwellMeans:
-    """Means over D dwells.
-
-    - poses (D, k): poses as recorded.
-    - readings (D, 3): mean readings.
-    - middle_s (D,): middle of each dwell.
-    - numbers: numbers of the dwells.
-    """
-
-    poses: Floats
-    readings: Floats
-    middle_s: Floats
-    numbers: tuple[int, ...]
-
-    @classmethod
-    def of(cls, dwells: Sequence[DwellFactor]) -> DwellMeans:
-        """The means of these dwells."""
-        return cls(
-            np.array([dwell.recorded_pose for dwell in dwells]),
-            np.array([dwell.means[4:] for dwell in dwells]),
-            np.array([0.5 * (dwell.start_s + dwell.end_s) for dwell in dwells]),
-            tuple(dwell.number for dwell in dwells),
-        )
-
-    def __getitem__(self, part: Mask) -> DwellMeans:
-        numbers = tuple(itertools.compress(self.numbers, part))
-        return DwellMeans(self.poses[part], self.readings[part], self.middle_s[part], numbers)
-
-    def force(self, mounting: Mounting) -> Floats:
-        """Specific force (D, 3) in the platform in units of gravity, if the poses mean what ``mounting`` says."""
-        bench = mounting.bench
-        return bench.specific_force(self.middle_s, mounting.poses(self.poses)) / bench.gravity_mps2
-
-
-@dataclass(frozen=True)
-class AffineFit:
-    """The least-squares fit of the mean readings by the specific force.
-
-    - sensitivity (3, 3): rows s_i.
-    - left: rms of the residuals, g.
-    - nominal (3, 3): nominal sensitivities.
-    """
-
-    sensitivity: Floats
-    left: float
-    nominal: Floats
-
-    @cached_property
-    def scales(self) -> Floats:
-        """|s_i| divided by its nominal value, (3,)."""
-        return np.linalg.norm(self.sensitivity, axis=1) / np.linalg.norm(self.nominal, axis=1)
-
-    @cached_property
-    def cosines(self) -> Floats:
-        """Cosines (3, 3) of the angles between axis i and the nominal axis of accelerometer j."""
-        own, nominal = (rows / np.linalg.norm(rows, axis=1)[:, None] for rows in (self.sensitivity, self.nominal))
-        return own @ nominal.T
-
-    def is_near(self, channels: Channels = CHANNELS) -> bool:
-        """Tell whether all axes and scale factors are near nominal with the channels in this order and with these
-        signs."""
-        own = np.abs(channels) - 1
-        cosines = np.sign(channels) * self.cosines[own, [0, 1, 2]]
-        scales = np.linalg.norm(self.sensitivity, axis=1)[own] / np.linalg.norm(self.nominal, axis=1)
-        return bool((cosines > _FARTHEST).all() and (scales > _GAIN[0]).all() and (scales < _GAIN[1]).all())
-
 
 def refuse(dwells: Sequence[DwellFactor], bench: Bench) -> None:
     """Raise BlunderError, saying what is probably wrong, if these cannot be dwells of the bench as it is stated.
@@ -129,8 +63,8 @@ def refuse(dwells: Sequence[DwellFactor], bench: Bench) -> None:
     step = -(-len(dwells) // _MOST_DWELLS)
     means, stated = DwellMeans.of(dwells[::step]), Mounting.stated(bench)
     _refuse_silent(means, stated)
-    affine = _affine(means, stated)
-    if affine is None and not _shows_all(means.readings / bench.gravity_mps2):
+    affine = fit_affine(means, stated)
+    if affine is None and not determines_axes(means.readings / bench.gravity_mps2):
         return
     if affine is not None and affine.left < _UNEXPLAINED:
         if affine.is_near():
@@ -149,34 +83,10 @@ def refuse(dwells: Sequence[DwellFactor], bench: Bench) -> None:
         )
 
 
-def _affine(means: DwellMeans, mounting: Mounting) -> AffineFit | None:
-    """Return the fit; None if the orientations do not determine all three axes."""
-    force = means.force(mounting)
-    if not _shows_all(force):
-        return None
-    readings = means.readings / mounting.bench.gravity_mps2
-    columns = np.column_stack([force, np.ones(len(force))])
-    held = np.vstack([columns, [0.0, 0.0, 0.0, 0.05 / _BIAS]])  # readings are assumed good to 0.05 g
-    solution = np.linalg.lstsq(held, np.vstack([readings, np.zeros((1, 3))]), rcond=None)[0]
-    freedom = max(len(force) - 4, 1) / len(force)
-    left = math.sqrt(np.mean((readings - columns @ solution) ** 2) / freedom)
-    return AffineFit(np.asarray(solution[:3].T, float), left, _nominal(mounting.bench))
-
-
-def _shows_all(force: Floats) -> bool:
-    """Tell whether directions (D, 3) determine three axes."""
-    return len(force) >= 3 and np.linalg.svd(force, compute_uv=False)[-1] > _SPREAD * math.sqrt(len(force))
-
-
-def _nominal(bench: Bench) -> Floats:
-    """Return the nominal sensitivities (3, 3)."""
-    return paper_parameters.state_of(paper_parameters.nominal(bench.nominal)).reshape(3, 4)[:, :3]
-
-
 def _refuse_silent(means: DwellMeans, stated: Mounting) -> None:
     """Refuse a channel that is constant, or nearly so, although gravity along it should change much."""
     readings, count = means.readings, len(means.readings)
-    expected = means.force(stated) @ _nominal(stated.bench).T
+    expected = means.force(stated) @ nominal_sensitivity(stated.bench).T
     same = np.abs(readings - readings[-1]) <= _STUCK * np.abs(readings[-1])
     for i, channel in enumerate(map(abs, stated.bench.input.channels)):
         first = count - int(np.argmin(np.append(same[::-1, i], False)))
@@ -197,7 +107,7 @@ def _refuse_silent(means: DwellMeans, stated: Mounting) -> None:
 def _refuse_wrong_gain(found: AffineFit, bench: Bench) -> None:
     """Refuse a channel that measures gravity by another factor than the others, as in another unit."""
     for i, scale in enumerate(found.scales.tolist()):
-        if not _GAIN[0] < scale < _GAIN[1]:
+        if not GAIN_RANGE[0] < scale < GAIN_RANGE[1]:
             others = " and ".join(f"{other:.3g}" for other in np.delete(found.scales, i))
             raise BlunderError(
                 f"channel {abs(bench.input.channels[i])} feels {scale:.3g} times gravity, the others {others}: check "
@@ -245,7 +155,7 @@ def _mendings(means: DwellMeans, stated: Mounting, affine: AffineFit | None) -> 
     for mounting in mountings(stated):
         if mounting.changes > fewest:
             break
-        fitted = affine if not mounting.changes else _affine(means, mounting)
+        fitted = affine if not mounting.changes else fit_affine(means, mounting)
         if fitted is None or fitted.left > left:
             continue
         for channels in _WIRINGS:
@@ -340,7 +250,7 @@ def _refuse_one_sign(means: DwellMeans, stated: Mounting) -> None:
     if not 3 <= len(means.numbers) <= _FEW_DWELLS:
         return
     bench = stated.bench
-    expected, readings = means.force(stated) @ _nominal(bench).T, means.readings / bench.gravity_mps2
+    expected, readings = means.force(stated) @ nominal_sensitivity(bench).T, means.readings / bench.gravity_mps2
     errors = np.abs(readings - expected)
     k, i = np.unravel_index(int(np.argmax(errors)), errors.shape)
     mended = errors.copy()
@@ -361,7 +271,7 @@ def _refuse_exchange(means: DwellMeans, stated: Mounting) -> None:
     if len(means.numbers) < 6:
         return
     bench = stated.bench
-    expected, readings = means.force(stated) @ _nominal(bench).T, means.readings / bench.gravity_mps2
+    expected, readings = means.force(stated) @ nominal_sensitivity(bench).T, means.readings / bench.gravity_mps2
     wired = np.stack([readings[:, np.abs(own) - 1] * np.sign(own) for own in _WIRINGS])  # (48, D, 3)
     squares = ((wired - expected) ** 2).sum(axis=2)
     before = np.cumsum(squares, axis=1)[:, :-1]  # sums over the dwells up to k, for each assignment
@@ -384,7 +294,7 @@ def _refuse_exchange(means: DwellMeans, stated: Mounting) -> None:
 def _one_dwell(means: DwellMeans, stated: Mounting) -> bool:
     """Tell whether without some single dwell all axes are near nominal and the angles explain the readings."""
     for k in range(len(means.numbers)):
-        found = _affine(means[np.arange(len(means.numbers)) != k], stated)
+        found = fit_affine(means[np.arange(len(means.numbers)) != k], stated)
         if found is not None and found.is_near() and found.left < _UNEXPLAINED:
             return True
     return False

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.piece_values import OfPieces, of_all_pieces
-from kf_calib.dwells.qr import solved_by_lower, triangle
+from kf_calib.dwells.qr import inverse_of_lower, triangle
 from kf_calib.dwells.rows import on_basis
 from kf_calib.dwells.stack import AlikeDwells, DwellStack
 from kf_calib.dwells.sufficient_statistics import DwellFactor
@@ -76,7 +76,9 @@ def whiten(
         else:
             rows, count = _weighted(batch, of_batch, noise_about)
             if informative is None:
-                whitened = _less(rows, count)
+                # rows (d, r, n) off their first ``count`` columns, without these columns
+                nuisances = np.linalg.qr(rows[..., :count])[0]
+                whitened = rows[..., count:] - nuisances @ (np.swapaxes(nuisances, 1, 2) @ rows[..., count:])
             else:
                 whitened = _informative(triangle(rows)[:, count:, count:], informative)
         for k, of_dwell in zip(batch.dwells.tolist(), whitened, strict=True):
@@ -223,7 +225,7 @@ def _of_means(batch: _Batch, columns: Floats, about: _About) -> Floats:
         rows = np.concatenate([np.concatenate([scaled, rows[..., blocks.nuisances :]], axis=2), prior], axis=1)
         return triangle(rows)[:, blocks.nuisances :, blocks.nuisances :]
     lower = cast("Floats", np.linalg.cholesky(np.eye(3) + scaled @ np.swapaxes(scaled, 1, 2)))
-    return solved_by_lower(lower, rows[..., blocks.nuisances :])
+    return inverse_of_lower(lower) @ rows[..., blocks.nuisances :]
 
 
 def _channels(batch: _Batch, columns: Floats, blocks: _Blocks, about: _About, height: int) -> Floats:
@@ -263,12 +265,6 @@ def _unit_along(batch: _Batch, noise: Noise, state: Floats) -> Floats:
 def _combined(parts: Floats, along: Floats) -> Floats:
     """Return the rows (d, 1, r, n) of whitened channels (d, 3, r, n) along unit vectors (d, 3)."""
     return np.einsum("di,dirn->drn", along, parts)[:, None]
-
-
-def _less(rows: Floats, count: int) -> Floats:
-    """Project rows (d, r, n) off their first ``count`` columns and drop these columns."""
-    nuisances = np.linalg.qr(rows[..., :count])[0]
-    return rows[..., count:] - nuisances @ (np.swapaxes(nuisances, 1, 2) @ rows[..., count:])
 
 
 def misfit_rows(

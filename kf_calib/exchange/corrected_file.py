@@ -182,8 +182,8 @@ def apply_to_table(
     grid = grid_of(path)
     meanings = Columns.of(grid, columns, Numbers.of(grid))
     table = Opening(meanings, overrides, units, angles=False).table()
-    means = np.array([own.mean_mps2 for own in table.orientations])
-    warmth = np.array([own.temperature_c for own in table.orientations])
+    means = table.orientations.mean_mps2
+    warmth = table.orientations.temperature_c
     if correction.needs_temperature and not np.isfinite(warmth).all():
         raise InputError(f"{path}: has no temperature, which the calibration needs: add a column of it.")
     norm = NormAtRest(correction)

@@ -14,7 +14,8 @@ from kf_calib.errors import InputError
 from kf_calib.estimation.correction import Correction
 from kf_calib.exchange.norm_at_rest import NormAtRest
 from kf_calib.sources.files.line_parts import Account, LineReader
-from kf_calib.sources.files.lines import LONGEST_LINE_BYTES, is_json, reader_for, stated_of
+from kf_calib.sources.files.lines import is_json, reader_for, stated_of
+from kf_calib.sources.files.text_file import LONGEST_LINE_BYTES
 from kf_calib.sources.units import Units
 
 _TELLING_LINES = 9

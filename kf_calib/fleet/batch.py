@@ -21,7 +21,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -346,7 +346,7 @@ class _Watch:
 
     def __init__(self, limit_s: float, thread: int) -> None:
         self._limit_s, self._thread = limit_s, ctypes.c_ulong(thread)
-        self._ended, self._telling = threading.Event(), threading.RLock()
+        self._ended, self._telling, self._told = threading.Event(), threading.RLock(), False
 
     def run(self) -> None:
         waited_s, patience_s = self._limit_s, min(self._limit_s, _GRACE_S)
@@ -355,12 +355,24 @@ class _Watch:
                 os._exit(1)
             with self._telling:
                 if not self._ended.is_set():
-                    ctypes.pythonapi.PyThreadState_SetAsyncExc(self._thread, ctypes.py_object(OverTime))
+                    self._tell()
             waited_s = min(_AGAIN_S, patience_s) or _AGAIN_S
             patience_s = max(patience_s - waited_s, 0.0)
 
     def end(self) -> None:
-        """From now on nothing is raised, not even what was on its way."""
+        """From now on nothing is raised, not even what was on its way.
+
+        What was comes here: CPython 3.11 would go on looking for one that is called back, and never begin a function
+        that a debugger traces.
+        """
         with self._telling:
             self._ended.set()
-            ctypes.pythonapi.PyThreadState_SetAsyncExc(self._thread, None)
+        if self._told:
+            with suppress(OverTime):
+                self._tell()  # in place of what was on its way
+                while True:
+                    pass
+
+    def _tell(self) -> None:
+        self._told = True
+        ctypes.pythonapi.PyThreadState_SetAsyncExc(self._thread, ctypes.py_object(OverTime))

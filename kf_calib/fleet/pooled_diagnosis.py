@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.diagnosis.missing_effect import SEEN
 from kf_calib.effects import described
 from kf_calib.errors import InputError
 from kf_calib.fleet.attribution import Attributed, AttributionTable, attributed, chosen
@@ -72,6 +73,12 @@ class UnitFigures:
     unit: str
     probability: float
     coefficients: tuple[PooledEstimate, ...]
+
+    @property
+    def is_seen(self) -> bool:
+        """Whether a coefficient is beyond ``SEEN`` sigma."""
+        known = [(each.value, each.sigma) for each in self.coefficients]
+        return any(value is not None and sigma is not None and abs(value) > SEEN * sigma for value, sigma in known)
 
 
 @dataclass(frozen=True)

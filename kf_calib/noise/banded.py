@@ -2,7 +2,7 @@
 
 All operations take time proportional to D. A matrix is stored by columns as (D, 6, 3): for each three their own
 covariance, and below it the covariance of the next three with them (zeros for the last). Where no three are correlated
-with the next, only their own are stored, (D, 3, 3), and the Cholesky factor is (D, 3, 3) as well.
+with the next, only their own are stored, (D, 3, 3), and in place of the Cholesky factor its inverse, (D, 3, 3).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, cast
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.dwells.qr import solved_by_lower
+from kf_calib.dwells.qr import inverse_of_lower
 
 _BELOW = np.arange(6)[:, None] - np.arange(3)  # distance of an entry from the diagonal
 _KEPT, _BAND = _BELOW >= 0, np.maximum(_BELOW, 0)
@@ -22,9 +22,10 @@ _TWICE = np.repeat([1.0, 2.0], 3)[:, None]  # blocks beside the diagonal occur o
 
 
 def root(columns: Floats) -> Floats:
-    """The lower Cholesky factor in LAPACK's band storage: its diagonals (6, 3 D) from the main one down."""
+    """The lower Cholesky factor in LAPACK's band storage: its diagonals (6, 3 D) from the main one down; the inverse
+    (D, 3, 3) of the factor where no three are correlated with the next."""
     if columns.shape[1] == 3:
-        return cast("Floats", np.linalg.cholesky(columns))
+        return inverse_of_lower(cast("Floats", np.linalg.cholesky(columns)))
     padded = np.zeros((len(columns), 8, 3))
     padded[:, :6] = columns
     bands = padded[:, np.arange(3)[:, None] + np.arange(6), np.arange(3)[:, None]].reshape(-1, 6).T
@@ -36,7 +37,7 @@ def root(columns: Floats) -> Floats:
 
 def diagonal(lower: Floats) -> Floats:
     """The main diagonal (3 D,) of a Cholesky factor."""
-    return np.einsum("dii->di", lower).ravel() if lower.ndim == 3 else lower[0]
+    return 1.0 / np.einsum("dii->di", lower).ravel() if lower.ndim == 3 else lower[0]
 
 
 def solve(lower: Floats, rows: Floats, transposed: bool = False) -> Floats:
@@ -44,7 +45,8 @@ def solve(lower: Floats, rows: Floats, transposed: bool = False) -> Floats:
     if not rows.size:
         return rows  # scipy's wrapper would write beyond empty arrays
     if lower.ndim == 3:
-        return solved_by_lower(lower, rows.reshape(-1, 3, rows.shape[1]), transposed).reshape(rows.shape)
+        back = np.swapaxes(lower, 1, 2) if transposed else lower
+        return (back @ rows.reshape(-1, 3, rows.shape[1])).reshape(rows.shape)
     return cast("Floats", _lapack("tbtrs")(lower, rows, uplo="L", trans="T" if transposed else "N")[0])
 
 
@@ -55,8 +57,7 @@ def inverse(columns: Floats, lower: Floats) -> Floats:
       X_d = L_d^-T (I - M' M)^-1 L_d^-1,  M = U_{d+1}^-1 L_{d+1,d};  below it: -X_{d+1} L_{d+1,d} L_d^-1
     """
     if lower.ndim == 3:
-        back = solved_by_lower(lower, np.broadcast_to(np.eye(3), lower.shape))
-        return np.swapaxes(back, 1, 2) @ back
+        return np.swapaxes(lower, 1, 2) @ lower
     forward, within_band = _unbanded(lower), np.zeros_like(columns)
     back, beside = np.linalg.inv(forward[:, :3]), forward[:-1, 3:]
     within_band[:, :3] = np.swapaxes(back, 1, 2) @ back

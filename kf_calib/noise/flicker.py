@@ -32,8 +32,8 @@ def flicker_within(dwells: Sequence[DwellFactor], columns: Sequence[Floats], sta
     stack = DwellStack.of(dwells)
     if not noise.scatter_mps2.any() or noise.walk_mps2_per_sqrt_s or stack.folded.dwells[0].carrier_hz:
         return np.zeros(3)
-    if not any(triangles.shape[1] > 1 or triangles[:, :, 1:3].any() for triangles in stack.triangles):
-        return np.zeros(3)  # no more than the mean of a dwell is known
+    if stack.folded.shows_means_only:
+        return np.zeros(3)
     channels = np.eye(3)[None].repeat(len(dwells), axis=0)
     if noise.attitude_unknown:
         along = along_force(stack, sensitivities_of(stack, state))

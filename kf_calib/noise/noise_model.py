@@ -20,7 +20,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells import walk_path, window_average
 from kf_calib.dwells.piece_values import OfPieces
-from kf_calib.dwells.stack import DwellStack
+from kf_calib.dwells.stack import DwellStack, Folded
 from kf_calib.dwells.sufficient_statistics import Autocovariance, DwellFactor
 from kf_calib.noise import random_walk
 from kf_calib.noise.autoregression import expected_products, unbiased
@@ -145,10 +145,10 @@ def within_dwells(
     stack = DwellStack.of(dwells)
     dwells, within_seen = stack.folded.dwells, bool((stack.folded.counts > 1).any())
     if walk_mps2_per_sqrt_s:
-        inflation, variance = _correlation(dwells, walk_mps2_per_sqrt_s)
+        inflation, variance = _correlation(stack.folded, walk_mps2_per_sqrt_s)
     else:  # the same for all fits to the dwells
         if "correlation" not in stack.folded.known:
-            stack.folded.known["correlation"] = _correlation(dwells, 0.0)
+            stack.folded.known["correlation"] = _correlation(stack.folded, 0.0)
         inflation, variance = stack.folded.known["correlation"]
     if along is not None:
         return Noise(_sigma_along(stack, along, inflation), inflation, within_seen=within_seen)
@@ -165,9 +165,9 @@ def within_dwells(
     return Noise(sigma, inflation, within_seen=within_seen)
 
 
-def _correlation(dwells: Sequence[DwellFactor], walk_mps2_per_sqrt_s: float) -> tuple[Floats, Floats]:
+def _correlation(folded: Folded, walk_mps2_per_sqrt_s: float) -> tuple[Floats, Floats]:
     """Return kappa (3,) and the variances (3,) of readings within dwells, less those of a random walk."""
-    total = _total_of(dwells)
+    total, dwells = folded.autocovariance, folded.dwells
     if walk_mps2_per_sqrt_s:
         total = replace(total, products=total.products - walk_mps2_per_sqrt_s**2 * _walk_products(dwells))
     known = _of_averages if dwells[0].averaged else _inflation
@@ -175,14 +175,6 @@ def _correlation(dwells: Sequence[DwellFactor], walk_mps2_per_sqrt_s: float) -> 
     if not dwells[0].averaged and total.count < _SHORT * inflation.max() * total.blocks:
         return _alike(total)
     return inflation, variance
-
-
-def _total_of(dwells: Sequence[DwellFactor]) -> Autocovariance:
-    """Return the sums of lagged products of all dwells."""
-    total = dwells[0].autocovariance.times(dwells[0].weight)
-    for dwell in dwells[1:]:
-        total = total + dwell.autocovariance.times(dwell.weight) if dwell.autocovariance.count else total
-    return total
 
 
 def _sigma_along(stack: DwellStack, along: Floats, inflation: Floats) -> Floats:

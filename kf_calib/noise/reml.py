@@ -167,7 +167,7 @@ def _with_estimates(stated: Noise, likelihood: Likelihood, parts: Parts, sizes: 
     if "setting" in parts:
         rest: Parts = tuple(part for part in parts if part != "setting")
         cost = likelihood.of(rest).most_likely()[1].cost if rest else without.cost
-        gain = cost - likelihood.of(parts).at(sizes**2).cost
+        gain = cost - likelihood.of(parts).cost(sizes**2)
         noise = replace(noise, setting_judged=2.0 * gain > _JUDGED)
     return noise
 
@@ -285,13 +285,14 @@ def _reduce(means: Means, prior: Floats | None = None, apart: slice = slice(0)) 
     prior = np.zeros((0, design.shape[1] + 1)) if prior is None else prior
     known: Mask = np.array(prior[:, :-1].any(axis=0))
     known[apart] = True
-    free = design[:, ~known]
+    free = design[:, ~known]  # a copy, which the basis may overwrite
     scale = np.linalg.norm(free, axis=0)
-    basis, upper = orthonormal(free / np.where(scale > 0, scale, 1.0))
+    free /= np.where(scale > 0, scale, 1.0)
+    basis, upper = orthonormal(free)
     turn, singular, _ = np.linalg.svd(upper, full_matrices=False)
     basis = basis @ turn[:, singular > 1e-9 * singular[0]]
     rest = means.readings.ravel() - basis @ (basis.T @ means.readings.ravel())
-    columns = np.hstack([basis, design[:, known]])
+    columns = np.hstack([basis, design[:, known]]) if known.any() else basis
     means = replace(means, design=columns.reshape(*means.readings.shape, -1), readings=rest.reshape(-1, 3))
     return _Reduced(means, np.hstack([np.zeros((len(prior), basis.shape[1])), prior[:, np.append(known, True)]]))
 

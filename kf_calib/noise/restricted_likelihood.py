@@ -9,11 +9,12 @@ The means are z = A x + e, where e has the covariance V = V_0 + sum v_k K_k. Wit
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.dwells.qr import orthonormal, square_triangle
+from kf_calib.dwells.qr import square_triangle, triangle
 from kf_calib.noise import banded
 from kf_calib.noise.noise_model import lift_rounding
 
@@ -22,6 +23,7 @@ _NEAR = 0.5  # if ln of a size changes by more, the search did not begin near it
 _ENOUGH = 1e-9  # the search ends when less log-likelihood than this can be gained,
 _ROUNDING = 1e-12  # or less than this share of the cost, which for thousands of dwells is not computed better
 _STEPS, _HALVES = 100, 12
+_AT_ONCE = 1024  # means that are worked on together where they are not correlated
 
 
 @dataclass(frozen=True)
@@ -45,17 +47,24 @@ class _Level:
     """The likelihood at given variances, and what its derivatives are made from.
 
     - cost, misfit: as of a point.
-    - covariance (D, 6, 3), lower (6, 3 D), or (D, 3, 3) where no means are correlated: V and its Cholesky factor, in
-      the layouts of ``banded``.
-    - basis (3 D, p), rest (3 D,): of the whitened rows, an orthonormal basis of A and what it leaves of z.
+    - upper (p + 1, p + 1): the triangular factor of the whitened rows [A | z] and of the prior.
+    - whitened: the means of all parts.
     """
 
     cost: float
     misfit: float
+    upper: Floats
+    whitened: list[_Whitened]
+
+
+@dataclass(frozen=True)
+class _Whitened:
+    """Some of the means: their covariance V and its root, both in the layouts of ``banded``, and their rows (3 d, p +
+    1) divided by the root."""
+
     covariance: Floats
     lower: Floats
-    basis: Floats
-    rest: Floats
+    rows: Floats
 
 
 @dataclass(frozen=True)
@@ -77,33 +86,42 @@ class Restricted:
         """The likelihood and its derivatives at ``variances`` (k,)."""
         return self._with_derivatives(self._level(variances))
 
+    def cost(self, variances: Floats) -> float:
+        """Minus the log-likelihood at ``variances`` (k,)."""
+        return self._level(variances).cost
+
     def root_of(self, variances: Floats, places: slice) -> tuple[Floats, Floats]:
         """A root (q, q) of the information on the coefficients of some columns at ``variances`` (k,), all others
         integrated out, and the readings (q,) in its rows: root @ x is what the readings say of them."""
-        whitened, columns = self._whitened(variances)[1], np.arange(self.rows.shape[1] - 1)
+        columns = np.arange(self.rows.shape[1] - 1)
         chosen = columns[places]
         order = np.concatenate([np.setdiff1d(columns, chosen), chosen, [len(columns)]])
-        upper, first = square_triangle(whitened[:, order]), len(columns) - len(chosen)
+        upper, first = triangle(self._level(variances).upper[:, order]), len(columns) - len(chosen)
         return upper[first:-1, first:-1], upper[first:-1, -1]
 
-    def _whitened(self, variances: Floats) -> tuple[tuple[Floats, Floats], Floats]:
-        """Return the covariance V and its root at ``variances`` (k,), and the rows [A | z] whitened by it, those of
-        prior knowledge first."""
-        wider = variances @ self.shapes.reshape(len(variances), self.fixed.size)
-        covariance = self.fixed + wider.reshape(self.fixed.shape)
+    @cached_property
+    def _parts(self) -> list[slice]:
+        """The means that are worked on together: all where they are correlated, else as many as stay in the cache."""
+        count = len(self.fixed)
+        size = _AT_ONCE if self.fixed.shape[1] == 3 else count
+        return [slice(k, min(k + size, count)) for k in range(0, count, size)]
+
+    def _whitened(self, variances: Floats, part: slice) -> _Whitened:
+        """Return the means of a part, whitened at ``variances`` (k,)."""
+        fixed = self.fixed[part]
+        covariance = fixed + (variances @ self.shapes[:, part].reshape(len(variances), fixed.size)).reshape(fixed.shape)
         covariance[:, :3] = lift_rounding(covariance[:, :3])
         lower = banded.root(covariance)
-        whitened = banded.solve(lower, self.rows)
-        return (covariance, lower), np.concatenate([self.prior, whitened]) if len(self.prior) else whitened
+        return _Whitened(covariance, lower, banded.solve(lower, self.rows[3 * part.start : 3 * part.stop]))
 
     def _level(self, variances: Floats) -> _Level:
         """Return the likelihood at ``variances`` (k,), without its derivatives, which take more time."""
-        (covariance, lower), whitened = self._whitened(variances)
-        known = len(self.prior)
-        basis, upper = orthonormal(whitened[:, :-1].copy())
-        rest = whitened[:, -1] - basis @ (basis.T @ whitened[:, -1])
-        cost = np.log(banded.diagonal(lower)).sum() + np.log(np.abs(np.diag(upper))).sum() + 0.5 * rest @ rest
-        return _Level(float(cost), float(rest @ rest), covariance, lower, basis[known:], rest[known:])
+        whitened = [self._whitened(variances, part) for part in self._parts]
+        upper = square_triangle(np.concatenate([self.prior, *(triangle(part.rows) for part in whitened)]))
+        determinant = sum(float(np.log(banded.diagonal(part.lower)).sum()) for part in whitened)
+        misfit = float(upper[-1, -1] ** 2)
+        cost = determinant + float(np.log(np.abs(np.diag(upper)[:-1])).sum()) + 0.5 * misfit
+        return _Level(cost, misfit, upper, whitened)
 
     def _with_derivatives(self, level: _Level) -> Point:
         """Return the likelihood with its derivatives.
@@ -112,13 +130,19 @@ class Restricted:
         sec. 6.6), and y' K_k P K_l y / 2 is the average of observed and expected information (Gilmour, Thompson and
         Cullis, 1995).
         """
-        covariance, lower, basis, rest = level.covariance, level.lower, level.basis, level.rest
-        back = banded.solve(lower, np.column_stack([basis, rest]), transposed=True)
-        inner = banded.inverse(covariance, lower) - banded.outer(back, covariance.shape[1])
-        moved = banded.solve(lower, banded.products(self.shapes, back[:, -1]))
-        within = basis.T @ moved
-        information = 0.5 * (moved.T @ moved - within.T @ within)
-        return Point(level.cost, level.misfit, 0.5 * banded.traces(inner, self.shapes), information)
+        count, width = len(self.shapes), len(level.upper) - 1
+        slope, squares, within = np.zeros(count), np.zeros((count, count)), np.zeros((width, count))
+        inverse, along = np.linalg.inv(level.upper[:-1, :-1]), level.upper[:-1, -1]
+        for part, whitened in zip(self._parts, level.whitened, strict=True) if count else ():
+            lower, shapes, basis = whitened.lower, self.shapes[:, part], whitened.rows[:, :-1] @ inverse
+            rest = whitened.rows[:, -1] - basis @ along
+            back = banded.solve(lower, np.column_stack([basis, rest]), transposed=True)
+            inner = banded.inverse(whitened.covariance, lower) - banded.outer(back, whitened.covariance.shape[1])
+            moved = banded.solve(lower, banded.products(shapes, back[:, -1]))
+            slope += 0.5 * banded.traces(inner, shapes)
+            squares += moved.T @ moved
+            within += basis.T @ moved
+        return Point(level.cost, level.misfit, slope, 0.5 * (squares - within.T @ within))
 
     def most_likely(self, start: Floats | None = None) -> tuple[Floats, Point]:
         """The sizes (k,), roots of the variances, at which the likelihood is largest, and the likelihood there.

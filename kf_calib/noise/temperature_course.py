@@ -13,15 +13,13 @@ curve follows, the temperatures are taken as they were read and count as exact.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.dwells.stack import Folded
 
 _KNOTS, _MOST_KNOTS = 3, 200  # of a dwell, and of the run
 _ORDER = 4  # of the differences that are held small: what is left of the noise is least in the run of a climate
@@ -47,51 +45,46 @@ class Course:
     errors_c: Floats
 
 
-@lru_cache(maxsize=4)
-def temperature_course(dwells: tuple[DwellFactor, ...]) -> Course:
+def temperature_course(folded: Folded) -> Course:
     """The course of the temperature over dwells, and slews between them, in order of time."""
-    read = _of_nodes(dwells, "temperature_c")
+    if "temperature_course" not in folded.known:
+        folded.known["temperature_course"] = _course(folded)
+    return folded.known["temperature_course"]
+
+
+def _course(folded: Folded) -> Course:
+    read = folded.of_nodes("temperature_c")
     exact = Course(read, np.zeros((len(read), 0)))
-    standing = [dwell for dwell in dwells if not dwell.moving]
-    if len(standing) < 4 or not np.isfinite(read).all():
+    if (~folded.moving).sum() < 4 or not np.isfinite(read).all():
         return exact
-    if _only_scatters(dwells, read):
-        return Course(np.full(len(read), _means(dwells, read).mean()), exact.errors_c)
-    at_s = _of_nodes(dwells, "elapsed_s")
-    return _smooth(standing, at_s) or exact
+    if _only_scatters(folded, read):
+        return Course(np.full(len(read), _means(folded, read).mean()), exact.errors_c)
+    return _smooth(folded, read) or exact
 
 
-def _of_nodes(dwells: Sequence[DwellFactor], name: str) -> Floats:
-    """Return one of the conditions at the nodes of all pieces, (m,)."""
-    return np.concatenate([getattr(piece.nodes, name) for dwell in dwells for piece in dwell.pieces])
-
-
-def _only_scatters(dwells: Sequence[DwellFactor], read: Floats) -> bool:
+def _only_scatters(folded: Folded, read: Floats) -> bool:
     """Tell whether temperatures at the nodes only scatter as a thermometer does in a steady room.
 
     They only scatter if the means of consecutive dwells differ as much as any two means do (von Neumann's ratio near 1)
     and by no more than temperatures within a dwell.
     """
-    means, counts = _means(dwells, read), np.array([3 * len(dwell.pieces) for dwell in dwells])
+    means, counts = _means(folded, read), 3 * folded.piece_numbers
     spread = np.add.reduceat((read - np.repeat(means, counts)) ** 2, np.cumsum(counts) - counts) / counts
     between, within = means.var(), float(spread.mean())
     alike = np.mean(np.diff(means) ** 2) > between  # about 2 var if consecutive means are independent
     return bool(alike and between < 2.0 * within)
 
 
-def _means(dwells: Sequence[DwellFactor], read: Floats) -> Floats:
+def _means(folded: Folded, read: Floats) -> Floats:
     """Return the mean temperature (D,) of the nodes of each dwell."""
-    counts = np.array([3 * len(dwell.pieces) for dwell in dwells])
-    return np.add.reduceat(read, np.cumsum(counts) - counts) / counts
+    return np.add.reduceat(read, 3 * folded.ends[:-1]) / (3 * folded.piece_numbers)
 
 
-def _smooth(dwells: Sequence[DwellFactor], at_s: Floats) -> Course | None:
-    """Return the smooth course at the times ``at_s`` (m,); None where temperatures are taken as they were read."""
-    pieces = [piece.nodes for dwell in dwells for piece in dwell.pieces]
-    ends, levels = np.array([own.elapsed_s for own in pieces]), np.array([own.temperature_c[1] for own in pieces])
-    lengths = ends[:, 2] - ends[:, 0]
-    owners = np.repeat(np.arange(len(dwells)), [len(dwell.pieces) for dwell in dwells])
-    used = lengths > 0.0
+def _smooth(folded: Folded, read: Floats) -> Course | None:
+    """Return the smooth course through temperatures at the nodes (m,); None where they are taken as they were read."""
+    standing, ends, levels = ~folded.moving, folded.elapsed_s.reshape(-1, 3), read.reshape(-1, 3)[:, 1]
+    lengths, owners = ends[:, 2] - ends[:, 0], np.repeat(np.cumsum(standing) - 1, folded.piece_numbers)
+    used = (lengths > 0.0) & np.repeat(standing, folded.piece_numbers)
     ends, levels, lengths, owners = ends[used], levels[used], lengths[used], owners[used]
     if not len(levels) or np.ptp(levels) < _ROUNDING_C:
         return None  # a thermometer that always reads the same
@@ -99,28 +92,27 @@ def _smooth(dwells: Sequence[DwellFactor], at_s: Floats) -> Course | None:
     within, freedom = _within_dwells(ends[:, 1], levels, weights, owners)
     if freedom < _FEWEST:
         return None
-    knots = min(_KNOTS * len(dwells), _MOST_KNOTS)
+    knots = min(_KNOTS * int(standing.sum()), _MOST_KNOTS)
     begin, spacing = ends[0, 0], (ends[-1, 2] - ends[0, 0]) / (knots - 3)
     over_piece = np.einsum("j,njk->nk", _SIMPSON, _bumps((ends - begin) / spacing, knots))
     spline = _Spline.through(over_piece, levels, weights)
     usual_s = float(np.median(np.bincount(owners, lengths)))
     if spline.variance / usual_s < (_QUIET * levels.std()) ** 2 or spline.variance > _STEPS * within:
         return None
-    there = _bumps(np.clip((at_s - begin) / spacing, 0.0, knots - 3), knots)
+    there = _bumps(np.clip((folded.elapsed_s - begin) / spacing, 0.0, knots - 3), knots)
     return Course(levels.mean() + there @ spline.coefficients, _largest(there @ spline.errors))
 
 
 def _within_dwells(middles: Floats, levels: Floats, weights: Floats, owners: NDArray[np.intp]) -> tuple[float, int]:
     """Return the weighted variance of levels about a parabola in each dwell, and its degrees of freedom."""
     squares, freedom = 0.0, 0
-    for number in np.unique(owners):
+    for number in np.flatnonzero(np.bincount(owners) > 3):
         inside = owners == number
-        if inside.sum() > 3:
-            u, root = middles[inside] - middles[inside].mean(), np.sqrt(weights[inside])
-            basis = np.linalg.qr(np.vander(u / np.abs(u).max(), 3) * root[:, None])[0]
-            left = root * (levels[inside] - levels[inside].mean())
-            squares += float(np.sum((left - basis @ (basis.T @ left)) ** 2))
-            freedom += int(inside.sum()) - 3
+        u, root = middles[inside] - middles[inside].mean(), np.sqrt(weights[inside])
+        basis = np.linalg.qr(np.vander(u / np.abs(u).max(), 3) * root[:, None])[0]
+        left = root * (levels[inside] - levels[inside].mean())
+        squares += float(np.sum((left - basis @ (basis.T @ left)) ** 2))
+        freedom += int(inside.sum()) - 3
     return squares / max(freedom, 1), freedom
 
 

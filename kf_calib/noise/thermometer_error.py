@@ -31,7 +31,7 @@ def sensitivity_to_temperature(
     (3,): noise of white readings.
     """
     folded = DwellStack.of(dwells).folded
-    errors_c = temperature_course(folded.dwells).errors_c
+    errors_c = temperature_course(folded).errors_c
     if not errors_c.shape[1]:
         return None
     change = change_mps2_per_k()
@@ -48,7 +48,7 @@ def thermometer_errors(dwells: Sequence[DwellFactor], sensitivity_mps2_per_k: Fl
     """Changes of the readings at the nodes of each dwell by each independent error of the temperature of 1 sigma,
     (pieces, nodes, 3, k)."""
     folded = DwellStack.of(dwells).folded
-    errors_c = temperature_course(folded.dwells).errors_c
+    errors_c = temperature_course(folded).errors_c
     change = (_regressors(dwells) @ sensitivity_mps2_per_k.T)[:, :, None] * errors_c[:, None, :]
     columns = np.zeros((folded.ends[-1], folded.dwells[0].width, 3, errors_c.shape[1]))
     columns[:, :3] = change.reshape(-1, 3, *change.shape[1:])
@@ -59,5 +59,5 @@ def _regressors(dwells: Sequence[DwellFactor]) -> Floats:
     """Return 1, f, T and T f at the nodes of all dwells, (m, 8)."""
     stack = DwellStack.of(dwells)
     regressors = np.hstack([np.ones((len(stack.force_mps2), 1)), stack.force_mps2])
-    warmth = temperature_course(stack.folded.dwells).temperature_c - REFERENCE_TEMPERATURE_C
+    warmth = temperature_course(stack.folded).temperature_c - REFERENCE_TEMPERATURE_C
     return np.hstack([regressors, warmth[:, None] * regressors])

@@ -35,12 +35,17 @@ def with_own_noise(dwells: DwellStack, along: Floats | None = None) -> DwellStac
 
     along (D, 3): the weights of the channels in the size of the force, where nothing else is known in a dwell.
     """
-    if dwells.folded.dwells[0].averaged:
+    folded, free = dwells.folded, np.ones(3)
+    if folded.dwells[0].averaged or not folded.autocovariance.blocks:  # as of a table: no reading is known
         return dwells
-    variances, freedom = _variances(dwells.folded, along)
-    weights = weights_of(variances, freedom)
-    if np.array_equal(weights, dwells.folded.weights):
-        return dwells
+    if np.all(weights_of(*_variances(folded, along, free)) == 1.0):  # equal even if no reading told what the next says
+        weights = np.ones(len(dwells))
+    else:
+        weights = weights_of(*_variances(folded, along, _lost_to_correlation(folded.autocovariance)))
+    return dwells if np.array_equal(weights, folded.weights) else _with_weights(dwells, weights)
+
+
+def _with_weights(dwells: DwellStack, weights: Floats) -> DwellStack:
     return DwellStack.of([dwell.weighted(float(weight)) for dwell, weight in zip(dwells, weights, strict=True)])
 
 
@@ -85,17 +90,12 @@ def _prior(variances: Floats, freedom: Floats) -> tuple[float, float]:
     return float(_SHAPES[best]), float(levels[best, 0])
 
 
-def _variances(folded: Folded, along: Floats | None) -> tuple[Floats, Floats]:
+def _variances(folded: Folded, along: Floats | None, lost: Floats) -> tuple[Floats, Floats]:
     """Return the variances (D,) of the readings of each dwell about their course, relative to those of the run, and
-    their degrees of freedom (D,).
-
-    Autocorrelation makes these fewer (``_lost_to_correlation``).
-    """
-    first, dwells = folded.ends[:-1], folded.dwells
-    widths = np.repeat([float(dwell.width) for dwell in dwells], folded.piece_numbers)
+    their degrees of freedom (D,), of which autocorrelation takes a part: ``lost`` (3,) as ``_lost_to_correlation``."""
+    first = folded.ends[:-1]
+    widths = np.repeat(folded.widths, folded.piece_numbers)
     freedom = np.add.reduceat(np.maximum(folded.piece_counts - widths, 0.0), first)
-    total = sum((dwell.autocovariance for dwell in dwells), Autocovariance())
-    lost = _lost_to_correlation(total)
     if along is not None:
         return folded.squares_along(along) / np.maximum(freedom, 1.0), freedom / lost.mean()
     squares = np.add.reduceat(folded.squares, first)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,7 +35,7 @@ class HandJudgement:
     """
 
     result: Calibration | None
-    dwells: list[DwellFactor]
+    dwells: Sequence[DwellFactor]
     sides: Sides
     wanted: Floats
     looks: int = 0

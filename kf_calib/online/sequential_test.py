@@ -72,16 +72,19 @@ class Watch:
         with one_blas_thread():
             return cls(bench, settings, *_begun(dwells, bench, settings, fitted), looks)._look()
 
-    def after(self, dwell: DwellFactor, fitted: Fit | None = None) -> Watch:
+    def after(
+        self, dwell: DwellFactor, fitted: Fit | None = None, dwells: Sequence[DwellFactor] | None = None
+    ) -> Watch:
         """The sequential test after one more dwell.
 
-        fitted: the model fitted to all dwells, this one included, where it is known.
+        fitted: the model fitted to all dwells, this one included, where it is known. dwells: all of them, where pieces
+        of earlier ones may have been merged since.
         """
         with one_blas_thread():
             running = self.running.after(dwell, exact=False).lean()  # it is built again when a quarter has been added
             if len(running.dwells) < _GROWN * self.fitted_at:
                 return replace(self, running=running)._look()
-            running, fitted_at, tests = _begun(running.dwells, self.bench, self.settings, fitted)
+            running, fitted_at, tests = _begun(dwells or running.dwells, self.bench, self.settings, fitted)
             return replace(self, running=running, fitted_at=fitted_at, tests=tests)._look()
 
     @property

@@ -8,6 +8,7 @@ result may have changed. The final judgement is that of ``diagnose``.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -310,15 +311,15 @@ def judge_so_far(passed: Pass, wanted: Floats, before: Judgement | None = None) 
         return Judgement(result, look, watch, wanted, _course(result, wanted), sigma_before=sigma_before)
 
 
-def _sequential_test(dwells: list[DwellFactor], result: Calibration, watch: Watch | None) -> Watch | None:
+def _sequential_test(dwells: Sequence[DwellFactor], result: Calibration, watch: Watch | None) -> Watch | None:
     """Return the sequential test with all dwells so far, begun again if the model has changed; None if too few."""
     bench, settings = result.bench, result.settings
     if len(dwells) < _least(result):
         return None
     if watch is None or watch.settings.effects != settings.effects:
         return Watch.over(dwells, bench, settings, 0 if watch is None else watch.looks, result.fit)
-    for dwell in dwells[len(watch.dwells) :]:
-        watch = watch.after(dwell, result.fit)
+    for k in range(len(watch.dwells), len(dwells)):
+        watch = watch.after(dwells[k], result.fit, dwells[: k + 1])
     return watch
 
 

@@ -11,12 +11,10 @@ from pathlib import Path
 
 from kf_calib.bench.bench import Bench
 from kf_calib.errors import InputError
-from kf_calib.positioning.command import CommandPositioner
 from kf_calib.positioning.drive import Time, WallTime
-from kf_calib.positioning.hand import HandPositioner
-from kf_calib.positioning.lines import LinePositioner
-from kf_calib.positioning.positioner import Positioner, Watchfulness
+from kf_calib.positioning.positioner import HandPositioner, Positioner, Watchfulness
 from kf_calib.positioning.profile import read_profile
+from kf_calib.positioning.profiled import CommandPositioner, LinePositioner
 from kf_calib.positioning.simulated import DrivenFeed, SimulatedPositioner, SimulatedTime, open_simulated
 from kf_calib.support import file_lock
 

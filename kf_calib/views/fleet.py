@@ -1,4 +1,6 @@
-"""The runs of a fleet as a summary, and as a JSON object."""
+"""The runs of a fleet as a summary, and as a JSON object; how units and chances of a fleet are written in tables and
+figures.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,6 @@ from kf_calib.fleet.overview import FleetOverview
 from kf_calib.fleet.results import Fleet, ParameterPopulation
 from kf_calib.support.units import shown
 from kf_calib.views.console import symbol
-from kf_calib.views.fleet_words import chance_words, short_name
 from kf_calib.views.json import clean
 from kf_calib.views.pooled_diagnosis import pooled_objects, pooled_report
 from kf_calib.views.tables import Table
@@ -103,3 +104,16 @@ def _population_table(populations: Sequence[ParameterPopulation]) -> Table:
         )
         table.add_row(symbol(population.symbol), str(population.runs), *cells, unit.label)
     return table
+
+
+_LEAST = 1e-6
+
+
+def short_name(unit: str) -> str:
+    """The name of a unit; of one that goes by its recording, the name of the file."""
+    return unit.rsplit("/", 1)[-1] if unit.startswith("/") or "://" in unit else unit
+
+
+def chance_words(chance: float) -> str:
+    """A chance, for a reader who asks no more than how small it is."""
+    return f"{chance:.1g}" if chance >= _LEAST else f"< {_LEAST:.0e}"

@@ -191,7 +191,8 @@ def _sigmas(standing: Standing) -> RenderableType:
             table.add_row(symbol(name), "-", unit.label, "not seen yet", "", "", "")
             continue
         aim = wanted[k] if targets else 0.5 * last[k]
-        time = span(left) if left else "reached"
+        # a prediction can be too early: only sigma itself tells that a target is reached, and the bar then says so
+        time = ("" if targets else "reached") if sigma <= aim else span(left) if left else "soon"
         aimed = (unit.number(aim), unit.label, time) if math.isfinite(aim) else ("", "", "")
         table.add_row(symbol(name), unit.number(sigma), unit.label, *aimed, bar(float(sigma), float(wanted[k]), k))
     return table

@@ -35,7 +35,7 @@ def _html(drawn: RenderableType) -> str | None:
     """Return what the console draws as HTML, or None where the package that fills in templates is not installed."""
     if find_spec("jinja2") is None:
         return None
+    from kf_calib.views.report.page import fragment
     from kf_calib.views.report.parts import parts_of
-    from kf_calib.views.report.templates import fragment
 
     return fragment(parts_of(drawn))

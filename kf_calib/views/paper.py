@@ -121,14 +121,9 @@ def table2(experiment: Experiment) -> Table:
     for name in ("optimal set", "non-optimal set"):
         for k, heading in enumerate(("paper", "expected", "batch", "filter")):
             table.add_column(f"{name if k == 0 else ''}\n{heading}", justify="right")
-    for k, name in enumerate(_order()):
+    for k, name in enumerate([name for unit in dict.fromkeys(paper_parameters.UNITS) for name in _of_unit(unit)]):
         table.add_row(symbol(name), *_both(experiment, name), end_section=k in (5, 8))
     return table
-
-
-def _order() -> list[str]:
-    """Return the symbols in the order of the paper: angles, scale factors, biases."""
-    return [name for unit in dict.fromkeys(paper_parameters.UNITS) for name in _of_unit(unit)]
 
 
 def _of_unit(unit: str) -> list[str]:

@@ -1,4 +1,6 @@
-"""A plan of orientations as a report, as a JSON object, and as CSV that a bench or ``simulate --plan`` can run."""
+"""A plan of orientations as a report, as a JSON object, and as CSV that a bench or ``simulate --plan`` can run; and a
+plan of sides to turn up.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +16,8 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.design.orientation_plan import Plan, papers_sigma
+from kf_calib.design.sides import SYMBOLS, HandPlan
+from kf_calib.estimation.free_attitude import up_in_words
 from kf_calib.support.output_files import write_whole
 from kf_calib.support.units import Unit, shown
 from kf_calib.views.console import symbol
@@ -167,3 +171,30 @@ def write_csv(made: Plan, path: Path) -> None:
     header = ",".join(f"gimbal_{name}_deg" for name in gimbal_names(made))
     rows = [",".join(repr(float(angle)) for angle in row) for row in made.gimbal_deg]
     write_whole(path, ("\n".join([header, *rows]) + "\n").encode())
+
+
+_UNITS = dict(zip(paper_parameters.SYMBOLS, paper_parameters.UNITS, strict=True))
+
+
+def hand_plan_report(made: HandPlan) -> RenderableType:
+    """The poses in their order, and the sigmas to expect."""
+    poses = Table(title=f"{len(made.up)} poses to hold still", title_justify="left")
+    for heading in ("pose", "points up", "in words"):
+        poses.add_column(heading, justify="right" if heading == "pose" else "left")
+    for k, up in enumerate(made.up, 1):
+        poses.add_row(str(k), up, up_in_words(up))
+    sigmas = Table(title="Predicted sigma (1σ)", title_justify="left")
+    for heading in ("parameter", "sigma", "unit"):
+        sigmas.add_column(heading, justify="right" if heading == "sigma" else "left")
+    for name, sigma in zip(SYMBOLS, made.sigma[-1], strict=True):
+        unit = shown(_UNITS[name])
+        sigmas.add_row(symbol(name), f"± {unit.number(sigma, 2)}", unit.label)
+    near = "a pose need not be exact: within some ten degrees of it will do."
+    return Group(poses, sigmas, note(near))
+
+
+def hand_plan_object(made: HandPlan) -> dict[str, Any]:
+    """The JSON object of ``plan --no-angles``; sigmas in SI."""
+    before, after = (dict(zip(SYMBOLS, made.sigma[k], strict=True)) for k in (0, -1))
+    return clean({"axes": None, "count": len(made.up), "gimbal_deg": None, "up": made.up, "sigma": after,
+                  "sigma_before": before})  # fmt: skip

@@ -9,7 +9,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from kf_calib.diagnosis.verdict import format_probability
-from kf_calib.fleet.pooled_diagnosis import BenchCoefficients, EffectRow, Finding, PooledDiagnosis, PooledEstimate
+from kf_calib.fleet.pooled_diagnosis import EffectRow, Finding, PooledDiagnosis, PooledEstimate
 from kf_calib.fleet.pooled_terms import Attribution
 from kf_calib.support.units import shown
 from kf_calib.views.console import symbol
@@ -92,6 +92,8 @@ def _sentence(finding: Finding) -> str:
     share = format_probability(chance)
     if finding.attribution is Attribution.RUN:
         sentence = f"{finding.effect} occurs in single runs, in each by another amount ({share})"
+        beyond_doubt = [each.unit for each in finding.units if each.is_seen]
+        sentence += f": {_listed(beyond_doubt)}" if beyond_doubt else ""
     else:
         sentence = f"{finding.effect} is {_OF[finding.attribution]} ({share})"
     if finding.attribution is Attribution.SOME and finding.share_interval is not None:
@@ -133,7 +135,8 @@ def _coefficients(finding: Finding) -> Table:
     for heading in ("of", "coefficient", "value", "sigma", "unit"):
         table.add_column(heading, justify="right" if heading in ("value", "sigma") else "left")
     for bench in finding.benches:
-        _add(table, _when(bench), bench.coefficients)
+        name = bench.bench or "the bench"
+        _add(table, f"{name}, since {_moment(bench.since)}" if bench.since else name, bench.coefficients)
     if not finding.benches and finding.population is None:
         for unit_figures in finding.units:
             if unit_figures.probability > _HAS_IT:
@@ -146,11 +149,6 @@ def _coefficients(finding: Finding) -> Table:
             "spread", "", shown(unit).number(finding.population.spread), f"{low} to {high}", shown(unit).label
         )
     return table
-
-
-def _when(bench: BenchCoefficients) -> str:
-    name = bench.bench or "the bench"
-    return f"{name}, since {_moment(bench.since)}" if bench.since else name
 
 
 def _moment(date: str) -> str:

@@ -11,7 +11,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from kf_calib.sources.tables.survey import ColumnFound, RowFound, Survey
+from kf_calib.sources.tables.survey import ColumnFound, Survey
 from kf_calib.support.plain_text import cut
 from kf_calib.views.json import clean
 from kf_calib.views.overview import pose_text, up_text
@@ -50,14 +50,11 @@ def table_object(overview: TableOverview) -> dict[str, Any]:
             "recording": str(survey.path), "format": "table", "files": [str(survey.path)],
             "bytes": survey.path.stat().st_size, "topics": [], "columns": [vars(column) for column in survey.columns],
             "orientation": survey.orientation or None, "bench": overview.bench,
-            "dwells": [_row_object(row) for row in survey.rows], "missing": overview.missing,
+            "dwells": [vars(row) | {"pose": list(row.pose), "up": list(row.up)} for row in survey.rows],
+            "missing": overview.missing,
             "command": overview.command, "warnings": survey.warnings,
         }
     )  # fmt: skip
-
-
-def _row_object(row: RowFound) -> dict[str, Any]:
-    return vars(row) | {"pose": list(row.pose), "up": list(row.up)}
 
 
 def table_report(overview: TableOverview) -> RenderableType:
@@ -115,17 +112,14 @@ def _quantity(meaning: str) -> str:
     return f"{_QUANTITIES[name]}{' ' * bool(number)}{number}"
 
 
-def _orientation(row: RowFound) -> str:
-    return row.face or pose_text(row.pose) or up_text(row.up)
-
-
 def _row_table(survey: Survey) -> Table:
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
     for heading in ("dwell", "row", "at s", _ORIENTATIONS[survey.orientation], "norm m/s^2", "readings", "°C"):
         table.add_column(heading, justify="right")
     for row in survey.rows[:_SHOWN]:
         table.add_row(
-            str(row.number), str(row.row), f"{row.at_s:g}", _orientation(row), f"{row.norm_mps2:.4f}",
+            str(row.number), str(row.row), f"{row.at_s:g}", row.face or pose_text(row.pose) or up_text(row.up),
+            f"{row.norm_mps2:.4f}",
             "" if row.readings is None else str(row.readings),
             "" if math.isnan(row.temperature_c) else f"{row.temperature_c:.2f}",
         )  # fmt: skip

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from kf_calib.cli.error_report import without_values
+from kf_calib.cli.failures import without_values
 
 RECORDING = Path(__file__).resolve().parents[2] / "recordings" / "hidden.mcap"
 SECRET = "turbine-9"

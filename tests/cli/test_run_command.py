@@ -77,7 +77,8 @@ def test_a_full_disk_stops_the_table(tmp_path: Path) -> None:
     recording = tmp_path / "run.mcap"
     words = ["run", "--positioner", SIM, "--record", str(recording), "--target", "K=0.01ppm", "--json"]
     with full_disk(20_000):
-        done = subprocess.run([sys.executable, "-m", "kf_calib.cli", *words], capture_output=True, text=True)
+        start = [sys.executable, "-m", "kf_calib.cli", *words]
+        done = subprocess.run(start, capture_output=True, text=True, timeout=120)
     assert done.returncode == 2, done.stderr
     assert "nothing can be recorded any more" in done.stderr and "The table was stopped" in done.stderr
     assert sum(len(batch.accel) for batch in kf_calib.open_recording(recording)) > 0

@@ -11,7 +11,7 @@ from helpers.paths import RECORDINGS
 from helpers.synthetic import G
 
 from kf_calib.bench.bench import Bench
-from kf_calib.design.hand_poses import SYMBOLS, HandPlan
+from kf_calib.design.sides import SYMBOLS, HandPlan
 from kf_calib.estimation.free_attitude import DIRECTIONS
 from kf_calib.estimation.measurement_model import Model
 

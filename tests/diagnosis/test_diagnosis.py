@@ -24,7 +24,8 @@ from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.effects import effect_named
 from kf_calib.estimation.calibration import calibrate
-from kf_calib.estimation.score_test import Candidate, Scan, scan
+from kf_calib.estimation.candidate_scan import Candidate, Scan
+from kf_calib.estimation.score_test import scan
 from kf_calib.sources.simulation.visit_plans import six_faces
 
 HAND = SHARED / "ferraris_hand.mcap"

@@ -11,9 +11,8 @@ from helpers.long_runs import slow
 from helpers.paths import REAL
 
 import kf_calib
-from kf_calib.diagnosis.earned_name import SEEN, unearned
 from kf_calib.diagnosis.hypothesis_table import Hypothesis
-from kf_calib.diagnosis.missing_effect import diagnose
+from kf_calib.diagnosis.missing_effect import SEEN, diagnose, unearned
 from kf_calib.effects import walk_named
 
 
@@ -44,9 +43,9 @@ def _result(ratio: float | None, held_out: float | None, walk_gain: float = 0.0,
         (3.1, (1.0, 0.9), ""),
         (2.9, (1.0, 0.9), "no coefficient of bent is beyond 3 sigma"),
         (None, (1.0, 0.9), "no coefficient of bent is beyond 3 sigma"),
-        (5.0, (1.0, 1.25), "it makes the held-out error larger by 25%"),
+        (5.0, (1.0, 1.25), "it makes the held-out error 1.25 times as large"),
         (5.0, (1.0, 1.01), ""),  # what shows within dwells alone
-        (5.0, (1.0, 1.06), "it makes the held-out error larger by 6%"),
+        (5.0, (1.0, 1.06), "it makes the held-out error 1.06 times as large"),
         (5.0, (None, 1.25), ""),
     ],
 )

@@ -13,10 +13,10 @@ from unknown_trials.small_bench import WHITE_MPS2, SmallRun, hidden_run, visits
 
 import kf_calib
 from kf_calib.diagnosis.evidence import MarginalLikelihood
+from kf_calib.diagnosis.hypotheses import log_odds_of_repeating
 from kf_calib.diagnosis.hypothesis_table import IRREGULAR, NOISE
-from kf_calib.diagnosis.repeated_orientations import log_odds_of_repeating
 from kf_calib.diagnosis.results import Diagnosis
-from kf_calib.diagnosis.two_drivers import bases
+from kf_calib.diagnosis.unknown_effect import bases_of_pairs
 from kf_calib.estimation.cross_validation import orientations
 from kf_calib.estimation.dwell_columns import stimulus_of
 
@@ -41,8 +41,8 @@ def test_what_depends_on_two_drivers_or_on_the_past_is_unknown_and_goes_with_the
 
 @pytest.mark.parametrize("gimbals", [0, 3])
 def test_pairs_of_drivers_have_terms_that_are_all_different(gimbals: int) -> None:
-    every = [term for _, terms in bases(gimbals) for term in terms]
-    assert len(every) == len(set(every)) and len(dict(bases(gimbals))) == 3 + 2 * gimbals
+    every = [term for _, terms in bases_of_pairs(gimbals) for term in terms]
+    assert len(every) == len(set(every)) and len(dict(bases_of_pairs(gimbals))) == 3 + 2 * gimbals
 
 
 def test_a_play_follows_where_it_is_pushed() -> None:

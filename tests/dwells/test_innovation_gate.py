@@ -28,10 +28,8 @@ def test_outliers_are_rejected_counted_and_harmless(share: float) -> None:
     shift = np.abs(other.estimate.parameters - one.estimate.parameters) / one.estimate.sigma
     assert shift.max() < 2.5
     spoiled = calibrate(dirty, Settings(gate_sigma=None))
-    weights, spoilt = (
-        np.array([dwell.weight for dwell in spoiled.fit.dwells]),
-        hit.reshape(-1, 300)[:, 20:288].any(axis=1),
-    )
+    weights = np.array([dwell.weight for dwell in spoiled.fit.dwells])
+    spoilt = hit.reshape(-1, 300)[:, 20:288].any(axis=1)
     if spoilt.all():
         assert np.median(spoiled.estimate.sigma / one.estimate.sigma) > 2
     else:  # dwells that were not hit keep their noise, and the others count less
@@ -47,13 +45,13 @@ def test_an_orientation_that_disagrees_is_kept_as_evidence() -> None:
 
 
 def test_varying_columns_are_fitted_before_judging() -> None:
-    from kf_calib.dwells import innovation_gate
+    from kf_calib.dwells import rows
 
     rng = np.random.default_rng(4)
     turning = np.linspace(0, 0.2, 500)
     columns = np.column_stack([np.ones(500), np.sin(turning), np.cos(turning), np.zeros(500)])
     values = columns @ rng.normal(size=(4, 3)) * 10 + rng.normal(size=(500, 3)) * 1e-4
     values[77] += 0.01
-    innovation = innovation_gate.innovations(columns, values, static=False)
-    keep = innovation_gate.inliers(columns, values, innovation, False, 6.0)
+    innovation = rows.innovations(columns, values, static=False)
+    keep = rows.inliers(columns, values, innovation, False, 6.0)
     assert keep is not None and list(np.flatnonzero(~keep)) == [77]

@@ -1,4 +1,4 @@
-"""Merged pieces are those that the same readings give at once, and a dwell of hours has a bounded number of them."""
+"""Merged pieces are those that the same readings give at once; dwells of hours and runs of days have few of them."""
 
 from __future__ import annotations
 
@@ -6,12 +6,20 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from helpers.hidden_effects import BENCH
+from helpers.synthetic import plan_of
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.dwells import walk_path
-from kf_calib.dwells.pieces import MOST_PIECES, Piece, coarsened, merged_piece
+from kf_calib.dwells import folding, walk_path
+from kf_calib.dwells.pieces import FEWEST_PIECES, MOST_PIECES, Piece, coarsened, merged_piece
 from kf_calib.dwells.qr import triangle
 from kf_calib.dwells.rows import Nodes, basis
+from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.results import Calibration
+from kf_calib.sources.simulation.noise_processes import TrueNoise
+from kf_calib.sources.simulation.sensors import GRADES
+from kf_calib.sources.simulation.simulator import Simulation
 
 
 def piece_of(time_s: Floats, readings: Floats, arrival_s: float = 0.0, carrier_hz: float = 0.0) -> Piece:
@@ -62,6 +70,39 @@ def test_a_dwell_of_days_has_a_bounded_number_of_pieces() -> None:
     assert sum(piece.count for piece in kept) == total and (np.diff(begins) > 0.0).all()
     assert lengths[0] < 20.0 and (lengths[1:] <= np.maximum(begins[1:], 20.0)).all()
     assert lengths.max() < 72.0 * 3600.0 / 32.0
+
+
+def test_a_run_of_days_has_a_bounded_number_of_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Long dwells lose half of theirs again and again, short ones none; no reading is lost."""
+    monkeypatch.setattr(folding, "MOST_RUN_PIECES", 300)
+    long, short = list(standing(hours=0.4)), list(standing(hours=0.05))
+    dwells, numbers = folding._DwellSequence(), list[int]()
+    for number in range(1, 61):
+        for piece in long if number % 2 else short:
+            dwells.add(DwellFactor(number, (piece,)))
+        numbers.append(sum(len(dwell.pieces) for dwell in dwells.folded))
+    counts = [len(dwell.pieces) for dwell in dwells.folded]
+    assert max(counts[:48:2]) <= FEWEST_PIECES and set(counts[1::2]) == {len(short)} and max(numbers) < 30 * 29
+    assert [dwell.count for dwell in dwells.folded[:2]] == [sum(piece.count for piece in own) for own in (long, short)]
+
+
+def test_fewer_pieces_tell_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a bench with 1/f noise whose temperature swings: parameters, sigmas and p-value."""
+    results = list[Calibration]()
+    for most in (10_000, 50):
+        monkeypatch.setattr(folding, "MOST_RUN_PIECES", most)
+        noise = TrueNoise(white_mps2=1e-4, flicker_mps2=3e-6)
+        plan = plan_of(14, dwell_s=1200.0, seed=2)
+        results.append(
+            calibrate(Simulation(BENCH, GRADES["navigation"].sensors(2), noise, plan, sample_hz=1.0, seed=2))
+        )
+    whole, merged = results
+    assert sum(len(dwell.pieces) for dwell in merged.fit.dwells) < 0.8 * sum(
+        len(dwell.pieces) for dwell in whole.fit.dwells
+    )
+    assert np.abs((merged.estimate.parameters - whole.estimate.parameters) / whole.estimate.sigma).max() < 0.01
+    np.testing.assert_allclose(merged.estimate.sigma, whole.estimate.sigma, rtol=0.01)
+    assert merged.consistency.p_value == pytest.approx(whole.consistency.p_value, abs=0.01)
 
 
 def test_moments_of_a_walk_over_many_readings_are_those_that_it_has(monkeypatch: pytest.MonkeyPatch) -> None:

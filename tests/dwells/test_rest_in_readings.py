@@ -7,13 +7,15 @@ from functools import cache
 from itertools import pairwise
 
 import numpy as np
+import pytest
 from helpers.paths import RECORDINGS
+from scipy import stats
 
 import kf_calib
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.dwells.blocks import Block, Tally
-from kf_calib.dwells.rest_in_readings import RestSegmenter
+from kf_calib.dwells.rest_in_readings import RestSegmenter, _chi_squared
 
 BENCH = Bench((), 9.81, angles=False)
 
@@ -85,3 +87,10 @@ def test_one_outlier_does_not_end_a_rest_and_noise_of_a_loud_start_is_unlearnt()
     quiet = [block for block in blocks if block.elapsed_s[0] > 30.0]
     assert len({block.dwell for block in quiet}) == 1
     assert quiet[0].elapsed_s[0] < 32.0 and quiet[-1].elapsed_s[-1] > 49.0
+
+
+@pytest.mark.parametrize("freedom", [3, 12, 60, 300])
+def test_the_bounds_of_a_variance_are_those_of_chi_squared(freedom: int) -> None:
+    for normal in (-0.674, 0.0, 2.0):
+        exact = stats.chi2.ppf(stats.norm.cdf(normal), freedom) / freedom
+        assert _chi_squared(normal, freedom) == pytest.approx(exact, rel=0.03)

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from helpers.by_hand import by_hand
 from helpers.synthetic import Run
 
+from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.bench.streams import Source
 from kf_calib.dwells.piece_values import OfPieces, of_all_pieces
-from kf_calib.dwells.stack import Attitudes, DwellStack
+from kf_calib.dwells.stack import Attitudes, DwellStack, Folded
 from kf_calib.dwells.sufficient_statistics import DwellFactor, dwells_before, dwells_without
+from kf_calib.dwells.tabulated import dwells_of
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.settings import Settings
+from kf_calib.sources.tables.orientation import Orientations
 
 SOURCES = {"angles": Run(seed=3, dwells=7), "noisy_angles": Run(seed=4, dwells=6, count=700, encoder_deg=0.001)}
 
@@ -91,3 +96,41 @@ def test_columns_by_piece_are_a_sequence_by_dwell() -> None:
     np.testing.assert_array_equal(of_all_pieces(columns[0:2]), values)
     np.testing.assert_array_equal(columns.beside(columns).values[..., 2:], values)
     np.testing.assert_array_equal(columns.first(1).values, values[..., :1])
+
+
+def table_of(count: int) -> Orientations:
+    """A table of angles, in which one row has no standard deviation."""
+    rng = np.random.default_rng(count)
+    sigmas = rng.uniform(1e-4, 2e-4, (count, 3))
+    sigmas[1] = np.nan
+    return Orientations(
+        rng.normal(size=(count, 3)), rng.uniform(-3.0, 3.0, (count, 2)), np.cumsum(rng.uniform(30.0, 60.0, count)),
+        sigmas, rng.integers(4, 500, count), rng.normal(25.0, 1.0, count),
+    )  # fmt: skip
+
+
+def test_the_arrays_of_a_table_are_those_of_its_dwells() -> None:
+    of_table = dwells_of(table_of(7), Bench(axes_of("yz"), 9.81)).folded
+    one_by_one = Folded(list(of_table.dwells))
+    for name in ("piece_numbers", "ends", "widths", "moving", "pose_sigmas_rad", "piece_counts", "reading_counts",
+                 "counts", "squares", "elapsed_s", "ends_s", "force_mps2", "pose", "before"):  # fmt: skip
+        np.testing.assert_array_equal(getattr(of_table, name), getattr(one_by_one, name), name)
+    for name in ("since_arrival_s", "temperature_c"):
+        np.testing.assert_array_equal(of_table.of_nodes(name), one_by_one.of_nodes(name))
+    np.testing.assert_array_equal(of_table.rates("rate_radps"), one_by_one.rates("rate_radps"))
+    np.testing.assert_array_equal(of_table.triangles[0], one_by_one.triangles[0])
+    np.testing.assert_allclose(of_table.spreads, one_by_one.spreads, rtol=1e-6, atol=1e-12)
+    np.testing.assert_array_equal(of_table.shaking[0], one_by_one.shaking[0])
+    assert of_table.came_from == one_by_one.came_from == {} and of_table.autocovariance.count == 0
+    assert of_table.shows_means_only and one_by_one.shows_means_only
+    assert not Folded(folded(SOURCES["angles"])).shows_means_only
+
+
+def test_a_row_of_a_table_takes_no_more_than_its_numbers() -> None:
+    """A dwell as an object would take 1.5 kB."""
+    table, bench = table_of(4000), Bench(axes_of("yz"), 9.81)
+    tracemalloc.start()
+    stack = dwells_of(table, bench)
+    used = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert used < 700 * len(stack) and len(list(stack.folded.dwells[:3])) == 3

@@ -25,11 +25,12 @@ from kf_calib.estimation.calibration import calibrate, evaluate
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.engine_comparison import compare
+from kf_calib.estimation.estimate import Estimate
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.iterated_fit import fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.prior import PRIORS
-from kf_calib.estimation.results import Calibration, Estimate
+from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
 from kf_calib.noise.noise_model import Noise as NoiseModel
 from kf_calib.noise.noise_model import within_dwells
@@ -198,7 +199,7 @@ def test_vibration_rectification_is_found_at_the_size_white_noise_allows() -> No
         for (value, sigma), truth in zip(values(result).values(), source.hidden[0].sizes, strict=True):
             assert abs(value - truth) < 4.0 * sigma < 1.6e-6
         assert result.consistency.p_value > 1e-3 and result.noise.effective_sigma_mps2.max() < 2e-5
-        assert bare.noise.effective_sigma_mps2.min() > 1.0  # where the readings themselves are folded
+        assert bare.noise.effective_sigma_mps2.min() > 0.5  # folded as they are, the quiet dwells most
 
 
 def test_windows_are_as_long_as_the_vibration_that_is_seen_needs() -> None:

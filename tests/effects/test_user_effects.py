@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.metadata
 import json
 import re
 import sys
 import tomllib
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -60,11 +58,8 @@ class Bend(SensorEffect):
 
 
 @pytest.fixture(autouse=True)
-def nothing_registered(monkeypatch: pytest.MonkeyPatch):
+def nothing_registered(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(effects, "_registered", {})
-    effects._register_installed.cache_clear()
-    yield
-    effects._register_installed.cache_clear()
 
 
 def made(expression: str, bench: Bench = BENCH) -> Formula:
@@ -365,30 +360,6 @@ def test_the_catalogue_passes_the_checks(name: str) -> None:
     checks.check_effect(effect)
     if isinstance(effect, FrameEffect):
         assert checks.trial(BENCH).force_mps2.shape == (300, 3)
-
-
-def installed(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
-    point = importlib.metadata.EntryPoint("bend", value, "kf_calib.effects")
-    monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: [point] if group == point.group else [])
-    module = ModuleType("bending")
-    exec(TEN_LINES, vars(module))
-    monkeypatch.setitem(sys.modules, "bending", module)
-
-
-@pytest.mark.parametrize("value", ["bending:Bend", "bending"])
-def test_effects_of_installed_packages(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
-    installed(monkeypatch, value)
-    assert "bend" in names(BENCH) and str(effect_named("bend", BENCH)) == "bend"
-
-
-@pytest.mark.parametrize(
-    "value, says", [("missing_package:Bend", "ModuleNotFoundError"), ("json:loads", "is no effect class")]
-)
-def test_broken_packages_are_one_sentence(monkeypatch: pytest.MonkeyPatch, value: str, says: str) -> None:
-    installed(monkeypatch, value)
-    with pytest.raises(InputError, match=f"entry point bend = {value} of kf_calib.effects: .*{says}"):
-        names(BENCH)
-    assert str(effect_named("second-order", BENCH)) == "second-order"  # what needs no package works on
 
 
 # The command line and model files

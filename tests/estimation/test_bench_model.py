@@ -15,7 +15,7 @@ from kf_calib.errors import InputError
 from kf_calib.estimation import bench_model
 from kf_calib.estimation.bench_model import BenchModel, BenchTerm
 from kf_calib.estimation.calibration import calibrate
-from kf_calib.estimation.results import Estimate
+from kf_calib.estimation.estimate import Estimate
 from kf_calib.estimation.settings import Settings
 from kf_calib.sources.simulation.options import simulation
 

@@ -8,7 +8,7 @@ from helpers.paths import ROOT
 
 from kf_calib.bench import paper_parameters
 from kf_calib.estimation.calibration import calibrate
-from kf_calib.estimation.correlation import correlation
+from kf_calib.estimation.estimate import correlation
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
 from kf_calib.sources.files.recording import Recording

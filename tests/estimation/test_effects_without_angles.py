@@ -20,22 +20,11 @@ from kf_calib.errors import UnobservableError
 from kf_calib.estimation.calibration import evaluate
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
+from kf_calib.sources.tables.orientation import Orientations
 from kf_calib.support.threads import one_blas_thread
 
 G, POSES, COUNT, SIGMA_MPS2 = 9.81, 36, 400, 2e-4
 BENCH = Bench((), G, angles=False, scatter_sigma_mps2=0.0, nominal={"theta1": 0.0, "theta3": 0.0})
-
-
-@dataclass
-class Mean:
-    """A pose of a table without angles."""
-
-    mean_mps2: np.ndarray
-    elapsed_s: float
-    temperature_c: float
-    pose: np.ndarray
-    sigma_mps2: np.ndarray
-    count: int = COUNT
 
 
 @dataclass
@@ -88,11 +77,9 @@ def calibrated(name: str, seed: int) -> tuple[Calibration, np.ndarray]:
     means = force @ lower.T + rng.normal(size=3) * 0.1 + added(felt) * truth
     means += rng.normal(size=means.shape) * SIGMA_MPS2
     white = SIGMA_MPS2 * np.sqrt(COUNT)
-    table = [
-        Mean(mean, time_s[k], 25.0 + warmth_k[k], np.array([0.0, 0.0, 0.0, 1.0]),
-             white * np.sqrt(rng.chisquare(COUNT - 3, 3) / (COUNT - 3)))
-        for k, mean in enumerate(means)
-    ]  # fmt: skip
+    sigmas = white * np.sqrt(rng.chisquare(COUNT - 3, means.shape) / (COUNT - 3))
+    unknown = np.tile([0.0, 0.0, 0.0, 1.0], (POSES, 1))
+    table = Orientations(means, unknown, time_s, sigmas, np.full(POSES, COUNT), 25.0 + warmth_k)
     with one_blas_thread():
         return evaluate(dwells_of(table, BENCH), BENCH, Settings(effects=(name,))), truth
 

@@ -10,7 +10,7 @@ from helpers.paths import ROOT
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.estimation.calibration import calibrate
-from kf_calib.estimation.information_share import prior_estimate, shares_of
+from kf_calib.estimation.parameter_history import prior_estimate, shares_of
 from kf_calib.estimation.prior import PRIORS
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings

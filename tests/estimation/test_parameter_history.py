@@ -9,11 +9,10 @@ from helpers.synthetic import Run
 from scipy.stats import chi2
 
 import kf_calib
-from kf_calib.estimation.batch_least_squares import least_squares, running_states
 from kf_calib.estimation.calibration import calibrate
-from kf_calib.estimation.correlation import correlation
 from kf_calib.estimation.dwell_pass import Pass
-from kf_calib.estimation.engine_comparison import compare
+from kf_calib.estimation.engine_comparison import compare, least_squares, running_states
+from kf_calib.estimation.estimate import correlation
 from kf_calib.estimation.innovation_tests import InnovationTests, innovation_tests, reading_correlation
 from kf_calib.estimation.parameter_history import history_of
 from kf_calib.estimation.prior import PRIORS

@@ -21,22 +21,11 @@ from kf_calib.estimation.calibration import calibrate, evaluate
 from kf_calib.estimation.engine_comparison import compare
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
+from kf_calib.sources.tables.orientation import Orientations
 from kf_calib.support.threads import one_blas_thread
 
 COUNT = 1000
 DWELLS = 24
-
-
-@dataclass
-class Mean:
-    """A dwell of a table: its mean reading, standard deviation and count."""
-
-    mean_mps2: np.ndarray
-    pose: np.ndarray
-    elapsed_s: float
-    sigma_mps2: np.ndarray
-    count: int = COUNT
-    temperature_c: float = np.nan
 
 
 @dataclass
@@ -64,10 +53,11 @@ class Trial:
         self.deviations = white * np.sqrt(rng.chisquare(COUNT - 3, (DWELLS, 3)) / (COUNT - 3))
 
     def evaluated(self) -> Calibration:
-        table = [
-            Mean(mean, pose, 60.0 * k, deviation)
-            for k, (mean, pose, deviation) in enumerate(zip(self.means, self.poses, self.deviations, strict=True))
-        ]
+        count = len(self.means)
+        table = Orientations(
+            self.means, self.poses, 60.0 * np.arange(count), self.deviations, np.full(count, COUNT),
+            np.full(count, np.nan),
+        )  # fmt: skip
         with one_blas_thread():
             return evaluate(dwells_of(table, self.bench), self.bench, Settings())
 

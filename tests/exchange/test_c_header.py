@@ -58,7 +58,7 @@ def compiled_together(texts: Sequence[str], folder: Path) -> list[Formula]:
         "shim.so",
         *(["-lm"] if any("math.h" in text for text in texts) else []),
     ]
-    done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     library = ctypes.CDLL(str(folder / "shim.so"))
     return [partial(_corrected, getattr(library, f"all_{k}")) for k in range(len(texts))]

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import copy
+import io
 import json
 import math
 import re
-import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,10 @@ from helpers.calibrations import SENSORS, simulated
 from helpers.paths import ROOT
 
 import kf_calib
+from kf_calib import effects
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.bench import Bench
+from kf_calib.cli import main
 from kf_calib.errors import InputError
 from kf_calib.exchange import calibration_file
 from kf_calib.sources.simulation.noise_processes import TrueNoise
@@ -117,12 +120,17 @@ def test_programs_are_run_only_where_allowed(tmp_path: Path) -> None:
 
 
 def _called(folder: Path, *words: object) -> tuple[int, str, str]:
-    """In a process of its own, which knows no effect yet."""
-    done = subprocess.run(
-        [sys.executable, "-m", "kf_calib", *map(str, words)], cwd=folder, capture_output=True, text=True,
-        env={"PYTHONPATH": str(ROOT), "PATH": "", "OPENBLAS_NUM_THREADS": "1"},
-    )  # fmt: skip
-    return done.returncode, done.stdout, done.stderr
+    """The command line in a folder, where no effect of a user's is known yet."""
+    out, err = io.StringIO(), io.StringIO()
+    with (
+        pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err),
+        pytest.raises(SystemExit) as ended,
+    ):  # fmt: skip
+        patch.setattr(effects, "_registered", {})
+        patch.setattr(sys, "argv", ["kf-calib", *map(str, words)])
+        patch.chdir(folder)
+        main()
+    return int(ended.value.code or 0), out.getvalue(), err.getvalue()
 
 
 def put(*path: str | int, value: object) -> Callable[[dict[str, Any]], None]:

@@ -154,7 +154,7 @@ def test_the_pdf_has_every_number_and_the_xml(cal: Path, lab: Path, tmp_path: Pa
     pages = text.count("Certificate no. 2026-0147")
     assert pages > 1 and all(f"Page {k} of {pages}" in text for k in range(1, pages + 1))
     if shutil.which("pdfdetach"):
-        subprocess.run(["pdfdetach", "-saveall", "-o", tmp_path, tmp_path / "made.pdf"], check=True)
+        subprocess.run(["pdfdetach", "-saveall", "-o", tmp_path, tmp_path / "made.pdf"], check=True, timeout=120)
         assert (tmp_path / document.ATTACHED).read_bytes() == xml
 
 
@@ -175,7 +175,7 @@ def test_a_sensitivity_is_shown_with_three_digits_at_least(cal: Path, lab: Path,
 def text_of(pdf: bytes, folder: Path) -> str:
     (folder / "made.pdf").write_bytes(pdf)
     command = ["pdftotext", "-layout", folder / "made.pdf", "-"]
-    done = subprocess.run(command, capture_output=True, check=True)
+    done = subprocess.run(command, capture_output=True, check=True, timeout=120)
     return " ".join(done.stdout.decode().split())
 
 

@@ -6,20 +6,20 @@ Accelerometers 1, 2, 3 are wired to channels 3, 2 reversed, and 1. A count is 3.
 from __future__ import annotations
 
 import json
-import os
 import re
 import socket
-import subprocess
-import sys
 import threading
+from contextlib import chdir
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from exchange.test_c_header import compiled, compiled_only
 from exchange.test_raw_input import forces_in_csv
 
+from kf_calib.cli import cli
 from kf_calib.sources.live import frames
 
 GRAVITY_MPS2, COUNT_MPS2, NOISE_MPS2 = 9.8123, 3.9e-6 * 9.80665, 2e-4
@@ -107,13 +107,11 @@ def served(content: bytes) -> str:
 
 
 def called(folder: Path, *words: str, given: bytes | None = None) -> str:
-    """What the program prints, in a process of its own."""
-    done = subprocess.run(
-        [sys.executable, "-m", "kf_calib", *words], cwd=folder, capture_output=True, input=given, timeout=120,
-        env={**os.environ, "COLUMNS": "200"},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr.decode()
-    return done.stdout.decode()
+    """What the program prints in that folder, in this process: many starts take long."""
+    with chdir(folder):
+        done = CliRunner(env={"COLUMNS": "200"}).invoke(cli, words, input=given)
+    assert done.exit_code == 0, f"{words}: {done.output} {done.exception}"
+    return done.stdout
 
 
 def recorded_by_options(folder: Path, run: Run) -> None:

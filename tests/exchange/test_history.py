@@ -16,7 +16,7 @@ import kf_calib
 from kf_calib.errors import InputError
 from kf_calib.exchange import calibration_file
 from kf_calib.exchange.calibration_file import SavedCalibration
-from kf_calib.exchange.history import ParameterTrack, history
+from kf_calib.exchange.history import ParameterTrack, _filtered, _pairs, history
 
 REPETITIONS = 200
 START = datetime(2024, 1, 1, tzinfo=UTC)
@@ -82,6 +82,18 @@ def test_each_calibration_is_predicted_by_those_before_it() -> None:
     scores = np.array([(each.values - each.predicted) / each.predicted_sigma for each in found])
     assert np.isnan(scores[:, :2]).all() and np.isfinite(scores[:, 2:]).all()
     assert np.mean(np.abs(scores[:, 2:]) < 1.96) > 0.93 and scores[:, 2:].std() > 0.4
+
+
+def test_the_variance_of_a_prediction_is_that_of_a_mixture_of_all_walks_and_repeatabilities() -> None:
+    """E[v + m^2] - E[m]^2 over the pairs, by their probabilities."""
+    own, sigmas = track(10, 1e-6, 1e-6, 4e-6, 1e-6, 3)[0], np.full(10, 1e-6)
+    values, days = own.values - 1.0, 30.0 * np.arange(10)  # less one: m^2 must not drown the variance in rounding
+    of_pairs = _filtered(values, sigmas, days, *_pairs(values, sigmas, days, True), True)
+    mean = of_pairs.weights @ of_pairs.predicted
+    variance = of_pairs.weights @ (of_pairs.predicted_variances + of_pairs.predicted**2) - mean**2
+    assert own.predicted_sigma[2:] == pytest.approx(np.sqrt(variance)[2:], rel=1e-5)
+    within = of_pairs.weights @ of_pairs.predicted_variances
+    assert (variance[2:] > (1.0 + 1e-4) * within[2:]).any()  # else the mixture would not show
 
 
 def test_the_sigma_to_come_is_the_closed_form() -> None:

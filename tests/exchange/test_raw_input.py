@@ -20,6 +20,7 @@ import pytest
 from exchange.test_c_header import compiled_only, compiled_together
 from exchange.test_exports import READERS, ROUNDING
 from helpers.altered import short_run
+from helpers.long_runs import slow
 from helpers.stated_sensors import correction, samples, saved
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
@@ -38,6 +39,9 @@ ORDERS = [
     for signs in itertools.product((1, -1), repeat=3)
 ]
 SCALES = [1e-9, 2.5e-7, 3.9e-6, 1 / 16384, 1e-3, 0.061, 1.0, 1.7, 42.0, 1e5]
+WIRINGS = {"in turn": list(zip(ORDERS, itertools.cycle(SCALES), strict=False)),
+           "every": list(itertools.product(ORDERS, SCALES))}  # fmt: skip
+"""All 48 orders of channels with the ten sizes in turn, and all 480 pairs of them."""
 
 
 def devices() -> Iterator[tuple[str, RawInput]]:
@@ -61,8 +65,9 @@ def test_a_raw_input_is_its_matrix_and_can_be_undone(channels: Any) -> None:
         assert RawInput.from_metadata(own.to_metadata()) == own
 
 
+@pytest.mark.parametrize("wirings", ["in turn", *slow("every")])
 @pytest.mark.parametrize("to", READERS)
-def test_every_program_takes_raw_readings_of_any_wiring_and_size(to: str) -> None:
+def test_every_program_takes_raw_readings_of_any_wiring_and_size(to: str, wirings: str) -> None:
     """By the formula of the program; one that has no room for it takes readings in m/s^2, and says what to do."""
     own = correction(
         turned=0.0 if to in ("px4", "ardupilot") else 1e-2, bias=0.0 if to in ("kalibr", "openvins") else 0.05
@@ -71,7 +76,7 @@ def test_every_program_takes_raw_readings_of_any_wiring_and_size(to: str) -> Non
     own = content.correction() if to == "csv" else own
     force, temperature = samples(200)
     readings = own.predicted(force, temperature)
-    for channels, scale in itertools.product(ORDERS, SCALES):
+    for channels, scale in WIRINGS[wirings]:
         made = RawInput(channels, (scale, scale, scale), "g")
         wired = replace(own, bench=replace(own.bench, input=made))
         target = exported(content, wired, to, lossy=True)
@@ -93,16 +98,17 @@ def _done_before(said: str, raw: np.ndarray) -> np.ndarray:
 
 
 @compiled_only
-@pytest.mark.parametrize("names", [(), ("second-order", "thermal-bias")])
-def test_the_function_in_c_takes_raw_readings_of_any_wiring(names: tuple[str, ...], tmp_path: Path) -> None:
-    """Compiled into one library: all 480 wirings and sizes, and with effects, which take long to write, all 48
-    wirings with the ten sizes in turn."""
+@pytest.mark.parametrize(
+    ("names", "wirings"), [((), "in turn"), (("second-order", "thermal-bias"), "in turn"), *slow(((), "every"))]
+)
+def test_the_function_in_c_takes_raw_readings_of_any_wiring(
+    names: tuple[str, ...], wirings: str, tmp_path: Path
+) -> None:
+    """Compiled into one library."""
     own = correction(*names)
     force, temperature = samples(100)
     readings = own.predicted(force, temperature)
-    turn_about = zip(ORDERS, itertools.cycle(SCALES), strict=False)
-    every = list(turn_about if names else itertools.product(ORDERS, SCALES))
-    devices = [RawInput(order, (size, size, size), "mg") for order, size in every]
+    devices = [RawInput(order, (size, size, size), "mg") for order, size in WIRINGS[wirings]]
     wired = [replace(own, bench=replace(own.bench, input=made)) for made in devices]
     texts = [exported(saved(), each, "c").text() for each in wired]
     for made, by_python, text, in_c in zip(devices, wired, texts, compiled_together(texts, tmp_path), strict=True):

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import os
+import resource
 import shutil
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -126,6 +128,25 @@ def test_work_that_ends_in_time_is_left_alone_and_work_that_does_not_is_stopped(
     while threading.active_count() > before and time.monotonic() < deadline_s:
         time.sleep(0.01)
     assert threading.active_count() <= before
+
+
+@pytest.mark.parametrize(("limit_s", "work_s"), [(30.0, 0.0), (0.001, 0.1), (0.001, 0.001)])
+def test_after_work_with_a_limit_a_debugger_can_trace_what_follows(limit_s: float, work_s: float) -> None:
+    """In a process of its own: a function that never begins takes all of its two seconds."""
+    child = os.fork()
+    if child == 0:
+        resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(time.process_time()) + 2, resource.RLIM_INFINITY))
+        for _ in range(20):
+            with suppress(OverTime):
+                in_time(limit_s, lambda: time.sleep(work_s))
+        sys.settrace(lambda *_: None)
+        math_of(2.0)
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+
+def math_of(number: float) -> float:
+    return math.sqrt(number)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes with names")

@@ -19,7 +19,7 @@ from kf_calib.estimation import bench_model
 from kf_calib.fleet.overview import overview_of
 from kf_calib.fleet.pooled_diagnosis import pooled_diagnosis
 from kf_calib.views.figures import figures
-from kf_calib.views.fleet_words import short_name
+from kf_calib.views.fleet import short_name
 from kf_calib.views.report.fleet import fleet_page
 
 pytestmark = pytest.mark.xdist_group("fleet")

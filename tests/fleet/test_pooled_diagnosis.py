@@ -20,7 +20,7 @@ from kf_calib.fleet.pooled_diagnosis import PooledDiagnosis, pooled_diagnosis
 from kf_calib.fleet.pooled_terms import Attribution
 from kf_calib.fleet.results import bench_model
 from kf_calib.fleet.run_factor import ReferenceUnit
-from kf_calib.views.pooled_diagnosis import pooled_report
+from kf_calib.views.pooled_diagnosis import pooled_report, sentences
 
 BENT = np.array([2.5, -2.0, 2.0])
 REPAIRED = 13
@@ -120,6 +120,18 @@ def test_what_differs_from_run_to_run_of_a_unit_is_of_each_run() -> None:
     assert [each.attribution for each in pooled_diagnosis(runs).findings] == [Attribution.RUN]
     same = [run_factor_of(k, lambda n: {"hysteresis": 2.0 * own_of(n // 3)}, unit=unit) for k, unit in enumerate(units)]
     assert [each.attribution for each in pooled_diagnosis(same).findings] == [Attribution.SENSORS]
+
+
+def test_single_runs_that_have_an_effect_are_named() -> None:
+    """One run of each of two units has it, the other eighteen have not."""
+    units = [f"unit{k // 2}" for k in range(20)]
+    hidden = {k: {"hysteresis": 12.0 * own_of(k) / np.linalg.norm(own_of(k))} for k in (4, 11)}
+    runs = [run_factor_of(k, lambda n: hidden.get(n, {}), unit=unit) for k, unit in enumerate(units)]
+    diagnosis = pooled_diagnosis(runs)
+    (only,) = diagnosis.findings
+    assert only.attribution is Attribution.RUN
+    named = sentences(diagnosis)[1].partition("%): ")[2].partition(". In its place")[0].rstrip(".")
+    assert named == ", ".join(runs[k].run for k in (4, 11))
 
 
 def test_wrong_gravity_shows_against_a_reference_unit_alone() -> None:

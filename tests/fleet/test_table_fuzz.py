@@ -87,6 +87,12 @@ def damaged(content: bytes, rng: random.Random) -> bytes:
     return bytes(made)
 
 
+def renamed(content: bytes) -> bytes:
+    """The bytes of a file with a letter changed in the name of the program that wrote it: that harms nothing."""
+    assert content.count(b"parquet-cpp") == 1
+    return content.replace(b"parquet-cpp", b"parquet-cPp")
+
+
 def rewritten(rng: random.Random) -> bytes:
     """A whole file with other values in some cells, as somebody else might write it."""
     while True:
@@ -140,12 +146,12 @@ def case(content: bytes, kind: str, folder: Path) -> dict[str, np.ndarray] | Non
 @pytest.mark.parametrize("cases", [40, *slow(1000)])
 def test_damaged_tables_are_refused_in_a_sentence_or_read_as_they_were(cases: int, tmp_path: Path) -> None:
     rng, whole, read = random.Random(1), {row["run"]: row["factor"]["upper"] for row in rows()}, 0
-    for _ in range(cases):
-        factors = case(damaged(plain("parquet"), rng), "parquet", tmp_path)
+    for content in (renamed(plain("parquet")), *(damaged(plain("parquet"), rng) for _ in range(cases))):
+        factors = case(content, "parquet", tmp_path)
         for run, factor in (factors or {}).items():
             np.testing.assert_array_equal(factor[np.triu_indices(len(factor))], whole[run])
         read += factors is not None
-    assert read < 0.5 * cases and (read > 0 or cases < 100)  # some five in a hundred harm nothing
+    assert 0 < read < 0.5 * cases  # the first one, and some five in a hundred of the others, harm nothing
 
 
 @pytest.mark.parametrize("cases", [40, *slow(1000)])
@@ -161,7 +167,7 @@ def test_tables_that_somebody_else_wrote_are_read_or_refused_in_a_sentence(cases
 def test_damaged_small_files_are_refused_in_a_sentence_or_read(cases: int, tmp_path: Path) -> None:
     """In a process of its own: what Arrow does not expect there ends the process."""
     words = [sys.executable, "-W", "error", "-c", _SMALL_FILES, str(tmp_path), str(cases)]
-    done = subprocess.run(words, cwd=ROOT / "tests", capture_output=True, text=True)
+    done = subprocess.run(words, cwd=ROOT / "tests", capture_output=True, text=True, timeout=500)
     assert done.returncode == 0, done.stderr
     assert 0 < int(done.stdout) < cases
 

@@ -60,7 +60,7 @@ def drawn(text: str, below: int = SHARES) -> int:
 
 
 def _git(root: Path, *words: str) -> str:
-    done = subprocess.run(["git", *words], cwd=root, capture_output=True, text=True)
+    done = subprocess.run(["git", *words], cwd=root, capture_output=True, text=True, timeout=120)
     if done.returncode:
         raise pytest.UsageError(f"git {' '.join(words)}: {done.stderr.strip()}: name a commit of this checkout.")
     return done.stdout.strip()

@@ -77,17 +77,12 @@ def test_the_largest_errors_have_nearly_all_of_the_variance() -> None:
 def test_a_piece_weighs_as_the_mean_over_its_whole_length_does(monkeypatch: pytest.MonkeyPatch) -> None:
     """White noise of 1 K in a reading of 1 s, each carried on for a time c: (l + c) / l² is its variance."""
     begins, lengths = np.array([0.0, 5.0, 60.0, 62.0, 90.0]), np.array([5.0, 20.0, 2.0, 13.0, 0.0])
-    pieces: list[Any] = [
-        SimpleNamespace(nodes=SimpleNamespace(
-            elapsed_s=begin + np.array([0.0, 0.5, 1.0]) * length,
-            temperature_c=begin + np.array([0.0, 1.0, 5.0]),
-        ))
-        for begin, length in zip(begins, lengths, strict=True)
-    ]  # fmt: skip
+    at_s = begins[:, None] + np.array([0.0, 0.5, 1.0]) * lengths[:, None]
+    read = begins[:, None] + np.array([0.0, 1.0, 5.0])
     told = list[tuple[np.ndarray, ...]]()
     monkeypatch.setattr(temperature_course, "_within_dwells", lambda *given: (told.append(given), (1.0, 0))[1])
-    dwells: list[Any] = [SimpleNamespace(pieces=pieces[:2]), SimpleNamespace(pieces=pieces[2:])]
-    assert temperature_course._smooth(dwells, begins) is None  # too few degrees of freedom
+    folded: Any = SimpleNamespace(moving=np.zeros(2, bool), piece_numbers=np.array([2, 3]), elapsed_s=at_s.ravel())
+    assert temperature_course._smooth(folded, read.ravel()) is None  # too few degrees of freedom
     ((middles, levels, weights, owners),) = told
     np.testing.assert_allclose(middles, (begins + 0.5 * lengths)[:4])
     np.testing.assert_allclose(levels, begins[:4] + 1.0)

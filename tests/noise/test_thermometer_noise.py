@@ -10,6 +10,7 @@ from helpers.synthetic import plan_of
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, axes_of
+from kf_calib.dwells.stack import DwellStack
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.results import Calibration, consistency
@@ -44,7 +45,7 @@ def noisy() -> tuple[Calibration, Ambient]:
 
 def errors(dwells: list[DwellFactor], ambient: Ambient) -> tuple[Floats, Floats, Floats]:
     """Errors of the temperatures as they were read and of their course, and the sigma of the course."""
-    course = temperature_course(tuple(dwells))
+    course = temperature_course(DwellStack.of(dwells).folded)
     true = ambient(np.concatenate([dwell.nodes.elapsed_s for dwell in dwells]))
     read = np.concatenate([dwell.nodes.temperature_c for dwell in dwells])
     return read - true, course.temperature_c - true, np.linalg.norm(course.errors_c, axis=1)
@@ -110,7 +111,7 @@ def at_temperatures(dwell: DwellFactor, temperature_c: Floats) -> DwellFactor:
 
 
 def assert_as_read(dwells: list[DwellFactor]) -> None:
-    course = temperature_course(tuple(dwells))
+    course = temperature_course(DwellStack.of(dwells).folded)
     np.testing.assert_array_equal(course.temperature_c, np.concatenate([own.nodes.temperature_c for own in dwells]))
     assert course.errors_c.shape[1] == 0
 

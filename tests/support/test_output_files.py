@@ -122,7 +122,7 @@ def test_the_file_of_a_standard_stream_is_not_written(here: Path, words: str, st
     ((name, path),) = stream.items()
     command = [sys.executable, "-m", "kf_calib.cli", *words.split(), "--overwrite"]
     with Path(path).open("r+b") as file:
-        done = subprocess.run(command, **{name: file}, stderr=subprocess.PIPE)
+        done = subprocess.run(command, **{name: file}, stderr=subprocess.PIPE, timeout=120)
     assert done.returncode == 2 and b"of this very command" in done.stderr
     assert Path("lines.csv").read_bytes() == before
 
@@ -277,6 +277,7 @@ def _no_links(*_: object) -> None:
     raise OSError(errno.EPERM, "Operation not permitted")
 
 
+@pytest.mark.timeout(120)
 def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path: Path) -> None:
     """And nothing else: not what a process writes that goes on, nor one of another machine."""
     program = (
@@ -334,6 +335,7 @@ def test_a_file_that_finds_no_room_is_told_after_the_result(run, here: Path, wor
     assert Path("old").read_bytes() == MINE and not list(here.glob(".*"))
 
 
+@pytest.mark.timeout(120)
 def test_a_recording_that_finds_no_room_is_told_at_once(here: Path) -> None:
     """Though more readings would come."""
     words = ["record", "out.mcap", "-", "--axes", "y z x", "--gravity", "9.81"]
@@ -379,7 +381,7 @@ def test_files_are_written_where_nobody_reads_the_result(here: Path) -> None:
     reading, writing = os.pipe()
     os.close(reading)
     command = [sys.executable, "-m", "kf_calib.cli", "replay", "run.mcap", "--save-model", "m.toml"]
-    done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE)
+    done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, timeout=120)
     os.close(writing)
     assert (done.returncode, done.stderr) == (0, b"") and Path("m.toml").exists()
 
@@ -414,7 +416,7 @@ def test_a_live_run_without_a_reading_leaves_the_earlier_recording(run, here: Pa
 ])  # fmt: skip
 def test_a_live_run_to_which_nothing_came_says_so(here: Path, as_json: list[str], text: bytes, instead: str) -> None:
     words = ["live", "-", "--axes", "y", "--gravity", "9.81", "--record", "out.mcap", *as_json]
-    done = subprocess.run([sys.executable, "-m", "kf_calib", *words], input=text, capture_output=True)
+    done = subprocess.run([sys.executable, "-m", "kf_calib", *words], input=text, capture_output=True, timeout=120)
     said = f"kf-calib: nothing was recorded: no reading came from standard input{instead}: check that the bench is on"
     assert done.returncode == 2 and said in done.stderr.decode() and done.stderr.count(b"\n") == 1
     assert not done.stdout and not Path("out.mcap").exists()
@@ -478,6 +480,7 @@ def test_of_two_that_begin_at_once_one_is_refused(tmp_path: Path, monkeypatch: p
     assert sum(len(each.accel) for each in Recording(path)) == 100 and len(list(tmp_path.iterdir())) == 1
 
 
+@pytest.mark.timeout(120)
 def test_a_killed_run_leaves_no_lock(here: Path) -> None:
     words = ["record", "out.mcap", "-", "--axes", "y z x", "--gravity", "9.81"]
     with subprocess.Popen([sys.executable, "-m", "kf_calib.cli", *words], stdin=subprocess.PIPE) as child:
@@ -502,6 +505,7 @@ def test_a_disk_without_room_for_a_reading_leaves_the_earlier_recording(tmp_path
 
 
 @pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
+@pytest.mark.timeout(120)
 def test_a_recording_that_is_ended_early_keeps_its_readings(here: Path, signal_number: int) -> None:
     Path("out.mcap").write_bytes(MINE)
     words = ["record", "out.mcap", "-", "--overwrite", "--axes", "y z x", "--gravity", "9.81"]
@@ -558,5 +562,6 @@ def test_ctrl_c_is_130(run, here: Path, monkeypatch: pytest.MonkeyPatch) -> None
 @pytest.mark.parametrize("words", ["replay run.mcap --json", "replay run.mcap", "--help", "plan --count 6"])
 def test_an_output_that_takes_nothing_is_exit_2(here: Path, words: str) -> None:
     with Path("/dev/full").open("w") as full:
-        done = subprocess.run([sys.executable, "-m", "kf_calib.cli", *words.split()], stdout=full, stderr=-1)
+        start = [sys.executable, "-m", "kf_calib.cli", *words.split()]
+        done = subprocess.run(start, stdout=full, stderr=-1, timeout=120)
     assert done.returncode == 2 and done.stderr.count(b"\n") == 1 and b"No space left" in done.stderr

@@ -174,7 +174,7 @@ def test_a_pipe_gets_utf_8_where_a_code_page_lacks_signs(code_page: str) -> None
         "-c",
         "from kf_calib.cli.echo import open_streams, echo; open_streams(); echo('σ ┃ µg χ²')",
     ]
-    done = subprocess.run(words, env=environment, capture_output=True, check=True)
+    done = subprocess.run(words, env=environment, capture_output=True, check=True, timeout=120)
     assert done.stdout.decode("utf-8").strip() == "σ ┃ µg χ²"
 
 
@@ -196,5 +196,5 @@ def test_text_files_name_their_encoding() -> None:
     """The default is UTF-8 on Linux and macOS, and the code page of the country on Windows."""
     root = Path(__file__).resolve().parents[2]
     words = [sys.executable, "-m", "ruff", "check", "--preview", "--select", "PLW1514", "--isolated", "kf_calib"]
-    done = subprocess.run(words, cwd=root, capture_output=True, text=True)
+    done = subprocess.run(words, cwd=root, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stdout

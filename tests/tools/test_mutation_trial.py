@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import functools
 import importlib.util
 import os
 import signal
+import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -13,7 +13,7 @@ from types import ModuleType
 import pytest
 from mutation_trials.changes import changes_in, function_at
 from mutation_trials.server import in_child, replace_code
-from mutation_trials.test_map import Mapper, TestMap
+from mutation_trials.test_map import TestMap
 
 SOURCE = """
 LIMIT = 3.0
@@ -97,17 +97,43 @@ def test_the_tests_that_call_a_function_come_with_the_quick_file_first_after_tho
     assert tests.tests_of(Path("m.py"), "no function's") == ["a.py::slow", "d.py::long", "b.py::one", "b.py::two"]
 
 
-def test_a_map_knows_what_was_called(module: ModuleType) -> None:
-    path = Path(str(module.__file__))
-    mapper = Mapper(path.parent.parent, Path(path.parent.name))
-    item = type("Item", (), {"nodeid": "a.py::test"})()
-    running = mapper.pytest_runtest_protocol(item)
-    before = sys.gettrace()
-    next(running)
-    module.Circle()
-    with pytest.raises(StopIteration):
-        running.send(True)
-    sys.settrace(before)
-    place = path.relative_to(path.parent.parent)
-    assert mapper.map.functions == {"a.py::test": [f"{place}:Circle.__init__"]}
-    assert functools.reduce(max, mapper.map.seconds.values()) >= 0.0
+MAPPED = """
+import sys
+from pathlib import Path
+import pytest
+from mutation_trials.test_map import Mapper
+
+mapper = Mapper(Path.cwd(), Path("shapes"))
+code = pytest.main(["-q", "-p", "no:cacheprovider", "test_shapes.py"], plugins=[mapper])
+mapper.write(Path("map.json"))
+sys.exit(code)
+"""
+TESTS = """
+import pytest
+from shapes.circle import Circle, wide
+
+@pytest.fixture(scope="module")
+def circle():
+    return Circle()
+
+def test_area(circle):
+    assert circle.area() == 3.0
+
+def test_wide(circle):
+    assert wide(2.0) == [1.0]
+"""
+
+
+def test_a_map_knows_what_tests_and_their_fixtures_call(tmp_path: Path) -> None:
+    (tmp_path / "shapes").mkdir()
+    (tmp_path / "shapes/circle.py").write_text(f"import functools\n{SOURCE}")
+    (tmp_path / "test_shapes.py").write_text(TESTS)
+    tools = Path(__file__).resolve().parents[2] / "tools"
+    environment = {**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{tools}"}
+    run = [sys.executable, "-c", MAPPED]
+    subprocess.run(run, cwd=tmp_path, env=environment, check=True, timeout=60, capture_output=True)
+    known = TestMap.read(tmp_path / "map.json")
+    called = {test: {place.partition(":")[2] for place in places} for test, places in known.functions.items()}
+    assert called == {"test_shapes.py::test_area": {"Circle.__init__", "Circle.area"},
+                      "test_shapes.py::test_wide": {"Circle.__init__", "wide"}}  # fmt: skip
+    assert known.failed == [] and all(0.0 <= seconds < 5.0 for seconds in known.seconds.values())

@@ -28,7 +28,8 @@ def history(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
 
 def git(root: Path, *words: str) -> str:
     named = ("-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false")
-    return subprocess.run(["git", *named, *words], cwd=root, capture_output=True, text=True, check=True).stdout
+    command = ["git", *named, *words]
+    return subprocess.run(command, cwd=root, capture_output=True, text=True, check=True, timeout=300).stdout
 
 
 def test_each_test_is_taken_once_a_round(history: tuple[Path, list[str]]) -> None:
@@ -80,7 +81,7 @@ def test_no_test_is_begun_when_the_time_is_over(history: tuple[Path, list[str]])
 
 def test_the_option_leaves_the_tests_of_the_share(history: tuple[Path, list[str]]) -> None:
     """Asked of the slow tests of one file, in this checkout."""
-    if subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True).returncode:
+    if subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, timeout=300).returncode:
         pytest.skip("this is no checkout")
     words = [sys.executable, "-m", "pytest", "-n", "0", "-p", "no:cacheprovider", "-q", "--collect-only", "-m", "slow",
              "tests/sources/simulation/test_injected.py"]  # fmt: skip
@@ -88,7 +89,7 @@ def test_the_option_leaves_the_tests_of_the_share(history: tuple[Path, list[str]
     every, taken = (
         set(re.findall(r"^tests/.*::.*$", done.stdout, re.MULTILINE))
         for done in (
-            subprocess.run([*words, "-o", "addopts=", *more], cwd=ROOT, capture_output=True, text=True)
+            subprocess.run([*words, "-o", "addopts=", *more], cwd=ROOT, capture_output=True, text=True, timeout=300)
             for more in ((), ("--slow-share", "HEAD"))
         )
     )

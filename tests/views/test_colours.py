@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from kf_calib.views.figures import style
-from kf_calib.views.report.templates import own_text
+from kf_calib.views.report.page import own_text
 
 SEEN = {
     "all cones": np.eye(3),

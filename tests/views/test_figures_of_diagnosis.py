@@ -25,8 +25,8 @@ from kf_calib.errors import InputError
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.dwell_readings import readings_of, worst_dwell
 from kf_calib.support.units import shown_in
-from kf_calib.views.figures.log_axis import label_axis, plain
-from kf_calib.views.figures.words import rounded_number, wrapped
+from kf_calib.views.figures.scales import label_axis, plain
+from kf_calib.views.figures.symbols import rounded_number, wrapped
 
 HIDDEN = ROOT / "recordings" / "hidden.mcap"
 MICRO_G = 9.80665e-6

@@ -24,7 +24,7 @@ from kf_calib.sources.files.recording import Recording
 from kf_calib.support.units import shown_whole
 from kf_calib.views import rerun as view
 from kf_calib.views.rerun import diagnosis, improvement
-from kf_calib.views.rerun.driver_chart import round_numbers
+from kf_calib.views.rerun.diagnosis import round_numbers
 from kf_calib.views.rerun.growing import GrowingView
 from kf_calib.views.rerun.names import new_stream
 from kf_calib.views.rerun.series import VisitHistory, predicted

@@ -12,8 +12,9 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.candidate_tests import slow_hz
 from kf_calib.effects import Effect, effect_named, names
 from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.candidate_scan import Candidate
 from kf_calib.estimation.results import Calibration
-from kf_calib.estimation.score_test import Candidate, scan
+from kf_calib.estimation.score_test import scan
 from kf_calib.sources.files.recording import Recording
 
 

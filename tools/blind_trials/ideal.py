@@ -24,7 +24,8 @@ from blind_trials.recording import simulate_trial
 from blind_trials.task import PAIR_SIGMA, SIZES_SIGMA, Task
 from kf_calib.effects import effect_named
 from kf_calib.estimation.calibration import calibrate
-from kf_calib.estimation.score_test import Candidate, scan
+from kf_calib.estimation.candidate_scan import Candidate
+from kf_calib.estimation.score_test import scan
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.simulation.injected import catalogue
 

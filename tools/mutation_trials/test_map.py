@@ -102,13 +102,13 @@ class Mapper:
     @pytest.hookimpl(wrapper=True, tryfirst=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[Any]:
         self._now, begun_s = {}, _processor_s()
-        threading.settrace(self._trace)
-        sys.settrace(self._trace)
+        threading.setprofile(self._note)
+        sys.setprofile(self._note)
         try:
             return (yield)
         finally:
-            sys.settrace(None)
-            threading.settrace(None)  # pyright: ignore[reportArgumentType]
+            sys.setprofile(None)
+            threading.setprofile(None)
             self.map.functions[item.nodeid] = sorted(self._called())
             self.map.seconds[item.nodeid] = round(_processor_s() - begun_s, 3)
 
@@ -133,8 +133,8 @@ class Mapper:
             self.map.functions[test] = sorted({*names, *self._shared[_file(test)]})
         self.map.write(path)
 
-    def _trace(self, frame: FrameType, event: str, _: Any) -> None:
-        """Called at each call of a function; no line is traced, which would take many times as long."""
+    def _note(self, frame: FrameType, event: str, _: Any) -> None:
+        """Called at calls and returns; lines, which would take many times as long, are not traced."""
         code = frame.f_code
         if id(code) not in self._now:
             self._now[id(code)] = code

@@ -107,18 +107,14 @@ class Stamps:
         cell = row[self.at[0]] if len(self.at) == 1 else " ".join(row[at] for at in self.at)
         try:
             if self.is_date:
-                return _date_ns(cell, self.month_first)
+                stamp = stamp_of(cell, self.month_first)
+                since = (stamp if stamp.tzinfo else stamp.replace(tzinfo=UTC)) - datetime(1970, 1, 1, tzinfo=UTC)
+                return stamp_ns((since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000, 0)
             return stamp_ns(self.factor * Decimal(numbers.with_point(cell)), self.decimals)
         except LineError:
             raise
         except (ValueError, ArithmeticError):
             raise LineError(f"column {cut(header[self.at[0]], 40)!r} is {cut(cell, 40)!r}, which is no time") from None
-
-
-def _date_ns(cell: str, month_first: bool) -> int:
-    stamp = stamp_of(cell, month_first)
-    since = (stamp if stamp.tzinfo else stamp.replace(tzinfo=UTC)) - datetime(1970, 1, 1, tzinfo=UTC)
-    return stamp_ns((since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000, 0)
 
 
 @dataclass
@@ -185,7 +181,13 @@ class CsvColumns:
     def step_s(self) -> float:
         """The usual step from row to row, s; NaN where no time can be told."""
         try:
-            stamps = self._stamps_of_rows(self.time())
+            time = self.time()
+            stamps, numbers = list[int](), self.numbers or DECIMAL_POINT
+            for row in self.rows:
+                try:
+                    stamps.append(time.ns(row, self.header, numbers))
+                except LineError:
+                    continue
         except InputError:
             return math.nan
         steps = np.abs(np.diff(np.array(stamps, float)))
@@ -381,15 +383,6 @@ class CsvColumns:
             f"no column gives the time: {self._quoted(places[:1])} is {cut(cells[0][0] if cells[0] else '', 40)!r}, "
             "write seconds, or stamps such as 2026-05-04T13:45:00.010+02:00."
         )
-
-    def _stamps_of_rows(self, time: Stamps) -> list[int]:
-        stamps_ns, numbers = list[int](), self.numbers or DECIMAL_POINT
-        for row in self.rows:
-            try:
-                stamps_ns.append(time.ns(row, self.header, numbers))
-            except LineError:
-                continue
-        return stamps_ns
 
     def _quoted(self, places: Sequence[int]) -> str:
         return ", ".join(repr(cut(self.header[at], 40)) for at in places)

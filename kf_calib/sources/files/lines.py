@@ -24,14 +24,13 @@ from kf_calib.sources.files.csv_heading import CsvHeading
 from kf_calib.sources.files.joints import as_columns
 from kf_calib.sources.files.line_parts import Account, LineReader
 from kf_calib.sources.files.sample_lines import CsvLines, JsonLines
-from kf_calib.sources.files.text_file import TextFile
+from kf_calib.sources.files.text_file import Cutter, TextFile
 from kf_calib.sources.tables.columns import HOW
 from kf_calib.sources.units import Units
 from kf_calib.support.plain_text import cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 _BLOCK_BYTES = 1 << 18
-LONGEST_LINE_BYTES = 1 << 20
 _TELLING_ROWS = 8  # of CSV, at the beginning of a stream
 OpenReader = Callable[[Sequence[str], Account], tuple[LineReader, int]]
 _SURVEY_LINES = 1_000_000  # without a pose in them, none will come
@@ -206,44 +205,6 @@ def bench_of(name: str, reader: Described, overrides: Mapping[str, str], default
             'as many axes as there are angles, outer first, for example --axes "y z x".'
         )
     return bench
-
-
-class Cutter:
-    """Bytes as they come, cut into lines; a line that is too long is refused and left empty."""
-
-    def __init__(self, account: Account) -> None:
-        self._account, self._tail, self._cut = account, bytearray(), 0
-
-    @property
-    def is_amid(self) -> bool:
-        """Whether the last line has not ended yet."""
-        return bool(self._tail)
-
-    def push(self, block: bytes) -> list[str]:
-        """The lines that end in ``block``."""
-        end, lines = block.rfind(b"\n") + 1, list[str]()
-        if end:
-            lines = self._decode(bytes(self._tail) + block[: end - 1])
-            self._tail.clear()
-        if len(self._tail) <= LONGEST_LINE_BYTES:  # else what comes up to the next end of line is not kept
-            self._tail += block[end:]
-        return lines
-
-    def rest(self) -> list[str]:
-        """The line without an end, if there is one."""
-        block = bytes(self._tail)
-        self._tail.clear()
-        return self._decode(block) if block else []
-
-    def _decode(self, block: bytes) -> list[str]:
-        lines = block.replace(b"\r\n", b"\n").removesuffix(b"\r").split(b"\n")
-        if len(block) > LONGEST_LINE_BYTES:
-            for i, line in enumerate(lines):
-                if len(line) > LONGEST_LINE_BYTES:
-                    self._account.refuse(self._cut + i + 1, "it is longer than 1 MiB")
-                    lines[i] = b""
-        self._cut += len(lines)
-        return b"\n".join(lines).decode("utf-8", errors="replace").split("\n")
 
 
 def reader_for(

@@ -171,7 +171,8 @@ class _Walk:
     def parcels(self) -> Iterator[_Parcel]:
         parcel = _Parcel()
         for start, opcode, content in self._records():
-            size = self._unpacked_size(opcode, content)
+            stated = CHUNK.unpack_from(content)[2] if opcode == Opcode.CHUNK else len(content)
+            size = stated if stated <= self.max_chunk else 0  # a chunk of more is passed over
             is_full = bool(parcel.records) and parcel.size + size > _BLOCK and opcode != Opcode.MESSAGE_INDEX
             if opcode == _NOTHING_YET or is_full:
                 yield parcel
@@ -182,10 +183,6 @@ class _Walk:
                 parcel.end = self.position
         if parcel.records:
             yield parcel
-
-    def _unpacked_size(self, opcode: int, content: bytes) -> int:
-        stated = CHUNK.unpack_from(content)[2] if opcode == Opcode.CHUNK else len(content)
-        return stated if stated <= self.max_chunk else 0  # a chunk of more is passed over
 
     def unpack(self, parcel: _Parcel) -> RecordBlock:
         parts: list[bytes] = []

@@ -203,7 +203,10 @@ class Recording:
             contents.channels = {channel.id: channel for channel in summary.channels}
             for index in summary.metadata:
                 if index.name == BENCH_RECORD and contents.bench is None:
-                    _look_up_bench(file, contents, index.offset)
+                    try:
+                        contents.add(Opcode.METADATA, file.record_at(index.offset, Opcode.METADATA), warn=_ignore)
+                    except DamagedError:
+                        contents.bench_damaged = True
         lists_topics = bool(contents.channels and contents.schemas)
         if lists_topics and (contents.bench is not None or contents.bench_damaged):
             return contents
@@ -267,13 +270,6 @@ class Recording:
             return merged_metadata(recorded, overrides, "the recording", default)
         except BenchError as error:
             raise BenchError(f"{self.path}: {error}") from None
-
-
-def _look_up_bench(file: RecordFile, contents: Contents, position: int) -> None:
-    try:
-        contents.add(Opcode.METADATA, file.record_at(position, Opcode.METADATA), warn=_ignore)
-    except DamagedError:
-        contents.bench_damaged = True
 
 
 @dataclass

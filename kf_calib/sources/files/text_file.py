@@ -8,6 +8,10 @@ import zlib
 from pathlib import Path
 from typing import BinaryIO, Self, cast
 
+from kf_calib.sources.files.line_parts import Account
+
+LONGEST_LINE_BYTES = 1 << 20
+
 _GZIP, _UTF16 = b"\x1f\x8b", (b"\xff\xfe", b"\xfe\xff")
 _HEAD_BYTES = 1 << 16
 
@@ -78,3 +82,41 @@ def _encoding(head: bytes) -> str:
     except UnicodeDecodeError:
         return "cp1252"
     return "utf-8"
+
+
+class Cutter:
+    """Bytes as they come, cut into lines; a line that is too long is refused and left empty."""
+
+    def __init__(self, account: Account) -> None:
+        self._account, self._tail, self._cut = account, bytearray(), 0
+
+    @property
+    def is_amid(self) -> bool:
+        """Whether the last line has not ended yet."""
+        return bool(self._tail)
+
+    def push(self, block: bytes) -> list[str]:
+        """The lines that end in ``block``."""
+        end, lines = block.rfind(b"\n") + 1, list[str]()
+        if end:
+            lines = self._decode(bytes(self._tail) + block[: end - 1])
+            self._tail.clear()
+        if len(self._tail) <= LONGEST_LINE_BYTES:  # else what comes up to the next end of line is not kept
+            self._tail += block[end:]
+        return lines
+
+    def rest(self) -> list[str]:
+        """The line without an end, if there is one."""
+        block = bytes(self._tail)
+        self._tail.clear()
+        return self._decode(block) if block else []
+
+    def _decode(self, block: bytes) -> list[str]:
+        lines = block.replace(b"\r\n", b"\n").removesuffix(b"\r").split(b"\n")
+        if len(block) > LONGEST_LINE_BYTES:
+            for i, line in enumerate(lines):
+                if len(line) > LONGEST_LINE_BYTES:
+                    self._account.refuse(self._cut + i + 1, "it is longer than 1 MiB")
+                    lines[i] = b""
+        self._cut += len(lines)
+        return b"\n".join(lines).decode("utf-8", errors="replace").split("\n")

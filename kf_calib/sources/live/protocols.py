@@ -10,8 +10,8 @@ from kf_calib.errors import InputError
 from kf_calib.sources.files.csv_columns import CsvColumns
 from kf_calib.sources.files.csv_heading import CsvHeading
 from kf_calib.sources.files.line_parts import Account, LineReader
-from kf_calib.sources.files.lines import Cutter
 from kf_calib.sources.files.sample_lines import CsvLines, JsonLines
+from kf_calib.sources.files.text_file import Cutter
 from kf_calib.sources.live.feed import nothing
 from kf_calib.sources.live.frames import FrameReader
 from kf_calib.sources.units import Units

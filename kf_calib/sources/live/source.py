@@ -240,7 +240,16 @@ class LiveSource:
             with self._lock:
                 self._bench = bench
                 self._lock.notify_all()
-            self._take_all()
+            reason = ""
+            for item in self._feed:
+                match item:
+                    case Batch():
+                        self._take(self._by_one_clock(item, time.monotonic()))
+                    case Lost(reason):
+                        self._continuity.cut()
+                    case Regained(after_s):
+                        self._mark_gap(reason, after_s)
+            self._take(self._clock.rest())
         except BaseException as error:  # the consumer is told, after what came before
             self._failure = error
         self._feed.close()
@@ -250,18 +259,6 @@ class LiveSource:
             self._feed.link = "ended"
             self._is_finished = True
             self._lock.notify_all()
-
-    def _take_all(self) -> None:
-        reason = ""
-        for item in self._feed:
-            match item:
-                case Batch():
-                    self._take(self._by_one_clock(item, time.monotonic()))
-                case Lost(reason):
-                    self._continuity.cut()
-                case Regained(after_s):
-                    self._mark_gap(reason, after_s)
-        self._take(self._clock.rest())
 
     def _by_one_clock(self, batch: Batch, now: float) -> Batch:
         """The samples that can be stored, by stamps that go on though the bench's clock was set."""
@@ -281,7 +278,12 @@ class LiveSource:
                 return
             if not (self._feed.patient or queue.fits(size)) and queue.behind_from is None:
                 queue.behind_from = self._store_if_open(Recorder.flush)
-            self._note_begin(batch.accel)
+            if self._begin_ns is None and len(batch.accel):
+                self._begin_ns = int(batch.accel.time_ns[0])
+                if dates.of_stamp(self._begin_ns) is None and not self._feed.patient:
+                    self.received = datetime.now(UTC)
+                    facts = {"received": dates.format_date(self.received)}
+                    self._store_if_open(lambda recorder: recorder.mark(RUN_RECORD, facts))
             self._store_if_open(lambda recorder: recorder.write(batch))
             self._count(batch)
             while self._feed.patient and not queue.fits(size) and not self._feed.stopping:
@@ -289,14 +291,6 @@ class LiveSource:
                 self._store_if_open(Recorder.tick)
             self._hand_on(batch, size)
             self._lock.notify_all()
-
-    def _note_begin(self, accel: Stream) -> None:
-        if self._begin_ns is None and len(accel):
-            self._begin_ns = int(accel.time_ns[0])
-            if dates.of_stamp(self._begin_ns) is None and not self._feed.patient:
-                self.received = datetime.now(UTC)
-                facts = {"received": dates.format_date(self.received)}
-                self._store_if_open(lambda recorder: recorder.mark(RUN_RECORD, facts))
 
     def _hand_on(self, batch: Batch, size: int) -> None:
         queue = self._queue

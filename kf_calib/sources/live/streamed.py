@@ -14,7 +14,7 @@ from kf_calib.bench.bench import Bench
 from kf_calib.bench.raw_input import PLAIN
 from kf_calib.bench.streams import Batch, Stream, bench_without_angles, with_accel, without_poses
 from kf_calib.errors import BenchError, InputError
-from kf_calib.sources.files.lines import Described, bench_of, stated_of
+from kf_calib.sources.files.lines import bench_of, stated_of
 from kf_calib.sources.live.feed import IDLE_S, Feed, Link, Lost, Regained, nothing
 from kf_calib.sources.live.protocols import Protocol
 from kf_calib.sources.units import Units
@@ -108,7 +108,8 @@ class StreamedFeed(Feed):
                 continue
             if not self._angles:
                 if readings:
-                    return self._converting(self._bench_without_angles(reader))
+                    bench, self._said = bench_without_angles(self.name, stated_of(self.name, reader, self._overrides))
+                    return self._converting(bench)
                 continue
             if not reader.pose_width and time.monotonic() - first_s > _POSE_WAIT_S:
                 reader.pose_width = self._stated_width(reader.metadata)
@@ -121,10 +122,6 @@ class StreamedFeed(Feed):
         raise self._protocol.unusable(
             "no platform angles (--no-angles does without them)" if self._angles else "no readings"
         )
-
-    def _bench_without_angles(self, reader: Described) -> Bench:
-        bench, self._said = bench_without_angles(self.name, stated_of(self.name, reader, self._overrides))
-        return bench
 
     def _converting(self, bench: Bench) -> Bench:
         """The bench, whose raw input all readings are converted by from now on."""
@@ -152,7 +149,10 @@ class StreamedFeed(Feed):
             return item
         item = with_accel(item, self._input.readings(item.accel.values))
         if self._angles:
-            return _with_pose_width(item, width)
+            # a batch without poses was made before their width was known
+            if item.pose.values.shape[1] == width:
+                return item
+            return Batch(item.accel, Stream.empty(width), item.temperature)
         self._poses_left_out += len(item.pose)
         return without_poses(item)
 
@@ -296,13 +296,6 @@ class StreamedFeed(Feed):
         end_s = time.monotonic() + seconds
         while not self.stopping and (left_s := end_s - time.monotonic()) > 0.0:
             time.sleep(min(left_s, _TICK_S))
-
-
-def _with_pose_width(batch: Batch, width: int) -> Batch:
-    """A batch without poses, made before their width was known, with that width."""
-    if batch.pose.values.shape[1] == width:
-        return batch
-    return Batch(batch.accel, Stream.empty(width), batch.temperature)
 
 
 def _reason(error: OSError) -> str:

@@ -101,10 +101,16 @@ def spread_plan(
     """
     if count < 1:
         raise InputError(f"a plan of {count} orientations is not possible: ask for one or more.")
+    return explicit_plan(_spread_angles_deg(count, tuple(axes), seed, up), dwell_s)
+
+
+@lru_cache(maxsize=128)
+def _spread_angles_deg(count: int, axes: tuple[Vector, ...], seed: int, up: str) -> Floats:
+    """The gimbal angles (count, k) of a spread plan: they take a tenth of a second, and do not depend on the dwells."""
     rng = np.random.default_rng(seed)
     directions = Rotation.random(rng=rng).apply(_fibonacci_lattice(count))
     angles = [_angles_towards(direction, axes, rng, up) for direction in rng.permutation(directions)]
-    return explicit_plan(np.degrees(angles), dwell_s)
+    return np.degrees(angles)
 
 
 def up_directions(axes: Sequence[Vector], angles_rad: Floats, up: str = "y") -> Floats:

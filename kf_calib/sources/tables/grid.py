@@ -89,7 +89,7 @@ def _of_text(path: Path) -> Grid:
     )
     try:
         reader = csv.reader(text.splitlines(), delimiter=delimiter, skipinitialspace=True)
-        lines = [(reader.line_num + skipped, [_text(cell) for cell in row]) for row in reader]
+        lines = [(reader.line_num + skipped, _texts(row)) for row in reader]
     except csv.Error as error:
         raise InputError(f"{path}: is no CSV file ({error}): save the table as CSV or .xlsx.") from None
     lines = [line for line in lines if not (line[1] and str(line[1][0] or "").startswith("#"))]
@@ -186,6 +186,12 @@ def _cell(value: Any) -> Cell:
         return float(value) if not isinstance(value, bool) else str(value)
     except (TypeError, ValueError, OverflowError):
         return _text(str(value))
+
+
+def _texts(row: list[str]) -> Sequence[str | None]:
+    """Return the texts of the cells of a row; most rows have no blank and no long cell."""
+    texts = list(map(str.strip, row))
+    return texts if all(texts) and max(map(len, texts), default=0) <= _LONGEST_CELL else [_text(cell) for cell in row]
 
 
 def _text(cell: str) -> str | None:

@@ -32,6 +32,8 @@ class Numbers:
         """How the numbers in a grid are written; raises InputError where two cells contradict each other."""
         cell_of_sign = dict[str, tuple[int, int]]()
         for k, row in enumerate(grid.rows):
+            if not _shows_another(_joined(row), cell_of_sign):
+                continue
             for j, cell in enumerate(row):
                 if not isinstance(cell, str) or not _shows_another(cell, cell_of_sign):
                     continue
@@ -117,6 +119,15 @@ _PLAIN = frozenset("0123456789.+-eE")
 def _is_plain(cell: str) -> bool:
     """Whether a number is written as programs write it; raises no error for what is none."""
     return _PLAIN.issuperset(cell)
+
+
+def _joined(row: Sequence[Cell]) -> str:
+    """Return the texts of a row as one."""
+    texts = cast("Sequence[str]", row)
+    try:
+        return "".join(texts)
+    except TypeError:  # a cell of a spreadsheet, or an empty one
+        return "".join(cell for cell in row if isinstance(cell, str))
 
 
 def _shows_another(cell: str, seen: Container[str]) -> bool:

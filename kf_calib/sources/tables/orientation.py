@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import overload
+
+import numpy as np
 
 from kf_calib.bench.arrays import Floats, Ints
+from kf_calib.support.computed_sequence import ComputedSequence
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,11 +32,11 @@ class Orientation:
 
 
 @dataclass(frozen=True, eq=False)
-class Orientations(Sequence[Orientation]):
+class Orientations(ComputedSequence[Orientation]):
     """The rows of a table, as columns: 100 000 objects would take ten times the memory.
 
     Fields are those of ``Orientation``, with a row each, its count in ``counts``; sigma_mps2 is None where no row has
-    it.
+    it, and NaN in a row that has none.
     """
 
     mean_mps2: Floats
@@ -44,18 +46,25 @@ class Orientations(Sequence[Orientation]):
     counts: Ints
     temperature_c: Floats
 
+    @classmethod
+    def of(cls, rows: Sequence[Orientation]) -> Orientations:
+        """Any rows as columns; columns as they are."""
+        if isinstance(rows, Orientations):
+            return rows
+        sigmas = np.array([np.full(3, np.nan) if row.sigma_mps2 is None else row.sigma_mps2 for row in rows])
+        return cls(
+            np.array([row.mean_mps2 for row in rows]), np.array([row.pose for row in rows]),
+            np.array([row.elapsed_s for row in rows]), None if np.isnan(sigmas).all() else sigmas,
+            np.array([row.count for row in rows], np.int64), np.array([row.temperature_c for row in rows], float),
+        )  # fmt: skip
+
     def __len__(self) -> int:
         return len(self.elapsed_s)
 
-    @overload
-    def __getitem__(self, index: int) -> Orientation: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[Orientation]: ...
-    def __getitem__(self, index: int | slice) -> Orientation | list[Orientation]:
-        if isinstance(index, slice):
-            return [self[k] for k in range(*index.indices(len(self)))]
-        k = range(len(self))[index]
+    def item(self, k: int) -> Orientation:
+        """The row at an index."""
+        sigmas = np.full(3, np.nan) if self.sigma_mps2 is None else self.sigma_mps2[k]
         return Orientation(
-            self.mean_mps2[k], self.pose[k], float(self.elapsed_s[k]),
-            None if self.sigma_mps2 is None else self.sigma_mps2[k], int(self.counts[k]), float(self.temperature_c[k]),
+            self.mean_mps2[k], self.pose[k], float(self.elapsed_s[k]), None if np.isnan(sigmas).any() else sigmas,
+            int(self.counts[k]), float(self.temperature_c[k]),
         )  # fmt: skip

@@ -8,7 +8,7 @@ from pathlib import Path
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch
 from kf_calib.errors import InputError
-from kf_calib.sources.tables.orientation import Orientation
+from kf_calib.sources.tables.orientation import Orientation, Orientations
 
 
 class Table:
@@ -27,7 +27,7 @@ class Table:
         start_ns: int | None = None,
         path: Path | None = None,
     ) -> None:
-        self.name, self.bench, self.orientations = name, bench, orientations
+        self.name, self.bench, self.orientations = name, bench, Orientations.of(orientations)
         self.warnings, self.fraction, self._start_ns, self.path = list(warnings), 1.0, start_ns, path
 
     def __repr__(self) -> str:

@@ -12,9 +12,9 @@ from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.effects.effect import Grade
 from kf_calib.support.units import shown
 from kf_calib.views.console import GRADES, size_range
-from kf_calib.views.figures.log_axis import label_axis
+from kf_calib.views.figures.scales import label_axis
 from kf_calib.views.figures.style import GREY, blank, styled
-from kf_calib.views.figures.words import wrapped
+from kf_calib.views.figures.symbols import wrapped
 
 _LOW, _HIGH = 0.01, 1000.0  # smallest detectable sizes that the axis spans
 _SEEN, _HIDDEN = "#0072b2", "#e69f00"  # of Okabe and Ito's palette

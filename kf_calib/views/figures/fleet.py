@@ -31,9 +31,8 @@ from kf_calib.views.figures.style import (
     say,
     styled,
 )
-from kf_calib.views.figures.symbols import plain
-from kf_calib.views.figures.words import wrapped
-from kf_calib.views.fleet_words import chance_words, short_name
+from kf_calib.views.figures.symbols import plain, wrapped
+from kf_calib.views.fleet import chance_words, short_name
 
 _WIDE = 4
 _OUTSIDE = 0.01  # chance below which a unit is an outlier

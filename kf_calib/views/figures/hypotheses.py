@@ -13,7 +13,7 @@ from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.views.diagnosis import name_of
 from kf_calib.views.figures.style import BEST, GREY, PALE, blank, say, styled
-from kf_calib.views.figures.words import wrapped
+from kf_calib.views.figures.symbols import wrapped
 
 _FAMILIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # Okabe and Ito's, the likeliest first
 _NO_EFFECT = {NOTHING: PALE, NOISE: GREY, NONE: BEST}

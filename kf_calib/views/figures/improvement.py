@@ -18,8 +18,8 @@ from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration, Parameter, format_p
 from kf_calib.support.units import shown
 from kf_calib.views.console import symbol
-from kf_calib.views.figures.log_axis import label_axis
 from kf_calib.views.figures.residuals import driver_axis, driver_to_show
+from kf_calib.views.figures.scales import label_axis
 from kf_calib.views.figures.style import (
     ACCELEROMETERS,
     BEST,
@@ -31,7 +31,7 @@ from kf_calib.views.figures.style import (
     say,
     styled,
 )
-from kf_calib.views.figures.words import wrapped
+from kf_calib.views.figures.symbols import wrapped
 
 _COLUMNS = 5  # models whose residuals are drawn
 _COEFFICIENTS, _WIDE = 6, 3  # panels of coefficients, and in a row

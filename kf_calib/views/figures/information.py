@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 
 from kf_calib.bench.paper_parameters import STATE_COUNT
-from kf_calib.estimation.correlation import correlation
+from kf_calib.estimation.estimate import correlation
 from kf_calib.estimation.parameter_history import ParameterHistory, history_of
 from kf_calib.estimation.results import Calibration
 from kf_calib.views.figures.parameter_panels import MANY
@@ -93,14 +92,10 @@ def draw_correlations(figure: FigureBase, result: Calibration) -> bool:
         axes.axhline(edge, color=GREY, linewidth=0.8)
         axes.axvline(edge, color=GREY, linewidth=0.8)
     for row, column in zip(*np.nonzero(np.abs(beside) >= NOTABLE), strict=True):
-        _number(axes, row, column, float(beside[row, column]), len(names))
+        value = float(beside[row, column])
+        axes.text(column, row, f"{value:.2f}".replace("0.", ".").replace("-", "−"), ha="center", va="center",
+                  fontsize=min(8.0, 110.0 / len(names)), color="white" if abs(value) > 0.65 else "#222222")  # fmt: skip
     lost = bool(np.isnan(np.diag(matrix)).any())
     axes.set_title(f"Correlations; written from {NOTABLE} on{'; grey: not determined' if lost else ''}", pad=12.0)
     figure.colorbar(image, ax=axes, label="correlation (no unit)", shrink=0.8)
     return True
-
-
-def _number(axes: Axes, row: int, column: int, value: float, count: int) -> None:
-    """Write a correlation into its square."""
-    axes.text(column, row, f"{value:.2f}".replace("0.", ".").replace("-", "−"), ha="center", va="center",
-              fontsize=min(8.0, 110.0 / count), color="white" if abs(value) > 0.65 else "#222222")  # fmt: skip

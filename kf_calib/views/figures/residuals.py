@@ -27,7 +27,7 @@ from kf_calib.views.figures.style import (
     say,
     styled,
 )
-from kf_calib.views.figures.words import rounded_number, wrapped
+from kf_calib.views.figures.symbols import rounded_number, wrapped
 
 _SIGNIFICANT, _SOME = 0.01, 0.005  # p-value and share above and below which a driver explains nothing
 _TITLE = 36  # letters in a line of a title

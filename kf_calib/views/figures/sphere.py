@@ -12,7 +12,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.estimation.residual_table import mean_sigmas, quantity_means
 from kf_calib.views.figures.style import GREY, blank, styled
-from kf_calib.views.figures.words import wrapped
+from kf_calib.views.figures.symbols import wrapped
 
 _COLOURS = "PuOr_r"  # colour-blind eyes tell its ends apart
 _LEAST = 3.0  # sigma at the ends of the colours, at least

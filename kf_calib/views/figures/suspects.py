@@ -17,7 +17,7 @@ from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.estimation.results import format_p
 from kf_calib.support.units import span
 from kf_calib.views.figures.style import BEST, GREY, PALE, RUNNER_UP, blank, say, styled
-from kf_calib.views.figures.words import wrapped
+from kf_calib.views.figures.symbols import wrapped
 
 _MOST, _ALIKE = 7, 8  # explanations that are drawn, effects in the matrix of overlaps
 _DRIVERS = 6

@@ -1,8 +1,9 @@
-"""Symbols as in the paper, and the units that parameters are shown in."""
+"""Words and numbers in figures, symbols as in the paper, and the units that parameters are shown in."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from textwrap import fill
 from typing import NamedTuple
 
 from kf_calib.bench import paper_parameters
@@ -47,3 +48,13 @@ def with_coefficients(coefficients: Iterable[Parameter | Coefficient]) -> tuple[
     """The same, followed by coefficients of effects."""
     found = [(each.symbol, units.shown(each)) for each in coefficients]
     return (*twelve(), *(Shown(label(symbol), plain(unit.label), unit.per_si) for symbol, unit in found))
+
+
+def wrapped(text: str, width: int) -> str:
+    """A text in lines of at most so many letters, broken between words only: names of effects stay whole."""
+    return fill(text, width, break_on_hyphens=False, break_long_words=False)
+
+
+def rounded_number(value: float, digits: int = 3) -> str:
+    """A number to so many significant digits, without an exponent unless it is very small."""
+    return f"{float(f'{value:.{digits}g}'):.12g}"

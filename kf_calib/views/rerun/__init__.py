@@ -23,7 +23,7 @@ import rerun as rr
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.stepwise_selection import Improvement
-from kf_calib.estimation.correlation import correlation
+from kf_calib.estimation.estimate import correlation
 from kf_calib.estimation.results import Calibration, Parameter, format_p
 from kf_calib.online.status import Judgement
 from kf_calib.support.plain_text import printable

@@ -34,7 +34,7 @@ def _overview(result: Calibration, history: VisitHistory, is_predicted: bool) ->
     return rrb.Horizontal(
         rrb.Vertical(*_sigmas(history), _pose(result)),
         rrb.Vertical(_platform(result), *_fit(is_predicted), row_shares=[2, 1, 1] if is_predicted else [1, 1]),
-        _summary(),
+        rrb.TextDocumentView(origin="summary", name="result"),
         column_shares=[5, 4.4, 3.8],
         name="Overview",
     )
@@ -129,7 +129,3 @@ def _platform(result: Calibration) -> rrb.Spatial3DView:
         eye_controls=eye(result.bench, (1.8, 1.2, 2.2), (0.05, 0.18, 0.0)),
         line_grid=False,
     )
-
-
-def _summary() -> rrb.TextDocumentView:
-    return rrb.TextDocumentView(origin="summary", name="result")

@@ -15,7 +15,8 @@ import rerun as rr
 from scipy.spatial.transform import Rotation
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.estimation.results import Calibration, Estimate
+from kf_calib.estimation.estimate import Estimate
+from kf_calib.estimation.results import Calibration
 from kf_calib.support.units import shown
 from kf_calib.views.rerun.names import ACCELEROMETERS, GOLD, GREY, RED, WHITE, number, thin
 from kf_calib.views.rerun.series import above, crowd, ends, nis_band, times

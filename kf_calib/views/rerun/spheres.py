@@ -59,18 +59,14 @@ def log_spheres(
         middle = np.array([column * _PITCH, -i * _PITCH, 0.0])
         circles = [np.roll(circle, k, axis=1) + middle for k in range(3)]
         stream.log(f"{path}/{i + 1}/sphere", rr.LineStrips3D(circles, colors=(75, 75, 80), radii=0.004), static=True)
-        arrow = rr.Arrows3D(origins=[middle], vectors=[1.3 * _axis(result, i)], colors=ACCELEROMETERS[i], radii=0.02,
+        sensitivity = result.estimate.state[4 * i : 4 * i + 3]
+        axis = sensitivity / np.linalg.norm(sensitivity)
+        arrow = rr.Arrows3D(origins=[middle], vectors=[1.3 * axis], colors=ACCELEROMETERS[i], radii=0.02,
                             labels=[f"E{'₁₂₃'[i]}"], show_labels=True)  # fmt: skip
         stream.log(f"{path}/{i + 1}/axis", arrow, static=True)
         weight = np.clip(np.abs(ratios[:, i]) / _FULL, 0.0, 1.0)
         points = rr.Points3D(directions + middle, colors=signed(ratios[:, i]), radii=0.03 + 0.09 * weight)
         log(f"{path}/{i + 1}/residuals", points)
-
-
-def _axis(result: Calibration, i: int) -> Floats:
-    """Return the direction (3,) of a sensitive axis in the platform."""
-    sensitivity = result.estimate.state[4 * i : 4 * i + 3]
-    return sensitivity / np.linalg.norm(sensitivity)
 
 
 def signed(ratios: Floats) -> NDArray[np.uint8]:

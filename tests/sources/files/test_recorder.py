@@ -375,6 +375,7 @@ with Recorder(sys.argv[1], BENCH, flush_s=0.01, chunk_size=30_000) as recorder:
 
 
 @pytest.mark.parametrize("seed", range(KILLS))
+@pytest.mark.timeout(120)
 def test_a_killed_recorder_loses_no_more_than_the_open_chunk(tmp_path: Path, seed: int) -> None:
     path = tmp_path / "killed.mcap"
     here = str(ROOT / "tests")

@@ -148,7 +148,8 @@ def test_standard_input_is_read_to_its_end() -> None:
         "from kf_calib.sources.live import open_live\n"
         f"with open_live('-', {KEYS!r}) as source: print(sum(len(batch.accel) for batch in source), source.warnings)"
     )
-    done = subprocess.run([sys.executable, "-c", code], input=csv_rows(0, 50)[:-1], capture_output=True, check=True)
+    words, given = [sys.executable, "-c", code], csv_rows(0, 50)[:-1]
+    done = subprocess.run(words, input=given, capture_output=True, check=True, timeout=120)
     assert done.stdout.decode().strip() == "50 []"
 
 
@@ -403,6 +404,7 @@ with open_live("-", {"axes": "y z x", "gravity_mps2": "9.81"}, Path(sys.argv[1])
 """
 
 
+@pytest.mark.timeout(120)
 def test_a_killed_process_leaves_all_but_the_end(tmp_path: Path) -> None:
     """tools/bench_live.py measures how much: here, that what is there is whole, without a gap."""
     path, count = tmp_path / "a.mcap", 0

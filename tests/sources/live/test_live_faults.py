@@ -182,10 +182,11 @@ with serving(lambda client, number: client.sendall(csv_rows(100 * number, 100 * 
 def test_a_loss_of_power_is_noticed_in_seconds() -> None:
     """A network of its own, which is cut: neither FIN nor RST. It took 119 minutes."""
     alone = ["unshare", "-n"]
-    if shutil.which("unshare") is None or subprocess.run([*alone, "ip", "link"], capture_output=True).returncode:
+    allowed = [*alone, "ip", "link"]
+    if shutil.which("unshare") is None or subprocess.run(allowed, capture_output=True, timeout=120).returncode:
         pytest.skip("needs Linux and the rights of root")
     command = [*alone, sys.executable, "-c", POWERLESS, str(Path(__file__).parent), str(ROOT / "tests")]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
     assert float(done.stdout) < 15.0
 
 

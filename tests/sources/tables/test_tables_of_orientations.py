@@ -15,8 +15,7 @@ import kf_calib
 from kf_calib.dwells.tabulated import dwells_of
 from kf_calib.errors import InputError
 from kf_calib.estimation.calibration import filterpy_estimate
-from kf_calib.sources.tables.orientation import Orientation
-from kf_calib.sources.tables.table import Table
+from kf_calib.sources.tables.table import Orientation, Table
 from kf_calib.sources.tables.words import face_of, meaning_of
 
 BENCH = {"axes": "y z x", "gravity_mps2": "9.8123"}
