@@ -26,9 +26,8 @@ _TAIL = 1.0  # decades beyond the usual sizes in which the density falls by a fa
 _SHARPER = 100.0  # where only the greatest usual size is known, the least one is smaller by this factor
 _UNKNOWN_DECADES = 7.0  # above one sigma: where no usual size is known
 _STEPS = {1: 120, 2: 40, 3: 16}  # sizes that are tried, by number of effects
+_HIDDEN = 1e20  # SI: sigma of a coefficient of which rounding alone is seen
 _ABOVE = 300.0  # times the estimate: beyond it, sizes differ no more in evidence
-
-
 _SIZES = np.exp(np.linspace(0.0, math.log(1e14), 120))  # prior variance of a coefficient over that of its estimate
 
 
@@ -111,11 +110,11 @@ def _nodes(root: Floats, estimate: Floats, prior: SizePrior, effects: int) -> tu
     """Return sizes (n,) and their prior probabilities (n,), of all sizes from one sigma of the coefficient that is
     determined best: an effect that is smaller shows nothing, and belongs to the explanation without it. One of which
     nothing is seen beside the others changes nothing: its size is zero."""
-    if not root.any():
+    least = best_sigma(root)
+    if least > _HIDDEN:
         return np.zeros(1), np.ones(1)
     if prior.value:
         return np.array([prior.low]), np.ones(1)
-    least = best_sigma(root)
     most = _ABOVE * max(float(np.abs(estimate).max(initial=0.0)), least)
     edges = np.geomspace(least, most, _STEPS.get(effects, 8) + 1)
     sizes = np.sqrt(edges[1:] * edges[:-1])
@@ -164,8 +163,10 @@ class AddedEffects:
 
 
 def _solved(root: Floats, readings: Floats) -> Floats:
-    """Return the shortest least-squares solution of root @ x = readings, with columns of any scale."""
-    lengths = np.maximum(np.linalg.norm(root, axis=0), 1e-300)
+    """Return the shortest least-squares solution of root @ x = readings, with columns of any scale; zero where
+    rounding alone is seen."""
+    lengths = np.linalg.norm(root, axis=0)
+    lengths = np.where(lengths * _HIDDEN > 1.0, lengths, 1.0)
     return np.asarray(np.linalg.lstsq(root / lengths, readings, rcond=1e-9)[0] / lengths, float)
 
 

@@ -36,6 +36,7 @@ from kf_calib.diagnosis.unknown_effect import FormulaFamily, one_digit_seconds
 from kf_calib.diagnosis.within_dwell_trend import Trend, trend
 from kf_calib.dwells.qr import orthonormal
 from kf_calib.effects import Effect, FrameEffect, Stimulus, effect_named, walk_named
+from kf_calib.errors import UnobservableError
 from kf_calib.estimation.cross_validation import orientations
 from kf_calib.estimation.dwell_columns import stimulus_of
 from kf_calib.estimation.results import Calibration
@@ -312,7 +313,10 @@ class Hypotheses:
 
     def _row(self, effects: tuple[str, ...], log_prior: float, formulas: tuple[str, ...] = ()) -> Hypothesis:
         """Return the row of effects or formulas, refitted and weighed."""
-        refit = self._refit((*effects, *formulas))
+        try:
+            refit = self._refit((*effects, *formulas))
+        except UnobservableError:  # the run does not tell its coefficients: nothing speaks for it
+            return Hypothesis(effects, formulas, log_evidence=-math.inf)
         marginals = self.evidence.of(refit.fit, walk=self.walk in effects)
         if not marginals:
             return Hypothesis(effects, formulas, log_evidence=-math.inf)
