@@ -59,10 +59,10 @@ def _hidden_table() -> RenderableType:
     from rich.console import Group
 
     from kf_calib.sources.simulation.injected import INNER, catalogue
-    from kf_calib.views.tables import Table
+    from kf_calib.views.tables import ConsoleTable
 
     kinds = catalogue().values()
-    table = Table(title=f"{len(kinds)} effects to hide", title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    table = ConsoleTable(title=f"{len(kinds)} effects to hide", title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     table.add_column("effect\nwhat it is")
     for heading in ("in the\ncatalogue", "SI unit\ncoefficients", "constants", "navigation grade\nMEMS"):
         table.add_column(heading, no_wrap=True)

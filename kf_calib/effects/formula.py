@@ -51,7 +51,7 @@ _LARGE_MPS2 = 1e-3  # what a prior lets a coefficient add to a typical reading
 
 
 @dataclass(frozen=True)
-class Quantity:
+class FormulaQuantity:
     """A name in formulas: its SI unit, its meaning, and its values (m, 1), (m, 3) or a number."""
 
     unit: str
@@ -59,31 +59,31 @@ class Quantity:
     of: Callable[[Stimulus], Floats | float]
 
 
-QUANTITIES: dict[str, Quantity] = {
-    "fx": Quantity("m/s^2", "specific force along x of the platform", lambda s: s.force_mps2[:, 0:1]),
-    "fy": Quantity("m/s^2", "specific force along y of the platform", lambda s: s.force_mps2[:, 1:2]),
-    "fz": Quantity("m/s^2", "specific force along z of the platform", lambda s: s.force_mps2[:, 2:3]),
-    "a": Quantity("m/s^2", "specific force along the input axis", lambda s: s.along),
-    "p": Quantity("m/s^2", "specific force along the pendulous axis", lambda s: s.pendulous),
-    "o": Quantity("m/s^2", "specific force along the output axis", lambda s: s.output),
-    "da": Quantity("m/s^2", "last step of a from dwell to dwell", lambda s: s.step),
+QUANTITIES: dict[str, FormulaQuantity] = {
+    "fx": FormulaQuantity("m/s^2", "specific force along x of the platform", lambda s: s.force_mps2[:, 0:1]),
+    "fy": FormulaQuantity("m/s^2", "specific force along y of the platform", lambda s: s.force_mps2[:, 1:2]),
+    "fz": FormulaQuantity("m/s^2", "specific force along z of the platform", lambda s: s.force_mps2[:, 2:3]),
+    "a": FormulaQuantity("m/s^2", "specific force along the input axis", lambda s: s.along),
+    "p": FormulaQuantity("m/s^2", "specific force along the pendulous axis", lambda s: s.pendulous),
+    "o": FormulaQuantity("m/s^2", "specific force along the output axis", lambda s: s.output),
+    "da": FormulaQuantity("m/s^2", "last step of a from dwell to dwell", lambda s: s.step),
     **{
-        f"play{width:g}": Quantity(
+        f"play{width:g}": FormulaQuantity(
             "m/s^2", f"a through a play of {width:g} m/s^2", partial(Stimulus.played, half_width_mps2=width)
         )
         for width in (1.0, 3.0, 6.0)
     },
-    "T": Quantity("K", "temperature less 25 degC", lambda s: s.warmth[:, None]),
-    "dT": Quantity("K/s", "rate of the temperature", lambda s: s.warming[:, None]),
-    "t": Quantity("s", "time since the first sample", lambda s: s.elapsed_s[:, None]),
-    "tau": Quantity("s", "time since the arrival in the dwell", lambda s: s.since_arrival_s[:, None]),
-    "g": Quantity("m/s^2", "local gravity", lambda s: s.bench.gravity_mps2),
-    "s": Quantity("s", "one second", lambda s: 1.0),
-    "m": Quantity("m", "one metre", lambda s: 1.0),
-    "K": Quantity("K", "one kelvin", lambda s: 1.0),
-    "rad": Quantity("rad", "one radian", lambda s: 1.0),
-    "deg": Quantity("rad", "one degree", lambda s: math.pi / 180.0),
-    "pi": Quantity("", "3.14159...", lambda s: math.pi),
+    "T": FormulaQuantity("K", "temperature less 25 degC", lambda s: s.warmth[:, None]),
+    "dT": FormulaQuantity("K/s", "rate of the temperature", lambda s: s.warming[:, None]),
+    "t": FormulaQuantity("s", "time since the first sample", lambda s: s.elapsed_s[:, None]),
+    "tau": FormulaQuantity("s", "time since the arrival in the dwell", lambda s: s.since_arrival_s[:, None]),
+    "g": FormulaQuantity("m/s^2", "local gravity", lambda s: s.bench.gravity_mps2),
+    "s": FormulaQuantity("s", "one second", lambda s: 1.0),
+    "m": FormulaQuantity("m", "one metre", lambda s: 1.0),
+    "K": FormulaQuantity("K", "one kelvin", lambda s: 1.0),
+    "rad": FormulaQuantity("rad", "one radian", lambda s: 1.0),
+    "deg": FormulaQuantity("rad", "one degree", lambda s: math.pi / 180.0),
+    "pi": FormulaQuantity("", "3.14159...", lambda s: math.pi),
 }
 
 
@@ -105,15 +105,17 @@ def gimbal_letters(axes: tuple[Vector, ...]) -> str:
 
 
 @lru_cache(maxsize=32)
-def quantities(axes: tuple[Vector, ...]) -> dict[str, Quantity]:
+def quantities(axes: tuple[Vector, ...]) -> dict[str, FormulaQuantity]:
     """Everything a formula may name on a bench with these gimbal axes."""
     letters, named = gimbal_letters(axes), dict(QUANTITIES)
     for k, letter in enumerate(letters):
-        angle = Quantity("rad", f"angle of gimbal {k + 1}", _Angle(k))
+        angle = FormulaQuantity("rad", f"angle of gimbal {k + 1}", _Angle(k))
         names = [f"q{k + 1}", *([f"q_{letter}"] if letter != "?" and letters.count(letter) == 1 else [])]
         names += ["outer"] * (k == 0) + ["inner"] * (k == len(letters) - 1)
         named |= dict.fromkeys(names, angle)
-        named[f"q{k + 1}_before"] = Quantity("rad", f"angle of gimbal {k + 1} in the dwell before", _Angle(k, True))
+        named[f"q{k + 1}_before"] = FormulaQuantity(
+            "rad", f"angle of gimbal {k + 1} in the dwell before", _Angle(k, True)
+        )
     return named
 
 

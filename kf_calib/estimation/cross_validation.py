@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import cast
 
 import numpy as np
@@ -53,7 +54,7 @@ def grouped(places: Floats, apart: float) -> list[list[int]]:
     Groups are looked up by the cell of their first place in the four coordinates that differ most. A cell is twice as
     wide as ``apart``, so that what is near lies in the cell itself or in the neighbours on the nearer side.
     """
-    groups, at = list[list[int]](), dict[int, list[int]]()
+    groups, at, coordinates = list[list[int]](), dict[int, list[int]](), places.tolist()
     widest = np.argsort(-np.ptp(places, axis=0))[:4]
     scaled = (places[:, widest] - places[:, widest].min(axis=0)) / (2.0 * apart * _ROUNDING) + 1.0
     cells = np.floor(scaled).astype(int)
@@ -67,17 +68,17 @@ def grouped(places: Floats, apart: float) -> list[list[int]]:
         around = (cells[part] @ strides)[:, None] + sides[part] @ choices.T
         for k, (cell, *others) in enumerate(around.tolist(), first):
             nearby = [number for near in (cell, *others) if near in at for number in at[near]]
-            joined = min((g for g in nearby if _is_near(places[groups[g][0]], places[k], apart)), default=-1)
-            if joined >= 0:
-                groups[joined].append(k)
+            joined = [g for g in nearby if _is_near(coordinates[groups[g][0]], coordinates[k], apart)]
+            if joined:
+                groups[min(joined)].append(k)
             else:
                 at.setdefault(cell, []).append(len(groups))
                 groups.append([k])
     return groups
 
 
-def _is_near(one: Floats, other: Floats, apart: float) -> bool:
-    return bool((np.abs(one - other) < apart).all())
+def _is_near(one: Sequence[float], other: Sequence[float], apart: float) -> bool:
+    return all(abs(x - y) < apart for x, y in zip(one, other, strict=True))
 
 
 @dataclass(frozen=True)
@@ -156,19 +157,45 @@ def _without(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | No
 
 
 @dataclass(frozen=True)
+class _OfGroups:
+    """Rows (N, c) of G groups, one group after the other, and the number of rows of each, (G,)."""
+
+    rows: Floats
+    sizes: NDArray[np.intp]
+
+    @cached_property
+    def firsts(self) -> NDArray[np.intp]:
+        """The first row of each group."""
+        return np.cumsum(self.sizes) - self.sizes
+
+    def alike(self) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp]]]:
+        """Groups (g,) of one size at a time, not too many, and the places (g, m) of their rows."""
+        for size in np.unique(self.sizes).tolist():
+            groups = np.flatnonzero(self.sizes == size)
+            for chosen in (groups[k : k + _AT_ONCE] for k in range(0, len(groups), _AT_ONCE)):
+                yield chosen, self.firsts[chosen, None] + np.arange(size)
+
+    def of(self, groups: NDArray[np.intp]) -> Floats:
+        """The rows (g, m, c) of some groups; those of fewer rows are padded with zeros."""
+        places = np.arange(int(self.sizes[groups].max()))
+        inside = places < self.sizes[groups, None]
+        return np.where(inside[:, :, None], self.rows[np.where(inside, self.firsts[groups, None] + places, 0)], 0.0)
+
+
+@dataclass(frozen=True)
 class _Roots:
     """Roots of the covariances of the estimates without each of G orientations: ``common`` (p, p) beside ``common``
-    times ``more`` (G, p, m); or, where more is None, ``common`` (G, p, p) itself."""
+    times the transposed rows of ``more``; or, where more is None, ``common`` (G, p, p) itself."""
 
     common: Floats
-    more: Floats | None
+    more: _OfGroups | None
 
     def of(self, groups: NDArray[np.intp]) -> Floats:
         """The roots (n, p, p + m) without some of the orientations."""
         if self.more is None:
             return self.common[groups]
         common = np.broadcast_to(self.common, (len(groups), *self.common.shape))
-        return np.concatenate([common, self.common @ self.more[groups]], axis=2)
+        return np.concatenate([common, self.common @ np.swapaxes(self.more.of(groups), 1, 2)], axis=2)
 
 
 def _by_leverage(fitted: Fit, rows: Sequence[Floats], place: NDArray[np.intp]) -> tuple[Floats, _Roots] | None:
@@ -186,36 +213,36 @@ def _by_leverage(fitted: Fit, rows: Sequence[Floats], place: NDArray[np.intp]) -
     inverse = cast("Floats", np.linalg.inv(factor[:, :-1]))
     state = inverse @ factor[:, -1]
     of_groups = _of_groups(rows, place)
-    count, height = of_groups.shape[:2]
-    states, more = np.empty((count, width)), np.empty((count, width, height))
-    for part in (slice(k, k + _AT_ONCE) for k in range(0, count, _AT_ONCE)):
-        shares = of_groups[part, :, :-1] @ inverse
-        left = np.eye(height) - shares @ np.swapaxes(shares, 1, 2)
-        if np.linalg.eigvalsh(left)[:, 0].min() < _LEAST_LEFT:
+    states, more = np.empty((len(of_groups.sizes), width)), np.empty((len(of_groups.rows), width))
+    for groups, places in of_groups.alike():
+        ours = of_groups.rows[places]
+        shares = ours[..., :-1] @ inverse
+        left = np.eye(places.shape[1]) - shares @ np.swapaxes(shares, 1, 2)
+        if places.size and np.linalg.eigvalsh(left)[:, 0].min() < _LEAST_LEFT:
             return None
-        residuals = of_groups[part, :, -1:] - of_groups[part, :, :-1] @ state[:, None]
+        residuals = ours[..., -1:] - ours[..., :-1] @ state[:, None]
         lower = cast("Floats", np.linalg.cholesky(left))
         solved = inverse_of_lower(lower) @ np.concatenate([shares, residuals], axis=2)
-        more[part] = np.swapaxes(solved[..., :-1], 1, 2)
-        states[part] = state - (more[part] @ solved[..., -1:])[:, :, 0] @ inverse.T
-    return states, _Roots(inverse, more)
+        more[places] = solved[..., :-1]
+        states[groups] = state - (np.swapaxes(solved[..., :-1], 1, 2) @ solved[..., -1:])[:, :, 0] @ inverse.T
+    return states, _Roots(inverse, replace(of_groups, rows=more))
 
 
-def _of_groups(rows: Sequence[Floats], place: NDArray[np.intp]) -> Floats:
-    """Return the rows of each group of dwells, (G, m, p + 1), with no more than p of them: an orthogonal transformation
-    changes nothing. Groups of fewer rows are padded with zeros."""
+def _of_groups(rows: Sequence[Floats], place: NDArray[np.intp]) -> _OfGroups:
+    """Return the rows [A | z] of each group of dwells, no more than A has columns: an orthogonal transformation changes
+    nothing."""
     counts = np.fromiter(map(len, rows), np.intp, len(rows))
     order = np.argsort(np.repeat(place, counts), kind="stable")
     sizes = np.bincount(place, weights=counts).astype(int)
-    stacked, firsts, width = np.concatenate(rows)[order], np.cumsum(sizes) - sizes, rows[0].shape[1]
-    of_groups = np.zeros((len(sizes), min(int(sizes.max()), width - 1), width))
-    for size in np.unique(sizes).tolist():
-        alike = np.flatnonzero(sizes == size)
-        for chosen in (alike[k : k + _AT_ONCE] for k in range(0, len(alike), _AT_ONCE)):
-            ours = stacked[firsts[chosen, None] + np.arange(size)]
-            ours = triangle(ours)[:, : width - 1] if size >= width else ours
-            of_groups[chosen, : ours.shape[1]] = ours
-    return of_groups
+    stacked, most = _OfGroups(np.concatenate(rows)[order], sizes), rows[0].shape[1] - 1
+    if int(sizes.max()) <= most:
+        return stacked
+    reduced = _OfGroups(np.empty((int(np.minimum(sizes, most).sum()), most + 1)), np.minimum(sizes, most))
+    for groups, places in stacked.alike():
+        ours = stacked.rows[places]
+        places = reduced.firsts[groups, None] + np.arange(min(places.shape[1], most))
+        reduced.rows[places] = triangle(ours)[:, :most] if ours.shape[1] > most else ours
+    return reduced
 
 
 def _merged(fitted: Fit, rows: Sequence[Floats], groups: list[list[int]]) -> tuple[Floats, _Roots] | None:

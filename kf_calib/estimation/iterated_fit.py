@@ -42,6 +42,7 @@ from kf_calib.noise.unequal_noise import with_own_noise
 _PASSES = 3
 _PASSES_WITH_UNKNOWNS = 10
 _EXACT_RAD = 1e-9
+_MANY = 8192  # dwells by which variances are known to one percent, which is enough until the fit nearly settles
 _TURNS = 50  # most times that forces and state are found in turn
 _SINGULAR = 100.0
 _STILL = 2.5e-4  # the search ends when no step of ln(value) exceeds this share of its largest allowed step
@@ -79,13 +80,14 @@ def fit(
                 raise UnobservableError(_not_sensible(model))
             return fitted
         left, reach = _left_to_settle(fitted, state), largest_steps(fitted)
+        before, fitted = fitted if slews else None, replace(fitted)  # without its rows, which need much memory
         linearised = _moved_to(fitted, _with_constants_moved(fitted, constant_steps, reach, number), state)
-        noise = _noise_at(linearised, fitted, within, components)
-        fitted = replace(fitted, linearised=linearised, noise=noise)
+        fitted = replace(fitted, linearised=linearised)
+        fitted = replace(fitted, noise=_noise_at(linearised, before, within, components, number < _PASSES - 1))
         within = _within_again(fitted, within)
         # a constant without a derivative holds the input axes near their linearisation, so that convergence is slow
         still = (np.abs(constant_steps) <= _STILL * reach).all() and not model.stepped
-        turning = noise.weights.setting_rad > 0.0
+        turning = fitted.noise.weights.setting_rad > 0.0
         if number >= _PASSES - 1 and still and (left < SETTLED or not turning):
             return fitted
     if must_settle and not bench.angles and left > UNSETTLED:
@@ -113,13 +115,17 @@ def _with_constants_moved(fitted: Fit, constant_steps: Floats, reach: Floats, nu
     return model.moved(np.clip(constant_steps, -reach, reach)) if number and model.unknowns else model
 
 
-def _noise_at(linearised: LinearisedDwells, before: Fit, within: Noise, components: VarianceComponents) -> Noise:
-    """Return the noise within dwells completed by all that is estimated from the residuals of a linearisation, and by
-    the noise of slews in the fit before it."""
+def _noise_at(
+    linearised: LinearisedDwells, before: Fit | None, within: Noise, components: VarianceComponents, roughly: bool
+) -> Noise:
+    """Return the noise within dwells completed by all that is estimated from the residuals of a linearisation; by the
+    noise of slews in the fit before it where there are any. Of very many dwells, some tell ``roughly`` what it is."""
     within = replace(within, sensitivity_mps2_per_k=_sensitivity_to_temperature(linearised, within))
     means, prior = with_shared_noise(linearised.dwells, within, linearised.means)
+    if roughly and not prior.size:
+        means = means[:: max(len(means.counts) // _MANY, 1)]
     noise = components.completed(within, means, linearised.state, prior)
-    noise = replace(noise, slew_sigma_mps2=_slew_sigma(before, linearised.state) if linearised.slews else None)
+    noise = replace(noise, slew_sigma_mps2=_slew_sigma(before, linearised.state) if before else None)
     flicker_mps2 = flicker_within(linearised.dwells_at_state, linearised.columns, linearised.state, noise)
     return replace(noise, flicker_mps2=flicker_mps2 if flicker_mps2.any() else None)
 

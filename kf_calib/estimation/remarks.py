@@ -108,14 +108,14 @@ def remarks_on(
     windows = window_average.inflation() if dwells[0].averaged else 1.0
     if noise.inflation.max() > 1.5 * windows:
         kappa = ", ".join(f"{value / windows:.3g}" for value in noise.inflation)
-        usual = float(np.median([dwell.count for dwell in dwells]))
+        usual = float(np.median(dwells.folded.counts))
         short = not dwells[0].averaged and usual < TOO_SHORT * noise.inflation.max()
         slow = "; dwells are too short to tell how slow it is: stay longer in each" if short else ""
         yield f"the noise within a dwell is correlated: sigmas allow for it by inflating its variance by {kappa}{slow}."
-    weights = [dwell.weight for dwell in dwells]
-    if min(weights) < max(weights):
+    least, most = dwells.folded.weights.min(), dwells.folded.weights.max()
+    if least < most:
         yield (
-            f"the noise within dwells differs, {max(weights) ** -0.5:.2g} to {min(weights) ** -0.5:.2g} times that of "
+            f"the noise within dwells differs, {most**-0.5:.2g} to {least**-0.5:.2g} times that of "
             "the run: each dwell has the weight of its own."
         )
     if not noise.checked and noise.scatter_mps2.any() and not noise.scatter_stated:

@@ -258,7 +258,8 @@ def _channels(batch: _Batch, columns: Floats, blocks: _Blocks, about: _About, he
 
 def _unit_along(batch: _Batch, noise: Noise, state: Floats) -> Floats:
     """Return the unit vectors (d, 3) by which whitened channels are combined to the size of the force."""
-    along = along_force(batch.stack, sensitivities_of(batch.stack, state))[batch.dwells] * noise.effective_sigma_mps2
+    sensitivities = sensitivities_of(batch.stack, state, batch.dwells)
+    along = along_force(batch.stack, sensitivities, batch.dwells) * noise.effective_sigma_mps2
     return along / np.linalg.norm(along, axis=1, keepdims=True)
 
 

@@ -42,7 +42,7 @@ class FleetOverview:
     last: datetime | None
     tracks: tuple[Track, ...]
     weeks: Weeks
-    looks: tuple[Look, ...]
+    looks: tuple[AnotherLook, ...]
     pooled: PooledDiagnosis | None
     remarks: tuple[str, ...]
 
@@ -72,7 +72,7 @@ def _unit(row: Mapping[str, Any]) -> str:
 
 
 @dataclass(frozen=True)
-class Look:
+class AnotherLook:
     """A unit to look at; chance: that the strongest of the reasons is nothing but noise, given how many were tried.
 
     reasons: in words, the strongest first.
@@ -85,14 +85,14 @@ class Look:
 
 def looks(
     rows: Sequence[Mapping[str, Any]], units: Sequence[str], tracks: Sequence[Track], pooled: PooledDiagnosis | None
-) -> tuple[Look, ...]:
+) -> tuple[AnotherLook, ...]:
     """The units that need another look, first those that need it most."""
     reasons = dict[str, list[tuple[float, str]]]()
     for unit, chance, said in [*_of_runs(rows), *_of_parameters(units, tracks), *_of_effects(pooled)]:
         if chance < _LEVEL:
             reasons.setdefault(unit, []).append((chance, said))
     ordered = {unit: sorted(own, key=lambda each: each[0]) for unit, own in reasons.items()}
-    found = [Look(unit, own[0][0], tuple(said for _, said in own)) for unit, own in ordered.items()]
+    found = [AnotherLook(unit, own[0][0], tuple(said for _, said in own)) for unit, own in ordered.items()]
     return tuple(sorted(found, key=lambda look: (look.chance, -len(look.reasons), look.unit)))
 
 

@@ -34,7 +34,7 @@ class Means:
     ends_s: Floats
     bending: Floats = field(default_factory=lambda: np.zeros((1, 3, 3)))
 
-    def __getitem__(self, part: int | list[int]) -> Means:
+    def __getitem__(self, part: int | list[int] | slice) -> Means:
         known = {each.name: getattr(self, each.name) for each in fields(self)}
         if len(self.bending) != len(self.counts):
             del known["bending"]

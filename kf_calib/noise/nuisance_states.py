@@ -54,12 +54,14 @@ def rotation_map(force_mps2: Floats, sensitivities: Floats, axes: Floats) -> Flo
     return np.asarray(sensitivities @ np.swapaxes(turned, 1, 2), float)
 
 
-def along_force(dwells: Sequence[DwellFactor], sensitivities: Floats) -> Floats:
+def along_force(dwells: Sequence[DwellFactor], sensitivities: Floats, some: NDArray[np.intp] | None = None) -> Floats:
     """The weights m (D, 3) of the three channels in the size of the force of each dwell: m = S^-T f / |f|.
 
-    No rotation changes m . reading, which is |f| but for biases; sensitivities S are (D, 3, 3).
+    No rotation changes m . reading, which is |f| but for biases; sensitivities S are (D, 3, 3). some (d,): indices of
+    the dwells of which alone it is wanted, and their sensitivities (d, 3, 3).
     """
     force = DwellStack.of(dwells).felt_means_mps2
+    force = force if some is None else force[some]
     unit = force / np.linalg.norm(force, axis=1, keepdims=True)
     return np.asarray(np.linalg.solve(np.swapaxes(sensitivities, 1, 2), unit[:, :, None])[:, :, 0], float)
 

@@ -51,7 +51,7 @@ class Likelihood:
     """The restricted likelihood of the dwells' means, with a given noise and any further parts of it.
 
     - alone: the likelihood without further parts.
-    - shapes: the covariances (k, D, 6, 3) that each part contributes per unit of its variances.
+    - shapes: the covariances (k, D, 6, 3) that each part contributes per unit of its variances, as of ``Restricted``.
     - units (k,): the natural size of each number of a part, chosen as large as the misfit.
     """
 
@@ -61,7 +61,7 @@ class Likelihood:
 
     def of(self, parts: Parts) -> Restricted:
         """The likelihood with these parts, whose sizes are in ``units``."""
-        return replace(self.alone, shapes=np.concatenate([self.alone.shapes, *(self.shapes[part] for part in parts)]))
+        return replace(self.alone, shapes=tuple(self.shapes[part] for part in parts))
 
     def without(self) -> Point:
         """The likelihood evaluated without any further part."""
@@ -310,8 +310,8 @@ def _likelihood(
     fixed = mean_covariances(noise, means, state, float(units["common"][0]))
     if standing:  # no means are correlated: only their own covariances are kept
         shapes = {part: _shapes(part, means, state) for part in parts}
-        alone = Restricted(rows.reshape(3 * count, -1), reduced.prior, fixed, np.zeros((0, count, 3, 3)))
-        return Likelihood(alone, {part: units[part][:, None, None, None] ** 2 * shapes[part] for part in parts}, units)
+        alone = Restricted(rows.reshape(3 * count, -1), reduced.prior, fixed, ())
+        return Likelihood(alone, _scaled(shapes, units), units)
     path = mean_links(means.ends_s, held_s)
     rows[1:] -= path.share[:, None, None] * rows[:-1].copy()
     walk = np.zeros((1, count, 6, 3))
@@ -321,27 +321,35 @@ def _likelihood(
         rows.reshape(3 * count, -1),
         reduced.prior,
         _conditional_covariances(fixed, path) + noise.walk_mps2_per_sqrt_s**2 * walk[0],
-        walk[:0],
+        (),
     )
     shapes = {
         part: walk if part == "walk" else _conditional_covariances(_shapes(part, means, state), path) for part in parts
     }
-    return Likelihood(alone, {part: units[part][:, None, None, None] ** 2 * shapes[part] for part in parts}, units)
+    return Likelihood(alone, _scaled(shapes, units), units)
+
+
+def _scaled(shapes: Mapping[Part, Floats], units: Mapping[Part, Floats]) -> dict[Part, Floats]:
+    """Return the covariances of parts per unit of their sizes; one for all dwells where that is the same."""
+    return {part: units[part][:, None, None, None] ** 2 * of_part for part, of_part in shapes.items()}
 
 
 def _shapes(part: Part, means: Means, state: Floats) -> Floats:
-    """Return the covariances (k, D, 3, 3) of the means that a part contributes per unit of its variances."""
+    """Return the covariances of the means that a part contributes per unit of its variances, (k, D, 3, 3), or (k, 1, 3,
+    3) where they are those of all dwells."""
     if part == "setting":
         return setting_covariances(means, state)[None]
-    of_each = np.eye(3)[:, None, :, None] * np.eye(3)[:, None, None, :] * np.ones((len(means.counts), 1, 1))
+    of_each = np.eye(3)[:, None, :, None] * np.eye(3)[:, None, None, :]
     return of_each if part == "scatter" else of_each.sum(axis=0, keepdims=True)
 
 
 def _conditional_covariances(covariances: Floats, path: Links) -> Floats:
     """Return the covariances (..., D, 6, 3), in the layout of ``banded``, of means less their share of the mean before.
 
-    ``covariances`` (..., D, 3, 3) are those of the means themselves, which are independent of each other.
+    ``covariances`` (..., D, 3, 3), or (..., 1, 3, 3) of all alike, are those of the means themselves, which are
+    independent of each other.
     """
+    covariances = np.broadcast_to(covariances, (*covariances.shape[:-3], len(path.share) + 1, 3, 3))
     share, banded = path.share[:, None, None], np.zeros((*covariances.shape[:-2], 6, 3))
     banded[..., :3, :] = covariances
     banded[..., 1:, :3, :] += share**2 * covariances[..., :-1, :, :]

@@ -73,14 +73,19 @@ class Restricted:
 
     - rows (3 D, p + 1): [A | z].
     - prior (q, p + 1): whitened rows of prior knowledge of x.
-    - fixed (D, 6, 3), shapes (k, D, 6, 3): V_0 and K_k, in the layout of ``banded``; (D, 3, 3) and (k, D, 3, 3) where
-      no means are correlated.
+    - fixed (D, 6, 3), shapes: V_0 and some of the K_k (k, D, 6, 3) each, in the layout of ``banded``; (D, 3, 3) and
+      (k, D, 3, 3) where no means are correlated, (k, 1, 3, 3) where they are the same for all.
     """
 
     rows: Floats
     prior: Floats
     fixed: Floats
-    shapes: Floats
+    shapes: tuple[Floats, ...]
+
+    @property
+    def count(self) -> int:
+        """Number of the variances."""
+        return sum(map(len, self.shapes))
 
     def at(self, variances: Floats) -> Point:
         """The likelihood and its derivatives at ``variances`` (k,)."""
@@ -106,10 +111,18 @@ class Restricted:
         size = _AT_ONCE if self.fixed.shape[1] == 3 else count
         return [slice(k, min(k + size, count)) for k in range(0, count, size)]
 
+    def _shapes_of(self, part: slice) -> Floats:
+        """Return the K_k of a part of the means, (k, d, 6, 3) or (k, d, 3, 3)."""
+        alike = self.fixed[part].shape
+        shapes = [np.broadcast_to(own[:, part] if own.shape[1] > 1 else own, (len(own), *alike)) for own in self.shapes]
+        return np.concatenate([np.zeros((0, *alike)), *shapes])
+
     def _whitened(self, variances: Floats, part: slice) -> _Whitened:
         """Return the means of a part, whitened at ``variances`` (k,)."""
         fixed = self.fixed[part]
-        covariance = fixed + (variances @ self.shapes[:, part].reshape(len(variances), fixed.size)).reshape(fixed.shape)
+        covariance = fixed + (variances @ self._shapes_of(part).reshape(len(variances), fixed.size)).reshape(
+            fixed.shape
+        )
         covariance[:, :3] = lift_rounding(covariance[:, :3])
         lower = banded.root(covariance)
         return _Whitened(covariance, lower, banded.solve(lower, self.rows[3 * part.start : 3 * part.stop]))
@@ -130,11 +143,11 @@ class Restricted:
         sec. 6.6), and y' K_k P K_l y / 2 is the average of observed and expected information (Gilmour, Thompson and
         Cullis, 1995).
         """
-        count, width = len(self.shapes), len(level.upper) - 1
+        count, width = self.count, len(level.upper) - 1
         slope, squares, within = np.zeros(count), np.zeros((count, count)), np.zeros((width, count))
         inverse, along = np.linalg.inv(level.upper[:-1, :-1]), level.upper[:-1, -1]
         for part, whitened in zip(self._parts, level.whitened, strict=True) if count else ():
-            lower, shapes, basis = whitened.lower, self.shapes[:, part], whitened.rows[:, :-1] @ inverse
+            lower, shapes, basis = whitened.lower, self._shapes_of(part), whitened.rows[:, :-1] @ inverse
             rest = whitened.rows[:, -1] - basis @ along
             back = banded.solve(lower, np.column_stack([basis, rest]), transposed=True)
             inner = banded.inverse(whitened.covariance, lower) - banded.outer(back, whitened.covariance.shape[1])
@@ -155,7 +168,7 @@ class Restricted:
             sizes, point = self._search(begin)
             if (np.abs(np.log(np.maximum(sizes, 10.0 * _LEAST) / begin)) < _NEAR).all():
                 return sizes, point
-        return self._search(np.ones(len(self.shapes)))
+        return self._search(np.ones(self.count))
 
     def curvature(self, sizes: Floats) -> Floats:
         """Second derivatives (k, k) of the cost by the logarithms of the sizes, from differences of the first

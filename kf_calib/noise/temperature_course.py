@@ -34,7 +34,7 @@ _PENALTIES = np.geomspace(1e-12, 1e12, 241)
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
+class TemperatureCourse:
     """The temperature at the nodes of all pieces of some dwells and slews.
 
     - temperature_c (m,): NaN where it was not measured.
@@ -45,20 +45,20 @@ class Course:
     errors_c: Floats
 
 
-def temperature_course(folded: Folded) -> Course:
+def temperature_course(folded: Folded) -> TemperatureCourse:
     """The course of the temperature over dwells, and slews between them, in order of time."""
     if "temperature_course" not in folded.known:
         folded.known["temperature_course"] = _course(folded)
     return folded.known["temperature_course"]
 
 
-def _course(folded: Folded) -> Course:
+def _course(folded: Folded) -> TemperatureCourse:
     read = folded.of_nodes("temperature_c")
-    exact = Course(read, np.zeros((len(read), 0)))
+    exact = TemperatureCourse(read, np.zeros((len(read), 0)))
     if (~folded.moving).sum() < 4 or not np.isfinite(read).all():
         return exact
     if _only_scatters(folded, read):
-        return Course(np.full(len(read), _means(folded, read).mean()), exact.errors_c)
+        return TemperatureCourse(np.full(len(read), _means(folded, read).mean()), exact.errors_c)
     return _smooth(folded, read) or exact
 
 
@@ -80,7 +80,7 @@ def _means(folded: Folded, read: Floats) -> Floats:
     return np.add.reduceat(read, 3 * folded.ends[:-1]) / (3 * folded.piece_numbers)
 
 
-def _smooth(folded: Folded, read: Floats) -> Course | None:
+def _smooth(folded: Folded, read: Floats) -> TemperatureCourse | None:
     """Return the smooth course through temperatures at the nodes (m,); None where they are taken as they were read."""
     standing, ends, levels = ~folded.moving, folded.elapsed_s.reshape(-1, 3), read.reshape(-1, 3)[:, 1]
     lengths, owners = ends[:, 2] - ends[:, 0], np.repeat(np.cumsum(standing) - 1, folded.piece_numbers)
@@ -100,7 +100,7 @@ def _smooth(folded: Folded, read: Floats) -> Course | None:
     if spline.variance / usual_s < (_QUIET * levels.std()) ** 2 or spline.variance > _STEPS * within:
         return None
     there = _bumps(np.clip((folded.elapsed_s - begin) / spacing, 0.0, knots - 3), knots)
-    return Course(levels.mean() + there @ spline.coefficients, _largest(there @ spline.errors))
+    return TemperatureCourse(levels.mean() + there @ spline.coefficients, _largest(there @ spline.errors))
 
 
 def _within_dwells(middles: Floats, levels: Floats, weights: Floats, owners: NDArray[np.intp]) -> tuple[float, int]:

@@ -14,7 +14,7 @@ from kf_calib.effects import Bearer, Effect, as_text, remarks_of
 from kf_calib.estimation.observability import Visibility
 from kf_calib.support.units import shown
 from kf_calib.views.console import GRADES, effect_rows, size_range, symbol
-from kf_calib.views.tables import Table
+from kf_calib.views.tables import ConsoleTable
 
 _BEARERS = {
     Bearer.BENCH: "the bench, never sensors",
@@ -28,7 +28,7 @@ def overview(effects: Sequence[Effect]) -> RenderableType:
 
     A line has the name of the effect, what it is, its coefficients and their unit, and the effects it is confused with.
     """
-    table = Table(title=f"{len(effects)} effects", title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    table = ConsoleTable(title=f"{len(effects)} effects", title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     for heading in ("effect", "what it is", "coefficients", "unit", "confused with"):
         table.add_column(heading, no_wrap=heading in ("effect", "coefficients", "unit"))
     for effect in effects:
@@ -58,7 +58,7 @@ def details(effects: Sequence[Effect]) -> RenderableType:
 
 def _detail(effect: Effect) -> list[RenderableType]:
     """Return the report of one effect, part by part."""
-    table = Table(box=None, pad_edge=False, header_style="")
+    table = ConsoleTable(box=None, pad_edge=False, header_style="")
     for heading in ("coefficient", "unit", "prior scale"):
         table.add_column(heading)
     for row in effect_rows(effect):
@@ -94,7 +94,7 @@ def sight_report(sights: Sequence[Visibility], about: str) -> RenderableType:
 
     sights: one for each effect. about: title of the table.
     """
-    table = Table(title=about, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    table = ConsoleTable(title=about, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     for heading in ("effect", "visible", "left of it", "smallest size", "confused with (overlap)"):
         right = heading == "left of it"
         table.add_column(heading, justify="right" if right else "left", no_wrap=heading == "effect" or right)

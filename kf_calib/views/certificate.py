@@ -13,7 +13,7 @@ from kf_calib.exchange.certificate.content import OUTCOMES, Certificate, Certifi
 from kf_calib.support.units import shown
 from kf_calib.views.console import symbol
 from kf_calib.views.json import clean
-from kf_calib.views.tables import Table
+from kf_calib.views.tables import ConsoleTable
 from kf_calib.views.terminal import note
 
 
@@ -55,7 +55,7 @@ def _line_object(line: Contribution) -> dict[str, Any]:
 def certificate_report(certificate: Certificate, standing: str, pdf: Path, xml: Path | None) -> RenderableType:
     """The report of ``certificate``."""
     with_conformity = any(result.conformity for result in certificate.results)
-    table = Table(title="Uncertainty (type A and type B: standard; U = k u)", title_justify="left")
+    table = ConsoleTable(title="Uncertainty (type A and type B: standard; U = k u)", title_justify="left")
     for heading in ("parameter", "type A", "type B", "U", "k", "unit", *(["conformity"] if with_conformity else [])):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit", "conformity") else "right")
     first, combined = certificate.budget.contributions[0].parts, certificate.budget.combined

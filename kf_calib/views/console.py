@@ -19,7 +19,7 @@ from kf_calib.estimation.results import Calibration, OutlyingDwell, Parameter, f
 from kf_calib.noise.reml import FEWEST, degrees_of_freedom
 from kf_calib.support.printing import printed
 from kf_calib.support.units import rounded, shown, shown_whole
-from kf_calib.views.tables import Table
+from kf_calib.views.tables import ConsoleTable
 from kf_calib.views.terminal import PlainConsole, note
 
 _NOT_ESTIMATED, _NOT_USED = "not estimated", "not used"
@@ -55,10 +55,10 @@ def parameter_row(parameter: Parameter, fixed_by: str = "") -> tuple[str, str, s
     return symbol(parameter.symbol), whole_value(parameter), f"{sign}{deviation}", f"± {sigma}", unit.label
 
 
-def parameter_table(result: Calibration) -> Table:
+def parameter_table(result: Calibration) -> ConsoleTable:
     """The table of the twelve parameters: value, deviation from nominal and one sigma."""
     walking = "; the biases walk: those at the end of the run" if result.noise.walk_mps2_per_sqrt_s else ""
-    table = Table(title=f"Parameters (1σ{walking})", title_justify="left")
+    table = ConsoleTable(title=f"Parameters (1σ{walking})", title_justify="left")
     for heading in ("parameter", "value", "less nominal", "sigma", "unit"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
     for k, parameter in enumerate(list(result.parameters.values())[:12]):
@@ -66,9 +66,9 @@ def parameter_table(result: Calibration) -> Table:
     return table
 
 
-def without_table(result: Calibration, outlying: OutlyingDwell) -> Table:
+def without_table(result: Calibration, outlying: OutlyingDwell) -> ConsoleTable:
     """The table of the parameters fitted without an outlying dwell, and of their differences from those with it."""
-    table = Table(title=f"Without dwell {outlying.number} (1σ)", title_justify="left")
+    table = ConsoleTable(title=f"Without dwell {outlying.number} (1σ)", title_justify="left")
     for heading in ("parameter", "value", "sigma", "unit", "less with it"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
     pairs = zip(result.parameters.values(), outlying.without.parameters.values(), strict=True)
@@ -81,9 +81,9 @@ def without_table(result: Calibration, outlying: OutlyingDwell) -> Table:
     return table
 
 
-def effect_table(result: Calibration) -> Table:
+def effect_table(result: Calibration) -> ConsoleTable:
     """The table of the coefficients of the effects in the model, with sigmas and ratios to them."""
-    table = Table(title="Effects in the model (1σ)", title_justify="left")
+    table = ConsoleTable(title="Effects in the model (1σ)", title_justify="left")
     for heading in ("effect", "coefficient", "value", "sigma", "unit", "value / sigma"):
         table.add_column(heading, justify="left" if heading in ("effect", "coefficient", "unit") else "right")
     for effect in result.model.effects:
@@ -99,9 +99,9 @@ def effect_table(result: Calibration) -> Table:
     return table
 
 
-def model_table(model: Model) -> Table:
+def model_table(model: Model) -> ConsoleTable:
     """The table of a model: the twelve parameters and every effect with its symbols, units and prior scales."""
-    table = Table(title="Model", title_justify="left")
+    table = ConsoleTable(title="Model", title_justify="left")
     for heading in ("effect", "what it is", "coefficient", "unit", "prior scale"):
         table.add_column(heading)
     about = (
@@ -133,9 +133,9 @@ def size_range(sizes: tuple[float, float], own: Coefficient) -> str:
     return f"{'up to' if sizes[0] == 0.0 else f'{unit.number(sizes[0])} to'} {unit.text(sizes[1])}"
 
 
-def noise_table(result: Calibration) -> Table:
+def noise_table(result: Calibration) -> ConsoleTable:
     """The table of the noise model, with one column for each accelerometer."""
-    noise, table = result.noise, Table(title="Noise (1σ)", title_justify="left")
+    noise, table = result.noise, ConsoleTable(title="Noise (1σ)", title_justify="left")
     for heading in ("", "accelerometer 1", "accelerometer 2", "accelerometer 3", "unit"):
         table.add_column(heading, justify="left" if heading in ("", "unit") else "right")
     reading, angle = shown("m/s^2"), shown("rad")
@@ -205,7 +205,7 @@ def summary(result: Calibration) -> RenderableType:
 
 def comparison_table(compared: Comparison) -> RenderableType:
     """The table that ``compare`` prints: time, memory and difference from the block engine of each way of computing."""
-    table = Table(title="The same recording, three ways", title_justify="left")
+    table = ConsoleTable(title="The same recording, three ways", title_justify="left")
     for heading in ("way", "wall s", "peak MB", "largest difference, σ", "of diag P"):
         table.add_column(heading, justify="left" if heading == "way" else "right")
     for name, way in compared.ways.items():

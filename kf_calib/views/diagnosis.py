@@ -27,7 +27,7 @@ from kf_calib.support.units import shown
 from kf_calib.views.console import plain, symbol
 from kf_calib.views.json import clean, outlying_object, readings_object
 from kf_calib.views.next_step import angles_in_words, next_steps
-from kf_calib.views.tables import Table
+from kf_calib.views.tables import ConsoleTable
 from kf_calib.views.terminal import note
 from kf_calib.views.text_plot import TextPlot
 
@@ -260,10 +260,10 @@ def plain_report(diagnosis: Diagnosis) -> str:
     return plain(diagnosis_report(diagnosis))
 
 
-def _hypothesis_table(table: HypothesisTable, most: int | None = None) -> Table:
+def _hypothesis_table(table: HypothesisTable, most: int | None = None) -> ConsoleTable:
     """Return the table of the explanations that have 1 % of the probability or more, at most ``most`` of them, with
     what their refits say."""
-    shown_ = Table(title="What it may be", title_justify="left")
+    shown_ = ConsoleTable(title="What it may be", title_justify="left")
     for heading in ("explanation", "family", "probability", "largest coefficient (1σ)", "held out / noise"):
         left = heading in ("explanation", "family")
         shown_.add_column(heading, justify="left" if left else "right")
@@ -301,10 +301,10 @@ def name_of(row: Hypothesis) -> str:
     return " + ".join(row.effects) or (f"{row.driver} changes" if row.driver else row.families[0])
 
 
-def _suspect_table(diagnosis: Diagnosis) -> Table:
+def _suspect_table(diagnosis: Diagnosis) -> ConsoleTable:
     """Return the table of the suspects with their coefficients."""
     title = "Suspects (1σ; p: noise alone lets some effect explain as much; held out: rms over noise floor)"
-    table = Table(title=title, title_justify="left")
+    table = ConsoleTable(title=title, title_justify="left")
     for heading in ("effect", "p", "χ² / dof", "fits", "symbol", "value", "sigma", "unit", "held out"):
         left = heading in ("effect", "fits", "symbol", "unit")
         table.add_column(heading, justify="left" if left else "right", no_wrap=heading == "effect")
@@ -324,9 +324,9 @@ def _suspect_table(diagnosis: Diagnosis) -> Table:
     return table
 
 
-def _dwell_table(diagnosis: Diagnosis) -> Table:
+def _dwell_table(diagnosis: Diagnosis) -> ConsoleTable:
     """Return the table of the dwells that disagree most: their residuals over the sigma of their means."""
-    table = Table(title="Where it fails: residual / σ of the dwell's mean", title_justify="left")
+    table = ConsoleTable(title="Where it fails: residual / σ of the dwell's mean", title_justify="left")
     place = "gimbals, deg" if diagnosis.before.bench.axes else "up, in its axes"
     for heading in ("dwell", "at s", place, "1", "2", "3"):
         table.add_column(heading, justify="right")
@@ -346,9 +346,9 @@ def _place(dwell: DwellFactor, gimbals: bool) -> str:
     return ", ".join(f"{part:+.2f}" for part in force / np.linalg.norm(force))
 
 
-def _detectable_table(sizes: list[Detectable]) -> Table:
+def _detectable_table(sizes: list[Detectable]) -> ConsoleTable:
     """Return the table of the smallest detectable sizes."""
-    table = Table(title="Smallest coefficient that would be found in 9 of 10 such runs", title_justify="left")
+    table = ConsoleTable(title="Smallest coefficient that would be found in 9 of 10 such runs", title_justify="left")
     for heading in ("effect", "size", "unit", "effect", "size", "unit"):
         table.add_column(heading, justify="right" if heading == "size" else "left")
     half = (len(sizes) + 1) // 2

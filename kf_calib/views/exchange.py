@@ -22,7 +22,7 @@ from kf_calib.sources.files.contents import CALIBRATED_TOPIC
 from kf_calib.support.units import field_unit, shown
 from kf_calib.views.console import parameter_row, symbol
 from kf_calib.views.json import clean
-from kf_calib.views.tables import Table
+from kf_calib.views.tables import ConsoleTable
 from kf_calib.views.terminal import note
 
 _SHOWN = 12
@@ -115,9 +115,9 @@ def verification_report(verification: Verification) -> RenderableType:
     return Group(*parts, *map(note, verification.warnings))
 
 
-def _moves_table(verification: Verification) -> Table:
+def _moves_table(verification: Verification) -> ConsoleTable:
     """Return the table of the parameters that were compared, the clearest changes first."""
-    table = Table(title="Changes (1σ of both; p: that none of them has moved)", title_justify="left")
+    table = ConsoleTable(title="Changes (1σ of both; p: that none of them has moved)", title_justify="left")
     for heading in ("parameter", "change", "sigma", "unit", "change / sigma", "p", ""):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit", "") else "right")
     moved = set(verification.moved)
@@ -162,7 +162,9 @@ def history_report(history: History) -> RenderableType:
     of = f" of {history.serial}" if history.serial else ""
     first, last = history.dates[0].date(), history.dates[-1].date()
     parts: list[RenderableType] = [Text(f"{len(history.dates)} calibrations{of}, {first} to {last}.", style="bold")]
-    table = Table(title="Change over the calibrations (1σ; p: that a constant differs so much)", title_justify="left")
+    table = ConsoleTable(
+        title="Change over the calibrations (1σ; p: that a constant differs so much)", title_justify="left"
+    )
     for heading in ("parameter", "last less first", "drift a year", "repeatability", "walk in a year", "unit", "p"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
     for track in history.tracks:
@@ -242,7 +244,7 @@ def calibration_object(saved: SavedCalibration, path: Path) -> dict[str, Any]:
 
 def calibration_report(saved: SavedCalibration, path: Path) -> RenderableType:
     """The report of ``info`` of a calibration."""
-    table = Table(title="Parameters (1σ)", title_justify="left")
+    table = ConsoleTable(title="Parameters (1σ)", title_justify="left")
     for heading in ("parameter", "value", "less nominal", "sigma", "unit"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
     for k, parameter in enumerate(saved.parameters):

@@ -18,7 +18,7 @@ from kf_calib.support.units import shown
 from kf_calib.views.console import symbol
 from kf_calib.views.json import clean
 from kf_calib.views.pooled_diagnosis import pooled_objects, pooled_report
-from kf_calib.views.tables import Table
+from kf_calib.views.tables import ConsoleTable
 from kf_calib.views.terminal import note
 
 _SHOWN = 6
@@ -79,9 +79,9 @@ def fleet_report(
     return Group(*parts, *(note(said) for said in overview.remarks))
 
 
-def look_table(overview: FleetOverview) -> Table:
+def look_table(overview: FleetOverview) -> ConsoleTable:
     """The units that need another look first, with the reasons."""
-    table = Table(title="Units that need another look first", title_justify="left")
+    table = ConsoleTable(title="Units that need another look first", title_justify="left")
     for heading in ("unit", "chance by noise", "why"):
         table.add_column(heading, justify="right" if heading == "chance by noise" else "left")
     for each in overview.looks[:_SHOWN]:
@@ -92,8 +92,8 @@ def look_table(overview: FleetOverview) -> Table:
     return table
 
 
-def _population_table(populations: Sequence[ParameterPopulation]) -> Table:
-    table = Table(title="Parameters over the runs (spread, sigma: 1σ)", title_justify="left")
+def _population_table(populations: Sequence[ParameterPopulation]) -> ConsoleTable:
+    table = ConsoleTable(title="Parameters over the runs (spread, sigma: 1σ)", title_justify="left")
     for heading in ("parameter", "runs", "median less nominal", "spread", "sigma of a run", "unit"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
     for population in populations:

@@ -18,7 +18,7 @@ from kf_calib.support.units import shown
 from kf_calib.views.console import effect_table, parameter_table, symbol
 from kf_calib.views.diagnosis import description_object, description_sentence, orientation_object
 from kf_calib.views.json import clean
-from kf_calib.views.tables import Bar, Table
+from kf_calib.views.tables import Bar, ConsoleTable
 from kf_calib.views.terminal import note
 
 _WIDTH = 30  # length of the longest bar in characters
@@ -216,7 +216,7 @@ def progress(state: Improvement) -> RenderableType:
     longest = max(error for both in errors for error in both if error is not None)
     unit, alone = shown("m/s^2"), "without any one orientation the model is not determined"
     head = "over the noise floor" if floor else f"{unit.label} ({alone})"
-    table = Table(title=f"Rms error, {head}", title_justify="left", box=None, pad_edge=False)
+    table = ConsoleTable(title=f"Rms error, {head}", title_justify="left", box=None, pad_edge=False)
     for heading in ("step", "p", "", "", ""):
         table.add_column(heading, no_wrap=True)
     for (label, _, probability, p_value), (held_out, fitted) in zip(rows, errors, strict=True):
@@ -264,10 +264,10 @@ def _test(removal: Removal) -> str:
     return f"without {removal.name} χ² rises by {removal.statistic:.1f}, {removal.dof} dof (p {p_value}): {word}"
 
 
-def _spread_table(state: Improvement) -> Table:
+def _spread_table(state: Improvement) -> ConsoleTable:
     """Return the table of the range of each parameter over the equally good explanations."""
     names = ", ".join(each.name for each in state.alternatives)
-    table = Table(title=f"Parameters less nominal, over the explanations {names}", title_justify="left")
+    table = ConsoleTable(title=f"Parameters less nominal, over the explanations {names}", title_justify="left")
     for heading in ("parameter", "lowest", "highest", "sigma", "unit", "differ by, σ"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
     for k, each in enumerate(state.spreads):
@@ -319,7 +319,7 @@ def _numbered(diagnosis: Diagnosis, choices: Sequence[tuple[str, ...]]) -> list[
     if not choices:
         return []
     refits = {suspect.name: suspect for suspect in diagnosis.suspects}
-    table = Table(box=None, pad_edge=False)
+    table = ConsoleTable(box=None, pad_edge=False)
     for heading in ("", "suspect", "probability", "p", "fits", "held out"):
         table.add_column(heading, justify="right" if heading in ("", "probability", "held out") else "left")
     for number, names in enumerate(choices, start=1):

@@ -20,7 +20,7 @@ from kf_calib.support.units import STANDARD_GRAVITY_MPS2, shown, span
 from kf_calib.views.console import symbol
 from kf_calib.views.diagnosis import found_object, orientation_object
 from kf_calib.views.json import clean, replay_object
-from kf_calib.views.tables import Bar, Table
+from kf_calib.views.tables import Bar, ConsoleTable
 
 if TYPE_CHECKING:
     from kf_calib.sources.live import Status
@@ -177,7 +177,7 @@ def _of_risen(judgement: Judgement, name: str, factor: float) -> str:
 def _sigmas(standing: Standing) -> RenderableType:
     """Return the table of the twelve sigmas with what they are to come down to, in what time: their targets, or where
     none is set half of what they were after the last orientation."""
-    table = Table.grid(padding=(0, 1))
+    table = ConsoleTable.grid(padding=(0, 1))
     wanted = np.full(12, np.nan) if standing.judgement is None else standing.judgement.wanted
     targets = bool(np.isfinite(wanted).any())
     for justify in ("left", "right", "left", "right", "left", "right", "left"):

@@ -17,7 +17,7 @@ from kf_calib.support.units import shown, span
 from kf_calib.views.console import symbol
 from kf_calib.views.json import clean, replay_object
 from kf_calib.views.live import bar, link, source_object
-from kf_calib.views.tables import Bar, Table
+from kf_calib.views.tables import Bar, ConsoleTable
 
 if TYPE_CHECKING:
     from kf_calib.sources.live import Status
@@ -103,7 +103,7 @@ def _rest(standing: HandStanding, resting: str) -> Text:
 
 def _sigmas(judgement: HandJudgement | None) -> RenderableType:
     """Return the table of the nine parameters with their sigmas and targets; what the frame fixes is left out."""
-    table = Table.grid(padding=(0, 1))
+    table = ConsoleTable.grid(padding=(0, 1))
     for justify in ("left", "right", "right", "left", "right", "left"):
         table.add_column(justify=justify, no_wrap=True)
     table.add_row("", "less nominal", "σ", "", "target", "", style="dim")

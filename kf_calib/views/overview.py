@@ -14,7 +14,7 @@ from rich.text import Text
 from kf_calib.dwells.overview import DwellSummary
 from kf_calib.sources.files.inventory import Inventory, Topic
 from kf_calib.views.json import clean
-from kf_calib.views.tables import Table
+from kf_calib.views.tables import ConsoleTable
 from kf_calib.views.terminal import note
 
 _FORMATS = {"mcap": "MCAP", "db3": "SQLite of ROS 2", "lines": "lines of text", "mcap+db3": "MCAP and SQLite of ROS 2"}
@@ -83,8 +83,8 @@ def overview_report(overview: Overview) -> RenderableType:
     return Group(*parts)
 
 
-def _topic_table(topics: Sequence[Topic]) -> Table:
-    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+def _topic_table(topics: Sequence[Topic]) -> ConsoleTable:
+    table = ConsoleTable(box=SIMPLE_HEAD, pad_edge=False)
     for heading in ("topic", "type", "messages", "Hz", "from s", "to s", "gaps"):
         table.add_column(heading, justify="left" if heading in ("topic", "type", "gaps") else "right")
     begin = min((topic.first_ns for topic in topics if topic.first_ns is not None), default=0)
@@ -110,7 +110,7 @@ def _dwell_parts(dwells: Sequence[DwellSummary]) -> list[RenderableType]:
         return [Text("No dwell was found.")]
     lasts = [dwell.lasts_s for dwell in dwells]
     parts: list[RenderableType] = [Text(f"{len(dwells)} dwells of {min(lasts):.3g} to {max(lasts):.3g} s:")]
-    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    table = ConsoleTable(box=SIMPLE_HEAD, pad_edge=False)
     platform = "platform" if dwells[0].pose else "up by the readings"
     for heading in ("dwell", "at s", "lasts s", "readings", platform, "norm m/s^2"):
         table.add_column(heading, justify="right")

@@ -15,7 +15,7 @@ from kf_calib.reproduction.grebenkin2019 import NONOPTIMAL_PRINTED, OPTIMAL_PRIN
 from kf_calib.reproduction.grebenkin2019_conditions import AZIMUTHS_DEG, PERIODS_S, ConditionFit, ConditionSearch
 from kf_calib.views.console import symbol
 from kf_calib.views.json import clean
-from kf_calib.views.tables import Table
+from kf_calib.views.tables import ConsoleTable
 
 _ABOUT = {
     "platform": "turns about the platform's axes, the third from the start",
@@ -113,10 +113,10 @@ def paper_report(experiment: Experiment, searched: ConditionSearch) -> Renderabl
     return Group(table2(experiment), *map(Text, sentences(experiment, searched)))
 
 
-def table2(experiment: Experiment) -> Table:
+def table2(experiment: Experiment) -> ConsoleTable:
     """The table of both sets of orientations: print, expectation in closed form, least squares and filter."""
     title = f"Table 2: mean |error| over the deviation to be found, %, {experiment.repetitions} repetitions"
-    table = Table(title=title, title_justify="left")
+    table = ConsoleTable(title=title, title_justify="left")
     table.add_column("\nparameter")
     for name in ("optimal set", "non-optimal set"):
         for k, heading in enumerate(("paper", "expected", "batch", "filter")):

@@ -22,7 +22,7 @@ from kf_calib.support.output_files import write_whole
 from kf_calib.support.units import Unit, shown
 from kf_calib.views.console import symbol
 from kf_calib.views.json import clean
-from kf_calib.views.tables import Table
+from kf_calib.views.tables import ConsoleTable
 from kf_calib.views.terminal import note
 
 
@@ -94,9 +94,9 @@ def plan_report(made: Plan, beside_paper: bool = False) -> RenderableType:
                  *map(note, made.remarks))  # fmt: skip
 
 
-def _orientations(made: Plan) -> Table:
+def _orientations(made: Plan) -> ConsoleTable:
     """Return the table of the orientations in their order."""
-    table = Table(title=f"{len(made.poses)} orientations, in this order", title_justify="left")
+    table = ConsoleTable(title=f"{len(made.poses)} orientations, in this order", title_justify="left")
     for heading in (
         "",
         "begins, s",
@@ -111,9 +111,9 @@ def _orientations(made: Plan) -> Table:
     return table
 
 
-def _sigmas(made: Plan, beside_paper: bool) -> Table:
+def _sigmas(made: Plan, beside_paper: bool) -> ConsoleTable:
     """Return the table of the predicted sigmas."""
-    table = Table(title="Predicted sigma (1σ)", title_justify="left")
+    table = ConsoleTable(title="Predicted sigma (1σ)", title_justify="left")
     columns = _columns(made, beside_paper)
     for heading in ("parameter", *columns, "unit"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
@@ -178,12 +178,12 @@ _UNITS = dict(zip(paper_parameters.SYMBOLS, paper_parameters.UNITS, strict=True)
 
 def hand_plan_report(made: HandPlan) -> RenderableType:
     """The poses in their order, and the sigmas to expect."""
-    poses = Table(title=f"{len(made.up)} poses to hold still", title_justify="left")
+    poses = ConsoleTable(title=f"{len(made.up)} poses to hold still", title_justify="left")
     for heading in ("pose", "points up", "in words"):
         poses.add_column(heading, justify="right" if heading == "pose" else "left")
     for k, up in enumerate(made.up, 1):
         poses.add_row(str(k), up, up_in_words(up))
-    sigmas = Table(title="Predicted sigma (1σ)", title_justify="left")
+    sigmas = ConsoleTable(title="Predicted sigma (1σ)", title_justify="left")
     for heading in ("parameter", "sigma", "unit"):
         sigmas.add_column(heading, justify="right" if heading == "sigma" else "left")
     for name, sigma in zip(SYMBOLS, made.sigma[-1], strict=True):

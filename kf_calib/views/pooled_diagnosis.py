@@ -13,7 +13,7 @@ from kf_calib.fleet.pooled_diagnosis import EffectRow, Finding, PooledDiagnosis,
 from kf_calib.fleet.pooled_terms import Attribution
 from kf_calib.support.units import shown
 from kf_calib.views.console import symbol
-from kf_calib.views.tables import Table
+from kf_calib.views.tables import ConsoleTable
 
 _OF = {
     Attribution.BENCH: "of the bench",
@@ -115,10 +115,10 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:_LISTED]) + (f" and {more} more" if more > 0 else "") if names else "none for certain"
 
 
-def _probabilities(rows: Sequence[EffectRow]) -> Table:
+def _probabilities(rows: Sequence[EffectRow]) -> ConsoleTable:
     """Return the table of the probabilities of each attribution."""
     tried = [each for each in Attribution if any(each in (row.probabilities or {}) for row in rows)]
-    table = Table(title="What has each effect, and with what probability", title_justify="left")
+    table = ConsoleTable(title="What has each effect, and with what probability", title_justify="left")
     table.add_column("effect")
     for each in tried:
         table.add_column(_OF[each], justify="right")
@@ -129,9 +129,9 @@ def _probabilities(rows: Sequence[EffectRow]) -> Table:
     return table
 
 
-def _coefficients(finding: Finding) -> Table:
+def _coefficients(finding: Finding) -> ConsoleTable:
     """Return the table of the coefficients of one effect."""
-    table = Table(title=f"{finding.effect}, {_OF[finding.attribution]} (1σ)", title_justify="left")
+    table = ConsoleTable(title=f"{finding.effect}, {_OF[finding.attribution]} (1σ)", title_justify="left")
     for heading in ("of", "coefficient", "value", "sigma", "unit"):
         table.add_column(heading, justify="right" if heading in ("value", "sigma") else "left")
     for bench in finding.benches:
@@ -156,7 +156,7 @@ def _moment(date: str) -> str:
     return date[:16].replace("T", " ")
 
 
-def _add(table: Table, name: str, values: Sequence[PooledEstimate]) -> None:
+def _add(table: ConsoleTable, name: str, values: Sequence[PooledEstimate]) -> None:
     """Add a row for each coefficient."""
     for k, coefficient in enumerate(values):
         cells = ("not seen", "")

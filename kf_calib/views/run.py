@@ -13,7 +13,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.sources.files.decision_records import angles_of, number_of
 from kf_calib.support.units import span
 from kf_calib.views.json import clean
-from kf_calib.views.tables import Table
+from kf_calib.views.tables import ConsoleTable
 
 if TYPE_CHECKING:
     from kf_calib.positioning.drive import Decision, Drive, Outcome
@@ -67,7 +67,7 @@ def decided(decisions: Sequence[Mapping[str, str]], ends: Sequence[Mapping[str, 
     """The decisions in the records of a recording as a table, and how the run ended; None where there are none."""
     if not decisions:
         return None
-    table = Table("", "after", "gimbals, deg", "stay", "why")
+    table = ConsoleTable("", "after", "gimbals, deg", "stay", "why")
     for record in decisions:
         angles = angles_of(record.get("gimbal_deg", ""))
         where = ", ".join(f"{angle:g}" for angle in angles)
@@ -92,7 +92,7 @@ def angles_in_words(gimbal_deg: Sequence[float]) -> str:
 def dry_run(poses: Floats, ways: Sequence[Sequence[Floats]], slews_s: Sequence[float], stay_s: float, overhead_s: float
             ) -> RenderableType:  # fmt: skip
     """The path of the opening and its duration. poses (n, k), rad; ways: stations to each; slews_s: time to each."""
-    table = Table("", "gimbals, deg", "by way of", "slew", "there until")
+    table = ConsoleTable("", "gimbals, deg", "by way of", "slew", "there until")
     passed_s = 0.0
     for number, (pose, way, slew_s) in enumerate(zip(poses, ways, slews_s, strict=True), start=1):
         passed_s += slew_s + overhead_s + stay_s

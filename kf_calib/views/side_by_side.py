@@ -11,7 +11,7 @@ from kf_calib.support.tail_probabilities import LEVEL
 from kf_calib.support.units import shown
 from kf_calib.views.console import symbol
 from kf_calib.views.json import clean
-from kf_calib.views.tables import Table
+from kf_calib.views.tables import ConsoleTable
 
 
 def verdict(pair: SideBySide) -> str:
@@ -27,9 +27,9 @@ def verdict(pair: SideBySide) -> str:
     return f"The parameters of the two recordings {word}: {chance}; {most}."
 
 
-def difference_table(differences: Sequence[Difference], first: str, second: str) -> Table:
+def difference_table(differences: Sequence[Difference], first: str, second: str) -> ConsoleTable:
     """The table of the parameters in both, less nominal, and of their differences; first, second: what they are of."""
-    table = Table(title="Parameters less nominal (1σ)", title_justify="left")
+    table = ConsoleTable(title="Parameters less nominal (1σ)", title_justify="left")
     for heading in ("parameter", first, "sigma", second, "sigma", "unit", "difference", "in σ"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
     for k, each in enumerate(differences):

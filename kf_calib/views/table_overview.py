@@ -15,7 +15,7 @@ from kf_calib.sources.tables.survey import ColumnFound, Survey
 from kf_calib.support.plain_text import cut
 from kf_calib.views.json import clean
 from kf_calib.views.overview import pose_text, up_text
-from kf_calib.views.tables import Table
+from kf_calib.views.tables import ConsoleTable
 from kf_calib.views.terminal import note
 
 _SHOWN = 40  # orientations
@@ -87,8 +87,8 @@ def _counted(count: int, what: str) -> str:
     return f"{count} {what}{'s' * (count != 1)}"
 
 
-def _column_table(columns: Sequence[ColumnFound]) -> Table:
-    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+def _column_table(columns: Sequence[ColumnFound]) -> ConsoleTable:
+    table = ConsoleTable(box=SIMPLE_HEAD, pad_edge=False)
     for heading in ("column", "first cell", "taken for", "unit", "told"):
         table.add_column(heading, justify="left")
     for survey in columns:
@@ -112,8 +112,8 @@ def _quantity(meaning: str) -> str:
     return f"{_QUANTITIES[name]}{' ' * bool(number)}{number}"
 
 
-def _row_table(survey: Survey) -> Table:
-    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+def _row_table(survey: Survey) -> ConsoleTable:
+    table = ConsoleTable(box=SIMPLE_HEAD, pad_edge=False)
     for heading in ("dwell", "row", "at s", _ORIENTATIONS[survey.orientation], "norm m/s^2", "readings", "°C"):
         table.add_column(heading, justify="right")
     for row in survey.rows[:_SHOWN]:

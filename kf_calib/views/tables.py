@@ -29,7 +29,7 @@ class Bar(Text):
         return max(len(self.plain) - 1, 0) + part
 
 
-class Table(rich.table.Table):
+class ConsoleTable(rich.table.Table):
     """A table whose right-aligned columns hold numbers, which are never folded; other columns are folded between words.
 
     Where the table does not fit, its frame is left out, then its bars. If that is not enough, each row becomes a record
@@ -46,19 +46,19 @@ class Table(rich.table.Table):
                 return
         yield Text(self._without_bars()._records(max(options.max_width, _NARROWEST)))
 
-    def _of(self, columns: list[Column]) -> Table:
+    def _of(self, columns: list[Column]) -> ConsoleTable:
         """Return the same rows with other columns."""
         other = copy.copy(self)
         other.columns = [replace(column, _index=k) for k, column in enumerate(columns)]
         return other
 
-    def _unframed(self) -> Table:
+    def _unframed(self) -> ConsoleTable:
         """Return the same table with a line under the headings in place of a frame."""
         other = copy.copy(self)
         other.box, other.show_edge, other.padding = self.box and SIMPLE_HEAD, False, (0, 0 if self.box else 1)
         return other
 
-    def _without_bars(self) -> Table:
+    def _without_bars(self) -> ConsoleTable:
         """Return the same table without columns of bars."""
         return self._of([column for column in self.columns if not any(isinstance(cell, Bar) for cell in column.cells)])
 

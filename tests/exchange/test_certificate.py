@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import xml.etree.ElementTree as ET
 from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import UTC, date, datetime
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -187,6 +187,31 @@ def test_what_is_not_stated_stays_blank(cal: Path, tmp_path: Path) -> None:
         assert f"{field} not stated" in text
     assert "The attached XML is not a DCC" in text and "No claim of accreditation is made." in text
     assert "No error of the bench is stated" in text
+
+
+@pytest.mark.parametrize(
+    ("begun", "ended", "shown"),
+    [(None, None, None), (date(2025, 6, 15), date(2025, 6, 15), "2025-06-15"),
+     (date(2025, 6, 15), date(2025, 6, 16), "2025-06-15 to 2025-06-16")],
+)  # fmt: skip
+def test_days_of_the_calibration_are_shown_where_they_are_known(
+    cal: Path, begun: date | None, ended: date | None, shown: str | None
+) -> None:
+    facts = document.content(replace(made(cal, None), begun=begun, ended=ended), "checked")["facts"]
+    assert dict(facts)["Calibrated"] == shown
+
+
+@pytest.mark.parametrize(
+    ("lowest_c", "highest_c", "shown"),
+    [(None, None, None), (19.5, 21.25, "19.50 °C to 21.25 °C")],
+)
+def test_the_temperature_of_the_block_is_shown_where_it_was_measured(
+    cal: Path, lowest_c: float | None, highest_c: float | None, shown: str | None
+) -> None:
+    own = made(cal, None)
+    measured = {"temperature_min_c": lowest_c, "temperature_max_c": highest_c}
+    saved = own.saved.model_copy(update={"conditions": own.saved.conditions.model_copy(update=measured)})
+    assert dict(document.content(replace(own, saved=saved), "checked")["method"])["Temperature of the block"] == shown
 
 
 HOSTILE = r"""#panic("x") #import "/etc/passwd" $x$ [[ <script>&amp; "'` \u{41} *b* _i_ @ref // ]]> -- ~ éß Ω"""

@@ -47,7 +47,7 @@ def problem(seed: int, beside: float, known: int, count: int = 9) -> Restricted:
     prior = np.zeros((known, 7))
     prior[:, :known] = np.diag(rng.uniform(0.5, 2.0, known))
     shapes = np.array([covariance(rng, count, beside) for _ in range(3)])
-    return Restricted(rng.normal(size=(3 * count, 7)), prior, covariance(rng, count, beside), shapes)
+    return Restricted(rng.normal(size=(3 * count, 7)), prior, covariance(rng, count, beside), (shapes[:1], shapes[1:]))
 
 
 @pytest.mark.parametrize("count", [1, 2, 7])
@@ -76,7 +76,7 @@ def test_the_restricted_likelihood_is_that_of_dense_matrices(known: int, beside:
     made, variances = problem(1, beside, known), np.array([0.3, 2.0, 0.7])
     point = made.at(variances)
     full = np.eye(len(made.rows) + known)
-    full[known:, known:] = dense(made.fixed + np.tensordot(variances, made.shapes, 1))
+    full[known:, known:] = dense(made.fixed + np.tensordot(variances, np.concatenate(made.shapes), 1))
     design, readings = np.vstack([made.prior, made.rows])[:, :-1], np.vstack([made.prior, made.rows])[:, -1]
     weight = np.linalg.inv(full)
     inner = design.T @ weight @ design
@@ -86,7 +86,7 @@ def test_the_restricted_likelihood_is_that_of_dense_matrices(known: int, beside:
     assert point.misfit == pytest.approx(misfit, rel=1e-9)
     assert point.cost == pytest.approx(expected, rel=1e-9)
     onto = (project @ readings)[known:]
-    moved = np.column_stack([dense(own) @ onto for own in made.shapes])
+    moved = np.column_stack([dense(own) @ onto for own in np.concatenate(made.shapes)])
     np.testing.assert_allclose(point.information, 0.5 * moved.T @ project[known:, known:] @ moved, rtol=1e-8)
 
 

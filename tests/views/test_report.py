@@ -27,7 +27,8 @@ from kf_calib.views.report.contents import page_of
 from kf_calib.views.report.drawing import Drawing, draw_all
 from kf_calib.views.report.measured import Measured
 from kf_calib.views.report.page import save
-from kf_calib.views.report.parts import Table, parts_of
+from kf_calib.views.report.parts import PageTable, parts_of
+from kf_calib.views.tables import ConsoleTable
 
 HIDDEN = ROOT / "recordings" / "hidden.mcap"
 EVIL = "<script>document.title='evil'</script>"
@@ -180,7 +181,7 @@ def test_the_same_result_is_the_same_file_and_a_small_one(found: kf_calib.Diagno
 def test_numbers_are_those_of_the_console_with_their_points_in_line(found: kf_calib.Diagnosis) -> None:
     drawn = console.parameter_table(found.before)
     (table,) = parts_of(drawn)
-    assert isinstance(table, Table)
+    assert isinstance(table, PageTable)
     printed = [[str(cell) for cell in column.cells] for column in drawn.columns]
     assert [[str(cell).replace("−", "-") for cell in column] for column in zip(*table.rows, strict=True)] == printed
     for heading, column in zip(table.headings, zip(*table.rows, strict=True), strict=True):
@@ -198,11 +199,11 @@ def test_numbers_are_those_of_the_console_with_their_points_in_line(found: kf_ca
     ],
 )  # fmt: skip
 def test_a_number_is_split_at_its_decimal_point(text: str, parts: tuple[str, str, str]) -> None:
-    table = console.Table()
+    table = ConsoleTable()
     table.add_column("x", justify="right")
     table.add_row(text)
     (shown,) = parts_of(table)
-    assert isinstance(shown, Table)
+    assert isinstance(shown, PageTable)
     cell = shown.rows[0][0]
     assert (cell.whole, cell.fraction, cell.rest) == parts
 

@@ -32,7 +32,7 @@ from kf_calib.reproduction.grebenkin2019 import repeat
 from kf_calib.sources.files.recording import Recording
 from kf_calib.views import catalogue, console, diagnosis, improvement, live, paper
 from kf_calib.views import plan as plans
-from kf_calib.views.tables import Bar, Table
+from kf_calib.views.tables import Bar, ConsoleTable
 
 HIDDEN = ROOT / "recordings" / "hidden.mcap"
 BENCH = Bench.from_metadata({"axes": "y z x", "gravity_mps2": "9.81"})
@@ -96,8 +96,8 @@ def _numbers(text: str) -> Counter[str]:
     return Counter(re.findall(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?", text))
 
 
-def _table() -> Table:
-    table = Table(title="Sizes")
+def _table() -> ConsoleTable:
+    table = ConsoleTable(title="Sizes")
     table.add_column("name")
     table.add_column("p", justify="right")
     table.add_column("")

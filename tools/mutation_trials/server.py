@@ -33,7 +33,7 @@ import pytest
 QUIET = ("-n", "0", "-q", "-m", "not slow", "-p", "no:cacheprovider", "--no-header", "--tb=no")
 _SLOWER, _LEAST_S = 10.0, 20.0
 """Tests of a file that take so many times as long as usual, and at least so long, have noticed something."""
-_LONGEST_S = 1200.0
+_LONGEST_S = 300.0
 """By the clock; tests that wait for ever take no processor time."""
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass, field
+from itertools import groupby
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -100,14 +101,15 @@ TrueStep = Callable[[TrueState], None]
 """One part of the bench: changes what is true in a ``TrueState``. It may remember what went before."""
 
 
-@dataclass(frozen=True)
-class Gimbals:
-    """The chain of gimbals, on a base whose axis ``up`` points up: angles -> attitude in the bench frame."""
-
-    up: str
-
-    def __call__(self, state: TrueState) -> None:
-        state.attitude = attitude(state.axes, state.angles_rad, self.up)
+def set_attitudes(states: Sequence[TrueState], up: str) -> None:
+    """The chain of gimbals, on a base whose axis ``up`` points up: angles -> attitude in the bench frame; of many
+    stretches at once, because a call of scipy's rotations takes as long as a stretch of samples."""
+    for axes, alike in groupby(states, key=lambda state: tuple(state.axes)):
+        some = list(alike)
+        whole = attitude(axes, np.concatenate([state.angles_rad for state in some]), up)
+        ends = np.cumsum([len(state.angles_rad) for state in some]).tolist()
+        for state, end in zip(some, ends, strict=True):
+            state.attitude = whole[end - len(state.angles_rad) : end]
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -43,7 +44,7 @@ class Sensors:
         """Rows K_i E_i (3, 3)."""
         return self.scales[:, None] * self.input_axes
 
-    @property
+    @cached_property
     def input_axes(self) -> Floats:
         """Rows E_i (3, 3).
 
@@ -54,7 +55,9 @@ class Sensors:
         lean_x, lean_z = math.sin(p["nu1"]), -math.sin(p["nu2"])
         second = np.array([lean_x, math.sqrt(1.0 - lean_x**2 - lean_z**2), lean_z])
         first, third = _raised_and_turned(p["theta1"], p["phi1"]), _raised_and_turned(p["theta3"], p["phi3"])
-        return np.array([first, second, third])
+        axes = np.array([first, second, third])
+        axes.setflags(write=False)
+        return axes
 
     @property
     def scales(self) -> Floats:

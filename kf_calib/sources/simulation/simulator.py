@@ -25,7 +25,6 @@ from kf_calib.sources.simulation.noise_processes import TrueNoise, generator
 from kf_calib.sources.simulation.physics import (
     Ambient,
     Disturbance,
-    Gimbals,
     Gravity,
     Inputs,
     Response,
@@ -34,6 +33,7 @@ from kf_calib.sources.simulation.physics import (
     TrueState,
     TrueStep,
     WalkingBias,
+    set_attitudes,
 )
 from kf_calib.sources.simulation.sensors import Sensors
 from kf_calib.sources.simulation.visit_plans import YZX, Motion, PlannedVisit, attitude, stays
@@ -164,14 +164,14 @@ class Simulation:
             there[f"b{k}"] += walked
         return there
 
-    def _steps(self) -> list[TrueStep]:
-        """The chain, fresh from its start."""
+    def _steps(self) -> tuple[list[TrueStep], list[TrueStep]]:
+        """The chain, fresh from its start: what comes before the attitude that the gimbals make, and what after it."""
         hidden = self._hidden_steps()
         turned: list[TrueStep] = [*self._further, *hidden["angles"]]
-        platform: list[TrueStep] = [*turned, Gimbals(self.bench.up), *hidden["attitude"], *self._setting_steps()]
+        platform: list[TrueStep] = [*hidden["attitude"], *self._setting_steps()]
         response: list[TrueStep] = [Inputs(self.sensors), *hidden["input"], Response(self.sensors), *hidden["reading"]]
         force: list[TrueStep] = [Gravity(self.bench), *hidden["force"]]
-        return [*platform, *force, *response, *self._noise_steps(), *hidden["record"]]
+        return turned, [*platform, *force, *response, *self._noise_steps(), *hidden["record"]]
 
     def _hidden_steps(self) -> dict[Stage, list[TrueStep]]:
         return steps_of(self.hidden, self._rig)
@@ -200,20 +200,26 @@ class Simulation:
     def _drawn_per_dwell(self, quantity: str, sigma: float) -> Floats:
         return sigma * generator(self.seed, quantity).standard_normal((len(self.plan), 3))
 
-    def _readings(self, first: int, last: int, steps: Sequence[TrueStep]) -> Stream:
+    def _readings(self, first: int, last: int, steps: tuple[Sequence[TrueStep], Sequence[TrueStep]]) -> Stream:
+        before, after = steps
         time_ns = np.arange(first, last) * self._accel.period_ns
         values = np.empty((last - first, 3))
         turning_points = np.searchsorted(time_ns, np.concatenate([self.motion.arrive_ns, self.motion.leave_ns]))
         cuts = np.unique([0, last - first, *turning_points])
-        for start, end in pairwise(cuts.tolist()):
-            state = self._state(time_ns[start:end])
-            for step in steps:
+        stretches = [slice(start, end) for start, end in pairwise(cuts.tolist())]
+        dwells = self.motion.locate(time_ns[cuts[:-1]])[0].tolist()
+        states = [self._state(time_ns[part], dwell) for part, dwell in zip(stretches, dwells, strict=True)]
+        for state in states:
+            for step in before:
                 step(state)
-            values[start:end] = state.reading_mps2
+        set_attitudes(states, self.bench.up)
+        for part, state in zip(stretches, states, strict=True):
+            for step in after:
+                step(state)
+            values[part] = state.reading_mps2
         return Stream(START_NS + time_ns, values)
 
-    def _state(self, time_ns: Times) -> TrueState:
-        dwell = int(self.motion.locate(time_ns[:1])[0][0])
+    def _state(self, time_ns: Times, dwell: int) -> TrueState:
         moving = bool(time_ns[0] >= self.motion.leave_ns[dwell])
         posed_ns = time_ns if moving else time_ns[:1]
         return TrueState(

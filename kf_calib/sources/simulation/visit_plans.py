@@ -118,6 +118,29 @@ def up_directions(axes: Sequence[Vector], angles_rad: Floats, up: str = "y") -> 
     return attitude(axes, angles_rad, up).inv().apply([0.0, 1.0, 0.0])
 
 
+def _up_direction(axes: Sequence[Vector], angles_rad: Sequence[float], up: str) -> Floats:
+    """``up_directions`` (3,) at one set of angles, to the last bit, in numbers instead of arrays: a search for angles
+    asks for a thousand."""
+    x, y, z, w = base_with_up(up).as_quat()[0].tolist()
+    for axis, angle in zip(axes, angles_rad, strict=True):
+        a, b, c, d = _quaternion(*(angle * part for part in axis))
+        x, y, z, w = (
+            w * a + d * x + (y * c - z * b), w * b + d * y + (z * a - x * c), w * c + d * z + (x * b - y * a),
+            w * d - x * a - y * b - z * c,
+        )  # fmt: skip
+        norm = math.sqrt(x * x + y * y + z * z + w * w)
+        x, y, z, w = x / norm, y / norm, z / norm, w / norm
+    return np.array([2.0 * (x * y + z * w), -x * x + y * y - z * z + w * w, 2.0 * (y * z - x * w)])
+
+
+def _quaternion(x: float, y: float, z: float) -> tuple[float, float, float, float]:
+    """The unit quaternion (x, y, z, w) of a rotation vector, rad: (v sin(|v| / 2) / |v|, cos(|v| / 2))."""
+    angle = math.sqrt(x * x + y * y + z * z)
+    square = angle * angle
+    scale = math.sin(angle / 2.0) / angle if angle > 1e-3 else 0.5 - square / 48.0 + square * square / 3840.0
+    return scale * x, scale * y, scale * z, math.cos(angle / 2.0)
+
+
 def _total_turn(angles_deg: Sequence[float]) -> float:
     return sum(map(abs, angles_deg))
 
@@ -138,8 +161,8 @@ def _angles_towards(direction: Floats, axes: Sequence[Vector], rng: np.random.Ge
     """
 
     def miss(angles_rad: Floats, start_rad: Floats) -> Floats:
-        apart = up_directions(axes, angles_rad[None], up)[0] - direction
-        return np.append(apart, _PULL * (angles_rad - start_rad))
+        apart = _up_direction(axes, angles_rad.tolist(), up) - direction
+        return np.concatenate([apart, _PULL * (angles_rad - start_rad)])
 
     best, cost = np.zeros(len(axes)), math.inf
     for _ in range(_STARTS):

@@ -20,7 +20,7 @@ from kf_calib.sources.tables.grid import grid_of
 from kf_calib.sources.tables.numbers import Numbers
 from kf_calib.sources.tables.orientation import Orientations
 from kf_calib.sources.tables.table import Table
-from kf_calib.sources.tables.times import Times
+from kf_calib.sources.tables.times import RowTimes
 from kf_calib.sources.tables.words import ANGLE, NO_HEADER, are_numbers, face_of
 from kf_calib.sources.units import Units, mps2_per, reading_units
 from kf_calib.support.plain_text import cut
@@ -109,9 +109,9 @@ class Opening:
         return ", ".join(map(repr, names))
 
     @cached_property
-    def times(self) -> Times:
+    def times(self) -> RowTimes:
         """When the rows were measured."""
-        return Times.of(self.columns)
+        return RowTimes.of(self.columns)
 
     @property
     def are_samples(self) -> bool:

@@ -18,7 +18,7 @@ _FIRST = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 @dataclass(frozen=True)
-class Times:
+class RowTimes:
     """Times of the rows since the first, and the stamp of the first where it has a date.
 
     said: what they were taken from; empty where the table has none, and the rows count as a minute apart.
@@ -29,7 +29,7 @@ class Times:
     said: str
 
     @classmethod
-    def of(cls, columns: Columns) -> Times:
+    def of(cls, columns: Columns) -> RowTimes:
         """Raises InputError for a cell that is no time, and for rows that are out of order."""
         places, count = columns.places("time"), len(columns.grid.rows)
         if not places:

@@ -20,7 +20,7 @@ from kf_calib.views.figures.collection import DIRECTIONS, FALL, NO_FALL, ON_THEI
 from kf_calib.views.report.drawing import Drawing
 from kf_calib.views.report.explorer import Explorer, explorer
 from kf_calib.views.report.measured import Measured, facts
-from kf_calib.views.report.page import Facts, Page, Part, Section, Standing
+from kf_calib.views.report.page import Agreement, Facts, Page, PagePart, Section
 from kf_calib.views.report.parts import Paragraph, parts_of
 
 MEASURED = "What was measured"
@@ -137,14 +137,14 @@ def _run(name: str, diagnosed: Diagnosis, prefix: str) -> Section:
     return Section(name, (*parts, *warnings_of(diagnosed.before.warnings).parts))
 
 
-_HEADLINES: dict[bool | None, tuple[Standing, str]] = {
+_HEADLINES: dict[bool | None, tuple[Agreement, str]] = {
     True: ("agrees", "Model and measurements agree"),
     False: ("disagrees", "Model and measurements disagree"),
     None: ("open", "There is nothing to judge the model by"),
 }
 
 
-def _standing(consistent: bool | None) -> tuple[Standing, str]:
+def _standing(consistent: bool | None) -> tuple[Agreement, str]:
     return _HEADLINES[consistent]
 
 
@@ -168,33 +168,33 @@ def _explorer_of(diagnosed: Diagnosis) -> Explorer:
     return explorer(diagnosed.before, left, [shape for each in offered for shape in each.shapes])
 
 
-def in_text(drawn: RenderableType, with_notes: bool = False) -> tuple[Part, ...]:
+def in_text(drawn: RenderableType, with_notes: bool = False) -> tuple[PagePart, ...]:
     """Return what the console draws, without its notes, which have a section of their own."""
     return tuple(each for each in parts_of(drawn) if with_notes or each.kind != "note")
 
 
-def _calibrated(result: Calibration) -> tuple[Part, ...]:
+def _calibrated(result: Calibration) -> tuple[PagePart, ...]:
     """Return the tables of a calibration, less the counts of readings, which are among what was measured."""
     return in_text(console.summary(result))[1:]
 
 
-def _tables(result: Calibration) -> tuple[Part, ...]:
+def _tables(result: Calibration) -> tuple[PagePart, ...]:
     """Return the tables alone: of the misfit as a whole, the page would say that it agrees where another test fails."""
     return tuple(each for each in _calibrated(result) if each.kind == "table")
 
 
-def _evidence(diagnosed: Diagnosis) -> tuple[Part, ...]:
+def _evidence(diagnosed: Diagnosis) -> tuple[PagePart, ...]:
     """Return the evidence for a diagnosis, as the console has it."""
     return in_text(Group(*diagnosis.details_of(diagnosed)))
 
 
-def _driven(measured: Measured) -> tuple[Part, ...]:
+def _driven(measured: Measured) -> tuple[PagePart, ...]:
     """Return the decisions of a bench that drove itself; nothing where a person chose."""
     drawn = run.decided(measured.decisions, measured.ends)
     return () if drawn is None else in_text(drawn)
 
 
-def _with_what_is_missing(diagnosed: Diagnosis) -> tuple[Part, ...]:
+def _with_what_is_missing(diagnosed: Diagnosis) -> tuple[PagePart, ...]:
     """Return the parameters with the missing effects beside those without; nothing where none is missing."""
     if diagnosed.after is None:
         return ()

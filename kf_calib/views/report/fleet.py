@@ -8,7 +8,7 @@ import kf_calib.views.figures.fleet  # noqa: F401  # registers the figures of a 
 from kf_calib.fleet.overview import FleetOverview
 from kf_calib.views import pooled_diagnosis
 from kf_calib.views.report.contents import figures_of, in_text, measured_section, warnings_of
-from kf_calib.views.report.page import Page, Section, Standing
+from kf_calib.views.report.page import Agreement, Page, Section
 from kf_calib.views.report.parts import Paragraph
 
 
@@ -28,7 +28,7 @@ def fleet_page(overview: FleetOverview, commands: Sequence[str]) -> Page:
     )  # fmt: skip
 
 
-def _standing_of(overview: FleetOverview) -> tuple[Standing, str]:
+def _standing_of(overview: FleetOverview) -> tuple[Agreement, str]:
     """Return whether models and measurements agree over a fleet, and in how many runs they do not."""
     if not overview.failed and not overview.inconsistent:
         return "agrees", f"{overview.runs} runs agree with their models"

@@ -20,9 +20,9 @@ from markupsafe import Markup
 from kf_calib.support.output_files import write_whole
 from kf_calib.views.report.drawing import Drawing, draw_all
 from kf_calib.views.report.explorer import Explorer
-from kf_calib.views.report.parts import Paragraph, Table
+from kf_calib.views.report.parts import PageTable, Paragraph
 
-Standing = Literal["agrees", "disagrees", "open"]
+Agreement = Literal["agrees", "disagrees", "open"]
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Facts:
     of: tuple[tuple[str, tuple[tuple[str, str], ...]], ...]
 
 
-Part = Paragraph | Table | Drawing | Explorer | Facts
+PagePart = Paragraph | PageTable | Drawing | Explorer | Facts
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Section:
     """A section of a page; one without parts is left out."""
 
     title: str
-    parts: tuple[Part, ...]
+    parts: tuple[PagePart, ...]
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Page:
 
     title: str
     what: str
-    standing: Standing
+    standing: Agreement
     headline: str
     verdict: tuple[str, ...]
     sections: tuple[Section, ...]
@@ -83,7 +83,7 @@ def _digest(script: str) -> str:
     return b64encode(hashlib.sha256(script.encode()).digest()).decode()
 
 
-def fragment(parts: Sequence[Paragraph | Table]) -> str:
+def fragment(parts: Sequence[Paragraph | PageTable]) -> str:
     """Paragraphs and tables as HTML that is a part of another page, such as a notebook."""
     return filled_in("fragment.html", parts=parts)
 

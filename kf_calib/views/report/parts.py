@@ -11,8 +11,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from kf_calib.support.plain_text import printable
-from kf_calib.views.tables import Bar
-from kf_calib.views.tables import Table as ConsoleTable
+from kf_calib.views.tables import Bar, ConsoleTable
 from kf_calib.views.terminal import Note
 
 _NUMBER = re.compile(r"(?P<whole>.*?\d)(?P<fraction>\.\d+)?(?P<power>e[-+]\d+)?(?P<rest>[^\d.].*)?", re.DOTALL)
@@ -29,7 +28,7 @@ class Paragraph:
 
 
 @dataclass(frozen=True)
-class Cell:
+class PageCell:
     """The text of a cell; of a number, its parts before the decimal point, behind it, and after the last digit.
 
     A page leaves room for what the longest fraction of the column has more, and for the longest text after a number.
@@ -56,22 +55,22 @@ class Heading:
 
 
 @dataclass(frozen=True)
-class Table:
+class PageTable:
     """A table; ends: numbers of the rows below which there is a line."""
 
     kind: ClassVar[str] = "table"
     title: str
     headings: tuple[Heading, ...]
-    rows: tuple[tuple[Cell, ...], ...]
+    rows: tuple[tuple[PageCell, ...], ...]
     ends: frozenset[int]
 
 
-def parts_of(drawn: RenderableType) -> list[Paragraph | Table]:
+def parts_of(drawn: RenderableType) -> list[Paragraph | PageTable]:
     """The parts of what the console draws, in its order; a text without words is none."""
     return list(_parts(drawn))
 
 
-def _parts(drawn: RenderableType) -> Iterator[Paragraph | Table]:
+def _parts(drawn: RenderableType) -> Iterator[Paragraph | PageTable]:
     if isinstance(drawn, Group):
         for each in drawn.renderables:
             yield from _parts(each)
@@ -82,22 +81,22 @@ def _parts(drawn: RenderableType) -> Iterator[Paragraph | Table]:
         yield Paragraph(text.removeprefix("Note: "), "note") if isinstance(drawn, Note) else Paragraph(text)
 
 
-def _table(drawn: ConsoleTable) -> Table:
+def _table(drawn: ConsoleTable) -> PageTable:
     numbers = [column.justify == "right" for column in drawn.columns]
     columns = [_column(list(column.cells), each) for column, each in zip(drawn.columns, numbers, strict=True)]
     headings = [Heading(_said(column.header), each) for column, each in zip(drawn.columns, numbers, strict=True)]
     ends = frozenset(k for k, row in enumerate(drawn.rows[:-1]) if row.end_section)
-    return Table(_said(drawn.title or ""), tuple(headings), tuple(zip(*columns, strict=True)), ends)
+    return PageTable(_said(drawn.title or ""), tuple(headings), tuple(zip(*columns, strict=True)), ends)
 
 
-def _column(cells: Iterable[RenderableType], is_number: bool) -> list[Cell]:
+def _column(cells: Iterable[RenderableType], is_number: bool) -> list[PageCell]:
     """Return the cells of a column; those of numbers with the room that keeps their decimal points in line."""
     if not is_number:
-        return [Cell("", bar=each.length) if isinstance(each, Bar) else Cell(_said(each)) for each in cells]
+        return [PageCell("", bar=each.length) if isinstance(each, Bar) else PageCell(_said(each)) for each in cells]
     split = [_split(_MINUS.sub("−", _said(each))) for each in cells]
     fraction = max((each[1] for each in split), key=len, default="")
     rest = max((each[2] for each in split), key=len, default="")
-    return [Cell(own[0], own[1], fraction[len(own[1]) :], own[2], rest) if own[0] else Cell("")
+    return [PageCell(own[0], own[1], fraction[len(own[1]) :], own[2], rest) if own[0] else PageCell("")
             for own in split]  # fmt: skip
 
 

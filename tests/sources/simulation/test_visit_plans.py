@@ -83,6 +83,16 @@ def test_own_kinematics_agree_with_the_package():
     np.testing.assert_allclose(up_directions(OBLIQUE, angles), bench.specific_force(np.zeros(50), angles), atol=1e-14)
 
 
+@pytest.mark.parametrize("up", ["y", "z", "-x"])
+@pytest.mark.parametrize("axes", [YZX, axes_of("zx"), OBLIQUE], ids=str)
+def test_one_set_of_angles_has_the_direction_that_it_has_among_many(axes, up):
+    """The kinematics in numbers, which a search for angles asks, against those by scipy's rotations; tiny turns too."""
+    angles = np.random.default_rng(1).uniform(-2 * np.pi, 2 * np.pi, (50, len(axes)))
+    angles[:10] *= 1e-4
+    one_by_one = [visit_plans._up_direction(axes, row, up) for row in angles.tolist()]
+    np.testing.assert_allclose(one_by_one, up_directions(axes, angles, up), rtol=0, atol=5e-16)
+
+
 def test_explicit_plan_keeps_order_and_angles():
     plan = explicit_plan([(0, 90, 1), (5, 0, 0)], dwell_s=3.0)
     assert [visit.gimbal_deg for visit in plan] == [(0.0, 90.0, 1.0), (5.0, 0.0, 0.0)]
