@@ -190,6 +190,15 @@ def test_sizes_of_two_effects_are_averaged_each_over_its_own_prior() -> None:
     assert found == pytest.approx(float(logsumexp(logs, b=weights)) + 0.5 * readings @ readings, abs=0.1)
 
 
+@pytest.mark.parametrize("rounding", [0.0, 1e-170])
+def test_what_rounding_alone_sees_changes_nothing(rounding: float) -> None:
+    """An effect beside another that the readings of a recorded phone do not show at all."""
+    alone, effects = np.eye(3) * 1e5, [SecondOrder(), Hysteresis()]
+    readings, root = np.array([6.0, -2.0, 4.0]), np.hstack([alone, np.full((3, 3), rounding)])
+    one = AddedEffects(effects[:1], "navigation", 3).log_bayes(56.0, alone, readings)
+    assert AddedEffects(effects, "navigation", 3).log_bayes(56.0, root, readings) == pytest.approx(one, abs=0.05)
+
+
 def test_an_oscillation_is_weighed_against_what_needs_no_carrier(monkeypatch: pytest.MonkeyPatch) -> None:
     """The readings that are kept for its sake alone are no loss to it: half the fall of chi-squared, less the price of
     six coefficients and a frequency, of any size."""
