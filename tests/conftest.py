@@ -17,6 +17,7 @@ from hypothesis import settings
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: a process a core is enough
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # the program is started often: what one start compiles, others read
+os.environ.pop("PYTHONUNBUFFERED", None)  # streams keep what they are to write, as users have them
 os.environ["COLUMNS"] = ""
 del os.environ["COLUMNS"]  # readline sets it behind Python's back, and a child would print tables that narrow
 
@@ -110,6 +111,15 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     drawn = contents.figures
     blank.dispatch = drawn.dispatch
     monkeypatch.setattr(contents, "figures", blank)
+
+
+@pytest.fixture
+def unmeasured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """``compare`` does not measure memory, for which it does all of it again, and slowly; tests/cli/test_cli.py and
+    tests/views/test_run_figures.py have it measured."""
+    from kf_calib.estimation import engine_comparison
+
+    monkeypatch.setattr(engine_comparison, "_peak_mb", lambda run: 1.0)
 
 
 @pytest.fixture

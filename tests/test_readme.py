@@ -47,12 +47,12 @@ def test_the_python_of_a_page_prints_what_is_shown(page: Path, tmp_path: Path) -
         _assert_shown(shown, _words(printed), f"{page.name}: {code}")
 
 
-def test_the_demo_does_the_main_job_and_prints_what_is_shown(tmp_path: Path) -> None:
-    """In a process of its own."""
+@pytest.mark.usefixtures("unmeasured")
+def test_the_demo_does_the_main_job_and_prints_what_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
     out = tmp_path / "out"
-    words = [sys.executable, "-m", "kf_calib.cli", "demo", str(out)]
-    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
+    done = CliRunner().invoke(cli, ["demo", str(out)])
+    assert done.exit_code == 0, f"{done.output} {done.exception}"
     ((_, shown),) = with_text_below(README, "sh")
     _assert_shown(shown, _words(done.stdout.replace(str(out), "out")), "tools/demo")
     assert "Model and measurements agree" in done.stdout

@@ -70,17 +70,18 @@ def main() -> None:
     except (click.exceptions.Abort, KeyboardInterrupt):
         code = 130
     except (BrokenPipeError, SystemExit):  # click's and rich's way out where nobody reads any more
-        code = _unheard(0)
+        code = 0
     except Exception as error:
         tell(error)
-        code = _unheard(2)
+        code = 2
+    _leave_nothing_to_print()
     sys.exit(code if isinstance(code, int) else 0)
 
 
-def _unheard(code: int) -> int:
-    """The exit code, which Python would change at its end where what is left to print cannot be printed."""
-    try:
-        sys.stdout.flush()
-    except OSError:
-        fall_silent()
-    return code
+def _leave_nothing_to_print() -> None:
+    """Python would change the exit code at its end where what is left to print cannot be printed."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:
+            fall_silent(stream)

@@ -9,7 +9,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from typing import Any
+from typing import Any, TextIO
 
 import click
 
@@ -76,10 +76,11 @@ def complain(text: str) -> None:
         click.echo(f"kf-calib: {sentence(text)}", err=True)
 
 
-def fall_silent() -> None:
-    """Have all that is still to be printed go nowhere; Python itself prints at its end what is left."""
+def fall_silent(stream: TextIO | None = None) -> None:
+    """Have all that is still to be printed (None: on standard output) go nowhere; Python itself prints at its end what
+    is left."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, sys.stdout.fileno())
+    os.dup2(nowhere, (stream or sys.stdout).fileno())
     os.close(nowhere)
 
 

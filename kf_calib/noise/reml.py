@@ -309,7 +309,7 @@ def _likelihood(
     rows = np.concatenate([means.design, means.readings[:, :, None]], axis=2)
     fixed = mean_covariances(noise, means, state, float(units["common"][0]))
     if standing:  # no means are correlated: only their own covariances are kept
-        shapes = {part: _shapes(part, means, state) for part in parts}
+        shapes: dict[Part, Floats] = {part: _shapes(part, means, state) for part in parts}
         alone = Restricted(rows.reshape(3 * count, -1), reduced.prior, fixed, ())
         return Likelihood(alone, _scaled(shapes, units), units)
     path = mean_links(means.ends_s, held_s)
@@ -323,7 +323,7 @@ def _likelihood(
         _conditional_covariances(fixed, path) + noise.walk_mps2_per_sqrt_s**2 * walk[0],
         (),
     )
-    shapes = {
+    shapes: dict[Part, Floats] = {
         part: walk if part == "walk" else _conditional_covariances(_shapes(part, means, state), path) for part in parts
     }
     return Likelihood(alone, _scaled(shapes, units), units)

@@ -21,6 +21,8 @@ from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.engine_comparison import compare
 from kf_calib.support import stage
 
+pytestmark = pytest.mark.usefixtures("unmeasured")
+
 FRAME = re.compile(r"[━╺] +(?:(\d+)% )?\d:\d\d:\d\d (.+?) *$")
 
 

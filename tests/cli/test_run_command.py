@@ -6,13 +6,13 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 from helpers.full_disk import full_disk
+from helpers.warm_command import warm
 
 import kf_calib
 from kf_calib.sources.files.decision_records import END_RECORD, angles_of, decision_records
@@ -62,8 +62,9 @@ def test_a_signal_stops_the_table_first(number: signal.Signals, code: int, said:
     recording = tmp_path / "run.mcap"
     words = ["run", "--positioner", f"{SIM}&speed=20", "--record", str(recording), "--target", "K=0.01ppm", "--json"]
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
-    process = subprocess.Popen([sys.executable, "-m", "kf_calib.cli", *words], stdout=subprocess.PIPE,
-                               stderr=subprocess.PIPE, text=True, env=environment)  # fmt: skip
+    process = subprocess.Popen(
+        warm(*words), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+    )
     while not decision_records(recording) and process.poll() is None:
         time.sleep(0.1)
     process.send_signal(number)
@@ -77,8 +78,7 @@ def test_a_full_disk_stops_the_table(tmp_path: Path) -> None:
     recording = tmp_path / "run.mcap"
     words = ["run", "--positioner", SIM, "--record", str(recording), "--target", "K=0.01ppm", "--json"]
     with full_disk(20_000):
-        start = [sys.executable, "-m", "kf_calib.cli", *words]
-        done = subprocess.run(start, capture_output=True, text=True, timeout=120)
+        done = subprocess.run(warm(*words), capture_output=True, text=True, timeout=120)
     assert done.returncode == 2, done.stderr
     assert "nothing can be recorded any more" in done.stderr and "The table was stopped" in done.stderr
     assert sum(len(batch.accel) for batch in kf_calib.open_recording(recording)) > 0

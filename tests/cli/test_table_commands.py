@@ -13,6 +13,8 @@ import kf_calib
 from kf_calib.bench.raw_input import RawInput
 from kf_calib.sources.files.record_files import fingerprint
 
+pytestmark = pytest.mark.usefixtures("unmeasured")
+
 TWELVE = ROOT / "recordings" / "twelve_poses.csv"
 OPTIONS = (TWELVE, "--axes", "y z x", "--gravity", "9.8123")
 GAPS = "Lage;Kanal A;Kanal B;Kanal C;Temp;n\n" + "".join(

@@ -21,6 +21,8 @@ from kf_calib.estimation.free_attitude import weights_of_size
 from kf_calib.estimation.observability import visibility_of
 from kf_calib.estimation.settings import Settings
 
+pytestmark = pytest.mark.usefixtures("unmeasured")
+
 ATTITUDE = ("magnetic", "base-tilt", "base-tilt-drift", "platform-drift", "flexure", "uneven-flexure")
 ALWAYS = ("gravity-error", "cross-talk")
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.long_runs import slow
 from helpers.synthetic import Run
 from scipy.stats import multivariate_normal
 from unknown_trials.hidden import HIDDEN
@@ -30,7 +31,7 @@ def diagnosed(name: str, sigmas: float = 12.0, seed: int = 2) -> Diagnosis:
     [
         ("temperature x two forces", {"temperature and specific force"}),
         ("last step x force", {"previous orientation and specific force"}),
-        ("play", {"previous orientation"}),
+        *slow(("play", {"previous orientation"})),
     ],
 )
 def test_what_depends_on_two_drivers_or_on_the_past_is_unknown_and_goes_with_them(name: str, drivers: set[str]) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from helpers.hidden_effects import BENCH
+from helpers.long_runs import slow
 from helpers.synthetic import plan_of
 
 from kf_calib.bench.arrays import Floats
@@ -56,10 +57,11 @@ def test_merged_pieces_are_those_that_the_readings_give_at_once(carrier_hz: floa
     assert (one.count, one.reading_count, one.carrier_hz) == (150, 150, carrier_hz)
 
 
-def test_a_dwell_of_days_has_a_bounded_number_of_pieces() -> None:
+@pytest.mark.parametrize("hours", [12.0, *slow(72.0)])
+def test_a_dwell_of_days_has_a_bounded_number_of_pieces(hours: float) -> None:
     """Short after the arrival and even later, each reading in one of them."""
     kept, total = list[Piece](), 0
-    for piece in standing(hours=72.0):
+    for piece in standing(hours=hours):
         if len(kept) == MOST_PIECES:
             kept = list(coarsened(kept))
             assert len(kept) <= MOST_PIECES // 2 + 16
@@ -69,7 +71,7 @@ def test_a_dwell_of_days_has_a_bounded_number_of_pieces() -> None:
     begins = np.array([piece.nodes.since_arrival_s[0] for piece in kept])
     assert sum(piece.count for piece in kept) == total and (np.diff(begins) > 0.0).all()
     assert lengths[0] < 20.0 and (lengths[1:] <= np.maximum(begins[1:], 20.0)).all()
-    assert lengths.max() < 72.0 * 3600.0 / 32.0
+    assert lengths.max() < hours * 3600.0 / 32.0
 
 
 def test_a_run_of_days_has_a_bounded_number_of_pieces(monkeypatch: pytest.MonkeyPatch) -> None:

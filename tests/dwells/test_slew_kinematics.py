@@ -23,6 +23,8 @@ from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.sensors import GRADES
 from kf_calib.sources.simulation.simulator import Simulation
 
+pytestmark = pytest.mark.usefixtures("unmeasured")
+
 BENCH = Bench(axes_of("yzx"), 9.81, latitude_deg=50.0, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
 ARMS_M = [0.01, -0.02, 0.03, 0.015, 0.012, -0.011, 0.02, -0.01, 0.03]
 ARMS = "lever-arm=" + ",".join(map(str, ARMS_M))

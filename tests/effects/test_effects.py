@@ -43,6 +43,8 @@ from kf_calib.sources.simulation.sensors import GRADES
 from kf_calib.sources.simulation.simulator import Simulation
 from kf_calib.sources.simulation.visit_plans import PlannedVisit, explicit_plan
 
+pytestmark = pytest.mark.usefixtures("unmeasured")
+
 BENCH = Bench(axes_of("yzx"), 9.81, latitude_deg=50.0, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
 PLAN = plan_of(30, dwell_s=6.0, seed=4)
 NAMES = [name for name in names(BENCH) if not effect_named(name, BENCH).dynamic]  # tests/test_slews.py has these

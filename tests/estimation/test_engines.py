@@ -19,6 +19,8 @@ from kf_calib.estimation.engine_comparison import compare
 from kf_calib.estimation.prior import PRIORS
 from kf_calib.estimation.settings import Settings
 
+pytestmark = pytest.mark.usefixtures("unmeasured")
+
 CASES = {
     "paper grade": Run(seed=1, dwells=8, count=150),
     "four orientations": Run(seed=2, dwells=4, count=200),

@@ -17,6 +17,8 @@ from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.engine_comparison import compare
 from kf_calib.estimation.settings import Settings
 
+pytestmark = pytest.mark.usefixtures("unmeasured")
+
 BENCH = Bench(axes_of("yzx"), 9.81, latitude_deg=50.0)
 SETTING_DEG = 0.01
 NOT_STATED: dict[str, float | None] = {"angle_sigma_deg": None, "scatter_sigma_mps2": None}

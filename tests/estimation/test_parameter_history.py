@@ -20,6 +20,8 @@ from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.samples import samples_of
 from kf_calib.estimation.settings import Settings
 
+pytestmark = pytest.mark.usefixtures("unmeasured")
+
 HIDDEN, FACES = (ROOT / "recordings" / name for name in ("hidden.mcap", "mems_faces.mcap"))
 
 

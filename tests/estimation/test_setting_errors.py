@@ -24,6 +24,8 @@ from kf_calib.estimation.settings import Settings
 from kf_calib.sources.tables.orientation import Orientations
 from kf_calib.support.threads import one_blas_thread
 
+pytestmark = pytest.mark.usefixtures("unmeasured")
+
 COUNT = 1000
 DWELLS = 24
 
@@ -64,11 +66,12 @@ class Trial:
 
 @pytest.mark.parametrize("stated", [True, False])
 @pytest.mark.parametrize("axes", ["x", "yx"])
-def test_attitudes_do_not_tell_what_the_poses_leave_untold(axes: str, stated: bool) -> None:
+@pytest.mark.parametrize("runs", [12, *slow(40)])
+def test_attitudes_do_not_tell_what_the_poses_leave_untold(axes: str, stated: bool, runs: int) -> None:
     """An axis that lies flat turns the force in a plane, and one that is upright not at all: the sensitivities to a
     force along x stay nominal, and all others are covered."""
     ratios = list[np.ndarray]()
-    for seed in range(40):
+    for seed in range(runs):
         trial = Trial(300 + seed, 0.05, 1e-5, stated, axes)
         result = trial.evaluated()
         estimate, nominal = result.estimate, result.model.nominal_state().reshape(3, 4)
@@ -80,7 +83,7 @@ def test_attitudes_do_not_tell_what_the_poses_leave_untold(axes: str, stated: bo
     z = np.array(ratios).reshape(len(ratios), 9)
     low, high = binom.interval(0.9999, z.size, 0.95)
     assert low <= np.sum(np.abs(z) < 1.96) <= high
-    assert 0.85 < np.sqrt(np.mean(z**2)) < 1.15
+    assert abs(np.sqrt(np.mean(z**2)) - 1.0) < 4.0 / np.sqrt(2.0 * z.size)
 
 
 def turned_apart(state: np.ndarray, frame: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -118,7 +121,7 @@ SIZES = [
 
 @pytest.mark.parametrize(
     "setting_deg, mean_ug, stated, runs",
-    [(0.05, 1.0, True, 60), (0.2, 0.1, False, 60), *slow(*((*size, 300) for size in SIZES))],
+    [(0.05, 1.0, True, 20), (0.2, 0.1, False, 20), *slow(*((*size, 300) for size in SIZES))],
 )
 def test_sigmas_and_alarms_are_those_of_the_setting_error(
     setting_deg: float, mean_ug: float, stated: bool, runs: int

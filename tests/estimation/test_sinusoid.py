@@ -28,6 +28,8 @@ from kf_calib.sources.simulation.noise_processes import TrueNoise
 from kf_calib.sources.simulation.sensors import GRADES
 from kf_calib.sources.simulation.simulator import Simulation
 
+pytestmark = pytest.mark.usefixtures("unmeasured")
+
 SIGMA = 5e-5
 SHARES = (1.0, -0.6, 0.8)
 WITH = Settings(effects=("sinusoid",))

@@ -25,6 +25,8 @@ from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.engine_comparison import compare
 from kf_calib.estimation.settings import Settings
 
+pytestmark = pytest.mark.usefixtures("unmeasured")
+
 NINE = [0, 3, 4, 5, 7, 8, 9, 10, 11]
 """The states that are left: s1x b1, s2x s2y b2, s3x s3y s3z b3."""
 LEFT = [symbol for symbol in SYMBOLS if symbol not in ("theta1", "phi1", "nu2")]
@@ -90,7 +92,7 @@ def test_equals_nonlinear_least_squares_on_the_size_of_f() -> None:
     assert np.allclose(sigma, np.sqrt(np.diag(covariance)), rtol=1e-3)
 
 
-@pytest.mark.parametrize("runs", [30, *slow(400)])
+@pytest.mark.parametrize("runs", [18, *slow(30, 400)])
 def test_errors_are_those_that_sigmas_state(runs: int) -> None:
     """1 sigma covers 68 % of each, the normalised squared error of nine parameters is 9, p is uniform."""
     errors, squares, p_values = list[np.ndarray](), list[float](), list[float]()
@@ -106,7 +108,7 @@ def test_errors_are_those_that_sigmas_state(runs: int) -> None:
         p_values.append(result.consistency.p_value)
     ratios = np.array(errors)
     assert binom.ppf(0.001, runs, 0.683) <= np.sum(np.abs(ratios) < 1.0, axis=0).min()
-    assert np.mean(np.abs(ratios) < 1.96) == pytest.approx(0.95, abs=0.02)
+    assert np.mean(np.abs(ratios) < 1.96) == pytest.approx(0.95, abs=0.02 * max(30 / runs, 1.0) ** 0.5)
     low, high = chi2.ppf([0.005, 0.995], 9 * len(squares)) / len(squares)
     assert low < np.mean(squares) < high
     assert kstest(p_values, "uniform").pvalue > 0.01

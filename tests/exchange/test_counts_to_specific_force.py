@@ -18,6 +18,7 @@ import pytest
 from click.testing import CliRunner
 from exchange.test_c_header import compiled, compiled_only
 from exchange.test_raw_input import forces_in_csv
+from helpers.long_runs import slow
 
 from kf_calib.cli import cli
 from kf_calib.sources.live import frames
@@ -134,7 +135,7 @@ def live_by_the_stream(folder: Path, run: Run) -> None:
 
 
 @compiled_only
-@pytest.mark.parametrize("acquired", [recorded_by_options, live_by_the_bench_file, live_by_the_stream])
+@pytest.mark.parametrize("acquired", [recorded_by_options, live_by_the_stream, *slow(live_by_the_bench_file)])
 def test_counts_become_specific_force_with_what_they_are_stated_once(acquired, tmp_path: Path) -> None:
     run = made_run(seed=11)
     acquired(tmp_path, run)

@@ -99,7 +99,7 @@ def _done_before(said: str, raw: np.ndarray) -> np.ndarray:
 
 @compiled_only
 @pytest.mark.parametrize(
-    ("names", "wirings"), [((), "in turn"), (("second-order", "thermal-bias"), "in turn"), *slow(((), "every"))]
+    ("names", "wirings"), [(("second-order", "thermal-bias"), "in turn"), *slow(((), "in turn"), ((), "every"))]
 )
 def test_the_function_in_c_takes_raw_readings_of_any_wiring(
     names: tuple[str, ...], wirings: str, tmp_path: Path
@@ -141,7 +141,12 @@ class Taken:
         return "\n".join([f"time_ns,{header},outer_deg,middle_deg,inner_deg", *lines, ""])
 
 
-@pytest.fixture(scope="module", params=list(devices()), ids=lambda param: param[0])
+COUNTS, IN_G, IN_MPS2 = devices()
+
+
+@pytest.fixture(
+    scope="module", params=[COUNTS, IN_G, pytest.param(IN_MPS2, marks=pytest.mark.slow)], ids=lambda param: param[0]
+)
 def device(request: Any, tmp_path_factory: pytest.TempPathFactory, run: Any) -> Taken:
     """Recorded from lines, with what it sends stated once, and calibrated with no further word."""
     name, own = request.param

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from fleet_generator import Campaign
 from helpers.drawn_fleets import SYMBOLS, DrawnFleet, Plan, drawn_fleet
+from helpers.long_runs import slow
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.estimation.calibration import calibrate
@@ -94,8 +95,9 @@ def test_coverage_of_300_fleets() -> None:
             assert not count or abs(share - 0.95) <= allowed, (what, kind, share, count)
 
 
-def test_coverage_of_small_fleets() -> None:
-    covered = counted(range(8), seed=3, most=6)
+@pytest.mark.parametrize("fleets", [4, *slow(8)])
+def test_coverage_of_small_fleets(fleets: int) -> None:
+    covered = counted(range(fleets), seed=3, most=6)
     for what in ("bench", "unit", "affected unit", "spread"):
         share, count = share_of(covered, what)
         assert abs(share - 0.95) < 4.0 * np.sqrt(0.95 * 0.05 / count), (what, share, count)

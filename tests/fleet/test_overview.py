@@ -134,6 +134,14 @@ def test_runs_of_units_that_were_measured_once_scatter_about_the_mean_of_all() -
     assert track.scatter == pytest.approx(np.std(track.values, ddof=1), rel=1e-9)
 
 
+@pytest.mark.parametrize(("count", "told"), [(2, False), (3, True)])
+def test_one_of_three_units_can_lie_outside_and_none_of_two(count: int, told: bool) -> None:
+    rows = rows_of(count)[:count]
+    rows[0]["parameters"][0]["value"] += 1.0
+    (track,) = overview_of("fleet", rows, {}, None, ()).tracks
+    assert (track.chances < 1.0).any() == told
+
+
 def test_every_figure_and_the_page_are_drawn() -> None:
     found = overview_with(lambda number: {"flexure": BENT}, outlying=3)
     drawn = {title: draw() for title, draw in figures(found).items()}

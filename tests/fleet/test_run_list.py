@@ -15,7 +15,15 @@ from kf_calib.fleet.run_list import ListedRun, runs_of
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """Two recordings, a bag of two files, and what is no recording."""
-    for name in ("a.mcap", "deep/b.db3", "bag/metadata.yaml", "bag/bag_0.mcap", "bag/bag_1.mcap", "a.truth.json"):
+    for name in (
+        "a.mcap",
+        "deep/b.db3",
+        "deep/notes.txt",
+        "bag/metadata.yaml",
+        "bag/bag_0.mcap",
+        "bag/bag_1.mcap",
+        "a.truth.json",
+    ):
         path = tmp_path / name
         path.parent.mkdir(exist_ok=True)
         path.write_text(name)
@@ -36,6 +44,10 @@ def test_a_folder_is_its_recordings_and_a_bag_is_one(folder: Path) -> None:
 def test_words_name_each_run_once_in_their_order(folder: Path) -> None:
     words = [folder / "deep" / "*.db3", folder / "a.mcap", folder]
     assert names(runs_of(map(str, words)), folder) == ["deep/b.db3", "a.mcap", "bag"]
+
+
+def test_a_folder_that_a_pattern_finds_is_its_recordings(folder: Path) -> None:
+    assert names(runs_of([str(folder / "dee*")]), folder) == ["deep/b.db3"]
 
 
 def test_a_list_says_whose_runs_they_are(folder: Path) -> None:

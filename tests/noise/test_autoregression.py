@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.long_runs import slow
 from scipy.linalg import toeplitz
 from scipy.signal import lfilter
 
@@ -20,7 +21,7 @@ def test_expected_products_are_those_of_the_projected_covariance(count: int, phi
 
 
 @pytest.mark.parametrize(
-    "size, phi, blocks", [(80, 0.9, 36), (100, 0.9, 36), (80, 0.5, 24), (400, 0.9, 24), (1000, 0.97, 24)]
+    "size, phi, blocks", [(80, 0.9, 36), (80, 0.5, 24), *slow((100, 0.9, 36), (400, 0.9, 24), (1000, 0.97, 24))]
 )
 def test_inflation_is_found_from_blocks_that_are_short_for_it(size: int, phi: float, blocks: int) -> None:
     """In the median of 40 runs within a tenth, and within a factor of two in each: blocks of 4 kappa and more."""

@@ -125,7 +125,7 @@ def test_a_way_out_of_the_program_leads_over_the_stop(kind: type[BaseException])
 def test_commands_and_ways_keep_within_limits_and_out_of_forbidden_zones() -> None:
     """By where the platform truly was, at every look."""
     keys = {"limits_deg": "outer=-120:120 x=-100:100", "forbidden_deg": "z=20:70,x=-40:40; y=60:90,z=-90:-30"}
-    drive = driven(keys=keys, targets=("K=5ppm", "b=30ug"))
+    drive = driven(keys=keys, targets=("K=10ppm", "b=60ug"))
     reach, witness = Reach.of(bench_of(drive).run.bench), Witness(drive)
     been, sleep = list[tuple[float, ...]](), drive.clock.sleep
 
@@ -167,7 +167,7 @@ def test_a_budget_of_time_ends_the_run() -> None:
 
 def test_a_bench_with_backlash_overshoot_and_noise_is_driven_to_the_end() -> None:
     servo = Servo(overshoot_deg=0.3, backlash_deg=0.001, position_sigma_deg=0.002, rate_degps=35.0)
-    drive = driven(servo=servo, keys={"rate_degps": "35", "angle_sigma_deg": "0.001"})
+    drive = driven(servo=servo, keys={"rate_degps": "35", "angle_sigma_deg": "0.001"}, targets=("K=10ppm",))
     assert drive.run().ended in ("targets", "named", "disagrees")
     assert drive.positioner.read() == pytest.approx(drive.outcome.stands_at, abs=0.02)
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -260,16 +259,10 @@ def test_gravity_fixed_is_what_a_base_bench_gives() -> None:
     )
 
 
-def command(*words: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "kf_calib.cli", "paper", *map(str, words)], capture_output=True, text=True, timeout=120
-    )
-
-
-def test_command_prints_the_agreed_keys_and_saves_the_figures(tmp_path: Path) -> None:
-    done = command("--json", "--repetitions", 50, "--seed", 4, "--pdf", tmp_path / "paper.pdf")
-    assert done.returncode == 0 and done.stderr == "" and done.stdout.count("\n") == 1
-    result = json.loads(done.stdout)
+def test_command_prints_the_agreed_keys_and_saves_the_figures(run: Any, tmp_path: Path) -> None:
+    code, out, err = run("paper", "--json", "--repetitions", 50, "--seed", 4, "--pdf", tmp_path / "paper.pdf")
+    assert code == 0 and err == "" and out.count("\n") == 1
+    result = json.loads(out)
     assert len(result["table2"]) == 12
     for row in result["table2"]:
         assert row["optimal_printed"] == OPTIMAL_PRINTED[row["parameter"]]
@@ -286,7 +279,7 @@ def test_command_prints_the_agreed_keys_and_saves_the_figures(tmp_path: Path) ->
     [(["--repetitions", 0], "repetitions"), (["--period-s", 0], "period"), (["--latitude", 90], "latitude"),
      (["--png", "/no/such/folder/x.png", "--repetitions", 1], "no folder")],
 )  # fmt: skip
-def test_bad_usage_is_one_sentence(words: list[object], says: str) -> None:
-    done = command(*words)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert says in done.stderr and done.stderr.count("\n") == 1
+def test_bad_usage_is_one_sentence(run: Any, words: list[object], says: str) -> None:
+    code, out, err = run("paper", *words)
+    assert (code, out) == (2, "")
+    assert says in err and err.count("\n") == 1

@@ -25,6 +25,8 @@ from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.opening import FileKind, kind_of, opened
 from kf_calib.sources.tables.survey import survey
 
+pytestmark = pytest.mark.usefixtures("unmeasured")
+
 FACES = ROOT / "recordings" / "mems_faces.mcap"
 G = 9.80665
 BENCH = ("--axes", "y z x", "--gravity", "9.81", "--angle-sigma", "0.2", "--scatter-sigma", "0.0")

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from helpers.full_disk import full_disk
+from helpers.warm_command import warm
 
 from kf_calib import effects
 from kf_calib.bench.bench import Bench, parse_axes
@@ -120,7 +121,7 @@ def test_an_input_is_never_written(run, here: Path, words: str) -> None:
 def test_the_file_of_a_standard_stream_is_not_written(here: Path, words: str, stream: dict[str, str]) -> None:
     before = Path("lines.csv").read_bytes()
     ((name, path),) = stream.items()
-    command = [sys.executable, "-m", "kf_calib.cli", *words.split(), "--overwrite"]
+    command = warm(*words.split(), "--overwrite")
     with Path(path).open("r+b") as file:
         done = subprocess.run(command, **{name: file}, stderr=subprocess.PIPE, timeout=120)
     assert done.returncode == 2 and b"of this very command" in done.stderr
@@ -340,9 +341,7 @@ def test_a_recording_that_finds_no_room_is_told_at_once(here: Path) -> None:
     """Though more readings would come."""
     words = ["record", "out.mcap", "-", "--axes", "y z x", "--gravity", "9.81"]
     with full_disk(3000):
-        child = subprocess.Popen(
-            [sys.executable, "-m", "kf_calib.cli", *words], stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
+        child = subprocess.Popen(warm(*words), stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     with child:
         child.stdin.write(Path("lines.csv").read_text())
         with suppress(BrokenPipeError):
@@ -380,7 +379,7 @@ def test_a_picture_that_cannot_be_drawn_is_a_warning(run, here: Path, monkeypatc
 def test_files_are_written_where_nobody_reads_the_result(here: Path) -> None:
     reading, writing = os.pipe()
     os.close(reading)
-    command = [sys.executable, "-m", "kf_calib.cli", "replay", "run.mcap", "--save-model", "m.toml"]
+    command = warm("replay", "run.mcap", "--save-model", "m.toml")
     done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, timeout=120)
     os.close(writing)
     assert (done.returncode, done.stderr) == (0, b"") and Path("m.toml").exists()
@@ -416,7 +415,7 @@ def test_a_live_run_without_a_reading_leaves_the_earlier_recording(run, here: Pa
 ])  # fmt: skip
 def test_a_live_run_to_which_nothing_came_says_so(here: Path, as_json: list[str], text: bytes, instead: str) -> None:
     words = ["live", "-", "--axes", "y", "--gravity", "9.81", "--record", "out.mcap", *as_json]
-    done = subprocess.run([sys.executable, "-m", "kf_calib", *words], input=text, capture_output=True, timeout=120)
+    done = subprocess.run(warm(*words), input=text, capture_output=True, timeout=120)
     said = f"kf-calib: nothing was recorded: no reading came from standard input{instead}: check that the bench is on"
     assert done.returncode == 2 and said in done.stderr.decode() and done.stderr.count(b"\n") == 1
     assert not done.stdout and not Path("out.mcap").exists()
@@ -509,9 +508,9 @@ def test_a_disk_without_room_for_a_reading_leaves_the_earlier_recording(tmp_path
 def test_a_recording_that_is_ended_early_keeps_its_readings(here: Path, signal_number: int) -> None:
     Path("out.mcap").write_bytes(MINE)
     words = ["record", "out.mcap", "-", "--overwrite", "--axes", "y z x", "--gravity", "9.81"]
-    with subprocess.Popen(
-        [sys.executable, "-m", "kf_calib.cli", *words], stdin=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as child:
+    killed = signal_number == signal.SIGKILL  # which nobody passes on
+    command = [sys.executable, "-m", "kf_calib.cli", *words] if killed else warm(*words)
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as child:
         child.stdin.write(Path("lines.csv").read_bytes())
         child.stdin.flush()
         while Path("out.mcap").read_bytes() == MINE:  # a line a moment: the clock, not the end, brings them to the disk
@@ -562,6 +561,5 @@ def test_ctrl_c_is_130(run, here: Path, monkeypatch: pytest.MonkeyPatch) -> None
 @pytest.mark.parametrize("words", ["replay run.mcap --json", "replay run.mcap", "--help", "plan --count 6"])
 def test_an_output_that_takes_nothing_is_exit_2(here: Path, words: str) -> None:
     with Path("/dev/full").open("w") as full:
-        start = [sys.executable, "-m", "kf_calib.cli", *words.split()]
-        done = subprocess.run(start, stdout=full, stderr=-1, timeout=120)
+        done = subprocess.run(warm(*words.split()), stdout=full, stderr=-1, timeout=120)
     assert done.returncode == 2 and done.stderr.count(b"\n") == 1 and b"No space left" in done.stderr

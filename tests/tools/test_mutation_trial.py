@@ -94,6 +94,8 @@ def test_the_tests_that_call_a_function_come_with_the_quick_file_first_after_tho
     assert tests == TestMap(called, seconds, ["c.py::bad"])
     assert tests.tests_of(Path("m.py"), "f") == ["b.py::one", "a.py::slow", "d.py::long"]
     assert tests.tests_of(Path("m.py"), "f", [Path("d.py")]) == ["d.py::long", "b.py::one", "a.py::slow"]
+    own = TestMap({"a/test_m.py::slow": ["m.py:f"]} | called, {"a/test_m.py::slow": 99.0} | seconds, ["c.py::bad"])
+    assert own.tests_of(Path("m.py"), "f", [Path("d.py")])[:2] == ["a/test_m.py::slow", "d.py::long"]
     assert tests.tests_of(Path("m.py"), "no function's") == ["a.py::slow", "d.py::long", "b.py::one", "b.py::two"]
 
 

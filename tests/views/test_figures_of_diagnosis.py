@@ -70,8 +70,11 @@ def axes_of(figure: Figure, title: str) -> Axes:
 
 
 @pytest.mark.parametrize("hidden", [
-    (), ("triple-product=25sigma",), ("sinusoid=30sigma",), ("second-order=15sigma", "hysteresis=15sigma"),
-    *slow((("second-order=15sigma",),), (("bias-drift=15sigma",),)),
+    (), ("triple-product=25sigma",),
+    *slow(
+        (("second-order=15sigma",),), (("bias-drift=15sigma",),), (("sinusoid=30sigma",),),
+        (("second-order=15sigma", "hysteresis=15sigma"),),
+    ),
 ])  # fmt: skip
 def test_every_figure_of_a_diagnosis_has_ink_in_every_panel(hidden: tuple[str, ...]) -> None:
     for title, draw in plot.figures(found(*hidden)).items():
@@ -205,8 +208,8 @@ def test_undone_steps_and_choices_left_open_are_drawn_beside_the_way() -> None:
 
 
 @pytest.mark.parametrize("made", [
-    lambda: begin(run(), Refits()), lambda: begin(calibrate(Run(seed=1, dwells=4, count=100)), Refits()),
-    lambda: improve(noisy_run(walk_mps2_per_sqrt_s=3e-6, seed=4)),
+    lambda: begin(calibrate(Run(seed=1, dwells=4, count=100)), Refits()),
+    *slow(lambda: begin(run(), Refits()), lambda: improve(noisy_run(walk_mps2_per_sqrt_s=3e-6, seed=4))),
 ])  # fmt: skip
 def test_odd_improvements_are_drawn(made: object) -> None:
     """Consistent at once, no degrees of freedom, a walk."""

@@ -39,18 +39,22 @@ class TestMap:
     def tests_of(self, path: Path, function: str, first: Iterable[Path] = ()) -> list[str]:
         """The tests that execute a function, or, where there is none, anything of its module.
 
-        File by file, since tests of a file share what one has made: first the files named, then those that take little.
+        File by file, since tests of a file share what one has made: first those of the module's name, then the files
+        named, then those that take little.
         """
         place, module = f"{path}:{function}", f"{path}:"
         sound = {test: places for test, places in self.functions.items() if test not in self.failed}
         hits = {test for test, places in sound.items() if place in places or module in places}
         hits = hits or {test for test, places in sound.items() if any(one.startswith(module) for one in places)}
-        cost, early = defaultdict[str, float](float), {str(name) for name in first}
+        cost, early, own = defaultdict[str, float](float), {str(name) for name in first}, f"/test_{path.stem}.py"
         for test in hits:
             cost[_file(test)] += self.seconds[test]
-        return sorted(
-            hits, key=lambda test: (_file(test) not in early, cost[_file(test)], _file(test), self.seconds[test])
-        )
+
+        def place_in_order(test: str) -> tuple[bool, bool, float, str, float]:
+            file = _file(test)
+            return not file.endswith(own), file not in early, cost[file], file, self.seconds[test]
+
+        return sorted(hits, key=place_in_order)
 
     def files_of(self, modules: Iterable[Path]) -> list[str]:
         """The files whose tests call anything of modules."""

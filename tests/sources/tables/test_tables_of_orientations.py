@@ -18,6 +18,8 @@ from kf_calib.estimation.calibration import filterpy_estimate
 from kf_calib.sources.tables.table import Orientation, Table
 from kf_calib.sources.tables.words import face_of, meaning_of
 
+pytestmark = pytest.mark.usefixtures("unmeasured")
+
 BENCH = {"axes": "y z x", "gravity_mps2": "9.8123"}
 TWELVE = ROOT / "recordings" / "twelve_poses.csv"
 FACES = {"+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+z": (0, 0, 1), "-z": (0, 0, -1)}
