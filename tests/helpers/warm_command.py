@@ -60,8 +60,7 @@ def launch(path: str, words: list[str]) -> None:
     }  # fmt: skip
     with socket.socket(socket.AF_UNIX) as link:
         link.connect(path)
-        blocked = [each for each in PASSED_ON if int(each) not in ignored]
-        signal.pthread_sigmask(signal.SIG_BLOCK, blocked)
+        signal.pthread_sigmask(signal.SIG_BLOCK, PASSED_ON)  # what comes now is passed on later
         told_bytes = json.dumps(told).encode()
         socket.send_fds(link, [len(told_bytes).to_bytes(8)], STREAMS)
         link.sendall(told_bytes)
@@ -70,9 +69,9 @@ def launch(path: str, words: list[str]) -> None:
         nothing = os.open(os.devnull, os.O_RDWR)
         for stream in STREAMS:  # the command alone has them now: nobody waits for an end that is ours
             os.dup2(nothing, stream)
-        for each in blocked:
+        for each in PASSED_ON:  # those that are ignored, too: the command may have a mind of its own
             signal.signal(each, lambda number, _: os.kill(pid, number))
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, blocked)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, PASSED_ON)
         status = int(answers.readline())
     if status < 0:
         signal.signal(-status, signal.SIG_DFL) if -status != signal.SIGKILL else None
@@ -147,8 +146,9 @@ def become(told: dict, streams: list[int]) -> None:
         os.close(given)
     if told["session"]:
         os.setsid()
-    for number in told["ignored"]:
-        signal.signal(number, signal.SIG_IGN)
+    for each in PASSED_ON:
+        usual = signal.default_int_handler if each == signal.SIGINT else signal.SIG_DFL
+        signal.signal(each, signal.SIG_IGN if int(each) in told["ignored"] else usual)
     os.environ.clear()
     os.environ.update(told["env"])
     os.chdir(told["cwd"])
