@@ -11,18 +11,19 @@ knowledge, since noise from dwell to dwell does not enter them.
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
+from kf_calib.diagnosis.coefficient_sizes import AddedEffects
+from kf_calib.diagnosis.detectability import sensor_grade
 from kf_calib.dwells.qr import triangle
+from kf_calib.effects.effect import Grade
 from kf_calib.estimation.candidate_scan import SEEN
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.fit import Fit
@@ -30,31 +31,13 @@ from kf_calib.estimation.whitened_rows import flicker_of_scatter, whiten
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.reml import Likelihood, Part, Parts, likelihood_of, with_shared_noise
-from kf_calib.noise.restricted_likelihood import Point
+from kf_calib.noise.restricted_likelihood import Restricted
 from kf_calib.noise.thermometer_error import thermometer_errors
 
-_SIZES = np.exp(np.linspace(0.0, math.log(1e14), 120))  # prior variance of a coefficient over that of its estimate
 _RANGE = math.log(1e4)  # width of the flat prior of the logarithm of a size of noise
 _UNSTATED = 0.5  # prior probability of noise from dwell to dwell that was not stated
 _BEYOND = 0.02  # prior probability of more noise than was stated
 _IMMENSE_MPS2 = 1e3  # scatter so large that nothing is left of a dwell's mean
-
-
-def size_evidence(dof: int, delta_chi2: Floats | float) -> Floats:
-    """Log Bayes factor of an effect whose size and direction are unknown, against no effect.
-
-    The coefficients have the prior N(0, g C) with C the covariance of their estimate, and ln g is uniform from 0 to
-    ln 1e14, which is a size of 1 to 1e7 sigma (the g-prior of A. Zellner, 1986, mixed over g; F. Liang et al., 2008):
-
-      B = mean over g of (1 + g)^(-k/2) exp(g / (1 + g) F / 2)
-
-    dof: number of coefficients k. delta_chi2: decrease F of chi-squared with them; a number or an array. Returns
-    ln B.
-    """
-    log_terms = -0.5 * dof * np.log1p(_SIZES) + 0.5 * np.asarray(delta_chi2, float)[..., None] * (
-        _SIZES / (1.0 + _SIZES)
-    )
-    return np.logaddexp.reduce(log_terms, axis=-1) - math.log(len(_SIZES))
 
 
 @dataclass(frozen=True)
@@ -106,11 +89,31 @@ class _ColumnBlocks:
 @dataclass(frozen=True)
 class _LikelihoodRows:
     """What a likelihood is made of: the means of the dwells, rows of prior knowledge, and the number of coefficients of
-    the added effects."""
+    the added effects.
+
+    added: the columns of what is seen of the effects. seen (r, q): makes their numbers of the q coefficients.
+    """
 
     means: Means
     prior: Floats
     dof: int
+    added: slice
+    seen: Floats
+
+
+@dataclass(frozen=True)
+class _AddedColumns:
+    """The columns of added effects in a likelihood, before ``after`` others. seen (r, q): as in ``_LikelihoodRows``."""
+
+    effects: AddedEffects
+    seen: Floats
+    after: int
+
+    def log_bayes(self, delta_chi2: float, likelihood: Restricted, variances: Floats) -> float:
+        """The log Bayes factor of the effects against none at these variances (k,) of the noise."""
+        stop = likelihood.rows.shape[1] - 1 - self.after
+        root, readings = likelihood.root_of(variances, slice(stop - len(self.seen), stop))
+        return self.effects.log_bayes(delta_chi2, root @ self.seen, readings)
 
 
 class Evidence:
@@ -125,10 +128,11 @@ class Evidence:
             scatter_mps2=noise.scatter_mps2 if noise.scatter_stated else np.zeros(3),
             setting_rad=noise.setting_rad if noise.setting_stated else 0.0,
         )
+        self.grade: Grade = sensor_grade(before)
 
     @cached_property
     def _without_effects(self) -> _LikelihoodRows:
-        return self._rows(self._fit.linearised, self.noise)[0]
+        return self._rows(self._fit.linearised, self.noise)
 
     def of(self, refit: Fit | None = None, walk: bool = False) -> list[MarginalLikelihood]:
         """The evidence of the effects that a refit has and the fit has not, for each set of free parts of the noise.
@@ -138,26 +142,27 @@ class Evidence:
         noise, without = self.noise, self._without_effects
         if refit is not None and refit.noise.sensitivity_mps2_per_k is not None:
             noise = replace(noise, sensitivity_mps2_per_k=refit.noise.sensitivity_mps2_per_k)
-            (without,) = self._rows(self._fit.linearised, noise)
+            without = self._rows(self._fit.linearised, noise)
         averaged = noise
         if refit is not None and refit.dwells[0].averaged != self._fit.dwells[0].averaged:
             # averages have a noise of their own; by that of single readings, of which there are more, it would be small
             averaged = replace(noise, sigma_mps2=refit.noise.sigma_mps2, inflation=refit.noise.inflation)
-        added, *related = [without] if refit is None else self._rows(refit.linearised, averaged, self._relations(refit))
+        added = without if refit is None else self._rows(refit.linearised, averaged)
         if refit is not None and not added.dof and not walk:  # nothing of the effects is seen
-            added, related, averaged = without, [], noise
+            added, averaged = without, noise
         norm, norm_without = (float(np.linalg.norm(rows.prior[:, -1])) for rows in (added, without))
         without = replace(without, prior=pad_residual_norm(without.prior, norm))
         walking: Parts = ("walk",) if walk or self._walks else ()
-        likelihood_without, likelihood, *likelihoods_related = (
+        likelihood_without, likelihood = (
             likelihood_of(
-                noise_of_rows, (*walking, "setting", "common"), rows.means, self._fit.linearised.state, rows.prior
+                noise_of_rows, (*walking, "setting", "common"), rows.means, self._fit.linearised.state, rows.prior,
+                rows.added,
             )
-            for noise_of_rows, rows in [(noise, without), *((averaged, rows) for rows in (added, *related))]
-        )
-        relations = [(rows.dof, likelihoods_related[k]) for k, rows in enumerate(related)]
+            for noise_of_rows, rows in ((noise, without), (averaged, added))
+        )  # fmt: skip
+        columns = self._added(refit, added) if refit is not None and added.dof else None
         marginals = [
-            self._marginal(likelihood, likelihood_without, parts + walking, added.dof, relations)
+            self._marginal(likelihood, likelihood_without, parts + walking, columns)
             for parts in self._free_parts(len(without.means.counts))
         ]
         # Readings that are folded otherwise, on a carrier or averaged, leave more or less of themselves within dwells.
@@ -167,14 +172,12 @@ class Evidence:
         gain = 0.5 * (norm**2 - norm_without**2) if otherwise else 0.0
         return [replace(marginal, log=marginal.log + gain) for marginal in marginals if marginal is not None]
 
-    def _relations(self, refit: Fit) -> list[Floats]:
-        """Return what the added states may be together: matrices (q, k), times k free numbers each; empty where they
-        may have any values."""
-        added = refit.linearised.model.effects[len(self._fit.linearised.model.effects) :]
-        if not any(effect.relations for effect in added):
-            return []
-        of_effects = [effect.relations or [np.eye(len(effect.states))] for effect in added]
-        return [np.asarray(block_diag(*blocks), float) for blocks in itertools.product(*of_effects)]
+    def _added(self, refit: Fit, rows: _LikelihoodRows) -> _AddedColumns:
+        """Return the columns of the effects that a refit has in addition."""
+        effects = refit.linearised.model.effects[len(self._fit.linearised.model.effects) :]
+        known = AddedEffects([effect for effect in effects if effect.coefficients], self.grade, rows.dof)
+        after = rows.means.design.shape[2] - rows.added.stop
+        return _AddedColumns(known, rows.seen, after)
 
     def _free_parts(self, dwells: int) -> Iterator[Parts]:
         """Yield the sets of parts of the noise from dwell to dwell that may be free."""
@@ -194,40 +197,31 @@ class Evidence:
         likelihood: Likelihood,
         likelihood_without: Likelihood,
         parts: Parts,
-        dof: int,
-        relations: Sequence[tuple[int, Likelihood]],
+        added: _AddedColumns | None,
     ) -> MarginalLikelihood | None:
         """Return the evidence with these parts of the noise free; None where one of them is best at zero.
 
         The logarithms of the sizes of the parts are averaged out by Laplace's method. A part of no size is counted
-        where it is absent. relations: for each possible relation of the coefficients, how many of them it leaves and
-        the likelihood with it; they are averaged in the noise that is likeliest without a relation.
+        where it is absent. added: the columns of the added effects, whose coefficients are averaged in the noise that
+        is likeliest; None where there are none.
         """
         at_parts = likelihood.of(parts)
         relative, point = at_parts.most_likely() if parts else (np.zeros(0), likelihood.without())
         if not all(size for part, size in zip(parts, relative, strict=True) if part != "walk" or not self._walks):
             return None
         sizes = np.array([likelihood.units[part][0] for part in parts]) * relative
-
-        def at_sizes(other: Likelihood) -> Point:
-            return other.of(parts).at((sizes / np.array([other.units[part][0] for part in parts])) ** 2)
-
-        without = at_sizes(likelihood_without)
+        variances_without = (sizes / np.array([likelihood_without.units[part][0] for part in parts])) ** 2
+        without = likelihood_without.of(parts).at(variances_without)
         delta_chi2, log = max(without.misfit - point.misfit, 0.0), self._log_prior(parts) - without.cost
         if parts:
             curvatures = np.linalg.eigvalsh(at_parts.curvature(relative))
             log += float(
                 np.sum(0.5 * np.log(2.0 * np.pi / np.maximum(curvatures, 2.0 * np.pi / _RANGE**2)) - math.log(_RANGE))
             )
-        if relations:
-            related = [
-                (left_dof, max(without.misfit - at_sizes(with_it).misfit, 0.0)) for left_dof, with_it in relations
-            ]
-            log += float(np.logaddexp.reduce([size_evidence(*each) for each in related])) - math.log(len(related))
-        elif dof:
-            log += float(size_evidence(dof, delta_chi2))
+        if added is not None:
+            log += added.log_bayes(delta_chi2, at_parts, relative**2)
         beyond: Parts = tuple(part for part in parts if part != "walk")
-        return MarginalLikelihood(beyond, log, tuple(sizes.tolist()), delta_chi2, dof)
+        return MarginalLikelihood(beyond, log, tuple(sizes.tolist()), delta_chi2, added.effects.dof if added else 0)
 
     def _log_prior(self, parts: Parts) -> float:
         """Return the logarithm of the prior probability that these parts of the noise are there and no others."""
@@ -235,10 +229,8 @@ class Evidence:
         priors = {part: _BEYOND if is_stated else _UNSTATED for part, is_stated in stated.items()}
         return sum(math.log(prior if part in parts else 1.0 - prior) for part, prior in priors.items())
 
-    def _rows(
-        self, linearised: LinearisedDwells, noise: Noise, relations: Sequence[Floats] = ()
-    ) -> list[_LikelihoodRows]:
-        """Return what the likelihood needs, with coefficients of any values and then with each of their relations.
+    def _rows(self, linearised: LinearisedDwells, noise: Noise) -> _LikelihoodRows:
+        """Return what the likelihood needs.
 
         Columns that the model hides are left out. Where an effect was fitted with an unknown constant, the derivative
         by this constant is one more column, but no coefficient.
@@ -246,13 +238,13 @@ class Evidence:
         means, shared_prior = with_shared_noise(linearised.dwells, noise, linearised.means)
         blocks = _ColumnBlocks(self._fit.linearised.model.count, linearised.model.count, means.design.shape[2])
         prior = np.vstack([shared_prior, blocks.spread(_within(linearised, noise, self._fit.linearised.state))])
-        constants = sum(column >= blocks.model for column in linearised.model.unknowns)
-        rows = list[_LikelihoodRows]()
-        for relation in (np.eye(blocks.with_added - blocks.model), *relations):
-            seen = _visible(means, noise, prior, blocks, relation)
-            seen_means = replace(means, design=blocks.combined(means.design, seen))
-            rows.append(_LikelihoodRows(seen_means, blocks.combined(prior, seen), max(seen.shape[1] - constants, 0)))
-        return rows
+        constants = [column - blocks.model for column in linearised.model.unknowns if column >= blocks.model]
+        seen, numbers = _visible(means, noise, prior, blocks)
+        seen_means, added = replace(means, design=blocks.combined(means.design, seen)), len(numbers)
+        return _LikelihoodRows(
+            seen_means, blocks.combined(prior, seen), max(added - len(constants), 0),
+            slice(blocks.model, blocks.model + added), np.delete(numbers, constants, axis=1),
+        )  # fmt: skip
 
 
 def pad_residual_norm(prior: Floats, norm: float) -> Floats:
@@ -288,20 +280,19 @@ def _within(linearised: LinearisedDwells, noise: Noise, state: Floats) -> Floats
     return triangle(np.vstack([rows, np.zeros((lacking, rows.shape[1]))]))
 
 
-def _visible(means: Means, noise: Noise, prior: Floats, blocks: _ColumnBlocks, relation: Floats) -> Floats:
-    """Return combinations (q, k) of the added columns that are orthonormal beside the model's, without hidden ones.
-
-    relation (q, r): the combinations that are possible.
-    """
+def _visible(means: Means, noise: Noise, prior: Floats, blocks: _ColumnBlocks) -> tuple[Floats, Floats]:
+    """Return combinations (q, r) of the added columns that are orthonormal beside the model's, without hidden ones, and
+    what makes their numbers (r, q) of those of the columns."""
     sigma = noise.effective_sigma_mps2 / np.sqrt(means.counts[:, None])
     columns = np.vstack([(means.design / sigma[..., None]).reshape(-1, means.design.shape[2]), prior[:, :-1]])
     model, _ = _of_unit_length(columns[:, : blocks.model])
-    added, lengths = _of_unit_length(columns[:, blocks.model : blocks.with_added] @ relation)
+    added, lengths = _of_unit_length(columns[:, blocks.model : blocks.with_added])
     left, singular, _ = np.linalg.svd(model, full_matrices=False)
     basis = left[:, singular > 1e-9 * singular[0]]
     _, singular, right = np.linalg.svd(added - basis @ (basis.T @ added), full_matrices=False)
     seen = singular > SEEN
-    return relation @ (right[seen].T / singular[seen] / lengths[:, None])
+    right, singular = right[seen], singular[seen]
+    return right.T / singular / lengths[:, None], singular[:, None] * right * lengths
 
 
 def _of_unit_length(columns: Floats) -> tuple[Floats, Floats]:

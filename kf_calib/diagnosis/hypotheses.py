@@ -18,8 +18,9 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.candidate_tests import CandidateTests, values_of
+from kf_calib.diagnosis.coefficient_sizes import AddedEffects, size_evidence
 from kf_calib.diagnosis.dwell_noise import dwell_noise_is_stated
-from kf_calib.diagnosis.evidence import Evidence, MarginalLikelihood, size_evidence
+from kf_calib.diagnosis.evidence import Evidence, MarginalLikelihood
 from kf_calib.diagnosis.hypothesis_table import (
     IRREGULAR,
     KINDS,
@@ -33,8 +34,11 @@ from kf_calib.diagnosis.hypothesis_table import (
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.unknown_effect import FormulaFamily, one_digit_seconds
 from kf_calib.diagnosis.within_dwell_trend import Trend, trend
-from kf_calib.effects import FrameEffect, effect_named, walk_named
+from kf_calib.dwells.qr import orthonormal
+from kf_calib.effects import Effect, FrameEffect, Stimulus, effect_named, walk_named
+from kf_calib.errors import UnobservableError
 from kf_calib.estimation.cross_validation import orientations
+from kf_calib.estimation.dwell_columns import stimulus_of
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import unweighted_left
 from kf_calib.noise.noise_model import mean_covariances
@@ -161,10 +165,16 @@ class Hypotheses:
 
     def _log_bayes(self, name: str, delta_chi2: float) -> float:
         """Return the log Bayes factor of an effect from its fall of chi-squared in the linear tests."""
-        if name not in self.effects.best:
-            return 0.5 * delta_chi2 / self.inflation
         delta_chi2 = delta_chi2 / self.inflation
-        return float(size_evidence(self._dof(name), delta_chi2)) + self._log_share((name,), delta_chi2)
+        if name not in self.effects.best:
+            return 0.5 * delta_chi2
+        candidate, scale = self.effects.candidate(name), self.inflation**-0.5
+        if not candidate.dof:
+            return float(size_evidence(0, delta_chi2))
+        basis, root = orthonormal(candidate.columns * scale)
+        sizes = AddedEffects([candidate.effect], self.evidence.grade, candidate.dof)
+        log = sizes.log_bayes(delta_chi2, root, basis.T @ self.effects.scan.residual * scale)
+        return log + self._log_share((name,), delta_chi2)
 
     def _delta_chi2(self, name: str) -> float:
         """Return the fall of chi-squared of an effect; of a random walk, twice its gain in likelihood."""
@@ -184,7 +194,20 @@ class Hypotheses:
         tried = max(len(numbers), *(scan.candidates[k].tried for k in numbers))
         deltas = scan.statistics[numbers]
         relative = min(1.0, delta_chi2 / max(float(deltas.max()), 1e-9))
-        return float(np.logaddexp.reduce(0.5 * relative * (deltas - deltas.max()))) - math.log(tried)
+        log_priors = np.array([self._log_prior_of_constant(scan.candidates[k].effect) for k in numbers])
+        log_mean = float(np.logaddexp.reduce(log_priors)) - math.log(len(numbers))
+        log_sum = float(np.logaddexp.reduce(0.5 * relative * (deltas - deltas.max()) + log_priors))
+        return log_sum - log_mean - math.log(tried)
+
+    def _log_prior_of_constant(self, effect: Effect) -> float:
+        """Return the log of the prior of an effect's constant, 0 but for time constants longer than the effect goes on
+        in this run: the density falls by as much as they are longer."""
+        return -math.log(max(effect.value / effect.acts_for_s(self._stimulus), 1.0))
+
+    @cached_property
+    def _stimulus(self) -> Stimulus:
+        linearised = self.before.fit.linearised
+        return stimulus_of(linearised.dwells, self.before.bench, linearised.state)
 
     def _effects(self, screened: Mapping[str, float]) -> Iterator[Hypothesis]:
         """Yield the rows of single effects."""
@@ -290,7 +313,10 @@ class Hypotheses:
 
     def _row(self, effects: tuple[str, ...], log_prior: float, formulas: tuple[str, ...] = ()) -> Hypothesis:
         """Return the row of effects or formulas, refitted and weighed."""
-        refit = self._refit((*effects, *formulas))
+        try:
+            refit = self._refit((*effects, *formulas))
+        except UnobservableError:  # the run does not tell its coefficients: nothing speaks for it
+            return Hypothesis(effects, formulas, log_evidence=-math.inf)
         marginals = self.evidence.of(refit.fit, walk=self.walk in effects)
         if not marginals:
             return Hypothesis(effects, formulas, log_evidence=-math.inf)

@@ -28,7 +28,7 @@ from typing import Literal
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.evidence import size_evidence
+from kf_calib.diagnosis.coefficient_sizes import size_evidence
 from kf_calib.dwells.qr import triangle
 from kf_calib.effects import Effect
 from kf_calib.estimation.candidate_scan import SEEN, Complement, Scan, scan_of, slices

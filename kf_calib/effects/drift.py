@@ -88,6 +88,9 @@ class WarmUp(_Decay):
     def terms(self, s: Stimulus) -> Floats:
         return np.repeat(np.exp(-s.elapsed_s / self.value)[:, None], 3, axis=1)
 
+    def acts_for_s(self, s: Stimulus) -> float:
+        return s.span_s
+
 
 class Settling(_Decay):
     """C Delta a_i exp(-tau / tau_0), tau since the arrival in the dwell, Delta a_i the last step of the input."""
@@ -102,6 +105,9 @@ class Settling(_Decay):
 
     def terms(self, s: Stimulus) -> Floats:
         return s.step * np.exp(-s.since_arrival_s / self.value)[:, None]
+
+    def acts_for_s(self, s: Stimulus) -> float:
+        return float(s.since_arrival_s.max())
 
 
 class Sinusoid(Effect):

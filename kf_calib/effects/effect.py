@@ -133,7 +133,8 @@ class Effect(ABC):
     formulas: what an accelerometer reads more per unit of each coefficient that it has, where that depends on specific
     force and temperature alone: of a, p, o (along its axes), before, after (readings of the two other accelerometers,
     in their order), T and the constant. Empty where it cannot be written so.
-    typical: usual sizes of its coefficients. family: the physical class to which it belongs.
+    typical: usual sizes of its coefficients. expected: the value that they have by nature, and how far they may be from
+    it (sigma); None where nature does not say. family: the physical class to which it belongs.
     prior: how much likelier it is than another effect before anything is measured, 1 for most.
     borne_by: what can have it at all; what nobody knows, as of a user's effect, may be of either.
     drawn_against: the quantity over which what it adds to readings has a shape (``effects.axis``); None: what it adds.
@@ -152,6 +153,7 @@ class Effect(ABC):
     step: ClassVar[float] = 1e-4
     formulas: ClassVar[tuple[str, ...]] = ()
     typical: ClassVar[Typical] = Typical()
+    expected: ClassVar[tuple[float, float] | None] = None
     family: ClassVar[str] = "none of the known"
     prior: ClassVar[float] = 1.0
     borne_by: ClassVar[Bearer] = Bearer.EITHER
@@ -226,6 +228,10 @@ class Effect(ABC):
         """Values of the unknown among which it is looked for first."""
         assert self.unknown is not None
         return self.unknown.grid()
+
+    def acts_for_s(self, s: Stimulus) -> float:
+        """How long it goes on without a break: longer than that, its time constant would be another effect's."""
+        return np.inf
 
     def edges(self, s: Stimulus) -> Floats:
         """Sorted values of an unknown that is not smooth, from its lowest to its highest: between two of them the

@@ -79,6 +79,7 @@ class EarthRotation(FrameEffect):
     name, title, source = "earth-rotation", "rotation of the Earth", "WGS 84, rate of the Earth"
     confused_with = "platform-drift"
     typical = Typical((1.0, 1.0), (1.0, 1.0))
+    expected = (1.0, 0.1)  # the direction of north and the latitude are not known better than that on every bench
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:

@@ -20,7 +20,7 @@ from typing import Literal
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.dwells.qr import orthonormal
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.noise.means import Means, means_of
@@ -209,12 +209,15 @@ def degrees_of_freedom(means: Means, free: bool = False) -> int:
     return (len(means.readings) if free else means.readings.size) - _reduce(means).means.design.shape[2]
 
 
-def likelihood_of(noise: Noise, parts: Collection[Part], means: Means, state: Floats, prior: Floats) -> Likelihood:
+def likelihood_of(
+    noise: Noise, parts: Collection[Part], means: Means, state: Floats, prior: Floats, apart: slice = slice(0)
+) -> Likelihood:
     """The likelihood of the dwells' means in a noise to which these parts may be added.
 
-    ``means`` and ``prior`` are those that ``with_shared_noise`` returns; further rows may be added to ``prior``.
+    ``means`` and ``prior`` are those that ``with_shared_noise`` returns; further rows may be added to ``prior``. The
+    columns ``apart`` stay as they are, before those that have a prior and no others after them.
     """
-    return _likelihood(noise, parts, _reduce(means, prior), state)
+    return _likelihood(noise, parts, _reduce(means, prior, apart), state)
 
 
 def gain_of(part: Part, noise: Noise, means: Means, state: Floats, prior: Floats) -> float:
@@ -272,15 +275,16 @@ class _Reduced:
     prior: Floats
 
 
-def _reduce(means: Means, prior: Floats | None = None) -> _Reduced:
-    """Return the means about the basis of those columns that have no prior.
+def _reduce(means: Means, prior: Floats | None = None, apart: slice = slice(0)) -> _Reduced:
+    """Return the means about the basis of those columns that have no prior and are not to stay ``apart``.
 
     What the basis explains is subtracted from the readings. The change of basis alters the likelihood only by a
     constant, and the rounding of readings of size g no longer matters.
     """
     design = means.design.reshape(-1, means.design.shape[2])
     prior = np.zeros((0, design.shape[1] + 1)) if prior is None else prior
-    known = prior[:, :-1].any(axis=0)
+    known: Mask = np.array(prior[:, :-1].any(axis=0))
+    known[apart] = True
     free = design[:, ~known]  # a copy, which the basis may overwrite
     scale = np.linalg.norm(free, axis=0)
     free /= np.where(scale > 0, scale, 1.0)

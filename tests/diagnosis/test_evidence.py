@@ -13,9 +13,14 @@ from scipy.special import logsumexp
 from scipy.stats import chi2, multivariate_normal
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.evidence import Evidence, size_evidence
+from kf_calib.diagnosis.coefficient_sizes import AddedEffects, size_evidence
+from kf_calib.diagnosis.evidence import Evidence
 from kf_calib.diagnosis.refits import Refits, calibration_of
-from kf_calib.effects import effect_named
+from kf_calib.effects import Effect, effect_named
+from kf_calib.effects.drift import Hysteresis, Sinusoid
+from kf_calib.effects.effect import Typical
+from kf_calib.effects.frame import EarthRotation
+from kf_calib.effects.sensor import SecondOrder
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.results import Calibration
 from kf_calib.noise.noise_model import mean_covariances
@@ -111,12 +116,17 @@ def test_an_effect_that_is_there_beats_one_that_is_not(before: Calibration) -> N
 
 
 def test_coefficients_of_one_field_are_averaged_over_its_directions(before: Calibration) -> None:
-    """Against dense least squares with three columns a direction; in more noise nothing is changed but the falls."""
+    """Against a dense normal density with three columns a direction; no size is known in a MEMS unit, where it is the
+    falls of chi-squared that count."""
     refit, effect = Refits().with_effects(before, ("magnetic",)), effect_named("magnetic", before.bench)
     assert [own.shape for own in effect.relations] == [(6, 3)] * 18
-    own = next(each for each in Evidence(before.fit).of(refit.fit) if not each.parts)
-    still = next(each for each in Evidence(before.fit).of() if not each.parts)
+    evidence = Evidence(before.fit)
+    own, still = (next(each for each in rows if not each.parts) for rows in (evidence.of(refit.fit), evidence.of()))
     (columns, readings), added = _dense(refit, 0.0), before.model.count
+    logs = [_averaged(columns[:, :added], columns[:, added:] @ each, readings, effect) for each in effect.relations]
+    assert own.log - still.log == pytest.approx(logsumexp(logs) - np.log(len(logs)), abs=0.05) and own.dof == 6
+    evidence.grade = "mems"
+    own, still = (next(each for each in rows if not each.parts) for rows in (evidence.of(refit.fit), evidence.of()))
     parts = [np.hstack([columns[:, :added], columns[:, added:] @ relation]) for relation in effect.relations]
     falls = np.array([_left(*_dense(before, 0.0)) - _left(each, readings) for each in parts])
     expected = logsumexp(size_evidence(3, falls)) - np.log(len(falls))
@@ -124,9 +134,74 @@ def test_coefficients_of_one_field_are_averaged_over_its_directions(before: Cali
     assert expected > float(size_evidence(6, falls.max()))
 
 
-def test_an_oscillation_is_weighed_against_what_needs_no_carrier() -> None:
+def _averaged(columns: Floats, added: Floats, readings: Floats, effect: Effect) -> float:
+    """Log Bayes factor of normal coefficients on ``added``, by a sum over standard deviations from 1e-6 to 1e6 times
+    the usual, whose density falls by e for each decade beyond these; below one sigma they count as none."""
+    beside = np.linalg.qr(columns / np.linalg.norm(columns, axis=0), mode="complete")[0][:, columns.shape[1] :]
+    left, seen = beside.T @ readings, beside.T @ added
+    low, high = np.log10(np.array(effect.typical.of("navigation")))
+    decades = np.linspace(low - 6.0, high + 6.0, 1200)
+    density = np.exp(-np.maximum(np.maximum(low - decades, decades - high), 0.0))
+    logs = [_log_normal(left, 10.0**each * seen) for each in decades]
+    density = density / density.sum() * (10.0**decades > 1.0 / np.linalg.norm(seen, axis=0).max())
+    return float(logsumexp(logs, b=density) + 0.5 * left @ left)
+
+
+def _log_normal(readings: Floats, scaled: Floats) -> float:
+    """Log density of readings with the covariance 1 + scaled scaled^T, but for a constant."""
+    covariance = np.eye(len(readings)) + scaled @ scaled.T
+    return float(-0.5 * (np.linalg.slogdet(covariance)[1] + readings @ np.linalg.solve(covariance, readings)))
+
+
+def test_the_rate_of_the_earth_is_one_or_it_is_not_the_rotation_of_the_earth() -> None:
+    """A drift of the base of the size that bases have, which looks exactly alike: its coefficient would be 6e-5."""
+    sigma, root = 6e-6, np.array([[1.0 / 6e-6]])
+    log_bayes = {
+        name: AddedEffects([effect], "navigation", 1).log_bayes((value / sigma) ** 2, root, np.array([value / sigma]))
+        for name, value in (("wrong", 6e-5), ("right", 1.0))
+        for effect in [EarthRotation()]
+    }
+    of_spread = -np.log(0.1 / sigma)
+    assert log_bayes["wrong"] == pytest.approx(50.0 - 0.5 * ((1.0 - 6e-5) / 0.1) ** 2 + of_spread, abs=0.01)
+    assert log_bayes["right"] == pytest.approx(0.5 * sigma**-2 + of_spread, abs=0.01)
+
+
+def test_sizes_of_two_effects_are_averaged_each_over_its_own_prior() -> None:
+    """Against a sum over a grid of both standard deviations and the dense normal density of the readings."""
+    random = np.random.default_rng(5)
+    root, effects = np.triu(random.normal(size=(6, 6)) * 1e5), [SecondOrder(), Hysteresis()]
+    estimate = np.array([3e-6, -1e-6, 2e-6, 4e-5, -1e-5, 2e-5])
+    readings = root @ estimate
+    found = AddedEffects(effects, "navigation", 6).log_bayes(float(readings @ readings), root, readings)
+    decades, densities = list[Floats](), list[Floats]()
+    for effect in effects:
+        low, high = np.log10(np.array(effect.typical.of("navigation")))
+        decades.append(np.linspace(low - 5.0, high + 5.0, 90))
+        densities.append(np.exp(-np.maximum(np.maximum(low - decades[-1], decades[-1] - high), 0.0)))
+    for k in range(2):
+        smallest = 1.0 / np.linalg.norm(root[:, 3 * k : 3 * k + 3], axis=0).max()
+        densities[k] = densities[k] / densities[k].sum() * (10.0 ** decades[k] > smallest)
+    logs, weights = list[float](), list[float]()
+    for one, a in zip(decades[0], densities[0], strict=True):
+        for other, b in zip(decades[1], densities[1], strict=True):
+            logs.append(_log_normal(readings, root * 10.0 ** np.repeat([one, other], 3)))
+            weights.append(a * b)
+    assert found == pytest.approx(float(logsumexp(logs, b=weights)) + 0.5 * readings @ readings, abs=0.1)
+
+
+@pytest.mark.parametrize("rounding", [0.0, 1e-170])
+def test_what_rounding_alone_sees_changes_nothing(rounding: float) -> None:
+    """An effect beside another that the readings of a recorded phone do not show at all."""
+    alone, effects = np.eye(3) * 1e5, [SecondOrder(), Hysteresis()]
+    readings, root = np.array([6.0, -2.0, 4.0]), np.hstack([alone, np.full((3, 3), rounding)])
+    one = AddedEffects(effects[:1], "navigation", 3).log_bayes(56.0, alone, readings)
+    assert AddedEffects(effects, "navigation", 3).log_bayes(56.0, root, readings) == pytest.approx(one, abs=0.05)
+
+
+def test_an_oscillation_is_weighed_against_what_needs_no_carrier(monkeypatch: pytest.MonkeyPatch) -> None:
     """The readings that are kept for its sake alone are no loss to it: half the fall of chi-squared, less the price of
-    six coefficients and a frequency."""
+    six coefficients and a frequency, of any size."""
+    monkeypatch.setattr(Sinusoid, "typical", Typical())
     made = source("sinusoid=15sigma;frequency=0.1", plan=plan_of(16, dwell_s=8.0, seed=5))
     before, refits = calibration_of(made, None)
     refit, evidence = refits.with_effects(before, ("sinusoid",)), Evidence(before.fit)

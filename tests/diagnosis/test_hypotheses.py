@@ -17,6 +17,8 @@ from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.effects import effect_named, names
+from kf_calib.errors import UnobservableError
+from kf_calib.estimation.results import Calibration
 from kf_calib.views.diagnosis import diagnosis_object
 
 FAMILIES = {
@@ -54,6 +56,20 @@ def test_what_is_told_of_a_table() -> None:
     assert table.probability_of_added("a", "a") == pytest.approx(0.995 * 0.95 / 1.002)
     assert table.probability_of_added("mine = t", "mine") == pytest.approx(0.002 / 1.002)
     assert table.probability_of_added("b2", "b2") is None
+
+
+def test_a_pair_that_the_run_does_not_determine_is_no_explanation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its refit fails in some runs without angles; the others are weighed all the same."""
+    refitted = Refits.of
+
+    def of(self: Refits, before: Calibration, effects: Sequence[str]) -> Calibration:
+        if len(effects) > 1:
+            raise UnobservableError("the sizes of the readings at rest do not determine both")
+        return refitted(self, before, effects)
+
+    monkeypatch.setattr(Refits, "of", of)
+    found = diagnose(source("second-order=8sigma", plan=plan_of(10, dwell_s=4.0, seed=5)))
+    assert found.table and found.table.first.effects and all(len(row.effects) < 2 for row in found.table.rows)
 
 
 @pytest.mark.parametrize(

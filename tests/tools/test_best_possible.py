@@ -19,7 +19,7 @@ from blind_trials.best_possible import (
 )
 from scipy.special import ndtr
 
-from kf_calib.diagnosis.evidence import size_evidence
+from kf_calib.diagnosis.coefficient_sizes import size_evidence
 
 
 def test_the_best_chooser_is_right_as_often_as_theory_has_it() -> None:

@@ -21,7 +21,7 @@ from scipy.stats import vonmises_fisher
 
 from blind_trials.bayes_factor import log_odds
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.evidence import size_evidence
+from kf_calib.diagnosis.coefficient_sizes import size_evidence
 
 _NEAR = 12.0  # in the logarithm of the odds: a pair that lags by more is never the likeliest
 _DRAWN = 400  # directions, for the mean over them

@@ -22,12 +22,15 @@ _SAME_OVERLAP = 1.0 - 1e-6  # from here on, they are the same
 
 
 def visible_effects(options: tuple[str, ...] = ()) -> list[str]:
-    """Return the names of the effects that can be hidden and that such a run shows, by what the program says of it."""
+    """Return the names of the effects that can be hidden and that such a run shows, by what the program says of it.
+
+    An effect whose size nature sets, as the rate of the Earth, has no other size in sigma and is left out.
+    """
     clean = Task("", "", 1, (), options)
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         simulate_trial(clean, Path("clean.mcap"))
         unseen = set(run_command("diagnose", "clean.mcap", "--json")["invisible"])
-    hideable = {kind.name: kind for kind in known_kinds()}
+    hideable = {kind.name: kind for kind in known_kinds() if len(set(kind.typical("navigation"))) > 1}
     names = [each["effect"] for each in run_command("effects", "--json")["effects"]]
     kinds = {name: hideable[name.split(":")[0]] for name in names if name.split(":")[0] in hideable}
     return [n for n, kind in kinds.items() if n not in unseen or (kind.counted and _is_visible_itself(clean, n))]

@@ -1,0 +1,180 @@
+"""The prior of the size of an effect's coefficients, and the evidence of an effect whose sizes are averaged over it.
+
+The coefficients c of one effect are normal with a common standard deviation s, and log s is uniform over the sizes that
+such coefficients usually have in sensors of the grade at hand (``Effect.typical``), with tails on both sides: the
+density falls by a factor e for each decade beyond. The prior is proper, and says what physics says: an effect that
+would have a size that it never has is an unlikely name, however well its columns fit. An effect that is too small to be
+seen is none: sizes below one sigma count as its absence. A coefficient whose value is known, as the rate of the Earth
+is, is normal about that value. Where no usual size is known, every size from 1 to 1e7 sigma is equally likely.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.effects.effect import Effect, Grade
+
+_TAIL = 1.0  # decades beyond the usual sizes in which the density falls by a factor e
+_SHARPER = 100.0  # where only the greatest usual size is known, the least one is smaller by this factor
+_UNKNOWN_DECADES = 7.0  # above one sigma: where no usual size is known
+_STEPS = {1: 120, 2: 40, 3: 16}  # sizes that are tried, by number of effects
+_HIDDEN = 1e20  # SI: sigma of a coefficient of which rounding alone is seen
+_ABOVE = 300.0  # times the estimate: beyond it, sizes differ no more in evidence
+_SIZES = np.exp(np.linspace(0.0, math.log(1e14), 120))  # prior variance of a coefficient over that of its estimate
+
+
+def size_evidence(dof: int, delta_chi2: Floats | float) -> Floats:
+    """Log Bayes factor of an effect whose size and direction are unknown, against no effect.
+
+    The coefficients have the prior N(0, g C) with C the covariance of their estimate, and ln g is uniform from 0 to
+    ln 1e14, which is a size of 1 to 1e7 sigma (the g-prior of A. Zellner, 1986, mixed over g; F. Liang et al., 2008):
+
+      B = mean over g of (1 + g)^(-k/2) exp(g / (1 + g) F / 2)
+
+    dof: number of coefficients k. delta_chi2: decrease F of chi-squared with them; a number or an array. Returns
+    ln B.
+    """
+    log_terms = -0.5 * dof * np.log1p(_SIZES) + 0.5 * np.asarray(delta_chi2, float)[..., None] * (
+        _SIZES / (1.0 + _SIZES)
+    )
+    return np.logaddexp.reduce(log_terms, axis=-1) - math.log(len(_SIZES))
+
+
+@dataclass(frozen=True)
+class SizePrior:
+    """The prior of the common standard deviation s of some coefficients, in SI.
+
+    low, high: sizes that are usual. tail: decades beyond them in which the density of log s falls by a factor e. value:
+    about which the coefficients are normal.
+    """
+
+    low: float
+    high: float
+    tail: float = _TAIL
+    value: float = 0.0
+
+    def below(self, sizes: Floats) -> Floats:
+        """Probability that s is below each of these sizes."""
+        low, high, at = np.log10(self.low), np.log10(self.high), np.log10(sizes)
+        before = self.tail * np.exp(np.minimum(at - low, 0.0) / self.tail)
+        after = self.tail * -np.expm1(-np.maximum(at - high, 0.0) / self.tail)
+        return np.asarray((before + np.clip(at - low, 0.0, high - low) + after) / (high - low + 2.0 * self.tail), float)
+
+
+def size_prior(effect: Effect, grade: Grade, sigma: float) -> SizePrior:
+    """The prior of an effect of which the run tells the best determined coefficient to ``sigma``."""
+    if effect.expected is not None:
+        value, spread = effect.expected
+        return SizePrior(spread, spread, 0.01, value)
+    usual = effect.typical.of(grade)
+    if usual is None:
+        return SizePrior(sigma, sigma * 10.0**_UNKNOWN_DECADES, 0.1)
+    return SizePrior(usual[0] or usual[1] / _SHARPER, usual[1])
+
+
+def log_bayes_of_sizes(
+    delta_chi2: float, root: Floats, estimate: Floats, groups: NDArray[np.intp], priors: Sequence[SizePrior]
+) -> float:
+    """Log Bayes factor of effects whose sizes are averaged over their priors, against no effect.
+
+      B = exp(F / 2) mean over s of N(c; m, C + S^2) / N(c; c, C),  C = (R^T R)^-1
+
+    - delta_chi2: the decrease F of chi-squared with them.
+    - root (r, q): a root R of the information on their coefficients, all else averaged out.
+    - estimate (q,): the coefficients c, in any directions that R does not see.
+    - groups (q,): the number of the effect that each coefficient belongs to. priors: of these effects.
+    """
+    centre = np.array([prior.value for prior in priors])[groups]
+    left = root @ (estimate - centre)
+    nodes = [_nodes(root[:, groups == k], estimate[groups == k], prior, len(priors)) for k, prior in enumerate(priors)]
+    mesh = np.meshgrid(*(sizes for sizes, _ in nodes), indexing="ij")
+    log_weights = sum(np.meshgrid(*(np.log(weights) for _, weights in nodes), indexing="ij"))
+    sizes = np.stack([each.ravel() for each in mesh], axis=1)[:, groups]
+    scaled = root * sizes[:, None, :]  # (n, r, q)
+    spread = np.eye(len(groups)) + np.swapaxes(scaled, 1, 2) @ scaled
+    along = left @ scaled
+    misfit = left @ left - np.einsum("nq,nq->n", along, np.linalg.solve(spread, along[..., None])[..., 0])
+    logs = np.ravel(log_weights) - 0.5 * (np.linalg.slogdet(spread)[1] + misfit)
+    return 0.5 * delta_chi2 + float(np.logaddexp.reduce(logs))
+
+
+def _nodes(root: Floats, estimate: Floats, prior: SizePrior, effects: int) -> tuple[Floats, Floats]:
+    """Return sizes (n,) and their prior probabilities (n,), of all sizes from one sigma of the coefficient that is
+    determined best: an effect that is smaller shows nothing, and belongs to the explanation without it. One of which
+    nothing is seen beside the others changes nothing: its size is zero."""
+    least = best_sigma(root)
+    if least > _HIDDEN:
+        return np.zeros(1), np.ones(1)
+    if prior.value:
+        return np.array([prior.low]), np.ones(1)
+    most = _ABOVE * max(float(np.abs(estimate).max(initial=0.0)), least)
+    edges = np.geomspace(least, most, _STEPS.get(effects, 8) + 1)
+    sizes = np.sqrt(edges[1:] * edges[:-1])
+    weights = np.diff(prior.below(edges))
+    weights[-1] += 1.0 - prior.below(edges[-1:])[0]
+    return sizes, np.maximum(weights, 1e-300)
+
+
+@dataclass(frozen=True)
+class AddedEffects:
+    """What is known beforehand of the coefficients of effects that are added to a model.
+
+    - effects: those of them that have coefficients. grade: of the sensors.
+    - dof: the number of coefficients that are seen.
+    """
+
+    effects: Sequence[Effect]
+    grade: Grade
+    dof: int
+
+    def log_bayes(self, delta_chi2: float, root: Floats, readings: Floats) -> float:
+        """The log Bayes factor of the effects against none, averaged over all relations that the coefficients may have.
+
+        delta_chi2: decrease of chi-squared with them. root (r, q), readings (r,): what the run says of the coefficients
+        is root @ c = readings, in noise of unit size.
+        """
+        blocks = [effect.relations or [np.eye(len(effect.coefficients))] for effect in self.effects]
+        readings = root @ _solved(root, readings)
+        logs = [self._log_bayes(delta_chi2, root, readings, relation) for relation in itertools.product(*blocks)]
+        return float(np.logaddexp.reduce(logs)) - math.log(len(logs))
+
+    def _log_bayes(self, delta_chi2: float, root: Floats, readings: Floats, relation: Sequence[Floats]) -> float:
+        """Return the log Bayes factor where the coefficients of each effect are a matrix times free numbers."""
+        widths = [matrix.shape[1] for matrix in relation]
+        related = root @ np.asarray(block_diag(*relation), float)
+        estimate = _solved(related, readings)
+        left = readings - related @ estimate
+        delta_chi2 = max(delta_chi2 - float(left @ left), 0.0)
+        if not any(has_usual_size(effect, self.grade) for effect in self.effects):
+            return float(size_evidence(min(self.dof, sum(widths)), delta_chi2))
+        groups = np.repeat(np.arange(len(relation)), widths)
+        priors = [
+            size_prior(effect, self.grade, best_sigma(related[:, groups == k])) for k, effect in enumerate(self.effects)
+        ]
+        return log_bayes_of_sizes(delta_chi2, related, estimate, groups, priors)
+
+
+def _solved(root: Floats, readings: Floats) -> Floats:
+    """Return the shortest least-squares solution of root @ x = readings, with columns of any scale; zero where
+    rounding alone is seen."""
+    lengths = np.linalg.norm(root, axis=0)
+    lengths = np.where(lengths * _HIDDEN > 1.0, lengths, 1.0)
+    return np.asarray(np.linalg.lstsq(root / lengths, readings, rcond=1e-9)[0] / lengths, float)
+
+
+def has_usual_size(effect: Effect, grade: Grade) -> bool:
+    """Whether it is known what size the coefficients of an effect usually have."""
+    return effect.expected is not None or effect.typical.of(grade) is not None
+
+
+def best_sigma(root: Floats) -> float:
+    """Sigma of the coefficient that is determined best, from a root (r, q) of the information on them all."""
+    return float(1.0 / max(np.linalg.norm(root, axis=0).max(initial=0.0), 1e-300))
