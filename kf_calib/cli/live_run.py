@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from kf_calib.online.status import Judgement
     from kf_calib.sources.live import LiveSource
 
+
 def on_bench(settings: Settings, wanted: Mapping[str, float], auto: bool) -> Callable[..., Session]:
     """How the session of a bench is begun."""
     from kf_calib.online.session import Session

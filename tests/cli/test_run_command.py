@@ -62,9 +62,7 @@ def test_a_signal_stops_the_table_first(number: signal.Signals, code: int, said:
     recording = tmp_path / "run.mcap"
     words = ["run", "--positioner", f"{SIM}&speed=20", "--record", str(recording), "--target", "K=0.01ppm", "--json"]
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
-    process = subprocess.Popen(
-        warm(*words), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
-    )
+    process = subprocess.Popen(warm(*words), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
     while not decision_records(recording) and process.poll() is None:
         time.sleep(0.1)
     process.send_signal(number)
