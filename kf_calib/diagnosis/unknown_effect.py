@@ -295,11 +295,13 @@ def _of_time(dwells: Sequence[DwellFactor]) -> Iterator[tuple[str, list[str]]]:
     moments_s = [moment for dwell in dwells for moment in (dwell.start_s, 0.5 * (dwell.start_s + dwell.end_s))][1:]
     for moment_s in moments_s[:: len(moments_s) // _JUMPS + 1]:
         yield JUMP, [f"t > {moment_s:.6g}*s"]
-    duration_s = dwells[-1].end_s
+    duration_s, longest_s = dwells[-1].end_s, max(dwell.end_s - dwell.start_s for dwell in dwells)
     for decay_s in _DECAYS_S:
-        yield DECAY, [f"exp(-t/({10 * decay_s}*s))"]
-        yield ARRIVAL, [f"exp(-tau/({decay_s}*s))"]
-        yield ARRIVAL, [f"{axis}*exp(-tau/({decay_s}*s))" for axis in ("fx", "fy", "fz")]
+        if decay_s == _DECAYS_S[0] or 10 * decay_s <= duration_s:
+            yield DECAY, [f"exp(-t/({10 * decay_s}*s))"]
+        if decay_s <= 2.0 * longest_s:  # a slower one is hardly more than a constant in each dwell
+            yield ARRIVAL, [f"exp(-tau/({decay_s}*s))"]
+            yield ARRIVAL, [f"{axis}*exp(-tau/({decay_s}*s))" for axis in ("fx", "fy", "fz")]
     for turns in (0.5, 1, 1.5, 2, 3, 4, 6, 8):
         waves = [f"{wave}({turns}*2*pi*t/({duration_s:.0f}*s))" for wave in ("sin", "cos")]
         yield PERIODIC, waves

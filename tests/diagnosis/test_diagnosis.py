@@ -157,6 +157,8 @@ def test_a_hand_placed_run_claims_nothing() -> None:
 
     found = diagnose(Recording(HAND))
     assert not found.missing and not found.unknown and "third-order" in found.test.invisible
+    without_angles = diagnose(Recording(HAND, angles=False))
+    assert not without_angles.sure and not without_angles.unknown  # a decay over minutes, in dwells of seconds
 
 
 def test_the_p_value_of_a_run_does_not_depend_on_how_its_frame_is_turned() -> None:

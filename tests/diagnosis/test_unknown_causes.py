@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +19,7 @@ from kf_calib.diagnosis.evidence import MarginalLikelihood
 from kf_calib.diagnosis.hypotheses import log_odds_of_repeating
 from kf_calib.diagnosis.hypothesis_table import IRREGULAR, NOISE
 from kf_calib.diagnosis.results import Diagnosis
-from kf_calib.diagnosis.unknown_effect import bases_of_pairs
+from kf_calib.diagnosis.unknown_effect import ARRIVAL, _of_time, bases_of_pairs
 from kf_calib.estimation.cross_validation import orientations
 from kf_calib.estimation.dwell_columns import stimulus_of
 
@@ -134,3 +136,10 @@ def test_memory_in_proportion_to_the_last_step_is_not_surely_settling() -> None:
     assert diagnosis.table is not None
     assert diagnosis.table.probability(["settling"]) < 0.95
     assert any(row.driver == "previous orientation" and row.probability > 0.05 for row in diagnosis.table.rows)
+
+
+@pytest.mark.parametrize(("dwell_s", "decays"), [(7.0, {10}), (20.0, {10, 30}), (200.0, {10, 30, 100, 300})])
+def test_no_decay_since_the_arrival_is_much_longer_than_the_dwells(dwell_s: float, decays: set[int]) -> None:
+    dwells = [SimpleNamespace(start_s=300.0 * k, end_s=300.0 * k + dwell_s) for k in range(12)]
+    texts = [text for driver, texts in _of_time(dwells) if driver == ARRIVAL for text in texts]
+    assert {int(found) for text in texts for found in re.findall(r"tau/\((\d+)", text)} == decays
