@@ -5,7 +5,7 @@ The parabola over two pieces together is, on either piece, a linear combination 
 therefore merged exactly. Only the model's columns become coarser: each was one parabola per piece and is one over both.
 Pieces shortly after the arrival stay short, since a merged piece is never longer than the time since the arrival.
 
-Values at the nodes of all pieces of all dwells, in one array that is also a sequence by dwell.
+``OfPieces`` has the values at the nodes of all pieces of all dwells in one array, which is also a sequence by dwell.
 """
 
 from __future__ import annotations

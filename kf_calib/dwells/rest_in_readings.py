@@ -10,7 +10,7 @@ and with the mean so far. One window that is not still, as by an outlier, does n
 Nothing is decided with readings that come later than half a second, so that a live run and the replay of its recording
 find the same dwells, however the readings are divided into batches.
 
-The dwells of a run, found before any of its readings is evaluated.
+``dwell_summaries`` lists the dwells of a run before any of its readings is evaluated.
 """
 
 from __future__ import annotations

@@ -304,11 +304,6 @@ class DwellStack(ComputedSequence[DwellFactor]):
         added = coefficients if self.added is None else self.added + coefficients
         return DwellStack(self.folded, self.turned_rad, self.attitudes, self.facing, added)
 
-    @property
-    def piece_dwells(self) -> PieceIndices:
-        """The index of the dwell of each piece, (pieces,)."""
-        return np.repeat(np.arange(len(self)), self.folded.piece_numbers)
-
     @cached_property
     def triangles(self) -> list[Floats]:
         """The triangles (d, P, K + 3, K + 3) of the dwells of each shape."""

@@ -1,9 +1,8 @@
 """What an effect depends on, found by trying: which inputs change its columns when they alone are changed.
 
-What an effect is drawn against: the quantity over which what it adds to readings has a shape.
-
-An effect of the catalogue states it (``Effect.drawn_against``), a formula has it in itself. What states none is drawn
-against what it adds with its fitted coefficients: an effect of the platform against the turn that it makes.
+An effect is drawn against one quantity, over which what it adds to readings has a shape. An effect of the catalogue
+states it (``Effect.drawn_against``), a formula has it in itself. What states none is drawn against what it adds with
+its fitted coefficients: an effect of the platform against the turn that it makes.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""What the surroundings do to the sensors.
-
-What changes with temperature; T is the temperature less the reference (25 degC).
-"""
+"""What the surroundings do to the sensors: magnetic fields, and temperature T, counted from the reference (25 degC)."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """What the readers of JSON and CSV lines share: units, exact stamps, rows, and an account of what was not used.
 
-The lines at the beginning of a CSV file: comments and titles, the names of the columns, perhaps their units.
-
-A file of text as bytes in UTF-8, piece by piece: packed by gzip or not, and in whichever encoding it is written.
+A file of text is given as bytes in UTF-8, piece by piece, whether gzip has packed it or not, and in whichever encoding
+it is written. A CSV file begins with a heading: comments and titles, the names of the columns, perhaps their units.
 """
 
 from __future__ import annotations

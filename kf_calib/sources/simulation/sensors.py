@@ -1,13 +1,12 @@
-"""True accelerometers of the simulator: the paper's twelve parameters, and grades to draw them from.
+"""True accelerometers of the simulator: the paper's twelve parameters, grades to draw them from, and their noise.
 
 Reading i = K_i E_i . f + b_i (M. D. Grebenkin, Vestnik MEPhI 8(3), 2019, eq. 1-6), with unit vectors E_i made by
 turning the platform's axes, apart from any formula of the estimator.
 
-Noise of the simulated bench: processes that stream, and go on over dwells and batches without a seam.
-
-Every coloured noise is a sum of first-order processes ``y_n = phi y_(n-1) + s w_n``, w white with variance 1: white
-noise, AR(1), 1/f (many time constants) and the random walk (phi = 1). Each has a generator of its own, so what it
-yields does not depend on how the samples are cut into batches, nor on which other noises are on.
+Noise is made by processes that stream, and go on over dwells and batches without a seam. Every coloured noise is a sum
+of first-order processes ``y_n = phi y_(n-1) + s w_n``, w white with variance 1: white noise, AR(1), 1/f (many time
+constants) and the random walk (phi = 1). Each has a generator of its own, so what it yields does not depend on how the
+samples are cut into batches, nor on which other noises are on.
 """
 
 from __future__ import annotations
