@@ -266,13 +266,13 @@ def _families(bench: Bench, dwells: Sequence[DwellFactor]) -> Iterator[tuple[str
 
 def _of_force() -> Iterator[tuple[str, list[str]]]:
     """Yield the formulas of the specific force."""
-    yield "specific force, degree 2", ["a*a", "a*p", "a*o", "p*o", "p*p"]
+    yield "specific force (degree 2)", ["a*a", "a*p", "a*o", "p*o", "p*p"]
     for terms in (["a**3"], ["a*a*p"], ["a*a*o"], ["a*p*o"], ["p**3"], ["o**3"], ["a**3", "a*p*p", "p**3", "a*a*p"]):
-        yield "specific force, degree 3", terms
+        yield "specific force (degree 3)", terms
     for terms in (["a**4"], ["a**4", "a*a"], ["p**4", "p*p"], ["a**2*p**2"]):
-        yield "specific force, degree 4", terms
+        yield "specific force (degree 4)", terms
     for terms in (["a**5"], ["a**5", "a**3"], ["p**5", "p**3"]):
-        yield "specific force, degree 5", terms
+        yield "specific force (degree 5)", terms
 
 
 def _of_gimbals(count: int) -> Iterator[tuple[str, list[str]]]:

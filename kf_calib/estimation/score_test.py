@@ -277,7 +277,7 @@ def batches(sizes: Sequence[int], columns: int) -> list[list[int]]:
 
 def _judged(
     dwells: Sequence[DwellFactor], columns: Sequence[Floats], noise: Noise, state: Floats, width: int
-) -> tuple[list[Floats], int]:
+) -> tuple[Sequence[Floats], int]:
     """Call ``whitened_rows.misfit_rows`` without reducing the rows to the rank of their columns."""
     return whitened_rows.misfit_rows(dwells, columns, noise, state, width, reduced=False)
 

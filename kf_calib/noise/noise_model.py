@@ -344,7 +344,7 @@ def considered_information(noise: Noise, means: Means, state: Floats) -> Floats:
     """
     count = means.design.shape[2]
     if noise.checked or not noise.setting_rad:
-        return np.zeros((len(means.counts), count, count))
+        return np.broadcast_to(np.zeros((count, count)), (len(means.counts), count, count))
     weight = 1.0 / np.einsum("dii->di", mean_covariances(noise.weights, means, state))
     weighted = weight[:, :, None] * means.design
     return noise.setting_rad**2 * np.swapaxes(weighted, 1, 2) @ setting_covariances(means, state) @ weighted

@@ -172,7 +172,7 @@ class Running:
             running = running._update(self._rows([k])[0], variance)
         return running
 
-    def _rows(self, chosen: Sequence[int] | None = None) -> list[Floats]:
+    def _rows(self, chosen: Sequence[int] | None = None) -> Sequence[Floats]:
         """Return the whitened rows of all dwells, or of those chosen."""
         chosen = range(len(self.dwells)) if chosen is None else chosen
         dwells, columns = (

@@ -57,7 +57,7 @@ def test_a_play_follows_where_it_is_pushed() -> None:
         expected.append(held)
     np.testing.assert_allclose(stimulus.played(3.0), expected, atol=1e-12)
     np.testing.assert_allclose(stimulus.played(0.0), stimulus.along, atol=1e-12)
-    np.testing.assert_array_equal(stimulus.ending(6).played(3.0), stimulus.played(3.0)[-6:])
+    np.testing.assert_array_equal(stimulus.at(slice(-6, None)).played(3.0), stimulus.played(3.0)[-6:])
 
 
 def scattered(repeated: int, with_orientation: bool) -> Diagnosis:
