@@ -12,7 +12,7 @@ from helpers.synthetic import Run, plan_of
 from scipy.stats import binom, f
 
 from kf_calib.diagnosis.candidate_tests import overlap_matrix
-from kf_calib.diagnosis.detectability import QUIET, sensor_grade
+from kf_calib.diagnosis.coefficient_sizes import QUIET, sensor_grade
 from kf_calib.diagnosis.explanation import Explanation
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
