@@ -14,10 +14,9 @@ from kf_calib.diagnosis.refits import Refits
 from kf_calib.effects import effect_named
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.dwell_columns import candidate_columns, piece_columns, stimulus_of
-from kf_calib.estimation.further_effects import FurtherEffects
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.results import Calibration
-from kf_calib.estimation.score_test import Frame
+from kf_calib.estimation.score_test import Frame, FurtherEffects
 from kf_calib.estimation.whitened_rows import MisfitColumns, misfit_rows
 from kf_calib.sources.simulation.injected import parse
 from kf_calib.sources.simulation.sensors import GRADES, TrueNoise
