@@ -262,8 +262,8 @@ def _with_alternatives(state: Improvement, refits: Refits) -> Improvement:
     earlier one."""
     diagnosis, result = state.diagnosis, state.result
     if _rivals(diagnosis) and diagnosis.table is not None:
-        rows = [(row.effects, row.refit) for row in (diagnosis.table.first, *diagnosis.table.rivals) if row.effects]
-        equal = [Alternative(" + ".join(names), refit) for names, refit in rows if refit is not None]
+        rows = [row for row in (diagnosis.table.first, *diagnosis.table.rivals) if row.effects and not row.formulas]
+        equal = [Alternative(" + ".join(row.effects), row.refit) for row in rows if row.refit is not None]
         return replace(state, alternatives=tuple(equal))
     alternatives, effects = list[Alternative](), list(result.settings.effects)
     index = {str(effect): k for k, effect in enumerate(result.model.effects)}
