@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
+from unknown_trials.hidden import second_order
 from unknown_trials.small_bench import G_MPS2, RATE_HZ, WHITE_MPS2, SmallRun, hidden_run
 
 _MEAN_MPS2 = WHITE_MPS2 / np.sqrt(240.0)  # noise of the mean of a dwell
@@ -67,6 +68,6 @@ _LATE_S = {"stamps an hour later half-way": 3600.0, "stamps 8 s earlier half-way
 
 def noisy_run(kind: str, sigmas: float, seed: int) -> SmallRun:
     """A run with noise of this kind, and a second-order term of this size in sigmas of white noise hidden."""
-    run = hidden_run(lambda at: (at.force_mps2 / G_MPS2)[:, None] ** 2 * np.ones((1, at.time_s.shape[1], 1)), sigmas, seed)
+    run = hidden_run(second_order, sigmas, seed)
     half = np.arange(len(run.at.time_s)) >= len(run.at.time_s) // 2
     return replace(run, altered=KINDS[kind], late_s=half[:, None] * _LATE_S.get(kind, 0.0))
