@@ -279,14 +279,19 @@ def _with_alternatives(state: Improvement, refits: Refits) -> Improvement:
 
 
 def next_effect(diagnosis: Diagnosis, accept_first: bool = False) -> str | None:
-    """The effect to add next: the likeliest where it is missing with 95 % probability, whether alone or with others.
+    """The effect to add next: of those that are missing with 95 % probability, whether alone or with others, the one
+    that explains most.
 
     None where nothing is missing, or where the choice is left to a person. accept_first: take the likeliest anyway.
     """
     if diagnosis.test.consistent is not False or not diagnosis.missing or diagnosis.table is None:
         return None
-    first = max(diagnosis.missing, key=lambda name: diagnosis.table.probability((name,)) if diagnosis.table else 0.0)
-    return first if accept_first or diagnosis.table.probability((first,)) >= SURE else None
+    probabilities = {name: diagnosis.table.probability((name,)) for name in diagnosis.missing}
+    sure = [name for name, probability in probabilities.items() if probability >= SURE]
+    if not sure:
+        return max(probabilities, key=lambda name: probabilities[name]) if accept_first else None
+    falls = {suspect.name: suspect.statistic for suspect in diagnosis.suspects}
+    return max(sure, key=lambda name: falls.get(name, 0.0))
 
 
 def _rivals(diagnosis: Diagnosis) -> list[str]:
