@@ -337,8 +337,7 @@ def messages_of(path: Path, options: Mapping[str, Any], angles: bool, input: Raw
 
 
 def settings_of(options: Mapping[str, Any]) -> Settings:
-    from kf_calib.estimation.prior import PRIORS
-    from kf_calib.estimation.settings import Settings
+    from kf_calib.estimation.settings import PRIORS, Settings
 
     return Settings(
         engine=options["engine"],

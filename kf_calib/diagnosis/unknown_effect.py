@@ -25,10 +25,9 @@ from kf_calib.effects.formula import formula
 from kf_calib.errors import InputError
 from kf_calib.estimation.candidate_scan import Scan
 from kf_calib.estimation.fit import Fit
-from kf_calib.estimation.further_effects import FurtherEffects
 from kf_calib.estimation.iterated_fit import fit
 from kf_calib.estimation.results import consistency
-from kf_calib.estimation.score_test import Frame
+from kf_calib.estimation.score_test import Frame, FurtherEffects
 from kf_calib.support import stage
 
 _CHANCE = 1e-4  # significance level of one family, of which there are about a hundred

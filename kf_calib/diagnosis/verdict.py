@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from kf_calib.diagnosis.candidate_tests import CandidateTests
-from kf_calib.diagnosis.dwell_noise import dwell_noise_is_stated
 from kf_calib.diagnosis.hypothesis_table import IRREGULAR, NOISE, NONE, NOTHING, SURE, Hypothesis
+from kf_calib.diagnosis.refits import dwell_noise_is_stated
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.unknown_effect import one_digit_seconds
-from kf_calib.estimation.oscillation_carrier import holds_its_oscillation
+from kf_calib.estimation.dwell_pass import holds_its_oscillation
 from kf_calib.estimation.results import format_p
 from kf_calib.support.units import shown
 

@@ -20,7 +20,7 @@ from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation import square_root_information
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.free_attitude import weights_of_size
-from kf_calib.estimation.prior import Prior
+from kf_calib.estimation.settings import Prior
 from kf_calib.noise import random_walk
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import considered_information, lift_rounding, mean_covariances

@@ -19,7 +19,7 @@ from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_column
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise, flicker_sigma, slow_waves, steps
 from kf_calib.noise.reml import Part, gain_of, gauss_markov_gains, misfit, with_shared_noise
-from kf_calib.noise.thermometer_error import thermometer_errors
+from kf_calib.noise.temperature_course import thermometer_errors
 
 _DETERMINED = 1e-9  # share of a state in combinations that are not determined
 

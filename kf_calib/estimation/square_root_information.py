@@ -21,7 +21,7 @@ from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.pieces import as_one_array
 from kf_calib.dwells.qr import triangle
 from kf_calib.estimation.measurement_model import Model
-from kf_calib.estimation.prior import Prior
+from kf_calib.estimation.settings import Prior
 from kf_calib.noise import random_walk
 
 _STILL = np.zeros(2)

@@ -75,6 +75,16 @@ def test_noise_of_real_sensors_gets_no_name(kind: str, sigmas: float) -> None:
         assert {*diagnosis.missing} <= {"second-order"} or not diagnosis.sure, diagnosis.verdict
 
 
+@pytest.mark.parametrize("waves", [6, *slow(3, 4)])
+def test_waves_of_an_encoder_are_told_with_their_number_a_turn(waves: int) -> None:
+    at = visits(5, 24)
+    phase_rad = waves * at.angles_rad[:, 1]
+    of_dwells = np.column_stack([np.sin(phase_rad), np.cos(phase_rad), 0.5 * np.sin(phase_rad + 1.0)])
+    hidden_mps2 = np.repeat(6.0 * WHITE_MPS2 / np.sqrt(240) * of_dwells[:, None], 240, axis=1)
+    told = kf_calib.diagnose(SmallRun(at, hidden_mps2, 3), replicate=False).description
+    assert told is not None and told.driver == f"angle of gimbal 2, {waves} a turn"
+
+
 @pytest.mark.parametrize("gimbals", [0, 3])
 def test_pairs_of_drivers_have_terms_that_are_all_different(gimbals: int) -> None:
     every = [term for _, terms in bases_of_pairs(gimbals) for term in terms]
