@@ -71,10 +71,15 @@ def test_the_driver_of_the_hidden_effect_comes_first(name: str, symbol: str) -> 
     assert all(each.share <= first.share for each in rest)
 
 
-def test_nothing_has_a_share_where_the_model_fits() -> None:
-    drivers = drivers_of(run())
+@pytest.mark.parametrize("seed", [3, 5])
+def test_nothing_has_a_share_where_the_model_fits(seed: int) -> None:
+    """Whether chi-squared is below its degrees of freedom, 30 of 36, or above, 45."""
+    before = run(seed=seed)
+    drivers = drivers_of(before)
     assert {"a", "p", "o", "da", "t", "T", "q1", "q2", "q3"} <= {each.symbol for each in drivers}
     assert all(each.share == 0.0 and each.p_value > 1e-3 for each in drivers)
+    after = Refits().with_effects(before, ("second-order",))
+    assert Explanation(("second-order",), before, after, True).share is None
 
 
 def test_what_an_explanation_predicts_is_the_difference_of_the_predictions() -> None:

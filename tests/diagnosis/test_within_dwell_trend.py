@@ -9,9 +9,10 @@ import pytest
 from helpers.hidden_effects import BENCH, noisy_source
 from helpers.hidden_effects import noisy_run as run
 from helpers.long_runs import slow
-from helpers.synthetic import plan_of
+from helpers.synthetic import Run, plan_of
 from scipy import stats
 
+from kf_calib.bench.streams import Stream
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.unknown_effect import WITHIN_DWELLS
@@ -96,6 +97,17 @@ def test_what_dwells_hide_shows_within_them() -> None:
     }  # fmt: skip
     told = " ".join(plain(diagnosis_report(found, details=True)).split())
     assert f"most in dwell {dwell}, accelerometer {channel}" in told
+
+
+def test_a_trend_is_told_where_it_is() -> None:
+    """A ramp over one dwell of one accelerometer, 12 sigma of a mean from its middle to its end."""
+    made = Run(seed=1, dwells=10, count=400, white_mps2=1e-4)
+    made.bench = dataclasses.replace(made.bench, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
+    values = made.accel.values.copy()
+    values[6 * 400 : 7 * 400, 1] += np.linspace(-1.0, 1.0, 400) * 12.0 * 1e-4 / np.sqrt(400.0)
+    made.accel = Stream(made.accel.time_ns, values)
+    found = found_in(calibrate(made))
+    assert found.most == (7, 2)
 
 
 def test_a_watch_sees_it_while_the_run_goes_on() -> None:

@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 from scipy.stats import binom
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.dwells.coherent_tone import Cells, Trace, _share_beside_parabola, band_hz, tone
+from kf_calib.dwells.coherent_tone import Cells, Trace, _levels, _share_beside_parabola, band_hz, tone
 
 RATE_HZ, DWELL_S = 6.0, 58.0
 
@@ -134,6 +134,26 @@ def test_what_a_parabola_leaves_of_a_sinusoid(cycles: float) -> None:
     assert float(_share_beside_parabola(np.array([np.pi * cycles]))[0]) == pytest.approx(
         (left**2).sum() / len(u), abs=1e-3
     )
+
+
+def test_the_level_of_noise_is_as_sure_as_it_says() -> None:
+    """Of 1000 spectra of independent exponential variates, whose mean is a cubic in logarithms: it has no bias, and the
+    variance that is told, to a fifth."""
+    frequency_hz, rng = np.geomspace(0.01, 2.0, 1000), np.random.default_rng(7)
+    x = np.log(frequency_hz / 0.1)
+    true = np.exp(0.3 - 0.8 * x + 0.2 * x**2 + 0.05 * x**3)
+    levels, variance = _levels(rng.exponential(size=(1000, 1000)) * true, frequency_hz, 1.0)
+    ratios = np.log(levels / true)
+    assert np.abs(ratios.mean(axis=0)).max() < 0.05
+    assert np.var(ratios, axis=0) == pytest.approx(variance, rel=0.2)
+
+
+def test_every_frequency_counts_in_the_level() -> None:
+    """Of 79 the last fifteen are too few for a band; they belong to the one before."""
+    power, frequency_hz = np.random.default_rng(8).exponential(size=(3, 79)), np.linspace(1.0, 1.1, 79)
+    louder = power * np.where(np.arange(79) < 64, 1.0, 100.0)
+    before, after = (_levels(each, frequency_hz, 1.0)[0][:, -1] for each in (power, louder))
+    assert np.all(after > 1.2 * before)
 
 
 def test_too_little_is_not_searched() -> None:

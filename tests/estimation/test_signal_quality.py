@@ -14,7 +14,14 @@ from helpers.synthetic import Run
 from kf_calib.bench.streams import Stream
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.estimation.calibration import calibrate
-from kf_calib.estimation.signal_quality import Readings, clustering, common_step, missing_above
+from kf_calib.estimation.signal_quality import (
+    Readings,
+    _first_seen,
+    _repeating,
+    clustering,
+    common_step,
+    missing_above,
+)
 from kf_calib.sources.files.recording import Recording
 
 QUICK = ["--orientations", "24", "--dwell-s", "8", "--slew-degps", "360", "--sample-hz", "100", "--seed", "3"]
@@ -47,6 +54,19 @@ def test_the_step_is_found_and_matters_where_averaging_cannot_help(sigmas: float
         assert each.matters == (sigmas > 2.0)
         assert each.mean_error_mps2 <= each.step_mps2 / 2
     assert not found.saturation and found.outliers.clustered_p is None
+
+
+def test_values_repeat_where_there_are_half_as_many_as_readings() -> None:
+    """100 and 101 values in 200 readings, and all of them in 1000, of which every fourth is compared."""
+    twice = np.repeat(np.arange(100.0), 2)
+    once_more = np.append(twice[:-1], 100.0)
+    block = np.random.default_rng(6).permutation(np.column_stack([twice, once_more, np.arange(200.0)]))
+    seen = _first_seen(1, block)
+    assert seen.distinct.tolist() == [100.0, 101.0, 200.0] and seen.sampled == 200
+    assert [bool(_repeating([seen], channel)[0]) for channel in range(3)] == [True, False, False]
+    longer = _first_seen(1, np.repeat(block, 5, axis=0))
+    assert longer.sampled == 250 and longer.distinct.max() == 200.0
+    assert [len(values) for values in longer.values] == [32, 32, 0]
 
 
 @pytest.mark.parametrize("sigmas", [1.0, 2.0, 3.0, 4.0, 8.0])

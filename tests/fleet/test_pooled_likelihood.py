@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 from helpers.long_runs import slow
@@ -12,7 +14,7 @@ from scipy.stats import chi2, multivariate_normal, norm
 
 from kf_calib.fleet.campaign import Campaign, log_evidence, log_evidence_of_modes, modes, posterior, sizes
 from kf_calib.fleet.own_coefficients import UnitInformation, UnitsAndCommon, population
-from kf_calib.fleet.pooled_terms import Attribution, PooledTerms, Sums, Term
+from kf_calib.fleet.pooled_terms import Attribution, DatedSums, PooledTerms, Sums, Term
 from kf_calib.fleet.shape import POWERS, SHARES, SomeUnits, about_mean, about_zero
 
 
@@ -61,6 +63,54 @@ def test_common_coefficients_are_those_of_one_least_squares_of_all_runs() -> Non
     inverse = np.linalg.inv(stacked[:, :-1].T @ stacked[:, :-1])
     np.testing.assert_allclose(mean, truth[:6], rtol=1e-7)
     np.testing.assert_allclose(covariance, inverse[:6, :6], rtol=1e-7, atol=1e-12)
+
+
+def test_the_evidence_of_an_error_of_a_bench_and_of_its_repair_is_that_of_normal_densities() -> None:
+    """Of the readings of eight runs on two benches, in which the runs of a bench have the same tilt, or those of one
+    bench another one from some run on: averaged over sizes of the tilt, dates, benches, and errors on both sides or one
+    side of a repair."""
+    broken = {"base-tilt": np.array([9.0, -6.0])}
+    runs = [run_factor_of(k, lambda k: broken if k in (3, 5) else {}, bench=f"bench {k % 2}") for k in range(8)]
+    campaign = Campaign(runs)
+    (tilt,) = (group for group in campaign.groups if group.name == "base-tilt")
+    places = [runs[0].places[f"base-tilt/{symbol}"] for symbol in tilt.symbols]
+    rows = np.vstack([run.factor[run.width :, places] * tilt.sigma for run in runs])
+    readings, run_of_row = (
+        np.concatenate([run.factor[run.width :, -1] for run in runs]),
+        np.repeat(range(8), len(rows) // 8),
+    )
+
+    def log_odds(*parts: Sequence[int], size: float) -> float:
+        """Where the runs of each part have the same tilt, of this size."""
+        columns = [rows * np.isin(run_of_row, part)[:, None] for part in parts]
+        covariance = np.eye(len(rows)) + size**2 * sum(each @ each.T for each in columns)
+        return float(multivariate_normal(cov=covariance).logpdf(readings) - norm.logpdf(readings).sum())
+
+    def mean(logs: Sequence[float]) -> float:
+        return float(logsumexp(logs) - np.log(len(logs)))
+
+    dated = DatedSums.of(campaign, PooledTerms([], 2))
+    benches, tried = [[0, 2, 4, 6], [1, 3, 5, 7]], sizes(0.5 / np.sqrt(8.0), tilt.largest)
+    logs = [log_odds(*benches, size=size) for size in tried]
+    constant = dated.constant(tilt)
+    assert constant.log_odds == pytest.approx(mean(logs), rel=1e-6)
+    assert constant.size == pytest.approx(tried[int(np.argmax(logs))])
+
+    coarse = sizes(0.5 / np.sqrt(8.0), tilt.largest, 4.0)
+    sides = {
+        (bench, first): [[before, after], [before], [after]]
+        for bench in (0, 1) for first in (1, 2, 3)
+        for before, after in [(benches[bench][:first], benches[bench][first:])]
+    }  # fmt: skip
+    by_date = {
+        (bench, first): [mean([log_odds(benches[1 - bench], *parts, size=size) for parts in each]) for size in coarse]
+        for (bench, first), each in sides.items()
+    }
+    repaired, best = dated.repaired(tilt), max(by_date, key=lambda date: max(by_date[date]))
+    assert repaired is not None
+    assert repaired.log_odds == pytest.approx(mean([log for logs in by_date.values() for log in logs]), rel=1e-6)
+    assert repaired.repair == (best[0], benches[best[0]][best[1]])
+    assert repaired.size == pytest.approx(coarse[int(np.argmax(by_date[best]))])
 
 
 def test_runs_of_a_unit_are_summed_however_they_are_mixed() -> None:

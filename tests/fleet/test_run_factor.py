@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
+from helpers.hidden_effects import noisy_run
 
 import kf_calib
 from kf_calib.dwells.qr import triangle
@@ -45,3 +47,17 @@ def test_without_angles_nine_states_are_left_and_no_effects() -> None:
     found = run_factor(result.fit)
     assert len(found.columns) == found.width == 12 - len(result.model.fixed)
     assert not found.effects and np.isfinite(found.factor).all()
+
+
+@pytest.mark.parametrize(
+    ("noise", "states", "estimated"),
+    [
+        ({"scatter_mps2": 3e-4, "setting_sigma_deg": 2e-4}, {}, False),
+        ({"scatter_mps2": 3e-4}, {"scatter_sigma_mps2": None}, True),
+        ({"setting_sigma_deg": 2e-3}, {"angle_sigma_deg": None}, True),
+    ],
+)
+def test_noise_estimated_from_the_misfit_is_told_from_noise_that_was_stated(
+    noise: dict[str, float], states: dict[str, float | None], estimated: bool
+) -> None:
+    assert run_factor(noisy_run(states=states, seed=3, **noise).fit).noise_estimated == estimated

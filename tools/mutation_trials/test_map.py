@@ -84,7 +84,7 @@ def static_map(root: Path) -> TestMap:
         imported = {f"{one.replace('.', '/')}.py:" for one in _imported(path) if one.startswith("kf_calib")}
         package = Path("kf_calib", *name.parts[1:-1])
         mirrored = (
-            {f"{module.relative_to(root)}:" for module in (root / package).glob("*.py")} if name.parts[2:] else set()
+            {f"{module.relative_to(root)}:" for module in (root / package).rglob("*.py")} if name.parts[2:] else set()
         )
         made.functions[str(name)] = sorted(imported | mirrored)
         made.seconds[str(name)] = path.stat().st_size / _BYTES_PER_S
