@@ -87,7 +87,8 @@ def apply(
     outputs = claimed(overwrite=overwrite)
     saved, correction = _correction(calibration, programs)
     bench = replace(reading.bench, gravity_mps2=reading.bench.gravity_mps2 or saved.bench.gravity_mps2)
-    reading, done = replace(reading, bench=bench), list[tuple[Applied, list[str]]]()
+    reading = replace(reading, bench=bench)
+    done: list[tuple[Applied, list[str]]] = []
     with progress(f"correcting {recording.name}", as_json) as tick:
         outputs.write(output, lambda path: done.append(_applied(correction, recording, path, reading, unchecked, tick)))
     ((applied, warnings),) = done

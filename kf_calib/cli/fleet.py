@@ -17,15 +17,7 @@ from kf_calib.cli.command import MODEL, OUTPUT, POSITIVE, argument, command, opt
 from kf_calib.cli.echo import complain, echo, print_json, progress, show
 from kf_calib.cli.failures import Interrupter, answered, sentence
 from kf_calib.cli.files import Delivery, claimed, delivery
-from kf_calib.cli.options import (
-    EvaluationOptions,
-    Json,
-    Overwrite,
-    ReadingOptions,
-    ShownUnits,
-    opened,
-    target_option,
-)
+from kf_calib.cli.options import EvaluationOptions, Json, Overwrite, ReadingOptions, ShownUnits, opened, target_option
 from kf_calib.cli.pictures import FigureFiles
 from kf_calib.cli.report import ReportFile, commands_of
 from kf_calib.errors import InputError

@@ -291,11 +291,13 @@ class EvaluationOptions:
     # fmt: on
     def settings(self, bench_model: Path | None = None) -> Settings:
         """The same for the library; bench_model: a file with the errors of the bench."""
-        from kf_calib.estimation.bench_model import read_bench_model
         from kf_calib.estimation.prior import PRIORS
 
-        effects = self.effects_of_model()
-        errors = None if bench_model is None else read_bench_model(bench_model)
+        effects, errors = self.effects_of_model(), None
+        if bench_model is not None:
+            from kf_calib.estimation.bench_model import read_bench_model
+
+            errors = read_bench_model(bench_model)
         return replace(
             self.dwells.settings(),
             engine=self.engine,

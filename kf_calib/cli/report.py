@@ -16,16 +16,7 @@ from kf_calib.cli.certificate import StatementFile, stated_in, write_certificate
 from kf_calib.cli.command import INPUT, argument, command, option
 from kf_calib.cli.echo import print_json, progress, show
 from kf_calib.cli.files import Delivery, claimed, delivery, output_option
-from kf_calib.cli.options import (
-    EvaluationOptions,
-    Json,
-    Overwrite,
-    ReadingOptions,
-    ShownUnits,
-    Strict,
-    exit_if,
-    opened,
-)
+from kf_calib.cli.options import EvaluationOptions, Json, Overwrite, ReadingOptions, ShownUnits, Strict, exit_if, opened
 
 if TYPE_CHECKING:
     from kf_calib.diagnosis.results import Diagnosis
