@@ -12,7 +12,7 @@ from helpers.paths import ROOT
 import kf_calib
 from kf_calib.dwells.stationarity import Stillness
 from kf_calib.errors import InputError
-from kf_calib.estimation.prior import Prior
+from kf_calib.estimation.settings import Prior
 
 RECORDING = ROOT / "recordings" / "mems_faces.mcap"
 

@@ -31,7 +31,7 @@ from kf_calib.bench.streams import Batch
 from kf_calib.dwells.folding import Folder
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.settings import Settings
-from kf_calib.online.progress import targets
+from kf_calib.online.evaluation import targets
 from kf_calib.online.session import Session
 from kf_calib.online.status import judge_so_far
 from kf_calib.sources.files.recording import Recording

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 
 import kf_calib
 from kf_calib.bench.streams import Source
-from kf_calib.estimation.innovation_tests import innovation_tests
+from kf_calib.estimation.filter_history import innovation_tests
 from kf_calib.exchange.calibration_file import saved
 from kf_calib.exchange.verification import Verification, verify
 from kf_calib.support.units import shown

@@ -291,7 +291,7 @@ class EvaluationOptions:
     # fmt: on
     def settings(self, bench_model: Path | None = None) -> Settings:
         """The same for the library; bench_model: a file with the errors of the bench."""
-        from kf_calib.estimation.prior import PRIORS
+        from kf_calib.estimation.settings import PRIORS
 
         effects, errors = self.effects_of_model(), None
         if bench_model is not None:

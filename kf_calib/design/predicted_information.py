@@ -25,7 +25,7 @@ from kf_calib.effects import Effect, Stimulus
 from kf_calib.estimation import square_root_information
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import Model, effect_columns
-from kf_calib.estimation.prior import Prior
+from kf_calib.estimation.settings import Prior
 from kf_calib.noise import random_walk
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise, considered_information, lift_rounding, mean_covariances

@@ -69,15 +69,13 @@ class SizePrior:
         return np.asarray((before + np.clip(at - low, 0.0, high - low) + after) / (high - low + 2.0 * self.tail), float)
 
 
-def size_prior(effect: Effect, grade: Grade, sigma: float) -> SizePrior:
-    """The prior of an effect of which the run tells the best determined coefficient to ``sigma``."""
+def usual_sizes(effect: Effect, grade: Grade) -> SizePrior | None:
+    """The prior of an effect from the sizes that its coefficients usually have; None where these are not known."""
     if effect.expected is not None:
         value, spread = effect.expected
         return SizePrior(spread, spread, 0.01, value)
     usual = effect.typical.of(grade)
-    if usual is None:
-        return SizePrior(sigma, sigma * 10.0**_UNKNOWN_DECADES, 0.1)
-    return SizePrior(usual[0] or usual[1] / _SHARPER, usual[1])
+    return None if usual is None else SizePrior(usual[0] or usual[1] / _SHARPER, usual[1])
 
 
 def log_bayes_of_sizes(
@@ -153,12 +151,11 @@ class AddedEffects:
         estimate = _solved(related, readings)
         left = readings - related @ estimate
         delta_chi2 = max(delta_chi2 - float(left @ left), 0.0)
-        if not any(has_usual_size(effect, self.grade) for effect in self.effects):
+        usual = [usual_sizes(effect, self.grade) for effect in self.effects]
+        if not any(usual):
             return float(size_evidence(min(self.dof, sum(widths)), delta_chi2))
         groups = np.repeat(np.arange(len(relation)), widths)
-        priors = [
-            size_prior(effect, self.grade, best_sigma(related[:, groups == k])) for k, effect in enumerate(self.effects)
-        ]
+        priors = [prior or _any_size(best_sigma(related[:, groups == k])) for k, prior in enumerate(usual)]
         return log_bayes_of_sizes(delta_chi2, related, estimate, groups, priors)
 
 
@@ -170,9 +167,9 @@ def _solved(root: Floats, readings: Floats) -> Floats:
     return np.asarray(np.linalg.lstsq(root / lengths, readings, rcond=1e-9)[0] / lengths, float)
 
 
-def has_usual_size(effect: Effect, grade: Grade) -> bool:
-    """Whether it is known what size the coefficients of an effect usually have."""
-    return effect.expected is not None or effect.typical.of(grade) is not None
+def _any_size(sigma: float) -> SizePrior:
+    """Return the prior where no usual size is known, of an effect whose best coefficient is determined to ``sigma``."""
+    return SizePrior(sigma, sigma * 10.0**_UNKNOWN_DECADES, 0.1)
 
 
 def best_sigma(root: Floats) -> float:

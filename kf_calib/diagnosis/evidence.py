@@ -32,7 +32,7 @@ from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.reml import Likelihood, Part, Parts, likelihood_of, with_shared_noise
 from kf_calib.noise.restricted_likelihood import Restricted
-from kf_calib.noise.thermometer_error import thermometer_errors
+from kf_calib.noise.temperature_course import thermometer_errors
 
 _RANGE = math.log(1e4)  # width of the flat prior of the logarithm of a size of noise
 _UNSTATED = 0.5  # prior probability of noise from dwell to dwell that was not stated

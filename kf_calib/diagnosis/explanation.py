@@ -1,17 +1,171 @@
-"""What more in the model explains of the residuals of a run: what it predicts of them, and what it leaves."""
+"""What more in the model explains of the residuals of a run: what it predicts of them, and what it leaves.
+
+The shape of each of its effects is a partial-residual plot: what the fitted effect adds to each dwell, with the
+residuals that are left put back on it, over the regressor of the effect (``effects.axis``). An error of a gimbal's
+angle is drawn as the turn of the platform about that gimbal, which the three readings of a dwell show together.
+"""
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.effect_shape import EffectShape, shape_over, shapes_of
-from kf_calib.diagnosis.residual_drivers import Driver, misfit_beyond_noise, unexplained_mps2
-from kf_calib.estimation.residual_table import mean_sigmas
+from kf_calib.diagnosis.residual_drivers import Driver, is_function_of, misfit_beyond_noise, unexplained_mps2, walk_path
+from kf_calib.effects import Effect, FrameEffect, Stimulus
+from kf_calib.effects.inputs import axis_of, is_formula, turned_about
+from kf_calib.effects.stimulus import smooth_between
+from kf_calib.estimation.residual_table import mean_sigmas, means_over_dwells
 from kf_calib.estimation.results import Calibration
+
+_LEAST_LEVER = 0.05  # of gravity: a dwell that shows a turn with 20 times the sigma of others is left out
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class EffectShape:
+    """What an effect adds to the mean of each of D dwells, and what the readings show of it.
+
+    - effect: its name.
+    - words, symbol, unit: the quantity that it is drawn over: in words, in the letters of formulas ("": none), SI unit.
+    - values (D, C): that quantity.
+    - quantity: SI unit of all that follows: m/s^2 of C = 3 accelerometers, or rad of the C = 1 turn of the platform,
+      which is NaN in dwells that do not show it.
+    - residuals: what the model without the effect leaves. left: what the model with it leaves.
+    - component: what the fitted effect adds. component_sigma: of the component; of readings, less its mean over the
+      dwells, as the biases take up any mean. sigma: of a dwell, as the misfit is judged.
+    - is_curve: whether the component is nearly a function of the quantity.
+    """
+
+    effect: str
+    words: str
+    symbol: str
+    unit: str
+    values: Floats
+    quantity: str
+    residuals: Floats
+    left: Floats
+    component: Floats
+    component_sigma: Floats
+    sigma: Floats
+    is_curve: bool
+
+    @property
+    def readings(self) -> Floats:
+        """What the readings show of the effect (D, C): the component with what is left."""
+        return self.component + self.left
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """What each of the C columns is of."""
+        return tuple(f"accelerometer {i}" for i in (1, 2, 3)) if self.component.shape[1] == 3 else ("platform",)
+
+    def curve(self, column: int, count: int = 200) -> tuple[Floats, Floats, Floats]:
+        """Values (n,) of the quantity that rise, and the component and its sigma there, smooth between the dwells."""
+        known = np.isfinite(self.component[:, column])
+        x, first = np.unique(self.values[known, column], return_index=True)
+        at = np.linspace(x[0], x[-1], count) if len(x) else x
+        middle, sigma = (each[known, column][first] for each in (self.component, self.component_sigma))
+        return at, smooth_between(x, middle, at), smooth_between(x, sigma, at)
+
+    @property
+    def clearest(self) -> int:
+        """The column in which the component stands out most from the sigma of the dwells."""
+        spread = self.component - np.nanmean(self.component, axis=0)
+        return int(np.argmax(np.nansum((spread / self.sigma) ** 2, axis=0)))
+
+
+def shapes_of(before: Calibration, after: Calibration) -> list[EffectShape]:
+    """The shapes of the effects that a calibration has beyond another, in the order of its model; formulas beside each
+    other have one."""
+    added = [effect for effect in after.model.effects if str(effect) not in before.model.parts]
+    return [_shape(before, after, list(group)) for _, group in itertools.groupby(added, _drawn_together)]
+
+
+def shape_over(before: Calibration, after: Calibration, driver: Driver, name: str) -> EffectShape:
+    """The shape of all that a calibration has beyond another, over a quantity of the bench."""
+    added = [effect for effect in after.model.effects if str(effect) not in before.model.parts]
+    component, component_sigma = _component(after, added)
+    return EffectShape(
+        effect=name, words=driver.words, symbol=driver.symbol, unit=driver.unit, values=driver.values,
+        quantity="m/s^2", residuals=before.residuals_mps2, left=unexplained_mps2(after), component=component,
+        component_sigma=component_sigma, sigma=mean_sigmas(before),
+        is_curve=is_function_of(component, driver.values, driver.unit),
+    )  # fmt: skip
+
+
+def _drawn_together(effect: Effect) -> tuple[str, int | None]:
+    """Return what effects that are next to each other have in common if they are drawn as one."""
+    gimbal = effect.gimbal if isinstance(effect, FrameEffect) else None
+    return (type(effect).__name__ if is_formula(effect) else str(effect)), gimbal
+
+
+def _shape(before: Calibration, after: Calibration, effects: Sequence[Effect]) -> EffectShape:
+    (component, component_sigma), left = _component(after, effects), unexplained_mps2(after)
+    residuals, sigma, quantity = before.residuals_mps2, mean_sigmas(before), "m/s^2"
+    axis, about = axis_of(effects, before.bench), turned_about(effects)
+    if axis is not None and not (_framed(effects) and about is None):
+        (values,) = means_over_dwells(after, [axis.of])
+        words, symbol, unit = axis.words, axis.symbol, axis.unit
+    elif _framed(effects):  # reading i changes by |s_i| g times the turn of gravity towards its input axis
+        words, symbol, unit = "turn of gravity towards the input axis", "", "rad"
+        values = component / (np.linalg.norm(after.linearised.state[:12].reshape(3, 4)[:, :3], axis=1)
+                              * before.bench.gravity_mps2)  # fmt: skip
+    else:
+        words, symbol, unit, values = f"what the fitted {_name(effects)} adds", "", "m/s^2", component
+    if about is not None and axis is not None:
+        lever, quantity, values = _lever(after, about), "rad", values[:, :1]
+        component, residuals, left = (_turn(each, lever, sigma) for each in (component, residuals, left))
+        lengths = np.linalg.norm(lever, axis=1, keepdims=True)
+        component_sigma = np.linalg.norm(component_sigma, axis=1, keepdims=True) / lengths
+        sigma = np.sum((lever / sigma) ** 2, axis=1, keepdims=True) ** -0.5
+    return EffectShape(
+        effect=_name(effects), words=words, symbol=symbol, unit=unit, values=values, quantity=quantity,
+        residuals=residuals, left=left, component=component, component_sigma=component_sigma, sigma=sigma,
+        is_curve=is_function_of(component, values, unit) or _walks(effects),
+    )  # fmt: skip
+
+
+def _framed(effects: Sequence[Effect]) -> bool:
+    return all(isinstance(effect, FrameEffect) for effect in effects)
+
+
+def _walks(effects: Sequence[Effect]) -> bool:
+    return any(effect.walks for effect in effects)
+
+
+def _name(effects: Sequence[Effect]) -> str:
+    """Return the effects as a sum, formulas without the names that they were given."""
+    return " + ".join(effect.title if is_formula(effect) else str(effect) for effect in effects)
+
+
+def _component(after: Calibration, effects: Sequence[Effect]) -> tuple[Floats, Floats]:
+    """Return what effects add to the mean readings (D, 3), the path of the biases where one lets them walk, and its
+    sigma from the covariance of the coefficients."""
+    parts = [after.model.parts[str(effect)] for effect in effects]
+    columns = np.array([column for part in parts for column in range(part.start, part.stop)], int)
+    design, covariance = after.linearised.means.design[:, :, columns], after.estimate.covariance
+    added = design @ after.estimate.state[columns]
+    if not _framed(effects):
+        design = design - design.mean(axis=0)
+    sigma = np.sqrt(np.einsum("dip,pq,diq->di", design, covariance[np.ix_(columns, columns)], design))
+    return added + (walk_path(after) if _walks(effects) else 0.0), sigma
+
+
+def _lever(after: Calibration, about: Callable[[Stimulus], Floats]) -> Floats:
+    """Return the change (D, 3) of each mean reading per unit of a turn about an axis, m/s^2; NaN where it is little."""
+    (lever,) = means_over_dwells(after, [lambda s: np.cross(about(s), s.force_mps2) @ s.sensitivity.T])
+    little = np.linalg.norm(lever, axis=1) < _LEAST_LEVER * after.bench.gravity_mps2
+    return np.where(little[:, None], np.nan, lever)
+
+
+def _turn(values_mps2: Floats, lever: Floats, sigma: Floats) -> Floats:
+    """Return the turn (D, 1) that changes of the readings (D, 3) amount to, by weighted least squares."""
+    weights = lever / sigma**2
+    return np.sum(weights * values_mps2, axis=1, keepdims=True) / np.sum(weights * lever, axis=1, keepdims=True)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,6 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.candidate_tests import CandidateTests, values_of
 from kf_calib.diagnosis.coefficient_sizes import AddedEffects, size_evidence
-from kf_calib.diagnosis.dwell_noise import dwell_noise_is_stated
 from kf_calib.diagnosis.evidence import Evidence, MarginalLikelihood
 from kf_calib.diagnosis.hypothesis_table import (
     IRREGULAR,
@@ -31,7 +30,7 @@ from kf_calib.diagnosis.hypothesis_table import (
     HypothesisTable,
     table_of,
 )
-from kf_calib.diagnosis.refits import Refits
+from kf_calib.diagnosis.refits import Refits, dwell_noise_is_stated
 from kf_calib.diagnosis.unknown_effect import FormulaFamily, one_digit_seconds
 from kf_calib.diagnosis.within_dwell_trend import Trend, trend
 from kf_calib.dwells.qr import orthonormal

@@ -18,7 +18,6 @@ import numpy as np
 
 from kf_calib.bench.streams import Source
 from kf_calib.diagnosis.candidate_tests import CandidateTests, overlap_matrix
-from kf_calib.diagnosis.dwell_noise import dwell_noise_is_stated, with_noise_as_stated
 from kf_calib.diagnosis.hypotheses import Hypotheses, log_odds_of
 from kf_calib.diagnosis.hypothesis_table import (
     ALIKE,
@@ -30,7 +29,7 @@ from kf_calib.diagnosis.hypothesis_table import (
     noise_p,
     table_of,
 )
-from kf_calib.diagnosis.refits import Refits, calibration_of
+from kf_calib.diagnosis.refits import Refits, calibration_of, dwell_noise_is_stated, with_noise_as_stated
 from kf_calib.diagnosis.replication import Replication, replication
 from kf_calib.diagnosis.results import Diagnosis, Suspect
 from kf_calib.diagnosis.verdict import second_pass_in_words, verdict_in_words

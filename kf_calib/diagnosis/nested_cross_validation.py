@@ -11,9 +11,9 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.stepwise_selection import improve
 from kf_calib.dwells.sufficient_statistics import dwells_without
 from kf_calib.errors import UnobservableError
+from kf_calib.estimation.attitude import linearised_at
 from kf_calib.estimation.calibration import evaluate
 from kf_calib.estimation.cross_validation import orientations, told_of
-from kf_calib.estimation.relinearisation import linearised_at
 from kf_calib.estimation.results import Calibration
 from kf_calib.noise.noise_model import mean_covariances
 from kf_calib.support.threads import one_blas_thread

@@ -1,4 +1,4 @@
-"""Refits of one run: calibrations with other effects in the model, each computed once."""
+"""Refits of one run: calibrations with other effects or other noise in the model, each computed once."""
 
 from __future__ import annotations
 
@@ -6,16 +6,18 @@ from collections.abc import Hashable, Sequence
 from dataclasses import replace
 from os import PathLike
 
+import numpy as np
+
 from kf_calib.bench.streams import Source
 from kf_calib.diagnosis.candidate_tests import CandidateTests, assess_candidates, candidate_frame
 from kf_calib.diagnosis.unknown_effect import FormulaFamily, families
 from kf_calib.effects import Effect
 from kf_calib.errors import InputError
 from kf_calib.estimation.calibration import calibrate, evaluate_fit
+from kf_calib.estimation.dwell_pass import holds_its_oscillation
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.iterated_fit import fit
 from kf_calib.estimation.measurement_model import Model
-from kf_calib.estimation.oscillation_carrier import holds_its_oscillation
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import Frame
 from kf_calib.sources.opening import opened
@@ -114,3 +116,21 @@ def calibration_of(
             "each row, or state --scatter-sigma."
         )
     return before, refits or Refits(source)
+
+
+def dwell_noise_is_stated(before: Calibration) -> bool:
+    """Whether both scatter and setting error were stated rather than estimated."""
+    return before.noise.scatter_stated and before.noise.setting_stated
+
+
+def with_noise_as_stated(refits: Refits, before: Calibration, refit: Calibration) -> Calibration:
+    """The run without the added effects, with the noise from dwell to dwell as it was estimated in their refit.
+
+    Estimated without the effects, the noise would be too large, as it would contain what they explain.
+    """
+    noise, bench = refit.noise, before.bench
+    if not noise.setting_stated:
+        bench = replace(bench, angle_sigma_deg=float(np.degrees(noise.setting_rad)))
+    if not noise.scatter_stated:
+        bench = replace(bench, scatter_sigma_mps2=float(np.sqrt(np.mean(noise.scatter_mps2**2))))
+    return refits.of(replace(before, bench=bench), before.settings.effects)

@@ -25,10 +25,9 @@ from kf_calib.effects.formula import formula
 from kf_calib.errors import InputError
 from kf_calib.estimation.candidate_scan import Scan
 from kf_calib.estimation.fit import Fit
-from kf_calib.estimation.further_effects import FurtherEffects
 from kf_calib.estimation.iterated_fit import fit
 from kf_calib.estimation.results import consistency
-from kf_calib.estimation.score_test import Frame
+from kf_calib.estimation.score_test import Frame, FurtherEffects
 from kf_calib.support import stage
 
 _CHANCE = 1e-4  # significance level of one family, of which there are about a hundred
@@ -267,13 +266,13 @@ def _families(bench: Bench, dwells: Sequence[DwellFactor]) -> Iterator[tuple[str
 
 def _of_force() -> Iterator[tuple[str, list[str]]]:
     """Yield the formulas of the specific force."""
-    yield "specific force, degree 2", ["a*a", "a*p", "a*o", "p*o", "p*p"]
+    yield "specific force (degree 2)", ["a*a", "a*p", "a*o", "p*o", "p*p"]
     for terms in (["a**3"], ["a*a*p"], ["a*a*o"], ["a*p*o"], ["p**3"], ["o**3"], ["a**3", "a*p*p", "p**3", "a*a*p"]):
-        yield "specific force, degree 3", terms
+        yield "specific force (degree 3)", terms
     for terms in (["a**4"], ["a**4", "a*a"], ["p**4", "p*p"], ["a**2*p**2"]):
-        yield "specific force, degree 4", terms
+        yield "specific force (degree 4)", terms
     for terms in (["a**5"], ["a**5", "a**3"], ["p**5", "p**3"]):
-        yield "specific force, degree 5", terms
+        yield "specific force (degree 5)", terms
 
 
 def _of_gimbals(count: int) -> Iterator[tuple[str, list[str]]]:

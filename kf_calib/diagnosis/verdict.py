@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from kf_calib.diagnosis.candidate_tests import CandidateTests
-from kf_calib.diagnosis.dwell_noise import dwell_noise_is_stated
 from kf_calib.diagnosis.hypothesis_table import IRREGULAR, NOISE, NONE, NOTHING, SURE, Hypothesis
+from kf_calib.diagnosis.refits import dwell_noise_is_stated
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.unknown_effect import one_digit_seconds
-from kf_calib.estimation.oscillation_carrier import holds_its_oscillation
+from kf_calib.estimation.dwell_pass import holds_its_oscillation
 from kf_calib.estimation.results import format_p
 from kf_calib.support.units import shown
 
@@ -86,13 +86,13 @@ def _named(diagnosis: Diagnosis, first: Hypothesis) -> str:
 
 
 def _share(diagnosis: Diagnosis) -> str:
-    """Return the probability of the likeliest row, as the table has it, and that of its effects with others beside
-    them."""
+    """Return the probability of the likeliest row, as the table has it, and that of its effects, alone or with
+    others."""
     assert diagnosis.table is not None
     first = diagnosis.table.first
     alone = format_probability(first.probability)
     with_others = format_probability(diagnosis.table.probability(first.effects))
-    return alone if alone == with_others else f"{alone} by itself, {with_others} with others beside it"
+    return alone if alone == with_others else f"{alone} alone, {with_others} alone or with others"
 
 
 def _not_named(diagnosis: Diagnosis, first: Hypothesis) -> str:
@@ -142,7 +142,8 @@ def _others(diagnosis: Diagnosis, but: str = "") -> str:
     assert diagnosis.table is not None
     rows = [row for row in diagnosis.table.rivals if row.families != (but,)]
     words = [f"{_in_words(diagnosis, row)} {format_probability(row.probability)}" for row in rows[:_TOLD]]
-    words += [f"{len(rows) - _TOLD} others"] if len(rows) > _TOLD else []
+    more = len(rows) - _TOLD
+    words += [f"{more} other{'s' * (more > 1)}"] if more > 0 else []
     return f"; or {', '.join(words)}" if words else ""
 
 

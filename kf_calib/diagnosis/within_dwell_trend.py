@@ -24,7 +24,7 @@ from kf_calib.dwells.sufficient_statistics import DwellFactor, alike
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.fit import Fit
 from kf_calib.noise.noise_model import Noise, flicker_sigma
-from kf_calib.noise.thermometer_error import thermometer_errors
+from kf_calib.noise.temperature_course import thermometer_errors
 
 _DEGREE = 3
 _GRID = 600

@@ -63,6 +63,15 @@ def orthonormal(rows: Floats) -> tuple[Floats, Floats]:
     return rows, factor
 
 
+def multiplied(rows: Floats, matrix: Floats) -> Floats:
+    """The product (m, l) of rows (m, n) and a matrix (n, l) that is no wider; to save memory, it overwrites the
+    rows."""
+    product = rows[:, : matrix.shape[1]]
+    for part in (slice(k, k + _PART) for k in range(0, len(rows), _PART)):
+        product[part] = rows[part] @ matrix
+    return product
+
+
 def inverse_of_lower(lower: Floats) -> Floats:
     """The inverses (n, k, k) of many small lower triangles, by substitution: each entry has the accuracy of its terms.
 

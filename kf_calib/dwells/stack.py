@@ -386,17 +386,6 @@ class DwellStack(ComputedSequence[DwellFactor]):
         """By how much effects change the mean readings of each dwell per unit of force, (D, 3, 3)."""
         return np.zeros((len(self), 3, 3)) if self.attitudes is None else self.attitudes.bending
 
-    @cached_property
-    def regressors(self) -> list[Floats]:
-        """The rows of the regressors 1, f_x, f_y, f_z that are felt in each piece of the dwells of each shape, (d, P,
-        K, 4)."""
-        forces, rows = self.felt_force_mps2.reshape(-1, 3, 3), list[Floats]()
-        for shape, triangles in zip(self.folded.shapes, self.triangles, strict=True):
-            values = np.ones((*shape.pieces.shape, 3, 4))
-            values[..., 1:] = forces[shape.pieces]
-            rows.append(triangles[:, :, : shape.width, :3] @ parabola(values))
-        return rows
-
     def is_same(self, other: DwellStack) -> bool:
         """Whether the other stack has the same dwells with the same changes."""
         same = self.folded is other.folded or self.folded.dwells == other.folded.dwells  # the same objects

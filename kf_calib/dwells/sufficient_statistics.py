@@ -204,13 +204,6 @@ class DwellFactor:
             rate_change_radps2=np.concatenate([rate_or_zero(nodes.rate_change_radps2) for nodes in of_pieces]),
         )
 
-    @cached_property
-    def regressors(self) -> Floats:
-        """The rows of the regressors 1, f_x, f_y, f_z in each piece, (pieces, K, 4)."""
-        nodes = replace(self.nodes, force_mps2=self.felt_force(self.nodes.force_mps2))
-        values = nodes.regressors.reshape(len(self.pieces), 3, -1)
-        return self.triangles[:, : self.width, :3] @ parabola(values)
-
     def felt_force(self, force_mps2: Floats) -> Floats:
         """The specific force (n, 3) that is felt where the angles show this one."""
         if self.turned_rad is not None:

@@ -351,3 +351,24 @@ def _left_jacobian(rho: Floats, vectors: Floats) -> Floats:
     twice = np.cross(rho[:, None, :], once)
     first, second = 1 / 2 - squares / 24 + squares**2 / 720, 1 / 6 - squares / 120 + squares**2 / 5040
     return vectors + first * once + second * twice
+
+
+@dataclass(frozen=True)
+class KnownEffect:
+    """An effect with its coefficients (q,) and their covariance (q, q), SI. It is subtracted from the readings, and
+    that the coefficients are uncertain enlarges the covariance of what is estimated (Schmidt)."""
+
+    effect: Effect
+    coefficients: Floats
+    covariance: Floats
+
+    @property
+    def sentence(self) -> str:
+        """What has been done with it, in words without a full stop."""
+        return f"{self.effect} of the bench is taken from the bench model: subtracted, and its sigma considered"
+
+    @property
+    def root(self) -> Floats:
+        """A root (q, q) of the covariance: changes of the coefficients by one sigma in independent directions."""
+        values, vectors = np.linalg.eigh(self.covariance)
+        return vectors * np.sqrt(np.maximum(values, 0.0))

@@ -22,7 +22,7 @@ _INTEGRALS = legendre.legvander(_POINTS, 2).T * _WEIGHTS  # (3, n): of Legendre'
 
 _RATE_WINDOW_S = 5.0  # at least: a thermometer of 0.01 K noise then shows rates of 1e-3 K/s
 _RATE_STILL = 0.02
-_OF_ALL = ("bench", "sensitivity", "carrier_hz", "part", "whole")  # is the same at all instants
+_OF_ALL = ("bench", "sensitivity", "carrier_hz", "part", "whole", "places")  # is the same at all instants
 
 
 def smooth_between(times: Floats, values: Floats, at: Floats) -> Floats:
@@ -87,12 +87,15 @@ class Stimulus:
     carrier_hz: float = 0.0
     part: int = 0
     whole: Stimulus | None = None
-    """What it is the end of: temperatures that came before matter, too."""
+    """What it is a part of: temperatures that came before matter, too."""
+    places: slice = field(default_factory=lambda: slice(None))
+    """Which instants of the whole it has."""
 
-    def ending(self, count: int) -> Stimulus:
-        """Its last ``count`` instants."""
-        ends = {each.name: getattr(self, each.name)[-count:] for each in fields(self) if each.name not in _OF_ALL}
-        return replace(self, **ends, whole=self)
+    def at(self, places: slice) -> Stimulus:
+        """It at some of its instants."""
+        values = {each.name: getattr(self, each.name) for each in fields(self) if each.name not in _OF_ALL}
+        some = {name: value if len(value) < len(self) else value[places] for name, value in values.items()}
+        return replace(self, **some, whole=self, places=places)
 
     def __len__(self) -> int:
         return len(self.elapsed_s)
@@ -156,7 +159,7 @@ class Stimulus:
         The operator of Prandtl and Ishlinskii, y_n = max(a_n - r, min(a_n + r, y_(n-1))), from the orientation before.
         """
         if self.whole is not None:
-            return self.whole.played(half_width_mps2)[-len(self) :]
+            return self.whole.played(half_width_mps2)[self.places]
         along, through = self.along, np.empty_like(self.along)
         held = (along - self.step)[0]
         moved = np.append(True, np.any(np.diff(along, axis=0) != 0.0, axis=1))
@@ -183,7 +186,7 @@ class Stimulus:
         rate that is mostly noise leaves of an effect another one explains. At the longest an eighth of the run.
         """
         if self.whole is not None:
-            return self.whole.warming[-len(self) :]
+            return self.whole.warming[self.places]
         times, first = np.unique(self.elapsed_s, return_index=True)
         window_s, best, best_change = _RATE_WINDOW_S, self._change(times, first, _RATE_WINDOW_S), np.inf
         rate = best
@@ -219,7 +222,7 @@ class Stimulus:
         With equal steps h, r = h / tau: L_n = p L_(n-1) + (c - p) T_(n-1) + (1 - c) T_n, p = e^-r, c = (1 - p)/r.
         """
         if self.whole is not None:
-            return self.whole.lagged_warmth(tau_s)[-len(self) :]
+            return self.whole.lagged_warmth(tau_s)[self.places]
         from scipy.linalg import get_blas_funcs
 
         times, first = np.unique(np.append(self.elapsed_s[1:-1:3], self.elapsed_s[[0, -1]]), return_index=True)

@@ -3,13 +3,13 @@
 A setting error alpha turns the specific force, and R(alpha) f is never longer than f. The model f + alpha x f about the
 force that the angles show is therefore wrong by half the square of alpha, along the force, where the readings are exact
 to their noise. So each dwell is linearised about its own posterior mode, which is found in turn with the state: the
-fixed point of an iterated Kalman update, and least squares with the state and all alpha free (``fit``). Where no angles
-are used, alpha has no prior, and the size of the force is all that is known.
+fixed point of an iterated Kalman update, and least squares with the state and all alpha free (``fit``), by Gauss-Newton
+steps with a line search. Where no angles are used, alpha has no prior, and the size of the force is all that is known.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -30,6 +30,15 @@ _STEP = 1e-6  # relative to g, of the differences that give the bending
 _ABRUPT = 0.5  # a bending beyond this is a jump of an effect's column, which has no derivative
 _FARTHEST_RAD = 0.3  # of one step of an attitude
 _UNTOLD = 10.0  # setting errors: where the poses spread less, the attitudes would tell as much as they
+
+SETTLED = 1e-4
+"""In sigmas of each state: a smaller step ends the search."""
+UNSETTLED = 1.0
+"""In sigmas: a fit whose last step was larger has not converged."""
+_HALVES = 6
+_UPHILL = 1e-6  # by which the misfit may grow, relative; more is no rounding
+_TURNS = 4  # most times that attitudes are found at a given state
+_STILL_RAD = 1e-7
 
 
 def at_their_modes(
@@ -214,3 +223,70 @@ def facing_readings(dwells: Sequence[DwellFactor], state: Floats, gravity_mps2: 
     forces = force_shown(stack.means[:, 4:], state)
     forces *= gravity_mps2 / np.linalg.norm(forces, axis=1, keepdims=True)
     return with_forces(stack, forces, stack.attitudes, state)
+
+
+def relinearised(
+    linearised: LinearisedDwells, noise: Noise, model: Model, state: Floats, untold: Floats | None = None
+) -> LinearisedDwells:
+    """The dwells with the columns of a model at a state, and attitudes where the readings show them there.
+
+    untold: as in ``at_their_modes``.
+    """
+    known = state if len(state) == linearised.model.count else linearised.state
+    return LinearisedDwells(at_their_modes(linearised, noise, known, untold), model, state, linearised.slews)
+
+
+def _farthest_rad(one: LinearisedDwells, other: LinearisedDwells) -> float:
+    """Return the largest angle between the forces of two linearisations of the same dwells."""
+    unit, there = (c.means.force_mps2 / np.linalg.norm(c.means.force_mps2, axis=1, keepdims=True) for c in (one, other))
+    return float(np.linalg.norm(unit - there, axis=1).max())
+
+
+def linearised_at(
+    dwells: Sequence[DwellFactor], model: Model, state: Floats, noise: Noise, untold: Floats | None = None
+) -> LinearisedDwells:
+    """Dwells with the columns of a model at a state, and attitudes where the readings show them there.
+
+    untold: as in ``at_their_modes``.
+    """
+    if noise.attitude_unknown:
+        dwells = facing_readings(dwells, state, model.bench.gravity_mps2)
+    linearised = LinearisedDwells(dwells, model, state)
+    for _ in range(_TURNS if noise.setting_rad else 1):
+        before, linearised = linearised, relinearised(linearised, noise, model, state, untold)
+        if _farthest_rad(before, linearised) < _STILL_RAD:
+            break
+    return linearised
+
+
+def at_its_mode(dwell: DwellFactor, so_far: LinearisedDwells, noise: Noise) -> DwellFactor:
+    """A dwell that follows those ``so_far``, with its attitude where its readings show it at their state: the iterated
+    update of a filter by one dwell."""
+    if not noise.setting_rad:
+        return dwell
+    both, untold = [so_far.dwells[-1], dwell], untold_directions(so_far, noise)
+    return linearised_at(both, so_far.model, so_far.state, noise, untold).dwells[-1]
+
+
+def left_to_settle(state: Floats, before: Floats, sigma: Floats) -> float:
+    """By how many of their sigmas (p,) the states moved at most; those without a sigma are not determined."""
+    return float((np.abs(state - before) / np.where(sigma > 0, sigma, np.inf)).max())
+
+
+def descended(
+    linearised: LinearisedDwells, noise: Noise, state: Floats, misfit: Callable[[LinearisedDwells], float]
+) -> LinearisedDwells:
+    """The dwells linearised at ``state``, or on the way to it where the misfit is less there.
+
+    misfit: of a linearisation at its own state, the sum of squares of all readings and all setting errors over their
+    sigmas.
+    """
+    model, begin, share = linearised.model, linearised.state, 1.0
+    highest = misfit(linearised) * (1.0 + _UPHILL)
+    nearest = relinearised(linearised, noise, model, state)
+    for _ in range(_HALVES - 1):
+        if misfit(nearest) <= highest:
+            break
+        share *= 0.5
+        nearest = relinearised(linearised, noise, model, begin + share * (state - begin))
+    return nearest

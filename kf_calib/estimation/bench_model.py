@@ -23,8 +23,8 @@ from typing_extensions import TypedDict
 
 from kf_calib.bench.bench import Bench
 from kf_calib.effects import effect_named
+from kf_calib.effects.effect import KnownEffect
 from kf_calib.errors import InputError
-from kf_calib.estimation.known_effect import KnownEffect
 from kf_calib.support.output_files import write_whole
 from kf_calib.support.toml_files import FINITE, TEXT, Misfit, converted, toml_table
 

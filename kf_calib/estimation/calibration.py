@@ -29,14 +29,13 @@ from kf_calib.effects import of_the_users
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation import kalman_filterpy, square_root_information
 from kf_calib.estimation.dwell_columns import LinearisedDwells
-from kf_calib.estimation.dwell_pass import Pass, refuse_unusable
+from kf_calib.estimation.dwell_pass import Pass, fitted_to, on_carrier, refuse_unusable
 from kf_calib.estimation.estimate import Estimate, estimate_of, estimates
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.free_attitude import holding_frame
 from kf_calib.estimation.iterated_fit import fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.observability import visibility_of
-from kf_calib.estimation.oscillation_carrier import fitted_to, on_carrier
 from kf_calib.estimation.outlying_dwell import outlying_dwells, outlying_in_words
 from kf_calib.estimation.remarks import misfit_remark, remarks_on
 from kf_calib.estimation.results import Calibration, Consistency, OutlyingDwell, Visit, consistency

@@ -13,13 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.dwells.pieces import as_one_array
 from kf_calib.dwells.qr import inverse_of_lower, triangle
 from kf_calib.dwells.stack import DwellStack
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation import square_root_information
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.free_attitude import weights_of_size
-from kf_calib.estimation.prior import Prior
+from kf_calib.estimation.settings import Prior
 from kf_calib.noise import random_walk
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import considered_information, lift_rounding, mean_covariances
@@ -54,7 +55,7 @@ def grouped(places: Floats, apart: float) -> list[list[int]]:
     Groups are looked up by the cell of their first place in the four coordinates that differ most. A cell is twice as
     wide as ``apart``, so that what is near lies in the cell itself or in the neighbours on the nearer side.
     """
-    groups, at, coordinates = list[list[int]](), dict[int, list[int]](), places.tolist()
+    groups, at = list[list[int]](), dict[int, list[int]]()
     widest = np.argsort(-np.ptp(places, axis=0))[:4]
     scaled = (places[:, widest] - places[:, widest].min(axis=0)) / (2.0 * apart * _ROUNDING) + 1.0
     cells = np.floor(scaled).astype(int)
@@ -68,17 +69,13 @@ def grouped(places: Floats, apart: float) -> list[list[int]]:
         around = (cells[part] @ strides)[:, None] + sides[part] @ choices.T
         for k, (cell, *others) in enumerate(around.tolist(), first):
             nearby = [number for near in (cell, *others) if near in at for number in at[near]]
-            joined = [g for g in nearby if _is_near(coordinates[groups[g][0]], coordinates[k], apart)]
+            joined = [g for g in nearby if (np.abs(places[groups[g][0]] - places[k]) < apart).all()]
             if joined:
                 groups[min(joined)].append(k)
             else:
                 at.setdefault(cell, []).append(len(groups))
                 groups.append([k])
     return groups
-
-
-def _is_near(one: Sequence[float], other: Sequence[float], apart: float) -> bool:
-    return all(abs(x - y) < apart for x, y in zip(one, other, strict=True))
 
 
 @dataclass(frozen=True)
@@ -133,17 +130,16 @@ def _without(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | No
     The considered information of the dwells that are left out is left out, too.
     """
     linearised, noise = fitted.linearised, fitted.noise.for_goodness_of_fit.of_readings
-    rows, means = fitted.rows(fitted.noise.for_goodness_of_fit.weights), linearised.means
-    place = np.empty(len(rows), np.intp)
+    means, place = linearised.means, np.empty(len(fitted.dwells), np.intp)
     for k, group in enumerate(groups):
         place[group] = k
-    estimates = _by_leverage(fitted, rows, place) or _merged(fitted, rows, groups)
+    estimates = _by_leverage(fitted, place) or _merged(fitted, groups)
     if estimates is None:
         return None
     states, roots = estimates
     design, extra = means.design, considered_information(noise, means, linearised.state)
     spreads = mean_covariances(noise, means, linearised.state)
-    for part in (slice(k, k + _AT_ONCE) for k in range(0, len(rows), _AT_ONCE)):  # roots are large
+    for part in (slice(k, k + _AT_ONCE) for k in range(0, len(place), _AT_ONCE)):  # roots are large
         ours = design[part] @ roots.of(place[part])
         spreads[part] += ours @ np.swapaxes(ours, 1, 2)
     if extra.any():
@@ -198,7 +194,7 @@ class _Roots:
         return np.concatenate([common, self.common @ np.swapaxes(self.more.of(groups), 1, 2)], axis=2)
 
 
-def _by_leverage(fitted: Fit, rows: Sequence[Floats], place: NDArray[np.intp]) -> tuple[Floats, _Roots] | None:
+def _by_leverage(fitted: Fit, place: NDArray[np.intp]) -> tuple[Floats, _Roots] | None:
     """Return the states (G, p) without each orientation, and the roots of their covariances; None where an orientation
     tells nearly all of a state.
 
@@ -206,14 +202,13 @@ def _by_leverage(fitted: Fit, rows: Sequence[Floats], place: NDArray[np.intp]) -
 
       x_g = x - R^-1 Q_g^T (I - Q_g Q_g^T)^-1 r_g,   P_g = R^-1 (I + Q_g^T (I - Q_g Q_g^T)^-1 Q_g) R^-T.
     """
-    every, width = [_frame(fitted), *fitted.following, *rows], len(_frame(fitted))
-    factor = square_root_information.accumulate([own for own in every if len(own)])[:width]
+    factor, of_groups = _of_all(fitted, place)
+    width = len(factor)
     if square_root_information.rank(factor) < width:
         return None
     inverse = cast("Floats", np.linalg.inv(factor[:, :-1]))
     state = inverse @ factor[:, -1]
-    of_groups = _of_groups(rows, place)
-    states, more = np.empty((len(of_groups.sizes), width)), np.empty((len(of_groups.rows), width))
+    states, more = np.empty((len(of_groups.sizes), width)), of_groups.rows[:, :-1]  # rows that are done with give way
     for groups, places in of_groups.alike():
         ours = of_groups.rows[places]
         shares = ours[..., :-1] @ inverse
@@ -228,13 +223,26 @@ def _by_leverage(fitted: Fit, rows: Sequence[Floats], place: NDArray[np.intp]) -
     return states, _Roots(inverse, replace(of_groups, rows=more))
 
 
+def _of_all(fitted: Fit, place: NDArray[np.intp]) -> tuple[Floats, _OfGroups]:
+    """Return the factor [R | z] (p, p + 1) of all rows, and the rows of each orientation."""
+    rows, frame = _rows(fitted), _frame(fitted)
+    factor = square_root_information.accumulate([np.concatenate([frame, *fitted.following, as_one_array(rows)])])
+    return factor[: len(frame)], _of_groups(rows, place)
+
+
+def _rows(fitted: Fit) -> Sequence[Floats]:
+    return fitted.rows(fitted.noise.for_goodness_of_fit.weights)
+
+
 def _of_groups(rows: Sequence[Floats], place: NDArray[np.intp]) -> _OfGroups:
     """Return the rows [A | z] of each group of dwells, no more than A has columns: an orthogonal transformation changes
     nothing."""
     counts = np.fromiter(map(len, rows), np.intp, len(rows))
-    order = np.argsort(np.repeat(place, counts), kind="stable")
     sizes = np.bincount(place, weights=counts).astype(int)
-    stacked, most = _OfGroups(np.concatenate(rows)[order], sizes), rows[0].shape[1] - 1
+    in_order = as_one_array(rows)
+    if np.any(np.diff(place) < 0):
+        in_order = in_order[np.argsort(np.repeat(place, counts), kind="stable")]
+    stacked, most = _OfGroups(in_order, sizes), rows[0].shape[1] - 1
     if int(sizes.max()) <= most:
         return stacked
     reduced = _OfGroups(np.empty((int(np.minimum(sizes, most).sum()), most + 1)), np.minimum(sizes, most))
@@ -245,11 +253,11 @@ def _of_groups(rows: Sequence[Floats], place: NDArray[np.intp]) -> _OfGroups:
     return reduced
 
 
-def _merged(fitted: Fit, rows: Sequence[Floats], groups: list[list[int]]) -> tuple[Floats, _Roots] | None:
+def _merged(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, _Roots] | None:
     """Return the states (G, p) without each orientation, and the roots of their covariances, by merging the factors of
     the orientations before it and after it; None if one is then undetermined."""
     linearised, around = fitted.linearised, fitted.linearised.model.nominal_state()
-    empty = _frame(fitted)
+    rows, empty = _rows(fitted), _frame(fitted)
     slews = square_root_information.update(empty, np.concatenate(fitted.following))[0] if linearised.slews else empty
     heads, tails = [slews], [empty]
     for group in groups[:-1]:

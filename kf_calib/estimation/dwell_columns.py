@@ -127,12 +127,13 @@ def piece_columns(effects: Sequence[Effect], stimulus: Stimulus) -> Floats:
 
 
 def _by_dwell(dwells: Sequence[DwellFactor], columns: Callable[[Stimulus], Floats], stimulus: Stimulus) -> OfPieces:
-    """Arrange the columns of a stimulus (m, 3, p) by dwell; those of dwells of which only the mean is known are kept
-    at the middle node alone."""
-    folded, values = DwellStack.of(dwells).folded, _by_piece(columns, stimulus)
-    if folded.shows_means_only:
-        values = np.broadcast_to(values[:, 1:2].copy(), values.shape)
-    return OfPieces(values, folded.ends)
+    """Arrange the columns of a stimulus (m, 3, p) by dwell; of dwells of which only the mean is known they are those at
+    the middle node."""
+    folded = DwellStack.of(dwells).folded
+    if not folded.shows_means_only or stimulus.carrier_hz:
+        return OfPieces(_by_piece(columns, stimulus), folded.ends)
+    middle = columns(stimulus.at(slice(1, None, 3)))[:, None]
+    return OfPieces(np.broadcast_to(middle, (len(middle), 3, *middle.shape[2:])), folded.ends)
 
 
 def _by_piece(columns: Callable[[Stimulus], Floats], stimulus: Stimulus) -> Floats:
@@ -178,7 +179,7 @@ class LinearisedDwells:
             self.state,
         )
         longer.dwells_at_state = DwellStack.of([*self.dwells_at_state, dwell])
-        last = stimulus_of(longer.dwells_at_state, self.model.bench, self.state).ending(3 * len(dwell.pieces))
+        last = stimulus_of(longer.dwells_at_state, self.model.bench, self.state).at(slice(-3 * len(dwell.pieces), None))
         longer.columns = [*self.columns, *_by_dwell([dwell], lambda s: self.model.columns(s, self.state), last)]
         longer.slew_columns = self.slew_columns
         return longer

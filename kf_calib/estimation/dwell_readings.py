@@ -1,4 +1,4 @@
-"""The readings of one dwell, less what the fitted model says of their mean."""
+"""The readings within dwells: those of one less the prediction of their mean, and how those of all correlate."""
 
 from __future__ import annotations
 
@@ -8,9 +8,13 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import Source
+from kf_calib.dwells.sufficient_statistics import Autocovariance
 from kf_calib.errors import InputError
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration
+from kf_calib.noise.autoregression import expected_products
+
+_BOUND = 2.0  # sigmas
 
 
 @dataclass(frozen=True)
@@ -74,3 +78,29 @@ def _inside(source: Source, start_s: float, end_s: float, every: int) -> tuple[F
     if not times:
         return np.zeros(0), np.zeros((0, 3))
     return np.concatenate(times), np.concatenate(values)
+
+
+@dataclass(frozen=True)
+class ReadingCorrelation:
+    """Autocorrelation (L, 3) of the readings within dwells about their parabolas, at lags of 1, 2, ... L readings.
+
+    white (L,): what white noise would give, of which a parabola removes a part. bound (L,): 2 sigma about it.
+    """
+
+    values: Floats
+    white: Floats
+    bound: Floats
+
+
+def reading_correlation(result: Calibration) -> ReadingCorrelation:
+    """The autocorrelation of the readings within the dwells of a run, pooled; empty if the dwells are too short."""
+    total = sum((dwell.autocovariance for dwell in result.fit.dwells), Autocovariance())
+    size = round(total.count / max(total.blocks, 1))
+    lags = min(len(total.pairs) - 1, size // 4)
+    if lags < 1:
+        return ReadingCorrelation(np.zeros((0, 3)), np.zeros(0), np.zeros(0))
+    pairs = np.maximum(total.pairs[: lags + 1], 1.0)
+    raw = total.products[: lags + 1] / pairs[:, None]
+    white = expected_products(np.eye(1, size)[0], lags) / (size - np.arange(lags + 1))
+    level = np.where(raw[0] > 0.0, raw[0], np.nan)
+    return ReadingCorrelation(raw[1:] / level, white[1:] / white[0], _BOUND / np.sqrt(pairs[1:]))

@@ -19,7 +19,7 @@ from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_column
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise, flicker_sigma, slow_waves, steps
 from kf_calib.noise.reml import Part, gain_of, gauss_markov_gains, misfit, with_shared_noise
-from kf_calib.noise.thermometer_error import thermometer_errors
+from kf_calib.noise.temperature_course import thermometer_errors
 
 _DETERMINED = 1e-9  # share of a state in combinations that are not determined
 
@@ -71,7 +71,7 @@ class Fit:
         return square_root_information.solve(factor, self.linearised.model.nominal_state())
 
     @cached_property
-    def misfit_rows(self) -> list[Floats]:
+    def misfit_rows(self) -> Sequence[Floats]:
         """Whitened rows [H | W | z] by which the misfit is judged, see ``whitened_rows.misfit_rows``."""
         linearised = self.linearised
         rows, _ = whitened_rows.misfit_rows(
@@ -96,7 +96,7 @@ class Fit:
                 following[before] = np.vstack([following[before], rows])
         return following
 
-    def all_rows(self, noise: Noise | None = None) -> list[Floats]:
+    def all_rows(self, noise: Noise | None = None) -> Sequence[Floats]:
         """Whitened rows of each dwell together with those of the slews after it; within a slew the biases are
         constant."""
         if not self.linearised.slews:
@@ -229,15 +229,15 @@ class Fit:
         best = int(np.argmax(gains))
         return max(float(gains[best]), 0.0), float(times_s[best])
 
-    def rows(self, noise: Noise | None = None) -> list[Floats]:
+    def rows(self, noise: Noise | None = None) -> Sequence[Floats]:
         """Whitened rows [H | z] of each dwell, with the weights of the fit or with another noise."""
         return self._weighted if noise is None else self._whitened(noise)
 
     @cached_property
-    def _weighted(self) -> list[Floats]:
+    def _weighted(self) -> Sequence[Floats]:
         return self._whitened(self.noise.weights)
 
-    def _whitened(self, noise: Noise) -> list[Floats]:
+    def _whitened(self, noise: Noise) -> Sequence[Floats]:
         linearised = self.linearised
         rows = whitened_rows.whiten(
             linearised.dwells_at_state, linearised.columns, noise, linearised.state, flicker_mps2=noise.flicker_mps2

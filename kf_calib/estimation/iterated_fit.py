@@ -26,17 +26,23 @@ from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects import Effect
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation import free_attitude, square_root_information
-from kf_calib.estimation.attitude import facing_readings, without_attitudes
+from kf_calib.estimation.attitude import (
+    SETTLED,
+    UNSETTLED,
+    descended,
+    facing_readings,
+    left_to_settle,
+    relinearised,
+    without_attitudes,
+)
 from kf_calib.estimation.dwell_columns import LinearisedDwells, change_by_temperature, stimulus_of
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import Model
-from kf_calib.estimation.relinearisation import SETTLED, UNSETTLED, descended, left_to_settle, relinearised
 from kf_calib.estimation.score_test import delta_chi2
-from kf_calib.noise.flicker import flicker_within
 from kf_calib.noise.noise_model import ATTITUDE_UNKNOWN_RAD, FLOOR_MPS2, Noise, within_dwells
-from kf_calib.noise.nuisance_states import along_force, sensitivities_of
+from kf_calib.noise.nuisance_states import along_force, flicker_within, sensitivities_of
 from kf_calib.noise.reml import VarianceComponents, with_shared_noise
-from kf_calib.noise.thermometer_error import sensitivity_to_temperature
+from kf_calib.noise.temperature_course import sensitivity_to_temperature
 from kf_calib.noise.unequal_noise import with_own_noise
 
 _PASSES = 3

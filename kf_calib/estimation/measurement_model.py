@@ -19,8 +19,8 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.effects import Coefficient, Effect, FrameEffect, Stimulus, effect_named
+from kf_calib.effects.effect import KnownEffect
 from kf_calib.errors import InputError
-from kf_calib.estimation.known_effect import KnownEffect
 from kf_calib.support.text import printed
 
 if TYPE_CHECKING:  # a replay without a bench model does not import what reads one

@@ -16,14 +16,13 @@ from kf_calib.bench.bench import Bench
 from kf_calib.dwells.blocks import Tally
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation import square_root_information, whitened_rows
+from kf_calib.estimation.attitude import at_its_mode
 from kf_calib.estimation.correction import Corrected, Correction
 from kf_calib.estimation.cross_validation import HeldOut, held_out
 from kf_calib.estimation.dwell_columns import LinearisedDwells
-from kf_calib.estimation.estimate import Estimate, enlarged, estimate_of
+from kf_calib.estimation.estimate import Estimate, Parameter, Parameters, enlarged, estimate_of
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import Model
-from kf_calib.estimation.parameters import Parameter, Parameters
-from kf_calib.estimation.relinearisation import at_its_mode
 from kf_calib.estimation.residual_table import residual_table, table_as
 from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.signal_quality import Readings

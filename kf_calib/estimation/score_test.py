@@ -5,14 +5,18 @@ projected onto the orthogonal complement of H. The projections answer every ques
 statistic, its coefficients and their sigmas, its overlap with any other candidate, and the smallest size that would be
 detected.
 
-The columns of all candidates are evaluated and whitened once per run and noise model and are written in an orthonormal
-basis of their own (``Frame``). To test them against another model, only that model's columns and the readings have to
-be whitened; the projection is then done on a small matrix.
+The columns of all candidates of the catalogue are evaluated and whitened once per run and noise model and are written
+in an orthonormal basis of their own (``Frame``). To test them against another model, only that model's columns and the
+readings have to be whitened; the projection is then done on a small matrix, and any two candidates can be compared.
+
+Formulas are too many for that, and only two things are asked of a group of them: what it explains, and whether it is a
+known effect by another name (``FurtherEffects``). The model's columns and those of the known effects are made
+orthonormal once, and each group is reduced to a small triangle of its own.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +24,11 @@ from numpy.typing import NDArray
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.line_spectrum import SpectralLine
-from kf_calib.dwells.qr import orthonormal
+from kf_calib.dwells.qr import orthonormal, triangle
 from kf_calib.dwells.sufficient_statistics import DwellFactor, lines_of
 from kf_calib.effects import Effect, Stimulus
 from kf_calib.estimation import square_root_information, whitened_rows
-from kf_calib.estimation.candidate_scan import SEEN, Complement, Scan, counts_of, project, slices
+from kf_calib.estimation.candidate_scan import SEEN, Complement, Scan, counts_of, is_within, project, scan_of, slices
 from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns, piece_columns, stimulus_of
 from kf_calib.estimation.periodogram import Periodogram
 from kf_calib.estimation.whitened_rows import MisfitColumns
@@ -36,6 +40,9 @@ _TOGETHER = 24  # least number of columns that are whitened at a time; more woul
 _CELLS = 10_000  # columns times dwells that are whitened at a time, if this allows more columns
 _OF_ONE_KIND = 400  # columns whitened at a time if there are many effects of one kind
 _MANY = 100  # above this number of oscillations, a periodogram is faster
+
+_OF_NOISE = ("sigma_mps2", "inflation", "setting_rad", "scatter_mps2", "walk_mps2_per_sqrt_s",
+             "sensitivity_mps2_per_k")  # fmt: skip
 
 
 class Frame:
@@ -161,10 +168,6 @@ class Frame:
         return self._periodogram[1].delta_chi2(*_with_and_without_walk(linearised, self.noise, self.state, STATE_COUNT))
 
 
-_OF_NOISE = ("sigma_mps2", "inflation", "setting_rad", "scatter_mps2", "walk_mps2_per_sqrt_s",
-             "sensitivity_mps2_per_k")  # fmt: skip
-
-
 def _key(effect: Effect) -> tuple[str, float]:
     """Return what identifies an effect together with the value of its constant."""
     return str(effect), effect.value
@@ -274,7 +277,7 @@ def batches(sizes: Sequence[int], columns: int) -> list[list[int]]:
 
 def _judged(
     dwells: Sequence[DwellFactor], columns: Sequence[Floats], noise: Noise, state: Floats, width: int
-) -> tuple[list[Floats], int]:
+) -> tuple[Sequence[Floats], int]:
     """Call ``whitened_rows.misfit_rows`` without reducing the rows to the rank of their columns."""
     return whitened_rows.misfit_rows(dwells, columns, noise, state, width, reduced=False)
 
@@ -298,3 +301,65 @@ def _with_and_without_walk(
 def _inside(noise: Noise) -> int:
     """Number of leading columns of a dwell's rows that belong to the steps of the biases within the dwell."""
     return 3 if noise.walk_mps2_per_sqrt_s else 0
+
+
+class FurtherEffects:
+    """Tests of groups of effects beside the model in ``linearised``, compared with ``known`` effects.
+
+    An effect counts as known if the cosine of the largest angle between it and one of these is above ``cosine``.
+    """
+
+    def __init__(self, frame: Frame, linearised: LinearisedDwells, known: Sequence[Effect], cosine: float) -> None:
+        self._frame, self._carried, self._cosine = frame, linearised, cosine
+        rows, width = frame.whitened_model(linearised)
+        self._beside = Complement(rows, width)
+        self._residual = self._beside.of(rows[:, -1])
+        self._known, self._parts = self._bases(known)
+
+    def _bases(self, known: Sequence[Effect]) -> tuple[Floats, list[slice]]:
+        """Return orthonormal bases (m, k) of what the model leaves of each known effect, and the columns of each."""
+        bases, parts, last = np.empty((len(self._residual), sum(counts_of(known)))), list[slice](), 0
+        for some, columns in self._columns(known):
+            rest = self._beside.of(columns)
+            for effect, part in zip(some, slices(counts_of(some)), strict=True):
+                candidate = self._scan([effect], columns[:, part], rest[:, part]).candidates[0]
+                parts.append(slice(last, last + candidate.dof))
+                bases[:, parts[-1]], last = rest[:, part] @ candidate.inverse, parts[-1].stop
+        return bases[:, :last], parts
+
+    def _columns(self, known: Sequence[Effect]) -> Iterator[tuple[list[Effect], Floats]]:
+        """Yield a few of the known effects at a time with their whitened columns (m, q)."""
+        held = [effect for effect in known if self._frame.has(effect)]
+        for part in batches(counts_of(held), columns_at_once(self._carried)):
+            some = [held[k] for k in part]
+            yield some, self._frame.columns(some)
+        others = [effect for effect in known if effect not in held]
+        yield others, self._frame.whitened(self._carried, others)
+
+    def scans(self, groups: Sequence[Sequence[Effect]]) -> Iterator[tuple[Scan, list[bool]]]:
+        """Scan each group alone, and tell of each of its effects whether it is known."""
+        widths = [sum(counts_of(group)) for group in groups]
+        for part in batches(widths, columns_at_once(self._carried)):
+            some = [groups[k] for k in part]
+            columns = self._frame.whitened(self._carried, [effect for group in some for effect in group])
+            rest = self._beside.of(columns)
+            cosines = self._known.T @ rest
+            for group, own in zip(some, slices([widths[k] for k in part]), strict=True):
+                found = self._scan(group, columns[:, own], rest[:, own])
+                yield found, self._are_known(found, cosines[:, own])
+
+    def _scan(self, effects: Sequence[Effect], columns: Floats, rest: Floats) -> Scan:
+        """Scan effects by their columns (m, q) and what the model leaves of these."""
+        upper = triangle(np.column_stack([rest, self._residual]))
+        return scan_of(upper, np.linalg.norm(columns, axis=0), effects, counts_of(effects))
+
+    def _are_known(self, scan: Scan, products: Floats) -> list[bool]:
+        """Tell whether each candidate lies within a known effect; products (k, q): of the bases of these with the
+        columns."""
+        known = list[bool]()
+        for candidate, columns in zip(
+            scan.candidates, slices(counts_of([candidate.effect for candidate in scan.candidates])), strict=True
+        ):
+            cosines = (products[:, columns] @ candidate.inverse).T
+            known.append(any(is_within(cosines[:, part], self._cosine) for part in self._parts))
+        return known

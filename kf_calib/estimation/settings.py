@@ -1,4 +1,4 @@
-"""The settings of a calibration."""
+"""The settings of a calibration, among them what is known of the parameters before the first reading."""
 
 from __future__ import annotations
 
@@ -6,12 +6,54 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, get_args
 
+import numpy as np
+
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.stationarity import Stillness
 from kf_calib.errors import InputError, check_number
-from kf_calib.estimation.prior import PRIORS, Prior
 
 if TYPE_CHECKING:  # read only where one is given
     from kf_calib.estimation.bench_model import BenchModel
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Prior standard deviations of misalignment (rad), scale factor (1) and bias (m/s^2).
+
+    ``Prior()`` is diffuse: it contains no information, and the estimate equals that of least squares.
+    """
+
+    misalignment_rad: float | None = None
+    scale: float | None = None
+    bias_mps2: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if value is not None:
+                check_number(f"the prior's {name}", value)
+
+    @property
+    def diffuse(self) -> bool:
+        """Whether any of the sigmas is missing, so that the prior contains no information."""
+        return self.misalignment_rad is None or self.scale is None or self.bias_mps2 is None
+
+    def covariance(self, parameters: Floats) -> Floats:
+        """Covariance (12, 12) of the affine state about the nominal ``parameters`` (12,)."""
+        if self.misalignment_rad is None or self.scale is None or self.bias_mps2 is None:
+            raise ValueError("a diffuse prior has no covariance")
+        sigma = np.array([self.misalignment_rad, self.misalignment_rad, self.scale, self.bias_mps2] * 3)
+        jacobian = paper_parameters.sensitivity_jacobian(parameters)
+        return jacobian @ np.diag(sigma**2) @ jacobian.T
+
+
+PRIORS: dict[str, Prior] = {
+    "diffuse": Prior(),
+    "navigation": Prior(misalignment_rad=5e-3, scale=2e-3, bias_mps2=2e-2),
+    "mems": Prior(misalignment_rad=0.1, scale=0.1, bias_mps2=1.0),
+}
+"""Priors by grade of accelerometer; each is about twice as wide as the specification of sensors of that grade."""
+
 
 Engine = Literal["block", "filterpy"]
 
@@ -49,7 +91,7 @@ class Settings:
         if self.bench_model is not None and self.engine != "block":
             raise InputError("the filterpy engine takes no bench model (--bench-model): use --engine block.")
         if not isinstance(self.prior, Prior):
-            known = 'kf_calib.estimation.prior.PRIORS["navigation"]'
+            known = 'kf_calib.estimation.settings.PRIORS["navigation"]'
             raise InputError(f"prior is {self.prior!r}: give a Prior, for example {known}.")
         if not isinstance(self.stillness, Stillness):
             raise InputError(f"stillness is {self.stillness!r}: give a kf_calib.dwells.stationarity.Stillness.")

@@ -23,18 +23,19 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
-from kf_calib.bench.mountings import Mounting, mountings
 from kf_calib.bench.raw_input import CHANNELS
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.errors import BlunderError
-from kf_calib.estimation.affine_fit import (
+from kf_calib.estimation.mountings import (
     _FARTHEST,
     GAIN_RANGE,
     AffineFit,
     Channels,
     DwellMeans,
+    Mounting,
     determines_axes,
     fit_affine,
+    mountings,
     nominal_sensitivity,
 )
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2

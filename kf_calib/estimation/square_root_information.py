@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
+from kf_calib.dwells.pieces import as_one_array
 from kf_calib.dwells.qr import triangle
 from kf_calib.estimation.measurement_model import Model
-from kf_calib.estimation.prior import Prior
+from kf_calib.estimation.settings import Prior
 from kf_calib.noise import random_walk
 
 _STILL = np.zeros(2)
@@ -122,7 +123,7 @@ def accumulate(rows: Sequence[Floats], walked: Floats | None = None) -> Floats:
     D in ``rows``. Without a walk all rows are reduced by one QR.
     """
     if walked is None or not walked.any():
-        stacked = rows[0] if len(rows) == 1 else np.concatenate(rows)
+        stacked = as_one_array(rows)
         lacking = max(stacked.shape[1] - len(stacked), 0)
         return triangle(np.vstack([stacked, np.zeros((lacking, stacked.shape[1]))]) if lacking else stacked)
     width = rows[-1].shape[1] - 4

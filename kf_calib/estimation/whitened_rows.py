@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
-from kf_calib.dwells.pieces import OfPieces, of_all_pieces
+from kf_calib.dwells.pieces import OfPieces, RowsOfMeans, of_all_pieces
 from kf_calib.dwells.qr import inverse_of_lower, triangle
-from kf_calib.dwells.rows import on_basis
+from kf_calib.dwells.rows import on_basis, parabola
 from kf_calib.dwells.stack import AlikeDwells, DwellStack
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation.measurement_model import Model
@@ -45,7 +45,7 @@ def whiten(
     about: Floats | None = None,
     flicker_mps2: Floats | None = None,
     reduced: bool = True,
-) -> list[Floats]:
+) -> Sequence[Floats]:
     """Whitened rows [S | H | z] (r, s + p + 1) of each dwell, with unit noise and the dwell's nuisance states
     eliminated by QR.
 
@@ -68,8 +68,12 @@ def whiten(
     values = of_all_pieces(columns)
     informative = np.append(np.ones(inside), _units(values)) if reduced else None
     stack, noise_about = DwellStack.of(dwells), _About(noise, state, about, flicker_mps2)
+    batches = list(_batches(stack, values.shape[-1]))
+    if informative is not None and all(batch.shows_means_only(noise) for batch in batches):
+        parts = ((each.dwells, _of_means(each, values[each.pieces], noise_about)) for each in batches)
+        return RowsOfMeans.of(len(stack), parts)
     all_rows = list[Floats]([np.empty((0, 0))] * len(stack))
-    for batch in _batches(stack, values.shape[-1]):
+    for batch in batches:
         of_batch = values[batch.pieces]
         if informative is not None and batch.shows_means_only(noise):
             whitened = _of_means(batch, of_batch, noise_about)
@@ -125,6 +129,13 @@ class _Batch:
     def triangles(self) -> Floats:
         """Their triangles (d, P, K + 3, K + 3)."""
         return self.stack.triangles[self.number][self.part]
+
+    @property
+    def regressors(self) -> Floats:
+        """The rows (d, P, K, 4) of the regressors 1, f_x, f_y, f_z that are felt."""
+        values = np.ones((*self.pieces.shape, 3, 4))
+        values[..., 1:] = self.stack.felt_force_mps2.reshape(-1, 3, 3)[self.pieces]
+        return self.triangles[:, :, : self.shape.width, :3] @ parabola(values)
 
     def shows_means_only(self, noise: Noise) -> bool:
         """Whether nothing but the mean of each dwell and channel is known, so that whitened rows have full rank."""
@@ -234,7 +245,7 @@ def _channels(batch: _Batch, columns: Floats, blocks: _Blocks, about: _About, he
     many, pieces, functions, _, _ = columns.shape
     shape, triangles = (many, pieces * height, -1), batch.triangles
     basis, readings = triangles[:, :, :height, :functions], triangles[:, :, :height, functions:]
-    regressors = batch.stack.regressors[batch.number][batch.part][:, :, :height]
+    regressors = batch.regressors[:, :, :height]
     nuisances = nuisance_map(sensitivities_of(batch.stack, about.state, batch.dwells), about.noise)
     parts = np.zeros((many, 3, pieces * height, blocks.width))
     for i in range(3):
@@ -275,7 +286,7 @@ def misfit_rows(
     state: Floats,
     width: int,
     reduced: bool = True,
-) -> tuple[list[Floats], int]:
+) -> tuple[Sequence[Floats], int]:
     """Rows [H | W | G | z] by which the misfit is judged, and the number of columns before G; H is the first ``width``
     columns.
 
@@ -370,7 +381,7 @@ class MisfitColumns:
         return whitened
 
 
-def with_frame(rows: list[Floats], model: Model, noise: Noise, first: int = 0) -> list[Floats]:
+def with_frame(rows: Sequence[Floats], model: Model, noise: Noise, first: int = 0) -> Sequence[Floats]:
     """The rows [S | H | W | z] with one more for each state that the model fixes at zero, which has no column: a
     reading of that state times g. They join the rows at index ``first``."""
     if not model.fixed:

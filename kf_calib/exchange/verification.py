@@ -26,13 +26,13 @@ from kf_calib.effects import Effect
 from kf_calib.effects.inputs import beyond_force_and_temperature
 from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C
 from kf_calib.errors import InputError, UnobservableError
+from kf_calib.estimation.attitude import linearised_at
 from kf_calib.estimation.calibration import evaluate_fit
 from kf_calib.estimation.correction import Correction
 from kf_calib.estimation.dwell_pass import Pass, refuse_unusable
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.iterated_fit import fit
 from kf_calib.estimation.measurement_model import SQUARE, Model
-from kf_calib.estimation.relinearisation import linearised_at
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
 from kf_calib.exchange.calibration_file import SavedCalibration

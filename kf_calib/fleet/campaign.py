@@ -30,7 +30,8 @@ from kf_calib.errors import InputError
 from kf_calib.fleet.run_factor import ReferenceUnit, RunFactor, column_name
 
 _TOGETHER = 64  # runs whose matrices are computed at once
-_SEEN = 1e-6  # of a column's norm: what is less beside the run's own parameters is rounding
+SEEN = 1e-6
+"""Share of the largest information of a unit, or of a column's norm: what is less is rounding, not seen."""
 _LARGE = 64.0  # sigmas of one run, up to which sizes are expected where the catalogue knows no usual ones
 
 _TOLD = 3  # units that a message names
@@ -223,7 +224,7 @@ def _catalogue(factors: Iterable[RunFactor]) -> tuple[list[RunKey], dict[str, li
 def _hidden(upper: Floats, width: int, places: NDArray[np.intp]) -> Mask:
     """Return which columns the run's own parameters explain but for rounding."""
     rest, whole = np.linalg.norm(upper[width:, places], axis=0), np.linalg.norm(upper[:, places], axis=0)
-    return np.asarray(rest <= _SEEN * whole)
+    return np.asarray(rest <= SEEN * whole)
 
 
 def _usual(effect: Effect | None) -> float:

@@ -23,6 +23,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.fleet.campaign import (
     FLAT,
+    SEEN,
     STEP,
     Blocks,
     Group,
@@ -153,7 +154,6 @@ def _added(values: Floats, places: Sequence[int], count: int) -> Floats:
 
 
 _NARROW, _WIDE = 0.02, 1e6  # sigma of one run: the smallest spread that is told from none, and a larger one than any
-_SEEN = 1e-6  # of the largest information of a unit: what is less counts as not seen
 _ABOVE = (0.025, 0.975)  # probability that chi-squared is above that at the lower and the upper end of the interval
 
 
@@ -187,7 +187,7 @@ class _Misfits:
     def __init__(self, told: UnitsAndCommon, members: Mask) -> None:
         self._common = told.common
         self._values, self._along, self._turned = modes(told.of_units.info[members], told.of_units.score[members])
-        self._seen = self._values > _SEEN * self._values.max(initial=0.0)
+        self._seen = self._values > SEEN * self._values.max(initial=0.0)
         self._rows = self._turned @ told.across[members]
         self._coefficients = told.of_units.score.shape[1]
         self._prior = np.concatenate([np.full(self._coefficients, FLAT), told.prior])
@@ -195,7 +195,7 @@ class _Misfits:
     @cached_property
     def freedom(self) -> int:
         """Degrees of freedom of the misfit: what units tell, less the mean and what this takes of the common ones."""
-        ranks = [int(np.linalg.matrix_rank(info, hermitian=True, rtol=_SEEN)) if info.size else 0
+        ranks = [int(np.linalg.matrix_rank(info, hermitian=True, rtol=SEEN)) if info.size else 0
                  for info in (self._common.info, self._sums(0.0).info)]  # fmt: skip
         return int(self._seen.sum()) + ranks[0] - ranks[1]
 

@@ -27,7 +27,7 @@ from functools import cached_property
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.fleet.campaign import Group, log_evidence_of_modes, log_mean, modes, sizes
+from kf_calib.fleet.campaign import SEEN, Group, log_evidence_of_modes, log_mean, modes, sizes
 from kf_calib.fleet.own_coefficients import UnitInformation, told_of_mean
 from kf_calib.support.tail_probabilities import weights
 
@@ -36,7 +36,6 @@ SHARES = (np.arange(50) + 0.5) / 50.0
 
 _TOGETHER = 64  # units at a time, to save memory
 _DRAWS = 4000
-_SEEN = 1e-6  # of the largest information of a unit: what is less counts as not seen
 _LEAST_OF_UNIT = 1.0  # sigma of one run: the smallest size of the effect of a unit
 _STEPS = {0: 2.0**0.5, 2: 2.0**0.5, 32: 1.2}  # ratio of a size to the one before: closer where sizes are alike
 POWERS = tuple(_STEPS)
@@ -130,10 +129,10 @@ def _ratios(values: Floats, along: Floats, tried: Floats, power: int) -> Floats:
     the directions in which the information is apart, in units of the noise.
     """
     count = values.shape[1]
-    seen = values > _SEEN * values.max(axis=1, keepdims=True)
+    seen = values > SEEN * values.max(axis=1, keepdims=True)
     noted = np.where(seen, along / np.sqrt(np.where(seen, values, 1.0)), 0.0)[:, None]
     spread = np.where(seen, values, 0.0) ** (0.5 * count / (power + 0.5 * count))
-    spread = spread / np.maximum(np.mean(spread, axis=1, keepdims=True), _SEEN) if power else spread
+    spread = spread / np.maximum(np.mean(spread, axis=1, keepdims=True), SEEN) if power else spread
     before = spread[:, None] * tried[:, None] ** 2 / (2.0 * power + count)  # variances (n, sizes, q)
     after = before / (1.0 + before)
     normal = 0.5 * np.sum(noted**2 * after - np.log1p(before), axis=2)

@@ -48,6 +48,18 @@ class Means:
 def means_of(dwells: Sequence[DwellFactor], columns: Sequence[Floats]) -> Means:
     """The means of dwells with these columns."""
     stack, values = DwellStack.of(dwells), of_all_pieces(columns)
+    if stack.folded.shows_means_only and not values.strides[1]:  # the same at all nodes
+        design = values[:, 0]
+    else:
+        design = _design(stack, values)
+    return Means(
+        design, stack.means[:, 4:], stack.felt_means_mps2, stack.folded.weights * stack.folded.counts,
+        stack.folded.ends_s, stack.bendings,
+    )  # fmt: skip
+
+
+def _design(stack: DwellStack, values: Floats) -> Floats:
+    """Return the means (D, 3, p) of columns (pieces, K nodes, 3, p)."""
     folded, of_pieces = stack.folded, np.empty((len(values), values[0, 0].size))
     for shape, triangles in zip(folded.shapes, stack.triangles, strict=True):
         first = triangles[:, :, 0, : shape.width] / triangles[:, :, :1, 0]  # means of the basis
@@ -55,10 +67,7 @@ def means_of(dwells: Sequence[DwellFactor], columns: Sequence[Floats]) -> Means:
             pieces = shape.pieces[k : k + _AT_ONCE]
             coefficients = basis_values(values[pieces])
             of_pieces[pieces] = (first[k : k + _AT_ONCE, :, None] @ coefficients)[:, :, 0]
-    design = folded.weighted(of_pieces).reshape(len(stack), *values.shape[2:])
-    return Means(
-        design, stack.means[:, 4:], stack.felt_means_mps2, folded.weights * folded.counts, folded.ends_s, stack.bendings
-    )  # fmt: skip
+    return folded.weighted(of_pieces).reshape(len(stack), *values.shape[2:])
 
 
 def bending_of(dwell: DwellFactor) -> Floats:

@@ -25,7 +25,7 @@ from kf_calib.dwells.sufficient_statistics import Autocovariance, DwellFactor
 from kf_calib.noise import random_walk
 from kf_calib.noise.autoregression import expected_products, unbiased
 from kf_calib.noise.means import Means
-from kf_calib.noise.thermometer_error import thermometer_errors
+from kf_calib.noise.temperature_course import thermometer_errors
 
 FLOOR_MPS2 = 1e-9
 """Least sigma of a reading, used where readings are exactly constant; the rounding of a double is about 1e-15 m/s^2."""
@@ -64,8 +64,8 @@ class Noise:
     - walk_mps2_per_sqrt_s: the intensity q of the random walk of each bias.
     - walk_spread: the sigma of ln q; None if q was stated or is zero.
     - sensitivity_mps2_per_k (3, 8): change of the readings per K on the regressors 1, f and T, T f
-      (``thermometer_error``); None where the noise of the thermometer does not matter.
-    - flicker_mps2 (3,): sqrt(h) of 1/f noise within dwells (``flicker``); None for none.
+      (``temperature_course``); None where the noise of the thermometer does not matter.
+    - flicker_mps2 (3,): sqrt(h) of 1/f noise within dwells (``nuisance_states``); None for none.
     - within_seen: whether readings within dwells showed their noise; in a table of means alone they do not.
     """
 
@@ -344,7 +344,7 @@ def considered_information(noise: Noise, means: Means, state: Floats) -> Floats:
     """
     count = means.design.shape[2]
     if noise.checked or not noise.setting_rad:
-        return np.zeros((len(means.counts), count, count))
+        return np.broadcast_to(np.zeros((count, count)), (len(means.counts), count, count))
     weight = 1.0 / np.einsum("dii->di", mean_covariances(noise.weights, means, state))
     weighted = weight[:, :, None] * means.design
     return noise.setting_rad**2 * np.swapaxes(weighted, 1, 2) @ setting_covariances(means, state) @ weighted

@@ -21,7 +21,7 @@ from typing import Literal
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, Mask
-from kf_calib.dwells.qr import orthonormal
+from kf_calib.dwells.qr import multiplied, orthonormal
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.noise.means import Means, means_of
 from kf_calib.noise.noise_model import FLOOR_MPS2, Noise, mean_covariances, setting_covariances, shared_noise
@@ -286,11 +286,11 @@ def _reduce(means: Means, prior: Floats | None = None, apart: slice = slice(0)) 
     known: Mask = np.array(prior[:, :-1].any(axis=0))
     known[apart] = True
     free = design[:, ~known]  # a copy, which the basis may overwrite
-    scale = np.linalg.norm(free, axis=0)
+    scale = np.sqrt(np.einsum("ij,ij->j", free, free))
     free /= np.where(scale > 0, scale, 1.0)
     basis, upper = orthonormal(free)
     turn, singular, _ = np.linalg.svd(upper, full_matrices=False)
-    basis = basis @ turn[:, singular > 1e-9 * singular[0]]
+    basis = multiplied(basis, turn[:, singular > 1e-9 * singular[0]])
     rest = means.readings.ravel() - basis @ (basis.T @ means.readings.ravel())
     columns = np.hstack([basis, design[:, known]]) if known.any() else basis
     means = replace(means, design=columns.reshape(*means.readings.shape, -1), readings=rest.reshape(-1, 3))

@@ -1,25 +1,33 @@
-"""The course of the temperature over a run: a smooth curve through what a noisy thermometer read, and its uncertainty.
+"""The course of the temperature over a run, a smooth curve through what a noisy thermometer read; what its error does.
 
-The noise of a thermometer is an error in the variables: times the sensitivity of an accelerometer to the temperature it
-enters the residuals. A block of metal follows its surroundings slowly, so that a smooth curve through all readings of
-the run has much less noise than the readings in one dwell. What is left of it is a smooth error of the curve, which is
-the same for all three accelerometers.
+A block of metal follows its surroundings slowly, so that a smooth curve through all readings of the run has much less
+noise than the readings in one dwell. What is left of it is a smooth error of the curve, which is the same for all three
+accelerometers.
 
 The curve is a cubic spline with many knots whose fourth differences are held small (P. Eilers and B. Marx, 1996). How
 small, and the noise of the thermometer, are those of the largest restricted likelihood. The error of the curve is that
 of the posterior (G. Wahba, 1983). Where the thermometer is quiet, or where the temperature has steps that no smooth
 curve follows, the temperatures are taken as they were read and count as exact.
+
+The error of the curve, times the sensitivity of an accelerometer to the temperature, enters the readings: an error in
+the variables, which counts as noise (W. Deming, 1943, the effective variance). The sensitivity is that of the model at
+its estimate, as a function of the specific force f and of the temperature T: its values on the regressors 1, f, T and
+T f. For an effect with a memory of the temperature, it is that to a temperature that is wrong for long.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.dwells.stack import Folded
+from kf_calib.dwells.pieces import OfPieces
+from kf_calib.dwells.stack import DwellStack, Folded
+from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C
 
 _KNOTS, _MOST_KNOTS = 3, 200  # of a dwell, and of the run
 _ORDER = 4  # of the differences that are held small: what is left of the noise is least in the run of a climate
@@ -31,6 +39,8 @@ _STEPS = 2.0  # the curve leaves at most this times the variance that parabolas 
 _KEPT = 1e-4  # share of the variance of the errors that may be left out
 _SIMPSON = np.array([1.0, 4.0, 1.0]) / 6.0
 _PENALTIES = np.geomspace(1e-12, 1e12, 241)
+
+_MATTERS = 0.1  # share of the sigma of the mean of a dwell above which the error counts
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,3 +178,45 @@ def _largest(errors: Floats) -> Floats:
     values, vectors = np.linalg.eigh(errors.T @ errors)
     left_out = np.cumsum(np.maximum(values, 0.0)) < _KEPT * values.sum()
     return errors @ vectors[:, ~left_out]
+
+
+def sensitivity_to_temperature(
+    dwells: Sequence[DwellFactor], change_mps2_per_k: Callable[[], Floats], sigma_mps2: Floats
+) -> Floats | None:
+    """Change of the readings per K (3, 8) on the regressors 1, f, T, T f; None where the error of the temperature does
+    not matter.
+
+    change_mps2_per_k: gives the change per K (m, 3) at the nodes of all dwells by the model at its state. sigma_mps2
+    (3,): noise of white readings.
+    """
+    folded = DwellStack.of(dwells).folded
+    errors_c = temperature_course(folded).errors_c
+    if not errors_c.shape[1]:
+        return None
+    change = change_mps2_per_k()
+    if not change.any():
+        return None
+    counts = np.repeat(folded.counts, 3 * folded.piece_numbers)
+    variance = change**2 * np.sum(errors_c**2, axis=1, keepdims=True) * counts[:, None]
+    if variance.max() < (_MATTERS * sigma_mps2.min()) ** 2:
+        return None
+    return np.asarray(np.linalg.lstsq(_regressors(dwells), change, rcond=1e-9)[0].T, float)
+
+
+def thermometer_errors(dwells: Sequence[DwellFactor], sensitivity_mps2_per_k: Floats) -> OfPieces:
+    """Changes of the readings at the nodes of each dwell by each independent error of the temperature of 1 sigma,
+    (pieces, nodes, 3, k)."""
+    folded = DwellStack.of(dwells).folded
+    errors_c = temperature_course(folded).errors_c
+    change = (_regressors(dwells) @ sensitivity_mps2_per_k.T)[:, :, None] * errors_c[:, None, :]
+    columns = np.zeros((folded.ends[-1], folded.dwells[0].width, 3, errors_c.shape[1]))
+    columns[:, :3] = change.reshape(-1, 3, *change.shape[1:])
+    return OfPieces(columns, folded.ends)
+
+
+def _regressors(dwells: Sequence[DwellFactor]) -> Floats:
+    """Return 1, f, T and T f at the nodes of all dwells, (m, 8)."""
+    stack = DwellStack.of(dwells)
+    regressors = np.hstack([np.ones((len(stack.force_mps2), 1)), stack.force_mps2])
+    warmth = temperature_course(stack.folded).temperature_c - REFERENCE_TEMPERATURE_C
+    return np.hstack([regressors, warmth[:, None] * regressors])

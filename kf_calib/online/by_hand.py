@@ -4,8 +4,6 @@ session = HandSession(source, settings, wanted)   # of a source without angles
 session.listeners.append(print)
 session.standing.task                             # what to do now, at any moment and from any thread
 final = session.run()                             # the same as replay gives
-
-Status of a calibration by hand while it goes on: what the poses so far give, and what to do now.
 """
 
 from __future__ import annotations
@@ -26,10 +24,10 @@ from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.calibration import conclude, evaluate_fit, with_remarks
 from kf_calib.estimation.dwell_pass import LEAST_READINGS, Pass, refuse_unusable
 from kf_calib.estimation.iterated_fit import fit
+from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
-from kf_calib.online.evaluation import Evaluation
-from kf_calib.online.progress import Progress
+from kf_calib.online.evaluation import Evaluation, Progress
 from kf_calib.support.threads import one_blas_thread
 
 ENOUGH_S = 4.0
@@ -177,15 +175,14 @@ class HandSession(Evaluation[HandJudgement, HandStanding]):
         settings = settings or Settings()
         standing = HandStanding(enough_s=ENOUGH_S + settings.stillness.settle_s)
         super().__init__(source, settings, wanted, standing, every=every, again=again)
-        self._refuse_engine()
-        if settings.effects or settings.walk_mps2_per_sqrt_s:
-            self.accept(*settings.effects)
 
-    def accept(self, *names: str) -> None:
-        raise InputError(
-            "a live run without angles has scale factors, biases and the angles between the axes only: leave out "
-            "effects (--with, --model) and --bias-walk."
-        )
+    def _refuse(self, model: Model, begun: bool = False) -> None:
+        """Raise InputError for effects and a random walk of the biases, which need angles."""
+        if model.effects or self.settings.walk_mps2_per_sqrt_s:
+            raise InputError(
+                "a live run without angles has scale factors, biases and the angles between the axes only: leave out "
+                "effects (--with, --model) and --bias-walk."
+            )
 
     def _progress(self) -> Mapping[str, object]:
         assert isinstance(self._segmenter, RestSegmenter)

@@ -1,8 +1,8 @@
 """What every evaluation of a run has while the run goes on: two threads, neither of which waits for the other.
 
 The thread that calls ``run`` folds the readings as they come, and looks at the open dwell after 1, 2, 4 ... s. A second
-thread judges the dwells that have closed. Nobody who shows the results holds either up. The readings are folded as a
-replay of the recording folds them.
+thread judges the dwells that have closed. Nobody who shows the results holds either up: what is known at the moment is
+a ``Progress``. The readings are folded as a replay of the recording folds them.
 
 Whoever has a loop of its own does without the threads: ``ingest`` takes a batch and judges the dwells that it closes,
 ``finish`` gives the final judgement.
@@ -13,22 +13,50 @@ from __future__ import annotations
 import threading
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextvars import copy_context
 from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
+import numpy as np
+
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import Batch, Source
 from kf_calib.dwells.blocks import Tally
 from kf_calib.dwells.folding import Folder
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.estimation.dwell_pass import LEAST_READINGS, Pass
+from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Settings
-from kf_calib.online.progress import Progress, targets
 from kf_calib.support.threads import one_blas_thread
 
 _FIRST_LOOK_S = 1.0
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What is known of a run at a moment.
+
+    samples: number of readings. elapsed_s: time of the last of them. dwells: number of closed dwells. judged_s,
+    looked_s: times of the latest judgement, and of the latest look at the open dwell. problem: why there is no
+    judgement. notice: the latest action, such as an effect that was accepted or refused. model: effects in the model.
+    """
+
+    samples: int = 0
+    elapsed_s: float = 0.0
+    dwells: int = 0
+    judged_s: float = 0.0
+    looked_s: float = 0.0
+    problem: str = ""
+    notice: str = ""
+    model: Sequence[str] = ()
+
+
+def targets(texts: Mapping[str, float]) -> Floats:
+    """Targets (12,) of the sigmas in SI, from numbers by symbol; NaN where there is none."""
+    return np.array([texts.get(symbol, np.nan) for symbol in paper_parameters.SYMBOLS])
 
 
 J = TypeVar("J")
@@ -73,10 +101,12 @@ class Evaluation(ABC, Generic[J, S]):
         self._last: _Closed | None = None
         self._before: J | None = None
         self._taken, self._is_judging = 0, False
+        self._refuse_engine()
+        self._refuse(self._passed.model)
 
     @abstractmethod
-    def accept(self, *names: str) -> None:
-        """Add effects (names or formulas) to the model from now on; raises InputError where one cannot be added."""
+    def _refuse(self, model: Model, begun: bool = False) -> None:
+        """Raise InputError for a model that such a run cannot determine, or no longer where it has ``begun``."""
 
     @abstractmethod
     def _judged(self, passed: Pass, before: J | None) -> J:
@@ -96,6 +126,17 @@ class Evaluation(ABC, Generic[J, S]):
     def _progress(self) -> Mapping[str, object]:
         """Return further parts of the standing that change with every batch."""
         return {}
+
+    def accept(self, *names: str) -> None:
+        """Add effects (names or formulas) to the model from now on; raises InputError where one cannot be added."""
+        with self._lock:
+            settings = replace(self.settings, effects=(*self.settings.effects, *names))
+            self._refuse(Model.of(self.source.bench, settings.effects), begun=True)
+            self.settings = settings
+            self._publish(notice=f"{' and '.join(names)} accepted", model=self.settings.effects)
+            if self._last is not None and not self._waiting:
+                self._waiting.append(self._last)
+            self._lock.notify_all()
 
     def run(self) -> J:
         """Evaluate the source to its end and return the final judgement.

@@ -28,11 +28,11 @@ from kf_calib.dwells.qr import triangle
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects import Effect
 from kf_calib.estimation import square_root_information, whitened_rows
+from kf_calib.estimation.attitude import at_its_mode, linearised_at
 from kf_calib.estimation.candidate_scan import Scan, project
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.measurement_model import Model
-from kf_calib.estimation.prior import Prior
-from kf_calib.estimation.relinearisation import at_its_mode, linearised_at
+from kf_calib.estimation.settings import Prior
 from kf_calib.noise.noise_model import Noise, steps
 
 
@@ -172,7 +172,7 @@ class Running:
             running = running._update(self._rows([k])[0], variance)
         return running
 
-    def _rows(self, chosen: Sequence[int] | None = None) -> list[Floats]:
+    def _rows(self, chosen: Sequence[int] | None = None) -> Sequence[Floats]:
         """Return the whitened rows of all dwells, or of those chosen."""
         chosen = range(len(self.dwells)) if chosen is None else chosen
         dwells, columns = (

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Source
@@ -67,7 +67,6 @@ class Session(Evaluation[Judgement, Standing]):
         standing = Standing(model=(settings or Settings()).effects)
         super().__init__(source, settings, wanted, standing, every=every, again=again)
         self.auto = auto
-        self._refuse(self._passed.model)
 
     @classmethod
     def fed(
@@ -97,19 +96,8 @@ class Session(Evaluation[Judgement, Standing]):
         with one_blas_thread():
             return suggest(itinerary, Visited(stays, min(judged, len(stays))), standing.judgement)
 
-    def accept(self, *names: str) -> None:
-        with self._lock:
-            settings = replace(self.settings, effects=(*self.settings.effects, *names))
-            self._refuse(Model.of(self.source.bench, settings.effects), begun=True)
-            self.settings = settings
-            self._publish(notice=f"{' and '.join(names)} accepted", model=self.settings.effects)
-            if self._last is not None and not self._waiting:
-                self._waiting.append(self._last)
-            self._lock.notify_all()
-
     def _refuse(self, model: Model, begun: bool = False) -> None:
         """Raise InputError where the model needs more than a source whose readings come once can give."""
-        self._refuse_engine()
         if model.oscillates:
             raise InputError(
                 f"{model.oscillation} needs a second pass over the readings: record the run, then "

@@ -27,11 +27,10 @@ from kf_calib.diagnosis.verdict import explanations_in_words
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation.calibration import conclude, evaluate_fit, with_remarks
 from kf_calib.estimation.cross_validation import SAME_POSE_DEG
-from kf_calib.estimation.dwell_pass import Pass, refuse_unusable
-from kf_calib.estimation.oscillation_carrier import fitted_to
+from kf_calib.estimation.dwell_pass import Pass, fitted_to, refuse_unusable
 from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.noise.noise_model import mean_covariances
-from kf_calib.online.progress import Progress
+from kf_calib.online.evaluation import Progress
 from kf_calib.online.sequential_test import Watch
 from kf_calib.support.threads import one_blas_thread
 

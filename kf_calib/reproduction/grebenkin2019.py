@@ -24,7 +24,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.paper_parameters import DEVIATIONS
 from kf_calib.estimation import kalman_filterpy
-from kf_calib.estimation.prior import PRIORS
+from kf_calib.estimation.settings import PRIORS
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation

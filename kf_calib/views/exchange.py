@@ -11,7 +11,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from kf_calib.estimation.correction import Correction
-from kf_calib.estimation.parameters import Parameter
+from kf_calib.estimation.estimate import Parameter
 from kf_calib.estimation.results import format_p
 from kf_calib.exchange.calibration_file import SavedCalibration
 from kf_calib.exchange.corrected_file import Applied

@@ -23,7 +23,7 @@ from rich.table import Column
 from rich.text import Text
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.effect_shape import EffectShape
+from kf_calib.diagnosis.explanation import EffectShape
 from kf_calib.support.text import printable, sentence
 from kf_calib.support.units import Unit, shown, shown_whole, significant
 

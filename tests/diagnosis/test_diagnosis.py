@@ -26,6 +26,7 @@ from kf_calib.effects import effect_named
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.candidate_scan import Candidate, Scan
 from kf_calib.estimation.score_test import scan
+from kf_calib.estimation.settings import Settings
 from kf_calib.sources.simulation.visit_plans import six_faces
 
 HAND = SHARED / "ferraris_hand.mcap"
@@ -52,6 +53,16 @@ def test_a_hidden_effect_is_named(name: str) -> None:
     assert found.after.held_out_rms_mps2 <= 1.3 * found.after.held_out_floor_mps2
     assert found.before.held_out_rms_mps2 > 1.5 * found.before.held_out_floor_mps2
     assert f"Missing: {name}, " in found.verdict and "the error on orientations left out from" in found.verdict
+
+
+def test_a_suspect_has_the_coefficients_of_its_effect_alone() -> None:
+    """Not those of an effect that was in the model before."""
+    hidden = source("second-order=15sigma", "hysteresis=15sigma")
+    found = diagnose(calibrate(hidden, Settings(effects="hysteresis")), replicate=False)
+    assert found.missing == ("second-order",) and len(found.suspects) > 1
+    for suspect in found.suspects:
+        symbols = [each.symbol for each in effect_named(suspect.name, BENCH).parameters]
+        assert [each.symbol for each in suspect.coefficients] == (symbols or ["qb"]), suspect.name
 
 
 @pytest.mark.parametrize("case", [{}, {"phi": 0.9, "count": 500}, {"setting_deg": 0.01}])

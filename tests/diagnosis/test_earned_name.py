@@ -54,9 +54,10 @@ def test_what_a_name_is_earned_by(ratio: float | None, errors: tuple[float | Non
     assert unearned(row, _result(None, errors[0]), "bias-walk") == said
 
 
-@pytest.mark.parametrize("correlation, earned", [(0.8, False), (0.97, True)])
+@pytest.mark.parametrize("correlation, earned", [(0.8, False), (0.826, False), (0.833, True), (0.97, True)])
 def test_coefficients_that_are_alike_earn_their_name_together(correlation: float, earned: bool) -> None:
-    """Of 0.1 and -2.9 sigmas: Wald's statistic is 24.7 with a correlation of 0.8, and 150 with one of 0.97."""
+    """Of 0.1 and -2.9 sigmas: Wald's statistic is 24.7 with a correlation of 0.8, 28.0, 29.1, and 150 with one of 0.97;
+    the probability of two normal variates is that of one beyond 5 sigma, 6e-7, at 28.7."""
     row = Hypothesis(("bent",), refit=_result(2.9, 0.9, correlation=correlation))
     assert (unearned(row, _result(None, 1.0), "bias-walk") == "") == earned
 

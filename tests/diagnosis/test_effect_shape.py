@@ -11,7 +11,7 @@ from helpers.long_runs import slow
 from scipy.stats import binom
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.effect_shape import EffectShape, shapes_of
+from kf_calib.diagnosis.explanation import EffectShape, shapes_of
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.residual_drivers import is_function_of
 from kf_calib.effects import effect_named, names

@@ -189,3 +189,15 @@ def test_noise_from_dwell_to_dwell_may_be_an_unknown_cause(
     table = Hypotheses(refits, run, refits.assess(run)).quick_table()
     irregular = sum(row.probability for row in table.rows if row.driver == IRREGULAR)
     assert least <= irregular / table.families[NOISE] <= most
+
+
+def test_what_an_effect_leaves_is_tested_in_the_noise_that_it_leaves() -> None:
+    """Scatter that nobody stated is at first what the effect makes of it; beside the effect there is none."""
+    diagnosis = diagnose(noisy_run("second-order=15sigma", states=NOT_STATED, seed=3), replicate=False)
+    again, after = diagnosis.before_in_noise_left, diagnosis.after
+    assert diagnosis.missing == ("second-order",) and again is not None and after is not None
+    assert diagnosis.before.noise.scatter_mps2.max() > 5e-6 > 10.0 * after.noise.scatter_mps2.max()
+    np.testing.assert_allclose(again.noise.scatter_mps2, after.noise.scatter_mps2)
+    assert again.noise.setting_rad == pytest.approx(after.noise.setting_rad)
+    assert again.consistency.consistent is False
+    assert diagnose(noisy_run("second-order=15sigma", seed=3), replicate=False).before_in_noise_left is None

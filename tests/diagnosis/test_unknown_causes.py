@@ -42,6 +42,16 @@ def test_what_depends_on_two_drivers_or_on_the_past_is_unknown_and_goes_with_the
     assert diagnosis.description is not None and diagnosis.description.share > 0.7
 
 
+@pytest.mark.parametrize("waves", [6, *slow(3, 4)])
+def test_waves_of_an_encoder_are_told_with_their_number_a_turn(waves: int) -> None:
+    at = visits(5, 24)
+    phase_rad = waves * at.angles_rad[:, 1]
+    of_dwells = np.column_stack([np.sin(phase_rad), np.cos(phase_rad), 0.5 * np.sin(phase_rad + 1.0)])
+    hidden_mps2 = np.repeat(6.0 * WHITE_MPS2 / np.sqrt(240) * of_dwells[:, None], 240, axis=1)
+    told = kf_calib.diagnose(SmallRun(at, hidden_mps2, 3), replicate=False).description
+    assert told is not None and told.driver == f"angle of gimbal 2, {waves} a turn"
+
+
 @pytest.mark.parametrize("gimbals", [0, 3])
 def test_pairs_of_drivers_have_terms_that_are_all_different(gimbals: int) -> None:
     every = [term for _, terms in bases_of_pairs(gimbals) for term in terms]
@@ -57,7 +67,7 @@ def test_a_play_follows_where_it_is_pushed() -> None:
         expected.append(held)
     np.testing.assert_allclose(stimulus.played(3.0), expected, atol=1e-12)
     np.testing.assert_allclose(stimulus.played(0.0), stimulus.along, atol=1e-12)
-    np.testing.assert_array_equal(stimulus.ending(6).played(3.0), stimulus.played(3.0)[-6:])
+    np.testing.assert_array_equal(stimulus.at(slice(-6, None)).played(3.0), stimulus.played(3.0)[-6:])
 
 
 def scattered(repeated: int, with_orientation: bool) -> Diagnosis:

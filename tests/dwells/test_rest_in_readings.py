@@ -78,6 +78,18 @@ def test_a_rest_is_known_while_it_lasts_and_memory_is_that_of_one_block() -> Non
     assert waiting[0].elapsed_s[0] == rest[0].elapsed_s[0] and segmenter.standing is None
 
 
+@pytest.mark.parametrize("rest_s", [39.6, 39.8, 40.1, 40.3, 40.6])
+def test_a_dwell_ends_a_quarter_of_a_second_before_its_last_still_window(rest_s: float) -> None:
+    """Also where a block of 4000 readings, of 40 seconds, is full just before or after the departure."""
+    rng = np.random.default_rng(4)
+    turn = np.cumsum(rng.normal(size=(150, 3)), axis=0)
+    values = np.concatenate([at_rest(rest_s, (0, 9.8, 0), rng, 0.02), turn, at_rest(5.0, (9.8, 0, 0), rng, 0.02)])
+    accel = Stream(10_000_000 * np.arange(len(values), dtype=np.int64), values)
+    blocks, _, _ = found(accel, Stream.empty(1), np.arange(10, len(accel), 10))
+    last = max(block.elapsed_s[-1] for block in blocks if block.dwell == 1)
+    assert last == pytest.approx(np.floor(4.0 * rest_s) / 4.0 - 0.25, abs=0.021)
+
+
 def test_one_outlier_does_not_end_a_rest_and_noise_of_a_loud_start_is_unlearnt() -> None:
     rng = np.random.default_rng(2)
     values = np.concatenate([at_rest(30.0, (0, 0, 9.8), rng, 0.4), at_rest(20.0, (0, 9.8, 0), rng, 0.01)])

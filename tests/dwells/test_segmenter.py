@@ -109,6 +109,14 @@ def test_a_creeping_platform_is_used_though_it_never_rests() -> None:
     assert [round(end - start) for start, end in got] == [60, 59]
 
 
+@pytest.mark.parametrize(("creep_s", "end_s"), [(4.0, 36.0), (9.5, 30.5), (10.5, 40.0), (20.0, 40.0)])
+def test_what_creeps_for_ten_seconds_leaves_and_what_creeps_for_longer_stands(creep_s: float, end_s: float) -> None:
+    """Before a slew at 40 s, by 0.03 degrees, within the tolerance."""
+    pose = path((0, 0), (40.0 - creep_s, 0), (40, 0.03), (44, 40), (70, 40), rate_hz=10)
+    (_, end), _ = spans(Given(Batch(readings(pose, 70), pose)))
+    assert end == pytest.approx(end_s, abs=0.6)
+
+
 def test_settling_is_left_out() -> None:
     pose = path(*SLEWS, rate_hz=10)
     assert spans(Given(Batch(readings(pose, 35), pose)), settle_s=3.0)[1][0] == pytest.approx(17.0, abs=0.2)
@@ -155,6 +163,19 @@ def test_an_arrival_is_known_to_a_reading_whatever_the_angles_say(angle_hz: floa
     blocks = list(dwell_blocks(Given(Batch(accel, pose)), Segmenter(BENCH)))
     arrivals = {block.dwell: block.arrival_felt_s for block in blocks}
     assert [arrivals[2], arrivals[3]] == pytest.approx([14.0, 25.0], abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("windows", "left", "arrived"), [(3, 0.0, 0.75), (4, 0.25, 0.75), (8, 0.75, 1.25), (41, 4.75, 5.25)]
+)
+def test_readings_bracket_a_motion_by_a_quarter_of_a_second(windows: int, left: float, arrived: float) -> None:
+    """In the middle of so many quarters of a second the readings jump: the old level ends a window before, and the new
+    one begins a window after; three windows are too few to tell."""
+    count = 25 * windows
+    levels = np.where(np.arange(count)[:, None] < 25 * (windows // 2), [0.0, G, 0.0], [0.0, 0.0, G])
+    values = levels + np.random.default_rng(4).normal(size=(count, 3)) * 1e-4
+    accel, end_ns = Stream(np.arange(count) * 10_000_000, values), count * 10_000_000
+    assert Stillness().moved_between(accel, 0, end_ns, G) == (round(left * 1e9), round(arrived * 1e9))
 
 
 def test_an_attitude_in_place_of_angles() -> None:

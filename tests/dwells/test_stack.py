@@ -59,11 +59,10 @@ def test_a_stack_says_what_its_dwells_say(dwells: list[DwellFactor], is_changed:
     np.testing.assert_array_equal(stack.folded.counts, [dwell.count for dwell in each])
     np.testing.assert_array_equal(stack.folded.squares, np.concatenate([dwell.squares for dwell in each]))
     np.testing.assert_allclose(stack.folded.shaking[0], np.concatenate([dwell.shaking[0] for dwell in each]))
-    for shape, triangles, regressors in zip(stack.folded.shapes, stack.triangles, stack.regressors, strict=True):
-        for k, pieces, own, rows in zip(shape.dwells, shape.pieces, triangles, regressors, strict=True):
+    for shape, triangles in zip(stack.folded.shapes, stack.triangles, strict=True):
+        for k, pieces, own in zip(shape.dwells, shape.pieces, triangles, strict=True):
             assert (numbers[pieces] == k).all()
             np.testing.assert_allclose(own, each[k].triangles, rtol=1e-13, atol=1e-12)
-            np.testing.assert_allclose(rows, each[k].regressors, rtol=1e-12, atol=1e-10)
     before = dwells_before(each)
     np.testing.assert_allclose(stack.before[0], [dwell.means[1:4] for dwell in before], rtol=1e-13, atol=1e-13)
     np.testing.assert_allclose(stack.before[1], [dwell.pose for dwell in before], rtol=1e-13)

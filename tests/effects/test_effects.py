@@ -29,9 +29,8 @@ from kf_calib.estimation.estimate import Estimate
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.iterated_fit import fit
 from kf_calib.estimation.measurement_model import Model
-from kf_calib.estimation.prior import PRIORS
 from kf_calib.estimation.results import Calibration
-from kf_calib.estimation.settings import Settings
+from kf_calib.estimation.settings import PRIORS, Settings
 from kf_calib.noise.noise_model import Noise as NoiseModel
 from kf_calib.noise.noise_model import within_dwells
 from kf_calib.online.running_filter import Running

@@ -16,8 +16,7 @@ from kf_calib.dwells.folding import Folder
 from kf_calib.estimation.calibration import calibrate, evaluate, filterpy_estimate
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.engine_comparison import compare
-from kf_calib.estimation.prior import PRIORS
-from kf_calib.estimation.settings import Settings
+from kf_calib.estimation.settings import PRIORS, Settings
 
 pytestmark = pytest.mark.usefixtures("unmeasured")
 

@@ -14,10 +14,9 @@ from kf_calib.diagnosis.refits import Refits
 from kf_calib.effects import effect_named
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.dwell_columns import candidate_columns, piece_columns, stimulus_of
-from kf_calib.estimation.further_effects import FurtherEffects
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.results import Calibration
-from kf_calib.estimation.score_test import Frame
+from kf_calib.estimation.score_test import Frame, FurtherEffects
 from kf_calib.estimation.whitened_rows import MisfitColumns, misfit_rows
 from kf_calib.sources.simulation.injected import parse
 from kf_calib.sources.simulation.sensors import GRADES, TrueNoise
@@ -75,15 +74,17 @@ def test_an_effect_in_the_model_leaves_nothing_of_its_formula(before: Calibratio
 
 @pytest.mark.parametrize("scatter_mps2", [0.0, 1e-5])
 def test_columns_alone_are_those_of_all_rows(before: Calibration, scatter_mps2: float) -> None:
+    """Also where the readings of dwells have unequal weights."""
     linearised, noise = (
         before.linearised,
         replace(before.noise.for_goodness_of_fit, scatter_mps2=np.full(3, scatter_mps2)),
     )
+    dwells = [dwell.weighted(1.0 + 0.5 * (k % 3)) for k, dwell in enumerate(linearised.dwells)]
     effects = candidates(Model(BENCH))[:9]
-    added = candidate_columns(linearised.dwells, effects, BENCH, linearised.state)
-    rows, width = misfit_rows(linearised.dwells, added, noise, linearised.state, 0, reduced=False)
-    found = MisfitColumns(linearised.dwells, noise, linearised.state)
-    columns = found.of(piece_columns(effects, stimulus_of(linearised.dwells, BENCH, linearised.state)))
+    added = candidate_columns(dwells, effects, BENCH, linearised.state)
+    rows, width = misfit_rows(dwells, added, noise, linearised.state, 0, reduced=False)
+    found = MisfitColumns(dwells, noise, linearised.state)
+    columns = found.of(piece_columns(effects, stimulus_of(dwells, BENCH, linearised.state)))
     np.testing.assert_allclose(
         columns, np.concatenate(rows)[:, width:-1], rtol=1e-12, atol=1e-12 * np.abs(columns).max()
     )

@@ -10,10 +10,9 @@ from helpers.paths import ROOT
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.estimation.calibration import calibrate
-from kf_calib.estimation.parameter_history import prior_estimate, shares_of
-from kf_calib.estimation.prior import PRIORS
+from kf_calib.estimation.filter_history import prior_estimate, shares_of
 from kf_calib.estimation.results import Calibration
-from kf_calib.estimation.settings import Settings
+from kf_calib.estimation.settings import PRIORS, Settings
 from kf_calib.sources.files.recording import Recording
 
 RECORDING = ROOT / "recordings" / "navigation_24.mcap"

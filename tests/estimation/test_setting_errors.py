@@ -5,7 +5,7 @@ The truth is drawn by scipy's rotations: means of dwells that stand off their po
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -17,6 +17,7 @@ from scipy.stats import binom, chi2
 
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.dwells.tabulated import dwells_of
+from kf_calib.estimation.attitude import _posterior_rotations
 from kf_calib.estimation.calibration import calibrate, evaluate
 from kf_calib.estimation.engine_comparison import compare
 from kf_calib.estimation.results import Calibration
@@ -202,3 +203,23 @@ def test_left_out_orientations_are_predicted_beside_a_setting_error() -> None:
     result = calibrate(Run(seed=5, dwells=24, count=100, setting_deg=0.2, white_mps2=1e-4))
     assert result.held_out is not None
     assert np.mean(result.held_out.statistics) == pytest.approx(3.0, abs=0.9)
+
+
+@pytest.mark.parametrize("scatter_mps2", [0.0, 2e-4])
+def test_the_likeliest_setting_error_is_that_of_normal_variates(scatter_mps2: float) -> None:
+    """Rotations a N(0, s^2) turn readings by S (a x f), in noise and scatter R: a = s^2 C^T (s^2 C C^T + R)^-1 e, with
+    C by turning forces a little. About the force the readings tell nothing."""
+    fit = calibrate(Run(seed=3, dwells=12, count=100, setting_deg=2e-3)).fit
+    noise = replace(fit.noise, setting_rad=3e-5, scatter_mps2=np.full(3, scatter_mps2))
+    means, state = fit.linearised.means, fit.state + 1e-5 * np.random.default_rng(1).normal(size=12)
+    modes, variances = _posterior_rotations(means, noise, state, np.zeros((12, 3, 3)))
+    sensitivity = state.reshape(3, 4)[:, :3]
+    errors = means.readings - means.force_mps2 @ sensitivity.T - state.reshape(3, 4)[:, 3]
+    for k, force in enumerate(means.force_mps2):
+        turned = [Rotation.from_rotvec(1e-6 * axis).apply(force) - force for axis in np.eye(3)]
+        columns = sensitivity @ np.array(turned).T / 1e-6
+        noise_of_mean = np.diag(noise.effective_sigma_mps2**2 / means.counts[k] + scatter_mps2**2)
+        gain = 9e-10 * columns.T @ np.linalg.inv(9e-10 * columns @ columns.T + noise_of_mean)
+        assert modes[k] == pytest.approx(gain @ errors[k], abs=1e-3 * np.linalg.norm(modes[k]))
+        covariance = 9e-10 * (np.eye(3) - gain @ columns)
+        assert variances[k] == pytest.approx(np.trace(covariance) - 9e-10, rel=1e-3)

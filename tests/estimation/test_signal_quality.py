@@ -175,6 +175,9 @@ def test_common_step() -> None:
         assert common_step(values, 1e-12) == pytest.approx(step, rel=1e-9)
     coarse = 0.05 * np.array([0.0, 6, 16, 31])  # differences of 6, 10 and 15: no two share the step alone
     assert common_step(coarse + rng.uniform(-1e-6, 1e-6, 4), 2e-6) == pytest.approx(0.05, rel=1e-3)
+    for tolerances in (10.0, 20.0, 39.0):  # hardly above rounding: neighbours on the grid are one step apart
+        rounded = np.arange(30.0) * tolerances + rng.uniform(-0.5, 0.5, 30)
+        assert common_step(rounded, 1.0) == pytest.approx(tolerances, rel=0.01)
     assert common_step(rng.normal(size=40), 1e-6) is None
     assert common_step(np.array([1.0, 2.0, 3.0]), 1e-6) is None
 

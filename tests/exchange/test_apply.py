@@ -12,15 +12,17 @@ import numpy as np
 import pytest
 from helpers.calibrations import simulated
 from helpers.paths import ROOT
+from helpers.synthetic import G
 from mcap.reader import make_reader
 from mcap.records import DataEnd
 from mcap.stream_reader import StreamReader
 from mcap_ros2.decoder import DecoderFactory
 
 import kf_calib
-from kf_calib.bench.streams import Batch
+from kf_calib.bench.raw_input import PLAIN
+from kf_calib.bench.streams import Batch, Stream
 from kf_calib.exchange.corrected_file import apply_to_file
-from kf_calib.exchange.corrected_lines import CorrectedLines
+from kf_calib.exchange.corrected_lines import CorrectedLines, NormAtRest
 from kf_calib.sources.files.recorder import Recorder
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.simulation.physics import Ambient
@@ -50,6 +52,23 @@ def count_of(path: Path, topic: str) -> int:
     """Of the messages that a reader comes by; to decode them takes long."""
     with path.open("rb") as file:
         return sum(1 for _ in make_reader(file, validate_crcs=True).iter_messages([topic]))
+
+
+@pytest.mark.parametrize("norm", [1.0, G])
+def test_a_norm_at_rest_counts_from_three_windows_of_half_a_second(folder: Path, norm: float) -> None:
+    """Readings in g are told once the third window is over; what moves is no window; parts of any length give the
+    same."""
+    correction = kf_calib.open_calibration(folder / "cal.json").correction()
+    values = np.array([0.6, 0.64, 0.48]) * norm + np.random.default_rng(0).normal(size=(400, 3)) * 1e-3 * norm
+    values[100:150] += norm * np.sin(np.arange(50.0))[:, None]
+    times, told = np.arange(400) * 10_000_000, dict[int, list[int]]()
+    for size in (1, 7, 50):
+        at_rest = NormAtRest(correction)
+        for first in range(0, 400, size):
+            at_rest.add(Stream(times[first : first + size], values[first : first + size]))
+            if at_rest.misfit(PLAIN, final=False):
+                told.setdefault(size, []).append(first + size)
+    assert {size: first[0] for size, first in told.items()} == ({1: 201, 7: 203, 50: 250} if norm == 1.0 else {})
 
 
 def test_the_original_stays_byte_for_byte_and_one_topic_comes_to_it(folder: Path, run: Any) -> None:

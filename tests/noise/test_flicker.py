@@ -22,8 +22,7 @@ from kf_calib.effects import effect_named, names
 from kf_calib.estimation.calibration import evaluate
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.settings import Settings
-from kf_calib.noise.flicker import _likeliest
-from kf_calib.noise.nuisance_states import SLOW
+from kf_calib.noise.nuisance_states import SLOW, _likeliest
 from kf_calib.support.threads import one_blas_thread
 
 BENCH = Bench(axes_of("yzx"), G, latitude_deg=50.0, angle_sigma_deg=0.0)

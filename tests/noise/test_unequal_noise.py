@@ -8,14 +8,16 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 from helpers.long_runs import slow
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Stream
+from kf_calib.dwells.sufficient_statistics import Autocovariance
 from kf_calib.estimation.calibration import calibrate
-from kf_calib.noise.unequal_noise import weights_of
+from kf_calib.noise.unequal_noise import _lost_to_correlation, weights_of
 
 G_MPS2, HZ, DWELLS = 9.81, 20.0, 24
 SETTING_RAD = np.radians(0.002)
@@ -57,6 +59,20 @@ def test_equal_noise_keeps_one_noise(freedom: float) -> None:
         (weights_of(drawn(k, np.inf, 24, freedom)[1], np.full(24, freedom)) != 1.0).any() for k in range(1000)
     )
     assert unequal <= 3  # of 1000 at a level of 1e-4
+
+
+def test_correlation_enlarges_the_variance_of_a_variance() -> None:
+    """Of AR(1) noise: 1 + 2 sum of phi^(2 l) = (1 + phi^2) / (1 - phi^2); of white noise 1, as of a channel that stands
+    still."""
+    phi, random = np.array([0.0, 0.6, 0.9]), np.random.default_rng(3)
+    total = Autocovariance()
+    for _ in range(200):
+        white = random.normal(size=(3, 1500))
+        readings = np.array([lfilter([1.0], [1.0, -own], each) for own, each in zip(phi, white, strict=True)])[:, 500:]
+        total += Autocovariance.of(readings * [[1e-4], [1e-3], [1e-2]])
+    assert _lost_to_correlation(total) == pytest.approx((1.0 + phi**2) / (1.0 - phi**2), rel=0.05)
+    still = Autocovariance.of(np.zeros((3, 1000)))
+    assert _lost_to_correlation(still).tolist() == [1.0, 1.0, 1.0] == _lost_to_correlation(Autocovariance()).tolist()
 
 
 @dataclass

@@ -40,7 +40,7 @@ from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.settings import Settings
 from kf_calib.online import status
-from kf_calib.online.progress import targets
+from kf_calib.online.evaluation import targets
 from kf_calib.online.session import Session
 from kf_calib.online.status import Judgement, current, judge_so_far
 from kf_calib.sources.files.recording import Recording

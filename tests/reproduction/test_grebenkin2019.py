@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.bench import Bench
-from kf_calib.estimation.prior import PRIORS
+from kf_calib.estimation.settings import PRIORS
 from kf_calib.reproduction import grebenkin2019, grebenkin2019_conditions
 from kf_calib.reproduction.grebenkin2019 import NONOPTIMAL_PRINTED, OPTIMAL_PRINTED, Conditions
 from kf_calib.views import paper as views

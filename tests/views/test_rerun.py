@@ -17,9 +17,8 @@ from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.stepwise_selection import Improvement
 from kf_calib.errors import InputError
 from kf_calib.estimation.calibration import calibrate
-from kf_calib.estimation.prior import PRIORS
 from kf_calib.estimation.results import Calibration
-from kf_calib.estimation.settings import Settings
+from kf_calib.estimation.settings import PRIORS, Settings
 from kf_calib.support.units import rounded, shown
 from kf_calib.views import rerun as view
 from kf_calib.views.rerun import markdown_summary

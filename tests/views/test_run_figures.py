@@ -28,11 +28,9 @@ from kf_calib.design.predicted_information import Prospect
 from kf_calib.design.visit_order import Timing
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.engine_comparison import Comparison, compare
-from kf_calib.estimation.innovation_tests import innovation_tests
-from kf_calib.estimation.parameter_history import history_of
-from kf_calib.estimation.prior import PRIORS
+from kf_calib.estimation.filter_history import history_of, innovation_tests
 from kf_calib.estimation.results import Calibration
-from kf_calib.estimation.settings import Settings
+from kf_calib.estimation.settings import PRIORS, Settings
 from kf_calib.reproduction.grebenkin2019 import OPTIMAL_PRINTED, Experiment, printed_column, repeat
 from kf_calib.views.figures import experiment as paper
 from kf_calib.views.figures.style import content_of, label, ticks, written

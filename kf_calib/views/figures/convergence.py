@@ -19,8 +19,7 @@ from matplotlib.figure import Figure, FigureBase
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
-from kf_calib.estimation.innovation_tests import InnovationTests, innovation_tests
-from kf_calib.estimation.parameter_history import ParameterHistory, history_of
+from kf_calib.estimation.filter_history import InnovationTests, ParameterHistory, history_of, innovation_tests
 from kf_calib.estimation.results import Calibration
 from kf_calib.exchange.history import History, ParameterTrack
 from kf_calib.support.units import rounded, shown

@@ -21,7 +21,7 @@ from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.design.orientation_plan import Plan
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.estimation.estimate import correlation
-from kf_calib.estimation.parameter_history import ParameterHistory, history_of
+from kf_calib.estimation.filter_history import ParameterHistory, history_of
 from kf_calib.estimation.residual_table import mean_sigmas, quantity_means, residual_table
 from kf_calib.estimation.results import Calibration
 from kf_calib.views.figures.convergence import MANY, draw_sigmas

@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import Source
-from kf_calib.diagnosis.effect_shape import EffectShape
+from kf_calib.diagnosis.explanation import EffectShape
 from kf_calib.diagnosis.residual_drivers import Driver
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.estimation.dwell_readings import DwellReadings, readings_of

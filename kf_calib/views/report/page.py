@@ -31,7 +31,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.effect_shape import EffectShape
+from kf_calib.diagnosis.explanation import EffectShape
 from kf_calib.diagnosis.residual_drivers import Driver, drivers_of
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.stepwise_selection import Improvement

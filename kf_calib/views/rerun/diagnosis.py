@@ -20,8 +20,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.effect_shape import EffectShape
-from kf_calib.diagnosis.explanation import Explanation
+from kf_calib.diagnosis.explanation import EffectShape, Explanation
 from kf_calib.diagnosis.hypothesis_table import LISTED, HypothesisTable
 from kf_calib.diagnosis.residual_drivers import Driver
 from kf_calib.diagnosis.results import Diagnosis

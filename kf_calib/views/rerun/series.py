@@ -16,7 +16,7 @@ from scipy.special import chdtri
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
-from kf_calib.estimation.parameter_history import prior_estimate
+from kf_calib.estimation.filter_history import prior_estimate
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration, Visit
 from kf_calib.support import units

@@ -11,14 +11,13 @@ from scipy.stats import chi2
 import kf_calib
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.dwell_pass import Pass
+from kf_calib.estimation.dwell_readings import reading_correlation
 from kf_calib.estimation.engine_comparison import compare, least_squares, running_states
 from kf_calib.estimation.estimate import correlation
-from kf_calib.estimation.innovation_tests import InnovationTests, innovation_tests, reading_correlation
-from kf_calib.estimation.parameter_history import history_of
-from kf_calib.estimation.prior import PRIORS
+from kf_calib.estimation.filter_history import InnovationTests, history_of, innovation_tests
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.samples import samples_of
-from kf_calib.estimation.settings import Settings
+from kf_calib.estimation.settings import PRIORS, Settings
 
 pytestmark = pytest.mark.usefixtures("unmeasured")
 
@@ -89,6 +88,18 @@ def test_readings_of_white_noise_are_white_and_those_of_coloured_noise_are_not()
     assert len(excess) == 64 and np.mean(excess < 1.0) > 0.9
     coloured = reading_correlation(calibrate(Run(seed=1, dwells=12, count=400, phi=0.8)))
     assert coloured.values[0] == pytest.approx(0.8, abs=0.05)
+
+
+def test_readings_are_correlated_over_a_quarter_of_a_dwell_where_dwells_are_short() -> None:
+    """36 readings each: nine lags; of white noise less its parabola, by 20000 draws."""
+    result = calibrate(Run(seed=1, dwells=60, count=64))
+    short = reading_correlation(result)
+    assert round(np.mean([dwell.count for dwell in result.fit.dwells])) == 36 and short.values.shape == (9, 3)
+    assert np.mean(np.abs(short.values - short.white[:, None]) < short.bound[:, None]) > 0.85
+    noise, curve = np.random.default_rng(5).normal(size=(20_000, 36)), np.linalg.qr(np.vander(np.arange(36.0), 3))[0]
+    left = noise - noise @ curve @ curve.T
+    products = np.array([np.mean(left[:, lag:] * left[:, : 36 - lag]) for lag in range(10)])
+    assert short.white == pytest.approx(products[1:] / products[0], abs=5e-3)
 
 
 def test_engines_on_their_way_are_those_of_the_dwells_so_far() -> None:
