@@ -291,7 +291,7 @@ def _drive(device: Opened, most: int, options: DriveOptions, running: DrivenRun)
     from kf_calib.online.session import Session
     from kf_calib.positioning.drive import Drive
     from kf_calib.positioning.loop import Rules
-    from kf_calib.positioning.simulated import SimulatedTime
+    from kf_calib.positioning.opening import SimulatedTime
 
     session = running.session
     assert isinstance(session, Session)

@@ -11,7 +11,7 @@ from rich.text import Text
 
 from kf_calib.design.next_orientation import Advice
 from kf_calib.diagnosis.candidate_tests import LEVEL
-from kf_calib.diagnosis.detectability import Detectable
+from kf_calib.diagnosis.coefficient_sizes import Detectable
 from kf_calib.diagnosis.explanation import EffectShape
 from kf_calib.diagnosis.hypothesis_table import Hypothesis, HypothesisTable
 from kf_calib.diagnosis.replication import Replication

@@ -11,19 +11,28 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
-from helpers.hidden_effects import BENCH, run, source
+from helpers.hidden_effects import BENCH, noisy_source, run, source
 from helpers.long_runs import slow
 from scipy.stats import chi2
 
 from kf_calib.cli import cli
 from kf_calib.diagnosis import selection_journal
+from kf_calib.diagnosis.candidate_tests import assess_candidates
 from kf_calib.diagnosis.nested_cross_validation import nested_cross_validation
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.selection_journal import figures
-from kf_calib.diagnosis.stepwise_selection import Improvement, SelectionStep, improve, removals, take_step, undone
+from kf_calib.diagnosis.stepwise_selection import (
+    Improvement,
+    Removal,
+    SelectionStep,
+    improve,
+    removals,
+    take_step,
+    undone,
+)
 from kf_calib.dwells.sufficient_statistics import dwells_without
 from kf_calib.errors import InputError
-from kf_calib.estimation.calibration import evaluate
+from kf_calib.estimation.calibration import calibrate, evaluate
 from kf_calib.estimation.dwell_columns import stimulus_of
 from kf_calib.estimation.iterated_fit import fit
 from kf_calib.estimation.measurement_model import Model
@@ -55,6 +64,24 @@ def improved(second_order: Calibration) -> Improvement:
 @pytest.fixture(scope="module")
 def quiet() -> Calibration:
     return run()
+
+
+@pytest.mark.parametrize(("chi_squared", "needed"), [(6.5, False), (6.8, True)])
+def test_an_effect_is_needed_at_a_level_of_one_per_cent(chi_squared: float, needed: bool) -> None:
+    """Chi-squared of one degree of freedom exceeds 6.63 once in a hundred times."""
+    assert Removal("second-order", chi_squared, 1, float(chi2.sf(chi_squared, 1))).needed == needed
+
+
+def test_a_walk_is_tested_on_one_side() -> None:
+    """Its intensity cannot be negative: twice its gain in likelihood is chi-squared in half of the runs without a walk,
+    and zero in the others."""
+    hidden = noisy_source("bias-walk=9sigma", dwells=24, seed=3)
+    before, after = calibrate(hidden), calibrate(hidden, Settings(effects="bias-walk"))
+    (removal,) = removals(after.fit)
+    assert removal.statistic > 1.0 and removal.p_value == pytest.approx(0.5 * chi2.sf(removal.statistic, 1), rel=1e-9)
+    tests = assess_candidates(before.fit, 7.0)
+    alone = 0.5 * chi2.sf(2.0 * before.fit.walk_gain, 1)
+    assert tests.effects.p_values["bias-walk"] == pytest.approx(1.0 - (1.0 - alone) ** 7, rel=1e-6)
 
 
 def test_the_error_falls_to_the_noise(improved: Improvement) -> None:

@@ -10,6 +10,7 @@ from helpers.synthetic import G, Run
 
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.bench.streams import Batch, Stream
+from kf_calib.dwells.dwell_events import carry_on
 from kf_calib.dwells.segmenter import Segmenter, dwell_blocks
 from kf_calib.dwells.stationarity import Stillness
 from kf_calib.errors import InputError
@@ -115,6 +116,17 @@ def test_what_creeps_for_ten_seconds_leaves_and_what_creeps_for_longer_stands(cr
     pose = path((0, 0), (40.0 - creep_s, 0), (40, 0.03), (44, 40), (70, 40), rate_hz=10)
     (_, end), _ = spans(Given(Batch(readings(pose, 70), pose)))
     assert end == pytest.approx(end_s, abs=0.6)
+
+
+@pytest.mark.parametrize(("turn_deg", "told"), [(0.8, False), (1.3, True)])
+def test_a_platform_that_turns_in_what_counts_as_still_is_told(turn_deg: float, told: bool) -> None:
+    """By more than a degree within a block, of 40 seconds, where the tolerance is four degrees."""
+    pose = path((0, 0), (60, 1.5 * turn_deg), (64, 40), (124, 40), rate_hz=10)
+    segmenter = Segmenter(BENCH, Stillness(tolerance_deg=4.0))
+    assert len(list(dwell_blocks(Given(Batch(readings(pose, 124), pose)), segmenter))) > 1
+    assert segmenter.tally.turned_deg == pytest.approx(turn_deg, rel=0.05)
+    sentences = segmenter.tally.unmet_settings(segmenter.stillness)
+    assert any("the platform turns by" in sentence for sentence in sentences) == told
 
 
 def test_settling_is_left_out() -> None:
@@ -255,6 +267,11 @@ def test_temperature_goes_on_as_it_went_last() -> None:
     rising = (times >= 6) & (times < 8)
     np.testing.assert_allclose(values[rising], 30 + 5 * (times[rising] - 6))
     np.testing.assert_allclose(values[times >= 8], 32 + np.minimum(times[times >= 8] - 8, 2.0))
+
+
+def test_two_temperatures_of_one_time_make_no_line() -> None:
+    warm = Stream(np.array([4, 6, 6]) * S, np.array([[20.0], [30.0], [31.0]]))
+    assert carry_on(warm, np.array([5, 7, 30]) * S).tolist() == [20.0, 31.0, 31.0]
 
 
 def test_a_gentle_start_of_a_slew_is_not_in_the_dwell() -> None:

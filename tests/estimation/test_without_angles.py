@@ -23,6 +23,7 @@ from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.calibration import evaluate
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.engine_comparison import compare
+from kf_calib.estimation.free_attitude import undetermined
 from kf_calib.estimation.settings import Settings
 
 pytestmark = pytest.mark.usefixtures("unmeasured")
@@ -187,6 +188,14 @@ def test_six_magnitudes_of_a_hand_held_sensor_give_the_published_scale_factors()
         assert found[symbol].value == pytest.approx(published, abs=1e-4)  # longer dwells, found in the readings
     for symbol, bias in zip(("b1", "b2", "b3"), (0.5511, -0.6197, 0.3856), strict=True):
         assert found[symbol].value == pytest.approx(bias, abs=0.02)
+
+
+@pytest.mark.parametrize(("share", "poor"), [(0.17, []), (0.23, ["K2", "b3"])])
+def test_what_is_known_to_a_fifth_is_determined(share: float, poor: list[str]) -> None:
+    """A scale factor to a fifth of 1, a bias to a fifth of gravity."""
+    variances = np.full((3, 4), 1e-6)
+    variances[1, 1], variances[2, 3], variances[1, 0] = share**2, (share * 9.81) ** 2, 1e9
+    assert undetermined(np.diag(variances.ravel())) == poor
 
 
 def test_a_poor_set_of_poses_is_told_not_fitted() -> None:
