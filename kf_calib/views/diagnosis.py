@@ -295,7 +295,7 @@ def _held_out(refit: Calibration | None) -> str:
 def name_of(row: Hypothesis) -> str:
     """An explanation in a few words, for a line of a table or figure."""
     if row.formulas:
-        return f"formula of {row.driver}"
+        return " + ".join((*row.effects, f"formula of {row.driver}"))
     return " + ".join(row.effects) or (f"{row.driver} changes" if row.driver else row.families[0])
 
 

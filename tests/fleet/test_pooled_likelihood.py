@@ -15,7 +15,7 @@ from scipy.stats import chi2, multivariate_normal, norm
 from kf_calib.fleet.campaign import Campaign, log_evidence, log_evidence_of_modes, modes, posterior, sizes
 from kf_calib.fleet.own_coefficients import UnitInformation, UnitsAndCommon, population
 from kf_calib.fleet.pooled_terms import Attribution, DatedSums, PooledTerms, Sums, Term
-from kf_calib.fleet.shape import POWERS, SHARES, SomeUnits, about_mean, about_zero
+from kf_calib.fleet.shape import POWERS, SHARES, SomeUnits, _likeliest, _told, about_mean, about_zero
 
 
 def beside_nothing(own: UnitInformation) -> UnitsAndCommon:
@@ -262,6 +262,25 @@ def test_evidence_about_a_mean_is_the_integral_over_the_mean() -> None:
             logs.append(float(logsumexp(each.sum(axis=1) + prior)))
     truth = logsumexp(logs) - np.log(len(logs) * len(SHARES))
     assert shape.log_odds == pytest.approx(truth, abs=0.2)
+
+
+def test_the_likeliest_mean_of_some_units_is_where_likelihood_times_prior_is_largest() -> None:
+    """Its derivatives by differences vanish, against those at a tenth of a sigma beside it, for each share of units."""
+    rng, spread, prior = np.random.default_rng(9), 0.4, 3.0
+    own = rng.normal(size=(30, 2, 3))
+    info = own @ np.swapaxes(own, 1, 2)
+    scores = (info @ (np.array([2.0, -1.5]) * (np.arange(30) < 14)[:, None])[:, :, None])[:, :, 0]
+    told = _told(modes(info, scores + rng.normal(size=(30, 2))), spread)
+    mean = _likeliest(told, prior)
+
+    def logs(at: np.ndarray) -> np.ndarray:
+        shares = SHARES[:, None]
+        each = np.logaddexp(np.log(shares) + told.ratios(at), np.log1p(-shares))
+        return each.sum(axis=1) - 0.5 * np.sum((at / prior) ** 2, axis=1)
+
+    for axis in np.eye(2):
+        slopes, beside = ((logs(at + 1e-4 * axis) - logs(at - 1e-4 * axis)) / 2e-4 for at in (mean, mean + 0.1 * axis))
+        assert np.abs(slopes).max() < 0.05 * np.abs(beside).min()
 
 
 @pytest.mark.parametrize("alike", [False, True])

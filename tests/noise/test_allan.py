@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from helpers.synthetic import Run
 
+from kf_calib.bench.arrays import Floats
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.engine_comparison import compare
 from kf_calib.noise.allan import LongestDwells, cluster_sizes, deviations, model_lines
@@ -52,6 +55,21 @@ def test_the_readings_of_a_run_have_the_noise_that_was_put_in() -> None:
     assert allan.white_mps2[0] == pytest.approx(3e-4, rel=0.06)
     assert (np.abs(allan.deviation_mps2 / allan.white_mps2 - 1.0) < 4.0 * allan.spread[:, None]).all()
     assert not allan.flicker_mps2.any() and not allan.walk_mps2.any()
+
+
+def test_the_spread_is_that_of_white_noise_drawn_anew() -> None:
+    """Of 400 draws of three channels: to a third, as neighbouring differences share a cluster."""
+    result = calibrate(Run(seed=3, dwells=6, count=400))
+    dwells, rng = LongestDwells(result.fit.dwells, result.noise), np.random.default_rng(6)
+    drawn = list[Floats]()
+    for _ in range(400):
+        dwells.kept = {
+            number: [SimpleNamespace(elapsed_s=np.arange(400) / 20.0, residual_mps2=rng.normal(size=(400, 3)))]
+            for number in dwells.kept
+        }
+        drawn.append(dwells.allan_deviation().deviation_mps2)
+    ratios = np.std(np.log(drawn), axis=(0, 2)) / dwells.allan_deviation().spread
+    assert 0.8 < ratios[:6].min() and ratios[:6].max() < 1.35
 
 
 def test_the_longest_dwell_is_used_whatever_its_length(monkeypatch: pytest.MonkeyPatch) -> None:

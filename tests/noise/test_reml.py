@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +18,7 @@ from kf_calib.estimation.settings import Settings
 from kf_calib.noise import banded
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise
-from kf_calib.noise.reml import VarianceComponents
+from kf_calib.noise.reml import Parts, VarianceComponents
 from kf_calib.noise.restricted_likelihood import Restricted
 
 
@@ -123,6 +125,36 @@ def test_no_other_sizes_are_likelier_wherever_the_search_begins(seed: int) -> No
         again, point = made.most_likely(near)
         assert point.cost == pytest.approx(best.cost, abs=1e-7)
         np.testing.assert_allclose(again, sizes, atol=2e-4)
+
+
+def test_means_that_are_worked_on_in_parts_have_the_same_likelihood(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nine means that are not correlated, at once or four at a time."""
+    whole = problem(1, 0.0, 2)
+    uncorrelated = [np.concatenate([shape[..., :3, :]], axis=-2) for shape in (whole.fixed, *whole.shapes)]
+    made = Restricted(whole.rows, whole.prior, uncorrelated[0], tuple(uncorrelated[1:]))
+    variances = np.array([0.3, 2.0, 0.7])
+    at_once = made.at(variances)
+    monkeypatch.setattr("kf_calib.noise.restricted_likelihood._AT_ONCE", 4)
+    in_parts = Restricted(made.rows, made.prior, made.fixed, made.shapes).at(variances)
+    assert in_parts.cost == pytest.approx(at_once.cost, rel=1e-12)
+    np.testing.assert_allclose(in_parts.slope, at_once.slope, rtol=1e-9)
+    assert in_parts.misfit == pytest.approx(whole.at(variances).misfit, rel=1e-9)
+
+
+def test_a_combination_of_parts_is_taken_that_gains_most_beyond_its_charge(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All parts together gain 10.2 for 5, one of them 10 for 2 and the other 9.5 for a half."""
+    costs = {("setting", "common"): -10.2, ("setting",): -10.0, ("common",): -9.5}
+    charges = {("setting", "common"): 5.0, ("setting",): 2.0, ("common",): 0.5}
+    monkeypatch.setattr("kf_calib.noise.reml._charge", lambda parts, _: charges[parts])
+
+    def of(parts: Parts) -> SimpleNamespace:
+        return SimpleNamespace(most_likely=lambda _: (np.ones(len(parts)), SimpleNamespace(cost=costs[parts])))
+
+    likelihood: Any = SimpleNamespace(of=of)
+    combinations = [("setting",), ("common",), ("setting", "common")]
+    for without, best in ((0.0, ("common",)), (-8.9, ("common",)), (-9.1, ())):
+        nothing: Any = SimpleNamespace(cost=without)
+        assert VarianceComponents(None, None)._likeliest(likelihood, combinations, nothing) == best
 
 
 def test_a_search_that_begins_near_its_end_is_shorter(monkeypatch: pytest.MonkeyPatch) -> None:
