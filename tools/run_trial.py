@@ -44,7 +44,7 @@ from kf_calib.online.session import Session
 from kf_calib.online.suggestion import Itinerary
 from kf_calib.positioning.drive import Drive
 from kf_calib.positioning.loop import Rules
-from kf_calib.positioning.simulated import SimulatedPositioner
+from kf_calib.positioning.opening import SimulatedPositioner
 from kf_calib.sources.files.record_files import END_RECORD, decision_records
 from kf_calib.sources.simulation.driven import FAULTS, DrivenBench
 from kf_calib.sources.simulation.options import options_from_query, simulation

@@ -147,7 +147,9 @@ class Search:
         poses = self.candidates[chosen]
         if not self.reach.continuous:
             return poses
-        starts = [poses, *(self._random_candidates(count, seed) for seed in range(2 if count <= _FEW else 0))]
+        starts = [poses]
+        if count <= _FEW:
+            starts += [np.random.default_rng(seed).choice(self.candidates, count) for seed in range(2)]
         polished = [self.polish(start) for start in starts]
         return min([poses, *polished], key=self.cost)
 
@@ -162,10 +164,6 @@ class Search:
     def _score(self, factors: Floats, power: float = math.inf) -> Floats:
         """Return the aim plus a small share of D, which decides between designs of equal aim."""
         return self.aim(factors, power) + _TIE * optimality_criteria.D(factors)
-
-    def _random_candidates(self, count: int, seed: int) -> Floats:
-        """Choose random candidates to start from."""
-        return np.random.default_rng(seed).choice(self.candidates, count)
 
     def exchange(self, count: int) -> list[int]:
         """Indices of the best candidates, found by greedy choice followed by exchange.

@@ -1,4 +1,4 @@
-"""The prior of the size of an effect's coefficients, and the evidence of an effect whose sizes are averaged over it.
+"""The sizes of an effect's coefficients: the prior of those that are usual, and the smallest that a run would show.
 
 The coefficients c of one effect are normal with a common standard deviation s, and log s is uniform over the sizes that
 such coefficients usually have in sensors of the grade at hand (``Effect.typical``), with tails on both sides: the
@@ -6,6 +6,8 @@ density falls by a factor e for each decade beyond. The prior is proper, and say
 would have a size that it never has is an unlikely name, however well its columns fit. An effect that is too small to be
 seen is none: sizes below one sigma count as its absence. A coefficient whose value is known, as the rate of the Earth
 is, is normal about that value. Where no usual size is known, every size from 1 to 1e7 sigma is equally likely.
+
+The smallest size at which an effect would be found is computed from its columns alone.
 """
 
 from __future__ import annotations
@@ -13,14 +15,20 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.effects.effect import Effect, Grade
+from kf_calib.diagnosis.candidate_tests import LEVEL, SHARE, CandidateTests
+from kf_calib.effects import Coefficient, Effect, FrameEffect, Stimulus
+from kf_calib.effects.effect import Grade, Typical
+from kf_calib.estimation.dwell_columns import stimulus_of
+from kf_calib.estimation.fit import Fit
+from kf_calib.estimation.measurement_model import effect_columns
+from kf_calib.estimation.observability import smallest_size
 
 _TAIL = 1.0  # decades beyond the usual sizes in which the density falls by a factor e
 _SHARPER = 100.0  # where only the greatest usual size is known, the least one is smaller by this factor
@@ -29,6 +37,14 @@ _STEPS = {1: 120, 2: 40, 3: 16}  # sizes that are tried, by number of effects
 _HIDDEN = 1e20  # SI: sigma of a coefficient of which rounding alone is seen
 _ABOVE = 300.0  # times the estimate: beyond it, sizes differ no more in evidence
 _SIZES = np.exp(np.linspace(0.0, math.log(1e14), 120))  # prior variance of a coefficient over that of its estimate
+
+QUIET = 1e-4
+"""Density of white noise below which sensors are of navigation grade, m/s^2/sqrt(Hz) (10 ug/sqrt(Hz))."""
+_CONDITIONS = {
+    "temperature_c": "the temperature does not change in this run, or is not recorded",
+    "variance_mps2_2": "the strength of vibration does not change in this run, or is not looked at",
+}
+"""Conditions, other than orientations, that effects may depend on, and what is said where they do not vary."""
 
 
 def size_evidence(dof: int, delta_chi2: Floats | float) -> Floats:
@@ -175,3 +191,97 @@ def _any_size(sigma: float) -> SizePrior:
 def best_sigma(root: Floats) -> float:
     """Sigma of the coefficient that is determined best, from a root (r, q) of the information on them all."""
     return float(1.0 / max(np.linalg.norm(root, axis=0).max(initial=0.0), 1e-300))
+
+
+@dataclass(frozen=True)
+class Detectable:
+    """The size of a coefficient at which an effect is found in 90 of 100 runs; of several, that of the least visible.
+
+    name: of the effect. minimum: the size in SI. coefficient: which of them it is the size of. typical: usual sizes of
+    such coefficients, in SI.
+    """
+
+    name: str
+    minimum: float
+    coefficient: Coefficient
+    typical: Typical
+
+    @property
+    def unit(self) -> str:
+        """The SI unit of the coefficient."""
+        return self.coefficient.unit
+
+
+@dataclass(frozen=True)
+class Unseen:
+    """An effect of which a run shows nothing, and why."""
+
+    name: str
+    why: str
+
+
+def detectable(test: CandidateTests) -> list[Detectable]:
+    """The smallest detectable size of every visible effect, from its columns and not from the readings."""
+    limits = list[Detectable]()
+    for name, k in test.effects.best.items():
+        candidate = test.effects.scan.candidates[k]
+        limit = (
+            None if name in test.invisible else smallest_size(candidate, SHARE * LEVEL / test.effects.independent_tests)
+        )
+        if limit is not None:
+            coefficient, minimum = limit
+            limits.append(Detectable(name, minimum, coefficient, candidate.effect.typical))
+    return limits
+
+
+def unseen(fitted: Fit, test: CandidateTests) -> list[Unseen]:
+    """The effects of which a run shows nothing, each with the reason; then frequencies that were not searched."""
+    bench, dwells = fitted.linearised.model.bench, fitted.dwells
+    stimulus = stimulus_of(dwells, bench, fitted.linearised.state)
+    in_dwells = [name for name in test.effects.unseen if name not in test.effects.in_slews_only]
+    effects = [Unseen(name, _reason(test.effects.candidate(name).effect, stimulus)) for name in in_dwells]
+    effects += [
+        Unseen(name, "shows while the platform turns, and only dwells are tested")
+        for name in test.effects.in_slews_only
+    ]
+    if test.lines.untested_band:
+        effects.append(Unseen(test.lines.untested_band, "not among the frequencies that are searched in this run"))
+    return effects
+
+
+def _reason(effect: Effect, stimulus: Stimulus) -> str:
+    """Return why nothing of an effect is seen in dwells."""
+    columns = effect_columns([effect], stimulus)
+    if not stimulus.bench.angles and not columns.any() and _needs_angles(effect, stimulus):
+        return "depends on how the platform stands, which is not known without angles"
+    for quantity, words in _CONDITIONS.items():
+        values = np.nan_to_num(getattr(stimulus, quantity))
+        ramp = np.arange(len(values), dtype=float).reshape(-1, *[1] * (values.ndim - 1)) / len(values)
+        if not np.ptp(values, axis=0).any():
+            changed = effect_columns([effect], replace(stimulus, **{quantity: values + ramp}))
+            if not np.array_equal(changed, columns):
+                return words
+    if not columns.any():
+        return "adds nothing to a reading in these orientations"
+    return effect.degeneracy(stimulus.bench) or "adds to every dwell what the model adds already"
+
+
+def _needs_angles(effect: Effect, stimulus: Stimulus) -> bool:
+    """Tell whether an effect would have columns if some attitude were known."""
+    if isinstance(effect, FrameEffect):
+        return True
+    poses = np.random.default_rng(1).normal(size=stimulus.pose.shape)
+    return bool(effect_columns([effect], replace(stimulus, pose=poses, previous_pose=poses)).any())
+
+
+def sensor_grade(fitted: Fit) -> Grade:
+    """The grade of the sensors, by the noise of this run: navigation grade below 10 ug/sqrt(Hz), otherwise MEMS.
+
+    The density of a reading's noise is its effective sigma (as if white) times the square root of the time from one
+    reading to the next; that of the quietest accelerometer counts. Quartz-flexure accelerometers have about
+    1 ug/sqrt(Hz), consumer chips 100 and more; 10 is half way between in logarithm.
+    """
+    dwells = fitted.dwells
+    readings, lasting_s = sum(dwell.count - 1 for dwell in dwells), sum(d.end_s - d.start_s for d in dwells)
+    density = fitted.noise.effective_sigma_mps2 * np.sqrt(lasting_s / max(readings, 1))
+    return "navigation" if float(density.min()) < QUIET else "mems"

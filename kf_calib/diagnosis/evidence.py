@@ -20,8 +20,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
-from kf_calib.diagnosis.coefficient_sizes import AddedEffects
-from kf_calib.diagnosis.detectability import sensor_grade
+from kf_calib.diagnosis.coefficient_sizes import AddedEffects, sensor_grade
 from kf_calib.dwells.qr import triangle
 from kf_calib.effects.effect import Grade
 from kf_calib.estimation.candidate_scan import SEEN

@@ -193,7 +193,10 @@ class Explanation:
         """Part of the misfit beyond noise that it explains, 0 to 1: the decrease of chi-squared from refit to refit,
         less the degrees of freedom that it takes; None if the means of the dwells agree without it."""
         excess, before, after = misfit_beyond_noise(self.before), self.before.consistency, self.after.consistency
-        return _share(before.statistic - after.statistic, before.dof - after.dof, excess) if excess > 0.0 else None
+        if excess <= 0.0:
+            return None
+        delta_chi2, dof = before.statistic - after.statistic, before.dof - after.dof
+        return float(np.clip((delta_chi2 - dof) / excess, 0.0, 1.0))
 
     @cached_property
     def shapes(self) -> list[EffectShape]:
@@ -213,13 +216,3 @@ class Explanation:
     def unexplained_ratios(self) -> Floats:
         """The same over the sigma of the means."""
         return self.unexplained_mps2 / mean_sigmas(self.before)
-
-    @cached_property
-    def predicted_mps2(self) -> Floats:
-        """What it predicts of the residuals (D, 3): the difference of the two models' predictions."""
-        return self.before.residuals_mps2 - self.unexplained_mps2
-
-
-def _share(delta_chi2: float, dof: int, excess: float) -> float:
-    """Return the part of the misfit beyond noise that a fall of chi-squared beyond its degrees of freedom explains."""
-    return float(np.clip((delta_chi2 - dof) / excess, 0.0, 1.0)) if excess > 0.0 else 0.0

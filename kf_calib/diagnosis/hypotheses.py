@@ -99,6 +99,7 @@ class Hypotheses:
         rows += [self._row(names, self._prior("pair", math.comb(len(effects), 2), *names)) for names in pairs]
         likeliest, refitted = max(rows, key=lambda row: row.log_evidence), {row.effects for row in rows}
         rows += [self._single(name, effects) for name in likeliest.effects if (name,) not in refitted]
+        rows += self._beside_unknown(rows, effects)
         rows = [row for row in rows if math.isfinite(row.log_evidence)]
         least = max(row.log_evidence for row in rows) - SCREEN_LOG_BF
         walks = [row for row in rows if row.effects == (self.walk,) and row.log_evidence > least]
@@ -284,18 +285,35 @@ class Hypotheses:
         """Numbers of the candidates of each visible effect: one for each value of its constant."""
         return {name: numbers for name in self.effects.best if (numbers := values_of(self.effects.scan, name))}
 
-    def _formulas(self, screened: Mapping[str, float]) -> Iterator[Hypothesis]:
-        """Yield the rows of formulas that are no known effect, the likeliest of each driver."""
+    def _beside_unknown(self, rows: Sequence[Hypothesis], screened: Mapping[str, float]) -> Iterator[Hypothesis]:
+        """Yield the rows of the likeliest effects, each beside a formula that is no known effect; none where one effect
+        alone is the likeliest and leaves no misfit."""
+        with_effects = (row for row in rows if row.effects and row.refit)
+        likeliest = max(with_effects, key=lambda row: row.log_evidence, default=None)
+        if likeliest is None or likeliest.refit is None:
+            return
+        if len(likeliest.effects) == 1 and likeliest.refit.consistency.consistent:
+            return
+        for name in likeliest.effects:
+            if name != self.walk:
+                yield from self._formulas(screened, name)
+
+    def _formulas(self, screened: Mapping[str, float], beside: str = "") -> Iterator[Hypothesis]:
+        """Yield the rows of formulas that are no known effect, the likeliest of each driver; ``beside``: a known effect
+        that is missing, too."""
+        known = (beside,) if beside else ()
+        before = self._refit(known) if beside else self.before
+        kind, count = ("beside", len(screened)) if beside else ("formula", 1)
         effects = [self.effects.candidate(name).effect for name in self.effects.best]
         # at the end of the range of its constant an effect is the limit of another one, which may be a formula
         effects = [each for each in effects if each.unknown is None or each.value < _END * each.unknown.high]
-        names_in_model = [effect.name for effect in self.before.model.effects]
+        names_in_model = [effect.name for effect in before.model.effects]
         drivers = dict[str, list[FormulaFamily]]()
-        for family in self.refits.families(self.before.fit, effects):
+        for family in self.refits.families(before.fit, effects):
             if family.rank and not family.known:
                 drivers.setdefault(family.driver, []).append(family)
         logs = {driver: self._log_bayes_of_formulas(families) for driver, families in drivers.items()}
-        limit = _screening_limit(log for name, log in screened.items() if name != self.walk)
+        limit = 0.0 if beside else _screening_limit(log for name, log in screened.items() if name != self.walk)
         ranked = sorted(drivers, key=lambda driver: -np.logaddexp.reduce(logs[driver]))[: _MOST["formula"]]
         for driver in ranked:
             if logs[driver].max() < limit:
@@ -303,8 +321,9 @@ class Hypotheses:
             best = int(np.argmax(logs[driver]))
             share = float(np.logaddexp.reduce(logs[driver]) - logs[driver][best]) - math.log(len(logs[driver]))
             formulas = drivers[driver][best].formulas_beside(names_in_model)
-            row = self._row((), self._prior("formula", len(drivers)) + share, formulas)
-            yield replace(row, driver=driver, families=(drivers[driver][best].family or NONE,))
+            row = self._row(known, self._prior(kind, count * len(drivers), *known) + share, formulas)
+            families = (*self._families(known), drivers[driver][best].family or NONE)
+            yield replace(row, driver=driver, families=tuple(dict.fromkeys(families)))
 
     def _log_bayes_of_formulas(self, families: Sequence[FormulaFamily]) -> Floats:
         """Return the log Bayes factors of the formulas of one driver by the linear tests."""

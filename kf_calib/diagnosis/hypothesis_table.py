@@ -34,8 +34,8 @@ CREDIBLE = 0.99
 LISTED = 0.01
 """Least probability of an explanation that has a line of its own where the table is shown."""
 
-KINDS = {"nothing": 0.4, "effect": 0.4, "pair": 0.1, "formula": 0.1}
-"""Prior probability of each kind of explanation."""
+KINDS = {"nothing": 0.4, "effect": 0.4, "pair": 0.08, "beside": 0.02, "formula": 0.1}
+"""Prior probability of each kind of explanation; ``beside``: a known effect beside a formula."""
 
 _ALIKE = 0.05 * KINDS["formula"]  # of what has a known effect's look: what is in no catalogue, and 1 of 20 looks so
 
@@ -44,7 +44,8 @@ _ALIKE = 0.05 * KINDS["formula"]  # of what has a known effect's look: what is i
 class Hypothesis:
     """One row of the table.
 
-    - effects: names of the effects that would be missing. formulas: those of no known effect, as they can be added.
+    - effects: names of the effects that would be missing. formulas: those of no known effect, as they can be added,
+      alone or beside an effect.
     - driver: in words, what the formulas depend on; "irregular" for changes of an unknown cause that follow nothing,
       "like a known effect" for a cause that cannot be told from one.
     - families: the physical classes of the effects.
@@ -66,8 +67,8 @@ class Hypothesis:
 
     @property
     def unknown(self) -> bool:
-        """Whether the row says that something is missing that no known effect explains."""
-        return bool(self.driver)
+        """Whether the row says that nothing is missing but what no known effect explains."""
+        return bool(self.driver) and not self.effects
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,7 @@ class HypothesisTable:
 
     def probability_of_just(self, effects: Sequence[str]) -> float:
         """Probability that these effects are missing, and no others: that of their row."""
-        return sum(row.probability for row in self.rows if set(effects) == set(row.effects))
+        return sum(row.probability for row in self.rows if set(effects) == set(row.effects) and not row.formulas)
 
     def probability_of_families(self, families: Iterable[str]) -> float:
         """Probability that something of any of these families is missing."""

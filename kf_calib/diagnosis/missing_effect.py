@@ -153,7 +153,7 @@ def _beside_lines(refits: Refits, before: Calibration, test: CandidateTests) -> 
 def _with(refits: Refits, before: Calibration, row: Hypothesis, name: str, family: str) -> Hypothesis:
     """Return a row with one effect more, fitted together with the others if it is likely enough to be told."""
     effects, families = (*row.effects, name), tuple(dict.fromkeys([*row.families, family]))
-    refit = refits.with_effects(before, effects) if row.probability >= LISTED else None
+    refit = refits.with_effects(before, (*effects, *row.formulas)) if row.probability >= LISTED else None
     return replace(row, effects=effects, families=families, refit=refit)
 
 
@@ -184,9 +184,14 @@ def _decided(refits: Refits, diagnosis: Diagnosis) -> Diagnosis:
         overlaps=_overlaps(diagnosis.test, first.effects, names),
         together=tuple(pairs),
         as_scatter=table.families.get(NOISE, 0.0) > _DOUBT,
-        after=named.refit if named else None,
+        after=_after(refits, before, named) if named else None,
         suspects=_suspects(diagnosis, table),
     )
+
+
+def _after(refits: Refits, before: Calibration, named: Hypothesis) -> Calibration | None:
+    """Return the calibration with the effects of a row, without the formula beside them."""
+    return refits.with_effects(before, named.effects) if named.formulas else named.refit
 
 
 def _overlaps(test: CandidateTests, first: tuple[str, ...], names: tuple[str, ...]) -> dict[str, float]:
@@ -204,7 +209,7 @@ def _suspects(diagnosis: Diagnosis, table: HypothesisTable) -> tuple[Suspect, ..
     effects, suspects = diagnosis.test.effects, list[Suspect]()
     symbols_before = tuple(diagnosis.before.parameters)[12:]
     for row in table.rows:
-        if len(row.effects) != 1 or row.refit is None or len(suspects) == _SHOWN:
+        if len(row.effects) != 1 or row.formulas or row.refit is None or len(suspects) == _SHOWN:
             continue
         (name,) = row.effects
         if name in effects.best:

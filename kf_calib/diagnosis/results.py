@@ -11,7 +11,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.design import next_orientation as advise
 from kf_calib.design.next_orientation import Advice
 from kf_calib.diagnosis.candidate_tests import CandidateTests
-from kf_calib.diagnosis.detectability import Detectable, Unseen, detectable, sensor_grade, unseen
+from kf_calib.diagnosis.coefficient_sizes import Detectable, Unseen, detectable, sensor_grade, unseen
 from kf_calib.diagnosis.explanation import Explanation
 from kf_calib.diagnosis.hypothesis_table import SURE, Hypothesis, HypothesisTable
 from kf_calib.diagnosis.refits import Refits

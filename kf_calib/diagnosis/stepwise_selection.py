@@ -262,8 +262,8 @@ def _with_alternatives(state: Improvement, refits: Refits) -> Improvement:
     earlier one."""
     diagnosis, result = state.diagnosis, state.result
     if _rivals(diagnosis) and diagnosis.table is not None:
-        rows = [(row.effects, row.refit) for row in (diagnosis.table.first, *diagnosis.table.rivals) if row.effects]
-        equal = [Alternative(" + ".join(names), refit) for names, refit in rows if refit is not None]
+        rows = [row for row in (diagnosis.table.first, *diagnosis.table.rivals) if row.effects and not row.formulas]
+        equal = [Alternative(" + ".join(row.effects), row.refit) for row in rows if row.refit is not None]
         return replace(state, alternatives=tuple(equal))
     alternatives, effects = list[Alternative](), list(result.settings.effects)
     index = {str(effect): k for k, effect in enumerate(result.model.effects)}
@@ -279,14 +279,19 @@ def _with_alternatives(state: Improvement, refits: Refits) -> Improvement:
 
 
 def next_effect(diagnosis: Diagnosis, accept_first: bool = False) -> str | None:
-    """The effect to add next: the likeliest where it is missing with 95 % probability, whether alone or with others.
+    """The effect to add next: of those that are missing with 95 % probability, whether alone or with others, the one
+    that explains most.
 
     None where nothing is missing, or where the choice is left to a person. accept_first: take the likeliest anyway.
     """
     if diagnosis.test.consistent is not False or not diagnosis.missing or diagnosis.table is None:
         return None
-    first = max(diagnosis.missing, key=lambda name: diagnosis.table.probability((name,)) if diagnosis.table else 0.0)
-    return first if accept_first or diagnosis.table.probability((first,)) >= SURE else None
+    probabilities = {name: diagnosis.table.probability((name,)) for name in diagnosis.missing}
+    sure = [name for name, probability in probabilities.items() if probability >= SURE]
+    if not sure:
+        return max(probabilities, key=lambda name: probabilities[name]) if accept_first else None
+    falls = {suspect.name: suspect.statistic for suspect in diagnosis.suspects}
+    return max(sure, key=lambda name: falls.get(name, 0.0))
 
 
 def _rivals(diagnosis: Diagnosis) -> list[str]:

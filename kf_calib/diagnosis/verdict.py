@@ -75,7 +75,7 @@ def second_pass_in_words(diagnosis: Diagnosis) -> str:
 def _named(diagnosis: Diagnosis, first: Hypothesis) -> str:
     """Return the likeliest effects in words, with the other explanations and their probabilities."""
     assert diagnosis.table is not None
-    share, rest = diagnosis.table.probability(first.effects), _unexplained(diagnosis)
+    share, rest = diagnosis.table.probability(first.effects), _beside(diagnosis, first) or _unexplained(diagnosis)
     named, others = f"{_effects_of(first)}{_size(diagnosis)} ({_share(diagnosis)})", _others(diagnosis) + rest
     if share >= SURE:
         return f"{'Part of it' if rest else 'Missing'}: {named}{others}"
@@ -85,11 +85,25 @@ def _named(diagnosis: Diagnosis, first: Hypothesis) -> str:
     return f"Likeliest: {named}{others}"
 
 
+def _beside(diagnosis: Diagnosis, first: Hypothesis) -> str:
+    """Return in words what goes on beside the effects that are named, and no known effect explains; "" for nothing."""
+    if not first.formulas:
+        return ""
+    assert diagnosis.table is not None
+    known = [row for row in diagnosis.table.listed if set(first.effects) < set(row.effects)]
+    others = [(" and ".join(name for name in row.effects if name not in first.effects), row) for row in known[:_TOLD]]
+    words = [f", or is {names} {format_probability(row.probability)}" for names, row in others]
+    unknown = f"the rest goes with {first.driver}, as no known effect does ({format_probability(first.probability)})"
+    return f"; {unknown}{''.join(words)}"
+
+
 def _share(diagnosis: Diagnosis) -> str:
     """Return the probability of the likeliest row, as the table has it, and that of its effects, alone or with
     others."""
     assert diagnosis.table is not None
     first = diagnosis.table.first
+    if first.formulas:
+        return format_probability(diagnosis.table.probability(first.effects))
     alone = format_probability(first.probability)
     with_others = format_probability(diagnosis.table.probability(first.effects))
     return alone if alone == with_others else f"{alone} alone, {with_others} alone or with others"
@@ -187,7 +201,7 @@ def explanations_in_words(diagnosis: Diagnosis) -> str:
 def _in_words(diagnosis: Diagnosis, row: Hypothesis) -> str:
     """Return an explanation in words."""
     if row.effects:
-        return _effects_of(row)
+        return _effects_of(row) + (f" beside no known effect, which goes with {row.driver}" if row.formulas else "")
     if row.driver:
         return "no known effect, irregular" if row.driver == IRREGULAR else f"no known effect, goes with {row.driver}"
     return f"scatter from dwell to dwell{' larger than stated' if dwell_noise_is_stated(diagnosis.before) else ''}"

@@ -160,11 +160,8 @@ def evaluate(
 ) -> Calibration:
     """The calibration from sufficient statistics of dwells and, if effects show in them, of slews, without a pass over
     the data."""
-    return evaluate_fit(fit(dwells, _model(bench, settings), settings.walk_mps2_per_sqrt_s, slews), settings)
-
-
-def _model(bench: Bench, settings: Settings) -> Model:
-    return Model.of(bench, settings.effects, settings.bench_model)
+    model = Model.of(bench, settings.effects, settings.bench_model)
+    return evaluate_fit(fit(dwells, model, settings.walk_mps2_per_sqrt_s, slews), settings)
 
 
 def evaluate_fit(fitted: Fit, settings: Settings) -> Calibration:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
-from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects import Stimulus
 from kf_calib.effects.formula import quantities
 from kf_calib.errors import InputError
@@ -66,15 +65,11 @@ def quantity_means(result: Run, names: list[str]) -> dict[str, Floats]:
 def means_over_dwells(result: Run, functions: Sequence[Callable[[Stimulus], Floats | float]]) -> list[Floats]:
     """Means (D, 3) over each dwell of functions of what the bench does, a number or values (m, 1) or (m, 3) each."""
     dwells = result.linearised.dwells
-    stimulus, weights = stimulus_of(dwells, result.bench, result.linearised.state), _weights(dwells)
+    stimulus = stimulus_of(dwells, result.bench, result.linearised.state)
+    weights = np.concatenate([np.outer(dwell.counts / dwell.count, _SIMPSON).ravel() for dwell in dwells])
     firsts = np.cumsum([0, *(3 * len(dwell.pieces) for dwell in dwells[:-1])])
     values = [np.broadcast_to(function(stimulus), (len(stimulus), 3)) for function in functions]
     return [np.add.reduceat(each * weights[:, None], firsts) for each in values]
-
-
-def _weights(dwells: Sequence[DwellFactor]) -> Floats:
-    """Return the weight of each node in the mean over its dwell."""
-    return np.concatenate([np.outer(dwell.counts / dwell.count, _SIMPSON).ravel() for dwell in dwells])
 
 
 def residual_table(result: Run) -> NDArray[np.void]:

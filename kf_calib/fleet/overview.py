@@ -274,7 +274,8 @@ def verdict_of(row: Mapping[str, Any]) -> str:
 
 def weeks_of(rows: Sequence[Mapping[str, Any]]) -> Weeks:
     """The verdicts of the runs by week."""
-    dated = [(_monday(row["date"]), verdict_of(row)) for row in rows if row["date"] is not None]
+    verdicts = [(row["date"], verdict_of(row)) for row in rows if row["date"] is not None]
+    dated = [(when.date() - timedelta(days=when.weekday()), verdict) for when, verdict in verdicts]
     mondays = sorted({monday for monday, _ in dated})
     count = (mondays[-1] - mondays[0]).days // 7 + 1 if mondays else 0
     begins = [mondays[0] + timedelta(weeks=k) for k in range(count)]
@@ -283,7 +284,3 @@ def weeks_of(rows: Sequence[Mapping[str, Any]]) -> Weeks:
         counts.setdefault(verdict, [0] * count)[(monday - mondays[0]).days // 7] += 1
     ordered = sorted(counts.items(), key=lambda item: -sum(item[1]))
     return Weeks(tuple(begins), {name: tuple(own) for name, own in ordered}, len(rows) - len(dated))
-
-
-def _monday(when: datetime) -> date:
-    return when.date() - timedelta(days=when.weekday())

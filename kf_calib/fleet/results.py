@@ -129,7 +129,8 @@ class Fleet:
         table = self.rows(["unit", "error"])
         units = table.filter(pc.is_null(table["error"]))["unit"]
         if len(units) < 2:
-            return None, (f"{_ALONE}: that needs two that did not fail, and there {_are(len(units))}.",)
+            verb = "is" if len(units) == 1 else "are"
+            return None, (f"{_ALONE}: that needs two that did not fail, and there {verb} {len(units)}.",)
         try:
             diagnosis = self.pooled(reference_unit=reference)
         except InputError as error:
@@ -158,10 +159,6 @@ class Fleet:
     def __str__(self) -> str:
         counts = ", ".join(f"{count} {verdict}" for verdict, count in self.verdicts().items())
         return f"{self.path}: {len(self)} runs ({counts})"
-
-
-def _are(count: int) -> str:
-    return f"is {count}" if count == 1 else f"are {count}"
 
 
 def _unnamed(count: int) -> str:

@@ -85,11 +85,8 @@ def _named_by(word: str) -> Iterator[ListedRun]:
     except FileNotFoundError:
         raise InputError(f"{word} is not there: name recordings, folders, globs, or a list of these.") from None
     except (OSError, ValueError, ImportError) as error:
-        raise InputError(f"{word}: cannot be looked up ({_in_words(error)}): check the name and the access.") from None
-
-
-def _in_words(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
+        why = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"{word}: cannot be looked up ({why}): check the name and the access.") from None
 
 
 def _in_listing(
@@ -99,7 +96,9 @@ def _in_listing(
     folders = {str(PurePosixPath(name).parent) for name in listing if PurePosixPath(name).name == _BAG}
     for folder in sorted(folders):
         inside = {name: info for name, info in listing.items() if str(PurePosixPath(name).parent) == folder}
-        yield _bag(files, folder, inside)
+        versions = "; ".join(_version(inside[name]) for name in sorted(inside))
+        size = sum(int(info.get("size") or 0) for info in inside.values())
+        yield ListedRun(_place(files, folder), size, versions, True)
     for name, info in sorted(listing.items()):
         if str(PurePosixPath(name).parent) in folders:
             continue
@@ -111,11 +110,6 @@ def _in_listing(
 
 def _run(files: Any, name: str, info: Mapping[str, Any]) -> ListedRun:
     return ListedRun(_place(files, name), int(info.get("size") or 0), _version(info))
-
-
-def _bag(files: Any, folder: str, inside: Mapping[str, Mapping[str, Any]]) -> ListedRun:
-    versions = "; ".join(_version(inside[name]) for name in sorted(inside))
-    return ListedRun(_place(files, folder), sum(int(info.get("size") or 0) for info in inside.values()), versions, True)
 
 
 def _place(files: Any, name: str) -> str:

@@ -42,10 +42,8 @@ def with_own_noise(dwells: DwellStack, along: Floats | None = None) -> DwellStac
         weights = np.ones(len(dwells))
     else:
         weights = weights_of(*_variances(folded, along, _lost_to_correlation(folded.autocovariance)))
-    return dwells if np.array_equal(weights, folded.weights) else _with_weights(dwells, weights)
-
-
-def _with_weights(dwells: DwellStack, weights: Floats) -> DwellStack:
+    if np.array_equal(weights, folded.weights):
+        return dwells
     return DwellStack.of([dwell.weighted(float(weight)) for dwell, weight in zip(dwells, weights, strict=True)])
 
 

@@ -1,23 +1,151 @@
-"""From the name of a positioner to one that is open: ``sim://…``, ``hand``, the name or the file of a profile."""
+"""Positioners that are opened by name: the simulated bench, ``hand``, or the name or the file of a profile.
+
+The simulated bench is positioner and source in one: ``sim://?hide=second-order=20sigma&seed=3&fault=stall``.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import math
+import queue
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qsl, urlencode
 
 from kf_calib.bench.bench import Bench
+from kf_calib.bench.streams import Batch
 from kf_calib.errors import InputError
 from kf_calib.positioning.drive import Time, WallTime
-from kf_calib.positioning.positioner import HandPositioner, Positioner, Watchfulness
+from kf_calib.positioning.positioner import HandPositioner, Positioner, PositionerError, Watchfulness
 from kf_calib.positioning.profile import CommandPositioner, LinePositioner, read_profile
-from kf_calib.positioning.simulated import DrivenFeed, SimulatedPositioner, SimulatedTime, open_simulated
+from kf_calib.sources.live.feed import Feed, nothing
+from kf_calib.sources.simulation.driven import DrivenBench, Servo
+from kf_calib.sources.simulation.options import options_from_query, simulation
 from kf_calib.support import file_lock
 
+_OF_SERVO = {field.name: field.type for field in fields(Servo)}
+_NAP_S = 0.05
+_EVALUATION_S = 60.0  # at most, for the evaluation of what was measured
+
 HAND = "hand"
+
+
+class SimulatedPositioner:
+    """The gimbals of a simulated bench, which a lost link reaches as it reaches those of a real one."""
+
+    def __init__(self, bench: DrivenBench) -> None:
+        self.bench = bench
+
+    def move_to(self, gimbal_deg: Sequence[float]) -> None:
+        with _told():
+            self.bench.move_to(gimbal_deg)
+
+    def read(self) -> tuple[float, ...]:
+        with _told():
+            return self.bench.read_deg()
+
+    def stop(self) -> None:
+        with _told():
+            self.bench.stop()
+
+    def fault(self) -> str:
+        with _told():
+            return self.bench.fault
+
+
+class _told:
+    """Turns what a link raises into an error of the positioner."""
+
+    def __enter__(self) -> None: ...
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, OSError):
+            raise PositionerError(f"the positioner does not answer ({error})") from error
+
+
+class DrivenFeed(Feed):
+    """The readings of a bench that is driven, as its time passes."""
+
+    patient = True
+
+    def __init__(self, bench: Bench) -> None:
+        super().__init__("the simulated bench")
+        self._bench = bench
+        self._batches = queue.SimpleQueue[Batch]()
+
+    def put(self, batch: Batch) -> None:
+        self._batches.put(batch)
+
+    def begin(self) -> Bench:
+        self.link = "live"
+        return self._bench
+
+    def __iter__(self) -> Iterator[Batch]:
+        while not (self.stopping and self._batches.empty()):
+            try:
+                yield self._batches.get(timeout=_NAP_S)
+            except queue.Empty:
+                yield nothing(self._bench.pose_width)
+
+
+class SimulatedTime:
+    """The clock of a simulated bench: while the loop sleeps, the bench measures, and its readings are evaluated.
+
+    speed: how much faster than the wall it goes at most. wait: for so many readings to be evaluated, at most so many
+    seconds.
+    """
+
+    tick_s = 0.2
+
+    def __init__(self, bench: DrivenBench, feed: DrivenFeed, speed: float = math.inf) -> None:
+        self.bench, self._feed, self._speed = bench, feed, speed
+        self.wait: Callable[[int, float], bool] = lambda readings, seconds: True
+        self._readings, self._began_s = 0, time.monotonic()
+
+    def now_s(self) -> float:
+        return self.bench.now_s
+
+    def sleep(self, seconds: float) -> None:
+        batch = self.bench.advance(seconds)
+        self._readings += len(batch.accel)
+        self._feed.put(batch)
+        ahead_s = self.bench.now_s / self._speed - (time.monotonic() - self._began_s)
+        if ahead_s > 0.0:
+            time.sleep(ahead_s)
+        self.wait(self._readings, _EVALUATION_S)
+
+
+def open_simulated(url: str, keys: Mapping[str, str]) -> tuple[DrivenBench, float]:
+    """The bench of a URL ``sim://?KEY=VALUE&...``, and its speed; keys: of the bench.
+
+    Beside the settings of the simulator it takes those of ``Servo``, and ``speed``. Raises InputError.
+    """
+    pairs = parse_qsl(url.partition("?")[2], keep_blank_values=True)
+    servo: dict[str, Any] = {
+        key: text if key == "fault" else _number(key, text) for key, text in pairs if key in _OF_SERVO
+    }
+    speeds = [_number(key, text) for key, text in pairs if key == "speed"]
+    if speeds and not speeds[-1] > 0.0:
+        raise InputError(f"speed={speeds[-1]:g} is not positive: write for example speed=20.")
+    rest = [pair for pair in pairs if pair[0] not in _OF_SERVO and pair[0] != "speed"]
+    for name in ("rate_degps", "acceleration_degps2"):
+        if name in keys:
+            servo.setdefault(name, float(keys[name]))
+    run = simulation(options_from_query(urlencode(rest)), keys)
+    start_deg = [0.0] * len(run.bench.axes)
+    return DrivenBench(run, Servo(**servo), start_deg), speeds[-1] if speeds else math.inf
+
+
+def _number(name: str, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(f"sim://: {name}={text} is not a number.") from None
 
 
 @dataclass(frozen=True)

@@ -100,9 +100,3 @@ class HandPositioner:
         """The gimbals stand where they were asked to be."""
         with self._lock:
             self._stands = self._asked
-
-    @property
-    def is_waiting(self) -> bool:
-        """Whether a motion was asked for and is not done."""
-        with self._lock:
-            return self._stands != self._asked

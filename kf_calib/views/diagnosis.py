@@ -11,7 +11,7 @@ from rich.text import Text
 
 from kf_calib.design.next_orientation import Advice
 from kf_calib.diagnosis.candidate_tests import LEVEL
-from kf_calib.diagnosis.detectability import Detectable
+from kf_calib.diagnosis.coefficient_sizes import Detectable
 from kf_calib.diagnosis.explanation import EffectShape
 from kf_calib.diagnosis.hypothesis_table import Hypothesis, HypothesisTable
 from kf_calib.diagnosis.replication import Replication
@@ -295,7 +295,7 @@ def _held_out(refit: Calibration | None) -> str:
 def name_of(row: Hypothesis) -> str:
     """An explanation in a few words, for a line of a table or figure."""
     if row.formulas:
-        return f"formula of {row.driver}"
+        return " + ".join((*row.effects, f"formula of {row.driver}"))
     return " + ".join(row.effects) or (f"{row.driver} changes" if row.driver else row.families[0])
 
 

@@ -251,7 +251,8 @@ def calibration_report(saved: SavedCalibration, path: Path) -> RenderableType:
         row = Parameter(**parameter.model_dump(), shown_unit=field.label, per_si=field.per_si)
         table.add_row(*parameter_row(row, saved.fixed.get(parameter.symbol, "")), end_section=k in (3, 7, 11))
     lines = [Text(f"{path}: a calibration, {saved.summary}.", style="bold"), Text(f"It takes {saved.bench.input}.")]
-    return Group(*lines, table, Text(_agreement(saved)), *map(note, saved.provenance.warnings), _commands(path))
+    commands = Text(f"Try: kf-calib apply {path} RECORDING -o OUT, or certificate, export, verify, history.")
+    return Group(*lines, table, Text(_agreement(saved)), *map(note, saved.provenance.warnings), commands)
 
 
 def _agreement(saved: SavedCalibration) -> str:
@@ -264,8 +265,3 @@ def _agreement(saved: SavedCalibration) -> str:
         f"Model and measurements {agree} (p {format_p(consistency.p_value)}, NIS/dof {consistency.nis_per_dof:.3g}, "
         f"{consistency.dof} degrees of freedom)."
     )
-
-
-def _commands(path: Path) -> Text:
-    """Return what can be done with the calibration."""
-    return Text(f"Try: kf-calib apply {path} RECORDING -o OUT, or certificate, export, verify, history.")

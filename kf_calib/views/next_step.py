@@ -26,11 +26,9 @@ def next_steps(diagnosis: Diagnosis, typed: str) -> list[NextStep]:
     no command can be told.
     """
     steps = list(_steps(diagnosis, typed))
-    return steps if typed else [NextStep(each.why) for each in steps if not each.command or _measures(each)]
-
-
-def _measures(step: NextStep) -> bool:
-    return step.why.startswith("Measure")
+    if typed:
+        return steps
+    return [NextStep(each.why) for each in steps if not each.command or each.why.startswith("Measure")]
 
 
 def _steps(diagnosis: Diagnosis, typed: str) -> Iterator[NextStep]:

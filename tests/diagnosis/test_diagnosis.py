@@ -18,7 +18,7 @@ from helpers.synthetic import Run, plan_of
 from kf_calib.cli import cli
 from kf_calib.diagnosis import results
 from kf_calib.diagnosis.candidate_tests import assess_candidates, independent_tests
-from kf_calib.diagnosis.detectability import detectable
+from kf_calib.diagnosis.coefficient_sizes import detectable
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.results import Diagnosis

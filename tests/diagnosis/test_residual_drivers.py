@@ -12,7 +12,7 @@ from helpers.synthetic import Run, plan_of
 from scipy.stats import binom, f
 
 from kf_calib.diagnosis.candidate_tests import overlap_matrix
-from kf_calib.diagnosis.detectability import QUIET, sensor_grade
+from kf_calib.diagnosis.coefficient_sizes import QUIET, sensor_grade
 from kf_calib.diagnosis.explanation import Explanation
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
@@ -88,8 +88,8 @@ def test_what_an_explanation_predicts_is_the_difference_of_the_predictions() -> 
     predicted = [np.einsum("dip,p->di", each.means.design, state) for each, state in (
         (before, best.before.estimate.state), (after, best.after.estimate.state))]  # fmt: skip
     assert best.names == ("second-order",)
-    assert best.predicted_mps2 == pytest.approx(predicted[1] - predicted[0], abs=1e-12)
-    assert best.unexplained_mps2 + best.predicted_mps2 == pytest.approx(best.before.residuals_mps2, abs=1e-15)
+    explained = best.before.residuals_mps2 - best.unexplained_mps2
+    assert explained == pytest.approx(predicted[1] - predicted[0], abs=1e-12)
     assert best.share is not None and best.share > 0.9 and best.fits
     (shape,) = best.shapes
     assert shape.symbol == "a" and shape.is_curve

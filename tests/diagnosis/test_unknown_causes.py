@@ -11,7 +11,8 @@ import pytest
 from helpers.long_runs import slow
 from helpers.synthetic import Run
 from scipy.stats import multivariate_normal
-from unknown_trials.hidden import HIDDEN
+from unknown_trials.hidden import HIDDEN, beside, cross_coupling, second_order
+from unknown_trials.real_noise import KINDS, noisy_run
 from unknown_trials.small_bench import WHITE_MPS2, SmallRun, hidden_run, visits
 
 import kf_calib
@@ -40,6 +41,38 @@ def test_what_depends_on_two_drivers_or_on_the_past_is_unknown_and_goes_with_the
     diagnosis = diagnosed(name)
     assert diagnosis.unknown and diagnosis.likeliest is not None and diagnosis.likeliest.driver in drivers
     assert diagnosis.description is not None and diagnosis.description.share > 0.7
+
+
+@pytest.mark.parametrize(
+    ("name", "driver"),
+    [
+        ("temperature x force across", "temperature and specific force"),
+        *slow(("decay x force across", "time and specific force"), ("play", "previous orientation")),
+    ],
+)
+@pytest.mark.parametrize("known", ["second-order", "cross-coupling-ip"])
+def test_what_goes_on_beside_a_known_effect_gets_no_known_name(known: str, name: str, driver: str) -> None:
+    hidden = second_order if known == "second-order" else cross_coupling
+    diagnosis = kf_calib.diagnose(beside(hidden, name, 60.0, 2), replicate=False)
+    assert diagnosis.missing == (known,) and not diagnosis.unknown and diagnosis.table is not None
+    assert diagnosis.table.first.driver == driver and diagnosis.table.probability_of_just((known,)) < 0.01
+    assert f"; the rest goes with {driver}, as no known effect does" in diagnosis.verdict
+    assert diagnosis.after is not None and str(diagnosis.after.model.effects[-1]) == known
+
+
+def test_sensors_that_were_switched_on_again_jump_and_do_not_walk() -> None:
+    diagnosis = kf_calib.diagnose(noisy_run("switched on again half-way", 60.0, 1), replicate=False)
+    assert diagnosis.missing == ("second-order",)
+    assert diagnosis.likeliest is not None and diagnosis.likeliest.driver == "time (a jump)"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sigmas", [0.0, 60.0])
+@pytest.mark.parametrize("kind", KINDS)
+def test_noise_of_real_sensors_gets_no_name(kind: str, sigmas: float) -> None:
+    for seed in range(1, 5):
+        diagnosis = kf_calib.diagnose(noisy_run(kind, sigmas, seed), replicate=False)
+        assert {*diagnosis.missing} <= {"second-order"} or not diagnosis.sure, diagnosis.verdict
 
 
 @pytest.mark.parametrize(("gimbal", "waves"), [(1, 2), (2, 6), *slow((2, 3), (2, 4))])

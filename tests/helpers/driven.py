@@ -11,7 +11,7 @@ from kf_calib.online.session import Session
 from kf_calib.online.suggestion import Itinerary
 from kf_calib.positioning.drive import Drive
 from kf_calib.positioning.loop import Rules
-from kf_calib.positioning.simulated import SimulatedPositioner
+from kf_calib.positioning.opening import SimulatedPositioner
 from kf_calib.sources.simulation.driven import DrivenBench, Servo
 from kf_calib.sources.simulation.options import options_from_query, simulation
 

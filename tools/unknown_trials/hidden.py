@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from unknown_trials.small_bench import G_MPS2, Visits
+from unknown_trials.small_bench import G_MPS2, SmallRun, Visits, hidden_run
 
 _PLAY = 0.5  # in g: half the width of the play
 
@@ -70,3 +71,19 @@ HIDDEN: dict[str, Callable[[Visits], Floats]] = {
     "a rough map of the force": lambda at: _over(at, _map(at)),
     "a thirteenth harmonic of an angle": lambda at: _over(at, np.sin(13.0 * at.angles_rad[:, 2:]) * np.ones(3)),
 }
+
+
+def second_order(at: Visits) -> Floats:
+    """The square of the force along each axis: an effect of the catalogue."""
+    return _over(at, _force(at)[:, 0] ** 2)
+
+
+def cross_coupling(at: Visits) -> Floats:
+    """The product of the forces along each axis and the next: another one, cross-coupling-ip."""
+    return _over(at, (_force(at) * _force(at, 1))[:, 0])
+
+
+def beside(known: Callable[[Visits], Floats], name: str, sigmas: float, seed: int) -> SmallRun:
+    """A run with an effect of the catalogue hidden, and one of none of half its size."""
+    both = hidden_run(known, sigmas, seed), hidden_run(HIDDEN[name], 0.5 * sigmas, seed)
+    return replace(both[0], hidden_mps2=both[0].hidden_mps2 + both[1].hidden_mps2)

@@ -19,7 +19,8 @@ from kf_calib.bench.streams import Batch, Stream
 
 G_MPS2 = 9.81
 WHITE_MPS2 = 5e-5
-_RATE_HZ, _DWELL_S, _SLEW_S = 20.0, 12.0, 4.0
+RATE_HZ = 20.0
+_DWELL_S, _SLEW_S = 12.0, 4.0
 _PATH = 20  # places of a slew at which the force on its way is known
 
 
@@ -58,7 +59,7 @@ def visits(seed: int, dwells: int, repeated: int = 0) -> Visits:
     ways = [_forces(before + share * (after - before)) for before, after in itertools.pairwise(angles)]
     path = np.array([np.repeat(forces[:1], _PATH, axis=0), *ways])
     starts = np.arange(dwells) * (_DWELL_S + _SLEW_S)
-    time = starts[:, None] + np.arange(int(_DWELL_S * _RATE_HZ)) / _RATE_HZ
+    time = starts[:, None] + np.arange(int(_DWELL_S * RATE_HZ)) / RATE_HZ
     swing, period, phase = rng.uniform(2.0, 5.0), time.max() * rng.uniform(0.4, 0.9), rng.uniform(0.0, 2.0 * np.pi)
     warm = 25.0 + rng.uniform(-3.0, 3.0) + swing * np.sin(2.0 * np.pi * time / period + phase)
     return Visits(angles, forces, path, time, warm)
@@ -68,13 +69,16 @@ def visits(seed: int, dwells: int, repeated: int = 0) -> Visits:
 class SmallRun:
     """A source of kf_calib: the visits, read by three sensors of random errors, with something ``hidden`` (D, n, 3).
 
-    With ``scatter_mps2`` the dwells scatter, although the bench says that they do not.
+    With ``scatter_mps2`` the dwells scatter, although the bench says that they do not. ``altered`` makes other readings
+    (D, n, 3) of these by a generator of random numbers; the clock is ``late_s`` (D, n) behind.
     """
 
     at: Visits
     hidden_mps2: Floats
     seed: int
     scatter_mps2: float = 0.0
+    altered: Callable[[Floats, np.random.Generator], Floats] = lambda readings, rng: readings
+    late_s: Floats | float = 0.0
     warnings: list[str] = field(default_factory=list[str])
     fraction: float = 1.0
 
@@ -91,10 +95,10 @@ class SmallRun:
         level = self.at.force_mps2 @ rows.T + rng.normal(size=3) * 1e-3
         level = level + rng.normal(size=level.shape) * self.scatter_mps2
         noise = rng.normal(size=self.hidden_mps2.shape) * WHITE_MPS2
-        return level[:, None] + self.hidden_mps2 + noise
+        return self.altered(level[:, None] + self.hidden_mps2 + noise, rng)
 
     def __iter__(self) -> Iterator[Batch]:
-        times = np.round(self.at.time_s * 1e9).astype(np.int64)
+        times = np.round((self.at.time_s + self.late_s) * 1e9).astype(np.int64)
         every = max(1, times.shape[1] // 30)
         poses = np.repeat(self.at.angles_rad[:, None], times.shape[1], axis=1)
         yield Batch(

@@ -17,7 +17,7 @@ from matplotlib.ticker import MaxNLocator
 
 from kf_calib.design.next_orientation import ENOUGH, Advice
 from kf_calib.diagnosis.candidate_tests import overlap_matrix
-from kf_calib.diagnosis.detectability import Detectable, Unseen
+from kf_calib.diagnosis.coefficient_sizes import Detectable, Unseen
 from kf_calib.diagnosis.explanation import Explanation
 from kf_calib.diagnosis.hypothesis_table import LISTED, NOISE, NONE, NOTHING, SURE, Hypothesis, HypothesisTable
 from kf_calib.diagnosis.residual_drivers import Driver

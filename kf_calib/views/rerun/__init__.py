@@ -8,6 +8,8 @@ A run has two timelines: ``orientation`` (the count of dwells from 1; 0 is a sta
 first sample; points within the dwells too). Entities: ``parameters/ACCELEROMETER/SYMBOL/{log10_sigma,log10_target,
 deviation,band}``, ``parameters/effects/SYMBOL/...``, ``platform/...``, ``innovation/CHANNEL/{value,bound,in_sigma}``,
 ``nis/{value,above,band}``, ``residual/CHANNEL``, ``bench/pose/...``, ``summary``.
+
+A view opens with the overview first, and with parameters and innovations in tabs (``layout``).
 """
 
 from __future__ import annotations
@@ -19,20 +21,32 @@ from typing import Any
 
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench, Vector
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.stepwise_selection import Improvement
 from kf_calib.estimation.estimate import correlation
 from kf_calib.estimation.results import Calibration, Parameter, format_p
 from kf_calib.online.status import Judgement
+from kf_calib.support import units
 from kf_calib.support.text import printable
 from kf_calib.support.units import Unit, shown, significant
 from kf_calib.views.console import noise_origins, whole_value
 from kf_calib.views.rerun.diagnosis import save_diagnosis_view as save_diagnosis
 from kf_calib.views.rerun.improvement import save_improvement_view as save_improvement
-from kf_calib.views.rerun.layout import layout
-from kf_calib.views.rerun.names import BENCH_TIME, LABELS, ORIENTATION, Colour, quantities, rrd_file, strict
+from kf_calib.views.rerun.names import (
+    BENCH_TIME,
+    CHANNELS,
+    GROUPS,
+    LABELS,
+    ORIENTATION,
+    Colour,
+    quantities,
+    rrd_file,
+    strict,
+)
 from kf_calib.views.rerun.series import (
     VisitHistory,
     log_bench,
@@ -42,11 +56,16 @@ from kf_calib.views.rerun.series import (
     log_residuals,
     predicted,
 )
-from kf_calib.views.rerun.spheres import log_platform
+from kf_calib.views.rerun.spheres import log_platform, magnified
 
 __all__ = ["BENCH_TIME", "ORIENTATION", "grow", "save_view"]
 
 _NO_TARGET = np.full(12, np.nan)
+
+NEXT: Colour = (255, 160, 205)
+_ENDLESS = rr.TimeRangeBoundary.infinite()
+WHOLE_RUN = rrb.TimeAxis(view_range=rr.TimeRange(start=_ENDLESS, end=_ENDLESS))
+"""The same stretch of time in all panels: left to themselves they begin where their own data do."""
 
 
 @singledispatch
@@ -111,9 +130,6 @@ def _log(
         log_bench(result, stream, shown)
     text = "\n\n".join([*([heading] if heading else []), markdown_summary(result)])
     stream.log("summary", rr.TextDocument(printable(text), media_type=rr.MediaType.MARKDOWN), static=True)
-
-
-NEXT: Colour = (255, 160, 205)
 
 
 def judgement_text(judgement: Judgement) -> str:
@@ -218,3 +234,116 @@ def _three(unit: Unit, values: Floats) -> str:
 
 def _warnings(result: Calibration) -> list[str]:
     return ["**Warnings**\n\n" + "\n".join(f"- {text}" for text in result.warnings)] if result.warnings else []
+
+
+def layout(result: Calibration, history: VisitHistory, goes_on: bool = False) -> rrb.Blueprint:
+    """The blueprint for a window of about 1600 x 1000, the overview in front; ``goes_on``: more dwells are to come."""
+    tabs = [_overview(result, history, predicted(result) or goes_on), _parameters(history)]
+    tabs += [_innovations(result)] if predicted(result) else []
+    return rrb.Blueprint(
+        rrb.Tabs(*tabs),
+        rrb.BlueprintPanel(state="hidden"),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.TimePanel(state="collapsed", timeline=ORIENTATION, play_state="following"),
+    )
+
+
+def _overview(result: Calibration, history: VisitHistory, is_predicted: bool) -> rrb.Horizontal:
+    return rrb.Horizontal(
+        rrb.Vertical(*_sigmas(history), _pose(result)),
+        rrb.Vertical(_platform(result), *_fit(is_predicted), row_shares=[2, 1, 1] if is_predicted else [1, 1]),
+        rrb.TextDocumentView(origin="summary", name="result"),
+        column_shares=[5, 4.4, 3.8],
+        name="Overview",
+    )
+
+
+def _sigmas(history: VisitHistory) -> list[rrb.TimeSeriesView]:
+    """A panel a kind of parameter, one for the coefficients of effects if there are any."""
+    corner = rrb.Corner2D.RightTop
+    kinds = [(f"{group.title}, {units.shown(group.unit).label}",
+              [k for k, shown in enumerate(history.shown[:12]) if shown.path.rpartition("/")[2] in group.symbols])
+             for group in GROUPS]  # fmt: skip
+    rest = [*range(12, len(history.shown))]
+    kinds += [("coefficients of effects", rest)] if rest else []
+    return [
+        _series([f"{history.shown[k].path}/{curve}" for k in columns for curve in ("log10_sigma", "log10_target")],
+                f"log₁₀ σ of {name}", corner)
+        for name, columns in kinds
+    ]  # fmt: skip
+
+
+def _fit(is_predicted: bool) -> list[rrb.TimeSeriesView]:
+    """How well each orientation fits: innovations and NIS, or residuals where few dwells were predicted."""
+    if not is_predicted:
+        return [_series(["residual/**"], "residuals over σ")]
+    ratios = [f"innovation/{channel}/in_sigma" for channel in CHANNELS]
+    return [
+        _series([*ratios, "innovation/bound"], "innovations over σ"),
+        _series(["nis/**"], "NIS, with the middle 95 % of χ²; red: above"),
+    ]
+
+
+def _parameters(history: VisitHistory) -> rrb.Grid:
+    """A panel for each parameter and coefficient: what is estimated, with 1 sigma."""
+    panels = [
+        _series([f"{shown.path}/deviation", f"{shown.path}/band"],
+                f"{shown.label}{' − nominal' * (k < 12)} ± σ, {shown.unit}", around=history.late_range(k))
+        for k, shown in enumerate(history.shown)
+    ]  # fmt: skip
+    return rrb.Grid(*panels, grid_columns=4, name="Parameters")
+
+
+def _innovations(result: Calibration) -> rrb.Vertical:
+    """A panel an accelerometer, on the same axes, which show the innovations after a third of the run."""
+    unit, last = units.shown("m/s^2"), result.visits[-1].dwell.number
+    late = [visit for visit in result.visits if visit.dwell.number >= last / 3]
+    bounds = np.array([2.0 * visit.innovation_sigma_mps2 for visit in late])
+    reach = 1.08 * unit.per_si * float(np.nanmax([np.abs([visit.innovation_mps2 for visit in late]), bounds]))
+    panels = [
+        _series([f"innovation/{channel}/value", f"innovation/{channel}/bound"],
+                f"accelerometer {i}: mean of a dwell less its prediction ± 2σ, {unit.label}", around=(-reach, reach))
+        for i, channel in enumerate(CHANNELS, 1)
+    ]  # fmt: skip
+    return rrb.Vertical(*panels, name="Innovations")
+
+
+def _series(
+    contents: list[str], name: str, legend: rrb.Corner2D | None = None, around: tuple[float, float] | None = None
+) -> rrb.TimeSeriesView:
+    """Curves over the timeline in use; no legend unless a corner is given for it."""
+    return rrb.TimeSeriesView(
+        contents=contents,
+        name=name,
+        plot_legend=rrb.PlotLegend(legend, visible=legend is not None),
+        axis_x=WHOLE_RUN,
+        axis_y=None if around is None else rrb.ScalarAxis(range=around),
+    )
+
+
+def _pose(result: Calibration) -> rrb.TimeSeriesView:
+    name = "gimbal angles, deg" if result.bench.axes else "attitude, quaternion"
+    return _series(["bench/pose/**"], name, rrb.Corner2D.RightTop)
+
+
+def eye(bench: Bench, position: Vector, target: Vector) -> rrb.EyeControls3D:
+    """A look at the platform from ``position`` to ``target``, both in a frame with y up, whatever axis is up."""
+    at_rest = np.zeros((1, len(bench.axes))) if bench.axes else np.array([[0.0, 0.0, 0.0, 1.0]])
+    place, goal, up = bench.to_platform(np.array([position, target, (0.0, 1.0, 0.0)]), at_rest)
+    return rrb.EyeControls3D(position=place, look_target=goal, eye_up=up)
+
+
+def _platform(result: Calibration) -> rrb.Spatial3DView:
+    so_far = [
+        rrb.VisibleTimeRange(
+            name, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative(seq=0)
+        )
+        for name in (ORIENTATION, BENCH_TIME)
+    ]
+    return rrb.Spatial3DView(
+        origin="platform",
+        name=f"platform{magnified(result.estimate)}",
+        overrides={"platform/visited": rrb.VisibleTimeRanges(so_far)},
+        eye_controls=eye(result.bench, (1.8, 1.2, 2.2), (0.05, 0.18, 0.0)),
+        line_grid=False,
+    )
