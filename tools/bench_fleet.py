@@ -25,13 +25,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from kf_calib.cli.evaluate import replay
 from kf_calib.cli.fleet import SingleCommands
+from kf_calib.cli.options import EvaluationOptions, ReadingOptions
 from kf_calib.fleet.batch import RunEvaluation, cluster, evaluate_all
 from kf_calib.fleet.run_list import ListedRun, Row, runs_of
 from kf_calib.fleet.store import Store
-
-_OF_REPLAY_ALONE = ("recording", "overwrite", "strict", "as_json", "save", "save_model")
 
 
 @dataclass(frozen=True)
@@ -46,8 +44,7 @@ class HandedOver:
 
 
 def evaluation() -> RunEvaluation:
-    usual = replay.make_context("replay", ["run.mcap"]).params
-    commands = SingleCommands({key: value for key, value in usual.items() if key not in _OF_REPLAY_ALONE})
+    commands = SingleCommands(ReadingOptions(), EvaluationOptions())
     return RunEvaluation(commands, commands.checksum)
 
 

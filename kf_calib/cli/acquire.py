@@ -8,29 +8,28 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import rich_click as click
 from click import get_current_context  # rich_click declares that there may be none
 
-from kf_calib.cli.command import NUMBER, OUTPUT, POSITIVE, command
+from kf_calib.cli.command import OUTPUT, POSITIVE, argument, command, option
 from kf_calib.cli.echo import complain, echo, print_json, progress, show
 from kf_calib.cli.failures import Interrupter, answered
 from kf_calib.cli.files import OutputFile, claimed, delivery
 from kf_calib.cli.options import (
-    F,
-    bench_options,
-    columns_option,
-    input_options,
-    json_option,
-    no_angles_option,
-    overrides,
-    overwrite_option,
-    pair,
-    units_option,
+    BenchOptions,
+    DeviceOptions,
+    ForeignColumns,
+    Json,
+    NoAngles,
+    Overwrite,
+    ShownUnits,
+    renamed,
 )
 from kf_calib.cli.pictures import write_view
 from kf_calib.errors import InputError
+from kf_calib.sources.simulation.settings import Ambient, SimulationOptions
 from kf_calib.support.output_files import Outputs, write_whole
 from kf_calib.support.text import sentence
 
@@ -43,6 +42,8 @@ if TYPE_CHECKING:
     from kf_calib.sources.simulation.simulator import Simulation
 
 
+Output = Annotated[Path, argument(type=OutputFile(), metavar="OUT")]
+_PERIOD_S = 3600.0  # of the temperature
 _LARGE_BYTES = 1e9  # of a recording: minutes of work
 _HOW_TO_HIDE = """\
 --hide NAME=SIZE: one size for all coefficients, with signs drawn from the seed, or SIZE,SIZE,... one for each;
@@ -84,60 +85,44 @@ def _list_hidden(ctx: click.Context, _: click.Parameter, texts: tuple[str, ...])
     return texts
 
 
-def simulation_options(command: F) -> F:
-    """What the simulated bench is and does."""
-    run_option, hidden_option, noise_option, warmth_option = (
-        partial(click.option, panel=panel) for panel in ("Run", "Hidden effects", "Noise", "Temperature")
-    )
-    options = [
-        run_option("--grade", type=click.Choice(["paper", "navigation", "mems"]), default="navigation",
-                   show_default=True, help="Grade of the simulated sensors."),
-        run_option("--plan", default="spread", show_default=True,
-                   help="spread, faces, or a CSV file of gimbal angles in deg, an orientation a line."),
-        run_option("--orientations", "count", type=click.IntRange(min=1), metavar="N", default=24, show_default=True,
-                   help="Orientations of a spread plan."),
-        run_option("--dwell-s", type=POSITIVE, default=30.0, show_default=True,
-                   help="Seconds in each orientation."),
-        run_option("--sample-hz", type=POSITIVE, default=100.0, show_default=True,
-                   help="Rate of the readings."),
-        run_option("--angle-hz", type=POSITIVE, default=10.0, show_default=True,
-                   help="Rate of the platform angles."),
-        run_option("--slew-degps", type=POSITIVE, default=20.0, show_default=True,
-                   help="Greatest speed between orientations, deg/s."),
-        run_option("--seed", type=int, metavar="N", default=0, show_default=True,
-                   help="Seed of sensors, plan and noise."),
-        run_option("--unstated", is_flag=True, help="Do not state the setting error and scatter in the recording."),
-        hidden_option("--hide", "hidden", multiple=True, metavar="NAME=SIZE", is_eager=True, callback=_list_hidden,
-                      help="Hide an effect in the truth, for example second-order=4ug/g^2, second-order=10sigma (10 "
-                      "times what noise leaves uncertain), random or random=10sigma; repeatable; help lists them all."),
-        noise_option("--white", "white_mps2", type=NUMBER, help="White noise of a reading, m/s^2."),
-        noise_option("--ar1", "ar1_phi", type=NUMBER, help="Correlation of that noise from one reading to the next."),
-        noise_option("--flicker", "flicker_mps2", type=NUMBER, help="1/f noise: floor of the Allan deviation, m/s^2."),
-        noise_option("--walk", "walk_mps2_per_sqrt_s", type=NUMBER, help="Random walk of the biases, m/s^2/sqrt(s)."),
-        noise_option("--scatter", "scatter_mps2", type=NUMBER, help="Offset of each sensor in each dwell, m/s^2."),
-        noise_option("--setting", "setting_sigma_deg", type=NUMBER, help="Setting error of each orientation, deg."),
-        noise_option("--encoder-sigma", "encoder_sigma_deg", type=NUMBER, help="Noise of the encoders, deg."),
-        noise_option("--encoder-step", "encoder_step_deg", type=NUMBER, help="Resolution of the encoders, deg."),
-        noise_option("--outlier-rate", type=NUMBER, help="Share of readings that are outliers."),
-        noise_option("--outlier-size", "outlier_mps2", type=NUMBER, help="Size of an outlier, m/s^2."),
-        warmth_option("--temperature", "constant_c", type=NUMBER, default=25.0, show_default=True,
-                      help="Temperature about which it swings, degC."),
-        warmth_option("--temperature-swing", "swing_c", type=NUMBER, default=0.0, show_default=True,
-                      help="Swing of the temperature to either side, K."),
-        warmth_option("--temperature-period-s", "period_s", type=NUMBER, default=3600.0, show_default=True,
-                      help="Period of that swing, s."),
-        warmth_option("--warm-up-c", "warm_up_c", type=NUMBER, default=0.0, show_default=True,
-                      help="How much colder the start is, K."),
-        warmth_option("--warm-up-s", "warm_up_s", type=NUMBER, default=1800.0, show_default=True,
-                      help="Time constant of the warming up, s."),
-        warmth_option("--thermometer-sigma", "sigma_c", type=NUMBER, default=0.01, show_default=True,
-                      help="Noise of the thermometer, K."),
-        warmth_option("--thermometer-step", "step_c", type=NUMBER, default=0.0, show_default=True,
-                      help="Resolution of the thermometer, K."),
-    ]  # fmt: skip
-    for option in reversed(options):
-        command = option(command)
-    return command
+_of_run, _of_hidden, _of_noise, _of_warmth = (
+    partial(option, panel=panel) for panel in ("Run", "Hidden effects", "Noise", "Temperature")
+)
+
+
+_OF_SIMULATION = {
+    "grade": _of_run("--grade", help="Grade of the simulated sensors."),
+    "plan": _of_run("--plan", help="spread, faces, or a CSV file of gimbal angles in deg, an orientation a line."),
+    "count": _of_run("--orientations", type=click.IntRange(min=1), metavar="N", help="Orientations of a spread plan."),
+    "dwell_s": _of_run("--dwell-s", type=POSITIVE, help="Seconds in each orientation."),
+    "sample_hz": _of_run("--sample-hz", type=POSITIVE, help="Rate of the readings."),
+    "angle_hz": _of_run("--angle-hz", type=POSITIVE, help="Rate of the platform angles."),
+    "slew_degps": _of_run("--slew-degps", type=POSITIVE, help="Greatest speed between orientations, deg/s."),
+    "seed": _of_run("--seed", metavar="N", help="Seed of sensors, plan and noise."),
+    "unstated": _of_run("--unstated", help="Do not state the setting error and scatter in the recording."),
+    "hidden": _of_hidden("--hide", metavar="NAME=SIZE", is_eager=True, callback=_list_hidden,
+                         help="Hide an effect in the truth, for example second-order=4ug/g^2, second-order=10sigma (10 "
+                         "times what noise leaves uncertain), random or random=10sigma; repeatable; help lists them "
+                         "all."),
+    "white_mps2": _of_noise("--white", help="White noise of a reading, m/s^2."),
+    "ar1_phi": _of_noise("--ar1", help="Correlation of that noise from one reading to the next."),
+    "flicker_mps2": _of_noise("--flicker", help="1/f noise: floor of the Allan deviation, m/s^2."),
+    "walk_mps2_per_sqrt_s": _of_noise("--walk", help="Random walk of the biases, m/s^2/sqrt(s)."),
+    "scatter_mps2": _of_noise("--scatter", help="Offset of each sensor in each dwell, m/s^2."),
+    "setting_sigma_deg": _of_noise("--setting", help="Setting error of each orientation, deg."),
+    "encoder_sigma_deg": _of_noise("--encoder-sigma", help="Noise of the encoders, deg."),
+    "encoder_step_deg": _of_noise("--encoder-step", help="Resolution of the encoders, deg."),
+    "outlier_rate": _of_noise("--outlier-rate", help="Share of readings that are outliers."),
+    "outlier_mps2": _of_noise("--outlier-size", help="Size of an outlier, m/s^2."),
+    "constant_c": _of_warmth("--temperature", help="Temperature about which it swings, degC."),
+    "swing_c": _of_warmth("--temperature-swing", help="Swing of the temperature to either side, K."),
+    "period_s": _of_warmth("--temperature-period-s", default=_PERIOD_S, help="Period of that swing, s."),
+    "warm_up_c": _of_warmth("--warm-up-c", help="How much colder the start is, K."),
+    "warm_up_s": _of_warmth("--warm-up-s", help="Time constant of the warming up, s."),
+    "sigma_c": _of_warmth("--thermometer-sigma", help="Noise of the thermometer, K."),
+    "step_c": _of_warmth("--thermometer-step", help="Resolution of the thermometer, K."),
+}  # fmt: skip
+"""What the simulated bench is and does."""
 
 
 class _Recorded(NamedTuple):
@@ -190,24 +175,23 @@ def _record(source: Source, path: Path, overwrite: bool, tick: Callable[[float],
     seldom=("angle_hz", "outlier_rate", "outlier_mps2", "encoder_sigma_deg", "encoder_step_deg", "flicker_mps2",
             "period_s", "warm_up_c", "warm_up_s", "sigma_c", "step_c", "large"),
 )  # fmt: skip
-@click.argument("output", type=OutputFile(), metavar="OUT")
-@simulation_options
-@click.option("--no-angles", is_flag=True, panel="Run", help="Record no angles, as of a board that is turned by hand.")
-@bench_options
-@overwrite_option
-@click.option("--large", is_flag=True, panel=OUTPUT, help="Begin even where the disk would not hold the recording.")
-@json_option
 def simulate(
-    output: Path, no_angles: bool, overwrite: bool, large: bool, as_json: bool, **options: Any
+    output: Output, options: Annotated[SimulationOptions, _OF_SIMULATION],
+    no_angles: Annotated[bool, option(
+        "--no-angles", panel="Run", help="Record no angles, as of a board that is turned by hand.")],
+    bench: BenchOptions, overwrite: Overwrite,
+    large: Annotated[bool, option(
+        "--large", panel=OUTPUT, help="Begin even where the disk would not hold the recording.")],
+    as_json: Json,
 ) -> None:  # fmt: skip
     """Record a simulated bench run to OUT; its truth goes to a side file that no estimator opens."""
     from kf_calib.sources.simulation.detectability import truth_file, write_truth
     from kf_calib.sources.simulation.options import simulation
     from kf_calib.sources.simulation.simulator import ByHand
 
-    claimed([Path(options["plan"])], {"OUT, whose truth goes there": truth_file(output)}, overwrite)
-    options["no_angles"] = no_angles
-    source = simulation(options, overrides(options), begin=partial(_foresee, path=output, large=large))
+    claimed([Path(options.plan)], {"OUT, whose truth goes there": truth_file(output)}, overwrite)
+    foresee = partial(_foresee, path=output, large=large)
+    source = simulation(options, bench.keys, angles=not no_angles, begin=foresee)
     with progress(f"simulating {output.name}", as_json) as tick:
         recorded = _record(ByHand(source) if no_angles else source, output, overwrite, tick)
     truth = write_truth(source, output, not no_angles)
@@ -239,23 +223,17 @@ def _size(count: int) -> str:
     'record run.mcap - --bench bench.toml --column "acc x [g]=ax_g" < bench.csv',
     "record run.mcap counts.csv --bench bench.toml --accel-scale 3.9e-6 --accel-unit g --channels 1,-2,3",
 )
-@click.argument("output", type=OutputFile(), metavar="OUT")
-@click.argument("lines", type=click.Path(path_type=Path, allow_dash=True), default="-")
-@no_angles_option
-@columns_option
-@input_options
-@bench_options
-@overwrite_option
-@json_option
 def record(
-    output: Path, lines: Path, no_angles: bool, columns: tuple[str, ...], overwrite: bool, as_json: bool, **options: Any
+    output: Output, lines: Annotated[Path, argument(type=click.Path(path_type=Path, allow_dash=True), default="-")],
+    no_angles: NoAngles, columns: ForeignColumns, device: DeviceOptions, bench: BenchOptions, overwrite: Overwrite,
+    as_json: Json,
 ) -> None:  # fmt: skip
     """Record CSV or JSON LINES (a file, or - for standard input) to the MCAP file OUT."""
     from kf_calib.sources.files.lines import Lines
 
     claimed(overwrite=overwrite)
-    renamed = dict(pair(text) for text in columns)
-    source = Lines(sys.stdin.buffer if str(lines) == "-" else lines, overrides(options), renamed, angles=not no_angles)
+    name, keys = renamed(columns), bench.keys | device.keys
+    source = Lines(sys.stdin.buffer if str(lines) == "-" else lines, keys, name, angles=not no_angles)
     with progress(f"recording {output.name}", as_json or str(lines) == "-") as tick, _told_if_table(lines):
         recorded = _record(source, output, overwrite, tick)
     warnings = [*source.warnings, *recorded.notes]
@@ -292,11 +270,12 @@ def _folder() -> str:
 
 
 @command("demo", "demo somewhere", "demo --tutorial")
-@click.argument("folder", type=click.Path(path_type=Path, file_okay=False), default=_folder)
-@click.option("--tutorial", is_flag=True, is_eager=True, help="Instead, copy the recordings of the tutorial to FOLDER.")
-@units_option
-@json_option
-def demo(folder: Path, tutorial: bool, as_json: bool) -> None:
+def demo(
+    folder: Annotated[Path, argument(type=click.Path(path_type=Path, file_okay=False), default=_folder)],
+    tutorial: Annotated[bool, option(
+        "--tutorial", is_eager=True, help="Instead, copy the recordings of the tutorial to FOLDER.")],
+    units: ShownUnits, as_json: Json,
+) -> None:  # fmt: skip
     """The main job on a simulated run: record, replay, compare with least squares, save the view; files in FOLDER.
 
     FOLDER is "out" where you name none, with --tutorial "recordings". Files of an earlier demo there are replaced.
@@ -354,8 +333,9 @@ def _do_main_job(folder: Path, as_json: bool) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     recording, rrd = folder / "demo.mcap", folder / "demo.rrd"
     outputs = Outputs({"FOLDER": recording, "the truth": truth_file(recording), "the view": rrd}, overwrite=True)
-    options = simulate.make_context("simulate", [str(recording)]).params
-    source = simulation(options | {"dwell_s": 15.0, "slew_degps": 90.0, "seed": 2019}, overrides(options))
+    source = simulation(
+        SimulationOptions(dwell_s=15.0, slew_degps=90.0, seed=2019, ambient=Ambient(period_s=_PERIOD_S)), {}
+    )
     with progress("recording a simulated run", as_json) as tick:
         made = _record(source, recording, True, tick)
         truth = write_truth(source, recording)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import rich_click as click
 
-from kf_calib.cli.command import INPUT, OUTPUT, command
-from kf_calib.cli.echo import print_json, show
+from kf_calib.cli.command import INPUT, argument, command, option
+from kf_calib.cli.echo import print_result
 from kf_calib.cli.files import claimed, output_option
-from kf_calib.cli.options import effects_from_option, json_option, overwrite_option, trust_option
+from kf_calib.cli.options import Json, Overwrite, ProgramOptions
 
 if TYPE_CHECKING:
     from kf_calib.estimation.measurement_model import Model
@@ -19,26 +19,23 @@ if TYPE_CHECKING:
     from kf_calib.exchange.certificate.statement import Statement
     from kf_calib.support.output_files import Outputs
 
-_path = click.Path(path_type=Path)
-statement_option = click.option("--statement", type=_path, metavar="LAB.toml", panel=INPUT,
-                                help="What the laboratory states: docs/certificate.md has the keys.")  # fmt: skip
+StatementFile = Annotated[Path | None, option(
+    "--statement", metavar="LAB.toml", panel=INPUT,
+    help="What the laboratory states: docs/certificate.md has the keys.",
+)]  # fmt: skip
 
 
 @command("certificate cal.json --statement lab.toml -o certificate.pdf")
-@click.argument("calibration", type=_path, metavar="CAL")
-@output_option("-o", "--out", "output", required=True, metavar="OUT.pdf", panel=OUTPUT,
-               help="The certificate: PDF/A-3b with the XML attached.")  # fmt: skip
-@output_option("--xml", metavar="OUT.xml", panel=OUTPUT, help="Save the XML as a file of its own, too.")
-@statement_option
-@click.option("--schema", type=_path, metavar="DCC.xsd", panel=INPUT,
-              help="Validate the XML against this copy of the DCC's schema.")  # fmt: skip
-@effects_from_option
-@trust_option
-@overwrite_option
-@json_option
 def certificate(
-    calibration: Path, output: Path, xml: Path | None, statement: Path | None, schema: Path | None,
-    effects_from: tuple[Path, ...], trust: bool, overwrite: bool, as_json: bool,
+    calibration: Annotated[Path, argument(metavar="CAL")],
+    output: Annotated[Path, output_option("-o", "--out", required=True, metavar="OUT.pdf",
+                                          help="The certificate: PDF/A-3b with the XML attached.")],
+    xml: Annotated[Path | None, output_option(
+        "--xml", metavar="OUT.xml", help="Save the XML as a file of its own, too.")],
+    statement: StatementFile,
+    schema: Annotated[Path | None, option("--schema", metavar="DCC.xsd", panel=INPUT,
+                                          help="Validate the XML against this copy of the DCC's schema.")],
+    programs: ProgramOptions, overwrite: Overwrite, as_json: Json,
 ) -> None:  # fmt: skip
     """A calibration certificate as ISO/IEC 17025 asks: results, expanded uncertainties, budget, traceability.
 
@@ -54,12 +51,9 @@ def certificate(
     for path in (calibration, stated.before):
         if path is not None:
             saved = calibration_file.open_calibration(path)
-            calibrations.append((saved, saved.model(path, effects_from, trust)))
+            calibrations.append((saved, saved.model(path, programs.effects_from, programs.trust)))
     written, standing = write_certificate(outputs, output, stated, *calibrations, xml=xml, schema=schema)
-    if as_json:
-        print_json(views.certificate_object(written, standing, output, xml))
-    else:
-        show(views.certificate_report(written, standing, output, xml))
+    print_result(as_json, views.certificate_object, views.certificate_report, written, standing, output, xml)
 
 
 def stated_in(certificate: Path | None, statement: Path | None) -> Statement | None:

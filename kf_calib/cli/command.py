@@ -1,4 +1,11 @@
-"""A command, its examples, and its ``--help``, which fits two screens.
+"""A command, its options, its examples, and its ``--help``, which fits two screens.
+
+A command is a function whose parameters say what the command line has, in this order: one of type
+``Annotated[float, option("--settle-s", ...)]`` is an option, with ``argument`` in its place an argument, and one whose
+type is a dataclass stands for the options of its fields, which are annotated in the same way, or, where the dataclass
+is not of the command line, in a mapping that annotates the parameter. Whether an option takes a
+number, a path or one of several words, is a flag or may be repeated, and what its default is, follows from type and
+default of the parameter as far as ``option`` does not say it.
 
 Numbers on the command line: finite, within their range, with a decimal point.
 """
@@ -6,8 +13,12 @@ Numbers on the command line: finite, within their range, with a decimal point.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection
-from typing import Any
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import fields, is_dataclass
+from functools import partial, wraps
+from pathlib import Path
+from types import NoneType
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import rich_click as click
 
@@ -64,15 +75,81 @@ def _show_all(ctx: click.Context, param: click.Parameter, asked: bool) -> None:
         ctx.exit()
 
 
+option, argument = partial(partial, click.option), partial(partial, click.argument)
+"""What a parameter's annotation says of it: what ``click.option`` or ``click.argument`` takes, but for its name."""
+
+
 def command(
     *examples: str, name: str | None = None, seldom: Collection[str] = ()
-) -> Callable[[Callable[..., Any]], click.RichCommand]:
+) -> Callable[[Callable[..., None]], click.RichCommand]:
     """A command of ``kf-calib``; examples: what follows its options in ``--help``, a line each.
 
     seldom: options of this command that ``--help`` leaves out, besides those of unusual benches and files.
     """
     epilog = "\n\n".join(["Examples:", *(f"$ kf-calib {line}" for line in examples)])
-    return click.command(name, cls=_Command, seldom=seldom, epilog=epilog)
+
+    def made(function: Callable[..., None]) -> click.RichCommand:
+        kinds = get_type_hints(function)
+
+        @wraps(function)
+        def callback(*args: Any, **values: Any) -> None:
+            groups = {name: grouped(kind, values) for name, kind in kinds.items() if is_dataclass(kind)}
+            function(*args, **{name: value for name, value in values.items() if name in kinds}, **groups)
+
+        for declare in reversed([*_declarations(function, {})]):
+            declare(callback)
+        return click.command(name, cls=_Command, seldom=seldom, epilog=epilog)(callback)
+
+    return made
+
+
+def _declarations(owner: Any, options: Mapping[str, Any]) -> Iterator[Callable[..., Any]]:
+    """Decorators that declare to click the parameters of a function, or the fields of a dataclass and of those in it.
+
+    options: those of fields that are not annotated.
+    """
+    defaults = {field.name: field.default for field in fields(owner)} if is_dataclass(owner) else {}
+    for name, hint in get_type_hints(owner, include_extras=True).items():
+        kind, declare = get_args(hint) if get_origin(hint) is Annotated else (hint, options.get(name))
+        if is_dataclass(kind):
+            yield from _declarations(kind, declare or options)
+        elif declare is not None:
+            implied = _implied(kind, defaults.get(name), is_option=declare.func is click.option)
+            yield declare(name, **implied | declare.keywords)
+
+
+def _implied(kind: Any, default: object, is_option: bool) -> dict[str, Any]:
+    """What type and default of a parameter say of its option; an optional one has the type beside None."""
+    if NoneType in get_args(kind):
+        kind = get_args(kind)[0]
+    implied = dict[str, Any]()
+    if get_origin(kind) is tuple:
+        kind = get_args(kind)[0]
+        implied |= {"multiple": True} if is_option else {"nargs": -1}
+    if get_origin(kind) is Literal:
+        implied["type"] = click.Choice(get_args(kind))
+    elif kind is bool:
+        implied["is_flag"] = True
+    elif kind is not str:
+        implied["type"] = {float: NUMBER, int: click.INT, Path: click.Path(path_type=Path)}[kind]
+    if default is None or default is False or default == ():
+        return implied
+    return implied | {"default": default, "show_default": True}
+
+
+def grouped(kind: Any, values: Mapping[str, Any]) -> Any:
+    """A dataclass of options, and those in it, with the values that click has of them by their names."""
+    hints = get_type_hints(kind)
+    groups = {name: grouped(hint, values) for name, hint in hints.items() if is_dataclass(hint)}
+    return kind(**{name: values[name] for name in hints if name in values}, **groups)
+
+
+def values_of(*groups: Any) -> Iterator[tuple[str, Any]]:
+    """Names and values of all options of dataclasses."""
+    for group in groups:
+        for field in fields(group):
+            value = getattr(group, field.name)
+            yield from values_of(value) if is_dataclass(value) else [(field.name, value)]
 
 
 class Number(click.ParamType[float]):

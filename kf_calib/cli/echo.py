@@ -120,6 +120,16 @@ def show(renderable: Any) -> None:
     echo_drawn(rendered(renderable))
 
 
+def print_result(
+    as_json: bool, of_json: Callable[..., Mapping[str, Any]], report: Callable[..., Any], *made: Any
+) -> None:
+    """Print what was made: one JSON object, or what people read; both are functions of it."""
+    if as_json:
+        print_json(of_json(*made))
+    else:
+        show(report(*made))
+
+
 def rendered(renderable: Any) -> str:
     """As text for standard output, its line ended; nothing is written."""
     from kf_calib.views.terminal import PlainConsole

@@ -3,35 +3,33 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated
 
 import rich_click as click
 
-from kf_calib.cli.command import INPUT, OUTPUT, command
+from kf_calib.cli.command import INPUT, OUTPUT, argument, command, grouped, option, values_of
 from kf_calib.cli.echo import complain, print_json, progress, show
 from kf_calib.cli.files import claimed, delivery, output_option
 from kf_calib.cli.options import (
-    BENCH_OPTIONS,
-    bench_model_option,
-    effects_of,
-    filter_options,
-    json_option,
+    BenchModelFile,
+    BenchOptions,
+    EvaluationOptions,
+    Json,
+    Overwrite,
+    ProgramOptions,
+    ReadingOptions,
+    Save,
+    SaveModel,
+    ShownUnits,
+    Strict,
+    exit_if,
     opened,
-    overrides,
-    overwrite_option,
-    recording_of,
-    recording_options,
-    save_model_option,
-    save_option,
-    settings_of,
-    strict_option,
-    units_option,
 )
-from kf_calib.cli.pictures import Pictures, figure_options, picture_options
-from kf_calib.cli.report import measured_of, report_option, save_report, typed
+from kf_calib.cli.pictures import FigureFiles, Pictures
+from kf_calib.cli.report import ReportFile, measured_of, save_report, typed
 from kf_calib.errors import InputError
 
 if TYPE_CHECKING:
@@ -53,33 +51,16 @@ _OF_DIAGNOSE_ALONE = (
 
 
 @command("replay run.mcap", 'replay bag.mcap --axes "y z x" --gravity 9.8123 --with second-order --rrd run.rrd')
-@click.argument("recording", type=click.Path(path_type=Path))
-@recording_options
-@filter_options
-@bench_model_option
-@picture_options
-@save_option
-@save_model_option
-@overwrite_option
-@strict_option
-@units_option
-@json_option
-@click.pass_context
 def replay(
-    ctx: click.Context,
-    recording: Path,
-    save: Path | None,
-    save_model: Path | None,
-    overwrite: bool,
-    strict: bool,
-    as_json: bool,
-    **options: Any,
-) -> None:
+    recording: Annotated[Path, argument()], reading: ReadingOptions, evaluation: EvaluationOptions,
+    bench_model: BenchModelFile, pictures: Pictures, save: Save, save_model: SaveModel, overwrite: Overwrite,
+    strict: Strict, units: ShownUnits, as_json: Json,
+) -> None:  # fmt: skip
     """Run a recording through the filter: twelve parameters, their sigma, and whether the model fits."""
     from kf_calib.estimation.calibration import calibrate
 
-    outputs, pictures = claimed(overwrite=overwrite), Pictures.taken_from(options)
-    source, settings = opened(recording, options)
+    outputs = claimed(overwrite=overwrite)
+    source, settings = opened(recording, reading, evaluation, bench_model)
     with progress(f"replaying {recording.name}", as_json) as tick:
         result = calibrate(source, settings, tick)
     if as_json:
@@ -94,26 +75,20 @@ def replay(
         deliver.calibration(save, result, source)
         deliver.model(save_model, result)
         pictures.save(deliver, result)
-    if strict and result.consistency.consistent is False:
-        ctx.exit(1)
+    exit_if(strict and result.consistency.consistent is False)
 
 
 @command("compare run.mcap")
-@click.argument("recording", type=click.Path(path_type=Path))
-@recording_options
-@filter_options
-@figure_options
-@report_option
-@overwrite_option
-@units_option
-@json_option
-def compare(recording: Path, report: Path | None, overwrite: bool, as_json: bool, **options: Any) -> None:
+def compare(
+    recording: Annotated[Path, argument()], reading: ReadingOptions, evaluation: EvaluationOptions,
+    figures: FigureFiles, report: ReportFile, overwrite: Overwrite, units: ShownUnits, as_json: Json,
+) -> None:  # fmt: skip
     """Block engine, filterpy and batch least squares on the same recording: differences, time, memory."""
     from kf_calib.estimation.engine_comparison import compare as run
 
-    outputs, pictures = claimed(overwrite=overwrite), Pictures.taken_from(options)
-    source, settings = opened(recording, options)
-    measured = measured_of(recording, options) if report else None
+    outputs = claimed(overwrite=overwrite)
+    source, settings = opened(recording, reading, evaluation)
+    measured = measured_of(recording, reading) if report else None
     with progress(f"comparing on {recording.name}", as_json) as tick:
         compared = run(source, settings, tick)
     if as_json:
@@ -125,24 +100,19 @@ def compare(recording: Path, report: Path | None, overwrite: bool, as_json: bool
 
         show(comparison_table(compared))
     with delivery(outputs, as_json) as deliver:
-        pictures.save(deliver, compared)
+        figures.save(deliver, compared)
         save_report(deliver, report, compared, measured)
 
 
 @command("effects", "effects hysteresis", "effects 'mine = fx*fy*T' second-order --recording run.mcap", name="effects")
-@click.argument("names", nargs=-1, metavar="[NAME]...")
-@click.option(
-    "--recording",
-    type=click.Path(path_type=Path),
-    metavar="REC",
-    panel=INPUT,
-    help="Say of each effect what this recording shows of it: visible, smallest size, confused with what.",
-)
-@recording_options
-@filter_options
-@units_option
-@json_option
-def list_effects(names: tuple[str, ...], recording: Path | None, as_json: bool, **options: Any) -> None:
+def list_effects(
+    names: Annotated[tuple[str, ...], argument(metavar="[NAME]...")],
+    recording: Annotated[Path | None, option(
+        "--recording", metavar="REC", panel=INPUT,
+        help="Say of each effect what this recording shows of it: visible, smallest size, confused with what.",
+    )],
+    reading: ReadingOptions, evaluation: EvaluationOptions, units: ShownUnits, as_json: Json,
+) -> None:  # fmt: skip
     """The effects a model may have: all of the catalogue and your own, or those NAMEd (formulas too) in detail.
 
     Without --recording they are those of a bench with --axes "y z x" at --latitude 50, or as stated.
@@ -152,13 +122,13 @@ def list_effects(names: tuple[str, ...], recording: Path | None, as_json: bool, 
     from kf_calib.effects import names as known
     from kf_calib.views import catalogue
 
-    effects_of(options)
+    evaluation.effects_of_model()
     for name in names:
         refuse_unknown(name)
     if recording is not None:
-        _list_visible(recording, names, as_json, options)
+        _list_visible(recording, names, as_json, reading, evaluation)
         return
-    bench = Bench.from_metadata({"axes": "y z x", "latitude_deg": "50"} | overrides(options))
+    bench = Bench.from_metadata({"axes": "y z x", "latitude_deg": "50"} | reading.keys)
     chosen = [effect_named(name, bench) for name in names or known(bench)]
     if as_json:
         print_json(catalogue.effects_object(chosen))
@@ -166,7 +136,9 @@ def list_effects(names: tuple[str, ...], recording: Path | None, as_json: bool, 
         show(catalogue.details(chosen) if names else catalogue.overview(chosen))
 
 
-def _list_visible(recording: Path, names: tuple[str, ...], as_json: bool, options: Mapping[str, Any]) -> None:
+def _list_visible(
+    recording: Path, names: tuple[str, ...], as_json: bool, reading: ReadingOptions, evaluation: EvaluationOptions
+) -> None:
     """What a recording shows of effects, beside the model of the options."""
     from kf_calib.effects import effect_named
     from kf_calib.effects import names as known
@@ -175,7 +147,7 @@ def _list_visible(recording: Path, names: tuple[str, ...], as_json: bool, option
     from kf_calib.views import catalogue
     from kf_calib.views.json import clean
 
-    source, settings = opened(recording, options)
+    source, settings = opened(recording, reading, evaluation)
     chosen = [effect_named(name, source.bench) for name in names or known(source.bench)]
     with progress(f"reading {recording.name}", as_json) as tick:
         result = calibrate(source, settings, tick)
@@ -188,31 +160,24 @@ def _list_visible(recording: Path, names: tuple[str, ...], as_json: bool, option
 
 
 @command("diagnose run.mcap", "diagnose run.mcap --with hysteresis")
-@click.argument("recording", type=click.Path(path_type=Path))
-@recording_options
-@filter_options
-@bench_model_option
-@click.option(
-    "--details", is_flag=True, panel=OUTPUT,
-    help="Print the evidence, too: all suspects, where it fails, what this run cannot show, smallest sizes.",
-)  # fmt: skip
-@picture_options
-@overwrite_option
-@strict_option
-@units_option
-@json_option
 @click.pass_context
 def diagnose(
-    ctx: click.Context, recording: Path, details: bool, overwrite: bool, strict: bool, as_json: bool, **options: Any
-) -> None:
+    ctx: click.Context, recording: Annotated[Path, argument()], reading: ReadingOptions,
+    evaluation: EvaluationOptions, bench_model: BenchModelFile,
+    details: Annotated[bool, option(
+        "--details", panel=OUTPUT,
+        help="Print the evidence, too: all suspects, where it fails, what this run cannot show, smallest sizes.",
+    )],
+    pictures: Pictures, overwrite: Overwrite, strict: Strict, units: ShownUnits, as_json: Json,
+) -> None:  # fmt: skip
     """Which physical effect is missing in the model: verdict, probabilities, the shape of it, and what to do next."""
     from kf_calib.diagnosis.missing_effect import diagnose as run
     from kf_calib.diagnosis.refits import Refits
     from kf_calib.estimation.calibration import calibrate
     from kf_calib.views import diagnosis as views
 
-    outputs, pictures = claimed(overwrite=overwrite), Pictures.taken_from(options)
-    source, settings = opened(recording, options)
+    outputs = claimed(overwrite=overwrite)
+    source, settings = opened(recording, reading, evaluation, bench_model)
     with progress(f"diagnosing {recording.name}", as_json) as tick:
         diagnosis = run(calibrate(source, settings, tick), Refits(source))
     if as_json:
@@ -221,8 +186,35 @@ def diagnose(
         show(views.diagnosis_report(diagnosis, typed(ctx, _OF_DIAGNOSE_ALONE), details))
     with delivery(outputs, as_json) as deliver:
         pictures.save(deliver, diagnosis)
-    if strict and diagnosis.test.consistent is False:
-        ctx.exit(1)
+    exit_if(strict and diagnosis.test.consistent is False)
+
+
+@dataclass(frozen=True)
+class StepOptions:
+    """How the effects are chosen."""
+
+    # fmt: off
+    interactive: Annotated[bool, option(
+        "--interactive", panel=STEPS, help="Ask at every step; usual on a terminal.")] = False
+    unattended: Annotated[bool, option(
+        "--unattended", panel=STEPS, help="Never ask; usual where there is no terminal.")] = False
+    accept_first: Annotated[bool, option(
+        "--accept-first", panel=STEPS, help="Where no effect has 95 % probability, take the likeliest.")] = False
+    honest: Annotated[bool, option("--honest", panel=STEPS, help="Held-out error with the choice of effects repeated "
+                                   "without what is held out, in 6 folds.")] = False
+    from_journal: Annotated[Path | None, option(
+        "--from-journal", metavar="FILE", panel=STEPS, help="First take the steps of this journal again.")] = None
+    # fmt: on
+
+    def asks(self, as_json: bool) -> bool:
+        """Whether to ask at every step; raises UsageError where the options say both."""
+        if self.interactive and self.unattended:
+            raise click.UsageError("--interactive asks at every step, --unattended never does: choose one.")
+        if self.interactive and as_json:
+            raise click.UsageError(
+                "--interactive asks questions, --json prints one object and nothing else: choose one."
+            )
+        return self.interactive or (not (self.unattended or as_json) and sys.stdin.isatty() and sys.stdout.isatty())
 
 
 @command(
@@ -230,48 +222,15 @@ def diagnose(
     "improve run.mcap --interactive",
     seldom=("accel_unit", "angle_unit", "columns", "left_out"),
 )
-@click.argument("recording", type=click.Path(path_type=Path))
-@click.option("--interactive", is_flag=True, panel=STEPS, help="Ask at every step; usual on a terminal.")
-@click.option("--unattended", is_flag=True, panel=STEPS, help="Never ask; usual where there is no terminal.")
-@click.option(
-    "--accept-first", is_flag=True, panel=STEPS, help="Where no effect has 95 % probability, take the likeliest."
-)
-@click.option(
-    "--honest",
-    is_flag=True,
-    panel=STEPS,
-    help="Held-out error with the choice of effects repeated without what is held out, in 6 folds.",
-)
-@click.option("--from-journal", type=click.Path(path_type=Path), metavar="FILE", panel=STEPS,
-              help="First take the steps of this journal again.")  # fmt: skip
-@recording_options
-@filter_options
-@save_option
-@output_option("--save-model", "--out-model", metavar="FILE.toml", help="Save the last model here.", panel=OUTPUT)
-@output_option("--journal", "journal_file", metavar="FILE", help="Keep a journal of the steps here.", panel=OUTPUT)
-@picture_options
-@report_option
-@overwrite_option
-@strict_option
-@units_option
-@json_option
 @click.pass_context
 def improve(
-    ctx: click.Context,
-    recording: Path,
-    interactive: bool,
-    unattended: bool,
-    accept_first: bool,
-    honest: bool,
-    save: Path | None,
-    save_model: Path | None,
-    journal_file: Path | None,
-    from_journal: Path | None,
-    report: Path | None,
-    overwrite: bool,
-    strict: bool,
-    as_json: bool,
-    **options: Any,
+    ctx: click.Context, recording: Annotated[Path, argument()], steps: StepOptions, reading: ReadingOptions,
+    evaluation: EvaluationOptions, save: Save,
+    save_model: Annotated[Path | None, output_option(
+        "--save-model", "--out-model", metavar="FILE.toml", help="Save the last model here.")],
+    journal_file: Annotated[Path | None, output_option(
+        "--journal", metavar="FILE", help="Keep a journal of the steps here.")],
+    pictures: Pictures, report: ReportFile, overwrite: Overwrite, strict: Strict, units: ShownUnits, as_json: Json,
 ) -> None:  # fmt: skip
     """Add the effects that are missing, one after another, and see the error fall, until there is a reason to stop."""
     from kf_calib.cli.improvement_dialogue import dialogue
@@ -280,18 +239,17 @@ def improve(
     from kf_calib.estimation.calibration import calibrate
     from kf_calib.views import improvement as views
 
-    interactive = _asks(interactive, unattended, as_json)
-    outputs, pictures = claimed(overwrite=overwrite), Pictures.taken_from(options)
-    earlier = selection_journal.read_journal(from_journal) if from_journal else None
+    interactive, outputs = steps.asks(as_json), claimed(overwrite=overwrite)
+    earlier = selection_journal.read_journal(steps.from_journal) if steps.from_journal else None
     origin = selection_journal.Origin.of(recording)
-    if earlier is not None and from_journal is not None:
-        earlier.refuse_other(origin, from_journal)
-        options |= _of_journal(ctx, options, earlier.origin, from_journal)
-        outputs.spare(options["effects_from"])
-    _refuse_engine(options)
-    settings = settings_of(options)
-    origin = replace(origin, **_for_journal(options, settings.effects))
-    measured = measured_of(recording, options) if report else None
+    if earlier is not None and steps.from_journal is not None:
+        earlier.refuse_other(origin, steps.from_journal)
+        reading, evaluation = _of_journal(ctx, earlier.origin, steps.from_journal)
+        outputs.spare(evaluation.programs.effects_from)
+    _refuse_engine(evaluation)
+    settings = evaluation.settings()
+    origin = _for_journal(origin, reading, evaluation, settings.effects)
+    measured = measured_of(recording, reading) if report else None
 
     with delivery(outputs, as_json) as deliver:
 
@@ -300,18 +258,18 @@ def improve(
 
         difference = None
         with progress(f"improving on {recording.name}", as_json) as tick:
-            source = recording_of(recording, options)
+            source = reading.opened(recording)
             start, refits = calibrate(source, settings, tick), Refits(source)
             if earlier is not None:
                 state, difference = selection_journal.replay_journal(earlier, start, refits)
             elif interactive:
                 state = stepwise_selection.begin(start, refits)
             else:
-                state = stepwise_selection.improve(start, accept_first, keep, refits)
+                state = stepwise_selection.improve(start, steps.accept_first, keep, refits)
         if interactive:
             state = dialogue(state, refits, keep)
-        with progress("holding out orientations", as_json or not honest) as tick:
-            checked = nested_cross_validation.nested_cross_validation(start, on_fold=tick) if honest else None
+        with progress("holding out orientations", as_json or not steps.honest) as tick:
+            checked = nested_cross_validation.nested_cross_validation(start, on_fold=tick) if steps.honest else None
         if as_json:
             files = {"saved_model": save_model, "journal": journal_file}
             print_json(views.improvement_object(state, checked, difference, files))
@@ -322,49 +280,42 @@ def improve(
         deliver.file(journal_file, lambda path: selection_journal.write_journal(path, state, origin))
         pictures.save(deliver, state)
         save_report(deliver, report, state, measured, [views.honest_sentence(checked)] if checked else [])
-    if strict and state.diagnosis.test.consistent is False:
-        ctx.exit(1)
+    exit_if(strict and state.diagnosis.test.consistent is False)
 
 
-def _asks(interactive: bool, unattended: bool, as_json: bool) -> bool:
-    """Whether to ask at every step; raises UsageError where the options say both."""
-    if interactive and unattended:
-        raise click.UsageError("--interactive asks at every step, --unattended never does: choose one.")
-    if interactive and as_json:
-        raise click.UsageError("--interactive asks questions, --json prints one object and nothing else: choose one.")
-    return interactive or (not (unattended or as_json) and sys.stdin.isatty() and sys.stdout.isatty())
-
-
-_BY_CONTENT = ("bench_file", "model_file", *BENCH_OPTIONS)
-_LEAVE = ("effects_from", "trust")
+_BY_CONTENT = ("model_file", *(field.name for field in fields(BenchOptions)))
+_LEAVE = tuple(field.name for field in fields(ProgramOptions))
 """Options by which a user allows Python files to be run: a journal cannot give them."""
 
 
-def _refuse_engine(options: Mapping[str, Any]) -> None:
-    if options["engine"] != "block":
+def _refuse_engine(evaluation: EvaluationOptions) -> None:
+    if evaluation.engine != "block":
         raise click.UsageError(
             "improve refits from folded dwells, as the block engine does: leave out --engine, and check what it finds "
             "with replay --model FILE --engine filterpy."
         )
 
 
-def _for_journal(options: Mapping[str, Any], effects: Sequence[str]) -> dict[str, Any]:
-    """Options and programs of an ``Origin``: all that numbers depend on; files of bench keys and of models by what they
+def _for_journal(
+    origin: Origin, reading: ReadingOptions, evaluation: EvaluationOptions, effects: Sequence[str]
+) -> Origin:
+    """An origin with all that numbers depend on: options and programs; files of bench keys and of models by what they
     say."""
     from kf_calib.effects import loaded
     from kf_calib.exchange import calibration_file
 
-    files = [*options["effects_from"]]
-    if options["model_file"] is not None:
-        files += (
-            calibration_file.read_model(options["model_file"]).allowed(options["effects_from"], options["trust"]).files
-        )
+    programs = evaluation.programs
+    files = [*programs.effects_from]
+    if evaluation.model_file is not None:
+        model = calibration_file.read_model(evaluation.model_file)
+        files += model.allowed(programs.effects_from, programs.trust).files
     others = (*_BY_CONTENT, *_LEAVE)
-    kept = {key: value for key, value in options.items() if value is not None and key not in others}
-    return {"options": kept | overrides(options) | {"effects": list(effects)}, "programs": tuple(loaded(files))}
+    kept = {key: value for key, value in values_of(reading, evaluation) if value is not None and key not in others}
+    options = kept | reading.keys | {"effects": list(effects)}
+    return replace(origin, options=options, programs=tuple(loaded(files)))
 
 
-def _of_journal(ctx: click.Context, options: Mapping[str, Any], origin: Origin, path: Path) -> dict[str, Any]:
+def _of_journal(ctx: click.Context, origin: Origin, path: Path) -> tuple[ReadingOptions, EvaluationOptions]:
     """The options of a journal, as if they had been given, with the Python files that may be run for it.
 
     Raises UsageError where some are given as well, and InputError where the journal's make no sense.
@@ -373,14 +324,16 @@ def _of_journal(ctx: click.Context, options: Mapping[str, Any], origin: Origin, 
 
     from kf_calib.effects.user import allowed
 
-    params = [param for param in ctx.command.params if param.name in options and param.name not in _LEAVE]
+    names = {name for name, _ in values_of(ReadingOptions(), EvaluationOptions())} - {*_LEAVE}
+    params = [param for param in ctx.command.params if param.name in names]
     given = [
         param.opts[0] for param in params if ctx.get_parameter_source(param.name or "") is ParameterSource.COMMANDLINE
     ]
     if given:
         raise click.UsageError(f"--from-journal has its options from the journal: leave out {', '.join(given)}.")
     journalled = {key: value for key, value in origin.options.items() if key not in ("bench_file", "model_file")}
-    values: dict[str, Any] = {key: None for key in _BY_CONTENT if key not in journalled}
+    values = ctx.params.copy()
+    values.update(dict.fromkeys(key for key in _BY_CONTENT if key not in journalled))
     for param in params:
         if (name := param.name or "") in journalled:
             try:
@@ -390,7 +343,8 @@ def _of_journal(ctx: click.Context, options: Mapping[str, Any], origin: Origin, 
             except (click.BadParameter, TypeError, ValueError) as error:
                 why = error.message if isinstance(error, click.BadParameter) else f"{journalled[name]!r}"
                 raise InputError(f"{path}: is no journal of improve (option {name}: {why}).") from None
-    programs = allowed(path, origin.programs, options["effects_from"], options["trust"])
+    programs = allowed(path, origin.programs, values["effects_from"], values["trust"])
     for change in programs.changes:
         complain(f"{change}")
-    return values | {"effects_from": (*options["effects_from"], *programs.files)}
+    values["effects_from"] = (*values["effects_from"], *programs.files)
+    return grouped(ReadingOptions, values), grouped(EvaluationOptions, values)

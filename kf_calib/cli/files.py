@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING
 
 import rich_click as click
 from click import get_current_context  # rich_click declares that there may be none
 
+from kf_calib.cli.command import OUTPUT, option
 from kf_calib.cli.echo import echo
 from kf_calib.cli.failures import tell
 from kf_calib.support.output_files import Outputs
@@ -18,8 +20,6 @@ from kf_calib.support.output_files import Outputs
 if TYPE_CHECKING:
     from kf_calib.bench.streams import Source
     from kf_calib.estimation.results import Calibration
-
-F = TypeVar("F", bound=Callable[..., Any])
 
 
 class OutputFile(click.Path):
@@ -29,9 +29,8 @@ class OutputFile(click.Path):
         super().__init__(path_type=Path)
 
 
-def output_option(*names: str, **attributes: Any) -> Callable[[F], F]:
-    """An option that names a file to write."""
-    return click.option(*names, type=OutputFile(), **attributes)
+output_option = partial(option, type=OutputFile(), panel=OUTPUT)
+"""An option that names a file to write."""
 
 
 def claimed(

@@ -4,32 +4,22 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import rich_click as click
 from click import get_current_context  # rich_click declares that there may be none
 
-from kf_calib.cli.command import MODEL, OUTPUT, POSITIVE, command
+from kf_calib.cli.command import MODEL, OUTPUT, POSITIVE, argument, command, option, values_of
 from kf_calib.cli.echo import complain, echo, print_json, progress, show
 from kf_calib.cli.failures import Interrupter, answered, sentence
 from kf_calib.cli.files import Delivery, claimed, delivery
-from kf_calib.cli.options import (
-    filter_options,
-    json_option,
-    opened,
-    overrides,
-    overwrite_option,
-    recording_options,
-    settings_of,
-    target_option,
-    units_option,
-)
-from kf_calib.cli.pictures import Pictures, figure_options
-from kf_calib.cli.report import commands_of, report_option
+from kf_calib.cli.options import EvaluationOptions, Json, Overwrite, ReadingOptions, ShownUnits, opened, target_option
+from kf_calib.cli.pictures import FigureFiles
+from kf_calib.cli.report import ReportFile, commands_of
 from kf_calib.errors import InputError
 from kf_calib.support import stage
 from kf_calib.support.extras import need
@@ -53,12 +43,13 @@ _PACKAGES = ("distributed", "pyarrow", "fsspec")
 class SingleCommands:
     """What ``replay`` and ``diagnose`` do with one recording and these options; sent to the workers."""
 
-    options: Mapping[str, Any]
+    reading: ReadingOptions
+    evaluation: EvaluationOptions
 
     def replay(self, path: Path) -> tuple[Source, Calibration]:
         from kf_calib.estimation.calibration import calibrate
 
-        source, settings = opened(path, self.options)
+        source, settings = opened(path, self.reading, self.evaluation)
         return source, calibrate(source, settings)
 
     def diagnose(self, source: Source, result: Calibration) -> Diagnosis:
@@ -83,7 +74,7 @@ class SingleCommands:
     @property
     def checksum(self) -> str:
         """Of all that numbers depend on besides the recording: options, the files they name, and the program."""
-        told = {key: _content(value) for key, value in sorted(self.options.items())}
+        told = {key: _content(value) for key, value in sorted(values_of(self.reading, self.evaluation))}
         text = json.dumps(told | {"kf_calib": version("kf_calib")})
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -95,47 +86,53 @@ def _content(value: Any) -> Any:
     return [_content(each) for each in value] if isinstance(value, tuple | list) else value
 
 
+@dataclass(frozen=True)
+class FleetOptions:
+    """Who does the work, and what is made of all runs together."""
+
+    # fmt: off
+    workers: Annotated[int | None, option(
+        "--workers", type=click.IntRange(min=1), show_default="one a core", panel=WORK,
+        help="Number of processes on this machine.")] = None
+    scheduler: Annotated[str | None, option(
+        "--scheduler", metavar="URL", panel=WORK,
+        help="A scheduler of Dask whose workers do it, for example tcp://host:8786.")] = None
+    limit_s: Annotated[float, option(
+        "--limit-s", type=POSITIVE, metavar="S", panel=WORK,
+        help="Seconds that one run may take; if it takes longer, its row says so.")] = 3600.0
+    pooled: Annotated[bool, option(
+        "--pooled/--no-pooled", panel=MODEL,
+        help="Whether two runs or more are diagnosed together: errors of the bench, of sensors.")] = True
+    reference_unit: Annotated[Path | None, option(
+        "--reference-unit", metavar="CAL.json", panel=MODEL,
+        help="A calibration from elsewhere of a unit among the runs: against its scale factors, an error of the "
+        "gravity of the bench shows.")] = None
+    targets: Annotated[tuple[str, ...], target_option(panel=OUTPUT)] = ()
+    # fmt: on
+
+    def refuse_contradictions(self) -> None:
+        """Raise UsageError for options that exclude one another."""
+        if self.workers is not None and self.scheduler is not None:
+            raise click.UsageError(
+                "--workers are processes of this machine, --scheduler has workers of its own: choose one."
+            )
+        if self.reference_unit is not None and not self.pooled:
+            raise click.UsageError("--reference-unit is for the diagnosis of all runs together: leave out --no-pooled.")
+
+
 @command(
     "fleet campaign/ -o fleet", "fleet s3://lab/2026/ -o fleet --scheduler tcp://host:8786",
     seldom=("reference_unit", "model_file", "left_out", "accel_unit", "angle_unit", "columns"),
 )  # fmt: skip
-@click.argument("runs", nargs=-1, required=True)
-@click.option("-o", "--out", "output", required=True, type=click.Path(file_okay=False, path_type=Path),
-              metavar="FOLDER", panel=OUTPUT,
-              help="The table of runs; runs that are in it already are not evaluated again.")  # fmt: skip
-@click.option("--workers", type=click.IntRange(min=1), show_default="one a core", panel=WORK,
-              help="Number of processes on this machine.")  # fmt: skip
-@click.option("--scheduler", metavar="URL", panel=WORK,
-              help="A scheduler of Dask whose workers do it, for example tcp://host:8786.")  # fmt: skip
-@click.option("--limit-s", type=POSITIVE, default=3600.0, show_default=True, metavar="S",
-              panel=WORK, help="Seconds that one run may take; if it takes longer, its row says so.")  # fmt: skip
-@click.option("--pooled/--no-pooled", default=True, show_default=True, panel=MODEL,
-              help="Whether two runs or more are diagnosed together: errors of the bench, of sensors.")  # fmt: skip
-@click.option("--reference-unit", type=click.Path(path_type=Path), metavar="CAL.json", panel=MODEL,
-              help="A calibration from elsewhere of a unit among the runs: against its scale factors, an error of the "
-              "gravity of the bench shows.")  # fmt: skip
-@target_option(panel=OUTPUT)
-@report_option
-@figure_options
-@overwrite_option
-@recording_options
-@filter_options
-@units_option
-@json_option
 def fleet(
-    runs: tuple[str, ...],
-    output: Path,
-    workers: int | None,
-    scheduler: str | None,
-    limit_s: float,
-    pooled: bool,
-    reference_unit: Path | None,
-    targets: tuple[str, ...],
-    report: Path | None,
-    overwrite: bool,
-    as_json: bool,
-    **options: Any,
-) -> None:
+    runs: Annotated[tuple[str, ...], argument(required=True)],
+    output: Annotated[Path, option(
+        "-o", "--out", required=True, type=click.Path(file_okay=False, path_type=Path), metavar="FOLDER", panel=OUTPUT,
+        help="The table of runs; runs that are in it already are not evaluated again.",
+    )],
+    options: FleetOptions, report: ReportFile, figures: FigureFiles, overwrite: Overwrite, reading: ReadingOptions,
+    evaluation: EvaluationOptions, units: ShownUnits, as_json: Json,
+) -> None:  # fmt: skip
     """Replay and diagnose many recordings, each by itself, on many processes, and then all of them together.
 
     RUNS are recordings, folders of them, globs, or lists (.txt with one of these a line, .csv with the columns run,
@@ -145,28 +142,24 @@ def fleet(
     """
     for package in _PACKAGES:
         need(package, "fleet", "kf-calib fleet")
-    if workers is not None and scheduler is not None:
-        raise click.UsageError(
-            "--workers are processes of this machine, --scheduler has workers of its own: choose one."
-        )
-    if reference_unit is not None and not pooled:
-        raise click.UsageError("--reference-unit is for the diagnosis of all runs together: leave out --no-pooled.")
+    options.refuse_contradictions()
     from kf_calib.bench.paper_parameters import targets_of
     from kf_calib.fleet.batch import RunEvaluation
     from kf_calib.fleet.results import BenchModelFiles, Fleet, populations
     from kf_calib.fleet.run_list import runs_of
     from kf_calib.views import fleet as views
 
-    outputs, pictures = claimed(overwrite=overwrite), Pictures.taken_from(options)
-    if report or pictures.png or pictures.svg or pictures.pdf:
+    outputs = claimed(overwrite=overwrite)
+    if report or figures != FigureFiles():
         import kf_calib.views.figures  # noqa: F401  # what is not installed is told before the work
-    wanted, reference = targets_of(targets), _reference(reference_unit)
-    commands = _checked(options)
-    evaluation = RunEvaluation(commands, commands.checksum, limit_s)
-    done = _evaluated(evaluation, runs_of(runs), output, workers, scheduler, as_json)
+    wanted, reference = targets_of(options.targets), _reference(options.reference_unit)
+    _refuse_impossible(reading, evaluation)
+    commands = SingleCommands(reading, evaluation)
+    one_run = RunEvaluation(commands, commands.checksum, options.limit_s)
+    done = _evaluated(one_run, runs_of(runs), output, options.workers, options.scheduler, as_json)
     table = Fleet(output)
     with progress("diagnosing the runs together", as_json):
-        overview = table.overview(wanted, pooled=pooled, reference_unit=reference)
+        overview = table.overview(wanted, pooled=options.pooled, reference_unit=reference)
     models = BenchModelFiles(output, overview.pooled, overwrite)
     if as_json:
         print_json(views.fleet_object(table, populations(table), done, overview, list(models.models)))
@@ -176,7 +169,7 @@ def fleet(
     with delivery(outputs, as_json) as deliver, progress("drawing the pictures", as_json):
         _deliver_bench_models(models, outputs, deliver, as_json)
         deliver.file(report, lambda path: _save_page(overview, commands_again, path))
-        pictures.save(deliver, overview)
+        figures.save(deliver, overview)
 
 
 def _save_page(overview: FleetOverview, commands: Sequence[str], path: Path) -> None:
@@ -216,11 +209,10 @@ def _deliver_bench_models(files: BenchModelFiles, outputs: Outputs, deliver: Del
             echo(said)
 
 
-def _checked(options: Mapping[str, Any]) -> SingleCommands:
-    """The commands; options that would fail in every run are refused at once."""
-    settings_of(options)
-    overrides(options)
-    return SingleCommands(options)
+def _refuse_impossible(reading: ReadingOptions, evaluation: EvaluationOptions) -> None:
+    """Refuse at once the options that would fail in every run."""
+    evaluation.settings()
+    _ = reading.keys
 
 
 def _evaluated(

@@ -7,23 +7,14 @@ from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated
 
 import rich_click as click
 from click.core import ParameterSource
 
-from kf_calib.cli.command import command
-from kf_calib.cli.echo import print_json, progress, show
-from kf_calib.cli.options import (
-    OF_DWELLS,
-    OF_MESSAGES,
-    json_option,
-    messages_of,
-    overrides,
-    pair,
-    recording_options,
-    units_of,
-)
+from kf_calib.cli.command import argument, command
+from kf_calib.cli.echo import print_result, progress
+from kf_calib.cli.options import OF_DWELLS, OF_MESSAGES, Json, ReadingOptions
 from kf_calib.errors import BenchError, CountsError, KfCalibError
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
@@ -51,37 +42,32 @@ _BY_HAND = (
 
 
 @command("info run.mcap", "info rosbag2_2026_05_04", "info log.csv --json")
-@click.argument("recording", type=click.Path(path_type=Path), metavar="FILE")
-@recording_options
-@json_option
 @click.pass_context
-def info(ctx: click.Context, recording: Path, columns: tuple[str, ...], as_json: bool, **options: Any) -> None:
+def info(
+    ctx: click.Context, recording: Annotated[Path, argument(metavar="FILE")], reading: ReadingOptions, as_json: Json
+) -> None:
     """What is in a recording: topics, rates, gaps, dwells, what is missing to evaluate it, and the command to try.
 
     FILE is an MCAP file, the folder of a ROS 2 bag, a .db3 file, lines of CSV or JSON, a table of orientations,
     or a calibration.
     """
-    from kf_calib.sources.opening import FileKind, kind_of
+    from kf_calib.sources.opening import FileKind
 
-    renamed = dict(map(pair, columns))
-    kind = kind_of(recording, renamed)
+    kind = reading.kind(recording)
     if kind is FileKind.CALIBRATION:
         _show_calibration(recording, as_json)
         return
     if kind is FileKind.TABLE:
-        _show_table(ctx, recording, renamed, options, as_json)
+        _show_table(ctx, recording, reading, as_json)
         return
     with progress(f"reading {recording.name}", as_json) as tick:
         if kind is FileKind.SAMPLES:
-            overview = _of_lines(ctx, recording, renamed, options, tick)
+            overview = _of_lines(ctx, recording, reading, tick)
         else:
-            overview = _of_messages(ctx, recording, options, tick)
+            overview = _of_messages(ctx, recording, reading, tick)
     from kf_calib.views.overview import overview_object, overview_report
 
-    if as_json:
-        print_json(overview_object(overview))
-    else:
-        show(overview_report(overview))
+    print_result(as_json, overview_object, overview_report, overview)
 
 
 def _show_calibration(path: Path, as_json: bool) -> None:
@@ -90,24 +76,21 @@ def _show_calibration(path: Path, as_json: bool) -> None:
     from kf_calib.views.exchange import calibration_object, calibration_report
 
     saved = open_calibration(path)
-    if as_json:
-        print_json(calibration_object(saved, path))
-    else:
-        show(calibration_report(saved, path))
+    print_result(as_json, calibration_object, calibration_report, saved, path)
 
 
-def _of_messages(ctx: click.Context, path: Path, options: Mapping[str, Any], tick: Tick) -> Overview:
+def _of_messages(ctx: click.Context, path: Path, reading: ReadingOptions, tick: Tick) -> Overview:
     """What is in files of messages."""
     from kf_calib.sources.files.inventory import inventory_of
 
-    inventory = inventory_of(path, options["fields"])
-    bench = {**inventory.bench, **overrides(options)}
+    inventory = inventory_of(path, reading.fields)
+    bench = {**inventory.bench, **reading.keys}
     by_hand = inventory.has_readings and inventory.has_angles is None and not any(t.paths for t in inventory.topics)
-    lacking = _lacks(bench, inventory.has_angles is not False and not (by_hand or options["no_angles"]))
+    lacking = _lacks(bench, inventory.has_angles is not False and not (by_hand or reading.no_angles))
     missing = {key: _NAMED[key][1] for key in lacking}
     dwells, warnings, wrong = None, list(inventory.warnings), None
     try:
-        source = messages_of(path, options, not options["no_angles"])
+        source = reading.messages(path, not reading.no_angles)
         dwells = _dwells(source, tick)
         warnings = list(dict.fromkeys([*warnings, *source.warnings]))
         wrong = _wrong_unit([dwell.norm_mps2 for dwell in dwells], source.bench.input)
@@ -116,27 +99,25 @@ def _of_messages(ctx: click.Context, path: Path, options: Mapping[str, Any], tic
     except KfCalibError as error:
         missing = {"": str(error), **missing}
     words = _given(ctx, _not_of(ctx, ("columns", "g_unit"))) + _fields(inventory) + [_NAMED[key][0] for key in lacking]
-    words += ["--no-angles"] if by_hand and not options["no_angles"] else []
+    words += ["--no-angles"] if by_hand and not reading.no_angles else []
     missing, words = _with_unit(missing, words, wrong)
     return _overview(inventory, bench, dwells, missing, words, warnings)
 
 
-def _of_lines(
-    ctx: click.Context, path: Path, renamed: Mapping[str, str], options: Mapping[str, Any], tick: Tick
-) -> Overview:
+def _of_lines(ctx: click.Context, path: Path, reading: ReadingOptions, tick: Tick) -> Overview:
     """What is in a log of samples; what is not stated of the bench does not matter for what stands still."""
     from kf_calib.sources.files.inventory import inventory_of_lines
     from kf_calib.sources.files.lines import Lines
 
-    units, missing, words = units_of(options), dict[str, str](), _given(ctx, _not_of(ctx, OF_MESSAGES))
+    units, missing, words = reading.units(), dict[str, str](), _given(ctx, _not_of(ctx, OF_MESSAGES))
     try:
-        inventory = inventory_of_lines(path, renamed, units)
+        inventory = inventory_of_lines(path, reading.renamed, units)
     except CountsError as error:
         missing["accel_scale"], size = str(error), f"{error.scale:.3g}"
         words.append(f"--accel-scale {size}")
         units = replace(units, accel_scale=float(size))
-        inventory = inventory_of_lines(path, renamed, units)
-    bench, angles = {**inventory.bench, **overrides(options)}, not options["no_angles"]
+        inventory = inventory_of_lines(path, reading.renamed, units)
+    bench, angles = {**inventory.bench, **reading.keys}, not reading.no_angles
     if angles and inventory.has_angles is None:
         angles, missing["angles"] = False, _BY_HAND[1].format(or_else=" or attitude")
         words.append(_BY_HAND[0])
@@ -152,7 +133,7 @@ def _of_lines(
         provisional["accel_unit"] = "m/s2"
     dwells, warnings, wrong = None, list(inventory.warnings), None
     try:
-        source = Lines(path, {**provisional, **bench}, renamed, units=units, angles=angles)
+        source = Lines(path, {**provisional, **bench}, reading.renamed, units=units, angles=angles)
         dwells = _dwells(source, tick)
         warnings = list(dict.fromkeys([*warnings, *source.warnings]))
         wrong = _wrong_unit([dwell.norm_mps2 for dwell in dwells], source.bench.input, are_named=not is_bare)
@@ -205,20 +186,18 @@ def _overview(
     return Overview(inventory, bench, dwells, list(missing.values()), command, warnings)
 
 
-def _show_table(
-    ctx: click.Context, path: Path, renamed: Mapping[str, str], options: Mapping[str, Any], as_json: bool
-) -> None:
+def _show_table(ctx: click.Context, path: Path, reading: ReadingOptions, as_json: bool) -> None:
     """Print what is in a table of orientations."""
     from kf_calib.sources.tables.survey import LEAST, LEAST_WITHOUT_SIGMA, survey
     from kf_calib.views.overview import TableOverview, table_object, table_report
 
-    table = survey(path, overrides(options), renamed, units_of(options), angles=not options["no_angles"])
-    bench = overrides(options)
+    bench = reading.keys
+    table = survey(path, bench, reading.renamed, reading.units(), angles=not reading.no_angles)
     lacking = _lacks(bench, table.orientation == "angles")
     least = LEAST if table.has_sigma else LEAST_WITHOUT_SIGMA
     missing = [table.trouble] if table.trouble else []
     words = _given(ctx, _not_of(ctx, OF_MESSAGES + OF_DWELLS))
-    if table.is_by_hand and not options["no_angles"]:
+    if table.is_by_hand and not reading.no_angles:
         words.append(_BY_HAND[0])
         missing.append(_BY_HAND[1].format(or_else=", attitude or face"))
     missing += [_NAMED[key][1] for key in lacking]
@@ -234,10 +213,7 @@ def _show_table(
         missing += told.values()
     command = " ".join(["kf-calib replay", _quoted(str(table.path)), *words])
     overview = TableOverview(table, bench, missing, command)
-    if as_json:
-        print_json(table_object(overview))
-    else:
-        show(table_report(overview))
+    print_result(as_json, table_object, table_report, overview)
 
 
 def _lacks(bench: Mapping[str, str], has_angles: bool) -> list[str]:

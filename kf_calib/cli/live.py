@@ -6,35 +6,35 @@ import contextlib
 import math
 import queue
 import sys
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import rich_click as click
 
-from kf_calib.cli.command import INPUT, NOT_NEGATIVE, POSITIVE, command
+from kf_calib.cli.command import INPUT, NOT_NEGATIVE, POSITIVE, argument, command, option
 from kf_calib.cli.echo import complain, json_line, rendered
 from kf_calib.cli.failures import answered
 from kf_calib.cli.files import claimed, delivery, output_option
 from kf_calib.cli.live_run import LiveRun, by_hand, on_bench, pressed_keys
 from kf_calib.cli.options import (
-    bench_options,
-    columns_option,
-    filter_options,
-    input_options,
-    json_option,
-    no_angles_option,
-    overrides,
-    overwrite_option,
-    pair,
-    save_model_option,
-    save_option,
-    settings_of,
-    strict_option,
+    BenchOptions,
+    DeviceOptions,
+    EvaluationOptions,
+    ForeignColumns,
+    Json,
+    NoAngles,
+    Overwrite,
+    Save,
+    SaveModel,
+    ShownUnits,
+    Strict,
+    exit_if,
+    renamed,
     target_option,
-    units_option,
 )
-from kf_calib.cli.pictures import rrd_option, write_view
+from kf_calib.cli.pictures import RerunFile, write_view
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.support.text import sentence
 
@@ -49,102 +49,49 @@ RUNNING = "While it runs"
 _REFRESH_S = 0.25
 
 
+_running, _reading = (partial(option, panel=panel) for panel in (RUNNING, INPUT))
+
+
+@dataclass(frozen=True)
+class LiveOptions:
+    """What is done while it runs, and how the source is read."""
+
+    # fmt: off
+    record: Annotated[Path | None, output_option(
+        "--record", metavar="OUT.mcap", panel=RUNNING, help="Record the run here.")] = None
+    targets: Annotated[tuple[str, ...], target_option(panel=RUNNING)] = ()
+    auto: Annotated[bool, _running(
+        "--auto", help="Accept a missing effect when it can be told from all others.")] = False
+    with_viewer: Annotated[bool, _running(
+        "--rerun", help="Show the run in the Rerun viewer, opened if none is.")] = False
+    rerun_port: Annotated[int, _running(
+        "--rerun-port", type=click.IntRange(1, 65535), metavar="PORT", help="The viewer's port.")] = 9876
+    rerun_bind: Annotated[str, _running(
+        "--rerun-bind", metavar="ADDRESS", help="Address a viewer that is opened listens on.")] = "127.0.0.1"
+    no_angles: NoAngles = False
+    columns: ForeignColumns = ()
+    header: Annotated[str, _reading("--header", metavar="NAMES", show_default=False,
+                                    help="Names of the columns of CSV rows that come without any.")] = ""
+    give_up_s: Annotated[float, _reading(
+        "--give-up-s", type=NOT_NEGATIVE, help="Seconds for which a lost link is tried again.")] = 600.0
+    idle_s: Annotated[float, _reading("--idle-s", type=POSITIVE, show_default="never",
+                                      help="End the run when nothing has come for so long.")] = math.inf
+    # fmt: on
+
+
 @command(
     "live /dev/ttyUSB0 --bench bench.toml --record run.mcap --target theta=1arcsec --target K=2ppm --rerun",
     'live "sim://?speed=10&hide=second-order=4e-6" --target K=0.1ppm',
     "live /dev/ttyACM0 --no-angles --record hand.mcap --target K=500ppm",
-    seldom=(
-        "rerun_port",
-        "rerun_bind",
-        "header",
-        "give_up_s",
-        "idle_s",
-        "accel_unit",
-        "model_file",
-        "left_out",
-        "save_model",
-    ),
-)
-@click.argument("source", metavar="SOURCE")
-@output_option("--record", metavar="OUT.mcap", panel=RUNNING, help="Record the run here.")
-@target_option(panel=RUNNING)
-@click.option(
-    "--auto", is_flag=True, panel=RUNNING, help="Accept a missing effect when it can be told from all others."
-)
-@click.option(
-    "--rerun", "with_viewer", is_flag=True, panel=RUNNING, help="Show the run in the Rerun viewer, opened if none is."
-)
-@click.option(
-    "--rerun-port",
-    type=click.IntRange(1, 65535),
-    default=9876,
-    show_default=True,
-    metavar="PORT",
-    panel=RUNNING,
-    help="The viewer's port.",
-)
-@click.option(
-    "--rerun-bind",
-    default="127.0.0.1",
-    show_default=True,
-    panel=RUNNING,
-    metavar="ADDRESS",
-    help="Address a viewer that is opened listens on.",
-)
-@no_angles_option
-@columns_option
-@click.option(
-    "--header", default="", metavar="NAMES", panel=INPUT, help="Names of the columns of CSV rows that come without any."
-)
-@click.option(
-    "--give-up-s",
-    type=NOT_NEGATIVE,
-    default=600.0,
-    show_default=True,
-    panel=INPUT,
-    help="Seconds for which a lost link is tried again.",
-)
-@click.option(
-    "--idle-s",
-    type=POSITIVE,
-    default=math.inf,
-    show_default="never",
-    panel=INPUT,
-    help="End the run when nothing has come for so long.",
-)
-@input_options
-@bench_options
-@filter_options
-@overwrite_option
-@rrd_option
-@save_option
-@save_model_option
-@strict_option
-@units_option
-@json_option
+    seldom=("rerun_port", "rerun_bind", "header", "give_up_s", "idle_s", "accel_unit", "model_file", "left_out",
+            "save_model"),
+)  # fmt: skip
 @click.pass_context
 def live(
-    ctx: click.Context,
-    source: str,
-    record: Path | None,
-    overwrite: bool,
-    no_angles: bool,
-    columns: tuple[str, ...],
-    header: str,
-    give_up_s: float,
-    idle_s: float,
-    targets: tuple[str, ...],
-    auto: bool,
-    with_viewer: bool,
-    rerun_port: int,
-    rerun_bind: str,
-    rrd: Path | None,
-    save: Path | None,
-    save_model: Path | None,
-    strict: bool,
-    as_json: bool,
-    **options: Any,
-) -> None:
+    ctx: click.Context, source: Annotated[str, argument(metavar="SOURCE")], options: LiveOptions,
+    device: DeviceOptions, bench: BenchOptions, evaluation: EvaluationOptions, overwrite: Overwrite, rrd: RerunFile,
+    save: Save, save_model: SaveModel, strict: Strict, units: ShownUnits, as_json: Json,
+) -> None:  # fmt: skip
     """Evaluate a bench while it runs: sigmas, verdict and the next orientation as they stand; record it.
 
     SOURCE: a serial port, socket://HOST:PORT, rfc2217://HOST:PORT, - (standard input), a file that grows, or sim://.
@@ -154,17 +101,17 @@ def live(
     from kf_calib.bench.paper_parameters import targets_of
     from kf_calib.sources.live import files_of, open_live
 
-    outputs = claimed(files_of(source), overwrite=overwrite)
-    settings, wanted = settings_of(options), targets_of(targets)
-    _refuse(settings, auto and no_angles)
+    outputs, record = claimed(files_of(source), overwrite=overwrite), options.record
+    settings, wanted = evaluation.settings(), targets_of(options.targets)
+    _refuse(settings, options.auto and options.no_angles)
     opening = open_live(
-        source, overrides(options), record, overwrite, columns=dict(map(pair, columns)), header=header,
-        give_up_s=give_up_s, idle_s=idle_s, angles=not no_angles,
+        source, bench.keys | device.keys, record, overwrite, columns=renamed(options.columns), header=options.header,
+        give_up_s=options.give_up_s, idle_s=options.idle_s, angles=not options.no_angles,
     )  # fmt: skip
     with opening as opened:
-        begin = by_hand(settings, wanted) if no_angles else on_bench(settings, wanted, auto)
+        begin = by_hand(settings, wanted) if options.no_angles else on_bench(settings, wanted, options.auto)
         run = LiveRun(opened, begin, record, not sys.stdout.isatty() or as_json)
-        view = _view(rrd, rerun_port if with_viewer else None, rerun_bind)
+        view = _view(rrd, options.rerun_port if options.with_viewer else None, options.rerun_bind)
         if view is not None:
             run.listeners.append(partial(_offer, view))
         with answered(run.handle_signal):  # until all is written: who closes a terminal sends several
@@ -184,8 +131,7 @@ def live(
                     deliver.file(rrd, partial(write_view, final.result))  # by the noise of the whole run
     if run.troubles:
         ctx.exit(2)
-    if strict and final is not None and final.consistent is False:
-        ctx.exit(1)
+    exit_if(strict and final is not None and final.consistent is False)
 
 
 def _offer(view: GrowingView, judgement: Judgement | HandJudgement) -> None:

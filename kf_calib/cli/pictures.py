@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any
 
-from kf_calib.cli.command import OUTPUT
 from kf_calib.cli.echo import complain
 from kf_calib.cli.files import Delivery, output_option
 
@@ -17,25 +15,35 @@ if TYPE_CHECKING:
     from kf_calib.diagnosis.stepwise_selection import Improvement
     from kf_calib.estimation.results import Calibration
 
-F = TypeVar("F", bound=Callable[..., Any])
+RerunFile = Annotated[Path | None, output_option("--rrd", metavar="FILE.rrd", help="Save the Rerun view here.")]
 
-rrd_option = output_option("--rrd", metavar="FILE.rrd", help="Save the Rerun view here.", panel=OUTPUT)
+
+@dataclass(frozen=True)
+class FigureFiles:
+    """The files of figures that a command is to save."""
+
+    png: Annotated[Path | None, output_option("--png", metavar="FILE.png", help="Save the main figure here.")] = None
+    svg: Annotated[Path | None, output_option("--svg", metavar="FILE.svg", help="Save the main figure here.")] = None
+    pdf: Annotated[
+        Path | None, output_option("--pdf", metavar="FILE.pdf", help="Save the figures, one a page here.")
+    ] = None
+
+    def save(self, deliver: Delivery, result: object) -> None:
+        """Save what was asked for of a result; matplotlib is imported when it has something to draw."""
+        for kind, path in (("png", self.png), ("svg", self.svg), ("pdf", self.pdf)):
+            deliver.file(path, lambda path, kind=kind: _save_figures(result, path, kind))
 
 
 @dataclass(frozen=True)
 class Pictures:
-    """The files that a command is to save; None where it is not asked for, or the command does not offer it."""
+    """The files of pictures that a command is to save."""
 
-    rrd: Path | None
-    screenshot: Path | None
-    png: Path | None
-    svg: Path | None
-    pdf: Path | None
-
-    @classmethod
-    def taken_from(cls, options: dict[str, Any]) -> Pictures:
-        """The pictures among a command's options, which have them no longer."""
-        return cls(**{each.name: options.pop(each.name, None) for each in fields(cls)})
+    rrd: RerunFile = None
+    figures: FigureFiles = FigureFiles()
+    screenshot: Annotated[Path | None, output_option(
+        "--screenshot", metavar="FILE.png",
+        help="Save a screenshot of the Rerun view here; needs a graphics driver.",
+    )] = None  # fmt: skip
 
     def save(self, deliver: Delivery, result: Any) -> None:
         """Save what was asked for of a result; Rerun and matplotlib are imported when they have something to draw.
@@ -44,8 +52,7 @@ class Pictures:
         """
         deliver.file(self.rrd, lambda path: write_view(result, path))
         self._screenshot(deliver, result)
-        for kind, path in (("png", self.png), ("svg", self.svg), ("pdf", self.pdf)):
-            deliver.file(path, lambda path, kind=kind: _save_figures(result, path, kind))
+        self.figures.save(deliver, result)
 
     def _screenshot(self, deliver: Delivery, result: Any) -> None:
         from kf_calib.views.screenshot import ScreenshotError, screenshot
@@ -71,21 +78,6 @@ def _save_figures(result: object, path: Path, kind: str) -> None:
     from kf_calib.views.figures import figures, save
 
     save(figures(result), path, kind)
-
-
-def picture_options(command: F) -> F:
-    """``--rrd``, ``--screenshot``, and ``--png``, ``--svg``, ``--pdf`` for figures."""
-    text = "Save a screenshot of the Rerun view here; needs a graphics driver."
-    screenshot = output_option("--screenshot", metavar="FILE.png", help=text, panel=OUTPUT)
-    return rrd_option(figure_options(screenshot(command)))
-
-
-def figure_options(command: F) -> F:
-    """``--png``, ``--svg``, ``--pdf`` for figures."""
-    for kind, what in (("pdf", "figures, one a page"), ("svg", "main figure"), ("png", "main figure")):
-        text = f"Save the {what} here."
-        command = output_option(f"--{kind}", metavar=f"FILE.{kind}", help=text, panel=OUTPUT)(command)
-    return command
 
 
 def write_view(result: Calibration | Diagnosis | Improvement, path: Path) -> None:

@@ -4,36 +4,27 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated
 
 import rich_click as click
 from click import get_current_context  # rich_click declares that there may be none
 from click.core import ParameterSource
 
-from kf_calib.cli.certificate import stated_in, statement_option, write_certificate
-from kf_calib.cli.command import INPUT, OUTPUT, command
+from kf_calib.cli.certificate import StatementFile, stated_in, write_certificate
+from kf_calib.cli.command import INPUT, argument, command, option
 from kf_calib.cli.echo import print_json, progress, show
 from kf_calib.cli.files import Delivery, claimed, delivery, output_option
-from kf_calib.cli.options import (
-    effects_of,
-    filter_options,
-    json_option,
-    opened,
-    overwrite_option,
-    recording_of,
-    recording_options,
-    strict_option,
-    units_option,
-)
+from kf_calib.cli.options import EvaluationOptions, Json, Overwrite, ReadingOptions, ShownUnits, Strict, exit_if, opened
 
 if TYPE_CHECKING:
     from kf_calib.diagnosis.results import Diagnosis
     from kf_calib.views.report.contents import Measured
 
-report_option = output_option(
-    "--report", metavar="FILE.html", panel=OUTPUT, help="Save a page with figures and tables here; it needs no network."
-)
+ReportFile = Annotated[Path | None, output_option(
+    "--report", metavar="FILE.html", help="Save a page with figures and tables here; it needs no network.",
+)]  # fmt: skip
 
 
 @command(
@@ -41,39 +32,24 @@ report_option = output_option(
     "report after.mcap --against before.mcap -o shift.html",
     "report run.mcap --model after.toml --against before.toml",
 )
-@click.argument("recording", type=click.Path(path_type=Path))
-@click.option(
-    "--against", type=click.Path(path_type=Path), metavar="PATH", panel=INPUT,
-    help="Beside it: another recording, evaluated in the same way, or the same one with the model of a .toml file.",
-)  # fmt: skip
-@recording_options
-@filter_options
-@output_option(
-    "-o", "--out", "output", metavar="FILE.html", default="report.html", show_default=True, panel=OUTPUT,
-    help="Where the page is saved.",
-)  # fmt: skip
-@output_option(
-    "--certificate", metavar="OUT.pdf", panel=OUTPUT,
-    help="Save a calibration certificate here, too; kf-calib certificate makes one of a saved calibration.",
-)  # fmt: skip
-@statement_option
-@overwrite_option
-@units_option
-@strict_option
-@json_option
 @click.pass_context
 def report(
-    ctx: click.Context,
-    recording: Path,
-    against: Path | None,
-    output: Path,
-    certificate: Path | None,
-    statement: Path | None,
-    overwrite: bool,
-    strict: bool,
-    as_json: bool,
-    **options: Any,
-) -> None:
+    ctx: click.Context, recording: Annotated[Path, argument()],
+    against: Annotated[Path | None, option(
+        "--against", metavar="PATH", panel=INPUT,
+        help="Beside it: another recording, evaluated in the same way, or the same one with the model of a .toml file.",
+    )],
+    reading: ReadingOptions, evaluation: EvaluationOptions,
+    output: Annotated[Path, output_option(
+        "-o", "--out", metavar="FILE.html", default="report.html", show_default=True,
+        help="Where the page is saved.",
+    )],
+    certificate: Annotated[Path | None, output_option(
+        "--certificate", metavar="OUT.pdf",
+        help="Save a calibration certificate here, too; kf-calib certificate makes one of a saved calibration.",
+    )],
+    statement: StatementFile, overwrite: Overwrite, units: ShownUnits, strict: Strict, as_json: Json,
+) -> None:  # fmt: skip
     """A page for the engineer: verdict, figures, residuals to explore, tables, commands to get the numbers again."""
     from kf_calib.diagnosis.side_by_side import SideBySide
     from kf_calib.views import diagnosis, side_by_side
@@ -83,14 +59,15 @@ def report(
 
     outputs, stated = claimed(overwrite=overwrite), stated_in(certificate, statement)
     has_other_model = against is not None and against.suffix == ".toml"
-    other_options = options | ({"model_file": against, "effects": ()} if has_other_model else {})
+    other_evaluation = replace(evaluation, model_file=against, effects=()) if has_other_model else evaluation
     if has_other_model:
         outputs.spare(_programs_of(against))
-        effects_of(other_options)  # refused, as that of --model, before any reading is read
-    diagnosed, measured = _diagnosed(recording, options, as_json)
+        other_evaluation.effects_of_model()  # refused, as that of --model, before any reading is read
+    diagnosed, measured = _diagnosed(recording, reading, evaluation, as_json)
     pair, sources = None, [measured]
     if against is not None:
-        other, beside = _diagnosed(recording if has_other_model else against, other_options, as_json)
+        path = recording if has_other_model else against
+        other, beside = _diagnosed(path, reading, other_evaluation, as_json)
         pair, sources = SideBySide(other, diagnosed, has_other_model), [beside, measured]
     verdict = diagnosis.verdict(diagnosed) if pair is None else side_by_side.verdict(pair)
     if as_json:
@@ -111,8 +88,7 @@ def report(
         write_certificate(outputs, certificate, stated, (saved, diagnosed.before.model))
         if not as_json:
             show(f"saved {certificate}")
-    if strict and diagnosed.test.consistent is False:
-        ctx.exit(1)
+    exit_if(strict and diagnosed.test.consistent is False)
 
 
 def save_report(
@@ -127,7 +103,7 @@ def save_report(
         deliver.file(path, lambda path: save(page_of(result, [measured], commands, remarks), path))
 
 
-def measured_of(recording: Path, options: dict[str, Any]) -> Measured:
+def measured_of(recording: Path, reading: ReadingOptions) -> Measured:
     """What a page says of a recording's file; raises MissingExtraError, before the work, where no page can be made."""
     import kf_calib.views.figures  # noqa: F401  # which a page needs
     from kf_calib.diagnosis.selection_journal import Origin
@@ -135,19 +111,21 @@ def measured_of(recording: Path, options: dict[str, Any]) -> Measured:
     from kf_calib.sources.opening import run_date
     from kf_calib.views.report.contents import Measured
 
-    fingerprint, began = Origin.of(recording).sha256, run_date(recording_of(recording, options))
+    fingerprint, began = Origin.of(recording).sha256, run_date(reading.opened(recording))
     is_driven = recording.suffix == ".mcap" and recording.is_file()
     decided, ends = (decision_records(recording), decision_records(recording, END_RECORD)) if is_driven else ((), ())
     return Measured(recording.name, fingerprint, began, decided, ends)
 
 
-def _diagnosed(recording: Path, options: dict[str, Any], quiet: bool) -> tuple[Diagnosis, Measured]:
+def _diagnosed(
+    recording: Path, reading: ReadingOptions, evaluation: EvaluationOptions, quiet: bool
+) -> tuple[Diagnosis, Measured]:
     """Return the diagnosis of a recording, and what a page says of its file."""
     from kf_calib.diagnosis.missing_effect import diagnose
     from kf_calib.diagnosis.refits import Refits
     from kf_calib.estimation.calibration import calibrate
 
-    measured, (source, settings) = measured_of(recording, options), opened(recording, options)
+    measured, (source, settings) = measured_of(recording, reading), opened(recording, reading, evaluation)
     with progress(f"diagnosing {recording.name}", quiet) as tick:
         return diagnose(calibrate(source, settings, tick), Refits(source)), measured
 
@@ -184,7 +162,7 @@ def typed(ctx: click.Context, less: Sequence[str]) -> str:
     for param in ctx.command.params:
         name = param.name or ""
         given = ctx.get_parameter_source(name) is ParameterSource.COMMANDLINE
-        if name in less or not given or name not in ctx.params:  # of --units, no value is left
+        if name in (*less, "units") or not given:
             continue
         value = ctx.params[name]
         if isinstance(param, click.Argument):

@@ -14,37 +14,35 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from contextvars import copy_context
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import rich_click as click
 
-from kf_calib.cli.command import POSITIVE, command
-from kf_calib.cli.echo import complain, print_json, rendered, show
+from kf_calib.cli.command import POSITIVE, command, option
+from kf_calib.cli.echo import complain, print_result, rendered
 from kf_calib.cli.failures import answered
 from kf_calib.cli.files import claimed, delivery, output_option
 from kf_calib.cli.live import follow, outcome
 from kf_calib.cli.live_run import LiveRun, on_bench
 from kf_calib.cli.options import (
-    bench_options,
-    filter_options,
-    input_options,
-    json_option,
-    overrides,
-    overwrite_option,
-    save_model_option,
-    save_option,
-    settings_of,
-    strict_option,
+    BenchOptions,
+    DeviceOptions,
+    EvaluationOptions,
+    Json,
+    Overwrite,
+    Save,
+    SaveModel,
+    ShownUnits,
+    Strict,
+    exit_if,
     target_option,
-    units_option,
 )
 from kf_calib.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from kf_calib.bench.bench import Bench
     from kf_calib.design.next_orientation import Pace
     from kf_calib.online.suggestion import Itinerary
@@ -168,6 +166,31 @@ def halt_in_words(outcome: Outcome) -> str:
 DRIVING = "How it is driven"
 
 
+_driving = partial(option, panel=DRIVING)
+
+
+@dataclass(frozen=True)
+class DriveOptions:
+    """How the bench is driven."""
+
+    # fmt: off
+    source: Annotated[str | None, _driving(
+        "--source", metavar="S", help="Where readings and angles come from, as for live.")] = None
+    record: Annotated[Path | None, output_option(
+        "--record", metavar="OUT.mcap", panel=DRIVING, help="Record the run here, with all decisions.")] = None
+    targets: Annotated[tuple[str, ...], target_option(panel=DRIVING)] = ()
+    budget_s: Annotated[float, _driving(
+        "--budget-s", type=POSITIVE, show_default="none", help="End the run when this time is spent.")] = math.inf
+    most: Annotated[int | None, _driving("--most", type=click.IntRange(min=1), metavar="N",
+                                         show_default="60; 24 without a target", help="Orientations at most.")] = None
+    stay_s: Annotated[float, _driving(
+        "--stay-s", type=POSITIVE, help="Seconds of readings in each orientation, where no target is set.")] = 30.0
+    improve: Annotated[bool, _driving("--improve", help="Add a missing effect when it is named beyond doubt, and go "
+                                      "on to the targets.")] = False
+    dry_run: Annotated[bool, _driving("--dry-run", help="Print path and duration; nothing is moved.")] = False
+    # fmt: on
+
+
 @command(
     'run --positioner "sim://?hide=second-order=20sigma&seed=3" --record run.mcap --target K=2ppm',
     "run --positioner acutrol3000 --source socket://10.0.0.5:5000 --bench bench.toml --record run.mcap "
@@ -176,35 +199,15 @@ DRIVING = "How it is driven"
     "run --positioner acutrol3000 --bench bench.toml --dry-run",
     seldom=("accel_unit", "model_file", "left_out", "save_model", "stay_s", "most"),
 )
-@click.option("--positioner", required=True, metavar="P", panel=DRIVING,
-              help="sim://... (emulated, with its readings), hand, the name of a shipped profile (acutrol3000, lines, "
-              "command), or the path of a profile in TOML.")  # fmt: skip
-@click.option("--source", metavar="S", panel=DRIVING, help="Where readings and angles come from, as for live.")
-@output_option("--record", metavar="OUT.mcap", panel=DRIVING, help="Record the run here, with all decisions.")
-@target_option(panel=DRIVING)
-@click.option("--budget-s", type=POSITIVE, default=math.inf, show_default="none", panel=DRIVING,
-              help="End the run when this time is spent.")  # fmt: skip
-@click.option("--most", type=click.IntRange(min=1), metavar="N", show_default="60; 24 without a target", panel=DRIVING,
-              help="Orientations at most.")  # fmt: skip
-@click.option("--stay-s", type=POSITIVE, default=30.0, show_default=True, panel=DRIVING,
-              help="Seconds of readings in each orientation, where no target is set.")  # fmt: skip
-@click.option("--improve", is_flag=True, panel=DRIVING,
-              help="Add a missing effect when it is named beyond doubt, and go on to the targets.")  # fmt: skip
-@click.option("--dry-run", is_flag=True, panel=DRIVING, help="Print path and duration; nothing is moved.")
-@input_options
-@bench_options
-@filter_options
-@overwrite_option
-@save_option
-@save_model_option
-@strict_option
-@units_option
-@json_option
 @click.pass_context
 def run(
-    ctx: click.Context, positioner: str, source: str | None, record: Path | None, overwrite: bool,
-    targets: tuple[str, ...], dry_run: bool, save: Path | None, save_model: Path | None, strict: bool, as_json: bool,
-    **options: Any,
+    ctx: click.Context,
+    positioner: Annotated[str, _driving(
+        "--positioner", required=True, metavar="P", help="sim://... (emulated, with its readings), hand, the name of a "
+        "shipped profile (acutrol3000, lines, command), or the path of a profile in TOML.",
+    )],
+    options: DriveOptions, device: DeviceOptions, bench: BenchOptions, evaluation: EvaluationOptions,
+    overwrite: Overwrite, save: Save, save_model: SaveModel, strict: Strict, units: ShownUnits, as_json: Json,
 ) -> None:  # fmt: skip
     """Let the bench run by itself: it chooses orientations, moves, records and judges until every target is reached.
 
@@ -216,21 +219,21 @@ def run(
     from kf_calib.positioning.opening import open_positioner
     from kf_calib.sources.live import files_of
 
-    settings, wanted, keys = settings_of(options), targets_of(targets), overrides(options)
-    most = options["most"] or (60 if wanted else 24)
-    if dry_run:
+    settings, wanted, keys = evaluation.settings(), targets_of(options.targets), bench.keys | device.keys
+    source, record = options.source, options.record
+    if options.dry_run:
         _show_dry_run(positioner, keys, options, as_json)
         return
     outputs = claimed(files_of(source) if source else [], overwrite=overwrite)
     with ExitStack() as stack:
         live, emulated = _source(positioner, source, keys, record, overwrite)
         opened = stack.enter_context(live)
-        device = emulated or stack.enter_context(open_positioner(positioner, opened.bench, complain))
-        make = partial(_drive, device, most, options)
-        begin = on_bench(settings, wanted, options["improve"])
+        driven = emulated or stack.enter_context(open_positioner(positioner, opened.bench, complain))
+        make = partial(_drive, driven, options.most or (60 if wanted else 24), options)
+        begin = on_bench(settings, wanted, options.improve)
         running = DrivenRun(opened, begin, record, not sys.stdout.isatty() or as_json, make)
         with answered(running.handle_signal):
-            _follow(running, positioner, device, record, as_json)
+            _follow(running, positioner, driven, record, as_json)
             opened.close()
             code = _code(running)
             final = None if running.drive_error else outcome(running, as_json)
@@ -241,8 +244,7 @@ def run(
                     deliver.model(save_model, final.result)
     if code:
         ctx.exit(code)
-    if strict and final is not None and final.consistent is False:
-        ctx.exit(1)
+    exit_if(strict and final is not None and final.consistent is False)
 
 
 def _source(positioner: str, source: str | None, keys: Mapping[str, str], record: Path | None, overwrite: bool
@@ -265,17 +267,15 @@ def _source(positioner: str, source: str | None, keys: Mapping[str, str], record
     return LiveSource(emulated.feed, record, overwrite), emulated
 
 
-def _itinerary(bench: Bench, most: int, options: Mapping[str, Any]) -> Itinerary:
+def _itinerary(bench: Bench, most: int, options: DriveOptions) -> Itinerary:
     from kf_calib.online.suggestion import Itinerary
 
     return Itinerary(
-        bench, _pace(bench), most=most, stay_s=options["stay_s"], ends_when_named=not options["improve"],
+        bench, _pace(bench), most=most, stay_s=options.stay_s, ends_when_named=not options.improve,
     )  # fmt: skip
 
 
 def _pace(bench: Bench) -> Pace:
-    from dataclasses import replace
-
     from kf_calib.design.next_orientation import Pace
 
     pace = Pace()
@@ -286,7 +286,7 @@ def _pace(bench: Bench) -> Pace:
     return pace
 
 
-def _drive(device: Opened, most: int, options: Mapping[str, Any], running: DrivenRun) -> Drive:
+def _drive(device: Opened, most: int, options: DriveOptions, running: DrivenRun) -> Drive:
     """The drive of a run whose session is there."""
     from kf_calib.online.session import Session
     from kf_calib.positioning.drive import Drive
@@ -300,7 +300,7 @@ def _drive(device: Opened, most: int, options: Mapping[str, Any], running: Drive
     if isinstance(device.clock, SimulatedTime):
         device.clock.wait = session.wait_until_judged
     return Drive(device.positioner, session, itinerary, rules, device.clock, trouble=partial(_trouble, running),
-                 budget_s=options["budget_s"])  # fmt: skip
+                 budget_s=options.budget_s)  # fmt: skip
 
 
 def _trouble(running: DrivenRun) -> str:
@@ -323,7 +323,6 @@ def _follow(running: DrivenRun, name: str, device: Opened, record: Path | None, 
 
     hand = device.positioner
     if isinstance(hand, HandPositioner):
-        import threading
 
         def listen() -> None:
             for _ in sys.stdin:
@@ -354,7 +353,7 @@ def _tell_end(running: DrivenRun, as_json: bool) -> None:
         running.print(rendered(ended_in_words(running.outcome)), end=False)
 
 
-def _show_dry_run(name: str, keys: Mapping[str, str], options: Mapping[str, Any], as_json: bool) -> None:
+def _show_dry_run(name: str, keys: Mapping[str, str], options: DriveOptions, as_json: bool) -> None:
     """Print the opening with its ways and times; the orientations after it are decided in the run."""
     import numpy as np
 
@@ -378,8 +377,5 @@ def _show_dry_run(name: str, keys: Mapping[str, str], options: Mapping[str, Any]
         slews_s.append(sum(float(itinerary.pace.slews_s(a, b)) for a, b in zip(stations, way, strict=False)))
         ways.append(way)
         here = pose
-    made = poses, ways, slews_s, options["stay_s"], itinerary.pace.overhead_s
-    if as_json:
-        print_json(views.dry_run_object(*made))
-    else:
-        show(views.dry_run(*made))
+    made = poses, ways, slews_s, options.stay_s, itinerary.pace.overhead_s
+    print_result(as_json, views.dry_run_object, views.dry_run, *made)

@@ -41,8 +41,6 @@ _FEWEST_UNSTATED = 12  # the same where the noise from dwell to dwell has to be 
 _QUIET = 0.1  # share of the variance from dwell to dwell below which the noise of a mean no longer matters
 _LITTLE = 0.1  # share of the gain of a dwell below which a further gain no longer matters
 _STAYING = (2.0, 4.0, 8.0, 16.0, 32.0)  # lengths of the open dwell that are tried, as multiples of its present one
-
-
 _GROWN = 1.25  # factor by which a run has to grow before all candidates are tested again
 _AGREEING = 3  # number of looks in a row that have to agree
 _FREEDOM = 9  # degrees of freedom that the model with the missing effects has to leave

@@ -6,7 +6,9 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import is_dataclass
 from pathlib import Path
+from typing import get_type_hints
 
 import click
 import numpy as np
@@ -14,8 +16,10 @@ import pytest
 
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.cli import cli, main
+from kf_calib.cli.command import grouped
 from kf_calib.sources.files.recorder import Recorder
 from kf_calib.sources.files.recording import Recording
+from kf_calib.sources.simulation.settings import Ambient, SimulationOptions
 
 PARAMETERS = ["theta1", "phi1", "K1", "b1", "nu1", "nu2", "K2", "b2", "theta3", "phi3", "K3", "b3"]
 QUICK = ["--orientations", "12", "--dwell-s", "6", "--slew-degps", "360", "--sample-hz", "50"]
@@ -53,6 +57,17 @@ def test_replay_prints_the_agreed_keys(run, recording: Path) -> None:
     truth = json.loads(recording.with_suffix(".truth.json").read_text())["parameters"]
     ratios = [(p["value"] - truth[p["symbol"]]) / p["sigma"] for p in result["parameters"]]
     assert np.abs(ratios).max() < 4.5
+
+
+def test_options_of_the_library_have_the_defaults_of_the_command_line() -> None:
+    context = click.Context(cli)
+    simulated = SimulationOptions(ambient=Ambient(period_s=3600.0))
+    for name in cli.list_commands(context):
+        command = cli.get_command(context, name)
+        assert command is not None and command.callback is not None
+        asked = command.make_context(name, [], resilient_parsing=True).params
+        for kind in filter(is_dataclass, get_type_hints(command.callback).values()):
+            assert grouped(kind, asked) == (simulated if kind is SimulationOptions else kind()), name
 
 
 def test_people_read_units_of_the_field_or_si_and_programs_si(run, recording: Path) -> None:

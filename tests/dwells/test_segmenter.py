@@ -129,6 +129,25 @@ def test_a_platform_that_turns_in_what_counts_as_still_is_told(turn_deg: float, 
     assert any("the platform turns by" in sentence for sentence in sentences) == told
 
 
+def test_what_waits_in_an_open_dwell_can_be_looked_at_and_stays() -> None:
+    """After nine seconds of a dwell; the blocks are those without a look, to the bit."""
+    pose = path(*SLEWS, rate_hz=10)
+    whole, split = Batch(readings(pose, 35), pose), np.searchsorted(readings(pose, 35).time_ns, 9 * S)
+    looked, other = Segmenter(BENCH), Segmenter(BENCH)
+    until = int(np.searchsorted(pose.time_ns, 9 * S))
+    parts = Batch(whole.accel[:split], pose[:until]), Batch(whole.accel[split:], pose[until:])
+    blocks = list(looked.push(parts[0]))
+    (waiting,) = looked.waiting()
+    assert not blocks and looked.standing == waiting.dwell == 1 and looked.tally.used == 0
+    assert 7.5 < waiting.elapsed_s[-1] < 9.0 and len(waiting.elapsed_s) > 700
+    blocks += [*looked.push(parts[1]), *looked.finish()]
+    expected = [block for part in parts for block in other.push(part)] + list(other.finish())
+    for one, two in zip(blocks, expected, strict=True):
+        np.testing.assert_array_equal(one.accel_mps2, two.accel_mps2)
+    np.testing.assert_array_equal(waiting.accel_mps2, blocks[0].accel_mps2[: len(waiting.accel_mps2)])
+    assert Segmenter(BENCH).waiting() == []
+
+
 def test_settling_is_left_out() -> None:
     pose = path(*SLEWS, rate_hz=10)
     assert spans(Given(Batch(readings(pose, 35), pose)), settle_s=3.0)[1][0] == pytest.approx(17.0, abs=0.2)

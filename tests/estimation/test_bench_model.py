@@ -18,9 +18,10 @@ from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.estimate import Estimate
 from kf_calib.estimation.settings import Settings
 from kf_calib.sources.simulation.options import simulation
+from kf_calib.sources.simulation.settings import SimulationOptions
 
 RECORDING = ROOT / "recordings" / "navigation_24.mcap"
-QUICK = {"dwell_s": 20.0, "sample_hz": 10.0, "slew_degps": 90.0, "seed": 3}
+QUICK = SimulationOptions(dwell_s=20.0, sample_hz=10.0, slew_degps=90.0, seed=3)
 SIGMA = 1e-6
 ECCENTRIC = BenchTerm("encoder-harmonic-1:z", ("s1_z", "c1_z"), (2e-5, -1e-5), ((SIGMA**2, 0.0), (0.0, SIGMA**2)))
 MODEL = BenchModel((ECCENTRIC,), "bench 1", 40)
@@ -28,7 +29,7 @@ MODEL = BenchModel((ECCENTRIC,), "bench 1", 40)
 
 def test_parameters_are_those_of_a_bench_without_the_error() -> None:
     plain = calibrate(simulation(QUICK, {}))
-    source = simulation(QUICK | {"hidden": ("encoder-harmonic-1:z=2e-5,-1e-5",)}, {})
+    source = simulation(replace(QUICK, hidden=("encoder-harmonic-1:z=2e-5,-1e-5",)), {})
     with_error, known = calibrate(source), calibrate(source, Settings(bench_model=MODEL))
     assert with_error.consistency.p_value < 1e-6
     assert known.consistency.p_value == pytest.approx(plain.consistency.p_value, abs=0.1)

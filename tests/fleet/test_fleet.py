@@ -188,7 +188,7 @@ def test_a_run_that_ends_its_process_is_tried_again_and_stops_no_other(
 ) -> None:
     own = shutil.copytree(campaign, tmp_path / "runs")
     normal = evaluation()
-    deadly = RunEvaluation(_Deadly(normal.commands.options), normal.settings)
+    deadly = RunEvaluation(_Deadly(normal.commands.reading, normal.commands.evaluation), normal.settings)
     runs = runs_of([str(path) for path in sorted(own.rglob("*.mcap"))[:2]])
     with batch.cluster(1) as client:
         progress = evaluate_all(client, deadly, runs, store)

@@ -79,7 +79,7 @@ class _Deaf(SingleCommands):
 
 def with_limit(kind: type[SingleCommands], limit_s: float) -> RunEvaluation:
     usual = evaluation()
-    return RunEvaluation(kind(usual.commands.options), usual.settings, limit_s)
+    return RunEvaluation(kind(usual.commands.reading, usual.commands.evaluation), usual.settings, limit_s)
 
 
 def test_a_run_that_never_ends_is_a_row_that_says_so_and_is_tried_again(

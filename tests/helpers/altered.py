@@ -11,6 +11,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Source, Stream
 from kf_calib.sources.simulation.options import simulation
+from kf_calib.sources.simulation.settings import SimulationOptions
 from kf_calib.sources.simulation.simulator import START_NS, Simulation
 
 Change = Callable[[Floats, Floats], Floats]
@@ -19,7 +20,8 @@ Change = Callable[[Floats, Floats], Floats]
 
 def short_run(keys: Mapping[str, str] | None = None, **options: Any) -> Simulation:
     """Twenty-four dwells of 4 s at 50 Hz, or as the options say."""
-    return simulation({"dwell_s": 4.0, "slew_degps": 90.0, "sample_hz": 50.0, **options}, keys or {})
+    usual = {"dwell_s": 4.0, "slew_degps": 90.0, "sample_hz": 50.0}
+    return simulation(SimulationOptions.of(**usual | options), keys or {})
 
 
 class Altered:

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from distributed import Client, LocalCluster
 
-from kf_calib.cli.evaluate import replay
 from kf_calib.cli.fleet import SingleCommands
+from kf_calib.cli.options import EvaluationOptions, ReadingOptions
 from kf_calib.fleet import batch
 from kf_calib.fleet.batch import RunEvaluation
 
@@ -39,7 +39,5 @@ def used(client: Client) -> Iterator[None]:
 
 def evaluation(**given: Any) -> RunEvaluation:
     """What ``kf-calib fleet`` does with each run, with some options."""
-    usual = replay.make_context("replay", ["run.mcap"]).params
-    own = ("recording", "overwrite", "strict", "as_json", "save", "save_model")
-    commands = SingleCommands({key: value for key, value in usual.items() if key not in own} | given)
+    commands = SingleCommands(ReadingOptions(), EvaluationOptions(**given))
     return RunEvaluation(commands, commands.checksum)

@@ -48,6 +48,29 @@ def test_ar1_inflation_is_that_of_the_mean(phi: float) -> None:
     np.testing.assert_allclose(result.noise.sigma_mps2, 1e-4, rtol=0.1)
 
 
+def test_a_walk_of_known_intensity_is_no_noise_of_a_reading() -> None:
+    """Beside white noise of 1e-4 m/s^2, one of 1e-4 m/s^2/s^(1/2) over dwells of 20 seconds."""
+    run, walk = Run(seed=1, dwells=80, count=400), 1e-4
+    steps = np.random.default_rng(2).normal(size=run.accel.values.shape) * walk / np.sqrt(run.rate_hz)
+    run.accel.values[:] += np.cumsum(steps.reshape(80, 400, 3), axis=1).reshape(-1, 3)
+    dwells = calibrate(run).fit.dwells
+    known = noise_model.within_dwells(dwells, walk)
+    assert known.sigma_mps2 == pytest.approx(1e-4, rel=0.06)
+    assert noise_model.within_dwells(dwells).sigma_mps2.mean() > 1.07e-4
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.5])
+def test_channels_of_short_blocks_have_one_correlation_and_variances_of_their_size(phi: float) -> None:
+    """Of 1000 blocks of 60 readings of AR(1) noise, less a parabola; a channel that stands still is left out."""
+    sigmas, rng, total = np.array([1e-4, 3e-4, 0.0]), np.random.default_rng(8), Autocovariance()
+    for _ in range(1000):
+        white = rng.normal(size=(3, 160)) * np.sqrt(1.0 - phi**2)
+        total += Autocovariance.of(detrended(sigmas[:, None] * lfilter([1.0], [1.0, -phi], white, axis=1)[:, 100:]))
+    kappa, variances = noise_model._alike(total)
+    assert kappa[:2] == pytest.approx((1.0 + phi) / (1.0 - phi), rel=0.1) and kappa[2] == 1.0
+    assert np.sqrt(variances) == pytest.approx(sigmas, rel=0.05)
+
+
 def test_ar2_resonance_is_followed_too() -> None:
     """A noise with a spectral line averages faster near zero frequency than its variance says: never below white."""
     run = Run(seed=2, dwells=12, count=2000, rate_hz=100.0, white_mps2=0.0)

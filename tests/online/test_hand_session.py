@@ -25,6 +25,7 @@ from kf_calib.online.by_hand import HandJudgement, HandSession
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.live import open_live
 from kf_calib.sources.simulation.options import simulation
+from kf_calib.sources.simulation.settings import SimulationOptions
 from kf_calib.views import live as views
 from kf_calib.views.console import plain
 from kf_calib.views.json import replay_object
@@ -157,7 +158,7 @@ def test_effects_are_refused_before_anything_is_read() -> None:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a pseudo-terminal")
 def test_a_board_on_a_serial_port_that_is_interrupted_gives_what_its_recording_gives(tmp_path: Path) -> None:
-    options = {"grade": "mems", "count": 14, "dwell_s": 3.0, "slew_degps": 180.0, "sample_hz": 50.0, "seed": 2}
+    options = SimulationOptions("mems", count=14, dwell_s=3.0, slew_degps=180.0, sample_hz=50.0, seed=2)
     run = simulation(options, {})
     bench = bench_without_angles("", run.bench.to_metadata())[0]
 

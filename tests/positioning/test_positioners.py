@@ -18,6 +18,7 @@ from kf_calib.positioning.positioner import Positioner, PositionerError
 from kf_calib.positioning.profile import SHIPPED, read_profile
 from kf_calib.sources.simulation.driven import DrivenBench, Servo
 from kf_calib.sources.simulation.options import simulation
+from kf_calib.sources.simulation.settings import SimulationOptions
 
 BENCH = Bench(axes_of("yzx"), 9.81)
 
@@ -30,7 +31,8 @@ class Table:
     """A driven bench whose time passes fast, with its controller on a socket."""
 
     def __init__(self, servo: Servo) -> None:
-        self.bench, self.lock = DrivenBench(simulation({"sample_hz": 50}, {}), servo, [0.0, 0.0, 0.0]), threading.Lock()
+        run, self.lock = simulation(SimulationOptions(sample_hz=50), {}), threading.Lock()
+        self.bench = DrivenBench(run, servo, [0.0, 0.0, 0.0])
         self.server, self._is_over = Server(self.bench, self.lock), False
         self._thread = threading.Thread(target=self._pass, daemon=True)
         self._thread.start()

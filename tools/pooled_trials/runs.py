@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.fleet.run_factor import RunFactor, run_factor
 from kf_calib.sources.simulation.options import simulation
+from kf_calib.sources.simulation.settings import SimulationOptions
 
 # Few readings, but half an hour of them, so that drifts and time constants show, and a temperature that changes.
 _OPTIONS = {
@@ -18,5 +19,5 @@ _BENCH = {"gravity_mps2": "9.81", "latitude_deg": "50"}
 
 def simulated(seed: int, hidden: Sequence[str] = ()) -> RunFactor:
     """Return the factor of a simulated run; hidden: effects as ``kf-calib simulate --hide`` takes them."""
-    source = simulation({**_OPTIONS, "seed": seed, "hidden": tuple(hidden)}, _BENCH)
+    source = simulation(SimulationOptions.of(**_OPTIONS, seed=seed, hidden=tuple(hidden)), _BENCH)
     return run_factor(calibrate(source).fit)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from decimal import Decimal
@@ -18,7 +18,7 @@ from operator import mul
 
 import numpy as np
 
-from kf_calib.bench.arrays import lengths
+from kf_calib.bench.arrays import Floats, lengths
 from kf_calib.bench.raw_input import PLAIN, UNITS, RawInput
 from kf_calib.errors import CountsError, InputError
 from kf_calib.sources.files.line_parts import CsvHeading, LineError, number_of, stamp_ns
@@ -196,28 +196,27 @@ class CsvColumns:
     def are_alike(self) -> bool:
         """Whether the readings of nearly all rows are as those before, as of a sensor that lies still between turns; a
         row a dwell would change from one to the next."""
-        places = [at for ours in READINGS for at, own in enumerate(self._meanings) if own.ours == ours]
+        places = [at for ours in READINGS for at in self._places(ours)]
         if len(places) != 3 or len(self.rows) < _MANY:
             return False
-        numbers = self.numbers or DECIMAL_POINT
-        values = np.array([[_told(row[at], numbers) for at in places] for row in self.rows])
+        values = self._values(places)
         with np.errstate(invalid="ignore", divide="ignore"):
             unit = values / lengths(values)[:, None]
             return bool((lengths(np.diff(unit, axis=0)) < _ALIKE_RAD).mean() > _MOST)
 
     def time(self) -> Stamps:
         """How the time is written. Raises InputError where no column tells it, or not in which unit."""
-        places = [at for at, own in enumerate(self._meanings) if own.ours == "time"]
-        places = places or [at for at, name in enumerate(self.names) if name.strip().lower() in _TIME_ALONE]
+        places = self._places("time") or [
+            at for at, name in enumerate(self.names) if name.strip().lower() in _TIME_ALONE
+        ]
         if not places:
             raise InputError(f"no column gives the time: name it time_s or time_ns; {self.wanted}, not {self._seen}.")
         exact = [at for at in places if _EXACT.fullmatch(self.names[at])]
         united = [at for at in places if self._meanings[at].unit]
         place = (exact or united or places)[0]
         unit = self._meanings[place].unit or {"millis": "ms", "micros": "us"}.get(self.names[place].strip().lower(), "")
-        cells = [row[place] for row in self.rows if row[place]]
-        values = [_told(cell, self.numbers or DECIMAL_POINT) for cell in cells]
-        if not unit and cells and math.isnan(values[0]):
+        values = self._values([place], [row for row in self.rows if row[place]])[:, 0]
+        if not unit and len(values) and math.isnan(values[0]):
             return self._dates(places[:2] if place == places[0] else [place])
         unit = unit or self._unit_of_time(place, values)
         decimals = {"ns": 0, "us": 3, "ms": 6}.get(unit, 9)
@@ -268,7 +267,7 @@ class CsvColumns:
     def gimbals(self, *, needed: bool) -> QuantityColumns:
         """The angles by the usual names, else every column of an angle in the order of the header; none where there is
         none. Raises InputError where their unit is not told and they are needed."""
-        places = [at for at, own in enumerate(self._meanings) if own.ours == "angle"]
+        places = self._places("angle")
         ranked = sorted((at for at in places if self._meanings[at].rank), key=lambda at: self._meanings[at].rank)
         places = ranked or places
         if len({self._meanings[at].rank for at in ranked}) < len(ranked):
@@ -294,11 +293,8 @@ class CsvColumns:
     def quaternion(self) -> QuantityColumns:
         """The attitude; nothing where its four columns are not there."""
         places = [self._one(ours) for ours in QUATERNION]
-        return (
-            QuantityColumns()
-            if None in places
-            else QuantityColumns(tuple(at for at in places if at is not None), (1.0,) * 4)
-        )
+        known = tuple(at for at in places if at is not None)
+        return QuantityColumns(known, (1.0,) * 4) if len(known) == 4 else QuantityColumns()
 
     def temperature(self) -> tuple[QuantityColumns, str]:
         """The temperature, if there is one, and its unit: ``c``, ``k`` or ``f``."""
@@ -316,7 +312,7 @@ class CsvColumns:
 
     def without_angles(self) -> InputError:
         """That no angles are there, or none whose unit is known."""
-        places = [at for at, own in enumerate(self._meanings) if own.ours == "angle"]
+        places = self._places("angle")
         name = self.header[places[0]] if places else ""
         example = f", for example by --column '{name}=outer_deg'" if places else ""
         return InputError(
@@ -325,10 +321,20 @@ class CsvColumns:
             "none (--no-angles)."
         )
 
+    def _places(self, ours: str) -> list[int]:
+        """Return the columns whose names say that quantity."""
+        return [at for at, own in enumerate(self._meanings) if own.ours == ours]
+
+    def _values(self, places: Sequence[int], rows: Sequence[CsvRow] | None = None) -> Floats:
+        """Return the numbers (n, k) in columns of rows (None: of the first), NaN where there is none."""
+        numbers = self.numbers or DECIMAL_POINT
+        values = [[_told(row[at], numbers) for at in places] for row in (self.rows if rows is None else rows)]
+        return np.array(values, float).reshape(-1, len(places))
+
     def _one(self, ours: str) -> int | None:
         """Return the column of a quantity that is there once; names of the format go before others, then such as begin
         like one of readings. Raises InputError where two are left."""
-        places = [at for at, own in enumerate(self._meanings) if own.ours == ours]
+        places = self._places(ours)
         for likely in (_EXACT.fullmatch, _LIKELY.match):
             places = [at for at in places if likely(self.names[at].strip())] or places
         if len(places) > 1:
@@ -341,15 +347,13 @@ class CsvColumns:
 
     def _usual_norm(self, places: Sequence[int]) -> float:
         """Return the median size of the readings in the first rows, NaN where there are none."""
-        numbers = self.numbers or DECIMAL_POINT
-        values = np.array([[_told(row[at], numbers) for at in places] for row in self.rows])
-        norms = lengths(values) if len(values) else np.empty(0)
+        norms = lengths(self._values(places))
         norms = norms[np.isfinite(norms)]
         return float(np.median(norms)) if len(norms) else math.nan
 
-    def _unit_of_time(self, place: int, values: Sequence[float]) -> str:
-        """Return the unit of stamps whose name tells none, by their size or their steps."""
-        known = np.array([value for value in values if math.isfinite(value)])
+    def _unit_of_time(self, place: int, values: Floats) -> str:
+        """Return the unit of stamps (n,) whose name tells none, by their size or their steps."""
+        known = values[np.isfinite(values)]
         size = float(np.abs(known).max(initial=0.0))
         if unit := next((unit for least, unit in _OF_EPOCH if size >= least), ""):
             return unit
@@ -363,11 +367,7 @@ class CsvColumns:
 
     def _unit_of_angles(self, places: Sequence[int]) -> str:
         """Return the unit of angles whose names tell none, empty where their size does not tell it either."""
-        numbers = self.numbers or DECIMAL_POINT
-        values = [_told(row[at], numbers) for row in self.rows for at in places if row[at]]
-        if any(abs(value) > 2.0 * math.pi for value in values):
-            return "deg"
-        return ""
+        return "deg" if (np.abs(self._values(places)) > 2.0 * math.pi).any() else ""
 
     def _dates(self, places: Sequence[int]) -> Stamps:
         """How stamps of a calendar are written; of two columns the second may give the time of day."""
@@ -393,9 +393,8 @@ class CsvColumns:
 
 
 def _is_date(text: str, month_first: bool) -> bool:
-    reading: Callable[[str, bool], object] = stamp_of
     try:
-        reading(text, month_first)
+        stamp_of(text, month_first)
     except ValueError:
         return False
     return True

@@ -3,12 +3,15 @@
 The data section of the original is copied as it is, up to its end; then come chunks with the messages of the new topic,
 and a summary that has the original's records and the new ones. Readers find messages by time through the summary.
 Messages of one topic have one size, so that a chunk of them is one numpy array: a million take a second or two.
+
+The writer of a ``Recorder`` could not do it: it begins a file and cannot go on with one, as it numbers schemas and
+channels from 1 and lists in its summary what it has written itself; and it takes ten times as long.
 """
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
@@ -16,24 +19,14 @@ import numpy as np
 import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import (
-    Channel,
-    Chunk,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    McapRecord,
-    Schema,
-    Statistics,
-    SummaryOffset,
-)
+from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, Footer, McapRecord, Schema, Statistics, SummaryOffset
 from numpy.typing import NDArray
 
 from kf_calib.bench.streams import Stream
 from kf_calib.errors import InputError
 from kf_calib.sources.files import cdr
 from kf_calib.sources.files.mcap_file import McapFile
-from kf_calib.sources.files.mcap_records import HEAD, MAGIC, parse_record
+from kf_calib.sources.files.mcap_records import FOOTER_BYTES, HEAD, MAGIC, parse_record, records_of
 
 _PIECE = 1 << 22
 _MESSAGES = 1 << 14  # in a chunk
@@ -105,14 +98,12 @@ class TopicAppender:
         assert source.summary is not None
         with source.open() as file:
             file.seek(source.summary.start)
-            content = file.read(source.size - source.summary.start)
-        for opcode, record in _records(content):
-            if opcode in (Opcode.FOOTER, Opcode.SUMMARY_OFFSET):
-                continue
+            section = file.read(source.size - source.summary.start - FOOTER_BYTES)
+        for opcode, content in records_of(section):
             if opcode == Opcode.STATISTICS:
-                self._statistics = parse_record(Statistics.read, record[HEAD.size :])
+                self._statistics = parse_record(Statistics.read, content)
             elif opcode in self._groups:
-                self._groups[opcode].append(record)
+                self._groups[opcode].append(HEAD.pack(opcode, len(content)) + content)
 
     def _new_channel(self, source: McapFile, topic: str, kind: cdr.MessageType) -> int:
         """Return the number of the new channel; its definition goes into the data section and the summary."""
@@ -223,18 +214,6 @@ def _bytes(record: McapRecord) -> bytes:
     builder = RecordBuilder()
     record.write(builder)
     return builder.end()
-
-
-def _records(content: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield opcode and bytes of each record of a summary, up to its footer."""
-    position = 0
-    while position + HEAD.size <= len(content):
-        opcode, length = HEAD.unpack_from(content, position)
-        end = position + HEAD.size + length
-        yield opcode, content[position:end]
-        if opcode == Opcode.FOOTER:
-            return
-        position = end
 
 
 def source_file(path: Path) -> McapFile:

@@ -286,6 +286,7 @@ def _unpack(data: bytes, max_size: int) -> bytes:
 
 
 _FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary, of its offsets, CRC
+FOOTER_BYTES = _FOOTER.size + len(MAGIC)
 _SUMMARY_LIMIT = 1 << 28
 
 
@@ -303,7 +304,7 @@ class Summary:
     @classmethod
     def read(cls, file: IO[bytes], size: int) -> Summary:
         """The summary of a file of ``size`` bytes. Raises DamagedError where there is none or it is not whole."""
-        footer_start = size - _FOOTER.size - len(MAGIC)
+        footer_start = size - FOOTER_BYTES
         if footer_start < len(MAGIC):
             raise DamagedError("it has no footer")
         file.seek(footer_start)
@@ -323,9 +324,7 @@ class Summary:
         return summary
 
     def _fill(self, content: bytes) -> None:
-        position = 0
-        while position < len(content):
-            opcode, record, position = _record_at(content, position)
+        for opcode, record in records_of(content):
             match opcode:
                 case Opcode.SCHEMA:
                     self.schemas.append(parse_record(Schema.read, record))
@@ -342,11 +341,15 @@ class Summary:
         self.chunks.sort(key=lambda index: index.chunk_start_offset)
 
 
-def _record_at(data: bytes, position: int) -> tuple[int, bytes, int]:
-    if position + HEAD.size > len(data):
-        raise DamagedError("a record has no room for its head")
-    opcode, length = HEAD.unpack_from(data, position)
-    start = position + HEAD.size
-    if start + length > len(data):
-        raise DamagedError("a record ends outside its section")
-    return opcode, data[start : start + length], start + length
+def records_of(section: bytes) -> Iterator[tuple[int, bytes]]:
+    """Opcode and content of each record. Raises DamagedError where one is not whole."""
+    end = 0
+    while end < len(section):
+        start = end + HEAD.size
+        if start > len(section):
+            raise DamagedError("a record has no room for its head")
+        opcode, length = HEAD.unpack_from(section, end)
+        end = start + length
+        if end > len(section):
+            raise DamagedError("a record ends outside its section")
+        yield opcode, section[start:end]

@@ -152,13 +152,13 @@ def _tcp(address: str) -> Tcp:
 
 
 def _simulated_feed(rest: str, overrides: Mapping[str, str], angles: bool) -> Feed:
-    from kf_calib.sources.simulation.options import DEFAULTS, options_from_query, simulation
+    from kf_calib.sources.simulation.options import options_from_query, simulation
 
     pairs = parse_qsl(rest.partition("?")[2], keep_blank_values=True)
     speeds = [text for key, text in pairs if key == "speed"]
     speed = _positive("speed", speeds[-1]) if speeds else 1.0
     options = options_from_query(urlencode([pair for pair in pairs if pair[0] != "speed"]))
-    size = batch_samples(options.get("sample_hz", DEFAULTS["sample_hz"]), speed)
+    size = batch_samples(options.sample_hz, speed)
     return SimulatedFeed(simulation(options, overrides, size), speed, angles)
 
 

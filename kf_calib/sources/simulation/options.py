@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import fields, replace
+from dataclasses import fields
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 from urllib.parse import parse_qsl
 
@@ -14,26 +13,20 @@ from kf_calib.bench.bench import Bench, Vector, parse_axes
 from kf_calib.errors import InputError
 from kf_calib.sources.simulation.detectability import sized
 from kf_calib.sources.simulation.injected import parse
-from kf_calib.sources.simulation.physics import Ambient
 from kf_calib.sources.simulation.sensors import GRADES
+from kf_calib.sources.simulation.settings import Ambient, NoiseOptions, SimulationOptions
 from kf_calib.sources.simulation.simulator import Simulation, without_angles
 from kf_calib.sources.simulation.visit_plans import PlannedVisit, angles_from_csv, explicit_plan, six_faces, spread_plan
 
-DEFAULTS: Mapping[str, Any] = MappingProxyType(
-    {
-        "grade": "navigation", "plan": "spread", "count": 24, "dwell_s": 30.0, "sample_hz": 100.0, "angle_hz": 10.0,
-        "slew_degps": 20.0, "hidden": (), "unstated": False, "seed": 0,
-    }
-)  # fmt: skip
 _NUMBERS = {"count": int, "seed": int}  # all others that are no words are float
 _WORDS = frozenset(("grade", "plan"))
 _SHORT = {"orientations": "count", "hide": "hidden"}
 
 
-def options_from_query(query: str) -> dict[str, Any]:
+def options_from_query(query: str) -> SimulationOptions:
     """Options from ``dwell_s=5&hide=second-order=10sigma``; ``hide`` may be repeated. Raises InputError."""
-    known = {*DEFAULTS, *(each.name for kind in (*GRADES.values(),) for each in fields(kind.noise))}
-    known |= {each.name for each in fields(Ambient)}
+    known = {each.name for kind in (SimulationOptions, NoiseOptions, Ambient) for each in fields(kind)}
+    known -= {"noise", "ambient"}
     options: dict[str, Any] = {}
     for key, text in parse_qsl(query, keep_blank_values=True):
         name = _SHORT.get(key, key).replace("-", "_")
@@ -48,47 +41,44 @@ def options_from_query(query: str) -> dict[str, Any]:
                 options[name] = text if name in _WORDS else _NUMBERS.get(name, float)(text)
         except ValueError:
             raise InputError(f"sim://: {key}={text} is not a number.") from None
-    return options
+    return SimulationOptions.of(**options)
 
 
 def simulation(
-    options: Mapping[str, Any],
+    options: SimulationOptions,
     bench_keys: Mapping[str, str],
     batch_samples: int = 65536,
+    angles: bool = True,
     begin: Callable[[Simulation], None] = lambda run: None,
 ) -> Simulation:
-    """The run that these options describe (those of ``simulate``; None: as the grade has it). Raises InputError.
+    """The run that these options describe. Raises InputError.
 
-    begin: is given the run before anything is hidden in it, which takes as long as the run is large.
+    angles: whether they are recorded (for sizes in sigmas). begin: is given the run before anything is hidden in it,
+    which takes as long as the run is large.
     """
-    options = {**DEFAULTS} | {key: value for key, value in options.items() if value is not None}
     keys = {"axes": "y z x", **bench_keys}
     if "latitude_deg" not in keys:
         keys.setdefault("gravity_mps2", "9.81")
-    grade = GRADES[options["grade"]]
-    names = {field.name for field in fields(grade.noise)}
-    noise = replace(grade.noise, **{key: options[key] for key in names if key in options})
+    grade = GRADES[options.grade]
+    noise = options.noise.over(grade.noise)
     axes = parse_axes(keys["axes"])
     visits = _visits(options, axes, keys.get("up", "y"))
-    if not options["unstated"]:
+    if not options.unstated:
         keys.setdefault("angle_sigma_deg", repr(noise.setting_sigma_deg))
         keys.setdefault("scatter_sigma_mps2", repr(noise.dwell_sigma_mps2(len(visits))))
-    ambient = Ambient(**{field.name: options[field.name] for field in fields(Ambient) if field.name in options})
     run = Simulation(
-        Bench.from_metadata(keys), grade.sensors(options["seed"]), noise, visits,
-        sample_hz=options["sample_hz"], angle_hz=options["angle_hz"], slew_rate_degps=options["slew_degps"],
-        ambient=ambient, seed=options["seed"], grade=options["grade"], batch_samples=batch_samples,
+        Bench.from_metadata(keys), grade.sensors(options.seed), noise, visits,
+        sample_hz=options.sample_hz, angle_hz=options.angle_hz, slew_rate_degps=options.slew_degps,
+        ambient=options.ambient, seed=options.seed, grade=options.grade, batch_samples=batch_samples,
     )  # fmt: skip
     begin(run)
-    judged = without_angles(run) if options.get("no_angles") else run
-    return run.hiding(
-        parse(options["hidden"], axes, seed=options["seed"], grade=options["grade"], sized=partial(sized, judged))
-    )
+    judged = run if angles else without_angles(run)
+    return run.hiding(parse(options.hidden, axes, seed=options.seed, grade=options.grade, sized=partial(sized, judged)))
 
 
-def _visits(options: Mapping[str, Any], axes: tuple[Vector, ...], up: str) -> list[PlannedVisit]:
-    if options["plan"] == "spread":
-        return spread_plan(options["count"], axes, options["dwell_s"], options["seed"], up)
-    if options["plan"] == "faces":
-        return six_faces(axes, options["dwell_s"], up)
-    return explicit_plan(angles_from_csv(Path(options["plan"]), len(axes)), options["dwell_s"])
+def _visits(options: SimulationOptions, axes: tuple[Vector, ...], up: str) -> list[PlannedVisit]:
+    if options.plan == "spread":
+        return spread_plan(options.count, axes, options.dwell_s, options.seed, up)
+    if options.plan == "faces":
+        return six_faces(axes, options.dwell_s, up)
+    return explicit_plan(angles_from_csv(Path(options.plan), len(axes)), options.dwell_s)

@@ -7,9 +7,8 @@ formula with the estimator. Hidden effects (``injected``) are further steps betw
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import astuple, dataclass, field
+from dataclasses import dataclass, field
 from itertools import groupby
 
 import numpy as np
@@ -18,48 +17,12 @@ from scipy.spatial.transform import Rotation
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, Vector
-from kf_calib.errors import InputError
 from kf_calib.sources.simulation.sensors import Process, Sensors
+from kf_calib.sources.simulation.settings import Ambient
 from kf_calib.sources.simulation.visit_plans import attitude, between
 
 SIDEREAL_DAY_S = 86164.0905
 """One turn of the Earth in inertial space."""
-
-
-@dataclass(frozen=True)
-class Ambient:
-    """Temperature over time: constant + swing sin(2 pi t / period) - warm_up exp(-t / warm_up_s), degC."""
-
-    constant_c: float = 25.0
-    swing_c: float = 0.0
-    period_s: float = 14400.0
-    warm_up_c: float = 0.0
-    warm_up_s: float = 1800.0
-    sigma_c: float = 0.01  # noise of the recorded values
-    step_c: float = 0.0  # their resolution; 0: not rounded
-
-    def __post_init__(self) -> None:
-        if not all(map(math.isfinite, astuple(self))):
-            raise InputError("a figure of the temperature is not a finite number: give one.")
-        for words, value_s in (("period of the temperature", self.period_s), ("warm-up time", self.warm_up_s)):
-            if not value_s > 0.0:
-                raise InputError(f"the {words} is {value_s:g} s: give a positive time.")
-        if self.sigma_c < 0.0:
-            raise InputError(f"the noise of the thermometer is {self.sigma_c:g} K: give zero or a positive number.")
-        if self.step_c < 0.0:
-            raise InputError(f"the resolution of the thermometer is {self.step_c:g} K: give zero or a positive number.")
-        coldest_c = self.constant_c - abs(self.swing_c) - max(self.warm_up_c, 0.0)
-        if coldest_c < -273.15:
-            raise InputError(f"the temperature falls to {coldest_c:g} degC, below absolute zero: give a warmer one.")
-
-    def __call__(self, time_s: Floats) -> Floats:
-        swing = self.swing_c * np.sin(2.0 * np.pi * time_s / self.period_s)
-        return self.constant_c + swing - self.warm_up_c * np.exp(-time_s / self.warm_up_s)
-
-    def rate(self, time_s: Floats) -> Floats:
-        """Its rate of change, K/s."""
-        swing = 2.0 * np.pi * self.swing_c / self.period_s * np.cos(2.0 * np.pi * time_s / self.period_s)
-        return swing + self.warm_up_c / self.warm_up_s * np.exp(-time_s / self.warm_up_s)
 
 
 @dataclass

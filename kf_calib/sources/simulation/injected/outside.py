@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from itertools import accumulate
 
 import numpy as np
@@ -16,74 +17,44 @@ from kf_calib.sources.simulation.visit_plans import attitude
 
 NO_FAMILY = "none of the known"
 """The family of what belongs to no physical class of the catalogue's effects."""
+_made, _added = partial(made, known=False), partial(added, known=False)
+_BIAS = "m/s^2", ("5ug", "100ug"), ("2mg", "20mg")  # unit and sizes of what acts as a bias
 
-made(
+_made(
     "encoder-harmonic-3", "rad", ("10urad", "200urad"), ("0.5mrad", "10mrad"),
-    stage="angles", coefficients=("s", "c"), per_axis=True, known=False, driver="angle", family="gimbal and encoder",
+    stage="angles", coefficients=("s", "c"), per_axis=True, driver="angle", family="gimbal and encoder",
 )(harmonic(3))  # fmt: skip
 
 
-@made(
-    "thermal-tilt", "rad/K", ("5urad/K", "50urad/K"), ("0.1mrad/K", "1mrad/K"),
-    stage="attitude", coefficients=("N", "E"), known=False, driver="temperature", family="temperature",
-)  # fmt: skip
+@_made("thermal-tilt", "rad/K", ("5urad/K", "50urad/K"), ("0.1mrad/K", "1mrad/K"),
+       stage="attitude", coefficients=("N", "E"), driver="temperature", family="temperature")  # fmt: skip
 def thermal_tilt(delta: Floats, rig: Rig, *, reference: float = 25.0) -> TrueStep:
     """Thermal tilt of the pier: the base is turned by T (delta N about North, delta E about East)."""
     return base_turning(delta, rig, lambda state: above(state, reference)[:, 0])
 
 
-@added(
-    "fifth-order",
-    "1/(m/s^2)^4",
-    ("5ug/g^5", "100ug/g^5"),
-    ("2mg/g^5", "20mg/g^5"),
-    known=False,
-    driver="specific force",
-    family="nonlinearity",
-)
+@_added("fifth-order", "1/(m/s^2)^4", ("5ug/g^5", "100ug/g^5"), ("2mg/g^5", "20mg/g^5"),
+        driver="specific force", family="nonlinearity")  # fmt: skip
 def fifth_order(k: Floats, state: TrueState) -> Floats:
     """Fifth-order nonlinearity: K5 a_i^5."""
     return k * state.input_mps2**5
 
 
-@added(
-    "triple-product",
-    "1/(m/s^2)^2",
-    ("5ug/g^3", "100ug/g^3"),
-    ("2mg/g^3", "20mg/g^3"),
-    known=False,
-    driver="specific force",
-    family="cross-axis",
-)
+@_added("triple-product", "1/(m/s^2)^2", ("5ug/g^3", "100ug/g^3"), ("2mg/g^3", "20mg/g^3"),
+        driver="specific force", family="cross-axis")  # fmt: skip
 def triple_product(k: Floats, state: TrueState) -> Floats:
     """Triple product: K_ipo a_i a_p a_o."""
     return k * state.input_mps2 * pendulous(state) * output(state)
 
 
-@added(
-    "fourth-harmonic",
-    "m/s^2",
-    ("5ug", "100ug"),
-    ("2mg", "20mg"),
-    known=False,
-    driver="specific force",
-    family="nonlinearity",
-)
+@_added("fourth-harmonic", *_BIAS, driver="specific force", family="nonlinearity")
 def fourth_harmonic(k: Floats, state: TrueState) -> Floats:
     """Spherical harmonic of degree 4: H (35 u^4 - 30 u^2 + 3) / 8, u the cosine of input axis and specific force."""
     squares = (state.input_mps2 / np.linalg.norm(state.force_mps2, axis=1, keepdims=True)) ** 2
     return k * (35.0 * squares**2 - 30.0 * squares + 3.0) / 8.0
 
 
-@added(
-    "third-cosine",
-    "m/s^2",
-    ("5ug", "100ug"),
-    ("2mg", "20mg"),
-    known=False,
-    driver="specific force",
-    family="nonlinearity",
-)
+@_added("third-cosine", *_BIAS, driver="specific force", family="nonlinearity")
 def third_cosine(k: Floats, state: TrueState) -> Floats:
     """Cosine of thrice the direction: H s^3 cos(3 psi), psi and s the angle about the output axis and the sine of the
     angle from it of the specific force (spherical harmonic of degree 3)."""
@@ -91,41 +62,34 @@ def third_cosine(k: Floats, state: TrueState) -> Floats:
     return k * np.real(across**3)
 
 
-@added(
-    "thermal-scale-2",
-    "1/K^2",
-    ("1ppm/K^2", "10ppm/K^2"),
-    ("20ppm/K^2", "200ppm/K^2"),
-    known=False,
-    driver="temperature",
-    family="temperature",
-)
+@_added("thermal-scale-2", "1/K^2", ("1ppm/K^2", "10ppm/K^2"), ("20ppm/K^2", "200ppm/K^2"),
+        driver="temperature", family="temperature")  # fmt: skip
 def thermal_scale_2(k: Floats, state: TrueState, *, reference: float = 25.0) -> Floats:
     """Thermal curvature of the scale factor: alpha_s2 T^2 a_i."""
     return k * above(state, reference) ** 2 * state.input_mps2
 
 
-@made("bias-jump", "m/s^2", ("5ug", "100ug"), ("2mg", "20mg"), known=False, driver="time", family="bias in time")
+@_made("bias-jump", *_BIAS, driver="time", family="bias in time")
 def bias_jump(k: Floats, rig: Rig, *, share: float = 0.4) -> TrueStep:
     """Jump of the bias: constant from ``share`` of the run on, where something in the sensor has given way."""
     start_s = share * rig.duration_s
     return adding(lambda state: k * column(np.where(state.time_s >= start_s, 1.0, 0.0)))
 
 
-@added("power-warm-up", "m/s^2", ("20ug", "200ug"), ("2mg", "20mg"), known=False, driver="time", family="bias in time")
+@_added("power-warm-up", "m/s^2", ("20ug", "200ug"), ("2mg", "20mg"), driver="time", family="bias in time")
 def power_warm_up(k: Floats, state: TrueState, *, tau: float = 120.0) -> Floats:
     """Warm-up by a power law: B / sqrt(1 + t / tau), as heat spreads into a thick base (diffusion)."""
     return k / np.sqrt(1.0 + column(state.time_s) / tau)
 
 
-@added("chirp", "m/s^2", ("5ug", "100ug"), ("2mg", "20mg"), known=False, driver="time", family=NO_FAMILY)
+@_added("chirp", *_BIAS, driver="time", family=NO_FAMILY)
 def chirp(k: Floats, state: TrueState, *, frequency: float = 2e-3, chirp: float = 1e-5) -> Floats:
     """Periodic bias of rising frequency: A sin(2 pi (f t + chirp t^2 / 2)), as from a fan that speeds up."""
     t = column(state.time_s)
     return k * np.sin(2.0 * np.pi * (frequency * t + 0.5 * chirp * t**2))
 
 
-@made("telegraph", "m/s^2", ("5ug", "100ug"), ("2mg", "20mg"), known=False, driver="time", family="bias in time")
+@_made("telegraph", *_BIAS, driver="time", family="bias in time")
 def telegraph(k: Floats, rig: Rig, *, tau: float = 200.0) -> TrueStep:
     """Telegraph noise: each bias switches between -k and +k, staying tau on average (burst or popcorn noise)."""
     chance = -0.5 * np.expm1(-2.0 * rig.period_s / tau)
@@ -141,22 +105,14 @@ def telegraph(k: Floats, rig: Rig, *, tau: float = 200.0) -> TrueStep:
     return adding(contribution)
 
 
-@made(
-    "previous-pose",
-    "m/s^2",
-    ("5ug", "100ug"),
-    ("2mg", "20mg"),
-    known=False,
-    driver="previous orientation",
-    family="memory",
-)
+@_made("previous-pose", *_BIAS, driver="previous orientation", family="memory")
 def previous_pose(k: Floats, rig: Rig) -> TrueStep:
     """Memory of the previous pose: k sin of the innermost angle of the dwell before; zero in the first dwell."""
     sines = np.concatenate([[0.0], np.sin(rig.motion.angles_rad[:-1, -1])])
     return adding(lambda state: k * sines[state.dwell])
 
 
-@made("cable-torque", "m/s^2", ("5ug", "100ug"), ("2mg", "20mg"), known=False, driver="angle", family=NO_FAMILY)
+@_made("cable-torque", *_BIAS, driver="angle", family=NO_FAMILY)
 def cable_torque(k: Floats, rig: Rig) -> TrueStep:
     """Torque of a wound-up cable: k times the square of the innermost angle, as it was commanded, in half turns."""
     return adding(lambda state: k * (state.angles_rad[:, -1:] / np.pi) ** 2)
@@ -165,7 +121,7 @@ def cable_torque(k: Floats, rig: Rig) -> TrueStep:
 # -- like real sensors and benches --
 
 
-@added("double-warm-up", "m/s^2", ("10ug", "200ug"), ("1mg", "10mg"), known=False, driver="time", family="bias in time")
+@_added("double-warm-up", "m/s^2", ("10ug", "200ug"), ("1mg", "10mg"), driver="time", family="bias in time")
 def double_warm_up(
     k: Floats, state: TrueState, *, tau: float = 120.0, slow: float = 1500.0, share: float = 0.4
 ) -> Floats:
@@ -175,7 +131,7 @@ def double_warm_up(
     return k * ((1.0 - share) * np.exp(-t / tau) + share * np.exp(-t / slow))
 
 
-@made("creep-and-walk", "m/s^2", ("5ug", "100ug"), ("1mg", "10mg"), known=False, driver="time", family="bias in time")
+@_made("creep-and-walk", "m/s^2", ("5ug", "100ug"), ("1mg", "10mg"), driver="time", family="bias in time")
 def creep_and_walk(k: Floats, rig: Rig, *, tau: float = 60.0, share: float = 0.3) -> TrueStep:
     """Creep of the bias after power-on, then a random walk: k (ln(1 + t / tau) + share W), W a random walk whose
     variance is t / tau; the creep is the faster at first, the walk later on."""
@@ -183,7 +139,7 @@ def creep_and_walk(k: Floats, rig: Rig, *, tau: float = 60.0, share: float = 0.3
     return adding(lambda state: k * (np.log1p(column(state.time_s) / tau) + share * walk(len(state.time_s))))
 
 
-@made("output-step", "m/s^2", ("5ug", "100ug"), ("2mg", "20mg"), coefficients=("step",), known=False, driver="time",
+@_made("output-step", *_BIAS, coefficients=("step",), driver="time",
       family="bias in time")  # fmt: skip
 def output_step(size: Floats, rig: Rig) -> TrueStep:
     """Step of one accelerometer's output: constant from an instant on; which one, and when between a fifth and four
@@ -193,7 +149,7 @@ def output_step(size: Floats, rig: Rig) -> TrueStep:
     return adding(lambda state: steps * column(np.where(state.time_s >= start_s, 1.0, 0.0)))
 
 
-@made("thermal-hysteresis", "m/s^2/K", ("5ug/K", "30ug/K"), ("0.15mg/K", "1mg/K"), known=False, driver="temperature",
+@_made("thermal-hysteresis", "m/s^2/K", ("5ug/K", "30ug/K"), ("0.15mg/K", "1mg/K"), driver="temperature",
       family="temperature")  # fmt: skip
 def thermal_hysteresis(alpha: Floats, rig: Rig, *, play: float = 2.0, reference: float = 25.0) -> TrueStep:
     """Temperature sensitivity with hysteresis: alpha times a temperature that follows the true one with a play of so
@@ -211,8 +167,8 @@ def thermal_hysteresis(alpha: Floats, rig: Rig, *, play: float = 2.0, reference:
     return adding(contribution)
 
 
-@made("loose-mount", "rad", ("2urad", "50urad"), ("0.1mrad", "5mrad"), stage="attitude", coefficients=("x", "y", "z"),
-      signed=False, known=False, driver="specific force", family="unstated noise")  # fmt: skip
+@_made("loose-mount", "rad", ("2urad", "50urad"), ("0.1mrad", "5mrad"), stage="attitude", coefficients=("x", "y", "z"),
+      signed=False, driver="specific force", family="unstated noise")  # fmt: skip
 def loose_mount(play: Floats, rig: Rig) -> TrueStep:
     """Loose mount: in each dwell the platform is turned in itself by play_j clip(u_k + z, -1, 1) about axis j, u_k
     the part of gravity's direction along the axis that follows j, z a standard normal number, the friction: it rests
@@ -224,8 +180,8 @@ def loose_mount(play: Floats, rig: Rig) -> TrueStep:
     return SettingError(play * np.clip(pull + friction, -1.0, 1.0))
 
 
-@made("eccentric-bearing", "rad", ("5urad", "50urad"), ("0.1mrad", "5mrad"), stage="angles", coefficients=("s", "c"),
-      per_axis=True, known=False, driver="angle", family="gimbal and encoder")  # fmt: skip
+@_made("eccentric-bearing", "rad", ("5urad", "50urad"), ("0.1mrad", "5mrad"), stage="angles", coefficients=("s", "c"),
+      per_axis=True, driver="angle", family="gimbal and encoder")  # fmt: skip
 def eccentric_bearing(size: Floats, rig: Rig, axis: int, *, share: float = 1.0) -> TrueStep:
     """Eccentric bearing of a gimbal: its encoder errs by s sin q + c cos q, and its axis is tilted in its parent by
     share s and share c, as with encoder-harmonic-1 and axis-nonorthogonality, because its shaft is off its centre."""
