@@ -19,7 +19,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.candidate_tests import CandidateTests, values_of
 from kf_calib.diagnosis.coefficient_sizes import AddedEffects, size_evidence
-from kf_calib.diagnosis.evidence import Evidence, MarginalLikelihood
+from kf_calib.diagnosis.evidence import Evidence, MarginalLikelihood, log_odds_of_repeating
 from kf_calib.diagnosis.hypothesis_table import (
     IRREGULAR,
     KINDS,
@@ -36,11 +36,9 @@ from kf_calib.diagnosis.within_dwell_trend import Trend, trend
 from kf_calib.dwells.qr import orthonormal
 from kf_calib.effects import Effect, FrameEffect, Stimulus, effect_named, walk_named
 from kf_calib.errors import UnobservableError
-from kf_calib.estimation.cross_validation import orientations
 from kf_calib.estimation.dwell_columns import stimulus_of
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import unweighted_left
-from kf_calib.noise.noise_model import mean_covariances
 
 _NO_NOISE = 0.1  # share of an unknown cause in scatter that was not stated
 _AGAINST_STATED = 0.5  # the same of noise that contradicts what was stated: none is likelier than the other
@@ -365,41 +363,3 @@ class Hypotheses:
         """Return the log of the prior probability of these effects, or formulas, among so many of their kind."""
         weight = math.prod(effect_named(name, self.before.bench).prior for name in effects)
         return math.log(weight * KINDS[kind] / max(members, 1))
-
-
-def log_odds_of_repeating(before: Calibration, noise: MarginalLikelihood) -> float:
-    """Log odds that the misfit depends on the orientation alone, against noise from dwell to dwell of these sizes; 0
-    where no orientation is repeated.
-
-    They are those of the differences of residuals between the visits of an orientation: with the noise that was stated
-    alone, or with that of the given parts, too.
-    """
-    groups = [group for group in orientations(before.fit.dwells) if len(group) > 1]
-    stated, linearised = before.noise.for_goodness_of_fit, before.linearised
-    if not groups or stated.attitude_unknown:
-        return 0.0
-    within = mean_covariances(stated.of_readings, linearised.means, linearised.state)
-    scatter, force = np.zeros_like(within), linearised.means.design[:, 0, :3]
-    for part, size in zip(noise.parts, noise.sizes, strict=False):
-        if part == "setting":
-            squares = np.sum(force**2, axis=1)[:, None, None] * np.eye(3) - force[:, :, None] * force[:, None, :]
-            scatter += size**2 * squares
-        elif part == "common":
-            scatter += size**2 * np.eye(3)
-    return sum(_log_ratio(before.residuals_mps2[group], within[group], scatter[group]) for group in groups)
-
-
-def _log_ratio(residuals: Floats, within: Floats, scatter: Floats) -> float:
-    """Return the log of the likelihood of the differences from the first visit without the scatter, over that with it;
-    residuals (n, 3), covariances (n, 3, 3)."""
-    differences = (residuals[1:] - residuals[0]).ravel()
-    return _log_density(differences, within) - _log_density(differences, within + scatter)
-
-
-def _log_density(differences: Floats, covariances: Floats) -> float:
-    """Return the log density of differences (3 (n - 1),) from the first of n vectors, but for a constant."""
-    count = len(covariances) - 1
-    spread = np.kron(np.ones((count, count)), covariances[0])
-    for k in range(count):
-        spread[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += covariances[k + 1]
-    return -0.5 * float(np.linalg.slogdet(spread)[1] + differences @ np.linalg.solve(spread, differences))

@@ -237,6 +237,7 @@ SEEN = 3.0
 """In sigmas of its refit: the least size of the largest coefficient of an effect that is named."""
 
 _TOGETHER_P = 6e-7  # of 5 sigma: of coefficients that are all determined, but clear only together
+_AS_IT_WAS = 0.98  # the same of an oscillation that explains no part of the misfit of the means
 _GROWN = 1.05  # the held-out error before and after; what shows only within dwells, or in slews, leaves it as it was
 
 
@@ -255,10 +256,16 @@ def unearned(row: Hypothesis, before: Calibration, walk: str) -> str:
         if name != walk and _largest_ratio(after, name) < SEEN and not _clear_together(after, name):
             return f"no coefficient of {name} is beyond {SEEN:g} sigma"
     errors = before.held_out_rms_mps2, after.held_out_rms_mps2
-    if errors[0] is None or errors[1] is None or errors[1] <= _GROWN * errors[0]:
+    if errors[0] is None or errors[1] is None:
         return ""
-    what = "they make" if len(row.effects) > 1 else "it makes"
-    return f"{what} the held-out error {errors[1] / errors[0]:.3g} times as large"
+    if errors[1] > _GROWN * errors[0]:
+        what = "they make" if len(row.effects) > 1 else "it makes"
+        return f"{what} the held-out error {errors[1] / errors[0]:.3g} times as large"
+    fails = before.consistency.consistent is False and after.consistency.consistent is False
+    oscillating = all(effect.oscillates for effect in after.model.effects if str(effect) in row.effects)
+    if oscillating and fails and errors[1] > _AS_IT_WAS * errors[0]:
+        return "it goes on within the orientations, and leaves the misfit between them as it was"
+    return ""
 
 
 def _largest_ratio(after: Calibration, name: str) -> float:

@@ -9,7 +9,7 @@ the noise level, which is the product of an autoregressive spectrum (the slope o
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, reduce
 
 import numpy as np
@@ -64,6 +64,12 @@ class Spectrum:
     def __add__(self, other: Spectrum) -> Spectrum:
         shared = {length: self.sums[length] + other.sums[length] for length in self.sums.keys() & other.sums.keys()}
         return Spectrum({**self.sums, **other.sums, **shared})
+
+    def times(self, weight: float) -> Spectrum:
+        """The spectrum of readings of this weight: the power of each segment counts by it."""
+        if weight == 1.0:
+            return self
+        return Spectrum({length: replace(each, power=weight * each.power) for length, each in self.sums.items()})
 
     @classmethod
     def of(cls, residuals: Floats, elapsed_s: Floats) -> Spectrum:

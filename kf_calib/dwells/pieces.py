@@ -10,7 +10,7 @@ Pieces shortly after the arrival stay short, since a merged piece is never longe
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -122,7 +122,8 @@ PieceIndices = NDArray[np.intp]
 
 
 class OfPieces(ComputedSequence[Floats]):
-    """Values of the pieces of all dwells in one array (pieces, ...), as a sequence of those of each dwell."""
+    """Values of the pieces of all dwells, or whitened rows, in one array (pieces, ...), as a sequence of those of each
+    dwell; objects a dwell would take as much memory as the numbers."""
 
     def __init__(self, values: Floats, ends: PieceIndices) -> None:
         self.values, self._ends = values, ends
@@ -144,41 +145,10 @@ class OfPieces(ComputedSequence[Floats]):
 
 
 def of_all_pieces(columns: Sequence[Floats]) -> Floats:
-    """The values of the pieces of all dwells in one array (pieces, ...)."""
+    """The values of the pieces, or the rows, of all dwells in one array (pieces, ...)."""
     return columns.values if isinstance(columns, OfPieces) else np.concatenate(columns)
 
 
 def basis_values(columns: Floats) -> Floats:
     """Coefficients (..., K, 3 c) on the basis functions of columns (..., K, 3, c) given at the nodes."""
     return on_basis(columns.reshape(*columns.shape[:-2], -1))
-
-
-class RowsOfMeans(ComputedSequence[Floats]):
-    """Whitened rows (D, 3, n) of dwells that show nothing but their means, in one array: of a hundred thousand, objects
-    would take as much memory as the numbers."""
-
-    def __init__(self, values: Floats) -> None:
-        self.values = values
-
-    @classmethod
-    def of(cls, count: int, parts: Iterable[tuple[NDArray[np.intp], Floats]]) -> RowsOfMeans:
-        """Rows (d, 3, n) of some of the dwells (d,) at a time."""
-        values: Floats | None = None
-        for dwells, rows in parts:
-            values = np.empty((count, *rows.shape[1:])) if values is None else values
-            values[dwells] = rows
-        return cls(np.empty((0, 0, 0)) if values is None else values)
-
-    def __len__(self) -> int:
-        return len(self.values)
-
-    def item(self, k: int) -> Floats:
-        """The rows of one dwell."""
-        return self.values[k]
-
-
-def as_one_array(rows: Sequence[Floats]) -> Floats:
-    """The rows of all dwells in one array."""
-    if isinstance(rows, RowsOfMeans):
-        return rows.values.reshape(-1, rows.values.shape[2])
-    return rows[0] if len(rows) == 1 else np.concatenate(rows)

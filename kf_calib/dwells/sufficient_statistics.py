@@ -361,9 +361,10 @@ def lines_of(dwells: Sequence[DwellFactor], level: float = 0.01) -> tuple[Spectr
     """Oscillations in the readings of dwells at the significance ``level``.
 
     These are the lines of the averaged spectrum or, if there are none, a single oscillation that is too weak to appear
-    there but keeps its phase from dwell to dwell. The p-values account for both tests.
+    there but keeps its phase from dwell to dwell. The p-values account for both tests. In the averaged spectrum dwells
+    count by their weights: the power of one that is louder than the others would have few degrees of freedom.
     """
-    spectral_lines = lines((dwell.spectrum for dwell in dwells), 0.5 * level)
+    spectral_lines = lines((dwell.spectrum.times(dwell.weight) for dwell in dwells), 0.5 * level)
     steady = None if spectral_lines else tone([dwell.trace for dwell in dwells], 0.5 * level)
     oscillations = spectral_lines or ((steady,) if steady else ())
     return tuple(replace(line, p_value=min(1.0, 2.0 * line.p_value)) for line in oscillations)

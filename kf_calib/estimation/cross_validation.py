@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.dwells.pieces import as_one_array
+from kf_calib.dwells.pieces import of_all_pieces
 from kf_calib.dwells.qr import inverse_of_lower, triangle
 from kf_calib.dwells.stack import DwellStack
 from kf_calib.dwells.sufficient_statistics import DwellFactor
@@ -226,7 +226,7 @@ def _by_leverage(fitted: Fit, place: NDArray[np.intp]) -> tuple[Floats, _Roots] 
 def _of_all(fitted: Fit, place: NDArray[np.intp]) -> tuple[Floats, _OfGroups]:
     """Return the factor [R | z] (p, p + 1) of all rows, and the rows of each orientation."""
     rows, frame = _rows(fitted), _frame(fitted)
-    factor = square_root_information.accumulate([np.concatenate([frame, *fitted.following, as_one_array(rows)])])
+    factor = square_root_information.accumulate([np.concatenate([frame, *fitted.following, of_all_pieces(rows)])])
     return factor[: len(frame)], _of_groups(rows, place)
 
 
@@ -239,7 +239,7 @@ def _of_groups(rows: Sequence[Floats], place: NDArray[np.intp]) -> _OfGroups:
     nothing."""
     counts = np.fromiter(map(len, rows), np.intp, len(rows))
     sizes = np.bincount(place, weights=counts).astype(int)
-    in_order = as_one_array(rows)
+    in_order = of_all_pieces(rows)
     if np.any(np.diff(place) < 0):
         in_order = in_order[np.argsort(np.repeat(place, counts), kind="stable")]
     stacked, most = _OfGroups(in_order, sizes), rows[0].shape[1] - 1

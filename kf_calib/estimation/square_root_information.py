@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
-from kf_calib.dwells.pieces import as_one_array
+from kf_calib.dwells.pieces import of_all_pieces
 from kf_calib.dwells.qr import triangle
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Prior
@@ -123,7 +123,7 @@ def accumulate(rows: Sequence[Floats], walked: Floats | None = None) -> Floats:
     D in ``rows``. Without a walk all rows are reduced by one QR.
     """
     if walked is None or not walked.any():
-        stacked = as_one_array(rows)
+        stacked = rows[0] if len(rows) == 1 else of_all_pieces(rows)
         lacking = max(stacked.shape[1] - len(stacked), 0)
         return triangle(np.vstack([stacked, np.zeros((lacking, stacked.shape[1]))]) if lacking else stacked)
     width = rows[-1].shape[1] - 4

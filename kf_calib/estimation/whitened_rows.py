@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
-from kf_calib.dwells.pieces import OfPieces, RowsOfMeans, of_all_pieces
+from kf_calib.dwells.pieces import OfPieces, of_all_pieces
 from kf_calib.dwells.qr import inverse_of_lower, triangle
 from kf_calib.dwells.rows import on_basis, parabola
 from kf_calib.dwells.stack import AlikeDwells, DwellStack
@@ -70,8 +70,10 @@ def whiten(
     stack, noise_about = DwellStack.of(dwells), _About(noise, state, about, flicker_mps2)
     batches = list(_batches(stack, values.shape[-1]))
     if informative is not None and all(batch.shows_means_only(noise) for batch in batches):
-        parts = ((each.dwells, _of_means(each, values[each.pieces], noise_about)) for each in batches)
-        return RowsOfMeans.of(len(stack), parts)
+        rows_of_means = np.empty((len(stack), 3, values.shape[-1] + 1))
+        for batch in batches:
+            rows_of_means[batch.dwells] = _of_means(batch, values[batch.pieces], noise_about)
+        return OfPieces(rows_of_means.reshape(-1, rows_of_means.shape[2]), 3 * np.arange(len(stack) + 1))
     all_rows = list[Floats]([np.empty((0, 0))] * len(stack))
     for batch in batches:
         of_batch = values[batch.pieces]

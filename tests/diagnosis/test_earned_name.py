@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers.long_runs import slow
 from helpers.paths import REAL
+from real_trials.turned import TurnedRecording
 
 import kf_calib
 from kf_calib.diagnosis.hypothesis_table import Hypothesis
@@ -18,6 +19,9 @@ from kf_calib.effects import walk_named
 
 class _Effect:
     parameters = coefficients = (SimpleNamespace(symbol="k1"), SimpleNamespace(symbol="k2"))
+
+    def __init__(self, oscillates: bool = False) -> None:
+        self.oscillates = oscillates
 
     def __str__(self) -> str:
         return "bent"
@@ -34,6 +38,7 @@ def _result(ratio: float | None, held_out: float | None, walk_gain: float = 0.0,
         fit=SimpleNamespace(walk_gain=walk_gain),
         parameters={"k1": SimpleNamespace(value=0.1, sigma=1.0), "k2": second},
         held_out_rms_mps2=held_out,
+        consistency=SimpleNamespace(consistent=False),
     )
 
 
@@ -52,6 +57,24 @@ def _result(ratio: float | None, held_out: float | None, walk_gain: float = 0.0,
 def test_what_a_name_is_earned_by(ratio: float | None, errors: tuple[float | None, float], said: str) -> None:
     row = Hypothesis(("bent",), refit=_result(ratio, errors[1]))
     assert unearned(row, _result(None, errors[0]), "bias-walk") == said
+
+
+@pytest.mark.parametrize("held_out, consistent, earned", [(0.99, False, False), (0.9, False, True), (0.99, True, True)])
+def test_an_oscillation_explains_a_misfit_of_the_means_or_is_not_named(
+    held_out: float, consistent: bool, earned: bool
+) -> None:
+    after = _result(5.0, held_out)
+    after.model.effects, after.consistency.consistent = [_Effect(oscillates=True)], consistent
+    assert (unearned(Hypothesis(("bent",), refit=after), _result(None, 1.0), "bias-walk") == "") == earned
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="the recordings of others are not there")
+@pytest.mark.slow
+def test_creep_of_a_real_unit_is_not_called_an_oscillation() -> None:
+    """With its poses stated to 0.05 deg, as gimbals would show them."""
+    recording = TurnedRecording(REAL / "xsens_mti.csv.gz")
+    diagnosis = diagnose(recording.altered(np.zeros(3)), replicate=False)
+    assert diagnosis.missing == () and "leaves the misfit between them as it was" in diagnosis.unearned
 
 
 @pytest.mark.parametrize("correlation, earned", [(0.8, False), (0.826, False), (0.833, True), (0.97, True)])

@@ -16,8 +16,7 @@ from unknown_trials.real_noise import KINDS, noisy_run
 from unknown_trials.small_bench import WHITE_MPS2, SmallRun, hidden_run, visits
 
 import kf_calib
-from kf_calib.diagnosis.evidence import MarginalLikelihood
-from kf_calib.diagnosis.hypotheses import log_odds_of_repeating
+from kf_calib.diagnosis.evidence import MarginalLikelihood, log_odds_of_repeating
 from kf_calib.diagnosis.hypothesis_table import IRREGULAR, NOISE
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.unknown_effect import ARRIVAL, _of_time, bases_of_pairs

@@ -77,7 +77,7 @@ def test_a_turn_of_a_fifth_of_a_degree_is_named_beside_setting_errors(
     """Linear columns leave 0.1 mm/s^2 of it along the specific force, which was taken for another effect."""
     found = diagnose(noisy_source(hidden, setting_sigma_deg=SETTING_DEG, states=states, seed=8))
     assert found.missing == (hidden.partition("=")[0],) and found.table is not None
-    assert found.table.rows[0].probability > 0.9
+    assert found.table.probability(found.missing) > 0.9
 
 
 def test_the_sigma_of_a_large_turn_and_of_the_twelve_hold_beside_setting_errors() -> None:

@@ -78,7 +78,7 @@ def _log_shape(shape: EffectShape, log: Log) -> None:
         chart.log_frame(log)
         log(f"{chart.path}/residuals", chart.points(ratios[:, k]))
         log(f"{chart.path}/curve", _curve(shape, chart, unit.per_si))
-    said = f"what {shape.effect} must explain, against {shape.words}, {unit.label}"
+    said = f"{shape.effect}, against {shape.words}, {unit.label}"
     log("driver/heading", heading(printable(said)))
 
 
