@@ -518,11 +518,11 @@ def strings(tree: ast.AST) -> set[str]:
 @pytest.mark.parametrize("seed", [1, 2, *slow(3, 4, 5)])
 def test_noise_of_the_angles_is_no_step_of_either_sign(seed: int) -> None:
     """Every second visit turns the platform about the vertical: no accelerometer comes from another side, though the
-    angles show a step of some thousandths of a degree."""
+    angles show a step of a thousandth of a degree."""
     rng = np.random.default_rng(seed)
     poses = np.repeat(rng.uniform(-np.pi, np.pi, (14, 3)), 2, axis=0)
     poses[1::2, 0] += 1.0
-    run = Run(seed=seed, dwells=28, count=200, poses=poses, encoder_deg=0.02)
+    run = Run(seed=seed, dwells=28, count=200, poses=poses, encoder_deg=0.003)
     tilt, turn = poses[:, 1], poses[:, 2]  # specific force G (sin tilt, cos tilt cos turn, -cos tilt sin turn)
     force = np.column_stack([np.sin(tilt), np.cos(tilt) * np.cos(turn), -np.cos(tilt) * np.sin(turn)])
     step = np.vstack([np.zeros(3), np.diff(force, axis=0)])
