@@ -12,9 +12,8 @@ import rich_click as click
 
 from kf_calib.cli.command import POSITIVE, NumberInRange, command, option
 from kf_calib.cli.echo import print_result, progress
-from kf_calib.cli.files import claimed, delivery, output_option
+from kf_calib.cli.files import FigureFiles, claimed, delivery, output_option
 from kf_calib.cli.options import EvaluationOptions, Json, Overwrite, ReadingOptions, ShownUnits, opened, target_option
-from kf_calib.cli.pictures import FigureFiles
 from kf_calib.errors import InputError
 
 if TYPE_CHECKING:
