@@ -51,6 +51,8 @@ _EXACT_RAD = 1e-9
 _MANY = 8192  # dwells by which variances are known to one percent, which is enough until the fit nearly settles
 _TURNS = 50  # most times that forces and state are found in turn
 _SINGULAR = 100.0
+_PASSES_WITH_NOISE = 5  # after which the estimate of the noise does not move the fit any more
+_SWINGING, _LEAST_SHARE = 0.9, 0.125
 _STILL = 2.5e-4  # the search ends when no step of ln(value) exceeds this share of its largest allowed step
 
 
@@ -77,7 +79,7 @@ def fit(
     fitted = _begun(dwells, model, slews, walk_mps2_per_sqrt_s, beginning)
     within, bench = fitted.noise, model.bench
     components = VarianceComponents(_setting_deg(dwells, bench), bench.scatter_sigma_mps2, model.walks)
-    left = 0.0
+    left, share, lefts = 0.0, 1.0, list[float]()
     for number in range(_most_passes(model)):
         fitted = _with_constants_searched(fitted, number)
         state, constant_steps = estimate_and_steps(fitted)
@@ -86,6 +88,9 @@ def fit(
                 raise UnobservableError(_not_sensible(model))
             return fitted
         left, reach = _left_to_settle(fitted, state), largest_steps(fitted)
+        share, lefts = _share_of_step(share, left, lefts), [*lefts, left]
+        state = fitted.linearised.state + share * (state - fitted.linearised.state)
+        constant_steps = share * constant_steps
         before, fitted = fitted if slews else None, replace(fitted)  # without its rows, which need much memory
         linearised = _moved_to(fitted, _with_constants_moved(fitted, constant_steps, reach, number), state)
         fitted = replace(fitted, linearised=linearised)
@@ -99,6 +104,13 @@ def fit(
     if must_settle and not bench.angles and left > UNSETTLED:
         raise UnobservableError(_not_settled(model))
     return fitted
+
+
+def _share_of_step(before: float, left: float, lefts: Sequence[float]) -> float:
+    """Return the share of a step that is taken: half of that ``before`` where the fit swings between two places, that
+    is where as much is ``left`` to settle as two steps ago."""
+    swings = len(lefts) > _PASSES_WITH_NOISE and left > max(_SWINGING * lefts[-2], SETTLED)
+    return max(0.5 * before, _LEAST_SHARE) if swings else before
 
 
 def _with_constants_searched(fitted: Fit, number: int) -> Fit:
@@ -181,9 +193,7 @@ def _not_sensible(model: Model) -> str:
 
 def _most_passes(model: Model) -> int:
     """Return how often noise, linearisation and constants are estimated in turn at most."""
-    if not model.bench.angles:
-        return _TURNS
-    return _PASSES_WITH_UNKNOWNS
+    return _PASSES_WITH_UNKNOWNS if model.bench.angles or model.stepped else _TURNS
 
 
 def _begun(
