@@ -52,7 +52,8 @@ _MANY = 8192  # dwells by which variances are known to one percent, which is eno
 _TURNS = 50  # most times that forces and state are found in turn
 _SINGULAR = 100.0
 _PASSES_WITH_NOISE = 5  # after which the estimate of the noise does not move the fit any more
-_SWINGING, _LEAST_SHARE = 0.9, 0.125
+_BACK, _ON = -0.5, 0.9  # cosine of a step with the last one
+_LEAST_SHARE, _MOST_SHARE = 0.125, 3.0
 _STILL = 2.5e-4  # the search ends when no step of ln(value) exceeds this share of its largest allowed step
 
 
@@ -79,7 +80,7 @@ def fit(
     fitted = _begun(dwells, model, slews, walk_mps2_per_sqrt_s, beginning)
     within, bench = fitted.noise, model.bench
     components = VarianceComponents(_setting_deg(dwells, bench), bench.scatter_sigma_mps2, model.walks)
-    left, share, lefts = 0.0, 1.0, list[float]()
+    left, relaxation = 0.0, _Relaxation()
     for number in range(_most_passes(model)):
         fitted = _with_constants_searched(fitted, number)
         state, constant_steps = estimate_and_steps(fitted)
@@ -88,9 +89,8 @@ def fit(
                 raise UnobservableError(_not_sensible(model))
             return fitted
         left, reach = _left_to_settle(fitted, state), largest_steps(fitted)
-        share, lefts = _share_of_step(share, left, lefts), [*lefts, left]
-        state = fitted.linearised.state + share * (state - fitted.linearised.state)
-        constant_steps = share * constant_steps
+        if not bench.angles and number > _PASSES_WITH_NOISE:
+            state, constant_steps = relaxation.of(fitted, state, constant_steps)
         before, fitted = fitted if slews else None, replace(fitted)  # without its rows, which need much memory
         linearised = _moved_to(fitted, _with_constants_moved(fitted, constant_steps, reach, number), state)
         fitted = replace(fitted, linearised=linearised)
@@ -106,11 +106,26 @@ def fit(
     return fitted
 
 
-def _share_of_step(before: float, left: float, lefts: Sequence[float]) -> float:
-    """Return the share of a step that is taken: half of that ``before`` where the fit swings between two places, that
-    is where as much is ``left`` to settle as two steps ago."""
-    swings = len(lefts) > _PASSES_WITH_NOISE and left > max(_SWINGING * lefts[-2], SETTLED)
-    return max(0.5 * before, _LEAST_SHARE) if swings else before
+class _Relaxation:
+    """How much of a step is taken: half as much as before where it goes back, so that a fit does not swing between two
+    places, and more where it goes on in the same direction, so that a slow one arrives."""
+
+    def __init__(self) -> None:
+        self.share, self._last = 1.0, np.zeros(0)
+
+    def of(self, fitted: Fit, state: Floats, constant_steps: Floats) -> tuple[Floats, Floats]:
+        """Return the state to go to, and the steps of the unknown constants, from those of a fit."""
+        start = fitted.linearised.state
+        sigma = fitted.sigma_of_determined
+        step = np.where(sigma > 0.0, (state - start) / np.where(sigma > 0.0, sigma, 1.0), 0.0)
+        if len(self._last) == len(step):
+            cosine = float(step @ self._last) / max(float(np.linalg.norm(step) * np.linalg.norm(self._last)), 1e-300)
+            if cosine < _BACK:
+                self.share = max(0.5 * self.share, _LEAST_SHARE)
+            elif cosine > _ON:
+                self.share = min(1.25 * self.share, _MOST_SHARE)
+        self._last = step
+        return start + self.share * (state - start), self.share * constant_steps
 
 
 def _with_constants_searched(fitted: Fit, number: int) -> Fit:
