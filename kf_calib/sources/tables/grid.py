@@ -176,6 +176,8 @@ def _cell(value: Any) -> Cell:
     """Return a cell of a spreadsheet or an array: number, stamp or text; None where there is nothing."""
     if value is None or value != value:  # NaN and NaT
         return None
+    if type(value) is float:
+        return value
     if isinstance(value, datetime) or (isinstance(value, str) and value.strip()):
         return _text(value) if isinstance(value, str) else value
     if isinstance(value, str):

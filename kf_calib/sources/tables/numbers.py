@@ -93,8 +93,11 @@ class Numbers:
         return cell
 
     def values(self, cells: Sequence[Cell]) -> list[float] | None:
-        """The numbers in cells that are all written as programs write them; None where one is not."""
+        """The numbers in cells that are all numbers, or all written as programs write them; None where one is not."""
         texts = cast("Sequence[str]", cells)
+        if set(map(type, cells)) == {float}:
+            numbers = cast("list[float]", list(cells))
+            return numbers if all(map(math.isfinite, numbers)) else None
         try:
             if self.decimal != "." or not _is_plain("".join(texts)):
                 return None
@@ -127,7 +130,7 @@ def _joined(row: Sequence[Cell]) -> str:
     try:
         return "".join(texts)
     except TypeError:  # a cell of a spreadsheet, or an empty one
-        return "".join(cell for cell in row if isinstance(cell, str))
+        return "".join([cell for cell in row if isinstance(cell, str)])
 
 
 def _shows_another(cell: str, seen: Container[str]) -> bool:
