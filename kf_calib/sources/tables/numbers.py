@@ -31,6 +31,8 @@ class Numbers:
     def of(cls, grid: Grid) -> Numbers:
         """How the numbers in a grid are written; raises InputError where two cells contradict each other."""
         cell_of_sign = dict[str, tuple[int, int]]()
+        if not any(isinstance(cell, str) for row in grid.rows for cell in row):
+            return cls()
         for k, row in enumerate(grid.rows):
             if not _shows_another(_joined(row), cell_of_sign):
                 continue

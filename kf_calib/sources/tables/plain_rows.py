@@ -1,7 +1,7 @@
 """Rows of a sheet of Excel that are written as most programs write them, read without a parser of XML.
 
 A table of 100 000 rows has a million cells, and a parser makes several objects of each cell. Rows of which all cells
-hold numbers or shared texts are therefore read by a regular expression, and cut out of what the parser reads.
+hold numbers or plain texts are therefore read by a regular expression, and cut out of what the parser reads.
 """
 
 from __future__ import annotations
@@ -15,13 +15,15 @@ from typing import Any
 
 BEGIN_OF_ROW = re.compile(rb"<(?:\w+:)?row\b")
 NUMBERED_ROW = re.compile(rb'<(?:\w+:)?row\b[^<>]*?\sr\s*=\s*["\'](\d{1,9})["\']')
-_ATTRIBUTE = rb' [\w:]+="[ !#-%\'-;=?-~]*+"'  # ASCII without references to characters
-_FORMULA = rb"<f(?:%b)*+(?:/>|>[ -%%'-;=?-~]*+</f>)" % _ATTRIBUTE
+_ATTRIBUTE = rb' [\w:]+="[ !#-%\'-;=?-~]*+"'
+_TEXT = rb"[ -%'-;=?-~]"  # ASCII without references to characters
+_FORMULA = rb"<f(?:%b)*+(?: ?/>|>%b*+</f>)" % (_ATTRIBUTE, _TEXT)
 _NUMBER = rb"(?!-0*<)-?\d{1,20}(?:\.\d{0,25})?+(?:[eE][+-]?\d{1,3})?+"  # -0 is the whole number 0 for a parser
 _CELL = (
-    rb'<c r="([A-Z]{1,3})[1-9]\d{0,6}"(?: s="(0|[1-9]\d{0,5})")?+(?: t="([ns])")?+(?:/>|>(?:%b)?+<v>(%b)</v></c>)'
-    % (_FORMULA, _NUMBER)
-)  # column, style, kind and value
+    rb'<c r="([A-Z]{1,3})[1-9]\d{0,6}"(?: s="(0|[1-9]\d{0,5})")?+'
+    rb'(?:(?: t="([ns])")?+(?: ?/>|>(?:%b)?+<v>(%b)</v></c>)'
+    rb'| t="inlineStr"><is><t(?: xml:space="preserve")?+>(%b++)</t></is></c>)'
+) % (_FORMULA, _NUMBER, _TEXT)  # column, style, kind, number and text
 _CELLS, _NO_GROUPS = re.compile(_CELL), re.sub(rb"\((?!\?)", rb"(?:", _CELL)
 _PLAIN_ROW = re.compile(rb'<row r="(\d{1,7})"(?:%b)*+>((?:%b)++)</row>' % (_ATTRIBUTE, _NO_GROUPS))
 _NAMESPACE = re.compile(rb"\sxmlns\s*=")
@@ -88,10 +90,16 @@ class PlainRows:
         for number, begin, end in self.spans:
             cells = _CELLS.findall(self.content, begin, end)
             values = list[Any]([None]) * column_number(cells[-1][0])
-            for letters, style, kind, text in cells:
-                if text and (place := column_number(letters)) <= len(values):
-                    is_number = not style and kind != b"s"
-                    values[place - 1] = float(text) if is_number else context.value(style, kind, text)
+            for letters, style, kind, number_text, text in cells:
+                place = column_number(letters)
+                if place > len(values) or not (number_text or text):
+                    continue
+                if text:
+                    values[place - 1] = text.decode()
+                elif style or kind == b"s":
+                    values[place - 1] = context.value(style, kind, number_text)
+                else:
+                    values[place - 1] = float(number_text)
             yield number, values
 
 

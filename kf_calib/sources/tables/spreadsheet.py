@@ -16,15 +16,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from kf_calib.errors import InputError
 from kf_calib.sources.tables.plain_rows import BEGIN_OF_ROW, NUMBERED_ROW, CellContext, PlainRows, column_number
 from kf_calib.support.extras import need
 from kf_calib.support.text import cut
-
-if TYPE_CHECKING:
-    from openpyxl.worksheet._read_only import ReadOnlyWorksheet
 
 SheetRow = tuple[int, list[Any]]
 """Number of a row in its sheet, from 1, and its cells up to the last that is filled."""
@@ -65,7 +62,7 @@ def sheets_of(path: Path) -> list[Sheet]:
         with path.open("rb") as file:
             parts = {name: PlainRows.of(content) for name, content in _fit_parts(file).items()}
         with warnings.catch_warnings(action="ignore"):  # of what openpyxl leaves out, which no cell is part of
-            book = openpyxl.load_workbook(_archive_of_rest(parts), read_only=True, data_only=True)
+            book: Any = openpyxl.load_workbook(_archive_of_rest(parts), read_only=True, data_only=True)
             sheets = [_sheet(sheet, parts[sheet._worksheet_path.lstrip("/")]) for sheet in book.worksheets]
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
@@ -101,8 +98,8 @@ def _merged(content: bytes) -> int:
 
 def _unreadable(path: Path, error: Exception) -> InputError:
     """Return the error for what openpyxl raises for a damaged file, which depends on where the damage is."""
-    error = error.__cause__ or error  # which openpyxl says again, with the name of the file
-    said = cut(" ".join(str(error).split()), 80) or type(error).__name__
+    cause = error.__cause__ or error  # openpyxl says it again, with the name of the archive
+    said = cut(" ".join(str(cause).split()), 80) or type(cause).__name__
     return InputError(f"{path}: is no Excel file that can be read ({said}): save it again.")
 
 
@@ -157,7 +154,7 @@ def _refuse_part(content: bytes) -> None:
         raise InputError("has rows that are out of order, which would be lost: save it again.")
 
 
-def _sheet(sheet: ReadOnlyWorksheet, part: PlainRows) -> Sheet:
+def _sheet(sheet: Any, part: PlainRows) -> Sheet:
     hidden_rows = set(map(int, _HIDDEN_ROW.findall(part.content)))  # openpyxl does not tell them row by row
     lines = _lines(sheet, part)
     seen = [line for line in lines if line[0] not in hidden_rows]
@@ -165,14 +162,16 @@ def _sheet(sheet: ReadOnlyWorksheet, part: PlainRows) -> Sheet:
     return Sheet(sheet.title, sheet.sheet_state != "visible", seen, left_out)
 
 
-def _lines(sheet: ReadOnlyWorksheet, part: PlainRows) -> list[SheetRow]:
+def _lines(sheet: Any, part: PlainRows) -> list[SheetRow]:
     """Return the rows of a sheet that hold anything."""
     sheet.reset_dimensions()  # what the file says of its size may be wrong
     lines, visited, filled, book = list[SheetRow](), 0, 0, sheet.parent
     plain = part.rows(CellContext(sheet._shared_strings, book._date_formats, book._timedelta_formats, book.epoch))
     for number, row in heapq.merge(enumerate(sheet.iter_rows(values_only=True), 1), plain, key=itemgetter(0)):
         visited += len(row)
-        last = max((k for k, cell in enumerate(row, 1) if cell is not None), default=0) if row else 0
+        last = len(row)
+        while last and row[last - 1] is None:
+            last -= 1
         filled += last
         if number > _MOST_ROWS or number + visited > _MOST_VISITED or filled > _MOST_FILLED:
             raise InputError(f"sheet {sheet.title!r} has more cells than any table of orientations: leave out what is "
