@@ -72,8 +72,10 @@ class PlainRows:
     def of(cls, content: bytes) -> PlainRows:
         """The plain rows of a part; none where ``<row`` could mean something else there, or where the number of another
         row follows from the rows before it."""
-        is_sheet = _SHEET.match(content) and len(_NAMESPACE.findall(content)) == 1
-        if not is_sheet or b"<!" in content or content.count(b"<?") > 1:
+        begin = _SHEET.match(content)
+        if not begin or len(_NAMESPACE.findall(content)) > 1:
+            return cls(content, content, [])
+        if b"<!" in content or content.find(b"<?", begin.end()) >= 0:
             return cls(content, content, [])
         spans, others, end = list[tuple[int, int, int]](), list[bytes](), 0
         for row in _PLAIN_ROW.finditer(content):
