@@ -18,9 +18,8 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
-from kf_calib.errors import InputError
+from kf_calib.errors import InputError, need
 from kf_calib.sources.tables.plain_rows import BEGIN_OF_ROW, NUMBERED_ROW, CellContext, PlainRows, column_number
-from kf_calib.support.extras import need
 from kf_calib.support.text import cut
 
 SheetRow = tuple[int, list[Any]]
