@@ -142,10 +142,13 @@ def _with_constants_searched(fitted: Fit, number: int) -> Fit:
 
 
 def _with_constants_moved(fitted: Fit, constant_steps: Floats, reach: Floats, number: int) -> Model:
-    """Return the model with its unknown constants moved by their steps, at most by ``reach``; as it is before they are
-    on their grids."""
+    """Return the model with its unknown constants moved by their steps, at most by ``reach``, and from some passes on
+    held at the ends of their ranges; as it is before they are on their grids."""
     model = fitted.linearised.model
-    return model.moved(np.clip(constant_steps, -reach, reach)) if number and model.unknowns else model
+    if not number or not model.unknowns:
+        return model
+    model = model if number < _PASSES else model.held_at_ends(constant_steps)
+    return model.moved(np.clip(constant_steps, -reach, reach))
 
 
 def _noise_at(
