@@ -7,12 +7,16 @@ import os
 import signal
 import subprocess
 import sys
+import time
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 from mutation_trials.changes import changes_in, function_at
-from mutation_trials.server import in_child, replace_code
+from mutation_trials.command import Trial, counts
+from mutation_trials.runner import Runner
+from mutation_trials.server import Outcome, in_child, replace_code, report
 from mutation_trials.test_map import TestMap
 
 SOURCE = """
@@ -79,10 +83,60 @@ def test_two_functions_of_one_name_and_line_cannot_be_told_apart_but_within_anot
 
 
 def test_a_child_answers_or_takes_too_long() -> None:
-    assert in_child(lambda answer: os.write(answer, b"a test") and None) == "a test"
-    assert in_child(lambda _: None) == ""
-    assert in_child(lambda _: os.kill(os.getpid(), signal.SIGKILL)) == "time"
-    assert "the tests were not run" in in_child(lambda _: 1 // 0)
+    def hang(answer: int) -> None:
+        report(answer, at="a test")
+        time.sleep(60.0)
+
+    assert in_child(lambda answer: report(answer, at="a test") or report(answer, failed="a test")) == Outcome("a test")
+    assert in_child(lambda answer: report(answer, at="a test") or report(answer, failed="")) == Outcome()
+    assert in_child(lambda _: None) == Outcome()
+    assert in_child(lambda _: os.kill(os.getpid(), signal.SIGXCPU)) == Outcome(late="a test")
+    assert in_child(hang, longest_s=0.3) == Outcome(late="a test")
+    assert "the tests were not run" in in_child(lambda _: 1 // 0).failed
+
+
+def test_what_a_child_has_started_ends_with_it() -> None:
+    def start(_: int) -> None:
+        if os.fork() == 0:
+            time.sleep(60.0)
+        time.sleep(60.0)
+
+    begun_s = time.monotonic()
+    assert in_child(start, longest_s=0.3) == Outcome(late="a test")
+    assert time.monotonic() - begun_s < 30.0
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "answer"),
+    [
+        ([Outcome()], "SURVIVED 1 of 1 tests"),
+        ([Outcome("t.py::one")], "t.py::one"),
+        ([Outcome(late="t.py::one"), Outcome()], "SURVIVED 1 of 1 tests"),
+        ([Outcome(late="t.py::one"), Outcome("t.py::two")], "t.py::two"),
+        ([Outcome(late="t.py::one"), Outcome(late="t.py::one"), Outcome()], "t.py::one (takes too long)"),
+        ([Outcome(late="t.py::one")] * 3, "TIMED OUT, as without the change: t.py::one"),
+    ],
+)
+def test_tests_that_take_too_long_notice_a_change_only_if_they_do_not_without_it(
+    outcomes: list[Outcome], answer: str, tmp_path: Path
+) -> None:
+    """The change is there for the first two runs, and not for the third."""
+    sources = ["0.5", "0.5", "1.0"]
+
+    class Scripted(Runner):
+        def __init__(self) -> None:
+            self._copy, self._budget_s, self._map = tmp_path, 1.0, TestMap({"t.py": ["m.py:"]}, {"t.py": 0.1})
+
+        def _ask(self, path: Path, function: str, tests: Sequence[str]) -> Outcome:
+            assert (tmp_path / path).read_text() == f"SIZE = {sources.pop(0)}"
+            return remaining.pop(0)
+
+    (tmp_path / "m.py").write_text("SIZE = 1.0")
+    change, remaining = changes_in("SIZE = 1.0")[0], list(outcomes)
+    tried = Trial(Path("kf_calib/m.py"), change, 1.0, Scripted().noticed_by(Path("m.py"), change))
+    assert str(tried.answer) == answer and not remaining
+    noticed = "" if tried.answer.timed_out else f"kf_calib: {int('::' in answer)} of 1 changes noticed"
+    assert counts([tried]) == (noticed or "1 timed out")
 
 
 def test_the_tests_that_call_a_function_come_with_the_quick_file_first_after_those_named(tmp_path: Path) -> None:

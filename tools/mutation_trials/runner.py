@@ -8,7 +8,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,18 +17,25 @@ from typing import Self
 
 from mutation_trials import server
 from mutation_trials.changes import Change, function_at
+from mutation_trials.server import Outcome
 from mutation_trials.test_map import TestMap, importing_tests
 
 
 @dataclass(frozen=True)
 class Answer:
-    """noticed_by: the test that failed; empty: none of ``tried``, of ``calling`` that call what was changed."""
+    """noticed_by: the test that failed; empty: none of ``tried``, of ``calling`` that call what was changed.
+
+    timed_out: the test that took too long, with the program as it is, too, so that it tells nothing.
+    """
 
     noticed_by: str
     tried: int
     calling: int
+    timed_out: str = ""
 
     def __str__(self) -> str:
+        if self.timed_out:
+            return f"TIMED OUT, as without the change: {self.timed_out}"
         return self.noticed_by or f"SURVIVED {self.tried} of {self.calling} tests"
 
 
@@ -95,9 +102,14 @@ class Runner:
         tests = self._affordable(calling)
         _write(place, change.of(source))
         try:
-            return Answer(self._ask(path, function, tests), len(tests), len(calling))
+            outcome = self._ask(path, function, tests)
+            if outcome.late:  # a forked process may hang by chance: only what takes too long twice is late
+                outcome = self._ask(path, function, tests)
         finally:
             _write(place, source)
+        timed_out = outcome.late if outcome.late and self._ask(path, function, tests).late else ""
+        late = f"{outcome.late} (takes too long)" if outcome.late and not timed_out else ""
+        return Answer(outcome.failed or late, len(tests), len(calling), timed_out)
 
     def _affordable(self, tests: Sequence[str]) -> list[str]:
         """As many as the budget allows, and one."""
@@ -109,8 +121,8 @@ class Runner:
             spent_s += self._map.seconds[test]
         return taken
 
-    def _ask(self, path: Path, function: str, tests: Sequence[str]) -> str:
-        usual_s = Counter[str]()
+    def _ask(self, path: Path, function: str, tests: Sequence[str]) -> Outcome:
+        usual_s = defaultdict[str, float](float)
         for test in tests:
             usual_s[test.partition("::")[0]] += self._map.seconds[test]
         asked = {
@@ -122,10 +134,10 @@ class Runner:
         }
         assert self._process.stdin is not None and self._process.stdout is not None
         print(json.dumps(asked), file=self._process.stdin, flush=True)
-        said = json.loads(self._process.stdout.readline())
-        if said.startswith("the tests were not run"):
-            raise RuntimeError(said)
-        return said
+        outcome = Outcome(**json.loads(self._process.stdout.readline()))
+        if outcome.failed.startswith("the tests were not run"):
+            raise RuntimeError(outcome.failed)
+        return outcome
 
     def __enter__(self) -> Self:
         return self
