@@ -25,18 +25,18 @@ from mutation_trials.test_map import TestMap, importing_tests
 class Answer:
     """noticed_by: the test that failed; empty: none of ``tried``, of ``calling`` that call what was changed.
 
-    timed_out: the test that took too long, with the program as it is, too, so that it tells nothing.
+    unsure: a test that failed or took too long, but passes with the change when it is run again, or does the same
+    without the change, so that it tells nothing.
     """
 
     noticed_by: str
     tried: int
     calling: int
-    timed_out: str = ""
+    unsure: str = ""
 
     def __str__(self) -> str:
-        if self.timed_out:
-            return f"TIMED OUT, as without the change: {self.timed_out}"
-        return self.noticed_by or f"SURVIVED {self.tried} of {self.calling} tests"
+        survived = f"SURVIVED {self.tried} of {self.calling} tests"
+        return self.noticed_by or (f"UNSURE {self.unsure}" if self.unsure else survived)
 
 
 def copied(root: Path, folder: Path) -> Path:
@@ -71,6 +71,14 @@ def _write(module: Path, source: str) -> None:
         stale.unlink()
 
 
+def _repeated(outcome: Outcome, tests: Sequence[str]) -> Sequence[str]:
+    """What to run to see whether an outcome was by chance: the test that failed, or all if it is not known which."""
+    if outcome.passed:
+        return []
+    test = outcome.failed or outcome.late
+    return [test] if "::" in test and not test.endswith(")") else tests
+
+
 class Runner:
     """The fast tests of a copy that call what some modules have, and the process that runs them.
 
@@ -102,14 +110,16 @@ class Runner:
         tests = self._affordable(calling)
         _write(place, change.of(source))
         try:
-            outcome = self._ask(path, function, tests)
-            if outcome.late:  # a forked process may hang by chance: only what takes too long twice is late
-                outcome = self._ask(path, function, tests)
+            first = self._ask(path, function, tests)
+            again = self._ask(path, function, _repeated(first, tests))
         finally:
             _write(place, source)
-        timed_out = outcome.late if outcome.late and self._ask(path, function, tests).late else ""
-        late = f"{outcome.late} (takes too long)" if outcome.late and not timed_out else ""
-        return Answer(outcome.failed or late, len(tests), len(calling), timed_out)
+        unchanged = self._ask(path, function, _repeated(again, tests))
+        said = str(again)
+        if first.passed or (not again.passed and unchanged.passed):
+            return Answer(said, len(tests), len(calling))
+        return Answer("", len(tests), len(calling), unsure=f"{first}, once in two runs" if again.passed else
+                      f"{said}, without the change, too")  # fmt: skip
 
     def _affordable(self, tests: Sequence[str]) -> list[str]:
         """As many as the budget allows, and one."""
@@ -122,9 +132,12 @@ class Runner:
         return taken
 
     def _ask(self, path: Path, function: str, tests: Sequence[str]) -> Outcome:
+        if not tests:
+            return Outcome()
         usual_s = defaultdict[str, float](float)
         for test in tests:
-            usual_s[test.partition("::")[0]] += self._map.seconds[test]
+            file = test.partition("::")[0]
+            usual_s[file] += self._map.seconds.get(test, self._map.seconds.get(file, 0.0))
         asked = {
             "path": str(path),
             "function": function,

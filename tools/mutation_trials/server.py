@@ -49,6 +49,14 @@ class Outcome:
     failed: str = ""
     late: str = ""
 
+    @property
+    def passed(self) -> bool:
+        """Whether all tests passed."""
+        return not (self.failed or self.late)
+
+    def __str__(self) -> str:
+        return f"{self.late} (takes too long)" if self.late else self.failed
+
 
 class FirstFailure:
     """A plugin of pytest: ``test`` is the first that failed, or ""; a file that takes too long ends the process.
