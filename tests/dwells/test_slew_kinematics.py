@@ -128,3 +128,11 @@ def test_rates_of_a_curve_are_those_of_the_attitude() -> None:
     np.testing.assert_allclose(
         curve.rate_change(at), (curve.rate(at + step) - curve.rate(at - step)) / (2 * step), atol=1e-2
     )
+
+
+def test_slews_have_no_autocovariance_and_no_spectrum() -> None:
+    """What moves tells nothing of the noise at rest."""
+    whole = Pass(run(["latency=5ms"]), Settings(effects=("latency",)))
+    dwells, slews = whole.fold(), whole.folder.slews
+    assert len(slews) == 9 and all(dwell.autocovariance.count and dwell.spectrum.sums for dwell in dwells)
+    assert all(slew.autocovariance.count == 0 and not slew.spectrum.sums for slew in slews)

@@ -15,7 +15,7 @@ from scipy.stats import binom
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.dwells.folding import detrended
-from kf_calib.dwells.line_spectrum import SpectralLine, Spectrum, lines
+from kf_calib.dwells.line_spectrum import SpectralLine, Spectrum, _Search, lines
 from kf_calib.effects import checks, effect_named
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.dwell_columns import LinearisedDwells, stimulus_of
@@ -210,6 +210,18 @@ def test_dwells_of_unequal_noise_have_no_line_if_they_count_by_their_weights() -
         alarms[0] += bool(lines(spectra))
         alarms[1] += bool(lines(each.times(size**-2.0) for each, size in zip(spectra, sizes, strict=True)))
     assert alarms[1] <= binom.ppf(0.995, 100, 0.01) < alarms[0]
+
+
+def test_a_single_bin_is_as_rare_as_its_p_value_says() -> None:
+    """In white noise of one segment and one channel: three bins of a thousand, to a third more or less."""
+    rng, time_s, rare, bins = np.random.default_rng(8), np.arange(1024) / 100.0, 0, 0
+    for _ in range(150):
+        readings = rng.normal(size=(3, 1024)) * [[1.0], [0.0], [0.0]]
+        (segments,) = Spectrum.of(detrended(readings), time_s).sums.values()
+        search = _Search(segments, 1024, np.array([True, False, False]))
+        bins += len(search.height) - 4
+        rare += sum(search._chance(k) < 3e-3 for k in 3 + np.flatnonzero(search.height[3:-1] > 4.0))
+    assert 0.8 < rare / bins / 3e-3 < 1.4
 
 
 def test_spectra_add_up() -> None:

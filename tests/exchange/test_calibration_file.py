@@ -210,8 +210,8 @@ BROKEN: dict[str, tuple[str | Callable[[dict[str, Any]], None], str]] = {
     "an unknown symbol": (put("state", "undetermined", 0, value="zz"), "state.undetermined names zz"),
     "an effect twice": (put("effects", 2, "text", value="second-order"), "effects names 'second-order' twice"),
     "effects without coefficients": (
-        lambda content: content["effects"].extend({"text": f"f{k} = fx*T", "constant": None} for k in range(90)),
-        "there are 93 effects, but only",
+        lambda content: content["effects"].extend({"text": f"f{k} = fx*T", "constant": None} for k in range(9)),
+        "there are 12 effects, but only 10 coefficients",
     ),
     "no date": (put("conditions", "began", value="yesterday"), "conditions.began is 'yesterday', which is no date"),
     "no date of saving": (put("provenance", "created", value="1"), "provenance.created is '1', which is no date"),

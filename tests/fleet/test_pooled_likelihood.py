@@ -264,6 +264,20 @@ def test_evidence_about_a_mean_is_the_integral_over_the_mean() -> None:
     assert shape.log_odds == pytest.approx(truth, abs=0.2)
 
 
+def test_evidence_about_a_mean_is_exact_where_it_is_clear_who_has_the_effect() -> None:
+    """Six of twelve units have 40 sigma within 0.3: by a sum over the mean, whose size is up to ten spreads."""
+    scores = np.random.default_rng(6).normal(0.0, 1.0, (12, 1))
+    scores[:6] += np.random.default_rng(7).normal(40.0, 0.3, (6, 1))
+    shape = about_mean(UnitInformation([""] * 12, np.ones((12, 1, 1)), scores))
+    grid, logs = np.linspace(35.0, 45.0, 801), list[float]()
+    for spread in sizes(0.25, 64.0):
+        has = norm(grid, np.hypot(1.0, spread)).logpdf(scores) - norm.logpdf(scores)
+        each = np.logaddexp(np.log(SHARES)[:, None, None] + has, np.log1p(-SHARES)[:, None, None]).sum(axis=1)
+        step = np.log(grid[1] - grid[0])
+        logs += [float(logsumexp(each + norm.logpdf(grid, scale=ratio * spread) + step)) for ratio in (1.0, 3.0, 10.0)]
+    assert shape.log_odds == pytest.approx(logsumexp(logs) - np.log(len(logs) * len(SHARES)), abs=0.02)
+
+
 def test_the_likeliest_mean_of_some_units_is_where_likelihood_times_prior_is_largest() -> None:
     """Its derivatives by differences vanish, against those at a tenth of a sigma beside it, for each share of units."""
     rng, spread, prior = np.random.default_rng(9), 0.4, 3.0
