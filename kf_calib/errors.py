@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from importlib.util import find_spec
 
 
 class KfCalibError(Exception):
@@ -34,6 +35,10 @@ class BlunderError(InputError):
     """The run is no calibration of the bench as it is stated: a channel reversed, a gimbal's sense, a unit ..."""
 
 
+class MissingExtraError(KfCalibError):
+    """A package is not installed that this needs; the message has the command that brings it."""
+
+
 def check_number(name: str, value: float, least: float = 0.0, *, above: bool = False) -> None:
     """Raise InputError unless ``value`` is a finite number of at least ``least`` (``above``: larger than that)."""
     try:
@@ -49,3 +54,10 @@ def how_to_write(number: str) -> str:
     """`` (write 9.81 with a point)`` for what is written as 9,81; nothing for anything else."""
     found = re.search(r"\d*,\d+", number)
     return f" (write {number[: found.end()].replace(',', '.')} with a point)" if found else ""
+
+
+def need(package: str, extra: str | None, purpose: str) -> None:
+    """Raise MissingExtraError unless ``package`` can be imported; extra: of kf_calib, that brings it, if one does."""
+    if find_spec(package) is None:
+        wanted = package if extra is None else f"'kf_calib[{extra}]'"
+        raise MissingExtraError(f"{purpose} needs {package}, which is not installed: pip install {wanted}.")

@@ -17,11 +17,11 @@ from kf_calib.cli.failures import tell
 
 SECTIONS = {
     "Evaluate a recording": {"replay": "evaluate.replay", "diagnose": "evaluate.diagnose",
-                             "improve": "evaluate.improve", "compare": "evaluate.compare",
-                             "report": "report.report"},
+                             "improve": "improve.improve", "compare": "evaluate.compare",
+                             "report": "evaluate.report"},
     "Evaluate many": {"fleet": "fleet.fleet"},
     "Use a calibration": {"apply": "exchange.apply", "verify": "exchange.verify", "history": "exchange.history",
-                          "export": "exchange.export", "certificate": "certificate.certificate"},
+                          "export": "exchange.export", "certificate": "exchange.certificate"},
     "Run a bench": {"plan": "plan.plan", "record": "acquire.record", "live": "live.live", "run": "run.run"},
     "Try it without a bench": {"demo": "acquire.demo", "simulate": "acquire.simulate"},
     "Look up": {"info": "info.info", "effects": "evaluate.list_effects", "paper": "paper.paper"},

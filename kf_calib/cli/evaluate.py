@@ -1,41 +1,46 @@
-"""Commands that evaluate a recording: replay, compare, effects, diagnose, improve."""
+"""Commands that evaluate a recording: replay, compare, effects, diagnose, report."""
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import rich_click as click
 
-from kf_calib.cli.command import INPUT, OUTPUT, argument, command, grouped, option, values_of
-from kf_calib.cli.echo import complain, print_json, progress, show
-from kf_calib.cli.files import claimed, delivery, output_option
+from kf_calib.cli.command import INPUT, OUTPUT, argument, command, option
+from kf_calib.cli.echo import print_json, progress, show
+from kf_calib.cli.files import (
+    FigureFiles,
+    Pictures,
+    ReportFile,
+    claimed,
+    commands_of,
+    delivery,
+    measured_of,
+    output_option,
+    save_report,
+    typed,
+)
 from kf_calib.cli.options import (
     BenchModelFile,
-    BenchOptions,
     EvaluationOptions,
     Json,
     Overwrite,
-    ProgramOptions,
     ReadingOptions,
     Save,
     SaveModel,
     ShownUnits,
+    StatementFile,
     Strict,
     exit_if,
     opened,
 )
-from kf_calib.cli.pictures import FigureFiles, Pictures
-from kf_calib.cli.report import ReportFile, measured_of, save_report, typed
-from kf_calib.errors import InputError
 
 if TYPE_CHECKING:
-    from kf_calib.diagnosis.selection_journal import Origin
+    from kf_calib.diagnosis.results import Diagnosis
+    from kf_calib.views.report.contents import Measured
 
-STEPS = "Steps"
 _OF_DIAGNOSE_ALONE = (
     "details",
     "rrd",
@@ -88,7 +93,7 @@ def compare(
 
     outputs = claimed(overwrite=overwrite)
     source, settings = opened(recording, reading, evaluation)
-    measured = measured_of(recording, reading) if report else None
+    measured = measured_of(recording, reading.opened(recording)) if report else None
     with progress(f"comparing on {recording.name}", as_json) as tick:
         compared = run(source, settings, tick)
     if as_json:
@@ -189,162 +194,86 @@ def diagnose(
     exit_if(strict and diagnosis.test.consistent is False)
 
 
-@dataclass(frozen=True)
-class StepOptions:
-    """How the effects are chosen."""
-
-    # fmt: off
-    interactive: Annotated[bool, option(
-        "--interactive", panel=STEPS, help="Ask at every step; usual on a terminal.")] = False
-    unattended: Annotated[bool, option(
-        "--unattended", panel=STEPS, help="Never ask; usual where there is no terminal.")] = False
-    accept_first: Annotated[bool, option(
-        "--accept-first", panel=STEPS, help="Where no effect has 95 % probability, take the likeliest.")] = False
-    honest: Annotated[bool, option("--honest", panel=STEPS, help="Held-out error with the choice of effects repeated "
-                                   "without what is held out, in 6 folds.")] = False
-    from_journal: Annotated[Path | None, option(
-        "--from-journal", metavar="FILE", panel=STEPS, help="First take the steps of this journal again.")] = None
-    # fmt: on
-
-    def asks(self, as_json: bool) -> bool:
-        """Whether to ask at every step; raises UsageError where the options say both."""
-        if self.interactive and self.unattended:
-            raise click.UsageError("--interactive asks at every step, --unattended never does: choose one.")
-        if self.interactive and as_json:
-            raise click.UsageError(
-                "--interactive asks questions, --json prints one object and nothing else: choose one."
-            )
-        return self.interactive or (not (self.unattended or as_json) and sys.stdin.isatty() and sys.stdout.isatty())
-
-
 @command(
-    "improve run.mcap --unattended --save-model found.toml",
-    "improve run.mcap --interactive",
-    seldom=("accel_unit", "angle_unit", "columns", "left_out"),
+    "report run.mcap",
+    "report after.mcap --against before.mcap -o shift.html",
+    "report run.mcap --model after.toml --against before.toml",
 )
 @click.pass_context
-def improve(
-    ctx: click.Context, recording: Annotated[Path, argument()], steps: StepOptions, reading: ReadingOptions,
-    evaluation: EvaluationOptions, save: Save,
-    save_model: Annotated[Path | None, output_option(
-        "--save-model", "--out-model", metavar="FILE.toml", help="Save the last model here.")],
-    journal_file: Annotated[Path | None, output_option(
-        "--journal", metavar="FILE", help="Keep a journal of the steps here.")],
-    pictures: Pictures, report: ReportFile, overwrite: Overwrite, strict: Strict, units: ShownUnits, as_json: Json,
+def report(
+    ctx: click.Context, recording: Annotated[Path, argument()],
+    against: Annotated[Path | None, option(
+        "--against", metavar="PATH", panel=INPUT,
+        help="Beside it: another recording, evaluated in the same way, or the same one with the model of a .toml file.",
+    )],
+    reading: ReadingOptions, evaluation: EvaluationOptions,
+    output: Annotated[Path, output_option(
+        "-o", "--out", metavar="FILE.html", default="report.html", show_default=True,
+        help="Where the page is saved.",
+    )],
+    certificate: Annotated[Path | None, output_option(
+        "--certificate", metavar="OUT.pdf",
+        help="Save a calibration certificate here, too; kf-calib certificate makes one of a saved calibration.",
+    )],
+    statement: StatementFile, overwrite: Overwrite, units: ShownUnits, strict: Strict, as_json: Json,
 ) -> None:  # fmt: skip
-    """Add the effects that are missing, one after another, and see the error fall, until there is a reason to stop."""
-    from kf_calib.cli.improvement_dialogue import dialogue
-    from kf_calib.diagnosis import nested_cross_validation, selection_journal, stepwise_selection
+    """A page for the engineer: verdict, figures, residuals to explore, tables, commands to get the numbers again."""
+    from kf_calib.cli.exchange import stated_in, write_certificate
+    from kf_calib.diagnosis.side_by_side import SideBySide
+    from kf_calib.views import console, diagnosis
+    from kf_calib.views.json import clean, side_by_side_object
+    from kf_calib.views.report.contents import page_of
+    from kf_calib.views.report.page import save
+
+    outputs, stated = claimed(overwrite=overwrite), stated_in(certificate, statement)
+    has_other_model = against is not None and against.suffix == ".toml"
+    other_evaluation = replace(evaluation, model_file=against, effects=()) if has_other_model else evaluation
+    if has_other_model:
+        outputs.spare(_programs_of(against))
+        other_evaluation.effects_of_model()  # refused, as that of --model, before any reading is read
+    diagnosed, measured = _diagnosed(recording, reading, evaluation, as_json)
+    pair, sources = None, [measured]
+    if against is not None:
+        path = recording if has_other_model else against
+        other, beside = _diagnosed(path, reading, other_evaluation, as_json)
+        pair, sources = SideBySide(other, diagnosed, has_other_model), [beside, measured]
+    verdict = diagnosis.verdict(diagnosed) if pair is None else console.difference_in_words(pair)
+    if as_json:
+        table = {"report": str(output), "recording": measured.name, "sha256": measured.sha256,
+                 "consistent": diagnosed.test.consistent, "p_value": diagnosed.test.p_value,
+                 "verdict": diagnosis.verdict(diagnosed)}  # fmt: skip
+        beside_it = {"against": None, "differences": [], "differences_p_value": None}
+        print_json(clean(table | (beside_it if pair is None else side_by_side_object(pair))))
+    else:
+        show(verdict)
+    with delivery(outputs, as_json) as deliver, progress("drawing the page", as_json):
+        result = diagnosed if pair is None else pair
+        deliver.file(output, lambda path: save(page_of(result, sources, commands_of(ctx)), path))
+    if certificate is not None and stated is not None:
+        from kf_calib.exchange import calibration_file
+
+        saved = calibration_file.saved(diagnosed.before, measured.name, measured.sha256, measured.began)
+        write_certificate(outputs, certificate, stated, (saved, diagnosed.before.model))
+        if not as_json:
+            show(f"saved {certificate}")
+    exit_if(strict and diagnosed.test.consistent is False)
+
+
+def _diagnosed(
+    recording: Path, reading: ReadingOptions, evaluation: EvaluationOptions, quiet: bool
+) -> tuple[Diagnosis, Measured]:
+    """Return the diagnosis of a recording, and what a page says of its file."""
+    from kf_calib.diagnosis.missing_effect import diagnose
     from kf_calib.diagnosis.refits import Refits
     from kf_calib.estimation.calibration import calibrate
-    from kf_calib.views import improvement as views
 
-    interactive, outputs = steps.asks(as_json), claimed(overwrite=overwrite)
-    earlier = selection_journal.read_journal(steps.from_journal) if steps.from_journal else None
-    origin = selection_journal.Origin.of(recording)
-    if earlier is not None and steps.from_journal is not None:
-        earlier.refuse_other(origin, steps.from_journal)
-        reading, evaluation = _of_journal(ctx, earlier.origin, steps.from_journal)
-        outputs.spare(evaluation.programs.effects_from)
-    _refuse_engine(evaluation)
-    settings = evaluation.settings()
-    origin = _for_journal(origin, reading, evaluation, settings.effects)
-    measured = measured_of(recording, reading) if report else None
-
-    with delivery(outputs, as_json) as deliver:
-
-        def keep(state: stepwise_selection.Improvement) -> None:
-            deliver.keep(journal_file, lambda path: selection_journal.write_journal(path, state, origin))
-
-        difference = None
-        with progress(f"improving on {recording.name}", as_json) as tick:
-            source = reading.opened(recording)
-            start, refits = calibrate(source, settings, tick), Refits(source)
-            if earlier is not None:
-                state, difference = selection_journal.replay_journal(earlier, start, refits)
-            elif interactive:
-                state = stepwise_selection.begin(start, refits)
-            else:
-                state = stepwise_selection.improve(start, steps.accept_first, keep, refits)
-        if interactive:
-            state = dialogue(state, refits, keep)
-        with progress("holding out orientations", as_json or not steps.honest) as tick:
-            checked = nested_cross_validation.nested_cross_validation(start, on_fold=tick) if steps.honest else None
-        if as_json:
-            files = {"saved_model": save_model, "journal": journal_file}
-            print_json(views.improvement_object(state, checked, difference, files))
-        else:
-            show(views.improvement_report(state, checked, difference))
-        deliver.calibration(save, state.result, source)
-        deliver.model(save_model, state.result)
-        deliver.file(journal_file, lambda path: selection_journal.write_journal(path, state, origin))
-        pictures.save(deliver, state)
-        save_report(deliver, report, state, measured, [views.honest_sentence(checked)] if checked else [])
-    exit_if(strict and state.diagnosis.test.consistent is False)
+    measured = measured_of(recording, reading.opened(recording))
+    source, settings = opened(recording, reading, evaluation)
+    with progress(f"diagnosing {recording.name}", quiet) as tick:
+        return diagnose(calibrate(source, settings, tick), Refits(source)), measured
 
 
-_BY_CONTENT = ("model_file", *(field.name for field in fields(BenchOptions)))
-_LEAVE = tuple(field.name for field in fields(ProgramOptions))
-"""Options by which a user allows Python files to be run: a journal cannot give them."""
+def _programs_of(model: Path | None) -> list[Path]:
+    from kf_calib.estimation import model_file
 
-
-def _refuse_engine(evaluation: EvaluationOptions) -> None:
-    if evaluation.engine != "block":
-        raise click.UsageError(
-            "improve refits from folded dwells, as the block engine does: leave out --engine, and check what it finds "
-            "with replay --model FILE --engine filterpy."
-        )
-
-
-def _for_journal(
-    origin: Origin, reading: ReadingOptions, evaluation: EvaluationOptions, effects: Sequence[str]
-) -> Origin:
-    """An origin with all that numbers depend on: options and programs; files of bench keys and of models by what they
-    say."""
-    from kf_calib.effects import loaded
-    from kf_calib.exchange import calibration_file
-
-    programs = evaluation.programs
-    files = [*programs.effects_from]
-    if evaluation.model_file is not None:
-        model = calibration_file.read_model(evaluation.model_file)
-        files += model.allowed(programs.effects_from, programs.trust).files
-    others = (*_BY_CONTENT, *_LEAVE)
-    kept = {key: value for key, value in values_of(reading, evaluation) if value is not None and key not in others}
-    options = kept | reading.keys | {"effects": list(effects)}
-    return replace(origin, options=options, programs=tuple(loaded(files)))
-
-
-def _of_journal(ctx: click.Context, origin: Origin, path: Path) -> tuple[ReadingOptions, EvaluationOptions]:
-    """The options of a journal, as if they had been given, with the Python files that may be run for it.
-
-    Raises UsageError where some are given as well, and InputError where the journal's make no sense.
-    """
-    from click.core import ParameterSource
-
-    from kf_calib.effects.user import allowed
-
-    names = {name for name, _ in values_of(ReadingOptions(), EvaluationOptions())} - {*_LEAVE}
-    params = [param for param in ctx.command.params if param.name in names]
-    given = [
-        param.opts[0] for param in params if ctx.get_parameter_source(param.name or "") is ParameterSource.COMMANDLINE
-    ]
-    if given:
-        raise click.UsageError(f"--from-journal has its options from the journal: leave out {', '.join(given)}.")
-    journalled = {key: value for key, value in origin.options.items() if key not in ("bench_file", "model_file")}
-    values = ctx.params.copy()
-    values.update(dict.fromkeys(key for key in _BY_CONTENT if key not in journalled))
-    for param in params:
-        if (name := param.name or "") in journalled:
-            try:
-                if isinstance(journalled[name], list | tuple) != bool(getattr(param, "multiple", False)):
-                    raise TypeError
-                values[name] = param.type_cast_value(ctx, journalled[name])
-            except (click.BadParameter, TypeError, ValueError) as error:
-                why = error.message if isinstance(error, click.BadParameter) else f"{journalled[name]!r}"
-                raise InputError(f"{path}: is no journal of improve (option {name}: {why}).") from None
-    programs = allowed(path, origin.programs, values["effects_from"], values["trust"])
-    for change in programs.changes:
-        complain(f"{change}")
-    values["effects_from"] = (*values["effects_from"], *programs.files)
-    return grouped(ReadingOptions, values), grouped(EvaluationOptions, values)
+    return [] if model is None else [each.path for each in model_file.read_model_file(model).programs]

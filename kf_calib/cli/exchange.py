@@ -1,4 +1,4 @@
-"""Commands that use calibrations: apply, verify, history, export."""
+"""Commands that use calibrations: apply, verify, history, export, certificate."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import rich_click as click
 
 from kf_calib.cli.command import INPUT, OUTPUT, argument, command, option
 from kf_calib.cli.echo import complain, print_json, print_result, progress, show
-from kf_calib.cli.files import claimed, delivery, output_option
+from kf_calib.cli.files import FigureFiles, claimed, delivery, output_option
 from kf_calib.cli.options import (
     OF_MESSAGES,
     BenchOptions,
@@ -22,22 +22,25 @@ from kf_calib.cli.options import (
     ProgramOptions,
     ReadingOptions,
     ShownUnits,
+    StatementFile,
     Strict,
     exit_if,
     refuse_given,
 )
-from kf_calib.cli.pictures import FigureFiles
-from kf_calib.errors import BenchError, InputError, KfCalibError
+from kf_calib.errors import BenchError, InputError, KfCalibError, need
 from kf_calib.support.output_files import whole
 
 if TYPE_CHECKING:
     from kf_calib.bench.raw_input import RawInput
     from kf_calib.estimation.correction import Correction
+    from kf_calib.estimation.measurement_model import Model
     from kf_calib.exchange.calibration_file import SavedCalibration
+    from kf_calib.exchange.certificate.content import Certificate
+    from kf_calib.exchange.certificate.statement import Statement
     from kf_calib.exchange.corrected_file import Applied
     from kf_calib.exchange.corrected_lines import CorrectedLines
     from kf_calib.sources.files.line_parts import TextFile
-
+    from kf_calib.support.output_files import Outputs
 
 _BLOCK_BYTES = 1 << 16
 CalibrationFile = Annotated[Path, argument(metavar="CAL")]
@@ -281,3 +284,68 @@ def export(
         print_json(views.exported_object(target, to, output))
     else:
         show(views.exported_report(target, output))
+
+
+@command("certificate cal.json --statement lab.toml -o certificate.pdf")
+def certificate(
+    calibration: CalibrationFile,
+    output: Annotated[Path, output_option("-o", "--out", required=True, metavar="OUT.pdf",
+                                          help="The certificate: PDF/A-3b with the XML attached.")],
+    xml: Annotated[Path | None, output_option(
+        "--xml", metavar="OUT.xml", help="Save the XML as a file of its own, too.")],
+    statement: StatementFile,
+    schema: Annotated[Path | None, option("--schema", metavar="DCC.xsd", panel=INPUT,
+                                          help="Validate the XML against this copy of the DCC's schema.")],
+    programs: ProgramOptions, overwrite: Overwrite, as_json: Json,
+) -> None:  # fmt: skip
+    """A calibration certificate as ISO/IEC 17025 asks: results, expanded uncertainties, budget, traceability.
+
+    What is neither in the calibration nor in the statement is left blank. It never claims accreditation.
+    """
+    from kf_calib.exchange import calibration_file
+    from kf_calib.exchange.certificate import statement as statements
+    from kf_calib.views import exchange as views
+
+    stated = statements.read_statement(statement)
+    outputs = claimed([] if stated.before is None else [stated.before], overwrite=overwrite)
+    calibrations = []
+    for path in (calibration, stated.before):
+        if path is not None:
+            saved = calibration_file.open_calibration(path)
+            calibrations.append((saved, saved.model(path, programs.effects_from, programs.trust)))
+    written, standing = write_certificate(outputs, output, stated, *calibrations, xml=xml, schema=schema)
+    print_result(as_json, views.certificate_object, views.certificate_report, written, standing, output, xml)
+
+
+def stated_in(certificate: Path | None, statement: Path | None) -> Statement | None:
+    """What a certificate states, checked before the work; None where there is to be none."""
+    if certificate is None:
+        if statement is not None:
+            raise click.UsageError("--statement is for a certificate: name one with --certificate OUT.pdf.")
+        return None
+    from kf_calib.exchange.certificate import statement as statements
+
+    need("typst", "report", "a certificate")
+    return statements.read_statement(statement)
+
+
+def write_certificate(
+    outputs: Outputs, pdf: Path, stated: Statement, calibrated: tuple[SavedCalibration, Model],
+    before: tuple[SavedCalibration, Model] | None = None, xml: Path | None = None, schema: Path | None = None,
+) -> tuple[Certificate, str]:  # fmt: skip
+    """Write the certificate of a calibration with its model as ``out``; what it says, and what the check of its XML
+    found. before: the same from before an adjustment.
+
+    Raises InputError for a calibration, statement or schema that cannot be used, MissingExtraError without typst.
+    """
+    from kf_calib.exchange.certificate import content, dcc, document
+    from kf_calib.support.output_files import write_whole
+
+    certificate_ = content.certificate(*calibrated, stated, before)
+    encoded = dcc.xml(certificate_)
+    standing = dcc.check_dcc(encoded, schema)
+    printed = document.pdf(certificate_, encoded, standing)
+    outputs.write(pdf, lambda path: write_whole(path, printed))
+    if xml is not None:
+        outputs.write(xml, lambda path: write_whole(path, encoded))
+    return certificate_, standing

@@ -1,25 +1,35 @@
-"""The files that commands write: which they are, and their turn, which comes when the result has been printed."""
+"""The files that commands write: which they are, and their turn, which comes when the result has been printed.
+
+Among them are pictures (the Rerun view, a screenshot of it, figures) and the page of a report.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import shlex
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any
 
 import rich_click as click
 from click import get_current_context  # rich_click declares that there may be none
+from click.core import ParameterSource
 
 from kf_calib.cli.command import OUTPUT, option
-from kf_calib.cli.echo import echo
+from kf_calib.cli.echo import complain, echo
 from kf_calib.cli.failures import tell
 from kf_calib.support.output_files import Outputs
 
 if TYPE_CHECKING:
     from kf_calib.bench.streams import Source
+    from kf_calib.diagnosis.results import Diagnosis
+    from kf_calib.diagnosis.stepwise_selection import Improvement
     from kf_calib.estimation.results import Calibration
+    from kf_calib.views.report.contents import Measured
 
 
 class OutputFile(click.Path):
@@ -108,3 +118,142 @@ def delivery(outputs: Outputs, quiet: bool) -> Iterator[Delivery]:
             tell(error)
     if delivering.failures:
         get_current_context().exit(2)
+
+
+RerunFile = Annotated[Path | None, output_option("--rrd", metavar="FILE.rrd", help="Save the Rerun view here.")]
+
+
+@dataclass(frozen=True)
+class FigureFiles:
+    """The files of figures that a command is to save."""
+
+    png: Annotated[Path | None, output_option("--png", metavar="FILE.png", help="Save the main figure here.")] = None
+    svg: Annotated[Path | None, output_option("--svg", metavar="FILE.svg", help="Save the main figure here.")] = None
+    pdf: Annotated[
+        Path | None, output_option("--pdf", metavar="FILE.pdf", help="Save the figures, one a page here.")
+    ] = None
+
+    def save(self, deliver: Delivery, result: object) -> None:
+        """Save what was asked for of a result; matplotlib is imported when it has something to draw."""
+        for kind, path in (("png", self.png), ("svg", self.svg), ("pdf", self.pdf)):
+            deliver.file(path, lambda path, kind=kind: _save_figures(result, path, kind))
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """The files of pictures that a command is to save."""
+
+    rrd: RerunFile = None
+    figures: FigureFiles = FigureFiles()
+    screenshot: Annotated[Path | None, output_option(
+        "--screenshot", metavar="FILE.png",
+        help="Save a screenshot of the Rerun view here; needs a graphics driver.",
+    )] = None  # fmt: skip
+
+    def save(self, deliver: Delivery, result: Any) -> None:
+        """Save what was asked for of a result; Rerun and matplotlib are imported when they have something to draw.
+
+        A viewer that finds no graphics driver is a complaint; all else that fails is told as for any other file.
+        """
+        deliver.file(self.rrd, lambda path: write_view(result, path))
+        self._screenshot(deliver, result)
+        self.figures.save(deliver, result)
+
+    def _screenshot(self, deliver: Delivery, result: Any) -> None:
+        from kf_calib.views.screenshot import ScreenshotError, screenshot
+
+        rrd = None if self.rrd in deliver.failures else self.rrd
+
+        def draw(path: Path) -> None:
+            with tempfile.TemporaryDirectory() as folder:
+                drawn = rrd or Path(folder) / "view.rrd"
+                if rrd is None:
+                    write_view(result, drawn)
+                screenshot(drawn, path)
+
+        deliver.file(self.screenshot, draw)
+        error = None if self.screenshot is None else deliver.failures.get(self.screenshot)
+        if isinstance(error, ScreenshotError) and self.screenshot is not None:
+            complain(f"the screenshot could not be taken: {error}")
+            del deliver.failures[self.screenshot]
+
+
+def _save_figures(result: object, path: Path, kind: str) -> None:
+    """Save figures as the kind that the option names, whatever the name of the file ends in."""
+    from kf_calib.views.figures import figures, save
+
+    save(figures(result), path, kind)
+
+
+def write_view(result: Calibration | Diagnosis | Improvement, path: Path) -> None:
+    """The Rerun view of a result; Rerun is imported when there is one to save."""
+    from kf_calib.views import rerun
+
+    rerun.save_view(result, path)
+
+
+ReportFile = Annotated[Path | None, output_option(
+    "--report", metavar="FILE.html", help="Save a page with figures and tables here; it needs no network.",
+)]  # fmt: skip
+
+
+def save_report(
+    deliver: Delivery, path: Path | None, result: object, measured: Measured | None, remarks: Sequence[str] = ()
+) -> None:
+    """Save the page of a command's result, if ``--report`` asks for one."""
+    if path is not None and measured is not None:
+        from kf_calib.views.report.contents import page_of
+        from kf_calib.views.report.page import save
+
+        commands = commands_of(get_current_context())
+        deliver.file(path, lambda path: save(page_of(result, [measured], commands, remarks), path))
+
+
+def measured_of(recording: Path, source: Source) -> Measured:
+    """What a page says of a recording's file, which ``source`` reads; raises MissingExtraError where no page can be
+    made."""
+    import kf_calib.views.figures  # noqa: F401  # which a page needs
+    from kf_calib.diagnosis.selection_journal import Origin
+    from kf_calib.sources.files.record_files import END_RECORD, decision_records
+    from kf_calib.sources.opening import run_date
+    from kf_calib.views.report.contents import Measured
+
+    fingerprint, began = Origin.of(recording).sha256, run_date(source)
+    is_driven = recording.suffix == ".mcap" and recording.is_file()
+    decided, ends = (decision_records(recording), decision_records(recording, END_RECORD)) if is_driven else ((), ())
+    return Measured(recording.name, fingerprint, began, decided, ends)
+
+
+_HOW_IT_ENDS = ("overwrite", "strict", "as_json")
+"""Options that change no number and no page."""
+
+
+def commands_of(ctx: click.Context) -> list[str]:
+    """The command that runs, as it could be typed again, and what prints its tables alone."""
+    commands = [f"kf-calib {ctx.info_name} {typed(ctx, _HOW_IT_ENDS)}"]
+    against = ctx.params.get("against")
+    if ctx.info_name == "report" and against is None:
+        shared = typed(ctx, ("output", *_HOW_IT_ENDS))
+        commands += [f"kf-calib {name} {shared}" for name in ("replay", "diagnose")]
+    others = [against] if against is not None and against.suffix != ".toml" else []
+    named = [ctx.params["recording"]] if "recording" in ctx.params else []
+    return [*commands, *(f"sha256sum {shlex.quote(str(path))}" for path in [*named, *others] if path.is_file())]
+
+
+def typed(ctx: click.Context, less: Sequence[str]) -> str:
+    """Return the arguments and options that were given, but for some, as words of a shell."""
+    words = list[str]()
+    for param in ctx.command.params:
+        name = param.name or ""
+        given = ctx.get_parameter_source(name) is ParameterSource.COMMANDLINE
+        if name in (*less, "units") or not given:
+            continue
+        value = ctx.params[name]
+        if isinstance(param, click.Argument):
+            words.insert(0, str(value))
+        elif isinstance(param, click.Option) and param.is_flag:
+            words.append(param.opts[-1] if value else param.secondary_opts[-1])
+        else:
+            words += [word for each in (value if isinstance(value, tuple) else [value])
+                      for word in (param.opts[-1], str(each))]  # fmt: skip
+    return shlex.join(words)

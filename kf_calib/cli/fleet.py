@@ -16,13 +16,10 @@ from click import get_current_context  # rich_click declares that there may be n
 from kf_calib.cli.command import MODEL, OUTPUT, POSITIVE, argument, command, option, values_of
 from kf_calib.cli.echo import complain, echo, print_json, progress, show
 from kf_calib.cli.failures import Interrupter, answered, sentence
-from kf_calib.cli.files import Delivery, claimed, delivery
+from kf_calib.cli.files import Delivery, FigureFiles, ReportFile, claimed, commands_of, delivery
 from kf_calib.cli.options import EvaluationOptions, Json, Overwrite, ReadingOptions, ShownUnits, opened, target_option
-from kf_calib.cli.pictures import FigureFiles
-from kf_calib.cli.report import ReportFile, commands_of
-from kf_calib.errors import InputError
+from kf_calib.errors import InputError, need
 from kf_calib.support import stage
-from kf_calib.support.extras import need
 
 if TYPE_CHECKING:
     from kf_calib.bench.streams import Source

@@ -16,7 +16,7 @@ import rich_click as click
 from kf_calib.cli.command import INPUT, NOT_NEGATIVE, POSITIVE, argument, command, option
 from kf_calib.cli.echo import complain, json_line, rendered
 from kf_calib.cli.failures import answered
-from kf_calib.cli.files import claimed, delivery, output_option
+from kf_calib.cli.files import RerunFile, claimed, delivery, output_option, write_view
 from kf_calib.cli.live_run import LiveRun, by_hand, on_bench, pressed_keys
 from kf_calib.cli.options import (
     BenchOptions,
@@ -34,7 +34,6 @@ from kf_calib.cli.options import (
     renamed,
     target_option,
 )
-from kf_calib.cli.pictures import RerunFile, write_view
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.support.text import sentence
 

@@ -37,6 +37,8 @@ ForeignColumns = Annotated[tuple[str, ...], _of_input(
 BenchModelFile = Annotated[Path | None, _of_model(
     "--bench-model", metavar="FILE.toml",
     help="Errors of the bench that many runs have shown: they are subtracted, and their sigma is considered.")]
+StatementFile = Annotated[Path | None, _of_input(
+    "--statement", metavar="LAB.toml", help="What the laboratory states: docs/certificate.md has the keys.")]
 Save = Annotated[Path | None, output_option(
     "--save", metavar="CAL.json", panel=OUTPUT,
     help="Save the calibration here, whole: for apply, verify, history, and --model.")]

@@ -10,9 +10,8 @@ import rich_click as click
 
 from kf_calib.cli.command import NumberInRange, command, option
 from kf_calib.cli.echo import print_result, progress
-from kf_calib.cli.files import claimed, delivery
+from kf_calib.cli.files import FigureFiles, claimed, delivery
 from kf_calib.cli.options import Json, Overwrite, ShownUnits
-from kf_calib.cli.pictures import FigureFiles
 
 _of_the_run = partial(option, panel="Run")
 _inferred = partial(option, panel="Conditions that the paper does not print: inferred")

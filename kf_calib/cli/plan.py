@@ -12,9 +12,8 @@ import rich_click as click
 
 from kf_calib.cli.command import POSITIVE, NumberInRange, command, option
 from kf_calib.cli.echo import print_result, progress
-from kf_calib.cli.files import claimed, delivery, output_option
+from kf_calib.cli.files import FigureFiles, claimed, delivery, output_option
 from kf_calib.cli.options import EvaluationOptions, Json, Overwrite, ReadingOptions, ShownUnits, opened, target_option
-from kf_calib.cli.pictures import FigureFiles
 from kf_calib.errors import InputError
 
 if TYPE_CHECKING:
@@ -69,7 +68,8 @@ class PlanOptions:
     time_correlation: Annotated[float, _of_reach(
         "--time-correlation", type=NumberInRange(0, 1), help="Correlation of time with the direction of gravity that "
         "the order may have; slews are the shortest below it.")] = 0.1
-    seed: Annotated[int, _of_reach("--seed", metavar="N", help="Seed of the order of visits.")] = 0
+    seed: Annotated[int, _of_reach(
+        "--seed", type=click.IntRange(min=0), metavar="N", help="Seed of the order of visits.")] = 0
     dwell_s: Annotated[float | None, _of_dwell(
         "--dwell-s", type=POSITIVE, help="Seconds in each orientation; as in the recording, or 30.")] = None
     sample_hz: Annotated[float, _of_dwell("--sample-hz", type=POSITIVE, help="Rate of the readings.")] = 100.0

@@ -30,7 +30,7 @@ from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.whitened_rows import flicker_of_scatter, whiten
 from kf_calib.noise.means import Means
-from kf_calib.noise.noise_model import Noise, mean_covariances
+from kf_calib.noise.noise_model import Noise, mean_covariances, setting_covariances
 from kf_calib.noise.reml import Likelihood, Part, Parts, likelihood_of, with_shared_noise
 from kf_calib.noise.restricted_likelihood import Restricted
 from kf_calib.noise.temperature_course import thermometer_errors
@@ -315,11 +315,10 @@ def log_odds_of_repeating(before: Calibration, noise: MarginalLikelihood) -> flo
     if not groups or stated.attitude_unknown:
         return 0.0
     within = mean_covariances(stated.of_readings, linearised.means, linearised.state)
-    scatter, force = np.zeros_like(within), linearised.means.design[:, 0, :3]
+    scatter = np.zeros_like(within)
     for part, size in zip(noise.parts, noise.sizes, strict=False):
         if part == "setting":
-            squares = np.sum(force**2, axis=1)[:, None, None] * np.eye(3) - force[:, :, None] * force[:, None, :]
-            scatter += size**2 * squares
+            scatter += size**2 * setting_covariances(linearised.means, linearised.state)
         elif part == "common":
             scatter += size**2 * np.eye(3)
     return sum(_log_ratio(before.residuals_mps2[group], within[group], scatter[group]) for group in groups)

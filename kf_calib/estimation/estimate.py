@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.bench.paper_parameters import STATE_COUNT
+from kf_calib.errors import need
 from kf_calib.estimation import square_root_information
-from kf_calib.support.extras import need
 
 _HOPELESS = {"rad": np.radians(10.0), "1": 0.2, "m/s^2": 2.0}  # larger sigmas: not determined
 

@@ -13,10 +13,9 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.effects import Stimulus
 from kf_calib.effects.formula import quantities
-from kf_calib.errors import InputError
+from kf_calib.errors import InputError, need
 from kf_calib.estimation.dwell_columns import LinearisedDwells, stimulus_of
 from kf_calib.noise.noise_model import Noise, mean_covariances
-from kf_calib.support.extras import need
 
 _SIMPSON = np.array([1.0, 4.0, 1.0]) / 6.0  # weights of begin, middle and end of a piece in its mean
 

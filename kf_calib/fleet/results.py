@@ -20,14 +20,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute
 
-from kf_calib.errors import InputError
+from kf_calib.errors import InputError, need
 from kf_calib.estimation.bench_model import BenchModel, BenchTerm
 from kf_calib.fleet.overview import COLUMNS, FleetOverview, counted, overview_of
 from kf_calib.fleet.pooled_diagnosis import BenchCoefficients, PooledDiagnosis, pooled_diagnosis
 from kf_calib.fleet.run_factor import ReferenceUnit, RunFactor
 from kf_calib.fleet.run_list import SCHEMA, factor_of
 from kf_calib.fleet.store import AT_ONCE, Store
-from kf_calib.support.extras import need
 from kf_calib.support.output_files import write_whole
 
 pc: Any = pyarrow.compute  # its functions are made when it is imported, which no type checker sees

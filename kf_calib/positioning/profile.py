@@ -31,9 +31,8 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, with_config
 from typing_extensions import TypedDict
 
-from kf_calib.errors import InputError
+from kf_calib.errors import InputError, need
 from kf_calib.positioning.positioner import PositionerError, Watchfulness
-from kf_calib.support.extras import need
 from kf_calib.support.toml_files import FINITE, TEXT, Misfit, converted, toml_table
 
 SHIPPED = Path(__file__).parent / "profiles"

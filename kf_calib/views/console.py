@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.console import Group, RenderableType
@@ -17,9 +19,13 @@ from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.remarks import beyond_stated
 from kf_calib.estimation.results import Calibration, OutlyingDwell, Parameter, format_p
 from kf_calib.noise.reml import FEWEST, degrees_of_freedom
+from kf_calib.support.tail_probabilities import LEVEL
 from kf_calib.support.text import printed
 from kf_calib.support.units import rounded, shown, shown_whole
 from kf_calib.views.terminal import ConsoleTable, PlainConsole, note
+
+if TYPE_CHECKING:
+    from kf_calib.diagnosis.side_by_side import Difference, SideBySide
 
 _NOT_ESTIMATED, _NOT_USED = "not estimated", "not used"
 _GREEK = {"theta": "θ", "phi": "φ", "nu": "ν"}
@@ -213,6 +219,45 @@ def comparison_table(compared: Comparison) -> RenderableType:
             f"{way.max_relative_variance:.1e}",
         )  # fmt: skip
     return Group(table, *map(note, compared.remarks))
+
+
+def difference_in_words(pair: SideBySide) -> str:
+    """In a sentence, by how much the parameters differ."""
+    far = pair.farthest
+    if far is None:
+        return "The two have no parameter in common that both determine."
+    most = f"{symbol(far.symbol)} differs most, by {abs(far.sigmas or 0.0):.1f} σ"
+    if pair.p_value is None:
+        return f"Between the two models, {most}."
+    word = "agree" if pair.p_value >= LEVEL else "DIFFER"
+    chance = f"noise alone gives differences as large with probability p {format_p(pair.p_value)}"
+    return f"The parameters of the two recordings {word}: {chance}; {most}."
+
+
+def difference_table(differences: Sequence[Difference], first: str, second: str) -> ConsoleTable:
+    """The table of the parameters in both, less nominal, and of their differences; first, second: what they are of."""
+    table = ConsoleTable(title="Parameters less nominal (1σ)", title_justify="left")
+    for heading in ("parameter", first, "sigma", second, "sigma", "unit", "difference", "in σ"):
+        table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
+    for k, each in enumerate(differences):
+        table.add_row(*_difference_row(each), end_section=k % 4 == 3)
+    return table
+
+
+def _difference_row(difference: Difference) -> tuple[str, ...]:
+    """Return the row of one parameter."""
+    both, moved = (*_cells_less_nominal(difference.first), *_cells_less_nominal(difference.second)), ("", "")
+    if difference.value is not None and difference.sigma is not None and difference.sigmas is not None:
+        moved = shown(difference.first).rounded(difference.value, difference.sigma)[0], f"{difference.sigmas:+.1f}"
+    return symbol(difference.symbol), *both, shown(difference.first).label, *moved
+
+
+def _cells_less_nominal(parameter: Parameter) -> tuple[str, str]:
+    """Return a parameter less its nominal value, and its sigma."""
+    if parameter.value is None or parameter.sigma is None:
+        return "not seen", ""
+    value, sigma = shown(parameter).rounded(parameter.value - parameter.nominal, parameter.sigma)
+    return value, f"± {sigma}"
 
 
 def plain(renderable: RenderableType, width: int = 110) -> str:

@@ -12,6 +12,7 @@ from kf_calib.estimation.results import Calibration, OutlyingDwell
 from kf_calib.estimation.signal_quality import Readings
 
 if TYPE_CHECKING:
+    from kf_calib.diagnosis.side_by_side import SideBySide
     from kf_calib.estimation.engine_comparison import Comparison
 
 
@@ -114,6 +115,30 @@ def compare_object(compared: Comparison) -> dict[str, Any]:
             "parameters": [p.symbol for p in compared.result.parameters.values()],
             "remarks": list(compared.remarks),
             "warnings": list(compared.result.warnings),
+        }
+    )
+
+
+def side_by_side_object(pair: SideBySide) -> dict[str, Any]:
+    """What ``report --json`` adds for a second evaluation: that one, and the differences from it in SI units."""
+    return clean(
+        {
+            "against": {
+                "consistent": pair.first.test.consistent,
+                "p_value": pair.first.test.p_value,
+                "verdict": pair.first.verdict,
+            },
+            "differences": [
+                {
+                    "symbol": difference.symbol,
+                    "first": difference.first.value,
+                    "second": difference.second.value,
+                    "sigmas": difference.sigmas,
+                    "unit": difference.first.unit,
+                }
+                for difference in pair.differences
+            ],
+            "differences_p_value": pair.p_value,
         }
     )
 

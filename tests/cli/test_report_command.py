@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from helpers.paths import ROOT
 
-from kf_calib.support import extras
+from kf_calib import errors
 
 HIDDEN, CLEAN = (ROOT / "recordings" / name for name in ("hidden.mcap", "navigation_24.mcap"))
 
@@ -92,8 +92,8 @@ def test_improve_and_compare_save_a_page_too(run, words: tuple[object, ...], say
 
 
 def test_without_jinja_the_sentence_says_what_to_install(run, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = extras.find_spec
-    monkeypatch.setattr(extras, "find_spec", lambda name: None if name == "jinja2" else found(name))
+    found = errors.find_spec
+    monkeypatch.setattr(errors, "find_spec", lambda name: None if name == "jinja2" else found(name))
     for name in [name for name in sys.modules if name.startswith("kf_calib.views.report")]:
         monkeypatch.delitem(sys.modules, name)
     code, out, err = run("report", CLEAN)

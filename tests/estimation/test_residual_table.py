@@ -12,7 +12,7 @@ import pytest
 from helpers.paths import ROOT
 
 import kf_calib
-from kf_calib.support import extras
+from kf_calib import errors
 from kf_calib.views.report import page
 
 FACES = ROOT / "recordings" / "mems_faces.mcap"
@@ -43,7 +43,7 @@ def test_a_row_for_each_dwell_and_accelerometer(run: kf_calib.Calibration) -> No
 def test_a_package_that_is_not_installed_is_a_sentence(
     run: kf_calib.Calibration, kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(extras, "find_spec", lambda name: None)
+    monkeypatch.setattr(errors, "find_spec", lambda name: None)
     with pytest.raises(kf_calib.KfCalibError, match=f"^a {kind} table needs {kind}.*: pip install {kind}.$"):
         run.residuals(kind)
 

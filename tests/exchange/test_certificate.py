@@ -19,10 +19,9 @@ from helpers.paths import ROOT
 from helpers.synthetic import SYMBOLS
 
 from kf_calib import calibrate
-from kf_calib.errors import InputError
+from kf_calib.errors import InputError, MissingExtraError
 from kf_calib.exchange import calibration_file
 from kf_calib.exchange.certificate import content, dcc, document, statement
-from kf_calib.support.extras import MissingExtraError
 from kf_calib.support.units import field_unit
 
 sets = pytest.mark.skipif(find_spec("typst") is None, reason="typst is not there: no PDF is made")
@@ -238,7 +237,7 @@ def test_the_same_date_gives_the_same_bytes(cal: Path, lab: Path, monkeypatch: p
 
 
 def test_without_typst_it_says_what_to_install(cal: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("kf_calib.support.extras.find_spec", lambda name: None)
+    monkeypatch.setattr("kf_calib.errors.find_spec", lambda name: None)
     with pytest.raises(MissingExtraError, match=r"a certificate needs typst, .* pip install 'kf_calib\[report\]'"):
         document.pdf(made(cal, None), b"<a/>", "checked")
 

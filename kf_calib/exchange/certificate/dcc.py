@@ -13,11 +13,10 @@ from datetime import date
 from importlib.metadata import version
 from pathlib import Path
 
-from kf_calib.errors import InputError
+from kf_calib.errors import InputError, need
 from kf_calib.exchange.certificate.budget import COVERAGE
 from kf_calib.exchange.certificate.content import Certificate, CertifiedResult
 from kf_calib.exchange.certificate.statement import Party
-from kf_calib.support.extras import need
 from kf_calib.support.text import cut
 
 DCC, SI = "https://ptb.de/dcc", "https://ptb.de/si"

@@ -13,9 +13,9 @@ import numpy as np
 from mcap.records import Schema
 
 from kf_calib.bench.streams import Stream
+from kf_calib.errors import MissingExtraError
 from kf_calib.sources.files.cdr import IMU, JOINT_STATE, QUATERNION, TEMPERATURE, Offsets
 from kf_calib.sources.files.fields import LOG_TIME, FieldError, Fields, Joints, JointsError, time_ns
-from kf_calib.support.extras import MissingExtraError
 
 ENCODINGS = ("json", "protobuf")
 """Those in which messages are told by their fields, whatever their type; in CDR only where fields are stated."""

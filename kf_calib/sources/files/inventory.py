@@ -11,6 +11,7 @@ import numpy as np
 from mcap.records import Channel
 from numpy.typing import NDArray
 
+from kf_calib.errors import MissingExtraError
 from kf_calib.sources.files.contents import POSES, READINGS, USABLE_SCHEMAS, Contents, fields_by_role
 from kf_calib.sources.files.field_messages import CDR, ENCODINGS, parser_of
 from kf_calib.sources.files.fields import FieldError, paths_of
@@ -20,7 +21,6 @@ from kf_calib.sources.files.mcap_records import MAX_CHUNK_MB, MessageFinder
 from kf_calib.sources.files.record_files import RecordFile, files_of, open_record_file
 from kf_calib.sources.files.sqlite_bag import SqliteBag
 from kf_calib.sources.units import Units
-from kf_calib.support.extras import MissingExtraError
 
 TopicTimes = NDArray[np.int64]
 _GAP = 5  # times the usual interval

@@ -15,8 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kf_calib.errors import InputError
-from kf_calib.support.extras import need
+from kf_calib.errors import InputError, need
 from kf_calib.support.text import cut
 
 if TYPE_CHECKING:

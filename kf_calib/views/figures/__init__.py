@@ -10,7 +10,7 @@ A function of each figure has the same name here as in its module.
 
 from __future__ import annotations
 
-from kf_calib.support.extras import need
+from kf_calib.errors import need
 
 need("matplotlib", "plot", "a figure")
 

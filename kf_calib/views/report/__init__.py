@@ -11,6 +11,6 @@ The page holds all that it needs, and asks the network for nothing: figures as S
 
 from __future__ import annotations
 
-from kf_calib.support.extras import need
+from kf_calib.errors import need
 
 need("jinja2", "report", "HTML")

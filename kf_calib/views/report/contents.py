@@ -20,7 +20,7 @@ from kf_calib.diagnosis.stepwise_selection import Improvement
 from kf_calib.estimation.cross_validation import orientations
 from kf_calib.estimation.engine_comparison import Comparison
 from kf_calib.estimation.results import Calibration
-from kf_calib.views import console, diagnosis, improvement, run, side_by_side
+from kf_calib.views import console, diagnosis, improvement, run
 from kf_calib.views.figures import figures
 from kf_calib.views.figures.collection import DIRECTIONS, FALL, NO_FALL, ON_THEIR_WAY, PROBABILITIES
 from kf_calib.views.report.drawing import Drawing
@@ -190,13 +190,14 @@ def _(pair: SideBySide, measured: Sequence[Measured], commands: Sequence[str], r
     names = [each.before.model.sum if pair.same_recording else own.name
              for each, own in zip(both, recordings, strict=True)]  # fmt: skip
     told = [f"{name}: {diagnosis.verdict(each)}" for name, each in zip(names, both, strict=True)]
-    table = side_by_side.difference_table(pair.differences, names[0], names[1])
+    table = console.difference_table(pair.differences, names[0], names[1])
     standing, headline = _standing(pair.second.test.consistent)
     measurements = [("" if pair.same_recording else name, tuple(facts(own, each.before)))
                     for name, own, each in zip(names, recordings, both, strict=True)]  # fmt: skip
     return Page(
         measured[0].name if pair.same_recording else f"{names[1]} beside {names[0]}", "Side by side",
-        standing, f"{names[1]}: {headline[0].lower()}{headline[1:]}", (side_by_side.verdict(pair), *told, *remarks),
+        standing, f"{names[1]}: {headline[0].lower()}{headline[1:]}",
+        (console.difference_in_words(pair), *told, *remarks),
         (
             Section("Difference of the parameters", tuple(parts_of(table))),
             Section(MEASURED, (Facts(tuple(measurements[1:] if pair.same_recording else measurements)),)),
@@ -278,7 +279,7 @@ def _with_what_is_missing(diagnosed: Diagnosis) -> tuple[PagePart, ...]:
     if diagnosed.after is None:
         return ()
     both = differences(diagnosed.before, diagnosed.after, same_recording=True)
-    table = side_by_side.difference_table(both, "model as it is", f"with {' + '.join(diagnosed.missing)}")
+    table = console.difference_table(both, "model as it is", f"with {' + '.join(diagnosed.missing)}")
     return (*parts_of(table), *parts_of(console.effect_table(diagnosed.after)))
 
 

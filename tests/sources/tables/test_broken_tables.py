@@ -110,7 +110,7 @@ def test_old_spreadsheets_are_to_be_saved_again(suffix: str, tmp_path: Path) -> 
 
 def test_excel_without_its_package_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "table.xlsx").write_bytes(b"PK\x03\x04")
-    monkeypatch.setattr("kf_calib.support.extras.find_spec", lambda _: None)
+    monkeypatch.setattr("kf_calib.errors.find_spec", lambda _: None)
     with pytest.raises(KfCalibError, match=r"needs openpyxl, which is not installed: pip install 'kf_calib\[tables\]'"):
         kf_calib.open_table(tmp_path / "table.xlsx", BENCH)
 
