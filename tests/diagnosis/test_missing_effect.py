@@ -81,8 +81,8 @@ def test_vibration_is_averaged_once_and_lines_that_are_left_are_vibration_too(
     monkeypatch.setattr(missing_effect, "_without_vibration", lambda refits, run, test: test)
     monkeypatch.setattr(missing_effect, "_restoring_time_s", lambda diagnosis: None)
     monkeypatch.setattr(missing_effect, "replace", lambda diagnosis, **changes: diagnosis)
-    monkeypatch.setattr(missing_effect, "verdict_in_words", lambda diagnosis: "")
-    monkeypatch.setattr(missing_effect, "second_pass_in_words", lambda diagnosis: "")
+    for name in [name for name in vars(missing_effect) if name.endswith("_in_words")]:
+        monkeypatch.setattr(missing_effect, name, lambda *_: "")
     monkeypatch.setattr(missing_effect.window_average, "window_s", lambda lines: 0.5)
     averaged = Tests("averaged", Tests("averaged without lines") if lines_left else None)
     fit = SimpleNamespace(dwells=[SimpleNamespace(averaged=averaged_before)])

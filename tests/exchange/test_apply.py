@@ -54,14 +54,15 @@ def count_of(path: Path, topic: str) -> int:
         return sum(1 for _ in make_reader(file, validate_crcs=True).iter_messages([topic]))
 
 
+@pytest.mark.parametrize("begin_ns", [0, 123_456_789])
 @pytest.mark.parametrize("norm", [1.0, G])
-def test_a_norm_at_rest_counts_from_three_windows_of_half_a_second(folder: Path, norm: float) -> None:
+def test_a_norm_at_rest_counts_from_three_windows_of_half_a_second(folder: Path, norm: float, begin_ns: int) -> None:
     """Readings in g are told once the third window is over; what moves is no window; parts of any length give the
     same."""
     correction = kf_calib.open_calibration(folder / "cal.json").correction()
     values = np.array([0.6, 0.64, 0.48]) * norm + np.random.default_rng(0).normal(size=(400, 3)) * 1e-3 * norm
     values[100:150] += norm * np.sin(np.arange(50.0))[:, None]
-    times, told = np.arange(400) * 10_000_000, dict[int, list[int]]()
+    times, told = begin_ns + np.arange(400) * 10_000_000, dict[int, list[int]]()
     for size in (1, 7, 50):
         at_rest = NormAtRest(correction)
         for first in range(0, 400, size):
@@ -69,6 +70,13 @@ def test_a_norm_at_rest_counts_from_three_windows_of_half_a_second(folder: Path,
             if at_rest.misfit(PLAIN, final=False):
                 told.setdefault(size, []).append(first + size)
     assert {size: first[0] for size, first in told.items()} == ({1: 201, 7: 203, 50: 250} if norm == 1.0 else {})
+
+
+@pytest.mark.parametrize(("count", "told"), [(7, False), (8, True)])
+def test_a_window_at_rest_has_eight_readings(folder: Path, count: int, told: bool) -> None:
+    at_rest = NormAtRest(kf_calib.open_calibration(folder / "cal.json").correction())
+    at_rest.add(Stream(np.arange(count) * 50_000_000, np.tile([0.6, 0.64, 0.48], (count, 1))))
+    assert bool(at_rest.misfit(PLAIN, final=True)) == told and not at_rest.misfit(PLAIN, final=False)
 
 
 def turned_means(count: int) -> np.ndarray:

@@ -217,6 +217,7 @@ BROKEN: dict[str, tuple[str | Callable[[dict[str, Any]], None], str]] = {
     "no date of saving": (put("provenance", "created", value="1"), "provenance.created is '1', which is no date"),
     "a date beyond time": (put("conditions", "began", value="9999-12-31T23:59:59+00:00"), "is no date"),
     "a duration beyond time": (put("conditions", "duration_s", value=1e300), "conditions.duration_s"),
+    "a duration of five thousand years": (put("conditions", "duration_s", value=1.5e11), "conditions.duration_s"),
     "a negative count": (put("conditions", "dwells", 0, "readings", value=-5), "conditions.dwells.0.readings"),
     "negative degrees of freedom": (put("consistency", "dof", value=-3), "consistency.dof"),
     "a probability above 1": (put("consistency", "p_value", value=1.5), "consistency.p_value"),
