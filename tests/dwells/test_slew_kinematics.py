@@ -163,3 +163,5 @@ def test_pieces_of_a_slew_are_two_degrees_and_a_fifth_of_a_second_together_and_t
     assert np.median(lengths) == pytest.approx(max(count, 3), abs=1.0) and lengths[:-1].max() <= count + 2
     if count == 3:
         assert 3 in lengths
+    last = [np.diff(curve.cuts(time_s[:size]))[-1] for size in range(7, 60)]
+    assert min(last) == 3
