@@ -239,12 +239,11 @@ class Evidence:
         means, shared_prior = with_shared_noise(linearised.dwells, noise, linearised.means)
         blocks = _ColumnBlocks(self._fit.linearised.model.count, linearised.model.count, means.design.shape[2])
         prior = np.vstack([shared_prior, blocks.spread(_within(linearised, noise, self._fit.linearised.state))])
-        unknowns = {place: each for place, each in linearised.model.unknowns.items() if place >= blocks.model}
-        constants, free = [place - blocks.model for place in unknowns], sum(not each.held for each in unknowns.values())
+        constants = [column - blocks.model for column in linearised.model.unknowns if column >= blocks.model]
         seen, numbers = _visible(means, noise, prior, blocks)
         seen_means, added = replace(means, design=blocks.combined(means.design, seen)), len(numbers)
         return _LikelihoodRows(
-            seen_means, blocks.combined(prior, seen), max(added - free, 0),
+            seen_means, blocks.combined(prior, seen), max(added - len(constants), 0),
             slice(blocks.model, blocks.model + added), np.delete(numbers, constants, axis=1),
         )  # fmt: skip
 

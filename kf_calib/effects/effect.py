@@ -200,11 +200,16 @@ class Effect(ABC):
 
     @property
     def states(self) -> tuple[Coefficient, ...]:
-        """The coefficients that are states: its own and, where its columns have a derivative by it, its unknown."""
+        """The coefficients that are states: its own and, where that is one, its unknown."""
         unknown = self.unknown
-        if unknown is None or not self.smooth:
+        if unknown is None or not self.has_constant_in_state:
             return self.coefficients
         return *self.coefficients, Coefficient(unknown.symbol, unknown.unit, 1.0, unknown.shown_unit, unknown.per_si)
+
+    @property
+    def has_constant_in_state(self) -> bool:
+        """Whether its unknown is estimated as a state: its columns have a derivative by it, and it is not held."""
+        return self.unknown is not None and self.smooth and not self.held
 
     @property
     def relations(self) -> Sequence[Floats]:

@@ -83,7 +83,6 @@ def remarks_on(
     unseen += [c.symbol for c, s in zip(model.coefficients, estimate.effect_sigma, strict=True) if np.isnan(s)]
     for effect in model.effects:
         if effect.held and effect.unknown is not None:
-            unseen.remove(effect.unknown.symbol)
             yield _on_held(effect, effect.unknown)
     if not model.bench.angles:
         yield from _without_angles(linearised, noise, judged)

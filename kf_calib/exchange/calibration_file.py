@@ -14,7 +14,7 @@ import math
 import os
 import platform
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -148,7 +148,7 @@ class SavedCalibration(FilePart):
         model = Model(bench, square="square" in self.fixed.values())
         for own in self.effects:
             effect = effects.effect_named(own.text, bench)
-            model += _at_constant(effect, own.constant, origin)
+            model += _at_constant(effect, own.constant, origin, self.state.symbols)
         try:
             agreement.refuse_coefficients(self.parameters, self.state, self.noise, model)
         except ValueError as error:
@@ -165,8 +165,11 @@ class SavedCalibration(FilePart):
         )  # fmt: skip
 
 
-def _at_constant(effect: effects.Effect, constant: float | None, origin: Path) -> effects.Effect:
-    """The effect with its constant, which a file states for effects that have one, and within their range."""
+def _at_constant(
+    effect: effects.Effect, constant: float | None, origin: Path, symbols: Collection[str]
+) -> effects.Effect:
+    """The effect with its constant, which a file states for effects that have one, and within their range; where it is
+    not among the ``symbols`` of the state, it was held."""
     if constant is None and effect.unknown is None:
         return effect
     if constant is None or effect.unknown is None or effect.at(constant).value != constant:
@@ -174,7 +177,9 @@ def _at_constant(effect: effects.Effect, constant: float | None, origin: Path) -
         can = f"from {known.low:g} to {known.high:g} {known.unit}" if known else "none at all"
         raise InputError(f"{origin}: {effect} has the constant {constant}, and can have {can}: give a calibration as "
                          "--save has written it.")  # fmt: skip
-    return effect.at(constant)
+    at_constant = effect.at(constant)
+    at_constant.held = effect.unknown.symbol not in symbols
+    return at_constant
 
 
 def saved(
