@@ -68,7 +68,8 @@ class PlanOptions:
     time_correlation: Annotated[float, _of_reach(
         "--time-correlation", type=NumberInRange(0, 1), help="Correlation of time with the direction of gravity that "
         "the order may have; slews are the shortest below it.")] = 0.1
-    seed: Annotated[int, _of_reach("--seed", metavar="N", help="Seed of the order of visits.")] = 0
+    seed: Annotated[int, _of_reach(
+        "--seed", type=click.IntRange(min=0), metavar="N", help="Seed of the order of visits.")] = 0
     dwell_s: Annotated[float | None, _of_dwell(
         "--dwell-s", type=POSITIVE, help="Seconds in each orientation; as in the recording, or 30.")] = None
     sample_hz: Annotated[float, _of_dwell("--sample-hz", type=POSITIVE, help="Rate of the readings.")] = 100.0

@@ -30,7 +30,7 @@ from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.whitened_rows import flicker_of_scatter, whiten
 from kf_calib.noise.means import Means
-from kf_calib.noise.noise_model import Noise, mean_covariances
+from kf_calib.noise.noise_model import Noise, mean_covariances, setting_covariances
 from kf_calib.noise.reml import Likelihood, Part, Parts, likelihood_of, with_shared_noise
 from kf_calib.noise.restricted_likelihood import Restricted
 from kf_calib.noise.temperature_course import thermometer_errors
@@ -239,11 +239,12 @@ class Evidence:
         means, shared_prior = with_shared_noise(linearised.dwells, noise, linearised.means)
         blocks = _ColumnBlocks(self._fit.linearised.model.count, linearised.model.count, means.design.shape[2])
         prior = np.vstack([shared_prior, blocks.spread(_within(linearised, noise, self._fit.linearised.state))])
-        constants = [column - blocks.model for column in linearised.model.unknowns if column >= blocks.model]
+        unknowns = {place: each for place, each in linearised.model.unknowns.items() if place >= blocks.model}
+        constants, free = [place - blocks.model for place in unknowns], sum(not each.held for each in unknowns.values())
         seen, numbers = _visible(means, noise, prior, blocks)
         seen_means, added = replace(means, design=blocks.combined(means.design, seen)), len(numbers)
         return _LikelihoodRows(
-            seen_means, blocks.combined(prior, seen), max(added - len(constants), 0),
+            seen_means, blocks.combined(prior, seen), max(added - free, 0),
             slice(blocks.model, blocks.model + added), np.delete(numbers, constants, axis=1),
         )  # fmt: skip
 
@@ -315,11 +316,10 @@ def log_odds_of_repeating(before: Calibration, noise: MarginalLikelihood) -> flo
     if not groups or stated.attitude_unknown:
         return 0.0
     within = mean_covariances(stated.of_readings, linearised.means, linearised.state)
-    scatter, force = np.zeros_like(within), linearised.means.design[:, 0, :3]
+    scatter = np.zeros_like(within)
     for part, size in zip(noise.parts, noise.sizes, strict=False):
         if part == "setting":
-            squares = np.sum(force**2, axis=1)[:, None, None] * np.eye(3) - force[:, :, None] * force[:, None, :]
-            scatter += size**2 * squares
+            scatter += size**2 * setting_covariances(linearised.means, linearised.state)
         elif part == "common":
             scatter += size**2 * np.eye(3)
     return sum(_log_ratio(before.residuals_mps2[group], within[group], scatter[group]) for group in groups)

@@ -32,7 +32,7 @@ from kf_calib.diagnosis.hypothesis_table import (
 )
 from kf_calib.diagnosis.refits import Refits, dwell_noise_is_stated
 from kf_calib.diagnosis.unknown_effect import FormulaFamily, one_digit_seconds
-from kf_calib.diagnosis.within_dwell_trend import Trend, trend
+from kf_calib.diagnosis.within_dwell_trend import DisturbedDwell, Trend, disturbed_dwell, trend
 from kf_calib.dwells.qr import orthonormal
 from kf_calib.effects import Effect, FrameEffect, Stimulus, effect_named, walk_named
 from kf_calib.errors import UnobservableError
@@ -45,6 +45,7 @@ _AGAINST_STATED = 0.5  # the same of noise that contradicts what was stated: non
 _OF_ORIENTATION = 0.8  # share of such causes that depend on the orientation alone, and come back with it
 _SHORT = 0.01  # prior probability of irregular changes that show within dwells only
 _END = 0.99  # of the range of a constant
+_APART = 1e-4  # p-value of an oscillation that does not go on alike in all dwells
 SCREEN_LOG_BF = 8.0  # rows further behind in log evidence are not refitted
 NONLINEARITY_MARGIN = 0.02  # share of the log evidence by which they may be further behind, as large effects bend
 _MOST = {"effect": 8, "attitude": 3, "pair": 4, "walk": 3, "formula": 3}
@@ -84,6 +85,7 @@ class Hypotheses:
         self.evidence, self.inflation = Evidence(before.fit), 1.0
         self.walk = "" if before.model.walks else walk_named(before.bench)
         self.stated = dwell_noise_is_stated(before)
+        self._disturbed = list[tuple[float, DisturbedDwell]]()  # with the log evidence of rows that are left out for it
 
     def table(self) -> HypothesisTable:
         """The table with the likeliest rows refitted."""
@@ -101,7 +103,10 @@ class Hypotheses:
         rows = [row for row in rows if math.isfinite(row.log_evidence)]
         least = max(row.log_evidence for row in rows) - SCREEN_LOG_BF
         walks = [row for row in rows if row.effects == (self.walk,) and row.log_evidence > least]
-        return table_of([*rows, *(row for walk in walks if self.stated for row in self._gauss_markov(walk))])
+        rows += [row for walk in walks if self.stated for row in self._gauss_markov(walk)]
+        best = max(row.log_evidence for row in rows)
+        disturbed = max((each for each in self._disturbed if each[0] > best), key=lambda each: each[0], default=None)
+        return replace(table_of(rows), disturbed=disturbed[1] if disturbed else None)
 
     def _gauss_markov(self, walk: Hypothesis) -> Iterator[Hypothesis]:
         """Yield the row of biases that move irregularly and return to their mean after any time, from that of a random
@@ -341,6 +346,11 @@ class Hypotheses:
         walks, log = self.walk in effects, float(np.logaddexp.reduce(logs)) + log_prior
         log += self._log_odds_within_dwells(effects, refit) if walks else 0.0
         delta_chi2 = best.delta_chi2 if best.dof else 2.0 * self.before.fit.walk_gain
+        if refit.model.oscillates and not self.before.model.oscillates:
+            disturbed = disturbed_dwell(refit.fit)
+            if disturbed.p_value < _APART:
+                self._disturbed.append((log, disturbed))
+                return Hypothesis(effects, formulas, log_evidence=-math.inf)
         return Hypothesis(effects, formulas, "", self._families(effects), log, delta_chi2, best.dof + walks, refit)
 
     def _log_odds_within_dwells(self, effects: Sequence[str], refit: Calibration) -> float:

@@ -13,6 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
+from kf_calib.diagnosis.within_dwell_trend import DisturbedDwell
 from kf_calib.estimation.results import Calibration
 from kf_calib.support.tail_probabilities import weights
 
@@ -73,12 +74,20 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class HypothesisTable:
-    """All rows, the likeliest first; their probabilities sum to one."""
+    """All rows, the likeliest first; their probabilities sum to one.
+
+    disturbed: the dwell in which an oscillation would be the likeliest of all, if other dwells had it, too.
+    """
 
     rows: tuple[Hypothesis, ...]
+    disturbed: DisturbedDwell | None = None
 
     def __repr__(self) -> str:
-        return "\n".join(f"{row.probability:7.2%} {' + '.join(row.effects or row.families)}" for row in self.listed)
+        def name(row: Hypothesis) -> str:
+            beside = [f"unknown, goes with {row.driver}"] if row.effects and row.formulas else []
+            return " + ".join([*(row.effects or row.families), *beside])
+
+        return "\n".join(f"{row.probability:7.2%} {name(row)}" for row in self.listed)
 
     @cached_property
     def families(self) -> dict[str, float]:

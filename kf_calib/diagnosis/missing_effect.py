@@ -32,7 +32,7 @@ from kf_calib.diagnosis.hypothesis_table import (
 from kf_calib.diagnosis.refits import Refits, calibration_of, dwell_noise_is_stated, with_noise_as_stated
 from kf_calib.diagnosis.replication import Replication, replication
 from kf_calib.diagnosis.results import Diagnosis, Suspect
-from kf_calib.diagnosis.verdict import second_pass_in_words, verdict_in_words
+from kf_calib.diagnosis.verdict import disturbance_in_words, second_pass_in_words, verdict_in_words
 from kf_calib.dwells import window_average
 from kf_calib.estimation.outlying_dwell import outlying_in_words
 from kf_calib.estimation.results import Calibration, format_p
@@ -90,7 +90,8 @@ def _diagnosed(refits: Refits, before: Calibration) -> Diagnosis:
             retest = retest.without_lines or retest  # lines that are left after averaging are vibration, too
             diagnosis = _explained(refits, averaged, retest.with_vibration(test.lines.vibration))
     diagnosis = replace(diagnosis, restoring_time_s=_restoring_time_s(diagnosis))
-    return replace(diagnosis, verdict=verdict_in_words(diagnosis) + second_pass_in_words(diagnosis))
+    words = verdict_in_words(diagnosis) + second_pass_in_words(diagnosis) + disturbance_in_words(diagnosis)
+    return replace(diagnosis, verdict=words)
 
 
 def _without_vibration(refits: Refits, before: Calibration, test: CandidateTests) -> CandidateTests:

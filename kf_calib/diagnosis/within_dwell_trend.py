@@ -8,27 +8,35 @@ reduces the weight of both ends, where the platform still shakes.
 Noise whose mean has the variance kappa sigma^2 / n gives each coefficient that same variance. A random walk of the
 biases adds q^2 T times a constant, and 1/f noise of density h / f adds h times a constant, whatever the length T of
 the dwell (from the covariances min(s, t) and -ln |s - t|).
+
+And a test of whether an oscillation goes on alike in all dwells, as the model of one has it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, Mask
+from kf_calib.bench.paper_parameters import BIASES
+from kf_calib.dwells.qr import orthonormal
 from kf_calib.dwells.rows import on_basis
 from kf_calib.dwells.sufficient_statistics import DwellFactor, alike
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.fit import Fit
+from kf_calib.estimation.square_root_information import scale_columns
+from kf_calib.estimation.whitened_rows import misfit_rows
 from kf_calib.noise.noise_model import Noise, flicker_sigma
 from kf_calib.noise.temperature_course import thermometer_errors
+from kf_calib.support.tail_probabilities import chi_squared_tail, sidak
 
 _DEGREE = 3
 _GRID = 600
 _FEWEST = 8  # readings that a dwell must have to be tested
+_SEEN = 1e-4  # of the square of a column: less that the model leaves is not told
 
 
 def shapes(u: Floats) -> Floats:
@@ -170,3 +178,56 @@ def _shapes_in(dwells: Sequence[DwellFactor], triangles: Floats) -> tuple[Floats
     determined = np.abs(np.einsum("dkk->dk", upper[:, :, : upper.shape[1]])) > 1e-6 * np.sqrt(counts)[:, None]
     determined &= ((counts >= _FEWEST) & (lengths > 0.0))[:, None]
     return frame[:, :, 1:], determined[:, 1:]
+
+
+@dataclass(frozen=True)
+class DisturbedDwell:
+    """The dwell in which the readings differ most from an oscillation that goes on in all dwells.
+
+    number: of the dwell. frequency_hz: of the oscillation. p_value: that noise alone lets any dwell differ as much.
+    """
+
+    number: int
+    frequency_hz: float
+    p_value: float
+
+
+def disturbed_dwell(fitted: Fit) -> DisturbedDwell:
+    """The dwell whose oscillation differs most from that of the model, in amplitude or phase.
+
+    The sine and cosine of the oscillation, and their derivative by its frequency, are added in one dwell alone, beside
+    a constant of that dwell, so that only the course of its readings counts. The decrease of chi-squared is chi-squared
+    distributed if the oscillation goes on alike in all dwells. What one dwell alone has is creep, or a disturbance.
+
+    fitted: a fit whose model has an oscillation. A random walk of the biases counts within no dwell.
+    """
+    linearised, noise = fitted.linearised, replace(fitted.noise.for_goodness_of_fit, walk_mps2_per_sqrt_s=0.0)
+    model, dwells = linearised.model, linearised.dwells_at_state
+    effect = model.oscillation
+    assert effect is not None
+    places = [*BIASES, *np.arange(model.count)[model.parts[str(effect)]].tolist()]
+    rows, width = misfit_rows(dwells, linearised.columns, noise, linearised.state, model.count, reduced=False)
+    stacked = np.concatenate(rows)
+    basis = orthonormal(scale_columns(stacked[:, : width + 1])[0][:, :width])[0]
+    left = stacked[:, -1] - basis @ (basis.T @ stacked[:, -1])
+    first, p_values = len(stacked) - sum(map(len, rows[-len(dwells) :])), list[float]()
+    for of_dwell in rows[-len(dwells) :]:
+        part = slice(first, first := first + len(of_dwell))
+        p_values.append(_p_of_columns(of_dwell[:, places], basis[part], left[part]))
+    most = int(np.argmin(p_values))
+    return DisturbedDwell(dwells[most].number, effect.value, sidak(p_values[most], len(p_values)))
+
+
+def _p_of_columns(columns: Floats, basis: Floats, left: Floats) -> float:
+    """Return the p-value of the decrease of chi-squared if the columns of one dwell (r, 3 + q), the first three of them
+    constants, are added to a model; basis (r, p): the dwell's rows of an orthonormal basis of this model; left (r,):
+    what the model leaves of the dwell's readings."""
+    sizes = np.linalg.norm(columns, axis=0)
+    columns = columns / np.where(sizes > 0.0, sizes, 1.0)
+    inside, along = basis.T @ columns, columns.T @ left
+    gram = columns.T @ columns - inside.T @ inside
+    constants = gram[3:, :3] @ np.linalg.pinv(gram[:3, :3], rcond=_SEEN, hermitian=True)
+    values, vectors = np.linalg.eigh(gram[3:, 3:] - constants @ gram[:3, 3:])
+    seen = values > _SEEN
+    delta_chi2 = np.sum((vectors[:, seen].T @ (along[3:] - constants @ along[:3])) ** 2 / values[seen])
+    return chi_squared_tail(int(seen.sum()), float(delta_chi2)) if seen.any() else 1.0

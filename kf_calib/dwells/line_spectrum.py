@@ -248,8 +248,8 @@ def _cubic(count: int) -> Floats:
 
 
 def _running_median(values: Floats, reach: int, skipped: int) -> Floats:
-    """Return the median (b,) of ``reach`` bins on either side without the nearest ``own``; the window is shifted at the
-    ends."""
+    """Return the median (b,) of ``reach`` bins on either side without the nearest ``skipped``; at the ends the window
+    is shifted."""
     count = len(values) - _FIRST_BIN - 1
     size = min(2 * reach + 1, count)
     k = np.arange(len(values))

@@ -18,9 +18,9 @@ from kf_calib.effects.effect import (
     Unknown,
 )
 from kf_calib.effects.stimulus import Stimulus
-from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 _TIME, _STEP = Regressor("t", "time", "s"), Regressor("da", "last step along the input axis", "m/s^2")
+_LEAST_STEP_MPS2 = 3.0 * MILLI_G  # setting errors and creep of 0.1 deg make less of no step, of either sign
 _HELD = 2.5  # cycles in a piece, of which its parabola holds a fourteenth of the power
 
 
@@ -53,7 +53,7 @@ class ScaleDrift(SensorEffect):
 
 
 class Hysteresis(SensorEffect):
-    """h sgn(Delta a_i), Delta a_i the last step of the input."""
+    """h sgn(Delta a_i), Delta a_i the last step of the input, of at least 3 mg."""
 
     family = "memory"
     name, title, source = "hysteresis", "reading that depends on the side it was come from", "IEEE Std 1293, hysteresis"
@@ -63,7 +63,7 @@ class Hysteresis(SensorEffect):
     typical = Typical((1 * MICRO_G, 20 * MICRO_G), (0.0, 2 * MILLI_G))
 
     def terms(self, s: Stimulus) -> Floats:
-        return np.sign(np.where(np.abs(s.step) > 1e-6 * STANDARD_GRAVITY_MPS2, s.step, 0.0))
+        return np.sign(np.where(np.abs(s.step) > _LEAST_STEP_MPS2, s.step, 0.0))
 
 
 class _Decay(SensorEffect):

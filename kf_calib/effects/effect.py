@@ -161,6 +161,8 @@ class Effect(ABC):
     variant: str = ""
     """The axis of an axis-wise effect (``encoder-harmonic-2:z``)."""
     value: float = 0.0
+    held: bool = False
+    """Whether its unknown stays where it is: at an end of its range, beyond which the readings would have it."""
 
     def __str__(self) -> str:
         return f"{self.name}:{self.variant}" if self.variant else self.name
@@ -170,6 +172,13 @@ class Effect(ABC):
         other = copy.copy(self)
         if self.unknown is not None:
             other.value = float(min(max(value, self.unknown.low), self.unknown.high))
+        return other
+
+    def held_if_beyond(self, step: float) -> Self:
+        """The same effect; its unknown is held if it is at an end of its range and ``step`` of ln(value) leads out."""
+        assert self.unknown is not None
+        other, known = copy.copy(self), self.unknown
+        other.held = self.held or (self.value >= known.high if step > 0.0 else step < 0.0 and self.value <= known.low)
         return other
 
     @property

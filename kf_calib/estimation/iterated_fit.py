@@ -51,6 +51,9 @@ _EXACT_RAD = 1e-9
 _MANY = 8192  # dwells by which variances are known to one percent, which is enough until the fit nearly settles
 _TURNS = 50  # most times that forces and state are found in turn
 _SINGULAR = 100.0
+_PASSES_WITH_NOISE = 5  # after which the estimate of the noise does not move the fit any more
+_BACK, _ON = -0.5, 0.9  # cosine of a step with the last one
+_LEAST_SHARE, _MOST_SHARE = 0.125, 3.0
 _STILL = 2.5e-4  # the search ends when no step of ln(value) exceeds this share of its largest allowed step
 
 
@@ -77,7 +80,7 @@ def fit(
     fitted = _begun(dwells, model, slews, walk_mps2_per_sqrt_s, beginning)
     within, bench = fitted.noise, model.bench
     components = VarianceComponents(_setting_deg(dwells, bench), bench.scatter_sigma_mps2, model.walks)
-    left = 0.0
+    left, relaxation = 0.0, _Relaxation()
     for number in range(_most_passes(model)):
         fitted = _with_constants_searched(fitted, number)
         state, constant_steps = estimate_and_steps(fitted)
@@ -86,6 +89,8 @@ def fit(
                 raise UnobservableError(_not_sensible(model))
             return fitted
         left, reach = _left_to_settle(fitted, state), largest_steps(fitted)
+        if not bench.angles and number > _PASSES_WITH_NOISE:
+            state, constant_steps = relaxation.of(fitted, state, constant_steps)
         before, fitted = fitted if slews else None, replace(fitted)  # without its rows, which need much memory
         linearised = _moved_to(fitted, _with_constants_moved(fitted, constant_steps, reach, number), state)
         fitted = replace(fitted, linearised=linearised)
@@ -99,6 +104,28 @@ def fit(
     if must_settle and not bench.angles and left > UNSETTLED:
         raise UnobservableError(_not_settled(model))
     return fitted
+
+
+class _Relaxation:
+    """How much of a step is taken: half as much as before where it goes back, so that a fit does not swing between two
+    places, and more where it goes on in the same direction, so that a slow one arrives."""
+
+    def __init__(self) -> None:
+        self.share, self._last = 1.0, np.zeros(0)
+
+    def of(self, fitted: Fit, state: Floats, constant_steps: Floats) -> tuple[Floats, Floats]:
+        """Return the state to go to, and the steps of the unknown constants, from those of a fit."""
+        start = fitted.linearised.state
+        sigma = fitted.sigma_of_determined
+        step = np.where(sigma > 0.0, (state - start) / np.where(sigma > 0.0, sigma, 1.0), 0.0)
+        if len(self._last) == len(step):
+            cosine = float(step @ self._last) / max(float(np.linalg.norm(step) * np.linalg.norm(self._last)), 1e-300)
+            if cosine < _BACK:
+                self.share = max(0.5 * self.share, _LEAST_SHARE)
+            elif cosine > _ON:
+                self.share = min(1.25 * self.share, _MOST_SHARE)
+        self._last = step
+        return start + self.share * (state - start), self.share * constant_steps
 
 
 def _with_constants_searched(fitted: Fit, number: int) -> Fit:
@@ -115,10 +142,13 @@ def _with_constants_searched(fitted: Fit, number: int) -> Fit:
 
 
 def _with_constants_moved(fitted: Fit, constant_steps: Floats, reach: Floats, number: int) -> Model:
-    """Return the model with its unknown constants moved by their steps, at most by ``reach``; as it is before they are
-    on their grids."""
+    """Return the model with its unknown constants moved by their steps, at most by ``reach``, and from some passes on
+    held at the ends of their ranges; as it is before they are on their grids."""
     model = fitted.linearised.model
-    return model.moved(np.clip(constant_steps, -reach, reach)) if number and model.unknowns else model
+    if not number or not model.unknowns:
+        return model
+    model = model if number < _PASSES else model.held_at_ends(constant_steps)
+    return model.moved(np.clip(constant_steps, -reach, reach))
 
 
 def _noise_at(
@@ -181,9 +211,7 @@ def _not_sensible(model: Model) -> str:
 
 def _most_passes(model: Model) -> int:
     """Return how often noise, linearisation and constants are estimated in turn at most."""
-    if not model.bench.angles:
-        return _TURNS
-    return _PASSES_WITH_UNKNOWNS
+    return _PASSES_WITH_UNKNOWNS if model.bench.angles or model.stepped else _TURNS
 
 
 def _begun(

@@ -140,6 +140,12 @@ class Model:
         moved = {str(each): each.at(each.value * math.exp(state[k])) for k, each in self.unknowns.items()}
         return replace(self, effects=tuple(moved.get(str(each), each) for each in self.effects))
 
+    def held_at_ends(self, steps: Floats) -> Model:
+        """The model with each unknown constant held that is at an end of its range and whose step, in steps (p,), leads
+        outwards: what cannot be followed is no column."""
+        held = {str(each): each.held_if_beyond(steps[k]) for k, each in self.unknowns.items()}
+        return replace(self, effects=tuple(held.get(str(each), each) for each in self.effects))
+
     def with_effect(self, effect: Effect) -> Model:
         """The model in which this effect replaces the one of the same name."""
         return replace(self, effects=tuple(effect if str(each) == str(effect) else each for each in self.effects))
@@ -182,7 +188,7 @@ class Model:
             part = self.parts[str(effect)]
             coefficients = slice(part.start, part.start + len(effect.coefficients))
             design[:, :, coefficients] = effect_columns([effect], stimulus)
-            if coefficients.stop < part.stop:
+            if coefficients.stop < part.stop and not effect.held:
                 design[:, :, coefficients.stop : part.stop] = effect.derivative(stimulus, state[coefficients])
         design[:, :, list(self.fixed)] = 0.0
         return design

@@ -16,7 +16,7 @@ from kf_calib.bench.streams import Stream
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.unknown_effect import WITHIN_DWELLS
-from kf_calib.diagnosis.within_dwell_trend import Trend, shapes, trend, variances
+from kf_calib.diagnosis.within_dwell_trend import DisturbedDwell, Trend, disturbed_dwell, shapes, trend, variances
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.results import Calibration
 from kf_calib.online.sequential_test import Watch
@@ -125,3 +125,36 @@ def test_nothing_is_judged_where_scatter_may_be_anything() -> None:
     before = run()
     bench = dataclasses.replace(before.fit.noise, scatter_stated=False)
     assert trend(dataclasses.replace(before.fit, noise=bench)) is None
+
+
+def swinging(amplitude_mps2: float, seed: int, only: int | None = None) -> Run:
+    """A run whose second accelerometer swings with a period of 7 s, in all 12 dwells of 20 s or in one."""
+    made = Run(seed=seed, dwells=12, count=400, white_mps2=1e-4, setting_deg=0.003)
+    made.bench = dataclasses.replace(made.bench, scatter_sigma_mps2=0.0)
+    values, elapsed_s = made.accel.values.copy(), made.accel.time_ns / 1e9
+    part = slice(None) if only is None else slice(only * 400, (only + 1) * 400)
+    values[part, 1] += amplitude_mps2 * np.sin(2.0 * np.pi * elapsed_s[part] / 7.0)
+    made.accel = Stream(made.accel.time_ns, values)
+    return made
+
+
+def disturbed_in(made: Run) -> DisturbedDwell:
+    return disturbed_dwell(Refits(made).with_effects(calibrate(made), ("sinusoid",)).fit)
+
+
+@pytest.mark.parametrize("count", [12, *slow(100)])
+def test_an_oscillation_that_goes_on_in_all_dwells_disturbs_none(count: int) -> None:
+    """The p-value of the dwell that differs most is uniform, however strong the oscillation is."""
+    p_values = [disturbed_in(swinging(1e-4 * 5.0 ** (seed % 3), seed)).p_value for seed in range(count)]
+    assert stats.kstest(p_values, "uniform").pvalue > 0.01
+
+
+@pytest.mark.parametrize("seed", [1, *slow(2, 3, 4)])
+def test_what_swings_in_one_dwell_alone_is_no_oscillation_of_the_run(seed: int) -> None:
+    """Creep and what goes on around a bench swing for a while; an effect of the sensor goes on."""
+    made = swinging(1e-4, seed, only=seed)
+    before, refits = calibrate(made), Refits(made)
+    disturbed = disturbed_dwell(refits.with_effects(before, ("sinusoid",)).fit)
+    assert disturbed.number == seed + 1 and disturbed.p_value < 1e-6
+    found = diagnose(before, refits)
+    assert "sinusoid" not in found.missing, found.verdict

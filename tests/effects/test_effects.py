@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 from helpers.long_runs import slow
 from helpers.paths import ROOT
-from helpers.synthetic import plan_of
+from helpers.synthetic import Run, plan_of
 from scipy.optimize import brentq
 from scipy.stats import chi2
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, axes_of
+from kf_calib.bench.streams import Stream
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.effects import Bearer, SensorEffect, Stimulus, effect_named, names
 from kf_calib.errors import InputError
@@ -512,3 +513,24 @@ def strings(tree: ast.AST) -> set[str]:
     alone = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
     constants = (node for node in ast.walk(tree) if isinstance(node, ast.Constant) and id(node) not in alone)
     return {node.value for node in constants if isinstance(node.value, str)}
+
+
+@pytest.mark.parametrize("seed", [1, 2, *slow(3, 4, 5)])
+def test_noise_of_the_angles_is_no_step_of_either_sign(seed: int) -> None:
+    """Every second visit turns the platform about the vertical: no accelerometer comes from another side, though the
+    angles show a step of a thousandth of a degree."""
+    rng = np.random.default_rng(seed)
+    poses = np.repeat(rng.uniform(-np.pi, np.pi, (14, 3)), 2, axis=0)
+    poses[1::2, 0] += 1.0
+    run = Run(seed=seed, dwells=28, count=200, poses=poses, encoder_deg=0.003)
+    tilt, turn = poses[:, 1], poses[:, 2]  # specific force G (sin tilt, cos tilt cos turn, -cos tilt sin turn)
+    force = np.column_stack([np.sin(tilt), np.cos(tilt) * np.cos(turn), -np.cos(tilt) * np.sin(turn)])
+    step = np.vstack([np.zeros(3), np.diff(force, axis=0)])
+    sides = np.where(np.abs(step) > 1e-9, np.sign(step), 0.0)
+    hidden = np.array([4e-4, -3e-4, 5e-4])
+    values = run.accel.values + np.repeat(hidden * sides, 200, axis=0)
+    run.accel = Stream(run.accel.time_ns, values)
+    result = calibrate(run, Settings(effects=("hysteresis",)))
+    sizes = [result.parameters[f"h{k}"] for k in (1, 2, 3)]
+    errors = [(each.value - true) / each.sigma for each, true in zip(sizes, hidden, strict=True)]
+    assert result.consistency.consistent and np.abs(errors).max() < 3.5, errors

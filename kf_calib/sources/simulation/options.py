@@ -41,6 +41,8 @@ def options_from_query(query: str) -> SimulationOptions:
                 options[name] = text if name in _WORDS else _NUMBERS.get(name, float)(text)
         except ValueError:
             raise InputError(f"sim://: {key}={text} is not a number.") from None
+    if (grade := options.get("grade", "paper")) not in GRADES:
+        raise InputError(f"sim://: there is no grade {grade!r}: use {', '.join(GRADES)}.")
     return SimulationOptions.of(**options)
 
 
@@ -56,6 +58,8 @@ def simulation(
     angles: whether they are recorded (for sizes in sigmas). begin: is given the run before anything is hidden in it,
     which takes as long as the run is large.
     """
+    if options.seed < 0:
+        raise InputError(f"seed is {options.seed}: give zero or a positive number.")
     keys = {"axes": "y z x", **bench_keys}
     if "latitude_deg" not in keys:
         keys.setdefault("gravity_mps2", "9.81")

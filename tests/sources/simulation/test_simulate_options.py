@@ -75,6 +75,22 @@ def test_impossible_temperatures_are_refused_in_one_sentence(run, tmp_path: Path
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("query", "sentence"),
+    [
+        ("grade=foo", "there is no grade 'foo': use paper, navigation, mems."),
+        ("seed=-3", "seed is -3: give zero or a positive number."),
+        ("orientations=abc", "orientations=abc is not a number."),
+        ("nothing=3", "has no setting 'nothing'"),
+        ("plan=/not/there.csv", "the plan cannot be read"),
+    ],
+)
+def test_impossible_settings_of_a_simulated_source_are_refused_in_one_sentence(run, tmp_path: Path, query, sentence):
+    code, out, err = run("live", f"sim://?{query}&speed=inf")
+    assert code == 2 and out == "" and err.count("\n") == 1 and sentence in err
+    assert run("plan", "--axes", "y z x", "--seed", "-1")[0] == 2
+
+
 def test_thermometer_noise_cannot_be_negative():
     with pytest.raises(InputError, match="thermometer"):
         Ambient(sigma_c=-1.0)
