@@ -168,7 +168,7 @@ def evaluate_fit(fitted: Fit, settings: Settings) -> Calibration:
     """The calibration from a fit: the filter's steps with their innovations, and the test of the misfit."""
     linearised, noise, model = fitted.linearised, fitted.noise, fitted.linearised.model
     first = square_root_information.start(settings.prior, model)
-    factor = square_root_information.accumulate([first, *fitted.all_rows()], fitted.steps)[: model.count]
+    factor = square_root_information.accumulate(fitted.all_rows(), fitted.steps, first)[: model.count]
     extra = considered_information(noise, linearised.means, linearised.state)
     final = estimate_of(factor, model.nominal_state(), extra.sum(axis=0) + fitted.considered)
     residuals = linearised.means.readings - linearised.means.design @ final.state

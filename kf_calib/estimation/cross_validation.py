@@ -53,27 +53,30 @@ def grouped(places: Floats, apart: float) -> list[list[int]]:
     every coordinate.
 
     Groups are looked up by the cell of their first place in the four coordinates that differ most. A cell is twice as
-    wide as ``apart``, so that what is near lies in the cell itself or in the neighbours on the nearer side.
+    wide as ``apart``, so that what is near lies in the cell itself or in the neighbours on the nearer side. One of the
+    other coordinates is compared first: it tells most of what is in one cell apart.
     """
     groups, at = list[list[int]](), dict[int, list[int]]()
-    widest = np.argsort(-np.ptp(places, axis=0))[:4]
-    scaled = (places[:, widest] - places[:, widest].min(axis=0)) / (2.0 * apart * _ROUNDING) + 1.0
+    order = np.argsort(-np.ptp(places, axis=0))
+    widest, other = places[:, order[:4]], places[:, order[:5][-1]].tolist()
+    scaled = (widest - widest.min(axis=0)) / (2.0 * apart * _ROUNDING) + 1.0
     cells = np.floor(scaled).astype(int)
     strides = np.append(1, np.cumprod(cells.max(axis=0)[:-1] + 2))
     sides, choices = (
         np.where(scaled - cells < 0.5, -strides, strides),
-        np.array([*itertools.product((0, 1), repeat=len(widest))]),
+        np.array([*itertools.product((0, 1), repeat=widest.shape[1])]),
     )
     for first in range(0, len(places), _AT_ONCE):
         part = slice(first, first + _AT_ONCE)
         around = (cells[part] @ strides)[:, None] + sides[part] @ choices.T
-        for k, (cell, *others) in enumerate(around.tolist(), first):
-            nearby = [number for near in (cell, *others) if near in at for number in at[near]]
-            joined = [g for g in nearby if (np.abs(places[groups[g][0]] - places[k]) < apart).all()]
+        for k, near in enumerate(around.tolist(), first):
+            nearby = [number for cell in near if cell in at for number in at[cell]]
+            close = [number for number in nearby if abs(other[groups[number][0]] - other[k]) < apart]
+            joined = [number for number in close if (np.abs(places[groups[number][0]] - places[k]) < apart).all()]
             if joined:
                 groups[min(joined)].append(k)
             else:
-                at.setdefault(cell, []).append(len(groups))
+                at.setdefault(near[0], []).append(len(groups))
                 groups.append([k])
     return groups
 

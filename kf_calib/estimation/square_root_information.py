@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
-from kf_calib.dwells.pieces import of_all_pieces
+from kf_calib.dwells.pieces import OfPieces, of_all_pieces
 from kf_calib.dwells.qr import triangle
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Prior
@@ -88,6 +88,8 @@ def row_rank(rows: Floats) -> int:
 def row_ranks(rows: Sequence[Floats]) -> int:
     """Number of all rows that depend on the states; rows of a prior, which come first, lack the columns of steps that
     those of the dwells have where the biases walk."""
+    if isinstance(rows, OfPieces):
+        return row_rank(rows.values)
     return sum(row_rank(np.concatenate(list(alike))) for _, alike in itertools.groupby(rows, lambda own: own.shape[1]))
 
 
@@ -116,17 +118,19 @@ def run(
     ]
 
 
-def accumulate(rows: Sequence[Floats], walked: Floats | None = None) -> Floats:
-    """Triangular factor [H | z] of all rows with a diffuse prior; the last row holds the norm of the residual.
+def accumulate(rows: Sequence[Floats], walked: Floats | None = None, first: Floats | None = None) -> Floats:
+    """Triangular factor [H | z] of all rows and of those of a prior, ``first``, which is diffuse without; the last row
+    holds the norm of the residual.
 
     ``walked`` (D, 2) are the variances of the biases' steps before and within each dwell; the dwells' rows are the last
     D in ``rows``. Without a walk all rows are reduced by one QR.
     """
     if walked is None or not walked.any():
         stacked = rows[0] if len(rows) == 1 else of_all_pieces(rows)
+        stacked = stacked if first is None else np.concatenate([first, stacked])
         lacking = max(stacked.shape[1] - len(stacked), 0)
         return triangle(np.vstack([stacked, np.zeros((lacking, stacked.shape[1]))]) if lacking else stacked)
-    width = rows[-1].shape[1] - 4
+    rows, width = rows if first is None else [first, *rows], rows[-1].shape[1] - 4
     factor, left = np.zeros((width, width + 1)), 0.0
     padded = np.vstack([np.zeros((len(rows) - len(walked), 2)), walked])
     for own, variances in zip(rows, padded, strict=True):

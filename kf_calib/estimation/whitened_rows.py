@@ -17,7 +17,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.pieces import OfPieces, of_all_pieces
 from kf_calib.dwells.qr import inverse_of_lower, triangle
-from kf_calib.dwells.rows import on_basis, parabola
+from kf_calib.dwells.rows import on_basis
 from kf_calib.dwells.stack import AlikeDwells, DwellStack
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation.measurement_model import Model
@@ -66,14 +66,14 @@ def whiten(
     """
     inside = 3 if noise.walk_mps2_per_sqrt_s else 0
     values = of_all_pieces(columns)
-    informative = np.append(np.ones(inside), _units(values)) if reduced else None
     stack, noise_about = DwellStack.of(dwells), _About(noise, state, about, flicker_mps2)
     batches = list(_batches(stack, values.shape[-1]))
-    if informative is not None and all(batch.shows_means_only(noise) for batch in batches):
+    if reduced and all(batch.shows_means_only(noise) for batch in batches):
         rows_of_means = np.empty((len(stack), 3, values.shape[-1] + 1))
         for batch in batches:
             rows_of_means[batch.dwells] = _of_means(batch, values[batch.pieces], noise_about)
         return OfPieces(rows_of_means.reshape(-1, rows_of_means.shape[2]), 3 * np.arange(len(stack) + 1))
+    informative = np.append(np.ones(inside), _units(values)) if reduced else None
     all_rows = list[Floats]([np.empty((0, 0))] * len(stack))
     for batch in batches:
         of_batch = values[batch.pieces]
@@ -132,12 +132,18 @@ class _Batch:
         """Their triangles (d, P, K + 3, K + 3)."""
         return self.stack.triangles[self.number][self.part]
 
-    @property
-    def regressors(self) -> Floats:
-        """The rows (d, P, K, 4) of the regressors 1, f_x, f_y, f_z that are felt."""
+    def regressors(self, height: int) -> Floats:
+        """The first ``height`` rows (d, P, height, 4) of the regressors 1, f_x, f_y, f_z that are felt."""
         values = np.ones((*self.pieces.shape, 3, 4))
         values[..., 1:] = self.stack.felt_force_mps2.reshape(-1, 3, 3)[self.pieces]
-        return self.triangles[:, :, : self.shape.width, :3] @ parabola(values)
+        return self.rows_of(values, height)
+
+    def rows_of(self, values: Floats, height: int) -> Floats:
+        """The first ``height`` rows (d, P, height, c) of columns given at the nodes (d, P, K, c). If it is one, the
+        dwells show only their means, which are the values at the middle."""
+        if height == 1:
+            return self.triangles[:, :, :1, :1] * values[:, :, 1:2]
+        return self.triangles[:, :, :height, : values.shape[2]] @ on_basis(values)
 
     def shows_means_only(self, noise: Noise) -> bool:
         """Whether nothing but the mean of each dwell and channel is known, so that whitened rows have full rank."""
@@ -245,25 +251,24 @@ def _channels(batch: _Batch, columns: Floats, blocks: _Blocks, about: _About, he
     """Return the first ``height`` rows of each piece (d, 3, P height, n) of the three channels before they are divided
     by their sigma."""
     many, pieces, functions, _, _ = columns.shape
-    shape, triangles = (many, pieces * height, -1), batch.triangles
-    basis, readings = triangles[:, :, :height, :functions], triangles[:, :, :height, functions:]
-    regressors = batch.regressors[:, :, :height]
+    shape, readings = (many, pieces * height, -1), batch.triangles[:, :, :height, functions:]
+    regressors = batch.regressors(height)
     nuisances = nuisance_map(sensitivities_of(batch.stack, about.state, batch.dwells), about.noise)
     parts = np.zeros((many, 3, pieces * height, blocks.width))
     for i in range(3):
-        part, design = parts[:, i], on_basis(columns[..., i, :])
+        part = parts[:, i]
         part[..., : blocks.states] = (regressors @ nuisances[:, i, None]).reshape(shape)
         if blocks.steps:
             steps = [batch.stack.folded.dwells[k].walk.step for k in batch.dwells.tolist()]
             part[..., blocks.steps_of(i)] = np.array(steps)[..., None]
-        part[..., blocks.nuisances + blocks.steps : -1] = (basis @ design).reshape(shape)
+        part[..., blocks.nuisances + blocks.steps : -1] = batch.rows_of(columns[..., i, :], height).reshape(shape)
         measured = readings[..., i, None]
         if about.about is not None:
-            measured = measured - basis @ on_basis((columns[..., i, :] @ about.about)[..., None])
+            measured = measured - batch.rows_of((columns[..., i, :] @ about.about)[..., None], height)
         part[..., -1:] = measured.reshape(shape)
     if blocks.waves:
         courses = flicker_waves(batch.stack.folded)[batch.pieces]
-        waves = (basis[..., :3] @ on_basis(courses)).reshape(shape)
+        waves = batch.rows_of(courses, height).reshape(shape)
         for i in range(3):
             parts[:, i, :, blocks.waves_of(i)] = waves
     return parts

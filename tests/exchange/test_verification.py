@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from helpers.calibrations import BENCH, simulated, with_result
+from helpers.calibrations import BENCH, simulated, warming_up, with_result
 from helpers.long_runs import slow
 from helpers.paths import ROOT
 from scipy import optimize, spatial, stats
@@ -159,8 +159,8 @@ def test_gravity_block_and_the_very_same_recording_are_told() -> None:
 
 def test_effects_of_the_run_are_not_compared() -> None:
     settings = kf_calib.Settings(effects=("warm-up", "second-order"))
-    own = calibration_file.saved(kf_calib.calibrate(simulated(0, 14), settings))
-    found = verify(own, own.model(), simulated(77, 14))
+    own = calibration_file.saved(kf_calib.calibrate(warming_up(0, 14), settings))
+    found = verify(own, own.model(), warming_up(77, 14))
     assert found.free == ("warm-up",) and found.holds
     assert {move.symbol for move in found.moves} >= {"K1", "K2_1"}
     assert not {move.symbol for move in found.moves} & {"B1", "B2", "B3", "tauWarm"}

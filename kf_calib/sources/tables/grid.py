@@ -176,6 +176,8 @@ def _cell(value: Any) -> Cell:
     """Return a cell of a spreadsheet or an array: number, stamp or text; None where there is nothing."""
     if value is None or value != value:  # NaN and NaT
         return None
+    if type(value) is float:
+        return value
     if isinstance(value, datetime) or (isinstance(value, str) and value.strip()):
         return _text(value) if isinstance(value, str) else value
     if isinstance(value, str):
@@ -202,7 +204,7 @@ def _text(cell: str) -> str | None:
 
 def _headed(name: str, lines: Sequence[tuple[int, Sequence[Cell]]]) -> Grid:
     """Return the grid of lines: the header is the first with more than two cells, a line of units may follow it."""
-    filled = [(number, list(cells)) for number, cells in lines if any(cell is not None for cell in cells)]
+    filled = [(number, list(cells)) for number, cells in lines if cells.count(None) < len(cells)]
     while filled and sum(cell is not None for cell in filled[0][1]) <= 2:  # a title, a date, a serial number
         del filled[0]
     if not filled:

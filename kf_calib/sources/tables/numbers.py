@@ -31,6 +31,8 @@ class Numbers:
     def of(cls, grid: Grid) -> Numbers:
         """How the numbers in a grid are written; raises InputError where two cells contradict each other."""
         cell_of_sign = dict[str, tuple[int, int]]()
+        if not any(isinstance(cell, str) for row in grid.rows for cell in row):
+            return cls()
         for k, row in enumerate(grid.rows):
             if not _shows_another(_joined(row), cell_of_sign):
                 continue
@@ -93,8 +95,11 @@ class Numbers:
         return cell
 
     def values(self, cells: Sequence[Cell]) -> list[float] | None:
-        """The numbers in cells that are all written as programs write them; None where one is not."""
+        """The numbers in cells that are all numbers, or all written as programs write them; None where one is not."""
         texts = cast("Sequence[str]", cells)
+        if set(map(type, cells)) == {float}:
+            numbers = cast("list[float]", list(cells))
+            return numbers if all(map(math.isfinite, numbers)) else None
         try:
             if self.decimal != "." or not _is_plain("".join(texts)):
                 return None
@@ -127,7 +132,7 @@ def _joined(row: Sequence[Cell]) -> str:
     try:
         return "".join(texts)
     except TypeError:  # a cell of a spreadsheet, or an empty one
-        return "".join(cell for cell in row if isinstance(cell, str))
+        return "".join([cell for cell in row if isinstance(cell, str)])
 
 
 def _shows_another(cell: str, seen: Container[str]) -> bool:

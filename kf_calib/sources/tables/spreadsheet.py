@@ -6,20 +6,21 @@ has seven. All of it is bounded before and while it is read, and what no program
 
 from __future__ import annotations
 
-import functools
+import heapq
+import io
 import itertools
 import re
 import warnings
 import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from kf_calib.errors import InputError, need
+from kf_calib.sources.tables.plain_rows import BEGIN_OF_ROW, NUMBERED_ROW, CellContext, PlainRows, column_number
 from kf_calib.support.text import cut
-
-if TYPE_CHECKING:
-    from openpyxl.worksheet._read_only import ReadOnlyWorksheet
 
 SheetRow = tuple[int, list[Any]]
 """Number of a row in its sheet, from 1, and its cells up to the last that is filled."""
@@ -29,8 +30,6 @@ _MOST_FILLED = 2_000_000  # cells from the first to the last of each row
 _MOST_BYTES, _MOST_TAGS = 64_000_000, 2_000_000  # unpacked, of all parts but pictures; a tag takes some 120 bytes
 _MOST_TAGS_OF_SHEETS, _MOST_TAGS_OF_A_ROW = 10_000_000, 200_000  # rows are forgotten one by one as they are read
 _PICTURES, _SHEETS = "xl/media/", "xl/worksheets/"
-_BEGIN_OF_ROW = re.compile(rb"<(?:\w+:)?row\b")
-_ROW = re.compile(rb'<(?:\w+:)?row\b[^<>]*?\sr\s*=\s*["\'](\d{1,9})["\']')
 _HIDDEN_ROW = re.compile(
     rb'<(?:\w+:)?row\b(?=[^<>]*?\shidden\s*=\s*["\'](?:1|true)["\'])[^<>]*?\sr\s*=\s*["\'](\d{1,9})["\']'
 )
@@ -60,10 +59,10 @@ def sheets_of(path: Path) -> list[Sheet]:
 
     try:
         with path.open("rb") as file:
-            _refuse_unfit(file)
-            with warnings.catch_warnings(action="ignore"):  # of what openpyxl leaves out, which no cell is part of
-                book = openpyxl.load_workbook(file, read_only=True, data_only=True)
-                sheets = [_sheet(sheet, _hidden_rows(file, sheet)) for sheet in book.worksheets]
+            parts = {name: PlainRows.of(content) for name, content in _fit_parts(file).items()}
+        with warnings.catch_warnings(action="ignore"):  # of what openpyxl leaves out, which no cell is part of
+            book: Any = openpyxl.load_workbook(_archive_of_rest(parts), read_only=True, data_only=True)
+            sheets = [_sheet(sheet, parts[sheet._worksheet_path.lstrip("/")]) for sheet in book.worksheets]
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except Exception as error:
@@ -92,23 +91,21 @@ def workbook_of(path: Path) -> Any:
 
 def _merged(content: bytes) -> int:
     """Return how many cells of a sheet are merged with others: all of them are made when it is read as a whole."""
-    places = [(_column(a), int(b), _column(c), int(d)) for a, b, c, d in _MERGED.findall(content)]
+    places = [(column_number(a), int(b), column_number(c), int(d)) for a, b, c, d in _MERGED.findall(content)]
     return sum((abs(right - left) + 1) * (abs(below - above) + 1) for left, above, right, below in places)
-
-
-def _column(letters: bytes) -> int:
-    return functools.reduce(lambda number, letter: 26 * number + letter - 64, letters, 0)
 
 
 def _unreadable(path: Path, error: Exception) -> InputError:
     """Return the error for what openpyxl raises for a damaged file, which depends on where the damage is."""
-    said = cut(" ".join(str(error).split()), 80) or type(error).__name__
+    cause = error.__cause__ or error  # openpyxl says it again, with the name of the archive
+    said = cut(" ".join(str(cause).split()), 80) or type(cause).__name__
     return InputError(f"{path}: is no Excel file that can be read ({said}): save it again.")
 
 
-def _refuse_unfit(file: Any) -> None:
-    """Raise InputError for an archive that unpacks to too much, or whose XML is none of a spreadsheet."""
-    size, tags, tags_of_sheets = 0, 0, 0
+def _fit_parts(file: Any) -> dict[str, bytes]:
+    """Return the parts of an archive but its pictures; raises InputError where it unpacks to too much, or has XML that
+    is none of a spreadsheet."""
+    size, tags, tags_of_sheets, parts = 0, 0, 0, dict[str, bytes]()
     with zipfile.ZipFile(file) as archive:
         for part in archive.infolist():
             size += part.file_size  # no more than this is ever unpacked
@@ -117,14 +114,23 @@ def _refuse_unfit(file: Any) -> None:
             if part.filename.startswith(_PICTURES):
                 size -= part.file_size
                 continue
-            content = archive.read(part)
+            parts[part.filename] = content = archive.read(part)
             is_sheet, count = part.filename.startswith(_SHEETS), content.count(b"<")
             tags += _most_tags_of_a_row(content) if is_sheet else count
             tags_of_sheets += count if is_sheet else 0
             if tags > _MOST_TAGS or tags_of_sheets > _MOST_TAGS_OF_SHEETS:
                 raise InputError("has more cells than any table of orientations: leave out what is not part of it.")
             _refuse_part(content)
-    file.seek(0)
+    return parts
+
+
+def _archive_of_rest(parts: Mapping[str, PlainRows]) -> io.BytesIO:
+    """Return an archive of parts without their plain rows."""
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w") as rest:
+        for name, part in parts.items():
+            rest.writestr(name, part.rest)
+    return archive
 
 
 def _most_tags_of_a_row(content: bytes) -> int:
@@ -132,7 +138,7 @@ def _most_tags_of_a_row(content: bytes) -> int:
 
     It is as if there were too many in all if there are more than Excel has columns for.
     """
-    begins = [0, *(found.start() for found in _BEGIN_OF_ROW.finditer(content)), len(content)]
+    begins = [0, *(found.start() for found in BEGIN_OF_ROW.finditer(content)), len(content)]
     most = max(content.count(b"<", begin, end) for begin, end in itertools.pairwise(begins))
     return most if most <= _MOST_TAGS_OF_A_ROW else _MOST_TAGS + 1
 
@@ -142,34 +148,31 @@ def _refuse_part(content: bytes) -> None:
         raise InputError("has XML that declares entities, as no spreadsheet does: save it again.")
     if _LONG_FORMAT.search(content):
         raise InputError("has a number format longer than Excel allows: save it again.")
-    numbers = list(map(int, _ROW.findall(content)))
+    numbers = list(map(int, NUMBERED_ROW.findall(content)))
     if any(after <= before for before, after in itertools.pairwise(numbers)):
         raise InputError("has rows that are out of order, which would be lost: save it again.")
 
 
-def _hidden_rows(file: Any, sheet: Any) -> set[int]:
-    """Return the numbers of the rows that are hidden, which openpyxl does not tell where it reads row by row."""
-    with zipfile.ZipFile(file) as archive:
-        content = archive.read(sheet._worksheet_path.lstrip("/"))
-    return set(map(int, _HIDDEN_ROW.findall(content)))
-
-
-def _sheet(sheet: ReadOnlyWorksheet, hidden_rows: set[int]) -> Sheet:
-    lines = _lines(sheet)
+def _sheet(sheet: Any, part: PlainRows) -> Sheet:
+    hidden_rows = set(map(int, _HIDDEN_ROW.findall(part.content)))  # openpyxl does not tell them row by row
+    lines = _lines(sheet, part)
     seen = [line for line in lines if line[0] not in hidden_rows]
     left_out = [number for number, _ in lines if number in hidden_rows]
     return Sheet(sheet.title, sheet.sheet_state != "visible", seen, left_out)
 
 
-def _lines(sheet: ReadOnlyWorksheet) -> list[SheetRow]:
+def _lines(sheet: Any, part: PlainRows) -> list[SheetRow]:
     """Return the rows of a sheet that hold anything."""
     sheet.reset_dimensions()  # what the file says of its size may be wrong
-    lines, visited, filled = list[SheetRow](), 0, 0
-    for number, row in enumerate(sheet.iter_rows(values_only=True), 1):
-        visited += 1 + len(row)
-        last = max((k for k, cell in enumerate(row, 1) if cell is not None), default=0) if row else 0
+    lines, visited, filled, book = list[SheetRow](), 0, 0, sheet.parent
+    plain = part.rows(CellContext(sheet._shared_strings, book._date_formats, book._timedelta_formats, book.epoch))
+    for number, row in heapq.merge(enumerate(sheet.iter_rows(values_only=True), 1), plain, key=itemgetter(0)):
+        visited += len(row)
+        last = len(row)
+        while last and row[last - 1] is None:
+            last -= 1
         filled += last
-        if number > _MOST_ROWS or visited > _MOST_VISITED or filled > _MOST_FILLED:
+        if number > _MOST_ROWS or number + visited > _MOST_VISITED or filled > _MOST_FILLED:
             raise InputError(f"sheet {sheet.title!r} has more cells than any table of orientations: leave out what is "
                              "not part of it, empty rows and columns too.")  # fmt: skip
         if last:

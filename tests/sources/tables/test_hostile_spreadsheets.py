@@ -6,6 +6,7 @@ import io
 import random
 import zipfile
 from collections.abc import Callable
+from datetime import datetime, time, timedelta
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,8 @@ from helpers.paths import ROOT
 import kf_calib
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.sources.opening import FileKind, kind_of
+from kf_calib.sources.tables.plain_rows import PlainRows
+from kf_calib.sources.tables.spreadsheet import sheets_of
 from kf_calib.sources.tables.table import Table
 from kf_calib.sources.tables.words import meaning_of
 
@@ -231,3 +234,41 @@ def test_merged_cells_end_no_copy(merged: bytes, says: str, run: Any, tmp_path: 
     with bounded():
         code, _, err = run("apply", calibration, path, "-o", out, "--axes", "z x", "--gravity", "9.81", "--unchecked")
     assert code == 2 and says in err and err.count("\n") == 1 and not out.exists()
+
+
+def test_plain_rows_are_what_a_parser_of_xml_makes_of_them(tmp_path: Path) -> None:
+    """Shared texts, dates, durations, formulas, empty cells and numbers of all kinds; with a comment in the XML, which
+    could hide rows, openpyxl reads them all. A row that is not plain keeps its place among the others."""
+    book, texts = openpyxl.Workbook(), ["face", "+x"]
+    dates = [datetime(2026, 5, 4, 9, 30), datetime(1900, 2, 1), time(13, 45), timedelta(hours=30, minutes=5), 45000.25]
+    for k, date in enumerate(dates):
+        book.active.append([texts[k % 2], date, -1.5e-7 * k, 12345678901234567, 0, None, 9.80665])
+    book.active.append(["+x & more", True])
+    book.active.append([None, None, 1e300])
+    book.active["H3"].font = openpyxl.styles.Font(bold=True)  # a cell with a style and no value
+    file = io.BytesIO()
+    book.save(file)
+    with zipfile.ZipFile(file) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    plain = parts[SHEET].replace(b"<v>0</v>", b'<f ca="1">SUM(A1:A2)</f><v>0</v>').replace(b"<v>9.80665<", b"<v>-0<", 1)
+    lines = list[Any]()
+    for number, sheet in enumerate([plain, plain.replace(b"<sheetData>", b"<sheetData><!-- -->")]):
+        path = tmp_path / f"{number}.xlsx"
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, content in parts.items():
+                archive.writestr(name, sheet if name == SHEET else content)
+        lines.append([(k, [float(x) if isinstance(x, int) else x for x in row]) for k, row in sheets_of(path)[0].lines])
+    assert [number for number, *_ in PlainRows.of(plain).spans] == [2, 3, 4, 5, 7] and not PlainRows.of(sheet).spans
+    assert repr(lines[0]) == repr(lines[1])
+    assert [number for number, _ in lines[0]] == [*range(1, 8)]
+
+
+@pytest.mark.parametrize("change", [
+    put(b"<sheetData>", b"<sheetData><!-- "), put(b"<sheetData>", b"<sheetData><![CDATA["),
+    put(b' r="3"', b""), put(b"<row", b'<row xmlns="other"'), put(b"<worksheet xmlns", b"<worksheet xmlns:x"),
+    put(b"<sheetData>", b"<sheetData><?pi "),
+])  # fmt: skip
+def test_what_could_make_a_row_mean_something_else_is_left_to_the_parser(change: Change) -> None:
+    with zipfile.ZipFile(io.BytesIO(plain())) as archive:
+        sheet = archive.read(SHEET)
+    assert PlainRows.of(sheet).spans and not PlainRows.of(change(sheet)).spans
