@@ -101,17 +101,13 @@ class SavedCalibration(FilePart):
     @model_validator(mode="after")
     def _agrees_with_itself(self) -> SavedCalibration:
         with np.errstate(all="ignore"):  # absurd numbers are refused, whatever they give
-            self._refuse_disagreement()
+            agreement.refuse_state(self.state, self.fixed)
+            agreement.refuse_effects(self.effects, self.state)
+            agreement.refuse_parameters(self.parameters, self.state, self.fixed, self.bench)
+            agreement.refuse_dependent_axes(self.state)
+            agreement.refuse_judgement(self.consistency)
+            agreement.refuse_conditions(self.conditions, self.provenance, self.bench)
         return self
-
-    def _refuse_disagreement(self) -> None:
-        """Raise ValueError if parts of the content contradict each other."""
-        agreement.refuse_state(self.state, self.fixed)
-        agreement.refuse_effects(self.effects, self.state)
-        agreement.refuse_parameters(self.parameters, self.state, self.fixed, self.bench)
-        agreement.refuse_dependent_axes(self.state)
-        agreement.refuse_judgement(self.consistency)
-        agreement.refuse_conditions(self.conditions, self.provenance, self.bench)
 
     @property
     def bench(self) -> Bench:
