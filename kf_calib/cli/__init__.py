@@ -74,14 +74,9 @@ def main() -> None:
     except Exception as error:
         tell(error)
         code = 2
-    _leave_nothing_to_print()
-    sys.exit(code if isinstance(code, int) else 0)
-
-
-def _leave_nothing_to_print() -> None:
-    """Python would change the exit code at its end where what is left to print cannot be printed."""
-    for stream in (sys.stdout, sys.stderr):
+    for stream in (sys.stdout, sys.stderr):  # Python would change the exit code where its end cannot print what is left
         try:
             stream.flush()
         except OSError:
             fall_silent(stream)
+    sys.exit(code if isinstance(code, int) else 0)

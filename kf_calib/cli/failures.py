@@ -106,11 +106,13 @@ def error_report(error: BaseException, words: Sequence[str]) -> Iterator[str]:
     yield f"Python {platform.python_version()}, {platform.system()} {platform.machine()}"
     yield ", ".join(f"{name} {_version(name)}" for name in _PACKAGES)
     yield f"standard output: {getattr(sys.stdout, 'encoding', None)}"
-    for cause in _causes(error):
+    cause: BaseException | None = error
+    while cause is not None:  # and those in whose handling it arose
         yield ""
         yield type(cause).__name__
         for frame in traceback.extract_tb(cause.__traceback__):
             yield f"  {place(Path(frame.filename))}:{frame.lineno} in {frame.name}"
+        cause = cause.__cause__ or cause.__context__
 
 
 def without_values(words: Sequence[str]) -> list[str]:
@@ -125,14 +127,6 @@ def place(path: Path) -> Path:
         return path.relative_to(PACKAGE.parent)
     parts = path.parts
     return Path(*parts[parts.index("site-packages") + 1 :]) if "site-packages" in parts else Path(path.name)
-
-
-def _causes(error: BaseException) -> Iterator[BaseException]:
-    """The error, and those in whose handling it arose."""
-    cause: BaseException | None = error
-    while cause is not None:
-        yield cause
-        cause = cause.__cause__ or cause.__context__
 
 
 def _version(package: str) -> str:

@@ -155,13 +155,9 @@ class Pictures:
 
         A viewer that finds no graphics driver is a complaint; all else that fails is told as for any other file.
         """
-        deliver.file(self.rrd, lambda path: write_view(result, path))
-        self._screenshot(deliver, result)
-        self.figures.save(deliver, result)
-
-    def _screenshot(self, deliver: Delivery, result: Any) -> None:
         from kf_calib.views.screenshot import ScreenshotError, screenshot
 
+        deliver.file(self.rrd, lambda path: write_view(result, path))
         rrd = None if self.rrd in deliver.failures else self.rrd
 
         def draw(path: Path) -> None:
@@ -176,6 +172,7 @@ class Pictures:
         if isinstance(error, ScreenshotError) and self.screenshot is not None:
             complain(f"the screenshot could not be taken: {error}")
             del deliver.failures[self.screenshot]
+        self.figures.save(deliver, result)
 
 
 def _save_figures(result: object, path: Path, kind: str) -> None:

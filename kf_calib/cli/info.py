@@ -55,7 +55,11 @@ def info(
 
     kind = reading.kind(recording)
     if kind is FileKind.CALIBRATION:
-        _show_calibration(recording, as_json)
+        from kf_calib.exchange.calibration_file import open_calibration
+        from kf_calib.views.exchange import calibration_object, calibration_report
+
+        saved = open_calibration(recording)
+        print_result(as_json, calibration_object, calibration_report, saved, recording)
         return
     if kind is FileKind.TABLE:
         _show_table(ctx, recording, reading, as_json)
@@ -68,15 +72,6 @@ def info(
     from kf_calib.views.overview import overview_object, overview_report
 
     print_result(as_json, overview_object, overview_report, overview)
-
-
-def _show_calibration(path: Path, as_json: bool) -> None:
-    """Show what a calibration holds."""
-    from kf_calib.exchange.calibration_file import open_calibration
-    from kf_calib.views.exchange import calibration_object, calibration_report
-
-    saved = open_calibration(path)
-    print_result(as_json, calibration_object, calibration_report, saved, path)
 
 
 def _of_messages(ctx: click.Context, path: Path, reading: ReadingOptions, tick: Tick) -> Overview:

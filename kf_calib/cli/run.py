@@ -44,7 +44,6 @@ from kf_calib.errors import InputError
 
 if TYPE_CHECKING:
     from kf_calib.bench.bench import Bench
-    from kf_calib.design.next_orientation import Pace
     from kf_calib.online.suggestion import Itinerary
     from kf_calib.positioning.drive import Decision, Drive, Outcome
     from kf_calib.positioning.opening import Opened
@@ -268,22 +267,17 @@ def _source(positioner: str, source: str | None, keys: Mapping[str, str], record
 
 
 def _itinerary(bench: Bench, most: int, options: DriveOptions) -> Itinerary:
-    from kf_calib.online.suggestion import Itinerary
-
-    return Itinerary(
-        bench, _pace(bench), most=most, stay_s=options.stay_s, ends_when_named=not options.improve,
-    )  # fmt: skip
-
-
-def _pace(bench: Bench) -> Pace:
     from kf_calib.design.next_orientation import Pace
+    from kf_calib.online.suggestion import Itinerary
 
     pace = Pace()
     if bench.rate_degps is not None:
         pace = replace(pace, rate_degps=bench.rate_degps)
     if bench.acceleration_degps2 is not None:
         pace = replace(pace, acceleration_degps2=bench.acceleration_degps2)
-    return pace
+    return Itinerary(
+        bench, pace, most=most, stay_s=options.stay_s, ends_when_named=not options.improve,
+    )  # fmt: skip
 
 
 def _drive(device: Opened, most: int, options: DriveOptions, running: DrivenRun) -> Drive:

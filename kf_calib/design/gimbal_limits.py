@@ -87,8 +87,9 @@ class Reach:
         if self.grid_deg is not None:
             step = math.radians(self.grid_deg)
             values: Floats = step * np.arange(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)
-            twice = j not in self.limits_deg and len(values) > 1 and _turns(values)  # -180 and 180 deg are the same
-            return values[: len(values) - twice]
+            if j not in self.limits_deg and len(values) > 1 and abs(values[-1] - values[0] - 2.0 * np.pi) < 1e-9:
+                return values[:-1]  # -180 and 180 deg are the same
+            return values
         count = int(_POSES ** (1.0 / len(self.bench.axes)) + 1e-9)
         if j not in self.limits_deg:
             return np.asarray((np.arange(count) - count // 2) * (2.0 * np.pi / count), np.float64)
@@ -138,11 +139,6 @@ class Reach:
                     leave = np.minimum(leave, np.where(still, np.inf, np.maximum(one, other)))
                 hit |= enter <= leave
         return hit
-
-
-def _turns(values: Floats) -> bool:
-    """Tell whether the last of evenly spaced angles equals the first."""
-    return bool(abs(values[-1] - values[0] - 2.0 * np.pi) < 1e-9)
 
 
 def _aside(angle: float, zone: Floats) -> tuple[float, float]:

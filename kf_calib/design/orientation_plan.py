@@ -227,8 +227,11 @@ def plan(search: Search, count: int, timing: Timing, seed: int = 0) -> Plan:
         adaptive = count == 1 and search.prospect.last is not None
         chosen = search.next()[None] if adaptive else search.best(count // copies)
         poses = _rounded(search, search.scheme.visits(chosen))
-        ordered = Plan(search, _ordered(search, poses, timing, seed), timing)
-        if search.reach.continuous and search.prospect.model.bench.reference == "inertial" and copies == 1:
+        last, bench = search.prospect.last, search.prospect.model.bench
+        force = bench.specific_force(np.zeros(len(poses)), poses)
+        poses = poses[order(poses, force, timing, search.reach, last.pose if last else None, seed)]
+        ordered = Plan(search, poses, timing)
+        if search.reach.continuous and bench.reference == "inertial" and copies == 1:
             sequence = replace(search, at_s=ordered.at_s)  # gravity turns with the Earth during the plan
             ordered = Plan(search, _rounded(search, sequence.polish(ordered.poses)), timing)
         _refuse_unseen(ordered)
@@ -292,13 +295,6 @@ def _rounded(search: Search, poses: Floats) -> Floats:
     low, high = search.reach.bounds.T
     rounded = np.clip(rounded, low, high)
     return np.where(search.reach.allowed(rounded)[:, None], rounded, poses)
-
-
-def _ordered(search: Search, poses: Floats, timing: Timing, seed: int) -> Floats:
-    """Return the poses in the order of the visits."""
-    last, bench = search.prospect.last, search.prospect.model.bench
-    force = bench.specific_force(np.zeros(len(poses)), poses)
-    return poses[order(poses, force, timing, search.reach, last.pose if last else None, seed)]
 
 
 def _refuse_unseen(plan: Plan) -> None:

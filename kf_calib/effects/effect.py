@@ -161,6 +161,8 @@ class Effect(ABC):
     variant: str = ""
     """The axis of an axis-wise effect (``encoder-harmonic-2:z``)."""
     value: float = 0.0
+    held: bool = False
+    """Whether its unknown stays where it is: at an end of its range, beyond which the readings would have it."""
 
     def __str__(self) -> str:
         return f"{self.name}:{self.variant}" if self.variant else self.name
@@ -170,6 +172,13 @@ class Effect(ABC):
         other = copy.copy(self)
         if self.unknown is not None:
             other.value = float(min(max(value, self.unknown.low), self.unknown.high))
+        return other
+
+    def held_if_beyond(self, step: float) -> Self:
+        """The same effect; its unknown is held if it is at an end of its range and ``step`` of ln(value) leads out."""
+        assert self.unknown is not None
+        other, known = copy.copy(self), self.unknown
+        other.held = self.held or (self.value >= known.high if step > 0.0 else step < 0.0 and self.value <= known.low)
         return other
 
     @property
@@ -191,11 +200,16 @@ class Effect(ABC):
 
     @property
     def states(self) -> tuple[Coefficient, ...]:
-        """The coefficients that are states: its own and, where its columns have a derivative by it, its unknown."""
+        """The coefficients that are states: its own and, where that is one, its unknown."""
         unknown = self.unknown
-        if unknown is None or not self.smooth:
+        if unknown is None or not self.has_constant_in_state:
             return self.coefficients
         return *self.coefficients, Coefficient(unknown.symbol, unknown.unit, 1.0, unknown.shown_unit, unknown.per_si)
+
+    @property
+    def has_constant_in_state(self) -> bool:
+        """Whether its unknown is estimated as a state: its columns have a derivative by it, and it is not held."""
+        return self.unknown is not None and self.smooth and not self.held
 
     @property
     def relations(self) -> Sequence[Floats]:

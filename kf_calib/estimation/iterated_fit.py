@@ -92,7 +92,8 @@ def fit(
         if not bench.angles and number > _PASSES_WITH_NOISE:
             state, constant_steps = relaxation.of(fitted, state, constant_steps)
         before, fitted = fitted if slews else None, replace(fitted)  # without its rows, which need much memory
-        linearised = _moved_to(fitted, _with_constants_moved(fitted, constant_steps, reach, number), state)
+        moved, held = _with_constants_moved(fitted, constant_steps, reach, number)
+        linearised = _moved_to(fitted, moved, np.delete(state, held))
         fitted = replace(fitted, linearised=linearised)
         fitted = replace(fitted, noise=_noise_at(linearised, before, within, components, number < _PASSES - 1))
         within = _within_again(fitted, within)
@@ -141,11 +142,14 @@ def _with_constants_searched(fitted: Fit, number: int) -> Fit:
     return fitted
 
 
-def _with_constants_moved(fitted: Fit, constant_steps: Floats, reach: Floats, number: int) -> Model:
-    """Return the model with its unknown constants moved by their steps, at most by ``reach``; as it is before they are
-    on their grids."""
+def _with_constants_moved(fitted: Fit, constant_steps: Floats, reach: Floats, number: int) -> tuple[Model, list[int]]:
+    """Return the model with its unknown constants moved by their steps, at most by ``reach``, as it is before they are
+    on their grids; and the states that are none any more, since their constants are at an end of their range."""
     model = fitted.linearised.model
-    return model.moved(np.clip(constant_steps, -reach, reach)) if number and model.unknowns else model
+    if not number or not model.unknowns:
+        return model, []
+    held, places = model.held_at_ends(constant_steps) if number >= _PASSES else (model, [])
+    return (held, places) if places else (model.moved(np.clip(constant_steps, -reach, reach)), [])
 
 
 def _noise_at(

@@ -128,17 +128,29 @@ class Model:
     @property
     def unknowns(self) -> dict[int, Effect]:
         """The effects whose unknown constant is a state, by the index of that state."""
-        return {self.parts[str(each)].stop - 1: each for each in self.effects if each.unknown and each.smooth}
+        return {self.parts[str(each)].stop - 1: each for each in self.effects if each.has_constant_in_state}
 
     @property
     def stepped(self) -> tuple[Effect, ...]:
         """The effects whose unknown constant has no derivative and is therefore not a state."""
-        return tuple(each for each in self.effects if each.unknown and not each.smooth)
+        return tuple(each for each in self.constants_beside_state if not each.smooth)
+
+    @property
+    def constants_beside_state(self) -> tuple[Effect, ...]:
+        """The effects whose unknown constant is no state: it has no derivative, or is held at an end of its range."""
+        return tuple(each for each in self.effects if each.unknown and not each.has_constant_in_state)
 
     def moved(self, state: Floats) -> Model:
         """The model with each unknown constant multiplied by exp of its state in ``state`` (p,)."""
         moved = {str(each): each.at(each.value * math.exp(state[k])) for k, each in self.unknowns.items()}
         return replace(self, effects=tuple(moved.get(str(each), each) for each in self.effects))
+
+    def held_at_ends(self, steps: Floats) -> tuple[Model, list[int]]:
+        """The model with each unknown constant held that is at an end of its range and whose step, in steps (p,), leads
+        outwards; and the states that these constants were."""
+        held = {str(each): each.held_if_beyond(steps[k]) for k, each in self.unknowns.items()}
+        model = replace(self, effects=tuple(held.get(str(each), each) for each in self.effects))
+        return model, [k for k, each in self.unknowns.items() if held[str(each)].held]
 
     def with_effect(self, effect: Effect) -> Model:
         """The model in which this effect replaces the one of the same name."""

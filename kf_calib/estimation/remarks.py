@@ -10,7 +10,8 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.dwells import window_average
-from kf_calib.effects import remarks_of
+from kf_calib.effects import Effect, remarks_of
+from kf_calib.effects.effect import Unknown
 from kf_calib.estimation import free_attitude, setup_blunders
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.estimate import Estimate
@@ -80,6 +81,9 @@ def remarks_on(
         )
     unseen = [symbol for symbol, hidden in zip(paper_parameters.SYMBOLS, estimate.unseen, strict=True) if hidden]
     unseen += [c.symbol for c, s in zip(model.coefficients, estimate.effect_sigma, strict=True) if np.isnan(s)]
+    for effect in model.effects:
+        if effect.held and effect.unknown is not None:
+            yield _on_held(effect, effect.unknown)
     if not model.bench.angles:
         yield from _without_angles(linearised, noise, judged)
     elif unseen:
@@ -142,6 +146,15 @@ def remarks_on(
             f"angle_sigma_deg was not stated; {np.degrees(noise.setting_rad):.2g} deg was estimated from the misfit "
             "between dwells, which an effect not in the model could also cause."
         )
+
+
+def _on_held(effect: Effect, unknown: Unknown) -> str:
+    """Return a remark on a constant that is held at an end of its range."""
+    end = "greatest" if effect.value >= unknown.high else "least"
+    return (
+        f"{unknown.symbol} is held at {shown(unknown).text(effect.value)}, the {end} value that is searched: the "
+        f"readings do not bound it on that side, and {effect} may be another effect that looks the same."
+    )
 
 
 def _without_angles(linearised: LinearisedDwells, noise: Noise, judged: Consistency) -> Iterator[str]:

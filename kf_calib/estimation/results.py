@@ -214,9 +214,9 @@ class Calibration:
             intensity, spread = self.noise.walk_mps2_per_sqrt_s, self.noise.walk_spread
             rows.append((walk.symbol, intensity, intensity * spread if spread else math.nan, 0.0, walk.unit))
             units.append((walk.shown_unit, walk.per_si))
-        for effect in self.model.stepped:
+        for effect in self.model.constants_beside_state:
             assert effect.unknown is not None
-            constant, spread = effect.unknown, self.fit.spreads[str(effect)]
+            constant, spread = effect.unknown, self.fit.spreads.get(str(effect), math.inf)
             sigma = effect.value * spread if spread < 1.0 else math.nan  # sigma over value
             rows.append((constant.symbol, effect.value, sigma, 0.0, constant.unit))
             units.append((constant.shown_unit, constant.per_si))

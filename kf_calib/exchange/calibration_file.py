@@ -14,7 +14,7 @@ import math
 import os
 import platform
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -101,17 +101,13 @@ class SavedCalibration(FilePart):
     @model_validator(mode="after")
     def _agrees_with_itself(self) -> SavedCalibration:
         with np.errstate(all="ignore"):  # absurd numbers are refused, whatever they give
-            self._refuse_disagreement()
+            agreement.refuse_state(self.state, self.fixed)
+            agreement.refuse_effects(self.effects, self.state)
+            agreement.refuse_parameters(self.parameters, self.state, self.fixed, self.bench)
+            agreement.refuse_dependent_axes(self.state)
+            agreement.refuse_judgement(self.consistency)
+            agreement.refuse_conditions(self.conditions, self.provenance, self.bench)
         return self
-
-    def _refuse_disagreement(self) -> None:
-        """Raise ValueError if parts of the content contradict each other."""
-        agreement.refuse_state(self.state, self.fixed)
-        agreement.refuse_effects(self.effects, self.state)
-        agreement.refuse_parameters(self.parameters, self.state, self.fixed, self.bench)
-        agreement.refuse_dependent_axes(self.state)
-        agreement.refuse_judgement(self.consistency)
-        agreement.refuse_conditions(self.conditions, self.provenance, self.bench)
 
     @property
     def bench(self) -> Bench:
@@ -148,7 +144,7 @@ class SavedCalibration(FilePart):
         model = Model(bench, square="square" in self.fixed.values())
         for own in self.effects:
             effect = effects.effect_named(own.text, bench)
-            model += _at_constant(effect, own.constant, origin)
+            model += _at_constant(effect, own.constant, origin, self.state.symbols)
         try:
             agreement.refuse_coefficients(self.parameters, self.state, self.noise, model)
         except ValueError as error:
@@ -165,8 +161,11 @@ class SavedCalibration(FilePart):
         )  # fmt: skip
 
 
-def _at_constant(effect: effects.Effect, constant: float | None, origin: Path) -> effects.Effect:
-    """The effect with its constant, which a file states for effects that have one, and within their range."""
+def _at_constant(
+    effect: effects.Effect, constant: float | None, origin: Path, symbols: Collection[str]
+) -> effects.Effect:
+    """The effect with its constant, which a file states for effects that have one, and within their range; where it is
+    not among the ``symbols`` of the state, it was held."""
     if constant is None and effect.unknown is None:
         return effect
     if constant is None or effect.unknown is None or effect.at(constant).value != constant:
@@ -174,7 +173,9 @@ def _at_constant(effect: effects.Effect, constant: float | None, origin: Path) -
         can = f"from {known.low:g} to {known.high:g} {known.unit}" if known else "none at all"
         raise InputError(f"{origin}: {effect} has the constant {constant}, and can have {can}: give a calibration as "
                          "--save has written it.")  # fmt: skip
-    return effect.at(constant)
+    at_constant = effect.at(constant)
+    at_constant.held = effect.unknown.symbol not in symbols
+    return at_constant
 
 
 def saved(

@@ -254,7 +254,7 @@ def _beside_the_state(model: Model, noise: SavedNoise) -> Iterator[tuple[str, st
     """Symbol, unit and value of what is estimated outside the filter, whose sigma stands nowhere else."""
     if (walk := model.intensity) is not None:
         yield walk.symbol, walk.unit, noise.walk_mps2_per_sqrt_s, None
-    for effect in model.stepped:
+    for effect in model.constants_beside_state:
         assert effect.unknown is not None
         yield effect.unknown.symbol, effect.unknown.unit, effect.value, None
 

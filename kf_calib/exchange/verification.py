@@ -118,7 +118,8 @@ def verify(
         fitted = fit(dwells, Model(source.bench, model.effects))
         free = tuple(str(each) for each in model.effects if beyond_force_and_temperature(each, source.bench))
         statistic, rms = _misfit(saved, fitted, _noise(saved, fitted), free)
-        dof = (1 if fitted.noise.attitude_unknown else 3) * len(dwells) - _free_count(model, free)
+        free_count = sum(len(range(*model.parts[name].indices(model.count))) for name in free)
+        dof = (1 if fitted.noise.attitude_unknown else 3) * len(dwells) - free_count
         p_value = chi_squared_tail(dof, statistic)
         new = evaluate_fit(fitted, settings)
         seen = None if new.estimate.unseen.any() else new
@@ -140,11 +141,6 @@ def _noise(saved: SavedCalibration, fitted: Fit) -> Noise:
     if not noise.setting_stated:
         noise = replace(noise, setting_rad=max(noise.setting_rad, np.radians(old.angle_sigma_deg)))
     return noise
-
-
-def _free_count(model: Model, free: Sequence[str]) -> int:
-    """Return the number of coefficients that are not compared."""
-    return sum(len(range(*model.parts[name].indices(model.count))) for name in free)
 
 
 def _misfit(saved: SavedCalibration, fitted: Fit, noise: Noise, free: Sequence[str]) -> tuple[float, float]:

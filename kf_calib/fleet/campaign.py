@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats, Mask
-from kf_calib.effects import Bearer, Effect, described
+from kf_calib.effects import Bearer, described
 from kf_calib.errors import InputError
 from kf_calib.fleet.run_factor import ReferenceUnit, RunFactor, column_name
 
@@ -201,7 +201,9 @@ class Campaign:
         for (name, of_effect), part in zip(symbols.items(), parts, strict=True):
             seen, effect = runs[part] > 0.0, described(name)
             sigma = float(np.mean(total[part][seen] / runs[part][seen])) ** -0.5 if seen.any() else 0.0
-            largest = max(_LARGE, _usual(effect) / sigma) if sigma else _LARGE
+            grades = () if effect is None else (effect.typical.navigation, effect.typical.mems)
+            usual = max((high for _, high in filter(None, grades)), default=0.0)
+            largest = max(_LARGE, usual / sigma) if sigma else _LARGE
             borne_by = Bearer.EITHER if effect is None else effect.borne_by
             groups.append(Group(name, part, tuple(of_effect), sigma, largest, borne_by))
         return groups
@@ -225,12 +227,6 @@ def _hidden(upper: Floats, width: int, places: NDArray[np.intp]) -> Mask:
     """Return which columns the run's own parameters explain but for rounding."""
     rest, whole = np.linalg.norm(upper[width:, places], axis=0), np.linalg.norm(upper[:, places], axis=0)
     return np.asarray(rest <= SEEN * whole)
-
-
-def _usual(effect: Effect | None) -> float:
-    """Return the largest usual size of an effect, SI; 0 where none is known."""
-    grades = () if effect is None else (effect.typical.navigation, effect.typical.mems)
-    return max((high for _, high in filter(None, grades)), default=0.0)
 
 
 def _stacked(part: Sequence[_Part]) -> Blocks:
@@ -259,8 +255,10 @@ def sizes(low: float, high: float, step: float = STEP) -> Floats:
 
 def log_evidence(info: Floats, score: Floats, prior: Floats) -> Floats:
     """log L (...,) of information (..., q, q), score (..., q) and standard deviations of the prior (..., q)."""
-    info, score, prior = _alike(info, score, prior)
-    if not score.shape[-1]:
+    shape, count = np.broadcast_shapes(info.shape[:-2], score.shape[:-1], prior.shape[:-1]), score.shape[-1]
+    info = np.broadcast_to(info, (*shape, count, count))
+    score, prior = (np.broadcast_to(each, (*shape, count)) for each in (score, prior))
+    if not count:
         return np.zeros(score.shape[:-1])
     lower = np.linalg.cholesky(_within(info, prior))
     along = np.linalg.solve(lower, (prior * score)[..., None])[..., 0]
@@ -296,13 +294,3 @@ def log_mean(logarithms: Floats, axis: int | tuple[int, ...] | None = None) -> F
 def _within(info: Floats, prior: Floats) -> Floats:
     """Return 1 + S A S."""
     return np.eye(info.shape[-1]) + prior[..., :, None] * info * prior[..., None, :]
-
-
-def _alike(info: Floats, score: Floats, prior: Floats) -> tuple[Floats, Floats, Floats]:
-    shape = np.broadcast_shapes(info.shape[:-2], score.shape[:-1], prior.shape[:-1])
-    count = score.shape[-1]
-    return (
-        np.broadcast_to(info, (*shape, count, count)),
-        np.broadcast_to(score, (*shape, count)),
-        np.broadcast_to(prior, (*shape, count)),
-    )

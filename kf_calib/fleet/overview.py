@@ -86,18 +86,13 @@ def _track(
     runs = np.bincount(places, minlength=count)
     sums = np.bincount(places, values - values[0], minlength=count)
     means = values[0] + np.divide(sums, runs, out=np.full(count, np.nan), where=runs > 0)
-    mean, spread = _middle(means[runs > 0])
-    deviations = _deviations(values, means[places], runs[places], mean)
+    low, median, high = np.quantile(means[runs > 0], _SIXTY_EIGHT).tolist()
+    spread = 0.5 * (high - low)
+    deviations = _deviations(values, means[places], runs[places], median)
     return Track(
-        symbol, unit, nominal, target, dates, places, values, sigmas, means, mean, spread,
-        _chances(means, mean, spread, many), deviations, _pooled(deviations, runs[places]),
+        symbol, unit, nominal, target, dates, places, values, sigmas, means, median, spread,
+        _chances(means, median, spread, many), deviations, _pooled(deviations, runs[places]),
     )  # fmt: skip
-
-
-def _middle(values: Floats) -> tuple[float, float]:
-    """Return the median, and half the width of the middle 68 %."""
-    low, median, high = np.quantile(values, _SIXTY_EIGHT).tolist()
-    return median, 0.5 * (high - low)
 
 
 def _deviations(values: Floats, means: Floats, runs: NDArray[np.intp], mean: float) -> Floats:

@@ -14,7 +14,7 @@ from kf_calib.effects import described
 from kf_calib.errors import InputError
 from kf_calib.fleet.attribution import Attributed, AttributionTable, attributed, chosen
 from kf_calib.fleet.campaign import FLAT, Campaign, Factors, Group, RunKey
-from kf_calib.fleet.own_coefficients import Population, UnitsAndCommon, population
+from kf_calib.fleet.own_coefficients import UnitsAndCommon, population
 from kf_calib.fleet.pooled_terms import Attribution, BenchEstimate, DatedSums, PooledTerms, Term
 from kf_calib.fleet.run_factor import ReferenceUnit
 from kf_calib.fleet.shape import SomeUnits
@@ -207,8 +207,11 @@ def _of_units(campaign: Campaign, attribution: Attributed, number: int, so_far: 
         of_all = chance[Attribution.SENSORS] / (chance[Attribution.SENSORS] + chance[Attribution.SOME])
         has = of_all + (1.0 - of_all) * some.probabilities
         share, interval = some.share(of_all)
-    people = population(information, has > 0.5, term.group.largest)
-    figures = _figures(term.group, people) if people is not None else None
+    people, figures = population(information, has > 0.5, term.group.largest), None
+    if people is not None:
+        sigma, (low, high) = term.group.sigma, people.spread_interval
+        mean = _estimates(term.group, people.mean, people.covariance)
+        figures = PopulationFigures(mean, people.spread * sigma, (low * sigma, high * sigma))
     rows = zip(information.of_units.units, has.tolist(), information.integrated().estimates(), strict=True)
     units = tuple(UnitFigures(unit, chance, _estimates(term.group, *values)) for unit, chance, values in rows)
     return replace(so_far, population=figures, units=units, share=share, share_interval=interval)
@@ -220,14 +223,6 @@ def _told(campaign: Campaign, term: Term, others: PooledTerms) -> UnitsAndCommon
     level = campaign.runs() if of_runs else campaign.units(others.repairs)
     told = UnitsAndCommon.joined([UnitsAndCommon.of(term.group, others, others.beside_own(blocks)) for blocks in level])
     return told if of_runs else told.by_unit()
-
-
-def _figures(group: Group, people: Population) -> PopulationFigures:
-    low, high = people.spread_interval
-    return PopulationFigures(
-        _estimates(group, people.mean, people.covariance), people.spread * group.sigma,
-        (low * group.sigma, high * group.sigma),
-    )  # fmt: skip
 
 
 def _rows(campaign: Campaign, attribution: Attributed, findings: Mapping[str, Finding]) -> Iterable[EffectRow]:

@@ -104,8 +104,13 @@ class Fleet:
         reference_unit: a unit whose scale factors are known, so that an error of gravity shows. Raises InputError where
         there are no runs to diagnose, or where these scale factors are from one of them.
         """
-        if reference_unit is not None:
-            self._refuse_own(reference_unit)
+        if reference_unit is not None and reference_unit.sha256:
+            for row in self.rows(["run", "sha256"]).to_pylist():
+                if row["sha256"] == reference_unit.sha256:
+                    raise InputError(
+                        f"the scale factors of the reference unit {reference_unit.unit} are from {row['run']}, one of "
+                        "these runs, which has their gravity: name a calibration that was made elsewhere."
+                    )
         return pooled_diagnosis(self.factors, reference_unit=reference_unit)
 
     def overview(
@@ -137,15 +142,6 @@ class Fleet:
                 raise
             return None, (f"{_ALONE}: {error}",)
         return diagnosis, (_unnamed(units.null_count),) if units.null_count else ()
-
-    def _refuse_own(self, reference: ReferenceUnit) -> None:
-        """Refuse scale factors that are from one of the runs, with its gravity."""
-        for row in self.rows(["run", "sha256"]).to_pylist() if reference.sha256 else ():
-            if row["sha256"] == reference.sha256:
-                raise InputError(
-                    f"the scale factors of the reference unit {reference.unit} are from {row['run']}, one of these "
-                    "runs, which has their gravity: name a calibration that was made elsewhere."
-                )
 
     def distinct(self, column: str) -> int:
         """Number of different values of a column, what is not known left out."""

@@ -19,7 +19,7 @@ from fsspec.core import url_to_fs
 from fsspec.implementations.local import LocalFileSystem
 from numpy.typing import NDArray
 
-from kf_calib.bench.arrays import Floats, Mask
+from kf_calib.bench.arrays import Mask
 from kf_calib.errors import InputError
 from kf_calib.fleet.run_factor import STATES, RunFactor
 
@@ -252,9 +252,12 @@ def factor_of(row: Mapping[str, Any]) -> RunFactor | None:
     kept, date = row["factor"], row["date"]
     if kept is None:
         return None
+    size = len(kept["columns"]) + 1
+    upper = np.zeros((size, size))
+    upper[np.triu_indices(size)] = np.asarray(kept["upper"])
     return RunFactor(
         row["run"], row["unit"], row["bench"], None if date is None else date.isoformat(timespec="milliseconds"),
-        tuple(kept["columns"]), kept["width"], _upper(np.asarray(kept["upper"]), len(kept["columns"]) + 1),
+        tuple(kept["columns"]), kept["width"], upper,
         kept["rows"], {each["effect"]: each["value"] for each in kept["constants"]}, np.asarray(kept["nominal"]),
         kept["noise_estimated"],
     )  # fmt: skip
@@ -309,12 +312,6 @@ def _are_numbers(values: pa.Array) -> Mask:
 def _lengths(lists: pa.ListArray) -> NDArray[np.int64]:
     """Return the lengths (n,) of lists, -1 where there is none."""
     return lists.value_lengths().fill_null(-1).to_numpy(zero_copy_only=False).astype(np.int64)
-
-
-def _upper(packed: Floats, size: int) -> Floats:
-    out = np.zeros((size, size))
-    out[np.triu_indices(size)] = packed
-    return out
 
 
 def _text(document: Mapping[str, Any]) -> str:

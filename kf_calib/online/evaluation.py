@@ -248,25 +248,21 @@ class Evaluation(ABC, Generic[J, S]):
             self._publish(samples=passed.tally.read, current=None)
 
     def _close_next(self, count: int, elapsed_s: float) -> None:
-        """Hand over the next closed dwells, one by one."""
+        """Hand the next closed dwells to the judging thread, one by one; they do not change any more."""
         for _ in range(count):
             self._closed += 1
-            self._close(elapsed_s)
-
-    def _close(self, elapsed_s: float) -> None:
-        """Hand the dwells that have closed to the judging thread; they do not change any more."""
-        passed, folder = self._passed, Folder()
-        folder.dwells, folder.slews = passed.folder.dwells[: self._closed], list(passed.folder.slews)
-        closed = _Closed(replace(passed, tally=replace(passed.tally), folder=folder), elapsed_s)
-        with self._lock:
-            self._last = closed
-            if not self.every:
-                self._waiting.clear()
-            if not self._hurried:
-                self._waiting.append(closed)
-            self._looked_s = 0.0
-            self._publish(dwells=self._closed, current=None)
-            self._lock.notify_all()
+            passed, folder = self._passed, Folder()
+            folder.dwells, folder.slews = passed.folder.dwells[: self._closed], list(passed.folder.slews)
+            closed = _Closed(replace(passed, tally=replace(passed.tally), folder=folder), elapsed_s)
+            with self._lock:
+                self._last = closed
+                if not self.every:
+                    self._waiting.clear()
+                if not self._hurried:
+                    self._waiting.append(closed)
+                self._looked_s = 0.0
+                self._publish(dwells=self._closed, current=None)
+                self._lock.notify_all()
 
     def _look(self, standing: int | None, elapsed_s: float) -> None:
         """Evaluate a copy of the open dwell when it has lasted 1, 2, 4 ... s."""

@@ -166,7 +166,8 @@ def _end(itinerary: Itinerary, visited: Visited, judgement: Judgement, is_reache
     if is_settled and itinerary.ends_when_named:
         named = " and ".join(judgement.diagnosis.missing)
         return Suggestion("end", f"the missing effect is named: {named}", ended="named")
-    if is_reached and not judgement.alarm and count > itinerary.opening and _is_back(visited):
+    is_back = _same(visited.stays[0][0], visited.stays[-1][0])
+    if is_reached and not judgement.alarm and count > itinerary.opening and is_back:
         return Suggestion("end", "every target is reached, and the model agrees", ended="targets")
     if count >= itinerary.most:
         return Suggestion("end", f"{count} orientations were visited, as many as allowed", ended="orientations")
@@ -182,18 +183,13 @@ def _opening(itinerary: Itinerary, left: Floats, outlook: Outlook | None, judgem
     has_targets = judgement is not None and bool(np.isfinite(judgement.wanted).any())
     if not has_targets and judgement is not None:
         stay_s = itinerary.stay_s
-    elif outlook is not None and not _is_blind(judgement):
+    elif outlook is not None and judgement is not None and np.isfinite(judgement.result.noise.sigma_mps2).all():
         stay_s = outlook.share_s(left)
     here = None if outlook is None else outlook.pending[-1][0]
     free = left if here is None else left[can_be_reached(itinerary.reach, here, left)]
     pose = free[0] if len(free) else left[0]
     why = f"{len(left)} more to begin with: spread over the sphere, so that the model can be judged"
     return Suggestion("opening", why, _in_deg(pose), min(stay_s, itinerary.longest_s))
-
-
-def _is_blind(judgement: Judgement | None) -> bool:
-    """Tell whether nothing is known of the noise yet."""
-    return judgement is None or not np.isfinite(judgement.result.noise.sigma_mps2).all()
 
 
 def _telling_apart(itinerary: Itinerary, visited: Visited, judgement: Judgement, outlook: Outlook) -> Suggestion:
@@ -237,11 +233,6 @@ def _sharpening(itinerary: Itinerary, outlook: Outlook, judgement: Judgement) ->
     name, factor = paper_parameters.SYMBOLS[worst], stay.sigma[worst] / outlook.sigma[worst]
     why = f"the most per second: lowers sigma of {name} to {factor:.2f} of its value in {stay.seconds:.0f} s"
     return Suggestion("sharpen", why, _in_deg(stay.pose), min(stay.stay_s, itinerary.longest_s), stay.sigma)
-
-
-def _is_back(visited: Visited) -> bool:
-    """Tell whether the platform is in its first orientation again."""
-    return _same(visited.stays[0][0], visited.stays[-1][0])
 
 
 def _same(one: Floats, other: Floats) -> bool:

@@ -68,7 +68,8 @@ class Outputs:
 
     def spare(self, inputs: Iterable[Path | None]) -> None:
         """Raise InputError where an output is one of these files, which the run reads."""
-        read = [read_path for path in inputs if path is not None for read_path in _files_of(path)]
+        read = [read_path for path in inputs if path is not None
+                for read_path in ([path, *path.iterdir()] if path.is_dir() else [path])]  # fmt: skip
         for name, path in self._files.items():
             for read_path in read:
                 if _same(path, read_path):
@@ -263,10 +264,6 @@ def _rename(part: Path, target: Path) -> None:
     if target.exists():
         shutil.copymode(target, part)
     part.replace(target)
-
-
-def _files_of(path: Path) -> list[Path]:
-    return [path, *path.iterdir()] if path.is_dir() else [path]
 
 
 def _same(one: Path, other: Path) -> bool:

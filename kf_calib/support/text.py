@@ -27,7 +27,9 @@ def printable(text: str) -> str:
     """The text with all but its line ends printable."""
     if text.isprintable():
         return text
-    return "".join(each if each.isprintable() or each == "\n" else _code(each) for each in text)
+    return "".join(
+        each if each.isprintable() or each == "\n" else each.encode("unicode_escape").decode() for each in text
+    )
 
 
 def sentence(text: str) -> str:
@@ -42,10 +44,6 @@ def cut(text: str, longest: int) -> str:
         return text
     end = min(_END, longest // 3)
     return f"{text[: longest - end - 3]} … {text[-end:]}"
-
-
-def _code(each: str) -> str:
-    return each.encode("unicode_escape").decode()
 
 
 _loaders = list[Callable[[], object]]()

@@ -67,17 +67,12 @@ def _detail(effect: Effect) -> list[RenderableType]:
     lines.append(f"borne by: {_BEARERS[effect.borne_by]}")
     if effect.confused_with:
         lines.append(f"confused with: {effect.confused_with}")
-    lines += [f"typical size: {sizes}" for sizes in _typical_sizes(effect)]
+    known = [(words, effect.typical.of(grade)) for grade, words in GRADES.items()]
+    sizes = [f"{size_range(own, effect.coefficients[0])} ({words})" for words, own in known if own is not None]
+    lines += [f"typical size: {', '.join(sizes)}"] if sizes else []
     lines += [f"note: {remark}" for remark in remarks_of(effect)]
     head = Text(f"{effect}: {effect.title}", style="bold")
     return [head, *map(Text, lines), *([table] if table.rows else []), Text()]
-
-
-def _typical_sizes(effect: Effect) -> list[str]:
-    """Return the usual sizes of a coefficient by grade, in one text; nothing where none is known."""
-    known = [(words, effect.typical.of(grade)) for grade, words in GRADES.items()]
-    said = [f"{size_range(sizes, effect.coefficients[0])} ({words})" for words, sizes in known if sizes is not None]
-    return [", ".join(said)] if said else []
 
 
 def formula_of(effect: Effect) -> str:
@@ -168,10 +163,7 @@ def _object(effect: Effect) -> dict[str, Any]:
         "unknown": None
         if unknown is None
         else {"symbol": unknown.symbol, "unit": unknown.unit, "low": unknown.low, "high": unknown.high},
-        "typical": {
-            "navigation": _bounds(effect.typical.navigation),
-            "mems": _bounds(effect.typical.mems),
-        },
+        "typical": {"navigation": _bounds(effect.typical.navigation), "mems": _bounds(effect.typical.mems)},
         "borne_by": effect.borne_by.value,
         "confused_with": effect.confused_with,
         "source": effect.source,

@@ -240,16 +240,11 @@ def difference_table(differences: Sequence[Difference], first: str, second: str)
     for heading in ("parameter", first, "sigma", second, "sigma", "unit", "difference", "in σ"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
     for k, each in enumerate(differences):
-        table.add_row(*_difference_row(each), end_section=k % 4 == 3)
+        both, moved = (*_cells_less_nominal(each.first), *_cells_less_nominal(each.second)), ("", "")
+        if each.value is not None and each.sigma is not None and each.sigmas is not None:
+            moved = shown(each.first).rounded(each.value, each.sigma)[0], f"{each.sigmas:+.1f}"
+        table.add_row(symbol(each.symbol), *both, shown(each.first).label, *moved, end_section=k % 4 == 3)
     return table
-
-
-def _difference_row(difference: Difference) -> tuple[str, ...]:
-    """Return the row of one parameter."""
-    both, moved = (*_cells_less_nominal(difference.first), *_cells_less_nominal(difference.second)), ("", "")
-    if difference.value is not None and difference.sigma is not None and difference.sigmas is not None:
-        moved = shown(difference.first).rounded(difference.value, difference.sigma)[0], f"{difference.sigmas:+.1f}"
-    return symbol(difference.symbol), *both, shown(difference.first).label, *moved
 
 
 def _cells_less_nominal(parameter: Parameter) -> tuple[str, str]:

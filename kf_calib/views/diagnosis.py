@@ -1,8 +1,10 @@
-"""A diagnosis as a report, and as a JSON object."""
+"""A diagnosis as a report, with what to do next as a command to paste, and as a JSON object."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import shlex
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,19 +20,17 @@ from kf_calib.diagnosis.replication import Replication
 from kf_calib.diagnosis.results import Diagnosis, Suspect
 from kf_calib.diagnosis.unknown_effect import Description
 from kf_calib.diagnosis.verdict import format_probability, replication_in_words
-from kf_calib.diagnosis.within_dwell_trend import Trend
-from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation.remarks import MISSING_OR_NOISE
 from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.support.text import printed
 from kf_calib.support.units import shown
 from kf_calib.views.console import plain, symbol
 from kf_calib.views.json import clean, outlying_object, readings_object
-from kf_calib.views.next_step import angles_in_words, next_steps
 from kf_calib.views.terminal import ConsoleTable, TextPlot, note
 
 _MOST = 5
 """Explanations in the table on one screen."""
+_TELLS = 1.0  # sigma; an orientation that separates explanations by less tells nothing
 
 
 def diagnosis_object(diagnosis: Diagnosis) -> dict[str, Any]:
@@ -54,6 +54,7 @@ def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
     named = diagnosis.missing[0] if diagnosis.missing else "noise" if diagnosis.noise else None
     missing = "unknown" if diagnosis.unknown or diagnosis.unearned else named
     shapes = diagnosis.explanations[0].shapes if diagnosis.explanations else []
+    trend = diagnosis.test.trend
     return clean(
         {
             "consistent": diagnosis.test.consistent,
@@ -76,7 +77,9 @@ def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
             "may_be_scatter": diagnosis.as_scatter,
             "invisible": diagnosis.test.invisible,
             "vibration_hz": [line.frequency_hz for line in diagnosis.test.lines.vibration],
-            "trend": _trend_object(diagnosis.test.trend),
+            "trend": None
+            if trend is None
+            else {"ratio": trend.ratio, "p_value": trend.p_value, "dwell": trend.most[0], "channel": trend.most[1]},
             "detectable": [
                 {"effect": each.name, "minimum": each.minimum, "unit": each.unit} for each in diagnosis.detectable
             ],
@@ -115,14 +118,6 @@ def _replication_object(tried: Replication | None) -> dict[str, Any] | None:
         return None
     figures = {"fall": tried.fall, "predicted": tried.predicted, "p_value": tried.p_value, "p_less": tried.p_less}
     return {**figures, "halves": [vars(half) | {"dwells": list(half.dwells)} for half in tried.halves]}
-
-
-def _trend_object(trend: Trend | None) -> dict[str, Any] | None:
-    """Return the test of trends within dwells as a JSON object, or None."""
-    if trend is None:
-        return None
-    dwell, channel = trend.most
-    return {"ratio": trend.ratio, "p_value": trend.p_value, "dwell": dwell, "channel": channel}
 
 
 def orientation_object(advice: Advice, why: str) -> dict[str, Any]:
@@ -172,13 +167,6 @@ def verdict(diagnosis: Diagnosis) -> str:
     return " ".join([*(sentence[0].upper() + sentence[1:] for sentence in first), diagnosis.verdict])
 
 
-def _notes(diagnosis: Diagnosis) -> list[str]:
-    """Return the warnings of the calibration that the verdict does not contain."""
-    said = verdict(diagnosis)
-    # compared without the first letter, which is a capital where the warning begins a sentence
-    return [warning for warning in diagnosis.before.warnings if warning[1:] not in said]
-
-
 def diagnosis_report(diagnosis: Diagnosis, typed: str = "", details: bool = False) -> RenderableType:
     """What ``diagnose`` prints, on one screen: the verdict, what it may be, the shape of it, and what to do.
 
@@ -199,8 +187,9 @@ def diagnosis_report(diagnosis: Diagnosis, typed: str = "", details: bool = Fals
         parts.append(Text(f"{step.why}:" if step.command else f"{step.why}."))
         parts += [Text(f"  {step.command}", style="bold", no_wrap=True, overflow="ignore")] if step.command else []
     told = diagnosis.missing or diagnosis.unknown or diagnosis.noise  # what a misfit may come from is said by then
-    notes = [each for each in _notes(diagnosis) if not (told and each.startswith(MISSING_OR_NOISE))]
-    parts += map(note, notes)
+    said = verdict(diagnosis)  # and warnings in it, without the first letter, which is a capital where one begins it
+    notes = [each for each in diagnosis.before.warnings if each[1:] not in said]
+    parts += [note(each) for each in notes if not (told and each.startswith(MISSING_OR_NOISE))]
     return Group(*parts, *(details_of(diagnosis) if details else []))
 
 
@@ -266,8 +255,8 @@ def _hypothesis_table(table: HypothesisTable, most: int | None = None) -> Consol
         left = heading in ("explanation", "family")
         shown_.add_column(heading, justify="left" if left else "right")
     for row in table.listed[:most]:
-        share = format_probability(row.probability)
-        shown_.add_row(name_of(row), ", ".join(row.families), share, _largest_coefficient(row), _held_out(row.refit))
+        cells = (format_probability(row.probability), _largest_coefficient(row), held_out_ratio(row.refit))
+        shown_.add_row(name_of(row), ", ".join(row.families), *cells)
     return shown_
 
 
@@ -285,8 +274,8 @@ def _largest_coefficient(row: Hypothesis) -> str:
     return f"{symbol(largest.symbol)} = {value} ± {sigma} {unit.label}"
 
 
-def _held_out(refit: Calibration | None) -> str:
-    """Return the held-out rms over the noise floor; "" where it is not known."""
+def held_out_ratio(refit: Calibration | None) -> str:
+    """The held-out rms over the noise floor; "" where it is not known."""
     if refit is None or refit.held_out_rms_mps2 is None or not refit.held_out_floor_mps2:
         return ""
     return f"{refit.held_out_rms_mps2 / refit.held_out_floor_mps2:.2f}"
@@ -307,7 +296,7 @@ def _suspect_table(diagnosis: Diagnosis) -> ConsoleTable:
         left = heading in ("effect", "fits", "symbol", "unit")
         table.add_column(heading, justify="left" if left else "right", no_wrap=heading == "effect")
     for suspect in diagnosis.suspects:
-        ratio = _held_out(suspect.refit)
+        ratio = held_out_ratio(suspect.refit)
         head = [suspect.name, format_p(suspect.p_value).removeprefix("= "), f"{suspect.statistic:.1f} / {suspect.dof}",
                 "yes" if suspect.fits else "no"]  # fmt: skip
         for k, p in enumerate(suspect.coefficients):
@@ -325,23 +314,17 @@ def _suspect_table(diagnosis: Diagnosis) -> ConsoleTable:
 def _dwell_table(diagnosis: Diagnosis) -> ConsoleTable:
     """Return the table of the dwells that disagree most: their residuals over the sigma of their means."""
     table = ConsoleTable(title="Where it fails: residual / σ of the dwell's mean", title_justify="left")
-    place = "gimbals, deg" if diagnosis.before.bench.axes else "up, in its axes"
-    for heading in ("dwell", "at s", place, "1", "2", "3"):
+    has_gimbals = bool(diagnosis.before.bench.axes)
+    for heading in ("dwell", "at s", "gimbals, deg" if has_gimbals else "up, in its axes", "1", "2", "3"):
         table.add_column(heading, justify="right")
     ratios = diagnosis.residual_ratios
     for k in np.argsort(-np.abs(ratios).max(axis=1))[:5].tolist():
         dwell = diagnosis.before.visits[k].dwell
-        orientation = _place(dwell, bool(diagnosis.before.bench.axes))
+        force = dwell.means[1:4] / np.linalg.norm(dwell.means[1:4])
+        angles = ", ".join(f"{angle:.1f}" for angle in np.degrees(dwell.recorded_pose))
+        orientation = angles if has_gimbals else ", ".join(f"{part:+.2f}" for part in force)
         table.add_row(str(dwell.number), f"{dwell.start_s:.0f}", orientation, *(f"{ratio:+.1f}" for ratio in ratios[k]))
     return table
-
-
-def _place(dwell: DwellFactor, gimbals: bool) -> str:
-    """Return the angles of the gimbals in a dwell, or the direction that was up in the axes of the block."""
-    if gimbals:
-        return ", ".join(f"{angle:.1f}" for angle in np.degrees(dwell.recorded_pose))
-    force = dwell.means[1:4]
-    return ", ".join(f"{part:+.2f}" for part in force / np.linalg.norm(force))
 
 
 def _detectable_table(sizes: list[Detectable]) -> ConsoleTable:
@@ -356,3 +339,58 @@ def _detectable_table(sizes: list[Detectable]) -> ConsoleTable:
     for left, right in zip(cells[:half], cells[half:], strict=True):
         table.add_row(*left, *right)
     return table
+
+
+@dataclass(frozen=True)
+class NextStep:
+    """why: a sentence without its full stop. command: what to paste; "" where there is none."""
+
+    why: str
+    command: str = ""
+
+
+def next_steps(diagnosis: Diagnosis, typed: str) -> list[NextStep]:
+    """What to do, the first thing first.
+
+    typed: recording and options of the command that was given, as words of a shell; "" outside the command line, where
+    no command can be told.
+    """
+    steps = list(_steps(diagnosis, typed))
+    if typed:
+        return steps
+    return [NextStep(each.why) for each in steps if not each.command or each.why.startswith("Measure")]
+
+
+def _steps(diagnosis: Diagnosis, typed: str) -> Iterator[NextStep]:
+    test, before = diagnosis.test, diagnosis.before
+    if test.consistent is None:
+        yield NextStep("Find orientations that determine the model", f"kf-calib plan {typed} --count 24")
+    elif test.consistent:
+        yield NextStep("Keep this calibration", f"kf-calib replay {typed} --save calibration.json")
+    elif before.outlying:
+        number = before.outlying[0].number
+        yield NextStep(f"Try the run without dwell {number}", f"kf-calib diagnose {typed} --leave-out {number}")
+    elif diagnosis.sure:
+        yield NextStep("Add it and see the error fall", f"kf-calib improve {typed}")
+    else:
+        yield from _unsure(diagnosis, typed)
+
+
+def _unsure(diagnosis: Diagnosis, typed: str) -> Iterator[NextStep]:
+    """Yield what decides among several explanations, then what can be tried without it."""
+    going = diagnosis.next_orientation
+    if going is not None and going[0].told and going[0].after < _TELLS:
+        yield NextStep("No single orientation tells them apart here: measure at more, or for longer")
+    elif going is not None:
+        yield NextStep(f"Measure with the gimbals at {angles_in_words(diagnosis)}: it {going[1]}")
+    if diagnosis.description is not None:
+        texts = " ".join(f"--with {shlex.quote(text)}" for text in diagnosis.description.formulas)
+        yield NextStep("Try what describes it", f"kf-calib diagnose {typed} {texts}")
+    elif diagnosis.missing:
+        yield NextStep("Or take the likeliest", f"kf-calib improve {typed} --accept-first")
+
+
+def angles_in_words(diagnosis: Diagnosis) -> str:
+    """The angles of the next orientation, outer gimbal first."""
+    assert diagnosis.next_orientation is not None
+    return f"{', '.join(f'{angle:g}' for angle in diagnosis.next_orientation[0].gimbal_deg)} deg"

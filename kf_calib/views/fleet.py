@@ -210,10 +210,7 @@ def fleet_object(
 
 
 def fleet_report(
-    fleet: Fleet,
-    populations: Sequence[ParameterPopulation],
-    done: BatchProgress,
-    overview: FleetOverview,
+    fleet: Fleet, populations: Sequence[ParameterPopulation], done: BatchProgress, overview: FleetOverview
 ) -> RenderableType:
     """The report of ``fleet``."""
     failures = fleet.failures()

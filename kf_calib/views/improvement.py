@@ -11,12 +11,12 @@ from rich.text import Text
 
 from kf_calib.diagnosis.nested_cross_validation import NestedCrossValidation
 from kf_calib.diagnosis.results import Diagnosis
-from kf_calib.diagnosis.stepwise_selection import Improvement, Removal, SelectionStep, Spread
+from kf_calib.diagnosis.stepwise_selection import Improvement, Removal, SelectionStep
 from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.support.units import shown
 from kf_calib.views.console import effect_table, parameter_table, symbol
-from kf_calib.views.diagnosis import description_object, description_sentence, orientation_object
+from kf_calib.views.diagnosis import description_object, description_sentence, held_out_ratio, orientation_object
 from kf_calib.views.json import clean
 from kf_calib.views.terminal import Bar, ConsoleTable, note
 
@@ -270,18 +270,13 @@ def _spread_table(state: Improvement) -> ConsoleTable:
     for heading in ("parameter", "lowest", "highest", "sigma", "unit", "differ by, σ"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
     for k, each in enumerate(state.spreads):
-        table.add_row(*_spread_row(each), end_section=k % 4 == 3)
+        parameter, unit = each.parameter, shown(each.parameter)
+        low, high = (
+            unit.rounded(value - parameter.nominal, parameter.sigma or 0.0) for value in (each.lowest, each.highest)
+        )
+        row = (symbol(parameter.symbol), low[0], high[0], f"± {low[1]}", unit.label, f"{each.sigmas:.1f}")
+        table.add_row(*row, end_section=k % 4 == 3)
     return table
-
-
-def _spread_row(spread: Spread) -> tuple[str, ...]:
-    """Return the row of one parameter in that table."""
-    parameter = spread.parameter
-    unit = shown(parameter)
-    low, high = (
-        unit.rounded(value - parameter.nominal, parameter.sigma or 0.0) for value in (spread.lowest, spread.highest)
-    )
-    return symbol(parameter.symbol), low[0], high[0], f"± {low[1]}", unit.label, f"{spread.sigmas:.1f}"
 
 
 def _settling(state: Improvement) -> list[str]:
@@ -325,10 +320,7 @@ def _numbered(diagnosis: Diagnosis, choices: Sequence[tuple[str, ...]]) -> list[
         suspect = refits.get(names[0]) if len(names) == 1 else None
         result = suspect.refit if suspect is not None else diagnosis.after
         p_value = "" if suspect is None else format_p(suspect.p_value).removeprefix("= ")
-        ratio = "" if result is None or result.held_out_rms_mps2 is None or not result.held_out_floor_mps2 else (
-            f"{result.held_out_rms_mps2 / result.held_out_floor_mps2:.2f}"
-        )  # fmt: skip
         fits = "yes" if suspect is None or suspect.fits else "no"
         share = "" if diagnosis.table is None else format_probability(diagnosis.table.probability_of_just(names))
-        table.add_row(str(number), " + ".join(names), share, p_value, fits, ratio)
+        table.add_row(str(number), " + ".join(names), share, p_value, fits, held_out_ratio(result))
     return [table]

@@ -102,18 +102,18 @@ def screen(standing: Standing, status: Status | None, name: str, recording: str 
     judgement = standing.judgement
     parts: list[RenderableType] = [_to_do(standing), link(standing, status, name, recording), _sigmas(standing)]
     if judgement is not None:
-        parts += [_fit(judgement), Text(judgement.verdict, style=_style(judgement))]
+        style = {True: "bold green", False: "bold yellow", None: "bold"}[judgement.consistent]
+        parts += [_fit(judgement), Text(judgement.verdict, style=style)]
         if judgement.risen is not None:
-            parts.append(Text(_of_risen(judgement, *judgement.risen), style="yellow"))
+            risen, factor = judgement.risen
+            parts.append(Text(
+                f"σ of {symbol(risen)} rose {factor:.1f} times with the last orientation: the orientations scatter "
+                "more than was known before, or the model has more to determine.", style="yellow",
+            ))  # fmt: skip
     parts += [Text(sentence(text), style="yellow") for text in (standing.problem, standing.notice) if text]
     if hint:
         parts.append(Text(hint, style="dim"))
     return Group(*parts)
-
-
-def _style(judgement: Judgement) -> str:
-    """Return the style in which the verdict is shown."""
-    return {True: "bold green", False: "bold yellow", None: "bold"}[judgement.consistent]
 
 
 def link(standing: Progress, status: Status | None, name: str, recording: str) -> Text:
@@ -169,14 +169,6 @@ def _all_reached(standing: Standing, judgement: Judgement) -> bool:
     """Tell whether there are targets, and every one is reached."""
     given = np.isfinite(judgement.wanted)
     return bool(given.any() and (standing.sigma <= judgement.wanted)[given].all())
-
-
-def _of_risen(judgement: Judgement, name: str, factor: float) -> str:
-    """Return a sentence on sigmas that the last dwell has taken up."""
-    return (
-        f"σ of {symbol(name)} rose {factor:.1f} times with the last orientation: the orientations scatter more than "
-        "was known before, or the model has more to determine."
-    )
 
 
 def _sigmas(standing: Standing) -> RenderableType:

@@ -121,23 +121,15 @@ def table2(experiment: Experiment) -> ConsoleTable:
     for name in ("optimal set", "non-optimal set"):
         for k, heading in enumerate(("paper", "expected", "batch", "filter")):
             table.add_column(f"{name if k == 0 else ''}\n{heading}", justify="right")
-    for k, name in enumerate([name for unit in dict.fromkeys(paper_parameters.UNITS) for name in _of_unit(unit)]):
-        table.add_row(symbol(name), *_both(experiment, name), end_section=k in (5, 8))
+    units = dict(zip(paper_parameters.SYMBOLS, paper_parameters.UNITS, strict=True))
+    names = [name for unit in dict.fromkeys(units.values()) for name in units if units[name] == unit]
+    for k, name in enumerate(names):
+        at, cells = paper_parameters.SYMBOLS.index(name), list[str]()
+        for key, column in (("optimal", experiment.optimal), ("nonoptimal", experiment.nonoptimal)):
+            figures = (column.orientations.expected[at], column.least_squares[at], column.kalman[at])
+            cells += [f"{_paper_column(key)[at]:.4f}", *(f"{figure:#.4g}" for figure in figures)]
+        table.add_row(symbol(name), *cells, end_section=k in (5, 8))
     return table
-
-
-def _of_unit(unit: str) -> list[str]:
-    """Return the symbols of the parameters with a unit."""
-    return [name for name, own in zip(paper_parameters.SYMBOLS, paper_parameters.UNITS, strict=True) if own == unit]
-
-
-def _both(experiment: Experiment, name: str) -> list[str]:
-    """Return print, expectation, least squares and filter of a parameter for the optimal set, then the other."""
-    k, cells = paper_parameters.SYMBOLS.index(name), list[str]()
-    for key, column in (("optimal", experiment.optimal), ("nonoptimal", experiment.nonoptimal)):
-        figures = (column.orientations.expected[k], column.least_squares[k], column.kalman[k])
-        cells += [f"{_paper_column(key)[k]:.4f}", *(f"{figure:#.4g}" for figure in figures)]
-    return cells
 
 
 def sentences(experiment: Experiment, searched: ConditionSearch) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
+import numpy as np
 import pytest
 from helpers.hidden_effects import BENCH, WHITE
 from helpers.hidden_effects import noisy_run as run
@@ -12,12 +13,14 @@ from helpers.hidden_effects import noisy_source as source
 from helpers.long_runs import slow
 from helpers.synthetic import Run, plan_of
 
+from kf_calib.bench.streams import Stream
 from kf_calib.diagnosis.candidate_tests import assess_candidates
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.unknown_effect import JUMP
 from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.settings import Settings
 from kf_calib.sources.simulation.sensors import GRADES, TrueNoise
 from kf_calib.sources.simulation.simulator import Simulation
 from kf_calib.sources.simulation.visit_plans import six_faces
@@ -97,6 +100,14 @@ def test_a_line_is_named_with_its_frequency() -> None:
     frequency = found.after.parameters["fSin"]
     assert frequency.value is not None and frequency.sigma is not None
     assert abs(frequency.value - 7.3) < 5.0 * frequency.sigma < 0.01
+
+
+def test_a_line_counts_for_an_oscillation_at_a_tenth_of_the_level() -> None:
+    """Four tenths are for the known effects, as much for the misfit, and one tenth for trends."""
+    test = assess_candidates(calibrate(source(LINE)).fit)
+    (line, *_) = test.lines.significant
+    assert test.effects.p_values["sinusoid"] == pytest.approx(0.4 * line.p_value / 0.1)
+    assert test.p_value == pytest.approx(min(1.0, line.p_value / 0.1), rel=1e-6)
 
 
 def test_without_its_source_a_line_is_judged_by_one_pass_and_that_is_said() -> None:
@@ -357,3 +368,24 @@ def test_a_walk_that_may_come_back_is_said_to() -> None:
     assert "return to their mean within about" in found.verdict
     walks = [walking(seed) for seed in range(1, 3)]
     assert not any(each.restoring_time_s for each in walks) and any("bias-walk" in each.missing for each in walks)
+
+
+@pytest.mark.parametrize("seed", [1, *slow(2, 3, 4, 5)])
+def test_a_warm_up_slower_than_any_is_held_there_and_is_a_drift(seed: int) -> None:
+    """Of a line that bends the other way, no time constant is the best: the fit settles at the greatest one, with the
+    slope of the line, and the drift is the likelier name."""
+    made = Run(seed=seed, dwells=20, count=200, white_mps2=1e-4, setting_deg=0.001)
+    made.bench = replace(made.bench, scatter_sigma_mps2=0.0)
+    elapsed_s, slopes = (made.accel.time_ns - made.accel.time_ns[0]) / 1e9, np.array([4e-6, -3e-6, 2e-6])
+    bent_s = elapsed_s * (1.0 + 0.12 * (elapsed_s / elapsed_s[-1] - 1.0))  # of the same slope, by least squares
+    made.accel = Stream(made.accel.time_ns, made.accel.values + bent_s[:, None] * slopes)
+    warm, drift = (calibrate(made, Settings(effects=(name,))) for name in ("warm-up", "bias-drift"))
+    assert warm.parameters["tauWarm"].value is None and any("tauWarm is held at 180 min" in w for w in warm.warnings)
+    assert warm.consistency.statistic == pytest.approx(drift.consistency.statistic, rel=0.05)
+    middle = np.exp(-0.5 * elapsed_s[-1] / 10800.0)
+    for k, slope in enumerate(slopes, 1):
+        size = warm.parameters[f"B{k}"]
+        assert size.value is not None and size.sigma is not None
+        assert abs(-size.value * middle / 10800.0 - slope) < 4.0 * size.sigma / 10800.0
+    table = diagnose(made).table
+    assert table is not None and table.probability(["bias-drift"]) > table.probability(["warm-up"])

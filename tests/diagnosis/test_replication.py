@@ -130,3 +130,9 @@ def test_a_diagnosis_has_it_unless_it_is_switched_off() -> None:
     assert diagnosis.replication.answer == "yes"
     assert kf_calib.diagnose(before, replicate=False).replication is None
     assert kf_calib.diagnose(kf_calib.calibrate(hidden(3, 0.0)[0])).replication is None
+
+
+def test_what_no_candidate_is_has_no_replication() -> None:
+    before = kf_calib.calibrate(hidden(3, 12.0)[0])
+    assert replicated(before, ["second-order"]).halves
+    assert replicated(before, []).halves == replicated(before, ["no such effect"]).halves == ()

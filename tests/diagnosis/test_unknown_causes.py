@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,12 +17,14 @@ from unknown_trials.real_noise import KINDS, noisy_run
 from unknown_trials.small_bench import WHITE_MPS2, SmallRun, hidden_run, visits
 
 import kf_calib
+from kf_calib.diagnosis import unknown_effect
 from kf_calib.diagnosis.evidence import MarginalLikelihood, log_odds_of_repeating
 from kf_calib.diagnosis.hypothesis_table import IRREGULAR, NOISE
 from kf_calib.diagnosis.results import Diagnosis
-from kf_calib.diagnosis.unknown_effect import ARRIVAL, _of_time, bases_of_pairs
+from kf_calib.diagnosis.unknown_effect import ARRIVAL, PERIODIC, _of_time, bases_of_pairs
 from kf_calib.estimation.cross_validation import orientations
 from kf_calib.estimation.dwell_columns import stimulus_of
+from kf_calib.estimation.results import Consistency
 
 
 def diagnosed(name: str, sigmas: float = 12.0, seed: int = 2) -> Diagnosis:
@@ -187,3 +190,28 @@ def test_no_decay_since_the_arrival_is_much_longer_than_the_dwells(dwell_s: floa
     dwells = [SimpleNamespace(start_s=300.0 * k, end_s=300.0 * k + dwell_s) for k in range(12)]
     texts = [text for driver, texts in _of_time(dwells) if driver == ARRIVAL for text in texts]
     assert {int(found) for text in texts for found in re.findall(r"tau/\((\d+)", text)} == decays
+
+
+@pytest.mark.parametrize(("fall", "taken", "share"), [
+    (0.0, 3, 0.0), (33.0, 3, 0.3), (103.0, 3, 1.0), (150.0, 3, 1.0), (60.0, 10, 0.5),
+])  # fmt: skip
+def test_a_formula_explains_a_share_of_the_misfit_beyond_noise(
+    fall: float, taken: int, share: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a misfit of 160 with 60 degrees of freedom; the formula takes some of these, and so much of the misfit."""
+    before, after = Consistency(160.0, 60, 0.0, False), Consistency(160.0 - fall, 60 - taken, 0.0, False)
+    monkeypatch.setattr(unknown_effect, "consistency", lambda fit: fit)
+    assert unknown_effect.explained_share(before, after) == pytest.approx(share)
+    sound = Consistency(50.0, 60, 0.8, True)
+    assert unknown_effect.explained_share(sound, sound) == 1.0
+
+
+def test_waves_over_time_have_half_a_cycle_to_eight() -> None:
+    """None is more than twice as fast as the one before, so that what is between is mostly explained by one of them."""
+    dwells: list[Any] = [SimpleNamespace(start_s=100.0 * k, end_s=100.0 * k + 60.0) for k in range(24)]
+    end_s = dwells[-1].end_s
+    waves = [text for driver, texts in _of_time(dwells) if driver == PERIODIC for text in texts]
+    phases = [eval(text.partition("(")[2][:-1], {"t": end_s, "s": 1.0, "pi": np.pi}) for text in waves]
+    cycles = np.array(sorted({round(float(phase / (2.0 * np.pi)), 6) for phase in phases}))
+    assert len(waves) == 2 * len(cycles) and (cycles[0], cycles[-1]) == (0.5, 8.0)
+    assert (cycles[1:] / cycles[:-1]).max() <= 2.0

@@ -73,6 +73,20 @@ def test_a_dwell_of_days_has_a_bounded_number_of_pieces(hours: float) -> None:
     assert lengths.max() < hours * 3600.0 / 32.0
 
 
+@pytest.mark.parametrize("arrival_s", [-7.0, 0.0, 40.0])
+def test_merged_pieces_are_as_long_as_they_may_be(arrival_s: float) -> None:
+    """At most the time since the arrival when it begins, and a share of all; one piece more would make it longer."""
+    kept = [piece_of(10.0 * k + 45.0 + np.arange(5.0), np.ones((5, 3)), arrival_s) for k in range(300)]
+    longest_s = (kept[-1].nodes.elapsed_s[-1] - 45.0) / 20.0
+    merged = coarsened(kept, 20)
+    begins, ends = np.array([[piece.nodes.elapsed_s[0], piece.nodes.elapsed_s[-1]] for piece in merged]).T
+    allowed = np.minimum(longest_s, begins - arrival_s)
+    several = np.array([piece.count > 5 for piece in merged])
+    assert several.any() and (ends - begins <= allowed)[several].all()
+    assert (ends[:-1] + 10.0 - begins[:-1] > allowed[:-1]).all()
+    assert sum(piece.count for piece in merged) == 1500
+
+
 def test_a_run_of_days_has_a_bounded_number_of_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     """Long dwells lose half of theirs again and again, short ones none; no reading is lost."""
     monkeypatch.setattr(folding, "MOST_RUN_PIECES", 300)

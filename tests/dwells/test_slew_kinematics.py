@@ -128,3 +128,28 @@ def test_rates_of_a_curve_are_those_of_the_attitude() -> None:
     np.testing.assert_allclose(
         curve.rate_change(at), (curve.rate(at + step) - curve.rate(at - step)) / (2 * step), atol=1e-2
     )
+
+
+def test_slews_have_no_autocovariance_and_no_spectrum() -> None:
+    """What moves tells nothing of the noise at rest."""
+    whole = Pass(run(["latency=5ms"]), Settings(effects=("latency",)))
+    dwells, slews = whole.fold(), whole.folder.slews
+    assert len(slews) == 9 and all(dwell.autocovariance.count and dwell.spectrum.sums for dwell in dwells)
+    assert all(slew.autocovariance.count == 0 and not slew.spectrum.sums for slew in slews)
+
+
+@pytest.mark.parametrize(("rate_hz", "degps", "count"), [
+    (100.0, 0.0, 20), (100.0, 40.0, 4), (10.0, 0.0, 3), (20.0, 0.0, 4), (100.0, 1000.0, 3),
+])  # fmt: skip
+def test_pieces_of_a_slew_are_two_degrees_and_a_fifth_of_a_second_together_and_three_readings(
+    rate_hz: float, degps: float, count: int
+) -> None:
+    """At a steady rate: 1 / (rate / 2 deg + 5 / s), but at least three readings, in the last piece, too."""
+    time_s = np.arange(0.0, 6.0, 1.0 / rate_hz)
+    curve = Curve.through(BENCH, time_s, np.radians(degps) * time_s[:, None] * [0.0, 0.0, 1.0])
+    cuts = curve.cuts(time_s)
+    lengths = np.diff(cuts)
+    assert cuts[0] == 0 and cuts[-1] == len(time_s) and lengths.min() >= 3
+    assert np.median(lengths) == pytest.approx(max(count, 3), abs=1.0) and lengths[:-1].max() <= count + 2
+    if count == 3:
+        assert 3 in lengths

@@ -78,6 +78,27 @@ def test_misfit_beside_a_walk_and_a_stated_scatter_is_that_of_all_steps_solved_t
     assert found.statistic == pytest.approx(left @ left, rel=1e-6)
 
 
+@pytest.mark.parametrize(("setting_deg", "stated", "charged"), [
+    (0.0, False, 0), (0.01, False, 1), (0.0, True, 0), (0.01, True, 0),
+])  # fmt: skip
+def test_a_setting_error_that_is_estimated_takes_a_degree_of_freedom(
+    setting_deg: float, stated: bool, charged: int
+) -> None:
+    """Of three means a dwell less twelve parameters; one that is stated, or estimated as none, takes none."""
+    found = calibrate(Run(seed=0, dwells=24, stated=stated, setting_deg=setting_deg))
+    assert (found.noise.setting_rad > 0.0) == bool(setting_deg)
+    assert found.consistency.dof == 3 * 24 - 12 - charged
+
+
+def test_what_a_run_does_not_determine_is_named() -> None:
+    """Gravity up and down along one axis of the platform tells nothing of the others."""
+    up_and_down = np.array([[0.0, 0.0, 0.0], [0.0, np.pi, 0.0]] * 4)
+    found = calibrate(Run(seed=1, dwells=8, poses=up_and_down))
+    unknown = {symbol for symbol, value in found.parameters.items() if value.sigma is None}
+    assert set(found.undetermined) == unknown and 0 < len(unknown) < 12
+    assert not calibrate(Run(seed=1)).undetermined
+
+
 def test_held_out_equals_refits_without_the_orientation() -> None:
     run = Run(seed=2, dwells=8)
     run.accel = Stream(run.accel.time_ns, run.accel.values)

@@ -15,7 +15,7 @@ from scipy.stats import binom
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.dwells.folding import detrended
-from kf_calib.dwells.line_spectrum import SpectralLine, Spectrum, lines
+from kf_calib.dwells.line_spectrum import SpectralLine, Spectrum, _leakage, _Search, lines
 from kf_calib.effects import checks, effect_named
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.dwell_columns import LinearisedDwells, stimulus_of
@@ -210,6 +210,46 @@ def test_dwells_of_unequal_noise_have_no_line_if_they_count_by_their_weights() -
         alarms[0] += bool(lines(spectra))
         alarms[1] += bool(lines(each.times(size**-2.0) for each, size in zip(spectra, sizes, strict=True)))
     assert alarms[1] <= binom.ppf(0.995, 100, 0.01) < alarms[0]
+
+
+def test_a_line_leaks_at_most_what_is_allowed_for_it() -> None:
+    """Power of a Hann window at so many bins from a line: the bound is reached between two bins."""
+    count = 4096
+    taper = np.sin(np.pi * (np.arange(count) + 0.5) / count) ** 2
+    bins = np.arange(3.0, 40.0, 0.125)
+    turning = np.exp(-2j * np.pi * np.outer(bins, np.arange(count)) / count)
+    leaked = np.abs(turning @ taper) ** 2 / taper.sum() ** 2
+    bound = _leakage(bins)
+    assert np.all(leaked <= 1.001 * bound)
+    np.testing.assert_allclose(leaked[4::8], bound[4::8], rtol=1e-3)
+    assert np.isinf(_leakage(np.array([-2.9, 0.0, 2.9]))).all()
+    np.testing.assert_array_equal(_leakage(-bins), bound)
+
+
+@pytest.mark.parametrize("beside", [0.0, 0.2, 0.5, 0.8])
+def test_a_line_between_bins_has_its_frequency_and_amplitude(beside: float) -> None:
+    """Each accelerometer has its amplitude, of a line that is twenty times the noise or more."""
+    rng, time_s = np.random.default_rng(5), np.arange(1024) / 100.0
+    hz, sizes = (200.0 + beside) * 100.0 / 1024.0, np.array([[3.0], [2.0], [1.0]])
+    spectra = [
+        Spectrum.of(detrended(0.05 * rng.normal(size=(3, 1024)) + sizes * np.sin(2 * np.pi * hz * time_s + k)), time_s)
+        for k in range(10)
+    ]
+    line = lines(spectra)[0]
+    assert line.frequency_hz == pytest.approx(hz, abs=0.01 * 100.0 / 1024.0)
+    np.testing.assert_allclose(line.amplitude_mps2, sizes[:, 0], rtol=0.01)
+
+
+def test_a_single_bin_is_as_rare_as_its_p_value_says() -> None:
+    """In white noise of one segment and one channel: three bins of a thousand, to a third more or less."""
+    rng, time_s, rare, bins = np.random.default_rng(8), np.arange(1024) / 100.0, 0, 0
+    for _ in range(150):
+        readings = rng.normal(size=(3, 1024)) * [[1.0], [0.0], [0.0]]
+        (segments,) = Spectrum.of(detrended(readings), time_s).sums.values()
+        search = _Search(segments, 1024, np.array([True, False, False]))
+        bins += len(search.height) - 4
+        rare += sum(search._chance(k) < 3e-3 for k in 3 + np.flatnonzero(search.height[3:-1] > 4.0))
+    assert 0.8 < rare / bins / 3e-3 < 1.4
 
 
 def test_spectra_add_up() -> None:

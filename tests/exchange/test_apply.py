@@ -54,14 +54,15 @@ def count_of(path: Path, topic: str) -> int:
         return sum(1 for _ in make_reader(file, validate_crcs=True).iter_messages([topic]))
 
 
+@pytest.mark.parametrize("begin_ns", [0, 123_456_789])
 @pytest.mark.parametrize("norm", [1.0, G])
-def test_a_norm_at_rest_counts_from_three_windows_of_half_a_second(folder: Path, norm: float) -> None:
+def test_a_norm_at_rest_counts_from_three_windows_of_half_a_second(folder: Path, norm: float, begin_ns: int) -> None:
     """Readings in g are told once the third window is over; what moves is no window; parts of any length give the
     same."""
     correction = kf_calib.open_calibration(folder / "cal.json").correction()
     values = np.array([0.6, 0.64, 0.48]) * norm + np.random.default_rng(0).normal(size=(400, 3)) * 1e-3 * norm
     values[100:150] += norm * np.sin(np.arange(50.0))[:, None]
-    times, told = np.arange(400) * 10_000_000, dict[int, list[int]]()
+    times, told = begin_ns + np.arange(400) * 10_000_000, dict[int, list[int]]()
     for size in (1, 7, 50):
         at_rest = NormAtRest(correction)
         for first in range(0, 400, size):
@@ -69,6 +70,50 @@ def test_a_norm_at_rest_counts_from_three_windows_of_half_a_second(folder: Path,
             if at_rest.misfit(PLAIN, final=False):
                 told.setdefault(size, []).append(first + size)
     assert {size: first[0] for size, first in told.items()} == ({1: 201, 7: 203, 50: 250} if norm == 1.0 else {})
+
+
+@pytest.mark.parametrize(("count", "told"), [(7, False), (8, True)])
+def test_a_window_at_rest_has_eight_readings(folder: Path, count: int, told: bool) -> None:
+    at_rest = NormAtRest(kf_calib.open_calibration(folder / "cal.json").correction())
+    at_rest.add(Stream(np.arange(count) * 50_000_000, np.tile([0.6, 0.64, 0.48], (count, 1))))
+    assert bool(at_rest.misfit(PLAIN, final=True)) == told and not at_rest.misfit(PLAIN, final=False)
+
+
+def turned_means(count: int) -> np.ndarray:
+    """Readings at rest (count, 3) in different directions, with a bias of the first channel as large as gravity."""
+    drawn = np.random.default_rng(3).normal(size=(60, 3))
+    unit = drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
+    kept = [0]
+    for k in range(1, 60):
+        if np.all(unit[k] @ unit[kept].T < 0.95):
+            kept.append(k)
+    return G * unit[kept[:count]]
+
+
+def test_another_order_of_channels_is_told_from_six_directions_and_six_sigma(folder: Path) -> None:
+    """Of means that are each uncertain by as much as is said; repeated directions count once."""
+    correction = kf_calib.open_calibration(folder / "cal.json").correction()
+    readings = turned_means(8) @ np.linalg.inv(correction.matrix).T + correction.bias_mps2
+    swapped = readings[:, [1, 0, 2]]
+    norms = np.linalg.norm((swapped - correction.bias_mps2) @ correction.matrix.T, axis=1)
+
+    def said(means: np.ndarray, sigma_mps2: float, final: bool = True) -> str:
+        at_rest = NormAtRest(correction)
+        at_rest.add_means(means, sigma_mps2)
+        return at_rest.misfit(PLAIN, final)
+
+    assert said(swapped, norms.std() / 6.5).partition("--channels ")[2].startswith("2,1,3")
+    assert said(swapped, norms.std() / 5.5) == "" == said(readings, 0.0) == said(swapped, 0.0, final=False)
+    for share, told in ((8.0, True), (4.0, False)):  # of windows of ten readings that scatter so much in all
+        scatter = norms.std() / share * np.sqrt(10.0) / np.sqrt(3.0)
+        noise = np.random.default_rng(1).normal(size=(len(swapped), 10, 3))
+        noise = (noise - noise.mean(axis=1, keepdims=True)) / noise.std(axis=1, keepdims=True, ddof=1)
+        at_rest = NormAtRest(correction)
+        values = (swapped[:, None] + scatter * noise).reshape(-1, 3)
+        at_rest.add(Stream(np.arange(len(values)) * 50_000_000, values))
+        assert bool(at_rest.misfit(PLAIN, final=True)) == told
+    few = np.vstack([swapped[:5], swapped[:5] * 1.0001])
+    assert said(few, 0.0) == "" != said(np.vstack([few, swapped[5:6]]), 0.0)
 
 
 def test_the_original_stays_byte_for_byte_and_one_topic_comes_to_it(folder: Path, run: Any) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.calibrations import SENSORS, simulated
+from helpers.calibrations import SENSORS, simulated, warming_up
 from helpers.paths import ROOT
 
 import kf_calib
@@ -48,7 +48,7 @@ class Cube(SensorEffect):
 @pytest.fixture(scope="module")
 def run() -> kf_calib.Calibration:
     settings = kf_calib.Settings(effects=("second-order", "warm-up", "mine = fx*fy"))
-    return kf_calib.calibrate(simulated(0, 14), settings)
+    return kf_calib.calibrate(warming_up(0, 14), settings)
 
 
 @pytest.fixture(scope="module")
@@ -64,6 +64,19 @@ def test_the_schema_in_the_package_is_that_of_the_program() -> None:
     )
     patterns = re.findall(r'"pattern": (".*")', made)
     assert patterns and not any(r"\\A" in each or r"\\z" in each for each in patterns)  # which JSON Schema has not
+
+
+def test_a_constant_that_was_held_is_no_state_and_is_read_again_as_it_is(tmp_path: Path) -> None:
+    """Of a run that does not warm up, the time constant is at an end of its range."""
+    result = kf_calib.calibrate(simulated(0, 14), kf_calib.Settings(effects=("warm-up",)))
+    kf_calib.save_calibration(result, tmp_path / "cal.json")
+    saved = kf_calib.open_calibration(tmp_path / "cal.json")
+    (effect,) = saved.model().effects
+    (fitted,) = result.model.effects
+    assert effect.held and fitted.held and effect.value == fitted.value
+    assert saved.state.symbols[12:] == ["B1", "B2", "B3"] and not saved.state.undetermined
+    assert saved.parameters[-1].symbol == "tauWarm" and saved.parameters[-1].value is None
+    assert all(np.isfinite(visit.innovation_mps2).all() for visit in result.visits[6:])
 
 
 def test_what_is_saved_is_read_again(run: kf_calib.Calibration, tmp_path: Path) -> None:
@@ -206,17 +219,18 @@ BROKEN: dict[str, tuple[str | Callable[[dict[str, Any]], None], str]] = {
     "a constant left out": (put("effects", 1, "constant", value=None), "warm-up has the constant None"),
     "a constant out of its range": (put("effects", 1, "constant", value=1e9), "has the constant 1000000000.0"),
     "a constant of an effect without": (put("effects", 0, "constant", value=3.0), "has the constant 3.0"),
-    "determined and not": (put("state", "undetermined", value=["tauWarm", "b1"]), "whether b1 was determined"),
-    "an unknown symbol": (put("state", "undetermined", 0, value="zz"), "state.undetermined names zz"),
+    "determined and not": (put("state", "undetermined", value=["b1"]), "whether b1 was determined"),
+    "an unknown symbol": (put("state", "undetermined", value=["zz"]), "state.undetermined names zz"),
     "an effect twice": (put("effects", 2, "text", value="second-order"), "effects names 'second-order' twice"),
     "effects without coefficients": (
-        lambda content: content["effects"].extend({"text": f"f{k} = fx*T", "constant": None} for k in range(90)),
-        "there are 93 effects, but only",
+        lambda content: content["effects"].extend({"text": f"f{k} = fx*T", "constant": None} for k in range(9)),
+        "there are 12 effects, but only 10 coefficients",
     ),
     "no date": (put("conditions", "began", value="yesterday"), "conditions.began is 'yesterday', which is no date"),
     "no date of saving": (put("provenance", "created", value="1"), "provenance.created is '1', which is no date"),
     "a date beyond time": (put("conditions", "began", value="9999-12-31T23:59:59+00:00"), "is no date"),
     "a duration beyond time": (put("conditions", "duration_s", value=1e300), "conditions.duration_s"),
+    "a duration of five thousand years": (put("conditions", "duration_s", value=1.5e11), "conditions.duration_s"),
     "a negative count": (put("conditions", "dwells", 0, "readings", value=-5), "conditions.dwells.0.readings"),
     "negative degrees of freedom": (put("consistency", "dof", value=-3), "consistency.dof"),
     "a probability above 1": (put("consistency", "p_value", value=1.5), "consistency.p_value"),

@@ -134,3 +134,12 @@ def test_what_was_not_determined_is_not_applied() -> None:
     own = correction("second-order")
     with pytest.raises(UnobservableError, match=r"did not determine K2_1: add orientations"):
         replace(own, unseen=("K2_1",))
+
+
+def test_directions_of_gravity_are_those_of_faces_edges_and_corners_of_a_cube() -> None:
+    """By their angles to the nearest face: none, 45 deg, and that whose cosine is the root of a third."""
+    unit = correction().gravities / BENCH.gravity_mps2
+    np.testing.assert_allclose(np.linalg.norm(unit, axis=1), 1.0)
+    assert len(np.unique(unit.round(9), axis=0)) == 26
+    to_face = np.sort(np.abs(unit).max(axis=1) ** 2)
+    np.testing.assert_allclose(to_face, np.repeat([1.0 / 3.0, 0.5, 1.0], [8, 12, 6]))

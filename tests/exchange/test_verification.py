@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from helpers.calibrations import BENCH, simulated, with_result
+from helpers.calibrations import BENCH, simulated, warming_up, with_result
 from helpers.long_runs import slow
 from helpers.paths import ROOT
 from scipy import optimize, spatial, stats
@@ -159,8 +159,8 @@ def test_gravity_block_and_the_very_same_recording_are_told() -> None:
 
 def test_effects_of_the_run_are_not_compared() -> None:
     settings = kf_calib.Settings(effects=("warm-up", "second-order"))
-    own = calibration_file.saved(kf_calib.calibrate(simulated(0, 14), settings))
-    found = verify(own, own.model(), simulated(77, 14))
+    own = calibration_file.saved(kf_calib.calibrate(warming_up(0, 14), settings))
+    found = verify(own, own.model(), warming_up(77, 14))
     assert found.free == ("warm-up",) and found.holds
     assert {move.symbol for move in found.moves} >= {"K1", "K2_1"}
     assert not {move.symbol for move in found.moves} & {"B1", "B2", "B3", "tauWarm"}
@@ -192,3 +192,12 @@ def test_a_calibration_that_determined_too_little_predicts_nothing() -> None:
     assert own.state.undetermined
     with pytest.raises(UnobservableError, match=r"did not determine .*: verify one that did"):
         verification.refuse_incomplete(own)
+
+
+def test_directions_are_spread_evenly() -> None:
+    """None is farther from the nearest than one and a half radii of a disc that is the share of one."""
+    lattice = verification._sphere(500)
+    np.testing.assert_allclose(np.linalg.norm(lattice, axis=1), 1.0)
+    anywhere = np.random.default_rng(1).normal(size=(20000, 3))
+    nearest = (anywhere / np.linalg.norm(anywhere, axis=1, keepdims=True)) @ lattice.T
+    assert np.arccos(nearest.max(axis=1)).max() < 1.5 * np.arccos(1.0 - 2.0 / 500)

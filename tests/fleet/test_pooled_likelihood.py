@@ -264,6 +264,25 @@ def test_evidence_about_a_mean_is_the_integral_over_the_mean() -> None:
     assert shape.log_odds == pytest.approx(truth, abs=0.2)
 
 
+@pytest.mark.parametrize(("mean", "spread", "having", "units"), [(40.0, 0.3, 6, 12), (20.0, 20.0, 20, 20)])
+def test_evidence_about_a_mean_is_exact_where_it_is_clear_who_has_the_effect(
+    mean: float, spread: float, having: int, units: int
+) -> None:
+    """By a sum over the mean, whose size is one, three or ten spreads."""
+    scores = np.random.default_rng(6).normal(0.0, 1.0, (units, 1))
+    scores[:having] += np.random.default_rng(7).normal(mean, spread, (having, 1))
+    shape = about_mean(UnitInformation([""] * units, np.ones((units, 1, 1)), scores))
+    grid, logs = np.linspace(-120.0, 120.0, 3841), list[float]()
+    for size in sizes(0.25, 64.0):
+        likelihood = np.zeros((len(SHARES), len(grid)))
+        for score in scores:
+            has = norm(grid, np.hypot(1.0, size)).logpdf(score) - norm.logpdf(score)
+            likelihood += np.logaddexp(np.log(SHARES)[:, None] + has, np.log1p(-SHARES)[:, None])
+        prior = [norm.logpdf(grid, scale=ratio * size) + np.log(grid[1] - grid[0]) for ratio in (1.0, 3.0, 10.0)]
+        logs += [float(logsumexp(likelihood + each)) for each in prior]
+    assert shape.log_odds == pytest.approx(logsumexp(logs) - np.log(len(logs) * len(SHARES)), abs=0.02)
+
+
 def test_the_likeliest_mean_of_some_units_is_where_likelihood_times_prior_is_largest() -> None:
     """Its derivatives by differences vanish, against those at a tenth of a sigma beside it, for each share of units."""
     rng, spread, prior = np.random.default_rng(9), 0.4, 3.0

@@ -10,6 +10,7 @@ import kf_calib
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.exchange import calibration_file
 from kf_calib.exchange.calibration_file import SavedCalibration
+from kf_calib.sources.simulation.injected import parse
 from kf_calib.sources.simulation.sensors import GRADES, Sensors, TrueNoise
 from kf_calib.sources.simulation.simulator import Simulation
 from kf_calib.sources.simulation.visit_plans import PlannedVisit
@@ -33,6 +34,12 @@ def simulated(
     sensors = Sensors({**SENSORS.parameters, **changed})
     settled = {"sample_hz": 20.0, "slew_rate_degps": np.inf, **options}
     return Simulation(bench, sensors, NOISE, visits(count, 7 * seed + 3), seed=seed, **settled)
+
+
+def warming_up(seed: int, count: int) -> Simulation:
+    """The same with a warm-up of two minutes, so that its time constant is determined."""
+    run = simulated(seed, count)
+    return run.hiding(parse(("warm-up=1e-3;tau=120",), run.bench.axes, seed=seed))
 
 
 def with_result(template: SavedCalibration, result: kf_calib.Calibration) -> SavedCalibration:

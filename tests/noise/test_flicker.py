@@ -11,18 +11,20 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from helpers.long_runs import slow
-from helpers.synthetic import NOMINAL, G, sensitivities
+from helpers.synthetic import NOMINAL, G, Run, sensitivities
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.bench.streams import Batch, Stream
+from kf_calib.dwells.pieces import of_all_pieces
+from kf_calib.dwells.stack import DwellStack
 from kf_calib.effects import effect_named, names
-from kf_calib.estimation.calibration import evaluate
+from kf_calib.estimation.calibration import calibrate, evaluate
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.settings import Settings
-from kf_calib.noise.nuisance_states import SLOW, _likeliest
+from kf_calib.noise.nuisance_states import SLOW, _amplitudes, _likeliest, flicker_sigmas
 from kf_calib.support.threads import one_blas_thread
 
 BENCH = Bench(axes_of("yzx"), G, latitude_deg=50.0, angle_sigma_deg=0.0)
@@ -125,3 +127,31 @@ def test_waves_count_where_their_likelihood_gains_what_chi2_exceeds_once_in_twen
     h = v * float(brentq(lambda ratio: gain(ratio) - share * limit, 1e-6, 1e3))
     variances = np.full((dwells, len(SLOW)), v)
     assert _likeliest(np.sqrt(variances + h / SLOW), variances) == pytest.approx(np.sqrt(h) if seen else 0.0, rel=0.06)
+
+
+def test_slow_waves_have_the_variance_of_their_share_of_one_over_f_noise() -> None:
+    """h / k of the component sqrt(2) cos(pi k t / T), of noise that is drawn: its waves are at most four dwells
+    long, and those that are longer give k = 1 an eighth. Each accelerometer has an h."""
+    rng, count, h = np.random.default_rng(11), 600, 4.0
+    at = (np.arange(count) + 0.5) / count
+    waves = np.sqrt(2.0) * np.cos(np.pi * SLOW[:, None] * at)
+    drawn = np.array([waves @ one_over_f(rng, h, count) / count for _ in range(2000)])
+    own = flicker_sigmas(np.array([np.sqrt(h), 0.0, 3.0])).reshape(3, len(SLOW))
+    assert drawn.std(axis=0) == pytest.approx(own[0], rel=0.18)
+    np.testing.assert_allclose(own[2] * np.sqrt(SLOW), 3.0)
+    assert np.all(own[1] > 0.0) and np.all(own[1] < 1.1e-9)
+
+
+def test_amplitudes_of_white_noise_have_the_variances_that_are_said() -> None:
+    """In dwells of 300 readings of two weights; along directions, in which channels of other noise come together."""
+    run = Run(seed=3, dwells=200)
+    run.accel.values[:, 1] += 2e-4 * np.random.default_rng(1).normal(size=len(run.accel.values))
+    result = calibrate(run, Settings(effects=()))
+    dwells = [dwell.weighted(2.0 if k % 2 else 1.0) for k, dwell in enumerate(result.fit.dwells)]
+    stack, columns = DwellStack.of(dwells), of_all_pieces(result.linearised.columns) @ result.estimate.state
+    sigma = np.array([1e-4, np.hypot(1e-4, 2e-4), 1e-4])
+    for channels in (np.eye(3), np.array([[0.6, 0.8, 0.0]])):
+        amplitudes, variances = _amplitudes(stack, columns, sigma, np.tile(channels, (200, 1, 1)))
+        for first, weight in ((0, 1.0), (1, 2.0)):  # whose noise is said to be less than it is
+            ratios = amplitudes[first::2] ** 2 / variances[first::2]
+            assert ratios.mean(axis=(0, 1)) == pytest.approx(np.full(len(channels), weight), rel=0.25)

@@ -48,6 +48,13 @@ def test_ar1_inflation_is_that_of_the_mean(phi: float) -> None:
     np.testing.assert_allclose(result.noise.sigma_mps2, 1e-4, rtol=0.1)
 
 
+@pytest.mark.parametrize(("phi", "count"), [(0.0, 100), (0.5, 300)])
+def test_a_parabola_takes_three_independent_readings_of_a_dwell(phi: float, count: int) -> None:
+    """Of pieces of 40 and of 125 readings, of which it takes much: sigma is right to three standard errors."""
+    dwells = calibrate(Run(seed=4, dwells=300, count=count, phi=phi)).fit.dwells
+    assert noise_model.within_dwells(dwells).sigma_mps2.mean() == pytest.approx(1e-4, rel=0.012)
+
+
 def test_a_walk_of_known_intensity_is_no_noise_of_a_reading() -> None:
     """Beside white noise of 1e-4 m/s^2, one of 1e-4 m/s^2/s^(1/2) over dwells of 20 seconds."""
     run, walk = Run(seed=1, dwells=80, count=400), 1e-4

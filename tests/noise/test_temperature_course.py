@@ -90,3 +90,19 @@ def test_a_piece_weighs_as_the_mean_over_its_whole_length_does(monkeypatch: pyte
         1.0 / weights, ((lengths + temperature_course._CARRIED_S) / np.maximum(lengths, 1e-9) ** 2)[:4]
     )
     assert owners.tolist() == [0, 0, 1, 1]
+
+
+@pytest.mark.parametrize(("course", "steady"), [("noise", True), ("swing", False), ("jumps", False)])
+def test_a_room_is_steady_if_the_thermometer_scatters_alike_within_dwells_and_between(
+    course: str, steady: bool
+) -> None:
+    """Fifty dwells of four pieces: noise alone, noise with a slow swing, and levels that differ from dwell to dwell."""
+    rng, dwells = np.random.default_rng(4), 50
+    level = {
+        "noise": np.zeros(dwells),
+        "swing": np.sin(np.arange(dwells) / 8.0),
+        "jumps": 3.0 * rng.normal(size=dwells),
+    }
+    read = np.repeat(level[course], 12) + rng.normal(size=12 * dwells)
+    folded: Any = SimpleNamespace(piece_numbers=np.full(dwells, 4), ends=np.arange(0, 4 * dwells + 1, 4))
+    assert temperature_course._only_scatters(folded, read) == steady

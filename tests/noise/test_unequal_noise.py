@@ -53,6 +53,16 @@ def test_a_dwell_of_few_readings_keeps_to_the_others() -> None:
     assert many_weights[0] / np.median(many_weights) == pytest.approx(1.0 / 20.0, rel=0.2)
 
 
+@pytest.mark.parametrize(("few", "counts"), [(1.9, False), (2.1, True), (3.9, True)])
+def test_the_noise_of_a_dwell_counts_from_two_degrees_of_freedom(few: float, counts: bool) -> None:
+    """With less its weight is that of a dwell of which nothing is known, however it trembles."""
+    _, estimates = drawn(3, 4.0, dwells=100)
+    freedom = np.append(np.full(99, 30.0), few)
+    weights = [weights_of(np.append(estimates[:99], size * np.median(estimates)), freedom) for size in (1.0, 40.0)]
+    relative = [own[-1] / own[0] for own in weights]
+    assert (relative[1] < 0.7 * relative[0]) == counts and (relative[1] == pytest.approx(relative[0])) != counts
+
+
 @pytest.mark.parametrize("freedom", [5.0, 300.0])
 def test_equal_noise_keeps_one_noise(freedom: float) -> None:
     unequal = sum(

@@ -7,12 +7,16 @@ import os
 import signal
 import subprocess
 import sys
+import time
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 from mutation_trials.changes import changes_in, function_at
-from mutation_trials.server import in_child, replace_code
+from mutation_trials.command import Trial, counts
+from mutation_trials.runner import Runner
+from mutation_trials.server import Outcome, in_child, replace_code, report
 from mutation_trials.test_map import TestMap
 
 SOURCE = """
@@ -79,10 +83,65 @@ def test_two_functions_of_one_name_and_line_cannot_be_told_apart_but_within_anot
 
 
 def test_a_child_answers_or_takes_too_long() -> None:
-    assert in_child(lambda answer: os.write(answer, b"a test") and None) == "a test"
-    assert in_child(lambda _: None) == ""
-    assert in_child(lambda _: os.kill(os.getpid(), signal.SIGKILL)) == "time"
-    assert "the tests were not run" in in_child(lambda _: 1 // 0)
+    def hang(answer: int) -> None:
+        report(answer, at="a test")
+        time.sleep(60.0)
+
+    assert in_child(lambda answer: report(answer, at="a test") or report(answer, failed="a test")) == Outcome("a test")
+    assert in_child(lambda answer: report(answer, at="a test") or report(answer, failed="")) == Outcome()
+    assert in_child(lambda _: None) == Outcome()
+    assert in_child(lambda _: os.kill(os.getpid(), signal.SIGXCPU)) == Outcome(late="a test")
+    assert in_child(hang, longest_s=0.3) == Outcome(late="a test")
+    assert "the tests were not run" in in_child(lambda _: 1 // 0).failed
+
+
+def test_what_a_child_has_started_ends_with_it() -> None:
+    def start(_: int) -> None:
+        if os.fork() == 0:
+            time.sleep(60.0)
+        time.sleep(60.0)
+
+    begun_s = time.monotonic()
+    assert in_child(start, longest_s=0.3) == Outcome(late="a test")
+    assert time.monotonic() - begun_s < 30.0
+
+
+PASSED, FAILED, LATE = Outcome(), Outcome("t.py::one"), Outcome(late="t.py::one")
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "answer", "count"),
+    [
+        ([PASSED], "SURVIVED 1 of 1 tests", "kf_calib: 0 of 1 changes noticed"),
+        ([FAILED, FAILED, PASSED], "t.py::one", "kf_calib: 1 of 1 changes noticed"),
+        ([LATE, FAILED, PASSED], "t.py::one", "kf_calib: 1 of 1 changes noticed"),
+        ([LATE, LATE, PASSED], "t.py::one (takes too long)", "kf_calib: 1 of 1 changes noticed"),
+        ([LATE, PASSED], "UNSURE t.py::one (takes too long), once in two runs", "1 unsure"),
+        ([LATE, LATE, LATE], "UNSURE t.py::one (takes too long), without the change, too", "1 unsure"),
+        ([FAILED, FAILED, FAILED], "UNSURE t.py::one, without the change, too", "1 unsure"),
+    ],
+)
+def test_a_test_notices_a_change_if_it_fails_again_and_not_without_it(
+    outcomes: list[Outcome], answer: str, count: str, tmp_path: Path
+) -> None:
+    """All tests run with the change; what fails, once more with it and once without it."""
+    runs = [("0.5", ["t.py"]), ("0.5", ["t.py::one"]), ("1.0", ["t.py::one"])]
+    (tmp_path / "m.py").write_text("SIZE = 1.0")
+    change, remaining = changes_in("SIZE = 1.0")[0], list(outcomes)
+
+    class Scripted(Runner):
+        def __init__(self) -> None:
+            self._copy, self._budget_s, self._map = tmp_path, 1.0, TestMap({"t.py": ["m.py:"]}, {"t.py": 0.1})
+
+        def _ask(self, path: Path, function: str, tests: Sequence[str]) -> Outcome:
+            if not tests:
+                return PASSED
+            size, expected = runs.pop(0)
+            assert (tmp_path / path).read_text() == f"SIZE = {size}" and tests == expected
+            return remaining.pop(0)
+
+    tried = Trial(Path("kf_calib/m.py"), change, 1.0, Scripted().noticed_by(Path("m.py"), change))
+    assert str(tried.answer) == answer and counts([tried]) == count and not remaining
 
 
 def test_the_tests_that_call_a_function_come_with_the_quick_file_first_after_those_named(tmp_path: Path) -> None:

@@ -21,8 +21,10 @@ ROOT = Path(__file__).resolve().parents[2]
 _ABOUT = """
 An operator, a comparison or a constant is changed at random in a private copy of the checkout. The fast tests that call
 the function are run until one fails, in a process that has everything loaded: files that import the module first, and
-quick ones before slow ones. A change at which they fail, or take ten times as long, is noticed. What survives changes
-no result, or shows that a test is missing: which of the two, a reader decides. Give --line to try those of a line.
+quick ones before slow ones. A change is noticed where a test fails or takes ten times as long, does so again, and does
+not without the change. If it passes when it is run again, or fails without the change, too, the line says UNSURE. What
+survives changes no result, or shows that a test is missing: which of the two, a reader decides. Give --line to try
+those of a line.
 """
 
 
@@ -57,10 +59,12 @@ def modules(names: Sequence[str]) -> list[Path]:
 
 
 def counts(trials: Sequence[Trial]) -> str:
-    """How many were noticed, by folder."""
-    total = Counter(trial.path.parent for trial in trials)
+    """How many were noticed, by folder, of those of which the tests tell anything; and of how many they do not."""
+    total = Counter(trial.path.parent for trial in trials if not trial.answer.unsure)
     noticed = Counter(trial.path.parent for trial in trials if trial.answer.noticed_by)
-    return "\n".join(f"{folder}: {noticed[folder]} of {total[folder]} changes noticed" for folder in sorted(total))
+    lines = [f"{folder}: {noticed[folder]} of {total[folder]} changes noticed" for folder in sorted(total)]
+    unsure = sum(bool(trial.answer.unsure) for trial in trials)
+    return "\n".join([*lines, *([f"{unsure} unsure"] if unsure else [])])
 
 
 def main(words: Sequence[str] | None = None) -> None:

@@ -8,7 +8,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,19 +17,26 @@ from typing import Self
 
 from mutation_trials import server
 from mutation_trials.changes import Change, function_at
+from mutation_trials.server import Outcome
 from mutation_trials.test_map import TestMap, importing_tests
 
 
 @dataclass(frozen=True)
 class Answer:
-    """noticed_by: the test that failed; empty: none of ``tried``, of ``calling`` that call what was changed."""
+    """noticed_by: the test that failed; empty: none of ``tried``, of ``calling`` that call what was changed.
+
+    unsure: a test that failed or took too long, but passes with the change when it is run again, or does the same
+    without the change, so that it tells nothing.
+    """
 
     noticed_by: str
     tried: int
     calling: int
+    unsure: str = ""
 
     def __str__(self) -> str:
-        return self.noticed_by or f"SURVIVED {self.tried} of {self.calling} tests"
+        survived = f"SURVIVED {self.tried} of {self.calling} tests"
+        return self.noticed_by or (f"UNSURE {self.unsure}" if self.unsure else survived)
 
 
 def copied(root: Path, folder: Path) -> Path:
@@ -64,6 +71,14 @@ def _write(module: Path, source: str) -> None:
         stale.unlink()
 
 
+def _repeated(outcome: Outcome, tests: Sequence[str]) -> Sequence[str]:
+    """What to run to see whether an outcome was by chance: the test that failed, or all if it is not known which."""
+    if outcome.passed:
+        return []
+    test = outcome.failed or outcome.late
+    return [test] if "::" in test and not test.endswith(")") else tests
+
+
 class Runner:
     """The fast tests of a copy that call what some modules have, and the process that runs them.
 
@@ -95,9 +110,16 @@ class Runner:
         tests = self._affordable(calling)
         _write(place, change.of(source))
         try:
-            return Answer(self._ask(path, function, tests), len(tests), len(calling))
+            first = self._ask(path, function, tests)
+            again = self._ask(path, function, _repeated(first, tests))
         finally:
             _write(place, source)
+        unchanged = self._ask(path, function, _repeated(again, tests))
+        said = str(again)
+        if first.passed or (not again.passed and unchanged.passed):
+            return Answer(said, len(tests), len(calling))
+        return Answer("", len(tests), len(calling), unsure=f"{first}, once in two runs" if again.passed else
+                      f"{said}, without the change, too")  # fmt: skip
 
     def _affordable(self, tests: Sequence[str]) -> list[str]:
         """As many as the budget allows, and one."""
@@ -109,10 +131,13 @@ class Runner:
             spent_s += self._map.seconds[test]
         return taken
 
-    def _ask(self, path: Path, function: str, tests: Sequence[str]) -> str:
-        usual_s = Counter[str]()
+    def _ask(self, path: Path, function: str, tests: Sequence[str]) -> Outcome:
+        if not tests:
+            return Outcome()
+        usual_s = defaultdict[str, float](float)
         for test in tests:
-            usual_s[test.partition("::")[0]] += self._map.seconds[test]
+            file = test.partition("::")[0]
+            usual_s[file] += self._map.seconds.get(test, self._map.seconds.get(file, 0.0))
         asked = {
             "path": str(path),
             "function": function,
@@ -122,10 +147,10 @@ class Runner:
         }
         assert self._process.stdin is not None and self._process.stdout is not None
         print(json.dumps(asked), file=self._process.stdin, flush=True)
-        said = json.loads(self._process.stdout.readline())
-        if said.startswith("the tests were not run"):
-            raise RuntimeError(said)
-        return said
+        outcome = Outcome(**json.loads(self._process.stdout.readline()))
+        if outcome.failed.startswith("the tests were not run"):
+            raise RuntimeError(outcome.failed)
+        return outcome
 
     def __enter__(self) -> Self:
         return self

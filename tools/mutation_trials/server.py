@@ -3,18 +3,22 @@
 usage: python server.py ROOT MAP [TEST_FILE...]
 
 The tests are collected once, and mapped (``test_map``) where the file MAP is not there yet. Then each line of standard
-input, a request, is answered by a line: the first test that failed, "" if none did, or "time" if one took too long.
+input, a request, is answered by a line, the fields of an ``Outcome``: which test failed, or took too long.
 A request is a JSON object: ``tests`` in the order to run them; ``usual_s``, the usual processor time of each of their
 files; ``budget_s``, after how much processor time no further test is begun; ``path``, the module that was changed in
 the copy; ``function``, the one that was changed, or "" for a change outside of functions: then all is loaded anew.
+
+A child process reports by lines of JSON: ``{"at": TEST}`` when a test begins, ``{"failed": TEST}`` at its end.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import gc
 import itertools
 import json
+import math
 import os
 import resource
 import select
@@ -24,6 +28,7 @@ import time
 import traceback
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import CodeType, FunctionType
 from typing import Any
@@ -32,19 +37,39 @@ import pytest
 
 QUIET = ("-n", "0", "-q", "-m", "not slow", "-p", "no:cacheprovider", "--no-header", "--tb=no")
 _SLOWER, _LEAST_S = 10.0, 20.0
-"""Tests of a file that take so many times as long as usual, and at least so long, have noticed something."""
+"""Processor time that the tests of a file may take, in their usual time, and at least."""
 _LONGEST_S = 300.0
-"""By the clock; tests that wait for ever take no processor time."""
+"""Time of the clock that one test may take; one that waits for ever takes no processor time."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """failed: the first test that failed, or ""; late: the test that was stopped because it took too long, or ""."""
+
+    failed: str = ""
+    late: str = ""
+
+    @property
+    def passed(self) -> bool:
+        """Whether all tests passed."""
+        return not (self.failed or self.late)
+
+    def __str__(self) -> str:
+        return f"{self.late} (takes too long)" if self.late else self.failed
 
 
 class FirstFailure:
-    """A plugin of pytest: ``test`` is the first that failed, or ""; a file that takes too long ends the process."""
+    """A plugin of pytest: ``test`` is the first that failed, or ""; a file that takes too long ends the process.
 
-    def __init__(self, asked: Mapping[str, Any]) -> None:
-        self.test, self._usual_s, self._file = "", asked["usual_s"], ""
+    answer: the pipe to which the name of a test is written when it begins.
+    """
+
+    def __init__(self, asked: Mapping[str, Any], answer: int) -> None:
+        self.test, self._usual_s, self._file, self._answer = "", asked["usual_s"], "", answer
         self._end_s, self._session = time.process_time() + asked["budget_s"], None
 
     def pytest_runtest_logstart(self, nodeid: str) -> None:
+        report(self._answer, at=nodeid)
         file = nodeid.partition("::")[0]
         if file != self._file:
             self._file = file
@@ -80,14 +105,14 @@ class Server:
 
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
         if not self._map_file.exists():
-            said = in_child(lambda _: self._map(session))
-            if said:
-                raise RuntimeError(said)
+            outcome = in_child(lambda _: self._map(session), math.inf)
+            if outcome != Outcome():
+                raise RuntimeError(f"the tests were not mapped: {outcome}")
         print("ready", file=self._answers, flush=True)
         for line in self._requests:
             asked = json.loads(line)
             work = functools.partial(self._answer, named(asked["tests"], session.items), asked)
-            print(json.dumps(in_child(work)), file=self._answers, flush=True)
+            print(json.dumps(asdict(in_child(work))), file=self._answers, flush=True)
         return True
 
     def _map(self, session: pytest.Session) -> None:
@@ -101,11 +126,11 @@ class Server:
     def _answer(self, items: Sequence[pytest.Item], asked: Mapping[str, Any], answer: int) -> None:
         if not (asked["function"] and replace_code(self._root / asked["path"])):
             self._load_anew(asked, answer)
-        plugin = FirstFailure(asked)
+        plugin = FirstFailure(asked, answer)
         if items:
             items[0].config.pluginmanager.register(plugin)
         _run(items, plugin.ended)
-        os.write(answer, plugin.test.encode())
+        report(answer, failed=plugin.test)
 
     def _load_anew(self, asked: Mapping[str, Any], answer: int) -> None:
         """In a process that takes the place of this one."""
@@ -156,27 +181,49 @@ def _run(items: Sequence[pytest.Item], ended: Callable[[], bool]) -> None:
             return
 
 
-def in_child(work: Callable[[int], None]) -> str:
-    """What a child process writes to the pipe that some work is given; "time" if it took too long."""
+def in_child(work: Callable[[int], None], longest_s: float = _LONGEST_S) -> Outcome:
+    """What a child process reports through the pipe that some work is given.
+
+    It is stopped, and what it has started with it, where it takes too much processor time, or reports nothing for
+    ``longest_s``.
+    """
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
         try:
+            os.setpgid(0, 0)
             os.close(reading)
             silent = os.open(os.devnull, os.O_RDWR)
             for stream in (0, 1, 2):
                 os.dup2(silent, stream)
             work(writing)
         except BaseException:
-            os.write(writing, f"the tests were not run: {traceback.format_exc()}".encode())
+            report(writing, failed=f"the tests were not run: {traceback.format_exc()}")
         os._exit(0)
     os.close(writing)
-    if not select.select([reading], [], [], _LONGEST_S)[0]:
-        os.kill(child, signal.SIGKILL)
-    with os.fdopen(reading, "rb") as answer:
-        said = answer.read().decode()
+    reported = _reported(reading, longest_s)
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(child, signal.SIGKILL)
     status = os.waitpid(child, 0)[1]
-    return "time" if os.WIFSIGNALED(status) and not said else said
+    if "failed" not in reported and os.WIFSIGNALED(status):
+        return Outcome(late=reported.get("at", "a test"))
+    return Outcome(failed=reported.get("failed", ""))
+
+
+def report(answer: int, **fields: str) -> None:
+    """Write a line of JSON to a pipe."""
+    os.write(answer, (json.dumps(fields) + "\n").encode())
+
+
+def _reported(pipe: int, longest_s: float) -> dict[str, str]:
+    """The last of each field that is reported, up to the end of the tests, or until nothing comes for so long."""
+    fields, rest, wait_s = dict[str, str](), b"", None if math.isinf(longest_s) else longest_s
+    while "failed" not in fields and select.select([pipe], [], [], wait_s)[0] and (part := os.read(pipe, 2**16)):
+        *lines, rest = (rest + part).split(b"\n")
+        for line in lines:
+            fields |= json.loads(line)
+    os.close(pipe)
+    return fields
 
 
 def load_anew(request: Path, answer: int) -> None:
@@ -187,10 +234,10 @@ def load_anew(request: Path, answer: int) -> None:
         def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
             items[:] = named(asked["tests"], items)
 
-    plugin = FirstFailure(asked)
+    plugin = FirstFailure(asked, answer)
     code = pytest.main([*QUIET, *asked["usual_s"]], plugins=[plugin, Ordered()])
     sound = code in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED) or plugin.ended()
-    os.write(answer, (plugin.test or ("" if sound else "does not load")).encode())
+    report(answer, failed=plugin.test or ("" if sound else "does not load"))
 
 
 def main(root: Path, map_file: Path, files: Sequence[str]) -> None:

@@ -67,7 +67,10 @@ class CHeader(Target):
             yield "const double T = temperature_c == temperature_c ? temperature_c - 25.0 : 0.0;"
         else:
             yield "(void)temperature_c;"
-        matrices = self._matrices(used)
+        sensitivity = correction.sensitivity
+        along = sensitivity / np.linalg.norm(sensitivity, axis=1, keepdims=True)
+        # what the specific force is multiplied by: a along the input axes, r as it is read
+        matrices = {name: own for name, own in {"a": along, "r": sensitivity}.items() if f"{name}[" in used}
         yield from (f"static const double {name}_axes[3][3] = {_array(own)};" for name, own in matrices.items())
         yield f"double f[3], e[3] = {{0.0, 0.0, 0.0}}{''.join(f', {name}[3]' for name in matrices)};"
         yield f"for (int i = 0; i < 3; i++) f[i] = {_product('c[i]', 'z')};"
@@ -84,12 +87,6 @@ class CHeader(Target):
         column = abs(self.input.channels[i]) - 1
         factor = float(self.input.matrix[i, column])
         return f"reading[{column}]" if factor == 1.0 else f"{text_of_number(factor)} * reading[{column}]"
-
-    def _matrices(self, used: str) -> dict[str, Floats]:
-        """Return what the specific force is multiplied by: a along the input axes, r as it is read."""
-        sensitivity = self.correction.sensitivity
-        unit = sensitivity / np.linalg.norm(sensitivity, axis=1, keepdims=True)
-        return {name: own for name, own in {"a": unit, "r": sensitivity}.items() if f"{name}[" in used}
 
     def _terms(self, i: int) -> Iterator[str]:
         """What accelerometer i, from 0, reads more: coefficients times formulas."""

@@ -179,7 +179,7 @@ class CsvTable(Target):
         for own in self.saved.parameters:
             yield in_cell(own.symbol), own.value, own.sigma, in_cell(own.unit)
         for effect in self.correction.effects:
-            if effect.unknown is not None and not effect.smooth:  # that of a smooth one is among the parameters
+            if effect.unknown is not None and not effect.has_constant_in_state:  # else it is among the parameters
                 yield effect.unknown.symbol, effect.value, None, effect.unknown.unit
         given, unit = self.input, "1" if self.input.is_plain else "m/s^2 a count"
         for i in range(3):

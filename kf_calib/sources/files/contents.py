@@ -160,7 +160,11 @@ class Contents:
         schema = self.schemas.get(channel.schema_id)
         is_ros = channel.message_encoding == CDR and schema and schema.encoding in ("ros2msg", "ros2idl")
         if channel.message_encoding not in ENCODINGS and not is_ros:
-            raise InputError(self._unreadable(channel))
+            described = f"a schema {schema.name} in {schema.encoding!r}" if schema else "no schema"
+            raise InputError(
+                f"{self.path}: topic {channel.topic} has {channel.message_encoding!r} messages with {described}, only "
+                "'cdr' with 'ros2msg', 'json' and 'protobuf' can be read: convert the file to ROS 2 first."
+            )
 
     def decoder(self, role: Role, topic: str, width: int, joints: Joints | None, warn: Warn) -> Decoder | FieldDecoder:
         """What reads the messages of a chosen topic. Raises InputError where nothing does."""
@@ -178,12 +182,6 @@ class Contents:
             )
         except FieldError as error:
             raise InputError(f"{said} cannot be used: {error}.") from None
-
-    def _unreadable(self, channel: Channel) -> str:
-        schema = self.schemas.get(channel.schema_id)
-        said = f"{self.path}: topic {channel.topic} has {channel.message_encoding!r} messages with "
-        said += f"a schema {schema.name} in {schema.encoding!r}" if schema else "no schema"
-        return f"{said}, only 'cdr' with 'ros2msg', 'json' and 'protobuf' can be read: convert the file to ROS 2 first."
 
     @property
     def schemas_of_topics(self) -> dict[str, str]:

@@ -274,7 +274,7 @@ class CsvColumns:
             raise InputError(f"{self._quoted(ranked)} name a gimbal twice: leave one out by --column THEIRS=-.")
         units = [self._meanings[at].unit for at in places]
         if "" in units:
-            unit = self.units.angle or self._unit_of_angles(places)
+            unit = self.units.angle or ("deg" if (np.abs(self._values(places)) > 2.0 * math.pi).any() else "")
             if not unit and not needed:
                 return QuantityColumns()
             if not unit:
@@ -364,10 +364,6 @@ class CsvColumns:
             f"no column gives the time with its unit: say which {name!r} has, for example --column '{name}=time_ms'; "
             f"{self.wanted}, not {self._seen}."
         )
-
-    def _unit_of_angles(self, places: Sequence[int]) -> str:
-        """Return the unit of angles whose names tell none, empty where their size does not tell it either."""
-        return "deg" if (np.abs(self._values(places)) > 2.0 * math.pi).any() else ""
 
     def _dates(self, places: Sequence[int]) -> Stamps:
         """How stamps of a calendar are written; of two columns the second may give the time of day."""

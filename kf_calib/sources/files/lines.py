@@ -350,12 +350,9 @@ class _Passage:
 
     def _read(self, stream: BinaryIO | TextFile) -> Iterator[bytes]:
         read = getattr(stream, "read1", stream.read)  # read1 does not wait until a whole block has come
-        while block := self._read_block(read):
-            yield block
-
-    def _read_block(self, read: Callable[[int], bytes]) -> bytes:
         try:
-            return read(_BLOCK_BYTES)
+            while block := read(_BLOCK_BYTES):
+                yield block
         except OSError as error:
             raise InputError(f"{self._name}: cannot be read on ({error.strerror}).") from None
 

@@ -155,7 +155,9 @@ class TopicAppender:
 
     def _blank_records(self, template: bytes) -> NDArray[np.void]:
         """Return as many records of messages as a chunk has, without what differs between them."""
-        kind = _record_type(self._layout)
+        message = ("message", cdr.dtype_of(self._layout))
+        kind = np.dtype([("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"),
+                         ("log_time", "<u8"), ("publish_time", "<u8"), message])  # fmt: skip
         blank = np.zeros(1, kind)
         blank["opcode"], blank["length"] = Opcode.MESSAGE, kind.itemsize - HEAD.size
         blank["channel"] = self._channel
@@ -201,12 +203,6 @@ class TopicAppender:
         self._out.write(data)
         self._crc, self._position = zlib.crc32(data, self._crc), self._position + len(data)
         return zlib.crc32(data, section)
-
-
-def _record_type(layout: cdr.Layout) -> np.dtype[np.void]:
-    """Return the structured type of a message record."""
-    return np.dtype([("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"),
-                     ("log_time", "<u8"), ("publish_time", "<u8"), ("message", cdr.dtype_of(layout))])  # fmt: skip
 
 
 def _bytes(record: McapRecord) -> bytes:

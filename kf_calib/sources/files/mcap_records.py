@@ -256,7 +256,7 @@ def are_packed(block: RecordBlock, groups: Iterable[MessageGroup]) -> bool:
 def unpacked(block: RecordBlock, groups: Iterable[MessageGroup], max_size: int) -> tuple[RecordBlock, list[str]]:
     """The block with its messages unpacked, and why those that are lost are. max_size: bytes of one, at most."""
     records, lost = list[bytes](), list[str]()
-    for start, size in _in_order(groups):
+    for start, size in sorted((start, group.size) for group in groups for start in group.at.tolist()):
         opcode, _, *fields = MESSAGE_RECORD.unpack_from(block.data, start - MESSAGE_RECORD.size)
         try:
             message = _unpack(block.data[start : start + size], max_size)
@@ -267,10 +267,6 @@ def unpacked(block: RecordBlock, groups: Iterable[MessageGroup], max_size: int) 
     starts = np.cumsum([0, *map(len, records)])[:-1].astype(np.int64)
     data = b"".join(records)
     return RecordBlock(data, (len(data),), starts, block.end), lost
-
-
-def _in_order(groups: Iterable[MessageGroup]) -> Iterator[tuple[int, int]]:
-    yield from sorted((start, group.size) for group in groups for start in group.at.tolist())
 
 
 def _unpack(data: bytes, max_size: int) -> bytes:

@@ -53,7 +53,8 @@ def sized(simulation: Simulation, effect: Hidden, sigmas: float) -> Hidden:
     Raises NoSizeError where no number does. By the secant method on the logarithms: most effects are proportional to
     their coefficients, and take one step.
     """
-    _refuse_without_white_noise(simulation.noise)
+    if not simulation.noise.white_mps2:
+        raise InputError("a size in sigma needs white noise of the readings: give some, or a size with a unit.")
     logarithm, slope, before = 0.0, 1.0, (0.0, 0.0)
     for round_ in range(_ROUNDS):
         scaled = effect.scaled(math.exp(logarithm))
@@ -79,11 +80,6 @@ def sizes_in_sigma(simulation: Simulation, effects: Sequence[Hidden]) -> list[fl
     measured = [effect for effect in effects if effect.kind.stage != "record"]
     found = iter(_sizes_in_sigma(simulation, measured) if measured else ())
     return [next(found) if effect.kind.stage != "record" else None for effect in effects]
-
-
-def _refuse_without_white_noise(noise: TrueNoise) -> None:
-    if not noise.white_mps2:
-        raise InputError("a size in sigma needs white noise of the readings: give some, or a size with a unit.")
 
 
 def _why_unseen(effect: Hidden) -> str:

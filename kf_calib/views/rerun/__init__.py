@@ -159,7 +159,8 @@ def _angles(degrees: tuple[float, ...]) -> str:
 
 def markdown_summary(result: Calibration) -> str:
     """The page in Markdown, in the units that people are shown."""
-    blocks = [_head(result), _table(result), _verdict(result), *_warnings(result), _noise(result), *_ties(result)]
+    warnings = ["**Warnings**\n\n" + "\n".join(f"- {text}" for text in result.warnings)] if result.warnings else []
+    blocks = [_head(result), _table(result), _verdict(result), *warnings, _noise(result), *_ties(result)]
     return "\n\n".join(blocks) + "\n"
 
 
@@ -230,10 +231,6 @@ def _ties(result: Calibration) -> list[str]:
 
 def _three(unit: Unit, values: Floats) -> str:
     return ", ".join(map(unit.number, values))
-
-
-def _warnings(result: Calibration) -> list[str]:
-    return ["**Warnings**\n\n" + "\n".join(f"- {text}" for text in result.warnings)] if result.warnings else []
 
 
 def layout(result: Calibration, history: VisitHistory, goes_on: bool = False) -> rrb.Blueprint:

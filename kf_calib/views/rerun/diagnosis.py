@@ -20,7 +20,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.explanation import EffectShape, Explanation
+from kf_calib.diagnosis.explanation import EffectShape
 from kf_calib.diagnosis.hypothesis_table import LISTED, HypothesisTable
 from kf_calib.diagnosis.residual_drivers import Driver
 from kf_calib.diagnosis.results import Diagnosis
@@ -108,7 +108,8 @@ def _summary(diagnosis: Diagnosis) -> str:
         blocks.append(f"**Next orientation**: gimbals at {angles} deg: {why}.")
     if explanations := diagnosis.explanations[:_MOST]:
         rows = [
-            f"| {rank} | {each.name} | {'yes' if each.fits else 'no'} | {_p(each)} |"
+            f"| {rank} | {each.name} | {'yes' if each.fits else 'no'} | "
+            f"{format_p(each.after.consistency.p_value).removeprefix('= ')} |"
             for rank, each in enumerate(explanations, 1)
         ]
         blocks.append("\n".join(["| explanation | adds | fits | p of the model with it |", "|:--|:--|:--|:--|", *rows]))
@@ -132,10 +133,6 @@ def _probabilities(table: HypothesisTable) -> str:
     rows = [*families, ("", None), *((name_of(row), row.probability) for row in table.listed)]
     lines = ["| | |" if share is None else f"| {name} | {format_probability(share)} |" for name, share in rows]
     return "\n".join(["| it may be | probability |", "|:--|--:|", *lines])
-
-
-def _p(explanation: Explanation) -> str:
-    return format_p(explanation.after.consistency.p_value).removeprefix("= ")
 
 
 def _layout(diagnosis: Diagnosis) -> rrb.Blueprint:

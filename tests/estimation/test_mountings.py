@@ -1,0 +1,49 @@
+"""What differs in a mounting from what is stated: poses as they are meant, from poses as they were recorded."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import permutations, product
+
+import numpy as np
+import pytest
+from helpers.synthetic import G
+from scipy.spatial.transform import Rotation
+
+from kf_calib.bench.bench import Bench, axes_of
+from kf_calib.estimation.mountings import AffineFit, Mounting
+
+
+def test_angles_are_put_in_order_and_into_radians() -> None:
+    stated = Mounting.stated(Bench(axes_of("yzx"), G))
+    recorded = np.array([[10.0, 20.0, 30.0], [-40.0, 50.0, 180.0]])
+    np.testing.assert_array_equal(stated.poses(recorded), recorded)
+    other = replace(stated, order=(2, 0, 1), angle_unit=np.pi / 180.0)
+    np.testing.assert_allclose(other.poses(recorded), np.radians(recorded[:, [2, 0, 1]]))
+
+
+@pytest.mark.parametrize("real_first", [False, True])
+@pytest.mark.parametrize("conjugate", [False, True])
+def test_quaternions_are_those_of_the_rotation_that_is_meant(conjugate: bool, real_first: bool) -> None:
+    """Of unit norm; scipy writes them with the real part last, and inverts them."""
+    meant = Rotation.from_rotvec(np.random.default_rng(1).normal(size=(5, 3)))
+    written = (meant.inv() if conjugate else meant).as_quat()
+    recorded = np.roll(written, 1, axis=1) if real_first else written
+    mounting = replace(Mounting.stated(Bench((), G)), conjugate=conjugate, real_first=real_first)
+    np.testing.assert_allclose(np.linalg.norm(mounting.poses(recorded), axis=1), 1.0)
+    np.testing.assert_allclose(Rotation.from_quat(mounting.poses(recorded)).as_matrix(), meant.as_matrix(), atol=1e-12)
+
+
+def test_a_fit_is_near_nominal_with_the_channels_as_they_are_wired_alone() -> None:
+    """Axes 20 deg off and scale factors a tenth off, wired in every order and with every sign."""
+    turned = np.diag([1.1, 0.9, 1.05]) @ Rotation.from_euler("x", 20.0, degrees=True).as_matrix()
+    orders = [tuple(s * k for s, k in zip(signs, order, strict=True))
+              for order in permutations((1, 2, 3)) for signs in product((1, -1), repeat=3)]  # fmt: skip
+    for wired in orders:
+        sensitivity = np.empty((3, 3))
+        for channel, row in zip(wired, turned, strict=True):
+            sensitivity[abs(channel) - 1] = np.sign(channel) * row
+        fit = AffineFit(sensitivity, 0.0, np.eye(3))
+        assert [order for order in orders if fit.is_near(order)] == [wired]
+    assert not AffineFit(np.diag([1.0, 1.0, 30.0]), 0.0, np.eye(3)).is_near()
+    assert not AffineFit(np.diag([1.0, 0.03, 1.0]), 0.0, np.eye(3)).is_near()
