@@ -106,8 +106,8 @@ def test_a_line_counts_for_an_oscillation_at_a_tenth_of_the_level() -> None:
     """Four tenths are for the known effects, as much for the misfit, and one tenth for trends."""
     test = assess_candidates(calibrate(source(LINE)).fit)
     (line, *_) = test.lines.significant
-    assert test.effects.p_values["sinusoid"] == pytest.approx(0.4 * line.p_value / 0.1)
-    assert test.p_value == pytest.approx(min(1.0, line.p_value / 0.1), rel=1e-6)
+    assert test.effects.p_values["sinusoid"] == pytest.approx(0.4 * line.p_value / 0.1, rel=1e-9, abs=0.0)
+    assert test.p_value == pytest.approx(line.p_value / 0.1, rel=1e-9, abs=0.0)
 
 
 def test_without_its_source_a_line_is_judged_by_one_pass_and_that_is_said() -> None:

@@ -10,6 +10,7 @@ from helpers.long_runs import slow
 from helpers.synthetic import plan_of
 
 from kf_calib.bench.bench import Bench, axes_of
+from kf_calib.dwells import folding
 from kf_calib.dwells.blocks import Curve
 from kf_calib.errors import InputError
 from kf_calib.estimation.calibration import calibrate
@@ -136,6 +137,15 @@ def test_slews_have_no_autocovariance_and_no_spectrum() -> None:
     dwells, slews = whole.fold(), whole.folder.slews
     assert len(slews) == 9 and all(dwell.autocovariance.count and dwell.spectrum.sums for dwell in dwells)
     assert all(slew.autocovariance.count == 0 and not slew.spectrum.sums for slew in slews)
+    assert all(len(dwell.trace) for dwell in dwells) and not any(len(slew.trace) for slew in slews)
+
+
+def test_traces_are_of_readings_that_are_not_averaged_and_of_bounded_length(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = Pass(run([]), Settings()).fold()
+    assert not any(len(dwell.trace) for dwell in Pass(run([]), Settings(window_s=1.0)).fold())
+    lengths = [len(dwell.trace) for dwell in whole]
+    monkeypatch.setattr(folding, "MOST_CELLS", lengths[0] + lengths[1] + 1)
+    assert [len(dwell.trace) for dwell in Pass(run([]), Settings()).fold()] == [*lengths[:3], *[0] * (len(whole) - 3)]
 
 
 @pytest.mark.parametrize(("rate_hz", "degps", "count"), [
@@ -153,3 +163,5 @@ def test_pieces_of_a_slew_are_two_degrees_and_a_fifth_of_a_second_together_and_t
     assert np.median(lengths) == pytest.approx(max(count, 3), abs=1.0) and lengths[:-1].max() <= count + 2
     if count == 3:
         assert 3 in lengths
+    last = [np.diff(curve.cuts(time_s[:size]))[-1] for size in range(7, 60)]
+    assert min(last) == 3

@@ -54,3 +54,13 @@ def test_what_is_not_determined_has_no_share(results: dict[str, Calibration]) ->
     few = replace(results["diffuse"], visits=results["diffuse"].visits[:3])
     assert few.visits[-1].estimate.unseen.all()
     assert np.isnan(information_shares(few)).all()
+
+
+def test_a_parameter_that_the_last_dwell_determines_has_all_of_it_from_there() -> None:
+    """And one that was known exactly, or that nothing tells, has no shares."""
+    unknown = np.nan
+    sigmas = np.array([[unknown, 2.0, 0.0, unknown], [unknown, 1.0, 0.0, unknown], [0.5, 0.5, 0.0, unknown]])
+    shares = shares_of(sigmas)
+    np.testing.assert_allclose(shares[:, 0], [0.0, 1.0])
+    np.testing.assert_allclose(shares[:, 1], [0.1875, 0.75])
+    assert np.isnan(shares[:, 2:]).all()

@@ -9,6 +9,7 @@ import pytest
 from helpers.long_runs import slow
 from helpers.restricted import restricted_log_likelihood
 from helpers.synthetic import Run
+from scipy.optimize import minimize_scalar
 from scipy.stats import chi2, multivariate_normal
 
 from kf_calib.bench.arrays import Floats
@@ -21,6 +22,7 @@ from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
 from kf_calib.noise import random_walk
 from kf_calib.noise.noise_model import mean_covariances, steps
+from kf_calib.noise.reml import gauss_markov_gains
 
 Q = 1e-5
 
@@ -102,6 +104,24 @@ def test_the_likelihood_is_that_of_a_dense_covariance(held_s: float) -> None:
         values.append((expected, found))
     differences = np.diff(np.array(values), axis=0)
     np.testing.assert_allclose(differences[:, 0], differences[:, 1], atol=2e-3)
+
+
+def test_gains_of_walks_that_revert_are_those_of_the_largest_likelihoods() -> None:
+    """Over that of a random walk: the largest of each, by a search of the likelihood over the intensity alone."""
+    result = fitted(walking(6, dwells=24))
+    means, state = result.linearised.means, result.linearised.state
+    gains, times_s = gauss_markov_gains(result.noise, means, state, np.zeros((0, means.design.shape[2] + 1)))
+
+    def largest(held_s: float) -> float:
+        def cost(log_intensity: float) -> float:
+            noise = replace(result.noise, walk_mps2_per_sqrt_s=float(np.exp(log_intensity)))
+            return -restricted_log_likelihood(noise, means, state, held_s=held_s)
+
+        return -float(minimize_scalar(cost, bounds=(np.log(1e-7), np.log(1e-3)), method="bounded").fun)
+
+    assert (np.diff(times_s) > 0.0).all()
+    for k in (0, len(times_s) // 2, len(times_s) - 1):
+        assert gains[k] == pytest.approx(largest(float(times_s[k])) - largest(np.inf), abs=0.02)
 
 
 @pytest.mark.parametrize("setting_deg", [0.01, 1.0, 100.0])
