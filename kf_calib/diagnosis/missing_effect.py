@@ -32,7 +32,7 @@ from kf_calib.diagnosis.hypothesis_table import (
 from kf_calib.diagnosis.refits import Refits, calibration_of, dwell_noise_is_stated, with_noise_as_stated
 from kf_calib.diagnosis.replication import Replication, replication
 from kf_calib.diagnosis.results import Diagnosis, Suspect
-from kf_calib.diagnosis.verdict import disturbance_in_words, second_pass_in_words, verdict_in_words
+from kf_calib.diagnosis.verdict import disturbance_in_words, format_probability, second_pass_in_words, verdict_in_words
 from kf_calib.dwells import window_average
 from kf_calib.estimation.outlying_dwell import outlying_in_words
 from kf_calib.estimation.results import Calibration, format_p
@@ -171,7 +171,7 @@ def _decided(refits: Refits, diagnosis: Diagnosis) -> Diagnosis:
             final_test = retest.with_vibration(test.lines.vibration)
             diagnosis, test = replace(diagnosis, before_in_noise_left=before_in_noise_left, test=final_test), retest
     credible = (first, *table.rivals) if first.effects else ()
-    why_not = unearned(first, before, test.effects.walk)
+    why_not = unearned(first, before, test.effects.walk) or behind_nothing(first, table)
     named = first if first.effects and not why_not else None
     names = tuple(dict.fromkeys(name for row in credible for name in row.effects))
     pairs = [row.effects for row in credible[1:] if len(row.effects) > 1 and not set(first.effects) & set(row.effects)]
@@ -188,6 +188,13 @@ def _decided(refits: Refits, diagnosis: Diagnosis) -> Diagnosis:
         after=_after(refits, before, named) if named else None,
         suspects=_suspects(diagnosis, table),
     )
+
+
+def behind_nothing(first: Hypothesis, table: HypothesisTable) -> str:
+    """Why the effects of the likeliest row must not be named where none missing at all is likelier; "" elsewhere."""
+    nothing = table.families.get(NOTHING, 0.0)
+    likelier = first.effects and nothing > first.probability
+    return f"that nothing is missing is likelier ({format_probability(nothing)})" if likelier else ""
 
 
 def _after(refits: Refits, before: Calibration, named: Hypothesis) -> Calibration | None:

@@ -12,8 +12,8 @@ from helpers.paths import REAL
 from real_trials.turned import TurnedRecording
 
 import kf_calib
-from kf_calib.diagnosis.hypothesis_table import Hypothesis
-from kf_calib.diagnosis.missing_effect import SEEN, diagnose, unearned
+from kf_calib.diagnosis.hypothesis_table import IRREGULAR, NONE, NOTHING, Hypothesis, table_of
+from kf_calib.diagnosis.missing_effect import SEEN, behind_nothing, diagnose, unearned
 from kf_calib.effects import walk_named
 
 
@@ -74,7 +74,20 @@ def test_creep_of_a_real_unit_is_not_called_an_oscillation() -> None:
     """With its poses stated to 0.05 deg, as gimbals would show them."""
     recording = TurnedRecording(REAL / "xsens_mti.csv.gz")
     diagnosis = diagnose(recording.altered(np.zeros(3)), replicate=False)
-    assert diagnosis.missing == () and "leaves the misfit between them as it was" in diagnosis.unearned
+    assert diagnosis.missing == () and "sinusoid" not in diagnosis.ambiguity
+    assert "In dwell 1 the readings swing with a period of 13 s, as in no other dwell" in diagnosis.verdict
+
+
+@pytest.mark.parametrize("nothing, said", [(0.6, "that nothing is missing is likelier (60 %)"), (0.3, "")])
+def test_a_name_is_not_earned_where_nothing_missing_is_likelier(nothing: float, said: str) -> None:
+    rows = [
+        Hypothesis(families=(NOTHING,), log_evidence=np.log(nothing)),
+        Hypothesis(("bent",), families=("nonlinearity",), log_evidence=np.log(0.9 * (1.0 - nothing))),
+        Hypothesis(driver=IRREGULAR, families=(NONE,), log_evidence=np.log(0.1 * (1.0 - nothing))),
+    ]
+    table = table_of(rows)
+    assert table.first.effects == ("bent",) and behind_nothing(table.first, table) == said
+    assert behind_nothing(Hypothesis(driver=IRREGULAR, families=(NONE,)), table) == ""
 
 
 @pytest.mark.parametrize("correlation, earned", [(0.8, False), (0.826, False), (0.833, True), (0.97, True)])
