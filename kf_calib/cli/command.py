@@ -13,7 +13,9 @@ Numbers on the command line: finite, within their range, with a decimal point.
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from functools import partial, wraps
 from pathlib import Path
@@ -94,13 +96,33 @@ def command(
         @wraps(function)
         def callback(*args: Any, **values: Any) -> None:
             groups = {name: grouped(kind, values) for name, kind in kinds.items() if is_dataclass(kind)}
-            function(*args, **{name: value for name, value in values.items() if name in kinds}, **groups)
+            with _numpy_as_loaded():
+                function(*args, **{name: value for name, value in values.items() if name in kinds}, **groups)
 
         for declare in reversed([*_declarations(function, {})]):
             declare(callback)
         return click.command(name, cls=_Command, seldom=seldom, epilog=epilog)(callback)
 
     return made
+
+
+@contextmanager
+def _numpy_as_loaded() -> Iterator[None]:
+    """Let numpy list no more than is loaded of it: scipy asks, as it is loaded, for all that is listed, and would wait
+    0.15 s for numpy's reader of Fortran, its tests and all that these need."""
+    if "scipy" in sys.modules:
+        yield
+        return
+    import numpy as np  # not for --help
+
+    content = np.__dict__
+    before = {name: content[name] for name in ("__all__", "__dir__")}
+    content["__all__"] = [name for name in content["__all__"] if name in content]
+    content["__dir__"] = lambda: [*content]
+    try:
+        yield
+    finally:
+        content.update(before)
 
 
 def _declarations(owner: Any, options: Mapping[str, Any]) -> Iterator[Callable[..., Any]]:
