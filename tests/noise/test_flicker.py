@@ -150,7 +150,7 @@ def test_amplitudes_of_white_noise_have_the_variances_that_are_said() -> None:
     dwells = [dwell.weighted(2.0 if k % 2 else 1.0) for k, dwell in enumerate(result.fit.dwells)]
     stack, columns = DwellStack.of(dwells), of_all_pieces(result.linearised.columns) @ result.estimate.state
     sigma = np.array([1e-4, np.hypot(1e-4, 2e-4), 1e-4])
-    for channels in (np.eye(3), np.array([[0.6, 0.8, 0.0]])):
+    for channels in (np.eye(3), np.array([[0.5, 0.5, np.sqrt(0.5)]])):
         amplitudes, variances = _amplitudes(stack, columns, sigma, np.tile(channels, (200, 1, 1)))
         for first, weight in ((0, 1.0), (1, 2.0)):  # whose noise is said to be less than it is
             ratios = amplitudes[first::2] ** 2 / variances[first::2]
