@@ -176,7 +176,7 @@ class Effect(ABC):
 
     def held_if_beyond(self, step: float) -> Self:
         """The same effect; its unknown is held if it is at the upper end of its range and ``step`` of ln(value) leads
-        out: what goes on more slowly than any of its kind differs no more from a straight line."""
+        out of it, as of a warm-up so slow that it is a straight line in this run."""
         assert self.unknown is not None
         other = copy.copy(self)
         other.held = self.held or (step > 0.0 and self.value >= self.unknown.high)
