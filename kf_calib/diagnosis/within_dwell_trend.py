@@ -199,7 +199,7 @@ def disturbed_dwell(fitted: Fit) -> DisturbedDwell:
     a constant of that dwell, so that only the course of its readings counts. The decrease of chi-squared is chi-squared
     distributed if the oscillation goes on alike in all dwells. What one dwell alone has is creep, or a disturbance.
 
-    fitted: a fit whose model has an oscillation. A random walk of the biases counts within no dwell.
+    fitted: a fit whose model has an oscillation. Its random walk of the biases, if it has one, is left out here.
     """
     linearised, noise = fitted.linearised, replace(fitted.noise.for_goodness_of_fit, walk_mps2_per_sqrt_s=0.0)
     model, dwells = linearised.model, linearised.dwells_at_state

@@ -20,7 +20,8 @@ from kf_calib.effects.effect import (
 from kf_calib.effects.stimulus import Stimulus
 
 _TIME, _STEP = Regressor("t", "time", "s"), Regressor("da", "last step along the input axis", "m/s^2")
-_LEAST_STEP_MPS2 = 3.0 * MILLI_G  # setting errors and creep of 0.1 deg make less of no step, of either sign
+_LEAST_STEP_MPS2 = 0.1 * MILLI_G  # less has either sign by noise of the angles and creep of the platform
+_UNSURE = 5.0  # sigmas of a setting error, which both ends of a step have
 _HELD = 2.5  # cycles in a piece, of which its parabola holds a fourteenth of the power
 
 
@@ -53,7 +54,7 @@ class ScaleDrift(SensorEffect):
 
 
 class Hysteresis(SensorEffect):
-    """h sgn(Delta a_i), Delta a_i the last step of the input, of at least 3 mg."""
+    """h sgn(Delta a_i), Delta a_i the last step of the input, beyond what setting errors make."""
 
     family = "memory"
     name, title, source = "hysteresis", "reading that depends on the side it was come from", "IEEE Std 1293, hysteresis"
@@ -63,7 +64,9 @@ class Hysteresis(SensorEffect):
     typical = Typical((1 * MICRO_G, 20 * MICRO_G), (0.0, 2 * MILLI_G))
 
     def terms(self, s: Stimulus) -> Floats:
-        return np.sign(np.where(np.abs(s.step) > _LEAST_STEP_MPS2, s.step, 0.0))
+        unsure_rad = _UNSURE * np.radians(s.bench.angle_sigma_deg or 0.0)
+        least_mps2 = max(_LEAST_STEP_MPS2, unsure_rad * s.bench.gravity_mps2)
+        return np.sign(np.where(np.abs(s.step) > least_mps2, s.step, 0.0))
 
 
 class _Decay(SensorEffect):
