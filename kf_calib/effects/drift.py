@@ -54,7 +54,7 @@ class ScaleDrift(SensorEffect):
 
 
 class Hysteresis(SensorEffect):
-    """h sgn(Delta a_i), Delta a_i the last step of the input, beyond what setting errors make."""
+    """h sgn(Delta a_i), Delta a_i the last step that setting errors do not make."""
 
     family = "memory"
     name, title, source = "hysteresis", "reading that depends on the side it was come from", "IEEE Std 1293, hysteresis"
