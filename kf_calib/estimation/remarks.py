@@ -149,10 +149,11 @@ def remarks_on(
 
 
 def _on_held(effect: Effect, unknown: Unknown) -> str:
-    """Return a remark on a constant that is held at the end of its range."""
+    """Return a remark on a constant that is held at an end of its range."""
+    end = "greatest" if effect.value >= unknown.high else "least"
     return (
-        f"{unknown.symbol} is held at {shown(unknown).text(effect.value)}, the greatest value that is searched: the "
-        f"readings do not bound it, and {effect} may be another effect that looks the same."
+        f"{unknown.symbol} is held at {shown(unknown).text(effect.value)}, the {end} value that is searched: the "
+        f"readings do not bound it on that side, and {effect} may be another effect that looks the same."
     )
 
 
