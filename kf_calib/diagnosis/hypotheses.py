@@ -355,10 +355,11 @@ class Hypotheses:
 
     def _log_odds_within_dwells(self, refit: Calibration) -> float:
         """Return the log odds of what a walk explains within dwells, where it goes on but has no column: trends that
-        the same columns leave without a walk, less those that are left beside it."""
+        the same columns leave in the noise of the run without a walk, less those that are left beside it."""
         if not self.test.trend:
             return 0.0
-        standing = replace(refit.fit, noise=replace(refit.noise, walk_mps2_per_sqrt_s=0.0))
+        noise = replace(self.before.noise, sensitivity_mps2_per_k=refit.noise.sensitivity_mps2_per_k)
+        standing = replace(refit.fit, noise=noise)
         return _log_odds(trend(standing)) - _log_odds(trend(refit.fit))
 
     def _families(self, effects: Sequence[str]) -> tuple[str, ...]:

@@ -11,16 +11,19 @@ from helpers.hidden_effects import BENCH, WHITE
 from helpers.hidden_effects import noisy_run as run
 from helpers.hidden_effects import noisy_source as source
 from helpers.long_runs import slow
+from helpers.paths import SHARED
 from helpers.synthetic import Run, plan_of
 
 from kf_calib.bench.streams import Stream
 from kf_calib.diagnosis.candidate_tests import assess_candidates
+from kf_calib.diagnosis.hypothesis_table import NOTHING
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.unknown_effect import JUMP
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.settings import Settings
+from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.simulation.sensors import GRADES, TrueNoise
 from kf_calib.sources.simulation.simulator import Simulation
 from kf_calib.sources.simulation.visit_plans import six_faces
@@ -205,6 +208,23 @@ def test_of_vibration_alone_nothing_is_said_but_that_it_is_there(seeds: range, d
     quiet = [diagnose(source("vibration-rectification=1e-12", seed=seed, dwells=dwells)) for seed in seeds]
     assert all(found.test.lines.vibration for found in quiet)
     assert sum(not found.test.consistent for found in quiet) <= 0.05 * len(quiet)
+
+
+@pytest.mark.parametrize("size, said", [("15ug/g^2", False), ("300ug/g^2", True)])
+def test_a_size_that_no_such_sensor_has_is_told(size: str, said: bool) -> None:
+    """Of navigation grade 20 ug/g^2 is the greatest that is usual."""
+    found = diagnose(run(f"second-order={size}", dwells=14), replicate=False)
+    assert found.missing == ("second-order",), found.verdict
+    assert ("times the greatest that is usual (20 µg/g²): something else" in found.verdict) == said, found.verdict
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="the recordings of others are not there")
+def test_that_nothing_may_be_missing_is_told_among_the_others() -> None:
+    """Six poses of a board in the hand, p = 0.003."""
+    found = diagnose(Recording(SHARED / "ferraris_hand.mcap", angles=False), replicate=False)
+    assert found.table is not None
+    nothing = found.table.families[NOTHING]
+    assert 0.05 < nothing < 0.6 and f"nothing missing {100.0 * nothing:.0f} %" in found.verdict, found.verdict
 
 
 @pytest.mark.parametrize(
