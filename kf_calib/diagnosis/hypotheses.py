@@ -354,13 +354,19 @@ class Hypotheses:
         return Hypothesis(effects, formulas, "", self._families(effects), log, delta_chi2, best.dof + walks, refit)
 
     def _log_odds_within_dwells(self, refit: Calibration) -> float:
-        """Return the log odds of what a walk explains within dwells, where it goes on but has no column: trends that
-        the same columns leave in the noise of the run without a walk, less those that are left beside it."""
+        """Return the log odds of what a walk explains within dwells, where it goes on but has no column.
+
+        They are the ratio of the densities of the trends with the walk and without it, the same columns in the noise of
+        the run: a walk that should move the readings within dwells, and does not, is none. They are no more than the
+        p-values of both allow, as that of any irregular change is.
+        """
         if not self.test.trend:
             return 0.0
         noise = replace(self.before.noise, sensitivity_mps2_per_k=refit.noise.sensitivity_mps2_per_k)
-        standing = replace(refit.fit, noise=noise)
-        return _log_odds(trend(standing)) - _log_odds(trend(refit.fit))
+        standing, walking = trend(replace(refit.fit, noise=noise)), trend(refit.fit)
+        if standing is None or walking is None:
+            return 0.0
+        return min(walking.log_density - standing.log_density, _log_odds(standing) - _log_odds(walking))
 
     def _families(self, effects: Sequence[str]) -> tuple[str, ...]:
         """Return the families of effects, each once."""

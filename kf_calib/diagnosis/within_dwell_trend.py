@@ -72,12 +72,14 @@ class Trend:
     """The test of all trends within dwells.
 
     ratio: mean square of all coefficients over what noise gives. p_value: its p-value. sums (D, 3): sum of these ratios
-    for each dwell and channel.
+    for each dwell and channel. log_density: logarithm of the density of the coefficients in this noise, but for a
+    constant that is that of the dwells.
     """
 
     ratio: float
     p_value: float
     sums: Floats
+    log_density: float = 0.0
 
     @property
     def most(self) -> tuple[int, int]:
@@ -120,8 +122,9 @@ def trend_beside(linearised: LinearisedDwells, noise: Noise, state: Floats) -> T
     readings = sum(dwell.count for dwell in dwells)
     unsure = float(np.mean((4.0 * noise.inflation - 2.0) / readings)) / 3.0
     unsure += (2.0 * (noise.walk_spread or 0.0) * float(np.mean(by_walk / expected))) ** 2
-    ratio = float(ratios.sum() / count)
-    return Trend(ratio, float(fdtrc(count, 2.0 / unsure, ratio)), ratios.sum(axis=2))
+    ratio, logs = float(ratios.sum() / count), np.log(np.broadcast_to(expected, squares.shape))
+    log_density = -0.5 * float(np.sum(ratios + np.where(determined[:, None, :], logs, 0.0)))
+    return Trend(ratio, float(fdtrc(count, 2.0 / unsure, ratio)), ratios.sum(axis=2), log_density)
 
 
 def _by_thermometer(linearised: LinearisedDwells, noise: Noise) -> Floats | float:
