@@ -303,14 +303,23 @@ def test_a_jump_is_not_called_a_walk(seed: int) -> None:
 
 @pytest.mark.parametrize("seeds", [range(6, 7), *slow(range(3, 8))])
 def test_in_a_few_dwells_a_walk_could_explain_what_an_effect_does(seeds: range) -> None:
-    """Three coefficients of six degrees of freedom: what is left is no proof. In 16 dwells it is."""
+    """Three coefficients of six degrees of freedom: what is left is no proof. In 16 dwells it is.
+
+    That a walk would move the readings within dwells, too, speaks against it, but not for sure: its size is unsure.
+    """
     few = [diagnose(source("hysteresis=12sigma", plan=plan_of(6, dwell_s=8.0, seed=seed))) for seed in seeds]
-    kept = [found for found in few if {"hysteresis", "bias-walk"} <= set(found.ambiguity)]
-    assert len(kept) > 0.7 * len(few)  # now and then the effect fits so closely that it is a proof
-    assert all("bias-walk" in found.verdict or " others" in found.verdict for found in kept)
-    first = [found.likeliest.effects if found.unearned and found.likeliest else () for found in kept]
-    assert all(found.missing or effects == ("hysteresis",) for found, effects in zip(kept, first, strict=True))
-    assert "bias-walk" not in diagnose(source("hysteresis=12sigma")).ambiguity
+    assert all("hysteresis" in found.ambiguity for found in few)
+    walks = [_of_a_walk(found) for found in few]
+    assert np.median(walks) > 1e-3  # now and then the effect fits so closely that it is a proof
+    for found in (found for found in few if "bias-walk" in found.ambiguity):
+        assert "bias-walk" in found.verdict or " others" in found.verdict
+    enough = diagnose(source("hysteresis=12sigma"))
+    assert "bias-walk" not in enough.ambiguity and _of_a_walk(enough) < 1e-6
+
+
+def _of_a_walk(found: Diagnosis) -> float:
+    assert found.table is not None
+    return found.table.probability(["bias-walk"])
 
 
 SCATTER = ({"scatter_mps2": 3e-6}, {"scatter_sigma_mps2": 0.0})
