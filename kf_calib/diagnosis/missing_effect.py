@@ -29,7 +29,13 @@ from kf_calib.diagnosis.hypothesis_table import (
     noise_p,
     table_of,
 )
-from kf_calib.diagnosis.refits import Refits, calibration_of, dwell_noise_is_stated, with_noise_as_stated
+from kf_calib.diagnosis.refits import (
+    Refits,
+    calibration_of,
+    dwell_noise_is_stated,
+    with_noise_as_stated,
+    with_noise_beside_oscillation,
+)
 from kf_calib.diagnosis.replication import Replication, replication
 from kf_calib.diagnosis.results import Diagnosis, Suspect
 from kf_calib.diagnosis.verdict import disturbance_in_words, format_probability, second_pass_in_words, verdict_in_words
@@ -78,6 +84,10 @@ def _diagnosed(refits: Refits, before: Calibration) -> Diagnosis:
         test = replace(refits.assess(before), noise_p=min(dwell.p_value for dwell in before.outlying))
         verdict = f"One dwell is wrong (p {format_p(test.p_value)}): {outlying_in_words(before.outlying)}"
         return Diagnosis(before=before, test=test, verdict=verdict, unknown=test.consistent is False)
+    quieter = with_noise_beside_oscillation(refits, before)
+    if quieter is not None:  # an oscillation was taken for slow noise
+        diagnosis = _explained(refits, quieter, _without_vibration(refits, quieter, refits.assess(quieter)))
+        return _in_words(replace(diagnosis, before=before, before_in_noise_left=quieter))
     test = _without_vibration(refits, before, refits.assess(before))
     diagnosis = _explained(refits, before, test)
     if diagnosis.unknown and test.without_lines:  # the lines keep their phase through the run, but not their amplitude
@@ -89,6 +99,11 @@ def _diagnosed(refits: Refits, before: Calibration) -> Diagnosis:
             retest = refits.assess(averaged)
             retest = retest.without_lines or retest  # lines that are left after averaging are vibration, too
             diagnosis = _explained(refits, averaged, retest.with_vibration(test.lines.vibration))
+    return _in_words(diagnosis)
+
+
+def _in_words(diagnosis: Diagnosis) -> Diagnosis:
+    """Return a diagnosis with its verdict."""
     diagnosis = replace(diagnosis, restoring_time_s=_restoring_time_s(diagnosis))
     words = verdict_in_words(diagnosis) + second_pass_in_words(diagnosis) + disturbance_in_words(diagnosis)
     return replace(diagnosis, verdict=words)

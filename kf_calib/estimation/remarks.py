@@ -115,6 +115,9 @@ def remarks_on(
         usual = float(np.median(dwells.folded.counts))
         short = not dwells[0].averaged and usual < TOO_SHORT * noise.inflation.max()
         slow = "; dwells are too short to tell how slow it is: stay longer in each" if short else ""
+        if judged.quiet:
+            slow = "; yet the dwells differ by much less than such noise lets them: what goes on within them alike may "
+            slow += "be an oscillation, for which diagnose looks"
         yield f"the noise within a dwell is correlated: sigmas allow for it by inflating its variance by {kappa}{slow}."
     least, most = dwells.folded.weights.min(), dwells.folded.weights.max()
     if least < most:

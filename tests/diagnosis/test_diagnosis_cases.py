@@ -194,6 +194,24 @@ def test_an_oscillation_and_another_effect_are_both_found() -> None:
     assert found.after.parameters["fSin"].value == pytest.approx(0.9, abs=1e-3)
 
 
+@pytest.mark.parametrize("size, seed", [(200, 7), *slow((100, 8), (400, 9))])
+def test_an_oscillation_of_one_cycle_a_dwell_is_not_taken_for_slow_noise(size: int, seed: int) -> None:
+    """Its variance, as if it were noise, is a hundred times that of the noise; the dwells' means say it is none."""
+    found = diagnose(source(f"sinusoid={size}sigma", seed=seed), replicate=False)
+    assert found.missing == ("sinusoid",) and found.after is not None, found.verdict
+    assert found.after.consistency.consistent and found.after.noise.inflation.max() < 1.5
+    assert found.before.noise.inflation.max() > 5.0
+    assert any("may be an oscillation" in warning for warning in found.before.warnings)
+
+
+@pytest.mark.parametrize("seeds", [range(2), *slow(range(2, 22))])
+def test_slow_noise_is_not_taken_for_an_oscillation(seeds: range) -> None:
+    """Of 1/f noise within dwells and a walk, which the means of the dwells follow."""
+    for seed in seeds:
+        found = diagnose(source(seed=seed, walk_mps2_per_sqrt_s=2e-5, flicker_mps2=3e-5), replicate=False)
+        assert not found.before.consistency.quiet and "sinusoid" not in found.missing, found.verdict
+
+
 def test_vibration_is_no_oscillation_of_one_amplitude_and_what_it_rectifies_is_named() -> None:
     """With a line of 3 m/s^2 in the readings."""
     found = diagnose(source("vibration-rectification=15sigma", dwells=14))
@@ -225,6 +243,13 @@ def test_that_nothing_may_be_missing_is_told_among_the_others() -> None:
     assert found.table is not None
     nothing = found.table.families[NOTHING]
     assert 0.05 < nothing < 0.6 and f"nothing missing {100.0 * nothing:.0f} %" in found.verdict, found.verdict
+
+
+@pytest.mark.parametrize("seed", [7, *slow(8, 9)])
+def test_a_rate_of_the_temperature_is_told_from_a_long_lag_as_well_as_can_be(seed: int) -> None:
+    """Where it swings, its rate and its integral differ by little; at 200 sigma an error of 2 % of the rate decides."""
+    found = diagnose(source("thermal-rate=200sigma", seed=seed), replicate=False)
+    assert "thermal-rate" in (*found.missing, *found.ambiguity), found.verdict
 
 
 @pytest.mark.parametrize(
