@@ -72,9 +72,10 @@ def test_a_pair_that_the_run_does_not_determine_is_no_explanation(monkeypatch: p
     assert found.table and found.table.first.effects and all(len(row.effects) < 2 for row in found.table.rows)
 
 
-@pytest.mark.parametrize(
-    ("probability", "text"), [(0.9995, "over 99.9 %"), (0.993, "99.3 %"), (0.5, "50 %"), (1e-5, "under 0.1 %")]
-)
+@pytest.mark.parametrize(("probability", "text"), [
+    (0.9995, "over 99.9 %"), (0.993, "99.3 %"), (0.987, "99 %"), (0.75, "75 %"), (0.5, "50 %"), (0.013, "1 %"),
+    (0.007, "0.7 %"), (1e-5, "under 0.1 %"),
+])  # fmt: skip
 def test_a_probability_is_never_rounded_to_certainty(probability: float, text: str) -> None:
     assert format_probability(probability) == text
 

@@ -84,6 +84,12 @@ def test_a_walk_is_tested_on_one_side() -> None:
     assert tests.effects.p_values["bias-walk"] == pytest.approx(1.0 - (1.0 - alone) ** 7, rel=1e-6)
 
 
+def test_a_walk_that_gains_nothing_is_as_likely_as_not(quiet: Calibration) -> None:
+    """In half of the runs without a walk; the smallest p-value of seven is then below a half 127 times in 128."""
+    assert quiet.fit.walk_gain < 1e-6
+    assert assess_candidates(quiet.fit, 7.0).effects.p_values["bias-walk"] == pytest.approx(1.0 - 0.5**7, rel=1e-3)
+
+
 def test_the_error_falls_to_the_noise(improved: Improvement) -> None:
     assert [step.added for step in improved.steps] == ["second-order"] and improved.because == "consistent"
     assert ratio(improved.start.before) > 1.5 and ratio(improved.result) < 1.3

@@ -182,6 +182,15 @@ def test_common_step() -> None:
     assert common_step(np.array([1.0, 2.0, 3.0]), 1e-6) is None
 
 
+def test_a_step_is_found_through_rounding_that_adds_up_over_many_steps() -> None:
+    """The least difference is known to four tolerances: over thirty steps the errors of its multiples add up."""
+    rng = np.random.default_rng(3)
+    for _ in range(100):
+        places = np.cumsum(rng.integers(2, 31, 24))
+        values = places * 100.0 + rng.uniform(-0.03, 0.03, 24)
+        assert common_step(values, 0.03) == pytest.approx(100.0 * np.gcd.reduce(np.diff(places)), rel=1e-4)
+
+
 def test_degenerate_readings_say_nothing_wrong() -> None:
     short, holed, one = Run(seed=8, count=40, dwells=6), Run(seed=8), Run(seed=8, dwells=5)
     holed.accel.values[::7] = np.nan
