@@ -27,7 +27,9 @@ from kf_calib.cli import cli
 README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
 WITH_COMMANDS = [page for page in PAGES if "```console" in page.read_text()]
-OF_LONG_COMMANDS = {"filter_and_batch.md", "fleet.md", "missing_effect.md", "no_angles.md", "report.md"}
+OF_LONG_COMMANDS = {
+    "filter_and_batch.md", "fleet.md", "missing_effect.md", "no_angles.md", "own_effect.md", "plan.md", "report.md",
+}  # fmt: skip
 """They take most of the time of all pages."""
 IN_SHORT = [page for page in WITH_COMMANDS if page.name not in OF_LONG_COMMANDS]
 BLOCK = re.compile(r"^```(\S*)(?: \S+)?\n(.*?)^```", re.DOTALL | re.MULTILINE)
@@ -36,7 +38,7 @@ OF_OTHER_TESTS = ("--honest", "--from-journal")
 FILE = re.compile(r"^:caption: (\S+)\n\n(.*)", re.DOTALL)
 
 
-@pytest.mark.parametrize("page", [README, ROOT / "docs" / "python.md"], ids=lambda page: page.name)
+@pytest.mark.parametrize("page", [README, *slow(ROOT / "docs" / "python.md")], ids=lambda page: page.name)
 def test_the_python_of_a_page_prints_what_is_shown(
     page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -51,6 +53,7 @@ def test_the_python_of_a_page_prints_what_is_shown(
         _assert_shown(shown, _words(capsys.readouterr().out), f"{page.name}: {code}")
 
 
+@pytest.mark.slow  # .ci/run has it done from the wheel, by tools/package
 @pytest.mark.usefixtures("unmeasured")
 def test_the_demo_does_the_main_job_and_prints_what_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
