@@ -27,6 +27,9 @@ from kf_calib.cli import cli
 README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
 WITH_COMMANDS = [page for page in PAGES if "```console" in page.read_text()]
+OF_LONG_COMMANDS = {"filter_and_batch.md", "fleet.md", "missing_effect.md", "no_angles.md", "report.md"}
+"""They take most of the time of all pages."""
+IN_SHORT = [page for page in WITH_COMMANDS if page.name not in OF_LONG_COMMANDS]
 BLOCK = re.compile(r"^```(\S*)(?: \S+)?\n(.*?)^```", re.DOTALL | re.MULTILINE)
 OF_OTHER_TESTS = ("--honest", "--from-journal")
 """Options of commands that take long, and do what tests/diagnosis/test_stepwise_selection.py proves."""
@@ -67,8 +70,11 @@ def test_the_readme_and_the_changelog_are_short() -> None:
 
 
 @pytest.mark.usefixtures("undrawn")
-@pytest.mark.parametrize("page", WITH_COMMANDS, ids=lambda page: page.name)
-@pytest.mark.parametrize("in_short", [True, *slow(False)])
+@pytest.mark.parametrize(
+    "page, in_short",
+    [*((page, True) for page in IN_SHORT), *slow(*((page, False) for page in WITH_COMMANDS))],
+    ids=lambda value: value.name if isinstance(value, Path) else None,
+)
 def test_the_commands_of_a_page_print_what_is_shown(
     page: Path, in_short: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

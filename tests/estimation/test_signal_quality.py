@@ -233,13 +233,20 @@ def test_hidden_flat_tops_are_said_before_an_effect_is_named(printed, tmp_path: 
     assert {each["channel"] for each in found["readings"]["saturation"]} == {2}
     assert {abs(each["level_mps2"]) for each in found["readings"]["saturation"]} == {9.5}
     assert found["verdict"].startswith("Readings of accelerometer 2 are cut off at ")
-    words, details = printed("diagnose", path), printed("diagnose", path, "--details")
-    assert words.startswith("Readings of accelerometer 2 are cut off at ")
-    assert "saturation of accelerometer 2" in details
-    assert words.count("widen its range") == len(found["readings"]["saturation"])
     replayed = json.loads(printed("replay", path, "--json"))
     assert replayed["readings"] == found["readings"]
     assert any("cut off" in warning for warning in replayed["warnings"])
+
+
+@pytest.mark.slow
+def test_hidden_flat_tops_are_printed_before_an_effect(printed, tmp_path: Path) -> None:
+    path = tmp_path / "flat.mcap"
+    printed("simulate", path, *QUICK, "--plan", "faces", "--hide", "saturation=0,9.5,0")
+    words, details = printed("diagnose", path), printed("diagnose", path, "--details")
+    assert words.startswith("Readings of accelerometer 2 are cut off at ")
+    assert "saturation of accelerometer 2" in details
+    replayed = json.loads(printed("replay", path, "--json"))
+    assert words.count("widen its range") == len(replayed["readings"]["saturation"])
 
 
 @pytest.mark.parametrize("step, matters", [(2e-5, False), (1e-3, True)])
