@@ -12,7 +12,6 @@ from helpers.thresholds import begins_at
 
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.estimation.calibration import calibrate
-from kf_calib.estimation.estimate import Estimate
 from kf_calib.estimation.remarks import beyond_stated, misfit_remark, remarks_on
 from kf_calib.estimation.results import Calibration, Consistency
 from kf_calib.noise.noise_model import Noise
@@ -75,14 +74,3 @@ def test_few_dwells_are_told_in_grammar(result: Calibration) -> None:
     assert "12 dwells are too few to test" in remarks(result, judged=UNTESTED)
     assert "too few" not in remarks(result)
     assert "no standard deviation" in remarks(result, judged=Consistency(20.0, 24, None, None))
-
-
-def test_a_parameter_is_not_determined_from_ten_degrees_a_fifth_or_two_metres_per_second_squared_on() -> None:
-    """Of a unit triad, in which sigmas of sensitivities are those of angles and of scale factors."""
-    state = np.eye(3, 4).ravel()
-
-    def unseen(parameter: int, sigma: float) -> bool:
-        return bool(Estimate(state, sigma**2 * np.eye(12), np.zeros((12, 0))).unseen[parameter])
-
-    for parameter, least in ((4, np.radians(10.0)), (6, 0.2), (7, 2.0)):
-        assert begins_at(lambda sigma, k=parameter: unseen(k, sigma), 1e-3, 10.0) == pytest.approx(least)

@@ -93,6 +93,7 @@ def test_each_of_47_wrong_wirings_is_refused_and_its_mending_mends(channels: tup
         (None, lambda _, q: np.degrees(q), "the angles are in degrees? Try --angle-unit deg."),
         (None, lambda _, q: np.radians(q), "turned from degrees into radians twice"),
         (None, lambda _, q: q[:, ::-1], "--joints"),
+        (None, lambda _, q: q * [1, 0, 0], "in many orientations, the angles in few, and no order or sign of channels"),
         (lambda _, a: a * [1, 1, 1e-6], None, "channel 3 is dead"),
         (lambda _, a: np.where([True, True, False], a, 0.3), None, "channel 3 is stuck: all along it reads 0.3"),
         (lambda _, a: a * [1, 1 / 9.80665, 1], None, "channel 2 feels 0."),
