@@ -81,6 +81,7 @@ def test_stated_scatter_and_flicker_name_nothing(noise: dict[str, float], runs: 
     assert sum(not each.consistent for each in tests) == 0
 
 
+@pytest.mark.slow  # two effects, one by one: test_stepwise_selection.py
 def test_two_accelerometers_with_different_effects() -> None:
     found = diagnose(source("second-order=3e-7,0,0", "hysteresis=0,0,3e-5"))
     assert set(found.missing) == {"second-order", "hysteresis"}
