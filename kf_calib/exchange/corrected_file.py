@@ -108,6 +108,9 @@ def _template(correction: Correction) -> bytes:
     return bytes(message)
 
 
+_FIRST_NS = np.iinfo(np.int64).min  # before any stamp
+
+
 class _Thermometer:
     """Pairs readings with temperatures, interpolated between measurements and constant beyond them.
 
@@ -118,7 +121,7 @@ class _Thermometer:
     def __init__(self, needed: bool) -> None:
         self._needed = needed
         self._times, self._values = np.zeros(0, np.int64), np.zeros(0)
-        self._waiting = Stream.empty(3)
+        self._waiting, self._reached_ns = Stream.empty(3), _FIRST_NS
         self.extremes: tuple[float, float] | None = None
 
     def pairs(self, batch: Batch) -> list[tuple[Stream, Floats | None]]:
@@ -131,8 +134,11 @@ class _Thermometer:
             return []
         ready = self._waiting.time_ns <= self._times[-1]
         count = len(ready) if ready.all() else int(np.argmin(ready))  # in order of their coming
+        if not count:
+            return []
         found, self._waiting = self._waiting[:count], self._waiting[count:]
-        return [self._paired(found)] if count else []
+        self._reached_ns = int(found.time_ns[-1])
+        return [self._paired(found)]
 
     def rest(self) -> list[tuple[Stream, Floats | None]]:
         """Readings after the last temperature. Raises InputError where there was none at all."""
@@ -148,12 +154,12 @@ class _Thermometer:
     def _take(self, stream: Stream) -> None:
         """Keep new temperatures that are finite and later than the last, and no more of the old ones than needed."""
         values = stream.values[:, 0] if len(stream) else np.zeros(0)
-        later = np.maximum.accumulate(np.append(self._times[-1:], stream.time_ns))
-        fresh = stream.time_ns > later[:-1] if len(later) > len(stream) else np.ones(len(stream), bool)
-        fresh &= np.isfinite(values)
+        last_ns = self._times[-1] if len(self._times) else _FIRST_NS
+        before_ns = np.maximum.accumulate(np.append(last_ns, stream.time_ns))[:-1]
+        fresh = (stream.time_ns > before_ns) & np.isfinite(values)
         if not fresh.any():
             return
-        first = self._waiting.time_ns[0] if len(self._waiting) else stream.time_ns[0]
+        first = self._waiting.time_ns[0] if len(self._waiting) else self._reached_ns
         kept = max(int(np.searchsorted(self._times, first)) - 1, 0)
         self._times = np.append(self._times[kept:], stream.time_ns[fresh])
         self._values = np.append(self._values[kept:], values[fresh])

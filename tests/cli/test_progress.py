@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from helpers.long_runs import slow
 from helpers.synthetic import Run
 
 from kf_calib.cli import cli
@@ -52,8 +53,14 @@ def test_a_diagnosis_and_an_improvement_say_what_they_try() -> None:
     refits = Refits()
     said = heard(lambda: diagnose(run, refits))
     assert re.fullmatch(r"scanning [3-9]\d effects", said[0])
-    assert heard(lambda: improve(run)) == said  # nothing is missing
     assert not heard(lambda: improve(run, refits=refits))  # its columns are known
+
+
+@pytest.mark.slow
+def test_an_improvement_says_what_a_diagnosis_says() -> None:
+    """Where nothing is missing."""
+    run = calibrate(Run(dwells=8, count=100))
+    assert heard(lambda: improve(run)) == heard(lambda: diagnose(run))
 
 
 def test_whoever_does_not_listen_any_more_hears_nothing() -> None:
@@ -113,7 +120,7 @@ def test_a_terminal_sees_what_a_command_does(run, terminal, recording: Path) -> 
     assert any("refitting with" in text or "scanning" in text for text in texts)
 
 
-@pytest.mark.parametrize("command", ["diagnose", "compare"])
+@pytest.mark.parametrize("command", ["compare", *slow("diagnose")])
 def test_where_the_error_stream_is_no_terminal_there_is_none(run, recording: Path, command: str) -> None:
     code, _, err = run(command, recording)
     assert code == 0 and not err

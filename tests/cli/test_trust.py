@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.long_runs import slow
 
 from kf_calib import effects
 from kf_calib.bench.bench import Bench, axes_of
@@ -161,8 +162,24 @@ def commands_nothing(text: str) -> bool:
     return all(each == "\n" or each.isprintable() for each in text)
 
 
-@pytest.mark.parametrize("command", ["replay", "compare", "diagnose", "improve", "effects", "plan"])
-@pytest.mark.parametrize("words", [[], ["--json"], ["--pose-topic", ESCAPES], ["--with", ESCAPES]])
+READERS = ["replay", "compare", "diagnose", "improve", "effects", "plan"]
+LONG = [(command, ["--json"]) for command in ("compare", "diagnose", "improve")]
+"""Their JSON is made as that of the others, and what they print on a terminal takes as long."""
+
+
+@pytest.mark.usefixtures("unmeasured")
+@pytest.mark.parametrize(
+    "command, words",
+    [
+        *(
+            case
+            for words in ([], ["--json"], ["--pose-topic", ESCAPES], ["--with", ESCAPES])
+            for case in ((command, words) for command in READERS)
+            if case not in LONG
+        ),
+        *slow(*LONG),
+    ],
+)
 def test_a_hostile_recording_commands_no_terminal(
     run, tmp_path: Path, original: Path, command: str, words: list[str]
 ) -> None:

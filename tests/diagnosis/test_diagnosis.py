@@ -41,8 +41,11 @@ def unlisted(name: str) -> Diagnosis:
 @pytest.mark.parametrize(
     "name",
     [
-        "encoder-harmonic-1:z", "thermal-scale", "settling",
-        *slow("second-order", "hysteresis", "axis-nonorthogonality:z", "cross-coupling-ip", "scale-drift"),
+        "settling",
+        *slow(
+            "encoder-harmonic-1:z", "thermal-scale", "second-order", "hysteresis", "axis-nonorthogonality:z",
+            "cross-coupling-ip", "scale-drift",
+        ),
     ],
 )  # fmt: skip
 def test_a_hidden_effect_is_named(name: str) -> None:
@@ -90,6 +93,16 @@ def test_what_is_in_no_catalogue_is_unknown(name: str, driver: str) -> None:
     shown = diagnosis_object(found)
     assert shown["missing"] == "unknown" and shown["unknown"]["formula"] == shape.formulas[0]
     assert assess_candidates(Refits().with_effects(found.before, shape.formulas).fit).consistent
+
+
+def test_a_formula_is_told_where_no_known_effect_explains_it() -> None:
+    from kf_calib.views.diagnosis import diagnosis_object
+
+    said = diagnosis_object(unlisted("encoder-harmonic-3:z"))
+    first = said["hypotheses"][0]
+    assert said["missing"] == "unknown" and not first["effects"] and "sin(3*q" in first["formula"]
+    assert said["unknown"]["formula"] == first["formula"] and said["unknown"]["driver"] == first["driver"]
+    assert said["families"][0]["family"] == "gimbal and encoder"
 
 
 def test_views_work_nothing_out(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -168,8 +181,15 @@ def test_a_hand_placed_run_claims_nothing() -> None:
 
     found = diagnose(Recording(HAND))
     assert not found.missing and not found.unknown and "third-order" in found.test.invisible
-    without_angles = diagnose(Recording(HAND, angles=False))
-    assert not without_angles.sure and not without_angles.unknown  # a decay over minutes, in dwells of seconds
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not HAND.exists(), reason=f"{HAND} is not here")
+def test_a_hand_placed_run_without_angles_is_sure_of_nothing() -> None:
+    from kf_calib.sources.files.recording import Recording
+
+    found = diagnose(Recording(HAND, angles=False))
+    assert not found.sure and not found.unknown  # a decay over minutes, in dwells of seconds
 
 
 def test_the_p_value_of_a_run_does_not_depend_on_how_its_frame_is_turned() -> None:

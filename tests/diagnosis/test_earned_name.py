@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.long_runs import slow
 from helpers.paths import REAL
 from real_trials.turned import TurnedRecording
 
@@ -108,8 +107,9 @@ def test_a_walk_is_earned_by_its_likelihood(gain: float, said: str) -> None:
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="the recordings of others are not there")
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", ["iPhone4S_d2", *slow("mpu6050", "mpu9150_0", "mpu9150_1", "nexus5_d1", "nexus5_d2", "xsens_mti")]
+    "name", ["iPhone4S_d2", "mpu6050", "mpu9150_0", "mpu9150_1", "nexus5_d1", "nexus5_d2", "xsens_mti"]
 )
 def test_what_is_named_in_a_real_recording_is_seen_in_it(name: str) -> None:
     diagnosis = diagnose(kf_calib.open_log(REAL / f"{name}.csv.gz", {"gravity_mps2": "9.80665"}, angles=False))

@@ -100,7 +100,7 @@ def test_scatter_of_unknown_size_is_averaged_out(before: Calibration) -> None:
 
     sizes = np.geomspace(own.sizes[0] / 100.0, own.sizes[0] * 100.0, 201)
     grid = logsumexp([likelihood(size) for size in sizes]) - np.log(len(sizes))
-    assert own.log - still.log == pytest.approx(grid - likelihood(0.0), abs=0.15)
+    assert own.log - still.log == pytest.approx(grid - likelihood(0.0), abs=0.04)
 
 
 def test_an_effect_that_is_there_beats_one_that_is_not(before: Calibration) -> None:

@@ -15,7 +15,7 @@ from scipy.stats import t
 import kf_calib
 from kf_calib.bench.streams import Stream
 from kf_calib.diagnosis.candidate_tests import candidate_frame
-from kf_calib.diagnosis.replication import FEWEST, Replication, replication
+from kf_calib.diagnosis.replication import FEWEST, Replication, _one_sided, replication
 from kf_calib.estimation.results import Calibration, Consistency
 
 WHITE_MPS2, COUNT = 1e-4, 600
@@ -115,6 +115,12 @@ def test_a_misfit_that_is_left_counts_as_noise() -> None:
     clear = replicated(before, ["second-order"])
     unclear = replicated(before, ["second-order"], Consistency(50.0 * 100.0, 50, 0.0, False))
     assert unclear.p_value > 100.0 * clear.p_value
+
+
+@pytest.mark.parametrize("dof", [1.0, 4.5, 60.0])
+def test_a_prediction_is_tested_on_one_side_by_students_t(dof: float) -> None:
+    for value in (-6.0, -0.4, 0.0, 0.7, 5.0):
+        assert _one_sided(value, dof) == pytest.approx(t.sf(value, dof), rel=1e-9)
 
 
 def test_few_dwells_cannot_tell() -> None:

@@ -153,6 +153,16 @@ def test_settling_is_left_out() -> None:
     assert spans(Given(Batch(readings(pose, 35), pose)), settle_s=3.0)[1][0] == pytest.approx(17.0, abs=0.2)
 
 
+def test_a_third_is_left_out_of_a_dwell_that_is_too_short_for_settling_and_that_is_told() -> None:
+    """Of 12 and of 6 seconds before the platform leaves; not of the last, which the end of the run cuts."""
+    pose = path((0, 0), (10, 0), (14, 40), (26, 40), (27, 80), (33, 80), (37, 40), (44, 40), rate_hz=50)
+    starts = [start for start, _ in spans(Given(Batch(readings(pose, 44), pose)), settle_s=5.0)]
+    assert starts == pytest.approx([0, 14 + 12 / 3, 27 + 6 / 3, 37 + 7 / 3], abs=0.4)
+    assert spans.tally.short_dwells == 2 and spans.tally.least_settling_s == pytest.approx(6 / 3, abs=0.15)
+    (told,) = spans.tally.unmet_settings(Stillness(settle_s=5.0))
+    assert told.startswith("2 dwells are too short to leave out 5 s after each arrival (--settle-s): a third of each")
+
+
 def test_angles_absent_during_motion_readings_decide() -> None:
     """One angle message a dwell, at its middle: the dwells reach to where the readings move."""
     truth = path(*SLEWS, rate_hz=100)

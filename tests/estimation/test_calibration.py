@@ -90,6 +90,13 @@ def test_a_setting_error_that_is_estimated_takes_a_degree_of_freedom(
     assert found.consistency.dof == 3 * 24 - 12 - charged
 
 
+def test_where_nothing_is_left_to_judge_there_is_no_verdict() -> None:
+    """Of twelve means and twelve parameters."""
+    found = calibrate(Run(seed=2, dwells=4)).consistency
+    assert (found.dof, found.p_value, found.consistent, found.nis_per_dof) == (0, None, None, None)
+    assert found.statistic == pytest.approx(0.0, abs=1e-6)
+
+
 def test_what_a_run_does_not_determine_is_named() -> None:
     """Gravity up and down along one axis of the platform tells nothing of the others."""
     up_and_down = np.array([[0.0, 0.0, 0.0], [0.0, np.pi, 0.0]] * 4)

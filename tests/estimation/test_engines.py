@@ -13,10 +13,13 @@ from scipy.optimize import least_squares
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.dwells.folding import Folder
+from kf_calib.estimation import kalman_filterpy
 from kf_calib.estimation.calibration import calibrate, evaluate, filterpy_estimate
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.engine_comparison import compare
+from kf_calib.estimation.samples import Samples, all_nuisance_sigmas
 from kf_calib.estimation.settings import PRIORS, Settings
+from kf_calib.noise.noise_model import Noise
 
 pytestmark = pytest.mark.usefixtures("unmeasured")
 
@@ -68,6 +71,22 @@ def test_engines_agree_with_a_prior_and_a_walk(prior: str) -> None:
     result = calibrate(run, Settings(prior=PRIORS[prior], walk_mps2_per_sqrt_s=1e-5))
     difference, variance = distance(filterpy_estimate(run, result), result.estimate)
     assert difference <= 2e-3 and variance <= 1e-3
+
+
+def test_squares_of_filterpys_innovations_sum_to_the_misfit_of_batch_least_squares_and_prior() -> None:
+    """In their covariance: sum nu^T S^-1 nu = sum |z - H x|^2 / sigma^2 + (x - x0)^T P0^-1 (x - x0)."""
+    rng, sigma = np.random.default_rng(2), 0.3
+    observation, readings = rng.normal(size=(20, 3, 4)), rng.normal(size=(20, 3))
+    nominal, root = rng.normal(size=4), np.tril(rng.normal(size=(4, 4)))
+    noise = Noise(np.full(3, sigma), np.ones(3))
+    nuisances = np.zeros((20, 3, len(all_nuisance_sigmas(noise))))
+    samples = Samples(1, np.arange(20.0), observation, nuisances, all_nuisance_sigmas(noise), readings,
+                      readings, np.full(3, sigma))  # fmt: skip
+    posterior = kalman_filterpy.estimate([samples], noise, nominal, root @ root.T, np.ones(4))
+    rows = np.vstack([observation.reshape(-1, 4) / sigma, np.linalg.inv(root)])
+    state, misfit, *_ = np.linalg.lstsq(rows, np.append(readings / sigma, np.linalg.solve(root, nominal)))
+    assert posterior.state == pytest.approx(state, rel=1e-9)
+    assert posterior.nis == pytest.approx(float(misfit[0]), rel=1e-9) and posterior.samples == 20
 
 
 def test_a_walk_widens_and_a_prior_narrows() -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.thresholds import begins_at
 
 from kf_calib.estimation import iterated_fit
 
@@ -55,3 +56,37 @@ def test_a_constant_is_averaged_over_a_likelihood_that_steps(
     mean = np.average(logs, weights=weights)
     assert np.log(model.stepped[0].value) == pytest.approx(mean, abs=1e-5)
     assert spreads["delay"] == pytest.approx(np.sqrt(np.average((logs - mean) ** 2, weights=weights)), rel=1e-4)
+
+
+def _taken(*steps: tuple[float, float]) -> list[float]:
+    """Shares that are taken of steps one after the other, in sigmas of 1e-3 and 1e-6."""
+    relaxation, sigma, shares = iterated_fit._Relaxation(), np.array([1e-3, 1e-6]), list[float]()
+    fitted: Any = SimpleNamespace(linearised=SimpleNamespace(state=np.array([2.0, -1.0])), sigma_of_determined=sigma)
+    for step in steps:
+        state, constants = relaxation.of(fitted, fitted.linearised.state + sigma * step, np.ones(1))
+        shares.append(float(constants[0]))
+        np.testing.assert_allclose((state - fitted.linearised.state) / sigma, np.multiply(step, shares[-1]), atol=1e-8)
+    return shares
+
+
+def test_a_step_that_goes_back_is_halved_and_one_that_goes_on_grows_by_a_quarter() -> None:
+    """Down to an eighth and up to three times; by the cosine with the step before, below -0.5 or above 0.9."""
+    assert _taken(*[(1.0, 1.0), (-1.0, -1.0)] * 3) == [1.0, 0.5, 0.25, 0.125, 0.125, 0.125]
+    assert _taken(*[(1.0, 1.0)] * 7) == pytest.approx([1.0, 1.25, 1.5625, 1.953125, 2.44140625, 3.0, 3.0])
+
+    def second(deg: float) -> float:
+        return _taken((2.0, 0.0), (np.cos(np.radians(deg)), np.sin(np.radians(deg))))[1]
+
+    assert begins_at(lambda deg: second(deg) <= 1.0, 1.0, 90.0) == pytest.approx(np.degrees(np.arccos(0.9)))
+    assert begins_at(lambda deg: second(deg) < 1.0, 90.0, 179.0) == pytest.approx(120.0)
+
+
+def test_axes_that_are_nearly_in_one_plane_tell_no_force() -> None:
+    """From a condition number of a hundred on."""
+
+    def state(condition: float) -> np.ndarray:
+        return np.column_stack([np.diag([1.0, 2.0, 2.0 / condition]), np.ones(3)]).ravel()
+
+    singular = begins_at(lambda condition: not iterated_fit._sensible(state(condition)), 2.0, 1e4)
+    assert singular == pytest.approx(100.0, rel=1e-6)
+    assert not iterated_fit._sensible(state(2.0) * np.nan)

@@ -12,13 +12,16 @@ import numpy as np
 import pytest
 from helpers.altered import Altered, short_run
 from helpers.long_runs import slow
+from helpers.thresholds import begins_at
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, parse_axes
 from kf_calib.bench.keys import UP
 from kf_calib.bench.raw_input import RawInput, parse_channels
+from kf_calib.dwells.blocks import Tally
 from kf_calib.errors import BlunderError, InputError
 from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.dwell_pass import refuse_unusable
 from kf_calib.estimation.setup_blunders import common_scale
 from kf_calib.sources.tables.opening import open_table
 from kf_calib.sources.tables.table import Table
@@ -90,6 +93,7 @@ def test_each_of_47_wrong_wirings_is_refused_and_its_mending_mends(channels: tup
         (None, lambda _, q: np.degrees(q), "the angles are in degrees? Try --angle-unit deg."),
         (None, lambda _, q: np.radians(q), "turned from degrees into radians twice"),
         (None, lambda _, q: q[:, ::-1], "--joints"),
+        (None, lambda _, q: q * [1, 0, 0], "in many orientations, the angles in few, and no order or sign of channels"),
         (lambda _, a: a * [1, 1, 1e-6], None, "channel 3 is dead"),
         (lambda _, a: np.where([True, True, False], a, 0.3), None, "channel 3 is stuck: all along it reads 0.3"),
         (lambda _, a: a * [1, 1 / 9.80665, 1], None, "channel 2 feels 0."),
@@ -163,6 +167,32 @@ def test_scale_factors_that_are_all_off_by_the_same() -> None:
     notes = calibrate(Altered(run, lambda _, a: a * local / scales)).warnings
     assert "off by the same -576 ppm" in " ".join(notes)
     assert "off by the same" not in " ".join(calibrate(run).warnings)
+
+
+@pytest.mark.parametrize(("sigma", "least", "apart"), [(1e-7, 20e-6, 50e-6), (1e-4, 500e-6, 300e-6)])
+def test_scale_factors_are_off_by_the_same_from_five_sigma_and_20_ppm_on(
+    sigma: float, least: float, apart: float
+) -> None:
+    """If all three are within three sigma of their mean, or a twentieth of it: that of three about 1000 ppm."""
+    bench, sigmas = Bench(parse_axes("y z x"), 9.8123), np.array([0.0, sigma, 0.0])
+    off = begins_at(lambda each: common_scale(np.full(3, 1.0 + each), sigmas, bench), 1e-6, 1e-2)
+    assert off == pytest.approx(least, rel=1e-6)
+    sides = np.array([1.0, 0.0, -1.0])
+    off = begins_at(lambda each: not common_scale(1.001 + each * sides, sigmas, bench), 1e-6, 1e-2)
+    assert off == pytest.approx(apart, rel=1e-6)
+
+
+def test_angles_look_like_degrees_from_three_turns_on() -> None:
+    """Of a gimbal in which nothing stands still; the farthest angle is told in turns."""
+    bench = Bench(parse_axes("y z x"), 9.8123)
+
+    def refusal(turns: float) -> str:
+        with pytest.raises(InputError) as refused:
+            refuse_unusable([], Tally(read=1000, poses=100, farthest_rad=2.0 * np.pi * turns), bench)
+        return str(refused.value)
+
+    assert begins_at(lambda turns: "degrees" in refusal(turns), 0.1, 100.0) == pytest.approx(3.0)
+    assert "angles of up to 57 turns look like degrees" in refusal(57.3)
 
 
 def test_degrees_of_a_noisy_encoder_in_which_nothing_stands_still() -> None:

@@ -99,8 +99,16 @@ def test_a_real_imu_counts_in_2048ths_of_g(ferraris: Path) -> None:
     assert not found.warnings
 
 
-@pytest.mark.parametrize("limit", [7.0, 9.0, 9.7])
-@pytest.mark.parametrize("change", [np.copy, stored, stepped(5e-5), stepped(2e-4)])
+CHANGES = (np.copy, stored, stepped(5e-5), stepped(2e-4))
+
+
+@pytest.mark.parametrize(
+    "limit, change",
+    [
+        (7.0, np.copy), *((9.0, change) for change in CHANGES), (9.7, np.copy),
+        *slow(*((limit, change) for limit in (7.0, 9.7) for change in CHANGES[1:])),
+    ],
+)  # fmt: skip
 def test_flat_tops_are_found_where_they_are(limit: float, change) -> None:
     clean = calibrate(Run(seed=1, poses=FACES, dwells=12))
     beyond = {
@@ -182,6 +190,15 @@ def test_common_step() -> None:
     assert common_step(np.array([1.0, 2.0, 3.0]), 1e-6) is None
 
 
+def test_a_step_is_found_through_rounding_that_adds_up_over_many_steps() -> None:
+    """The least difference is known to four tolerances: over thirty steps the errors of its multiples add up."""
+    rng = np.random.default_rng(3)
+    for _ in range(100):
+        places = np.cumsum(rng.integers(2, 31, 24))
+        values = places * 100.0 + rng.uniform(-0.03, 0.03, 24)
+        assert common_step(values, 0.03) == pytest.approx(100.0 * np.gcd.reduce(np.diff(places)), rel=1e-4)
+
+
 def test_degenerate_readings_say_nothing_wrong() -> None:
     short, holed, one = Run(seed=8, count=40, dwells=6), Run(seed=8), Run(seed=8, dwells=5)
     holed.accel.values[::7] = np.nan
@@ -224,13 +241,20 @@ def test_hidden_flat_tops_are_said_before_an_effect_is_named(printed, tmp_path: 
     assert {each["channel"] for each in found["readings"]["saturation"]} == {2}
     assert {abs(each["level_mps2"]) for each in found["readings"]["saturation"]} == {9.5}
     assert found["verdict"].startswith("Readings of accelerometer 2 are cut off at ")
-    words, details = printed("diagnose", path), printed("diagnose", path, "--details")
-    assert words.startswith("Readings of accelerometer 2 are cut off at ")
-    assert "saturation of accelerometer 2" in details
-    assert words.count("widen its range") == len(found["readings"]["saturation"])
     replayed = json.loads(printed("replay", path, "--json"))
     assert replayed["readings"] == found["readings"]
     assert any("cut off" in warning for warning in replayed["warnings"])
+
+
+@pytest.mark.slow
+def test_hidden_flat_tops_are_printed_before_an_effect(printed, tmp_path: Path) -> None:
+    path = tmp_path / "flat.mcap"
+    printed("simulate", path, *QUICK, "--plan", "faces", "--hide", "saturation=0,9.5,0")
+    words, details = printed("diagnose", path), printed("diagnose", path, "--details")
+    assert words.startswith("Readings of accelerometer 2 are cut off at ")
+    assert "saturation of accelerometer 2" in details
+    replayed = json.loads(printed("replay", path, "--json"))
+    assert words.count("widen its range") == len(replayed["readings"]["saturation"])
 
 
 @pytest.mark.parametrize("step, matters", [(2e-5, False), (1e-3, True)])

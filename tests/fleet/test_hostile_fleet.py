@@ -21,6 +21,7 @@ import pytest
 from distributed import Client
 from fleet_generator import Campaign, record
 from helpers.fleet_workers import evaluation, threads, used
+from helpers.long_runs import slow
 
 import kf_calib
 from kf_calib.cli.fleet import SingleCommands
@@ -200,7 +201,7 @@ def _without_columns(rows: list[dict[str, Any]]) -> None:
     rows[0]["factor"]["columns"] = None
 
 
-@pytest.mark.parametrize("change", [_nameless, _undated, _short, _not_finite, _without_columns])
+@pytest.mark.parametrize("change", [_short, _without_columns, *slow(_nameless, _undated, _not_finite)])
 def test_a_row_that_is_not_whole_is_evaluated_again_and_the_fleet_goes_on(
     change: Callable[[list[dict[str, Any]]], None], runs: Path, client: Client, store: Store, tmp_path: Path
 ) -> None:
@@ -216,7 +217,7 @@ def test_a_row_that_is_not_whole_is_evaluated_again_and_the_fleet_goes_on(
     assert (last.evaluated, last.kept, last.notes) == (0, 2, ())
 
 
-@pytest.mark.parametrize("columns", [{"run": [1, 2]}, {"a": ["b"]}, {"run": ["x"], "evaluated": ["yesterday"]}])
+@pytest.mark.parametrize("columns", [{"run": ["x"], "evaluated": ["yesterday"]}, *slow({"run": [1, 2]}, {"a": ["b"]})])
 def test_a_table_of_another_form_is_passed_over_and_stays(
     columns: dict[str, list[Any]], runs: Path, client: Client, run: Any, tmp_path: Path
 ) -> None:

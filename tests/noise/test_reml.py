@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from helpers.restricted import restricted_log_likelihood
 from helpers.synthetic import Run
+from helpers.thresholds import begins_at
+from scipy.stats import chi2
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.estimation.calibration import calibrate
@@ -155,6 +157,28 @@ def test_means_that_are_worked_on_in_parts_have_the_same_likelihood(monkeypatch:
     assert in_parts.cost == pytest.approx(at_once.cost, rel=1e-12)
     np.testing.assert_allclose(in_parts.slope, at_once.slope, rtol=1e-9)
     assert in_parts.misfit == pytest.approx(whole.at(variances).misfit, rel=1e-9)
+
+
+def test_nothing_is_estimated_where_the_misfit_is_one_that_noise_exceeds_once_in_ten_times(
+    walked: Calibration,
+) -> None:
+    """All of it in one accelerometer, in which it is far beyond noise; of the others nothing is left at all."""
+    means, state, noise = walked.linearised.means, walked.linearised.state, walked.noise
+    within = Noise(noise.sigma_mps2, noise.inflation)
+    design, sigma = means.design[:, 1], within.effective_sigma_mps2[1] / np.sqrt(means.counts)
+    columns = design[:, np.abs(design).any(axis=0)] / sigma[:, None]
+    left = np.random.default_rng(3).normal(size=len(sigma))
+    left -= columns @ np.linalg.lstsq(columns, left)[0]
+    readings = means.design @ state
+    free = readings.size - means.design.shape[2]
+
+    def scattered(misfit: float) -> bool:
+        excess = readings.copy()
+        excess[:, 1] += sigma * left * np.sqrt(misfit) / np.linalg.norm(left)
+        found = VarianceComponents(0.0, None).completed(within, replace(means, readings=excess), state)
+        return bool(found.scatter_mps2.any())
+
+    assert begins_at(scattered, 0.1 * free, 10.0 * free) == pytest.approx(chi2.isf(0.1, free), rel=1e-4)
 
 
 def test_a_combination_of_parts_is_taken_that_gains_most_beyond_its_charge(monkeypatch: pytest.MonkeyPatch) -> None:

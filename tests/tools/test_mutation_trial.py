@@ -144,6 +144,26 @@ def test_a_test_notices_a_change_if_it_fails_again_and_not_without_it(
     assert str(tried.answer) == answer and counts([tried]) == count and not remaining
 
 
+def test_changes_that_are_made_together_are_told_by_all_tests_that_fail(tmp_path: Path) -> None:
+    """Of three changes two are noticed; the module is as it was afterwards."""
+    source = "SIZE = 1.0\ndef one():\n    return SIZE + 2\ndef other():\n    return 3, 0.5\n"
+    tests = "import m\ndef test_size():\n    assert m.one() > 2.5\ndef test_other():\n    assert m.other()[0] == 3\n"
+    (tmp_path / "m.py").write_text(source)
+    (tmp_path / "test_m.py").write_text(f"{tests}def test_nothing():\n    pass\n")
+    (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers = slow")
+    wanted = {"1.0 -> 0.5", "3 -> 4", "0.5 -> 1.0"}
+
+    class Still(Runner):
+        def __init__(self) -> None:
+            self._copy, self._environment = tmp_path, os.environ | {"PYTHONPATH": str(tmp_path)}
+            self._map = TestMap({"test_m.py": ["m.py:"]}, {"test_m.py": 0.1})
+
+    changes = [(Path("m.py"), change) for change in changes_in(source) if str(change) in wanted]
+    assert len(changes) == 3
+    assert Still().failing_together(changes) == ["test_m.py::test_size", "test_m.py::test_other"]
+    assert (tmp_path / "m.py").read_text() == source
+
+
 def test_the_tests_that_call_a_function_come_with_the_quick_file_first_after_those_named(tmp_path: Path) -> None:
     called = {"a.py::slow": ["m.py:f"], "b.py::one": ["m.py:f"], "b.py::two": ["m.py:g"], "c.py::bad": ["m.py:f"],
               "d.py::long": ["m.py:f"]}  # fmt: skip

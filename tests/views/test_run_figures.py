@@ -231,7 +231,7 @@ def test_sigmas_of_the_experiment_end_at_those_expected(experiment: Experiment) 
     )
 
 
-@pytest.mark.parametrize("name", [*list(ODD)[:3:2], *slow(*(name for k, name in enumerate(ODD) if k not in (0, 2)))])
+@pytest.mark.parametrize("name", [next(iter(ODD)), *slow(*list(ODD)[1:])])
 def test_odd_runs_have_all_figures(name: str) -> None:
     for draw in plot.figures(ODD[name]()).values():
         figure = draw()

@@ -20,6 +20,7 @@ from kf_calib.design.orientation_plan import plan
 from kf_calib.design.predicted_information import Prospect
 from kf_calib.design.visit_order import Timing
 from kf_calib.diagnosis.missing_effect import diagnose
+from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.stepwise_selection import improve
 from kf_calib.effects import effect_named, names
 from kf_calib.estimation.calibration import calibrate
@@ -64,12 +65,14 @@ def _visible(result: Calibration) -> RenderableType:
     return catalogue.sight_report(visibility_of(result.fit, chosen), "What a recording shows")
 
 
+REFITS = Refits()
+"""What a diagnosis has computed, an improvement need not again."""
 SAID: dict[str, Callable[[Calibration], RenderableType]] = {
     "replay": console.summary,
     "model": lambda result: console.model_table(result.model),
     "compare": _compared,
-    "diagnose": lambda result: diagnosis.diagnosis_report(diagnose(result)),
-    "improve": lambda result: improvement.improvement_report(improve(result), None, None),
+    "diagnose": lambda result: diagnosis.diagnosis_report(diagnose(result, REFITS)),
+    "improve": lambda result: improvement.improvement_report(improve(result, refits=REFITS), None, None),
     "effects": lambda result: catalogue.overview([effect_named(name, BENCH) for name in names(BENCH)]),
     "effects NAME": lambda result: catalogue.details([effect_named("warm-up", BENCH)]),
     "effects --recording": _visible,

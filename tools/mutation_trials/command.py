@@ -10,7 +10,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mutation_trials.changes import Change, changes_in, is_program
@@ -78,9 +78,15 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--map", type=Path, help="which tests call what, written where it is not there")
     words_on_unmapped = "do not run all tests once to learn what they call: take those that import the module"
     parser.add_argument("--unmapped", action="store_true", help=words_on_unmapped)
+    words_on_whole = (
+        "make all that survives at once, run all tests that call any of it, and try each on those that fail"
+    )
+    parser.add_argument("--whole", action="store_true", help=words_on_whole)
     parser.add_argument("-o", "--out", type=Path, help="write the table here, too")
     options = parser.parse_args(words)
     tasks = drawn(modules(options.paths), options.count, options.seed, options.line)
+    if options.out is not None:
+        options.out.write_text("")
     with tempfile.TemporaryDirectory(prefix="mutation") as folder:
         copy = copied(ROOT, Path(folder, "copy"))
         map_file = options.map or ROOT / "out" / "mutation" / f"{content_hash(ROOT)}.json"
@@ -90,17 +96,34 @@ def main(words: Sequence[str] | None = None) -> None:
         map_file.parent.mkdir(parents=True, exist_ok=True)
         with Runner(copy, {path for path, _ in tasks}, map_file.resolve(), options.budget) as runner:
             trials = list(_tried(runner, tasks, options.out))
+            if options.whole:
+                trials = list(_tried_together(runner, trials, options.out))
     print(counts(trials))
 
 
 def _tried(runner: Runner, tasks: Sequence[tuple[Path, Change]], out: Path | None) -> Iterator[Trial]:
-    lines = ""
     for path, change in tasks:
         begun_s = time.monotonic()
         answer = runner.noticed_by(path, change)
         trial = Trial(path, change, time.monotonic() - begun_s, answer)
-        print(trial, flush=True)
-        lines += f"{trial}\n"
-        if out is not None:
-            out.write_text(lines)
+        _tell(trial, out)
         yield trial
+
+
+def _tried_together(runner: Runner, trials: Sequence[Trial], out: Path | None) -> Iterator[Trial]:
+    """Yield the trials, those of changes that survived tried on the tests that fail where all of these are made."""
+    survived = [trial for trial in trials if not (trial.answer.noticed_by or trial.answer.unsure)]
+    tests = runner.failing_together((trial.path, trial.change) for trial in survived)
+    for trial in trials:
+        if trial in survived:
+            answer = runner.noticed_by(trial.path, trial.change, tests)
+            trial = replace(trial, answer=replace(answer, tried=answer.calling))
+            _tell(trial, out)
+        yield trial
+
+
+def _tell(trial: Trial, out: Path | None) -> None:
+    print(trial, flush=True)
+    if out is not None:
+        with out.open("a") as file:
+            print(trial, file=file)

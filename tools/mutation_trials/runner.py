@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -79,6 +81,14 @@ def _repeated(outcome: Outcome, tests: Sequence[str]) -> Sequence[str]:
     return [test] if "::" in test and not test.endswith(")") else tests
 
 
+def failing(root: Path, files: Sequence[str], environment: Mapping[str, str]) -> list[str]:
+    """The tests of some files that fail, in a process of their own."""
+    words = [sys.executable, "-m", "pytest", *server.QUIET, "-rfE", *files]
+    said = subprocess.run(words, cwd=root, env=environment, capture_output=True, text=True).stdout
+    found = (re.fullmatch(r"(?:FAILED|ERROR) (.+?)(?: - .*)?", line) for line in said.splitlines())
+    return [match[1] for match in found if match]
+
+
 class Runner:
     """The fast tests of a copy that call what some modules have, and the process that runs them.
 
@@ -90,24 +100,24 @@ class Runner:
         self._copy, self._budget_s = copy, budget_s
         files = TestMap.read(map_file).files_of(modules) if map_file.exists() else []
         places = os.pathsep.join([str(copy), str(copy / "tools")])
-        environment = os.environ | {"PYTHONPATH": places, "OPENBLAS_NUM_THREADS": "1"}
-        environment.pop("PYTHONDONTWRITEBYTECODE", None)
+        self._environment = os.environ | {"PYTHONPATH": places, "OPENBLAS_NUM_THREADS": "1"}
+        self._environment.pop("PYTHONDONTWRITEBYTECODE", None)
         words = [sys.executable, server.__file__, copy, map_file, *files]
         self._process = subprocess.Popen(
-            [*map(str, words)], cwd=copy, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-        )
+            [*map(str, words)], cwd=copy, env=self._environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            text=True,
+        )  # fmt: skip
         assert self._process.stdout is not None
         if self._process.stdout.readline().strip() != "ready":
             raise RuntimeError("the tests cannot be run: see tools/test")
         self._map = TestMap.read(map_file)
 
-    def noticed_by(self, path: Path, change: Change) -> Answer:
-        """The test that notices a change."""
-        place = self._copy / path
-        source = place.read_text()
+    def noticed_by(self, path: Path, change: Change, among: Sequence[str] | None = None) -> Answer:
+        """The test that notices a change; among: the tests that are run, in place of those that the budget allows."""
+        place, source = self._copy / path, self._source(path)
         function = function_at(source, change)
         calling = self._map.tests_of(path, function, importing_tests(self._copy, path))
-        tests = self._affordable(calling)
+        tests = self._affordable(calling) if among is None else among
         _write(place, change.of(source))
         try:
             first = self._ask(path, function, tests)
@@ -120,6 +130,27 @@ class Runner:
             return Answer(said, len(tests), len(calling))
         return Answer("", len(tests), len(calling), unsure=f"{first}, once in two runs" if again.passed else
                       f"{said}, without the change, too")  # fmt: skip
+
+    def failing_together(self, changes: Iterable[tuple[Path, Change]]) -> list[str]:
+        """The tests that fail where changes are made at once, of all that call any of what they change; of several at
+        one place the first is made."""
+        made, files = defaultdict[Path, dict[int, Change]](dict), set[str]()
+        for path, change in changes:
+            made[path].setdefault(change.start, change)
+            calling = self._map.tests_of(path, function_at(self._source(path), change))
+            files |= {test.partition("::")[0] for test in calling}
+        sources = {path: self._source(path) for path in made}
+        try:
+            for path, by_start in made.items():
+                last_first = sorted(by_start.values(), reverse=True)
+                _write(self._copy / path, functools.reduce(lambda text, one: one.of(text), last_first, sources[path]))
+            return failing(self._copy, sorted(files), self._environment)
+        finally:
+            for path, source in sources.items():
+                _write(self._copy / path, source)
+
+    def _source(self, path: Path) -> str:
+        return (self._copy / path).read_text()
 
     def _affordable(self, tests: Sequence[str]) -> list[str]:
         """As many as the budget allows, and one."""
