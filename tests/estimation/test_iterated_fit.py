@@ -90,3 +90,11 @@ def test_axes_that_are_nearly_in_one_plane_tell_no_force() -> None:
     singular = begins_at(lambda condition: not iterated_fit._sensible(state(condition)), 2.0, 1e4)
     assert singular == pytest.approx(100.0, rel=1e-6)
     assert not iterated_fit._sensible(state(2.0) * np.nan)
+
+
+def test_the_error_of_the_temperature_matters_to_effects_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(iterated_fit, "sensitivity_to_temperature", lambda *_: "asked")
+    within: Any = SimpleNamespace(effective_sigma_mps2=None)
+    for effects, expected in (((), None), (("warm-up",), "asked")):
+        linearised: Any = SimpleNamespace(model=SimpleNamespace(effects=effects), dwells_at_state=None)
+        assert iterated_fit._sensitivity_to_temperature(linearised, within) == expected
