@@ -14,6 +14,7 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 from helpers.browser import chromium
+from helpers.long_runs import slow
 
 import kf_calib
 
@@ -95,13 +96,14 @@ def browser() -> Iterator[Any]:
         yield opened
 
 
-def test_a_browser_shows_every_page_without_an_error_and_asks_nobody(browser: Any, site: Path) -> None:
+@pytest.mark.parametrize("pages", ["filter index search", *slow("*")])
+def test_a_browser_shows_every_page_without_an_error_and_asks_nobody(browser: Any, site: Path, pages: str) -> None:
     told, asked, shown = list[str](), list[str](), browser.new_page()
     shown.on("console", lambda message: told.append(f"{shown.url}: {message.text}"))
     shown.on("pageerror", lambda error: told.append(f"{shown.url}: {error}"))
     shown.on("requestfailed", lambda request: told.append(f"{shown.url}: {request.url} cannot be loaded"))
     shown.on("request", lambda request: asked.append(request.url))
-    for path in sorted(site.glob("*.html")):
+    for path in sorted(path for name in pages.split() for path in site.glob(f"{name}.html")):
         shown.goto(path.as_uri())
         assert shown.locator("h1").first.is_visible() or path.stem in ("search", "genindex"), path.name
     assert told == []

@@ -12,6 +12,7 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
+from helpers.long_runs import slow
 from helpers.paths import ROOT
 
 PACKAGE = ROOT / "kf_calib"
@@ -126,7 +127,8 @@ def test_a_leaf_is_known_to_its_command_and_its_views_alone(leaf: str) -> None:
         assert all(other in known_to or other.startswith("kf_calib.cli.") for other in among), name
 
 
-def test_everything_else_is_imported_and_the_tests_of_the_core_are_collected_without_leaves() -> None:
+@pytest.mark.parametrize("collecting", [False, *slow(True)])
+def test_everything_else_is_imported_and_the_tests_of_the_core_are_collected_without_leaves(collecting: bool) -> None:
     """Commands, too, which import what they need when they run."""
     leafy = [f"kf_calib.{name}" for leaf, known_to in LEAVES.items() for name in (leaf, *known_to)
              if not name.startswith("cli.")]  # fmt: skip
@@ -142,7 +144,7 @@ sys.meta_path.insert(0, Missing())
 for name in {others}:
     importlib.import_module(name)
 import pytest
-sys.exit(pytest.main(["--collect-only", "-qq", "-n", "0", "-p", "no:cacheprovider", *{folders}]))
+{collecting} and sys.exit(pytest.main(["--collect-only", "-qq", "-n", "0", "-p", "no:cacheprovider", *{folders}]))
 """
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]

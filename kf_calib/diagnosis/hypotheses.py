@@ -119,7 +119,7 @@ class Hypotheses:
         for marginal in self.evidence.of(walk.refit.fit, walk=True):
             if not marginal.parts:  # the gains are over a walk that nothing else explains
                 log = marginal.log + float(np.logaddexp.reduce(gains)) - math.log(len(gains)) + prior
-                log += self._log_odds_within_dwells(walk.effects, walk.refit)
+                log += self._log_odds_within_dwells(walk.refit)
                 yield Hypothesis(driver=driver, families=walk.families, log_evidence=log)
 
     def quick_table(self) -> HypothesisTable:
@@ -344,7 +344,7 @@ class Hypotheses:
         logs = [marginal.log + self._log_share(effects, marginal.delta_chi2) for marginal in marginals]
         best: MarginalLikelihood = marginals[int(np.argmax(logs))]
         walks, log = self.walk in effects, float(np.logaddexp.reduce(logs)) + log_prior
-        log += self._log_odds_within_dwells(effects, refit) if walks else 0.0
+        log += self._log_odds_within_dwells(refit) if walks else 0.0
         delta_chi2 = best.delta_chi2 if best.dof else 2.0 * self.before.fit.walk_gain
         if refit.model.oscillates and not self.before.model.oscillates:
             disturbed = disturbed_dwell(refit.fit)
@@ -353,14 +353,20 @@ class Hypotheses:
                 return Hypothesis(effects, formulas, log_evidence=-math.inf)
         return Hypothesis(effects, formulas, "", self._families(effects), log, delta_chi2, best.dof + walks, refit)
 
-    def _log_odds_within_dwells(self, effects: Sequence[str], refit: Calibration) -> float:
-        """Return the log odds of what a walk explains within dwells, where it goes on but has no column: trends that
-        the other effects leave, less those that are left beside it."""
+    def _log_odds_within_dwells(self, refit: Calibration) -> float:
+        """Return the log odds of what a walk explains within dwells, where it goes on but has no column.
+
+        They are the ratio of the densities of the trends with the walk and without it, the same columns in the noise of
+        the run: a walk that should move the readings within dwells, and does not, is none. They are no more than the
+        p-values of both allow, as that of any irregular change is.
+        """
         if not self.test.trend:
             return 0.0
-        others = tuple(name for name in effects if name != self.walk)
-        before = trend(self._refit(others).fit) if others else self.test.trend
-        return _log_odds(before) - _log_odds(trend(refit.fit))
+        noise = replace(self.before.noise, sensitivity_mps2_per_k=refit.noise.sensitivity_mps2_per_k)
+        standing, walking = trend(replace(refit.fit, noise=noise)), trend(refit.fit)
+        if standing is None or walking is None:
+            return 0.0
+        return min(walking.log_density - standing.log_density, _log_odds(standing) - _log_odds(walking))
 
     def _families(self, effects: Sequence[str]) -> tuple[str, ...]:
         """Return the families of effects, each once."""

@@ -29,11 +29,18 @@ from kf_calib.diagnosis.hypothesis_table import (
     noise_p,
     table_of,
 )
-from kf_calib.diagnosis.refits import Refits, calibration_of, dwell_noise_is_stated, with_noise_as_stated
+from kf_calib.diagnosis.refits import (
+    Refits,
+    calibration_of,
+    dwell_noise_is_stated,
+    with_noise_as_stated,
+    with_noise_beside_oscillation,
+)
 from kf_calib.diagnosis.replication import Replication, replication
 from kf_calib.diagnosis.results import Diagnosis, Suspect
 from kf_calib.diagnosis.verdict import disturbance_in_words, format_probability, second_pass_in_words, verdict_in_words
 from kf_calib.dwells import window_average
+from kf_calib.effects import effect_named
 from kf_calib.estimation.outlying_dwell import outlying_in_words
 from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.support.tail_probabilities import chi_squared_tail
@@ -79,6 +86,9 @@ def _diagnosed(refits: Refits, before: Calibration) -> Diagnosis:
         verdict = f"One dwell is wrong (p {format_p(test.p_value)}): {outlying_in_words(before.outlying)}"
         return Diagnosis(before=before, test=test, verdict=verdict, unknown=test.consistent is False)
     test = _without_vibration(refits, before, refits.assess(before))
+    oscillating = None if test.lines.vibration else _oscillating(refits, before)
+    if oscillating is not None:
+        return _in_words(oscillating)
     diagnosis = _explained(refits, before, test)
     if diagnosis.unknown and test.without_lines:  # the lines keep their phase through the run, but not their amplitude
         test = test.without_lines
@@ -89,6 +99,21 @@ def _diagnosed(refits: Refits, before: Calibration) -> Diagnosis:
             retest = refits.assess(averaged)
             retest = retest.without_lines or retest  # lines that are left after averaging are vibration, too
             diagnosis = _explained(refits, averaged, retest.with_vibration(test.lines.vibration))
+    return _in_words(diagnosis)
+
+
+def _oscillating(refits: Refits, before: Calibration) -> Diagnosis | None:
+    """Return the diagnosis of a run in which an oscillation was taken for slow noise; None for any other."""
+    quieter = with_noise_beside_oscillation(refits, before)
+    if quieter is None:
+        return None
+    diagnosis = _explained(refits, quieter, _without_vibration(refits, quieter, refits.assess(quieter)))
+    named = any(effect_named(name, before.bench).oscillates for name in diagnosis.missing)
+    return replace(diagnosis, before=before, before_in_noise_left=quieter) if named else None
+
+
+def _in_words(diagnosis: Diagnosis) -> Diagnosis:
+    """Return a diagnosis with its verdict."""
     diagnosis = replace(diagnosis, restoring_time_s=_restoring_time_s(diagnosis))
     words = verdict_in_words(diagnosis) + second_pass_in_words(diagnosis) + disturbance_in_words(diagnosis)
     return replace(diagnosis, verdict=words)

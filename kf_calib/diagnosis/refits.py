@@ -8,11 +8,12 @@ from os import PathLike
 
 import numpy as np
 
+from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import Source
 from kf_calib.diagnosis.candidate_tests import CandidateTests, assess_candidates, candidate_frame
 from kf_calib.diagnosis.unknown_effect import FormulaFamily, families
-from kf_calib.effects import Effect
-from kf_calib.errors import InputError
+from kf_calib.effects import Effect, oscillation_of
+from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.calibration import calibrate, evaluate_fit
 from kf_calib.estimation.dwell_pass import holds_its_oscillation
 from kf_calib.estimation.fit import Fit
@@ -20,10 +21,13 @@ from kf_calib.estimation.iterated_fit import fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import Frame
+from kf_calib.noise.noise_model import Noise
 from kf_calib.sources.opening import opened
 from kf_calib.sources.tables.table import Table
 from kf_calib.support import stage
 from kf_calib.support.threads import one_blas_thread
+
+_QUIETER = 0.25  # share of the noise that an oscillation leaves, of that which it was taken for
 
 
 class Refits:
@@ -134,3 +138,28 @@ def with_noise_as_stated(refits: Refits, before: Calibration, refit: Calibration
     if not noise.scatter_stated:
         bench = replace(bench, scatter_sigma_mps2=float(np.sqrt(np.mean(noise.scatter_mps2**2))))
     return refits.of(replace(before, bench=bench), before.settings.effects)
+
+
+def with_noise_beside_oscillation(refits: Refits, before: Calibration) -> Calibration | None:
+    """The run in the noise within dwells that an oscillation leaves; None where that is not much less.
+
+    An oscillation of a cycle or two in each dwell looks like slow noise, in which the means of the dwells would differ
+    by much more than they do.
+    """
+    oscillation = oscillation_of(before.bench)
+    if oscillation is None or before.model.oscillates or not (before.consistency.quiet and before.noise.within_seen):
+        return None
+    try:
+        beside = refits.with_effects(before, (str(oscillation),)).noise
+    except UnobservableError:
+        return None
+    if not (_power(beside) < _QUIETER * _power(before.noise)).any():
+        return None
+    noise = replace(before.noise, sigma_mps2=beside.sigma_mps2, inflation=beside.inflation)
+    quieter = evaluate_fit(replace(before.fit, noise=noise), before.settings)
+    return replace(quieter, tally=before.tally, readings=before.readings)
+
+
+def _power(noise: Noise) -> Floats:
+    """Return the variance (3,) of each accelerometer's noise within dwells, as if white, (m/s^2)^2 of a reading."""
+    return noise.effective_sigma_mps2**2

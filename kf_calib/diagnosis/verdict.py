@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from kf_calib.diagnosis.candidate_tests import CandidateTests
@@ -10,11 +12,13 @@ from kf_calib.diagnosis.refits import dwell_noise_is_stated
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.unknown_effect import one_digit_seconds
 from kf_calib.estimation.dwell_pass import holds_its_oscillation
-from kf_calib.estimation.results import format_p
+from kf_calib.estimation.results import Parameter, format_p
 from kf_calib.support.units import shown, significant
 
 _AS_LIKELY = 0.25  # share of the likeliest from which another explanation is told together with it
+_CHANCE = 0.01  # probability from which it is told that nothing may be missing
 _TOLD = 4  # most other explanations that are told
+_UNUSUAL = 5.0  # times the greatest usual size, from which a coefficient is said to be too large for its name
 _FAMILIES = {
     "bias in time": "The bias changes with time", "scale in time": "The scale factor changes with time",
     "temperature": "It goes with temperature", "nonlinearity": "The accelerometer is not linear",
@@ -48,7 +52,7 @@ def verdict_in_words(diagnosis: Diagnosis) -> str:
     if diagnosis.unearned:
         return f"{start} {_not_named(diagnosis, first)}."
     if first.effects:
-        return f"{start} {_named(diagnosis, first)}{_returning(diagnosis)}.{_held_out(diagnosis)}"
+        return f"{start} {_named(diagnosis, first)}{_returning(diagnosis)}.{_held_out(diagnosis)}{_unusual(diagnosis)}"
     return f"{start} {_noise(diagnosis, first) if diagnosis.noise else _unknown(diagnosis, first)}"
 
 
@@ -166,7 +170,9 @@ def _noise(diagnosis: Diagnosis, first: Hypothesis) -> str:
 def _others(diagnosis: Diagnosis, but: str = "") -> str:
     """Return the other explanations in words, but for those of one family."""
     assert diagnosis.table is not None
-    rows = [row for row in diagnosis.table.rivals if row.families != (but,)]
+    nothing = [row for row in diagnosis.table.rows if row.families == (NOTHING,) and row.probability > _CHANCE]
+    rows = [row for row in (*diagnosis.table.rivals, *nothing) if row.families != (but,)]
+    rows.sort(key=lambda row: -row.probability)
     words = [f"{_in_words(diagnosis, row)} {format_probability(row.probability)}" for row in rows[:_TOLD]]
     more = len(rows) - _TOLD
     words += [f"{more} other{'s' * (more > 1)}"] if more > 0 else []
@@ -214,6 +220,8 @@ def _in_words(diagnosis: Diagnosis, row: Hypothesis) -> str:
     """Return an explanation in words."""
     if row.effects:
         return _effects_of(row) + (f" beside no known effect, which goes with {row.driver}" if row.formulas else "")
+    if row.families == (NOTHING,):
+        return "nothing missing"
     if row.driver:
         return "no known effect, irregular" if row.driver == IRREGULAR else f"no known effect, goes with {row.driver}"
     return f"scatter from dwell to dwell{' larger than stated' if dwell_noise_is_stated(diagnosis.before) else ''}"
@@ -244,8 +252,7 @@ def _size(diagnosis: Diagnosis) -> str:
     assert diagnosis.after is not None
     parameters = diagnosis.after.parameters
     first = next(each for each in diagnosis.after.model.effects if str(each) == diagnosis.missing[0])
-    sized = [parameters[c.symbol] for c in first.parameters]
-    parameters_named = [max(sized, key=lambda p: abs(p.value or 0.0) / (p.sigma or np.inf))]
+    parameters_named = [_clearest([parameters[c.symbol] for c in first.parameters])]
     parameters_named += [parameters[first.unknown.symbol]] if first.unknown else []
     return "".join(
         f", {p.symbol} = {shown(p).number(p.value)} ± {shown(p).text(p.sigma, 2)}"
@@ -265,3 +272,25 @@ def _held_out(diagnosis: Diagnosis) -> str:
         f" Adding it takes the error on orientations left out from {before.held_out_rms_mps2 / floor:.2f} to "
         f"{after.held_out_rms_mps2 / floor:.2f} times what noise gives."
     )
+
+
+def _unusual(diagnosis: Diagnosis) -> str:
+    """Return a sentence on a coefficient that is far beyond all sizes that are usual, by two sigmas at least; "" where
+    there is none, or where no usual size is known."""
+    assert diagnosis.after is not None
+    for effect in (each for each in diagnosis.after.model.effects if str(each) in diagnosis.missing):
+        usual = effect.typical.of(diagnosis.grade)
+        if usual is None or not effect.coefficients:
+            continue
+        p = _clearest([diagnosis.after.parameters[c.symbol] for c in effect.coefficients])
+        if p.value is not None and abs(p.value) - 2.0 * (p.sigma or 0.0) > _UNUSUAL * usual[1]:
+            return (
+                f" {p.symbol} is {abs(p.value) / usual[1]:.0f} times the greatest that is usual "
+                f"({shown(p).text(usual[1])}): something else that looks like {effect} may be behind it."
+            )
+    return ""
+
+
+def _clearest(parameters: Sequence[Parameter]) -> Parameter:
+    """Return the parameter that is the most sigmas from zero."""
+    return max(parameters, key=lambda p: abs(p.value or 0.0) / (p.sigma or np.inf))

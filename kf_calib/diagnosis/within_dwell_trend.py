@@ -36,6 +36,7 @@ from kf_calib.support.tail_probabilities import chi_squared_tail, sidak
 _DEGREE = 3
 _GRID = 600
 _FEWEST = 8  # readings that a dwell must have to be tested
+_PLACES = 9  # of the intensity of a walk, over which a density is averaged
 _SEEN = 1e-4  # of the square of a column: less that the model leaves is not told
 
 
@@ -72,12 +73,14 @@ class Trend:
     """The test of all trends within dwells.
 
     ratio: mean square of all coefficients over what noise gives. p_value: its p-value. sums (D, 3): sum of these ratios
-    for each dwell and channel.
+    for each dwell and channel. log_density: logarithm of the density of the coefficients in this noise, but for a
+    constant that is that of the dwells.
     """
 
     ratio: float
     p_value: float
     sums: Floats
+    log_density: float = 0.0
 
     @property
     def most(self) -> tuple[int, int]:
@@ -121,7 +124,24 @@ def trend_beside(linearised: LinearisedDwells, noise: Noise, state: Floats) -> T
     unsure = float(np.mean((4.0 * noise.inflation - 2.0) / readings)) / 3.0
     unsure += (2.0 * (noise.walk_spread or 0.0) * float(np.mean(by_walk / expected))) ** 2
     ratio = float(ratios.sum() / count)
-    return Trend(ratio, float(fdtrc(count, 2.0 / unsure, ratio)), ratios.sum(axis=2))
+    shown = np.broadcast_to(determined[:, None, :], squares.shape)
+    log_density = _log_density(
+        squares[shown],
+        (expected - by_walk)[shown],
+        np.broadcast_to(by_walk, squares.shape)[shown],
+        noise.walk_spread or 0.0,
+    )
+    return Trend(ratio, float(fdtrc(count, 2.0 / unsure, ratio)), ratios.sum(axis=2), log_density)
+
+
+def _log_density(squares: Floats, by_noise: Floats, by_walk: Floats, spread: float) -> float:
+    """Return the logarithm of the density of coefficients, but for their number, from their squares and their variances
+    by noise and by a walk, (n,) each; averaged over the intensity of the walk, of which the logarithm is known to
+    ``spread``."""
+    places, weights = np.polynomial.hermite_e.hermegauss(_PLACES if spread else 1)
+    variances = by_noise + by_walk * np.exp(2.0 * spread * places)[:, None]
+    logs = np.log(weights / weights.sum()) - 0.5 * np.sum(squares / variances + np.log(variances), axis=1)
+    return float(np.logaddexp.reduce(logs))
 
 
 def _by_thermometer(linearised: LinearisedDwells, noise: Noise) -> Floats | float:

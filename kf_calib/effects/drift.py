@@ -47,7 +47,7 @@ class ScaleDrift(SensorEffect):
     drawn_against = Regressor("t*a", "time times force along the input axis", "m/s")
     confused_with = "base-tilt-drift"
     symbol, unit, scale = "kappa", "1/s", 1e-7
-    typical = Typical((1e-6 / 86400, 10e-6 / 86400))
+    typical = Typical((1e-6 / 86400, 10e-6 / 86400), (0.0, 1e-2 / 3600))  # a chip that warms by 20 K, at 0.05 %/K
 
     def terms(self, s: Stimulus) -> Floats:
         return s.elapsed_s[:, None] * s.along

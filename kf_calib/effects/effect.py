@@ -162,7 +162,7 @@ class Effect(ABC):
     """The axis of an axis-wise effect (``encoder-harmonic-2:z``)."""
     value: float = 0.0
     held: bool = False
-    """Whether its unknown stays at the upper end of its range, beyond which the readings would have it."""
+    """Whether its unknown stays where it is: at an end of its range, beyond which the readings would have it."""
 
     def __str__(self) -> str:
         return f"{self.name}:{self.variant}" if self.variant else self.name
@@ -175,11 +175,11 @@ class Effect(ABC):
         return other
 
     def held_if_beyond(self, step: float) -> Self:
-        """The same effect; its unknown is held if it is at the upper end of its range and ``step`` of ln(value) leads
-        out of it, as of a warm-up so slow that it is a straight line in this run."""
+        """The same effect; its unknown is held if it is at an end of its range and ``step`` of ln(value) leads
+        outwards, as of a warm-up so slow that it is a straight line in this run, or a lag too short to be seen."""
         assert self.unknown is not None
-        other = copy.copy(self)
-        other.held = self.held or (step > 0.0 and self.value >= self.unknown.high)
+        other, known = copy.copy(self), self.unknown
+        other.held = self.held or (self.value >= known.high if step > 0.0 else step < 0.0 and self.value <= known.low)
         return other
 
     @property

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, turn
@@ -187,12 +186,12 @@ class Stimulus:
         """
         if self.whole is not None:
             return self.whole.warming[self.places]
-        times, first = np.unique(self.elapsed_s, return_index=True)
-        window_s, best, best_change = _RATE_WINDOW_S, self._change(times, first, _RATE_WINDOW_S), np.inf
+        times, _ = self._smooth_warmth
+        window_s, best, best_change = _RATE_WINDOW_S, self._change(_RATE_WINDOW_S), np.inf
         rate = best
         while 2.0 * window_s <= max((times[-1] - times[0]) / 8.0, _RATE_WINDOW_S):
             window_s *= 2.0
-            longer = self._change(times, first, window_s)
+            longer = self._change(window_s)
             size = float(np.mean(longer**2))
             change = float(np.mean((longer - rate) ** 2)) / size if size > 0.0 else 0.0
             if change < best_change:
@@ -202,12 +201,35 @@ class Stimulus:
             rate = longer
         return best
 
-    def _change(self, times: Floats, first: NDArray[np.intp], window_s: float) -> Floats:
-        """The change of temperature per second over a window to either side of each instant, shorter at the ends."""
-        before = np.maximum(self.elapsed_s - window_s, times[0])
-        after = np.minimum(self.elapsed_s + window_s, times[-1])
-        change = np.interp(after, times, self.warmth[first]) - np.interp(before, times, self.warmth[first])
-        return change / np.maximum(after - before, 1e-9)
+    def _change(self, window_s: float) -> Floats:
+        """The change (m,) of temperature per second over a window to either side of each instant. Nearer to an end than
+        that it goes on in a straight line, or over what there is in a run of less than four windows."""
+        times, _ = self._smooth_warmth
+        first, last = times[0] + window_s, times[-1] - window_s
+        if last - first < 2.0 * window_s:
+            return self._change_from(self.elapsed_s - window_s, self.elapsed_s + window_s)
+        at = np.clip(self.elapsed_s, first, last)
+        rate = self._change_from(at - window_s, at + window_s)
+        for end, inner in ((first, first + window_s), (last, last - window_s)):
+            ends = np.array([end, inner])
+            at_end, at_inner = self._change_from(ends - window_s, ends + window_s)
+            beyond = (self.elapsed_s - end) / (inner - end)
+            rate += np.where(beyond < 0.0, beyond * (at_inner - at_end), 0.0)
+        return rate
+
+    def _change_from(self, before_s: Floats, after_s: Floats) -> Floats:
+        """The change (n,) of temperature per second from instants to others, within the run."""
+        times, values = self._smooth_warmth
+        before_s, after_s = np.maximum(before_s, times[0]), np.minimum(after_s, times[-1])
+        change = smooth_between(times, values, after_s) - smooth_between(times, values, before_s)
+        return change / np.maximum(after_s - before_s, 1e-9)
+
+    @cached_property
+    def _smooth_warmth(self) -> tuple[Floats, Floats]:
+        """Instants and temperatures less the reference, K, that a smooth curve goes through: the middles of the pieces,
+        and both ends."""
+        times, first = np.unique(np.append(self.elapsed_s[1:-1:3], self.elapsed_s[[0, -1]]), return_index=True)
+        return times, np.append(self.warmth[1:-1:3], self.warmth[[0, -1]])[first]
 
     @property
     def level_axes(self) -> Floats:
@@ -225,8 +247,7 @@ class Stimulus:
             return self.whole.lagged_warmth(tau_s)[self.places]
         from scipy.linalg import get_blas_funcs
 
-        times, first = np.unique(np.append(self.elapsed_s[1:-1:3], self.elapsed_s[[0, -1]]), return_index=True)
-        values = np.append(self.warmth[1:-1:3], self.warmth[[0, -1]])[first]
+        times, values = self._smooth_warmth
         span = max(times[-1] - times[0], 1e-9)
         grid = np.linspace(times[0], times[-1], int(np.clip(20.0 * span / tau_s, 1000, 20_000)))
         ratio = (grid[1] - grid[0]) / tau_s

@@ -137,7 +137,7 @@ class Model:
 
     @property
     def constants_beside_state(self) -> tuple[Effect, ...]:
-        """The effects whose unknown constant is no state: it has no derivative, or is held at the end of its range."""
+        """The effects whose unknown constant is no state: it has no derivative, or is held at an end of its range."""
         return tuple(each for each in self.effects if each.unknown and not each.has_constant_in_state)
 
     def moved(self, state: Floats) -> Model:
@@ -146,8 +146,8 @@ class Model:
         return replace(self, effects=tuple(moved.get(str(each), each) for each in self.effects))
 
     def held_at_ends(self, steps: Floats) -> tuple[Model, list[int]]:
-        """The model with each unknown constant held that is at the upper end of its range and whose step, in steps
-        (p,), leads out of it; and the states that these constants were."""
+        """The model with each unknown constant held that is at an end of its range and whose step, in steps (p,), leads
+        outwards; and the states that these constants were."""
         held = {str(each): each.held_if_beyond(steps[k]) for k, each in self.unknowns.items()}
         model = replace(self, effects=tuple(held.get(str(each), each) for each in self.effects))
         return model, [k for k, each in self.unknowns.items() if held[str(each)].held]

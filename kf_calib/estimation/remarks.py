@@ -115,6 +115,9 @@ def remarks_on(
         usual = float(np.median(dwells.folded.counts))
         short = not dwells[0].averaged and usual < TOO_SHORT * noise.inflation.max()
         slow = "; dwells are too short to tell how slow it is: stay longer in each" if short else ""
+        if judged.quiet:
+            slow = "; yet the dwells differ by much less than such noise lets them: what goes on within them alike may "
+            slow += "be an oscillation, for which diagnose looks"
         yield f"the noise within a dwell is correlated: sigmas allow for it by inflating its variance by {kappa}{slow}."
     least, most = dwells.folded.weights.min(), dwells.folded.weights.max()
     if least < most:
@@ -149,10 +152,11 @@ def remarks_on(
 
 
 def _on_held(effect: Effect, unknown: Unknown) -> str:
-    """Return a remark on a constant that is held at the end of its range."""
+    """Return a remark on a constant that is held at an end of its range."""
+    end = "greatest" if effect.value >= unknown.high else "least"
     return (
-        f"{unknown.symbol} is held at {shown(unknown).text(effect.value)}, the greatest value that is searched: the "
-        f"readings do not bound it, and {effect} may be another effect that looks the same."
+        f"{unknown.symbol} is held at {shown(unknown).text(effect.value)}, the {end} value that is searched: the "
+        f"readings do not bound it on that side, and {effect} may be another effect that looks the same."
     )
 
 

@@ -35,6 +35,7 @@ from kf_calib.support.units import field_unit, shown
 
 _WEAK = 5.0  # times the size that a coefficient may well have
 _CLEAR = 3.0  # sigmas: of a coefficient that is seen, however large it is
+_QUIET = 1e-6  # chance that noise lets the dwells differ as little, below which it is not what goes on within them
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,11 @@ class Consistency:
     dof: int
     p_value: float | None
     consistent: bool | None
+
+    @property
+    def quiet(self) -> bool:
+        """Whether the dwells differ by much less than the noise lets them: it is not what goes on within them."""
+        return self.p_value is not None and 1.0 - self.p_value < _QUIET
 
     @property
     def nis_per_dof(self) -> float | None:

@@ -135,7 +135,9 @@ class Watch:
         looks = self.looks + 1
         crossed = self.p_value < LEVEL / (looks * (looks + 1))
         alarmed = len(self.dwells) if crossed and self.alarmed is None else self.alarmed
-        return replace(self, looks=looks, alarmed=alarmed)
+        looked = replace(self, looks=looks, alarmed=alarmed)
+        looked.__dict__.update({name: vars(self)[name] for name in ("p_value", "trend") if name in vars(self)})
+        return looked
 
 
 def _begun(

@@ -54,7 +54,7 @@ def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
     named = diagnosis.missing[0] if diagnosis.missing else "noise" if diagnosis.noise else None
     missing = "unknown" if diagnosis.unknown or diagnosis.unearned else named
     shapes = diagnosis.explanations[0].shapes if diagnosis.explanations else []
-    trend = diagnosis.test.trend
+    trend, disturbed = diagnosis.test.trend, diagnosis.table.disturbed if diagnosis.table else None
     return clean(
         {
             "consistent": diagnosis.test.consistent,
@@ -80,6 +80,7 @@ def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
             "trend": None
             if trend is None
             else {"ratio": trend.ratio, "p_value": trend.p_value, "dwell": trend.most[0], "channel": trend.most[1]},
+            "disturbed_dwell": None if disturbed is None else vars(disturbed),
             "detectable": [
                 {"effect": each.name, "minimum": each.minimum, "unit": each.unit} for each in diagnosis.detectable
             ],

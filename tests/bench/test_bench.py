@@ -259,7 +259,7 @@ BENCH_VALUES = st.dictionaries(
 )
 
 
-@pytest.mark.parametrize("examples", [100, *slow(500)])
+@pytest.mark.parametrize("examples", [40, *slow(500)])
 def test_whatever_values_say_is_a_bench_or_a_sentence(examples: int) -> None:
     """As they come in a recording (text), in JSON or TOML (made text), and from Python."""
 

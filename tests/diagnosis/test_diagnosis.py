@@ -41,9 +41,11 @@ def unlisted(name: str) -> Diagnosis:
 @pytest.mark.parametrize(
     "name",
     [
-        "thermal-scale", "settling",
-        *slow("encoder-harmonic-1:z", "second-order", "hysteresis", "axis-nonorthogonality:z", "cross-coupling-ip"),
-        *slow("scale-drift"),
+        "settling",
+        *slow(
+            "encoder-harmonic-1:z", "thermal-scale", "second-order", "hysteresis", "axis-nonorthogonality:z",
+            "cross-coupling-ip", "scale-drift",
+        ),
     ],
 )  # fmt: skip
 def test_a_hidden_effect_is_named(name: str) -> None:

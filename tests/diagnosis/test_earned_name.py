@@ -14,6 +14,7 @@ import kf_calib
 from kf_calib.diagnosis.hypothesis_table import IRREGULAR, NONE, NOTHING, Hypothesis, table_of
 from kf_calib.diagnosis.missing_effect import SEEN, behind_nothing, diagnose, unearned
 from kf_calib.effects import walk_named
+from kf_calib.views.diagnosis import found_object
 
 
 class _Effect:
@@ -75,6 +76,8 @@ def test_creep_of_a_real_unit_is_not_called_an_oscillation() -> None:
     diagnosis = diagnose(recording.altered(np.zeros(3)), replicate=False)
     assert diagnosis.missing == () and "sinusoid" not in diagnosis.ambiguity
     assert "In dwell 1 the readings swing with a period of 13 s, as in no other dwell" in diagnosis.verdict
+    told = found_object(diagnosis)["disturbed_dwell"]
+    assert told["number"] == 1 and told["frequency_hz"] == pytest.approx(1.0 / 13.0, rel=0.1) and told["p_value"] < 1e-4
 
 
 @pytest.mark.parametrize("nothing, said", [(0.6, "that nothing is missing is likelier (60 %)"), (0.3, "")])

@@ -62,7 +62,7 @@ def test_what_is_not_drawn_is_not_seen(name: str) -> None:
         source(f"{name}=15sigma")
 
 
-@pytest.mark.parametrize("name", [*SEEN[::3], *slow(*(name for k, name in enumerate(SEEN) if k % 3))])
+@pytest.mark.parametrize("name", [*SEEN[::6], *slow(*(name for k, name in enumerate(SEEN) if k % 6))])
 def test_what_the_readings_show_of_an_effect_follows_its_axis(name: str) -> None:
     """The readings go with the curve, and the curve is one over the axis: a fit of it that knows the axis alone."""
     shape = shape_of(name)

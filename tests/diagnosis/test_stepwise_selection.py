@@ -201,9 +201,13 @@ def test_dwells_left_out_are_still_where_others_came_from(quiet: Calibration) ->
     np.testing.assert_array_equal(part.previous_force_mps2, whole.previous_force_mps2[kept])
 
 
-def test_the_honest_error_repeats_the_choice(second_order: Calibration, quiet: Calibration) -> None:
+def test_the_honest_error_repeats_the_choice(second_order: Calibration) -> None:
     checked = nested_cross_validation(second_order, folds=3)
     assert checked.chosen == {"second-order": 3} and 0.7 < checked.rms_mps2 / checked.expected_mps2 < 1.3
+
+
+@pytest.mark.slow
+def test_the_honest_error_of_a_run_without_effects_is_that_of_its_model(quiet: Calibration) -> None:
     empty = nested_cross_validation(quiet, folds=3)
     assert empty.chosen == {} and 0.7 < empty.rms_mps2 / empty.expected_mps2 < 1.3
     assert quiet.held_out_rms_mps2 == pytest.approx(empty.rms_mps2, rel=0.15)
@@ -219,7 +223,7 @@ def test_honest_errors_are_those_of_orientations_left_out() -> None:
     assert checked.expected_mps2 == pytest.approx(cured.held_out_floor_mps2, rel=0.02)
 
 
-@pytest.mark.parametrize("runs", [2, *slow(20)])
+@pytest.mark.parametrize("runs", slow(2, 20))
 def test_sigmas_are_honest_after_improvement(runs: int) -> None:
     """NEES of the twelve over runs with a hidden effect: far outside its band before, inside after.
 

@@ -34,9 +34,8 @@ def diagnosed(name: str, sigmas: float = 12.0, seed: int = 2) -> Diagnosis:
 @pytest.mark.parametrize(
     ("name", "drivers"),
     [
-        ("temperature x two forces", {"temperature and specific force"}),
         ("last step x force", {"previous orientation and specific force"}),
-        *slow(("play", {"previous orientation"})),
+        *slow(("temperature x two forces", {"temperature and specific force"}), ("play", {"previous orientation"})),
     ],
 )
 def test_what_depends_on_two_drivers_or_on_the_past_is_unknown_and_goes_with_them(name: str, drivers: set[str]) -> None:
@@ -52,7 +51,7 @@ def test_what_depends_on_two_drivers_or_on_the_past_is_unknown_and_goes_with_the
         *slow(("decay x force across", "time and specific force"), ("play", "previous orientation")),
     ],
 )
-@pytest.mark.parametrize("known", ["second-order", "cross-coupling-ip"])
+@pytest.mark.parametrize("known", ["second-order", *slow("cross-coupling-ip")])
 def test_what_goes_on_beside_a_known_effect_gets_no_known_name(known: str, name: str, driver: str) -> None:
     hidden = second_order if known == "second-order" else cross_coupling
     diagnosis = kf_calib.diagnose(beside(hidden, name, 60.0, 2), replicate=False)
@@ -62,6 +61,7 @@ def test_what_goes_on_beside_a_known_effect_gets_no_known_name(known: str, name:
     assert diagnosis.after is not None and str(diagnosis.after.model.effects[-1]) == known
 
 
+@pytest.mark.slow  # a jump by itself: test_diagnosis_cases.py
 def test_sensors_that_were_switched_on_again_jump_and_do_not_walk() -> None:
     diagnosis = kf_calib.diagnose(noisy_run("switched on again half-way", 60.0, 1), replicate=False)
     assert diagnosis.missing == ("second-order",)
@@ -77,7 +77,7 @@ def test_noise_of_real_sensors_gets_no_name(kind: str, sigmas: float) -> None:
         assert {*diagnosis.missing} <= {"second-order"} or not diagnosis.sure, diagnosis.verdict
 
 
-@pytest.mark.parametrize(("gimbal", "waves"), [(1, 2), (2, 6), *slow((2, 3), (2, 4))])
+@pytest.mark.parametrize(("gimbal", "waves"), [(2, 6), *slow((1, 2), (2, 3), (2, 4))])
 def test_waves_of_an_encoder_are_told_with_their_number_a_turn(gimbal: int, waves: int) -> None:
     at = visits(5, 24)
     phase_rad = waves * at.angles_rad[:, gimbal - 1]
@@ -114,7 +114,7 @@ def scattered(repeated: int, with_orientation: bool) -> Diagnosis:
     by_dwell = rng.normal(size=(20, 3)) * 6.0 * WHITE_MPS2 / np.sqrt(240)
     if with_orientation and repeated:
         by_dwell[-repeated:] = by_dwell[:repeated]
-    return kf_calib.diagnose(SmallRun(at, np.repeat(by_dwell[:, None], 240, axis=1), 5))
+    return kf_calib.diagnose(SmallRun(at, np.repeat(by_dwell[:, None], 240, axis=1), 5), replicate=False)
 
 
 def shares(diagnosis: Diagnosis) -> tuple[float, float]:
@@ -131,10 +131,15 @@ def test_without_a_repeated_orientation_scatter_and_an_unknown_cause_cannot_be_t
     assert "cannot be told" in diagnosis.verdict and "repeat an orientation" in diagnosis.verdict
 
 
-def test_repeated_orientations_tell() -> None:
-    new, comes_back = scattered(6, False), scattered(6, True)
-    assert shares(new)[0] > shares(new)[1] and new.noise
+def test_what_comes_back_with_the_orientation_is_unknown() -> None:
+    comes_back = scattered(6, True)
     assert shares(comes_back)[0] < 0.05 * shares(comes_back)[1] and comes_back.unknown
+
+
+@pytest.mark.slow
+def test_what_is_new_each_time_an_orientation_is_repeated_is_noise() -> None:
+    new = scattered(6, False)
+    assert shares(new)[0] > shares(new)[1] and new.noise
 
 
 def test_odds_of_repeating_are_those_of_the_differences_between_visits() -> None:

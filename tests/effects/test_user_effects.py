@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.long_runs import slow
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -191,15 +192,19 @@ WORDS = ["a", "fx", "T", "tau", "q1", "sin", "exp", "sqrt", "maximum", "1e9", "0
 # fmt: on
 
 
-@given(st.one_of(st.text(max_size=40), st.lists(st.sampled_from(WORDS), max_size=14).map("".join)))
-@settings(max_examples=150, deadline=None)
-def test_any_text_is_a_finite_effect_or_a_sentence(text: str) -> None:
-    try:
-        effect = effect_named(f"mine = {text}", BENCH)
-    except InputError as error:
-        assert "\n" not in str(error)
-    else:
-        assert np.isfinite(effect.columns(checks.trial(BENCH))).all()
+@pytest.mark.parametrize("examples", [60, *slow(500)])
+def test_any_text_is_a_finite_effect_or_a_sentence(examples: int) -> None:
+    @settings(max_examples=examples, deadline=None, database=None)
+    @given(st.one_of(st.text(max_size=40), st.lists(st.sampled_from(WORDS), max_size=14).map("".join)))
+    def tried(text: str) -> None:
+        try:
+            effect = effect_named(f"mine = {text}", BENCH)
+        except InputError as error:
+            assert "\n" not in str(error)
+        else:
+            assert np.isfinite(effect.columns(checks.trial(BENCH))).all()
+
+    tried()
 
 
 @pytest.mark.parametrize(

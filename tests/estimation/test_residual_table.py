@@ -9,6 +9,7 @@ from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.known_runs import hidden_improved
 from helpers.paths import ROOT
 
 import kf_calib
@@ -16,7 +17,6 @@ from kf_calib import errors
 from kf_calib.views.report import page
 
 FACES = ROOT / "recordings" / "mems_faces.mcap"
-HIDDEN = FACES.with_name("hidden.mcap")
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def run() -> kf_calib.Calibration:
 @pytest.fixture(scope="module")
 def improved() -> kf_calib.Improvement:
     """Of a run whose residuals fail until the effect that is hidden in it is in the model."""
-    return kf_calib.improve(kf_calib.calibrate(HIDDEN))
+    return hidden_improved()
 
 
 def test_a_row_for_each_dwell_and_accelerometer(run: kf_calib.Calibration) -> None:

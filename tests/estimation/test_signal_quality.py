@@ -99,8 +99,16 @@ def test_a_real_imu_counts_in_2048ths_of_g(ferraris: Path) -> None:
     assert not found.warnings
 
 
-@pytest.mark.parametrize("limit", [7.0, 9.0, 9.7])
-@pytest.mark.parametrize("change", [np.copy, stored, stepped(5e-5), stepped(2e-4)])
+CHANGES = (np.copy, stored, stepped(5e-5), stepped(2e-4))
+
+
+@pytest.mark.parametrize(
+    "limit, change",
+    [
+        (7.0, np.copy), *((9.0, change) for change in CHANGES), (9.7, np.copy),
+        *slow(*((limit, change) for limit in (7.0, 9.7) for change in CHANGES[1:])),
+    ],
+)  # fmt: skip
 def test_flat_tops_are_found_where_they_are(limit: float, change) -> None:
     clean = calibrate(Run(seed=1, poses=FACES, dwells=12))
     beyond = {

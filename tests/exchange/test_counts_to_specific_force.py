@@ -135,7 +135,7 @@ def live_by_the_stream(folder: Path, run: Run) -> None:
 
 
 @compiled_only
-@pytest.mark.parametrize("acquired", [recorded_by_options, live_by_the_stream, *slow(live_by_the_bench_file)])
+@pytest.mark.parametrize("acquired", [recorded_by_options, *slow(live_by_the_stream, live_by_the_bench_file)])
 def test_counts_become_specific_force_with_what_they_are_stated_once(acquired, tmp_path: Path) -> None:
     run = made_run(seed=11)
     acquired(tmp_path, run)

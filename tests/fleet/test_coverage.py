@@ -154,6 +154,7 @@ def simulated(campaign: Campaign) -> tuple[list[RunFactor], dict[str, Floats]]:
     return factors, truth
 
 
+@pytest.mark.slow  # drawn ones have what their runs say, above
 def test_one_affected_unit_of_simulated_recordings(tmp_path: Path) -> None:
     """Six units, each measured twice; one has a second-order term of 30 sigma a run."""
     campaign = Campaign(tmp_path, runs=12, units=6, benches=1, of_unit=("second-order=30sigma",), share=0.17, seed=5)

@@ -312,7 +312,7 @@ def test_pieces_that_are_merged_do_not_depend_on_how_readings_come() -> None:
 
 
 def test_screen_lines_and_objects_of_a_standing() -> None:
-    session = Session(bench("second-order=25sigma", orientations=8), wanted={"theta1": 1e-6, "K1": 1e-9})
+    session = Session(bench("second-order=60sigma", orientations=6), wanted={"theta1": 1e-6, "K1": 1e-9})
     found = judgements(session)
     shown = plain(views.screen(session.standing, None, "sim://", hint="q: end"), width=80)
     for part in (
@@ -326,7 +326,7 @@ def test_screen_lines_and_objects_of_a_standing() -> None:
         assert part in shown
     assert len(shown.splitlines()) <= 24
     told = views.line(found[-1])
-    assert told.startswith("dwell 8 to") and "worst sigma K1" in told and "\n" not in told
+    assert told.startswith("dwell 6 to") and "worst sigma K1" in told and "\n" not in told
     empty = plain(views.screen(Session(bench()).standing, None, "sim://"), width=80)
     assert "0 readings" in empty and len(empty.splitlines()) <= 24
 

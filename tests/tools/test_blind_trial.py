@@ -31,6 +31,7 @@ def test_seeds_differ_and_do_not_depend_on_other_families() -> None:
     assert len(thin(every, 1)) == len({task.figure for task in every})
 
 
+@pytest.mark.slow
 def test_a_trial_through_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A large effect is named; the report, the picture and the list of failures are written."""
     files = {name: tmp_path / name for name in ("trial.json", "picture.svg", "failures.txt")}

@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.hidden_effects import noisy_run, run
+from helpers.known_runs import hidden_diagnosed
 from helpers.long_runs import slow
-from helpers.paths import ROOT
 from helpers.synthetic import Run
 from matplotlib.axes import Axes
 from matplotlib.container import BarContainer
 from matplotlib.figure import Figure
 
-import kf_calib
 from kf_calib import plot
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
@@ -27,7 +26,6 @@ from kf_calib.estimation.dwell_readings import readings_of, worst_dwell
 from kf_calib.support.units import shown_in
 from kf_calib.views.figures.style import label_axis, rounded_number, short_number, wrapped
 
-HIDDEN = ROOT / "recordings" / "hidden.mcap"
 MICRO_G = 9.80665e-6
 
 
@@ -39,11 +37,6 @@ def found(*hidden: str) -> Diagnosis:
 @cache
 def improved() -> Improvement:
     return improve(run("second-order=15sigma"))
-
-
-@cache
-def hysteresis() -> Diagnosis:
-    return diagnose(calibrate(kf_calib.open_recording(HIDDEN)))
 
 
 def panels(figure: Figure) -> list[Axes]:
@@ -69,9 +62,9 @@ def axes_of(figure: Figure, title: str) -> Axes:
 
 
 @pytest.mark.parametrize("hidden", [
-    (), ("triple-product=25sigma",),
+    ("triple-product=25sigma",),
     *slow(
-        (("second-order=15sigma",),), (("bias-drift=15sigma",),), (("sinusoid=30sigma",),),
+        ((),), (("second-order=15sigma",),), (("bias-drift=15sigma",),), (("sinusoid=30sigma",),),
         (("second-order=15sigma", "hysteresis=15sigma"),),
     ),
 ])  # fmt: skip
@@ -83,8 +76,8 @@ def test_every_figure_of_a_diagnosis_has_ink_in_every_panel(hidden: tuple[str, .
 
 
 def test_bars_of_suspects_are_their_shares_and_those_that_do_not_fit_are_hatched() -> None:
-    explained = hysteresis().explanations
-    figure = plot.suspects(hysteresis())
+    explained = hidden_diagnosed().explanations
+    figure = plot.suspects(hidden_diagnosed())
     axes = axes_of(figure, "What each explains")
     bars = [bar for container in axes.containers if isinstance(container, BarContainer) for bar in container]
     assert [bar.get_width() for bar in bars] == pytest.approx([100.0 * each.share for each in explained])  # type: ignore[operator]
@@ -96,7 +89,7 @@ def test_bars_of_suspects_are_their_shares_and_those_that_do_not_fit_are_hatched
     assert axes.get_xlabel().endswith("%")
 
 
-@pytest.mark.parametrize("hidden", [(), ("triple-product=25sigma",)])
+@pytest.mark.parametrize("hidden", [("triple-product=25sigma",), *slow(((),))])
 def test_bars_of_probabilities_are_those_of_the_table(hidden: tuple[str, ...]) -> None:
     table = found(*hidden).table
     assert table is not None
@@ -123,16 +116,16 @@ def test_cells_of_the_matrix_are_overlaps_and_a_walk_that_takes_any_path_has_non
 
 
 def test_separation_is_that_of_the_advice() -> None:
-    going = hysteresis().next_orientation
+    going = hidden_diagnosed().next_orientation
     assert going is not None
-    axes = axes_of(plot.suspects(hysteresis()), "Next: gimbals at")
+    axes = axes_of(plot.suspects(hidden_diagnosed()), "Next: gimbals at")
     bars = [bar.get_width() for container in axes.containers for bar in container]
     assert bars == pytest.approx([going[0].before, going[0].after])
     assert all(f"{angle:g}" in axes.get_title("left") for angle in going[0].gimbal_deg)
 
 
 def test_what_could_hide_names_every_effect_once() -> None:
-    diagnosis = hysteresis()
+    diagnosis = hidden_diagnosed()
     figure = plot.detection_limits(diagnosis)
     first, second, below = panels(figure)
     rows = [label.get_text() for axes in (first, second) for label in axes.get_yticklabels()]
@@ -151,7 +144,7 @@ def test_what_could_hide_names_every_effect_once() -> None:
 
 
 def test_residuals_of_single_dwells_are_drawn_in_micro_g_or_si() -> None:
-    diagnosis = hysteresis()
+    diagnosis = hidden_diagnosed()
     figure = plot.residuals(diagnosis)
     with shown_in("si"):
         words = panels(plot.residuals(diagnosis))
@@ -247,7 +240,7 @@ def test_readings_of_a_dwell_have_the_mean_of_its_residual(tmp_path: Path) -> No
 
 
 def test_the_sphere_shows_every_dwell_before_and_after() -> None:
-    diagnosis = hysteresis()
+    diagnosis = hidden_diagnosed()
     figure = plot.on_the_sphere(diagnosis)
     maps = [axes for axes in panels(figure) if axes.name == "mollweide"]
     assert len(maps) == 6

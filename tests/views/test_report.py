@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.browser import chromium
-from helpers.paths import ROOT
+from helpers.known_runs import hidden_diagnosed, hidden_improved
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -28,14 +28,13 @@ from kf_calib.views.report.drawing import Drawing, draw_all
 from kf_calib.views.report.page import PageTable, parts_of, save
 from kf_calib.views.terminal import ConsoleTable
 
-HIDDEN = ROOT / "recordings" / "hidden.mcap"
 EVIL = "<script>document.title='evil'</script>"
 MORE_EVIL = "</script><img src=x onerror=\"document.title='evil'\">"
 
 
 @pytest.fixture(scope="module")
 def found() -> kf_calib.Diagnosis:
-    return kf_calib.diagnose(HIDDEN)
+    return hidden_diagnosed()
 
 
 @pytest.fixture(scope="module")
@@ -284,7 +283,7 @@ def test_the_contents_name_every_section_of_the_page(path: Path) -> None:
 
 
 def test_the_page_of_an_improvement_leads_with_the_story_and_the_picture_of_the_steps() -> None:
-    state = kf_calib.improve(HIDDEN)
+    state = hidden_improved()
     page = page_of(state, [Measured("hidden.mcap", "6e21")], [])
     wrong, added, brought, left = page.verdict
     assert wrong.startswith("What was wrong: ") and "off by" in wrong

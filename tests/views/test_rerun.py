@@ -248,8 +248,6 @@ def test_a_file_that_is_no_recording(tmp_path: Path) -> None:
 
 @pytest.mark.draws
 def test_it_opens_as_a_picture(recording: Path, tmp_path: Path) -> None:
-    import rerun as rr
-
     shown = _drawn(recording, tmp_path / "run.png")
     assert shown.shape == (800, 1200, 3)
     assert len(np.unique(shown.reshape(-1, 3), axis=0)) > 500
@@ -257,6 +255,14 @@ def test_it_opens_as_a_picture(recording: Path, tmp_path: Path) -> None:
         assert (np.abs(shown.astype(int) - colour).max(axis=2) < 12).sum() > 300
     early = _drawn(recording, tmp_path / "early.png", timeline=view.ORIENTATION, time=3)
     assert (early != shown).any(axis=2).mean() > 0.003  # ellipsoids, and the cursor in each panel
+
+
+@pytest.mark.draws
+@pytest.mark.slow
+def test_the_picture_is_not_that_of_an_empty_file(recording: Path, tmp_path: Path) -> None:
+    import rerun as rr
+
+    shown = _drawn(recording, tmp_path / "run.png")
     with rr.RecordingStream("empty") as stream:
         stream.save(tmp_path / "empty.rrd")
         stream.log("nothing", rr.TextDocument(""), static=True)

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.paths import ROOT
+from helpers.known_runs import hidden_diagnosed, hidden_improved
+from helpers.paths import RECORDINGS
 
-from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.results import Diagnosis
-from kf_calib.diagnosis.stepwise_selection import Improvement, improve
+from kf_calib.diagnosis.stepwise_selection import Improvement
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration
@@ -31,8 +31,6 @@ from kf_calib.views.rerun.series import VisitHistory, predicted
 from kf_calib.views.rerun.spheres import signed
 from kf_calib.views.screenshot import screenshot, viewer
 
-RECORDINGS = ROOT / "recordings"
-
 
 def run(name: str, *effects: str, **settings: object) -> Calibration:
     return calibrate(Recording(RECORDINGS / f"{name}.mcap"), Settings(effects=effects, **settings))  # type: ignore[arg-type]
@@ -45,12 +43,12 @@ def hidden() -> Calibration:
 
 @pytest.fixture(scope="module")
 def found() -> Diagnosis:
-    return diagnose(RECORDINGS / "hidden.mcap")
+    return hidden_diagnosed()
 
 
 @pytest.fixture(scope="module")
-def improved(found: Diagnosis) -> Improvement:
-    return improve(found.before)
+def improved() -> Improvement:
+    return hidden_improved()
 
 
 def content(path: Path, component: str, timeline: str = "") -> dict[str, dict[int | None, list]]:

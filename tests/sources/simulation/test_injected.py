@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.long_runs import slow
 from scipy.optimize import brentq
 
 from kf_calib.bench.bench import Bench, axes_of, parse_axes
@@ -545,7 +546,7 @@ def test_batches_do_not_matter_to_an_effect(name):
     assert np.array_equal(run(text, batch_samples=17).accel.values, run(text).accel.values)
 
 
-@pytest.mark.parametrize("batch_samples", [1, 7, 97])
+@pytest.mark.parametrize("batch_samples", [7, 97, *slow(1)])
 def test_batches_do_not_matter_to_all_effects_at_once(batch_samples):
     texts = [f"{name}={size}" for name, size in VISIBLE.items() if name not in ("saturation", "quantisation")]
     assert np.array_equal(run(texts, batch_samples, inertial=True).accel.values, run(texts, inertial=True).accel.values)
@@ -564,7 +565,7 @@ def test_memory_does_not_grow_with_the_run():
         texts = [f"{name}={size}" for name, size in VISIBLE.items()]
         simulation = Simulation(
             BENCH, ORTHOGONAL, QUIET, explicit_plan([(0, 0, 0), (0, 90, 0)], dwell_s),
-            ambient=AMBIENT, sample_hz=500.0, batch_samples=1000, hidden=parse(texts, BENCH.axes),
+            ambient=AMBIENT, sample_hz=250.0, batch_samples=500, hidden=parse(texts, BENCH.axes),
         )  # fmt: skip
         tracemalloc.start()
         for _ in simulation:
