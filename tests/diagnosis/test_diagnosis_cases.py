@@ -308,6 +308,7 @@ def test_a_walk_and_another_effect_are_both_found(name: str) -> None:
     found = diagnose(source("bias-walk=15sigma", f"{name}=15sigma", seed=2, dwells=24))
     assert set(found.missing) == {name, "bias-walk"}, found.verdict
     assert found.after is not None and found.after.consistency.consistent
+    assert found.table is not None and found.table.first.dof == 3 + 1, "coefficients, and the intensity of the walk"
 
 
 @pytest.mark.parametrize("seeds", [range(1, 2), *slow(range(5))])

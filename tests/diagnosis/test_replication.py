@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ import kf_calib
 from kf_calib.bench.streams import Stream
 from kf_calib.diagnosis.candidate_tests import candidate_frame
 from kf_calib.diagnosis.replication import FEWEST, Replication, _one_sided, replication
+from kf_calib.diagnosis.verdict import replication_in_words
 from kf_calib.estimation.results import Calibration, Consistency
 
 WHITE_MPS2, COUNT = 1e-4, 600
@@ -121,6 +124,21 @@ def test_a_misfit_that_is_left_counts_as_noise() -> None:
 def test_a_prediction_is_tested_on_one_side_by_students_t(dof: float) -> None:
     for value in (-6.0, -0.4, 0.0, 0.7, 5.0):
         assert _one_sided(value, dof) == pytest.approx(t.sf(value, dof), rel=1e-9)
+
+
+@pytest.mark.parametrize(("fall", "said"), [
+    (40.2, "It replicates: named from half of the dwells, it lowers χ² of the others by 40 (35 predicted; p = 1e-08)."),
+    (0.6, "It does not replicate: named from half of the dwells, it lowers χ² of the others by 1 (35 predicted; "
+          "p = 0.5), less than its size predicts (p = 0.001)."),
+    (-2.8, "It does not replicate: named from half of the dwells, it raises χ² of the others by 3, less than its size "
+           "predicts (p = 0.001)."),
+])  # fmt: skip
+def test_what_the_other_half_shows_is_told_in_words(fall: float, said: str) -> None:
+    answer, p_value = ("yes", 1e-8) if fall > 9.0 else ("no", 0.5)
+    tried = SimpleNamespace(halves=[1, 2], relevant=[1], fall=fall, predicted=35.0, p_value=p_value, p_less=1e-3,
+                            answer=answer)  # fmt: skip
+    diagnosis: Any = SimpleNamespace(replication=tried)
+    assert replication_in_words(diagnosis) == said
 
 
 def test_few_dwells_cannot_tell() -> None:

@@ -146,7 +146,7 @@ def test_spectra_add_up() -> None:
     np.testing.assert_allclose(line.amplitude_mps2, [0.0, 0.3, 1.0], atol=0.15)
 
 
-@pytest.mark.parametrize(("count", "length"), [(100, 96), (1500, 1024), (9000, 4000)])
+@pytest.mark.parametrize(("count", "length"), [(100, 96), (1500, 1024), (2500, 2048), (9000, 4000)])
 def test_a_spectrum_is_that_of_welch_without_overlap(count: int, length: int) -> None:
     """In segments of the longest length that fits, of 64, 96, 128 ... 2048, 4000 readings; its density is |X|^2 over
     rate and sum of squares of the Hann window, and twice that but at the ends."""

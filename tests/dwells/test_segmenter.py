@@ -134,12 +134,14 @@ def test_what_waits_in_an_open_dwell_can_be_looked_at_and_stays() -> None:
     pose = path(*SLEWS, rate_hz=10)
     whole, split = Batch(readings(pose, 35), pose), np.searchsorted(readings(pose, 35).time_ns, 9 * S)
     looked, other = Segmenter(BENCH), Segmenter(BENCH)
+    assert np.isnan(looked.arrival_s)
     until = int(np.searchsorted(pose.time_ns, 9 * S))
     parts = Batch(whole.accel[:split], pose[:until]), Batch(whole.accel[split:], pose[until:])
     blocks = list(looked.push(parts[0]))
     (waiting,) = looked.waiting()
     assert not blocks and looked.standing == waiting.dwell == 1 and looked.tally.used == 0
     assert 7.5 < waiting.elapsed_s[-1] < 9.0 and len(waiting.elapsed_s) > 700
+    assert looked.arrival_s <= 0.0, "the platform stood before the run began"
     blocks += [*looked.push(parts[1]), *looked.finish()]
     expected = [block for part in parts for block in other.push(part)] + list(other.finish())
     for one, two in zip(blocks, expected, strict=True):

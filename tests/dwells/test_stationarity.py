@@ -101,3 +101,10 @@ def test_a_platform_comes_to_rest_where_it_is_as_in_the_next_two_margins(settle_
     assert Stillness(settle_s=settle_s).rest_ns(pose, False, 0, int((1.3 + settle_s) * S))[1] is False
     creeping = course(seconds, 0.03 * seconds)
     assert STILLNESS.rest_ns(creeping, False, 0, 12 * S) == (0, True)
+
+
+def test_of_messages_that_are_seldom_the_next_three_show_rest() -> None:
+    """Each 1.5 seconds: less than the margins from one to the next, but not than from one to the mean of three."""
+    seconds = every(1.5, 30.0)
+    pose = course(seconds, 0.8 * REST_DEG * np.minimum(np.arange(len(seconds)), 5.0))
+    assert STILLNESS.rest_ns(pose, False, 0, 30 * S) == (6 * S, True)

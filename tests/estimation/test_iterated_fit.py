@@ -90,3 +90,25 @@ def test_axes_that_are_nearly_in_one_plane_tell_no_force() -> None:
     singular = begins_at(lambda condition: not iterated_fit._sensible(state(condition)), 2.0, 1e4)
     assert singular == pytest.approx(100.0, rel=1e-6)
     assert not iterated_fit._sensible(state(2.0) * np.nan)
+
+
+def test_the_error_of_the_temperature_matters_to_effects_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(iterated_fit, "sensitivity_to_temperature", lambda *_: "asked")
+    within: Any = SimpleNamespace(effective_sigma_mps2=None)
+    for effects, expected in (((), None), (("warm-up",), "asked")):
+        linearised: Any = SimpleNamespace(model=SimpleNamespace(effects=effects), dwells_at_state=None)
+        assert iterated_fit._sensitivity_to_temperature(linearised, within) == expected
+
+
+@pytest.mark.parametrize(("stated_deg", "of_poses_deg", "expected"), [
+    (None, 0.04, None), (0.03, 0.0, 0.03), (0.03, 0.04, 0.05), (0.0, 0.04, 0.04),
+])  # fmt: skip
+def test_a_stated_setting_error_has_that_of_noisy_angles_added(
+    stated_deg: float | None, of_poses_deg: float, expected: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In squares, by their mean over the dwells."""
+    poses = SimpleNamespace(pose_sigmas_rad=np.radians(of_poses_deg) * np.sqrt([0.5, 1.5]))
+    monkeypatch.setattr(iterated_fit, "DwellStack", SimpleNamespace(of=lambda _: SimpleNamespace(folded=poses)))
+    bench: Any = SimpleNamespace(angle_sigma_deg=stated_deg)
+    found = iterated_fit._setting_deg([], bench)
+    assert found == (None if expected is None else pytest.approx(expected))

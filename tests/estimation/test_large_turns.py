@@ -55,9 +55,10 @@ def test_columns_times_coefficients_are_the_whole_rotation(name: str) -> None:
     np.testing.assert_allclose(effect.added(stimulus, sizes), expected, rtol=0, atol=1e-13 * 9.81)
 
 
-def test_engines_agree_where_a_large_turn_meets_setting_errors() -> None:
+@pytest.mark.parametrize("setting_deg", [SETTING_DEG, 0.0])
+def test_engines_agree_where_a_large_turn_meets_setting_errors_and_where_it_does_not(setting_deg: float) -> None:
     plan = plan_of(10, dwell_s=2.0, seed=5)
-    source = noisy_source("base-tilt=0.004", setting_sigma_deg=SETTING_DEG, plan=plan)
+    source = noisy_source("base-tilt=0.004", setting_sigma_deg=setting_deg, plan=plan)
     compared = compare(source, Settings(effects=("base-tilt",)))
     assert any(dwell.turned_rad is not None for dwell in compared.result.linearised.dwells_at_state)
     for way in compared.ways.values():

@@ -112,3 +112,10 @@ def test_a_verdict_is_that_of_one_per_cent() -> None:
         return not raises(lambda: refuse_judgement(judged))
 
     assert begins_at(agrees, 1e-6, 1.0) == pytest.approx(0.01)
+
+
+def test_a_file_says_which_effects_its_run_could_not_show(content: dict[str, Any]) -> None:
+    """Of one temperature, at rest, with an outer gimbal about the vertical; a wrong gravity is three scale factors."""
+    unseen, shown = set(content["not_seen"]), {"third-order", "hysteresis", "bias-drift", "encoder-scale:z", "flexure"}
+    assert unseen >= {"thermal-bias", "thermal-scale", "latency", "lever-arm", "gravity-error", "encoder-scale:y"}
+    assert not unseen & (shown | {"second-order", "bias-walk"})

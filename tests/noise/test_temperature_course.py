@@ -92,6 +92,20 @@ def test_a_piece_weighs_as_the_mean_over_its_whole_length_does(monkeypatch: pyte
     assert owners.tolist() == [0, 0, 1, 1]
 
 
+def test_a_temperature_that_rises_evenly_is_followed_through_noise_of_the_thermometer() -> None:
+    """By ten kelvin in a thousand seconds, in twenty dwells of four pieces: to half of what a piece scatters by, and
+    with errors of that size."""
+    begins = (50.0 * np.arange(20)[:, None] + 10.0 * np.arange(4)).ravel()
+    elapsed_s = (begins[:, None] + np.array([0.0, 5.0, 10.0])).ravel()
+    noise = 0.1 * np.random.default_rng(6).normal(size=len(elapsed_s))
+    folded: Any = SimpleNamespace(moving=np.zeros(20, bool), piece_numbers=np.full(20, 4), elapsed_s=elapsed_s)
+    course = temperature_course._smooth(folded, 20.0 + 0.01 * elapsed_s + noise)
+    assert course is not None
+    left = course.temperature_c - (20.0 + 0.01 * elapsed_s)
+    sigma = np.sqrt(np.sum(course.errors_c**2, axis=1))
+    assert np.sqrt(np.mean(left**2)) < 0.1 / 2.0 and 0.3 < np.sqrt(np.mean((left / sigma) ** 2)) < 2.0
+
+
 @pytest.mark.parametrize(("course", "steady"), [("noise", True), ("swing", False), ("jumps", False)])
 def test_a_room_is_steady_if_the_thermometer_scatters_alike_within_dwells_and_between(
     course: str, steady: bool

@@ -10,6 +10,7 @@ from helpers.synthetic import plan_of
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, axes_of
+from kf_calib.diagnosis.within_dwell_trend import trend
 from kf_calib.dwells.stack import DwellStack
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation.calibration import calibrate
@@ -78,6 +79,15 @@ def test_the_error_of_the_temperature_is_in_the_sigmas_and_in_the_test_of_the_mo
     )
     np.testing.assert_allclose(run.noise.sensitivity_mps2_per_k[:, 0], [each.value for each in found], rtol=1e-6)
     np.testing.assert_allclose(run.noise.sensitivity_mps2_per_k[:, 1:], 0.0, atol=1e-9)
+
+
+def test_the_error_of_the_temperature_is_no_trend_within_dwells(noisy: tuple[Calibration, Ambient]) -> None:
+    """Where it is left out of the noise, all dwells seem to have one."""
+    run, _ = noisy
+    exact = replace(run.fit, noise=replace(run.noise, sensitivity_mps2_per_k=None))
+    with_error, without = trend(run.fit), trend(exact)
+    assert with_error is not None and with_error.p_value > 1e-3 and 0.7 < with_error.ratio < 1.4
+    assert without is not None and without.p_value < 1e-40
 
 
 def test_an_effect_too_small_for_the_error_of_the_temperature_to_matter_has_none() -> None:
