@@ -47,7 +47,7 @@ def test_every_command_that_prints_json_is_in_the_page() -> None:
     assert DOCUMENTED.keys() == COMMANDS.keys()
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("undrawn", "unmeasured")
 @pytest.mark.parametrize("command", COMMANDS)
 def test_keys_are_those_of_the_page(command: str, run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)

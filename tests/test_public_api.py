@@ -27,6 +27,7 @@ def test_a_path_is_a_recording(run: kf_calib.Calibration, path: str | Path) -> N
     np.testing.assert_array_equal(kf_calib.calibrate(path).estimate.state, run.estimate.state)
 
 
+@pytest.mark.usefixtures("unmeasured")
 def test_a_path_can_be_compared_diagnosed_and_improved(run: kf_calib.Calibration) -> None:
     np.testing.assert_array_equal(kf_calib.compare(RECORDING).result.estimate.state, run.estimate.state)
     assert kf_calib.diagnose(str(RECORDING)).verdict == kf_calib.diagnose(run).verdict

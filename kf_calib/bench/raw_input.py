@@ -206,7 +206,10 @@ def text_of(key: str, value: Any) -> str:
     if isinstance(value, list | tuple):
         value = ",".join(map(repr, value))
     if isinstance(value, Real) and not isinstance(value, bool) and key == "accel_scale":
-        value = repr(float(value))
+        try:
+            value = repr(float(value))
+        except OverflowError:
+            raise ValueError("it must be a finite number") from None
     if not isinstance(value, str):
         raise ValueError("it must be text")
     try:

@@ -143,6 +143,7 @@ class ThermalLag(SensorEffect):
     drawn_against = _TEMPERATURE
     confused_with = "thermal-bias and thermal-rate together"
     symbol, unit, scale = "alphaL", "m/s^2/K", 1e-3
+    typical = ThermalBias.typical
     unknown = Unknown("tauLag", "s", 30.0, 7200.0, "min", 1.0 / 60.0)
 
     def __init__(self) -> None:

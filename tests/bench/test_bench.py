@@ -265,6 +265,8 @@ def test_whatever_values_say_is_a_bench_or_a_sentence(examples: int) -> None:
 
     @settings(max_examples=examples, deadline=None, database=None, suppress_health_check=list(HealthCheck))
     @example({"nominal": {"\n": None}})
+    @example({"accel_scale": 10**400})
+    @example({"nominal": {"theta1": 10**400}})
     @given(
         st.dictionaries(st.sampled_from(sorted(KEYS)), JSON_VALUES | st.sampled_from(["y z x", "9.81", "1,2,3", "z"]))
     )

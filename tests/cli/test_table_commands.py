@@ -25,7 +25,7 @@ GAPS = "Lage;Kanal A;Kanal B;Kanal C;Temp;n\n" + "".join(
 FACES = "face,A,B,C\n+x,1,0,0\n-x,-1,0,0.001\n+y,0,1.002,0\n-y,0,-1,0.001\n+z,0.001,0,1\n-z,0,0.001,-1\n"
 
 
-@pytest.mark.parametrize("command", [("replay",), ("diagnose",), ("compare",), *slow((("improve",),))])
+@pytest.mark.parametrize("command", [("replay",), ("diagnose",), *slow((("improve",),), (("compare",),))])
 def test_a_table_goes_where_a_recording_goes(command: tuple[str, ...], run) -> None:
     code, out, err = run(*command, *OPTIONS, "--json")
     assert (code, err) == (0, "")

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 from helpers.hidden_effects import noisy_run, noisy_source, run, source
+from helpers.known_runs import diagnosed
 from helpers.long_runs import slow
 from helpers.synthetic import plan_of
 
@@ -98,7 +99,7 @@ def test_every_effect_has_a_family() -> None:
 
 
 def test_an_effect_far_above_the_noise_is_sure_and_its_family_too() -> None:
-    found = diagnose(run("encoder-harmonic-1:z=15sigma"))
+    found = diagnosed("encoder-harmonic-1:z=15sigma")
     said = diagnosis_object(found)
     first = said["hypotheses"][0]
     assert first["effects"] == ["encoder-harmonic-1:z"] and first["formula"] is None
@@ -114,14 +115,14 @@ def test_an_effect_far_above_the_noise_is_sure_and_its_family_too() -> None:
 
 def test_where_names_share_it_the_family_comes_first() -> None:
     """A quadratic and an asymmetry of the scale factor overlap almost wholly."""
-    found = diagnose(run("scale-asymmetry=9sigma"))
+    found = diagnosed("scale-asymmetry=9sigma")
     assert set(found.ambiguity) >= {"scale-asymmetry", "second-order"}
     assert "The accelerometer is not linear (" in found.verdict or found.sure
     assert found.table is not None and found.table.families["nonlinearity"] > 0.95
 
 
 def test_nothing_is_likeliest_in_noise() -> None:
-    found = diagnose(run())
+    found = diagnosed()
     assert found.table is not None and found.table.rows[0].families == (NOTHING,)
     assert found.table.rows[0].probability > 0.5 and found.likeliest is None
     assert diagnosis_object(found)["missing"] is None

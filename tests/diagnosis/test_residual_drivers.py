@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
 import pytest
 from helpers.hidden_effects import noisy_run, run
+from helpers.known_runs import diagnosed
 from helpers.long_runs import slow
 from helpers.synthetic import Run, plan_of
 from scipy.stats import binom, f
@@ -29,7 +28,6 @@ from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.sources.simulation.injected import catalogue
 
 PLAN = plan_of(16, dwell_s=8.0, seed=5)
-found = cache(lambda *hidden: diagnose(run(*hidden)))
 
 
 def test_the_share_of_a_driver_is_that_of_least_squares_on_whitened_means() -> None:
@@ -83,7 +81,7 @@ def test_nothing_has_a_share_where_the_model_fits(seed: int) -> None:
 
 
 def test_what_an_explanation_predicts_is_the_difference_of_the_predictions() -> None:
-    best = found("second-order=15sigma").explanations[0]
+    best = diagnosed("second-order=15sigma").explanations[0]
     before, after = best.before.linearised, best.after.linearised
     predicted = [np.einsum("dip,p->di", each.means.design, state) for each, state in (
         (before, best.before.estimate.state), (after, best.after.estimate.state))]  # fmt: skip
@@ -142,7 +140,7 @@ def test_the_path_of_a_walk_is_no_residual() -> None:
 
 
 def test_overlaps_of_several_effects_are_those_of_pairs() -> None:
-    diagnosis = found("second-order=15sigma")
+    diagnosis = diagnosed("second-order=15sigma")
     chosen = ["second-order", "scale-asymmetry", diagnosis.test.effects.walk, "latency"]
     overlaps = overlap_matrix(diagnosis.test, chosen)
     one, other = (diagnosis.test.effects.candidate(name) for name in chosen[:2])
@@ -154,7 +152,7 @@ def test_overlaps_of_several_effects_are_those_of_pairs() -> None:
 
 
 def test_an_effect_that_is_not_seen_has_a_reason() -> None:
-    diagnosis = found("second-order=15sigma")
+    diagnosis = diagnosed("second-order=15sigma")
     reasons = {each.name: each.why for each in diagnosis.unseen}
     assert list(reasons)[: len(diagnosis.test.effects.unseen)] == diagnosis.test.effects.unseen
     assert "scale factor" in reasons["gravity-error"]
@@ -186,4 +184,4 @@ def test_usual_sizes_are_those_of_the_simulator_where_the_unit_is_the_same() -> 
 
 
 def test_where_nothing_is_missing_there_is_no_explanation() -> None:
-    assert found().explanations == []
+    assert diagnosed().explanations == []

@@ -11,7 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from helpers import known_runs
 from helpers.hidden_effects import BENCH, noisy_source, run, source
+from helpers.known_runs import diagnosed
 from helpers.long_runs import slow
 from scipy.stats import chi2
 
@@ -53,17 +55,17 @@ def ratio(result: Calibration) -> float:
 
 @pytest.fixture(scope="module")
 def second_order() -> Calibration:
-    return run("second-order=15sigma")
+    return diagnosed("second-order=15sigma").before
 
 
 @pytest.fixture(scope="module")
-def improved(second_order: Calibration) -> Improvement:
-    return improve(second_order)
+def improved() -> Improvement:
+    return known_runs.improved("second-order=15sigma")
 
 
 @pytest.fixture(scope="module")
 def quiet() -> Calibration:
-    return run()
+    return diagnosed().before
 
 
 @pytest.mark.parametrize(("chi_squared", "needed"), [(6.5, False), (6.8, True)])
@@ -114,7 +116,7 @@ def test_two_effects_are_added_one_by_one() -> None:
 
 
 def test_nothing_is_added_to_noise(quiet: Calibration) -> None:
-    state = improve(quiet)
+    state = known_runs.improved()
     assert state.because == "consistent" and not state.steps and state.result is quiet
 
 

@@ -1,9 +1,13 @@
-"""The recording with a hidden hysteresis, diagnosed and improved once for all tests of a process."""
+"""Diagnoses and improvements that several tests look at: each is made once for all tests of a process.
+
+Those of the recording with a hidden hysteresis, and of simulated runs by what is hidden in them.
+"""
 
 from __future__ import annotations
 
 from functools import cache
 
+from helpers.hidden_effects import run
 from helpers.paths import RECORDINGS
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
@@ -14,16 +18,26 @@ HIDDEN = RECORDINGS / "hidden.mcap"
 
 
 @cache
-def _refits() -> Refits:
-    """What the diagnosis has computed, the improvement need not again."""
-    return Refits(HIDDEN)
+def _refits(*hidden: str, recorded: bool = False) -> Refits:
+    """What a diagnosis has computed, the improvement need not again."""
+    return Refits(HIDDEN if recorded else None)
 
 
 @cache
 def hidden_diagnosed() -> Diagnosis:
-    return diagnose(HIDDEN, _refits())
+    return diagnose(HIDDEN, _refits(recorded=True))
 
 
 @cache
 def hidden_improved() -> Improvement:
-    return improve(hidden_diagnosed().before, refits=_refits())
+    return improve(hidden_diagnosed().before, refits=_refits(recorded=True))
+
+
+@cache
+def diagnosed(*hidden: str) -> Diagnosis:
+    return diagnose(run(*hidden), _refits(*hidden))
+
+
+@cache
+def improved(*hidden: str) -> Improvement:
+    return improve(diagnosed(*hidden).before, refits=_refits(*hidden))

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from helpers.full_disk import full_disk
+from helpers.long_runs import slow
 from helpers.warm_command import warm
 
 from kf_calib import effects
@@ -324,8 +325,8 @@ FAST = "live sim://?speed=500&orientations=6&dwell_s=5&sample_hz=50&slew_degps=1
 
 
 @pytest.mark.parametrize("words", [
-    "replay run.mcap --rrd", "replay run.mcap --save-model", "plan --count 6 --pdf", f"{FAST} --rrd",
-    f"{FAST} --save-model", "replay run.mcap --png",
+    "replay run.mcap --rrd", "replay run.mcap --save-model", f"{FAST} --rrd", f"{FAST} --save-model",
+    "replay run.mcap --png", *slow("plan --count 6 --pdf"),
 ])  # fmt: skip
 def test_a_file_that_finds_no_room_is_told_after_the_result(run, here: Path, words: str) -> None:
     """It was waited for, for ever."""

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.hidden_effects import noisy_run, run
-from helpers.known_runs import hidden_diagnosed
+from helpers.known_runs import diagnosed, hidden_diagnosed, improved
 from helpers.long_runs import slow
 from helpers.synthetic import Run
 from matplotlib.axes import Axes
@@ -16,9 +15,7 @@ from matplotlib.container import BarContainer
 from matplotlib.figure import Figure
 
 from kf_calib import plot
-from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
-from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.stepwise_selection import Improvement, begin, extend, improve, undone
 from kf_calib.errors import InputError
 from kf_calib.estimation.calibration import calibrate
@@ -27,16 +24,6 @@ from kf_calib.support.units import shown_in
 from kf_calib.views.figures.style import label_axis, rounded_number, short_number, wrapped
 
 MICRO_G = 9.80665e-6
-
-
-@cache
-def found(*hidden: str) -> Diagnosis:
-    return diagnose(run(*hidden))
-
-
-@cache
-def improved() -> Improvement:
-    return improve(run("second-order=15sigma"))
 
 
 def panels(figure: Figure) -> list[Axes]:
@@ -69,7 +56,7 @@ def axes_of(figure: Figure, title: str) -> Axes:
     ),
 ])  # fmt: skip
 def test_every_figure_of_a_diagnosis_has_ink_in_every_panel(hidden: tuple[str, ...]) -> None:
-    for title, draw in plot.figures(found(*hidden)).items():
+    for title, draw in plot.figures(diagnosed(*hidden)).items():
         figure = draw()
         assert_ink(figure)
         assert len(figure.get_axes()) >= 1, title
@@ -91,9 +78,9 @@ def test_bars_of_suspects_are_their_shares_and_those_that_do_not_fit_are_hatched
 
 @pytest.mark.parametrize("hidden", [("triple-product=25sigma",), *slow(((),))])
 def test_bars_of_probabilities_are_those_of_the_table(hidden: tuple[str, ...]) -> None:
-    table = found(*hidden).table
+    table = diagnosed(*hidden).table
     assert table is not None
-    families, explanations = panels(plot.hypotheses(found(*hidden)))
+    families, explanations = panels(plot.hypotheses(diagnosed(*hidden)))
     widths = [patch.get_width() for patch in families.patches]  # type: ignore[attr-defined]
     assert widths[0] == pytest.approx(100.0 * next(iter(table.families.values())))
     names = [label.get_text() for label in explanations.get_yticklabels()]
@@ -103,7 +90,7 @@ def test_bars_of_probabilities_are_those_of_the_table(hidden: tuple[str, ...]) -
 
 
 def test_cells_of_the_matrix_are_overlaps_and_a_walk_that_takes_any_path_has_none() -> None:
-    diagnosis = found("second-order=15sigma", "hysteresis=15sigma")
+    diagnosis = diagnosed("second-order=15sigma", "hysteresis=15sigma")
     axes = axes_of(plot.suspects(diagnosis), "Overlap")
     names = [label.get_text() for label in axes.get_yticklabels()]
     test = diagnosis.test
@@ -160,7 +147,7 @@ def test_residuals_of_single_dwells_are_drawn_in_micro_g_or_si() -> None:
 
 
 def test_errors_fall_in_the_figure_as_in_the_result() -> None:
-    state = improved()
+    state = improved("second-order=15sigma")
     figure = plot.improvement(state)
     assert_ink(figure)
     axes = axes_of(figure, "The error of the model")
@@ -212,7 +199,7 @@ def test_odd_improvements_are_drawn(made: object) -> None:
 
 
 def test_residuals_of_each_step_share_their_axes() -> None:
-    state = improved()
+    state = improved("second-order=15sigma")
     axes = panels(plot.residuals_of_steps(state))
     assert len(axes) == 3 * (1 + len(state.steps))
     assert len({each.get_ylim() for each in axes}) == len({each.get_xlim() for each in axes}) == 1
