@@ -367,3 +367,10 @@ def test_how_the_streams_come_in_parts_changes_no_bit(rate_hz: float, ahead_s: f
     assert len(expected) > 3
     for seed in range(6):
         assert blocks_of(in_parts(whole, seed, ahead_s), slews) == expected
+
+
+def test_while_the_platform_moves_there_is_no_dwell_that_it_arrived_at() -> None:
+    pose = path((0, 0), (10, 0), (30, 200), rate_hz=10)
+    segmenter = Segmenter(BENCH)
+    blocks = list(segmenter.push(Batch(readings(pose, 29), pose)))
+    assert blocks and segmenter.standing is None and np.isnan(segmenter.arrival_s)

@@ -8,13 +8,15 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from helpers.drawn_fleets import Plan, drawn_fleet
 from scipy.special import logsumexp
 
-from kf_calib.effects import Bearer
+from kf_calib.effects import Bearer, described
 from kf_calib.fleet.attribution import (
     AttributionHypothesis,
     AttributionTable,
@@ -238,3 +240,16 @@ def test_effects_are_taken_until_none_more_is_probable_and_each_beside_all_other
         again = attribution_table(campaign, PooledTerms(others, 1))
         assert table.none < 0.01 and chosen(again).term == term
         assert table.of(term.group.name) == pytest.approx(again.of(term.group.name), abs=0.02)
+
+
+def test_the_sigma_of_an_effect_is_that_of_a_run_that_sees_it_and_zero_where_none_does() -> None:
+    """By the mean information of coefficients over the runs that see them; sizes go up to 64 sigma, or, where more is
+    usual, to that."""
+    one, other = (1e12 * np.diag(own) for own in ([4.0, 9.0, 0.0, 0.0], [8.0, 0.0, 0.0, 0.0]))
+    runs: Any = SimpleNamespace(_run_information=lambda: [(None, one, None), (None, other, None)])
+    hysteresis, unseen, formula = Campaign._sized(runs, {HYSTERESIS: "hk", SECOND_ORDER: "q", "mine = T": "c"})
+    assert hysteresis.sigma == pytest.approx((1e12 * (6.0 + 9.0) / 2.0) ** -0.5)
+    effect = described(HYSTERESIS)
+    assert effect is not None and effect.typical.mems is not None
+    assert hysteresis.largest == pytest.approx(effect.typical.mems[1] / hysteresis.sigma)
+    assert (unseen.sigma, unseen.largest) == (formula.sigma, formula.largest) == (0.0, 64.0)
