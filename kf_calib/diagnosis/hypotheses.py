@@ -356,16 +356,18 @@ class Hypotheses:
     def _log_odds_within_dwells(self, refit: Calibration) -> float:
         """Return the log odds of what a walk explains within dwells, where it goes on but has no column.
 
-        They are the ratio of the densities of the trends with the walk and without it, the same columns in the noise of
-        the run: a walk that should move the readings within dwells, and does not, is none. They are no more than the
-        p-values of both allow, as that of any irregular change is.
+        They are the ratio of the densities of the trends with the walk and without it: a walk that should move the
+        readings within dwells, and does not, is none. They are no more than the p-values of both allow, as that of any
+        irregular change is. Without it, the trends are those that the same columns leave in the noise of the run, or
+        those without its effects, if these are smaller: coefficients that are hardly determined may be far off.
         """
         if not self.test.trend:
             return 0.0
         noise = replace(self.before.noise, sensitivity_mps2_per_k=refit.noise.sensitivity_mps2_per_k)
-        standing, walking = trend(replace(refit.fit, noise=noise)), trend(refit.fit)
-        if standing is None or walking is None:
+        beside, walking = trend(replace(refit.fit, noise=noise)), trend(refit.fit)
+        if beside is None or walking is None:
             return 0.0
+        standing = max(beside, self.test.trend, key=lambda each: each.log_density)
         return min(walking.log_density - standing.log_density, _log_odds(standing) - _log_odds(walking))
 
     def _families(self, effects: Sequence[str]) -> tuple[str, ...]:

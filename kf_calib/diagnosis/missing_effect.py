@@ -283,11 +283,14 @@ def unearned(row: Hypothesis, before: Calibration, walk: str) -> str:
     after = row.refit
     if after is None:
         return ""
+    left = _noise_left(after)
     for name in row.effects:
         if name == walk and _walk_sigma(before) < SEEN:
             return f"{name} is below {SEEN:g} sigma"
-        if name != walk and _largest_ratio(after, name) < SEEN and not _clear_together(after, name):
-            return f"no coefficient of {name} is beyond {SEEN:g} sigma"
+        if name == walk or _is_seen(after, name, left):
+            continue
+        beside = f" of what is left, which is {left:.2g} times the noise" if _is_seen(after, name, 1.0) else ""
+        return f"no coefficient of {name} is beyond {SEEN:g} sigma{beside}"
     errors = before.held_out_rms_mps2, after.held_out_rms_mps2
     if errors[0] is None or errors[1] is None:
         return ""
@@ -301,6 +304,18 @@ def unearned(row: Hypothesis, before: Calibration, walk: str) -> str:
     return ""
 
 
+def _noise_left(after: Calibration) -> float:
+    """Return how many times the noise a model leaves; 1 where that is no misfit."""
+    fails, nis_per_dof = after.consistency.consistent is False, after.consistency.nis_per_dof
+    return max(nis_per_dof, 1.0) ** 0.5 if fails and nis_per_dof is not None else 1.0
+
+
+def _is_seen(after: Calibration, name: str, left: float) -> bool:
+    """Tell whether a coefficient of an effect is beyond three sigmas, or all together are beyond doubt, in a noise that
+    is ``left`` times as large."""
+    return _largest_ratio(after, name) >= SEEN * left or _clear_together(after, name, left)
+
+
 def _largest_ratio(after: Calibration, name: str) -> float:
     """Return the largest of an effect's coefficients over its sigma; 0 where none is determined."""
     effect = next(each for each in after.model.effects if str(each) == name)
@@ -308,7 +323,7 @@ def _largest_ratio(after: Calibration, name: str) -> float:
     return max((abs(p.value) / p.sigma for p in known if p.value is not None and p.sigma), default=0.0)
 
 
-def _clear_together(after: Calibration, name: str) -> bool:
+def _clear_together(after: Calibration, name: str, left: float) -> bool:
     """Tell whether the coefficients of an effect are beyond doubt by their joint covariance, though none is alone: as
     of columns that are alike."""
     effect = next(each for each in after.model.effects if str(each) == name)
@@ -318,7 +333,7 @@ def _clear_together(after: Calibration, name: str) -> bool:
     places = slice(first, first + len(effect.coefficients))
     state, covariance = after.estimate.state[places], after.estimate.covariance[places, places]
     statistic = float(state @ np.linalg.lstsq(covariance, state, rcond=None)[0])
-    return chi_squared_tail(len(state), statistic) < _TOGETHER_P
+    return chi_squared_tail(len(state), statistic / left**2) < _TOGETHER_P
 
 
 def _walk_sigma(before: Calibration) -> float:

@@ -38,7 +38,7 @@ def _result(ratio: float | None, held_out: float | None, walk_gain: float = 0.0,
         fit=SimpleNamespace(walk_gain=walk_gain),
         parameters={"k1": SimpleNamespace(value=0.1, sigma=1.0), "k2": second},
         held_out_rms_mps2=held_out,
-        consistency=SimpleNamespace(consistent=False),
+        consistency=SimpleNamespace(consistent=False, nis_per_dof=1.0),
     )
 
 
@@ -57,6 +57,22 @@ def _result(ratio: float | None, held_out: float | None, walk_gain: float = 0.0,
 def test_what_a_name_is_earned_by(ratio: float | None, errors: tuple[float | None, float], said: str) -> None:
     row = Hypothesis(("bent",), refit=_result(ratio, errors[1]))
     assert unearned(row, _result(None, errors[0]), "bias-walk") == said
+
+
+@pytest.mark.parametrize(
+    "ratio, nis_per_dof, said",
+    [
+        (5.0, 2.5, ""),
+        (5.0, 4.0, "no coefficient of bent is beyond 3 sigma of what is left, which is 2 times the noise"),
+        (2.9, 4.0, "no coefficient of bent is beyond 3 sigma"),
+        (40.0, 100.0, ""),
+    ],
+)
+def test_a_coefficient_is_measured_by_what_it_leaves(ratio: float, nis_per_dof: float, said: str) -> None:
+    row = Hypothesis(("bent",), refit=_result(ratio, 0.9))
+    assert row.refit is not None
+    row.refit.consistency.nis_per_dof = nis_per_dof
+    assert unearned(row, _result(None, 1.0), "bias-walk") == said
 
 
 @pytest.mark.parametrize("held_out, consistent, earned", [(0.99, False, False), (0.9, False, True), (0.99, True, True)])
