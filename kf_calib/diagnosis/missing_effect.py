@@ -337,8 +337,8 @@ def _largest_ratio(after: Calibration, name: str) -> float:
 
 
 def _clear_together(after: Calibration, name: str, left: float) -> bool:
-    """Tell whether the coefficients of an effect are beyond doubt by their joint covariance, though none is alone: as
-    of columns that are alike."""
+    """Tell whether the coefficients of an effect are beyond doubt by their joint covariance, though none is alone, as
+    of columns that are alike; in a noise that is ``left`` times as large."""
     effect = next(each for each in after.model.effects if str(each) == name)
     if any(after.parameters[coefficient.symbol].value is None for coefficient in effect.coefficients):
         return False
