@@ -76,11 +76,13 @@ class Hypothesis:
 class HypothesisTable:
     """All rows, the likeliest first; their probabilities sum to one.
 
-    disturbed: the dwell in which an oscillation would be the likeliest of all, if other dwells had it, too.
+    disturbed: the dwell in which an oscillation would be the likeliest of all, if other dwells had it, too. certain:
+    the row of effects that are missing for sure, where the likeliest row has further ones that nothing shows.
     """
 
     rows: tuple[Hypothesis, ...]
     disturbed: DisturbedDwell | None = None
+    certain: Hypothesis | None = None
 
     def __repr__(self) -> str:
         def name(row: Hypothesis) -> str:
@@ -132,8 +134,8 @@ class HypothesisTable:
 
     @property
     def first(self) -> Hypothesis:
-        """The likeliest explanation, with nothing missing left out."""
-        return next(row for row in self.rows if row.families != (NOTHING,))
+        """The likeliest explanation, with nothing missing left out, or what is certain of it."""
+        return self.certain or next(row for row in self.rows if row.families != (NOTHING,))
 
     @cached_property
     def rivals(self) -> tuple[Hypothesis, ...]:

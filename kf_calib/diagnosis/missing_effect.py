@@ -24,6 +24,7 @@ from kf_calib.diagnosis.hypothesis_table import (
     LISTED,
     NOISE,
     NOTHING,
+    SURE,
     Hypothesis,
     HypothesisTable,
     noise_p,
@@ -195,8 +196,12 @@ def _decided(refits: Refits, diagnosis: Diagnosis) -> Diagnosis:
         if retest.consistent is False:
             final_test = retest.with_vibration(test.lines.vibration)
             diagnosis, test = replace(diagnosis, before_in_noise_left=before_in_noise_left, test=final_test), retest
-    credible = (first, *table.rivals) if first.effects else ()
     why_not = unearned(first, before, test.effects.walk) or behind_nothing(first, table)
+    certain = _certain_part(first, table, before, test.effects.walk) if why_not else None
+    if certain is not None:
+        table, first, why_not = replace(table, certain=certain), certain, ""
+        diagnosis = replace(diagnosis, table=table)
+    credible = (first, *table.rivals) if first.effects else ()
     named = first if first.effects and not why_not else None
     names = tuple(dict.fromkeys(name for row in credible for name in row.effects))
     pairs = [row.effects for row in credible[1:] if len(row.effects) > 1 and not set(first.effects) & set(row.effects)]
@@ -213,6 +218,14 @@ def _decided(refits: Refits, diagnosis: Diagnosis) -> Diagnosis:
         after=_after(refits, before, named) if named else None,
         suspects=_suspects(diagnosis, table),
     )
+
+
+def _certain_part(first: Hypothesis, table: HypothesisTable, before: Calibration, walk: str) -> Hypothesis | None:
+    """Return the row of some of the effects of the likeliest row that have earned their name and are missing with 95 %
+    probability, alone or with others; None where there is none."""
+    parts = [row for row in table.rows if row.refit is not None and row.effects and not row.formulas]
+    parts = [row for row in parts if set(row.effects) < set(first.effects) and table.probability(row.effects) >= SURE]
+    return next((row for row in parts if not unearned(row, before, walk)), None)
 
 
 def behind_nothing(first: Hypothesis, table: HypothesisTable) -> str:
@@ -324,8 +337,8 @@ def _largest_ratio(after: Calibration, name: str) -> float:
 
 
 def _clear_together(after: Calibration, name: str, left: float) -> bool:
-    """Tell whether the coefficients of an effect are beyond doubt by their joint covariance, though none is alone: as
-    of columns that are alike."""
+    """Tell whether the coefficients of an effect are beyond doubt by their joint covariance, though none is alone, as
+    of columns that are alike; in a noise that is ``left`` times as large."""
     effect = next(each for each in after.model.effects if str(each) == name)
     if any(after.parameters[coefficient.symbol].value is None for coefficient in effect.coefficients):
         return False

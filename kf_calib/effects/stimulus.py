@@ -202,8 +202,11 @@ class Stimulus:
         return best
 
     def _change(self, window_s: float) -> Floats:
-        """The change (m,) of temperature per second over a window to either side of each instant. Nearer to an end than
-        that it goes on in a straight line, or over what there is in a run of less than four windows."""
+        """The change (m,) of temperature per second over a window to either side of each instant.
+
+        Nearer to an end of the run than one window, it is continued in a straight line; in a run shorter than four
+        windows, the window is cut off at the end instead.
+        """
         times, _ = self._smooth_warmth
         first, last = times[0] + window_s, times[-1] - window_s
         if last - first < 2.0 * window_s:

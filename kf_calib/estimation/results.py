@@ -35,7 +35,7 @@ from kf_calib.support.units import field_unit, shown
 
 _WEAK = 5.0  # times the size that a coefficient may well have
 _CLEAR = 3.0  # sigmas: of a coefficient that is seen, however large it is
-_QUIET = 1e-6  # chance that noise lets the dwells differ as little, below which it is not what goes on within them
+_QUIET = 1e-6  # probability that dwells differ as little by noise, below which the noise is taken for too large
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Consistency:
 
     @property
     def quiet(self) -> bool:
-        """Whether the dwells differ by much less than the noise lets them: it is not what goes on within them."""
+        """Whether the dwells differ by so much less than the noise that it cannot be as large."""
         return self.p_value is not None and 1.0 - self.p_value < _QUIET
 
     @property

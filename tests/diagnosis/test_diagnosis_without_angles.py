@@ -41,6 +41,30 @@ def test_an_effect_of_ten_sigma_is_named_or_among_its_equals(name: str) -> None:
     assert found.after.held_out.rms_mps2 < 0.8 * found.before.held_out.rms_mps2
 
 
+@pytest.mark.parametrize(
+    "name, size",
+    [
+        ("cross-coupling-ip", 150),
+        *slow(("cross-coupling-po", 150), ("cross-axis-square", 150), ("thermal-scale", 40), ("thermal-scale", 150),
+              ("second-order", 150), ("hysteresis", 150), ("thermal-misalignment", 150)),
+    ],
+)  # fmt: skip
+def test_a_large_effect_is_named_though_others_beside_it_are_not_told_apart(name: str, size: int) -> None:
+    """At this size its own shape is not exact: further effects take what it leaves, and none of them is shown."""
+    found = kf_calib.diagnose(by_hand(f"{name}={size}sigma"), replicate=False)
+    assert found.missing in ((name,), ()) and name in found.ambiguity, found.verdict
+    if name not in ("thermal-misalignment", "cross-axis-square"):  # of which others take the place
+        assert found.missing == (name,) and found.sure, found.verdict
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [40, 150])
+def test_an_oscillation_within_dwells_is_not_another_effect(size: int) -> None:
+    """What takes some of it and leaves most has no name."""
+    found = kf_calib.diagnose(by_hand(f"sinusoid={size}sigma"), replicate=False)
+    assert found.missing in ((), ("sinusoid",)), found.verdict
+
+
 @pytest.mark.slow  # docs/no_angles.md says the same of it, in short
 def test_the_board_in_recordings_is_improved_by_what_its_truth_says() -> None:
     truth = json.loads((RECORDINGS / "hand.truth.json").read_text())["effects"][0]
