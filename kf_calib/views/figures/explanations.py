@@ -307,9 +307,9 @@ def draw_detection_limits(figure: FigureBase, diagnosis: Diagnosis, below: float
 def _ordered(sizes: Sequence[Detectable], grade: Grade) -> list[Detectable]:
     """Return what could hide most first, then those without a usual size."""
 
-    def largest_hidden(each: Detectable) -> float:
-        usual = each.typical.of(grade)
-        return usual[1] / each.minimum if usual is not None else float("inf")
+    def largest_hidden(detectable: Detectable) -> float:
+        usual = detectable.typical.of(grade)
+        return usual[1] / detectable.minimum if usual is not None else float("inf")
 
     return sorted(sizes, key=largest_hidden)
 
