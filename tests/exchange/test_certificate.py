@@ -67,7 +67,7 @@ def lab(tmp_path: Path) -> Path:
     return path
 
 
-def made(cal: Path, lab: Path | None) -> content.Certificate:
+def made(cal: Path, lab: Path | None) -> budget.Certificate:
     saved, own = calibration_file.open_calibration(cal), statement.read_statement(lab)
     earlier = None if own.before is None else calibration_file.open_calibration(own.before)
     return budget.certificate(saved, saved.model(), own, None if earlier is None else (earlier, earlier.model()))
