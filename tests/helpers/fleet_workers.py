@@ -20,7 +20,6 @@ from kf_calib.estimation.results import Calibration
 from kf_calib.fleet import batch
 from kf_calib.fleet.batch import RunEvaluation
 
-
 _calibrations = dict[tuple[str, str], Calibration]()
 _diagnoses = dict[int, Diagnosis]()
 
