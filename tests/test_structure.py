@@ -183,6 +183,33 @@ def test_one_name_stands_for_one_thing() -> None:
     assert verbs == {"save": {"kf_calib.views.figures.collection", "kf_calib.views.report.page"}}
 
 
+FILLERS = {"found", "own", "each", "out"}
+COMPREHENSIONS = ast.ListComp | ast.SetComp | ast.DictComp | ast.GeneratorExp | ast.Lambda
+NEAR = 4  # lines
+
+
+def far_fillers(function: ast.FunctionDef) -> set[str]:
+    """The names without a meaning of their own whose uses in a function, but for comprehensions, are far apart."""
+    inside = {id(name) for node in ast.walk(function) if isinstance(node, COMPREHENSIONS) for name in ast.walk(node)}
+    names = [node for node in ast.walk(function) if isinstance(node, ast.Name) and node.id in FILLERS]
+    stored = {node.id for node in names if isinstance(node.ctx, ast.Store) and id(node) not in inside}
+    arguments = {argument.arg for argument in (*function.args.args, *function.args.kwonlyargs)} & FILLERS
+    lines = {name: [node.lineno for node in names if node.id == name and id(node) not in inside] for name in FILLERS}
+    lines = {name: [*numbers, *([function.lineno] if name in arguments else [])] for name, numbers in lines.items()}
+    return {name for name in stored | arguments if max(lines[name]) - min(lines[name]) > NEAR}
+
+
+def test_a_name_that_is_used_far_from_where_it_is_given_says_what_it_holds() -> None:
+    """Not ``found`` or ``own``, which a reader would have to look up."""
+    far = {
+        f"{module}.{node.name}": names
+        for module, path in MODULES.items()
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.FunctionDef) and (names := far_fillers(node))
+    }
+    assert far == {}
+
+
 def test_import_is_cheap_and_leaves_filterpy_and_rerun_alone() -> None:
     code = "import sys, kf_calib; print(*[m for m in ('filterpy', 'rerun', 'scipy', 'matplotlib') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=300)

@@ -227,11 +227,11 @@ def dialogue(state: Improvement, refits: Refits, on_step: Callable[[Improvement]
             show(Text(sentence(str(error)), style="red"))
 
 
-def choices_of(found: Diagnosis) -> list[tuple[str, ...]]:
+def choices_of(diagnosed: Diagnosis) -> list[tuple[str, ...]]:
     """The effects that can be added by number: the missing effects together, then each suspect."""
-    out = [found.missing] if found.missing else []
-    out += [(suspect.name,) for suspect in found.suspects if (suspect.name,) != found.missing]
-    return out
+    choices = [diagnosed.missing] if diagnosed.missing else []
+    choices += [(suspect.name,) for suspect in diagnosed.suspects if (suspect.name,) != diagnosed.missing]
+    return choices
 
 
 def after_answer(state: Improvement, refits: Refits, answer: str, choices: Sequence[tuple[str, ...]]) -> Improvement:

@@ -247,16 +247,20 @@ class Hypotheses:
         ranked = sorted(log_bayes, key=lambda names: -log_bayes[names])[: _MOST["pair"]]
         limit = _screening_limit(log_bayes.values())
         pairs = [names for names in ranked if log_bayes[names] > limit]
-        walk = self.walk
-        if walk and self.before.fit.walk_gain > 0.0:
-            with_walk = self._refit((walk,))
-            test = self.refits.assess_beside_walk(with_walk, self.effects.independent_tests)
-            beside = Hypotheses(self.refits, with_walk, test)
-            # an effect may be visible beside the walk only, where the noise is another
-            visible = beside._numbers.keys() & self._numbers.keys()
-            effects = [name for name in beside._log_bayes_of_effects() if name in visible]
-            pairs += [(name, walk) for name in effects[: _MOST["walk"]]]
+        if self.walk and self.before.fit.walk_gain > 0.0:
+            pairs += [(name, self.walk) for name in self._likeliest_beside_walk()]
         return pairs
+
+    def _likeliest_beside_walk(self) -> list[str]:
+        """Return the effects that are likeliest beside a random walk."""
+        with_walk = self._refit((self.walk,))
+        test = self.refits.assess_beside_walk(with_walk, self.effects.independent_tests)
+        beside = Hypotheses(self.refits, with_walk, test)
+        # an effect may be visible beside the walk only, where the noise is another
+        visible = beside._numbers.keys() & self._numbers.keys()
+        log_bayes = {name: log for name, log in beside._log_bayes_of_effects().items() if name in visible}
+        limit = _screening_limit(log_bayes.values())
+        return [name for name, log in log_bayes.items() if log > limit][: _MOST["walk"]]
 
     def _log_bayes_of_pairs(self, screened: Mapping[str, float]) -> dict[tuple[str, str], float]:
         """Return the log Bayes factors of pairs by the linear tests: each effect at the value of its constant that is

@@ -105,11 +105,11 @@ def _refuse_silent(means: DwellMeans, stated: Mounting) -> None:
             )
 
 
-def _refuse_wrong_gain(found: AffineFit, bench: Bench) -> None:
+def _refuse_wrong_gain(fitted: AffineFit, bench: Bench) -> None:
     """Refuse a channel that measures gravity by another factor than the others, as in another unit."""
-    for i, scale in enumerate(found.scales.tolist()):
+    for i, scale in enumerate(fitted.scales.tolist()):
         if not GAIN_RANGE[0] < scale < GAIN_RANGE[1]:
-            others = " and ".join(f"{other:.3g}" for other in np.delete(found.scales, i))
+            others = " and ".join(f"{other:.3g}" for other in np.delete(fitted.scales, i))
             raise BlunderError(
                 f"channel {abs(bench.input.channels[i])} feels {scale:.3g} times gravity, the others {others}: check "
                 "its unit and its range; all channels must be in one unit."

@@ -246,8 +246,8 @@ def refuse_coefficients(
     if [(each.symbol, each.unit) for each in parameters[STATE_COUNT:]] != [own[:2] for own in expected]:
         names = ", ".join(f"{symbol} in {unit}" for symbol, unit, *_ in expected)
         raise ValueError(f"parameters must have {names or 'nothing'} after the twelve, as its effects have")
-    for own, (_, _, value, sigma) in zip(parameters[STATE_COUNT:], expected, strict=True):
-        _compare(own, "its state" if sigma is not None else "another place", value, sigma)
+    for parameter, (_, _, value, sigma) in zip(parameters[STATE_COUNT:], expected, strict=True):
+        _compare(parameter, "its state" if sigma is not None else "another place", value, sigma)
 
 
 def _beside_the_state(model: Model, noise: SavedNoise) -> Iterator[tuple[str, str, float, None]]:

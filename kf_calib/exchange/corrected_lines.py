@@ -190,7 +190,7 @@ class CorrectedLines:
     def _corrected(self, lines: list[RawLine], ended: bool) -> bytes:
         """Return lines, corrected; the readings of all of them at once."""
         corrected = dict[int, str]()
-        for number, text, end in self._started(lines, ended, corrected):
+        for number, text, end in self._started(lines, ended):
             corrected[number] = text + end
         lines, self._waiting = self._waiting, []
         if self._reader is None:
@@ -204,7 +204,7 @@ class CorrectedLines:
             self._put(corrected, raw)
         return _bytes(corrected)
 
-    def _started(self, lines: list[RawLine], ended: bool, out: dict[int, str]) -> list[RawLine]:
+    def _started(self, lines: list[RawLine], ended: bool) -> list[RawLine]:
         """Add lines to those that wait, and return what of them is a heading, once it is known what they are."""
         self._account.lines = self._cutter.number
         self._waiting += lines

@@ -127,11 +127,11 @@ class PooledTerms:
 
     def beside_own(self, blocks: Blocks) -> Blocks:
         """The blocks with the coefficients eliminated that are a unit's own."""
-        own = [term for term in self.terms if not term.attribution.common]
-        if not own:
+        of_units = [term for term in self.terms if not term.attribution.common]
+        if not of_units:
             return blocks
-        columns = np.concatenate([np.arange(term.group.columns.start, term.group.columns.stop) for term in own])
-        spread = np.concatenate([_spreads(term, blocks) for term in own], axis=1)
+        columns = np.concatenate([np.arange(term.group.columns.start, term.group.columns.stop) for term in of_units])
+        spread = np.concatenate([_spreads(term, blocks) for term in of_units], axis=1)
         across = blocks.info[:, columns] * spread[:, :, None]
         inner = np.eye(len(columns)) + across[:, :, columns] * spread[:, None, :]
         gains = np.linalg.solve(inner, across)

@@ -130,9 +130,9 @@ def effect_rows(effect: Effect) -> list[tuple[str, str, str]]:
     return rows
 
 
-def size_range(sizes: tuple[float, float], own: Coefficient) -> str:
+def size_range(sizes: tuple[float, float], coefficient: Coefficient) -> str:
     """Sizes of a coefficient from ... to (SI), as they are shown: ``1 to 20 µg/g²``, or ``up to 100 µg/g²``."""
-    unit = shown(own)
+    unit = shown(coefficient)
     if sizes[0] == sizes[1]:
         return unit.text(sizes[1])
     return f"{'up to' if sizes[0] == 0.0 else f'{unit.number(sizes[0])} to'} {unit.text(sizes[1])}"
@@ -239,11 +239,12 @@ def difference_table(differences: Sequence[Difference], first: str, second: str)
     table = ConsoleTable(title="Parameters less nominal (1σ)", title_justify="left")
     for heading in ("parameter", first, "sigma", second, "sigma", "unit", "difference", "in σ"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
-    for k, each in enumerate(differences):
-        both, moved = (*_cells_less_nominal(each.first), *_cells_less_nominal(each.second)), ("", "")
-        if each.value is not None and each.sigma is not None and each.sigmas is not None:
-            moved = shown(each.first).rounded(each.value, each.sigma)[0], f"{each.sigmas:+.1f}"
-        table.add_row(symbol(each.symbol), *both, shown(each.first).label, *moved, end_section=k % 4 == 3)
+    for k, difference in enumerate(differences):
+        both = *_cells_less_nominal(difference.first), *_cells_less_nominal(difference.second)
+        moved = "", ""
+        if difference.value is not None and difference.sigma is not None and difference.sigmas is not None:
+            moved = shown(difference.first).rounded(difference.value, difference.sigma)[0], f"{difference.sigmas:+.1f}"
+        table.add_row(symbol(difference.symbol), *both, shown(difference.first).label, *moved, end_section=k % 4 == 3)
     return table
 
 

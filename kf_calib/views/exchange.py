@@ -223,9 +223,9 @@ def exported_object(target: Target, to: str, path: Path) -> dict[str, Any]:
     )
 
 
-def exported_report(target: Target, out: Path) -> RenderableType:
+def exported_report(target: Target, path: Path) -> RenderableType:
     """The report of ``export``."""
-    lines = [Text(f"{out} is the calibration for {target.title}.", style="bold")]
+    lines = [Text(f"{path} is the calibration for {target.title}.", style="bold")]
     if not target.correction.input.is_plain:
         lines.append(Text(f"It takes {target.input}."))
     if target.to_be_done_before:

@@ -45,23 +45,23 @@ _BORNE_BY = {
 }
 
 
-def pooled_objects(found: PooledDiagnosis) -> list[dict[str, Any]]:
+def pooled_objects(diagnosed: PooledDiagnosis) -> list[dict[str, Any]]:
     """The JSON objects of a pooled diagnosis, one an effect; those that were found come first."""
-    findings = {each.effect: each for each in found.findings}
-    return [_pooled_object(row, findings.get(row.effect)) for row in found.effects]
+    findings = {each.effect: each for each in diagnosed.findings}
+    return [_pooled_object(row, findings.get(row.effect)) for row in diagnosed.effects]
 
 
 def _pooled_object(row: EffectRow, finding: Finding | None) -> dict[str, Any]:
     shares, people = row.probabilities or {}, finding.population if finding else None
     means = [("units", None, each) for each in (people.mean if people else ())]
-    own = [(each.bench, each.since, value) for each in row.benches for value in each.coefficients]
+    of_benches = [(each.bench, each.since, value) for each in row.benches for value in each.coefficients]
     return {
         "effect": row.effect,
         "borne_by": _BORNE_BY[finding.attribution] if finding else None if row.no_one is None else "none",
         "probability": shares[finding.attribution] if finding else row.no_one,
         "probabilities": {each.value: share for each, share in shares.items()},
         "rivals": dict(finding.rivals) if finding else {},
-        "coefficients": [{"of": of, "since": since, **vars(each)} for of, since, each in [*own, *means]],
+        "coefficients": [{"of": of, "since": since, **vars(each)} for of, since, each in [*of_benches, *means]],
         "spread": people.spread if people else None,
         "spread_interval": people.spread_interval if people else None,
         "share": finding.share if finding else None,
@@ -73,18 +73,18 @@ def _pooled_object(row: EffectRow, finding: Finding | None) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def pooled_report(found: PooledDiagnosis) -> RenderableType:
+def pooled_report(pooled: PooledDiagnosis) -> RenderableType:
     """A pooled diagnosis for a console: what was found, the probabilities, and the coefficients."""
-    parts: list[RenderableType] = [Text(sentence) for sentence in sentences(found)]
-    rows = [row for row in found.effects if row.no_one is not None and row.no_one < 1.0 - _LEAST_PROBABILITY]
+    parts: list[RenderableType] = [Text(sentence) for sentence in sentences(pooled)]
+    rows = [row for row in pooled.effects if row.no_one is not None and row.no_one < 1.0 - _LEAST_PROBABILITY]
     if rows:
         parts.append(_probabilities(rows))
-    return Group(*parts, *(_coefficients(each) for each in found.findings))
+    return Group(*parts, *(_coefficients(each) for each in pooled.findings))
 
 
-def sentences(found: PooledDiagnosis) -> list[str]:
+def sentences(pooled: PooledDiagnosis) -> list[str]:
     """A pooled diagnosis in sentences: what the runs show, and of what each effect is."""
-    return [_summary(found), *map(_sentence, found.findings)]
+    return [_summary(pooled), *map(_sentence, pooled.findings)]
 
 
 def _summary(pooled: PooledDiagnosis) -> str:
@@ -129,8 +129,8 @@ def _probabilities(rows: Sequence[EffectRow]) -> ConsoleTable:
     tried = [each for each in Attribution if any(each in (row.probabilities or {}) for row in rows)]
     table = ConsoleTable(title="What has each effect, and with what probability", title_justify="left")
     table.add_column("effect")
-    for each in tried:
-        table.add_column(_OF[each], justify="right")
+    for attribution in tried:
+        table.add_column(_OF[attribution], justify="right")
     table.add_column("of nothing", justify="right")
     for row in rows:
         shares = [(row.probabilities or {}).get(each, 0.0) for each in tried]

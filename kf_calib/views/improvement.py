@@ -269,12 +269,12 @@ def _spread_table(state: Improvement) -> ConsoleTable:
     table = ConsoleTable(title=f"Parameters less nominal, over the explanations {names}", title_justify="left")
     for heading in ("parameter", "lowest", "highest", "sigma", "unit", "differ by, σ"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
-    for k, each in enumerate(state.spreads):
-        parameter, unit = each.parameter, shown(each.parameter)
+    for k, spread in enumerate(state.spreads):
+        parameter, unit = spread.parameter, shown(spread.parameter)
         low, high = (
-            unit.rounded(value - parameter.nominal, parameter.sigma or 0.0) for value in (each.lowest, each.highest)
+            unit.rounded(value - parameter.nominal, parameter.sigma or 0.0) for value in (spread.lowest, spread.highest)
         )
-        row = (symbol(parameter.symbol), low[0], high[0], f"± {low[1]}", unit.label, f"{each.sigmas:.1f}")
+        row = (symbol(parameter.symbol), low[0], high[0], f"± {low[1]}", unit.label, f"{spread.sigmas:.1f}")
         table.add_row(*row, end_section=k % 4 == 3)
     return table
 

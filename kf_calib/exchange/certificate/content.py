@@ -124,9 +124,9 @@ def _dates(saved: SavedCalibration) -> tuple[date, date] | tuple[None, None]:
 
 
 def _results(
-    saved: SavedCalibration, found: Budget, statement: Statement, before: list[tuple[float, float]] | None
+    saved: SavedCalibration, budget: Budget, statement: Statement, before: list[tuple[float, float]] | None
 ) -> tuple[CertifiedResult, ...]:
-    combined, expanded, k, dof = (each.tolist() for each in (found.combined, found.expanded, found.k, found.dof))
+    combined, expanded, k, dof = (each.tolist() for each in (budget.combined, budget.expanded, budget.k, budget.dof))
     limits, results = statement.largest, list[CertifiedResult]()
     for i, parameter in enumerate(saved.parameters[: len(paper_parameters.SYMBOLS)]):
         value = None if parameter.sigma is None else parameter.value

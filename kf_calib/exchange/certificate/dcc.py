@@ -153,9 +153,9 @@ def _statements(parent: ET.Element, certificate: Certificate) -> None:
                 _words(element, "declaration", text)
 
 
-def rule(own: Certificate) -> str:
+def rule(certificate: Certificate) -> str:
     """The rule by which conformity is decided, in words."""
-    if own.statement.decision_rule == "guard band":
+    if certificate.statement.decision_rule == "guard band":
         return ("Guard band of the width of the expanded uncertainty U: pass where the deviation from nominal is at "
                 "most the limit less U, fail where it is more than the limit plus U; between them, conditional pass "
                 "within the limit and conditional fail beyond it (ILAC-G8).")  # fmt: skip
@@ -179,9 +179,9 @@ def _measurement(parent: ET.Element, certificate: Certificate) -> None:
         _quantity(data, each)
 
 
-def _conditions(parent: ET.Element, own: Certificate) -> None:
+def _conditions(parent: ET.Element, certificate: Certificate) -> None:
     """Gravity, temperature of the block and what the laboratory says of its surroundings."""
-    saved, stated = own.saved, own.statement.conditions
+    saved, stated = certificate.saved, certificate.statement.conditions
     own_data = _condition(parent, "Local acceleration of free fall")
     _real(_in(own_data, "quantity"), None, saved.bench.gravity_mps2, UNITS["m/s^2"])
     for name in ("min", "mean", "max"):

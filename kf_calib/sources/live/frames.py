@@ -256,13 +256,13 @@ def _sound_body(frame: bytes) -> bytes | None:
     return body
 
 
-def _stream(found: Sequence[_Found], kind: int, width: int) -> Stream:
+def _stream(groups: Sequence[_Found], kind: int, width: int) -> Stream:
     """All samples of a kind, in the order of their frames."""
-    own = [each for each in found if each.kind == kind and len(each.places)]
-    if not own:
+    of_kind = [each for each in groups if each.kind == kind and len(each.places)]
+    if not of_kind:
         return Stream.empty(width)
-    order = np.argsort(np.concatenate([each.places for each in own]), kind="stable")
+    order = np.argsort(np.concatenate([each.places for each in of_kind]), kind="stable")
     return Stream(
-        np.concatenate([each.time_ns for each in own]).astype(np.int64)[order],
-        np.concatenate([each.values for each in own])[order],
+        np.concatenate([each.time_ns for each in of_kind]).astype(np.int64)[order],
+        np.concatenate([each.values for each in of_kind])[order],
     )

@@ -220,8 +220,8 @@ def _headed(name: str, lines: Sequence[tuple[int, Sequence[Cell]]]) -> Grid:
         units = [*rows[0][1], *[None] * width]
         header = [f"{title} [{unit}]" if unit else title for title, unit in zip(header, units, strict=False)]
         del rows[0]
-    for number, own in rows:
-        beyond = [cell for cell in own[width:] if cell is not None]
+    for number, cells in rows:
+        beyond = [cell for cell in cells[width:] if cell is not None]
         if beyond:
             raise InputError(
                 f"{name}: row {number} has {width + len(beyond)} cells where the header has {width}, the last is "

@@ -62,16 +62,16 @@ def figures(result: Any) -> Figures:
 
 
 @figures.register
-def _(found: Diagnosis) -> Figures:
-    fails = found.test.consistent is False
-    likely: Figures = {PROBABILITIES: lambda: hypotheses(found)} if found.table else {}
+def _(diagnosed: Diagnosis) -> Figures:
+    fails = diagnosed.test.consistent is False
+    likely: Figures = {PROBABILITIES: lambda: hypotheses(diagnosed)} if diagnosed.table else {}
     return {
-        "Where the model fails" if fails else "What the model leaves": lambda: residuals(found),
-        "What the residuals go with": lambda: what_they_go_with(found),
+        "Where the model fails" if fails else "What the model leaves": lambda: residuals(diagnosed),
+        "What the residuals go with": lambda: what_they_go_with(diagnosed),
         **likely,
-        "Which effect is missing" if fails else "Whether an effect is missing": lambda: suspects(found),
-        "What could hide here": lambda: detection_limits(found),
-        "Residuals by the direction of gravity": lambda: on_the_sphere(found),
+        "Which effect is missing" if fails else "Whether an effect is missing": lambda: suspects(diagnosed),
+        "What could hide here": lambda: detection_limits(diagnosed),
+        "Residuals by the direction of gravity": lambda: on_the_sphere(diagnosed),
     }
 
 
@@ -115,8 +115,8 @@ def _(made: Plan) -> Figures:
 
 
 @figures.register
-def _(found: History) -> Figures:
-    return {"The calibrations over time": lambda: history(found)}
+def _(calibrations: History) -> Figures:
+    return {"The calibrations over time": lambda: history(calibrations)}
 
 
 def save(what: Figure | Figures, path: str | Path, kind: str = "", width_px: int | None = None) -> Path:

@@ -134,7 +134,7 @@ def _draw(axes: Axes, bars: Sequence[_Bar], title: str, odds: str = "") -> None:
 
 _MOST, _ALIKE = 7, 8  # explanations that are drawn, effects in the matrix of overlaps
 _DRIVERS = 6
-_NO_MISFIT = "The misfit as a whole is no larger than noise"
+_NO_MISFIT = "The means of the dwells differ by no more than noise"
 _SUSPECT_NAME = 24  # letters of a name in a line
 _DARK = 0.6  # overlap above which numbers are white
 _FITTING = "#56b4e9"  # of Okabe and Ito's palette
@@ -224,7 +224,7 @@ def _overlaps(axes: Axes, diagnosis: Diagnosis, names: Sequence[str]) -> None:
 def _drivers(axes: Axes, drivers: Sequence[Driver]) -> None:
     """Draw the share of the misfit that goes with each quantity of the bench."""
     if not any(driver.share for driver in drivers):
-        return _words(axes, f"{_NO_MISFIT}:\nno part of it is left to go with a quantity.")
+        return _words(axes, f"{_NO_MISFIT}:\nthey go with no quantity.")
     for k, driver in enumerate(drivers):
         axes.barh(k, 100.0 * driver.share, color=PALE, height=0.62)
         axes.text(103.0, k, f"p {format_p(driver.p_value)}", va="center", fontsize=8.5, color=GREY)
@@ -307,9 +307,9 @@ def draw_detection_limits(figure: FigureBase, diagnosis: Diagnosis, below: float
 def _ordered(sizes: Sequence[Detectable], grade: Grade) -> list[Detectable]:
     """Return what could hide most first, then those without a usual size."""
 
-    def largest_hidden(each: Detectable) -> float:
-        usual = each.typical.of(grade)
-        return usual[1] / each.minimum if usual is not None else float("inf")
+    def largest_hidden(detectable: Detectable) -> float:
+        usual = detectable.typical.of(grade)
+        return usual[1] / detectable.minimum if usual is not None else float("inf")
 
     return sorted(sizes, key=largest_hidden)
 

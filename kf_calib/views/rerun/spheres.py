@@ -201,13 +201,13 @@ def log_ellipsoids(
     _log_bar(stream, factor, f"; wires: orientation {numbers[first]}" if first < len(shown) - 1 else "")
 
 
-def _fields(own: list[Ellipsoid], tips: Floats, factor: float) -> dict[str, Any]:
+def _fields(ellipsoids: list[Ellipsoid], tips: Floats, factor: float) -> dict[str, Any]:
     """Return what Rerun draws ellipsoids from."""
     return {
-        "centers": [tips[i] for i, _, _ in own],
-        "half_sizes": [np.maximum(factor * sigma, THINNEST) for _, sigma, _ in own],
-        "quaternions": [Rotation.from_matrix(turn).as_quat() for _, _, turn in own],
-        "colors": [(*ACCELEROMETERS[i], 150) for i, _, _ in own],
+        "centers": [tips[i] for i, _, _ in ellipsoids],
+        "half_sizes": [np.maximum(factor * sigma, THINNEST) for _, sigma, _ in ellipsoids],
+        "quaternions": [Rotation.from_matrix(turn).as_quat() for _, _, turn in ellipsoids],
+        "colors": [(*ACCELEROMETERS[i], 150) for i, _, _ in ellipsoids],
     }
 
 
