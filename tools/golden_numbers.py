@@ -17,6 +17,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from helpers import stored_numbers
 from helpers.numbered_cases import FAST, SLOW
 
+MOST = 40  # differences that are printed of a case
+
 
 def main() -> None:
     """Renew the cases that are named, or all."""
@@ -31,8 +33,8 @@ def main() -> None:
         changed = [] if is_new else stored_numbers.changed(name, tree)
         if is_new or changed:
             stored_numbers.write(name, tree)
-        told = "new" if is_new else "\n".join(["", *map(str, changed)]) if changed else "as it was"
-        print(f"{name}: {told}", flush=True)
+        told = [f"{len(changed)} changed", *map(str, changed[:MOST])] if changed else ["new" if is_new else "as it was"]
+        print(f"{name}:", *told, sep="\n  ", flush=True)
 
 
 if __name__ == "__main__":

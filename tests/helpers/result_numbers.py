@@ -22,9 +22,10 @@ _ZERO = 1e-13  # what is smaller is what rounding leaves of zero
 _LEFT_OUT = ("kf_calib.sources", "kf_calib.views", "kf_calib.diagnosis.refits")
 _DEEPEST = 12
 _ARBITRARY = frozenset(
-    ("Fit.misfit_rows", "Estimate.undetermined", "Estimate.unseen", "Estimate.determined", "Estimate.sigma",
-     "Calibration.reached", "Candidate.columns", "Candidate.basis", "Candidate.directions", "Candidate.inverse",
-     "Scan.residual", "DwellFactor.factor", "WalkPath.modes", "Visit.nis", "Diagnosis.drivers")
+    ("Fit.misfit_rows", "Fit.considered", "Estimate.undetermined", "Estimate.unseen", "Estimate.determined",
+     "Estimate.sigma", "Calibration.reached", "Candidate.columns", "Candidate.basis", "Candidate.directions",
+     "Candidate.inverse", "Scan.residual", "DwellFactor.factor", "WalkPath.modes", "Visit.nis", "Diagnosis.drivers",
+     "Folded.pose_sigmas_rad")
 )  # fmt: skip
 """Signs and bases that may be chosen at will, and what rounding decides where nothing is determined: these differ from
 one processor to another."""

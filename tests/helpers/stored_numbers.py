@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -23,11 +24,16 @@ _RELATIVE, _OF_SIGMA = 1e-5, 1e-4
 _ZERO = 1e-12
 _DIGITS = 10
 _NAME = re.compile(r"[A-Za-z][\w:=^*().+-]{0,40}( [\w:=^*().+-]+){0,2}")
-_SHOWN = 10
+_SHOWN, _WIDTH = 10, 60
 LOOSE: Mapping[str, float] = {"position_feedback": 30.0, "without_angles": 1000.0, "plans": 1000.0}
 """By what factor more numbers of a case may differ. A setting error that is estimated is where a search for the largest
 likelihood ends, to 3e-5 of itself; a fit without angles ends where its steps are below a thousandth of a sigma; a plan
 is the best that a search meets. Of these, 1e-5 is not reached on another processor (measured: 1e-4, 2e-3, 1e-3)."""
+_LOOSE_NAMES: Mapping[str, float] = {
+    "log10_odds_to_next": 1e3, "minimum": 10.0, "Fit.scatter_gain": 1e3, "Fit.gauss_markov_gain": 1e3,
+    "Fit.gauss_markov_gains": 1e3, "EffectRow.no_one": 1e3,
+}  # fmt: skip
+"""The same for numbers that are small differences of large ones, or so large that nothing was determined."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +46,8 @@ class Difference:
 
     def __str__(self) -> str:
         both = isinstance(self.stored, float | int) and isinstance(self.new, float | int)
-        return f"{self.path}: stored {self.stored}, now {self.new}" + (
-            f", by {self.new - self.stored:.3g}" if both else ""
-        )
+        stored, new = (textwrap.shorten(str(each), _WIDTH) for each in (self.stored, self.new))
+        return f"{self.path}: stored {stored}, now {new}" + (f", by {self.new - self.stored:.3g}" if both else "")
 
 
 def plain(tree: Any) -> Any:
@@ -115,7 +120,7 @@ def _of_key(
         and _alike(one, other, 0.0, _OF_SIGMA * max(loose / 10.0, 1.0) * sigma)
     ):
         return
-    yield from differences(one, other, f"{path}/{key}", loose)
+    yield from differences(one, other, f"{path}/{key}", loose * _LOOSE_NAMES.get(key, 1.0))
 
 
 def _of_figures(stored: list[float], new: list[float], path: str, loose: float) -> Iterator[Difference]:
