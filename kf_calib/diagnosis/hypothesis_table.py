@@ -140,8 +140,7 @@ class HypothesisTable:
     @cached_property
     def rivals(self) -> tuple[Hypothesis, ...]:
         """The explanations other than the first that have ``CREDIBLE`` of the probability together with it, without
-        those
-        that only add to its effects or look like them."""
+        those that only add to its effects or look like them."""
         first, rows = self.first, [row for row in self.rows if row.families != (NOTHING,) and row.driver != ALIKE]
         before = np.cumsum([0.0, *(row.probability for row in rows)]) / sum(row.probability for row in rows)
         credible = [row for k, row in enumerate(rows) if before[k] < CREDIBLE and row is not first]

@@ -53,7 +53,18 @@ def verdict_in_words(diagnosis: Diagnosis) -> str:
         return f"{start} {_not_named(diagnosis, first)}."
     if first.effects:
         return f"{start} {_named(diagnosis, first)}{_returning(diagnosis)}.{_held_out(diagnosis)}{_unusual(diagnosis)}"
-    return f"{start} {_noise(diagnosis, first) if diagnosis.noise else _unknown(diagnosis, first)}"
+    said = _noise(diagnosis, first) if diagnosis.noise else _unknown(diagnosis, first)
+    if not _may_be_chance(diagnosis, first):
+        return f"{start} {said}"
+    assert diagnosis.table is not None
+    nothing = format_probability(diagnosis.table.families[NOTHING])
+    return f"{start} It may be chance: nothing is missing ({nothing}). Otherwise: {said[0].lower()}{said[1:]}"
+
+
+def _may_be_chance(diagnosis: Diagnosis, first: Hypothesis) -> bool:
+    """Tell whether nothing missing is likelier than what the table has first, which is no known effect."""
+    assert diagnosis.table is not None
+    return not first.effects and diagnosis.table.families.get(NOTHING, 0.0) > first.probability
 
 
 def _what_fails(test: CandidateTests) -> str:
@@ -170,7 +181,8 @@ def _noise(diagnosis: Diagnosis, first: Hypothesis) -> str:
 def _others(diagnosis: Diagnosis, but: str = "") -> str:
     """Return the other explanations in words, but for those of one family."""
     assert diagnosis.table is not None
-    nothing = [row for row in diagnosis.table.rows if row.families == (NOTHING,) and row.probability > _CHANCE]
+    least = 1.0 if _may_be_chance(diagnosis, diagnosis.table.first) else _CHANCE  # which has been told
+    nothing = [row for row in diagnosis.table.rows if row.families == (NOTHING,) and row.probability > least]
     rows = [row for row in (*diagnosis.table.rivals, *nothing) if row.families != (but,)]
     rows.sort(key=lambda row: -row.probability)
     words = [f"{_in_words(diagnosis, row)} {format_probability(row.probability)}" for row in rows[:_TOLD]]
