@@ -132,6 +132,7 @@ def test_without_a_repeated_orientation_scatter_and_an_unknown_cause_cannot_be_t
     assert "cannot be told" in diagnosis.verdict and "repeat an orientation" in diagnosis.verdict
 
 
+@pytest.mark.slow  # the odds of repeating: below
 def test_what_comes_back_with_the_orientation_is_unknown() -> None:
     comes_back = scattered(6, True)
     assert shares(comes_back)[0] < 0.05 * shares(comes_back)[1] and comes_back.unknown
@@ -183,6 +184,7 @@ def test_a_pose_after_a_whole_turn_is_the_same_orientation() -> None:
     assert [group for group in groups if len(group) > 1] == [[0, 8], [1, 9], [2, 10], [3, 11]]
 
 
+@pytest.mark.slow  # what goes with the last step and is unknown: above
 def test_memory_in_proportion_to_the_last_step_is_not_surely_settling() -> None:
     """With time constants far beyond the dwells it is the same: the catalogue does not hold its limit."""
     diagnosis = diagnosed("in proportion to the last step", 15.0, 1)
