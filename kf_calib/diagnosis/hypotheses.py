@@ -69,15 +69,17 @@ def _log_sum(logs: Sequence[float]) -> float:
 
 
 def dispersed(rows: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Return the rows with the differences of their log evidence divided by the overdispersion that the likeliest
-    leaves.
+    """Return the rows; where the likeliest is of a known effect beside a formula that does not fit, with the
+    differences of their log evidence divided by the overdispersion that it leaves.
 
-    A misfit that is left shows that none of the models is exact. As noise of its size, it may favour one of two that
-    are both inexact (quasi-likelihood: Burnham and Anderson, Model Selection and Multimodel Inference, 2002, 2.5).
+    The misfit that is left shows that the formula is not exact. As noise of its size, it may favour a known effect that
+    makes up for it (quasi-likelihood: Burnham and Anderson, Model Selection and Multimodel Inference, 2002, 2.5).
     """
     best = max(rows, key=lambda row: row.log_evidence)
-    log, left = best.log_evidence, best.refit.consistency.overdispersion if best.refit else 1.0
-    return [replace(row, log_evidence=log + (row.log_evidence - log) / left) for row in rows] if left > 1 else [*rows]
+    if not (best.effects and best.formulas and best.refit):
+        return [*rows]
+    log, left = best.log_evidence, best.refit.consistency.overdispersion
+    return [replace(row, log_evidence=log + (row.log_evidence - log) / left) for row in rows] if left > 1.0 else [*rows]
 
 
 def _screening_limit(logs: Iterable[float]) -> float:
