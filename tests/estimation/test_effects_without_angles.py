@@ -101,7 +101,7 @@ def calibrated(name: str, seed: int) -> tuple[Calibration, np.ndarray]:
         return evaluate(dwells_of_table(table, BENCH), BENCH, Settings(effects=(name,))), truth
 
 
-FEW = dict.fromkeys(list(EFFECTS)[::2], 2) | {"second-order": 8, "cross-coupling-po": 8}
+FEW = dict.fromkeys(list(EFFECTS)[::2], 2) | {"second-order": 4, "cross-coupling-po": 4}
 OTHERS = [(name, 2) for name in EFFECTS if name not in FEW] + [(name, 100) for name in EFFECTS]
 
 
