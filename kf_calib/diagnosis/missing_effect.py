@@ -16,6 +16,7 @@ from os import PathLike
 
 import numpy as np
 
+from kf_calib.bench.arrays import one_blas_thread
 from kf_calib.bench.streams import Source
 from kf_calib.diagnosis.candidate_tests import CandidateTests, overlap_matrix
 from kf_calib.diagnosis.hypotheses import Hypotheses, log_odds_of
@@ -45,7 +46,6 @@ from kf_calib.effects import effect_named
 from kf_calib.estimation.outlying_dwell import outlying_in_words
 from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.support.tail_probabilities import chi_squared_tail
-from kf_calib.support.threads import one_blas_thread
 
 _SHOWN = 6  # number of suspects that are shown
 _DOUBT = 0.01  # probability from which noise that was not stated is named as a rival
