@@ -19,10 +19,9 @@ from kf_calib.bench.keys import ranges
 from kf_calib.bench.paper_parameters import targets_of
 from kf_calib.design import optimality_criteria
 from kf_calib.design.exact_design import Scheme, Search
-from kf_calib.design.gimbal_limits import Reach
+from kf_calib.design.gimbal_limits import Reach, Timing, middles_s, order, slews_s, time_correlation
 from kf_calib.design.orientation_plan import fewest, papers_sigma, plan
 from kf_calib.design.predicted_information import Prospect
-from kf_calib.design.visit_order import Timing, middles_s, order, slews_s, time_correlation
 from kf_calib.dwells.qr import triangle
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.calibration import calibrate

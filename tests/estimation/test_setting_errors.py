@@ -15,15 +15,15 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2
 
+from kf_calib.bench.arrays import one_blas_thread
 from kf_calib.bench.bench import Bench, axes_of
-from kf_calib.dwells.tabulated import dwells_of
+from kf_calib.bench.streams import Orientations
+from kf_calib.dwells.folding import dwells_of_table
 from kf_calib.estimation.attitude import _posterior_rotations
 from kf_calib.estimation.calibration import calibrate, evaluate
 from kf_calib.estimation.engine_comparison import compare
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
-from kf_calib.sources.tables.table import Orientations
-from kf_calib.support.threads import one_blas_thread
 
 pytestmark = pytest.mark.usefixtures("unmeasured")
 
@@ -62,7 +62,7 @@ class Trial:
             np.full(count, np.nan),
         )  # fmt: skip
         with one_blas_thread():
-            return evaluate(dwells_of(table, self.bench), self.bench, Settings())
+            return evaluate(dwells_of_table(table, self.bench), self.bench, Settings())
 
 
 @pytest.mark.parametrize("stated", [True, False])

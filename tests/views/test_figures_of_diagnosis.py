@@ -19,7 +19,7 @@ from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.stepwise_selection import Improvement, begin, extend, improve, undone
 from kf_calib.errors import InputError
 from kf_calib.estimation.calibration import calibrate
-from kf_calib.estimation.dwell_readings import readings_of, worst_dwell
+from kf_calib.estimation.filter_history import readings_of, worst_dwell
 from kf_calib.support.units import shown_in
 from kf_calib.views.figures.style import label_axis, rounded_number, short_number, wrapped
 
