@@ -45,8 +45,7 @@ if TYPE_CHECKING:
     from kf_calib.exchange.calibration_file import SavedCalibration, open_calibration, save_calibration
     from kf_calib.fleet.results import Fleet
     from kf_calib.fleet.results import Fleet as open_fleet
-    from kf_calib.online.running_filter import Running
-    from kf_calib.online.sequential_test import Watch
+    from kf_calib.online.sequential_test import Running, Watch
     from kf_calib.online.session import Session
     from kf_calib.sources.files.lines import Lines as open_log
     from kf_calib.sources.files.recorder import Recorder

@@ -20,7 +20,7 @@ MODULES = {
     ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__"): path
     for path in PACKAGE.rglob("*.py")
 }
-DATA = "recordings"  # a link: the tutorial's recordings come with the package
+DATA = "recordings", "profiles"  # a link: the tutorial's recordings come with the package; profiles of positioners
 CORE = {"bench", "dwells", "effects", "noise", "estimation", "design", "diagnosis", "online"}
 LEVELS = (
     {"errors"}, {"support"}, {"bench"}, {"effects", "sources"}, {"dwells"}, {"noise"}, {"estimation"},
@@ -153,7 +153,7 @@ import pytest
 def test_nothing_lies_beside_the_packages() -> None:
     flat = sorted(path.name for path in PACKAGE.iterdir() if path.is_file() and path.suffix == ".py")
     assert set(flat) <= {"__init__.py", "__main__.py", "errors.py"}
-    for package in (path for path in PACKAGE.rglob("*") if path.is_dir() and path.name not in ("__pycache__", DATA)):
+    for package in (path for path in PACKAGE.rglob("*") if path.is_dir() and path.name not in ("__pycache__", *DATA)):
         text = (package / "__init__.py").read_text()
         assert ast.get_docstring(ast.parse(text)), package
 

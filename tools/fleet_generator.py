@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from kf_calib.bench.arrays import one_blas_thread
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.sources.files.recorder import Recorder
@@ -30,7 +31,6 @@ from kf_calib.sources.simulation.injected import Hidden, parse
 from kf_calib.sources.simulation.sensors import GRADES, generator
 from kf_calib.sources.simulation.simulator import Simulation
 from kf_calib.sources.simulation.visit_plans import PlannedVisit, spread_plan
-from kf_calib.support.threads import one_blas_thread
 
 _PLANS = 8  # tours that the runs of a bench share: to find one takes as long as to simulate a run
 _DAY_NS = 86_400_000_000_000

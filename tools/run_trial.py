@@ -33,10 +33,9 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.design import optimality_criteria, orientation_plan
 from kf_calib.design.exact_design import Scheme, Search
-from kf_calib.design.gimbal_limits import Reach
+from kf_calib.design.gimbal_limits import PEAK_OVER_MEAN, Reach, Timing
 from kf_calib.design.next_orientation import Pace
 from kf_calib.design.predicted_information import Prospect
-from kf_calib.design.visit_order import PEAK_OVER_MEAN, Timing
 from kf_calib.dwells.qr import triangle
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Settings

@@ -1,9 +1,19 @@
-"""Array types, named by what the arrays hold, and the lengths of vectors."""
+"""Arrays: their types, named by what they hold; lengths of vectors; sequences whose items are made when they are asked
+for; and how many threads the linear algebra may take.
+"""
 
 from __future__ import annotations
 
+import sys
+from abc import abstractmethod
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
+from functools import cache
+from typing import TypeVar, overload
+
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController
 
 Times = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -21,3 +31,38 @@ def crossed(one: Floats, other: Floats) -> Floats:
     """The cross products (n, 3) of vectors (n, 3); ``np.cross`` takes several times as long."""
     (a, b, c), (x, y, z) = one.T, other.T
     return np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=1)
+
+
+Computed = TypeVar("Computed", covariant=True)
+
+
+class ComputedSequence(Sequence[Computed]):
+    """A sequence that makes its items by ``item``; a slice is a list of them."""
+
+    @abstractmethod
+    def item(self, k: int) -> Computed:
+        """The item at an index from 0 to the length less one."""
+
+    def __iter__(self) -> Iterator[Computed]:
+        return map(self.item, range(len(self)))
+
+    @overload
+    def __getitem__(self, index: int) -> Computed: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Computed]: ...
+    def __getitem__(self, index: int | slice) -> Computed | list[Computed]:
+        if isinstance(index, slice):
+            return [self.item(k) for k in range(*index.indices(len(self)))]
+        return self.item(range(len(self))[index])
+
+
+def one_blas_thread() -> AbstractContextManager[object]:
+    """A context in which BLAS uses one thread: with several, small decompositions take three times as long and may give
+    different bits every time."""
+    return _controller("scipy.linalg" in sys.modules).limit(limits=1, user_api="blas")
+
+
+@cache
+def _controller(scipy: bool) -> ThreadpoolController:
+    """The controller of the loaded libraries, cached because finding them takes a millisecond; scipy brings its own."""
+    return ThreadpoolController()

@@ -22,8 +22,7 @@ from typing import Any, NamedTuple
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.raw_input import CONVERTED, RESTATE, UNITS, text_of
 from kf_calib.errors import BenchError, how_to_write
-from kf_calib.support import dates
-from kf_calib.support.text import COMMANDS, LONGEST, cut
+from kf_calib.support.text import COMMANDS, LONGEST, cut, parse_date
 
 FORMAT_VERSION = "1"
 UP = ("y", "z", "x", "-y", "-z", "-x")
@@ -72,7 +71,7 @@ def _text(value: Any) -> str:
 
 def _date(value: Any) -> str:
     """Return the text of a date."""
-    dates.parse_date(_text(value))  # raises ValueError
+    parse_date(_text(value))  # raises ValueError
     return value
 
 

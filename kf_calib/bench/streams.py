@@ -3,6 +3,8 @@
 Stamps are integers in nanoseconds (``time_ns``). Readings are specific force in m/s^2, +g if the sensitive axis points
 up. Gimbal angles are in rad, outer axis first. A *pose* consists of the gimbal angles (k columns) or, if the bench has
 no gimbal axes, of the attitude quaternion from platform to bench (x, y, z, w).
+
+A table of orientations is a source, too: of its dwells only the mean readings are known.
 """
 
 from __future__ import annotations
@@ -18,10 +20,11 @@ if TYPE_CHECKING:
     from kf_calib.bench.bench import Bench
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 
-from kf_calib.bench.arrays import Floats, Times
+from kf_calib.bench.arrays import ComputedSequence, Floats, Ints, Times
 from kf_calib.bench.bench import Bench
-from kf_calib.errors import BenchError
+from kf_calib.errors import BenchError, InputError
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 
@@ -118,3 +121,100 @@ def bench_without_angles(name: str, metadata: Mapping[str, str]) -> tuple[Bench,
 def without_poses(batch: Batch) -> Batch:
     """The batch with its readings and temperatures only."""
     return Batch(batch.accel, Stream.empty(4), batch.temperature)
+
+
+@dataclass(frozen=True, slots=True)
+class Orientation:
+    """A dwell as a table has it: conditions and mean readings.
+
+    - mean_mps2 (3,): mean readings of accelerometers 1, 2, 3.
+    - pose (k,): gimbal angles, rad, or quaternion.
+    - elapsed_s: time of its middle since the first row.
+    - sigma_mps2 (3,): standard deviation of the readings about their mean; None where it is not known.
+    - count: number of readings behind the mean; 1 where the standard deviation is not known.
+    - temperature_c: NaN where it was not measured.
+    """
+
+    mean_mps2: Floats
+    pose: Floats
+    elapsed_s: float
+    sigma_mps2: Floats | None
+    count: int
+    temperature_c: float
+
+
+@dataclass(frozen=True, eq=False)
+class Orientations(ComputedSequence[Orientation]):
+    """The rows of a table, as columns: 100 000 objects would take ten times the memory.
+
+    Fields are those of ``Orientation``, with a row each, its count in ``counts``; sigma_mps2 is None where no row has
+    it, and NaN in a row that has none.
+    """
+
+    mean_mps2: Floats
+    pose: Floats
+    elapsed_s: Floats
+    sigma_mps2: Floats | None
+    counts: Ints
+    temperature_c: Floats
+
+    @classmethod
+    def of(cls, rows: Sequence[Orientation]) -> Orientations:
+        """Any rows as columns; columns as they are."""
+        if isinstance(rows, Orientations):
+            return rows
+        sigmas = np.array([np.full(3, np.nan) if row.sigma_mps2 is None else row.sigma_mps2 for row in rows])
+        return cls(
+            np.array([row.mean_mps2 for row in rows]), np.array([row.pose for row in rows]),
+            np.array([row.elapsed_s for row in rows]), None if np.isnan(sigmas).all() else sigmas,
+            np.array([row.count for row in rows], np.int64), np.array([row.temperature_c for row in rows], float),
+        )  # fmt: skip
+
+    def __len__(self) -> int:
+        return len(self.elapsed_s)
+
+    def item(self, k: int) -> Orientation:
+        """The row at an index."""
+        sigmas = np.full(3, np.nan) if self.sigma_mps2 is None else self.sigma_mps2[k]
+        return Orientation(
+            self.mean_mps2[k], self.pose[k], float(self.elapsed_s[k]), None if np.isnan(sigmas).any() else sigmas,
+            int(self.counts[k]), float(self.temperature_c[k]),
+        )  # fmt: skip
+
+
+class Table:
+    """Mean readings of dwells, with the bench they were taken on.
+
+    name: what messages call it. warnings: how it was understood. start_ns: stamp of the first row, if it has a date.
+    path: the file that it is from, if it is from one.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        bench: Bench,
+        orientations: Sequence[Orientation],
+        warnings: Sequence[str] = (),
+        start_ns: int | None = None,
+        path: Path | None = None,
+    ) -> None:
+        self.name, self.bench, self.orientations = name, bench, Orientations.of(orientations)
+        self.warnings, self.fraction, self._start_ns, self.path = list(warnings), 1.0, start_ns, path
+
+    def __repr__(self) -> str:
+        return f"<Table {self.name}: {len(self.orientations)} orientations, {self.bench.input}>"
+
+    def begin_ns(self) -> int | None:
+        """Stamp of the first row; None where the table has no date."""
+        return self._start_ns
+
+    def __iter__(self) -> Iterator[Batch]:
+        self.refuse("this")
+        yield from ()
+
+    def refuse(self, what: str) -> None:
+        """Raise InputError for what means do not show."""
+        raise InputError(
+            f"{self.name} is a table of mean readings, and {what} needs the readings themselves: evaluate a recording "
+            "of the run (docs/own_csv.md)."
+        )

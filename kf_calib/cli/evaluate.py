@@ -219,7 +219,7 @@ def report(
 ) -> None:  # fmt: skip
     """A page for the engineer: verdict, figures, residuals to explore, tables, commands to get the numbers again."""
     from kf_calib.cli.exchange import stated_in, write_certificate
-    from kf_calib.diagnosis.side_by_side import SideBySide
+    from kf_calib.diagnosis.results import SideBySide
     from kf_calib.views import console, diagnosis
     from kf_calib.views.json import clean, side_by_side_object
     from kf_calib.views.report.contents import page_of

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from kf_calib.estimation.correction import Correction
     from kf_calib.estimation.measurement_model import Model
     from kf_calib.exchange.calibration_file import SavedCalibration
-    from kf_calib.exchange.certificate.content import Certificate
+    from kf_calib.exchange.certificate.budget import Certificate
     from kf_calib.exchange.certificate.statement import Statement
     from kf_calib.exchange.corrected_file import Applied
     from kf_calib.exchange.corrected_lines import CorrectedLines
@@ -338,10 +338,10 @@ def write_certificate(
 
     Raises InputError for a calibration, statement or schema that cannot be used, MissingExtraError without typst.
     """
-    from kf_calib.exchange.certificate import content, dcc, document
+    from kf_calib.exchange.certificate import budget, dcc, document
     from kf_calib.support.output_files import write_whole
 
-    certificate_ = content.certificate(*calibrated, stated, before)
+    certificate_ = budget.certificate(*calibrated, stated, before)
     encoded = dcc.xml(certificate_)
     standing = dcc.check_dcc(encoded, schema)
     printed = document.pdf(certificate_, encoded, standing)

@@ -39,7 +39,7 @@ from kf_calib.support.text import sentence
 
 if TYPE_CHECKING:
     from kf_calib.estimation.settings import Settings
-    from kf_calib.online.by_hand import HandJudgement, HandStanding
+    from kf_calib.online.session import HandJudgement, HandStanding
     from kf_calib.online.status import Judgement, Standing
     from kf_calib.sources.live import Status
     from kf_calib.views.rerun.growing import GrowingView
@@ -163,7 +163,7 @@ def follow(run: LiveRun, name: str, record: Path | None, as_json: bool) -> None:
 
 def _urgent_messages(run: LiveRun) -> dict[str, str]:
     """What a user must know at once, about what: said again where it changes."""
-    from kf_calib.online.by_hand import HandStanding
+    from kf_calib.online.session import HandStanding
 
     standing, status = run.session.standing if run.session else None, run.source.status
     return {
@@ -211,7 +211,7 @@ def _echo(run: LiveRun, text: str) -> None:
 def _on_screen(run: LiveRun, name: str, record: Path | None) -> None:
     from rich.live import Live
 
-    from kf_calib.online.by_hand import HandStanding
+    from kf_calib.online.session import HandStanding
     from kf_calib.online.status import Standing
     from kf_calib.views.live import hand_screen, screen
     from kf_calib.views.terminal import PlainConsole

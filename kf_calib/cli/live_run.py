@@ -25,8 +25,7 @@ from kf_calib.errors import InputError, KfCalibError
 if TYPE_CHECKING:
     from kf_calib.bench.streams import Source
     from kf_calib.estimation.settings import Settings
-    from kf_calib.online.by_hand import HandJudgement, HandSession
-    from kf_calib.online.session import Session
+    from kf_calib.online.session import HandJudgement, HandSession, Session
     from kf_calib.online.status import Judgement
     from kf_calib.sources.live import LiveSource
 
@@ -40,7 +39,7 @@ def on_bench(settings: Settings, wanted: Mapping[str, float], auto: bool) -> Cal
 
 def by_hand(settings: Settings, wanted: Mapping[str, float]) -> Callable[..., HandSession]:
     """How the session of a sensor in the hand is begun."""
-    from kf_calib.online.by_hand import HandSession
+    from kf_calib.online.session import HandSession
 
     return lambda source, every, again: HandSession(source, settings, wanted, every=every, again=again)
 

@@ -20,12 +20,12 @@ from kf_calib.support.units import shown_in, si
 
 if TYPE_CHECKING:
     from kf_calib.bench.raw_input import RawInput
+    from kf_calib.bench.streams import Table
     from kf_calib.estimation.settings import Settings
     from kf_calib.sources.files.lines import Lines
     from kf_calib.sources.files.recording import Recording
     from kf_calib.sources.opening import FileKind
-    from kf_calib.sources.tables.table import Table
-    from kf_calib.sources.units import Units
+    from kf_calib.sources.tables.words import Units
 
 _of_input, _of_model, _of_output = (partial(option, panel=panel) for panel in (INPUT, MODEL, OUTPUT))
 
@@ -184,7 +184,7 @@ class ReadingOptions:
 
     def units(self, input: RawInput | None = None) -> Units:
         """Units of a table or a log."""
-        from kf_calib.sources.units import Units
+        from kf_calib.sources.tables.words import Units
 
         return Units.of(self.keys, self.angle_unit, self.g_unit, input)
 

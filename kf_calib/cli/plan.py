@@ -94,7 +94,7 @@ def plan(
     """Orientations that determine the parameters best: which, in which order, and the sigmas to expect."""
     from kf_calib.design import orientation_plan
     from kf_calib.design.exact_design import Scheme, Search
-    from kf_calib.design.visit_order import Timing
+    from kf_calib.design.gimbal_limits import Timing
     from kf_calib.views import plan as views
 
     _refuse_contradictions(options, figures, reading, evaluation)
@@ -195,10 +195,10 @@ def _after(
 ) -> Prospect:
     import numpy as np
 
+    from kf_calib.bench.streams import Table
     from kf_calib.design.predicted_information import Prospect
     from kf_calib.estimation.calibration import calibrate
     from kf_calib.estimation.measurement_model import Model
-    from kf_calib.sources.tables.table import Table
 
     source, settings = opened(recording, reading, evaluation)
     gimbals = source.bench if source.bench.axes else _with_gimbals(recording, source.bench, reading)

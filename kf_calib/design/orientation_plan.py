@@ -19,16 +19,15 @@ from functools import cached_property
 import numpy as np
 
 from kf_calib.bench import paper_parameters
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import Floats, one_blas_thread
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.design import optimality_criteria
 from kf_calib.design.exact_design import Search
+from kf_calib.design.gimbal_limits import Timing, middles_s, order, slews_s, time_correlation
 from kf_calib.design.predicted_information import PAUSE_S, Prospect
-from kf_calib.design.visit_order import Timing, middles_s, order, slews_s, time_correlation
 from kf_calib.dwells.qr import triangle
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.noise.reml import directions
-from kf_calib.support.threads import one_blas_thread
 
 _DIGITS = 2  # decimals of an angle in deg
 _LITTLE = 1  # with so few degrees of freedom the model cannot be judged

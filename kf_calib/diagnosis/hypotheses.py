@@ -68,6 +68,20 @@ def _log_sum(logs: Sequence[float]) -> float:
     return float(np.logaddexp.reduce([-math.inf, *logs]))
 
 
+def dispersed(rows: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Return the rows; where the likeliest is of a known effect beside a formula that does not fit, with the
+    differences of their log evidence divided by the overdispersion that it leaves.
+
+    The misfit that is left shows that the formula is not exact. As noise of its size, it may favour a known effect that
+    makes up for it (quasi-likelihood: Burnham and Anderson, Model Selection and Multimodel Inference, 2002, 2.5).
+    """
+    best = max(rows, key=lambda row: row.log_evidence)
+    if not (best.effects and best.formulas and best.refit):
+        return [*rows]
+    log, left = best.log_evidence, best.refit.consistency.overdispersion
+    return [replace(row, log_evidence=log + (row.log_evidence - log) / left) for row in rows] if left > 1.0 else [*rows]
+
+
 def _screening_limit(logs: Iterable[float]) -> float:
     """Return the log evidence by the linear tests from which a row is refitted."""
     best = max(logs, default=0.0)
@@ -106,7 +120,7 @@ class Hypotheses:
         rows += [row for walk in walks if self.stated for row in self._gauss_markov(walk)]
         best = max(row.log_evidence for row in rows)
         disturbed = max((each for each in self._disturbed if each[0] > best), key=lambda each: each[0], default=None)
-        return replace(table_of(rows), disturbed=disturbed[1] if disturbed else None)
+        return replace(table_of(dispersed(rows)), disturbed=disturbed[1] if disturbed else None)
 
     def _gauss_markov(self, walk: Hypothesis) -> Iterator[Hypothesis]:
         """Yield the row of biases that move irregularly and return to their mean after any time, from that of a random
@@ -329,8 +343,10 @@ class Hypotheses:
             share = float(np.logaddexp.reduce(logs[driver]) - logs[driver][best]) - math.log(len(logs[driver]))
             formulas = drivers[driver][best].formulas_beside(names_in_model)
             row = self._row(known, self._prior(kind, count * len(drivers), *known) + share, formulas)
-            families = (*self._families(known), drivers[driver][best].family or NONE)
-            yield replace(row, driver=driver, families=tuple(dict.fromkeys(families)))
+            family = drivers[driver][best].family or NONE
+            if family in self._families(known):  # a known effect of the same family makes up for the formula's shape
+                row = replace(row, effects=())
+            yield replace(row, driver=driver, families=tuple(dict.fromkeys([*self._families(row.effects), family])))
 
     def _log_bayes_of_formulas(self, families: Sequence[FormulaFamily]) -> Floats:
         """Return the log Bayes factors of the formulas of one driver by the linear tests."""

@@ -16,6 +16,7 @@ from os import PathLike
 
 import numpy as np
 
+from kf_calib.bench.arrays import one_blas_thread
 from kf_calib.bench.streams import Source
 from kf_calib.diagnosis.candidate_tests import CandidateTests, overlap_matrix
 from kf_calib.diagnosis.hypotheses import Hypotheses, log_odds_of
@@ -45,7 +46,6 @@ from kf_calib.effects import effect_named
 from kf_calib.estimation.outlying_dwell import outlying_in_words
 from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.support.tail_probabilities import chi_squared_tail
-from kf_calib.support.threads import one_blas_thread
 
 _SHOWN = 6  # number of suspects that are shown
 _DOUBT = 0.01  # probability from which noise that was not stated is named as a rival
@@ -296,7 +296,7 @@ def unearned(row: Hypothesis, before: Calibration, walk: str) -> str:
     after = row.refit
     if after is None:
         return ""
-    left = _noise_left(after)
+    left = after.consistency.overdispersion**0.5
     for name in row.effects:
         if name == walk and _walk_sigma(before) < SEEN:
             return f"{name} is below {SEEN:g} sigma"
@@ -315,12 +315,6 @@ def unearned(row: Hypothesis, before: Calibration, walk: str) -> str:
     if oscillating and fails and errors[1] > _AS_IT_WAS * errors[0]:
         return "it goes on within the orientations, and leaves the misfit between them as it was"
     return ""
-
-
-def _noise_left(after: Calibration) -> float:
-    """Return how many times the noise a model leaves; 1 where that is no misfit."""
-    fails, nis_per_dof = after.consistency.consistent is False, after.consistency.nis_per_dof
-    return max(nis_per_dof, 1.0) ** 0.5 if fails and nis_per_dof is not None else 1.0
 
 
 def _is_seen(after: Calibration, name: str, left: float) -> bool:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import Floats, one_blas_thread
 from kf_calib.diagnosis.stepwise_selection import improve
 from kf_calib.dwells.sufficient_statistics import dwells_without
 from kf_calib.errors import UnobservableError
@@ -16,7 +16,6 @@ from kf_calib.estimation.calibration import evaluate
 from kf_calib.estimation.cross_validation import orientations, told_of
 from kf_calib.estimation.results import Calibration
 from kf_calib.noise.noise_model import mean_covariances
-from kf_calib.support.threads import one_blas_thread
 
 
 @dataclass(frozen=True)

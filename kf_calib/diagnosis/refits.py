@@ -8,8 +8,8 @@ from os import PathLike
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats
-from kf_calib.bench.streams import Source
+from kf_calib.bench.arrays import Floats, one_blas_thread
+from kf_calib.bench.streams import Source, Table
 from kf_calib.diagnosis.candidate_tests import CandidateTests, assess_candidates, candidate_frame
 from kf_calib.diagnosis.unknown_effect import FormulaFamily, families
 from kf_calib.effects import Effect, oscillation_of
@@ -23,9 +23,7 @@ from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import Frame
 from kf_calib.noise.noise_model import Noise
 from kf_calib.sources.opening import opened
-from kf_calib.sources.tables.table import Table
 from kf_calib.support import stage
-from kf_calib.support.threads import one_blas_thread
 
 _QUIETER = 0.25  # share of the noise that an oscillation leaves, of that which it was taken for
 

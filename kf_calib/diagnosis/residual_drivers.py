@@ -12,14 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import Floats, one_blas_thread
 from kf_calib.effects.formula import formula, quantities
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.residual_table import mean_sigmas, quantity_means
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import joint_delta_chi2
 from kf_calib.support.tail_probabilities import f_tail
-from kf_calib.support.threads import one_blas_thread
 
 _OF_FORCE = ("{0}*{0}", "{0}**3", "{0}**4")
 _OF_STEP = ("{0}", "{0}*abs({0})", "sign({0})")

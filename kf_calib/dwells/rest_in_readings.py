@@ -27,8 +27,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Source, Stream
-from kf_calib.dwells.blocks import Block, Tally
-from kf_calib.dwells.dwell_events import SECOND_NS, carry_on
+from kf_calib.dwells.blocks import SECOND_NS, Block, Tally, carry_on
 from kf_calib.dwells.segmenter import BLOCK_SAMPLES, Segmenter, dwell_blocks
 from kf_calib.dwells.stationarity import Stillness
 

@@ -22,8 +22,20 @@ import numpy as np
 from kf_calib.bench.arrays import Floats, Mask, Times
 from kf_calib.bench.bench import Bench, interpolate_pose, mean_pose, pose_distance, unwrap_pose
 from kf_calib.bench.streams import Batch, Source, Stream
-from kf_calib.dwells.blocks import LARGEST_C, LARGEST_MPS2, LARGEST_RAD, Block, Curve, Tally, within
-from kf_calib.dwells.dwell_events import SECOND_NS, DwellEvent, OpenDwell, StampOrder, carry_on
+from kf_calib.dwells.blocks import (
+    LARGEST_C,
+    LARGEST_MPS2,
+    LARGEST_RAD,
+    SECOND_NS,
+    Block,
+    Curve,
+    DwellEvent,
+    OpenDwell,
+    StampOrder,
+    Tally,
+    carry_on,
+    within,
+)
 from kf_calib.dwells.stationarity import HISTORY, Stillness, encoder_sigma
 from kf_calib.errors import InputError
 

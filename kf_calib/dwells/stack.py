@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats, Mask
+from kf_calib.bench.arrays import ComputedSequence, Floats, Mask
 from kf_calib.bench.bench import turned
 from kf_calib.dwells.pieces import PieceIndices
 from kf_calib.dwells.rows import parabola
@@ -25,7 +25,6 @@ from kf_calib.dwells.sufficient_statistics import (
     DwellFactor,
     rate_or_zero,
 )
-from kf_calib.support.computed_sequence import ComputedSequence
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -89,7 +89,7 @@ class Stillness:
         An interval is still if it lies in a window in which neither a step nor the difference between the ends exceeds
         the tolerance.
 
-        - known (m,): whether the window that begins with each message is complete.
+        - complete (m,): whether the window that begins with each message is complete.
         - covered_ns: end of the last window that was judged as still before.
         """
         ends = np.minimum(np.searchsorted(times, times + self.window_ns), len(times) - 1)

@@ -26,10 +26,9 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import turn_by
 from kf_calib.dwells.coherent_tone import Trace, tone
 from kf_calib.dwells.line_spectrum import SpectralLine, Spectrum, lines
-from kf_calib.dwells.pieces import Piece
+from kf_calib.dwells.pieces import Piece, WalkPath, walk_path_of
 from kf_calib.dwells.qr import square_triangle
 from kf_calib.dwells.rows import Nodes, parabola
-from kf_calib.dwells.walk_path import WalkPath, walk_path_of
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from functools import cache
 from pathlib import Path
 
 from kf_calib.bench.bench import Bench
-from kf_calib.effects import checks, drift, formula, frame, sensor, surroundings, user
+from kf_calib.effects import checks, drift, formula, frame, sensor, user
 from kf_calib.effects.effect import Bearer, Coefficient, Effect, FrameEffect, SensorEffect, Unknown
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.effects.user import Program
@@ -35,8 +35,8 @@ _PLAIN: dict[str, type[Effect]] = {
         sensor.VibrationRectification, sensor.DeadZone,
         drift.BiasDrift, drift.BiasWalk, drift.ScaleDrift, drift.WarmUp, drift.Settling, drift.Hysteresis,
         drift.Sinusoid,
-        surroundings.ThermalBias, surroundings.ThermalBias2, surroundings.ThermalScale, surroundings.ThermalRate,
-        surroundings.ThermalMisalignment, surroundings.ThermalLag, surroundings.Magnetic,
+        drift.ThermalBias, drift.ThermalBias2, drift.ThermalScale, drift.ThermalRate,
+        drift.ThermalMisalignment, drift.ThermalLag, drift.Magnetic,
         frame.BaseTilt, frame.BaseTiltDrift, frame.PlatformDrift, frame.GravityError,
         frame.EarthRotation, frame.Flexure, frame.UnevenFlexure, frame.CrossTalk, frame.Latency, frame.LeverArm,
     )

@@ -17,7 +17,7 @@ from typing import Literal, overload
 import numpy as np
 
 from kf_calib.bench import paper_parameters
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import Floats, one_blas_thread
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.bench.streams import Source
@@ -34,12 +34,12 @@ from kf_calib.estimation.estimate import Estimate, estimate_of, estimates
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.free_attitude import holding_frame
 from kf_calib.estimation.iterated_fit import fit
+from kf_calib.estimation.kalman_filterpy import Samples, samples_of
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.observability import visibility_of
 from kf_calib.estimation.outlying_dwell import outlying_dwells, outlying_in_words
 from kf_calib.estimation.remarks import misfit_remark, remarks_on
 from kf_calib.estimation.results import Calibration, Consistency, OutlyingDwell, Visit, consistency
-from kf_calib.estimation.samples import Samples, samples_of
 from kf_calib.estimation.settings import Settings
 from kf_calib.noise.noise_model import considered_information, mean_covariances
 from kf_calib.noise.random_walk import predict, to_mean
@@ -47,7 +47,6 @@ from kf_calib.noise.reml import FEWEST, degrees_of_freedom
 from kf_calib.sources.opening import opened
 from kf_calib.support import stage
 from kf_calib.support.tail_probabilities import LEVEL
-from kf_calib.support.threads import one_blas_thread
 
 
 def calibrate(

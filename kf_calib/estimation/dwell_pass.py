@@ -16,10 +16,10 @@ import numpy as np
 from kf_calib.bench.arrays import lengths
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.raw_input import LEVELS, wrong_unit
-from kf_calib.bench.streams import Source
-from kf_calib.dwells import tabulated, window_average
+from kf_calib.bench.streams import Source, Table
+from kf_calib.dwells import window_average
 from kf_calib.dwells.blocks import LARGEST_RAD, Block, Tally
-from kf_calib.dwells.folding import Folder
+from kf_calib.dwells.folding import Folder, dwells_of_table, rows_of_table
 from kf_calib.dwells.line_spectrum import SpectralLine
 from kf_calib.dwells.rest_in_readings import segmenter_of
 from kf_calib.dwells.rows import Rows, model_rows
@@ -35,7 +35,6 @@ from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.results import consistency
 from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.signal_quality import ReadingsMonitor
-from kf_calib.sources.tables.table import Table
 from kf_calib.support import stage
 
 LEAST_READINGS = 8
@@ -72,7 +71,7 @@ class Pass:
     def rows(self) -> Iterator[Rows]:
         """Rows of all blocks of the source; of a table, with every reading at its mean."""
         if isinstance(self.source, Table):
-            return tabulated.rows_of(self.source.orientations, self.source.bench)
+            return rows_of_table(self.source.orientations, self.source.bench)
         return self.rows_of(dwell_blocks(self.source, self.segmenter()))
 
     def rows_of(self, blocks: Iterable[Block]) -> Iterator[Rows]:
@@ -101,7 +100,7 @@ class Pass:
         """Take the dwells of a table as they are; raises InputError if the model needs more than their means."""
         if self.folder.carrier_hz or self.settings.window_s:
             table.refuse(" and ".join(map(str, self.model.effects)) or "an average over windows")
-        self.tabulated = tabulated.dwells_of(table.orientations, table.bench)
+        self.tabulated = dwells_of_table(table.orientations, table.bench)
         read = int(table.orientations.counts.sum())
         self.tally.read, self.tally.used, self.tally.poses = read, read, len(table.orientations)
 

@@ -22,19 +22,18 @@ from typing import TypeVar
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.bench.streams import Source
+from kf_calib.bench.streams import Source, Table
 from kf_calib.dwells.qr import triangle
 from kf_calib.estimation.calibration import calibrate, filterpy_estimate
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.estimate import Estimate
 from kf_calib.estimation.free_attitude import holding_frame
+from kf_calib.estimation.kalman_filterpy import Samples, samples_of
 from kf_calib.estimation.results import Calibration
-from kf_calib.estimation.samples import Samples, samples_of
 from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.square_root_information import scale_columns
 from kf_calib.noise.allan import AllanDeviation, LongestDwells
 from kf_calib.sources.opening import opened
-from kf_calib.sources.tables.table import Table
 from kf_calib.support import stage
 
 Result = TypeVar("Result")

@@ -25,8 +25,8 @@ from kf_calib.dwells.pieces import OfPieces
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation.attitude import added_by, bent_effects, matrix_of
 from kf_calib.estimation.dwell_columns import LinearisedDwells, stimulus_of
+from kf_calib.estimation.kalman_filterpy import Samples, all_nuisance_sigmas
 from kf_calib.estimation.measurement_model import FRAME, SQUARE
-from kf_calib.estimation.samples import Samples, all_nuisance_sigmas
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise
 

@@ -40,10 +40,10 @@ from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.score_test import delta_chi2
 from kf_calib.noise.noise_model import ATTITUDE_UNKNOWN_RAD, FLOOR_MPS2, Noise, within_dwells
+from kf_calib.noise.noise_of_readings import with_own_noise
 from kf_calib.noise.nuisance_states import along_force, flicker_within, sensitivities_of
 from kf_calib.noise.reml import VarianceComponents, with_shared_noise
 from kf_calib.noise.temperature_course import sensitivity_to_temperature
-from kf_calib.noise.unequal_noise import with_own_noise
 
 _PASSES = 3
 _PASSES_WITH_UNKNOWNS = 10

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import Floats, one_blas_thread
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.effects import Coefficient, Effect, effect_named, names
 from kf_calib.estimation.candidate_scan import Candidate, Scan
@@ -21,7 +21,6 @@ from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.score_test import scan
 from kf_calib.support.tail_probabilities import LEVEL
-from kf_calib.support.threads import one_blas_thread
 from kf_calib.support.units import shown
 
 POWER = 0.9

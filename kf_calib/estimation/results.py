@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from kf_calib.bench import paper_parameters
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import Floats, one_blas_thread
 from kf_calib.bench.bench import Bench
 from kf_calib.dwells.blocks import Tally
 from kf_calib.dwells.sufficient_statistics import DwellFactor
@@ -30,7 +30,6 @@ from kf_calib.noise.means import means_of
 from kf_calib.noise.noise_model import ATTITUDE_UNKNOWN_RAD, Noise, considered_information, steps
 from kf_calib.support.tail_probabilities import LEVEL, f_tail
 from kf_calib.support.text import as_html, printed
-from kf_calib.support.threads import one_blas_thread
 from kf_calib.support.units import field_unit, shown
 
 _WEAK = 5.0  # times the size that a coefficient may well have
@@ -82,6 +81,12 @@ class Consistency:
     def nis_per_dof(self) -> float | None:
         """The statistic divided by its degrees of freedom; None if there are none."""
         return self.statistic / self.dof if self.dof > 0 else None
+
+    @property
+    def overdispersion(self) -> float:
+        """NIS per degree of freedom where it is significantly more than 1, else 1."""
+        per_dof = self.nis_per_dof
+        return max(per_dof, 1.0) if self.consistent is False and per_dof is not None else 1.0
 
 
 @dataclass(frozen=True)

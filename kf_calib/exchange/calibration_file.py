@@ -58,9 +58,8 @@ from kf_calib.exchange.calibration_parts import (
 from kf_calib.sources.files.contents import CALIBRATION_FORMAT
 from kf_calib.sources.files.record_files import fingerprint
 from kf_calib.sources.opening import opened, run_date
-from kf_calib.support import dates
 from kf_calib.support.output_files import write_whole
-from kf_calib.support.text import cut, sentence
+from kf_calib.support.text import cut, format_date, sentence
 
 VERSION = 1
 _LARGEST_BYTES = 20_000_000
@@ -260,7 +259,7 @@ def _conditions(result: Calibration, began: datetime | None) -> SavedConditions:
     warmth = np.concatenate([dwell.nodes.temperature_c for dwell in dwells])
     known = bool(np.isfinite(warmth).any())
     return SavedConditions(
-        began=None if began is None else dates.format_date(began),
+        began=None if began is None else format_date(began),
         duration_s=dwells[-1].end_s,
         temperature_min_c=float(np.nanmin(warmth)) if known else None,
         temperature_mean_c=float(np.nanmean(warmth)) if known else None,

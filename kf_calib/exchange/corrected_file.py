@@ -32,7 +32,7 @@ from kf_calib.sources.tables.grid import Grid, delimiter_of, grid_of
 from kf_calib.sources.tables.numbers import Numbers
 from kf_calib.sources.tables.opening import Opening
 from kf_calib.sources.tables.spreadsheet import sheets_of, workbook_of
-from kf_calib.sources.units import Units
+from kf_calib.sources.tables.words import Units
 from kf_calib.support.output_files import whole, write_whole
 
 FRAME_ID = "block"

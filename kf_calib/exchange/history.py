@@ -33,8 +33,8 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.raw_input import RawInput
 from kf_calib.errors import InputError
 from kf_calib.exchange.calibration_file import SavedCalibration
-from kf_calib.support import dates
 from kf_calib.support.tail_probabilities import chi_squared_tail
+from kf_calib.support.text import parse_date
 
 DAY_S = 86400.0
 FEWEST = 2
@@ -145,7 +145,7 @@ def date_of(saved: SavedCalibration) -> datetime:
     """When the run of a calibration began, or, where its file does not say that, when it was computed."""
     text = saved.conditions.began or saved.provenance.created
     try:
-        return dates.parse_date(text)
+        return parse_date(text)
     except ValueError:
         raise InputError(f"{text!r} is no date: a calibration needs one (ISO 8601).") from None
 

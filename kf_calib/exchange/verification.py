@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import Floats, one_blas_thread
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Source
 from kf_calib.effects import Effect
@@ -40,7 +40,6 @@ from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise, mean_covariances
 from kf_calib.sources.files.record_files import fingerprint
 from kf_calib.support.tail_probabilities import chi_squared_tail, sidak
-from kf_calib.support.threads import one_blas_thread
 
 MOVED_LEVEL = 0.01
 """A calibration that still holds is said not to in one verification of a hundred: half of them by the misfit as a

@@ -33,6 +33,7 @@ from distributed import Client, Future, KilledWorker, LocalCluster, Worker, Work
 from fsspec.core import url_to_fs
 from fsspec.implementations.local import LocalFileSystem
 
+from kf_calib.bench.arrays import one_blas_thread
 from kf_calib.bench.streams import Source
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.errors import InputError, KfCalibError
@@ -43,7 +44,6 @@ from kf_calib.fleet.run_list import ListedRun, Row
 from kf_calib.fleet.store import Known, Store
 from kf_calib.sources.files.record_files import fingerprint
 from kf_calib.sources.opening import run_date
-from kf_calib.support.threads import one_blas_thread
 
 _AHEAD = 4
 """Runs under way for each process, so that none waits for its next one; what is under way bounds the memory."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import Floats, one_blas_thread
 from kf_calib.diagnosis.missing_effect import SEEN
 from kf_calib.effects import described
 from kf_calib.errors import InputError
@@ -18,7 +18,6 @@ from kf_calib.fleet.own_coefficients import UnitsAndCommon, population
 from kf_calib.fleet.pooled_terms import Attribution, BenchEstimate, DatedSums, PooledTerms, Term
 from kf_calib.fleet.run_factor import ReferenceUnit
 from kf_calib.fleet.shape import SomeUnits
-from kf_calib.support.threads import one_blas_thread
 
 RIVAL = 0.01
 """Probability above which another effect is named as a rival."""

@@ -18,13 +18,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.dwells import walk_path, window_average
-from kf_calib.dwells.pieces import OfPieces
+from kf_calib.dwells import window_average
+from kf_calib.dwells.pieces import OfPieces, lagged_walk_products
 from kf_calib.dwells.stack import DwellStack, Folded
 from kf_calib.dwells.sufficient_statistics import Autocovariance, DwellFactor
 from kf_calib.noise import random_walk
-from kf_calib.noise.autoregression import expected_products, unbiased
 from kf_calib.noise.means import Means
+from kf_calib.noise.noise_of_readings import expected_products, unbiased
 from kf_calib.noise.temperature_course import thermometer_errors
 
 FLOOR_MPS2 = 1e-9
@@ -204,7 +204,7 @@ def _walk_products(dwells: Sequence[DwellFactor]) -> Floats:
     for dwell in dwells:
         known, period_s = dwell.autocovariance, (dwell.end_s - dwell.start_s) / max(dwell.count - 1, 1)
         if known.blocks:
-            products += dwell.weight * walk_path.lagged_products(
+            products += dwell.weight * lagged_walk_products(
                 period_s, max(round(known.count / known.blocks), 1), known.pairs
             )
     return products[:, None]

@@ -1,7 +1,7 @@
 """A random walk of the biases as process noise of the filter (Bierman, 1977) and in the means of dwells.
 
 The filter's bias is the one at the end of a dwell. The rows of a dwell therefore begin with columns for the step that
-the biases take within it (``dwells.walk_path``).
+the biases take within it (``dwells.pieces``).
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from kf_calib.bench import paper_parameters
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import Floats, one_blas_thread
 from kf_calib.bench.streams import Batch, Source
 from kf_calib.dwells.blocks import Tally
 from kf_calib.dwells.folding import Folder
@@ -30,7 +30,6 @@ from kf_calib.errors import InputError, KfCalibError
 from kf_calib.estimation.dwell_pass import LEAST_READINGS, Pass
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Settings
-from kf_calib.support.threads import one_blas_thread
 
 _FIRST_LOOK_S = 1.0
 

@@ -15,25 +15,41 @@ A script that drives a bench of its own has no source to be read, and asks where
         for batch in readings(suggestion.stay_s):      # readings and angles, those of the slew too
             session.ingest(batch)
     final = session.finish()
+
+A calibration by hand needs readings alone, and gives a ``HandJudgement`` after every pose:
+
+    session = HandSession(source, settings, wanted)   # of a source without angles
+    session.listeners.append(print)
+    session.standing.task                             # what to do now, at any moment and from any thread
+    final = session.run()                             # the same as replay gives
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.arrays import Floats, one_blas_thread
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Source
+from kf_calib.design.sides import Sides, turn_in_words
+from kf_calib.diagnosis.candidate_tests import LEVEL
+from kf_calib.dwells.rest_in_readings import RestSegmenter
 from kf_calib.dwells.sufficient_statistics import DwellFactor
-from kf_calib.errors import InputError
-from kf_calib.estimation.dwell_pass import Pass
+from kf_calib.errors import InputError, UnobservableError
+from kf_calib.estimation.calibration import conclude, evaluate_fit, with_remarks
+from kf_calib.estimation.dwell_pass import LEAST_READINGS, Pass, refuse_unusable
+from kf_calib.estimation.iterated_fit import fit
 from kf_calib.estimation.measurement_model import Model
+from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
-from kf_calib.online.evaluation import Evaluation
+from kf_calib.online.evaluation import Evaluation, Progress
 from kf_calib.online.status import Current, Judgement, Standing, current, judge_so_far, judge_whole_run
 from kf_calib.online.suggestion import Itinerary, Suggestion, Visited, suggest
-from kf_calib.support.threads import one_blas_thread
 
 
 @dataclass(frozen=True)
@@ -130,3 +146,186 @@ class Session(Evaluation[Judgement, Standing]):
             self.accept(*diagnosis.missing)
         except InputError as error:
             self.say(str(error))
+
+
+ENOUGH_S = 4.0
+"""Time at rest, beside that of settling, that a pose is to be held."""
+
+
+@dataclass(frozen=True)
+class HandJudgement:
+    """What is known of a calibration by hand after a pose.
+
+    result: the calibration; None while the poses do not determine it. dwells: the poses so far. sides: their sides, and
+    the one to turn up next. wanted (12,): target of each sigma, SI; NaN where there is none. looks: how often the sizes
+    of f have been tested. final: whether the run has ended.
+    """
+
+    result: Calibration | None
+    dwells: Sequence[DwellFactor]
+    sides: Sides
+    wanted: Floats
+    looks: int = 0
+    final: bool = False
+
+    @property
+    def sigma(self) -> Floats:
+        """One sigma (12,), SI; NaN where a parameter is not determined or is fixed by the frame."""
+        if self.result is None:
+            return np.full(12, np.nan)
+        fixed = [symbol in self.result.fixed for symbol in paper_parameters.SYMBOLS]
+        return np.where(fixed, np.nan, self.result.estimate.sigma)
+
+    @property
+    def reached(self) -> bool:
+        """Whether there are targets of parameters that are left without angles, and every one is reached."""
+        aimed = np.isfinite(self.wanted) & ~np.isin(paper_parameters.SYMBOLS, ("theta1", "phi1", "nu2"))
+        return bool(aimed.any() and (self.sigma <= self.wanted)[aimed].all())
+
+    @property
+    def consistent(self) -> bool | None:
+        """Whether the sizes of f agree; None while there is nothing to judge by.
+
+        Of all tests of a run together the probability of a false alarm is that of one: the k-th has 1 / (k (k + 1)) of
+        it.
+        """
+        if self.final and self.result is not None:
+            return self.result.consistency.consistent
+        if self.result is None or self.result.consistency.p_value is None or self.result.model.square:
+            return None
+        return self.result.consistency.p_value >= LEVEL / (self.looks * (self.looks + 1))
+
+    @property
+    def verdict(self) -> str:
+        """What the poses tell, in a few words."""
+        if self.result is None:
+            return f"{', '.join(self.sides.missing)} not determined yet"
+        if self.result.model.square:
+            return "the angles between the axes are not told yet: they are taken for square"
+        if self.consistent is None:
+            return "too few poses to test them by each other"
+        if self.consistent:
+            return "the sizes of gravity agree"
+        return "the sizes of gravity differ by more than noise: was it held still?"
+
+
+@dataclass(frozen=True)
+class Held:
+    """The pose that it is held in: number of the dwell, readings used so far, and the axes that point up."""
+
+    number: int
+    readings: int
+    up: str
+
+
+@dataclass(frozen=True)
+class HandStanding(Progress):
+    """What is known of a calibration by hand at a moment; see ``Progress``.
+
+    current: the pose that it is held in. judgement: the latest judgement. sides: those of the poses so far, with that
+    of the pose it is held in. rest_s: for how long it has rested by now, with the time of settling; 0 while it moves.
+    enough_s: for how long it is to rest.
+    """
+
+    current: Held | None = None
+    judgement: HandJudgement | None = None
+    sides: Sides | None = None
+    rest_s: float = 0.0
+    enough_s: float = ENOUGH_S
+
+    @property
+    def task(self) -> str:
+        """What to do now."""
+        if self.sides is None:
+            return f"hold still for {self.enough_s:g} s" if self.rest_s else "lay it on any side and hold it still"
+        turn = f"turn it to a new side: {turn_in_words(self.sides.following)}"
+        if self.rest_s >= self.enough_s:
+            return self._over(f"enough: {turn}")
+        if not self.rest_s:
+            return self._over(f"{turn}; then hold it still")
+        if self.current is not None and self.sides.repeats is not None:
+            return f"on this side it was in pose {self.sides.repeats}, which tells little more: {turn}"
+        return f"hold still for {self.enough_s:g} s"
+
+    def _over(self, otherwise: str) -> str:
+        """Return that the run may end, where every target is reached, or else what to do."""
+        done = self.judgement is not None and self.judgement.reached
+        return "every target is reached: end the run, or go on with more sides" if done else otherwise
+
+
+def judge_poses(passed: Pass, wanted: Floats, before: HandJudgement | None = None) -> HandJudgement:
+    """The judgement of the poses so far; before: that of fewer poses.
+
+    Raises InputError where the readings cannot be used as they are.
+    """
+    dwells, model, settings = passed.dwells, passed.model, passed.settings
+    with one_blas_thread():
+        refuse_unusable(dwells, passed.tally, passed.source.bench)
+        try:
+            result = with_remarks(evaluate_fit(fit(dwells, model, settings.walk_mps2_per_sqrt_s), settings), passed)
+        except UnobservableError:
+            result = None
+        sides = Sides.of(dwells, passed.source.bench, None if result is None else result.fit)
+    tested = result is not None and result.consistency.p_value is not None and not result.model.square
+    return HandJudgement(result, dwells, sides, wanted, (before.looks if before else 0) + tested)
+
+
+def judge_all_poses(passed: Pass, wanted: Floats, looks: int, again: Source | None) -> HandJudgement:
+    """The final judgement: what ``replay`` of the recording gives. Raises KfCalibError as that does."""
+    with one_blas_thread():
+        result = conclude(passed, again)
+        sides = Sides.of(passed.dwells, passed.source.bench, result.fit)
+    return HandJudgement(result, passed.dwells, sides, wanted, looks, final=True)
+
+
+class HandSession(Evaluation[HandJudgement, HandStanding]):
+    """The evaluation of a sensor in the hand; see ``Evaluation``. Raises InputError for a model that needs angles."""
+
+    def __init__(
+        self,
+        source: Source,
+        settings: Settings | None = None,
+        wanted: Mapping[str, float] | None = None,
+        *,
+        every: bool = True,
+        again: Callable[[], Source | None] | None = None,
+    ) -> None:
+        settings = settings or Settings()
+        standing = HandStanding(enough_s=ENOUGH_S + settings.stillness.settle_s)
+        super().__init__(source, settings, wanted, standing, every=every, again=again)
+
+    def _refuse(self, model: Model, begun: bool = False) -> None:
+        """Raise InputError for effects and a random walk of the biases, which need angles."""
+        if model.effects or self.settings.walk_mps2_per_sqrt_s:
+            raise InputError(
+                "a live run without angles has scale factors, biases and the angles between the axes only: leave out "
+                "effects (--with, --model) and --bias-walk."
+            )
+
+    def _progress(self) -> Mapping[str, object]:
+        assert isinstance(self._segmenter, RestSegmenter)
+        return {"rest_s": self._segmenter.rest_s}
+
+    def _judged(self, passed: Pass, before: HandJudgement | None) -> HandJudgement:
+        return judge_poses(passed, self.wanted, before)
+
+    def _judged_whole(self, passed: Pass, before: HandJudgement | None, again: Source | None) -> HandJudgement:
+        return judge_all_poses(passed, self.wanted, before.looks if before else 0, again)
+
+    def _judged_next(self, judgement: HandJudgement) -> None:
+        self._show_sides(judgement.sides)
+
+    def _seen(self, dwell: DwellFactor) -> Held:
+        closed = [each for each in self._passed.folder.dwells[: self._closed] if each.count >= LEAST_READINGS]
+        judgement = self.standing.judgement
+        fitted = None if judgement is None or judgement.result is None else judgement.result.fit
+        sides = Sides.of([*closed, dwell], self.source.bench, fitted)
+        self._show_sides(sides)
+        return Held(dwell.number, dwell.count, sides.last)
+
+    def _show_sides(self, sides: Sides) -> None:
+        """Show the sides of these poses, unless those of more poses are shown: a judgement takes its time."""
+        with self._lock:
+            shown = self.standing.sides
+            if shown is None or len(shown.numbers) <= len(sides.numbers):
+                self._publish(sides=sides)

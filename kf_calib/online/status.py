@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from kf_calib.bench import paper_parameters
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import Floats, one_blas_thread
 from kf_calib.bench.streams import Source
 from kf_calib.design.gimbal_limits import wrap
 from kf_calib.design.next_orientation import Advice, Course, course
@@ -32,7 +32,6 @@ from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.noise.noise_model import mean_covariances
 from kf_calib.online.evaluation import Progress
 from kf_calib.online.sequential_test import Watch
-from kf_calib.support.threads import one_blas_thread
 
 _DETERMINES = 1e-3  # share of its sigma to which a parameter comes down that was not determined at all
 _RISEN = 1.5  # times a sigma that the next dwell may take it up by before that is told

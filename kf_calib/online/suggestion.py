@@ -21,9 +21,8 @@ import numpy as np
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
-from kf_calib.design.gimbal_limits import Reach, can_be_reached, wrap
+from kf_calib.design.gimbal_limits import PEAK_OVER_MEAN, Reach, Timing, can_be_reached, order, wrap
 from kf_calib.design.next_orientation import Outlook, Pace, poses_within
-from kf_calib.design.visit_order import PEAK_OVER_MEAN, Timing, order
 from kf_calib.errors import InputError
 from kf_calib.estimation.cross_validation import SAME_POSE_DEG
 from kf_calib.online.status import Judgement

@@ -20,7 +20,7 @@ from kf_calib.sources.files.mcap_file import HEAD_BYTES, is_lines
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.tables.grid import OLD_SUFFIXES, TEXT_SUFFIXES, ZIP
 from kf_calib.sources.tables.opening import open_table
-from kf_calib.support import dates
+from kf_calib.support.text import date_of_stamp, parse_date
 
 _OF_CALIBRATION = 200  # first bytes of a calibration, which name its format
 _FEWEST_SAMPLES = 50
@@ -113,6 +113,6 @@ def run_date(source: Source) -> datetime | None:
     """
     stated = source.bench.notes.get("date")
     if stated is not None:
-        return dates.parse_date(stated)
+        return parse_date(stated)
     begin_ns = getattr(source, "begin_ns", None)
-    return dates.of_stamp(begin_ns() if begin_ns else None) or getattr(source, "received", None)
+    return date_of_stamp(begin_ns() if begin_ns else None) or getattr(source, "received", None)

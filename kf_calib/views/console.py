@@ -25,7 +25,7 @@ from kf_calib.support.units import rounded, shown, shown_whole
 from kf_calib.views.terminal import ConsoleTable, PlainConsole, note
 
 if TYPE_CHECKING:
-    from kf_calib.diagnosis.side_by_side import Difference, SideBySide
+    from kf_calib.diagnosis.results import Difference, SideBySide
 
 _NOT_ESTIMATED, _NOT_USED = "not estimated", "not used"
 _GREEK = {"theta": "θ", "phi": "φ", "nu": "ν"}

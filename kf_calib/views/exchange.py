@@ -25,8 +25,7 @@ from kf_calib.views.json import clean
 from kf_calib.views.terminal import ConsoleTable, note
 
 if TYPE_CHECKING:
-    from kf_calib.exchange.certificate.budget import Contribution
-    from kf_calib.exchange.certificate.content import Certificate, CertifiedResult
+    from kf_calib.exchange.certificate.budget import Certificate, CertifiedResult, Contribution
 
 _SHOWN = 12
 
@@ -308,7 +307,7 @@ def _line_object(line: Contribution) -> dict[str, Any]:
 
 def certificate_report(certificate: Certificate, standing: str, pdf: Path, xml: Path | None) -> RenderableType:
     """The report of ``certificate``."""
-    from kf_calib.exchange.certificate.content import OUTCOMES  # loaded already by what makes certificates
+    from kf_calib.exchange.certificate.budget import OUTCOMES  # loaded already by what makes certificates
 
     with_conformity = any(result.conformity for result in certificate.results)
     table = ConsoleTable(title="Uncertainty (type A and type B: standard; U = k u)", title_justify="left")

@@ -12,7 +12,7 @@ from kf_calib.estimation.results import Calibration, OutlyingDwell
 from kf_calib.estimation.signal_quality import Readings
 
 if TYPE_CHECKING:
-    from kf_calib.diagnosis.side_by_side import SideBySide
+    from kf_calib.diagnosis.results import SideBySide
     from kf_calib.estimation.engine_comparison import Comparison
 
 

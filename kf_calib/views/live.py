@@ -17,8 +17,8 @@ from rich.text import Text
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.design.sides import turn_in_words
-from kf_calib.online.by_hand import HandJudgement, HandStanding
 from kf_calib.online.evaluation import Progress
+from kf_calib.online.session import HandJudgement, HandStanding
 from kf_calib.online.status import Judgement, Standing
 from kf_calib.support.text import sentence
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2, shown, span

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from helpers.hidden_effects import BENCH, run, source
+from helpers.known_runs import diagnosed
 from helpers.long_runs import slow
 from helpers.paths import SHARED
 from helpers.synthetic import Run, plan_of
@@ -32,10 +32,9 @@ from kf_calib.sources.simulation.visit_plans import six_faces
 HAND = SHARED / "ferraris_hand.mcap"
 
 
-@cache
-def unlisted(name: str) -> Diagnosis:
+def unlisted() -> Diagnosis:
     """Of an effect that is in no catalogue."""
-    return diagnose(source(f"{name}=20sigma", plan=plan_of(24, dwell_s=8.0, seed=5)))
+    return diagnosed("encoder-harmonic-3:z=20sigma")
 
 
 @pytest.mark.parametrize(
@@ -69,9 +68,9 @@ def test_a_suspect_has_the_coefficients_of_its_effect_alone() -> None:
 
 
 @pytest.mark.parametrize("case", [{}, {"phi": 0.9, "count": 500}, {"setting_deg": 0.01}])
-@pytest.mark.parametrize("runs", [4, *slow(15)])
+@pytest.mark.parametrize("runs", [2, *slow(15)])
 def test_nothing_is_found_in_noise(case: dict, runs: int) -> None:
-    """Of 15 runs at a level of 1 %, two or more alarms have a chance of 1 %; of 4, one has 4 %."""
+    """Of 15 runs at a level of 1 %, two or more alarms have a chance of 1 %; of 2, one has 2 %."""
     tests = [
         assess_candidates(calibrate(Run(seed=4000 + k, **{"dwells": 24, "count": 200, **case})).fit)
         for k in range(runs)
@@ -81,12 +80,13 @@ def test_nothing_is_found_in_noise(case: dict, runs: int) -> None:
 
 
 @pytest.mark.parametrize(
-    "name, driver", [("encoder-harmonic-3:z", "angle"), *slow(("triple-product", "specific force"))]
+    "name, dwells, driver", [("encoder-harmonic-3:z", 16, "angle"), *slow(("triple-product", 24, "specific force"))]
 )
-def test_what_is_in_no_catalogue_is_unknown(name: str, driver: str) -> None:
+def test_what_is_in_no_catalogue_is_unknown(name: str, dwells: int, driver: str) -> None:
     from kf_calib.views.diagnosis import diagnosis_object
 
-    found = unlisted(name)
+    plan = plan_of(dwells, dwell_s=8.0, seed=5)
+    found = unlisted() if dwells == 16 else diagnose(source(f"{name}=20sigma", plan=plan))
     assert found.unknown and not found.missing
     shape = found.description
     assert shape is not None and driver in shape.driver
@@ -98,7 +98,7 @@ def test_what_is_in_no_catalogue_is_unknown(name: str, driver: str) -> None:
 def test_a_formula_is_told_where_no_known_effect_explains_it() -> None:
     from kf_calib.views.diagnosis import diagnosis_object
 
-    said = diagnosis_object(unlisted("encoder-harmonic-3:z"))
+    said = diagnosis_object(unlisted())
     first = said["hypotheses"][0]
     assert said["missing"] == "unknown" and not first["effects"] and "sin(3*q" in first["formula"]
     assert said["unknown"]["formula"] == first["formula"] and said["unknown"]["driver"] == first["driver"]
@@ -110,7 +110,7 @@ def test_views_work_nothing_out(monkeypatch: pytest.MonkeyPatch) -> None:
     from kf_calib.views.console import plain
     from kf_calib.views.diagnosis import diagnosis_object, diagnosis_report
 
-    found = unlisted("encoder-harmonic-3:z")
+    found = unlisted()
     shown, printed = diagnosis_object(found), plain(diagnosis_report(found, details=True))
     assert shown["unknown"] and shown["detectable"] and "To try:" in printed
     for name in ("describe", "detectable", "advise", "mean_covariances"):
@@ -120,7 +120,7 @@ def test_views_work_nothing_out(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_formula_that_explains_more_than_a_known_effect_speaks_against_it() -> None:
     """A fifth power looks like a third power to 0.96: named third-order, it would be a wrong name."""
-    found = unlisted("fifth-order")
+    found = diagnose(source("fifth-order=20sigma", plan=plan_of(24, dwell_s=8.0, seed=5)), replicate=False)
     shape = found.description
     assert found.unknown and shape is not None and shape.formula == "mine = a**5"
 
@@ -141,15 +141,16 @@ def test_six_faces_say_what_they_cannot_see_and_where_to_go() -> None:
 
 def test_scores_are_falls_of_chi_squared() -> None:
     """The score test against the refit it predicts."""
-    before = run("second-order=6sigma")
+    diagnosis = diagnosed("second-order=6sigma")
+    before = diagnosis.before
     found = scan(before.linearised, before.noise.for_goodness_of_fit, [effect_named("second-order", BENCH)])
-    after = diagnose(before).suspects[0].refit
+    after = diagnosis.suspects[0].refit
     assert found.statistics[0] == pytest.approx(before.consistency.statistic - after.consistency.statistic, rel=0.02)
     np.testing.assert_allclose(found.coefficients(found.candidates[0]), after.estimate.effects, rtol=1e-3)
     np.testing.assert_allclose(found.candidates[0].sigma, after.estimate.effect_sigma, rtol=1e-3)
 
 
-@pytest.mark.parametrize("runs", [5, *slow(20)])
+@pytest.mark.parametrize("runs", [3, *slow(20)])
 def test_smallest_sizes_are_met(runs: int) -> None:
     """Power at the stated size, one coefficient hidden: about 0.9 of the runs."""
     sizes = {each.name: each.minimum for each in detectable(assess_candidates(run().fit))}
@@ -175,6 +176,7 @@ def test_command_line(tmp_path: Path) -> None:
     assert cured["consistent"] and cured["missing"] is None
 
 
+@pytest.mark.slow  # six faces, of which it has the plan, above
 @pytest.mark.skipif(not HAND.exists(), reason=f"{HAND} is not here")
 def test_a_hand_placed_run_claims_nothing() -> None:
     from kf_calib.sources.files.recording import Recording

@@ -44,8 +44,8 @@ def test_an_effect_of_ten_sigma_is_named_or_among_its_equals(name: str) -> None:
 @pytest.mark.parametrize(
     "name, size",
     [
-        ("cross-coupling-ip", 150),
-        *slow(("cross-coupling-po", 150), ("cross-axis-square", 150), ("thermal-scale", 40), ("thermal-scale", 150),
+        ("cross-coupling-po", 150),
+        *slow(("cross-coupling-ip", 150), ("cross-axis-square", 150), ("thermal-scale", 40), ("thermal-scale", 150),
               ("second-order", 150), ("hysteresis", 150), ("thermal-misalignment", 150)),
     ],
 )  # fmt: skip

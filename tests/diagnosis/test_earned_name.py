@@ -14,6 +14,7 @@ import kf_calib
 from kf_calib.diagnosis.hypothesis_table import IRREGULAR, NONE, NOTHING, Hypothesis, table_of
 from kf_calib.diagnosis.missing_effect import SEEN, behind_nothing, diagnose, unearned
 from kf_calib.effects import walk_named
+from kf_calib.estimation.results import Consistency
 from kf_calib.views.diagnosis import found_object
 
 
@@ -38,7 +39,7 @@ def _result(ratio: float | None, held_out: float | None, walk_gain: float = 0.0,
         fit=SimpleNamespace(walk_gain=walk_gain),
         parameters={"k1": SimpleNamespace(value=0.1, sigma=1.0), "k2": second},
         held_out_rms_mps2=held_out,
-        consistency=SimpleNamespace(consistent=False, nis_per_dof=1.0),
+        consistency=Consistency(100.0, 100, 1e-6, False),
     )
 
 
@@ -71,7 +72,7 @@ def test_what_a_name_is_earned_by(ratio: float | None, errors: tuple[float | Non
 def test_a_coefficient_is_measured_by_what_it_leaves(ratio: float, nis_per_dof: float, said: str) -> None:
     row = Hypothesis(("bent",), refit=_result(ratio, 0.9))
     assert row.refit is not None
-    row.refit.consistency.nis_per_dof = nis_per_dof
+    row.refit.consistency = Consistency(100.0 * nis_per_dof, 100, 1e-6, False)
     assert unearned(row, _result(None, 1.0), "bias-walk") == said
 
 
@@ -80,7 +81,8 @@ def test_an_oscillation_explains_a_misfit_of_the_means_or_is_not_named(
     held_out: float, consistent: bool, earned: bool
 ) -> None:
     after = _result(5.0, held_out)
-    after.model.effects, after.consistency.consistent = [_Effect(oscillates=True)], consistent
+    after.model.effects = [_Effect(oscillates=True)]
+    after.consistency = Consistency(100.0, 100, 1e-6, consistent)
     assert (unearned(Hypothesis(("bent",), refit=after), _result(None, 1.0), "bias-walk") == "") == earned
 
 

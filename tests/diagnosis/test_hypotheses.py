@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,14 +15,14 @@ from helpers.known_runs import diagnosed
 from helpers.long_runs import slow
 from helpers.synthetic import plan_of
 
-from kf_calib.diagnosis.hypotheses import Hypotheses, log_odds_of
+from kf_calib.diagnosis.hypotheses import Hypotheses, dispersed, log_odds_of
 from kf_calib.diagnosis.hypothesis_table import ALIKE, IRREGULAR, NOISE, NONE, NOTHING, Hypothesis, table_of
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.effects import effect_named, names
 from kf_calib.errors import UnobservableError
-from kf_calib.estimation.results import Calibration
+from kf_calib.estimation.results import Calibration, Consistency
 from kf_calib.views.diagnosis import diagnosis_object
 
 FAMILIES = {
@@ -35,6 +38,28 @@ def rows() -> list[Hypothesis]:
         Hypothesis(effects, families=("memory",) if effects else (NOTHING,), log_evidence=float(np.log(share)) - 900.0)
         for effects, share in shares
     ]
+
+
+@pytest.mark.parametrize(
+    ("per_dof", "fits", "divided_by"), [(4.0, False, 4.0), (1.3, True, 1.0), (0.5, False, 1.0), (1.3, None, 1.0)]
+)
+def test_a_misfit_beside_a_formula_weakens_the_evidence(per_dof: float, fits: bool | None, divided_by: float) -> None:
+    """Log-likelihoods over the noise variance are those over one that is as large as what is left."""
+    refit: Any = SimpleNamespace(consistency=Consistency(50.0 * per_dof, 50, None if fits is None else 0.5, fits))
+    logs = {"a": -310.0, "b": -300.0, "c": -340.0}
+    rows = [Hypothesis((name,), ("mine = t",), "time", log_evidence=log, refit=refit) for name, log in logs.items()]
+    evidence = [row.log_evidence for row in dispersed(rows)]
+    assert evidence == pytest.approx([-300.0 + (log + 300.0) / divided_by for log in logs.values()])
+
+
+def test_where_no_formula_is_likeliest_the_evidence_is_as_it_was() -> None:
+    refit: Any = SimpleNamespace(consistency=Consistency(200.0, 50, 1e-9, False))
+    rows = [
+        Hypothesis(("a",), log_evidence=-1.0, refit=refit),
+        Hypothesis(("b",), ("mine = t",), "time", log_evidence=-3.0, refit=refit),
+    ]
+    assert [row.log_evidence for row in dispersed(rows)] == [-1.0, -3.0]
+    assert [row.log_evidence for row in dispersed([replace(rows[1], effects=()), *rows[:1]])][1] == -1.0
 
 
 def test_probabilities_are_evidence_over_the_sum_of_all() -> None:

@@ -97,7 +97,7 @@ def test_true_effects_of_ten_sigma_replicate_and_coefficients_of_noise_do_not() 
     assert sum(half.p_value < 0.5 for tried in noise for half in tried.halves) == pytest.approx(60, abs=24)
 
 
-@pytest.mark.parametrize("runs", [6, *slow(20)])
+@pytest.mark.parametrize("runs", [3, *slow(20)])
 def test_a_wrong_name_does_not_replicate(runs: int) -> None:
     """A drift in a run that has none: what it takes from one half it does not take from the other."""
     tried = [replicated(kf_calib.calibrate(hidden(seed, 12.0)[0]), ["bias-drift"]) for seed in range(runs)]

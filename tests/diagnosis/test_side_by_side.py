@@ -12,7 +12,7 @@ from helpers.synthetic import Run
 from scipy.stats import kstest
 
 import kf_calib
-from kf_calib.diagnosis.side_by_side import SideBySide, differences
+from kf_calib.diagnosis.results import SideBySide, differences
 from kf_calib.estimation.calibration import calibrate
 
 HIDDEN = ROOT / "recordings" / "hidden.mcap"

@@ -121,26 +121,27 @@ def test_nothing_is_added_to_noise(quiet: Calibration) -> None:
 
 
 def test_the_unknown_stops_it() -> None:
-    state = improve(source("encoder-harmonic-3:z=20sigma"))
+    state = known_runs.improved("encoder-harmonic-3:z=20sigma")
     assert state.because == "unknown" and not state.steps and "Unknown" in state.reason
 
 
 def test_equal_explanations_are_left_to_a_person() -> None:
-    before = run("second-order=6sigma")
-    state = improve(before)
+    before = diagnosed("second-order=6sigma").before
+    state = known_runs.improved("second-order=6sigma")
     assert state.because == "ambiguous" and not state.steps
     assert [each.name for each in state.alternatives][:2] == ["second-order", "scale-asymmetry"]
     widest = max(state.spreads, key=lambda spread: spread.sigmas)
     by_hand = [each.result.parameters[widest.parameter.symbol].value for each in state.alternatives]
     assert widest.highest - widest.lowest == pytest.approx(max(by_hand) - min(by_hand)) and widest.sigmas > 0.5
     assert f"{widest.sigmas:.1f} sigma" in state.reason
-    first = improve(before, accept_first=True)
+    refits = known_runs.refits("second-order=6sigma")
+    first = improve(before, refits=refits, accept_first=True)
     assert [step.added for step in first.steps] == ["second-order"] and first.because == "consistent"
     assert "come out high" in first.steps[0].remarks[0]
     assert [each.name for each in first.alternatives] == [each.name for each in state.alternatives]
     assert [each.sigmas for each in first.spreads] == pytest.approx([each.sigmas for each in state.spreads], rel=0.01)
     assert "second-order and scale-asymmetry" in first.reason and f"{widest.sigmas:.1f} sigma" in first.reason
-    other = take_step(state, Refits(), "scale-asymmetry", None, "user")
+    other = take_step(state, refits, "scale-asymmetry", None, "user")
     assert other.alternatives[0].name == "scale-asymmetry" and other.alternatives[1].name == "second-order"
 
 
@@ -203,9 +204,10 @@ def test_dwells_left_out_are_still_where_others_came_from(quiet: Calibration) ->
     np.testing.assert_array_equal(part.previous_force_mps2, whole.previous_force_mps2[kept])
 
 
-def test_the_honest_error_repeats_the_choice(second_order: Calibration) -> None:
-    checked = nested_cross_validation(second_order, folds=3)
-    assert checked.chosen == {"second-order": 3} and 0.7 < checked.rms_mps2 / checked.expected_mps2 < 1.3
+@pytest.mark.parametrize("name, folds", [("hysteresis", 2), *slow(("second-order", 3))])
+def test_the_honest_error_repeats_the_choice(name: str, folds: int) -> None:
+    checked = nested_cross_validation(run(f"{name}=15sigma"), folds=folds)
+    assert checked.chosen == {name: folds} and 0.7 < checked.rms_mps2 / checked.expected_mps2 < 1.3
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 
 from helpers.known_runs import hidden_diagnosed
+
 from kf_calib.diagnosis.hypothesis_table import IRREGULAR, NOISE, NONE, NOTHING, Hypothesis, table_of
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.verdict import verdict_in_words

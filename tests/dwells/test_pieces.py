@@ -11,7 +11,7 @@ from helpers.long_runs import slow
 from helpers.synthetic import plan_of
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.dwells import folding, walk_path
+from kf_calib.dwells import folding, pieces
 from kf_calib.dwells.pieces import FEWEST_PIECES, MOST_PIECES, Piece, coarsened, merged_piece
 from kf_calib.dwells.qr import triangle
 from kf_calib.dwells.rows import Nodes, basis
@@ -122,9 +122,9 @@ def test_fewer_pieces_tell_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_moments_of_a_walk_over_many_readings_are_those_that_it_has(monkeypatch: pytest.MonkeyPatch) -> None:
     count = 40_000
-    covariance, squares = walk_path._moments(count)
-    monkeypatch.setattr(walk_path, "_MANY", count)
-    whole, whole_squares = walk_path._moments.__wrapped__(count)
+    covariance, squares = pieces._moments(count)
+    monkeypatch.setattr(pieces, "_MANY", count)
+    whole, whole_squares = pieces._moments.__wrapped__(count)
     scale = np.sqrt(np.diag(whole))
     assert covariance.shape == (4, 4) and np.abs((covariance - whole) / scale / scale[:, None]).max() < 2e-4
     assert squares == pytest.approx(whole_squares, rel=2e-4)

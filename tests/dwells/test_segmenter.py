@@ -10,7 +10,7 @@ from helpers.synthetic import G, Run
 
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.bench.streams import Batch, Stream
-from kf_calib.dwells.dwell_events import carry_on
+from kf_calib.dwells.blocks import carry_on
 from kf_calib.dwells.segmenter import Segmenter, dwell_blocks
 from kf_calib.dwells.stationarity import Stillness
 from kf_calib.errors import InputError

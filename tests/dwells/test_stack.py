@@ -10,14 +10,13 @@ from helpers.by_hand import by_hand
 from helpers.synthetic import Run
 
 from kf_calib.bench.bench import Bench, axes_of
-from kf_calib.bench.streams import Source
+from kf_calib.bench.streams import Orientations, Source
+from kf_calib.dwells.folding import dwells_of_table
 from kf_calib.dwells.pieces import OfPieces, of_all_pieces
 from kf_calib.dwells.stack import Attitudes, DwellStack, Folded
 from kf_calib.dwells.sufficient_statistics import DwellFactor, dwells_before, dwells_without
-from kf_calib.dwells.tabulated import dwells_of
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.settings import Settings
-from kf_calib.sources.tables.table import Orientations
 
 SOURCES = {"angles": Run(seed=3, dwells=7), "noisy_angles": Run(seed=4, dwells=6, count=700, encoder_deg=0.001)}
 
@@ -109,7 +108,7 @@ def table_of(count: int) -> Orientations:
 
 
 def test_the_arrays_of_a_table_are_those_of_its_dwells() -> None:
-    of_table = dwells_of(table_of(7), Bench(axes_of("yz"), 9.81)).folded
+    of_table = dwells_of_table(table_of(7), Bench(axes_of("yz"), 9.81)).folded
     one_by_one = Folded(list(of_table.dwells))
     for name in ("piece_numbers", "ends", "widths", "moving", "pose_sigmas_rad", "piece_counts", "reading_counts",
                  "counts", "squares", "elapsed_s", "ends_s", "force_mps2", "pose", "before"):  # fmt: skip
@@ -129,7 +128,7 @@ def test_a_row_of_a_table_takes_no_more_than_its_numbers() -> None:
     """A dwell as an object would take 1.5 kB."""
     table, bench = table_of(4000), Bench(axes_of("yz"), 9.81)
     tracemalloc.start()
-    stack = dwells_of(table, bench)
+    stack = dwells_of_table(table, bench)
     used = tracemalloc.get_traced_memory()[0]
     tracemalloc.stop()
     assert used < 700 * len(stack) and len(list(stack.folded.dwells[:3])) == 3

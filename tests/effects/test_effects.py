@@ -34,7 +34,7 @@ from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import PRIORS, Settings
 from kf_calib.noise.noise_model import Noise as NoiseModel
 from kf_calib.noise.noise_model import within_dwells
-from kf_calib.online.running_filter import Running
+from kf_calib.online.sequential_test import Running
 from kf_calib.sources.simulation.detectability import sized
 from kf_calib.sources.simulation.injected import parse
 from kf_calib.sources.simulation.physics import Ambient

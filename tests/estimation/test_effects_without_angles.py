@@ -14,14 +14,14 @@ import pytest
 from helpers.long_runs import slow
 from scipy.spatial.transform import Rotation
 
+from kf_calib.bench.arrays import one_blas_thread
 from kf_calib.bench.bench import Bench
-from kf_calib.dwells.tabulated import dwells_of
+from kf_calib.bench.streams import Orientations
+from kf_calib.dwells.folding import dwells_of_table
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation.calibration import evaluate
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
-from kf_calib.sources.tables.table import Orientations
-from kf_calib.support.threads import one_blas_thread
 
 G, POSES, COUNT, SIGMA_MPS2 = 9.81, 36, 400, 2e-4
 BENCH = Bench((), G, angles=False, scatter_sigma_mps2=0.0, nominal={"theta1": 0.0, "theta3": 0.0})
@@ -76,7 +76,7 @@ def walking(seed: int) -> Calibration:
     )  # fmt: skip
     bench = replace(BENCH, scatter_sigma_mps2=None)
     with one_blas_thread():
-        return evaluate(dwells_of(table, bench), bench, Settings(effects=("warm-up",)))
+        return evaluate(dwells_of_table(table, bench), bench, Settings(effects=("warm-up",)))
 
 
 def calibrated(name: str, seed: int) -> tuple[Calibration, np.ndarray]:
@@ -98,10 +98,10 @@ def calibrated(name: str, seed: int) -> tuple[Calibration, np.ndarray]:
     unknown = np.tile([0.0, 0.0, 0.0, 1.0], (POSES, 1))
     table = Orientations(means, unknown, time_s, sigmas, np.full(POSES, COUNT), 25.0 + warmth_k)
     with one_blas_thread():
-        return evaluate(dwells_of(table, BENCH), BENCH, Settings(effects=(name,))), truth
+        return evaluate(dwells_of_table(table, BENCH), BENCH, Settings(effects=(name,))), truth
 
 
-FEW = dict.fromkeys(list(EFFECTS)[::2], 2) | {"second-order": 8, "cross-coupling-po": 8}
+FEW = dict.fromkeys(list(EFFECTS)[::2], 2) | {"second-order": 4, "cross-coupling-po": 4}
 OTHERS = [(name, 2) for name in EFFECTS if name not in FEW] + [(name, 100) for name in EFFECTS]
 
 

@@ -17,7 +17,7 @@ from kf_calib.estimation import kalman_filterpy
 from kf_calib.estimation.calibration import calibrate, evaluate, filterpy_estimate
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.engine_comparison import compare
-from kf_calib.estimation.samples import Samples, all_nuisance_sigmas
+from kf_calib.estimation.kalman_filterpy import Samples, all_nuisance_sigmas
 from kf_calib.estimation.settings import PRIORS, Settings
 from kf_calib.noise.noise_model import Noise
 

@@ -11,12 +11,11 @@ from scipy.stats import chi2
 import kf_calib
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.dwell_pass import Pass
-from kf_calib.estimation.dwell_readings import reading_correlation
 from kf_calib.estimation.engine_comparison import compare, least_squares, running_states
 from kf_calib.estimation.estimate import correlation
-from kf_calib.estimation.filter_history import InnovationTests, history_of, innovation_tests
+from kf_calib.estimation.filter_history import InnovationTests, history_of, innovation_tests, reading_correlation
+from kf_calib.estimation.kalman_filterpy import samples_of
 from kf_calib.estimation.results import Calibration
-from kf_calib.estimation.samples import samples_of
 from kf_calib.estimation.settings import PRIORS, Settings
 
 pytestmark = pytest.mark.usefixtures("unmeasured")

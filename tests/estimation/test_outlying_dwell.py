@@ -59,13 +59,15 @@ def test_a_knock_that_no_turn_explains() -> None:
 @pytest.mark.parametrize(
     "hidden", ["second-order=40sigma", "warm-up=40sigma;tau=20", "hysteresis=30sigma", "base-tilt=100sigma"]
 )
-def test_an_effect_is_no_outlying_dwell(hidden: str) -> None:
-    for seed in range(2):
+@pytest.mark.parametrize("seeds", [range(1), *slow(range(1, 2))])
+def test_an_effect_is_no_outlying_dwell(hidden: str, seeds: range) -> None:
+    for seed in seeds:
         assert not calibrate(short_run(hidden=(hidden,), seed=seed)).outlying
 
 
-def test_noise_is_no_outlying_dwell() -> None:
-    for seed in range(8):
+@pytest.mark.parametrize("runs", [2, *slow(8)])
+def test_noise_is_no_outlying_dwell(runs: int) -> None:
+    for seed in range(runs):
         run = short_run(count=10, dwell_s=1.5, seed=seed, setting_sigma_deg=0.02, unstated=seed % 2)
         assert not calibrate(run).outlying
 

@@ -15,15 +15,15 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2
 
+from kf_calib.bench.arrays import one_blas_thread
 from kf_calib.bench.bench import Bench, axes_of
-from kf_calib.dwells.tabulated import dwells_of
+from kf_calib.bench.streams import Orientations
+from kf_calib.dwells.folding import dwells_of_table
 from kf_calib.estimation.attitude import _posterior_rotations
 from kf_calib.estimation.calibration import calibrate, evaluate
 from kf_calib.estimation.engine_comparison import compare
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
-from kf_calib.sources.tables.table import Orientations
-from kf_calib.support.threads import one_blas_thread
 
 pytestmark = pytest.mark.usefixtures("unmeasured")
 
@@ -62,12 +62,12 @@ class Trial:
             np.full(count, np.nan),
         )  # fmt: skip
         with one_blas_thread():
-            return evaluate(dwells_of(table, self.bench), self.bench, Settings())
+            return evaluate(dwells_of_table(table, self.bench), self.bench, Settings())
 
 
 @pytest.mark.parametrize("stated", [True, False])
 @pytest.mark.parametrize("axes", ["x", "yx"])
-@pytest.mark.parametrize("runs", [12, *slow(40)])
+@pytest.mark.parametrize("runs", [5, *slow(40)])
 def test_attitudes_do_not_tell_what_the_poses_leave_untold(axes: str, stated: bool, runs: int) -> None:
     """An axis that lies flat turns the force in a plane, and one that is upright not at all: the sensitivities to a
     force along x stay nominal, and all others are covered."""
@@ -122,7 +122,7 @@ SIZES = [
 
 @pytest.mark.parametrize(
     "setting_deg, mean_ug, stated, runs",
-    [(0.05, 1.0, True, 20), (0.2, 0.1, False, 20), *slow(*((*size, 300) for size in SIZES))],
+    [(0.05, 1.0, True, 10), (0.2, 0.1, False, 10), *slow(*((*size, 300) for size in SIZES))],
 )
 def test_sigmas_and_alarms_are_those_of_the_setting_error(
     setting_deg: float, mean_ug: float, stated: bool, runs: int

@@ -18,13 +18,13 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, parse_axes
 from kf_calib.bench.keys import UP
 from kf_calib.bench.raw_input import RawInput, parse_channels
+from kf_calib.bench.streams import Table
 from kf_calib.dwells.blocks import Tally
 from kf_calib.errors import BlunderError, InputError
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.dwell_pass import refuse_unusable
 from kf_calib.estimation.setup_blunders import common_scale
 from kf_calib.sources.tables.opening import open_table
-from kf_calib.sources.tables.table import Table
 
 
 def reordered(*channels: int):

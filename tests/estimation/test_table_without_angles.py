@@ -7,8 +7,8 @@ import pytest
 from helpers.long_runs import slow
 
 import kf_calib
+from kf_calib.bench.streams import Table
 from kf_calib.errors import InputError
-from kf_calib.sources.tables.table import Table
 
 SENSITIVITY = np.array([[1.01, 0.0, 0.0], [0.004, 0.99, 0.0], [-0.003, 0.002, 1.02]])
 BIAS_MPS2 = np.array([0.2, -0.1, 0.3])

@@ -22,7 +22,7 @@ from helpers.long_runs import slow
 import kf_calib
 from kf_calib.errors import KfCalibError
 from kf_calib.exchange import calibration_file
-from kf_calib.exchange.certificate.content import certificate
+from kf_calib.exchange.certificate.budget import certificate
 from kf_calib.exchange.certificate.statement import Statement
 from kf_calib.exchange.exports import TARGETS, exported
 

@@ -18,7 +18,7 @@ from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.errors import InputError
 from kf_calib.estimation.settings import Settings
 from kf_calib.exchange import calibration_file
-from kf_calib.exchange.certificate import content, statement
+from kf_calib.exchange.certificate import budget, statement
 from kf_calib.exchange.exports import TARGETS, exported
 from kf_calib.exchange.history import history
 from kf_calib.exchange.verification import verify
@@ -78,7 +78,7 @@ def test_it_is_not_mixed_with_calibrations_in_the_frame_of_a_platform(path: Path
     with pytest.raises(InputError, match="give those of one kind"):
         history([saved, platform])
     with pytest.raises(InputError, match="calibrate on a bench that records angles"):
-        content.certificate(saved, saved.model(path), statement.read_statement(None))
+        budget.certificate(saved, saved.model(path), statement.read_statement(None))
 
 
 def test_six_faces_are_saved_with_axes_taken_for_square(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from helpers.synthetic import SYMBOLS
 from kf_calib import calibrate
 from kf_calib.errors import InputError, MissingExtraError
 from kf_calib.exchange import calibration_file
-from kf_calib.exchange.certificate import content, dcc, document, statement
+from kf_calib.exchange.certificate import budget, dcc, document, statement
 from kf_calib.support.units import field_unit
 
 sets = pytest.mark.skipif(find_spec("typst") is None, reason="typst is not there: no PDF is made")
@@ -67,10 +67,10 @@ def lab(tmp_path: Path) -> Path:
     return path
 
 
-def made(cal: Path, lab: Path | None) -> content.Certificate:
+def made(cal: Path, lab: Path | None) -> budget.Certificate:
     saved, own = calibration_file.open_calibration(cal), statement.read_statement(lab)
     earlier = None if own.before is None else calibration_file.open_calibration(own.before)
-    return content.certificate(saved, saved.model(), own, None if earlier is None else (earlier, earlier.model()))
+    return budget.certificate(saved, saved.model(), own, None if earlier is None else (earlier, earlier.model()))
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def made(cal: Path, lab: Path | None) -> content.Certificate:
      (0.9, "guard band", "conditionalPass"), (1.1, "guard band", "conditionalFail"), (1.21, "guard band", "fail")],
 )  # fmt: skip
 def test_conformity(deviation: float, rule: Any, outcome: str) -> None:
-    assert content.conformity(deviation, 1.0, 0.2, rule) == outcome
+    assert budget.conformity(deviation, 1.0, 0.2, rule) == outcome
 
 
 def test_the_numbers_of_the_xml_are_those_of_the_calibration(cal: Path, lab: Path) -> None:
@@ -289,7 +289,7 @@ def test_what_the_run_does_not_determine_has_no_number(cal: Path) -> None:
     saved = calibration_file.open_calibration(cal)
     first = saved.parameters[0].model_copy(update={"value": None, "sigma": None})
     own = saved.model_copy(update={"parameters": [first, *saved.parameters[1:]]})
-    made = content.certificate(
+    made = budget.certificate(
         own, own.model(), statement.Statement(limits={"theta": "1 deg"}, decision_rule="guard band")
     )
     assert [each.value is None for each in made.results] == [True] + [False] * 11

@@ -95,7 +95,7 @@ def test_coverage_of_300_fleets() -> None:
             assert not count or abs(share - 0.95) <= allowed, (what, kind, share, count)
 
 
-@pytest.mark.parametrize("fleets", [4, *slow(8)])
+@pytest.mark.parametrize("fleets", [2, *slow(4, 8)])
 def test_coverage_of_small_fleets(fleets: int) -> None:
     covered = counted(range(fleets), seed=3, most=6)
     for what in ("bench", "unit", "affected unit", "spread"):

@@ -2,17 +2,43 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
 from distributed import Client, LocalCluster
 
+from kf_calib.bench.streams import Source
+from kf_calib.cli import fleet
 from kf_calib.cli.fleet import SingleCommands
-from kf_calib.cli.options import EvaluationOptions, ReadingOptions
+from kf_calib.cli.options import EvaluationOptions, ReadingOptions, opened
+from kf_calib.diagnosis.results import Diagnosis
+from kf_calib.estimation.results import Calibration
 from kf_calib.fleet import batch
 from kf_calib.fleet.batch import RunEvaluation
+
+_calibrations = dict[tuple[str, str], Calibration]()
+_diagnoses = dict[int, Diagnosis]()
+
+
+class RememberingCommands(SingleCommands):
+    """Commands that evaluate the same content with the same options once a process: most tests of a fleet are about
+    its table, and evaluate the same few recordings."""
+
+    def replay(self, path: Path) -> tuple[Source, Calibration]:
+        key = hashlib.sha256(path.read_bytes()).hexdigest(), self.checksum
+        if key not in _calibrations:
+            source, _calibrations[key] = super().replay(path)
+            return source, _calibrations[key]
+        return opened(path, self.reading, self.evaluation)[0], _calibrations[key]
+
+    def diagnose(self, source: Source, result: Calibration) -> Diagnosis:
+        if id(result) not in _diagnoses:  # of calibrations that live as long as the process
+            _diagnoses[id(result)] = super().diagnose(source, result)
+        return _diagnoses[id(result)]
 
 
 @contextmanager
@@ -26,7 +52,7 @@ def threads() -> Iterator[Client]:
 
 @contextmanager
 def used(client: Client) -> Iterator[None]:
-    """The command uses these workers, however many it asks for."""
+    """The command uses these workers, however many it asks for, and remembers what it evaluated."""
 
     @contextmanager
     def running(workers: int, scheduler: str | None = None) -> Iterator[Client]:
@@ -34,10 +60,11 @@ def used(client: Client) -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(batch, "cluster", running)
+        patch.setattr(fleet, "SingleCommands", RememberingCommands)
         yield
 
 
 def evaluation(**given: Any) -> RunEvaluation:
     """What ``kf-calib fleet`` does with each run, with some options."""
-    commands = SingleCommands(ReadingOptions(), EvaluationOptions(**given))
+    commands = RememberingCommands(ReadingOptions(), EvaluationOptions(**given))
     return RunEvaluation(commands, commands.checksum)

@@ -18,26 +18,26 @@ HIDDEN = RECORDINGS / "hidden.mcap"
 
 
 @cache
-def _refits(*hidden: str, recorded: bool = False) -> Refits:
+def refits(*hidden: str, recorded: bool = False) -> Refits:
     """What a diagnosis has computed, the improvement need not again."""
     return Refits(HIDDEN if recorded else None)
 
 
 @cache
 def hidden_diagnosed() -> Diagnosis:
-    return diagnose(HIDDEN, _refits(recorded=True))
+    return diagnose(HIDDEN, refits(recorded=True))
 
 
 @cache
 def hidden_improved() -> Improvement:
-    return improve(hidden_diagnosed().before, refits=_refits(recorded=True))
+    return improve(hidden_diagnosed().before, refits=refits(recorded=True))
 
 
 @cache
 def diagnosed(*hidden: str) -> Diagnosis:
-    return diagnose(run(*hidden), _refits(*hidden))
+    return diagnose(run(*hidden), refits(*hidden))
 
 
 @cache
 def improved(*hidden: str) -> Improvement:
-    return improve(diagnosed(*hidden).before, refits=_refits(*hidden))
+    return improve(diagnosed(*hidden).before, refits=refits(*hidden))

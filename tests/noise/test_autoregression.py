@@ -8,7 +8,7 @@ from helpers.long_runs import slow
 from scipy.linalg import toeplitz
 from scipy.signal import lfilter
 
-from kf_calib.noise.autoregression import expected_products, unbiased
+from kf_calib.noise.noise_of_readings import expected_products, unbiased
 
 
 @pytest.mark.parametrize("count, phi", [(30, 0.9), (80, 0.5), (200, 0.99), (81, -0.4)])

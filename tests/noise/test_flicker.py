@@ -16,6 +16,7 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from kf_calib.bench.arrays import one_blas_thread
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.dwells.pieces import of_all_pieces
@@ -25,7 +26,6 @@ from kf_calib.estimation.calibration import calibrate, evaluate
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.settings import Settings
 from kf_calib.noise.nuisance_states import SLOW, _amplitudes, _likeliest, flicker_sigmas
-from kf_calib.support.threads import one_blas_thread
 
 BENCH = Bench(axes_of("yzx"), G, latitude_deg=50.0, angle_sigma_deg=0.0)
 DWELLS, DWELL_S, GAP_S, RATE_HZ, POSE_HZ = 24, 60.0, 5.0, 5.0, 0.5

@@ -14,7 +14,7 @@ from scipy.stats import chi2, multivariate_normal
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import Stream
-from kf_calib.dwells import walk_path
+from kf_calib.dwells.pieces import walk_path_of
 from kf_calib.estimation import square_root_information
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.cross_validation import held_out
@@ -57,7 +57,7 @@ def test_a_path_has_the_covariance_of_its_readings() -> None:
         orthogonal, upper = np.linalg.qr(np.column_stack([np.ones_like(u), u, u * u]))
         onto.append(orthogonal.T)
         triangles.append(upper)
-    path = walk_path.walk_path_of(
+    path = walk_path_of(
         np.array([part[0] for part in parts]), np.array([part[-1] for part in parts]), [11, 7, 25], np.array(triangles)
     )
     full, project, first = covariance_at(times), np.zeros((9, len(times))), 0

@@ -17,7 +17,7 @@ from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.dwells.sufficient_statistics import Autocovariance
 from kf_calib.estimation.calibration import calibrate
-from kf_calib.noise.unequal_noise import _lost_to_correlation, weights_of
+from kf_calib.noise.noise_of_readings import _lost_to_correlation, weights_of
 
 G_MPS2, HZ, DWELLS = 9.81, 20.0, 24
 SETTING_RAD = np.radians(0.002)

@@ -21,7 +21,7 @@ from kf_calib.bench.streams import Batch, Stream, bench_without_angles, without_
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.settings import Settings
-from kf_calib.online.by_hand import HandJudgement, HandSession
+from kf_calib.online.session import HandJudgement, HandSession
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.live import open_live
 from kf_calib.sources.simulation.options import simulation

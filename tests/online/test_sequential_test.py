@@ -13,8 +13,7 @@ from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import scan
-from kf_calib.online.running_filter import Running
-from kf_calib.online.sequential_test import Watch
+from kf_calib.online.sequential_test import Running, Watch
 
 
 def quiet(seed: int, **kwargs: float) -> Calibration:

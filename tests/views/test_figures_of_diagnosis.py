@@ -19,7 +19,7 @@ from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.stepwise_selection import Improvement, begin, extend, improve, undone
 from kf_calib.errors import InputError
 from kf_calib.estimation.calibration import calibrate
-from kf_calib.estimation.dwell_readings import readings_of, worst_dwell
+from kf_calib.estimation.filter_history import readings_of, worst_dwell
 from kf_calib.support.units import shown_in
 from kf_calib.views.figures.style import label_axis, rounded_number, short_number, wrapped
 
@@ -89,8 +89,11 @@ def test_bars_of_probabilities_are_those_of_the_table(hidden: tuple[str, ...]) -
     assert area == pytest.approx(100.0)  # the rows sum to one, whatever families they belong to
 
 
-def test_cells_of_the_matrix_are_overlaps_and_a_walk_that_takes_any_path_has_none() -> None:
-    diagnosis = diagnosed("second-order=15sigma", "hysteresis=15sigma")
+@pytest.mark.parametrize(
+    "hidden", [("triple-product=25sigma",), *slow((("second-order=15sigma", "hysteresis=15sigma"),))]
+)
+def test_cells_of_the_matrix_are_overlaps_and_a_walk_that_takes_any_path_has_none(hidden: tuple[str, ...]) -> None:
+    diagnosis = diagnosed(*hidden)
     axes = axes_of(plot.suspects(diagnosis), "Overlap")
     names = [label.get_text() for label in axes.get_yticklabels()]
     test = diagnosis.test

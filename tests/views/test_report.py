@@ -282,6 +282,7 @@ def test_the_contents_name_every_section_of_the_page(path: Path) -> None:
     assert all(text.strip() for _, text in listed)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_page_of_an_improvement_leads_with_the_story_and_the_picture_of_the_steps() -> None:
     state = hidden_improved()
     page = page_of(state, [Measured("hidden.mcap", "6e21")], [])

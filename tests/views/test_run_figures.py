@@ -21,11 +21,10 @@ from kf_calib import plot
 from kf_calib.bench.bench import Bench
 from kf_calib.design import optimality_criteria
 from kf_calib.design.exact_design import Search
-from kf_calib.design.gimbal_limits import Reach
+from kf_calib.design.gimbal_limits import Reach, Timing
 from kf_calib.design.orientation_plan import Plan
 from kf_calib.design.orientation_plan import plan as planned
 from kf_calib.design.predicted_information import Prospect
-from kf_calib.design.visit_order import Timing
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.engine_comparison import Comparison, compare
 from kf_calib.estimation.filter_history import history_of, innovation_tests

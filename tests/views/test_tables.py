@@ -15,10 +15,9 @@ from kf_calib.bench.bench import Bench
 from kf_calib.cli.acquire import _hidden_table
 from kf_calib.design import optimality_criteria
 from kf_calib.design.exact_design import Search
-from kf_calib.design.gimbal_limits import Reach
+from kf_calib.design.gimbal_limits import Reach, Timing
 from kf_calib.design.orientation_plan import plan
 from kf_calib.design.predicted_information import Prospect
-from kf_calib.design.visit_order import Timing
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.stepwise_selection import improve

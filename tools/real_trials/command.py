@@ -15,7 +15,7 @@ from rich.table import Table
 from scipy.stats import beta
 
 import kf_calib
-from kf_calib.support.threads import one_blas_thread
+from kf_calib.bench.arrays import one_blas_thread
 from real_trials.ideal import chosen, credible
 from real_trials.injected import EFFECTS, alike, injected
 from real_trials.recordings import FEWEST_POSES, RealRecording

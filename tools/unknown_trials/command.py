@@ -15,7 +15,7 @@ from rich.table import Table
 from scipy.stats import beta
 
 import kf_calib
-from kf_calib.support.threads import one_blas_thread
+from kf_calib.bench.arrays import one_blas_thread
 from unknown_trials.hidden import HIDDEN, beside, cross_coupling, second_order
 from unknown_trials.real_noise import KINDS, noisy_run
 from unknown_trials.small_bench import SmallRun, hidden_run

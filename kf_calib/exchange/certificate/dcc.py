@@ -14,8 +14,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from kf_calib.errors import InputError, need
-from kf_calib.exchange.certificate.budget import COVERAGE
-from kf_calib.exchange.certificate.content import Certificate, CertifiedResult
+from kf_calib.exchange.certificate.budget import COVERAGE, Certificate, CertifiedResult
 from kf_calib.exchange.certificate.statement import Party
 from kf_calib.support.text import cut
 

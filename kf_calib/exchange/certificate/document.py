@@ -18,8 +18,7 @@ import numpy as np
 from kf_calib.errors import InputError, need
 from kf_calib.estimation.results import format_p
 from kf_calib.exchange.certificate import dcc
-from kf_calib.exchange.certificate.budget import Contribution
-from kf_calib.exchange.certificate.content import OUTCOMES, Certificate, CertifiedResult
+from kf_calib.exchange.certificate.budget import OUTCOMES, Certificate, CertifiedResult, Contribution
 from kf_calib.exchange.certificate.statement import Party
 from kf_calib.support.text import cut
 from kf_calib.support.units import Unit, field_unit

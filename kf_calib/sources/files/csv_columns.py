@@ -24,8 +24,7 @@ from kf_calib.errors import CountsError, InputError
 from kf_calib.sources.files.line_parts import CsvHeading, LineError, number_of, stamp_ns
 from kf_calib.sources.tables.columns import QUATERNION, READINGS, SPREADS
 from kf_calib.sources.tables.numbers import DECIMAL_POINT, Numbers, month_comes_first, stamp_of
-from kf_calib.sources.tables.words import ANGLE, NO_HEADER, TIME, Meaning, are_numbers, meaning_of
-from kf_calib.sources.units import Units, reading_units
+from kf_calib.sources.tables.words import ANGLE, NO_HEADER, TIME, Meaning, Units, are_numbers, meaning_of, reading_units
 from kf_calib.support.text import cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 

@@ -49,7 +49,7 @@ from kf_calib.sources.files.mcap_records import (
     unpacked,
 )
 from kf_calib.sources.files.record_files import RecordFile, files_of, open_record_file
-from kf_calib.support import dates
+from kf_calib.support.text import parse_date
 
 _MOST_DAMAGES = 100  # told one by one; a file can be made that has a million
 GAP_RECORD = "kf_calib.gap"
@@ -323,7 +323,7 @@ class _Passage:
         """When the first reading was received; None where no record so far says it."""
         try:
             said = next((mark.metadata["received"] for mark in self._marks if mark.name == RUN_RECORD), None)
-            return None if said is None else dates.parse_date(said)
+            return None if said is None else parse_date(said)
         except (KeyError, ValueError):
             return None
 

@@ -19,8 +19,8 @@ from kf_calib.sources.files.recorder import Recorder
 from kf_calib.sources.files.recording import CLOCK_RECORD, GAP_RECORD, RUN_RECORD
 from kf_calib.sources.live.clock import Clock, Continuity, Restart
 from kf_calib.sources.live.feed import Feed, Lost, Regained, Status
-from kf_calib.support import dates
 from kf_calib.support.output_files import refuse_output
+from kf_calib.support.text import date_of_stamp, format_date
 
 _FLUSH_S = 0.5  # with the time that flushing takes, less than the second that a kill may cost
 QUEUED = 200_000
@@ -280,9 +280,9 @@ class LiveSource:
                 queue.behind_from = self._store_if_open(Recorder.flush)
             if self._begin_ns is None and len(batch.accel):
                 self._begin_ns = int(batch.accel.time_ns[0])
-                if dates.of_stamp(self._begin_ns) is None and not self._feed.patient:
+                if date_of_stamp(self._begin_ns) is None and not self._feed.patient:
                     self.received = datetime.now(UTC)
-                    facts = {"received": dates.format_date(self.received)}
+                    facts = {"received": format_date(self.received)}
                     self._store_if_open(lambda recorder: recorder.mark(RUN_RECORD, facts))
             self._store_if_open(lambda recorder: recorder.write(batch))
             self._count(batch)

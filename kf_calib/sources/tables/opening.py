@@ -13,14 +13,12 @@ import numpy as np
 from kf_calib.bench.arrays import Floats, lengths
 from kf_calib.bench.bench import Bench, parse_axes
 from kf_calib.bench.raw_input import PLAIN, RawInput, merged_metadata
-from kf_calib.bench.streams import bench_without_angles
+from kf_calib.bench.streams import Orientations, Table, bench_without_angles
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.tables.columns import HOW, KNOWN, QUATERNION, READINGS, SPREADS, Columns, RowTimes
 from kf_calib.sources.tables.grid import grid_of
 from kf_calib.sources.tables.numbers import Numbers
-from kf_calib.sources.tables.table import Orientations, Table
-from kf_calib.sources.tables.words import ANGLE, NO_HEADER, are_numbers, face_of
-from kf_calib.sources.units import Units, mps2_per, reading_units
+from kf_calib.sources.tables.words import ANGLE, NO_HEADER, Units, are_numbers, face_of, mps2_per, reading_units
 from kf_calib.support.text import cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 

@@ -10,13 +10,13 @@ from types import MappingProxyType
 import numpy as np
 
 from kf_calib.bench.raw_input import RawInput
+from kf_calib.bench.streams import Table
 from kf_calib.errors import InputError
 from kf_calib.sources.tables.columns import Columns
 from kf_calib.sources.tables.grid import grid_of
 from kf_calib.sources.tables.numbers import Numbers
 from kf_calib.sources.tables.opening import Opening
-from kf_calib.sources.tables.table import Table
-from kf_calib.sources.units import Units
+from kf_calib.sources.tables.words import Units
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 LEAST = 4

@@ -9,9 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.estimation.dwell_readings import reading_correlation
 from kf_calib.estimation.engine_comparison import Comparison
-from kf_calib.estimation.filter_history import InnovationTests, innovation_tests
+from kf_calib.estimation.filter_history import InnovationTests, innovation_tests, reading_correlation
 from kf_calib.estimation.results import Calibration
 from kf_calib.noise.allan import AllanDeviation
 from kf_calib.support.units import shown

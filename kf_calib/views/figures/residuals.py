@@ -17,7 +17,7 @@ from kf_calib.bench.streams import Source
 from kf_calib.diagnosis.explanation import EffectShape
 from kf_calib.diagnosis.residual_drivers import Driver
 from kf_calib.diagnosis.results import Diagnosis
-from kf_calib.estimation.dwell_readings import DwellReadings, readings_of
+from kf_calib.estimation.filter_history import DwellReadings, readings_of
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.support.units import Unit, shown, shown_whole

@@ -14,8 +14,7 @@ from typing import Any
 from rich.console import Group, RenderableType
 
 from kf_calib.diagnosis.explanation import Explanation
-from kf_calib.diagnosis.results import Diagnosis
-from kf_calib.diagnosis.side_by_side import SideBySide, differences
+from kf_calib.diagnosis.results import Diagnosis, SideBySide, differences
 from kf_calib.diagnosis.stepwise_selection import Improvement
 from kf_calib.estimation.cross_validation import orientations
 from kf_calib.estimation.engine_comparison import Comparison

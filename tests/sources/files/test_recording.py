@@ -629,12 +629,13 @@ def check_damaged(path: Path, data: bytes) -> None:
     assert time.monotonic() - started < 2.0
 
 
-def test_truncated_anywhere(tmp_path: Path, small: bytes) -> None:
-    for cut in random.Random(1).sample(range(1, len(small)), 200):
+@pytest.mark.parametrize("trials", [60, *slow(200)])
+def test_truncated_anywhere(tmp_path: Path, small: bytes, trials: int) -> None:
+    for cut in random.Random(1).sample(range(1, len(small)), trials):
         check_damaged(tmp_path / "cut.mcap", small[:cut])
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *slow(1, 2, 3)])
 def test_a_bit_flipped_anywhere(tmp_path: Path, small: bytes, seed: int) -> None:
     rng = random.Random(seed)
     for _ in range(50):
@@ -643,20 +644,22 @@ def test_a_bit_flipped_anywhere(tmp_path: Path, small: bytes, seed: int) -> None
         check_damaged(tmp_path / "flipped.mcap", bytes(data))
 
 
-def test_a_bit_flipped_outside_the_chunks(tmp_path: Path, small: bytes) -> None:
+@pytest.mark.parametrize("trials", [60, *slow(200)])
+def test_a_bit_flipped_outside_the_chunks(tmp_path: Path, small: bytes, trials: int) -> None:
     chunks = [range(start + 60, start + length) for start, opcode, length in records(small) if opcode == Opcode.CHUNK]
     outside = [i for i in range(len(small)) if not any(i in chunk for chunk in chunks)]
     rng = random.Random(5)
-    for position in rng.sample(outside, 200):
+    for position in rng.sample(outside, trials):
         data = bytearray(small)
         data[position] ^= 1 << rng.randrange(8)
         check_damaged(tmp_path / "flipped.mcap", bytes(data))
 
 
-def test_a_bit_flipped_in_an_unfinished_file(tmp_path: Path, small: bytes) -> None:
+@pytest.mark.parametrize("trials", [40, *slow(100)])
+def test_a_bit_flipped_in_an_unfinished_file(tmp_path: Path, small: bytes, trials: int) -> None:
     unfinished = small[: place_of(small, Opcode.DATA_END)]
     rng = random.Random(6)
-    for _ in range(100):
+    for _ in range(trials):
         data = bytearray(unfinished)
         data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
         check_damaged(tmp_path / "flipped.mcap", bytes(data))

@@ -137,7 +137,7 @@ def _fuzzed(form: str, examples: int, size: int, round_number: int = 0) -> None:
 
 @pytest.mark.parametrize("form", INPUTS)
 def test_no_line_and_no_frame_ends_a_run(form: str) -> None:
-    _fuzzed(form, 150, 4)
+    _fuzzed(form, 50, 4)
 
 
 @pytest.mark.slow

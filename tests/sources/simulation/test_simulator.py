@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.long_runs import slow
 from scipy.signal import welch
 
 from kf_calib.bench.bench import Bench, axes_of, parse_axes
@@ -149,7 +150,7 @@ def test_streams_have_their_rates_and_end_with_the_plan():
 EVERYTHING = TrueNoise(1e-3, 0.5, 1e-4, 1e-5, 1e-3, 0.01, 1e-3, 1e-4, 1e-2, 1.0, 0.01)
 
 
-@pytest.mark.parametrize("batch_samples", [7, 97, 1000])
+@pytest.mark.parametrize("batch_samples", [97, 1000, *slow(7)])
 def test_samples_do_not_depend_on_the_size_of_batches(batch_samples):
     def run(size: int) -> Batch:
         bench = replace(BENCH, reference="inertial", latitude_deg=50.0)

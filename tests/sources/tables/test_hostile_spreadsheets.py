@@ -19,11 +19,10 @@ from helpers.long_runs import slow
 from helpers.paths import ROOT
 
 import kf_calib
+from kf_calib.bench.streams import Table
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.sources.opening import FileKind, kind_of
-from kf_calib.sources.tables.plain_rows import PlainRows
-from kf_calib.sources.tables.spreadsheet import sheets_of
-from kf_calib.sources.tables.table import Table
+from kf_calib.sources.tables.spreadsheet import PlainRows, sheets_of
 from kf_calib.sources.tables.words import meaning_of
 
 HEADER = ["time [s]", "outer [deg]", "inner [deg]", "ax [g]", "ay [g]", "az [g]"]

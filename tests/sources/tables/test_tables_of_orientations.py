@@ -13,10 +13,10 @@ from helpers.known_runs import hidden_diagnosed
 from helpers.paths import ROOT
 
 import kf_calib
-from kf_calib.dwells.tabulated import dwells_of
+from kf_calib.bench.streams import Orientation, Table
+from kf_calib.dwells.folding import dwells_of_table
 from kf_calib.errors import InputError
 from kf_calib.estimation.calibration import filterpy_estimate
-from kf_calib.sources.tables.table import Orientation, Table
 from kf_calib.sources.tables.words import face_of, meaning_of
 
 pytestmark = pytest.mark.usefixtures("unmeasured")
@@ -330,7 +330,7 @@ def test_rows_are_read_and_folded_in_a_time_that_grows_with_their_number(tmp_pat
         (tmp_path / "long.csv").write_text("\n".join([header, *rows]))
         begin = time.process_time()
         table = kf_calib.open_table(tmp_path / "long.csv", {"axes": "z x", "gravity_mps2": "9.81"})
-        assert len(dwells_of(table.orientations, table.bench)) == count
+        assert len(dwells_of_table(table.orientations, table.bench)) == count
         return time.process_time() - begin
 
     lasting_s(500)

@@ -1,1 +1,0 @@
-"""Profiles of positioners that come with the package, one TOML file each."""
