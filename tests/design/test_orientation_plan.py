@@ -60,7 +60,7 @@ def d_efficiency(poses: np.ndarray) -> float:
     return float((np.linalg.det(design.T @ design / len(poses)) * 27.0) ** 0.25)
 
 
-@pytest.mark.parametrize("count", [4, 6, 12, 24, *slow(8, 20)])
+@pytest.mark.parametrize("count", [4, 6, 12, *slow(8, 20, 24)])
 def test_without_limits_the_plan_is_d_optimal(count: int) -> None:
     made = plan(search(), count, TIMING)
     assert d_efficiency(made.poses) > 0.999 and made.d_efficiency == pytest.approx(d_efficiency(made.poses), abs=1e-5)
@@ -284,7 +284,7 @@ def test_predicted_sigma_after_the_next_dwell_is_what_the_filter_then_has(eight)
     np.testing.assert_allclose(made.sigma[-1], after.estimate.sigma, rtol=0.03)
 
 
-@pytest.mark.parametrize("runs", [8, *slow(30)])
+@pytest.mark.parametrize("runs", [3, *slow(30)])
 def test_a_plan_is_run_by_the_simulator_and_its_sigmas_hold(run, tmp_path: Path, runs: int) -> None:
     """Errors over predicted sigma of simulated runs of the CSV file: chi-squared of 12 a run, within 3.3 sigma."""
     file, out = tmp_path / "plan.csv", tmp_path / "run.mcap"

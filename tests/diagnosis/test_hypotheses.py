@@ -179,7 +179,8 @@ def test_a_setting_error_larger_than_stated_is_no_change_of_the_bias(seeds: Sequ
     assert all(table.families.get("bias in time", 0.0) < 0.5 for table in tables)
 
 
-@pytest.mark.parametrize("seeds", [range(1), *slow(range(100))])
+@pytest.mark.slow  # of few dwells, which are the harder: test_diagnosis_cases.py
+@pytest.mark.parametrize("seeds", [range(100)])
 def test_noise_that_nobody_stated_is_told_as_noise(seeds: range) -> None:
     not_stated, noise = {"angle_sigma_deg": None, "scatter_sigma_mps2": None}, {"setting_sigma_deg": 2e-4}
     found = [diagnose(noisy_source(dwells=16, states=not_stated, seed=500 + seed, **noise)) for seed in seeds]

@@ -515,7 +515,7 @@ def strings(tree: ast.AST) -> set[str]:
     return {node.value for node in constants if isinstance(node.value, str)}
 
 
-@pytest.mark.parametrize("seed", [1, 2, *slow(3, 4, 5)])
+@pytest.mark.parametrize("seed", [1, *slow(2, 3, 4, 5)])
 def test_noise_of_the_angles_is_no_step_of_either_sign(seed: int) -> None:
     """Every second visit turns the platform about the vertical: no accelerometer comes from another side, though the
     angles show a step of a thousandth of a degree."""

@@ -131,7 +131,7 @@ def test_what_is_printed_of_an_effect_is_covered_by_its_sigma(name: str, runs: i
     assert np.max(np.abs(ratios)) < (4.5 if runs < 100 else 6.0)
 
 
-@pytest.mark.parametrize("seed", [0, 12, 14, *slow(1, 2, 4, 7, 9, 13)])
+@pytest.mark.parametrize("seed", [0, *slow(12, 14, 1, 2, 4, 7, 9, 13)])
 def test_a_fit_of_what_is_hardly_determined_settles(seed: int) -> None:
     """Forces, noise and the time constant are found in turn: a fit that swings between two places, or creeps, is no
     estimate (the first three swung by 0.4 sigma for as long as they were followed, or were refused)."""

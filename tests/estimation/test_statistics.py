@@ -52,7 +52,7 @@ def test_coverage_of_1000_runs(name: str) -> None:
         assert np.mean(p_values < 0.01) <= 0.02
 
 
-@pytest.mark.parametrize("runs", [5, *slow(9, 25)])
+@pytest.mark.parametrize("runs", [3, *slow(9, 25)])
 @pytest.mark.parametrize("name", ["white", "ar1", "scatter", "setting stated", "encoders"])
 def test_coverage_pooled_over_parameters(name: str, runs: int) -> None:
     """The same over a few runs, the twelve parameters pooled; a sigma wrong by a third fails it, by a quarter in 25."""

@@ -25,7 +25,7 @@ def bare_table(seed: int, poses: int = 24, **bench: str) -> Table:
     return kf_calib.open_table(columns, {"gravity_mps2": "9.81", **bench}, angles=False)
 
 
-@pytest.mark.parametrize("tables", [8, *slow(24)])
+@pytest.mark.parametrize("tables", [4, *slow(24)])
 def test_the_noise_is_found_and_sigmas_are_those_of_the_errors(tables: int) -> None:
     """Over the tables, errors over sigma of scale factors and biases have the rms of Student's t with 15 degrees of
     freedom, sqrt(15 / 13), and the noise is that of the readings, not of what an unknown attitude leaves of it."""

@@ -201,7 +201,7 @@ def _without_columns(rows: list[dict[str, Any]]) -> None:
     rows[0]["factor"]["columns"] = None
 
 
-@pytest.mark.parametrize("change", [_short, _without_columns, *slow(_nameless, _undated, _not_finite)])
+@pytest.mark.parametrize("change", [_short, *slow(_without_columns, _nameless, _undated, _not_finite)])
 def test_a_row_that_is_not_whole_is_evaluated_again_and_the_fleet_goes_on(
     change: Callable[[list[dict[str, Any]]], None], runs: Path, client: Client, store: Store, tmp_path: Path
 ) -> None:

@@ -202,7 +202,7 @@ def test_population_beside_a_bench_is_that_of_generalised_least_squares() -> Non
             assert misfit < chi2.ppf(tail, 9)
 
 
-@pytest.mark.parametrize("draws", [100, *slow(200)])
+@pytest.mark.parametrize("draws", [40, *slow(200)])
 @pytest.mark.parametrize("units", [2, 8, *slow(3)])
 def test_interval_of_the_spread_holds_the_truth_however_few_the_units(units: int, draws: int) -> None:
     """Of one coefficient with unequal sigmas, and a spread as large as these: 95 % of the draws, but for 3.5 sigma."""

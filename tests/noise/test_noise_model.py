@@ -109,7 +109,7 @@ def test_what_is_stated_is_not_estimated() -> None:
 
 
 @pytest.mark.parametrize("kind", [{"setting_deg": 0.01}, {"scatter_mps2": 5e-4}])
-@pytest.mark.parametrize("seed", [0, 1, *slow(2, 3)])
+@pytest.mark.parametrize("seed", [0, *slow(1, 2, 3)])
 def test_no_other_size_of_the_dwell_parts_is_likelier(seed: int, kind: dict[str, float]) -> None:
     """By the likelihood alone, without the derivative that the search goes by."""
     result = calibrate(Run(seed=seed, dwells=30, stated=False, **kind))
@@ -124,7 +124,7 @@ def test_no_other_size_of_the_dwell_parts_is_likelier(seed: int, kind: dict[str,
     assert max(others) <= likelihood(1.0, 1.0) + 1e-6
 
 
-@pytest.mark.parametrize("runs", [10, *slow(40)])
+@pytest.mark.parametrize("runs", [4, *slow(40)])
 def test_dwells_too_short_for_their_noise_raise_no_alarm_and_are_told(runs: int) -> None:
     """Forty readings, correlated over ten: their parabola takes all that would tell how slow they are."""
     low = 0

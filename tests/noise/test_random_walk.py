@@ -179,7 +179,7 @@ def dense(result: Calibration) -> Floats:
     return full
 
 
-@pytest.mark.parametrize("runs", [7, *slow(100)])
+@pytest.mark.parametrize("runs", [3, *slow(100)])
 def test_sigmas_of_a_walk_and_of_the_twelve_beside_it_are_honest(runs: int) -> None:
     """95 % intervals, the NEES of the twelve (biases at the end of the run), the run's own misfit."""
     ratios, nees, misfit = [], 0.0, 0

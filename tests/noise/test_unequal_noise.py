@@ -129,7 +129,7 @@ class Drawn:
 
 
 @pytest.mark.parametrize("angles", [True, False])
-@pytest.mark.parametrize("seeds", [range(3000, 3006), *slow(range(3000, 3012), range(4000, 4200))])
+@pytest.mark.parametrize("seeds", [range(3000, 3003), *slow(range(3000, 3012), range(4000, 4200))])
 def test_sigmas_cover_and_alarms_are_rare_where_dwells_tremble_unequally(seeds: range, angles: bool) -> None:
     """93 to 97 % within 1.96 sigma, and 0.4 to 2 % of alarms, as far as so many runs can tell."""
     inside, alarms = list[float](), 0
