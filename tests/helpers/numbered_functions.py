@@ -13,15 +13,15 @@ from helpers.synthetic import Run
 from kf_calib.bench import bench, paper_parameters
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.bench.streams import Batch, Stream
-from kf_calib.design import gimbal_limits, optimality_criteria, visit_order
+from kf_calib.design import gimbal_limits, optimality_criteria
 from kf_calib.design.gimbal_limits import Reach
-from kf_calib.dwells import coherent_tone, line_spectrum, stationarity, walk_path
+from kf_calib.dwells import coherent_tone, line_spectrum, stationarity
 from kf_calib.dwells.rest_in_readings import RestSegmenter
 from kf_calib.dwells.segmenter import Segmenter
 from kf_calib.estimation import signal_quality
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.fleet.pooled_diagnosis import pooled_diagnosis
-from kf_calib.noise import allan, autoregression, banded, random_walk, unequal_noise
+from kf_calib.noise import allan, banded, noise_of_readings, random_walk
 from kf_calib.online.suggestion import Suggestion
 from kf_calib.positioning import loop
 from kf_calib.views.fleet import pooled_objects
@@ -79,13 +79,13 @@ def noises() -> Numbers:
     columns[:, :3] = np.swapaxes(columns[:, :3], 1, 2) + columns[:, :3] + 3.0 * np.eye(3)
     lower = banded.root(columns)
     return figures(
-        autoregression=[autoregression.Autoregression.of(gamma, 100) for gamma in gammas],
-        unbiased=[autoregression.unbiased(gamma, 200, 100) for gamma in gammas],
-        products=[autoregression.expected_products(gamma, 6) for gamma in gammas],
+        autoregression=[noise_of_readings.Autoregression.of(gamma, 100) for gamma in gammas],
+        unbiased=[noise_of_readings.unbiased(gamma, 200, 100) for gamma in gammas],
+        products=[noise_of_readings.expected_products(gamma, 6) for gamma in gammas],
         allan=allan.deviations(series, sizes), sizes=[allan.cluster_sizes(count) for count in (1, 7, 64, 1000)],
         links=links, walked=random_walk.variances(ends[:, 0], ends[:, 1], 0.3), to_mean=random_walk.to_mean(steps),
         whitened=np.abs(whitened.T @ whitened), advanced=[np.abs(each.T @ each) for each in advanced],
-        weights=[unequal_noise.weights_of(each, freedom) for each in variances],
+        weights=[noise_of_readings.weights_of(each, freedom) for each in variances],
         bands=[lower, banded.diagonal(lower), banded.solve(lower, rng.normal(size=(30, 2)))],
         inverse=[banded.inverse(columns, lower), banded.inverse(columns[:, :3], banded.root(columns[:, :3]))],
     )  # fmt: skip
@@ -109,7 +109,6 @@ def signals() -> Numbers:
         lines=[line_spectrum.lines([each]) for each in spectra], together=line_spectrum.lines(spectra),
         lowest=line_spectrum.lowest_hz(spectra), tones=[coherent_tone.tone(traces) for traces in _traces(rng)],
         encoders=[stationarity.encoder_sigma(size * rng.normal(size=(90, 3))) for size in (1e-6, 1e-3)],
-        products=[walk_path.lagged_products(0.1, size, rng.random(30)) for size in (2, 4)],
     )  # fmt: skip
 
 
@@ -180,7 +179,7 @@ def orientations() -> Numbers:
     poses = rng.uniform(-np.pi, np.pi, (60, 3))
     allowed = poses[reach.allowed(poses)]
     factors = np.array([np.triu(rng.normal(size=(12, 12))) + 3.0 * np.eye(12) for _ in range(8)])
-    timing = visit_order.Timing(30.0, 20.0)
+    timing = gimbal_limits.Timing(30.0, 20.0)
     aims = (optimality_criteria.D, optimality_criteria.A, optimality_criteria.E)
     ways = [gimbal_limits.route(reach, allowed[0], each) for each in allowed[:12]]
     return figures(
@@ -190,8 +189,8 @@ def orientations() -> Numbers:
         ways=[way if way is not None else [] for way in ways], scores=[aim(factors) for aim in aims],
         soft=[aim(factors, 8.0) for aim in aims], sigmas=optimality_criteria.sigmas(factors),
         slopes=[optimality_criteria.slope(aim, factors[0], 8.0) for aim in aims],
-        slews=visit_order.slews_s(poses[:-1], poses[1:], 20.0), middles=visit_order.middles_s(poses, timing),
-        correlation=visit_order.time_correlation(visit_order.middles_s(poses, timing), rng.normal(size=(60, 4))),
+        slews=gimbal_limits.slews_s(poses[:-1], poses[1:], 20.0), middles=gimbal_limits.middles_s(poses, timing),
+        correlation=gimbal_limits.time_correlation(gimbal_limits.middles_s(poses, timing), rng.normal(size=(60, 4))),
     )  # fmt: skip
 
 
