@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from helpers.hidden_effects import BENCH, WHITE
+from helpers.hidden_effects import BENCH, WHITE, noisy_source
 from helpers.hidden_effects import noisy_run as run
 from helpers.hidden_effects import noisy_source as source
 from helpers.long_runs import slow
