@@ -75,6 +75,7 @@ def not_wrong(found: Diagnosis, *truth: str) -> None:
 def test_an_effect_is_named_in_noise_of_other_kinds(noise: dict[str, float]) -> None:
     found = diagnose(source("hysteresis=15sigma", **noise))
     assert found.missing == ("hysteresis",) and "greatest that is usual" not in found.verdict, found.verdict
+    assert "bias-walk" not in found.ambiguity
 
 
 @pytest.mark.parametrize("runs", [3, *slow(8)])
@@ -195,6 +196,15 @@ def test_an_oscillation_and_another_effect_are_both_found() -> None:
     assert set(found.missing) == {"base-tilt", "sinusoid"}, found.verdict
     assert found.after is not None and found.after.consistency.consistent
     assert found.after.parameters["fSin"].value == pytest.approx(0.9, abs=1e-3)
+
+
+@pytest.mark.slow
+def test_an_oscillation_that_stands_for_what_is_left_of_three_effects_is_not_sure() -> None:
+    """With settling it leaves 1.8 times the noise, and had 99 %."""
+    hidden = ("thermal-lag=30sigma", "settling=30sigma", "encoder-harmonic-1:x=30sigma")
+    found = diagnose(source(*hidden, seed=7, dwells=24), replicate=False)
+    assert not found.sure and found.table is not None, found.verdict
+    assert max(row.probability for row in found.table.rows if "sinusoid" in row.effects) < 0.9
 
 
 @pytest.mark.parametrize("size, seed, dwells", [(200, 7, 10), *slow((200, 7, 16), (100, 8, 16), (400, 9, 16))])
@@ -341,7 +351,7 @@ def test_a_jump_is_not_called_a_walk(seed: int) -> None:
 
 @pytest.mark.parametrize("seeds", [range(6, 7), *slow(range(3, 8))])
 def test_in_a_few_dwells_a_walk_could_explain_what_an_effect_does(seeds: range) -> None:
-    """Three coefficients of six degrees of freedom: what is left is no proof. In 16 dwells it is.
+    """Three coefficients of six degrees of freedom: what is left is no proof.
 
     That a walk would move the readings within dwells, too, speaks against it, but not for sure: its size is unsure.
     """
@@ -352,7 +362,11 @@ def test_in_a_few_dwells_a_walk_could_explain_what_an_effect_does(seeds: range) 
     assert np.median(walks) > 1e-3  # now and then the effect fits so closely that it is a proof
     for found in (found for found in few if "bias-walk" in found.ambiguity):
         assert "bias-walk" in found.verdict or " others" in found.verdict
-    enough = diagnose(source("hysteresis=12sigma"), replicate=False)
+
+
+@pytest.mark.slow  # of the same effect in other noise: above
+def test_in_16_dwells_a_walk_could_not_explain_it() -> None:
+    enough = diagnose(source("hysteresis=12sigma"))
     assert "bias-walk" not in enough.ambiguity and _of_a_walk(enough) < 1e-6
 
 

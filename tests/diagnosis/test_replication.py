@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import known_runs
+from helpers.known_runs import diagnosed
 from helpers.long_runs import slow
 from helpers.synthetic import Run
 from scipy.spatial.transform import Rotation
@@ -148,12 +150,12 @@ def test_few_dwells_cannot_tell() -> None:
 
 
 def test_a_diagnosis_has_it_unless_it_is_switched_off() -> None:
-    before = kf_calib.calibrate(hidden(3, 15.0)[0])
-    diagnosis = kf_calib.diagnose(before)
+    diagnosis = diagnosed("second-order=15sigma")
     assert diagnosis.missing == ("second-order",) and diagnosis.replication is not None
     assert diagnosis.replication.answer == "yes"
-    assert kf_calib.diagnose(before, replicate=False).replication is None
-    assert kf_calib.diagnose(kf_calib.calibrate(hidden(3, 0.0)[0])).replication is None
+    refits = known_runs.refits("second-order=15sigma")
+    assert kf_calib.diagnose(diagnosis.before, refits, replicate=False).replication is None
+    assert diagnosed().replication is None
 
 
 def test_what_no_candidate_is_has_no_replication() -> None:

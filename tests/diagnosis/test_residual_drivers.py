@@ -97,7 +97,7 @@ def test_what_an_explanation_predicts_is_the_difference_of_the_predictions() -> 
         assert over.is_curve == (driver.symbol == "a")
 
 
-@pytest.mark.parametrize("runs", [12, *slow(100)])
+@pytest.mark.parametrize("runs", [5, *slow(100)])
 def test_the_band_of_an_effect_covers_as_often_as_it_says(runs: int) -> None:
     """Of runs of other noise: 1 sigma of the component, less its mean over the dwells, covers the truth in 68 % of the
     runs, accelerometer by accelerometer."""

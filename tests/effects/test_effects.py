@@ -436,18 +436,29 @@ def test_a_factor_restricted_equals_that_of_fewer_columns(navigation, name: str)
     np.testing.assert_allclose(covariance, reference, rtol=1e-9, atol=1e-9 * sigma.min() ** 2)
 
 
+RICHER = (("thermal-bias", "settling"), ("second-order", "mine = a*a*T"))
+
+
 @pytest.mark.parametrize(
-    "prior, walk",
+    "prior, walk, models",
     [
-        ("navigation", 1e-6),
-        *slow(("diffuse", 0.0), ("diffuse", 1e-6), ("navigation", 0.0)),
+        ("navigation", 1e-6, RICHER),
+        *slow(
+            ("navigation", 1e-6, (("thermal-bias",),)),
+            *(
+                (prior, walk, (("thermal-bias",), *RICHER))
+                for prior, walk in (("diffuse", 0.0), ("diffuse", 1e-6), ("navigation", 0.0))
+            ),
+        ),
     ],
 )
-def test_a_running_filter_is_a_refit_whatever_it_carries(navigation, walk: float, prior: str) -> None:
+def test_a_running_filter_is_a_refit_whatever_it_carries(
+    navigation, walk: float, prior: str, models: tuple[tuple[str, ...], ...]
+) -> None:
     """At any dwell, with any effects in its model and those of the catalogue carried beside it."""
     dwells, noise, state = navigation
     noise = replace(noise, walk_mps2_per_sqrt_s=walk)
-    for names_in in (("thermal-bias",), ("thermal-bias", "settling"), ("second-order", "mine = a*a*T")):
+    for names_in in models:
         model = Model.of(BENCH, names_in)
         others = [effect_named(name, BENCH) for name in NAMES if name not in names_in]
         running = Running.over(dwells[:11], model, noise, state, others, PRIORS[prior])

@@ -33,6 +33,7 @@ from kf_calib.bench.streams import Batch
 from kf_calib.cli import cli
 from kf_calib.cli.echo import Printer
 from kf_calib.diagnosis.missing_effect import diagnose
+from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.dwells.folding import Folder
 from kf_calib.dwells.pieces import MOST_PIECES
@@ -85,6 +86,24 @@ def judgements(session: Session) -> list[Judgement]:
     assert out[-1] is final and final.final and not any(each.final for each in out[:-1])
     assert "could not be judged" not in session.standing.notice
     return out
+
+
+def diagnosed_once(monkeypatch: pytest.MonkeyPatch, is_once: bool = True) -> list[int]:
+    """The numbers of dwells with which a session asks for a diagnosis, as it asks.
+
+    Diagnoses take most of its time: with ``is_once`` the first is made and that of the whole run, and the others say
+    what the first did.
+    """
+    asked, diagnoses = list[int](), list[Diagnosis]()
+
+    def told(result: Calibration, whole: Refits | None = None) -> Diagnosis:
+        asked.append(len(result.visits))
+        if not diagnoses or whole is not None or not is_once:
+            diagnoses.append(diagnose(result, whole))
+        return replace(diagnoses[-1], before=result)
+
+    monkeypatch.setattr(status, "diagnose", told)
+    return asked
 
 
 def equal(one: Judgement, settings: Settings, source: Simulation | Run) -> None:
@@ -150,24 +169,16 @@ def test_the_look_into_a_dwell_takes_nothing_from_it() -> None:
 
 
 @pytest.mark.parametrize(
-    "orientations, sigmas, spared, is_same", [(16, 9, 1, True), *slow((16, 9, 1, False), (24, 15, 3, False))]
+    "orientations, sigmas, spared, is_once", [(16, 9, 1, True), *slow((16, 9, 1, False), (24, 15, 3, False))]
 )
 def test_candidates_are_tried_again_only_where_that_may_say_something_else(
-    monkeypatch: pytest.MonkeyPatch, orientations: int, sigmas: int, spared: int, is_same: bool
+    monkeypatch: pytest.MonkeyPatch, orientations: int, sigmas: int, spared: int, is_once: bool
 ) -> None:
     """Where nothing is beyond chance only if somebody asks; then until three diagnoses agree, and as the run grows.
 
-    is_same: whether all diagnoses say what the first does, which takes less time.
+    is_once: whether all diagnoses say what the first does.
     """
-    diagnosed, diagnoses = list[int](), list[Diagnosis]()
-
-    def told(result: Calibration) -> Diagnosis:
-        diagnosed.append(len(result.visits))
-        if not (is_same and diagnoses):
-            diagnoses.append(diagnose(result))
-        return replace(diagnoses[-1], before=result)
-
-    monkeypatch.setattr(status, "diagnose", told)
+    diagnosed = diagnosed_once(monkeypatch, is_once)
     monkeypatch.setattr(status, "assess_candidates", lambda *_: pytest.fail("nobody has asked"))
     judgements = judged_one_by_one(bench(f"second-order={sigmas}sigma", orientations=orientations))
     alarmed = [k for k, each in judgements.items() if each.watch is not None and each.watch.alarmed is not None]
@@ -327,7 +338,8 @@ def test_pieces_that_are_merged_do_not_depend_on_how_readings_come() -> None:
     assert len(folded[0]) <= MOST_PIECES and folded[0] == folded[1]
 
 
-def test_screen_lines_and_objects_of_a_standing() -> None:
+def test_screen_lines_and_objects_of_a_standing(monkeypatch: pytest.MonkeyPatch) -> None:
+    diagnosed_once(monkeypatch)
     session = Session(bench("second-order=60sigma", orientations=6), wanted={"theta1": 1e-6, "K1": 1e-9})
     found = judgements(session)
     shown = plain(views.screen(session.standing, None, "sim://", hint="q: end"), width=80)

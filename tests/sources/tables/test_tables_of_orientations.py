@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.known_runs import hidden_diagnosed
+from helpers.long_runs import slow
 from helpers.paths import ROOT
 
 import kf_calib
@@ -51,8 +52,9 @@ def test_a_run_and_its_table_give_the_same_parameters_and_sigmas(name: str) -> N
 
 
 @pytest.mark.usefixtures("unmeasured")
-def test_the_engines_agree_on_a_table() -> None:
-    table = table_of(kf_calib.calibrate(ROOT / "recordings" / "navigation_24.mcap"))
+@pytest.mark.parametrize("recording", ["mems_faces", *slow("navigation_24")])
+def test_the_engines_agree_on_a_table(recording: str) -> None:
+    table = table_of(kf_calib.calibrate(ROOT / "recordings" / f"{recording}.mcap"))
     compared = kf_calib.compare(table)
     assert compared.max_difference_sigma < 1e-6
     assert compared.allan is None
