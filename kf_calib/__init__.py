@@ -77,7 +77,7 @@ _HOMES = {
     "InputError": ("errors", "InputError"),
     "KfCalibError": ("errors", "KfCalibError"),
     "UnobservableError": ("errors", "UnobservableError"),
-    "Running": ("online.running_filter", "Running"),
+    "Running": ("online.sequential_test", "Running"),
     "Session": ("online.session", "Session"),
     "Recorder": ("sources.files.recorder", "Recorder"),
     "open_log": ("sources.files.lines", "Lines"),

@@ -46,6 +46,7 @@ _OF_ORIENTATION = 0.8  # share of such causes that depend on the orientation alo
 _SHORT = 0.01  # prior probability of irregular changes that show within dwells only
 _END = 0.99  # of the range of a constant
 _APART = 1e-4  # p-value of an oscillation that does not go on alike in all dwells
+_OF_EFFECT = 6.0  # columns that an effect has
 SCREEN_LOG_BF = 8.0  # rows further behind in log evidence are not refitted
 NONLINEARITY_MARGIN = 0.02  # share of the log evidence by which they may be further behind, as large effects bend
 _MOST = {"effect": 8, "attitude": 3, "pair": 4, "walk": 3, "formula": 3}
@@ -69,17 +70,23 @@ def _log_sum(logs: Sequence[float]) -> float:
 
 
 def dispersed(rows: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Return the rows; where the likeliest is of a known effect beside a formula that does not fit, with the
-    differences of their log evidence divided by the overdispersion that it leaves.
+    """Return the rows; where the likeliest is of an effect beside a formula or an oscillation, and does not fit, with
+    the differences of their log evidence divided by the overdispersion that it leaves.
 
-    The misfit that is left shows that the formula is not exact. As noise of its size, it may favour a known effect that
-    makes up for it (quasi-likelihood: Burnham and Anderson, Model Selection and Multimodel Inference, 2002, 2.5).
+    Formulas, and an oscillation of any frequency, follow much of what they are not. What is left shows that they are
+    not exact, and as noise of that size it may favour an effect that makes up for them (quasi-likelihood: Burnham and
+    Anderson, Model Selection and Multimodel Inference, 2002, section 2.5). The divisor is at most the degrees of
+    freedom over the columns of an effect: by as much fewer numbers the rows differ in what they leave.
     """
     best = max(rows, key=lambda row: row.log_evidence)
-    if not (best.effects and best.formulas and best.refit):
+    if best.refit is None or len(best.effects) + bool(best.formulas) < 2:
         return [*rows]
-    log, left = best.log_evidence, best.refit.consistency.overdispersion
-    return [replace(row, log_evidence=log + (row.log_evidence - log) / left) for row in rows] if left > 1.0 else [*rows]
+    oscillating = any(effect.oscillates for effect in best.refit.model.effects if str(effect) in best.effects)
+    if not (best.formulas or oscillating):
+        return [*rows]
+    log, left = best.log_evidence, best.refit.consistency
+    divisor = max(min(left.overdispersion, left.dof / _OF_EFFECT), 1.0)
+    return [replace(row, log_evidence=log + (row.log_evidence - log) / divisor) for row in rows]
 
 
 def _screening_limit(logs: Iterable[float]) -> float:

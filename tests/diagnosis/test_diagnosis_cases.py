@@ -198,6 +198,15 @@ def test_an_oscillation_and_another_effect_are_both_found() -> None:
     assert found.after.parameters["fSin"].value == pytest.approx(0.9, abs=1e-3)
 
 
+@pytest.mark.slow
+def test_an_oscillation_that_stands_for_what_is_left_of_three_effects_is_not_sure() -> None:
+    """With settling it leaves 1.8 times the noise, and had 99 %."""
+    hidden = ("thermal-lag=30sigma", "settling=30sigma", "encoder-harmonic-1:x=30sigma")
+    found = diagnose(source(*hidden, seed=7, dwells=24), replicate=False)
+    assert not found.sure and found.table is not None, found.verdict
+    assert max(row.probability for row in found.table.rows if "sinusoid" in row.effects) < 0.9
+
+
 @pytest.mark.parametrize("size, seed, dwells", [(200, 7, 10), *slow((200, 7, 16), (100, 8, 16), (400, 9, 16))])
 def test_an_oscillation_of_one_cycle_a_dwell_is_not_taken_for_slow_noise(size: int, seed: int, dwells: int) -> None:
     """Its variance, as if it were noise, is a hundred times that of the noise; the dwells' means say it is none."""

@@ -14,7 +14,7 @@ from scipy.stats import chi2, multivariate_normal
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.coefficient_sizes import AddedEffects, size_evidence
-from kf_calib.diagnosis.evidence import Evidence
+from kf_calib.diagnosis.evidence import Evidence, _log_density
 from kf_calib.diagnosis.refits import Refits, calibration_of
 from kf_calib.effects import Effect, effect_named
 from kf_calib.effects.drift import Hysteresis, Sinusoid
@@ -227,3 +227,18 @@ def test_one_over_f_noise_is_no_evidence_of_a_temperature_effect(seeds: range) -
         own, none = (logsumexp([each.log for each in rows]) for rows in (evidence.of(refit.fit), evidence.of()))
         found.append(float(own - none))
     assert max(found) < np.log(20.0 * len(found))  # in noise odds exceed 1/p with a probability of p at most
+
+
+@pytest.mark.parametrize("visits", [2, 3, 4])
+def test_differences_of_visits_have_the_density_of_independent_visits(visits: int) -> None:
+    rng = np.random.default_rng(visits)
+    roots = rng.normal(size=(visits, 3, 3))
+    covariances = roots @ np.swapaxes(roots, 1, 2) + np.eye(3)
+    from_first = np.hstack([-np.tile(np.eye(3), (visits - 1, 1)), np.eye(3 * (visits - 1))])
+    whole = np.zeros((3 * visits, 3 * visits))
+    for k, each in enumerate(covariances):
+        whole[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = each
+    differences = rng.normal(size=3 * (visits - 1))
+    expected = multivariate_normal(cov=from_first @ whole @ from_first.T).logpdf(differences)
+    constant = 0.5 * len(differences) * np.log(2.0 * np.pi)
+    assert _log_density(differences, covariances) == pytest.approx(expected + constant, rel=1e-9)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -40,26 +39,45 @@ def rows() -> list[Hypothesis]:
     ]
 
 
+def refit_that_leaves(per_dof: float, fits: bool | None = False, oscillates: bool = False) -> Any:
+    """A refit with an effect, of which the misfit has 60 degrees of freedom."""
+
+    class Effect:
+        def __init__(self) -> None:
+            self.oscillates = oscillates
+
+        def __str__(self) -> str:
+            return "b"
+
+    consistency = Consistency(60.0 * per_dof, 60, None if fits is None else 0.5, fits)
+    return SimpleNamespace(consistency=consistency, model=SimpleNamespace(effects=[Effect()]))
+
+
 @pytest.mark.parametrize(
-    ("per_dof", "fits", "divided_by"), [(4.0, False, 4.0), (1.3, True, 1.0), (0.5, False, 1.0), (1.3, None, 1.0)]
+    ("per_dof", "fits", "divided_by"),
+    [(4.0, False, 4.0), (25.0, False, 10.0), (1.3, True, 1.0), (0.5, False, 1.0), (1.3, None, 1.0)],
 )
 def test_a_misfit_beside_a_formula_weakens_the_evidence(per_dof: float, fits: bool | None, divided_by: float) -> None:
     """Log-likelihoods over the noise variance are those over one that is as large as what is left."""
-    refit: Any = SimpleNamespace(consistency=Consistency(50.0 * per_dof, 50, None if fits is None else 0.5, fits))
-    logs = {"a": -310.0, "b": -300.0, "c": -340.0}
+    refit, logs = refit_that_leaves(per_dof, fits), {"a": -310.0, "b": -300.0, "c": -340.0}
     rows = [Hypothesis((name,), ("mine = t",), "time", log_evidence=log, refit=refit) for name, log in logs.items()]
     evidence = [row.log_evidence for row in dispersed(rows)]
     assert evidence == pytest.approx([-300.0 + (log + 300.0) / divided_by for log in logs.values()])
 
 
-def test_where_no_formula_is_likeliest_the_evidence_is_as_it_was() -> None:
-    refit: Any = SimpleNamespace(consistency=Consistency(200.0, 50, 1e-9, False))
-    rows = [
-        Hypothesis(("a",), log_evidence=-1.0, refit=refit),
-        Hypothesis(("b",), ("mine = t",), "time", log_evidence=-3.0, refit=refit),
-    ]
-    assert [row.log_evidence for row in dispersed(rows)] == [-1.0, -3.0]
-    assert [row.log_evidence for row in dispersed([replace(rows[1], effects=()), *rows[:1]])][1] == -1.0
+@pytest.mark.parametrize(
+    ("effects", "formulas", "oscillates", "weakened"),
+    [
+        (("b",), (), True, False), (("b",), (), False, False), ((), ("mine = t",), False, False),
+        (("a", "b"), (), False, False), (("a", "b"), (), True, True), (("b",), ("mine = t",), False, True),
+    ],
+)  # fmt: skip
+def test_only_beside_formulas_and_oscillations(
+    effects: tuple[str, ...], formulas: tuple[str, ...], oscillates: bool, weakened: bool
+) -> None:
+    refit = refit_that_leaves(4.0, oscillates=oscillates)
+    rows = [Hypothesis(effects, formulas, log_evidence=-1.0, refit=refit), Hypothesis(("c",), log_evidence=-9.0)]
+    assert [row.log_evidence for row in dispersed(rows)] == [-1.0, -3.0 if weakened else -9.0]
 
 
 def test_probabilities_are_evidence_over_the_sum_of_all() -> None:

@@ -11,7 +11,7 @@ from helpers.synthetic import G
 from scipy.spatial.transform import Rotation
 
 from kf_calib.bench.bench import Bench, axes_of
-from kf_calib.estimation.mountings import AffineFit, Mounting
+from kf_calib.estimation.mountings import AffineFit, Mounting, _reversed_gimbals
 
 
 def test_angles_are_put_in_order_and_into_radians() -> None:
@@ -47,3 +47,11 @@ def test_a_fit_is_near_nominal_with_the_channels_as_they_are_wired_alone() -> No
         assert [order for order in orders if fit.is_near(order)] == [wired]
     assert not AffineFit(np.diag([1.0, 1.0, 30.0]), 0.0, np.eye(3)).is_near()
     assert not AffineFit(np.diag([1.0, 0.03, 1.0]), 0.0, np.eye(3)).is_near()
+
+
+@pytest.mark.parametrize("gimbal", [0, 1, 2])
+def test_a_gimbal_that_turns_the_other_way_has_the_opposite_axis(gimbal: int) -> None:
+    stated = Mounting.stated(Bench(((0.6, 0.0, 0.8), (0.0, 1.0, 0.0), (0.48, 0.64, 0.6)), G))
+    signs = np.where(np.arange(3) == gimbal, -1.0, 1.0)[:, None]
+    found = _reversed_gimbals([gimbal])(stated).bench.axes
+    np.testing.assert_array_equal(np.array(found), signs * np.array(stated.bench.axes))

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from helpers import numbered_commands, numbered_runs
+from helpers import numbered_commands, numbered_functions, numbered_runs
 from helpers.numbered_runs import Numbers
 
 
@@ -14,8 +14,9 @@ def _of_run(made: Callable[[], Numbers]) -> numbered_commands.Made:
     return lambda folder: made()
 
 
+_WITHOUT_FOLDER = {**numbered_functions.FUNCTIONS, **numbered_runs.CALIBRATED, **numbered_runs.DIAGNOSED}
 FAST: dict[str, Callable[[Path], Mapping[str, Any]]] = {
-    **{name: _of_run(made) for name, made in (numbered_runs.DIAGNOSED | numbered_runs.CALIBRATED).items()},
+    **{name: _of_run(made) for name, made in _WITHOUT_FOLDER.items()},
     **numbered_commands.COMMANDS,
 }
 SLOW: dict[str, Callable[[Path], Mapping[str, Any]]] = {

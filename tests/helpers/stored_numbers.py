@@ -101,7 +101,7 @@ def differences(stored: Any, new: Any, path: str = "", loose: float = 1.0) -> It
             for key in {**stored, **new}:
                 yield from _of_key(stored, new, str(key), path, loose)
         case (list(), list()) if len(stored) == len(new):
-            if path.startswith("/figures/"):
+            if "/figures/" in path:
                 yield from _of_figures(stored, new, path, loose)
                 return
             for k, (one, other) in enumerate(zip(stored, new, strict=True)):

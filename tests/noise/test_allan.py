@@ -77,3 +77,10 @@ def test_the_longest_dwell_is_used_whatever_its_length(monkeypatch: pytest.Monke
     result = calibrate(Run(dwells=6, count=100))
     longest = max(result.fit.dwells, key=lambda dwell: dwell.count)
     assert list(LongestDwells(result.fit.dwells, result.noise).kept) == [longest.number]
+
+
+def test_scatter_from_dwell_to_dwell_stands_for_flicker_whose_floor_is_that_of_ieee_952() -> None:
+    """1/f noise of density h / f scatters the means of n dwells by h ln n, and its Allan deviation is h 2 ln 2."""
+    noise = Noise(np.ones(3), np.ones(3), scatter_mps2=np.array([1e-5, 2e-5, 0.0]))
+    floor = model_lines(noise, np.array([1.0]), np.array([1.0]), 20)[1]
+    np.testing.assert_allclose(floor**2, noise.scatter_mps2**2 / np.log(20.0) * 2.0 * np.log(2.0), rtol=1e-12)
