@@ -159,7 +159,7 @@ class Course:
         return np.where(sigma <= wanted, 0.0, np.maximum(needed, 1.0) * self.each_s)
 
 
-def course(fitted: Fit, sizes: Floats, count: int = _STEPS) -> Course | None:
+def course(fitted: Fit, sizes: Floats) -> Course | None:
     """The sequence of orientations that reduce the twelve sigmas most, each chosen after those before it; None without
     gimbals.
 
@@ -174,7 +174,7 @@ def course(fitted: Fit, sizes: Floats, count: int = _STEPS) -> Course | None:
     at_least = np.diag(1.0 / np.maximum(fitted.linearised.sizes, 1.0))  # keeps all sigmas finite, at the size of g
     root = np.asarray(np.linalg.inv(triangle(np.vstack([factor, at_least]))), float)
     sigmas, first = [sigmas_of(root, jacobian)], 0
-    for number in range(count):
+    for number in range(_STEPS):
         after = root_after(root, rows)
         reached = sigmas_of(after, jacobian)
         best = int(np.argmin(((reached / sizes) ** 2).sum(axis=1)))
@@ -368,7 +368,7 @@ class Outlook:
             stays.append((float(rates[k]), Stay(poses[k], stay_s, float(going_s[k] + stay_s), sigma[k])))
         return max(stays, key=lambda stay: stay[0])[1]
 
-    def share_s(self, poses: Floats, stays_s: Sequence[float] = STAYS_S) -> float:
+    def share_s(self, poses: Floats) -> float:
         """How long to stay in each of the poses (n, k) that are to be visited anyway, s.
 
         The length with which the targets are expected soonest: if they are missed after the last pose, the time is
@@ -377,9 +377,9 @@ class Outlook:
         way = np.vstack([self.pending[-1][0], poses])
         going_s = float(self.pace.slews_s(way[:-1], way[1:]).sum()) + len(poses) * self.pace.overhead_s
         expected_s = list[float]()
-        for stay_s in stays_s:
+        for stay_s in STAYS_S:
             rows = self._rows(poses, stay_s).reshape(-1, len(self._root))
             sigma = sigmas_of(root_after(self._root, rows[None])[0], self._jacobian)
             worst = float(np.max(sigma / self.wanted))
             expected_s.append((going_s + len(poses) * stay_s) * max(worst, 1.0) ** 2)
-        return stays_s[int(np.argmin(expected_s))]
+        return STAYS_S[int(np.argmin(expected_s))]

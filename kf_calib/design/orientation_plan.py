@@ -12,7 +12,7 @@ the filter after each dwell, in the order of the plan.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -237,17 +237,16 @@ def plan(search: Search, count: int, timing: Timing, seed: int = 0) -> Plan:
         return ordered
 
 
-def fewest(search: Search, timing: Timing, seed: int = 0, on_try: Callable[[int], None] = lambda count: None) -> Plan:
+def fewest(search: Search, timing: Timing, seed: int = 0) -> Plan:
     """The plan with the fewest dwells whose aim, relative sigmas, is at most 1 (``optimality_criteria.minimax``).
 
-    ``on_try`` is called with each number of dwells that is tried. Raises InputError if too many would be needed.
+    Raises InputError if too many dwells would be needed.
     """
     copies, tried = search.scheme.copies, dict[int, float]()
 
     def ratio(count: int) -> float:
         """Return the aim of the best ``count`` orientations; infinite if they leave parameters undetermined."""
         if count not in tried:
-            on_try(count * copies)
             enough = not optimality_criteria.is_unseen(
                 search.factor(search.candidate_rows[search.exchange(count)])
             ).any()

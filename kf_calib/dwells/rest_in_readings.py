@@ -350,12 +350,10 @@ class DwellSummary:
     up: tuple[float, float, float]
 
 
-def dwell_summaries(
-    source: Source, stillness: Stillness | None = None, on_progress: Callable[[float], None] = lambda _: None
-) -> list[DwellSummary]:
+def dwell_summaries(source: Source, on_progress: Callable[[float], None] = lambda _: None) -> list[DwellSummary]:
     """The dwells of a source, which is read to its end; raises what reading it raises."""
     dwells, totals = dict[int, DwellSummary](), dict[int, Floats]()
-    segmenter = segmenter_of(source.bench, stillness)
+    segmenter = segmenter_of(source.bench)
     for block in dwell_blocks(source, segmenter):
         on_progress(source.fraction)
         if not len(block.elapsed_s) or block.curve is not None:

@@ -27,7 +27,6 @@ from kf_calib.sources.tables.words import is_unit
 from kf_calib.support.units import WORDS
 
 ACCEL_UNITS = {unit: WORDS["m/s^2"][unit] for unit in ("mps2", "g", "mg")}
-ANGLE_UNITS = {unit: WORDS["rad"][unit] for unit in ("rad", "deg")}
 TIME_DECIMALS = {"time_ns": 0, "time_us": 3, "time_ms": 6, "time_s": 9}
 """Names of the stamp, and how many decimals its unit has in nanoseconds."""
 
