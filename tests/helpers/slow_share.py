@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-SHARES = 8
+SHARES = 10
 
 
 @dataclass(frozen=True)
