@@ -352,7 +352,7 @@ class Hypotheses:
             row = self._row(known, self._prior(kind, count * len(drivers), *known) + share, formulas)
             family = drivers[driver][best].family or NONE
             if family in self._families(known):  # a known effect of the same family makes up for the formula's shape
-                row = replace(row, effects=())
+                row = replace(row, effects=(), refit=row.refit and self._refit(formulas))
             yield replace(row, driver=driver, families=tuple(dict.fromkeys([*self._families(row.effects), family])))
 
     def _log_bayes_of_formulas(self, families: Sequence[FormulaFamily]) -> Floats:

@@ -219,8 +219,9 @@ class DatedSums:
     """What runs tell, summed over parts of the campaign between dates, each of one bench: memory does not grow with
     the number of runs."""
 
-    def __init__(self, campaign: Campaign, terms: PooledTerms) -> None:
-        self._campaign, self._terms = campaign, terms
+    def __init__(self, campaign: Campaign, terms: PooledTerms, parted: Sequence[tuple[int, int]] = ()) -> None:
+        """parted: benches and first ranks of further parts."""
+        self._campaign, self._terms, self._parted = campaign, terms, [*terms.repairs, *parted]
         self._first = [self._firsts(bench) for bench in range(len(campaign.benches))]
         counts = [len(own) for own in self._first]
         self._starts, slots, columns = np.cumsum([0, *counts]), sum(counts), campaign.groups[-1].columns.stop
@@ -234,7 +235,7 @@ class DatedSums:
         name = self._campaign.benches[bench]
         ranks = np.sort([key.rank for key in self._campaign.keys if key.bench == name])
         chosen = ranks[np.unique(np.linspace(0, len(ranks), min(_SLOTS, len(ranks)), endpoint=False).astype(int))]
-        return np.unique([*chosen, *(first for where, first in self._terms.repairs if where == bench)])
+        return np.unique([*chosen, *(first for where, first in self._parted if where == bench)])
 
     def add(self, blocks: Blocks) -> None:
         """Add runs, of which what is their own has been eliminated."""

@@ -67,7 +67,9 @@ def test_a_known_effect_that_mends_the_shape_of_a_formula_of_its_family_is_not_n
     diagnosis = diagnosed("saturating hysteresis", 300.0, seed)
     assert diagnosis.unknown and not diagnosis.missing, diagnosis.verdict
     assert diagnosis.likeliest is not None and diagnosis.likeliest.driver == "previous orientation"
-    assert any(name.startswith("mine") for name in diagnosis.likeliest.formulas)
+    (explanation, *_) = diagnosis.explanations
+    assert explanation.names == ("tanh(da/(5*m/s**2))",)
+    assert [shape.effect for shape in explanation.shapes] == [*explanation.names], "what is drawn is what is told"
 
 
 @pytest.mark.slow
