@@ -10,7 +10,6 @@ the length of a stay and its scatter does not, the best stay is about sqrt(white
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -24,6 +23,7 @@ from kf_calib.design.gimbal_limits import Reach, can_be_reached, wrap
 from kf_calib.design.predicted_information import Prospect
 from kf_calib.dwells.qr import triangle
 from kf_calib.effects import Effect
+from kf_calib.estimation.candidate_scan import counts_of, slices
 from kf_calib.estimation.cross_validation import SAME_POSE_DEG
 from kf_calib.estimation.dwell_columns import candidate_columns
 from kf_calib.estimation.fit import Fit
@@ -114,16 +114,19 @@ def to_show(fitted: Fit, hidden: Sequence[Effect]) -> tuple[Advice, int] | None:
         return None
     factor, (rows,) = _with_next(fitted, hidden, poses)
     width, shown = fitted.linearised.model.count, np.zeros(len(poses))
-    ends = np.cumsum([width, *(len(effect.coefficients) for effect in hidden)]).tolist()
     scales = np.array([coefficient.scale for effect in hidden for coefficient in effect.coefficients])
-    for start, end in itertools.pairwise(ends):
-        kept = np.r_[0:width, start:end]
-        so_far = np.broadcast_to(factor[:, kept], (len(rows), len(factor), len(kept)))
-        left = np.abs(triangle(np.concatenate([so_far, rows[:, :, kept]], axis=1))[:, width:, width:])
-        shown += (left * scales[start - width : end - width]).max(axis=(1, 2)) > 5.0
+    added = _below(factor[:width], rows)[:, width:, width:]  # what the model leaves of each dwell
+    for own in slices(counts_of(hidden)):
+        so_far = triangle(factor[width:, width:][:, own])
+        shown += (np.abs(_below(so_far, added[:, :, own])) * scales[own]).max(axis=(1, 2)) > 5.0
     best = int(np.argmax(shown))
     count = int(shown[best])
     return Advice(tuple(np.degrees(poses[best]).round(1).tolist()), 0.0, float(count), shows=count), count
+
+
+def _below(factor: Floats, rows: Floats) -> Floats:
+    """Return the triangular factors (m, ...) of a factor (r, c) with each of m sets of rows (m, k, c) below it."""
+    return triangle(np.concatenate([np.broadcast_to(factor, (len(rows), *factor.shape)), rows], axis=1))
 
 
 @dataclass(frozen=True)
@@ -205,7 +208,7 @@ def root_after(root: Floats, rows: Floats) -> Floats:
     """
     seen = rows @ root
     turned, one = np.swapaxes(seen, 1, 2), np.eye(rows.shape[1])
-    upper = triangle(np.concatenate([np.broadcast_to(one, (len(rows), *one.shape)), turned], axis=1))
+    upper = _below(one, turned)
     upper = upper * np.where(np.einsum("mrr->mr", upper) < 0.0, -1.0, 1.0)[:, :, None]
     gain = (root @ turned) @ np.linalg.inv(upper) @ np.linalg.inv(np.swapaxes(upper, 1, 2) + one)
     return root - gain @ seen

@@ -109,6 +109,8 @@ def log_bayes_of_sizes(
     centre = np.array([prior.value for prior in priors])[groups]
     left = root @ (estimate - centre)
     nodes = [_nodes(root[:, groups == k], estimate[groups == k], prior, len(priors)) for k, prior in enumerate(priors)]
+    if len(nodes) == 1:
+        return 0.5 * delta_chi2 + _log_density(root, left, *nodes[0])
     mesh = np.meshgrid(*(sizes for sizes, _ in nodes), indexing="ij")
     log_weights = sum(np.meshgrid(*(np.log(weights) for _, weights in nodes), indexing="ij"))
     sizes = np.stack([each.ravel() for each in mesh], axis=1)[:, groups]
@@ -118,6 +120,15 @@ def log_bayes_of_sizes(
     misfit = left @ left - np.einsum("nq,nq->n", along, np.linalg.solve(spread, along[..., None])[..., 0])
     logs = np.ravel(log_weights) - 0.5 * (np.linalg.slogdet(spread)[1] + misfit)
     return 0.5 * delta_chi2 + float(np.logaddexp.reduce(logs))
+
+
+def _log_density(root: Floats, left: Floats, sizes: Floats, weights: Floats) -> float:
+    """Return log mean over s of N(c; m, C + s^2) / N(c; c, C) of the coefficients of one effect, which share their
+    size s, from the singular values w of R: C + s^2 has the information w^2 / (1 + s^2 w^2) along their directions."""
+    along, singular, _ = np.linalg.svd(root, full_matrices=False)
+    scaled = (sizes[:, None] * singular) ** 2
+    misfit = left @ left - np.sum((left @ along) ** 2 * scaled / (1.0 + scaled), axis=1)
+    return float(np.logaddexp.reduce(np.log(weights) - 0.5 * (np.log1p(scaled).sum(axis=1) + misfit)))
 
 
 def _nodes(root: Floats, estimate: Floats, prior: SizePrior, effects: int) -> tuple[Floats, Floats]:

@@ -214,14 +214,21 @@ class Hypotheses:
         return sum(self._log_share_of(name, delta_chi2) for name in names if name in self.effects.best)
 
     def _log_share_of(self, name: str, delta_chi2: float) -> float:
-        scan, numbers = self.effects.scan, self._numbers[name]
-        tried = max(len(numbers), *(scan.candidates[k].tried for k in numbers))
-        deltas = scan.statistics[numbers]
+        deltas, log_priors, log_norm = self._constants[name]
         relative = min(1.0, delta_chi2 / max(float(deltas.max()), 1e-9))
-        log_priors = np.array([self._log_prior_of_constant(scan.candidates[k].effect) for k in numbers])
-        log_mean = float(np.logaddexp.reduce(log_priors)) - math.log(len(numbers))
-        log_sum = float(np.logaddexp.reduce(0.5 * relative * (deltas - deltas.max()) + log_priors))
-        return log_sum - log_mean - math.log(tried)
+        return float(np.logaddexp.reduce(0.5 * relative * (deltas - deltas.max()) + log_priors)) - log_norm
+
+    @cached_property
+    def _constants(self) -> dict[str, tuple[Floats, Floats, float]]:
+        """Of each visible effect: falls of chi-squared (n,) at the values of its constant, the logs of their priors
+        (n,), and the log of the sum of these over as many values as were tried."""
+        scan, constants = self.effects.scan, dict[str, tuple[Floats, Floats, float]]()
+        for name, numbers in self._numbers.items():
+            tried = max(len(numbers), *(scan.candidates[k].tried for k in numbers))
+            log_priors = np.array([self._log_prior_of_constant(scan.candidates[k].effect) for k in numbers])
+            log_norm = float(np.logaddexp.reduce(log_priors)) + math.log(tried / len(numbers))
+            constants[name] = scan.statistics[numbers], log_priors, log_norm
+        return constants
 
     def _log_prior_of_constant(self, effect: Effect) -> float:
         """Return the log of the prior of an effect's constant, 0 but for time constants longer than the effect goes on

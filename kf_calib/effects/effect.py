@@ -8,6 +8,7 @@ common to the three accelerometers. A new effect is a class with a docstring and
 from __future__ import annotations
 
 import copy
+import functools
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -290,8 +291,7 @@ class SensorEffect(Effect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        shown = self.shown or field_unit(self.unit)
-        return tuple(Coefficient(f"{self.symbol}{i}", self.unit, self.scale, *shown) for i in (1, 2, 3))
+        return _one_each(self.symbol, self.unit, self.scale, self.shown or field_unit(self.unit))
 
     @abstractmethod
     def terms(self, s: Stimulus) -> Floats: ...
@@ -303,6 +303,12 @@ class SensorEffect(Effect):
 
     def added(self, s: Stimulus, coefficients: Floats) -> Floats:
         return self.terms(s) * coefficients
+
+
+@functools.lru_cache(maxsize=512)
+def _one_each(symbol: str, unit: str, scale: float, shown: tuple[str, float]) -> tuple[Coefficient, ...]:
+    """Return a coefficient for each accelerometer."""
+    return tuple(Coefficient(f"{symbol}{i}", unit, scale, *shown) for i in (1, 2, 3))
 
 
 class FrameEffect(Effect):

@@ -16,6 +16,7 @@ orthonormal once, and each group is reduced to a small triangle of its own.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -323,8 +324,9 @@ class FurtherEffects:
             rest = self._beside.of(columns)
             for effect, part in zip(some, slices(counts_of(some)), strict=True):
                 candidate = self._scan([effect], columns[:, part], rest[:, part]).candidates[0]
-                parts.append(slice(last, last + candidate.dof))
-                bases[:, parts[-1]], last = rest[:, part] @ candidate.inverse, parts[-1].stop
+                if candidate.dof:
+                    parts.append(slice(last, last + candidate.dof))
+                    bases[:, parts[-1]], last = rest[:, part] @ candidate.inverse, parts[-1].stop
         return bases[:, :last], parts
 
     def _columns(self, known: Sequence[Effect]) -> Iterator[tuple[list[Effect], Floats]]:
@@ -361,5 +363,13 @@ class FurtherEffects:
             scan.candidates, slices(counts_of([candidate.effect for candidate in scan.candidates])), strict=True
         ):
             cosines = (products[:, columns] @ candidate.inverse).T
-            known.append(any(is_within(cosines[:, part], self._cosine) for part in self._parts))
+            known.append(any(is_within(cosines[:, part], self._cosine) for part in self._near(cosines)))
         return known
+
+    def _near(self, cosines: Floats) -> Iterator[slice]:
+        """Yield the parts of the columns of ``cosines`` (k, l) whose root mean square is not below the limit: as a
+        rule none, and no smallest cosine is larger."""
+        starts = [part.start for part in self._parts]
+        squares = np.add.reduceat(np.sum(cosines**2, axis=0), starts) if starts else np.empty(0)
+        least = (1.0 - 1e-9) * len(cosines) * self._cosine**2
+        return itertools.compress(self._parts, (squares > least).tolist())
