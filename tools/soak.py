@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import resource
 import subprocess
 import sys
 import threading
@@ -30,13 +29,15 @@ ANGLE_HZ, TINY = 1.0, 20  # of the platform in a week; different recordings in a
 
 
 def memory_mb(process: int) -> float:
-    """Resident memory of a process and of all that it has started, MB; 0 where it has ended."""
+    """Memory of a process and of all that it has started, MB, in which what they share counts once; 0 where it has
+    ended."""
     try:
         children = " ".join(path.read_text() for path in Path(f"/proc/{process}/task").glob("*/children")).split()
-        pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
-    except (OSError, IndexError):
+        taken = Path(f"/proc/{process}/smaps_rollup").read_text()
+    except OSError:
         return 0.0
-    return pages * resource.getpagesize() / 1e6 + sum(memory_mb(int(child)) for child in children)
+    kib = next((int(line.split()[1]) for line in taken.splitlines() if line.startswith("Pss:")), 0)
+    return 1024 * kib / 1e6 + sum(memory_mb(int(child)) for child in children)
 
 
 def live(folder: Path, hours: int, sample_hz: float) -> dict[str, Any]:

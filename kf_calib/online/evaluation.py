@@ -81,9 +81,8 @@ class Evaluation(ABC, Generic[J, S]):
     def __init__(
         self,
         source: Source,
-        settings: Settings | None,
-        wanted: Mapping[str, float] | None,
-        standing: S,
+        settings: Settings | None = None,
+        wanted: Mapping[str, float] | None = None,
         *,
         every: bool = True,
         again: Callable[[], Source | None] | None = None,
@@ -91,7 +90,7 @@ class Evaluation(ABC, Generic[J, S]):
         self.source, self.settings, self.wanted = source, settings or Settings(), targets(wanted or {})
         self.every, self.again = every, again
         self.listeners = list[Callable[[J], None]]()
-        self.standing = standing
+        self.standing = self._first_standing()
         self._passed = Pass(source, self.settings)
         self._segmenter = self._passed.segmenter()
         self._closed, self._looked_s = 0, 0.0
@@ -102,6 +101,10 @@ class Evaluation(ABC, Generic[J, S]):
         self._taken, self._is_judging = 0, False
         self._refuse_engine()
         self._refuse(self._passed.model)
+
+    @abstractmethod
+    def _first_standing(self) -> S:
+        """Return the standing before the first reading."""
 
     @abstractmethod
     def _refuse(self, model: Model, begun: bool = False) -> None:

@@ -80,8 +80,7 @@ class Session(Evaluation[Judgement, Standing]):
         auto: bool = False,
         again: Callable[[], Source | None] | None = None,
     ) -> None:
-        standing = Standing(model=(settings or Settings()).effects)
-        super().__init__(source, settings, wanted, standing, every=every, again=again)
+        super().__init__(source, settings, wanted, every=every, again=again)
         self.auto = auto
 
     @classmethod
@@ -111,6 +110,9 @@ class Session(Evaluation[Judgement, Standing]):
         judged = 0 if standing.judgement is None else len(standing.judgement.result.visits)
         with one_blas_thread():
             return suggest(itinerary, Visited(stays, min(judged, len(stays))), standing.judgement)
+
+    def _first_standing(self) -> Standing:
+        return Standing(model=self.settings.effects)
 
     def _refuse(self, model: Model, begun: bool = False) -> None:
         """Raise InputError where the model needs more than a source whose readings come once can give."""
@@ -281,18 +283,8 @@ def judge_all_poses(passed: Pass, wanted: Floats, looks: int, again: Source | No
 class HandSession(Evaluation[HandJudgement, HandStanding]):
     """The evaluation of a sensor in the hand; see ``Evaluation``. Raises InputError for a model that needs angles."""
 
-    def __init__(
-        self,
-        source: Source,
-        settings: Settings | None = None,
-        wanted: Mapping[str, float] | None = None,
-        *,
-        every: bool = True,
-        again: Callable[[], Source | None] | None = None,
-    ) -> None:
-        settings = settings or Settings()
-        standing = HandStanding(enough_s=ENOUGH_S + settings.stillness.settle_s)
-        super().__init__(source, settings, wanted, standing, every=every, again=again)
+    def _first_standing(self) -> HandStanding:
+        return HandStanding(enough_s=ENOUGH_S + self.settings.stillness.settle_s)
 
     def _refuse(self, model: Model, begun: bool = False) -> None:
         """Raise InputError for effects and a random walk of the biases, which need angles."""
