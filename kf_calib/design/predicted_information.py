@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -60,11 +60,7 @@ class Last:
     pose: Floats
     force_mps2: Floats
     temperature_c: float = math.nan
-    variance_mps2_2: Floats = None  # type: ignore[assignment]  # set in __post_init__
-
-    def __post_init__(self) -> None:
-        if self.variance_mps2_2 is None:  # pyright: ignore[reportUnnecessaryComparison]
-            object.__setattr__(self, "variance_mps2_2", np.zeros(3))
+    variance_mps2_2: Floats = field(default_factory=lambda: np.zeros(3))
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import io
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -205,18 +205,20 @@ def apply_to_table(
     return Applied(len(force), int(np.count_nonzero(~np.isfinite(force).all(axis=1))), used)
 
 
+def _new_heads(grid: Grid) -> Iterator[tuple[int, Sequence[str]]]:
+    """Yield the number of the row of the header, and of that of units where there is one, with what a copy has there
+    for the three readings."""
+    yield from zip(grid.head, (_NAMES, ["m/s^2"] * 3), strict=False)
+
+
 def _to_excel(path: Path, copy: Path, grid: Grid, places: list[int], force: Floats) -> None:
     """Write a copy of a workbook."""
     book = workbook_of(path)
     sheet = book[next(each.name for each in sheets_of(path) if not each.hidden)]
-    head = next(
-        k for k in range(grid.numbers[0] - 1, 0, -1)
-        if str(sheet.cell(k, places[0] + 1).value or "") in grid.header[places[0]]
-    )  # fmt: skip
-    for place, name in zip(places, _NAMES, strict=True):
-        for k in range(head, grid.numbers[0]):  # the name, and a unit below it
-            if sheet.cell(k, place + 1).value is not None:
-                sheet.cell(k, place + 1).value = name if k == head else "m/s^2"
+    for number, texts in _new_heads(grid):
+        for place, text in zip(places, texts, strict=True):
+            if sheet.cell(number, place + 1).value is not None:
+                sheet.cell(number, place + 1).value = text
     for number, own in zip(grid.numbers, force.tolist(), strict=True):
         for place, value in zip(places, own, strict=True):
             cell = sheet.cell(number, place + 1)
@@ -240,15 +242,15 @@ def _to_text(path: Path, copy: Path, grid: Grid, places: list[int], force: Float
     decimal = "," if delimiter != "," and not any("." in plain[k - 1] for k in grid.numbers) else "."
     changed = {number - 1: [repr(value).replace(".", decimal) for value in own]
                for number, own in zip(grid.numbers, force.tolist(), strict=True)}  # fmt: skip
-    heads = [k for k in range(grid.numbers[0] - 1) if len(cell_spans(plain[k], delimiter)) > max(places)]
-    for k in heads[-2:]:
-        at = cell_spans(plain[k], delimiter)[places[0]]
-        if plain[k][at[0] : at[1]].strip('" ') and plain[k][at[0] : at[1]].strip('" ') in grid.header[places[0]]:
-            changed[k] = list(_NAMES) if k == heads[-1] or k == heads[0] else ["m/s^2"] * 3
+    for number, texts in _new_heads(grid):
+        cells = [plain[number - 1][slice(*at)] for at in cell_spans(plain[number - 1], delimiter)]
+        kept = [cells[place] if place < len(cells) else "" for place in places]
+        changed[number - 1] = [text if cell.strip('" ') else cell for text, cell in zip(texts, kept, strict=True)]
     for k, texts in changed.items():
         spans, line = cell_spans(plain[k], delimiter), lines[k]
         for place, text in sorted(zip(places, texts, strict=True), reverse=True):
-            line = line[: spans[place][0]] + text + line[spans[place][1] :]
+            if place < len(spans):
+                line = line[: spans[place][0]] + text + line[spans[place][1] :]
         lines[k] = line
     joined = "".join(lines)
     write_whole(copy, joined.encode("utf-16") if utf16 else joined.encode("utf-8", errors="surrogateescape"))

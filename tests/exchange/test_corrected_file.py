@@ -1,14 +1,24 @@
-"""Temperatures of readings that are corrected batch by batch."""
+"""Copies of tables with corrected readings, and temperatures of readings that are corrected batch by batch."""
 
 from __future__ import annotations
 
+import csv
+from pathlib import Path
+from typing import Any
+
 import numpy as np
+import openpyxl
 import pytest
+from helpers.calibrations import simulated
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import InputError
-from kf_calib.exchange.corrected_file import _Thermometer
+from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.correction import Correction
+from kf_calib.exchange.calibration_file import saved
+from kf_calib.exchange.corrected_file import _Thermometer, apply_to_table
+from kf_calib.sources.tables.words import Units
 
 
 def streams(rng: np.random.Generator) -> tuple[Stream, Stream]:
@@ -57,3 +67,48 @@ def test_readings_wait_for_a_temperature_as_late_as_they_are() -> None:
     assert [len(stream) for stream, _ in thermometer.rest()] == [100]
     plain = _Thermometer(False)
     assert plain.pairs(Batch(readings, readings[:0], late)) == [(readings, None)] and plain.rest() == []
+
+
+@pytest.fixture(scope="module")
+def correction() -> Correction:
+    return saved(calibrate(simulated(1)), "run.mcap").correction()
+
+
+TABLES = {
+    "names": [["pose", "ax", "ay", "az"]],
+    "names with units": [["pose", "ax [g]", "ay [g]", "az [g]"]],
+    "names, units below": [["pose", "ax", "ay", "az"], ["", "g", "g", "g"]],
+    "a title, names, some units below": [["Bench 3"], ["pose", "ax [g]", "ay", "az"], ["", "", "g", "g"]],
+    "two lines above, names, units below": [["A", "b"], ["C"], ["pose", "ax", "ay", "az"], ["", "g", "g", "g"]],
+}
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".xlsx"])
+@pytest.mark.parametrize("name", TABLES)
+def test_a_corrected_table_has_names_where_names_were_and_units_where_units_were(
+    name: str, suffix: str, correction: Correction, tmp_path: Path
+) -> None:
+    readings_g = np.vstack([np.eye(3), -np.eye(3)])
+    heads, path, copy = TABLES[name], tmp_path / f"poses{suffix}", tmp_path / f"corrected{suffix}"
+    rows: list[list[Any]] = [*heads, *([f"face {k}", *own] for k, own in enumerate(readings_g.tolist()))]
+    if suffix == ".csv":
+        path.write_text("\n".join(",".join(map(str, row)) for row in rows))
+    else:
+        book = openpyxl.Workbook()
+        for row in rows:
+            book.active.append([None if cell == "" else cell for cell in row])  # type: ignore[union-attr]
+        book.save(path)
+    apply_to_table(correction, path, copy, {}, {}, Units())
+    if suffix == ".csv":
+        found = list(csv.reader(copy.read_text().splitlines()))
+    else:
+        values = openpyxl.load_workbook(copy).active.values  # type: ignore[union-attr]
+        found = [["" if cell is None else cell for cell in row] for row in values]
+    named, below = ["pose", "ax_mps2", "ay_mps2", "az_mps2"], len(heads) - 1 if "below" in name else len(heads)
+    assert [cell for cell in found[below - 1] if cell] == named
+    if "below" in name:
+        assert found[below] == [cell.replace("g", "m/s^2") for cell in heads[below]]
+    for given, kept in zip(heads[: below - 1], found, strict=False):
+        assert [cell for cell in kept if cell] == given
+    corrected = np.array([[float(cell) for cell in row[1:]] for row in found[len(heads) :]])
+    np.testing.assert_allclose(corrected, correction(readings_g * 9.80665), rtol=1e-12)

@@ -35,13 +35,15 @@ _TELLING = 200  # lines by which the delimiter is told
 class Grid:
     """A table: name for messages, header, and rows with the number that each has in the file.
 
-    remarks: how the file was read, where that was a choice. path: the file, if it is from one.
+    head: numbers of the row of the header and, where there is one, of the row of units below it. remarks: how the file
+    was read, where that was a choice. path: the file, if it is from one.
     """
 
     name: str
     header: tuple[str, ...]
     numbers: tuple[int, ...]
     rows: tuple[tuple[Cell, ...], ...]
+    head: tuple[int, ...] = ()
     is_semicolon: bool = False
     remarks: tuple[str, ...] = ()
     path: Path | None = None
@@ -212,14 +214,14 @@ def _headed(name: str, lines: Sequence[tuple[int, Sequence[Cell]]]) -> Grid:
     cells = filled[0][1]
     width = max(k + 1 for k, cell in enumerate(cells) if cell is not None)
     header = ["" if cell is None else str(cell) for cell in cells[:width]]
-    rows = filled[1:]
+    rows, head = filled[1:], [filled[0][0]]
     if width > _MOST_COLUMNS or width * len(rows) > _MOST_CELLS:
         raise InputError(f"{name}: has {width} columns and {len(rows)} rows, more than any table of orientations: "
                          "leave out what is not part of it.")  # fmt: skip
     if rows and all(cell is None or (isinstance(cell, str) and is_unit(cell)) for cell in rows[0][1]):
         units = [*rows[0][1], *[None] * width]
         header = [f"{title} [{unit}]" if unit else title for title, unit in zip(header, units, strict=False)]
-        del rows[0]
+        head.append(rows.pop(0)[0])
     for number, cells in rows:
         beyond = [cell for cell in cells[width:] if cell is not None]
         if beyond:
@@ -230,7 +232,7 @@ def _headed(name: str, lines: Sequence[tuple[int, Sequence[Cell]]]) -> Grid:
             )
     _refuse_without_rows(name, rows)
     full = tuple(tuple([*own[:width], *[None] * (width - len(own))]) for _, own in rows)
-    return Grid(name, tuple(header), tuple(number for number, _ in rows), full)
+    return Grid(name, tuple(header), tuple(number for number, _ in rows), full, tuple(head))
 
 
 def _refuse_without_rows(name: str, rows: Sequence[object]) -> None:
