@@ -1,8 +1,9 @@
 """Numbers that are stored in ``tests/golden/numbers``: written by ``tools/golden_numbers.py``, compared by the tests.
 
-A case is a tree of mappings and lists with numbers and short names. A number is alike within 1e-5 of itself, a value
+A case is a tree of mappings and lists with numbers, names and sentences. A number is alike within 1e-5 of itself, a value
 beside a ``sigma`` within 1e-4 of that, too; ``figures`` of a result, sums over many numbers, within 1e-5 for each of
-their terms, as if these had independent errors. Names, lengths and whole numbers have to be the same. ``LOOSE`` has the
+their terms, as if these had independent errors. Names, lengths and whole numbers have to be the same, and
+sentences but for the numbers in them. ``LOOSE`` has the
 cases in which numbers may differ by more.
 """
 
@@ -11,6 +12,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import tempfile
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,6 +26,8 @@ _RELATIVE, _OF_SIGMA = 1e-5, 1e-4
 _ZERO = 1e-12
 _DIGITS = 10
 _NAME = re.compile(r"[A-Za-z][\w:=^*().+-]{0,40}( [\w:=^*().+-]+){0,2}")
+_NUMBER = re.compile(r"[-+−]?\d[\d.,]*(e[-+]?\d+)?")
+_PLACES = (str(ROOT), tempfile.gettempdir())
 _SHOWN, _WIDTH = 10, 60
 LOOSE: Mapping[str, float] = {"position_feedback": 30.0, "without_angles": 1000.0, "plans": 1000.0}
 """By what factor more numbers of a case may differ. A setting error that is estimated is where a search for the largest
@@ -51,14 +55,14 @@ class Difference:
 
 
 def plain(tree: Any) -> Any:
-    """A tree as it is stored: numbers with ten digits, names of up to three words; sentences are left out."""
+    """A tree as it is stored: numbers with ten digits, sentences without their numbers; without what names a file."""
     match tree:
         case Mapping():
             return {str(key): plain(part) for key, part in tree.items() if _is_kept(part)}
         case bool() | None:
             return tree
         case str():
-            return tree if _NAME.fullmatch(tree) else None
+            return tree if _NAME.fullmatch(tree) else _NUMBER.sub("0", tree)
         case float():
             return float(f"{tree:.{_DIGITS}g}") if math.isfinite(tree) else str(tree)
         case Sequence():
@@ -69,7 +73,7 @@ def plain(tree: Any) -> Any:
 
 
 def _is_kept(part: Any) -> bool:
-    return not isinstance(part, str) or bool(_NAME.fullmatch(part))
+    return not isinstance(part, str) or not any(place in part for place in _PLACES)
 
 
 def read(name: str) -> Any:
