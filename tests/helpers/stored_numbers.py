@@ -1,10 +1,9 @@
 """Numbers that are stored in ``tests/golden/numbers``: written by ``tools/golden_numbers.py``, compared by the tests.
 
-A case is a tree of mappings and lists with numbers, names and sentences. A number is alike within 1e-5 of itself, a value
-beside a ``sigma`` within 1e-4 of that, too; ``figures`` of a result, sums over many numbers, within 1e-5 for each of
-their terms, as if these had independent errors. Names, lengths and whole numbers have to be the same, and
-sentences but for the numbers in them. ``LOOSE`` has the
-cases in which numbers may differ by more.
+A case is a tree of mappings and lists with numbers, names and sentences. A number is alike within 1e-5 of itself, a
+value beside a ``sigma`` within 1e-4 of that, too; ``figures`` of a result, sums over many numbers, within 1e-5 for each
+of their terms, as if these had independent errors. Names, lengths and whole numbers have to be the same, and sentences
+but for the numbers in them. ``LOOSE`` has the cases in which numbers may differ by more.
 """
 
 from __future__ import annotations
