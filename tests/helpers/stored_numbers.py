@@ -26,7 +26,7 @@ _ZERO = 1e-12
 _DIGITS = 10
 _NAME = re.compile(r"[A-Za-z][\w:=^*().+-]{0,40}( [\w:=^*().+-]+){0,2}")
 _NUMBER = re.compile(r"[-+−]?\d[\d.,]*(e[-+]?\d+)?")
-_PLACES = (str(ROOT), tempfile.gettempdir())
+_FILE = re.compile(f"({re.escape(str(ROOT))}|{re.escape(tempfile.gettempdir())})[^\\s:,;'\"]*")
 _SHOWN, _WIDTH = 10, 60
 LOOSE: Mapping[str, float] = {"position_feedback": 30.0, "without_angles": 1000.0, "plans": 1000.0}
 """By what factor more numbers of a case may differ. A setting error that is estimated is where a search for the largest
@@ -54,14 +54,14 @@ class Difference:
 
 
 def plain(tree: Any) -> Any:
-    """A tree as it is stored: numbers with ten digits, sentences without their numbers; without what names a file."""
+    """A tree as it is stored: numbers with ten digits, sentences without their numbers and the names of files."""
     match tree:
         case Mapping():
-            return {str(key): plain(part) for key, part in tree.items() if _is_kept(part)}
+            return {str(key): plain(part) for key, part in tree.items()}
         case bool() | None:
             return tree
         case str():
-            return tree if _NAME.fullmatch(tree) else _NUMBER.sub("0", tree)
+            return tree if _NAME.fullmatch(tree) else _NUMBER.sub("0", _FILE.sub("FILE", tree))
         case float():
             return float(f"{tree:.{_DIGITS}g}") if math.isfinite(tree) else str(tree)
         case Sequence():
@@ -69,10 +69,6 @@ def plain(tree: Any) -> Any:
         case _ if hasattr(tree, "tolist"):
             return plain(tree.tolist())
     return tree
-
-
-def _is_kept(part: Any) -> bool:
-    return not isinstance(part, str) or not any(place in part for place in _PLACES)
 
 
 def read(name: str) -> Any:
