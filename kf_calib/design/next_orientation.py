@@ -106,9 +106,9 @@ def _separations(
     return abs(float(triangle(factor @ mix)[-1, -1])), after
 
 
-def to_show(fitted: Fit, hidden: Sequence[Effect]) -> tuple[Advice, int] | None:
-    """The orientation that makes most of the ``hidden`` effects visible, each of the scale of its kind, and their
-    number; None without gimbals."""
+def to_show(fitted: Fit, hidden: Sequence[Effect]) -> Advice | None:
+    """The orientation that makes most of the ``hidden`` effects visible, each of the scale of its kind; None without
+    gimbals."""
     poses = _poses(fitted)
     if poses is None or not hidden:
         return None
@@ -121,7 +121,7 @@ def to_show(fitted: Fit, hidden: Sequence[Effect]) -> tuple[Advice, int] | None:
         shown += (np.abs(_below(so_far, added[:, :, own])) * scales[own]).max(axis=(1, 2)) > 5.0
     best = int(np.argmax(shown))
     count = int(shown[best])
-    return Advice(tuple(np.degrees(poses[best]).round(1).tolist()), 0.0, float(count), shows=count), count
+    return Advice(tuple(np.degrees(poses[best]).round(1).tolist()), 0.0, float(count), shows=count)
 
 
 def _below(factor: Floats, rows: Floats) -> Floats:

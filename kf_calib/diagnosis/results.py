@@ -194,12 +194,10 @@ class Diagnosis:
             stay = "" if advice.stay_s is None else f" after {span(advice.stay_s)} there"
             return advice, f"{words}: by {advice.after:.1f} sigma{stay}, {advice.before:.1f} without it"
         hidden = [test.effects.candidate(name).effect for name in test.invisible if name in test.effects.best]
-        advice_and_count = advise.to_show(fitted, hidden)
-        if advice_and_count is None or not advice_and_count[1]:
+        showing = advise.to_show(fitted, hidden)
+        if showing is None or not showing.shows:
             return None
-        return advice_and_count[
-            0
-        ], f"would show {advice_and_count[1]} of {len(hidden)} effects that these orientations cannot"
+        return showing, f"would show {showing.shows} of {len(hidden)} effects that these orientations cannot"
 
 
 @dataclass(frozen=True)

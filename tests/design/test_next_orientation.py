@@ -7,7 +7,8 @@ import pytest
 from helpers.hidden_effects import noisy_run as run
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.design.next_orientation import ENOUGH, Advice, _separations, to_tell_apart
+from kf_calib.design.next_orientation import ENOUGH, STAYS_S, Advice, _separations, to_show, to_tell_apart
+from kf_calib.diagnosis.candidate_tests import assess_candidates
 from kf_calib.effects import Effect, effect_named
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import scan
@@ -95,3 +96,26 @@ def test_where_the_platform_is_already_is_no_next_orientation(names: tuple[str, 
     assert then is not None
     turn = np.subtract(then.gimbal_deg, first.gimbal_deg)
     assert np.abs((turn + 180.0) % 360.0 - 180.0).max() > 1.0
+
+
+@pytest.mark.parametrize("gimbal", [1, 2])
+def test_a_dwell_there_shows_as_many_hidden_effects_as_it_is_said_to(gimbal: int) -> None:
+    """After a turn of one gimbal alone."""
+    turn = [PlannedVisit(tuple(45.0 * k * np.eye(3)[gimbal]), 8.0) for k in range(8)]
+    fitted, rng = run(plan=turn).fit, np.random.default_rng(gimbal)
+    test = assess_candidates(fitted)
+    hidden = [test.effects.candidate(name).effect for name in test.effects.best if name in test.invisible]
+    advice = to_show(fitted, hidden)
+    assert advice is not None and advice.shows >= 3
+
+    def shown(gimbal_deg: tuple[float, ...]) -> int:
+        further = assess_candidates(run(plan=[*turn, PlannedVisit(gimbal_deg, 8.0)]).fit)
+        return sum(str(effect) not in further.invisible for effect in hidden)
+
+    others = [tuple(5.0 * rng.integers(-36, 36, 3)) for _ in range(3)]
+    assert shown(advice.gimbal_deg) == advice.shows >= max(map(shown, others))
+
+
+def test_the_lengths_of_a_stay_that_are_compared_are_no_more_than_half_again_as_long() -> None:
+    ratios = np.array(STAYS_S[1:]) / STAYS_S[:-1]
+    assert ratios.min() > 1.3 and ratios.max() <= 1.5 and (STAYS_S[0], STAYS_S[-1]) == (2.0, 96.0)

@@ -6,9 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.altered import Altered
 from helpers.long_runs import slow
 from helpers.synthetic import plan_of
 
+from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.dwells import folding
 from kf_calib.dwells.blocks import Curve
@@ -78,6 +80,19 @@ def test_intervals_cover(text: str, truth: list[float], runs: int, low: float, h
     share = float(np.mean(np.abs(ratios) < 1.96))
     print(f"\n{text}: {share:.3f}, mean {np.mean(ratios):+.2f}, std {np.std(ratios):.2f}", end="")
     assert low <= share <= high
+
+
+def test_channels_have_the_noise_in_slews_that_the_model_leaves_in_each() -> None:
+    """That of the second is eight times that of the others."""
+
+    def noisier(_: Floats, values: Floats) -> Floats:
+        return values + np.random.default_rng(1).normal(size=(len(values), 1)) * [0.0, 4e-4, 0.0]
+
+    source = Altered(run(["latency=1ms"], dwells=8, batch=1 << 30), noisier)
+    fitted = calibrate(source, Settings(effects=("latency",))).fit
+    sigma = fitted.noise.of(moving=True).effective_sigma_mps2
+    assert sigma[[0, 2]] == pytest.approx([5e-5, 5e-5], rel=0.25)
+    assert sigma[1] == pytest.approx(np.hypot(5e-5, 4e-4), rel=0.25)
 
 
 def test_engines_and_batch_agree() -> None:

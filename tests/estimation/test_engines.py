@@ -56,11 +56,13 @@ def test_three_ways_agree_on_what_orientations_about_one_axis_determine() -> Non
         assert way.max_difference_sigma < 1e-6 and way.max_relative_variance < 1e-9
 
 
-def test_plain_form_of_filterpy_agrees_to_its_own_rounding() -> None:
+@pytest.mark.parametrize(("name", "walk"), [("paper grade", 0.0), ("scatter", 0.0), ("setting error", 1e-5)])
+def test_plain_form_of_filterpy_agrees_to_its_own_rounding(name: str, walk: float) -> None:
     """With a stated prior; with a diffuse one (1e5 sigma) the plain form itself is off by 1e-4 sigma."""
-    run = CASES["paper grade"]
-    result = calibrate(run, Settings(prior=PRIORS["navigation"]))
-    difference, variance = distance(filterpy_estimate(run, result, form="plain"), result.estimate)
+    run = CASES[name]
+    result = calibrate(run, Settings(prior=PRIORS["navigation"], walk_mps2_per_sqrt_s=walk))
+    rooted = filterpy_estimate(run, result) if walk else result.estimate
+    difference, variance = distance(filterpy_estimate(run, result, form="plain"), rooted)
     assert difference <= 1e-6 and variance <= 1e-6
 
 

@@ -14,9 +14,10 @@ from helpers.run_factors import campaign_of, nothing, run_factor_of
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.cli.echo import rendered
+from kf_calib.effects import Bearer
 from kf_calib.errors import InputError
 from kf_calib.estimation import bench_model as bench_models
-from kf_calib.fleet.pooled_diagnosis import PooledDiagnosis, pooled_diagnosis
+from kf_calib.fleet.pooled_diagnosis import PooledDiagnosis, _near, pooled_diagnosis
 from kf_calib.fleet.pooled_terms import Attribution
 from kf_calib.fleet.results import bench_model
 from kf_calib.fleet.run_factor import ReferenceUnit
@@ -65,6 +66,20 @@ def test_date_of_a_repair_is_found(both: PooledDiagnosis) -> None:
     repair = finding(both, "flexure").repair
     assert repair is not None and f"run{REPAIRED:03d}" in [gap.before_run for gap in repair.gaps[:2]]
     assert sum(gap.probability for gap in repair.gaps) >= 0.95
+
+
+def test_dates_beside_a_likely_one_are_looked_at_run_by_run() -> None:
+    """Of a likely date all runs from the date before it to the date after it."""
+    ranks = [0, 2, 3, 5, 6, 8, 9, 12]
+    assert _near([3, 6], [0.0, 1.0], ranks) == [3, 5, 6, 8, 9, 12]
+    assert _near([3, 6], [1.0, 0.0], ranks) == [0, 2, 3, 5]
+    assert _near([3, 6, 9], [0.1, 0.0, 0.9], ranks) == [0, 2, 3, 5, 6, 8, 9, 12] and _near([3], [0.0], ranks) == []
+
+
+def test_physics_says_what_can_have_an_effect_but_of_single_runs() -> None:
+    benches, units = {Attribution.BENCH, Attribution.REPAIRED}, {Attribution.SENSORS, Attribution.SOME}
+    for bearer, bearers in ((Bearer.BENCH, benches), (Bearer.SENSORS, units), (Bearer.EITHER, benches | units)):
+        assert {each for each in Attribution if each.possible(bearer)} == bearers | {Attribution.RUN}
 
 
 def test_spread_of_the_units_is_that_from_which_they_were_drawn(both: PooledDiagnosis) -> None:

@@ -63,6 +63,15 @@ def test_the_noise_of_a_dwell_counts_from_two_degrees_of_freedom(few: float, cou
     assert (relative[1] < 0.7 * relative[0]) == counts and (relative[1] == pytest.approx(relative[0])) != counts
 
 
+def test_fewer_than_four_dwells_or_noise_below_rounding_tell_no_weights() -> None:
+    variances = np.array([1.0, 30.0, 1.0, 30.0, 1.0, 30.0])
+    for known in range(7):
+        freedom = np.where(np.arange(6) < known, 50.0, 1.0)
+        assert (len(set(weights_of(variances, freedom).tolist())) > 1) == (known >= 4)
+    rounded_off = np.where(np.arange(6) < 4, 0.0, variances)
+    np.testing.assert_array_equal(weights_of(rounded_off, np.full(6, 50.0)), np.ones(6))
+
+
 @pytest.mark.parametrize("freedom", [5.0, 300.0])
 def test_equal_noise_keeps_one_noise(freedom: float) -> None:
     unequal = sum(
