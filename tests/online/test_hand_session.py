@@ -8,16 +8,19 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from helpers.paths import ROOT
 from helpers.synthetic import Run
+from helpers.thresholds import begins_at
 from scipy.spatial.transform import Rotation
 
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Stream, bench_without_angles, without_poses
+from kf_calib.diagnosis.candidate_tests import LEVEL
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.settings import Settings
@@ -137,6 +140,29 @@ def test_a_poor_set_of_sides_is_told_and_not_fitted() -> None:
     assert told[-1].sides.repeats == 1 and told[-1].sides.count == 3
     line = views.hand_line(told[-1])
     assert "the side of pose 1 again" in line and "3 sides seen" in line and "not determined yet" in line
+
+
+def judged(p_value: float | None, looks: int = 1, square: bool = False, final: bool = False) -> HandJudgement:
+    consistency = SimpleNamespace(p_value=p_value, consistent=p_value is not None and p_value >= LEVEL)
+    result: Any = SimpleNamespace(consistency=consistency, model=SimpleNamespace(square=square))
+    return HandJudgement(result, [], SimpleNamespace(missing=["x up"]), np.ones(12), looks, final)  # type: ignore[arg-type]
+
+
+def test_all_looks_together_raise_a_false_alarm_as_often_as_one() -> None:
+    shares = [begins_at(lambda p, k=k: judged(p, k).consistent, 1e-9, 1.0) for k in range(1, 400)]
+    assert shares[:3] == pytest.approx([LEVEL / 2.0, LEVEL / 6.0, LEVEL / 12.0])
+    assert 0.99 * LEVEL < sum(shares) < LEVEL
+    assert judged(LEVEL / 4.0, final=True).consistent is False and judged(2.0 * LEVEL, 9, final=True).consistent
+
+
+def test_a_verdict_waits_for_poses_that_test_each_other() -> None:
+    none = HandJudgement(None, [], judged(0.5).sides, np.ones(12))
+    waiting = (none, judged(0.5, square=True), judged(None))
+    assert [each.consistent for each in waiting] == [None, None, None]
+    told = [each.verdict for each in (*waiting, judged(0.5), judged(1e-9))]
+    beginnings = ("x up not determined", "the angles between", "too few poses", "the sizes of gravity agree",
+                  "the sizes of gravity differ")  # fmt: skip
+    assert all(one.startswith(other) for one, other in zip(told, beginnings, strict=True))
 
 
 def test_screen_and_object_show_nine_parameters_with_their_targets() -> None:
