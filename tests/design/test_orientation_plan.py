@@ -5,13 +5,13 @@ from __future__ import annotations
 import itertools
 import json
 import math
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.long_runs import slow
 from helpers.synthetic import Run
+from scipy.optimize import minimize
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.bench import Bench, axes_of, axis_names
@@ -260,16 +260,12 @@ def test_next_orientation_starts_from_the_filters_covariance(eight) -> None:
     ahead = Prospect.after(eight.fit)
     np.testing.assert_allclose(optimality_criteria.sigmas(ahead.start) * ahead.units, eight.estimate.sigma, rtol=1e-6)
     looking = Search(ahead, Reach(eight.bench), optimality_criteria.NAMED["A"])
-    spent = []
-    for _ in range(5):
-        begin = time.perf_counter()
-        made = plan(Search(ahead, Reach(eight.bench), optimality_criteria.NAMED["A"]), 1, TIMING)
-        _ = made.sigma
-        spent.append(time.perf_counter() - begin)
-    assert min(spent) < 0.1
+    made = plan(Search(ahead, Reach(eight.bench), optimality_criteria.NAMED["A"]), 1, TIMING)
     cost = looking.measure(made.poses)
     grid = np.radians(np.random.default_rng(0).uniform(-180, 180, (2000, 3)))
     assert cost <= min(looking.measure(pose[None]) for pose in grid) + 1e-3
+    nearby = minimize(lambda pose: looking.measure(pose[None]), made.poses[0], method="Nelder-Mead")
+    assert cost <= nearby.fun + 1e-5
     assert (made.sigma[-1] < made.sigma[0] * (1 + 1e-9)).all() and made.cost < math.exp(
         float(optimality_criteria.A(ahead.start))
     )
