@@ -230,6 +230,8 @@ def record(
     """Record CSV or JSON LINES (a file, or - for standard input) to the MCAP file OUT."""
     from kf_calib.sources.files.lines import Lines
 
+    if lines.suffix == ".mcap" and output.suffix != ".mcap":
+        raise InputError(f"the recording goes before the lines: kf-calib record {lines} {output}.")
     claimed(overwrite=overwrite)
     name, keys = renamed(columns), bench.keys | device.keys
     source = Lines(sys.stdin.buffer if str(lines) == "-" else lines, keys, name, angles=not no_angles)

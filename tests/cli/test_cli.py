@@ -214,6 +214,7 @@ def test_bad_recordings_are_one_sentence(run, recording: Path, tmp_path: Path, n
         (["replay"], "RECORDING"),
         (["repeat", "{run}"], "repeat"),
         (["record", "{run}", "{tmp}/text.mcap", "--axes", "y z x", "--gravity", "9.8"], "."),
+        (["record", "{tmp}/log.csv", "{run}", "--overwrite"], "the recording goes before the lines: kf-calib record "),
         (["simulate", "{run}"], "exists"),
         (["replay", "{run}", "--gravity", "9,81"], "write 9.81 with a point"),
         (["replay", "{run}", "--gravity", "nan"], "not a finite number"),
