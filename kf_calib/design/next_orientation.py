@@ -21,7 +21,7 @@ from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.design.gimbal_limits import Reach, can_be_reached, wrap
 from kf_calib.design.predicted_information import Prospect
-from kf_calib.dwells.qr import triangle
+from kf_calib.dwells.qr import inverse_of_lower, triangle
 from kf_calib.effects import Effect
 from kf_calib.estimation.candidate_scan import counts_of, slices
 from kf_calib.estimation.cross_validation import SAME_POSE_DEG
@@ -41,6 +41,7 @@ _STEPS = 12
 _WAY_S = 10.0  # assumed time to the next orientation after a single dwell
 _TOLD = 0.1  # sigma; effects with a smaller separation after any next dwell cannot be told apart
 _MOVE = 3.0  # dwells; the cost of one more visit
+_DIGITS_KEPT = 1e-8  # share of a variance that is left, below which its fall does not tell what is left
 _WAITS = (0.0, *np.geomspace(1.0 / 16.0, 1.0, 9))  # possible waits, as shares of the duration so far
 
 
@@ -178,12 +179,10 @@ def course(fitted: Fit, sizes: Floats) -> Course | None:
     root = np.asarray(np.linalg.inv(triangle(np.vstack([factor, at_least]))), float)
     sigmas, first = [sigmas_of(root, jacobian)], 0
     for number in range(_STEPS):
-        after = root_after(root, rows)
-        reached = sigmas_of(after, jacobian)
-        best = int(np.argmin(((reached / sizes) ** 2).sum(axis=1)))
+        best = int(np.argmin(((sigmas_after(root, rows, jacobian) / sizes) ** 2).sum(axis=1)))
         first = first if number else best
-        root = after[best]
-        sigmas.append(reached[best])
+        root = root_after(root, rows[best : best + 1])[0]
+        sigmas.append(sigmas_of(root, jacobian))
     angles = tuple(np.degrees(poses[first]).round(1).tolist())
     return Course(angles, np.array(sigmas), len(fitted.dwells), _each_s(fitted))
 
@@ -200,6 +199,26 @@ def sigmas_of(roots: Floats, jacobian: Floats) -> Floats:
     return np.asarray(np.linalg.norm(jacobian @ roots[..., :STATE_COUNT, :], axis=-1))
 
 
+def sigmas_after(root: Floats, rows: Floats, jacobian: Floats) -> Floats:
+    """Sigmas (m, 12) of the paper's parameters after each of m sets of whitened rows (m, r, p), from the root before.
+
+    A variance a a^T falls by |M^-1 W a^T|^2, with W and M as below; where that leaves little of it, by the roots.
+    """
+    seen, along = rows @ root, jacobian @ root[:STATE_COUNT]
+    before = np.square(along).sum(axis=1)
+    fallen = inverse_of_lower(np.swapaxes(_rooted(seen), 1, 2)) @ (seen @ along.T)
+    variances = before - np.square(fallen).sum(axis=1)
+    if (variances < _DIGITS_KEPT * before).any():
+        return sigmas_of(root_after(root, rows), jacobian)
+    return np.sqrt(variances)
+
+
+def _rooted(seen: Floats) -> Floats:
+    """Return the upper triangles M^T (m, r, r) of M M^T = I + W W^T, for W = ``seen`` (m, r, p)."""
+    upper = _below(np.eye(seen.shape[1]), np.swapaxes(seen, 1, 2))
+    return upper * np.where(np.einsum("mrr->mr", upper) < 0.0, -1.0, 1.0)[:, :, None]
+
+
 def root_after(root: Floats, rows: Floats) -> Floats:
     """Roots S (m, p, p) of the covariance S S^T after each of m sets of whitened rows (m, r, p), from the root
     before.
@@ -207,9 +226,7 @@ def root_after(root: Floats, rows: Floats) -> Floats:
     The new root is S - S W^T M^-T (M + I)^-1 W, where W are the rows times S and M M^T = I + W W^T (Andrews, 1968).
     """
     seen = rows @ root
-    turned, one = np.swapaxes(seen, 1, 2), np.eye(rows.shape[1])
-    upper = _below(one, turned)
-    upper = upper * np.where(np.einsum("mrr->mr", upper) < 0.0, -1.0, 1.0)[:, :, None]
+    turned, one, upper = np.swapaxes(seen, 1, 2), np.eye(rows.shape[1]), _rooted(seen)
     gain = (root @ turned) @ np.linalg.inv(upper) @ np.linalg.inv(np.swapaxes(upper, 1, 2) + one)
     return root - gain @ seen
 
@@ -365,7 +382,7 @@ class Outlook:
         going_s, before = self.pace.slews_s(here, poses) + self.pace.overhead_s, self.missing(self.sigma)
         stays = list[tuple[float, Stay]]()
         for stay_s in stays_s:
-            sigma = sigmas_of(root_after(self._root, self._rows(poses, stay_s)), self._jacobian)
+            sigma = sigmas_after(self._root, self._rows(poses, stay_s), self._jacobian)
             rates = (before - self.missing(sigma)) / (going_s + stay_s)
             k = int(np.argmax(rates))
             stays.append((float(rates[k]), Stay(poses[k], stay_s, float(going_s[k] + stay_s), sigma[k])))

@@ -7,7 +7,17 @@ import pytest
 from helpers.hidden_effects import noisy_run as run
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.design.next_orientation import ENOUGH, STAYS_S, Advice, _separations, to_show, to_tell_apart
+from kf_calib.design.next_orientation import (
+    ENOUGH,
+    STAYS_S,
+    Advice,
+    _separations,
+    root_after,
+    sigmas_after,
+    sigmas_of,
+    to_show,
+    to_tell_apart,
+)
 from kf_calib.diagnosis.candidate_tests import assess_candidates
 from kf_calib.effects import Effect, effect_named
 from kf_calib.estimation.results import Calibration
@@ -114,6 +124,22 @@ def test_a_dwell_there_shows_as_many_hidden_effects_as_it_is_said_to(gimbal: int
 
     others = [tuple(5.0 * rng.integers(-36, 36, 3)) for _ in range(3)]
     assert shown(advice.gimbal_deg) == advice.shows >= max(map(shown, others))
+
+
+@pytest.mark.parametrize("unknown", [1.0, 1e3, 1e12])
+def test_sigmas_after_a_dwell_are_those_of_the_information_with_its_rows(unknown: float) -> None:
+    """Of four combinations of the states so much was not known before the dwell."""
+    rng = np.random.default_rng(3)
+    root = np.triu(rng.normal(size=(14, 14))) @ np.diag(np.where(np.arange(14) < 4, unknown, 1.0))
+    rows, jacobian = rng.normal(size=(5, 3, 14)), rng.normal(size=(12, 12))
+    sigmas, roots = sigmas_after(root, rows, jacobian), root_after(root, rows)
+    np.testing.assert_allclose(sigmas, sigmas_of(roots, jacobian), rtol=1e-7)
+    if unknown < 1e6:  # what an inversion can tell
+        known = np.linalg.inv(root @ root.T)
+        covariance = np.linalg.inv(known + np.swapaxes(rows, 1, 2) @ rows)
+        np.testing.assert_allclose(roots @ np.swapaxes(roots, 1, 2), covariance, rtol=1e-6, atol=1e-6)
+        wanted = np.einsum("kp,mpq,kq->mk", jacobian, covariance[:, :12, :12], jacobian)
+        np.testing.assert_allclose(sigmas, np.sqrt(wanted), rtol=1e-6)
 
 
 def test_the_lengths_of_a_stay_that_are_compared_are_no_more_than_half_again_as_long() -> None:
