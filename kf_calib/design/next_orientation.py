@@ -29,7 +29,7 @@ from kf_calib.estimation.dwell_columns import candidate_columns
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.square_root_information import accumulate
 from kf_calib.estimation.whitened_rows import whiten
-from kf_calib.noise.noise_model import Noise, steps
+from kf_calib.noise.noise_model import steps
 
 ENOUGH = 6.0
 """Separation in sigma that suffices: of two equally likely effects the wrong one is then chosen once in a thousand
@@ -173,7 +173,7 @@ def course(fitted: Fit, sizes: Floats) -> Course | None:
     poses = _poses(fitted)
     if poses is None:
         return None
-    factor, (rows,) = _with_next(fitted, [], poses, fitted.noise)
+    factor, rows = factor_of(fitted), Prospect.following(fitted).columns([], poses)
     jacobian = paper_parameters.jacobian(fitted.linearised.state[:STATE_COUNT])
     at_least = np.diag(1.0 / np.maximum(fitted.linearised.sizes, 1.0))  # keeps all sigmas finite, at the size of g
     root = np.asarray(np.linalg.inv(triangle(np.vstack([factor, at_least]))), float)
@@ -257,31 +257,22 @@ def is_elsewhere(poses: Floats, pose: Floats) -> Mask:
 
 
 def _with_next(
-    fitted: Fit,
-    effects: Sequence[Effect],
-    poses: Floats,
-    noise: Noise | None = None,
-    waits_s: Sequence[float] | Floats = (0.0,),
+    fitted: Fit, effects: Sequence[Effect], poses: Floats, waits_s: Sequence[float] | Floats = (0.0,)
 ) -> tuple[Floats, Floats]:
     """Return the triangular factor of [H | G] of the run so far, and the whitened rows (w, m, 3, p + q) of a dwell's
-    mean after each wait at each pose."""
-    noise = noise or fitted.noise.for_goodness_of_fit
+    mean after each wait at each pose, in the noise by which the misfit is judged."""
+    linearised, noise = fitted.linearised, fitted.noise.for_goodness_of_fit
+    added = candidate_columns(linearised.dwells_at_state, effects, linearised.model.bench, linearised.state)
+    columns = [np.concatenate([own, more], axis=3) for own, more in zip(linearised.columns, added, strict=True)]
+    so_far = whiten(linearised.dwells_at_state, columns, noise, linearised.state)
     prospect = replace(Prospect.following(fitted), noise=noise)
     rows = np.array([prospect.columns(effects, poses, float(wait_s)) for wait_s in waits_s])
-    return factor_of(fitted, effects, noise), rows
+    return accumulate(so_far, steps(linearised.dwells, noise))[:-1, :-1], rows
 
 
-def factor_of(fitted: Fit, effects: Sequence[Effect] = (), noise: Noise | None = None) -> Floats:
-    """The triangular factor (p + q, p + q) of the whitened columns [H | G] of the run so far, without a prior.
-
-    effects: whose columns G are added. noise: by which they are whitened (None: that of the fit).
-    """
-    linearised, noise = fitted.linearised, noise or fitted.noise
-    model, state = linearised.model, linearised.state
-    added = candidate_columns(linearised.dwells_at_state, effects, model.bench, state)
-    columns = [np.concatenate([own, more], axis=3) for own, more in zip(linearised.columns, added, strict=True)]
-    upper = accumulate(whiten(linearised.dwells_at_state, columns, noise, state), steps(linearised.dwells, noise))
-    return upper[:-1, :-1]
+def factor_of(fitted: Fit) -> Floats:
+    """The triangular factor (p, p) of the whitened columns of the run so far, without a prior."""
+    return accumulate(fitted.all_rows(), fitted.steps)[:-1, :-1]
 
 
 STAYS_S = (2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0, 96.0)
