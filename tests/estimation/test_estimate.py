@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.thresholds import begins_at
 
-from kf_calib.estimation.estimate import Estimate, correlation, enlarged
+from kf_calib.estimation.estimate import Estimate, Parameter, correlation, enlarged
 
 
 def test_a_parameter_is_not_determined_from_ten_degrees_a_fifth_or_two_metres_per_second_squared_on() -> None:
@@ -18,6 +18,12 @@ def test_a_parameter_is_not_determined_from_ten_degrees_a_fifth_or_two_metres_pe
 
     for parameter, least in ((4, np.radians(10.0)), (6, 0.2), (7, 2.0)):
         assert begins_at(lambda sigma, k=parameter: unseen(k, sigma), 1e-3, 10.0) == pytest.approx(least)
+
+
+def test_a_parameter_in_words() -> None:
+    told = [str(Parameter("b1", value, sigma, unit, 0.0, "", 1.0))
+            for value, sigma, unit in ((1.0, 0.25, "m/s^2"), (1.0, 0.25, "1"), (None, 0.25, "1"), (1.0, None, "1"))]  # fmt: skip
+    assert told == ["b1 = 1 ± 0.25 m/s^2", "b1 = 1 ± 0.25", "b1 is not determined", "b1 is not determined"]
 
 
 def test_considered_parameters_enlarge_the_covariance_by_p_b_p() -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import itertools
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.signal_quality import (
     Readings,
     _first_seen,
+    _reach,
     _repeating,
     clustering,
     common_step,
@@ -130,6 +133,20 @@ def test_a_top_cut_within_the_noise_is_found_by_what_is_missing_above(below_sigm
     level = max(visit.dwell.means[4] for visit in calibrate(Run(seed=2, poses=FACES, dwells=12)).visits)
     found = readings(run, lambda v: np.minimum(v, [level - below_sigmas * 1e-4, 99.0, 99.0])).saturation
     assert [each.channel for each in found] == ([] if below_sigmas == -4.0 else [1])
+
+
+@pytest.mark.parametrize("blocks", [1, 3, 50])
+@pytest.mark.parametrize("static", [True, False])
+def test_readings_at_the_ends_of_a_dwell_are_counted_however_it_comes(blocks: int, static: bool) -> None:
+    values = np.clip(np.random.default_rng(4).normal(size=(600, 3)), [-1.0, -1.5, -9.0], [1.5, 1.0, 9.0])
+    seen = _first_seen(1, values)
+    for part in np.array_split(values, blocks):
+        rows: Any = SimpleNamespace(static=static, readings=part, innovation=np.ascontiguousarray(part.T) - 0.3)
+        _reach(seen, rows)
+    ends = np.append(values.max(axis=0), -values.min(axis=0))
+    np.testing.assert_array_equal(seen.ends, ends)
+    both = np.hstack([values, -values])
+    np.testing.assert_array_equal(seen.stuck, np.count_nonzero(both == ends, axis=0))
 
 
 def test_what_noise_puts_above_a_step() -> None:

@@ -75,3 +75,16 @@ def test_an_order_of_channels_is_told_where_the_norm_changes_by_six_sigma() -> N
         assert np.hypot(silent, 1e-3) == pytest.approx(here / 6.0, rel=1e-6)
     assert not at_rest(wired[:5], bias).misfit(PLAIN, True) and not at_rest(wired, bias).misfit(PLAIN, False)
     assert not at_rest(FACES + np.array([bias, 0.0, 0.0]), bias).misfit(PLAIN, True)
+
+
+def test_another_order_of_channels_is_told_where_it_leaves_less_than_a_sixth_of_the_change() -> None:
+    bias, uneven = 0.1, np.array([1.0, -1.0, 1.0, 1.0, -1.0, 1.0])
+
+    def changes(size: float) -> tuple[Floats, float, float]:
+        wired = FACES * (1.0 + size * uneven)[:, None] + np.array([0.0, bias, 0.0])
+        norms = (np.linalg.norm(wired[:, order] - [bias, 0.0, 0.0], axis=1) for order in ([0, 1, 2], [1, 0, 2]))
+        return wired, *(float(np.std(own)) for own in norms)
+
+    silent = begins_at(lambda size: not at_rest(changes(size)[0], bias, 1e-6, 1e-6).misfit(PLAIN, True), 1e-5, 0.1)
+    _, here, there = changes(silent)
+    assert here == pytest.approx(6.0 * there, rel=1e-6)

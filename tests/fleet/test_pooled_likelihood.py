@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,12 +12,12 @@ from helpers.long_runs import slow
 from helpers.run_factors import campaign_of, run_factor_of
 from scipy.linalg import block_diag
 from scipy.special import logsumexp
-from scipy.stats import chi2, multivariate_normal, norm
+from scipy.stats import binom, chi2, multivariate_normal, norm
 
 from kf_calib.fleet.campaign import Campaign, log_evidence, log_evidence_of_modes, modes, posterior, sizes
 from kf_calib.fleet.own_coefficients import UnitInformation, UnitsAndCommon, population
 from kf_calib.fleet.pooled_terms import Attribution, DatedSums, PooledTerms, Sums, Term
-from kf_calib.fleet.shape import POWERS, SHARES, SomeUnits, _likeliest, _told, about_mean, about_zero
+from kf_calib.fleet.shape import POWERS, SHARES, CoefficientShape, SomeUnits, _likeliest, _told, about_mean, about_zero
 
 
 def beside_nothing(own: UnitInformation) -> UnitsAndCommon:
@@ -317,3 +319,12 @@ def test_share_covers_the_truth_where_units_hardly_tell_who_has_the_effect(alike
         low, high = some.share(float(every))[1]
         inside += low <= 0.5 <= high
     assert inside >= 7
+
+
+def test_the_share_of_units_that_have_an_effect_is_within_the_quantiles_of_their_number() -> None:
+    """400 units that each have it with 30 %: a binomial number of them, and its 95 %."""
+    odds = [(np.zeros((200, 1, 1)), np.full((200, 1, 1), np.log(0.3)))] * 2
+    shape: Any = SimpleNamespace(units=400, _logs=np.zeros((1, 1)), _odds=lambda: odds)
+    np.testing.assert_allclose(
+        CoefficientShape.interval(shape), binom.ppf([0.025, 0.975], 400, 0.3) / 400, atol=1.5 / 400
+    )
