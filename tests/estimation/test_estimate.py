@@ -21,8 +21,8 @@ def test_a_parameter_is_not_determined_from_ten_degrees_a_fifth_or_two_metres_pe
 
 
 def test_a_parameter_in_words() -> None:
-    told = [str(Parameter("b1", value, sigma, unit, 0.0, "", 1.0))
-            for value, sigma, unit in ((1.0, 0.25, "m/s^2"), (1.0, 0.25, "1"), (None, 0.25, "1"), (1.0, None, "1"))]  # fmt: skip
+    cases = (1.0, 0.25, "m/s^2"), (1.0, 0.25, "1"), (None, 0.25, "1"), (1.0, None, "1")
+    told = [str(Parameter("b1", value, sigma, unit, 0.0, "", 1.0)) for value, sigma, unit in cases]
     assert told == ["b1 = 1 ± 0.25 m/s^2", "b1 = 1 ± 0.25", "b1 is not determined", "b1 is not determined"]
 
 
