@@ -106,3 +106,25 @@ def test_the_bounds_of_a_variance_are_those_of_chi_squared(freedom: int) -> None
     for normal in (-0.674, 0.0, 2.0):
         exact = stats.chi2.ppf(stats.norm.cdf(normal), freedom) / freedom
         assert _chi_squared(normal, freedom) == pytest.approx(exact, rel=0.03)
+
+
+@pytest.mark.parametrize("count", [200, 999, 1000, 1013])
+def test_windows_are_one_after_another_and_the_last_has_what_is_left(
+    count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    windows = list[tuple[int, int, np.ndarray, float]]()
+    monkeypatch.setattr(
+        RestSegmenter, "_add_window", lambda self, window, *bounds: (windows.append(window), iter(()))[1]
+    )
+    values = np.random.default_rng(1).normal(size=(count, 3)) + np.array([0.0, 9.8, 0.0])
+    segmenter = RestSegmenter(BENCH)
+    for part in np.array_split(np.arange(count), 7):
+        accel = Stream(part * 10_000_000, values[part])
+        assert not list(segmenter.push(Batch(accel, Stream.empty(4))))
+    list(segmenter.finish())
+    assert [each.begin for each in windows] == [0, *(each.end for each in windows[:-1])] and windows[-1].end == count
+    assert len({each.end - each.begin for each in windows[:-1]}) == 1
+    for each in windows:
+        own = values[each.begin : each.end]
+        np.testing.assert_allclose(each.mean, own.mean(axis=0), rtol=1e-12)
+        assert each.variance == pytest.approx(own.var(axis=0, ddof=1).sum(), rel=1e-12)

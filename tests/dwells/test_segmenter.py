@@ -374,3 +374,14 @@ def test_while_the_platform_moves_there_is_no_dwell_that_it_arrived_at() -> None
     segmenter = Segmenter(BENCH)
     blocks = list(segmenter.push(Batch(readings(pose, 29), pose)))
     assert blocks and segmenter.standing is None and np.isnan(segmenter.arrival_s)
+
+
+def test_a_run_with_a_single_message_of_its_angles_is_one_dwell() -> None:
+    """From its first reading, whenever the message comes; without readings, or without angles, there is none."""
+    accel = readings(path(*SLEWS[:2], rate_hz=10.0), 9.0)
+    for at_s in (0.0, 4.0, 12.0):
+        pose = Stream(np.array([round(at_s * S)]), np.zeros((1, 2)))
+        ((begin, end),) = spans(Given(Batch(accel, pose)), settle_s=1.0)
+        assert (begin, end) == pytest.approx((0.0, 8.99), abs=0.02)
+        assert spans(Given(Batch(accel[:0], pose))) == []
+    assert spans(Given(Batch(accel, pose[:0]))) == []
