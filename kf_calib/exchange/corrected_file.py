@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import io
 import struct
+from codecs import BOM_UTF8
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -234,23 +235,29 @@ def _to_excel(path: Path, copy: Path, grid: Grid, places: list[int], force: Floa
 def _to_text(path: Path, copy: Path, grid: Grid, places: list[int], force: Floats) -> None:
     """Write a copy of a text."""
     content = path.read_bytes()
-    utf16 = content.startswith((b"\xff\xfe", b"\xfe\xff"))
-    text = content.decode("utf-16") if utf16 else content.decode("utf-8", errors="surrogateescape")
-    lines = text.splitlines(keepends=True)
+    utf16, marked = content.startswith((b"\xff\xfe", b"\xfe\xff")), content.startswith(BOM_UTF8)
+    codec, errors = ("utf-16", "strict") if utf16 else ("utf-8-sig" if marked else "utf-8", "surrogateescape")
+    lines = content.decode(codec, errors).splitlines(keepends=True)
     plain = [line.rstrip("\r\n") for line in lines]
     delimiter = delimiter_of([line for line in plain if line.strip() and not line.startswith("#")])
     decimal = "," if delimiter != "," and not any("." in plain[k - 1] for k in grid.numbers) else "."
-    changed = {number - 1: [repr(value).replace(".", decimal) for value in own]
-               for number, own in zip(grid.numbers, force.tolist(), strict=True)}  # fmt: skip
-    for number, texts in _new_heads(grid):
-        cells = [plain[number - 1][slice(*at)] for at in cell_spans(plain[number - 1], delimiter)]
-        kept = [cells[place] if place < len(cells) else "" for place in places]
-        changed[number - 1] = [text if cell.strip('" ') else cell for text, cell in zip(texts, kept, strict=True)]
-    for k, texts in changed.items():
-        spans, line = cell_spans(plain[k], delimiter), lines[k]
+    new = {number: [repr(value).replace(".", decimal) for value in own]
+           for number, own in zip(grid.numbers, force.tolist(), strict=True)}  # fmt: skip
+    for number, texts in (*new.items(), *_new_heads(grid)):
+        line, is_units = lines[number - 1], number in grid.head[1:]
+        spans = cell_spans(plain[number - 1], delimiter)
+        cells = [line[start:end] for start, end in spans]
+        if _is_part(cells) or not (is_units or len(spans) > max(places)):
+            raise InputError(f"{path}: the row that ends in line {number} goes over several lines: write it in one, "
+                             "without line breaks in its cells.")  # fmt: skip
         for place, text in sorted(zip(places, texts, strict=True), reverse=True):
-            if place < len(spans):
+            if not is_units or (place < len(cells) and cells[place].strip('" ')):
                 line = line[: spans[place][0]] + text + line[spans[place][1] :]
-        lines[k] = line
-    joined = "".join(lines)
-    write_whole(copy, joined.encode("utf-16") if utf16 else joined.encode("utf-8", errors="surrogateescape"))
+        lines[number - 1] = line
+    write_whole(copy, "".join(lines).encode(codec, errors))
+
+
+def _is_part(cells: Sequence[str]) -> bool:
+    """Tell whether the cells of a line are the end of a row, in which a quoted cell has a line break."""
+    in_quotes = any(cell.startswith('"') or cell.endswith('"') for cell in cells)
+    return in_quotes and sum(cell.count('"') for cell in cells) % 2 == 1

@@ -112,3 +112,31 @@ def test_a_corrected_table_has_names_where_names_were_and_units_where_units_were
         assert [cell for cell in kept if cell] == given
     corrected = np.array([[float(cell) for cell in row[1:]] for row in found[len(heads) :]])
     np.testing.assert_allclose(corrected, correction(readings_g * 9.80665), rtol=1e-12)
+
+
+@pytest.mark.parametrize("line", [1, 4])
+@pytest.mark.parametrize("cell", ['"a\nb"', '"a\nb,c,d,e"'])
+def test_a_row_that_goes_over_several_lines_is_refused(
+    line: int, cell: str, correction: Correction, tmp_path: Path
+) -> None:
+    path, copy = tmp_path / "poses.csv", tmp_path / "corrected.csv"
+    faces = np.vstack([np.eye(3), -np.eye(3)]).tolist()
+    rows = ["ax [g],ay [g],az [g],remark", *(f'{x},{y},{z},"a face"' for x, y, z in faces)]
+    rows[line - 1] = f"{rows[line - 1].rpartition(',')[0]},{cell}"
+    path.write_text("\n".join(rows))
+    with pytest.raises(InputError, match=f"the row that ends in line {line + 1} goes over several lines"):
+        apply_to_table(correction, path, copy, {}, {}, Units())
+    assert not copy.exists()
+
+
+@pytest.mark.parametrize("codec", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
+def test_a_copy_has_the_encoding_of_the_table(codec: str, correction: Correction, tmp_path: Path) -> None:
+    path, copy = tmp_path / "poses.csv", tmp_path / "corrected.csv"
+    faces = np.vstack([np.eye(3), -np.eye(3)]).tolist()
+    rows = ["ax größe [g],ay größe [g],az größe [g],Prüfung", *(f"{x},{y},{z},außen" for x, y, z in faces)]
+    path.write_bytes("\n".join(rows).encode(codec))
+    columns = {f"a{axis} größe [g]": f"a{axis}_g" for axis in "xyz"}
+    apply_to_table(correction, path, copy, {}, columns, Units())
+    assert copy.read_bytes()[:2] == path.read_bytes()[:2]
+    first, *others = copy.read_text(codec).splitlines()
+    assert first == "ax_mps2,ay_mps2,az_mps2,Prüfung" and all(other.endswith(",außen") for other in others)
