@@ -38,7 +38,7 @@ from kf_calib.sources.files.sqlite_bag import SqliteBag
 from kf_calib.support.text import cut
 
 _USUAL_RATIO = 20  # sizes of a recording unpacked and packed, at most
-_SQLITE, _ZSTD = b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
+SQLITE, _ZSTD = b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
 
 
 class RecordFile(Protocol):
@@ -66,7 +66,7 @@ def open_record_file(path: Path, max_chunk: int, usable: frozenset[str]) -> Reco
         place = _unpacked(path, max_chunk)
     file: RecordFile
     try:
-        if _head(place).startswith(_SQLITE):
+        if _head(place).startswith(SQLITE):
             file = SqliteBag(path, place, usable, max_chunk)
         else:
             file = McapFile(path, max_chunk, place)
@@ -80,7 +80,7 @@ def open_record_file(path: Path, max_chunk: int, usable: frozenset[str]) -> Reco
 def _head(path: Path) -> bytes:
     try:
         with path.open("rb") as file:
-            return file.read(len(_SQLITE))
+            return file.read(len(SQLITE))
     except OSError:  # said where the file is opened to be read
         return b""
 

@@ -19,7 +19,7 @@ from kf_calib.support.text import cut
 Cell = str | float | datetime | None
 """A cell as it was read; text is not interpreted yet, an empty cell is None."""
 _CYRILLIC = re.compile(rb"[\xc0-\xff]{3}")
-ZIP, MCAP = b"PK\x03\x04", b"\x89MCAP"
+ZIP = b"PK\x03\x04"
 TEXT_SUFFIXES = (".csv", ".tsv", ".txt")
 EXCEL_SUFFIXES = (".xlsx", ".xlsm")
 OLD_SUFFIXES = (".xls", ".ods")
