@@ -22,13 +22,12 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.candidate_tests import LEVEL, SHARE, CandidateTests
+from kf_calib.diagnosis.candidate_tests import CandidateTests
 from kf_calib.effects import Coefficient, Effect, FrameEffect, Stimulus
 from kf_calib.effects.effect import Grade, Typical
 from kf_calib.estimation.dwell_columns import stimulus_of
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import effect_columns
-from kf_calib.estimation.observability import smallest_size
 
 _TAIL = 1.0  # decades beyond the usual sizes in which the density falls by a factor e
 _SHARPER = 100.0  # where only the greatest usual size is known, the least one is smaller by this factor
@@ -234,14 +233,10 @@ class Unseen:
 def detectable(test: CandidateTests) -> list[Detectable]:
     """The smallest detectable size of every visible effect, from its columns and not from the readings."""
     limits = list[Detectable]()
-    for name, k in test.effects.best.items():
-        candidate = test.effects.scan.candidates[k]
-        limit = (
-            None if name in test.invisible else smallest_size(candidate, SHARE * LEVEL / test.effects.independent_tests)
-        )
-        if limit is not None:
-            coefficient, minimum = limit
-            limits.append(Detectable(name, minimum, coefficient, candidate.effect.typical))
+    for name in test.effects.best:
+        if name not in test.invisible and (smallest := test.effects.smallest_size(name)) is not None:
+            coefficient, minimum = smallest
+            limits.append(Detectable(name, minimum, coefficient, test.effects.candidate(name).effect.typical))
     return limits
 
 

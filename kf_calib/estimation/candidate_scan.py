@@ -56,6 +56,11 @@ class Candidate:
         determined."""
         return np.where(self.hidden, np.inf, np.linalg.norm(self.inverse, axis=1))
 
+    @property
+    def scales(self) -> Floats:
+        """Sizes (q,) of the coefficients that a user would call large, in SI."""
+        return np.array([each.scale for each in self.effect.coefficients])
+
     def within(self, other: Candidate, cosine: float = _SAME) -> bool:
         """Tell whether the span of this candidate lies inside the span of the other.
 

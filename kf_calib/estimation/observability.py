@@ -23,6 +23,7 @@ from kf_calib.estimation.score_test import scan
 from kf_calib.support.tail_probabilities import LEVEL
 from kf_calib.support.units import shown
 
+_IMPOSSIBLE = 1e3  # times a coefficient that a user would call large: about 1 g at 1 g
 POWER = 0.9
 """Share of runs in which an effect of the smallest detectable size is found."""
 
@@ -127,7 +128,7 @@ def _sight(scan: Scan, effect: Effect) -> Visibility:
     chance = 0.5 * LEVEL / max(tests, 1)  # half: the misfit as a whole is tested beside
     sized = [(smallest_size(each, chance), each) for each in of_effect]
     size, best = min(sized, key=lambda pair: np.inf if pair[0] is None else pair[0][1])
-    if not best.dof:
+    if size is None:
         return Visibility(best.effect, 0.0)
     overlaps = dict[str, float]()
     for other in scan.candidates:
@@ -135,7 +136,8 @@ def _sight(scan: Scan, effect: Effect) -> Visibility:
         if name != str(effect):
             overlaps[name] = max(overlaps.get(name, 0.0), best.overlap(other))
     confused = sorted((pair for pair in overlaps.items() if pair[1] > _CONFUSED), key=lambda pair: -pair[1])[:_NAMED]
-    unseen = [c.symbol for c, hidden in zip(best.effect.coefficients, best.hidden, strict=True) if hidden]
+    found = np.isfinite(_found_from(best, chance)).tolist()
+    unseen = [each.symbol for each, is_found in zip(best.effect.coefficients, found, strict=True) if not is_found]
     return Visibility(best.effect, min(best.visibility, 1.0), tuple(unseen), size, tuple(confused))
 
 
@@ -147,13 +149,21 @@ def smallest_size(candidate: Candidate, chance: float) -> tuple[Coefficient, flo
     freedom. A coefficient of size a, whose column g is in units of the noise, lowers it by a noncentral chi-squared;
     so a = sqrt(l) / |g|, l being the noncentrality with P(chi2(k, l) > c) = 0.9.
     """
+    sizes = _found_from(candidate, chance)
+    if not np.isfinite(sizes).any():
+        return None
+    worst = int(np.argmax(np.where(np.isfinite(sizes), sizes, 0.0)))
+    return candidate.effect.coefficients[worst], float(sizes[worst])
+
+
+def _found_from(candidate: Candidate, chance: float) -> Floats:
+    """Return the sizes (q,) from which on coefficients are found; infinite where none could be so large."""
     from scipy.special import chdtri, chndtrinc
 
     sizes: Floats = np.linalg.norm(candidate.columns, axis=0)
-    seen = np.flatnonzero(~candidate.hidden & (sizes > 0))
-    if not (candidate.dof and seen.size):
-        return None
+    if not candidate.dof:
+        return np.full(len(sizes), np.inf)
     threshold = float(chdtri(candidate.dof, chance))
-    worst = int(seen[np.argmin(sizes[seen])])
     needed = float(np.sqrt(chndtrinc(threshold, candidate.dof, 1.0 - POWER)))
-    return candidate.effect.coefficients[worst], needed / float(sizes[worst])
+    found = needed / np.where(candidate.hidden | (sizes == 0.0), 1e-300, sizes)
+    return np.where(found > _IMPOSSIBLE * candidate.scales, np.inf, found)

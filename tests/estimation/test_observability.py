@@ -10,11 +10,14 @@ from helpers.hidden_effects import run
 from scipy.stats import chi2, ncx2
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.diagnosis.candidate_tests import assess_candidates
+from kf_calib.diagnosis.coefficient_sizes import detectable
 from kf_calib.effects import Effect, effect_named, names
 from kf_calib.estimation.dwell_columns import candidate_columns
 from kf_calib.estimation.observability import Visibility, smallest_size, visibility_of
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import scan
+from kf_calib.sources.simulation.visit_plans import PlannedVisit
 from kf_calib.support.tail_probabilities import LEVEL
 
 
@@ -102,3 +105,22 @@ def test_the_smallest_size_allows_for_the_number_of_tests() -> None:
     assert smallest is not None and tests > 30
     noncentrality = (smallest[1] * np.linalg.norm(candidate.columns, axis=0).min()) ** 2
     assert ncx2.sf(chi2.isf(0.5 * LEVEL / tests, 3), 3, noncentrality) == pytest.approx(0.9, abs=1e-6)
+
+
+def test_what_no_sensor_could_have_is_not_seen() -> None:
+    """Turned about one gimbal, along whose axis nothing changes: of the flexure along it, and of the cube of the
+    accelerometer that lies in it, only what is billions or thousands of times large would be found."""
+    result = run(plan=[PlannedVisit((0.0, 45.0 * k, 0.0), 8.0) for k in range(8)])
+    test = assess_candidates(result.fit)
+    found = {each.name: each for each in detectable(test)}
+    assert all(each.minimum <= 1000.0 * each.coefficient.scale for each in found.values())
+    for name, place in (("flexure", 2), ("third-order", 2)):
+        alone = test.effects.candidate(name)
+        (sight,) = visibility_of(result.fit, [alone.effect])
+        sizes = 5.0 / np.linalg.norm(alone.columns, axis=0) / alone.scales
+        assert sizes[place] > 1000.0 and np.delete(sizes, place).max() < 1.0
+        assert sight.unseen == (alone.effect.coefficients[place].symbol,)
+        assert found[name].minimum < alone.scales[0] and sight.smallest is not None
+        assert sight.smallest[1] < alone.scales[0]
+    for name in {*test.effects.best} - {*found}:
+        assert name in test.invisible
