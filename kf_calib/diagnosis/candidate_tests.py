@@ -21,7 +21,7 @@ from kf_calib.estimation.candidate_scan import Candidate, Scan
 from kf_calib.estimation.dwell_columns import stimulus_of
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import Model
-from kf_calib.estimation.observability import smallest_size
+from kf_calib.estimation.observability import is_seen, smallest_size
 from kf_calib.estimation.results import consistency
 from kf_calib.estimation.score_test import Frame
 from kf_calib.support import stage
@@ -70,12 +70,18 @@ class EffectTests:
     @cached_property
     def unseen(self) -> list[str]:
         """Effects of which the run shows nothing: those invisible in these orientations, and those of slews only."""
-        return [*(name for name in self.best if self.smallest_size(name) is None), *self.in_slews_only]
+        hidden = (name for name in self.best if not is_seen(self.candidate(name), self._chance))
+        return [*hidden, *self.in_slews_only]
 
     def smallest_size(self, name: str) -> tuple[Coefficient, float] | None:
         """The coefficient of an effect that is hardest to find, and the size (SI) from which on it is found in 9 of 10
-        runs; None where no sensor could have so much."""
-        return smallest_size(self.candidate(name), SHARE * LEVEL / self.independent_tests)
+        runs; None where none is determined by itself."""
+        return smallest_size(self.candidate(name), self._chance)
+
+    @property
+    def _chance(self) -> float:
+        """The probability that noise alone makes one effect significant."""
+        return SHARE * LEVEL / self.independent_tests
 
     def candidate(self, name: str) -> Candidate:
         """The best candidate of an effect."""

@@ -128,7 +128,7 @@ def _sight(scan: Scan, effect: Effect) -> Visibility:
     chance = 0.5 * LEVEL / max(tests, 1)  # half: the misfit as a whole is tested beside
     sized = [(smallest_size(each, chance), each) for each in of_effect]
     size, best = min(sized, key=lambda pair: np.inf if pair[0] is None else pair[0][1])
-    if size is None:
+    if not is_seen(best, chance):
         return Visibility(best.effect, 0.0)
     overlaps = dict[str, float]()
     for other in scan.candidates:
@@ -136,8 +136,8 @@ def _sight(scan: Scan, effect: Effect) -> Visibility:
         if name != str(effect):
             overlaps[name] = max(overlaps.get(name, 0.0), best.overlap(other))
     confused = sorted((pair for pair in overlaps.items() if pair[1] > _CONFUSED), key=lambda pair: -pair[1])[:_NAMED]
-    found = np.isfinite(_found_from(best, chance)).tolist()
-    unseen = [each.symbol for each, is_found in zip(best.effect.coefficients, found, strict=True) if not is_found]
+    lost = (best.hidden | np.isinf(_found_from(best, chance))).tolist()
+    unseen = [each.symbol for each, is_lost in zip(best.effect.coefficients, lost, strict=True) if is_lost]
     return Visibility(best.effect, min(best.visibility, 1.0), tuple(unseen), size, tuple(confused))
 
 
@@ -149,15 +149,20 @@ def smallest_size(candidate: Candidate, chance: float) -> tuple[Coefficient, flo
     freedom. A coefficient of size a, whose column g is in units of the noise, lowers it by a noncentral chi-squared;
     so a = sqrt(l) / |g|, l being the noncentrality with P(chi2(k, l) > c) = 0.9.
     """
-    sizes = _found_from(candidate, chance)
-    if not np.isfinite(sizes).any():
+    sizes = np.where(candidate.hidden, np.inf, _found_from(candidate, chance))
+    if np.isinf(sizes).all():
         return None
     worst = int(np.argmax(np.where(np.isfinite(sizes), sizes, 0.0)))
     return candidate.effect.coefficients[worst], float(sizes[worst])
 
 
+def is_seen(candidate: Candidate, chance: float) -> bool:
+    """Whether a sensor could have so much of an effect that it is found."""
+    return bool(np.isfinite(_found_from(candidate, chance)).any())
+
+
 def _found_from(candidate: Candidate, chance: float) -> Floats:
-    """Return the sizes (q,) from which on coefficients are found; infinite where none could be so large."""
+    """Return the sizes (q,) from which on coefficients alone are found; infinite where none could be so large."""
     from scipy.special import chdtri, chndtrinc
 
     sizes: Floats = np.linalg.norm(candidate.columns, axis=0)
@@ -165,5 +170,5 @@ def _found_from(candidate: Candidate, chance: float) -> Floats:
         return np.full(len(sizes), np.inf)
     threshold = float(chdtri(candidate.dof, chance))
     needed = float(np.sqrt(chndtrinc(threshold, candidate.dof, 1.0 - POWER)))
-    found = needed / np.where(candidate.hidden | (sizes == 0.0), 1e-300, sizes)
+    found = needed / np.maximum(sizes, 1e-300)
     return np.where(found > _IMPOSSIBLE * candidate.scales, np.inf, found)

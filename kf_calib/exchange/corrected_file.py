@@ -207,9 +207,9 @@ def apply_to_table(
 
 
 def _new_heads(grid: Grid) -> Iterator[tuple[int, Sequence[str]]]:
-    """Yield the number of the row of the header, and of that of units where there is one, with what a copy has there
+    """Return the number of the row of the header, and of that of units where there is one, with what a copy has there
     for the three readings."""
-    yield from zip(grid.head, (_NAMES, ["m/s^2"] * 3), strict=False)
+    return zip(grid.head, (_NAMES, ["m/s^2"] * 3), strict=False)
 
 
 def _to_excel(path: Path, copy: Path, grid: Grid, places: list[int], force: Floats) -> None:

@@ -18,7 +18,7 @@ from kf_calib.sources.files.line_parts import CsvHeading, head_of
 from kf_calib.sources.files.lines import Lines, is_json
 from kf_calib.sources.files.mcap_file import HEAD_BYTES, is_lines
 from kf_calib.sources.files.mcap_records import MAGIC
-from kf_calib.sources.files.record_files import SQLITE
+from kf_calib.sources.files.record_files import SQLITE, first_bytes
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.tables.grid import OLD_SUFFIXES, TEXT_SUFFIXES, ZIP
 from kf_calib.sources.tables.opening import open_table
@@ -50,13 +50,11 @@ def kind_of(path: str | PathLike[str], columns: Mapping[str, str] = MappingProxy
     file = Path(path)
     if not file.is_file():
         return FileKind.RECORDING
+    if first_bytes(file).startswith((MAGIC, SQLITE)):  # whatever its name ends in
+        return FileKind.RECORDING
     try:
-        with file.open("rb") as raw:
-            start = raw.read(len(SQLITE))
         head = head_of(file)
     except OSError:  # said where the file is opened to be read
-        return FileKind.RECORDING
-    if start.startswith((MAGIC, SQLITE)):  # whatever its name ends in
         return FileKind.RECORDING
     suffix = Path(file.stem if file.suffix.lower() == ".gz" else file).suffix.lower()
     if head.startswith(ZIP) or suffix in OLD_SUFFIXES:

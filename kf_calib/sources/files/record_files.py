@@ -62,11 +62,11 @@ def open_record_file(path: Path, max_chunk: int, usable: frozenset[str]) -> Reco
     Raises InputError where it is neither.
     """
     place = path
-    if _head(path).startswith(_ZSTD):
+    if first_bytes(path).startswith(_ZSTD):
         place = _unpacked(path, max_chunk)
     file: RecordFile
     try:
-        if _head(place).startswith(SQLITE):
+        if first_bytes(place).startswith(SQLITE):
             file = SqliteBag(path, place, usable, max_chunk)
         else:
             file = McapFile(path, max_chunk, place)
@@ -77,7 +77,8 @@ def open_record_file(path: Path, max_chunk: int, usable: frozenset[str]) -> Reco
     return file
 
 
-def _head(path: Path) -> bytes:
+def first_bytes(path: Path) -> bytes:
+    """By which a recording is told from other files; none where the file cannot be read."""
     try:
         with path.open("rb") as file:
             return file.read(len(SQLITE))

@@ -300,7 +300,11 @@ def draw_detection_limits(figure: FigureBase, diagnosis: Diagnosis, below: float
         _size_bars(figure.add_subplot(grid[0, column]), half_of_sizes, half, diagnosis.grade, not column)
     words = figure.add_subplot(grid[1, :])
     words.set_axis_off()
-    words.set_title("Not to be seen in this run at any size" if texts else "Every effect could be seen in this run")
+    words.set_title(
+        "Not to be seen in this run at any size that a sensor could have"
+        if texts
+        else "Every effect could be seen in this run"
+    )
     words.text(0.0, 1.0, "\n".join(texts), transform=words.transAxes, va="top", color=GREY, fontsize=8.0)
 
 
