@@ -249,11 +249,15 @@ class DwellStack(ComputedSequence[DwellFactor]):
     _made: dict[int, DwellFactor] = field(default_factory=dict[int, DwellFactor])
 
     @classmethod
-    def of(cls, dwells: Sequence[DwellFactor]) -> DwellStack:
-        """Any dwells as a stack; a stack as it is."""
+    def of(cls, dwells: Sequence[DwellFactor], like: DwellStack | None = None) -> DwellStack:
+        """Any dwells as a stack; a stack as it is.
+
+        like: a stack that may be of the same dwells; what has been computed from them is then not computed again.
+        """
         if isinstance(dwells, DwellStack):
             return dwells
-        still, folded = np.zeros(3), Folded(dwells)
+        is_alike = like is not None and like.folded.dwells == tuple(dwells)  # the same objects
+        still, folded = np.zeros(3), like.folded if like is not None and is_alike else Folded(dwells)
         turned_rad, attitudes = None, None
         if any(dwell.turned_rad is not None for dwell in dwells):
             turned_rad = np.array([still if dwell.turned_rad is None else dwell.turned_rad for dwell in dwells])
