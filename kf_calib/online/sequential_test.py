@@ -186,8 +186,10 @@ class Running:
         factor[:, -1] -= factor[:, :-1] @ self.about
         variances = steps(self.dwells, self.noise)
         running = replace(self, factor=factor, left=0.0, rows=0)
-        for k, variance in enumerate(variances):  # the rows of all dwells together would take much memory
-            running = running._update(self._rows([k])[0], variance)
+        for first in range(0, len(variances), _TOGETHER):
+            part = range(first, min(first + _TOGETHER, len(variances)))
+            for k, rows in zip(part, self._rows(part), strict=True):
+                running = running._update(rows, variances[k])
         return running
 
     def _rows(self, chosen: Sequence[int] | None = None) -> Sequence[Floats]:
@@ -201,6 +203,7 @@ class Running:
 
 
 _GROWN = 1.25
+_TOGETHER = 16  # dwells whose rows are whitened together: those of a long run would take much memory
 _FEWEST = 4
 """Number of dwells with which a watch can begin: fewer cannot determine scale factors and misalignments."""
 

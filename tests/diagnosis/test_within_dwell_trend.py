@@ -76,6 +76,7 @@ def test_coloured_noise_and_stated_scatter_make_no_trend(noise: dict[str, float]
     assert min(found_in(run(seed=seed, **noise)).p_value for seed in seeds) > 0.01
 
 
+@pytest.mark.slow
 def test_a_walk_in_the_model_is_expected_within_dwells_too() -> None:
     """Of a walk as strong as the noise of a dwell: without it in the model its slopes are no noise."""
     plan = plan_of(24, dwell_s=20.0, seed=3)
@@ -110,6 +111,7 @@ def test_a_trend_is_told_where_it_is() -> None:
     assert found.most == (7, 2)
 
 
+@pytest.mark.slow
 def test_a_watch_sees_it_while_the_run_goes_on() -> None:
     """Dwell by dwell, as the diagnosis does in the end, but for noise found a quarter of the run earlier."""
     before = run("chirp=25sigma;frequency=0.02;chirp=2e-4", seed=4)
@@ -142,7 +144,8 @@ def disturbed_in(made: Run) -> DisturbedDwell:
     return disturbed_dwell(Refits(made).with_effects(calibrate(made), ("sinusoid",)).fit)
 
 
-@pytest.mark.parametrize("count", [3, *slow(12, 100)])
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [12, 100])
 def test_an_oscillation_that_goes_on_in_all_dwells_disturbs_none(count: int) -> None:
     """The p-value of the dwell that differs most is uniform, however strong the oscillation is."""
     p_values = [disturbed_in(swinging(1e-4 * 5.0 ** (seed % 3), seed)).p_value for seed in range(count)]
