@@ -111,6 +111,20 @@ def test_a_trend_is_told_where_it_is() -> None:
     assert found.most == (7, 2)
 
 
+def test_dwells_that_are_noisier_than_others_show_no_trend_by_it() -> None:
+    """Every third dwell trembles eight times as much, and counts by that."""
+    made = Run(seed=1, dwells=12, count=400, white_mps2=1e-4)
+    made.bench = dataclasses.replace(made.bench, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
+    values = made.accel.values.copy()
+    for dwell in range(0, 12, 3):
+        part = slice(400 * dwell, 400 * (dwell + 1))
+        values[part] += 8e-4 * np.random.default_rng(dwell).standard_normal(values[part].shape)
+    made.accel = Stream(made.accel.time_ns, values)
+    result = calibrate(made)
+    assert np.ptp([dwell.weight for dwell in result.fit.dwells]) > 0.5
+    assert 0.7 < found_in(result).ratio < 1.4
+
+
 @pytest.mark.slow
 def test_a_watch_sees_it_while_the_run_goes_on() -> None:
     """Dwell by dwell, as the diagnosis does in the end, but for noise found a quarter of the run earlier."""
