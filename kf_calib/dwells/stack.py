@@ -256,9 +256,9 @@ class DwellStack(ComputedSequence[DwellFactor]):
         """
         if isinstance(dwells, DwellStack):
             return dwells
-        is_alike = like is not None and like.folded.dwells == tuple(dwells)  # the same objects
-        still, folded = np.zeros(3), like.folded if like is not None and is_alike else Folded(dwells)
-        turned_rad, attitudes = None, None
+        is_same = like is not None and like.folded.dwells == tuple(dwells)  # the same objects
+        folded = like.folded if like is not None and is_same else Folded(dwells)
+        still, turned_rad, attitudes = np.zeros(3), None, None
         if any(dwell.turned_rad is not None for dwell in dwells):
             turned_rad = np.array([still if dwell.turned_rad is None else dwell.turned_rad for dwell in dwells])
         if any(dwell.attitude is not None for dwell in dwells):
