@@ -233,6 +233,7 @@ def test_time_to_a_target_is_the_time_it_takes() -> None:
     assert first.course is not None and (first.course.sigma[-1] < first.result.estimate.sigma).all()
 
 
+@pytest.mark.slow
 def test_noise_raises_no_alarm_and_unstated_noise_is_waited_for() -> None:
     source = Run(seed=3, dwells=14, count=60, setting_deg=0.005, stated=False)
     found = judgements(Session(source))
@@ -271,6 +272,7 @@ def test_a_failing_evaluation_still_reads_the_source_to_its_end() -> None:
     assert len(read) == len(list(bench(orientations=5))) and "the evaluation stopped" in session.standing.notice
 
 
+@pytest.mark.slow
 def test_memory_is_that_of_the_dwells() -> None:
     """Ten times the samples in the same dwells: no more is kept of them."""
 
@@ -359,6 +361,7 @@ def test_screen_lines_and_objects_of_a_standing(monkeypatch: pytest.MonkeyPatch)
     assert "0 readings" in empty and len(empty.splitlines()) <= 24
 
 
+@pytest.mark.slow
 def test_a_target_is_reached_when_its_sigma_says_so_and_not_when_the_predicted_time_is_over() -> None:
     session = Session(bench(orientations=8))
     last = judgements(session)[-1]
