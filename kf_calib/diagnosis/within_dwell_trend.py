@@ -22,9 +22,10 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.bench.paper_parameters import BIASES
+from kf_calib.dwells.pieces import basis_values, of_all_pieces
 from kf_calib.dwells.qr import orthonormal
 from kf_calib.dwells.rows import on_basis
-from kf_calib.dwells.sufficient_statistics import DwellFactor, alike
+from kf_calib.dwells.stack import AlikeDwells, DwellStack, Folded
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.square_root_information import scale_columns
@@ -106,12 +107,12 @@ def trend_beside(linearised: LinearisedDwells, noise: Noise, state: Floats) -> T
     """
     from scipy.special import fdtrc
 
-    dwells = linearised.dwells
-    if dwells[0].averaged or not noise.scatter_stated:
+    dwells, folded = linearised.dwells, linearised.dwells.folded
+    if folded.dwells[0].averaged or not noise.scatter_stated:
         return None
-    sigma, lengths_s = noise.effective_sigma_mps2, np.array([dwell.end_s - dwell.start_s for dwell in dwells])
+    sigma, lengths_s = noise.effective_sigma_mps2, folded.ends_s[:, 1] - folded.ends_s[:, 0]
     squares, determined = _squares(dwells, _residuals(linearised, state))
-    by_readings = (sigma**2 / np.array([[dwell.weight * dwell.count] for dwell in dwells]))[:, :, None]
+    by_readings = (sigma**2 / (folded.weights * folded.counts)[:, None])[:, :, None]
     walk_shapes, flicker_shapes = _of_shapes()
     by_walk = noise.walk_mps2_per_sqrt_s**2 * lengths_s[:, None, None] * walk_shapes
     by_noise = by_readings + by_walk + flicker_sigma(noise, len(dwells))[:, None] ** 2 * flicker_shapes
@@ -120,8 +121,7 @@ def trend_beside(linearised: LinearisedDwells, noise: Noise, state: Floats) -> T
     count = 3 * int(determined.sum())
     if not count:
         return None
-    readings = sum(dwell.count for dwell in dwells)
-    unsure = float(np.mean((4.0 * noise.inflation - 2.0) / readings)) / 3.0
+    unsure = float(np.mean((4.0 * noise.inflation - 2.0) / folded.counts.sum())) / 3.0
     unsure += (2.0 * (noise.walk_spread or 0.0) * float(np.mean(by_walk / expected))) ** 2
     ratio = float(ratios.sum() / count)
     shown = np.broadcast_to(determined[:, None, :], squares.shape)
@@ -149,52 +149,54 @@ def _by_thermometer(linearised: LinearisedDwells, noise: Noise) -> Floats | floa
     if noise.sensitivity_mps2_per_k is None:
         return 0.0
     errors = thermometer_errors(linearised.dwells_at_state, noise.sensitivity_mps2_per_k)
-    rows = [
-        _rows(dwell, own.reshape(*own.shape[:2], 3 * own.shape[3]))
-        for dwell, own in zip(linearised.dwells, errors, strict=True)
-    ]
-    squares, _ = _squares(linearised.dwells, rows)
-    return squares.reshape(len(rows), 3, -1, _DEGREE).sum(axis=2)
+    of_errors = basis_values(errors.values)
+    squares, _ = _squares(linearised.dwells, _on_triangles(linearised.dwells, of_errors))
+    return squares.reshape(len(squares), 3, -1, _DEGREE).sum(axis=2)
 
 
 def _residuals(linearised: LinearisedDwells, state: Floats) -> list[Floats]:
-    """Return the residuals (pieces, K, 3) of each dwell on the rows of its triangles."""
+    """Return the residuals (d, pieces, K, 3) of the dwells of each shape on the rows of their triangles."""
+    dwells, columns = linearised.dwells_at_state, of_all_pieces(linearised.columns)
+    of_model = _on_triangles(dwells, on_basis(columns @ state[: columns.shape[-1]]))
     return [
-        dwell.triangles[:, : dwell.width, dwell.width :] - _rows(dwell, columns @ state[: columns.shape[-1]])
-        for dwell, columns in zip(linearised.dwells_at_state, linearised.columns, strict=True)
+        triangles[:, :, : shape.width, shape.width :] - own
+        for shape, triangles, own in zip(dwells.folded.shapes, dwells.triangles, of_model, strict=True)
     ]
 
 
-def _rows(dwell: DwellFactor, values: Floats) -> Floats:
-    """Return the rows (pieces, K, c) of functions of time that are given at the nodes."""
-    return dwell.triangles[:, : dwell.width, : dwell.width] @ on_basis(values)
+def _on_triangles(dwells: DwellStack, coefficients: Floats) -> list[Floats]:
+    """Return the rows (d, pieces, K, c) of the dwells of each shape of functions of time with these coefficients
+    (pieces, K, c) on the basis functions."""
+    return [
+        triangles[:, :, : shape.width, : shape.width] @ coefficients[shape.pieces]
+        for shape, triangles in zip(dwells.folded.shapes, dwells.triangles, strict=True)
+    ]
 
 
-def _squares(dwells: Sequence[DwellFactor], rows: Sequence[Floats]) -> tuple[Floats, Mask]:
-    """Return the squared coefficients (D, c, degrees) of rows (pieces, K, c) on the shapes, scaled to mean square 1,
-    and a mask (D, degrees) of the degrees that the readings of each dwell determine.
+def _squares(dwells: DwellStack, rows: Sequence[Floats]) -> tuple[Floats, Mask]:
+    """Return the squared coefficients (D, c, degrees) of the rows of each shape of dwells, (d, pieces, K, c), on the
+    shapes of a trend, scaled to mean square 1, and a mask (D, degrees) of the degrees that the readings of each dwell
+    determine.
     """
-    squares, determined = np.zeros((len(dwells), rows[0].shape[2], _DEGREE)), np.zeros((len(dwells), _DEGREE), bool)
-    for numbers in alike(dwells):
-        group, group_rows = [dwells[k] for k in numbers], np.array([rows[k] for k in numbers])
-        frame, shown = _shapes_in(group, np.array([dwell.triangles for dwell in group]))
-        counts = np.array([dwell.count for dwell in group])[:, None, None]
-        along = np.swapaxes(group_rows.reshape(len(group), -1, group_rows.shape[3]), 1, 2) @ frame
-        squares[numbers, :, : frame.shape[2]] = along**2 / counts
-        determined[numbers, : frame.shape[2]] = shown
+    folded = dwells.folded
+    squares, determined = np.zeros((len(dwells), rows[0].shape[3], _DEGREE)), np.zeros((len(dwells), _DEGREE), bool)
+    for alike, triangles, own in zip(folded.shapes, dwells.triangles, rows, strict=True):
+        frame, shown = _trends_in(folded, alike, triangles)
+        along = np.swapaxes(own.reshape(len(own), -1, own.shape[3]), 1, 2) @ frame
+        squares[alike.dwells, :, : frame.shape[2]] = along**2 / folded.counts[alike.dwells, None, None]
+        determined[alike.dwells, : frame.shape[2]] = shown
     return squares, determined
 
 
-def _shapes_in(dwells: Sequence[DwellFactor], triangles: Floats) -> tuple[Floats, Mask]:
-    """Return orthonormal columns (d, r, k) on the triangle rows of dwells of equal size, one column for each degree
+def _trends_in(folded: Folded, alike: AlikeDwells, triangles: Floats) -> tuple[Floats, Mask]:
+    """Return orthonormal columns (d, r, k) on the triangle rows of dwells of one shape, one column for each degree
     from one up, and a mask (d, k) of the degrees that each dwell determines.
     """
-    ends = np.array([(dwell.start_s, dwell.end_s) for dwell in dwells])
-    counts, lengths = np.array([dwell.count for dwell in dwells]), ends[:, 1] - ends[:, 0]
-    at = np.array([[piece.nodes.elapsed_s for piece in dwell.pieces] for dwell in dwells])
+    ends, counts = folded.ends_s[alike.dwells], folded.counts[alike.dwells]
+    lengths, at = ends[:, 1] - ends[:, 0], folded.elapsed_s.reshape(-1, 3)[alike.pieces]
     from_start = (at - ends[:, 0, None, None]) / np.where(lengths > 0.0, lengths, 1.0)[:, None, None]
-    rows = triangles[:, :, : dwells[0].width, :3] @ on_basis(shapes(2.0 * from_start - 1.0))
-    frame, upper = np.linalg.qr(rows.reshape(len(dwells), -1, rows.shape[3]))
+    rows = triangles[:, :, : alike.width, :3] @ on_basis(shapes(2.0 * from_start - 1.0))
+    frame, upper = np.linalg.qr(rows.reshape(len(rows), -1, rows.shape[3]))
     determined = np.abs(np.einsum("dkk->dk", upper[:, :, : upper.shape[1]])) > 1e-6 * np.sqrt(counts)[:, None]
     determined &= ((counts >= _FEWEST) & (lengths > 0.0))[:, None]
     return frame[:, :, 1:], determined[:, 1:]

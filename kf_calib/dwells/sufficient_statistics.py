@@ -367,11 +367,3 @@ def lines_of(dwells: Sequence[DwellFactor], level: float = 0.01) -> tuple[Spectr
     steady = None if spectral_lines else tone([dwell.trace for dwell in dwells], 0.5 * level)
     oscillations = spectral_lines or ((steady,) if steady else ())
     return tuple(replace(line, p_value=min(1.0, 2.0 * line.p_value)) for line in oscillations)
-
-
-def alike(dwells: Sequence[DwellFactor]) -> list[list[int]]:
-    """Indices of dwells, grouped by number of pieces and basis functions, so that a group's arrays can be stacked."""
-    indices = dict[tuple[int, int], list[int]]()
-    for k, dwell in enumerate(dwells):
-        indices.setdefault((len(dwell.pieces), dwell.width), []).append(k)
-    return list(indices.values())

@@ -169,16 +169,19 @@ class LinearisedDwells:
         self.columns = [own for each, own in zip(every, columns, strict=True) if not each.moving]
         self.slew_columns = [own for each, own in zip(every, columns, strict=True) if each.moving]
 
-    def followed_by(self, dwell: DwellFactor) -> LinearisedDwells:
-        """The same with one more dwell; the columns of the others are not computed again."""
+    def followed_by(self, dwell: DwellFactor, like: DwellStack | None = None) -> LinearisedDwells:
+        """The same with one more dwell; the columns of the others are not computed again.
+
+        like: all of these dwells, where they are a stack already.
+        """
         longer = LinearisedDwells.__new__(LinearisedDwells)
         longer.dwells, longer.slews, longer.model, longer.state = (
-            DwellStack.of([*self.dwells, dwell]),
+            DwellStack.of([*self.dwells, dwell], like),
             self.slews,
             self.model,
             self.state,
         )
-        longer.dwells_at_state = DwellStack.of([*self.dwells_at_state, dwell])
+        longer.dwells_at_state = DwellStack.of([*self.dwells_at_state, dwell], longer.dwells)
         last = stimulus_of(longer.dwells_at_state, self.model.bench, self.state).at(slice(-3 * len(dwell.pieces), None))
         longer.columns = [*self.columns, *_by_dwell([dwell], lambda s: self.model.columns(s, self.state), last)]
         longer.slew_columns = self.slew_columns

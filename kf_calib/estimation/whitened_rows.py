@@ -68,16 +68,17 @@ def whiten(
     values = of_all_pieces(columns)
     stack, noise_about = DwellStack.of(dwells), _About(noise, state, about, flicker_mps2)
     batches = list(_batches(stack, values.shape[-1]))
-    if reduced and all(batch.shows_means_only(noise) for batch in batches):
+    by_means = [reduced and batch.tells_means_only(values[batch.pieces], noise_about) for batch in batches]
+    if all(by_means):
         rows_of_means = np.empty((len(stack), 3, values.shape[-1] + 1))
         for batch in batches:
             rows_of_means[batch.dwells] = _of_means(batch, values[batch.pieces], noise_about)
         return OfPieces(rows_of_means.reshape(-1, rows_of_means.shape[2]), 3 * np.arange(len(stack) + 1))
     informative = np.append(np.ones(inside), _units(values)) if reduced else None
     all_rows = list[Floats]([np.empty((0, 0))] * len(stack))
-    for batch in batches:
+    for batch, is_by_means in zip(batches, by_means, strict=True):
         of_batch = values[batch.pieces]
-        if informative is not None and batch.shows_means_only(noise):
+        if is_by_means:
             whitened = _of_means(batch, of_batch, noise_about)
         else:
             rows, count = _weighted(batch, of_batch, noise_about)
@@ -132,23 +133,32 @@ class _Batch:
         """Their triangles (d, P, K + 3, K + 3)."""
         return self.stack.triangles[self.number][self.part]
 
+    @property
+    def force_mps2(self) -> Floats:
+        """The specific force (d, P, 3, 3) that is felt at the nodes."""
+        return self.stack.felt_force_mps2.reshape(-1, 3, 3)[self.pieces]
+
     def regressors(self, height: int) -> Floats:
         """The first ``height`` rows (d, P, height, 4) of the regressors 1, f_x, f_y, f_z that are felt."""
         values = np.ones((*self.pieces.shape, 3, 4))
-        values[..., 1:] = self.stack.felt_force_mps2.reshape(-1, 3, 3)[self.pieces]
+        values[..., 1:] = self.force_mps2
         return self.rows_of(values, height)
 
     def rows_of(self, values: Floats, height: int) -> Floats:
-        """The first ``height`` rows (d, P, height, c) of columns given at the nodes (d, P, K, c). If it is one, the
-        dwells show only their means, which are the values at the middle."""
+        """The first ``height`` rows (d, P, height, c) of columns given at the nodes (d, P, K, c). If it is one, only
+        the means of dwells tell something, which are the values at the middle."""
         if height == 1:
             return self.triangles[:, :, :1, :1] * values[:, :, 1:2]
         return self.triangles[:, :, :height, : values.shape[2]] @ on_basis(values)
 
-    def shows_means_only(self, noise: Noise) -> bool:
-        """Whether nothing but the mean of each dwell and channel is known, so that whitened rows have full rank."""
-        one = self.pieces.shape[1] == 1 and not (noise.walk_mps2_per_sqrt_s or noise.attitude_unknown)
-        return one and not self.triangles[:, 0, 1 : self.shape.width].any()
+    def tells_means_only(self, columns: Floats, about: _About) -> bool:
+        """Whether only the mean of each dwell tells something of the states, so that whitened rows have full rank:
+        nothing else is known, or the columns (d, P, K, 3, p) and the force are constant within every dwell."""
+        if about.noise.walk_mps2_per_sqrt_s or about.noise.attitude_unknown:
+            return False
+        if self.pieces.shape[1] == 1 and not self.triangles[:, 0, 1 : self.shape.width].any():
+            return True
+        return about.flicker_mps2 is None and _is_constant(columns) and _is_constant(self.force_mps2)
 
 
 def _batches(stack: DwellStack, width: int) -> Iterator[_Batch]:
@@ -231,13 +241,17 @@ def _blocks_of(about: _About, count: int) -> _Blocks:
 
 
 def _of_means(batch: _Batch, columns: Floats, about: _About) -> Floats:
-    """Return the whitened rows [H | z] (d, 3, p + 1) of dwells that show nothing but their means.
+    """Return the whitened rows [H | z] (d, 3, p + 1) of dwells of which only the means tell something.
 
-    The nuisance states N with the priors s^2 give the three means the covariance I + N s^2 N^T in units of their own
-    noise; the rows are divided by its Cholesky factor.
+    The mean over all pieces is the combination of the first rows of their triangles by the roots of their numbers of
+    readings, which are on the diagonals. The nuisance states N with the priors s^2 give the three means the covariance
+    I + N s^2 N^T in units of their own noise; the rows are divided by its Cholesky factor.
     """
     blocks, priors = _blocks_of(about, columns.shape[-1]), _priors(about)
-    rows = _channels(batch, columns, blocks, about, 1)[:, :, 0] / about.noise.effective_sigma_mps2[:, None]
+    roots = batch.triangles[:, :, 0, 0]
+    sigmas = about.noise.effective_sigma_mps2 / np.sqrt(batch.stack.folded.weights[batch.dwells])[:, None]
+    along = (roots / np.linalg.norm(roots, axis=1, keepdims=True))[:, None, None, :]
+    rows = (along @ _channels(batch, columns, blocks, about, 1))[:, :, 0] / sigmas[:, :, None]
     scaled = rows[..., : blocks.nuisances] * priors
     if np.abs(scaled).max(initial=0.0) > _LARGE:  # squares would lose digits: eliminate by QR
         prior = np.broadcast_to(np.eye(blocks.nuisances, rows.shape[2]), (len(rows), blocks.nuisances, rows.shape[2]))
@@ -397,6 +411,11 @@ def with_frame(rows: Sequence[Floats], model: Model, noise: Noise, first: int = 
     for k, place in enumerate(model.fixed):
         fixing[k, inside + place] = model.bench.gravity_mps2 / noise.effective_sigma_mps2[0]
     return [*rows[:first], np.vstack([fixing, rows[first]]), *rows[first + 1 :]]
+
+
+def _is_constant(values: Floats) -> bool:
+    """Tell whether values (d, P, K, ...) are the same at all nodes of each dwell."""
+    return bool((values == values[:, :1, :1]).all())
 
 
 def _units(columns: Floats) -> Floats:

@@ -38,6 +38,7 @@ from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.diagnosis.candidate_tests import LEVEL, REST, SHARE, candidates, critical_delta_chi2, independent_tests
 from kf_calib.diagnosis.within_dwell_trend import Trend, trend_beside
 from kf_calib.dwells.qr import triangle
+from kf_calib.dwells.stack import DwellStack
 from kf_calib.dwells.sufficient_statistics import DwellFactor, lines_of
 from kf_calib.effects import Effect
 from kf_calib.estimation import square_root_information, whitened_rows
@@ -111,11 +112,12 @@ class Running:
         known = {str(effect): effect for effect in self.linearised.model.effects}
         return Model(self.linearised.model.bench, tuple(known[name] for name in self.inside))
 
-    def after(self, dwell: DwellFactor, exact: bool = True) -> Running:
+    def after(self, dwell: DwellFactor, exact: bool = True, like: DwellStack | None = None) -> Running:
         """The filter after one more dwell.
 
         It is one update, unless the dwell changes what is known of the conditions in earlier dwells; then the factor is
-        built again. exact: False leaves earlier dwells as they were known when they closed.
+        built again. exact: False leaves earlier dwells as they were known when they closed. like: all of these dwells,
+        where they are a stack already.
         """
         dwell = at_its_mode(dwell, self.linearised, self.noise.weights)
         if exact:
@@ -123,9 +125,9 @@ class Running:
             if not all(map(np.array_equal, self.linearised.columns, linearised.columns[:-1])):
                 return replace(self, linearised=linearised)._rebuild()
         else:
-            linearised = self.linearised.followed_by(dwell)
+            linearised = self.linearised.followed_by(dwell, like)
         more = replace(self, linearised=linearised)
-        return more._update(more._rows([-1])[0], steps(linearised.dwells[-2:], self.noise)[-1])
+        return more._update(more._rows([-1])[0], steps(linearised.dwells, self.noise)[-1])
 
     def lean(self) -> Running:
         """The same filter without the columns of candidates in its dwells, which fill the memory in a long run. It can
@@ -184,8 +186,10 @@ class Running:
         factor[:, -1] -= factor[:, :-1] @ self.about
         variances = steps(self.dwells, self.noise)
         running = replace(self, factor=factor, left=0.0, rows=0)
-        for k, variance in enumerate(variances):  # the rows of all dwells together would take much memory
-            running = running._update(self._rows([k])[0], variance)
+        for first in range(0, len(variances), _TOGETHER):
+            part = range(first, min(first + _TOGETHER, len(variances)))
+            for k, rows in zip(part, self._rows(part), strict=True):
+                running = running._update(rows, variances[k])
         return running
 
     def _rows(self, chosen: Sequence[int] | None = None) -> Sequence[Floats]:
@@ -199,6 +203,7 @@ class Running:
 
 
 _GROWN = 1.25
+_TOGETHER = 16  # dwells whose rows are whitened together: those of a long run would take much memory
 _FEWEST = 4
 """Number of dwells with which a watch can begin: fewer cannot determine scale factors and misalignments."""
 
@@ -249,7 +254,8 @@ class Watch:
         of earlier ones may have been merged since.
         """
         with one_blas_thread():
-            running = self.running.after(dwell, exact=False).lean()  # it is built again when a quarter has been added
+            like = None if fitted is None else fitted.dwells
+            running = self.running.after(dwell, exact=False, like=like).lean()  # built again when a quarter is added
             if len(running.dwells) < _GROWN * self.fitted_at:
                 return replace(self, running=running)._look()
             running, fitted_at, tests = _begun(dwells or running.dwells, self.bench, self.settings, fitted)

@@ -39,6 +39,7 @@ from kf_calib.bench.streams import Batch, Source
 from kf_calib.design.sides import Sides, turn_in_words
 from kf_calib.diagnosis.candidate_tests import LEVEL
 from kf_calib.dwells.rest_in_readings import RestSegmenter
+from kf_calib.dwells.stack import DwellStack
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.calibration import conclude, evaluate_fit, with_remarks
@@ -260,7 +261,7 @@ def judge_poses(passed: Pass, wanted: Floats, before: HandJudgement | None = Non
 
     Raises InputError where the readings cannot be used as they are.
     """
-    dwells, model, settings = passed.dwells, passed.model, passed.settings
+    dwells, model, settings = DwellStack.of(passed.dwells), passed.model, passed.settings
     with one_blas_thread():
         refuse_unusable(dwells, passed.tally, passed.source.bench)
         try:

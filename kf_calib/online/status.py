@@ -24,6 +24,7 @@ from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.verdict import explanations_in_words
+from kf_calib.dwells.stack import DwellStack
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation.calibration import conclude, evaluate_fit, with_remarks
 from kf_calib.estimation.cross_validation import SAME_POSE_DEG
@@ -297,7 +298,7 @@ def judge_so_far(passed: Pass, wanted: Floats, before: Judgement | None = None) 
     passed: the pass over the readings. wanted (12,): targets of the sigmas. before: the judgement after fewer dwells.
     Raises InputError where the readings cannot be used as they are.
     """
-    dwells = passed.dwells
+    dwells = DwellStack.of(passed.dwells)
     with one_blas_thread():
         refuse_unusable(dwells, passed.tally, passed.source.bench)
         result = with_remarks(evaluate_fit(fitted_to(passed, dwells), passed.settings), passed)

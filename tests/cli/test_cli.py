@@ -118,6 +118,7 @@ def test_engines_give_one_answer(run, recording: Path) -> None:
         assert one["sigma"] == pytest.approx(other["sigma"], rel=1e-8)
 
 
+@pytest.mark.slow
 def test_compare_prints_the_agreed_keys(run, recording: Path) -> None:
     code, out, _ = run("compare", recording, "--json")
     result = json.loads(out)

@@ -48,6 +48,7 @@ def test_a_comparison_says_which_way_it_is_at_and_how_far_filterpy_is() -> None:
     assert shares == sorted(shares) and len(set(shares)) >= 8 and shares[-1] == 1.0 and shares[0] < 0.2
 
 
+@pytest.mark.slow
 def test_a_diagnosis_and_an_improvement_say_what_they_try() -> None:
     run = calibrate(Run(dwells=8, count=100))
     refits = Refits()

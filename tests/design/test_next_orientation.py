@@ -114,6 +114,7 @@ def test_where_the_platform_is_already_is_no_next_orientation(names: tuple[str, 
     assert np.abs((turn + 180.0) % 360.0 - 180.0).max() > 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gimbal", [1, 2])
 def test_a_dwell_there_shows_as_many_hidden_effects_as_it_is_said_to(gimbal: int) -> None:
     """After a turn of one gimbal alone."""

@@ -172,6 +172,7 @@ def test_limits_that_leave_the_set_singular_name_what_is_unseen(limits: dict, lo
         plan(search(), 3, TIMING)
 
 
+@pytest.mark.slow
 def test_setting_errors_count_as_the_noise_model_says() -> None:
     """With 0.002 deg a reading across gravity is 3e-4 m/s^2 off, thirty times the noise: six faces are not enough."""
     exact, loose = (plan(search(angle_sigma_deg=each), 6, TIMING) for each in (0.0, 0.002))
@@ -256,6 +257,7 @@ def eight():
     return calibrate(Run(seed=4, dwells=8, poses=poses))
 
 
+@pytest.mark.slow
 def test_next_orientation_starts_from_the_filters_covariance(eight) -> None:
     ahead = Prospect.after(eight.fit)
     np.testing.assert_allclose(optimality_criteria.sigmas(ahead.start) * ahead.units, eight.estimate.sigma, rtol=1e-6)

@@ -57,6 +57,7 @@ def test_a_hidden_effect_is_named(name: str) -> None:
     assert f"Missing: {name}, " in found.verdict and "the error on orientations left out from" in found.verdict
 
 
+@pytest.mark.slow
 def test_a_suspect_has_the_coefficients_of_its_effect_alone() -> None:
     """Not those of an effect that was in the model before."""
     hidden = source("second-order=15sigma", "hysteresis=15sigma")
@@ -79,8 +80,9 @@ def test_nothing_is_found_in_noise(case: dict, runs: int) -> None:
     assert np.median([min(each.effects.p_values.values()) for each in tests]) > 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "name, dwells, driver", [("encoder-harmonic-3:z", 16, "angle"), *slow(("triple-product", 24, "specific force"))]
+    "name, dwells, driver", [("encoder-harmonic-3:z", 16, "angle"), ("triple-product", 24, "specific force")]
 )
 def test_what_is_in_no_catalogue_is_unknown(name: str, dwells: int, driver: str) -> None:
     from kf_calib.views.diagnosis import diagnosis_object
@@ -118,6 +120,7 @@ def test_views_work_nothing_out(monkeypatch: pytest.MonkeyPatch) -> None:
     assert diagnosis_object(found) == shown and plain(diagnosis_report(found, details=True)) == printed
 
 
+@pytest.mark.slow
 def test_a_formula_that_explains_more_than_a_known_effect_speaks_against_it() -> None:
     """A fifth power looks like a third power to 0.96: named third-order, it would be a wrong name."""
     found = diagnose(source("fifth-order=20sigma", plan=plan_of(24, dwell_s=8.0, seed=5)), replicate=False)
@@ -139,6 +142,7 @@ def test_six_faces_say_what_they_cannot_see_and_where_to_go() -> None:
     assert advice is not None and "would show" in advice[1]
 
 
+@pytest.mark.slow
 def test_scores_are_falls_of_chi_squared() -> None:
     """The score test against the refit it predicts."""
     diagnosis = diagnosed("second-order=6sigma")
@@ -150,9 +154,10 @@ def test_scores_are_falls_of_chi_squared() -> None:
     np.testing.assert_allclose(found.candidates[0].sigma, after.estimate.effect_sigma, rtol=1e-3)
 
 
-@pytest.mark.parametrize("runs", [3, *slow(20)])
-def test_smallest_sizes_are_met(runs: int) -> None:
+@pytest.mark.slow
+def test_smallest_sizes_are_met() -> None:
     """Power at the stated size, one coefficient hidden: about 0.9 of the runs."""
+    runs = 20
     sizes = {each.name: each.minimum for each in detectable(assess_candidates(run().fit))}
     seen = 0
     for seed in range(runs):
@@ -161,6 +166,7 @@ def test_smallest_sizes_are_met(runs: int) -> None:
     assert seen >= 0.7 * runs
 
 
+@pytest.mark.slow
 def test_command_line(tmp_path: Path) -> None:
     out = tmp_path / "run.mcap"
     made = ["simulate", str(out), "--hide", "second-order=40sigma", "--dwell-s", "6", "--slew-degps", "90",

@@ -56,19 +56,18 @@ def not_wrong(found: Diagnosis, *truth: str) -> None:
     assert not found.missing or set(truth) & set(found.ambiguity), found.verdict
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "noise",
     [
         EVERY_KIND,
-        *slow(
-            {"ar1_phi": 0.9, "scatter_mps2": 1e-5, "outlier_rate": 1e-3, "outlier_mps2": 0.05},
-            {"setting_sigma_deg": 2e-4, "flicker_mps2": 2e-6},
-            {"ar1_phi": 0.9},
-            {"scatter_mps2": 1e-5},
-            {"setting_sigma_deg": 2e-4},
-            {"outlier_rate": 1e-3, "outlier_mps2": 0.05},
-            {"flicker_mps2": 2e-6},
-        ),
+        {"ar1_phi": 0.9, "scatter_mps2": 1e-5, "outlier_rate": 1e-3, "outlier_mps2": 0.05},
+        {"setting_sigma_deg": 2e-4, "flicker_mps2": 2e-6},
+        {"ar1_phi": 0.9},
+        {"scatter_mps2": 1e-5},
+        {"setting_sigma_deg": 2e-4},
+        {"outlier_rate": 1e-3, "outlier_mps2": 0.05},
+        {"flicker_mps2": 2e-6},
     ],
     ids=lambda noise: "+".join(noise),
 )
@@ -94,7 +93,8 @@ def test_two_accelerometers_with_different_effects() -> None:
     assert all((sigmas[symbol] > 8.0) == (symbol in {"K2_1", "h3"}) for symbol in sigmas), sigmas
 
 
-@pytest.mark.parametrize("seed", [1, *slow(2, 3, 4)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])
 def test_a_walk_is_not_taken_for_a_drift(seed: int) -> None:
     """Straight lines and exponentials follow a random walk well; a wrong name is worse than several."""
     not_wrong(walking(seed), "bias-walk")
@@ -116,6 +116,7 @@ def test_a_line_counts_for_an_oscillation_at_a_tenth_of_the_level() -> None:
     assert test.p_value == pytest.approx(line.p_value / 0.1, rel=1e-9, abs=0.0)
 
 
+@pytest.mark.slow
 def test_without_its_source_a_line_is_judged_by_one_pass_and_that_is_said() -> None:
     """A calibration does not reach back to its readings: whoever holds them gives their refits."""
     alone, whole = oscillating(LINE)
@@ -124,6 +125,7 @@ def test_without_its_source_a_line_is_judged_by_one_pass_and_that_is_said() -> N
     assert "second pass" not in whole.verdict
 
 
+@pytest.mark.slow
 def test_without_its_source_a_slow_oscillation_is_fitted_by_one_pass_and_that_is_said() -> None:
     alone, whole = oscillating("sinusoid=15sigma;frequency=0.1")
     assert "is needed to judge sinusoid" in alone.verdict
@@ -157,6 +159,7 @@ def test_one_cycle_a_run_is_not_told_from_what_the_temperature_does() -> None:
     not_wrong(diagnose(source("sinusoid=15sigma;frequency=0.0045", dwells=24)), "sinusoid")
 
 
+@pytest.mark.slow
 def test_pairs_that_explain_as_much_as_a_single_effect_are_said() -> None:
     both = diagnose(source("thermal-bias=12sigma", "thermal-rate=12sigma"))
     assert {"thermal-bias", "thermal-rate"} <= set(both.ambiguity), both.verdict
@@ -217,9 +220,10 @@ def test_an_oscillation_of_one_cycle_a_dwell_is_not_taken_for_slow_noise(size: i
     assert any("may be an oscillation" in warning for warning in found.before.warnings)
 
 
-@pytest.mark.parametrize("seeds, dwells", [(range(1), 12), *slow((range(22), 16))])
-def test_slow_noise_is_not_taken_for_an_oscillation(seeds: range, dwells: int) -> None:
+@pytest.mark.slow
+def test_slow_noise_is_not_taken_for_an_oscillation() -> None:
     """Of 1/f noise within dwells and a walk, which the means of the dwells follow."""
+    seeds, dwells = range(22), 16
     for seed in seeds:
         noise = {"walk_mps2_per_sqrt_s": 2e-5, "flicker_mps2": 3e-5}
         found = diagnose(source(seed=seed, dwells=dwells, **noise), replicate=False)
@@ -235,15 +239,17 @@ def test_vibration_is_no_oscillation_of_one_amplitude_and_what_it_rectifies_is_n
     assert alone.test.lines.vibration and "needed to judge the lines in their spectrum" in alone.verdict
 
 
-@pytest.mark.parametrize("seeds, dwells", [(range(1), 12), *slow((range(44), 24))])
-def test_of_vibration_alone_nothing_is_said_but_that_it_is_there(seeds: range, dwells: int) -> None:
+@pytest.mark.slow
+def test_of_vibration_alone_nothing_is_said_but_that_it_is_there() -> None:
     """Averages are few in short dwells: their noise is that of white readings in windows that overlap."""
+    seeds, dwells = range(44), 24
     quiet = [diagnose(source("vibration-rectification=1e-12", seed=seed, dwells=dwells)) for seed in seeds]
     assert all(found.test.lines.vibration for found in quiet)
     assert sum(not found.test.consistent for found in quiet) <= 0.05 * len(quiet)
 
 
-@pytest.mark.parametrize("size, said", [("300ug/g^2", True), *slow(("15ug/g^2", False))])
+@pytest.mark.slow
+@pytest.mark.parametrize("size, said", [("300ug/g^2", True), ("15ug/g^2", False)])
 def test_a_size_that_no_such_sensor_has_is_told(size: str, said: bool) -> None:
     """Of navigation grade 20 ug/g^2 is the greatest that is usual."""
     found = diagnose(run(f"second-order={size}", dwells=14), replicate=False)
@@ -307,8 +313,9 @@ def test_scatter_that_is_not_stated_gets_no_name() -> None:
     assert not found.missing, found.verdict
 
 
-@pytest.mark.parametrize("dwells", [5, *slow(6, 8)])
-@pytest.mark.parametrize("seed", [1, *slow(2)])
+@pytest.mark.slow
+@pytest.mark.parametrize("dwells", [5, 6, 8])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_few_dwells_name_nothing_that_unstated_scatter_could_be(dwells: int, seed: int) -> None:
     """With as many coefficients as dwells leave over, an effect fits whatever the setting errors were."""
     found = diagnose(Run(seed=seed, dwells=dwells, setting_deg=0.002, stated=False))
@@ -316,7 +323,8 @@ def test_few_dwells_name_nothing_that_unstated_scatter_could_be(dwells: int, see
     assert "state angle_sigma_deg and scatter_sigma_mps2" in found.verdict
 
 
-@pytest.mark.parametrize("name", ["hysteresis", *slow("second-order")])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["hysteresis", "second-order"])
 def test_a_walk_and_another_effect_are_both_found(name: str) -> None:
     """The walk is no column to be paired: it is judged by its likelihood beside the other."""
     found = diagnose(source("bias-walk=15sigma", f"{name}=15sigma", seed=2, dwells=24))
@@ -340,7 +348,8 @@ def test_a_walk_is_named_before_what_its_path_happens_to_look_like(seeds: range)
     assert ("bias-walk",) not in drifts
 
 
-@pytest.mark.parametrize("seed", [0, *slow(1, 2)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_jump_is_not_called_a_walk(seed: int) -> None:
     """A walk could take that path, and any other: at whatever moment it is, the jump is likelier."""
     found = diagnose(source("bias-jump=20sigma", seed=seed))
@@ -349,12 +358,13 @@ def test_a_jump_is_not_called_a_walk(seed: int) -> None:
     assert said is not None and said.driver == JUMP
 
 
-@pytest.mark.parametrize("seeds", [range(6, 7), *slow(range(3, 8))])
-def test_in_a_few_dwells_a_walk_could_explain_what_an_effect_does(seeds: range) -> None:
+@pytest.mark.slow
+def test_in_a_few_dwells_a_walk_could_explain_what_an_effect_does() -> None:
     """Three coefficients of six degrees of freedom: what is left is no proof.
 
     That a walk would move the readings within dwells, too, speaks against it, but not for sure: its size is unsure.
     """
+    seeds = range(3, 8)
     plans = [plan_of(6, dwell_s=8.0, seed=seed) for seed in seeds]
     few = [diagnose(source("hysteresis=12sigma", plan=plan), replicate=False) for plan in plans]
     assert all("hysteresis" in found.ambiguity for found in few)
@@ -403,7 +413,8 @@ def test_scatter_of_more_than_is_stated_is_no_effect(
     assert sum(row is not None and not row.formulas for row in rows) > 0.5 * len(rows)
 
 
-@pytest.mark.parametrize("name", ["second-order", *slow("scale-drift", "thermal-bias", "bias-asymmetry")])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["second-order", "scale-drift", "thermal-bias", "bias-asymmetry"])
 def test_an_effect_of_some_size_is_no_scatter(name: str) -> None:
     found = diagnose(source(f"{name}=8sigma", seed=6))
     assert name in found.ambiguity and not found.as_scatter, found.verdict
@@ -428,8 +439,9 @@ def test_a_bias_that_goes_to_and_fro_is_no_walk(seeds: range) -> None:
     assert walks <= len(found) // 6  # of six, four where nothing asks whether it comes back
 
 
-@pytest.mark.parametrize("runs", [2, *slow(24)])
-def test_a_walk_rarely_looks_as_if_it_came_back(runs: int) -> None:
+@pytest.mark.slow
+def test_a_walk_rarely_looks_as_if_it_came_back() -> None:
+    runs = 24
     walks = [run("bias-walk=15sigma", seed=seed, dwells=24) for seed in range(runs)]
     gains = [2.0 * Refits().with_effects(each, ("bias-walk",)).fit.gauss_markov_gain[0] for each in walks]
     assert sum(gain > 6.63 for gain in gains) <= runs // 24
@@ -454,7 +466,8 @@ def test_a_walk_that_may_come_back_is_said_to() -> None:
     assert not walk.restoring_time_s and "bias-walk" in walk.missing
 
 
-@pytest.mark.parametrize("seed", [1, *slow(2, 3, 4, 5)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2, 3, 4, 5])
 def test_a_warm_up_slower_than_any_is_held_there_and_is_a_drift(seed: int) -> None:
     """Of a line that bends the other way, no time constant is the best: the fit settles at the greatest one, with the
     slope of the line, and the drift is the likelier name."""

@@ -8,7 +8,6 @@ from functools import cache
 import numpy as np
 import pytest
 from helpers.by_hand import by_hand
-from helpers.long_runs import slow
 from helpers.paths import RECORDINGS
 from scipy.stats import binom
 
@@ -32,7 +31,8 @@ def clean() -> kf_calib.Calibration:
     return kf_calib.calibrate(by_hand())
 
 
-@pytest.mark.parametrize("name", ["second-order", *slow("scale-asymmetry", "thermal-bias", "bias-drift", "hysteresis")])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["second-order", "scale-asymmetry", "thermal-bias", "bias-drift", "hysteresis"])
 def test_an_effect_of_ten_sigma_is_named_or_among_its_equals(name: str) -> None:
     found = kf_calib.diagnose(kf_calib.calibrate(by_hand(f"{name}=10sigma")))
     assert found.test.consistent is False
@@ -41,12 +41,13 @@ def test_an_effect_of_ten_sigma_is_named_or_among_its_equals(name: str) -> None:
     assert found.after.held_out.rms_mps2 < 0.8 * found.before.held_out.rms_mps2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, size",
     [
         ("cross-coupling-po", 150),
-        *slow(("cross-coupling-ip", 150), ("cross-axis-square", 150), ("thermal-scale", 40), ("thermal-scale", 150),
-              ("second-order", 150), ("hysteresis", 150), ("thermal-misalignment", 150)),
+        ("cross-coupling-ip", 150), ("cross-axis-square", 150), ("thermal-scale", 40), ("thermal-scale", 150),
+              ("second-order", 150), ("hysteresis", 150), ("thermal-misalignment", 150),
     ],
 )  # fmt: skip
 def test_a_large_effect_is_named_though_others_beside_it_are_not_told_apart(name: str, size: int) -> None:
@@ -77,6 +78,7 @@ def test_the_board_in_recordings_is_improved_by_what_its_truth_says() -> None:
     assert sizes == pytest.approx([abs(size) for size in truth["sizes"].values()], rel=0.15)
 
 
+@pytest.mark.slow
 def test_a_walk_of_the_biases_is_found_by_its_likelihood() -> None:
     found = kf_calib.diagnose(kf_calib.calibrate(by_hand("bias-walk=3e-4", poses=18)))
     assert found.missing == ("bias-walk",) and found.after is not None
@@ -131,6 +133,7 @@ def _p_values(runs: int, poses: tuple[int, ...]) -> list[float]:
     return out
 
 
+@pytest.mark.slow
 def test_noise_alone_is_rarely_significant() -> None:
     assert min(_p_values(4, (14, 18))) > 1e-4
 

@@ -115,6 +115,7 @@ def test_an_effect_that_is_there_beats_one_that_is_not(before: Calibration) -> N
     assert logsumexp([own.log for own in evidence.of(walk.fit, walk=True)]) < log("second-order") - 10.0
 
 
+@pytest.mark.slow
 def test_coefficients_of_one_field_are_averaged_over_its_directions(before: Calibration) -> None:
     """Against a dense normal density with three columns a direction; no size is known in a MEMS unit, where it is the
     falls of chi-squared that count."""

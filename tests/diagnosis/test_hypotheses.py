@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from helpers.hidden_effects import noisy_run, noisy_source, run, source
 from helpers.known_runs import diagnosed
-from helpers.long_runs import slow
 from helpers.synthetic import plan_of
 
 from kf_calib.diagnosis.hypotheses import Hypotheses, dispersed, log_odds_of
@@ -141,6 +140,7 @@ def test_every_effect_has_a_family() -> None:
     assert {effect_named(name, bench).family for name in names(bench)} <= FAMILIES - {NONE}
 
 
+@pytest.mark.slow
 def test_an_effect_far_above_the_noise_is_sure_and_its_family_too() -> None:
     found = diagnosed("encoder-harmonic-1:z=15sigma")
     said = diagnosis_object(found)
@@ -156,6 +156,7 @@ def test_an_effect_far_above_the_noise_is_sure_and_its_family_too() -> None:
     assert {row["family"] for row in said["families"]} <= FAMILIES
 
 
+@pytest.mark.slow
 def test_where_names_share_it_the_family_comes_first() -> None:
     """A quadratic and an asymmetry of the scale factor overlap almost wholly."""
     found = diagnosed("scale-asymmetry=9sigma")
@@ -171,6 +172,7 @@ def test_nothing_is_likeliest_in_noise() -> None:
     assert diagnosis_object(found)["missing"] is None
 
 
+@pytest.mark.slow
 def test_an_error_that_no_known_effect_is_does_not_pass_as_noise_that_nobody_stated() -> None:
     """Three cycles a turn of an encoder: a setting error of twice the size has the same sum of squares."""
     not_stated = {"angle_sigma_deg": None, "scatter_sigma_mps2": None}
@@ -182,10 +184,11 @@ def test_an_error_that_no_known_effect_is_does_not_pass_as_noise_that_nobody_sta
     assert found.table is not None and found.table.rows[0].driver == "angle of gimbal 2, 3 a turn"
 
 
-@pytest.mark.parametrize("seeds", [(1,), *slow(range(1, 17))])
-def test_a_setting_error_larger_than_stated_is_no_change_of_the_bias(seeds: Sequence[int]) -> None:
+@pytest.mark.slow
+def test_a_setting_error_larger_than_stated_is_no_change_of_the_bias() -> None:
     """A bias that returns to its mean within less than a dwell is scatter, which has a likelier name: noise beyond what
     was stated, or something irregular and unknown, as no orientation is repeated that would tell."""
+    seeds = range(1, 17)
     states: dict[str, float | None] = {"angle_sigma_deg": 2e-4}
     found = [diagnose(noisy_run(dwells=24, setting_sigma_deg=8e-4, states=states, seed=seed)) for seed in seeds]
     tables = [each.table for each in found if each.table is not None]
@@ -198,8 +201,8 @@ def test_a_setting_error_larger_than_stated_is_no_change_of_the_bias(seeds: Sequ
 
 
 @pytest.mark.slow  # of few dwells, which are the harder: test_diagnosis_cases.py
-@pytest.mark.parametrize("seeds", [range(100)])
-def test_noise_that_nobody_stated_is_told_as_noise(seeds: range) -> None:
+def test_noise_that_nobody_stated_is_told_as_noise() -> None:
+    seeds = range(100)
     not_stated, noise = {"angle_sigma_deg": None, "scatter_sigma_mps2": None}, {"setting_sigma_deg": 2e-4}
     found = [diagnose(noisy_source(dwells=16, states=not_stated, seed=500 + seed, **noise)) for seed in seeds]
     assert sum(each.test.consistent is False for each in found) <= 0.03 * len(found)
@@ -230,6 +233,7 @@ def test_noise_from_dwell_to_dwell_may_be_an_unknown_cause(
     assert least <= irregular / table.families[NOISE] <= most
 
 
+@pytest.mark.slow
 def test_what_an_effect_leaves_is_tested_in_the_noise_that_it_leaves() -> None:
     """Scatter that nobody stated is at first what the effect makes of it; beside the effect there is none."""
     diagnosis = diagnose(noisy_run("second-order=15sigma", states=NOT_STATED, seed=3), replicate=False)

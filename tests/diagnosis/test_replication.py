@@ -149,6 +149,7 @@ def test_few_dwells_cannot_tell() -> None:
     assert Replication().answer == "cannot tell"
 
 
+@pytest.mark.slow
 def test_a_diagnosis_has_it_unless_it_is_switched_off() -> None:
     diagnosis = diagnosed("second-order=15sigma")
     assert diagnosis.missing == ("second-order",) and diagnosis.replication is not None

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from helpers.hidden_effects import noisy_run, run
 from helpers.known_runs import diagnosed
-from helpers.long_runs import slow
 from helpers.synthetic import Run, plan_of
 from scipy.stats import binom, f
 
@@ -97,10 +96,11 @@ def test_what_an_explanation_predicts_is_the_difference_of_the_predictions() -> 
         assert over.is_curve == (driver.symbol == "a")
 
 
-@pytest.mark.parametrize("runs", [5, *slow(100)])
-def test_the_band_of_an_effect_covers_as_often_as_it_says(runs: int) -> None:
+@pytest.mark.slow
+def test_the_band_of_an_effect_covers_as_often_as_it_says() -> None:
     """Of runs of other noise: 1 sigma of the component, less its mean over the dwells, covers the truth in 68 % of the
     runs, accelerometer by accelerometer."""
+    runs = 100
     inside, seen = 0, 0
     truth = 2e-6 / 9.80665  # 2 ug/g^2 in s^2/m
     offsets = list[float]()
@@ -151,6 +151,7 @@ def test_overlaps_of_several_effects_are_those_of_pairs() -> None:
     assert np.isnan(overlaps[3]).all()  # has no columns in dwells
 
 
+@pytest.mark.slow
 def test_an_effect_that_is_not_seen_has_a_reason() -> None:
     diagnosis = diagnosed("second-order=15sigma")
     reasons = {each.name: each.why for each in diagnosis.unseen}

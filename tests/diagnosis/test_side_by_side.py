@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.long_runs import slow
 from helpers.paths import ROOT
 from helpers.synthetic import Run
 from scipy.stats import kstest
@@ -48,7 +47,8 @@ def test_what_one_of_them_does_not_determine_has_no_difference() -> None:
         assert [(each.symbol, each.value, each.sigma) for each in without] == [("b2", None, None)]
 
 
-@pytest.mark.parametrize("dwells", [10, *slow(24)])
+@pytest.mark.slow
+@pytest.mark.parametrize("dwells", [10, 24])
 def test_two_runs_of_the_same_sensors_differ_as_noise_does(dwells: int) -> None:
     runs = [calibrate(Run(seed=seed, dwells=dwells, count=80, spread=(0.0, 0.0, 0.0))) for seed in range(30)]
     assert len({tuple(run.estimate.parameters) for run in runs}) == 30

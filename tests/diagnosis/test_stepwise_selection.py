@@ -204,7 +204,8 @@ def test_dwells_left_out_are_still_where_others_came_from(quiet: Calibration) ->
     np.testing.assert_array_equal(part.previous_force_mps2, whole.previous_force_mps2[kept])
 
 
-@pytest.mark.parametrize("name, folds", [("hysteresis", 2), *slow(("second-order", 3))])
+@pytest.mark.slow
+@pytest.mark.parametrize("name, folds", [("hysteresis", 2), ("second-order", 3)])
 def test_the_honest_error_repeats_the_choice(name: str, folds: int) -> None:
     checked = nested_cross_validation(run(f"{name}=15sigma"), folds=folds)
     assert checked.chosen == {name: folds} and 0.7 < checked.rms_mps2 / checked.expected_mps2 < 1.3
@@ -293,6 +294,7 @@ def test_the_command_prints_the_agreed_keys(recording: Path, tmp_path: Path) -> 
     assert own == content["parameters"] and replayed["held_out_rms_mps2"] == content["held_out_rms_mps2"]
 
 
+@pytest.mark.slow
 def test_in_words(recording: Path) -> None:
     done = call("improve", recording, "--strict")
     assert done.exit_code == 0 and "+ second-order" in done.stdout and "█" in done.stdout

@@ -31,11 +31,13 @@ def diagnosed(name: str, sigmas: float = 12.0, seed: int = 2) -> Diagnosis:
     return kf_calib.diagnose(hidden_run(HIDDEN[name], sigmas, seed), replicate=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "drivers"),
     [
         ("last step x force", {"previous orientation and specific force"}),
-        *slow(("temperature x two forces", {"temperature and specific force"}), ("play", {"previous orientation"})),
+        ("temperature x two forces", {"temperature and specific force"}),
+        ("play", {"previous orientation"}),
     ],
 )
 def test_what_depends_on_two_drivers_or_on_the_past_is_unknown_and_goes_with_them(name: str, drivers: set[str]) -> None:
@@ -61,7 +63,8 @@ def test_what_goes_on_beside_a_known_effect_gets_no_known_name(known: str, name:
     assert diagnosis.after is not None and str(diagnosis.after.model.effects[-1]) == known
 
 
-@pytest.mark.parametrize("seed", [700, *slow(701)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [700, 701])
 def test_a_known_effect_that_mends_the_shape_of_a_formula_of_its_family_is_not_named(seed: int) -> None:
     """Of a step through a hyperbolic tangent; the formula has another width, and settling makes up for it."""
     diagnosis = diagnosed("saturating hysteresis", 300.0, seed)

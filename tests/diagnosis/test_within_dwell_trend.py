@@ -76,6 +76,7 @@ def test_coloured_noise_and_stated_scatter_make_no_trend(noise: dict[str, float]
     assert min(found_in(run(seed=seed, **noise)).p_value for seed in seeds) > 0.01
 
 
+@pytest.mark.slow
 def test_a_walk_in_the_model_is_expected_within_dwells_too() -> None:
     """Of a walk as strong as the noise of a dwell: without it in the model its slopes are no noise."""
     plan = plan_of(24, dwell_s=20.0, seed=3)
@@ -110,6 +111,21 @@ def test_a_trend_is_told_where_it_is() -> None:
     assert found.most == (7, 2)
 
 
+def test_dwells_that_are_noisier_than_others_show_no_trend_by_it() -> None:
+    """Every third dwell trembles eight times as much, and counts by that."""
+    made = Run(seed=1, dwells=12, count=400, white_mps2=1e-4)
+    made.bench = dataclasses.replace(made.bench, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
+    values = made.accel.values.copy()
+    for dwell in range(0, 12, 3):
+        part = slice(400 * dwell, 400 * (dwell + 1))
+        values[part] += 8e-4 * np.random.default_rng(dwell).standard_normal(values[part].shape)
+    made.accel = Stream(made.accel.time_ns, values)
+    result = calibrate(made)
+    assert np.ptp([dwell.weight for dwell in result.fit.dwells]) > 0.5
+    assert 0.7 < found_in(result).ratio < 1.4
+
+
+@pytest.mark.slow
 def test_a_watch_sees_it_while_the_run_goes_on() -> None:
     """Dwell by dwell, as the diagnosis does in the end, but for noise found a quarter of the run earlier."""
     before = run("chirp=25sigma;frequency=0.02;chirp=2e-4", seed=4)
@@ -142,7 +158,8 @@ def disturbed_in(made: Run) -> DisturbedDwell:
     return disturbed_dwell(Refits(made).with_effects(calibrate(made), ("sinusoid",)).fit)
 
 
-@pytest.mark.parametrize("count", [3, *slow(12, 100)])
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [12, 100])
 def test_an_oscillation_that_goes_on_in_all_dwells_disturbs_none(count: int) -> None:
     """The p-value of the dwell that differs most is uniform, however strong the oscillation is."""
     p_values = [disturbed_in(swinging(1e-4 * 5.0 ** (seed % 3), seed)).p_value for seed in range(count)]

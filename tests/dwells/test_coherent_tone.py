@@ -71,6 +71,7 @@ def test_noise_alone_has_no_tone(kind: str, runs: int) -> None:
     assert found <= binom.ppf(0.995, runs, 0.05)
 
 
+@pytest.mark.slow
 def test_readings_that_come_often_are_averaged_without_a_beat() -> None:
     """What is slow shows nowhere else, whatever the rate."""
     rng, runs = np.random.default_rng(1), 20
@@ -78,6 +79,7 @@ def test_readings_that_come_often_are_averaged_without_a_beat() -> None:
     assert found <= binom.ppf(0.995, runs, 0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigmas, least", [(8.0, 0.6), (10.0, 0.95)])
 def test_a_weak_oscillation_is_found(sigmas: float, least: float) -> None:
     """From two cycles a dwell to two a second, at the level of a diagnosis."""

@@ -66,6 +66,7 @@ def test_the_table_of_a_diagnosis_names_dwells_by_these_numbers() -> None:
     assert first.split("│")[1].strip() == "7"
 
 
+@pytest.mark.slow
 def test_a_live_run_numbers_its_dwells_from_one() -> None:
     session, lines = Session(run(), Settings()), list[str]()
     session.listeners.append(lambda judgement: lines.append(live_view.line(judgement)))

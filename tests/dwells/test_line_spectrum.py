@@ -121,6 +121,7 @@ def test_the_level_follows_an_autoregression_of_eight_readings_and_nothing_finer
     assert (ratio.max() < 1.01 * ratio.min()) == followed
 
 
+@pytest.mark.slow
 def test_a_single_bin_is_as_rare_as_its_p_value_says() -> None:
     """In white noise of one segment and one channel: one bin in a thousand, to a third more or less."""
     rng, time_s, rare, bins = np.random.default_rng(9), np.arange(1024) / 100.0, 0, 0

@@ -101,6 +101,7 @@ def test_a_run_of_days_has_a_bounded_number_of_pieces(monkeypatch: pytest.Monkey
     assert [dwell.count for dwell in dwells.folded[:2]] == [sum(piece.count for piece in own) for own in (long, short)]
 
 
+@pytest.mark.slow
 def test_fewer_pieces_tell_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a bench with 1/f noise whose temperature swings: parameters, sigmas and p-value."""
     results = list[Calibration]()

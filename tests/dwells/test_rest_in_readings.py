@@ -40,6 +40,7 @@ def streams() -> tuple[Stream, Stream]:
     return accel[:6000], warm[warm.time_ns < accel.time_ns[6000]]
 
 
+@pytest.mark.slow
 def test_blocks_are_the_same_to_the_bit_however_the_readings_are_cut() -> None:
     accel, warm = streams()
     whole, tally, _ = found(accel, warm, np.array([], int))

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.altered import Altered
-from helpers.long_runs import slow
 from helpers.synthetic import plan_of
 
 from kf_calib.bench.arrays import Floats
@@ -56,11 +55,13 @@ def test_latency_is_found(angle_hz: float) -> None:
     assert abs(value[0] - 5e-3) < 2.0 * sigma[0] and sigma[0] < 1e-5
 
 
+@pytest.mark.slow
 def test_lever_arms_are_found() -> None:
     value, sigma = values(calibrate(run([ARMS]), Settings(effects=("lever-arm",))))
     assert np.abs(value - ARMS_M).max() < 1e-4 and (np.abs(value - ARMS_M) < 4.0 * sigma).all()
 
 
+@pytest.mark.slow
 def test_both_at_once_and_with_other_effects() -> None:
     source = run(["latency=2ms", ARMS, "second-order=1e-5,-1e-5,2e-5"], dwells=16)
     value, sigma = values(calibrate(source, Settings(effects=("latency", "lever-arm", "second-order", "bias-drift"))))
@@ -68,10 +69,11 @@ def test_both_at_once_and_with_other_effects() -> None:
     assert (np.abs(value - truth) < 4.0 * sigma).all()
 
 
-@pytest.mark.parametrize("runs, low, high", [(2, 0.75, 1.0), *slow((300, 0.92, 0.98))])
-@pytest.mark.parametrize("text, truth", [(ARMS, ARMS_M), *slow(("latency=1ms", [1e-3]))])
-def test_intervals_cover(text: str, truth: list[float], runs: int, low: float, high: float) -> None:
+@pytest.mark.slow
+@pytest.mark.parametrize("text, truth", [(ARMS, ARMS_M), ("latency=1ms", [1e-3])])
+def test_intervals_cover(text: str, truth: list[float]) -> None:
     """Coefficients over their sigmas, half the runs with noise of the encoders (which correlates a slew's readings)."""
+    runs, low, high = 300, 0.92, 0.98
     ratios = list[float]()
     for seed in range(100, 100 + runs):
         source = run([text], seed, sample_hz=50.0, encoder_sigma_deg=2e-4 * (seed % 2))
@@ -82,6 +84,7 @@ def test_intervals_cover(text: str, truth: list[float], runs: int, low: float, h
     assert low <= share <= high
 
 
+@pytest.mark.slow
 def test_channels_have_the_noise_in_slews_that_the_model_leaves_in_each() -> None:
     """That of the second is eight times that of the others."""
 
@@ -102,6 +105,7 @@ def test_engines_and_batch_agree() -> None:
     assert all(way.max_relative_variance <= 1e-8 for way in compared.ways.values())
 
 
+@pytest.mark.slow
 def test_slews_do_not_depend_on_batches() -> None:
     settings = Settings(effects=("latency",))
     whole, chopped = (Pass(run([], dwells=5, batch=batch), settings) for batch in (1 << 30, 37))
@@ -146,6 +150,7 @@ def test_rates_of_a_curve_are_those_of_the_attitude() -> None:
     )
 
 
+@pytest.mark.slow
 def test_slews_have_no_autocovariance_and_no_spectrum() -> None:
     """What moves tells nothing of the noise at rest."""
     whole = Pass(run(["latency=5ms"]), Settings(effects=("latency",)))

@@ -132,3 +132,10 @@ def test_a_row_of_a_table_takes_no_more_than_its_numbers() -> None:
     used = tracemalloc.get_traced_memory()[0]
     tracemalloc.stop()
     assert used < 700 * len(stack) and len(list(stack.folded.dwells[:3])) == 3
+
+
+def test_what_is_known_of_dwells_is_shared_with_a_stack_of_the_same_dwells_alone(dwells: list[DwellFactor]) -> None:
+    stack = DwellStack.of(dwells)
+    assert DwellStack.of(list(dwells), stack).folded is stack.folded
+    assert DwellStack.of(dwells[::-1], stack).folded is not stack.folded
+    assert DwellStack.of(dwells[1:], stack).folded is not stack.folded

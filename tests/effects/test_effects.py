@@ -146,11 +146,13 @@ def test_an_uneven_flexure_is_found_as_products_of_compliances_and_offsets() -> 
     assert even.consistency.statistic > 100 * max(result.consistency.statistic, 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "hidden, constant",
     [
         ("settling=30ug/g;tau=20", 20.0),
-        *slow(("warm-up=200ug;tau=300", 300.0), ("thermal-lag=20ug/K;tau=200", 200.0)),
+        ("warm-up=200ug;tau=300", 300.0),
+        ("thermal-lag=20ug/K;tau=200", 200.0),
     ],
 )
 def test_time_constants_are_found_with_their_sigma(hidden: str, constant: float) -> None:
@@ -167,6 +169,7 @@ def test_time_constants_are_found_with_their_sigma(hidden: str, constant: float)
         assert calibrate(source).consistency.p_value < 1e-9
 
 
+@pytest.mark.slow
 def test_magnetic_sensitivity_is_found_as_its_product_with_the_field() -> None:
     """A field of 2e-5 T to the North; its vertical part is along gravity, and so hidden in the scale factors."""
     source = run(["magnetic=0.05,-0.03,0.04;north=2e-5;east=0"])
@@ -179,6 +182,7 @@ def test_magnetic_sensitivity_is_found_as_its_product_with_the_field() -> None:
     assert bare.consistency.statistic > 100 * max(result.consistency.statistic, 1.0)
 
 
+@pytest.mark.slow
 def test_a_walk_of_the_biases_is_found_with_its_sigma() -> None:
     """Its intensity within 4 sigma, and without it the model fails; the effect has no coefficient else."""
     source = run(["bias-walk=1e-5"], 5e-5, plan=plan_of(60, dwell_s=10.0, seed=4))
@@ -213,6 +217,7 @@ def test_windows_are_as_long_as_the_vibration_that_is_seen_needs() -> None:
         assert abs(value - truth) < 4.0 * sigma < 8e-6
 
 
+@pytest.mark.slow
 def test_averages_of_still_readings_say_the_same_with_hardly_less_information() -> None:
     source = run([], 5e-5, plan=plan_of(24, dwell_s=15.0, seed=4))
     whole, means = calibrate(source), calibrate(source, Settings(window_s=1.0))
@@ -245,9 +250,10 @@ def sweep_plan(source: Simulation, step_rad: float = 2e-4) -> list[PlannedVisit]
     return explicit_plan(rows, 6.0)
 
 
-@pytest.mark.parametrize("widths", [[4.3e-3, 5.7e-3], *slow([4.3e-3, 5.0e-3, 5.7e-3, 6.6e-3])])
-def test_a_dead_zone_is_found_from_poses_that_sweep_through_it(widths: list[float]) -> None:
+@pytest.mark.slow
+def test_a_dead_zone_is_found_from_poses_that_sweep_through_it() -> None:
     """A share of one of the input is not felt; the width of the zone lies between two poses, and its sigma says so."""
+    widths = [4.3e-3, 5.0e-3, 5.7e-3, 6.6e-3]
     inside = []
     for seed, width in enumerate(widths):
         source = run([f"dead-zone={width}"], 5e-5, seed, plan=sweep_plan(run([], seed=seed)))
@@ -372,9 +378,10 @@ def still_dwells(seed: int) -> list[DwellFactor]:
     return Pass(run([], 5e-5, seed, CHEAP, 10.0, 150.0, 2.0, 180.0), Settings()).fold()
 
 
-@pytest.mark.parametrize("runs, off", [(2, 0.06), *slow((6, 0.03))])
-def test_intervals_cover_pooled_over_effects(runs: int, off: float) -> None:
+@pytest.mark.slow
+def test_intervals_cover_pooled_over_effects() -> None:
     """A few runs of every effect; the ratios of one run share its noise, so the band is wide."""
+    runs, off = 6, 0.03
     ratios = []
     for seed in range(100, 100 + runs):
         still = still_dwells(seed)
@@ -439,16 +446,15 @@ def test_a_factor_restricted_equals_that_of_fewer_columns(navigation, name: str)
 RICHER = (("thermal-bias", "settling"), ("second-order", "mine = a*a*T"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "prior, walk, models",
     [
         ("navigation", 1e-6, RICHER),
-        *slow(
-            ("navigation", 1e-6, (("thermal-bias",),)),
-            *(
-                (prior, walk, (("thermal-bias",), *RICHER))
-                for prior, walk in (("diffuse", 0.0), ("diffuse", 1e-6), ("navigation", 0.0))
-            ),
+        ("navigation", 1e-6, (("thermal-bias",),)),
+        *(
+            (prior, walk, (("thermal-bias",), *RICHER))
+            for prior, walk in (("diffuse", 0.0), ("diffuse", 1e-6), ("navigation", 0.0))
         ),
     ],
 )

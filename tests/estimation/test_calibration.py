@@ -243,6 +243,34 @@ def test_a_dwell_on_one_or_two_messages_of_a_noisy_encoder_is_left_out(seed: int
     assert len(exact.visits) == 24
 
 
+def test_a_dwell_whose_columns_are_constant_tells_its_mean_alone() -> None:
+    """Three rows have all that its readings tell of the states, of any number of pieces, weight and scatter."""
+    dwells = Pass(Run(dwells=14, count=200, setting_deg=0.01, encoder_deg=0.0), Settings()).fold()
+    dwells = [replace(next(iter(dwell.prefixes())) if k % 3 else dwell, weight=1.0 + 0.1 * k)
+              for k, dwell in enumerate(dwells)]  # fmt: skip
+    fitted = fit(dwells, Model.of(Run(dwells=1).bench, ("second-order",)))
+    columns, state = fitted.linearised.columns, fitted.linearised.state
+    for noise in (fitted.noise, replace(fitted.noise, scatter_mps2=np.array([0.0, 1e-6, 1e-3]), setting_rad=1e-3)):
+        whole = whitened_rows.whiten(dwells, columns, noise, state, reduced=False)
+        for all_rows, rows in zip(whole, whitened_rows.whiten(dwells, columns, noise, state), strict=True):
+            assert len(rows) == 3 < len(all_rows)
+            left, right = rows[:, :-1].T @ rows, all_rows[:, :-1].T @ all_rows
+            np.testing.assert_allclose(left, right, rtol=0, atol=1e-9 * np.abs(right).max())
+
+
+def test_a_column_that_changes_from_piece_to_piece_tells_more_than_a_mean() -> None:
+    """It is constant within each piece, and in most dwells altogether."""
+    dwells = Pass(Run(dwells=14, count=200), Settings()).fold()
+    fitted = fit(dwells, Model.of(Run(dwells=1).bench, ()))
+    columns, state, noise = list(fitted.linearised.columns), fitted.linearised.state, fitted.noise
+    columns[3] = columns[3] * (1.0 + np.arange(len(columns[3])))[:, None, None, None]
+    assert len(dwells[3].pieces) > 1
+    whole = whitened_rows.whiten(dwells, columns, noise, state, reduced=False)
+    for all_rows, rows in zip(whole, whitened_rows.whiten(dwells, columns, noise, state), strict=True):
+        left, right = rows[:, :-1].T @ rows, all_rows[:, :-1].T @ all_rows
+        np.testing.assert_allclose(left, right, rtol=0, atol=1e-9 * np.abs(right).max())
+
+
 def test_dwells_whitened_together_are_those_whitened_alone() -> None:
     """Of any shape, beside each other in any order; a factor is solved alike in company, undetermined or not."""
     dwells = Pass(Run(dwells=14, count=200, setting_deg=0.01), Settings()).fold()

@@ -121,6 +121,7 @@ def test_running_batch_least_squares_is_that_of_the_first_dwells() -> None:
         assert np.abs(states[count - 1] - alone).max() < 1e-6 * np.sqrt(np.diag(covariance)).min()
 
 
+@pytest.mark.slow
 def test_faces_do_not_determine_more_than_they_show() -> None:
     """Columns of rounding size determined the batch's estimate after some dwells."""
     compared = compare(FACES)

@@ -102,6 +102,7 @@ def test_a_dataframe_of_parameters(run: kf_calib.Calibration, kind: str) -> None
     assert list(frame["sigma"]) == [each.sigma for each in run.parameters.values()]
 
 
+@pytest.mark.slow
 def test_a_run_is_printed_alike_whatever_was_imported(run: kf_calib.Calibration) -> None:
     program = "from kf_calib.estimation.calibration import calibrate; import sys; print(calibrate(sys.argv[1]))"
     words = [sys.executable, "-c", program, FACES]

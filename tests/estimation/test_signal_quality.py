@@ -284,6 +284,7 @@ def test_a_hidden_step(printed, tmp_path: Path, step: float, matters: bool) -> N
     assert found["readings"]["saturation"] == []
 
 
+@pytest.mark.slow
 def test_hidden_outliers_and_none(printed, tmp_path: Path) -> None:
     found = json.loads(printed("replay", simulated(printed, tmp_path / "a.mcap", "outliers=10mg;rate=2e-3"), "--json"))
     assert found["readings"]["outliers"]["count"] == found["counts"]["gated"] > 20

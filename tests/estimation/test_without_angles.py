@@ -93,7 +93,8 @@ def test_equals_nonlinear_least_squares_on_the_size_of_f() -> None:
     assert np.allclose(sigma, np.sqrt(np.diag(covariance)), rtol=1e-3)
 
 
-@pytest.mark.parametrize("runs", [8, *slow(30, 400)])
+@pytest.mark.slow
+@pytest.mark.parametrize("runs", [30, 400])
 def test_errors_are_those_that_sigmas_state(runs: int) -> None:
     """1 sigma covers 68 % of each, the normalised squared error of nine parameters is 9, p is uniform."""
     errors, squares, p_values = list[np.ndarray](), list[float](), list[float]()

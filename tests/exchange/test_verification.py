@@ -126,6 +126,7 @@ def test_a_temperature_more_than_a_degree_beyond_that_of_the_calibration_is_told
     assert any("a difference may be the temperature's" in said for said in found.warnings) == told
 
 
+@pytest.mark.slow
 def test_the_parameter_that_moved_is_found_and_named() -> None:
     found = [verified(seed, K2=8e-6) for seed in range(15)]
     assert sum(not each.holds for each in found) >= 14

@@ -153,6 +153,7 @@ def test_coefficients_of_each_run_and_of_a_bench_have_the_evidence_of_normal_den
         assert (row.term.size, row.term.mean_size) == pytest.approx(max(logs, key=lambda pair: logs[pair]))
 
 
+@pytest.mark.slow
 def test_coefficients_of_units_have_the_evidence_of_normal_densities(
     readings: Readings, table: AttributionTable
 ) -> None:
@@ -228,6 +229,7 @@ def test_the_likeliest_effect_is_taken_and_first_whether_it_is_of_the_bench() ->
     assert table.of("drift") == {BENCH: 0.15, REPAIRED: 0.14, SENSORS: 0.2} and table.none == pytest.approx(0.19)
 
 
+@pytest.mark.slow
 def test_effects_are_taken_until_none_more_is_probable_and_each_beside_all_others() -> None:
     """The last table of each term is that beside the others, whatever was known when it was first taken."""
     campaign = readings_of(3, 5).campaign

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from fleet_generator import Campaign
 from helpers.drawn_fleets import SYMBOLS, DrawnFleet, Plan, drawn_fleet
-from helpers.long_runs import slow
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.estimation.calibration import calibrate
@@ -95,7 +94,8 @@ def test_coverage_of_300_fleets() -> None:
             assert not count or abs(share - 0.95) <= allowed, (what, kind, share, count)
 
 
-@pytest.mark.parametrize("fleets", [2, *slow(4, 8)])
+@pytest.mark.slow
+@pytest.mark.parametrize("fleets", [4, 8])
 def test_coverage_of_small_fleets(fleets: int) -> None:
     covered = counted(range(fleets), seed=3, most=6)
     for what in ("bench", "unit", "affected unit", "spread"):
@@ -111,6 +111,7 @@ def free_fit(runs: Sequence[RunFactor], effects: Sequence[str]) -> tuple[Floats,
     return inverse @ rows[:, :-1].T @ rows[:, -1], np.sqrt(np.diag(inverse))
 
 
+@pytest.mark.slow
 def test_one_affected_unit_of_ten_has_what_its_own_three_runs_say() -> None:
     """Its sigma is between that of its runs where all else is known, and where all else is known from them alone."""
     plan = Plan(units=10, benches=1, runs_each=3, affected=1, their_mean=30.0, their_spread=0.0)

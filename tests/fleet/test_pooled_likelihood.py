@@ -266,6 +266,7 @@ def test_evidence_about_a_mean_is_the_integral_over_the_mean() -> None:
     assert shape.log_odds == pytest.approx(truth, abs=0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("mean", "spread", "having", "units"), [(40.0, 0.3, 6, 12), (20.0, 20.0, 20, 20)])
 def test_evidence_about_a_mean_is_exact_where_it_is_clear_who_has_the_effect(
     mean: float, spread: float, having: int, units: int

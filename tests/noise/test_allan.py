@@ -46,6 +46,7 @@ def test_clusters_reach_a_third_of_the_longest_dwell() -> None:
     assert sizes[0] == 1 and 800 <= sizes[-1] <= 1000 and sizes == sorted(set(sizes))
 
 
+@pytest.mark.slow
 def test_the_readings_of_a_run_have_the_noise_that_was_put_in() -> None:
     run = Run(seed=3, dwells=8, count=600, white_mps2=3e-4)
     allan = compare(run).allan
@@ -57,6 +58,7 @@ def test_the_readings_of_a_run_have_the_noise_that_was_put_in() -> None:
     assert not allan.flicker_mps2.any() and not allan.walk_mps2.any()
 
 
+@pytest.mark.slow
 def test_the_spread_is_that_of_white_noise_drawn_anew() -> None:
     """Of 400 draws of three channels: to a third, as neighbouring differences share a cluster."""
     result = calibrate(Run(seed=3, dwells=6, count=400))

@@ -55,6 +55,7 @@ def test_a_parabola_takes_three_independent_readings_of_a_dwell(phi: float, coun
     assert noise_model.within_dwells(dwells).sigma_mps2.mean() == pytest.approx(1e-4, rel=0.012)
 
 
+@pytest.mark.slow
 def test_a_walk_of_known_intensity_is_no_noise_of_a_reading() -> None:
     """Beside white noise of 1e-4 m/s^2, one of 1e-4 m/s^2/s^(1/2) over dwells of 20 seconds."""
     run, walk = Run(seed=1, dwells=80, count=400), 1e-4
@@ -88,8 +89,9 @@ def test_ar2_resonance_is_followed_too() -> None:
     np.testing.assert_allclose(calibrate(run).noise.inflation, 1.0)
 
 
-@pytest.mark.parametrize("runs, off", [(5, 0.15), *slow((12, 0.1))])
-def test_setting_error_and_scatter_are_told_apart_and_sized(runs: int, off: float) -> None:
+@pytest.mark.slow
+def test_setting_error_and_scatter_are_told_apart_and_sized() -> None:
+    runs, off = 12, 0.1
     settings, scatters, mistaken = [], [], 0
     for seed in range(runs):
         setting = calibrate(Run(seed=seed, dwells=30, setting_deg=0.01, stated=False)).noise

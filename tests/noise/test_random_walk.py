@@ -209,6 +209,7 @@ def test_no_walk_is_seen_where_there_is_none() -> None:
         assert value.value is None or value.value < 4.0 * value.sigma
 
 
+@pytest.mark.slow
 def test_a_walk_in_the_model_lets_the_held_out_error_fall() -> None:
     run = walking(7, 3.0 * Q)
     bare, result = calibrate(run), fitted(run)

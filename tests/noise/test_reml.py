@@ -159,6 +159,7 @@ def test_means_that_are_worked_on_in_parts_have_the_same_likelihood(monkeypatch:
     assert in_parts.misfit == pytest.approx(whole.at(variances).misfit, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_nothing_is_estimated_where_the_misfit_is_one_that_noise_exceeds_once_in_ten_times(
     walked: Calibration,
 ) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.hidden_effects import run
-from helpers.long_runs import slow
 from helpers.synthetic import Run
 
 from kf_calib.diagnosis.candidate_tests import candidates
@@ -43,9 +42,10 @@ def test_a_running_scan_is_that_from_the_start() -> None:
     assert own[0] == own[1] and statistic == pytest.approx(float(dof), abs=6.0 * np.sqrt(2.0 * dof))
 
 
-@pytest.mark.parametrize("runs", [2, *slow(12)])
-def test_noise_raises_no_alarm_however_often_it_is_looked_at(runs: int) -> None:
+@pytest.mark.slow
+def test_noise_raises_no_alarm_however_often_it_is_looked_at() -> None:
     """11 looks at each of 12 runs: at 1 % a run two alarms have a chance of 0.6 %; of 2 runs, one has 2 %."""
+    runs = 12
     found = [watched(quiet(900 + k)) for k in range(runs)]
     assert all(each.looks == 11 for each in found)
     assert sum(each.alarmed is not None for each in found) <= runs // 12

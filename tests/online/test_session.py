@@ -233,6 +233,7 @@ def test_time_to_a_target_is_the_time_it_takes() -> None:
     assert first.course is not None and (first.course.sigma[-1] < first.result.estimate.sigma).all()
 
 
+@pytest.mark.slow
 def test_noise_raises_no_alarm_and_unstated_noise_is_waited_for() -> None:
     source = Run(seed=3, dwells=14, count=60, setting_deg=0.005, stated=False)
     found = judgements(Session(source))
@@ -271,6 +272,7 @@ def test_a_failing_evaluation_still_reads_the_source_to_its_end() -> None:
     assert len(read) == len(list(bench(orientations=5))) and "the evaluation stopped" in session.standing.notice
 
 
+@pytest.mark.slow
 def test_memory_is_that_of_the_dwells() -> None:
     """Ten times the samples in the same dwells: no more is kept of them."""
 
@@ -359,6 +361,7 @@ def test_screen_lines_and_objects_of_a_standing(monkeypatch: pytest.MonkeyPatch)
     assert "0 readings" in empty and len(empty.splitlines()) <= 24
 
 
+@pytest.mark.slow
 def test_a_target_is_reached_when_its_sigma_says_so_and_not_when_the_predicted_time_is_over() -> None:
     session = Session(bench(orientations=8))
     last = judgements(session)[-1]
@@ -559,12 +562,12 @@ def test_a_terminal_that_is_closed_costs_the_screen_only(tmp_path: Path, how: si
 
     out, model = tmp_path / "run.mcap", tmp_path / "model.toml"
     leader, follower = pty.openpty()
-    source = SLOW if how else SLOW.replace("orientations=30", "orientations=10")
+    source = SLOW.replace("orientations=30", "orientations=100" if how else "orientations=10")
     process = live(source, "--record", str(out), "--save-model", str(model), stdin=follower, stdout=follower,
                    stderr=follower, env={**os.environ, "TERM": "xterm"}, start_new_session=True)  # fmt: skip
     os.close(follower)
     seen = b""
-    while not re.search(rb"orientation [5-9]" if how else rb"orientation [1-9]", seen):
+    while not re.search(rb"orientation ([5-9]|\d\d)" if how else rb"orientation [1-9]", seen):  # it may leave some out
         seen += os.read(leader, 65536)
     os.close(leader)
     for _ in range(3 if how else 0):  # from the terminal, and from the shell
@@ -572,7 +575,7 @@ def test_a_terminal_that_is_closed_costs_the_screen_only(tmp_path: Path, how: si
         time.sleep(0.1)
     assert process.wait(120) == 2, "what it had to say could not be written"
     found = replayed("replay", str(out))
-    assert finished(found) and (found["dwells"] < 30 if how else found["dwells"] == 10) and model.exists()
+    assert finished(found) and (found["dwells"] < 100 if how else found["dwells"] == 10) and model.exists()
 
 
 def test_nobody_reading_ends_a_run_that_is_not_recorded() -> None:

@@ -208,6 +208,7 @@ def test_vectors_are_those_of_scipys_rotations(turns, sampled: str) -> None:
         np.testing.assert_allclose(force[i, k], attitudes[place].inv().apply(up), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_search_is_the_closed_form_at_what_it_found(searched: grebenkin2019_conditions.ConditionSearch) -> None:
     printed = grebenkin2019.printed_column(NONOPTIMAL_PRINTED)
     for each in (searched.together, searched.in_turn):
@@ -259,6 +260,7 @@ def test_gravity_fixed_is_what_a_base_bench_gives() -> None:
     )
 
 
+@pytest.mark.slow
 def test_command_prints_the_agreed_keys_and_saves_the_figures(run: Any, tmp_path: Path) -> None:
     code, out, err = run("paper", "--json", "--repetitions", 50, "--seed", 4, "--pdf", tmp_path / "paper.pdf")
     assert code == 0 and err == "" and out.count("\n") == 1

@@ -62,6 +62,7 @@ def test_every_figure_of_a_diagnosis_has_ink_in_every_panel(hidden: tuple[str, .
         assert len(figure.get_axes()) >= 1, title
 
 
+@pytest.mark.slow
 def test_bars_of_suspects_are_their_shares_and_those_that_do_not_fit_are_hatched() -> None:
     explained = hidden_diagnosed().explanations
     figure = plot.suspects(hidden_diagnosed())
@@ -133,6 +134,7 @@ def test_what_could_hide_names_every_effect_once() -> None:
             assert ends[k] == pytest.approx(min(usual[1] / each.minimum, 1000.0))
 
 
+@pytest.mark.slow
 def test_residuals_of_single_dwells_are_drawn_in_micro_g_or_si() -> None:
     diagnosis = hidden_diagnosed()
     figure = plot.residuals(diagnosis)
@@ -149,6 +151,7 @@ def test_residuals_of_single_dwells_are_drawn_in_micro_g_or_si() -> None:
     assert first.get_title("right") == f"rms {rounded_number(rms, 2)} µg"
 
 
+@pytest.mark.slow
 def test_errors_fall_in_the_figure_as_in_the_result() -> None:
     state = improved("second-order=15sigma")
     figure = plot.improvement(state)

@@ -79,6 +79,7 @@ def shown(browser: Any, path: Path, told: list[str], request: pytest.FixtureRequ
     page.close()
 
 
+@pytest.mark.slow
 @LIGHT
 def test_every_figure_has_ink_and_nothing_is_asked_or_complained_of(shown: Any, told: list[str]) -> None:
     drawn = shown.locator(".drawing svg, .drawing img, .plot canvas")
@@ -282,6 +283,7 @@ def test_the_contents_name_every_section_of_the_page(path: Path) -> None:
     assert all(text.strip() for _, text in listed)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_the_page_of_an_improvement_leads_with_the_story_and_the_picture_of_the_steps() -> None:
     state = hidden_improved()

@@ -205,6 +205,7 @@ def test_a_live_run_shows_targets_and_where_to_go(tmp_path: Path) -> None:
     assert judgement.verdict in content(path, "TextDocument:text")["/summary"][None][0]
 
 
+@pytest.mark.slow
 @pytest.mark.draws
 def test_the_file_of_a_run_that_goes_on_opens(tmp_path: Path) -> None:
     """As it is where the program was killed."""
@@ -226,6 +227,7 @@ def test_the_file_of_a_run_that_goes_on_opens(tmp_path: Path) -> None:
     assert not growing.trouble
 
 
+@pytest.mark.slow
 @pytest.mark.draws
 def test_no_panel_complains(found: Diagnosis, improved: Improvement, tmp_path: Path) -> None:
     for result in (found, improved):

@@ -87,7 +87,7 @@ def written_in(figure: Figure) -> list[str]:
     return [text.get_text() for axes in figure.get_axes() for text in axes.texts]
 
 
-@pytest.mark.parametrize("name", ["result", "compared", "made", "experiment"])
+@pytest.mark.parametrize("name", ["compared", "experiment", *slow("result", "made")])
 def test_every_figure_has_ink_units_and_nothing_cut_off(name: str, request: pytest.FixtureRequest) -> None:
     found = plot.figures(request.getfixturevalue(name))
     assert len(found) >= 2

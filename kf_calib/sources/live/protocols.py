@@ -23,8 +23,8 @@ _HELD_BYTES = 1 << 16
 class LineProtocol:
     """JSON or CSV lines as bytes come, from wherever in a line they begin.
 
-    header: of CSV rows that come without one. angles: whether poses must come. Raises InputError for a header that does
-    not say what is needed.
+    header: of CSV rows that come without one. angles: whether poses must come. A header that does not say what is
+    needed waits for the next line, which may be a row of units; InputError is raised where that does not say it either.
     """
 
     def __init__(
@@ -33,10 +33,11 @@ class LineProtocol:
         self._name, self._columns, self._account, self._angles = name, columns, account, angles
         self._units = units
         self._cutter = Cutter(account)
-        self._header = header.strip()
+        self._heading = [header.strip()] if header.strip() else []
+        self._waiting = list[str]()
         self.reader: LineReader | None = None
-        if self._header:
-            self.reader = self._csv(self._header, account, angles)
+        if self._heading:
+            self.reader = self._csv(self._heading, account, angles)
         self._is_first = False
 
     def push(self, block: bytes) -> Batch:
@@ -49,8 +50,8 @@ class LineProtocol:
         if self._is_first and lines:
             self._is_first = False
             lines = self._without_half_a_row(lines)
-        if self._header and self._header in lines:  # a logger that begins again sends its header again
-            lines = ["" if line == self._header else line for line in lines]
+        if self._heading:  # a logger that begins again sends its header again
+            lines = ["" if line in self._heading else line for line in lines]
         elif isinstance(self.reader, JsonLines):
             is_known = bool(self.reader.pose_width or self.reader.metadata)
             lines = ["" if line.startswith('{"bench"') and is_known else line for line in lines]
@@ -70,37 +71,44 @@ class LineProtocol:
 
     def rest(self) -> Batch:
         """The sample on a last line without an end."""
-        return self.push(b"\n") if self._cutter.is_amid else nothing(self.reader.pose_width if self.reader else 0)
+        if self._cutter.is_amid or self._waiting:
+            return self.push(b"\n")
+        return nothing(self.reader.pose_width if self.reader else 0)
 
     def _without_half_a_row(self, lines: list[str]) -> list[str]:
-        if isinstance(self.reader, CsvLines) and lines[0] and lines[0] != self._header:
+        if isinstance(self.reader, CsvLines) and lines[0] and lines[0] not in self._heading:
             self._account.refuse(self._account.lines + 1, "it may not be whole: the link was joined in it")
             return ["", *lines[1:]]
         return lines
 
     def _begin(self, lines: list[str]) -> list[str]:
         """The lines from the first on that says what they are; those before it are refused."""
+        lines, self._waiting = [*self._waiting, *lines], []
         for i, line in enumerate(lines):
             text = line.lstrip("\ufeff").strip()
-            if text and self._begins(text):
-                return lines[i + isinstance(self.reader, CsvLines) :]
+            if text and self._begins(text, lines[i + 1] if i + 1 < len(lines) else None):
+                return lines[i + len(self._heading) :]
+            if self._waiting:
+                break
             self._account.lines += 1
             if text:
                 self._account.refuse(self._account.lines, "it is neither a JSON object nor a header of CSV")
         return []
 
-    def _csv(self, header: str, account: Account, angles: bool) -> CsvLines:
-        return CsvLines(CsvColumns.of(CsvHeading.of([header]), self._columns, self._units), account, angles)
+    def _csv(self, heading: list[str], account: Account, angles: bool) -> CsvLines:
+        told = CsvHeading.of(heading)._replace(rows=[])  # what comes as numbers tells no unit: it may change
+        return CsvLines(CsvColumns.of(told, self._columns, self._units), account, angles)
 
-    def _has_readings(self, header: str) -> bool:
+    def _has_readings(self, heading: list[str]) -> bool:
         """Whether a header lacks nothing but angles."""
         try:
-            self._csv(header, Account(), angles=False)
+            self._csv(heading, Account(), angles=False)
         except InputError:
             return False
         return True
 
-    def _begins(self, text: str) -> bool:
+    def _begins(self, text: str, following: str | None) -> bool:
+        """Whether what is to be read begins with this line; the one that follows it is None where it has not come."""
         if text[0] == "{":
             try:
                 json.loads(text)
@@ -115,13 +123,19 @@ class LineProtocol:
             or not all(cell.strip(' "')[:1].isalpha() for cell in cells)
         ):
             return False
+        both = [text] if following is None else [text, following]
+        heading = both[: CsvHeading.of(both).lines]
         try:
-            if self._angles and len(cells) < _FEWEST_CELLS and not self._has_readings(text):
+            if self._angles and len(cells) < _FEWEST_CELLS and not self._has_readings(heading):
+                self._waiting = [text] if following is None else []
                 return False
-            self.reader, self._header = self._csv(text, self._account, self._angles), text
+            self.reader, self._heading = self._csv(heading, self._account, self._angles), heading
         except InputError as error:
+            if following is None:
+                self._waiting = [text]
+                return False
             raise InputError(f"{self._name}: {error}") from None
-        self._account.lines += 1
+        self._account.lines += len(heading)
         self._is_first = False
         return True
 

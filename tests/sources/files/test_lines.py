@@ -279,6 +279,7 @@ def test_hostile_input_ends_soon_and_in_little_memory(text):
     assert peak < 40 << 20
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_lines():
     class Feed:
         """A header, then ``blocks`` blocks of rows, made as they are read."""

@@ -81,6 +81,7 @@ def test_profile_metadata_and_order_are_as_the_format_says(tmp_path: Path) -> No
     assert times == sorted(times)
 
 
+@pytest.mark.slow
 def test_a_run_of_many_chunks_is_indexed_as_the_writer_does_it_in_few_bytes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -446,6 +446,27 @@ def test_random_bytes_are_refused_with_counts_in_little_memory() -> None:
     tracemalloc.stop()
 
 
+@pytest.mark.parametrize("cut", [0, 5, 60, 75, 90])
+def test_a_row_of_units_below_the_names_is_read_however_it_comes(cut: int) -> None:
+    """The recording has what one of the same readings in our units has; a logger that begins again sends both rows."""
+    heading = b"time,ax,ay,az,outer,middle,inner\nns,g,g,g,deg,deg,deg\n"
+    values = np.array([[0.5, 0.25, -1.0], [0.75, -0.5, 0.125]])
+    sent_rows = [[START_NS + k * 1_000_000, *row, 90, 0, -45] for k, row in enumerate(values.tolist())]
+    first, second = (",".join(map(str, row)).encode() + b"\n" for row in sent_rows)
+    sent = heading + first + heading + second
+    with scripted(*(part for part in (sent[:cut], sent[cut:]) if part)) as source:
+        got = read(source)
+    assert not source.status.refused
+    np.testing.assert_allclose(got.accel.values, values * 9.80665, rtol=1e-15)
+    np.testing.assert_allclose(got.pose.values, np.radians([[90.0, 0.0, -45.0]] * 2), rtol=1e-15)
+
+
+@pytest.mark.parametrize("pieces", [[b"time_s,ax,ay,az,outer_deg\n"], [b"time_s,ax,ay,az,outer_deg\n", b"s,g,g,g,K\n"]])
+def test_a_header_that_waits_for_its_units_in_vain_is_told(pieces: list[bytes]) -> None:
+    with scripted(*pieces) as source, pytest.raises(InputError, match=r"ax_mps2|outer_deg"):
+        list(source)
+
+
 def test_a_header_that_lacks_something_is_told_at_once() -> None:
     with scripted(b"time_s,ax,ay,az,outer_deg\n1,2,3,4,5\n") as source, pytest.raises(InputError, match="ax_mps2"):
         list(source)

@@ -161,6 +161,7 @@ def test_on_a_stabilised_platform_the_force_turns_within_a_dwell():
     assert size(run, "earth-rotation=0.01") == pytest.approx(expected, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_misfit_rises_by_the_square():
     """In the simulator's own noise; the mean over the seeds of n^2 + 2 n z, z normal."""
     noise = replace(NOISES["all"], ar1_phi=0.0, flicker_mps2=0.0)
@@ -310,6 +311,7 @@ def test_each_axis_gets_the_size_and_constants_stand():
     assert asked(run, "settling=10sigma;tau=3").truth["inner"]["tau"]["value"] == 3.0
 
 
+@pytest.mark.slow
 def test_random_draws_what_can_be_seen():
     run = simulation(sample_hz=10.0)
     names = set[str]()

@@ -560,6 +560,7 @@ def test_a_run_starts_afresh():
     assert np.array_equal(read(simulation).accel.values, read(simulation).accel.values)
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_run():
     def peak(dwell_s: float) -> int:
         texts = [f"{name}={size}" for name, size in VISIBLE.items()]

@@ -169,6 +169,7 @@ def test_a_run_repeats_itself_and_another_seed_differs():
     assert not np.any(read(simulation).accel.values == read(other).accel.values)
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_run():
     def peak(dwell_s: float) -> int:
         plan = explicit_plan([(0, 0, 0), (0, 90, 0)], dwell_s)

@@ -43,6 +43,7 @@ def test_angle_that_does_not_move_gravity_varies_too():
     assert set(np.floor(outer / (np.pi / 2)).astype(int)) == {-2, -1, 0, 1}
 
 
+@pytest.mark.slow
 def test_order_is_not_correlated_with_angle():
     up = directions(spread_plan(200, seed=5))
     order = np.linspace(-1, 1, 200)

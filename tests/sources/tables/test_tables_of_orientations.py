@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.known_runs import hidden_diagnosed
-from helpers.long_runs import slow
 from helpers.paths import ROOT
 
 import kf_calib
@@ -51,8 +50,9 @@ def test_a_run_and_its_table_give_the_same_parameters_and_sigmas(name: str) -> N
         assert found.sigma == pytest.approx(expected.sigma, rel=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unmeasured")
-@pytest.mark.parametrize("recording", ["mems_faces", *slow("navigation_24")])
+@pytest.mark.parametrize("recording", ["mems_faces", "navigation_24"])
 def test_the_engines_agree_on_a_table(recording: str) -> None:
     table = table_of(kf_calib.calibrate(ROOT / "recordings" / f"{recording}.mcap"))
     compared = kf_calib.compare(table)
@@ -264,12 +264,14 @@ def test_few_readings_have_the_sigma_of_their_mean() -> None:
         assert other.parameters[symbol].sigma == pytest.approx(expected.sigma, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_missing_effect_is_found_in_a_table() -> None:
     expected = hidden_diagnosed()
     found = kf_calib.diagnose(table_of(expected.before))
     assert found.verdict.split(":")[0].split("(")[0] == expected.verdict.split(":")[0].split("(")[0]
 
 
+@pytest.mark.slow
 def test_rows_equally_apart_are_searched_for_oscillations_too() -> None:
     """At some frequencies the sine is zero in all of them."""
     table = kf_calib.open_table(TWELVE, BENCH)
