@@ -252,12 +252,12 @@ class DwellStack(ComputedSequence[DwellFactor]):
     def of(cls, dwells: Sequence[DwellFactor], like: DwellStack | None = None) -> DwellStack:
         """Any dwells as a stack; a stack as it is.
 
-        like: a stack that may be of the same dwells; what has been computed from them is then not computed again.
+        like: a stack that may be of the same dwells, the same objects; what has been computed from them is then not
+        computed again.
         """
         if isinstance(dwells, DwellStack):
             return dwells
-        is_same = like is not None and like.folded.dwells == tuple(dwells)  # the same objects
-        folded = like.folded if like is not None and is_same else Folded(dwells)
+        folded = like.folded if like is not None and like.folded.dwells == tuple(dwells) else Folded(dwells)
         still, turned_rad, attitudes = np.zeros(3), None, None
         if any(dwell.turned_rad is not None for dwell in dwells):
             turned_rad = np.array([still if dwell.turned_rad is None else dwell.turned_rad for dwell in dwells])

@@ -68,7 +68,7 @@ def whiten(
     values = of_all_pieces(columns)
     stack, noise_about = DwellStack.of(dwells), _About(noise, state, about, flicker_mps2)
     batches = list(_batches(stack, values.shape[-1]))
-    by_means = [reduced and batch.tells_means_only(values[batch.pieces], noise_about) for batch in batches]
+    by_means = [reduced and batch.tells_means_only(values, noise_about) for batch in batches]
     if all(by_means):
         rows_of_means = np.empty((len(stack), 3, values.shape[-1] + 1))
         for batch in batches:
@@ -153,12 +153,12 @@ class _Batch:
 
     def tells_means_only(self, columns: Floats, about: _About) -> bool:
         """Whether only the mean of each dwell tells something of the states, so that whitened rows have full rank:
-        nothing else is known, or the columns (d, P, K, 3, p) and the force are constant within every dwell."""
+        nothing else is known, or the columns (pieces, K, 3, p) and the force are constant within every dwell."""
         if about.noise.walk_mps2_per_sqrt_s or about.noise.attitude_unknown:
             return False
         if self.pieces.shape[1] == 1 and not self.triangles[:, 0, 1 : self.shape.width].any():
             return True
-        return about.flicker_mps2 is None and _is_constant(columns) and _is_constant(self.force_mps2)
+        return about.flicker_mps2 is None and _is_constant(columns[self.pieces]) and _is_constant(self.force_mps2)
 
 
 def _batches(stack: DwellStack, width: int) -> Iterator[_Batch]:

@@ -221,9 +221,9 @@ def test_an_oscillation_of_one_cycle_a_dwell_is_not_taken_for_slow_noise(size: i
 
 
 @pytest.mark.slow
-def test_slow_noise_is_not_taken_for_an_oscillation() -> None:
+@pytest.mark.parametrize("seeds, dwells", [(range(1), 12), (range(22), 16)])
+def test_slow_noise_is_not_taken_for_an_oscillation(seeds: range, dwells: int) -> None:
     """Of 1/f noise within dwells and a walk, which the means of the dwells follow."""
-    seeds, dwells = range(22), 16
     for seed in seeds:
         noise = {"walk_mps2_per_sqrt_s": 2e-5, "flicker_mps2": 3e-5}
         found = diagnose(source(seed=seed, dwells=dwells, **noise), replicate=False)
@@ -240,9 +240,9 @@ def test_vibration_is_no_oscillation_of_one_amplitude_and_what_it_rectifies_is_n
 
 
 @pytest.mark.slow
-def test_of_vibration_alone_nothing_is_said_but_that_it_is_there() -> None:
+@pytest.mark.parametrize("seeds, dwells", [(range(1), 12), (range(44), 24)])
+def test_of_vibration_alone_nothing_is_said_but_that_it_is_there(seeds: range, dwells: int) -> None:
     """Averages are few in short dwells: their noise is that of white readings in windows that overlap."""
-    seeds, dwells = range(44), 24
     quiet = [diagnose(source("vibration-rectification=1e-12", seed=seed, dwells=dwells)) for seed in seeds]
     assert all(found.test.lines.vibration for found in quiet)
     assert sum(not found.test.consistent for found in quiet) <= 0.05 * len(quiet)

@@ -50,7 +50,7 @@ class LineProtocol:
         if self._is_first and lines:
             self._is_first = False
             lines = self._without_half_a_row(lines)
-        if self._heading:  # a logger that begins again sends its header again
+        if any(line in lines for line in self._heading):  # a logger that begins again sends its header again
             lines = ["" if line in self._heading else line for line in lines]
         elif isinstance(self.reader, JsonLines):
             is_known = bool(self.reader.pose_width or self.reader.metadata)
@@ -96,8 +96,7 @@ class LineProtocol:
         return []
 
     def _csv(self, heading: list[str], account: Account, angles: bool) -> CsvLines:
-        told = CsvHeading.of(heading)._replace(rows=[])  # what comes as numbers tells no unit: it may change
-        return CsvLines(CsvColumns.of(told, self._columns, self._units), account, angles)
+        return CsvLines(CsvColumns.of(CsvHeading.of(heading), self._columns, self._units), account, angles)
 
     def _has_readings(self, heading: list[str]) -> bool:
         """Whether a header lacks nothing but angles."""
@@ -123,21 +122,23 @@ class LineProtocol:
             or not all(cell.strip(' "')[:1].isalpha() for cell in cells)
         ):
             return False
-        both = [text] if following is None else [text, following]
-        heading = both[: CsvHeading.of(both).lines]
-        try:
+        both, lacks = [text, following or ""], None
+        for heading in ([text], both[: CsvHeading.of(both).lines]):  # what says all by itself is not asked for more
             if self._angles and len(cells) < _FEWEST_CELLS and not self._has_readings(heading):
-                self._waiting = [text] if following is None else []
-                return False
-            self.reader, self._heading = self._csv(heading, self._account, self._angles), heading
-        except InputError as error:
-            if following is None:
-                self._waiting = [text]
-                return False
-            raise InputError(f"{self._name}: {error}") from None
-        self._account.lines += len(heading)
-        self._is_first = False
-        return True
+                continue
+            try:
+                self.reader, self._heading = self._csv(heading, self._account, self._angles), heading
+            except InputError as error:
+                lacks = error
+                continue
+            self._account.lines += len(heading)
+            self._is_first = False
+            return True
+        if following is None:
+            self._waiting = [text]
+        elif lacks is not None:
+            raise InputError(f"{self._name}: {lacks}")
+        return False
 
 
 class Protocol:

@@ -467,6 +467,13 @@ def test_a_header_that_waits_for_its_units_in_vain_is_told(pieces: list[bytes]) 
         list(source)
 
 
+def test_garbage_below_a_header_that_says_all_costs_itself_only() -> None:
+    """Words between other separators would be taken for the header of a file."""
+    with scripted(f"{HEADER}\nnote; one; two; three; four; five; six\n".encode(), rows(0, 9)) as source:
+        assert numbers(read(source)) == list(range(9))
+    assert source.status.refused == 1
+
+
 def test_a_header_that_lacks_something_is_told_at_once() -> None:
     with scripted(b"time_s,ax,ay,az,outer_deg\n1,2,3,4,5\n") as source, pytest.raises(InputError, match="ax_mps2"):
         list(source)
