@@ -37,6 +37,7 @@ from kf_calib.dwells.qr import orthonormal
 from kf_calib.effects import Effect, FrameEffect, Stimulus, effect_named, walk_named
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation.dwell_columns import stimulus_of
+from kf_calib.estimation.observability import IMPOSSIBLE
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import unweighted_left
 
@@ -93,6 +94,15 @@ def _screening_limit(logs: Iterable[float]) -> float:
     """Return the log evidence by the linear tests from which a row is refitted."""
     best = max(logs, default=0.0)
     return best - SCREEN_LOG_BF - NONLINEARITY_MARGIN * max(best, 0.0)
+
+
+def _is_impossible(refit: Calibration, formulas: Sequence[str]) -> bool:
+    """Tell whether a formula of a refit has a coefficient that no sensor could have: it is nearly the same as one of
+    the parameters, and follows what else is missing by the little in which it is not."""
+    names = {text.partition("=")[0].strip() for text in formulas}
+    coefficients = [each for effect in refit.model.effects if str(effect) in names for each in effect.coefficients]
+    sizes = ((each.scale, refit.parameters[each.symbol].value or 0.0) for each in coefficients)
+    return any(abs(value) > IMPOSSIBLE * scale for scale, value in sizes)
 
 
 class Hypotheses:
@@ -371,6 +381,8 @@ class Hypotheses:
         try:
             refit = self._refit((*effects, *formulas))
         except UnobservableError:  # the run does not tell its coefficients: nothing speaks for it
+            return Hypothesis(effects, formulas, log_evidence=-math.inf)
+        if formulas and _is_impossible(refit, formulas):
             return Hypothesis(effects, formulas, log_evidence=-math.inf)
         marginals = self.evidence.of(refit.fit, walk=self.walk in effects)
         if not marginals:

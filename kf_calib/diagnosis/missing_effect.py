@@ -288,8 +288,8 @@ _GROWN = 1.05  # the held-out error before and after; what shows only within dwe
 
 
 def unearned(row: Hypothesis, before: Calibration, walk: str) -> str:
-    """Why the effects of a row must not be named, in words that follow "but"; "" where they may, or where no refit was
-    made.
+    """Why the effects of a row must not be named, or its formulas not be believed, in words that follow "but"; "" where
+    they may, or where no refit was made.
 
     before: the calibration without them. walk: the name of the random walk, which has no coefficient.
     """
@@ -311,7 +311,8 @@ def unearned(row: Hypothesis, before: Calibration, walk: str) -> str:
         what = "they make" if len(row.effects) > 1 else "it makes"
         return f"{what} the held-out error {errors[1] / errors[0]:.3g} times as large"
     fails = before.consistency.consistent is False and after.consistency.consistent is False
-    oscillating = all(effect.oscillates for effect in after.model.effects if str(effect) in row.effects)
+    named = [effect for effect in after.model.effects if str(effect) in row.effects]
+    oscillating = bool(named) and all(effect.oscillates for effect in named)
     if oscillating and fails and errors[1] > _AS_IT_WAS * errors[0]:
         return "it goes on within the orientations, and leaves the misfit between them as it was"
     return ""

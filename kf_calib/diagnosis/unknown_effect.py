@@ -36,17 +36,21 @@ _WITHIN = 0.01  # significance level of trends within dwells
 _SAME = 0.99  # cosine of the angle between a formula and a known effect above which they count as the same
 _DECAYS_S = (10, 30, 100, 300)
 _JUMPS = 100  # largest number of moments at which a jump is tried
+_BETWEEN = 50  # the same of one that comes between two dwells
 
 JUMP = "time (a jump)"
+TILT_JUMP = "time (a jump of the tilt of the base)"
+SCALE_JUMP = "time (a jump of the scale factors)"
 DECAY = "time (a decay)"
 ARRIVAL = "time since arrival"
 PERIODIC = "time (periodic)"
+_SEARCHED = frozenset({JUMP, TILT_JUMP, SCALE_JUMP, DECAY, ARRIVAL, PERIODIC})
 BETWEEN_DWELLS = "nothing that was recorded (irregular from dwell to dwell)"
 WITHIN_DWELLS = "time (irregular, within dwells too)"
 
 
 _CLASSES = (
-    (ARRIVAL, "memory"), ("previous orientation", "memory"), ("time", "bias in time"), ("temperature", "temperature"),
+    (ARRIVAL, "memory"), ("previous orientation", "memory"), (SCALE_JUMP, "scale in time"), ("time", "bias in time"), ("temperature", "temperature"),
     ("rate of temperature", "temperature"),
 )  # fmt: skip
 """How the drivers of formulas begin, and the physical class of effects to which these belong."""
@@ -100,7 +104,7 @@ class FormulaFamily:
     @property
     def dof(self) -> int:
         """Degrees of freedom: the rank, and one more where a moment, a time constant or a period is searched."""
-        return self.rank + (self.rank > 0 and self.driver in (JUMP, DECAY, ARRIVAL, PERIODIC))
+        return self.rank + (self.rank > 0 and self.driver in _SEARCHED)
 
     @property
     def family(self) -> str:
@@ -112,7 +116,7 @@ class FormulaFamily:
         if self.driver.startswith("specific force"):
             across = any(re.search(r"\b[po]\b", text) for text in self.texts)
             return "cross-axis" if across else "nonlinearity"
-        if self.texts[0].startswith(":base") and self.driver == "time":
+        if self.driver == TILT_JUMP or self.texts[0].startswith(":base") and self.driver == "time":
             return "base and platform"
         return next(family for start, family in _CLASSES if self.driver.startswith(start))
 
@@ -261,6 +265,7 @@ def _families(bench: Bench, dwells: Sequence[DwellFactor]) -> Iterator[tuple[str
     yield from _of_force()
     yield from _of_gimbals(len(bench.axes))
     yield from _of_time(dwells)
+    yield from _of_jumps(bench, dwells)
     yield from _of_surroundings(bench)
 
 
@@ -288,12 +293,9 @@ def _of_gimbals(count: int) -> Iterator[tuple[str, list[str]]]:
 
 
 def _of_time(dwells: Sequence[DwellFactor]) -> Iterator[tuple[str, list[str]]]:
-    """Yield the formulas of time: drift, jumps, decays and oscillations."""
+    """Yield the formulas of time: drift, decays and oscillations."""
     yield "time", ["t"]
     yield "time", ["t", "t*t"]
-    moments_s = [moment for dwell in dwells for moment in (dwell.start_s, 0.5 * (dwell.start_s + dwell.end_s))][1:]
-    for moment_s in moments_s[:: len(moments_s) // _JUMPS + 1]:
-        yield JUMP, [f"t > {moment_s:.6g}*s"]
     duration_s, longest_s = dwells[-1].end_s, max(dwell.end_s - dwell.start_s for dwell in dwells)
     for decay_s in _DECAYS_S:
         if decay_s == _DECAYS_S[0] or 10 * decay_s <= duration_s:
@@ -304,6 +306,22 @@ def _of_time(dwells: Sequence[DwellFactor]) -> Iterator[tuple[str, list[str]]]:
     for turns in (0.5, 1, 1.5, 2, 3, 4, 6, 8):
         waves = [f"{wave}({turns}*2*pi*t/({duration_s:.0f}*s))" for wave in ("sin", "cos")]
         yield PERIODIC, waves
+
+
+def _of_jumps(bench: Bench, dwells: Sequence[DwellFactor]) -> Iterator[tuple[str, list[str]]]:
+    """Yield the formulas of jumps: of the biases between and within dwells; of scale factors and base between them.
+
+    A jump between two dwells is in the middle of the way: at the arrival it would be within a dwell for some of it.
+    """
+    within_s = [0.5 * (dwell.start_s + dwell.end_s) for dwell in dwells]
+    between_s = [0.5 * (before.end_s + dwell.start_s) for before, dwell in itertools.pairwise(dwells)]
+    moments_s = sorted(within_s + between_s)
+    for moment_s in moments_s[:: len(moments_s) // _JUMPS + 1]:
+        yield JUMP, [f"t > {moment_s:.6g}*s"]
+    for moment_s in between_s[:: len(between_s) // _BETWEEN + 1]:
+        yield SCALE_JUMP, [f"a*(t > {moment_s:.6g}*s)"]
+        if bench.axes:
+            yield TILT_JUMP, [f":base = t > {moment_s:.6g}*s"]
 
 
 def _of_surroundings(bench: Bench) -> Iterator[tuple[str, list[str]]]:

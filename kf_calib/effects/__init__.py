@@ -45,7 +45,7 @@ _OF_A_GIMBAL = {
     kind.name: kind
     for kind in (
         frame.EncoderOffset, frame.EncoderScale, frame.EncoderHarmonic1, frame.EncoderHarmonic2,
-        frame.AxisNonorthogonality,
+        frame.Backlash, frame.AxisNonorthogonality,
     )
 }  # fmt: skip
 

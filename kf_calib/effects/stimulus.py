@@ -167,6 +167,16 @@ class Stimulus:
             through[first:last] = held
         return through
 
+    def side(self, gimbal: int, least_rad: float) -> Floats:
+        """The sense (m,) of the last move of a gimbal, 1 or -1, whichever dwells it stood still in since; 0 until it has
+        moved. A move of no more than ``least_rad`` is none."""
+        if self.whole is not None:
+            return self.whole.side(gimbal, least_rad)[self.places]
+        moves = self.pose[:, gimbal] - self.previous_pose[:, gimbal]
+        senses = np.where(np.abs(moves) > least_rad, np.sign(moves), 0.0)
+        last = np.maximum.accumulate(np.where(senses != 0.0, np.arange(len(self)), 0))
+        return senses[last]
+
     @cached_property
     def force_rate_mps3(self) -> Floats:
         """df/dt (m, 3) in the platform frame: f x omega."""
