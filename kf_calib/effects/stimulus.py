@@ -168,8 +168,8 @@ class Stimulus:
         return through
 
     def side(self, gimbal: int, least_rad: float) -> Floats:
-        """The sense (m,) of the last move of a gimbal, 1 or -1, whichever dwells it stood still in since; 0 until it has
-        moved. A move of no more than ``least_rad`` is none."""
+        """The sense (m,) of the last move of a gimbal, 1 or -1, in whatever dwells it has stood still since; 0 until it
+        has moved. A move of no more than ``least_rad`` is none."""
         if self.whole is not None:
             return self.whole.side(gimbal, least_rad)[self.places]
         moves = self.pose[:, gimbal] - self.previous_pose[:, gimbal]

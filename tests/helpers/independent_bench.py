@@ -5,7 +5,7 @@ knows nothing. What is wrong with it is given as functions of its state.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -16,6 +16,7 @@ from kf_calib.bench.streams import Batch, Stream
 
 G = 9.81262
 HZ, DWELL_S, SLEW_S = 20.0, 8.0, 4.0
+BENCH = Bench(axes_of("yzx"), G, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class IndependentBench:
     base: Error = _none
     mount: Error = _none
     scale: Error = _none
-    bench: Bench = Bench(axes_of("yzx"), G, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
+    bench: Bench = BENCH
     warnings: tuple[str, ...] = ()
 
     @cached_property
@@ -86,7 +87,3 @@ class IndependentBench:
         readings += self.white_mps2 * rng.standard_normal(readings.shape)
         time_ns = np.rint(state.time_s * 1e9).astype(np.int64) + 1_700_000_000_000_000_000
         yield Batch(Stream(time_ns, readings), Stream(time_ns, state.angles_rad))
-
-    def in_noise_of(self, dwell_mps2: float) -> IndependentBench:
-        """It with readings whose mean over a dwell is known to about so much."""
-        return replace(self, white_mps2=dwell_mps2 * (DWELL_S * HZ) ** 0.5)
