@@ -183,7 +183,7 @@ def test_undone_steps_and_choices_left_open_are_drawn_beside_the_way() -> None:
     axes = axes_of(figure, "The error of the model")
     ticks = [label.get_text() for label in axes.get_xticklabels()]
     assert ticks[1].split("\n")[:2] == ["1: + second-order", "(undone)"]
-    assert [tick for tick in ticks if tick.endswith("?")] == [
+    assert [" ".join(tick.split()) for tick in ticks if tick.endswith("?")] == [
         f"{k}: + {each.name}?" for k, each in enumerate(state.alternatives, start=2)
     ]
     way = next(line for line in axes.lines if line.get_label() == "rms of orientations left out of the fit")

@@ -131,7 +131,7 @@ for _order in (1, 2):
 
 
 @made(
-    "backlash", "rad", ("1arcsec", "20arcsec"), ("0.02deg", "0.5deg"),
+    "backlash", "rad", ("5urad", "100urad"), ("0.1mrad", "10mrad"),
     stage="angles", coefficients=("play",), signed=False, per_axis=True,
 )  # fmt: skip
 def backlash(play: Floats, rig: Rig, axis: int) -> TrueStep:
