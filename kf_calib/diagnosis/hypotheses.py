@@ -37,7 +37,6 @@ from kf_calib.dwells.qr import orthonormal
 from kf_calib.effects import Effect, FrameEffect, Stimulus, effect_named, walk_named
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation.dwell_columns import stimulus_of
-from kf_calib.estimation.observability import IMPOSSIBLE
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import unweighted_left
 
@@ -46,6 +45,7 @@ _AGAINST_STATED = 0.5  # the same of noise that contradicts what was stated: non
 _OF_ORIENTATION = 0.8  # share of such causes that depend on the orientation alone, and come back with it
 _SHORT = 0.01  # prior probability of irregular changes that show within dwells only
 _END = 0.99  # of the range of a constant
+_IMPOSSIBLE_MPS2 = 1.0  # added to a reading by what is no parameter: a tenth of gravity
 _APART = 1e-4  # p-value of an oscillation that does not go on alike in all dwells
 _OF_EFFECT = 6.0  # columns that an effect has
 SCREEN_LOG_BF = 8.0  # rows further behind in log evidence are not refitted
@@ -94,15 +94,6 @@ def _screening_limit(logs: Iterable[float]) -> float:
     """Return the log evidence by the linear tests from which a row is refitted."""
     best = max(logs, default=0.0)
     return best - SCREEN_LOG_BF - NONLINEARITY_MARGIN * max(best, 0.0)
-
-
-def _is_impossible(refit: Calibration, formulas: Sequence[str]) -> bool:
-    """Tell whether a formula of a refit has a coefficient that no sensor could have: it is nearly the same as one of
-    the parameters, and follows what else is missing by the little in which it is not."""
-    names = {text.partition("=")[0].strip() for text in formulas}
-    coefficients = [each for effect in refit.model.effects if str(effect) in names for each in effect.coefficients]
-    sizes = ((each.scale, refit.parameters[each.symbol].value or 0.0) for each in coefficients)
-    return any(abs(value) > IMPOSSIBLE * scale for scale, value in sizes)
 
 
 class Hypotheses:
@@ -359,12 +350,12 @@ class Hypotheses:
                 drivers.setdefault(family.driver, []).append(family)
         logs = {driver: self._log_bayes_of_formulas(families) for driver, families in drivers.items()}
         limit = 0.0 if beside else _screening_limit(log for name, log in screened.items() if name != self.walk)
-        ranked = sorted(drivers, key=lambda driver: -np.logaddexp.reduce(logs[driver]))[: _MOST["formula"]]
-        for driver in ranked:
+        means = {driver: float(np.logaddexp.reduce(own)) - math.log(len(own)) for driver, own in logs.items()}
+        for driver in sorted(drivers, key=lambda driver: -means[driver])[: _MOST["formula"]]:
             if logs[driver].max() < limit:
                 continue
             best = int(np.argmax(logs[driver]))
-            share = float(np.logaddexp.reduce(logs[driver]) - logs[driver][best]) - math.log(len(logs[driver]))
+            share = means[driver] - float(logs[driver][best])
             formulas = drivers[driver][best].formulas_beside(names_in_model)
             row = self._row(known, self._prior(kind, count * len(drivers), *known) + share, formulas)
             family = drivers[driver][best].family or NONE
@@ -382,7 +373,7 @@ class Hypotheses:
             refit = self._refit((*effects, *formulas))
         except UnobservableError:  # the run does not tell its coefficients: nothing speaks for it
             return Hypothesis(effects, formulas, log_evidence=-math.inf)
-        if formulas and _is_impossible(refit, formulas):
+        if formulas and self._is_impossible(refit, formulas):
             return Hypothesis(effects, formulas, log_evidence=-math.inf)
         marginals = self.evidence.of(refit.fit, walk=self.walk in effects)
         if not marginals:
@@ -398,6 +389,16 @@ class Hypotheses:
                 self._disturbed.append((log, disturbed))
                 return Hypothesis(effects, formulas, log_evidence=-math.inf)
         return Hypothesis(effects, formulas, "", self._families(effects), log, delta_chi2, best.dof + walks, refit)
+
+    def _is_impossible(self, refit: Calibration, formulas: Sequence[str]) -> bool:
+        """Tell whether a formula of a refit adds what no sensor could have: it is nearly the same as one of the
+        parameters, and follows what else is missing by the little in which it is not."""
+        names = {text.partition("=")[0].strip() for text in formulas}
+        for effect in (each for each in refit.model.effects if str(each) in names):
+            values = np.array([refit.parameters[each.symbol].value or 0.0 for each in effect.coefficients])
+            if np.abs(effect.added(self._stimulus, values)).max() > _IMPOSSIBLE_MPS2:
+                return True
+        return False
 
     def _log_odds_within_dwells(self, refit: Calibration) -> float:
         """Return the log odds of what a walk explains within dwells, where it goes on but has no column.

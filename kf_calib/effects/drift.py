@@ -108,6 +108,7 @@ class ScaleWarmUp(_Decay):
     symbol, unit, scale = "S", "1", 1e-3
     unknown = Unknown("tauScale", "s", 30.0, 10800.0, "min", 1.0 / 60.0)
     typical = Typical((1e-6, 100e-6), (0.1e-3, 10e-3))
+    prior = 0.25  # in a run that is short beside its time constant it is a scale-drift, and cannot be told from it
 
     def terms(self, s: Stimulus) -> Floats:
         return np.exp(-s.elapsed_s / self.value)[:, None] * s.along
