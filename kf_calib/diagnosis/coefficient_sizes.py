@@ -5,7 +5,8 @@ such coefficients usually have in sensors of the grade at hand (``Effect.typical
 density falls by a factor e for each decade beyond. The prior is proper, and says what physics says: an effect that
 would have a size that it never has is an unlikely name, however well its columns fit. An effect that is too small to be
 seen is none: sizes below one sigma count as its absence. A coefficient whose value is known, as the rate of the Earth
-is, is normal about that value. Where no usual size is known, every size from 1 to 1e7 sigma is equally likely.
+is, is normal about that value. Where no usual size is known, as of formulas, every size from 1 to 1e7 sigma is equally
+likely, in common for all such effects of an explanation.
 
 The smallest size at which an effect would be found is computed from its columns alone.
 """
@@ -173,16 +174,29 @@ class AddedEffects:
     def _log_bayes(self, delta_chi2: float, root: Floats, readings: Floats, relation: Sequence[Floats]) -> float:
         """Return the log Bayes factor where the coefficients of each effect are a matrix times free numbers."""
         widths = [matrix.shape[1] for matrix in relation]
-        related = root @ np.asarray(block_diag(*relation), float)
+        usual = [usual_sizes(effect, self.grade) for effect in self.effects]
+        related, groups = root @ np.asarray(block_diag(*relation), float), np.repeat(np.arange(len(widths)), widths)
+        sized = [k for k, prior in enumerate(usual) if prior]
+        others = ~np.isin(groups, sized)
+        if sized and others.any():
+            shared = _directions(related[:, others])
+            groups = np.append(np.searchsorted(sized, groups[~others]), np.full(shared.shape[1], len(sized)))
+            related = np.column_stack([related[:, ~others], shared])
         estimate = _solved(related, readings)
         left = readings - related @ estimate
         delta_chi2 = max(delta_chi2 - float(left @ left), 0.0)
-        usual = [usual_sizes(effect, self.grade) for effect in self.effects]
-        if not any(usual):
+        if not sized:
             return float(size_evidence(min(self.dof, sum(widths)), delta_chi2))
-        groups = np.repeat(np.arange(len(relation)), widths)
-        priors = [prior or _any_size(best_sigma(related[:, groups == k])) for k, prior in enumerate(usual)]
+        priors = [*filter(None, usual), _any_size(1.0)][: groups.max() + 1]
         return log_bayes_of_sizes(delta_chi2, related, estimate, groups, priors)
+
+
+def _directions(root: Floats) -> Floats:
+    """Return columns (r, k) of unit length across each other that span those of a root (r, q): of coefficients that are
+    as sure as the noise is large, whatever the units of the first were (the g-prior of ``size_evidence``)."""
+    lengths = np.linalg.norm(root, axis=0)
+    left, singular, _ = np.linalg.svd(root / np.where(lengths > 0.0, lengths, 1.0), full_matrices=False)
+    return left[:, singular > 1e-9]
 
 
 def _solved(root: Floats, readings: Floats) -> Floats:

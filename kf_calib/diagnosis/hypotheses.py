@@ -45,6 +45,7 @@ _AGAINST_STATED = 0.5  # the same of noise that contradicts what was stated: non
 _OF_ORIENTATION = 0.8  # share of such causes that depend on the orientation alone, and come back with it
 _SHORT = 0.01  # prior probability of irregular changes that show within dwells only
 _END = 0.99  # of the range of a constant
+_IMPOSSIBLE_MPS2 = 1.0  # added to a reading by what is no parameter: a tenth of gravity
 _APART = 1e-4  # p-value of an oscillation that does not go on alike in all dwells
 _OF_EFFECT = 6.0  # columns that an effect has
 SCREEN_LOG_BF = 8.0  # rows further behind in log evidence are not refitted
@@ -349,12 +350,12 @@ class Hypotheses:
                 drivers.setdefault(family.driver, []).append(family)
         logs = {driver: self._log_bayes_of_formulas(families) for driver, families in drivers.items()}
         limit = 0.0 if beside else _screening_limit(log for name, log in screened.items() if name != self.walk)
-        ranked = sorted(drivers, key=lambda driver: -np.logaddexp.reduce(logs[driver]))[: _MOST["formula"]]
-        for driver in ranked:
+        means = {driver: float(np.logaddexp.reduce(own)) - math.log(len(own)) for driver, own in logs.items()}
+        for driver in sorted(drivers, key=lambda driver: -means[driver])[: _MOST["formula"]]:
             if logs[driver].max() < limit:
                 continue
             best = int(np.argmax(logs[driver]))
-            share = float(np.logaddexp.reduce(logs[driver]) - logs[driver][best]) - math.log(len(logs[driver]))
+            share = means[driver] - float(logs[driver][best])
             formulas = drivers[driver][best].formulas_beside(names_in_model)
             row = self._row(known, self._prior(kind, count * len(drivers), *known) + share, formulas)
             family = drivers[driver][best].family or NONE
@@ -372,6 +373,8 @@ class Hypotheses:
             refit = self._refit((*effects, *formulas))
         except UnobservableError:  # the run does not tell its coefficients: nothing speaks for it
             return Hypothesis(effects, formulas, log_evidence=-math.inf)
+        if formulas and self._is_impossible(refit, formulas):
+            return Hypothesis(effects, formulas, log_evidence=-math.inf)
         marginals = self.evidence.of(refit.fit, walk=self.walk in effects)
         if not marginals:
             return Hypothesis(effects, formulas, log_evidence=-math.inf)
@@ -386,6 +389,16 @@ class Hypotheses:
                 self._disturbed.append((log, disturbed))
                 return Hypothesis(effects, formulas, log_evidence=-math.inf)
         return Hypothesis(effects, formulas, "", self._families(effects), log, delta_chi2, best.dof + walks, refit)
+
+    def _is_impossible(self, refit: Calibration, formulas: Sequence[str]) -> bool:
+        """Tell whether a formula of a refit adds what no sensor could have: it is nearly the same as one of the
+        parameters, and follows what else is missing by the little in which it is not."""
+        names = {text.partition("=")[0].strip() for text in formulas}
+        for effect in (each for each in refit.model.effects if str(each) in names):
+            values = np.array([refit.parameters[each.symbol].value or 0.0 for each in effect.coefficients])
+            if np.abs(effect.added(self._stimulus, values)).max() > _IMPOSSIBLE_MPS2:
+                return True
+        return False
 
     def _log_odds_within_dwells(self, refit: Calibration) -> float:
         """Return the log odds of what a walk explains within dwells, where it goes on but has no column.

@@ -138,13 +138,12 @@ def _is_function(x: Floats, y: Floats, of_an_angle: bool) -> bool:
     """The same of one column (D,); instants where it is not known do not count."""
     known = np.isfinite(x) & np.isfinite(y)
     x, y = x[known], y[known]
-    columns = [np.ones_like(x), x]
+    unit = x / max(np.abs(x).max(initial=0.0), 1e-300)
+    columns = [np.ones_like(x), x, np.where(np.abs(unit) > _ROUNDING, np.sign(x), 0.0)]
     if of_an_angle:
         columns += [wave(turns * x) for turns in (1, 2, 3, 4) for wave in (np.sin, np.cos)]
     else:
-        unit = x / max(np.abs(x).max(initial=0.0), 1e-300)
-        side = np.where(np.abs(unit) > _ROUNDING, np.sign(x), 0.0)
-        columns += [side, np.abs(unit), *(unit**power for power in (2, 3, 4))]
+        columns += [np.abs(unit), *(unit**power for power in (2, 3, 4))]
     basis = np.column_stack(columns)
     if len(x) <= basis.shape[1] + 2:
         return False

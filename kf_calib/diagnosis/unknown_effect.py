@@ -35,18 +35,27 @@ _EQUAL = 6.63  # chi-squared that one constant more has to gain (1 %)
 _WITHIN = 0.01  # significance level of trends within dwells
 _SAME = 0.99  # cosine of the angle between a formula and a known effect above which they count as the same
 _DECAYS_S = (10, 30, 100, 300)
+_CREEPS_S = (3, 10, 30)  # of a platform after its arrival
 _JUMPS = 100  # largest number of moments at which a jump is tried
+_BETWEEN = 50  # the same of one that comes between two dwells
 
 JUMP = "time (a jump)"
+TILT_JUMP = "time (a jump of the tilt of the base)"
+SCALE_JUMP = "time (a jump of the scale factors)"
+TURN_JUMP = "time (a jump of the alignment)"
 DECAY = "time (a decay)"
 ARRIVAL = "time since arrival"
 PERIODIC = "time (periodic)"
+PERIODIC_TILT = "time (a periodic tilt of the base)"
+_SEARCHED = "time (a jump", DECAY, ARRIVAL, PERIODIC, PERIODIC_TILT
+"""How the drivers begin of which a moment, a time constant or a period is searched."""
 BETWEEN_DWELLS = "nothing that was recorded (irregular from dwell to dwell)"
 WITHIN_DWELLS = "time (irregular, within dwells too)"
 
 
 _CLASSES = (
-    (ARRIVAL, "memory"), ("previous orientation", "memory"), ("time", "bias in time"), ("temperature", "temperature"),
+    (ARRIVAL, "memory"), ("previous orientation", "memory"), (SCALE_JUMP, "scale in time"),
+    (TURN_JUMP, "base and platform"), ("time", "bias in time"), ("temperature", "temperature"),
     ("rate of temperature", "temperature"),
 )  # fmt: skip
 """How the drivers of formulas begin, and the physical class of effects to which these belong."""
@@ -100,11 +109,13 @@ class FormulaFamily:
     @property
     def dof(self) -> int:
         """Degrees of freedom: the rank, and one more where a moment, a time constant or a period is searched."""
-        return self.rank + (self.rank > 0 and self.driver in (JUMP, DECAY, ARRIVAL, PERIODIC))
+        return self.rank + (self.rank > 0 and self.driver.startswith(_SEARCHED))
 
     @property
     def family(self) -> str:
         """The physical class of effects to which such formulas belong; "" where there is none."""
+        if self.driver.startswith(f"{ARRIVAL} and last move"):
+            return "gimbal and encoder"
         if self.driver.startswith("angle") and " and " in self.driver:
             return ""
         if self.driver.startswith("angle"):
@@ -112,7 +123,7 @@ class FormulaFamily:
         if self.driver.startswith("specific force"):
             across = any(re.search(r"\b[po]\b", text) for text in self.texts)
             return "cross-axis" if across else "nonlinearity"
-        if self.texts[0].startswith(":base") and self.driver == "time":
+        if self.texts[0].startswith(":base") and self.driver.startswith("time"):
             return "base and platform"
         return next(family for start, family in _CLASSES if self.driver.startswith(start))
 
@@ -260,7 +271,9 @@ def _families(bench: Bench, dwells: Sequence[DwellFactor]) -> Iterator[tuple[str
     """Yield the drivers in words, each with formulas; ``:place = ...`` stands for a rotation of a gimbal or base."""
     yield from _of_force()
     yield from _of_gimbals(len(bench.axes))
-    yield from _of_time(dwells)
+    yield from _of_time(dwells, bool(bench.axes))
+    yield from _of_jumps(bench, dwells)
+    yield from _of_creep(len(bench.axes), dwells)
     yield from _of_surroundings(bench)
 
 
@@ -284,16 +297,16 @@ def _of_gimbals(count: int) -> Iterator[tuple[str, list[str]]]:
             if n > 2:
                 yield f"angle of gimbal {k}, {n} a turn", [f":{k} = {text}" for text in both]
                 yield f"angle of gimbal {k}, {n} a turn", [f"{text}*{axis}" for text in both for axis in ("p", "o")]
+        for n in (1, 2):
+            tilts = [f":base = {wave}({n}*q{k})" for wave in ("sin", "cos")]
+            yield f"angle of gimbal {k}, {n} a turn (a tilt of the base)", tilts
         yield f"previous orientation (angle of gimbal {k})", [f"sin(q{k}_before)", f"cos(q{k}_before)"]
 
 
-def _of_time(dwells: Sequence[DwellFactor]) -> Iterator[tuple[str, list[str]]]:
-    """Yield the formulas of time: drift, jumps, decays and oscillations."""
+def _of_time(dwells: Sequence[DwellFactor], tilts: bool = False) -> Iterator[tuple[str, list[str]]]:
+    """Yield the formulas of time: drift, decays and oscillations. tilts: whether the base can be seen to tilt."""
     yield "time", ["t"]
     yield "time", ["t", "t*t"]
-    moments_s = [moment for dwell in dwells for moment in (dwell.start_s, 0.5 * (dwell.start_s + dwell.end_s))][1:]
-    for moment_s in moments_s[:: len(moments_s) // _JUMPS + 1]:
-        yield JUMP, [f"t > {moment_s:.6g}*s"]
     duration_s, longest_s = dwells[-1].end_s, max(dwell.end_s - dwell.start_s for dwell in dwells)
     for decay_s in _DECAYS_S:
         if decay_s == _DECAYS_S[0] or 10 * decay_s <= duration_s:
@@ -304,6 +317,35 @@ def _of_time(dwells: Sequence[DwellFactor]) -> Iterator[tuple[str, list[str]]]:
     for turns in (0.5, 1, 1.5, 2, 3, 4, 6, 8):
         waves = [f"{wave}({turns}*2*pi*t/({duration_s:.0f}*s))" for wave in ("sin", "cos")]
         yield PERIODIC, waves
+        if tilts:
+            yield PERIODIC_TILT, [f":base = {wave}" for wave in waves]
+
+
+def _of_creep(gimbals: int, dwells: Sequence[DwellFactor]) -> Iterator[tuple[str, list[str]]]:
+    """Yield the formulas of a platform that comes to rest after its encoder: by its last move, or the sense of it."""
+    longest_s = max(dwell.end_s - dwell.start_s for dwell in dwells)
+    for k in range(1, gimbals + 1):
+        move = f"q{k}-q{k}_before"
+        for decay_s in (each for each in _CREEPS_S if each <= 2.0 * longest_s):
+            for size in (f"({move})", f"sign({move})"):
+                yield f"{ARRIVAL} and last move of gimbal {k}", [f":{k} = {size}*exp(-tau/({decay_s}*s))"]
+
+
+def _of_jumps(bench: Bench, dwells: Sequence[DwellFactor]) -> Iterator[tuple[str, list[str]]]:
+    """Yield the formulas of jumps: of biases at any time; of scale factors, alignment and base between dwells.
+
+    A jump between two dwells is in the middle of the way: at the arrival it would be within a dwell for some of it.
+    """
+    within_s = [0.5 * (dwell.start_s + dwell.end_s) for dwell in dwells]
+    between_s = [0.5 * (before.end_s + dwell.start_s) for before, dwell in itertools.pairwise(dwells)]
+    moments_s = sorted(within_s + between_s)
+    for moment_s in moments_s[:: len(moments_s) // _JUMPS + 1]:
+        yield JUMP, [f"t > {moment_s:.6g}*s"]
+    for moment_s in between_s[:: len(between_s) // _BETWEEN + 1]:
+        yield SCALE_JUMP, [f"a*(t > {moment_s:.6g}*s)"]
+        yield TURN_JUMP, [f"{axis}*(t > {moment_s:.6g}*s)" for axis in ("p", "o")]
+        if bench.axes:
+            yield TILT_JUMP, [f":base = t > {moment_s:.6g}*s"]
 
 
 def _of_surroundings(bench: Bench) -> Iterator[tuple[str, list[str]]]:

@@ -49,7 +49,7 @@ def verdict_in_words(diagnosis: Diagnosis) -> str:
     start, first = f"{_what_fails(test)} (p {format_p(test.p_value)}).", diagnosis.likeliest
     if first is None:
         return start
-    if diagnosis.unearned:
+    if first.effects and diagnosis.unearned:
         return f"{start} {_not_named(diagnosis, first)}."
     if first.effects:
         return f"{start} {_named(diagnosis, first)}{_returning(diagnosis)}.{_held_out(diagnosis)}{_unusual(diagnosis)}"
@@ -162,9 +162,9 @@ def _unknown(diagnosis: Diagnosis, first: Hypothesis) -> str:
             f"({format_probability(share)}) or the dwells scatter more than was stated ({format_probability(noise)})"
             f"{_others(diagnosis, but=NOISE)}. To find out, repeat an orientation."
         )
-    return (
-        f"Unknown: no known effect explains it, {what} ({format_probability(first.probability)}){_others(diagnosis)}."
-    )
+    but = f", but {diagnosis.unearned}" if diagnosis.unearned else ""
+    said = f"{what} ({format_probability(first.probability)}){but}{_others(diagnosis)}"
+    return f"Unknown: no known effect explains it, {said}."
 
 
 def _noise(diagnosis: Diagnosis, first: Hypothesis) -> str:

@@ -33,8 +33,8 @@ _PLAIN: dict[str, type[Effect]] = {
         sensor.BiasAsymmetry, sensor.ScaleAsymmetry, sensor.SecondOrder, sensor.ThirdOrder, sensor.OddQuadratic,
         sensor.CrossCouplingIP, sensor.CrossCouplingIO, sensor.CrossCouplingPO, sensor.CrossAxisSquare,
         sensor.VibrationRectification, sensor.DeadZone,
-        drift.BiasDrift, drift.BiasWalk, drift.ScaleDrift, drift.WarmUp, drift.Settling, drift.Hysteresis,
-        drift.Sinusoid,
+        drift.BiasDrift, drift.BiasWalk, drift.ScaleDrift, drift.WarmUp, drift.ScaleWarmUp, drift.Settling,
+        drift.Hysteresis, drift.Sinusoid,
         drift.ThermalBias, drift.ThermalBias2, drift.ThermalScale, drift.ThermalRate,
         drift.ThermalMisalignment, drift.ThermalLag, drift.Magnetic,
         frame.BaseTilt, frame.BaseTiltDrift, frame.PlatformDrift, frame.GravityError,
@@ -45,7 +45,7 @@ _OF_A_GIMBAL = {
     kind.name: kind
     for kind in (
         frame.EncoderOffset, frame.EncoderScale, frame.EncoderHarmonic1, frame.EncoderHarmonic2,
-        frame.AxisNonorthogonality,
+        frame.Backlash, frame.AxisNonorthogonality,
     )
 }  # fmt: skip
 

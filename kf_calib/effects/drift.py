@@ -99,6 +99,24 @@ class WarmUp(_Decay):
         return s.span_s
 
 
+class ScaleWarmUp(_Decay):
+    """S exp(-t / tau) a_i, t since the first sample."""
+
+    family = "scale in time"
+    name, title, source = "scale-warm-up", "scale factor that settles after switching on", WarmUp.source
+    confused_with = "scale-drift, warm-up; needs early orientations of both signs"
+    symbol, unit, scale = "S", "1", 1e-3
+    unknown = Unknown("tauScale", "s", 30.0, 10800.0, "min", 1.0 / 60.0)
+    typical = Typical((1e-6, 100e-6), (0.1e-3, 10e-3))
+    prior = 0.25  # in a run that is short beside its time constant it is a scale-drift, and cannot be told from it
+
+    def terms(self, s: Stimulus) -> Floats:
+        return np.exp(-s.elapsed_s / self.value)[:, None] * s.along
+
+    def acts_for_s(self, s: Stimulus) -> float:
+        return s.span_s
+
+
 class Settling(_Decay):
     """C Delta a_i exp(-tau / tau_0), tau since the arrival in the dwell, Delta a_i the last step of the input."""
 

@@ -259,7 +259,7 @@ def _trial(axes: tuple[Vector, ...], gravity_mps2: float) -> Stimulus:
 @lru_cache(maxsize=1024)
 def formula(text: str, axes: tuple[Vector, ...], gravity_mps2: float, checked: bool = True) -> Formula | FrameFormula:
     """The formula's effect, made once for each bench: a run asks for it many times."""
-    (full, expression), bench = split(text), Bench(axes, gravity_mps2)
+    (full, expression), bench = split(text), _trial(axes, gravity_mps2).bench
     name, _, place = full.partition(":")
     if place:
         return FrameFormula(name, place, expression, bench, checked)

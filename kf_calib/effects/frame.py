@@ -15,6 +15,9 @@ from kf_calib.effects.stimulus import Stimulus
 from kf_calib.errors import InputError
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
+_LEAST_MOVE_RAD = 1e-4  # of a gimbal: less is noise of its encoder, or creep
+_UNSURE = 5.0  # sigmas of a setting error, which both ends of a move have
+
 
 class BaseTilt(FrameEffect):
     """A base turned by (delta_N, delta_E): the specific force turns the other way in it."""
@@ -223,6 +226,29 @@ class EncoderHarmonic2(EncoderHarmonic1):
     name, title = "encoder-harmonic-2", "second harmonic of an encoder"
     confused_with = "second-order"
     order = 2
+
+
+class Backlash(_GimbalEffect):
+    """q_k - 1/2 p sgn(Delta q_k), Delta q_k the last move of the gimbal: it trails behind its encoder by half the play
+    p, on the side that it was come from, and stays there while other gimbals move."""
+
+    name, title, source = "backlash", "play between a gimbal and its encoder", "geometry of the bench"
+    confused_with = "encoder-scale, hysteresis; needs the same pose from two sides"
+    typical = Typical((5e-6, 100e-6), (0.1e-3, 10e-3))
+
+    def __init__(self, gimbal: int, variant: str) -> None:
+        super().__init__(gimbal, variant)
+        number = gimbal + 1
+        self.drawn_against = Regressor(f"q{number}-q{number}_before", f"last move of gimbal {number}", "rad")
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return (Coefficient(f"play_{self.variant}", "rad", 1e-3),)
+
+    def rotations(self, s: Stimulus) -> Floats:
+        assert self.gimbal is not None
+        least_rad = max(_LEAST_MOVE_RAD, _UNSURE * np.radians(s.bench.angle_sigma_deg or 0.0))
+        return (-0.5 * s.side(self.gimbal, least_rad)[:, None] * self.about(s))[:, None, :]
 
 
 class AxisNonorthogonality(_GimbalEffect):

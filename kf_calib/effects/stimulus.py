@@ -167,6 +167,22 @@ class Stimulus:
             through[first:last] = held
         return through
 
+    def side(self, gimbal: int, least_rad: float) -> Floats:
+        """The sense (m,) of the last move of a gimbal, 1 or -1, in whatever dwells it has stood still since; 0 until it
+        has moved. A move of no more than ``least_rad`` is none.
+
+        Of poses that are proposed, each after the same dwell, none comes after another: one that leaves the gimbal
+        where it is has 0, as it is not known on which side that was.
+        """
+        if self.whole is not None:
+            return self.whole.side(gimbal, least_rad)[self.places]
+        moves = self.pose[:, gimbal] - self.previous_pose[:, gimbal]
+        senses = np.where(np.abs(moves) > least_rad, np.sign(moves), 0.0)
+        begins = senses != 0.0
+        if not self.half_s.any():  # instants of no piece, which are not measured
+            begins[1:] |= np.all(self.previous_pose[1:] == self.previous_pose[:-1], axis=1)
+        return senses[np.maximum.accumulate(np.where(begins, np.arange(len(self)), 0))]
+
     @cached_property
     def force_rate_mps3(self) -> Floats:
         """df/dt (m, 3) in the platform frame: f x omega."""

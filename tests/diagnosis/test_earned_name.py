@@ -1,4 +1,4 @@
-"""A name is earned by a coefficient that is seen and by an error that does not grow."""
+"""A name is earned by a coefficient that is seen and by an error of what was left out that falls."""
 
 from __future__ import annotations
 
@@ -28,8 +28,13 @@ class _Effect:
         return "bent"
 
 
-def _result(ratio: float | None, held_out: float | None, walk_gain: float = 0.0, correlation: float = 0.0) -> Any:
-    """A calibration with an effect of two coefficients, of which the second is ``ratio`` sigmas or not determined."""
+def _result(
+    ratio: float | None, held_out: float | None, walk_gain: float = 0.0, correlation: float = 0.0, floor: float = 0.85
+) -> Any:
+    """A calibration with an effect of two coefficients, of which the second is ``ratio`` sigmas or not determined.
+
+    held_out: the error of orientations left out. floor: what noise gives of it.
+    """
     covariance = np.array([[1.0, 2.0 * correlation], [2.0 * correlation, 4.0]])
     second = SimpleNamespace(value=None if ratio is None else -2.0 * ratio, sigma=None if ratio is None else 2.0)
     state = np.array([0.1, -2.0 * (ratio or 0.0)])
@@ -39,6 +44,7 @@ def _result(ratio: float | None, held_out: float | None, walk_gain: float = 0.0,
         fit=SimpleNamespace(walk_gain=walk_gain),
         parameters={"k1": SimpleNamespace(value=0.1, sigma=1.0), "k2": second},
         held_out_rms_mps2=held_out,
+        held_out_floor_mps2=floor,
         consistency=Consistency(100.0, 100, 1e-6, False),
     )
 
@@ -76,14 +82,23 @@ def test_a_coefficient_is_measured_by_what_it_leaves(ratio: float, nis_per_dof: 
     assert unearned(row, _result(None, 1.0), "bias-walk") == said
 
 
-@pytest.mark.parametrize("held_out, consistent, earned", [(0.99, False, False), (0.9, False, True), (0.99, True, True)])
-def test_an_oscillation_explains_a_misfit_of_the_means_or_is_not_named(
-    held_out: float, consistent: bool, earned: bool
+@pytest.mark.parametrize("held_out, floor, earned", [(0.99, 0.5, False), (0.9, 0.5, True), (0.99, 0.9, True)])
+@pytest.mark.parametrize("oscillates, said", [
+    (True, "it goes on within the orientations, and leaves the misfit between them as it was"),
+    (False, "it leaves the error of orientations left out as it was"),
+])  # fmt: skip
+def test_what_leaves_the_orientations_unexplained_is_not_named(
+    held_out: float, floor: float, earned: bool, oscillates: bool, said: str
 ) -> None:
-    after = _result(5.0, held_out)
-    after.model.effects = [_Effect(oscillates=True)]
-    after.consistency = Consistency(100.0, 100, 1e-6, consistent)
-    assert (unearned(Hypothesis(("bent",), refit=after), _result(None, 1.0), "bias-walk") == "") == earned
+    """Where noise alone gives as much, there is nothing left to explain."""
+    after = _result(5.0, held_out, floor=floor)
+    after.model.effects = [_Effect(oscillates)]
+    assert unearned(Hypothesis(("bent",), refit=after), _result(None, 1.0), "bias-walk") == ("" if earned else said)
+
+
+def test_formulas_that_leave_the_orientations_unexplained_are_not_believed() -> None:
+    row = Hypothesis(formulas=("mine = t",), refit=_result(5.0, 0.99, floor=0.5))
+    assert unearned(row, _result(None, 1.0), "bias-walk") == "it leaves the error of orientations left out as it was"
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="the recordings of others are not there")

@@ -179,7 +179,7 @@ def test_misfit_rises_by_the_square():
 
 UNSEEN = {
     "latency", "gravity-error", "encoder-offset:y", "encoder-offset:x", "encoder-scale:y", "encoder-harmonic-1:y",
-    "encoder-harmonic-2:y", "encoder-harmonic-3:y", "lever-arm", "cross-talk", "dead-zone",
+    "encoder-harmonic-2:y", "encoder-harmonic-3:y", "backlash:y", "lever-arm", "cross-talk", "dead-zone",
 }  # fmt: skip
 RECORDED = {"outliers", "saturation", "quantisation"}
 NAMES = [

@@ -32,11 +32,11 @@ C = 1.0 / math.sqrt(2.0)
 
 KNOWN = """
     bias-asymmetry scale-asymmetry second-order third-order odd-quadratic cross-coupling-ip cross-coupling-io
-    cross-coupling-po cross-axis-square bias-drift bias-walk scale-drift warm-up thermal-bias thermal-bias-2
-    thermal-scale thermal-misalignment thermal-rate thermal-lag settling hysteresis magnetic sinusoid
+    cross-coupling-po cross-axis-square bias-drift bias-walk scale-drift warm-up scale-warm-up thermal-bias
+    thermal-bias-2 thermal-scale thermal-misalignment thermal-rate thermal-lag settling hysteresis magnetic sinusoid
     vibration-rectification dead-zone quantisation saturation outliers base-tilt base-tilt-drift encoder-offset
-    encoder-scale encoder-harmonic-1 encoder-harmonic-2 axis-nonorthogonality flexure platform-drift earth-rotation
-    gravity-error cross-talk latency lever-arm uneven-flexure
+    encoder-scale encoder-harmonic-1 encoder-harmonic-2 backlash axis-nonorthogonality flexure platform-drift
+    earth-rotation gravity-error cross-talk latency lever-arm uneven-flexure
     """
 """The catalogue's names, fixed."""
 
@@ -337,6 +337,17 @@ def test_encoders_read_what_the_platform_is_not(error, true):
     np.testing.assert_allclose(readings(error.format("z"), pose), [force(true(q2), q3)], atol=1e-12)
     np.testing.assert_allclose(readings(error.format("inner"), pose), [force(q2, true(q3))], atol=1e-12)
     np.testing.assert_allclose(readings(error.format("1"), pose), [force(q2, q3)], atol=1e-12)  # about the vertical
+
+
+def test_play_stays_on_the_side_that_a_gimbal_came_from():
+    """z goes forward, x back; then x alone goes forward, and z stays behind its encoder."""
+    poses, play = [(10, 40, -70), (10, 60, -80), (10, 60, 30)], 0.01
+    middle, inner = (np.radians([pose[k] for pose in poses]) for k in (1, 2))
+    senses = {"z": [0.0, 1.0, 1.0], "x": [0.0, -1.0, 1.0]}
+    at_z = middle - 0.5 * play * np.array(senses["z"])
+    at_x = inner - 0.5 * play * np.array(senses["x"])
+    for name, q2, q3 in (("z", at_z, inner), ("x", middle, at_x)):
+        np.testing.assert_allclose(readings(f"backlash:{name}={play}", poses), list(map(force, q2, q3)), atol=1e-12)
 
 
 def test_nonorthogonal_axis():

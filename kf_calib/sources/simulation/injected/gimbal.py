@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import accumulate
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -127,6 +128,24 @@ for _order in (1, 2):
         f"encoder-harmonic-{_order}", "rad", ("1urad", "100urad"), ("0.1mrad", "5mrad"),
         stage="angles", coefficients=("s", "c"), per_axis=True,
     )(harmonic(_order))  # fmt: skip
+
+
+@made(
+    "backlash", "rad", ("5urad", "100urad"), ("0.1mrad", "10mrad"),
+    stage="angles", coefficients=("play",), signed=False, per_axis=True,
+)  # fmt: skip
+def backlash(play: Floats, rig: Rig, axis: int) -> TrueStep:
+    """Play between a gimbal and its encoder: the true angle is q less half the play where the gimbal was last moved
+    forward, and q more half of it where it was last moved back; it changes sides on the way (gears, belts, worms)."""
+
+    def step(state: TrueState) -> None:
+        moves = np.diff(rig.motion.angles_rad[:, axis], prepend=rig.motion.angles_rad[:1, axis])
+        senses = list(accumulate(np.sign(moves).tolist(), lambda before, sense: sense or before))
+        angles_rad = state.angles_rad + np.zeros((len(state.share), 1))
+        angles_rad[:, axis] -= 0.5 * play[0] * state.of_dwells(np.array(senses)[:, None])[:, 0]
+        state.angles_rad = angles_rad
+
+    return step
 
 
 @made(

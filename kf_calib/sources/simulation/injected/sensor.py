@@ -169,6 +169,13 @@ def warm_up(k: Floats, state: TrueState, *, tau: float = 1200.0) -> Floats:
     return k * column(np.exp(-state.time_s / tau))
 
 
+@added("scale-warm-up", "1", ("1ppm", "100ppm"), ("0.1permille", "10permille"))
+def scale_warm_up(k: Floats, state: TrueState, *, tau: float = 1200.0) -> Floats:
+    """Warm-up of the scale factor: S a_i exp(-t / tau) after switching on at the first sample (IEEE Std 1293, turn-on
+    transient)."""
+    return k * column(np.exp(-state.time_s / tau)) * state.input_mps2
+
+
 @added("sinusoid", "m/s^2", ("0.01ug", "1ug"), ("1ug", "100ug"))
 def sinusoid(k: Floats, state: TrueState, *, frequency: float = 0.15, phase: float = 0.7) -> Floats:
     """Sinusoid in time: A sin(2 pi f t + phase); microseism at 0.1 to 0.3 Hz (Peterson, USGS OFR 93-322), mains."""

@@ -1,0 +1,131 @@
+"""Effects of a bench that was written anew, with scipy alone: play, slips, bumps, wobble and creep get their names."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from helpers.independent_bench import DWELL_S, SLEW_S, IndependentBench, State
+
+import kf_calib
+from kf_calib.diagnosis.candidate_tests import assess_candidates
+from kf_calib.diagnosis.results import Diagnosis
+from kf_calib.estimation.calibration import Settings, calibrate
+
+WITHIN_RAD = 2e-5
+"""Size of what is hidden: some ten times what a dwell knows."""
+
+
+def diagnosed(bench: IndependentBench) -> Diagnosis:
+    return kf_calib.diagnose(calibrate(bench), replicate=False)
+
+
+def of_gimbal(k: int, values: np.ndarray) -> np.ndarray:
+    """Values (n,) as an error of one gimbal, (n, 3)."""
+    return values[:, None] * np.eye(3)[k]
+
+
+def after(state: State, dwell: int) -> np.ndarray:
+    """1 from the arrival in an orientation on, (n, 1)."""
+    return np.where(state.dwell >= dwell, 1.0, 0.0)[:, None]
+
+
+@pytest.mark.parametrize("gimbal, seed", [(1, 1), pytest.param(2, 2, marks=pytest.mark.slow),
+                                          pytest.param(2, 3, marks=pytest.mark.slow)])  # fmt: skip
+def test_play_of_a_gimbal_is_no_error_of_its_encoder(gimbal: int, seed: int) -> None:
+    """In a random order the sense of the last move goes with the angle, as an encoder's scale would."""
+    play = 2.0 * WITHIN_RAD
+    bench = IndependentBench(seed, gimbals=lambda s: of_gimbal(gimbal, -0.5 * play * np.sign(s.moves_rad[:, gimbal])))
+    name = f"backlash:{'yzx'[gimbal]}"
+    diagnosis = diagnosed(bench)
+    assert diagnosis.missing == (name,) and diagnosis.sure, diagnosis.verdict
+    assert diagnosis.after is not None and diagnosis.after.consistency.consistent
+    found = diagnosis.after.parameters[f"play_{'yzx'[gimbal]}"]
+    assert abs(found.value - play) < 4.0 * found.sigma < 0.3 * play
+
+
+SLIPS = {
+    "a jump of the tilt of the base": {"base": [1.0, 0.0, -0.7]},
+    "a jump of the alignment": {"mount": [0.6, 0.8, -0.5]},
+    "a jump of the scale factors": {"scale": [1.0, -0.6, 0.8]},
+}
+
+
+@pytest.mark.parametrize("what", ["a jump of the tilt of the base", *(
+    pytest.param(what, marks=pytest.mark.slow) for what in list(SLIPS)[1:])])  # fmt: skip
+def test_a_bump_is_told_with_its_moment(what: str) -> None:
+    """It comes on the way to the tenth orientation; a drift is nine tenths of it."""
+    ((where, direction),) = SLIPS[what].items()
+    bench = IndependentBench(4, **{where: lambda s: after(s, 9) * WITHIN_RAD * np.array(direction)})
+    diagnosis = diagnosed(bench)
+    assert diagnosis.unknown and not diagnosis.missing, diagnosis.verdict
+    first = diagnosis.likeliest
+    assert first is not None and first.driver == f"time ({what})"
+    moments_s = {float(text) for formula in first.formulas for text in re.findall(r"t > ([\d.]+)\*s", formula)}
+    assert all(9 * (DWELL_S + SLEW_S) - SLEW_S < moment_s < 9 * (DWELL_S + SLEW_S) for moment_s in moments_s)
+    assert calibrate(bench, Settings(effects=first.formulas)).consistency.consistent
+
+
+OTHERS = {
+    "time since arrival and last move of gimbal 2": {
+        "gimbals": lambda s: of_gimbal(1, -3.0 * WITHIN_RAD * np.sign(s.moves_rad[:, 1]) * np.exp(-s.since_s / 3.0))
+    },
+    "time (a periodic tilt of the base)": {
+        "base": lambda s: WITHIN_RAD * np.column_stack([np.sin(wave(s)), 0.0 * wave(s), np.cos(wave(s))])
+    },
+    "angle of gimbal 1, 2 a turn (a tilt of the base)": {
+        "base": lambda s: WITHIN_RAD * np.column_stack([np.cos(twice(s)), 0.0 * twice(s), np.sin(twice(s))])
+    },
+}  # fmt: skip
+
+
+def wave(state: State) -> np.ndarray:
+    """One turn in the run."""
+    return 2.0 * np.pi * state.time_s / state.time_s[-1]
+
+
+def twice(state: State) -> np.ndarray:
+    return 2.0 * state.angles_rad[:, 0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("driver", OTHERS)
+def test_what_no_effect_of_the_catalogue_is_gets_no_name(driver: str) -> None:
+    diagnosis = diagnosed(IndependentBench(5, **OTHERS[driver]))
+    assert diagnosis.unknown and not diagnosis.missing, diagnosis.verdict
+    assert diagnosis.likeliest is not None and diagnosis.likeliest.driver == driver
+
+
+@pytest.mark.slow
+def test_a_scale_factor_that_warms_up_is_no_bias_that_does() -> None:
+    shares = 2e-6 * np.array([1.0, -0.7, 0.8])
+    bench = IndependentBench(6, scale=lambda s: shares * np.exp(-s.time_s / 60.0)[:, None])
+    diagnosis = diagnosed(bench)
+    assert diagnosis.likeliest is not None and diagnosis.likeliest.effects == ("scale-warm-up",), diagnosis.verdict
+    assert diagnosis.after is not None
+    found = [diagnosis.after.parameters[f"S{i}"] for i in (1, 2, 3)]
+    errors = [(own.value - share) / own.sigma for own, share in zip(found, shares, strict=True)]
+    assert float(np.sum(np.square(errors))) < 20.0
+
+
+@pytest.mark.parametrize("seeds, most", [((1,), 0), pytest.param(range(1, 61), 4, marks=pytest.mark.slow)])
+def test_a_sound_bench_agrees(seeds: Sequence[int], most: int) -> None:
+    """But for 1 run of 100: five or more of sixty have a chance of 1 in 3000."""
+    p_values = [assess_candidates(calibrate(IndependentBench(seed)).fit).p_value for seed in seeds]
+    assert sum(p_value < 0.01 for p_value in p_values) <= most
+
+
+@pytest.mark.slow
+def test_a_formula_that_no_sensor_could_follow_describes_nothing() -> None:
+    """The sine of the middle angle is what accelerometer 1 feels, but for its alignment: with some g of it a formula
+    follows whatever that accelerometer does in few orientations."""
+    rng = np.random.default_rng(4)
+    on = np.cumsum(rng.random(18) < 0.25) % 2
+    bench = IndependentBench(7, dwells=18, mount=lambda s: on[s.dwell, None] * np.array([0.0, 30.0, 0.0]) * WITHIN_RAD)
+    diagnosis = diagnosed(bench)
+    first = diagnosis.likeliest
+    assert first is not None and not diagnosis.missing, diagnosis.verdict
+    for formula in first.formulas:
+        assert "sin(1*q2)" not in formula
