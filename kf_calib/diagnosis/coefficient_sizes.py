@@ -85,6 +85,10 @@ class SizePrior:
         return np.asarray((before + np.clip(at - low, 0.0, high - low) + after) / (high - low + 2.0 * self.tail), float)
 
 
+_ANY_SIZE = SizePrior(1.0, 10.0**_UNKNOWN_DECADES, 0.1)
+"""Where no usual size is known, of coefficients that are determined to one."""
+
+
 def usual_sizes(effect: Effect, grade: Grade) -> SizePrior | None:
     """The prior of an effect from the sizes that its coefficients usually have; None where these are not known."""
     if effect.expected is not None:
@@ -176,24 +180,24 @@ class AddedEffects:
         widths = [matrix.shape[1] for matrix in relation]
         usual = [usual_sizes(effect, self.grade) for effect in self.effects]
         related, groups = root @ np.asarray(block_diag(*relation), float), np.repeat(np.arange(len(widths)), widths)
-        sized = [k for k, prior in enumerate(usual) if prior]
+        sized, priors = [k for k, prior in enumerate(usual) if prior], [*filter(None, usual)]
         others = ~np.isin(groups, sized)
         if sized and others.any():
             shared = _directions(related[:, others])
             groups = np.append(np.searchsorted(sized, groups[~others]), np.full(shared.shape[1], len(sized)))
             related = np.column_stack([related[:, ~others], shared])
+            priors += [_ANY_SIZE] if shared.shape[1] else []
         estimate = _solved(related, readings)
         left = readings - related @ estimate
         delta_chi2 = max(delta_chi2 - float(left @ left), 0.0)
         if not sized:
             return float(size_evidence(min(self.dof, sum(widths)), delta_chi2))
-        priors = [*filter(None, usual), _any_size(1.0)][: groups.max() + 1]
         return log_bayes_of_sizes(delta_chi2, related, estimate, groups, priors)
 
 
 def _directions(root: Floats) -> Floats:
-    """Return columns (r, k) of unit length across each other that span those of a root (r, q): of coefficients that are
-    as sure as the noise is large, whatever the units of the first were (the g-prior of ``size_evidence``)."""
+    """Return orthonormal columns (r, k) that span those of a root (r, q): coefficients of one sigma each, whatever the
+    units were, so that one size of them all is that of the g-prior (``size_evidence``)."""
     lengths = np.linalg.norm(root, axis=0)
     left, singular, _ = np.linalg.svd(root / np.where(lengths > 0.0, lengths, 1.0), full_matrices=False)
     return left[:, singular > 1e-9]
@@ -205,11 +209,6 @@ def _solved(root: Floats, readings: Floats) -> Floats:
     lengths = np.linalg.norm(root, axis=0)
     lengths = np.where(lengths * _HIDDEN > 1.0, lengths, 1.0)
     return np.asarray(np.linalg.lstsq(root / lengths, readings, rcond=1e-9)[0] / lengths, float)
-
-
-def _any_size(sigma: float) -> SizePrior:
-    """Return the prior where no usual size is known, of an effect whose best coefficient is determined to ``sigma``."""
-    return SizePrior(sigma, sigma * 10.0**_UNKNOWN_DECADES, 0.1)
 
 
 def best_sigma(root: Floats) -> float:

@@ -283,8 +283,9 @@ SEEN = 3.0
 """In sigmas of its refit: the least size of the largest coefficient of an effect that is named."""
 
 _TOGETHER_P = 6e-7  # of 5 sigma: of coefficients that are all determined, but clear only together
-_AS_IT_WAS, _GROWN = 0.98, 1.05  # the held-out error with it over that without; by what shows within dwells it stays
-_FAILS = 1.2  # the held-out error over what noise gives: orientations that are left out are not explained
+_AS_IT_WAS = 0.98  # the held-out error with an effect over that without it, above which it has not fallen
+_GROWN = 1.05  # the same, above which it has grown; what shows only within dwells, or in slews, changes little
+_FAILS = 1.2  # the held-out error over what noise gives, above which orientations that are left out are not explained
 
 
 def unearned(row: Hypothesis, before: Calibration, walk: str) -> str:

@@ -42,7 +42,7 @@ _BETWEEN = 50  # the same of one that comes between two dwells
 JUMP = "time (a jump)"
 TILT_JUMP = "time (a jump of the tilt of the base)"
 SCALE_JUMP = "time (a jump of the scale factors)"
-TURN_JUMP = "time (a jump of the alignment)"
+ALIGNMENT_JUMP = "time (a jump of the alignment)"
 DECAY = "time (a decay)"
 ARRIVAL = "time since arrival"
 PERIODIC = "time (periodic)"
@@ -55,7 +55,7 @@ WITHIN_DWELLS = "time (irregular, within dwells too)"
 
 _CLASSES = (
     (ARRIVAL, "memory"), ("previous orientation", "memory"), (SCALE_JUMP, "scale in time"),
-    (TURN_JUMP, "base and platform"), ("time", "bias in time"), ("temperature", "temperature"),
+    (ALIGNMENT_JUMP, "base and platform"), ("time", "bias in time"), ("temperature", "temperature"),
     ("rate of temperature", "temperature"),
 )  # fmt: skip
 """How the drivers of formulas begin, and the physical class of effects to which these belong."""
@@ -343,7 +343,7 @@ def _of_jumps(bench: Bench, dwells: Sequence[DwellFactor]) -> Iterator[tuple[str
         yield JUMP, [f"t > {moment_s:.6g}*s"]
     for moment_s in between_s[:: len(between_s) // _BETWEEN + 1]:
         yield SCALE_JUMP, [f"a*(t > {moment_s:.6g}*s)"]
-        yield TURN_JUMP, [f"{axis}*(t > {moment_s:.6g}*s)" for axis in ("p", "o")]
+        yield ALIGNMENT_JUMP, [f"{axis}*(t > {moment_s:.6g}*s)" for axis in ("p", "o")]
         if bench.axes:
             yield TILT_JUMP, [f":base = t > {moment_s:.6g}*s"]
 

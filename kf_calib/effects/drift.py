@@ -25,7 +25,6 @@ from kf_calib.effects.stimulus import Stimulus
 
 _TIME, _STEP = Regressor("t", "time", "s"), Regressor("da", "last step along the input axis", "m/s^2")
 _LEAST_STEP_MPS2 = 0.1 * MILLI_G  # less has either sign by noise of the angles and creep of the platform
-_UNSURE = 5.0  # sigmas of a setting error, which both ends of a step have
 _HELD = 2.5  # cycles in a piece, of which its parabola holds a fourteenth of the power
 
 
@@ -68,8 +67,7 @@ class Hysteresis(SensorEffect):
     typical = Typical((1 * MICRO_G, 20 * MICRO_G), (0.0, 2 * MILLI_G))
 
     def terms(self, s: Stimulus) -> Floats:
-        unsure_rad = _UNSURE * np.radians(s.bench.angle_sigma_deg or 0.0)
-        least_mps2 = max(_LEAST_STEP_MPS2, unsure_rad * s.bench.gravity_mps2)
+        least_mps2 = max(_LEAST_STEP_MPS2, s.unsure_rad * s.bench.gravity_mps2)
         return np.sign(np.where(np.abs(s.step) > least_mps2, s.step, 0.0))
 
 
@@ -99,11 +97,12 @@ class WarmUp(_Decay):
         return s.span_s
 
 
-class ScaleWarmUp(_Decay):
+class ScaleWarmUp(WarmUp):
     """S exp(-t / tau) a_i, t since the first sample."""
 
     family = "scale in time"
-    name, title, source = "scale-warm-up", "scale factor that settles after switching on", WarmUp.source
+    name, title = "scale-warm-up", "scale factor that settles after switching on"
+    drawn_against = None
     confused_with = "scale-drift, warm-up; needs early orientations of both signs"
     symbol, unit, scale = "S", "1", 1e-3
     unknown = Unknown("tauScale", "s", 30.0, 10800.0, "min", 1.0 / 60.0)
@@ -111,10 +110,7 @@ class ScaleWarmUp(_Decay):
     prior = 0.25  # in a run that is short beside its time constant it is a scale-drift, and cannot be told from it
 
     def terms(self, s: Stimulus) -> Floats:
-        return np.exp(-s.elapsed_s / self.value)[:, None] * s.along
-
-    def acts_for_s(self, s: Stimulus) -> float:
-        return s.span_s
+        return super().terms(s) * s.along
 
 
 class Settling(_Decay):

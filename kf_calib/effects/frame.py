@@ -16,7 +16,6 @@ from kf_calib.errors import InputError
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 _LEAST_MOVE_RAD = 1e-4  # of a gimbal: less is noise of its encoder, or creep
-_UNSURE = 5.0  # sigmas of a setting error, which both ends of a move have
 
 
 class BaseTilt(FrameEffect):
@@ -230,7 +229,7 @@ class EncoderHarmonic2(EncoderHarmonic1):
 
 class Backlash(_GimbalEffect):
     """q_k - 1/2 p sgn(Delta q_k), Delta q_k the last move of the gimbal: it trails behind its encoder by half the play
-    p, on the side that it was come from, and stays there while other gimbals move."""
+    p, towards where it came from, and stays there while other gimbals move."""
 
     name, title, source = "backlash", "play between a gimbal and its encoder", "geometry of the bench"
     confused_with = "encoder-scale, hysteresis; needs the same pose from two sides"
@@ -247,8 +246,8 @@ class Backlash(_GimbalEffect):
 
     def rotations(self, s: Stimulus) -> Floats:
         assert self.gimbal is not None
-        least_rad = max(_LEAST_MOVE_RAD, _UNSURE * np.radians(s.bench.angle_sigma_deg or 0.0))
-        return (-0.5 * s.side(self.gimbal, least_rad)[:, None] * self.about(s))[:, None, :]
+        side = s.side(self.gimbal, max(_LEAST_MOVE_RAD, s.unsure_rad))
+        return (-0.5 * side[:, None] * self.about(s))[:, None, :]
 
 
 class AxisNonorthogonality(_GimbalEffect):

@@ -21,6 +21,7 @@ _INTEGRALS = legendre.legvander(_POINTS, 2).T * _WEIGHTS  # (3, n): of Legendre'
 
 _RATE_WINDOW_S = 5.0  # at least: a thermometer of 0.01 K noise then shows rates of 1e-3 K/s
 _RATE_STILL = 0.02
+_UNSURE = 5.0  # sigmas of a setting error
 _OF_ALL = ("bench", "sensitivity", "carrier_hz", "part", "whole", "places")  # is the same at all instants
 
 
@@ -132,6 +133,11 @@ class Stimulus:
         """Unit input axes E_i (3, 3), a row each."""
         return self.sensitivity / np.linalg.norm(self.sensitivity, axis=1, keepdims=True)
 
+    @property
+    def unsure_rad(self) -> float:
+        """The largest turn from dwell to dwell that setting errors may feign, of which both ends of a turn have one."""
+        return _UNSURE * float(np.radians(self.bench.angle_sigma_deg or 0.0))
+
     @cached_property
     def along(self) -> Floats:
         """a_i (m, 3): specific force along the input axis of each accelerometer."""
@@ -168,11 +174,10 @@ class Stimulus:
         return through
 
     def side(self, gimbal: int, least_rad: float) -> Floats:
-        """The sense (m,) of the last move of a gimbal, 1 or -1, in whatever dwells it has stood still since; 0 until it
-        has moved. A move of no more than ``least_rad`` is none.
+        """The sense (m,) of the last move of a gimbal, 1 or -1, which it keeps while it stands still; 0 until it moves.
 
-        Of poses that are proposed, each after the same dwell, none comes after another: one that leaves the gimbal
-        where it is has 0, as it is not known on which side that was.
+        A move of no more than ``least_rad`` is none. Poses that are proposed all come after the same dwell, and none
+        after another: one that leaves the gimbal where it is has 0, since the side that it was on is not known.
         """
         if self.whole is not None:
             return self.whole.side(gimbal, least_rad)[self.places]

@@ -86,11 +86,14 @@ def encoder_error(axis: int, error: Callable[[Floats], Floats]) -> TrueStep:
     """The step that makes the true angle of one gimbal differ from its reading."""
 
     def step(state: TrueState) -> None:
-        angles_rad = state.angles_rad.copy()
-        angles_rad[:, axis] += error(angles_rad[:, axis])
-        state.angles_rad = angles_rad
+        turn_gimbal(state, axis, error(state.angles_rad[:, axis]))
 
     return step
+
+
+def turn_gimbal(state: TrueState, axis: int, error_rad: Floats) -> None:
+    """Turns one gimbal by so much (n,) more."""
+    state.angles_rad = state.angles_rad + column(error_rad) * np.eye(state.angles_rad.shape[1])[axis]
 
 
 @made(
@@ -141,9 +144,7 @@ def backlash(play: Floats, rig: Rig, axis: int) -> TrueStep:
     def step(state: TrueState) -> None:
         moves = np.diff(rig.motion.angles_rad[:, axis], prepend=rig.motion.angles_rad[:1, axis])
         senses = list(accumulate(np.sign(moves).tolist(), lambda before, sense: sense or before))
-        angles_rad = state.angles_rad + np.zeros((len(state.share), 1))
-        angles_rad[:, axis] -= 0.5 * play[0] * state.of_dwells(np.array(senses)[:, None])[:, 0]
-        state.angles_rad = angles_rad
+        turn_gimbal(state, axis, -0.5 * play[0] * state.of_dwells(column(np.array(senses)))[:, 0])
 
     return step
 
