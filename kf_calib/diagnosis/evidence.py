@@ -38,6 +38,9 @@ from kf_calib.noise.temperature_course import thermometer_errors
 _RANGE = math.log(1e4)  # width of the flat prior of the logarithm of a size of noise
 _UNSTATED = 0.5  # prior probability of noise from dwell to dwell that was not stated
 _BEYOND = 0.02  # prior probability of more noise than was stated
+_NO_WORSE = (
+    1.01  # the largest share to which rounding, and what is linear, may let a misfit grow with more coefficients
+)
 _IMMENSE_MPS2 = 1e3  # scatter so large that nothing is left of a dwell's mean
 
 
@@ -200,7 +203,8 @@ class Evidence:
         parts: Parts,
         added: _AddedColumns | None,
     ) -> MarginalLikelihood | None:
-        """Return the evidence with these parts of the noise free; None where one of them is best at zero.
+        """Return the evidence with these parts of the noise free; None where one of them is best at zero, and where the
+        effects make the misfit larger, as a fit does that has not converged.
 
         The logarithms of the sizes of the parts are averaged out by Laplace's method. A part of no size is counted
         where it is absent. added: the columns of the added effects, whose coefficients are averaged in the noise that
@@ -213,6 +217,8 @@ class Evidence:
         sizes = np.array([likelihood.units[part][0] for part in parts]) * relative
         variances_without = (sizes / np.array([likelihood_without.units[part][0] for part in parts])) ** 2
         without = likelihood_without.of(parts).at(variances_without)
+        if point.misfit > without.misfit * _NO_WORSE + 1.0:
+            return None
         delta_chi2, log = max(without.misfit - point.misfit, 0.0), self._log_prior(parts) - without.cost
         if parts:
             curvatures = np.linalg.eigvalsh(at_parts.curvature(relative))

@@ -123,7 +123,7 @@ class FormulaFamily:
         if self.driver.startswith("specific force"):
             across = any(re.search(r"\b[po]\b", text) for text in self.texts)
             return "cross-axis" if across else "nonlinearity"
-        if self.texts[0].startswith(":base") and self.driver.startswith("time"):
+        if self.texts[0].startswith((":base", ":platform")) and self.driver.startswith("time"):
             return "base and platform"
         return next(family for start, family in _CLASSES if self.driver.startswith(start))
 
@@ -345,6 +345,7 @@ def _of_jumps(bench: Bench, dwells: Sequence[DwellFactor]) -> Iterator[tuple[str
         yield SCALE_JUMP, [f"a*(t > {moment_s:.6g}*s)"]
         yield ALIGNMENT_JUMP, [f"{axis}*(t > {moment_s:.6g}*s)" for axis in ("p", "o")]
         if bench.angles:
+            yield ALIGNMENT_JUMP, [f":platform = t > {moment_s:.6g}*s"]
             yield TILT_JUMP, [f":base = t > {moment_s:.6g}*s"]
 
 
@@ -353,7 +354,7 @@ def _of_surroundings(bench: Bench) -> Iterator[tuple[str, list[str]]]:
     for terms in (["T"], ["T*T"], ["T", "T*T", "T**3"], ["a*T"], ["a*T*T"], ["a*T", "a*T*T"], ["p*T", "o*T"]):
         yield "temperature", terms
     if bench.angles:
-        yield "temperature", [":base = T"]
+        yield from (("temperature", [f":{place} = T"]) for place in ("base", "platform"))
         yield "time", [":base = t"]
     yield "rate of temperature", ["dT"]
     yield "rate of temperature", ["a*dT"]

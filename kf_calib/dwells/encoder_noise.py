@@ -1,5 +1,5 @@
-"""Noise of angle messages, from second differences of them, to which slow motion does not contribute: sigma^2 =
-<d^2> / 6.
+"""Noise of angle messages, from differences of them, to which slow motion does not contribute: sigma^2 = <d^2> / 6 of
+second ones, to which a constant rate adds nothing, <d^2> / 20 of third ones, to which a constant acceleration does not.
 
 Angles of an encoder are independent of each other. A quaternion turns by twice the change of its components: the noise
 of an attitude is that of the angle of rotation.
@@ -12,8 +12,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import Stream
 
-_COUNT = 16  # messages of a block
-_BLOCKS = 4  # whose second least noise is that of the next one
+_COUNT = 32  # messages of a block
 _LONGEST_PERIOD_NS = 100_100_000  # messages farther apart than this do not tell noise from the beginning of a motion
 _MEDIAN = 0.6745  # of the absolute value of a normal number of unit variance
 
@@ -38,16 +37,16 @@ def distance_sigma(sigma: Floats, is_quaternion: bool) -> Floats:
 class EncoderNoise:
     """The noise of the messages, as those before each of them tell it.
 
-    Messages are taken sixteen by sixteen. The median of their second differences is their noise, and the second least
-    of the last four noises that of the next sixteen messages, so that outliers do not raise it, and a slew hardly. The
-    first sixteen have their own. It is 0 where messages are farther apart than 0.1 s. It does not depend on how the
-    messages were divided into batches.
+    Messages are taken 32 by 32. The median of their third differences tells their noise, and the lesser noise of the
+    last two blocks is that of the next 32 messages; the first 32 have their own. So outliers do not raise it, nor do
+    slews, whose third differences are small. It is 0 where messages are farther apart than 0.1 s. It does not depend on
+    how the messages were divided into batches.
     """
 
     def __init__(self, is_quaternion: bool) -> None:
         self._is_quaternion = is_quaternion
         self._waiting = Stream.empty(0)  # messages of the block that is not complete
-        self._noises = np.empty(0)  # of the four blocks before, rad; empty before the first message
+        self._noises = np.empty(0)  # of the two blocks before, rad; empty before the first message
 
     def waits_for_more(self, pose: Stream) -> bool:
         """Tell whether these messages, all that came so far, are too few for the noise of the first ones."""
@@ -59,17 +58,16 @@ class EncoderNoise:
         complete = len(stream) // _COUNT * _COUNT
         noises = self._of_blocks(stream[:complete])
         if not self._noises.size:
-            self._noises = np.full(_BLOCKS, 0.0 if _begins_slowly(pose) or not len(noises) else noises[0])
+            self._noises = np.full(2, 0.0 if _begins_slowly(pose) or not len(noises) else noises[0])
         noises = np.concatenate([self._noises, noises])
-        usual = np.sort(np.lib.stride_tricks.sliding_window_view(noises, _BLOCKS), axis=1)[:, 1]
-        self._noises, self._waiting = noises[-_BLOCKS:], stream[complete:]
-        return np.repeat(usual, _COUNT)[len(stream) - len(pose) : len(stream)]
+        self._noises, self._waiting = noises[-2:], stream[complete:]
+        return np.repeat(np.minimum(noises[1:], noises[:-1]), _COUNT)[len(stream) - len(pose) : len(stream)]
 
     def _of_blocks(self, stream: Stream) -> Floats:
         """Return the noise (b,) of complete blocks, rad."""
         values = stream.values.reshape(-1, _COUNT, stream.values.shape[1])
-        bends = np.median(np.abs(np.diff(values, 2, axis=1)), axis=1) / (_MEDIAN * np.sqrt(6.0))
-        noises = distance_sigma((2.0 if self._is_quaternion else 1.0) * bends, self._is_quaternion)
+        sigma = np.median(np.abs(np.diff(values, 3, axis=1)), axis=1) / (_MEDIAN * np.sqrt(20.0))
+        noises = distance_sigma((2.0 if self._is_quaternion else 1.0) * sigma, self._is_quaternion)
         stamps = stream.time_ns.reshape(-1, _COUNT)
         return np.where(stamps[:, -1] - stamps[:, 0] <= (_COUNT - 1) * _LONGEST_PERIOD_NS, noises, 0.0)
 
