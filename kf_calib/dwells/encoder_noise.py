@@ -7,12 +7,16 @@ of an attitude is that of the angle of rotation.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import Stream
 
 _COUNT = 32  # messages of a block
+_BLOCKS = 5  # the median of whose noises is taken
+_WHITE = 0.6  # least ratio of white noise by third differences to that by second ones
 _LONGEST_PERIOD_NS = 100_100_000  # messages farther apart than this do not tell noise from the beginning of a motion
 _MEDIAN = 0.6745  # of the absolute value of a normal number of unit variance
 
@@ -37,16 +41,16 @@ def distance_sigma(sigma: Floats, is_quaternion: bool) -> Floats:
 class EncoderNoise:
     """The noise of the messages, as those before each of them tell it.
 
-    Messages are taken 32 by 32. The median of their third differences tells their noise, and the lesser noise of the
-    last two blocks is that of the next 32 messages; the first 32 have their own. So outliers do not raise it, nor do
-    slews, whose third differences are small. It is 0 where messages are farther apart than 0.1 s. It does not depend on
-    how the messages were divided into batches.
+    Messages are taken 32 by 32, and the medians of their differences tell their noise: the third differences, unless
+    the second ones are larger than noise would have them, as in a slew. The median of the last five that are known is
+    the noise of the next 32 messages; the first 32 have their own. It is 0 where messages are farther apart than 0.1 s.
+    It does not depend on how the messages were divided into batches.
     """
 
     def __init__(self, is_quaternion: bool) -> None:
         self._is_quaternion = is_quaternion
         self._waiting = Stream.empty(0)  # messages of the block that is not complete
-        self._noises = np.empty(0)  # of the two blocks before, rad; empty before the first message
+        self._noises = np.empty(0)  # of the blocks before, rad; empty before the first message
 
     def waits_for_more(self, pose: Stream) -> bool:
         """Tell whether these messages, all that came so far, are too few for the noise of the first ones."""
@@ -58,18 +62,29 @@ class EncoderNoise:
         complete = len(stream) // _COUNT * _COUNT
         noises = self._of_blocks(stream[:complete])
         if not self._noises.size:
-            self._noises = np.full(2, 0.0 if _begins_slowly(pose) or not len(noises) else noises[0])
+            known = len(noises) and np.isfinite(noises[0]) and not _begins_slowly(pose)
+            self._noises = np.full(_BLOCKS, noises[0] if known else 0.0)
         noises = np.concatenate([self._noises, noises])
-        self._noises, self._waiting = noises[-2:], stream[complete:]
-        return np.repeat(np.minimum(noises[1:], noises[:-1]), _COUNT)[len(stream) - len(pose) : len(stream)]
+        noises = noises[np.maximum.accumulate(np.where(np.isfinite(noises), np.arange(len(noises)), 0))]
+        usual = np.median(np.lib.stride_tricks.sliding_window_view(noises, _BLOCKS), axis=1)
+        self._noises, self._waiting = noises[-_BLOCKS:], stream[complete:]
+        return np.repeat(usual, _COUNT)[len(stream) - len(pose) : len(stream)]
 
     def _of_blocks(self, stream: Stream) -> Floats:
-        """Return the noise (b,) of complete blocks, rad."""
+        """Return the noise (b,) of complete blocks, rad; NaN of those in which the platform moves."""
         values = stream.values.reshape(-1, _COUNT, stream.values.shape[1])
-        sigma = np.median(np.abs(np.diff(values, 3, axis=1)), axis=1) / (_MEDIAN * np.sqrt(20.0))
-        noises = distance_sigma((2.0 if self._is_quaternion else 1.0) * sigma, self._is_quaternion)
+        by_second, by_third = (
+            distance_sigma(
+                np.median(np.abs(np.diff(values, order, axis=1)), axis=1) / (_MEDIAN * math.sqrt(variance)),
+                self._is_quaternion,
+            )
+            for order, variance in ((2, 6.0), (3, 20.0))
+        )
         stamps = stream.time_ns.reshape(-1, _COUNT)
-        return np.where(stamps[:, -1] - stamps[:, 0] <= (_COUNT - 1) * _LONGEST_PERIOD_NS, noises, 0.0)
+        scale = np.where(
+            stamps[:, -1] - stamps[:, 0] <= (_COUNT - 1) * _LONGEST_PERIOD_NS, 1.0 + self._is_quaternion, 0.0
+        )
+        return np.where(by_third >= _WHITE * by_second, scale * by_third, np.nan)
 
 
 def _begins_slowly(pose: Stream) -> bool:

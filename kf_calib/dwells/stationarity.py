@@ -23,7 +23,7 @@ _FEWEST_BEFORE = 3  # least number of messages with which one is compared
 _LONGEST_PERIOD_NS = 2 * _SECOND_NS  # messages farther apart than this do not determine a departure
 _CREEPING_NS = 10 * _SECOND_NS  # creep that lasts longer than this is taken as permanent
 _LARGEST_DEG = 5.0  # largest tolerance; at it, a platform turning at 10 deg/s would count as still
-_SIGMAS = 10.0  # of an angle message: two that show the same pose differ by no more
+_SIGMAS = 12.0  # of an angle message: two that show the same pose differ by no more
 _PARTS = 8  # number of parts of a block whose mean poses are compared
 
 HISTORY = _FEWEST_BEFORE + 2
@@ -83,7 +83,7 @@ class Stillness:
 
     def allowed_rad(self, noise_rad: Floats | float) -> Floats:
         """Largest distance, rad, of two messages of a platform at rest, whose noise is ``noise_rad``: the tolerance, or
-        ten sigma."""
+        twelve sigma."""
         largest = max(self.tolerance_rad, math.radians(_LARGEST_DEG))
         return np.clip(_SIGMAS * np.asarray(noise_rad), self.tolerance_rad, largest)
 

@@ -89,7 +89,7 @@ def test_a_run_that_begins_slowly_does_not_wait(first_s: float) -> None:
     assert EncoderNoise(False).waits_for_more(pose[:2]) == (first_s == 0.05)
     whole, parted = EncoderNoise(False), EncoderNoise(False)
     noise = whole.of_next(pose)
-    assert bool(noise[:32].all()) == (first_s == 0.05) and noise[96:].all()
+    assert bool(noise[:32].all()) == (first_s == 0.05) and noise[128:].all()
     first = 2 if first_s == 0.3 else 32
     parts = [parted.of_next(pose[:first]), parted.of_next(pose[first:])]
     assert np.concatenate(parts).tobytes() == noise.tobytes()
@@ -97,10 +97,10 @@ def test_a_run_that_begins_slowly_does_not_wait(first_s: float) -> None:
 
 @pytest.mark.parametrize("rate_hz", [10.0, 20.0, 100.0])
 def test_a_slew_without_noise_has_none(rate_hz: float) -> None:
-    """Slews of 90 deg in 2, 4 and 10 s, dwells of 5 s between them: ten sigma stay below the tolerance of 0.05 deg."""
-    for slew_s in (2.0, 4.0, 10.0):
+    """Slews of 90 deg in 1, 2, 4 and 10 s, between dwells of 5 s: twelve sigma are less than 0.05 deg."""
+    for slew_s in (1.0, 2.0, 4.0, 10.0):
         seconds = np.arange(0.0, 100.0, 1.0 / rate_hz)
         phase = np.clip((seconds % (5.0 + slew_s) - 5.0) / slew_s, 0.0, 1.0)
         degrees = 90.0 * (seconds // (5.0 + slew_s) + 0.5 - 0.5 * np.cos(np.pi * phase))
         noise = EncoderNoise(False).of_next(stream(np.radians(degrees)[:, None], 1.0 / rate_hz))
-        assert np.degrees(10.0 * noise.max()) < 0.05
+        assert np.degrees(12.0 * noise.max()) < 0.05
