@@ -39,6 +39,7 @@ from kf_calib.errors import UnobservableError
 from kf_calib.estimation.dwell_columns import stimulus_of
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import unweighted_left
+from kf_calib.noise.reml import OF_ONE
 
 _NO_NOISE = 0.1  # share of an unknown cause in scatter that was not stated
 _AGAINST_STATED = 0.5  # the same of noise that contradicts what was stated: none is likelier than the other
@@ -108,6 +109,7 @@ class Hypotheses:
         self.walk = "" if before.model.walks else walk_named(before.bench)
         self.stated = dwell_noise_is_stated(before)
         self._disturbed = list[tuple[float, DisturbedDwell]]()  # with the log evidence of rows that are left out for it
+        self._scattering = 0  # number of the accelerometer that alone scatters
 
     def table(self) -> HypothesisTable:
         """The table with the likeliest rows refitted."""
@@ -128,7 +130,8 @@ class Hypotheses:
         rows += [row for walk in walks if self.stated for row in self._gauss_markov(walk)]
         best = max(row.log_evidence for row in rows)
         disturbed = max((each for each in self._disturbed if each[0] > best), key=lambda each: each[0], default=None)
-        return replace(table_of(dispersed(rows)), disturbed=disturbed[1] if disturbed else None)
+        table = table_of(dispersed(rows))
+        return replace(table, disturbed=disturbed[1] if disturbed else None, scattering=self._scattering)
 
     def _gauss_markov(self, walk: Hypothesis) -> Iterator[Hypothesis]:
         """Yield the row of biases that move irregularly and return to their mean after any time, from that of a random
@@ -164,6 +167,9 @@ class Hypotheses:
             share = self._share_of_unknown(marginal)
             logs_noise.append(marginal.log + prior + math.log(1.0 - share))
             logs_irregular += [marginal.log + prior + math.log(share)] if share else []
+        likeliest = max((each for each in marginals if each.parts), key=lambda each: each.log, default=None)
+        if likeliest is not None and likeliest.parts[0] in OF_ONE:
+            self._scattering = OF_ONE.index(likeliest.parts[0]) + 1
         log_irregular = _log_sum(logs_irregular)
         log_irregular += _log_odds(self.test.trend)
         yield Hypothesis(families=(NOTHING,), log_evidence=log_nothing)
@@ -176,9 +182,10 @@ class Hypotheses:
         Where they contradict what was stated, a cause that differs from orientation to orientation explains as much,
         unless repeated orientations tell. Four of five such causes depend on the orientation alone.
         """
-        stated = {"setting": self.before.noise.setting_stated, "common": self.before.noise.scatter_stated}
+        stated = {"setting": self.before.noise.setting_stated}
+        stated |= dict.fromkeys(("common", *OF_ONE), self.before.noise.scatter_stated)
         if not any(stated[part] for part in noise.parts if part in stated):
-            return _NO_NOISE if "common" in noise.parts else 0.0
+            return 0.0 if noise.parts == ("setting",) else _NO_NOISE
         repeats = math.exp(min(log_odds_of_repeating(self.before, noise), 100.0))
         unknown = _AGAINST_STATED * (1.0 - _OF_ORIENTATION + _OF_ORIENTATION * repeats)
         return unknown / (unknown + 1.0 - _AGAINST_STATED)

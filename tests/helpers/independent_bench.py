@@ -43,8 +43,8 @@ def _none(state: State) -> np.ndarray:
 @dataclass(frozen=True)
 class IndependentBench:
     """A source. gimbals: errors of the angles (n, 3), rad; base, mount: rotation vectors (n, 3) of the base, in the
-    bench, and of the block, in the platform; scale: share (n, 3) by which the readings are too large. pose_noise_rad:
-    of each recorded angle, or of the attitude about each axis."""
+    bench, and of the block, in the platform; scale: share (n, 3) by which the readings are too large; bias:
+    what is added to them, m/s^2. pose_noise_rad: of each recorded angle, or of the attitude about each axis."""
 
     seed: int
     dwells: int = 24
@@ -54,6 +54,7 @@ class IndependentBench:
     base: Error = _none
     mount: Error = _none
     scale: Error = _none
+    bias: Error = _none
     bench: Bench = BENCH
     warnings: tuple[str, ...] = ()
 
@@ -87,7 +88,7 @@ class IndependentBench:
         axes = np.eye(3) + 1e-3 * rng.standard_normal((3, 3))
         along = in_bench.inv().apply([0.0, G, 0.0]) @ (axes / np.linalg.norm(axes, axis=1)[:, None]).T
         scales, biases = 1.0 + 3e-4 * rng.standard_normal(3), 2e-3 * rng.standard_normal(3)
-        readings = (scales + self.scale(state)) * along + biases
+        readings = (scales + self.scale(state)) * along + biases + self.bias(state)
         readings += self.white_mps2 * rng.standard_normal(readings.shape)
         time_ns = np.rint(state.time_s * 1e9).astype(np.int64) + 1_700_000_000_000_000_000
         pose, noise_rad = state.angles_rad, self.pose_noise_rad * rng.standard_normal((len(time_ns), 3))
