@@ -47,6 +47,7 @@ _OF_ORIENTATION = 0.8  # share of such causes that depend on the orientation alo
 _SHORT = 0.01  # prior probability of irregular changes that show within dwells only
 _END = 0.99  # of the range of a constant
 _IMPOSSIBLE_MPS2 = 1.0  # added to a reading by what is no parameter: a tenth of gravity
+_UNHEARD_OF = 1000.0  # times the greatest coefficient that is usual
 _APART = 1e-4  # p-value of an oscillation that does not go on alike in all dwells
 _OF_EFFECT = 6.0  # columns that an effect has
 SCREEN_LOG_BF = 8.0  # rows further behind in log evidence are not refitted
@@ -380,7 +381,7 @@ class Hypotheses:
             refit = self._refit((*effects, *formulas))
         except UnobservableError:  # the run does not tell its coefficients: nothing speaks for it
             return Hypothesis(effects, formulas, log_evidence=-math.inf)
-        if formulas and self._is_impossible(refit, formulas):
+        if self._is_impossible(refit, effects, formulas):
             return Hypothesis(effects, formulas, log_evidence=-math.inf)
         marginals = self.evidence.of(refit.fit, walk=self.walk in effects)
         if not marginals:
@@ -397,15 +398,30 @@ class Hypotheses:
                 return Hypothesis(effects, formulas, log_evidence=-math.inf)
         return Hypothesis(effects, formulas, "", self._families(effects), log, delta_chi2, best.dof + walks, refit)
 
-    def _is_impossible(self, refit: Calibration, formulas: Sequence[str]) -> bool:
-        """Tell whether a formula of a refit adds what no sensor could have: it is nearly the same as one of the
-        parameters, and follows what else is missing by the little in which it is not."""
+    def _is_impossible(self, refit: Calibration, effects: Sequence[str], formulas: Sequence[str]) -> bool:
+        """Tell whether what a refit adds is what no sensor could have.
+
+        A formula may be nearly the same as one of the parameters, and follow what else is missing by the little in
+        which it is not. An effect whose coefficients are far beyond any size that is usual is another one.
+        """
         names = {text.partition("=")[0].strip() for text in formulas}
-        for effect in (each for each in refit.model.effects if str(each) in names):
-            values = np.array([refit.parameters[each.symbol].value or 0.0 for each in effect.coefficients])
-            if np.abs(effect.added(self._stimulus, values)).max() > _IMPOSSIBLE_MPS2:
+        for effect in refit.model.effects:
+            found = [refit.parameters[each.symbol] for each in effect.coefficients]
+            values = np.array([each.value or 0.0 for each in found])
+            if str(effect) in names and np.abs(effect.added(self._stimulus, values)).max() > _IMPOSSIBLE_MPS2:
+                return True
+            least = np.abs(values) - 2.0 * np.array([each.sigma or 0.0 for each in found])
+            if str(effect) in effects and least.max(initial=0.0) > self._greatest_of(effect):
                 return True
         return False
+
+    def _greatest_of(self, effect: Effect) -> float:
+        """Return a size, SI, that no coefficient of an effect has; those of sensors whose usual sizes are not known may
+        be a thousand times larger again than of those of navigation grade."""
+        usual, navigation = effect.typical.of(self.evidence.grade), effect.typical.navigation
+        if usual is not None:
+            return _UNHEARD_OF * usual[1]
+        return _UNHEARD_OF**2 * navigation[1] if navigation is not None else math.inf
 
     def _log_odds_within_dwells(self, refit: Calibration) -> float:
         """Return the log odds of what a walk explains within dwells, where it goes on but has no column.
