@@ -47,7 +47,7 @@ _OF_ORIENTATION = 0.8  # share of such causes that depend on the orientation alo
 _SHORT = 0.01  # prior probability of irregular changes that show within dwells only
 _END = 0.99  # of the range of a constant
 _IMPOSSIBLE_MPS2 = 1.0  # added to a reading by what is no parameter: a tenth of gravity
-_UNHEARD_OF = 1000.0  # times the greatest coefficient that is usual
+_UNHEARD_OF = 1e6  # times the greatest coefficient that is usual
 _APART = 1e-4  # p-value of an oscillation that does not go on alike in all dwells
 _OF_EFFECT = 6.0  # columns that an effect has
 SCREEN_LOG_BF = 8.0  # rows further behind in log evidence are not refitted
@@ -410,18 +410,11 @@ class Hypotheses:
             values = np.array([each.value or 0.0 for each in found])
             if str(effect) in names and np.abs(effect.added(self._stimulus, values)).max() > _IMPOSSIBLE_MPS2:
                 return True
+            usual = effect.typical.of(self.evidence.grade) or effect.typical.navigation
             least = np.abs(values) - 2.0 * np.array([each.sigma or 0.0 for each in found])
-            if str(effect) in effects and least.max(initial=0.0) > self._greatest_of(effect):
+            if str(effect) in effects and usual and least.max(initial=0.0) > _UNHEARD_OF * usual[1]:
                 return True
         return False
-
-    def _greatest_of(self, effect: Effect) -> float:
-        """Return a size, SI, that no coefficient of an effect has; those of sensors whose usual sizes are not known may
-        be a thousand times larger again than of those of navigation grade."""
-        usual, navigation = effect.typical.of(self.evidence.grade), effect.typical.navigation
-        if usual is not None:
-            return _UNHEARD_OF * usual[1]
-        return _UNHEARD_OF**2 * navigation[1] if navigation is not None else math.inf
 
     def _log_odds_within_dwells(self, refit: Calibration) -> float:
         """Return the log odds of what a walk explains within dwells, where it goes on but has no column.

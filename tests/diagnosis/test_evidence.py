@@ -24,6 +24,7 @@ from kf_calib.effects.sensor import SecondOrder
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.results import Calibration
 from kf_calib.noise.noise_model import mean_covariances
+from kf_calib.noise.reml import OF_ONE
 from kf_calib.sources.simulation.physics import Ambient
 from kf_calib.sources.simulation.sensors import GRADES, TrueNoise
 from kf_calib.sources.simulation.simulator import Simulation
@@ -56,9 +57,9 @@ def before() -> Calibration:
     return Refits().of(replace(found, bench=replace(found.bench, scatter_sigma_mps2=None)), ())
 
 
-def _dense(result: Calibration, scatter_mps2: float) -> tuple[Floats, Floats]:
+def _dense(result: Calibration, scatter_mps2: Floats | float) -> tuple[Floats, Floats]:
     """Whitened columns and readings of the means of dwells, by a dense Cholesky factor of each dwell."""
-    noise = replace(result.noise, scatter_mps2=np.full(3, scatter_mps2), walk_mps2_per_sqrt_s=0.0)
+    noise = replace(result.noise, scatter_mps2=scatter_mps2 * np.ones(3), walk_mps2_per_sqrt_s=0.0)
     means = result.linearised.means
     lower = np.linalg.cholesky(mean_covariances(noise, means, result.linearised.state))
     columns = np.linalg.solve(lower, np.concatenate([means.design, means.readings[:, :, None]], axis=2))
@@ -75,10 +76,11 @@ def _left(columns: Floats, readings: Floats) -> float:
 def test_falls_are_those_of_dense_least_squares(before: Calibration) -> None:
     """The effect shows in the means of dwells alone, where dense least squares sees it, too."""
     refit = Refits().with_effects(before, ("second-order",))
-    for own in Evidence(before.fit).of(refit.fit):
-        scatter = dict(zip(own.parts, own.sizes, strict=True)).get("common", 0.0)
-        if "setting" in own.parts:
-            continue
+    found = [own for own in Evidence(before.fit).of(refit.fit) if "setting" not in own.parts]
+    assert {own.parts for own in found} >= {(), ("common",)} and any(own.parts[:1] == ("first",) for own in found)
+    for own in found:
+        sizes = dict(zip(own.parts, own.sizes, strict=True))
+        scatter = np.array([sizes.get(part, sizes.get("common", 0.0)) for part in OF_ONE])
         fall = _left(*_dense(before, scatter)) - _left(*_dense(refit, scatter))
         assert own.delta_chi2 == pytest.approx(fall, rel=2e-3) and own.dof == 3
 
