@@ -300,8 +300,10 @@ def _misfit(fitted: Fit) -> float:
 
 
 def _sensible(state: Floats, model: Model) -> bool:
-    """Tell whether a state (p,) is one that a block can have: its scale factors are finite and not many times nominal.
-    Where angles are not used, it must tell the specific force from the readings; else a channel may be dead."""
+    """Tell whether a state (p,) can be that of a block: its scale factors are finite and not many times nominal, and
+    without angles they tell the specific force from the readings. With angles, effects alone may lead a fit astray."""
+    if model.bench.angles and not model.effects:
+        return True
     sensitivity, usual = (each[:STATE_COUNT].reshape(3, 4)[:, :3] for each in (state, model.nominal_state()))
     if not np.isfinite(state).all() or np.abs(sensitivity).max() > _SINGULAR * np.abs(usual).max():
         return False
