@@ -157,10 +157,10 @@ class Evidence:
         without = replace(without, prior=pad_residual_norm(without.prior, norm))
         walking: Parts = ("walk",) if walk or self._walks else ()
         sets = list(self._free_parts(refit or self._fit))
-        free = tuple(dict.fromkeys(part for parts in sets for part in parts))
+        free: Parts = (*walking, *dict.fromkeys(part for parts in sets for part in parts))
         likelihood_without, likelihood = (
             likelihood_of(
-                noise_of_rows, (*walking, *free), rows.means, self._fit.linearised.state, rows.prior, rows.added
+                noise_of_rows, free, rows.means, self._fit.linearised.state, rows.prior, rows.added
             )
             for noise_of_rows, rows in ((noise, without), (averaged, added))
         )  # fmt: skip
