@@ -35,6 +35,7 @@ from kf_calib.support.units import field_unit, shown
 _WEAK = 5.0  # times the size that a coefficient may well have
 _CLEAR = 3.0  # sigmas: of a coefficient that is seen, however large it is
 _QUIET = 1e-6  # probability that dwells differ as little by noise, below which the noise is taken for too large
+_WARMING_MPS2 = 0.1  # the most by which a bias is off after switching on: some 10 mg
 
 
 @dataclass(frozen=True)
@@ -104,9 +105,6 @@ class Turn:
         digits = min(max(1 - math.floor(math.log10(max(self.sigma_deg, 1e-6))), 0), 5)
         mended, recorded = (f"{angle:.{digits}f}" for angle in (self.mended_deg, self.recorded_deg))
         return f"gimbal {self.axis} stood at {mended} ± {self.sigma_deg:.1g} deg, not at {recorded}"
-
-
-_WARMING_MPS2 = 0.1  # the most by which a bias is off after switching on: some 10 mg
 
 
 @dataclass(frozen=True)
