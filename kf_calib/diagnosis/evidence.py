@@ -156,7 +156,7 @@ class Evidence:
         norm, norm_without = (float(np.linalg.norm(rows.prior[:, -1])) for rows in (added, without))
         without = replace(without, prior=pad_residual_norm(without.prior, norm))
         walking: Parts = ("walk",) if walk or self._walks else ()
-        sets = list(self._free_parts(refit or self._fit))
+        sets = list(self._free_parts(with_effects=refit is not None))
         free: Parts = (*walking, *dict.fromkeys(part for parts in sets for part in parts))
         likelihood_without, likelihood = (
             likelihood_of(
@@ -180,9 +180,12 @@ class Evidence:
         after = rows.means.design.shape[2] - rows.added.stop
         return _AddedColumns(known, rows.seen, after)
 
-    def _free_parts(self, fitted: Fit) -> Iterator[Parts]:
-        """Yield the sets of parts of the noise from dwell to dwell that may be free; of scatter of one accelerometer
-        alone, that which a fit leaves most of."""
+    def _free_parts(self, with_effects: bool) -> Iterator[Parts]:
+        """Yield the sets of parts of the noise from dwell to dwell that may be free.
+
+        Scatter of one accelerometer alone, that with the largest residuals, stands against all effects: beside one it
+        would hide what else is missing, which often shows in one accelerometer.
+        """
         yield ()
         model, dwells = self._fit.linearised.model, len(self._without_effects.means.counts)
         if (1 if self.noise.attitude_unknown else 3) * dwells <= model.count - len(model.fixed):
@@ -190,9 +193,10 @@ class Evidence:
         yield ("common",)
         if self.noise.attitude_unknown:  # a rotation of the dwells has no limit anyway
             return
-        means = fitted.linearised.means
-        residuals = (means.readings - means.design @ fitted.linearised.state) * np.sqrt(means.counts[:, None])
-        yield (OF_ONE[int(np.argmax(np.sum(residuals**2, axis=0) / fitted.noise.effective_sigma_mps2**2))],)
+        if not with_effects:
+            means, sigma = self._fit.linearised.means, self.noise.effective_sigma_mps2
+            residuals = (means.readings - means.design @ self._fit.linearised.state) * np.sqrt(means.counts[:, None])
+            yield (OF_ONE[int(np.argmax(np.sum(residuals**2, axis=0) / sigma**2))],)
         yield ("setting",)
         if not (self.noise.setting_stated and self.noise.scatter_stated):
             yield "setting", "common"
