@@ -263,10 +263,10 @@ def _fields(inventory: Inventory) -> list[str]:
     accel = [] if inventory.has_readings else ["--field accel=TOPIC:X,Y,Z@TIME"]
     if inventory.has_angles is not None:
         return accel
-    found = [
+    quaternions = [
         (topic.name, path, has_time(topic.paths)) for topic in inventory.topics if (path := attitude_in(topic.paths))
     ]
-    if not found:
+    if not quaternions:
         return [*accel, "--field angles=TOPIC:OUTER,MIDDLE,INNER@TIME"]
-    name, path, is_timed = max(found, key=lambda each: each[2])
+    name, path, is_timed = max(quaternions, key=lambda each: each[2])
     return [*accel, f"--field attitude={name}:{path}{'' if is_timed else '@TIME'}"]
