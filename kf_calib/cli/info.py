@@ -256,16 +256,15 @@ def _quoted(text: str) -> str:
 def _fields(inventory: Inventory) -> list[str]:
     """How the numbers would be named that are in messages which tell what they have, but not what it is; a quaternion
     in them is taken for the attitude."""
-    from kf_calib.sources.files.fields import attitude_in, has_time
+    from kf_calib.sources.files.fields import attitude_in, has_time, known_fields
 
     if not any(topic.paths for topic in inventory.topics):
         return []
     accel = [] if inventory.has_readings else ["--field accel=TOPIC:X,Y,Z@TIME"]
     if inventory.has_angles is not None:
         return accel
-    quaternions = [
-        (topic.name, path, has_time(topic.paths)) for topic in inventory.topics if (path := attitude_in(topic.paths))
-    ]
+    unknown = [topic for topic in inventory.topics if known_fields(topic.schema) is None]  # an Imu has its own attitude
+    quaternions = [(topic.name, path, has_time(topic.paths)) for topic in unknown if (path := attitude_in(topic.paths))]
     if not quaternions:
         return [*accel, "--field angles=TOPIC:OUTER,MIDDLE,INNER@TIME"]
     name, path, is_timed = max(quaternions, key=lambda each: each[2])

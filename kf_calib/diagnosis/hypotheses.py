@@ -110,7 +110,6 @@ class Hypotheses:
         self.walk = "" if before.model.walks else walk_named(before.bench)
         self.stated = dwell_noise_is_stated(before)
         self._disturbed = list[tuple[float, DisturbedDwell]]()  # with the log evidence of rows that are left out for it
-        self._scattering = 0  # number of the accelerometer that alone scatters
 
     def table(self) -> HypothesisTable:
         """The table with the likeliest rows refitted."""
@@ -132,7 +131,7 @@ class Hypotheses:
         best = max(row.log_evidence for row in rows)
         disturbed = max((each for each in self._disturbed if each[0] > best), key=lambda each: each[0], default=None)
         table = table_of(dispersed(rows))
-        return replace(table, disturbed=disturbed[1] if disturbed else None, scattering=self._scattering)
+        return replace(table, disturbed=disturbed[1] if disturbed else None, scattering=self._scattering())
 
     def _gauss_markov(self, walk: Hypothesis) -> Iterator[Hypothesis]:
         """Yield the row of biases that move irregularly and return to their mean after any time, from that of a random
@@ -161,21 +160,29 @@ class Hypotheses:
 
     def _without_effects(self) -> Iterator[Hypothesis]:
         """Yield the rows without an effect: nothing, noise that was not stated, and irregular changes."""
-        marginals, prior = self.evidence.of(), math.log(KINDS["nothing"])
+        marginals, prior = self._of_noise, math.log(KINDS["nothing"])
         log_nothing = float(next(marginal.log for marginal in marginals if not marginal.parts)) + prior
         logs_noise, logs_irregular = list[float](), [log_nothing + math.log(_SHORT)]
         for marginal in (each for each in marginals if each.parts):
             share = self._share_of_unknown(marginal)
             logs_noise.append(marginal.log + prior + math.log(1.0 - share))
             logs_irregular += [marginal.log + prior + math.log(share)] if share else []
-        likeliest = max((each for each in marginals if each.parts), key=lambda each: each.log, default=None)
-        if likeliest is not None and likeliest.parts[0] in OF_ONE:
-            self._scattering = OF_ONE.index(likeliest.parts[0]) + 1
         log_irregular = _log_sum(logs_irregular)
         log_irregular += _log_odds(self.test.trend)
         yield Hypothesis(families=(NOTHING,), log_evidence=log_nothing)
         yield Hypothesis(families=(NOISE,), log_evidence=_log_sum(logs_noise))
         yield Hypothesis(driver=IRREGULAR, families=(NONE,), log_evidence=log_irregular)
+
+    @cached_property
+    def _of_noise(self) -> list[MarginalLikelihood]:
+        """The evidence of the model without further effects, for each set of free parts of the noise."""
+        return self.evidence.of()
+
+    def _scattering(self) -> int:
+        """Return the number of the accelerometer that alone scatters, where that is the likeliest noise; else 0."""
+        likeliest = max(self._of_noise, key=lambda marginal: marginal.log if marginal.parts else -math.inf)
+        part = likeliest.parts[0] if likeliest.parts else ""
+        return OF_ONE.index(part) + 1 if part in OF_ONE else 0
 
     def _share_of_unknown(self, noise: MarginalLikelihood) -> float:
         """Return the share of an unknown cause in these parts of the noise from dwell to dwell.
@@ -404,14 +411,14 @@ class Hypotheses:
         A formula may be nearly the same as one of the parameters, and follow what else is missing by the little in
         which it is not. An effect whose coefficients are far beyond any size that is usual is another one.
         """
-        names = {text.partition("=")[0].strip() for text in formulas}
+        names, parameters = {text.partition("=")[0].strip() for text in formulas}, refit.parameters
         for effect in refit.model.effects:
-            found = [refit.parameters[each.symbol] for each in effect.coefficients]
-            values = np.array([each.value or 0.0 for each in found])
+            coefficients = [parameters[coefficient.symbol] for coefficient in effect.coefficients]
+            values = np.array([coefficient.value or 0.0 for coefficient in coefficients])
             if str(effect) in names and np.abs(effect.added(self._stimulus, values)).max() > _IMPOSSIBLE_MPS2:
                 return True
             usual = effect.typical.of(self.evidence.grade) or effect.typical.navigation
-            least = np.abs(values) - 2.0 * np.array([each.sigma or 0.0 for each in found])
+            least = np.abs(values) - 2.0 * np.array([coefficient.sigma or 0.0 for coefficient in coefficients])
             if str(effect) in effects and usual and least.max(initial=0.0) > _UNHEARD_OF * usual[1]:
                 return True
         return False

@@ -1,8 +1,8 @@
 """Noise of angle messages, from differences of them, to which slow motion does not contribute: sigma^2 = <d^2> / 6 of
 second ones, to which a constant rate adds nothing, <d^2> / 20 of third ones, to which a constant acceleration does not.
 
-Angles of an encoder are independent of each other. A quaternion turns by twice the change of its components: the noise
-of an attitude is that of the angle of rotation.
+Angles of an encoder are independent of each other. An attitude turns by twice as much as the components of its
+quaternion change, and its noise is that of the angle of rotation.
 """
 
 from __future__ import annotations
@@ -21,21 +21,17 @@ _LONGEST_PERIOD_NS = 100_100_000  # messages farther apart than this do not tell
 _MEDIAN = 0.6745  # of the absolute value of a normal number of unit variance
 
 
-def encoder_sigma(poses: Floats, is_quaternion: bool) -> Floats:
-    """Noise of an angle message, one standard deviation (k,), rad, from poses (n, k); 0 for fewer than three.
-
-    Of quaternions it is that of twice their components.
-    """
-    scale = 2.0 if is_quaternion else 1.0
-    if len(poses) < 3:
-        return np.zeros(poses.shape[1])
-    return scale * np.sqrt(np.mean(np.diff(poses, 2, axis=0) ** 2, axis=0) / 6.0)
+def encoder_sigma(poses: Floats) -> Floats:
+    """Noise of the components of a message, one standard deviation (k,), from poses (n, k); 0 for fewer than three."""
+    return (
+        np.sqrt(np.mean(np.diff(poses, 2, axis=0) ** 2, axis=0) / 6.0) if len(poses) > 2 else np.zeros(poses.shape[1])
+    )
 
 
 def distance_sigma(sigma: Floats, is_quaternion: bool) -> Floats:
     """Noise of the distance of a message from its pose, rad, from that of its components (..., k): the largest of
-    angles, the length of a rotation."""
-    return np.sqrt(np.sum(sigma**2, axis=-1)) if is_quaternion else np.max(sigma, axis=-1)
+    angles, the angle of a rotation."""
+    return 2.0 * np.sqrt(np.sum(sigma**2, axis=-1)) if is_quaternion else np.max(sigma, axis=-1)
 
 
 class EncoderNoise:
@@ -81,10 +77,8 @@ class EncoderNoise:
             for order, variance in ((2, 6.0), (3, 20.0))
         )
         stamps = stream.time_ns.reshape(-1, _COUNT)
-        scale = np.where(
-            stamps[:, -1] - stamps[:, 0] <= (_COUNT - 1) * _LONGEST_PERIOD_NS, 1.0 + self._is_quaternion, 0.0
-        )
-        return np.where(by_third >= _WHITE * by_second, scale * by_third, np.nan)
+        slow = stamps[:, -1] - stamps[:, 0] > (_COUNT - 1) * _LONGEST_PERIOD_NS
+        return np.where(by_third < _WHITE * by_second, np.nan, np.where(slow, 0.0, by_third))
 
 
 def _begins_slowly(pose: Stream) -> bool:

@@ -36,7 +36,7 @@ from kf_calib.dwells.blocks import (
     carry_on,
     within,
 )
-from kf_calib.dwells.encoder_noise import EncoderNoise, encoder_sigma
+from kf_calib.dwells.encoder_noise import EncoderNoise, distance_sigma, encoder_sigma
 from kf_calib.dwells.stationarity import HISTORY, Stillness
 from kf_calib.errors import InputError
 
@@ -463,8 +463,10 @@ class Segmenter:
     def _sigma_of_angle(self, inside: Floats) -> float:
         """Return the noise of an angle in these messages (n, k), rad, alike for all; about each of three axes, where
         they are attitudes."""
-        sigma = encoder_sigma(inside, not self.bench.axes)
-        return float(np.sqrt(np.sum(sigma**2) / (len(self.bench.axes) or 3)))
+        sigma = encoder_sigma(inside)
+        if self.bench.axes:
+            return float(np.sqrt(np.mean(sigma**2)))
+        return float(distance_sigma(sigma, True)) / math.sqrt(3.0)
 
     def _forget(self) -> None:
         """Drop the poses and temperatures that no waiting reading needs."""

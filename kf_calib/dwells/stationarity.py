@@ -166,8 +166,8 @@ class Stillness:
         variance = (curvature[starts + curvature_count[:, 0]] - curvature[starts]) / (
             6.0 * np.maximum(curvature_count, 1)
         )
-        sigma = (2.0 if is_quaternion else 1.0) * np.sqrt(np.maximum(variance, 0.0))
-        allowed = np.maximum(self.rest_rad, 4.0 * distance_sigma(sigma, is_quaternion))
+        sigma = distance_sigma(np.sqrt(np.maximum(variance, 0.0)), is_quaternion)
+        allowed = np.maximum(self.rest_rad, 4.0 * sigma)
         distance = pose_distance(pose.values, means + pose.values[0], is_quaternion)
         return (distance > allowed) & (curvature_count[:, 0] > 0)
 
@@ -188,7 +188,7 @@ class Stillness:
             if times[k] + span_ns > until_ns or end > len(times):
                 return at_ns, False
             following = poses[k + 1 : end]
-            sigma = distance_sigma(encoder_sigma(following, is_quaternion), is_quaternion)
+            sigma = distance_sigma(encoder_sigma(following), is_quaternion)
             allowed = max(self.rest_rad, 4.0 * float(sigma))
             distance = pose_distance(poses[k], mean_pose(following), is_quaternion)
             if distance <= allowed or np.diff(times[k:end]).max() > span_ns:
@@ -202,7 +202,7 @@ class Stillness:
         count, spread = len(poses), np.ptp(poses, axis=0).max()
         if count < 2 or spread <= self.rest_rad:
             return False
-        if spread > max(self.tolerance_rad, 8.0 * float(encoder_sigma(poses, False).max())):
+        if spread > max(self.tolerance_rad, 8.0 * float(encoder_sigma(poses).max())):
             return True
         parts = np.array_split(poses, min(_PARTS, count))
         means = np.array([part.mean(axis=0) for part in parts])

@@ -123,6 +123,24 @@ def test_a_quaternion_in_messages_is_proposed_as_attitude(
     assert not any("axes" in each for each in found["missing"])
 
 
+def test_the_orientation_in_an_imu_is_not_proposed(facts: Any, tmp_path: Path) -> None:
+    """It is what that sensor makes of the readings that are to be calibrated."""
+    path = tmp_path / "json.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("sensor_msgs/msg/Imu", "jsonschema", b"")
+        imu = writer.register_channel("/imu", "json", schema)
+        for k in range(20):
+            message = {"header": {"stamp": {"sec": 1, "nanosec": k * 10**7}},
+                       "orientation": {"x": 0, "y": 0, "z": 0, "w": 1},
+                       "linear_acceleration": {"x": 0, "y": 0, "z": 9.81}}  # fmt: skip
+            writer.add_message(imu, k * 10**7, json.dumps(message).encode(), 0)
+        writer.finish()
+    command = facts(path)["command"]
+    assert "attitude=" not in command and "--field angles=TOPIC:OUTER,MIDDLE,INNER@TIME" in command
+
+
 def test_gaps_and_times_that_go_back() -> None:
     step, topic = 10_000_000, Topic("/a", "", "cdr")
     times = START_NS + step * np.arange(5000)

@@ -36,15 +36,15 @@ def slewing(count: int, seed: int) -> Floats:
 def test_an_encoder_is_as_noisy_as_its_messages_scatter_about_a_line() -> None:
     noise = np.random.default_rng(1).normal(size=(20_000, 2)) * [3e-5, 1e-4]
     line = np.linspace(0.0, 5.0, 20_000)[:, None]
-    assert encoder_sigma(noise + line, False) == pytest.approx([3e-5, 1e-4], rel=0.03)
-    assert not encoder_sigma(noise[:2], False).any()
+    assert encoder_sigma(noise + line) == pytest.approx([3e-5, 1e-4], rel=0.03)
+    assert not encoder_sigma(noise[:2]).any()
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_an_attitude_is_as_noisy_as_its_angle_of_rotation(seed: int) -> None:
     poses = attitudes(20_000, seed)
     turned = (Rotation.from_quat(poses).mean().inv() * Rotation.from_quat(poses)).magnitude()
-    sigma = distance_sigma(encoder_sigma(poses, True), True)
+    sigma = distance_sigma(encoder_sigma(poses), True)
     assert sigma == pytest.approx(np.sqrt(np.mean(turned**2)), rel=0.02)
     assert sigma == pytest.approx(np.sqrt(3.0) * SIGMA_RAD, rel=0.02)
 

@@ -108,7 +108,7 @@ def signals() -> Numbers:
         crowds=[signal_quality.clustering(each, counts)[0] for each in (*hits, *crowded)],
         lines=[line_spectrum.lines([each]) for each in spectra], together=line_spectrum.lines(spectra),
         lowest=line_spectrum.lowest_hz(spectra), tones=[coherent_tone.tone(traces) for traces in _traces(rng)],
-        encoders=[encoder_noise.encoder_sigma(size * rng.normal(size=(90, 3)), False) for size in (1e-6, 1e-3)],
+        encoders=[encoder_noise.encoder_sigma(size * rng.normal(size=(90, 3))) for size in (1e-6, 1e-3)],
     )  # fmt: skip
 
 
