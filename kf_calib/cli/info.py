@@ -81,7 +81,9 @@ def _of_messages(ctx: click.Context, path: Path, reading: ReadingOptions, tick: 
     inventory = inventory_of(path, reading.fields)
     bench = {**inventory.bench, **reading.keys}
     by_hand = inventory.has_readings and inventory.has_angles is None and not any(t.paths for t in inventory.topics)
-    lacking = _lacks(bench, inventory.has_angles is not False and not (by_hand or reading.no_angles))
+    fields = _fields(inventory)
+    is_attitude = inventory.has_angles is False or any(" attitude=" in field for field in fields)
+    lacking = _lacks(bench, not (is_attitude or by_hand or reading.no_angles))
     missing = {key: _NAMED[key][1] for key in lacking}
     dwells, warnings, wrong = None, list(inventory.warnings), None
     try:
@@ -93,7 +95,7 @@ def _of_messages(ctx: click.Context, path: Path, reading: ReadingOptions, tick: 
         missing = missing or {"": str(error)}
     except KfCalibError as error:
         missing = {"": str(error), **missing}
-    words = _given(ctx, _not_of(ctx, ("columns", "g_unit"))) + _fields(inventory) + [_NAMED[key][0] for key in lacking]
+    words = _given(ctx, _not_of(ctx, ("columns", "g_unit"))) + fields + [_NAMED[key][0] for key in lacking]
     words += ["--no-angles"] if by_hand and not reading.no_angles else []
     missing, words = _with_unit(missing, words, wrong)
     return _overview(inventory, bench, dwells, missing, words, warnings)
@@ -252,9 +254,18 @@ def _quoted(text: str) -> str:
 
 
 def _fields(inventory: Inventory) -> list[str]:
-    """How the numbers would be named that are in messages which tell what they have, but not what it is."""
+    """How the numbers would be named that are in messages which tell what they have, but not what it is; a quaternion
+    in them is taken for the attitude."""
+    from kf_calib.sources.files.fields import attitude_in, has_time, known_fields
+
     if not any(topic.paths for topic in inventory.topics):
         return []
     accel = [] if inventory.has_readings else ["--field accel=TOPIC:X,Y,Z@TIME"]
-    angles = [] if inventory.has_angles is not None else ["--field angles=TOPIC:OUTER,MIDDLE,INNER@TIME"]
-    return accel + angles
+    if inventory.has_angles is not None:
+        return accel
+    unknown = [topic for topic in inventory.topics if known_fields(topic.schema) is None]  # an Imu has its own attitude
+    quaternions = [(topic.name, path, has_time(topic.paths)) for topic in unknown if (path := attitude_in(topic.paths))]
+    if not quaternions:
+        return [*accel, "--field angles=TOPIC:OUTER,MIDDLE,INNER@TIME"]
+    name, path, is_timed = max(quaternions, key=lambda each: each[2])
+    return [*accel, f"--field attitude={name}:{path}{'' if is_timed else '@TIME'}"]

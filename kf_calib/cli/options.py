@@ -251,7 +251,7 @@ class DwellOptions:
         help="Seconds left out after each arrival; of a short dwell no more than a third.")] = 1.0
     still_deg: Annotated[float, _of_model(
         "--still-deg", type=POSITIVE,
-        help="Motion within half a second that still counts as standing still, deg.")] = 0.05
+        help="Motion within half a second that counts as standing still, deg; noisy angles may scatter more.")] = 0.05
     gate: Annotated[bool, _of_model("--gate/--no-gate", help="Reject outlying readings.")] = True
     gate_sigma: Annotated[float, _of_model(
         "--gate-sigma", type=NumberInRange(min=3), help="Where the gate stands, robust sigma.")] = 6.0

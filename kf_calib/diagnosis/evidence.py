@@ -31,13 +31,15 @@ from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.whitened_rows import flicker_of_scatter, whiten
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise, mean_covariances, setting_covariances
-from kf_calib.noise.reml import Likelihood, Part, Parts, likelihood_of, with_shared_noise
+from kf_calib.noise.reml import OF_ONE, Likelihood, Part, Parts, likelihood_of, with_shared_noise
 from kf_calib.noise.restricted_likelihood import Restricted
 from kf_calib.noise.temperature_course import thermometer_errors
 
 _RANGE = math.log(1e4)  # width of the flat prior of the logarithm of a size of noise
 _UNSTATED = 0.5  # prior probability of noise from dwell to dwell that was not stated
 _BEYOND = 0.02  # prior probability of more noise than was stated
+_OF_ONE = 0.1  # share of one accelerometer alone in scatter
+_NO_WORSE = 1.01  # to which share a misfit may grow with more coefficients, by rounding and what is not linear
 _IMMENSE_MPS2 = 1e3  # scatter so large that nothing is left of a dwell's mean
 
 
@@ -154,18 +156,16 @@ class Evidence:
         norm, norm_without = (float(np.linalg.norm(rows.prior[:, -1])) for rows in (added, without))
         without = replace(without, prior=pad_residual_norm(without.prior, norm))
         walking: Parts = ("walk",) if walk or self._walks else ()
+        sets = list(self._free_parts(with_effects=refit is not None))
+        free: Parts = (*walking, *dict.fromkeys(part for parts in sets for part in parts))
         likelihood_without, likelihood = (
             likelihood_of(
-                noise_of_rows, (*walking, "setting", "common"), rows.means, self._fit.linearised.state, rows.prior,
-                rows.added,
+                noise_of_rows, free, rows.means, self._fit.linearised.state, rows.prior, rows.added
             )
             for noise_of_rows, rows in ((noise, without), (averaged, added))
         )  # fmt: skip
         columns = self._added(refit, added) if refit is not None and added.dof else None
-        marginals = [
-            self._marginal(likelihood, likelihood_without, parts + walking, columns)
-            for parts in self._free_parts(len(without.means.counts))
-        ]
+        marginals = [self._marginal(likelihood, likelihood_without, parts + walking, columns) for parts in sets]
         # Readings that are folded otherwise, on a carrier or averaged, leave more or less of themselves within dwells.
         # That is no evidence for what they were folded for: it counts as noise does.
         folded, folded_before = (refit or self._fit).dwells[0], self._fit.dwells[0]
@@ -180,15 +180,23 @@ class Evidence:
         after = rows.means.design.shape[2] - rows.added.stop
         return _AddedColumns(known, rows.seen, after)
 
-    def _free_parts(self, dwells: int) -> Iterator[Parts]:
-        """Yield the sets of parts of the noise from dwell to dwell that may be free."""
+    def _free_parts(self, with_effects: bool) -> Iterator[Parts]:
+        """Yield the sets of parts of the noise from dwell to dwell that may be free.
+
+        Scatter of one accelerometer alone, that with the largest residuals, stands against all effects: beside one it
+        would hide what else is missing, which often shows in one accelerometer.
+        """
         yield ()
-        model = self._fit.linearised.model
+        model, dwells = self._fit.linearised.model, len(self._without_effects.means.counts)
         if (1 if self.noise.attitude_unknown else 3) * dwells <= model.count - len(model.fixed):
             return
         yield ("common",)
         if self.noise.attitude_unknown:  # a rotation of the dwells has no limit anyway
             return
+        if not with_effects:
+            means, sigma = self._fit.linearised.means, self.noise.effective_sigma_mps2
+            residuals = (means.readings - means.design @ self._fit.linearised.state) * np.sqrt(means.counts[:, None])
+            yield (OF_ONE[int(np.argmax(np.sum(residuals**2, axis=0) / sigma**2))],)
         yield ("setting",)
         if not (self.noise.setting_stated and self.noise.scatter_stated):
             yield "setting", "common"
@@ -200,7 +208,8 @@ class Evidence:
         parts: Parts,
         added: _AddedColumns | None,
     ) -> MarginalLikelihood | None:
-        """Return the evidence with these parts of the noise free; None where one of them is best at zero.
+        """Return the evidence with these parts of the noise free; None where one of them is best at zero, and where the
+        effects make the misfit larger, as a fit does that has not converged.
 
         The logarithms of the sizes of the parts are averaged out by Laplace's method. A part of no size is counted
         where it is absent. added: the columns of the added effects, whose coefficients are averaged in the noise that
@@ -213,6 +222,8 @@ class Evidence:
         sizes = np.array([likelihood.units[part][0] for part in parts]) * relative
         variances_without = (sizes / np.array([likelihood_without.units[part][0] for part in parts])) ** 2
         without = likelihood_without.of(parts).at(variances_without)
+        if point.misfit > without.misfit * _NO_WORSE + 1.0:
+            return None
         delta_chi2, log = max(without.misfit - point.misfit, 0.0), self._log_prior(parts) - without.cost
         if parts:
             curvatures = np.linalg.eigvalsh(at_parts.curvature(relative))
@@ -228,6 +239,8 @@ class Evidence:
         """Return the logarithm of the prior probability that these parts of the noise are there and no others."""
         stated: dict[Part, bool] = {"setting": self.noise.setting_stated, "common": self.noise.scatter_stated}
         priors = {part: _BEYOND if is_stated else _UNSTATED for part, is_stated in stated.items()}
+        if parts and parts[0] in OF_ONE:
+            return math.log(_OF_ONE / len(OF_ONE)) + self._log_prior(("common", *parts[1:]))
         return sum(math.log(prior if part in parts else 1.0 - prior) for part, prior in priors.items())
 
     def _rows(self, linearised: LinearisedDwells, noise: Noise) -> _LikelihoodRows:
@@ -321,6 +334,8 @@ def log_odds_of_repeating(before: Calibration, noise: MarginalLikelihood) -> flo
             scatter += size**2 * setting_covariances(linearised.means, linearised.state)
         elif part == "common":
             scatter += size**2 * np.eye(3)
+        elif part in OF_ONE:
+            scatter[:, OF_ONE.index(part), OF_ONE.index(part)] += size**2
     return sum(_log_ratio(before.residuals_mps2[group], within[group], scatter[group]) for group in groups)
 
 

@@ -39,6 +39,7 @@ from kf_calib.errors import UnobservableError
 from kf_calib.estimation.dwell_columns import stimulus_of
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import unweighted_left
+from kf_calib.noise.reml import OF_ONE
 
 _NO_NOISE = 0.1  # share of an unknown cause in scatter that was not stated
 _AGAINST_STATED = 0.5  # the same of noise that contradicts what was stated: none is likelier than the other
@@ -46,6 +47,7 @@ _OF_ORIENTATION = 0.8  # share of such causes that depend on the orientation alo
 _SHORT = 0.01  # prior probability of irregular changes that show within dwells only
 _END = 0.99  # of the range of a constant
 _IMPOSSIBLE_MPS2 = 1.0  # added to a reading by what is no parameter: a tenth of gravity
+_UNHEARD_OF = 1e6  # times the greatest coefficient that is usual
 _APART = 1e-4  # p-value of an oscillation that does not go on alike in all dwells
 _OF_EFFECT = 6.0  # columns that an effect has
 SCREEN_LOG_BF = 8.0  # rows further behind in log evidence are not refitted
@@ -128,7 +130,8 @@ class Hypotheses:
         rows += [row for walk in walks if self.stated for row in self._gauss_markov(walk)]
         best = max(row.log_evidence for row in rows)
         disturbed = max((each for each in self._disturbed if each[0] > best), key=lambda each: each[0], default=None)
-        return replace(table_of(dispersed(rows)), disturbed=disturbed[1] if disturbed else None)
+        table = table_of(dispersed(rows))
+        return replace(table, disturbed=disturbed[1] if disturbed else None, scattering=self._scattering())
 
     def _gauss_markov(self, walk: Hypothesis) -> Iterator[Hypothesis]:
         """Yield the row of biases that move irregularly and return to their mean after any time, from that of a random
@@ -157,7 +160,7 @@ class Hypotheses:
 
     def _without_effects(self) -> Iterator[Hypothesis]:
         """Yield the rows without an effect: nothing, noise that was not stated, and irregular changes."""
-        marginals, prior = self.evidence.of(), math.log(KINDS["nothing"])
+        marginals, prior = self._of_noise, math.log(KINDS["nothing"])
         log_nothing = float(next(marginal.log for marginal in marginals if not marginal.parts)) + prior
         logs_noise, logs_irregular = list[float](), [log_nothing + math.log(_SHORT)]
         for marginal in (each for each in marginals if each.parts):
@@ -170,15 +173,27 @@ class Hypotheses:
         yield Hypothesis(families=(NOISE,), log_evidence=_log_sum(logs_noise))
         yield Hypothesis(driver=IRREGULAR, families=(NONE,), log_evidence=log_irregular)
 
+    @cached_property
+    def _of_noise(self) -> list[MarginalLikelihood]:
+        """The evidence of the model without further effects, for each set of free parts of the noise."""
+        return self.evidence.of()
+
+    def _scattering(self) -> int:
+        """Return the number of the accelerometer that alone scatters, where that is the likeliest noise; else 0."""
+        likeliest = max(self._of_noise, key=lambda marginal: marginal.log if marginal.parts else -math.inf)
+        part = likeliest.parts[0] if likeliest.parts else ""
+        return OF_ONE.index(part) + 1 if part in OF_ONE else 0
+
     def _share_of_unknown(self, noise: MarginalLikelihood) -> float:
         """Return the share of an unknown cause in these parts of the noise from dwell to dwell.
 
         Where they contradict what was stated, a cause that differs from orientation to orientation explains as much,
         unless repeated orientations tell. Four of five such causes depend on the orientation alone.
         """
-        stated = {"setting": self.before.noise.setting_stated, "common": self.before.noise.scatter_stated}
+        stated = {"setting": self.before.noise.setting_stated}
+        stated |= dict.fromkeys(("common", *OF_ONE), self.before.noise.scatter_stated)
         if not any(stated[part] for part in noise.parts if part in stated):
-            return _NO_NOISE if "common" in noise.parts else 0.0
+            return 0.0 if noise.parts == ("setting",) else _NO_NOISE
         repeats = math.exp(min(log_odds_of_repeating(self.before, noise), 100.0))
         unknown = _AGAINST_STATED * (1.0 - _OF_ORIENTATION + _OF_ORIENTATION * repeats)
         return unknown / (unknown + 1.0 - _AGAINST_STATED)
@@ -373,7 +388,7 @@ class Hypotheses:
             refit = self._refit((*effects, *formulas))
         except UnobservableError:  # the run does not tell its coefficients: nothing speaks for it
             return Hypothesis(effects, formulas, log_evidence=-math.inf)
-        if formulas and self._is_impossible(refit, formulas):
+        if self._is_impossible(refit, effects, formulas):
             return Hypothesis(effects, formulas, log_evidence=-math.inf)
         marginals = self.evidence.of(refit.fit, walk=self.walk in effects)
         if not marginals:
@@ -390,13 +405,21 @@ class Hypotheses:
                 return Hypothesis(effects, formulas, log_evidence=-math.inf)
         return Hypothesis(effects, formulas, "", self._families(effects), log, delta_chi2, best.dof + walks, refit)
 
-    def _is_impossible(self, refit: Calibration, formulas: Sequence[str]) -> bool:
-        """Tell whether a formula of a refit adds what no sensor could have: it is nearly the same as one of the
-        parameters, and follows what else is missing by the little in which it is not."""
-        names = {text.partition("=")[0].strip() for text in formulas}
-        for effect in (each for each in refit.model.effects if str(each) in names):
-            values = np.array([refit.parameters[each.symbol].value or 0.0 for each in effect.coefficients])
-            if np.abs(effect.added(self._stimulus, values)).max() > _IMPOSSIBLE_MPS2:
+    def _is_impossible(self, refit: Calibration, effects: Sequence[str], formulas: Sequence[str]) -> bool:
+        """Tell whether what a refit adds is what no sensor could have.
+
+        A formula may be nearly the same as one of the parameters, and follow what else is missing by the little in
+        which it is not. An effect whose coefficients are far beyond any size that is usual is another one.
+        """
+        names, parameters = {text.partition("=")[0].strip() for text in formulas}, refit.parameters
+        for effect in refit.model.effects:
+            coefficients = [parameters[coefficient.symbol] for coefficient in effect.coefficients]
+            values = np.array([coefficient.value or 0.0 for coefficient in coefficients])
+            if str(effect) in names and np.abs(effect.added(self._stimulus, values)).max() > _IMPOSSIBLE_MPS2:
+                return True
+            usual = effect.typical.of(self.evidence.grade) or effect.typical.navigation
+            least = np.abs(values) - 2.0 * np.array([coefficient.sigma or 0.0 for coefficient in coefficients])
+            if str(effect) in effects and usual and least.max(initial=0.0) > _UNHEARD_OF * usual[1]:
                 return True
         return False
 

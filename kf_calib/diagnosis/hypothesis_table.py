@@ -78,11 +78,14 @@ class HypothesisTable:
 
     disturbed: the dwell in which an oscillation would be the likeliest of all, if other dwells had it, too. certain:
     the row of effects that are missing for sure, where the likeliest row has further ones that nothing shows.
+    scattering: the number of the accelerometer that alone scatters from dwell to dwell, if something does; 0 where
+    others do, too.
     """
 
     rows: tuple[Hypothesis, ...]
     disturbed: DisturbedDwell | None = None
     certain: Hypothesis | None = None
+    scattering: int = 0
 
     def __repr__(self) -> str:
         def name(row: Hypothesis) -> str:

@@ -123,7 +123,7 @@ class FormulaFamily:
         if self.driver.startswith("specific force"):
             across = any(re.search(r"\b[po]\b", text) for text in self.texts)
             return "cross-axis" if across else "nonlinearity"
-        if self.texts[0].startswith(":base") and self.driver.startswith("time"):
+        if self.texts[0].startswith((":base", ":platform")) and self.driver.startswith("time"):
             return "base and platform"
         return next(family for start, family in _CLASSES if self.driver.startswith(start))
 
@@ -271,7 +271,7 @@ def _families(bench: Bench, dwells: Sequence[DwellFactor]) -> Iterator[tuple[str
     """Yield the drivers in words, each with formulas; ``:place = ...`` stands for a rotation of a gimbal or base."""
     yield from _of_force()
     yield from _of_gimbals(len(bench.axes))
-    yield from _of_time(dwells, bool(bench.axes))
+    yield from _of_time(dwells, bench.angles)
     yield from _of_jumps(bench, dwells)
     yield from _of_creep(len(bench.axes), dwells)
     yield from _of_surroundings(bench)
@@ -344,7 +344,8 @@ def _of_jumps(bench: Bench, dwells: Sequence[DwellFactor]) -> Iterator[tuple[str
     for moment_s in between_s[:: len(between_s) // _BETWEEN + 1]:
         yield SCALE_JUMP, [f"a*(t > {moment_s:.6g}*s)"]
         yield ALIGNMENT_JUMP, [f"{axis}*(t > {moment_s:.6g}*s)" for axis in ("p", "o")]
-        if bench.axes:
+        if bench.angles:
+            yield ALIGNMENT_JUMP, [f":platform = t > {moment_s:.6g}*s"]
             yield TILT_JUMP, [f":base = t > {moment_s:.6g}*s"]
 
 
@@ -352,8 +353,8 @@ def _of_surroundings(bench: Bench) -> Iterator[tuple[str, list[str]]]:
     """Yield the formulas of the temperature and of the previous orientation."""
     for terms in (["T"], ["T*T"], ["T", "T*T", "T**3"], ["a*T"], ["a*T*T"], ["a*T", "a*T*T"], ["p*T", "o*T"]):
         yield "temperature", terms
-    if bench.axes:
-        yield "temperature", [":base = T"]
+    if bench.angles:
+        yield from (("temperature", [f":{place} = T"]) for place in ("base", "platform"))
         yield "time", [":base = t"]
     yield "rate of temperature", ["dT"]
     yield "rate of temperature", ["a*dT"]

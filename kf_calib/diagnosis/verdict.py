@@ -160,11 +160,12 @@ def _unknown(diagnosis: Diagnosis, first: Hypothesis) -> str:
         return (
             "It cannot be told whether something unknown changes irregularly from dwell to dwell "
             f"({format_probability(share)}) or the dwells scatter more than was stated ({format_probability(noise)})"
-            f"{_others(diagnosis, but=NOISE)}. To find out, repeat an orientation."
+            f"{_others(diagnosis, but=NOISE)}. To find out, repeat an orientation.{_of_one(diagnosis)}"
         )
     but = f", but {diagnosis.unearned}" if diagnosis.unearned else ""
     said = f"{what} ({format_probability(first.probability)}){but}{_others(diagnosis)}"
-    return f"Unknown: no known effect explains it, {said}."
+    alone = _of_one(diagnosis) if first.driver == IRREGULAR else ""
+    return f"Unknown: no known effect explains it, {said}.{alone}"
 
 
 def _noise(diagnosis: Diagnosis, first: Hypothesis) -> str:
@@ -175,7 +176,13 @@ def _noise(diagnosis: Diagnosis, first: Hypothesis) -> str:
     what = "more than was stated" if dwell_noise_is_stated(diagnosis.before) else "by an amount that was not stated"
     advice = f"state {keys} or repeat an orientation" if keys else "repeat an orientation"
     share = format_probability(first.probability)
-    return f"The dwells scatter {what} ({share}){_others(diagnosis)}. To find out, {advice}."
+    return f"The dwells scatter {what} ({share}){_others(diagnosis)}. To find out, {advice}.{_of_one(diagnosis)}"
+
+
+def _of_one(diagnosis: Diagnosis) -> str:
+    """Return a sentence on the accelerometer that alone scatters; "" where others do, too."""
+    number = diagnosis.table.scattering if diagnosis.table else 0
+    return f" It is accelerometer {number} alone: look at its contacts and its supply." if number else ""
 
 
 def _others(diagnosis: Diagnosis, but: str = "") -> str:

@@ -122,6 +122,7 @@ class Tally:
     - slewing: readings of slews that were used; moving: readings not used because the platform moved.
     - short_dwells: dwells too short for the whole margin after the arrival; least_settling_s: the shortest margin used.
     - turned_deg: largest rotation of the platform within a block that counts as still.
+    - noise_rad: largest noise of angles from message to message, by which more than the tolerance counts as still.
     """
 
     read: int = 0
@@ -144,6 +145,7 @@ class Tally:
     short_dwells: int = 0
     least_settling_s: float = math.inf
     turned_deg: float = 0.0
+    noise_rad: float = 0.0
 
     def sentences(self) -> list[str]:
         """One sentence for each kind of sample that was dropped or rejected."""
@@ -170,6 +172,13 @@ class Tally:
                 f"{self.short_dwells} dwell{' is' if one else 's are'} too short to leave out {stillness.settle_s:g} s "
                 f"after {'its' if one else 'each'} arrival (--settle-s): a third of {'it' if one else 'each'} was left "
                 f"out, {'' if one else 'of the shortest '}{self.least_settling_s:.3g} s."
+            )
+        allowed_deg = math.degrees(stillness.allowed_rad(self.noise_rad))
+        if allowed_deg > stillness.tolerance_deg:
+            sentences.append(
+                f"the angles scatter by {math.degrees(self.noise_rad):.2g} deg (one sigma) from one message to the "
+                f"next, so that up to {allowed_deg:.2g} deg in half a second count as standing still, in place of "
+                f"{stillness.tolerance_deg:g} (--still-deg)."
             )
         if self.turned_deg > _TURNING_DEG:
             sentences.append(

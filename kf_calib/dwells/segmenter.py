@@ -36,7 +36,8 @@ from kf_calib.dwells.blocks import (
     carry_on,
     within,
 )
-from kf_calib.dwells.stationarity import HISTORY, Stillness, encoder_sigma
+from kf_calib.dwells.encoder_noise import EncoderNoise, distance_sigma, encoder_sigma
+from kf_calib.dwells.stationarity import HISTORY, Stillness
 from kf_calib.errors import InputError
 
 BLOCK_SAMPLES = 4000
@@ -74,7 +75,8 @@ class Segmenter:
         self._accel = Stream.empty(3)
         self._pose = Stream.empty(self.bench.pose_width)
         self._turns = np.empty((0, len(self.bench.axes) or 1))  # whole turns that were added to each recorded pose
-        self._early_poses = list[Stream]()  # recorded poses that are later than the readings so far
+        self._noise, self._noise_rad = EncoderNoise(not self.bench.axes), np.empty(0)  # of each recorded pose
+        self._early_poses = list[Stream]()  # recorded poses later than the readings so far, or too few for their noise
         self._last_recorded: tuple[Floats, Floats] | None = None  # the last recorded pose and its turns
         self._temperature = Stream.empty(1)
         self._orders = (StampOrder(), StampOrder(), StampOrder())
@@ -165,10 +167,16 @@ class Segmenter:
             return
         pose = Stream.joined(self._early_poses)
         reached = int(np.searchsorted(pose.time_ns, reached_ns, side="right"))
+        if not final and self._noise.waits_for_more(pose[:reached]):
+            self._early_poses = [pose]
+            return
         pose, self._early_poses = pose[:reached], [pose[reached:]] if reached < len(pose) else []
         continuous, turns = unwrap_pose(pose.values, not self.bench.axes, self._last_recorded)
         self._last_recorded = pose.values[-1], turns[-1]
-        self._pose += Stream(pose.time_ns, continuous)
+        pose = Stream(pose.time_ns, continuous)
+        noise_rad = self._noise.of_next(pose)
+        self.tally.noise_rad = max(self.tally.noise_rad, float(noise_rad.max(initial=0.0)))
+        self._pose, self._noise_rad = self._pose + pose, np.concatenate([self._noise_rad, noise_rad])
         self._turns = np.concatenate([self._turns, turns])
 
     def _usable(self, poses: Floats) -> Mask:
@@ -216,7 +224,7 @@ class Segmenter:
         settle)."""
         times, poses = self._pose.time_ns, self._pose.values
         start = 0 if self._decided_ns is None else int(np.searchsorted(times, self._decided_ns))
-        times, poses = times[start:], poses[start:]
+        times, poses, noise_rad = times[start:], poses[start:], self._noise_rad[start:]
         if len(times) < 2:
             return self._lone_pose(times) if final else []
         complete = times + self.stillness.window_ns <= times[-1]
@@ -224,7 +232,9 @@ class Segmenter:
         if count == 0:
             return []
         complete |= final
-        still, self._cover_ns = self.stillness.intervals(times, poses, not self.bench.axes, complete, self._cover_ns)
+        still, self._cover_ns = self.stillness.intervals(
+            times, poses, not self.bench.axes, complete, self._cover_ns, noise_rad
+        )
         still = still[:count]
         events = self._events(times, still)
         self._decided_ns = int(times[count])
@@ -426,7 +436,7 @@ class Segmenter:
             first = max(first - 1, first_of_dwell)
             last = first + 1
         inside = poses[first:last]
-        if not self.stillness.creeps(inside):
+        if not self.stillness.creeps(inside, not self.bench.axes):
             return self._standing_pose(inside)
         turned_rad = float(pose_distance(inside[-1], inside[0], not self.bench.axes))
         self.tally.turned_deg = max(self.tally.turned_deg, math.degrees(turned_rad))
@@ -444,11 +454,19 @@ class Segmenter:
         dwell_pose = self._dwell.pose
         allowed = 6.0 * inside.std(axis=0) / np.sqrt(len(inside)) + 1e-9
         if dwell_pose is None or (np.abs(mean - dwell_pose) > allowed).any():
-            sigma = float(np.sqrt(np.mean(encoder_sigma(inside) ** 2)))
+            sigma = self._sigma_of_angle(inside)
             self._dwell.pose, self._dwell.pose_sigma_rad = mean, sigma / math.sqrt(len(inside))
             self._encoder_rad = sigma or self._encoder_rad
             return mean
         return dwell_pose
+
+    def _sigma_of_angle(self, inside: Floats) -> float:
+        """Return the noise of an angle in these messages (n, k), rad, alike for all; about each of three axes, where
+        they are attitudes."""
+        sigma = encoder_sigma(inside)
+        if self.bench.axes:
+            return float(np.sqrt(np.mean(sigma**2)))
+        return float(distance_sigma(sigma, True)) / math.sqrt(3.0)
 
     def _forget(self) -> None:
         """Drop the poses and temperatures that no waiting reading needs."""
@@ -457,7 +475,7 @@ class Segmenter:
         if self.slews:  # the curve of a slew begins one window before the slew
             oldest -= self.stillness.window_ns + self.stillness.lead_ns
         needed = slice(max(int(np.searchsorted(self._pose.time_ns, oldest)) - HISTORY, 0), None)
-        self._pose, self._turns = self._pose[needed], self._turns[needed]
+        self._pose, self._turns, self._noise_rad = self._pose[needed], self._turns[needed], self._noise_rad[needed]
         self._temperature = self._temperature[max(int(np.searchsorted(self._temperature.time_ns, oldest)) - 2, 0) :]
 
 

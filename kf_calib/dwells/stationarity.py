@@ -2,8 +2,7 @@
 
 Angles determine a motion only to within their sampling period, and a slew that begins and ends gently stays within any
 tolerance for some time. The remaining motion is detected from the messages of the dwell itself and from the readings.
-The noise of an encoder is estimated from second differences of its messages, to which slow creep does not contribute:
-sigma^2 = <d^2> / 6.
+Noisy angles (``encoder_noise``) have more than the stated tolerance.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats, Mask, Times
 from kf_calib.bench.bench import mean_pose, pose_distance
 from kf_calib.bench.streams import Stream
+from kf_calib.dwells.encoder_noise import distance_sigma, encoder_sigma
 from kf_calib.errors import InputError, check_number
 
 _SECOND_NS = 1_000_000_000
@@ -23,6 +23,7 @@ _FEWEST_BEFORE = 3  # least number of messages with which one is compared
 _LONGEST_PERIOD_NS = 2 * _SECOND_NS  # messages farther apart than this do not determine a departure
 _CREEPING_NS = 10 * _SECOND_NS  # creep that lasts longer than this is taken as permanent
 _LARGEST_DEG = 5.0  # largest tolerance; at it, a platform turning at 10 deg/s would count as still
+_SIGMAS = 12.0  # of an angle message: two that show the same pose differ by no more
 _PARTS = 8  # number of parts of a block whose mean poses are compared
 
 HISTORY = _FEWEST_BEFORE + 2
@@ -80,22 +81,30 @@ class Stillness:
         """Time before an interval from which on messages are needed to judge it, ns."""
         return _CREEPING_NS + 6 * self.window_ns
 
+    def allowed_rad(self, noise_rad: Floats | float) -> Floats:
+        """Largest distance, rad, of two messages of a platform at rest, whose noise is ``noise_rad``: the tolerance, or
+        twelve sigma."""
+        largest = max(self.tolerance_rad, math.radians(_LARGEST_DEG))
+        return np.clip(_SIGMAS * np.asarray(noise_rad), self.tolerance_rad, largest)
+
     def intervals(
-        self, times: Times, poses: Floats, is_quaternion: bool, complete: Mask, covered_ns: int
+        self, times: Times, poses: Floats, is_quaternion: bool, complete: Mask, covered_ns: int, noise_rad: Floats
     ) -> tuple[Mask, int]:
         """Mask (m - 1,) of the intervals between consecutive messages that are still, and the end of the last still
         window.
 
         An interval is still if it lies in a window in which neither a step nor the difference between the ends exceeds
-        the tolerance.
+        what is allowed (``allowed_rad``).
 
         - complete (m,): whether the window that begins with each message is complete.
         - covered_ns: end of the last window that was judged as still before.
+        - noise_rad (m,): noise of the messages.
         """
+        allowed = self.allowed_rad(noise_rad)
         ends = np.minimum(np.searchsorted(times, times + self.window_ns), len(times) - 1)
-        steps = pose_distance(poses[1:], poses[:-1], is_quaternion) <= self.tolerance_rad
+        steps = pose_distance(poses[1:], poses[:-1], is_quaternion) <= allowed[:-1]
         broken = np.concatenate([[0], np.cumsum(~steps)])
-        rest = pose_distance(poses[ends], poses, is_quaternion) <= self.tolerance_rad
+        rest = pose_distance(poses[ends], poses, is_quaternion) <= allowed
         rest &= (broken[ends] == broken) & complete & (ends > np.arange(len(ends)))
         reach = np.maximum.accumulate(np.where(rest, times[ends], covered_ns))
         return (reach[:-1] > times[:-1]) & steps, int(reach[-1])
@@ -157,7 +166,8 @@ class Stillness:
         variance = (curvature[starts + curvature_count[:, 0]] - curvature[starts]) / (
             6.0 * np.maximum(curvature_count, 1)
         )
-        allowed = np.maximum(self.rest_rad, 4.0 * np.sqrt(np.maximum(variance, 0.0).max(axis=1)))
+        sigma = distance_sigma(np.sqrt(np.maximum(variance, 0.0)), is_quaternion)
+        allowed = np.maximum(self.rest_rad, 4.0 * sigma)
         distance = pose_distance(pose.values, means + pose.values[0], is_quaternion)
         return (distance > allowed) & (curvature_count[:, 0] > 0)
 
@@ -178,15 +188,17 @@ class Stillness:
             if times[k] + span_ns > until_ns or end > len(times):
                 return at_ns, False
             following = poses[k + 1 : end]
-            allowed = max(self.rest_rad, 4.0 * float(encoder_sigma(following).max()))
+            sigma = distance_sigma(encoder_sigma(following), is_quaternion)
+            allowed = max(self.rest_rad, 4.0 * float(sigma))
             distance = pose_distance(poses[k], mean_pose(following), is_quaternion)
             if distance <= allowed or np.diff(times[k:end]).max() > span_ns:
                 return at_ns, True
         return arrived_ns, True
 
-    def creeps(self, poses: Floats) -> bool:
+    def creeps(self, poses: Floats, is_quaternion: bool) -> bool:
         """Tell whether the messages (n, k) of a block vary by more than noise about one pose, from the means of its
         parts."""
+        poses = 2.0 * poses if is_quaternion else poses  # the angle of a rotation is twice that in its quaternion
         count, spread = len(poses), np.ptp(poses, axis=0).max()
         if count < 2 or spread <= self.rest_rad:
             return False
@@ -242,13 +254,6 @@ class Stillness:
             return arrival_ns
         moving_ns, standing_ns = accel.time_ns[first + unsettled[-1] :][:2].tolist()
         return (moving_ns + standing_ns) // 2
-
-
-def encoder_sigma(poses: Floats) -> Floats:
-    """Noise of an angle message, one standard deviation (k,), rad, from poses (n, k); 0 for fewer than three."""
-    return (
-        np.sqrt(np.mean(np.diff(poses, 2, axis=0) ** 2, axis=0) / 6.0) if len(poses) > 2 else np.zeros(poses.shape[1])
-    )
 
 
 def _cumulative_sums(values: Floats) -> Floats:

@@ -1,9 +1,9 @@
 """A user's own effect as a formula over what the bench does: ``mine = fx*fy*T``.
 
 One coefficient for each accelerometer, ``mine1 mine2 mine3``; reading i is ``mine_i`` times the formula larger. With
-a gimbal after its name, ``mine:z = sin(3*q_z)``, the formula is an error of that gimbal's angle, and as in
-``mine:base = T`` a tilt of the base about North and East. The quantities (f and a without accelerometer errors, all in
-SI units):
+a gimbal after its name, ``mine:z = sin(3*q_z)``, the formula is an error of that gimbal's angle; as in ``mine:base =
+T`` a tilt of the base about North and East, and as in ``mine:platform = t`` a turn of the platform about its own axes.
+The quantities (f and a without accelerometer errors, all in SI units):
 
 =================  =======  ============================================================================
 name               unit     what it is
@@ -43,8 +43,8 @@ from kf_calib.effects.stimulus import Stimulus
 from kf_calib.errors import InputError
 
 NAME_RULE = "letters, digits, - and _, a letter first, at most 40 of them"
-BASE = "base"
-"""After a formula's name: it tilts the base."""
+BASE, PLATFORM = "base", "platform"
+"""After a formula's name: it tilts the base, or turns the platform, and the block on it."""
 
 _LARGE_RAD = 1e-3
 _LARGE_MPS2 = 1e-3  # what a prior lets a coefficient add to a typical reading
@@ -215,7 +215,8 @@ class Formula(SensorEffect):
 
 
 class FrameFormula(FrameEffect):
-    """An effect ``name:place = expression``: an error of a gimbal's angle, or a tilt of the base about North and East.
+    """An effect ``name:place = expression``: an error of a gimbal's angle, a tilt of the base about North and East, or
+    a turn of the platform about its three axes.
 
     Raises InputError like ``Formula``, and where the expression is not one value for the whole block.
     """
@@ -225,7 +226,8 @@ class FrameFormula(FrameEffect):
 
     def __init__(self, name: str, place: str, expression: str, bench: Bench, checked: bool = True) -> None:
         self.reading, unit, shown = Reading(name, expression, bench), "", ("", 1.0)
-        self.gimbal = None if place == BASE else gimbal_number(place, gimbal_letters(bench.axes))
+        gimbal = None if place in (BASE, PLATFORM) else gimbal_number(place, gimbal_letters(bench.axes))
+        self.place, self.gimbal = place, gimbal
         if checked:
             unit, shown = _units(self.reading, turning=True)
         vars(self).update(name=name, variant=place, title=expression)
@@ -233,7 +235,8 @@ class FrameFormula(FrameEffect):
         stimulus = _trial(bench.axes, bench.gravity_mps2)
         if self.reading(stimulus).shape[1] != 1:
             raise InputError(f"{name}: an angle is one for the whole block: use fx, fy, fz in place of a, p, o and da.")
-        symbols = [f"{symbol_stem(name)}{axis}" for axis in ("NE" if place == BASE else [f"_{place}"])]
+        axes = {BASE: "NE", PLATFORM: "XYZ"}.get(place, [f"_{place}"])
+        symbols = [f"{symbol_stem(name)}{axis}" for axis in axes]
         self._coefficients = tuple(Coefficient(symbol, unit, 1.0, *shown) for symbol in symbols)
         self.remarks = checks.check_effect(self, stimulus) if checked else ()
         scale = _LARGE_RAD / self.reading.typical(stimulus)
@@ -246,6 +249,8 @@ class FrameFormula(FrameEffect):
     def rotations(self, s: Stimulus) -> Floats:
         values = self.reading(s)
         checks.refuse_not_finite(self, values, s)
+        if self.place == PLATFORM:
+            return -values[:, :, None] * np.eye(3)
         axes = [self.about(s)] if self.gimbal is not None else [-s.to_platform(n) for n in s.level_axes]
         return values[:, :, None] * np.stack(axes, axis=1)
 

@@ -96,7 +96,7 @@ class Flexure(FrameEffect):
 
     family = "base and platform"
     name, title, source = "flexure", "bending under the torque of gravity", "linear elasticity"
-    confused_with = "encoder-harmonic-1, cross-coupling, uneven-flexure"
+    confused_with = "encoder-harmonic-1, cross-coupling, uneven-flexure; the bias of a sensor that reports the attitude"
     typical = Typical((5e-6 / STANDARD_GRAVITY_MPS2, 100e-6 / STANDARD_GRAVITY_MPS2))
 
     @property

@@ -241,10 +241,16 @@ def refuse_unseen(result: Calibration) -> None:
         dwells = (
             "1 dwell of this run shows" if len(result.visits) == 1 else f"{len(result.visits)} dwells of this run show"
         )
+        moving = result.tally.moving / max(result.tally.read, 1)
+        restless = (
+            f" {moving:.0%} of the readings count as moving: if the platform stood still in them, raise --still-deg."
+            if moving > 0.5
+            else ""
+        )
         raise UnobservableError(
             f"the {dwells} too few different directions of gravity, so none "
             f"of the parameters can be seen ({', '.join(paper_parameters.SYMBOLS)}): visit at least four spread "
-            "orientations, or state a --prior."
+            f"orientations, or state a --prior.{restless}"
         )
 
 

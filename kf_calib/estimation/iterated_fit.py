@@ -84,7 +84,7 @@ def fit(
     for number in range(_most_passes(model)):
         fitted = _with_constants_searched(fitted, number)
         state, constant_steps = estimate_and_steps(fitted)
-        if not (bench.angles or _sensible(state)):
+        if not _sensible(state, model):
             if must_settle:
                 raise UnobservableError(_not_sensible(model))
             return fitted
@@ -193,6 +193,12 @@ def _along(linearised: LinearisedDwells, noise: Noise) -> Floats | None:
 
 
 def _not_settled(model: Model) -> str:
+    if model.bench.angles:
+        effects = ", ".join(map(str, model.effects))
+        return (
+            f"this run does not tell {effects} and the scale factors apart (the fit does not converge): leave out an "
+            "effect, or visit more orientations."
+        )
     effects = " and ".join(map(str, model.effects))
     return (
         "the sizes of the readings at rest do not determine "
@@ -264,7 +270,7 @@ def _settled(fitted: Fit) -> Fit:
     """Return the fit of the nine parameters with forces and state found in turn until neither moves."""
     for _ in range(_TURNS):
         state = fitted.state
-        if not _sensible(state):
+        if not _sensible(state, fitted.linearised.model):
             break
         left = _left_to_settle(fitted, state)
         fitted = replace(fitted, linearised=_moved_to(fitted, fitted.linearised.model, state))
@@ -293,10 +299,15 @@ def _misfit(fitted: Fit) -> float:
     return float(sum(np.sum((rows[:, -1] - rows[:, :-1] @ state) ** 2) for rows in fitted.all_rows()))
 
 
-def _sensible(state: Floats) -> bool:
-    """Tell whether a state (p,) tells the specific force from the readings."""
-    sensitivity = state[:STATE_COUNT].reshape(3, 4)[:, :3]
-    return bool(np.isfinite(state).all() and np.linalg.cond(sensitivity) < _SINGULAR)
+def _sensible(state: Floats, model: Model) -> bool:
+    """Tell whether a state (p,) can be that of a block: its scale factors are finite and not many times nominal, and
+    without angles they tell the specific force from the readings. With angles, effects alone may lead a fit astray."""
+    if model.bench.angles and not model.effects:
+        return True
+    sensitivity, usual = (each[:STATE_COUNT].reshape(3, 4)[:, :3] for each in (state, model.nominal_state()))
+    if not np.isfinite(state).all() or np.abs(sensitivity).max() > _SINGULAR * np.abs(usual).max():
+        return False
+    return model.bench.angles or bool(np.linalg.cond(sensitivity) < _SINGULAR)
 
 
 def _setting_deg(dwells: Sequence[DwellFactor], bench: Bench) -> float | None:

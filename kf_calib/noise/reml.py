@@ -42,8 +42,11 @@ _SIGNIFICANT = 5.41  # 1 % point of the likelihood-ratio statistic of a variance
 _WALK = 0.5  # a walk has to gain at least this much log-likelihood
 _JUDGED = 3.84  # 2.5 % point of that statistic: a setting error that is clearer belongs to the noise that judges
 
-Part = Literal["setting", "common", "scatter", "walk"]
+Part = Literal["setting", "common", "scatter", "walk", "first", "second", "third"]
 Parts = tuple[Part, ...]
+
+OF_ONE: Parts = ("first", "second", "third")
+"""The scatter of one accelerometer alone, as of a bad contact; "scatter" is that of each, "common" one of all."""
 
 
 @dataclass(frozen=True)
@@ -340,6 +343,8 @@ def _shapes(part: Part, means: Means, state: Floats) -> Floats:
     if part == "setting":
         return setting_covariances(means, state)[None]
     of_each = np.eye(3)[:, None, :, None] * np.eye(3)[:, None, None, :]
+    if part in OF_ONE:
+        return of_each[[OF_ONE.index(part)]]
     return of_each if part == "scatter" else of_each.sum(axis=0, keepdims=True)
 
 
@@ -366,6 +371,7 @@ def _units(means: Means) -> dict[Part, Floats]:
         "common": np.full(1, size.mean()),
         "scatter": size,
         "walk": np.full(1, 2.0 * size.mean() / math.sqrt(span_s)),
+        **{part: size[[k]] for k, part in enumerate(OF_ONE)},
     }
 
 

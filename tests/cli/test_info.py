@@ -100,6 +100,47 @@ def test_what_messages_in_json_have(facts: Any, tmp_path: Path) -> None:
     assert "TOPIC" not in facts(path, "--field", "accel=/imu:l.v@t", "--field", "attitude=/imu:acc@t")["command"]
 
 
+@pytest.mark.parametrize(
+    ("stamped", "proposed"), [(True, "/tool:pose.orientation"), (False, "/tool:pose.orientation@TIME")]
+)
+def test_a_quaternion_in_messages_is_proposed_as_attitude(
+    facts: Any, tmp_path: Path, stamped: bool, proposed: str
+) -> None:
+    """As of the pose of a robot's tool; axes of gimbals are not asked for then."""
+    path = tmp_path / "json.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        imu, tool = (writer.register_channel(topic, "json", 0) for topic in ("/imu", "/tool"))
+        for k in range(20):
+            at = {"header": {"stamp": {"sec": 1, "nanosec": k * 10**7}}} if stamped else {}
+            turned = {"position": {"x": 0, "y": 0, "z": 0}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}
+            writer.add_message(imu, k * 10**7, json.dumps(at | {"acc": [0, 0, 9.81]}).encode(), 0)
+            writer.add_message(tool, k * 10**7, json.dumps(at | {"pose": turned}).encode(), 0)
+        writer.finish()
+    found = facts(path, "--field", "accel=/imu:acc")
+    assert found["command"].endswith(f"--field attitude={proposed} --gravity 9.81")
+    assert not any("axes" in each for each in found["missing"])
+
+
+def test_the_orientation_in_an_imu_is_not_proposed(facts: Any, tmp_path: Path) -> None:
+    """It is what that sensor makes of the readings that are to be calibrated."""
+    path = tmp_path / "json.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("sensor_msgs/msg/Imu", "jsonschema", b"")
+        imu = writer.register_channel("/imu", "json", schema)
+        for k in range(20):
+            message = {"header": {"stamp": {"sec": 1, "nanosec": k * 10**7}},
+                       "orientation": {"x": 0, "y": 0, "z": 0, "w": 1},
+                       "linear_acceleration": {"x": 0, "y": 0, "z": 9.81}}  # fmt: skip
+            writer.add_message(imu, k * 10**7, json.dumps(message).encode(), 0)
+        writer.finish()
+    command = facts(path)["command"]
+    assert "attitude=" not in command and "--field angles=TOPIC:OUTER,MIDDLE,INNER@TIME" in command
+
+
 def test_gaps_and_times_that_go_back() -> None:
     step, topic = 10_000_000, Topic("/a", "", "cdr")
     times = START_NS + step * np.arange(5000)

@@ -24,6 +24,7 @@ from kf_calib.effects.sensor import SecondOrder
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.results import Calibration
 from kf_calib.noise.noise_model import mean_covariances
+from kf_calib.noise.reml import OF_ONE
 from kf_calib.sources.simulation.physics import Ambient
 from kf_calib.sources.simulation.sensors import GRADES, TrueNoise
 from kf_calib.sources.simulation.simulator import Simulation
@@ -56,9 +57,9 @@ def before() -> Calibration:
     return Refits().of(replace(found, bench=replace(found.bench, scatter_sigma_mps2=None)), ())
 
 
-def _dense(result: Calibration, scatter_mps2: float) -> tuple[Floats, Floats]:
+def _dense(result: Calibration, scatter_mps2: Floats | float) -> tuple[Floats, Floats]:
     """Whitened columns and readings of the means of dwells, by a dense Cholesky factor of each dwell."""
-    noise = replace(result.noise, scatter_mps2=np.full(3, scatter_mps2), walk_mps2_per_sqrt_s=0.0)
+    noise = replace(result.noise, scatter_mps2=scatter_mps2 * np.ones(3), walk_mps2_per_sqrt_s=0.0)
     means = result.linearised.means
     lower = np.linalg.cholesky(mean_covariances(noise, means, result.linearised.state))
     columns = np.linalg.solve(lower, np.concatenate([means.design, means.readings[:, :, None]], axis=2))
@@ -75,22 +76,26 @@ def _left(columns: Floats, readings: Floats) -> float:
 def test_falls_are_those_of_dense_least_squares(before: Calibration) -> None:
     """The effect shows in the means of dwells alone, where dense least squares sees it, too."""
     refit = Refits().with_effects(before, ("second-order",))
-    for own in Evidence(before.fit).of(refit.fit):
+    found = [own for own in Evidence(before.fit).of(refit.fit) if "setting" not in own.parts]
+    assert {own.parts for own in found} == {(), ("common",)}
+    for own in found:
         scatter = dict(zip(own.parts, own.sizes, strict=True)).get("common", 0.0)
-        if "setting" in own.parts:
-            continue
         fall = _left(*_dense(before, scatter)) - _left(*_dense(refit, scatter))
         assert own.delta_chi2 == pytest.approx(fall, rel=2e-3) and own.dof == 3
 
 
-def test_scatter_of_unknown_size_is_averaged_out(before: Calibration) -> None:
-    """Against a sum over a grid of sizes, with a flat prior of their logarithm over a factor of 1e4."""
+@pytest.mark.parametrize("of_one", [False, True])
+def test_scatter_of_unknown_size_is_averaged_out(before: Calibration, of_one: bool) -> None:
+    """Against a sum over a grid of sizes, with a flat prior of their logarithm over a factor of 1e4; of all
+    accelerometers, or of one of three, which has a tenth of the prior."""
     found = {own.parts: own for own in Evidence(before.fit).of()}
-    own, still = found["common",], found[()]
+    (part,) = [part for part in OF_ONE if (part,) in found]
+    own, still = found[part if of_one else "common",], found[()]
+    direction = np.eye(3)[OF_ONE.index(part)] if of_one else np.ones(3)
 
     def likelihood(scatter: float) -> float:
-        columns, readings = _dense(before, scatter)
-        noise = replace(before.noise, scatter_mps2=np.full(3, scatter), walk_mps2_per_sqrt_s=0.0)
+        columns, readings = _dense(before, scatter * direction)
+        noise = replace(before.noise, scatter_mps2=scatter * direction, walk_mps2_per_sqrt_s=0.0)
         spread = mean_covariances(noise, before.linearised.means, before.linearised.state)
         unit = before.linearised.means.design.reshape(-1, columns.shape[1])
         basis = np.linalg.svd(unit / np.linalg.norm(unit, axis=0), full_matrices=False)[2].T
@@ -100,7 +105,8 @@ def test_scatter_of_unknown_size_is_averaged_out(before: Calibration) -> None:
 
     sizes = np.geomspace(own.sizes[0] / 100.0, own.sizes[0] * 100.0, 201)
     grid = logsumexp([likelihood(size) for size in sizes]) - np.log(len(sizes))
-    assert own.log - still.log == pytest.approx(grid - likelihood(0.0), abs=0.04)
+    prior = np.log(0.1 / 3.0) if of_one else 0.0
+    assert own.log - still.log - prior == pytest.approx(grid - likelihood(0.0), abs=0.08 if of_one else 0.04)
 
 
 def test_an_effect_that_is_there_beats_one_that_is_not(before: Calibration) -> None:

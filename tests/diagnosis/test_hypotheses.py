@@ -13,6 +13,7 @@ from helpers.hidden_effects import noisy_run, noisy_source, run, source
 from helpers.known_runs import diagnosed
 from helpers.synthetic import plan_of
 
+from kf_calib.diagnosis import hypotheses
 from kf_calib.diagnosis.hypotheses import Hypotheses, dispersed, log_odds_of
 from kf_calib.diagnosis.hypothesis_table import ALIKE, IRREGULAR, NOISE, NONE, NOTHING, Hypothesis, table_of
 from kf_calib.diagnosis.missing_effect import diagnose
@@ -113,6 +114,21 @@ def test_a_pair_that_the_run_does_not_determine_is_no_explanation(monkeypatch: p
     monkeypatch.setattr(Refits, "of", of)
     found = diagnose(source("second-order=8sigma", plan=plan_of(10, dwell_s=4.0, seed=5)))
     assert found.table and found.table.first.effects and all(len(row.effects) < 2 for row in found.table.rows)
+
+
+def test_a_coefficient_far_beyond_the_usual_is_that_of_another_effect(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By two sigma at least; the variance of the readings followed one dwell with 2e10 µg/g²."""
+    before, refits = run("second-order=15sigma"), Refits()
+    rows_of = Hypotheses(refits, before, refits.assess(before))
+    refit = refits.with_effects(before, ("second-order",))
+    (effect,) = refit.model.effects
+    usual = effect.typical.of(rows_of.evidence.grade)
+    assert usual is not None
+    found = [refit.parameters[each.symbol] for each in effect.coefficients]
+    times = max((abs(each.value or 0.0) - 2.0 * (each.sigma or 0.0)) / usual[1] for each in found)
+    for limit, possible in ((1.001 * times, True), (0.999 * times, False)):
+        monkeypatch.setattr(hypotheses, "_UNHEARD_OF", limit)
+        assert np.isfinite(rows_of._row(("second-order",), 0.0).log_evidence) == possible
 
 
 @pytest.mark.parametrize(("probability", "text"), [

@@ -8,7 +8,7 @@ from helpers.thresholds import begins_at
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import Stream
-from kf_calib.dwells.stationarity import Stillness, encoder_sigma
+from kf_calib.dwells.stationarity import Stillness
 
 S = 1_000_000_000
 STILLNESS = Stillness()
@@ -24,12 +24,6 @@ def every(period_s: float, until_s: float) -> Floats:
     return np.arange(0.0, until_s + 1e-9, period_s)
 
 
-def test_an_encoder_is_as_noisy_as_its_messages_scatter_about_a_line() -> None:
-    noise = np.random.default_rng(1).normal(size=(20_000, 2)) * [3e-5, 1e-4]
-    assert encoder_sigma(noise + np.linspace(0.0, 5.0, 20_000)[:, None]) == pytest.approx([3e-5, 1e-4], rel=0.03)
-    assert not encoder_sigma(noise[:2]).any()
-
-
 def test_messages_are_still_where_a_window_of_them_stays_within_the_tolerance() -> None:
     """Against all windows of half a second one by one: those without a step or a difference of ends beyond 0.05 deg."""
     rng = np.random.default_rng(2)
@@ -38,7 +32,7 @@ def test_messages_are_still_where_a_window_of_them_stays_within_the_tolerance() 
         degrees = np.cumsum(rng.normal(size=80) * rng.choice([0.002, 0.03], 80, p=[0.8, 0.2]))
         pose = course(seconds, degrees)
         complete = pose.time_ns + STILLNESS.window_ns <= pose.time_ns[-1]
-        still, covered_ns = STILLNESS.intervals(pose.time_ns, pose.values, False, complete, 0)
+        still, covered_ns = STILLNESS.intervals(pose.time_ns, pose.values, False, complete, 0, np.zeros(80))
         expected, reach = np.zeros(79, bool), 0
         for k in np.flatnonzero(complete):
             end = int(np.flatnonzero(pose.time_ns >= pose.time_ns[k] + STILLNESS.window_ns)[0])
@@ -53,7 +47,7 @@ def test_a_block_creeps_where_its_parts_differ_by_more_than_a_fiftieth_of_the_to
     """A step in its middle, half of which is the distance of either side from the median; of two messages, which tell
     no noise, one as large as the tolerance."""
     sides, seconds = np.repeat([0.0, 1.0], count // 2), 0.1 * np.arange(count)
-    step = begins_at(lambda deg: STILLNESS.creeps(course(seconds, deg * sides).values), 1e-5, 1.0)
+    step = begins_at(lambda deg: STILLNESS.creeps(course(seconds, deg * sides).values, False), 1e-5, 1.0)
     assert step == pytest.approx(0.05 if count == 2 else 2.0 * REST_DEG, rel=1e-6)
 
 
@@ -62,8 +56,8 @@ def test_noise_of_an_encoder_is_no_creep() -> None:
     rng, seconds = np.random.default_rng(5), every(0.02, 10.0)
     for deg in (0.003, 0.03):
         blocks = [rng.normal(size=len(seconds)) * deg for _ in range(100)]
-        assert not any(STILLNESS.creeps(course(seconds, block).values) for block in blocks)
-        assert all(STILLNESS.creeps(course(seconds, block + 0.6 * deg * seconds).values) for block in blocks)
+        assert not any(STILLNESS.creeps(course(seconds, block).values, False) for block in blocks)
+        assert all(STILLNESS.creeps(course(seconds, block + 0.6 * deg * seconds).values, False) for block in blocks)
 
 
 @pytest.mark.parametrize(("period_s", "early_s"), [(0.1, 0.0), (0.4, 0.15), (1.0, 0.75), (3.0, 1.75)])

@@ -481,10 +481,10 @@ def test_a_model_prints_itself() -> None:
 @pytest.mark.parametrize(
     "text, same_as",
     [("mine:z = 1*rad", "encoder-offset:z"), ("mine:x = q_x", "encoder-scale:x"), ("mine:base = 1*rad", "base-tilt"),
-     ("mine:base = t*rad/(1*s)", "base-tilt-drift")],
+     ("mine:base = t*rad/(1*s)", "base-tilt-drift"), ("mine:platform = t*rad/(1*s)", "platform-drift")],
 )  # fmt: skip
 def test_a_formula_of_a_place_turns_it(text: str, same_as: str) -> None:
-    """An error of a gimbal's angle or a tilt of the base, through the same chain as the catalogue's."""
+    """An error of a gimbal's angle, a tilt of the base or a turn of the platform, as those of the catalogue are."""
     effect, known = effect_named(text, EXAMPLE), effect_named(same_as, EXAMPLE)
     stimulus = trial(EXAMPLE)
     np.testing.assert_allclose(effect.columns(stimulus), known.columns(stimulus), rtol=1e-12, atol=1e-12)

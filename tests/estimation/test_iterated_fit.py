@@ -81,15 +81,32 @@ def test_a_step_that_goes_back_is_halved_and_one_that_goes_on_grows_by_a_quarter
     assert begins_at(lambda deg: second(deg) < 1.0, 90.0, 179.0) == pytest.approx(120.0)
 
 
+WITHOUT_ANGLES, WITH_ANGLES, ALONE = (
+    SimpleNamespace(bench=SimpleNamespace(angles=angles), effects=effects, nominal_state=lambda: affine_state(2.0))
+    for angles, effects in ((False, ()), (True, ("scale-drift",)), (True, ()))
+)
+
+
+def affine_state(condition: float) -> np.ndarray:
+    """Of sensitivities of 1 and 2, of this condition number."""
+    return np.column_stack([np.diag([1.0, 2.0, 2.0 / condition]), np.ones(3)]).ravel()
+
+
 def test_axes_that_are_nearly_in_one_plane_tell_no_force() -> None:
-    """From a condition number of a hundred on."""
-
-    def state(condition: float) -> np.ndarray:
-        return np.column_stack([np.diag([1.0, 2.0, 2.0 / condition]), np.ones(3)]).ravel()
-
-    singular = begins_at(lambda condition: not iterated_fit._sensible(state(condition)), 2.0, 1e4)
+    """From a condition number of a hundred on; with angles a channel may be dead."""
+    singular = begins_at(
+        lambda condition: not iterated_fit._sensible(affine_state(condition), WITHOUT_ANGLES), 2.0, 1e4
+    )
     assert singular == pytest.approx(100.0, rel=1e-6)
-    assert not iterated_fit._sensible(state(2.0) * np.nan)
+    assert iterated_fit._sensible(affine_state(1e9), WITH_ANGLES)
+
+
+@pytest.mark.parametrize("model", [WITHOUT_ANGLES, WITH_ANGLES])
+def test_scale_factors_a_hundred_times_nominal_are_those_of_no_block(model: Any) -> None:
+    size = begins_at(lambda size: not iterated_fit._sensible(size * affine_state(2.0), model), 1.0, 1e4)
+    assert size == pytest.approx(100.0, rel=1e-6)
+    assert not iterated_fit._sensible(affine_state(2.0) * np.nan, model)
+    assert iterated_fit._sensible(1e3 * affine_state(2.0), ALONE)  # as of counts, which a check of the unit tells
 
 
 def test_the_error_of_the_temperature_matters_to_effects_alone(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -40,6 +40,14 @@ def test_a_mistyped_pose_is_named_and_mended(options, number: int, gimbal: int, 
         assert parameter.value == pytest.approx(run.sensors.parameters[symbol], abs=5 * parameter.sigma)
 
 
+@pytest.mark.parametrize(("number", "error_deg", "warming"), [(1, 0.02, True), (1, 2.0, False), (2, 0.02, False)])
+def test_the_first_dwell_may_have_been_warming_up(number: int, error_deg: float, warming: bool) -> None:
+    """If it is off by less than 10 mg."""
+    run = short_run()
+    (found,) = calibrate(Altered(run, poses=mistyped(run, number, 2, error_deg))).outlying
+    assert (" or the block was still warming up; without it" in str(found)) == warming
+
+
 def test_where_two_dwells_could_be_it_both_are_named() -> None:
     """Of six faces, opposite ones only are told by each other."""
     run = short_run(plan="faces")

@@ -196,7 +196,7 @@ def test_angles_look_like_degrees_from_three_turns_on() -> None:
 
 
 def test_degrees_of_a_noisy_encoder_in_which_nothing_stands_still() -> None:
-    run = short_run(encoder_sigma_deg=0.02, angle_hz=50.0)
+    run = short_run(encoder_sigma_deg=0.2, angle_hz=50.0)
     with pytest.raises(InputError, match=r"look like degrees \(--angle-unit deg\)"):
         calibrate(Altered(run, poses=lambda _, q: np.degrees(q)))
 

@@ -17,6 +17,8 @@ from kf_calib.bench.streams import Batch, Stream
 G = 9.81262
 HZ, DWELL_S, SLEW_S = 20.0, 8.0, 4.0
 BENCH = Bench(axes_of("yzx"), G, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
+ROBOT = Bench((), G, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
+"""It records its attitude in place of gimbal angles."""
 
 
 @dataclass(frozen=True)
@@ -41,15 +43,18 @@ def _none(state: State) -> np.ndarray:
 @dataclass(frozen=True)
 class IndependentBench:
     """A source. gimbals: errors of the angles (n, 3), rad; base, mount: rotation vectors (n, 3) of the base, in the
-    bench, and of the block, in the platform; scale: share (n, 3) by which the readings are too large."""
+    bench, and of the block, in the platform; scale: share (n, 3) by which the readings are too large; bias:
+    what is added to them, m/s^2. pose_noise_rad: of each recorded angle, or of the attitude about each axis."""
 
     seed: int
     dwells: int = 24
     white_mps2: float = 5e-5
+    pose_noise_rad: float = 0.0
     gimbals: Error = _none
     base: Error = _none
     mount: Error = _none
     scale: Error = _none
+    bias: Error = _none
     bench: Bench = BENCH
     warnings: tuple[str, ...] = ()
 
@@ -83,7 +88,12 @@ class IndependentBench:
         axes = np.eye(3) + 1e-3 * rng.standard_normal((3, 3))
         along = in_bench.inv().apply([0.0, G, 0.0]) @ (axes / np.linalg.norm(axes, axis=1)[:, None]).T
         scales, biases = 1.0 + 3e-4 * rng.standard_normal(3), 2e-3 * rng.standard_normal(3)
-        readings = (scales + self.scale(state)) * along + biases
+        readings = (scales + self.scale(state)) * along + biases + self.bias(state)
         readings += self.white_mps2 * rng.standard_normal(readings.shape)
         time_ns = np.rint(state.time_s * 1e9).astype(np.int64) + 1_700_000_000_000_000_000
-        yield Batch(Stream(time_ns, readings), Stream(time_ns, state.angles_rad))
+        pose, noise_rad = state.angles_rad, self.pose_noise_rad * rng.standard_normal((len(time_ns), 3))
+        if not self.bench.axes:
+            pose = (Rotation.from_euler("YZX", pose) * Rotation.from_rotvec(noise_rad)).as_quat()
+        else:
+            pose = pose + noise_rad
+        yield Batch(Stream(time_ns, readings), Stream(time_ns, pose))

@@ -15,7 +15,7 @@ from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.design import gimbal_limits, optimality_criteria
 from kf_calib.design.gimbal_limits import Reach
-from kf_calib.dwells import coherent_tone, line_spectrum, stationarity
+from kf_calib.dwells import coherent_tone, encoder_noise, line_spectrum
 from kf_calib.dwells.rest_in_readings import RestSegmenter
 from kf_calib.dwells.segmenter import Segmenter
 from kf_calib.estimation import signal_quality
@@ -108,7 +108,7 @@ def signals() -> Numbers:
         crowds=[signal_quality.clustering(each, counts)[0] for each in (*hits, *crowded)],
         lines=[line_spectrum.lines([each]) for each in spectra], together=line_spectrum.lines(spectra),
         lowest=line_spectrum.lowest_hz(spectra), tones=[coherent_tone.tone(traces) for traces in _traces(rng)],
-        encoders=[stationarity.encoder_sigma(size * rng.normal(size=(90, 3))) for size in (1e-6, 1e-3)],
+        encoders=[encoder_noise.encoder_sigma(size * rng.normal(size=(90, 3))) for size in (1e-6, 1e-3)],
     )  # fmt: skip
 
 

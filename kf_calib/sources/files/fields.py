@@ -15,7 +15,7 @@ letter of the gimbal's axis. As many joints of other names, or of none, are the 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from functools import cached_property
@@ -116,6 +116,17 @@ _KNOWN = {
 }
 
 
+def attitude_in(paths: Collection[str]) -> str | None:
+    """The path to the first quaternion x, y, z, w among these paths to numbers; None where there is none."""
+    ends = (path.removesuffix(".w") for path in paths if path.endswith(".w"))
+    return next((end for end in ends if all(f"{end}.{axis}" in paths for axis in _XYZ)), None)
+
+
+def has_time(paths: Collection[str]) -> bool:
+    """Tell whether messages with these paths to numbers have their time where it usually is."""
+    return any(path == time or path.startswith(f"{time}.") for time in _USUAL_TIMES for path in paths)
+
+
 def known_fields(schema: str) -> Fields | None:
     """Those of a message of ROS or Foxglove, by the name of its schema; None where it is none of these."""
     return _KNOWN.get(schema.replace("/msg/", "/"))
@@ -197,12 +208,14 @@ def _number(value: Any, path: str) -> float:
 
 
 def _flat(value: Any) -> Iterator[Any]:
-    """All that is in lists of lists, which may be nested deeply."""
+    """All that is in lists of lists, which may be nested deeply, and in vectors and quaternions: x, y, z and w."""
     waiting = [value]
     while waiting:
         first = waiting.pop()
         if _is_list(first):
             waiting += reversed(first)
+        elif not isinstance(first, int | float) and {*_XYZ} <= (names := {*_names_in(first)}) <= {*_XYZ, "w"}:
+            waiting += [_at(first, [name], name) for name in ("w", *reversed(_XYZ)) if name in names]
         else:
             yield first
 

@@ -112,6 +112,25 @@ def test_attitude_by_fields(tmp_path: Path) -> None:
     assert abs(found.pose.time_ns - batch.pose.time_ns).max() < 200  # what a float of seconds since 1970 holds
 
 
+def test_a_path_to_x_y_z_and_w_is_one_to_all_of_them(tmp_path: Path) -> None:
+    """Whatever their order is, as the pose of a tool and the list of transforms of a robot have them; not to other
+    objects."""
+    batch = Batch(BATCH.accel, Stream(BATCH.pose.time_ns, np.insert(BATCH.pose.values, 3, 1.0, axis=1)))
+    topics = {
+        "/imu": ("", lambda at, v: {"header": ros_time(at), "a": xyz(v)}),
+        "/pose": ("", lambda at, v: {"header": ros_time(at), "pose": {"orientation": dict([*xyz(v).items()][::-1])}}),
+        "/tf": ("", lambda at, v: {"transforms": [{"header": ros_time(at), "rotation": xyz(v)}]}),
+    }
+    path, bench = tmp_path / "j.mcap", Bench((), gravity_mps2=9.81).to_metadata()
+    for field in ("/pose:pose.orientation", "/tf:transforms.0.rotation@transforms.0.header.stamp"):
+        topic = field.partition(":")[0]
+        write_json(path, {key: topics[key] for key in ("/imu", topic)}, batch)
+        assert_equal(read(Recording(path, bench, fields=["accel=/imu:a", f"attitude={field}"])), batch)
+    write_json(path, {key: topics[key] for key in ("/imu", "/pose")}, batch)
+    with pytest.raises(KfCalibError, match="pose in a message is an object with orientation in place of a number"):
+        read(Recording(path, bench, fields=["accel=/imu:a", "attitude=/pose:pose"]))
+
+
 def test_replay_gives_identical_numbers(tmp_path: Path) -> None:
     original = Recording(HERE / "mems_faces.mcap")
     heated = read(original)
@@ -148,7 +167,7 @@ BROKEN: dict[str, tuple[Shape, str]] = {
     "another name": (lambda at, v: {"t_ns": at, "acceleration": v}, "a message has no acc: it has t_ns, acceleration"),
     "too few": (lambda at, v: {"t_ns": at, "acc": v[:2]}, "acc gives 2 numbers a message in place of 3"),
     "text": (lambda at, v: {"t_ns": at, "acc": ["a", "b", "c"]}, "acc in a message is 'a' in place of a number"),
-    "objects": (lambda at, v: {"t_ns": at, "acc": xyz(v)}, "acc in a message is an object with x, y, z"),
+    "objects": (lambda at, v: {"t_ns": at, "acc": xyz(v) | {"t": 0}}, "acc in a message is an object with x, y, z, t"),
     "no time": (lambda at, v: {"acc": v}, "a message has no t_ns: it has acc"),
     "time of text": (lambda at, v: {"t_ns": "noon", "acc": v}, "t_ns in a message is 'noon', not a time such as 2026"),
     "time of nothing": (lambda at, v: {"t_ns": None, "acc": v}, "t_ns in a message is no time: name another"),
@@ -281,7 +300,7 @@ def test_messages_in_protobuf(tmp_path: Path) -> None:
         ({"schema": b"nothing"}, IN_PROTOBUF, "its schema 'bench.Accel' does not say what its protobuf messages are"),
         ({"data": b"\xff\xff"}, IN_PROTOBUF, "a message is no bench.Accel in protobuf"),
         ({}, ("accel=/accel:w", IN_PROTOBUF[1]), "a message has no w: it has at, v, list"),
-        ({}, ("accel=/accel:v", IN_PROTOBUF[1]), "v in a message is an object with x, y, z"),
+        ({}, ("accel=/accel:at", IN_PROTOBUF[1]), "at in a message is an object with"),
     ],
 )
 def test_broken_messages_in_protobuf(tmp_path: Path, options: Any, fields: Any, says: str) -> None:
