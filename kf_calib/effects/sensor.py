@@ -20,6 +20,7 @@ from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 IEEE = "IEEE Std 1293, model equation"
 _EDGES = 500
+_ROUNDING_MPS2 = 1e-9  # has a sign, too
 _INPUT = Regressor("a", "force along the input axis", "m/s^2")
 
 
@@ -35,7 +36,7 @@ class BiasAsymmetry(SensorEffect):
     typical = Typical((1 * MICRO_G, 10 * MICRO_G))
 
     def terms(self, s: Stimulus) -> Floats:
-        return 0.5 * np.sign(s.along)
+        return 0.5 * np.sign(np.where(np.abs(s.along) > _ROUNDING_MPS2, s.along, 0.0))
 
 
 class ScaleAsymmetry(SensorEffect):
