@@ -27,6 +27,11 @@ def lengths(vectors: Floats) -> Floats:
         return np.asarray(np.linalg.norm(vectors, axis=1))
 
 
+def sign(values: Floats, least: float = 1e-9) -> Floats:
+    """The sign of numbers in SI; 0 of those that are no larger than what rounding leaves of zero."""
+    return np.sign(np.where(np.abs(values) > least, values, 0.0))
+
+
 def first_least(values: Floats, tie: float = 1e-9) -> int:
     """Index of the least of numbers (n,); the first of those that are as small but for rounding.
 

@@ -16,7 +16,6 @@ from kf_calib.errors import InputError
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 
-
 class BaseTilt(FrameEffect):
     """A base turned by (delta_N, delta_E): the specific force turns the other way in it."""
 

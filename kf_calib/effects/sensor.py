@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import Floats, sign
 from kf_calib.effects.effect import (
     MICRO_G,
     MICRO_PER_G,
@@ -20,7 +20,6 @@ from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 IEEE = "IEEE Std 1293, model equation"
 _EDGES = 500
-_ROUNDING_MPS2 = 1e-9  # has a sign, too
 _INPUT = Regressor("a", "force along the input axis", "m/s^2")
 
 
@@ -36,7 +35,7 @@ class BiasAsymmetry(SensorEffect):
     typical = Typical((1 * MICRO_G, 10 * MICRO_G))
 
     def terms(self, s: Stimulus) -> Floats:
-        return 0.5 * np.sign(np.where(np.abs(s.along) > _ROUNDING_MPS2, s.along, 0.0))
+        return 0.5 * sign(s.along)
 
 
 class ScaleAsymmetry(SensorEffect):
