@@ -223,17 +223,15 @@ def test_an_oscillation_of_one_cycle_a_dwell_is_not_taken_for_slow_noise(size: i
 @pytest.mark.slow
 @pytest.mark.parametrize("seeds, dwells", [(range(1), 12), (range(22), 16)])
 def test_slow_noise_is_not_taken_for_an_oscillation(seeds: range, dwells: int) -> None:
-    """Of 1/f noise within dwells and a walk, which the means of the dwells follow; at most it is one of several. In a
-    few runs one dwell alone does not fit."""
-    outlying = 0
+    """Of 1/f noise within dwells and a walk, which the means of the dwells follow; at most it is one of several. Nor
+    is the dwell that lies farthest off taken for a wrong one: its neighbours share much of what it has."""
     for seed in seeds:
         noise = {"walk_mps2_per_sqrt_s": 2e-5, "flicker_mps2": 3e-5}
         found = diagnose(source(seed=seed, dwells=dwells, **noise), replicate=False)
         assert not found.before.consistency.quiet
-        outlying += bool(found.before.outlying)
+        assert not found.before.outlying
         probability = found.table.probability(("sinusoid",)) if found.table else 0.0
         assert "sinusoid" not in found.missing or probability < 0.35, found.verdict
-    assert outlying <= 3
 
 
 @pytest.mark.slow  # vibration alone: below; which tests count beside it: test_missing_effect.py
