@@ -11,7 +11,7 @@ import pytest
 from helpers.paths import ROOT
 
 _CORES = {"Haswell": ("X86_V3",), "Prescott": ()}
-"""Kernels of OpenBLAS by its name for a processor, and what numpy may use of those instructions that it chooses from."""
+"""Kernels of OpenBLAS by its name for a processor, and which of its wider instructions numpy may use."""
 
 _CASES = "plans or mems or second_order or without_angles or orientations or position_feedback"
 
