@@ -27,6 +27,20 @@ def lengths(vectors: Floats) -> Floats:
         return np.asarray(np.linalg.norm(vectors, axis=1))
 
 
+def sign(values: Floats, least: float = 1e-9) -> Floats:
+    """The sign of numbers in SI; 0 of those that are no larger than what rounding leaves of zero."""
+    return np.sign(np.where(np.abs(values) > least, values, 0.0))
+
+
+def first_least(values: Floats, tie: float = 1e-9) -> int:
+    """Index of the least of numbers (n,); the first of those that are as small but for rounding.
+
+    Processors round differently. By ``argmin`` one of several equal choices would be another on each.
+    """
+    least = float(values.min())
+    return int(np.argmax(values <= least + tie * max(abs(least), 1.0)))
+
+
 def crossed(one: Floats, other: Floats) -> Floats:
     """The cross products (n, 3) of vectors (n, 3); ``np.cross`` takes several times as long."""
     (a, b, c), (x, y, z) = one.T, other.T

@@ -21,7 +21,7 @@ from functools import cached_property
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats, Ints, Mask
+from kf_calib.bench.arrays import Floats, Ints, Mask, first_least
 from kf_calib.design import optimality_criteria
 from kf_calib.design.gimbal_limits import Reach, wrap
 from kf_calib.design.optimality_criteria import Aim, Score
@@ -37,6 +37,8 @@ _SCATTERED, _ABOUT = 256, 48
 _OTHERS = 6  # random starts of an exchange without continuous refinement
 _FEW = 16  # up to this number of orientations, several starts are needed
 _STEP_RAD = 1e-5
+_FAINT = 1e-5  # information on each parameter at the beginning, as a share of that of all candidates
+_SAME = 1e-7  # of costs of designs that the refinement leads to from several starts
 _WEIGHINGS = 1000
 
 
@@ -151,7 +153,8 @@ class Search:
         if count <= _FEW:
             starts += [np.random.default_rng(seed).choice(self.candidates, count) for seed in range(2)]
         polished = [self.polish(start) for start in starts]
-        return min([poses, *polished], key=self.cost)
+        designs = [poses, *polished]
+        return designs[first_least(np.array([self.cost(each) for each in designs]), _SAME)]
 
     def measure(self, poses: Floats) -> float:
         """Value of the aim for orientations (n, k)."""
@@ -169,15 +172,19 @@ class Search:
         """Indices of the best candidates, found by greedy choice followed by exchange.
 
         If the candidates are the only possible orientations, random starts are tried as well. The greedy choice uses D,
-        which every dwell improves; a maximum over several sigmas falls only if all of the largest ones do.
+        which every dwell improves; a maximum over several sigmas falls only if all of the largest ones do. A little
+        information on every parameter is there from the beginning: without it, rounding would decide what the first
+        dwells are worth.
         """
         rows, greedy = self.candidate_rows, list[int]()
+        known = triangle(np.vstack([self.prospect.start, np.diag(_FAINT * np.linalg.norm(rows, axis=(0, 1)))]))
         for _ in range(count):
-            greedy.append(self._choice(optimality_criteria.D, rows[greedy])[0])
+            greedy.append(self._choice(optimality_criteria.D, known)[0])
+            known = triangle(np.vstack([known, rows[greedy[-1]]]))
         rng = np.random.default_rng(0)
         others = [] if self.reach.continuous else [rng.choice(len(rows), count).tolist() for _ in range(_OTHERS)]
         found = [self._exchange_from(start) for start in (greedy, *others)]
-        return min(found, key=lambda each: float(self._score(self.factor(rows[each]))))
+        return found[first_least(np.array([float(self._score(self.factor(rows[each]))) for each in found]))]
 
     def _exchange_from(self, start: list[int]) -> list[int]:
         """Exchange each dwell for the best candidate until none changes."""
@@ -186,24 +193,24 @@ class Search:
             before = list(chosen)
             for place in range(len(chosen)):
                 rest = chosen[:place] + chosen[place + 1 :]
-                best, cost = self._choice(self._score, rows[rest])
+                best, cost = self._choice(self._score, self.factor(rows[rest]))
                 if cost < float(self._score(self.factor(rows[chosen]))) - 1e-9:
                     chosen[place] = best
             if chosen == before:
                 break
         return chosen
 
-    def _choice(self, score: Score, rest: Floats) -> tuple[int, float]:
-        """Return the candidate that goes best with rows ``rest`` (n, r, p), and the cost of both.
+    def _choice(self, score: Score, upper: Floats) -> tuple[int, float]:
+        """Return the candidate that goes best with information of factor ``upper`` (p, p), and the cost of both.
 
         If there are many candidates, only the most promising ones are evaluated.
         """
-        rows, upper = self.candidate_rows, self.factor(rest)
+        rows = self.candidate_rows
         wide = len(rows) > 8 * _FIRST
         tried = self._promising(score, upper) if wide else np.arange(len(rows))
         both = np.concatenate([np.broadcast_to(upper, (len(tried), *upper.shape)), rows[tried]], axis=1)
         costs = score(triangle(both), math.inf)
-        k = int(np.argmin(costs))
+        k = first_least(costs)
         return int(tried[k]), float(costs[k])
 
     def _promising(self, score: Score, upper: Floats) -> Ints:
@@ -216,7 +223,7 @@ class Search:
         spread = triangle(np.vstack([upper, some]))
         white = rows @ np.linalg.inv(spread)
         promise = np.einsum("nri,ij,nrj->n", white, optimality_criteria.slope(score, spread, self.aim.powers[0]), white)
-        return np.argsort(promise)[:_FIRST]
+        return np.argsort((promise / np.abs(promise).max()).round(9), kind="stable")[:_FIRST]
 
     def polish(self, poses: Floats) -> Floats:
         """The orientations moved within their bounds to a local minimum of the cost."""
@@ -325,7 +332,7 @@ class Search:
         """Return the pose after which the cost is least."""
         rows, start = self.rows(poses), self.prospect.start
         so_far = np.broadcast_to(start, (len(rows), *start.shape))
-        return poses[int(np.argmin(self._score(triangle(np.concatenate([so_far, rows], axis=1)))))]
+        return poses[first_least(self._score(triangle(np.concatenate([so_far, rows], axis=1))))]
 
     def without_limits(self) -> Search:
         """The same search over all orientations that the axes can reach."""

@@ -25,7 +25,7 @@ from functools import cached_property
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats, Ints, Mask
+from kf_calib.bench.arrays import Floats, Ints, Mask, first_least
 from kf_calib.bench.bench import Bench, axis_names
 from kf_calib.bench.keys import Range, limits_of, zones_of
 from kf_calib.errors import InputError
@@ -301,7 +301,7 @@ def order(poses: Floats, columns: Floats, timing: Timing, reach: Reach, start: F
     best, least = np.arange(count), np.inf
     for _ in range(_STARTS):
         tour, own = _improve(rng.permutation(count), cost, rng)
-        if own < least:
+        if own < least - 1e-9:
             best, least = tour, own
     return best
 
@@ -312,7 +312,7 @@ def _improve(tour: Ints, cost: Callable[[Ints], Floats], rng: np.random.Generato
     while fruitless < _FRUITLESS:
         moved = _moves(tour, rng)
         costs = cost(moved)
-        k = int(np.argmin(costs))
+        k = first_least(costs)
         fruitless = 0 if costs[k] < least - 1e-9 else fruitless + 1
         if not fruitless:
             tour, least = moved[k], float(costs[k])

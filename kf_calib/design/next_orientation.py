@@ -17,7 +17,7 @@ from functools import cached_property
 import numpy as np
 
 from kf_calib.bench import paper_parameters
-from kf_calib.bench.arrays import Floats, Mask
+from kf_calib.bench.arrays import Floats, Mask, first_least
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.design.gimbal_limits import Reach, can_be_reached, wrap
 from kf_calib.design.predicted_information import Prospect
@@ -87,7 +87,7 @@ def to_tell_apart(fitted: Fit, one: Effect, coefficients: Floats, others: Sequen
     farthest = after.max(axis=1)
     useful = np.minimum(farthest, ENOUGH) if before < ENOUGH else farthest[:1]
     wait = int(np.argmax((useful**2 - before**2) / (_MOVE * dwell_s + waits_s[: len(useful)])))
-    best = int(np.argmax(after[wait]))
+    best = first_least(-after[wait])
     stay_s = float(waits_s[wait] + dwell_s) if wait else None
     angles = tuple(np.degrees(poses[best]).round(1).tolist())
     return Advice(angles, before, float(after[wait, best]), stay_s, tuple(separations))

@@ -21,7 +21,7 @@ from kf_calib.estimation.score_test import joint_delta_chi2
 from kf_calib.support.tail_probabilities import f_tail
 
 _OF_FORCE = ("{0}*{0}", "{0}**3", "{0}**4")
-_OF_STEP = ("{0}", "{0}*abs({0})", "sign({0})")
+_OF_STEP = ("{0}", "{0}*abs({0})", "tanh({0}/(0.01*m/s**2))")  # a sign, but for rounding
 _WAVES = tuple(f"{wave}({turns}*{{0}})" for turns in (1, 2, 3) for wave in ("sin", "cos"))
 _OF_TIME = ("{0}", "{0}*{0}", "{0}**3")
 _FUNCTIONS = {"a": _OF_FORCE, "p": _OF_FORCE, "o": _OF_FORCE, "da": _OF_STEP, "t": _OF_TIME, "T": _OF_TIME,

@@ -325,9 +325,8 @@ def _of_creep(gimbals: int, dwells: Sequence[DwellFactor]) -> Iterator[tuple[str
     """Yield the formulas of a platform that comes to rest after its encoder: by its last move, or the sense of it."""
     longest_s = max(dwell.end_s - dwell.start_s for dwell in dwells)
     for k in range(1, gimbals + 1):
-        move = f"q{k}-q{k}_before"
         for decay_s in (each for each in _CREEPS_S if each <= 2.0 * longest_s):
-            for size in (f"({move})", f"sign({move})"):
+            for size in (f"q{k}_move", f"sign(q{k}_move)"):
                 yield f"{ARRIVAL} and last move of gimbal {k}", [f":{k} = {size}*exp(-tau/({decay_s}*s))"]
 
 

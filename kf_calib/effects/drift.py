@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import Floats, sign
 from kf_calib.effects.effect import (
     MICRO_G,
     MILLI_G,
@@ -68,7 +68,7 @@ class Hysteresis(SensorEffect):
 
     def terms(self, s: Stimulus) -> Floats:
         least_mps2 = max(_LEAST_STEP_MPS2, s.unsure_rad * s.bench.gravity_mps2)
-        return np.sign(np.where(np.abs(s.step) > least_mps2, s.step, 0.0))
+        return sign(s.step, least_mps2)
 
 
 class _Decay(SensorEffect):

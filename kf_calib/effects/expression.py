@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from kf_calib.bench.arrays import sign
 from kf_calib.errors import InputError
 from kf_calib.support.units import RAISED, field_unit, per_power_of_g
 
@@ -38,6 +39,7 @@ FUNCTIONS: dict[str, np.ufunc] = {
     "sin": np.sin, "cos": np.cos, "tan": np.tan, "arctan": np.arctan, "tanh": np.tanh, "exp": np.exp, "log": np.log,
     "sqrt": np.sqrt, "abs": np.abs, "sign": np.sign, "minimum": np.minimum, "maximum": np.maximum,
 }  # fmt: skip
+_VALUES: Mapping[str, Callable[..., Any]] = {**FUNCTIONS, "sign": sign}
 _ALLOWED = (ast.BinOp, ast.UnaryOp, ast.Compare, ast.Call, ast.Name, ast.Constant, ast.Load, *_SIGNS)
 
 
@@ -56,7 +58,7 @@ class Expression:
         self,
         names: Mapping[str, Any],
         operators: Mapping[str, Callable[..., Any]] = OPERATORS,
-        functions: Mapping[str, Callable[..., Any]] = FUNCTIONS,
+        functions: Mapping[str, Callable[..., Any]] = _VALUES,
     ) -> Any:
         """Its value for these values of its names; other operators and functions evaluate it in another algebra."""
         from simpleeval import SimpleEval

@@ -18,6 +18,7 @@ t                  s        time since the first sample
 tau                s        time since the arrival in the dwell
 q1 q2 q3 ...       rad      gimbal angles, outer first; also outer, inner, and q_x q_y q_z where one is
 q1_before ...      rad      the same in the dwell before
+q1_move ...        rad      last move of a gimbal; 0 where it stood still, but for noise and rounding
 g                  m/s^2    local gravity
 s m K rad deg pi            units and the number, to make a formula's units agree: exp(-tau/(60*s))
 =================  =======  ============================================================================
@@ -87,14 +88,16 @@ QUANTITIES: dict[str, FormulaQuantity] = {
 }
 
 
-class _Angle:
-    """The angle of a gimbal, now or in the dwell before, (m, 1) rad."""
+def _angle(s: Stimulus, gimbal: int) -> Floats:
+    return s.pose[:, gimbal : gimbal + 1]
 
-    def __init__(self, gimbal: int, before: bool = False) -> None:
-        self.gimbal, self.before = gimbal, before
 
-    def __call__(self, s: Stimulus) -> Floats:
-        return (s.previous_pose if self.before else s.pose)[:, self.gimbal : self.gimbal + 1]
+def _angle_before(s: Stimulus, gimbal: int) -> Floats:
+    return s.previous_pose[:, gimbal : gimbal + 1]
+
+
+def _move(s: Stimulus, gimbal: int) -> Floats:
+    return s.move(gimbal)[:, None]
 
 
 def gimbal_letters(axes: tuple[Vector, ...]) -> str:
@@ -109,12 +112,15 @@ def quantities(axes: tuple[Vector, ...]) -> dict[str, FormulaQuantity]:
     """Everything a formula may name on a bench with these gimbal axes."""
     letters, named = gimbal_letters(axes), dict(QUANTITIES)
     for k, letter in enumerate(letters):
-        angle = FormulaQuantity("rad", f"angle of gimbal {k + 1}", _Angle(k))
+        angle = FormulaQuantity("rad", f"angle of gimbal {k + 1}", partial(_angle, gimbal=k))
         names = [f"q{k + 1}", *([f"q_{letter}"] if letter != "?" and letters.count(letter) == 1 else [])]
         names += ["outer"] * (k == 0) + ["inner"] * (k == len(letters) - 1)
         named |= dict.fromkeys(names, angle)
         named[f"q{k + 1}_before"] = FormulaQuantity(
-            "rad", f"angle of gimbal {k + 1} in the dwell before", _Angle(k, True)
+            "rad", f"angle of gimbal {k + 1} in the dwell before", partial(_angle_before, gimbal=k)
+        )
+        named[f"q{k + 1}_move"] = FormulaQuantity(
+            "rad", f"last move of gimbal {k + 1}, 0 where it stood still", partial(_move, gimbal=k)
         )
     return named
 

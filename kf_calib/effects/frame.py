@@ -15,8 +15,6 @@ from kf_calib.effects.stimulus import Stimulus
 from kf_calib.errors import InputError
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
-_LEAST_MOVE_RAD = 1e-4  # of a gimbal: less is noise of its encoder, or creep
-
 
 class BaseTilt(FrameEffect):
     """A base turned by (delta_N, delta_E): the specific force turns the other way in it."""
@@ -238,7 +236,7 @@ class Backlash(_GimbalEffect):
     def __init__(self, gimbal: int, variant: str) -> None:
         super().__init__(gimbal, variant)
         number = gimbal + 1
-        self.drawn_against = Regressor(f"q{number}-q{number}_before", f"last move of gimbal {number}", "rad")
+        self.drawn_against = Regressor(f"q{number}_move", f"last move of gimbal {number}", "rad")
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
@@ -246,8 +244,7 @@ class Backlash(_GimbalEffect):
 
     def rotations(self, s: Stimulus) -> Floats:
         assert self.gimbal is not None
-        side = s.side(self.gimbal, max(_LEAST_MOVE_RAD, s.unsure_rad))
-        return (-0.5 * side[:, None] * self.about(s))[:, None, :]
+        return (-0.5 * s.side(self.gimbal)[:, None] * self.about(s))[:, None, :]
 
 
 class AxisNonorthogonality(_GimbalEffect):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import Floats, sign
 from kf_calib.effects.effect import (
     MICRO_G,
     MICRO_PER_G,
@@ -35,7 +35,7 @@ class BiasAsymmetry(SensorEffect):
     typical = Typical((1 * MICRO_G, 10 * MICRO_G))
 
     def terms(self, s: Stimulus) -> Floats:
-        return 0.5 * np.sign(s.along)
+        return 0.5 * sign(s.along)
 
 
 class ScaleAsymmetry(SensorEffect):

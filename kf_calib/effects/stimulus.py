@@ -22,6 +22,7 @@ _INTEGRALS = legendre.legvander(_POINTS, 2).T * _WEIGHTS  # (3, n): of Legendre'
 _RATE_WINDOW_S = 5.0  # at least: a thermometer of 0.01 K noise then shows rates of 1e-3 K/s
 _RATE_STILL = 0.02
 _UNSURE = 5.0  # sigmas of a setting error
+_LEAST_MOVE_RAD = 1e-4  # of a gimbal: less is noise of its encoder, or creep
 _OF_ALL = ("bench", "sensitivity", "carrier_hz", "part", "whole", "places")  # is the same at all instants
 
 
@@ -173,16 +174,21 @@ class Stimulus:
             through[first:last] = held
         return through
 
-    def side(self, gimbal: int, least_rad: float) -> Floats:
+    def move(self, gimbal: int) -> Floats:
+        """The move (m,) of a gimbal since the dwell before, rad; 0 where it is no larger than what setting errors, the
+        noise of an encoder or rounding may feign: these have a sign, too."""
+        moves = self.pose[:, gimbal] - self.previous_pose[:, gimbal]
+        return np.where(np.abs(moves) > max(_LEAST_MOVE_RAD, self.unsure_rad), moves, 0.0)
+
+    def side(self, gimbal: int) -> Floats:
         """The sense (m,) of the last move of a gimbal, 1 or -1, which it keeps while it stands still; 0 until it moves.
 
-        A move of no more than ``least_rad`` is none. Poses that are proposed all come after the same dwell, and none
-        after another: one that leaves the gimbal where it is has 0, since the side that it was on is not known.
+        Poses that are proposed all come after the same dwell, and none after another: one that leaves the gimbal where
+        it is has 0, since the side that it was on is not known.
         """
         if self.whole is not None:
-            return self.whole.side(gimbal, least_rad)[self.places]
-        moves = self.pose[:, gimbal] - self.previous_pose[:, gimbal]
-        senses = np.where(np.abs(moves) > least_rad, np.sign(moves), 0.0)
+            return self.whole.side(gimbal)[self.places]
+        senses = np.sign(self.move(gimbal))
         begins = senses != 0.0
         if not self.half_s.any():  # instants of no piece, which are not measured
             begins[1:] |= np.all(self.previous_pose[1:] == self.previous_pose[:-1], axis=1)

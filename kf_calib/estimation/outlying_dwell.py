@@ -3,7 +3,10 @@
 Each dwell is predicted by a fit to all others. Its error e (3,) has the covariance C, the sum of that of the prediction
 and of the dwell's own noise, and e^T C^-1 e / 3 is F distributed with 3 and nu degrees of freedom. nu is infinite if
 the noise from dwell to dwell is stated; otherwise it is the degrees of freedom that the other dwells leave to estimate
-it. A dwell is outlying if three things hold: its error is significant at the level of the run, all other dwells are
+it. Where scatter was stated, it may be 1/f noise or a walk, which neighbouring dwells share: what leaving the dwell out
+takes off the chi-squared of the run in such noise is then less than e^T C^-1 e, and counts in its place.
+
+A dwell is outlying if three things hold: its error is significant at the level of the run, all other dwells are
 consistent without it, and either a rotation of one gimbal explains its readings or its error is larger than any known
 effect causes.
 """
@@ -20,7 +23,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.sufficient_statistics import DwellFactor, dwells_without
 from kf_calib.estimation.attitude import without_attitudes
 from kf_calib.estimation.dwell_columns import LinearisedDwells, turning_mps2
-from kf_calib.estimation.results import Calibration, OutlyingDwell, Turn
+from kf_calib.estimation.results import Calibration, OutlyingDwell, Turn, consistency
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import lift_rounding, mean_covariances
 from kf_calib.support.tail_probabilities import f_tail
@@ -70,7 +73,7 @@ def _test_dwell(result: Calibration, k: int, rest: Calibration) -> OutlyingDwell
     means = linearised.means[[k]]
     error, covariance = means.readings[0] - means.design[0] @ estimate.state, _covariance(rest, means)
     freedom = 1e9 if noise.setting_stated and noise.scatter_stated else max(rest.consistency.dof, 1)
-    statistic = float(error @ np.linalg.solve(covariance, error))
+    statistic = min(float(error @ np.linalg.solve(covariance, error)), _fall(result, rest))
     p_value = min(len(dwells) * f_tail(3.0, freedom, statistic / 3.0), 1.0)
     if p_value > _BEYOND_DOUBT:
         return None
@@ -78,6 +81,12 @@ def _test_dwell(result: Calibration, k: int, rest: Calibration) -> OutlyingDwell
     if not turns and np.linalg.norm(error) < _GROSS * result.bench.gravity_mps2:
         return None
     return OutlyingDwell(dwells[k], dwells[k].number, error, p_value, turns, rest)
+
+
+def _fall(result: Calibration, rest: Calibration) -> float:
+    """Return by how much chi-squared falls without the dwell, in the noise of the other dwells."""
+    with_all = consistency(replace(result.fit, noise=rest.noise))
+    return max(with_all.statistic - rest.consistency.statistic, 0.0)
 
 
 def _covariance(rest: Calibration, means: Means) -> Floats:

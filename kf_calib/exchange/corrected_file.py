@@ -30,7 +30,7 @@ from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.files.sample_lines import cell_spans
 from kf_calib.sources.tables.columns import READINGS, Columns
 from kf_calib.sources.tables.grid import Grid, delimiter_of, grid_of
-from kf_calib.sources.tables.numbers import Numbers
+from kf_calib.sources.tables.numbers import Numbers, written
 from kf_calib.sources.tables.opening import Opening
 from kf_calib.sources.tables.spreadsheet import sheets_of, workbook_of
 from kf_calib.sources.tables.words import Units
@@ -226,7 +226,7 @@ def _to_excel(path: Path, copy: Path, grid: Grid, places: list[int], force: Floa
             if type(cell).__name__ == "MergedCell":
                 raise InputError(f"{path}: cell {cell.coordinate} is merged with others, so no reading can be written "
                                  "there: part the cells.")  # fmt: skip
-            cell.value = value
+            cell.value = written(value)
     content = io.BytesIO()
     book.save(content)
     write_whole(copy, content.getvalue())
@@ -241,7 +241,7 @@ def _to_text(path: Path, copy: Path, grid: Grid, places: list[int], force: Float
     plain = [line.rstrip("\r\n") for line in lines]
     delimiter = delimiter_of([line for line in plain if line.strip() and not line.startswith("#")])
     decimal = "," if delimiter != "," and not any("." in plain[k - 1] for k in grid.numbers) else "."
-    new = {number: [repr(value).replace(".", decimal) for value in own]
+    new = {number: [repr(written(value)).replace(".", decimal) for value in own]
            for number, own in zip(grid.numbers, force.tolist(), strict=True)}  # fmt: skip
     for number, texts in (*new.items(), *_new_heads(grid)):
         line, is_units = lines[number - 1], number in grid.head[1:]

@@ -223,17 +223,18 @@ def test_an_oscillation_of_one_cycle_a_dwell_is_not_taken_for_slow_noise(size: i
 @pytest.mark.slow
 @pytest.mark.parametrize("seeds, dwells", [(range(1), 12), (range(22), 16)])
 def test_slow_noise_is_not_taken_for_an_oscillation(seeds: range, dwells: int) -> None:
-    """Of 1/f noise within dwells and a walk, which the means of the dwells follow; at most it is one of several. In a
-    few runs one dwell alone does not fit."""
-    outlying = 0
+    """Of 1/f noise within dwells and a walk, which the means of the dwells follow; at most it is one of several. One
+    run has a line in its noise by chance, as 1 of 200 such runs have. Nor is the dwell that lies farthest off taken for
+    a wrong one: its neighbours share much of what it has."""
+    by_chance = list[str]()
     for seed in seeds:
         noise = {"walk_mps2_per_sqrt_s": 2e-5, "flicker_mps2": 3e-5}
         found = diagnose(source(seed=seed, dwells=dwells, **noise), replicate=False)
-        assert not found.before.consistency.quiet
-        outlying += bool(found.before.outlying)
+        assert not found.before.consistency.quiet and not found.before.outlying
         probability = found.table.probability(("sinusoid",)) if found.table else 0.0
-        assert "sinusoid" not in found.missing or probability < 0.35, found.verdict
-    assert outlying <= 3
+        if "sinusoid" in found.missing and probability >= 0.35:
+            by_chance.append(found.verdict)
+    assert len(by_chance) <= 1, by_chance
 
 
 @pytest.mark.slow  # vibration alone: below; which tests count beside it: test_missing_effect.py

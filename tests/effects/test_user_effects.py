@@ -7,6 +7,7 @@ import json
 import re
 import sys
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -506,6 +507,18 @@ def test_the_angle_in_the_dwell_before() -> None:
     before = effect_named("mine = q2_before", EXAMPLE).columns(stimulus)[:, 0, 0]
     own = effect_named("mine = q2", EXAMPLE).columns(stimulus)[:, 0, 0]
     np.testing.assert_allclose(before[5:], own[:-5])
+
+
+def test_the_last_move_is_zero_where_a_gimbal_stood_still_whatever_its_encoder_says() -> None:
+    """A change of 1e-17 rad has a sign, and so has one of the noise of an encoder."""
+    stimulus = trial(EXAMPLE)
+    pose = stimulus.previous_pose.copy()
+    pose[:, 1] += np.resize([0.5, -0.5, 1e-17, -1e-6, 0.0], len(pose))
+    stimulus = replace(stimulus, pose=pose)
+    senses = effect_named("mine = sign(q2_move)", EXAMPLE).columns(stimulus)[:, 0, 0]
+    np.testing.assert_array_equal(senses, np.resize([1.0, -1.0, 0.0, 0.0, 0.0], len(pose)))
+    moves = effect_named("mine = q2_move", EXAMPLE).columns(stimulus)[:, 0, 0]
+    np.testing.assert_allclose(moves, 0.5 * senses)
 
 
 def test_what_a_recording_shows_of_an_effect(run, recording: Path) -> None:

@@ -19,6 +19,7 @@ from kf_calib.effects.effect import Effect
 from kf_calib.errors import KfCalibError
 
 _ZERO = 1e-13  # what is smaller is what rounding leaves of zero
+_ZEROS = {"Fit.walk_gain": 1e-9, "Fit.scatter_gain": 1e-9}  # the same of differences of large numbers
 _LEFT_OUT = ("kf_calib.sources", "kf_calib.views", "kf_calib.diagnosis.refits")
 _DEEPEST = 12
 _ARBITRARY = frozenset(
@@ -81,7 +82,7 @@ class ResultNumbers:
         weight = 1.5 + np.cos(figures[0])
         figures[0] += int(values.size)
         size = float(np.abs(numbers).max(initial=0.0))
-        if size > _ZERO:
+        if size > _ZEROS.get(name, _ZERO):
             figures[1] += weight * np.log(size)
             figures[2] += weight * float(np.cos(np.arange(1.0, len(numbers) + 1.0)) @ (numbers / size))
 

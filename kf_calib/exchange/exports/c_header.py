@@ -146,7 +146,7 @@ TextOfC = str | float
 _LARGEST_POWER = 12
 HELPERS = {
     "kf_calib_abs": "double x) { return x < 0.0 ? -x : x; }",
-    "kf_calib_sign": "double x) { return (x > 0.0) - (x < 0.0); }",
+    "kf_calib_sign": "double x) { return (x > 1e-9) - (x < -1e-9); }",
     "kf_calib_min": "double x, double y) { return y < x ? y : x; }",
     "kf_calib_max": "double x, double y) { return y > x ? y : x; }",
     "kf_calib_power": "double x, int n) { double y = 1.0; while (n-- > 0) y *= x; return y; }",

@@ -28,7 +28,7 @@ from kf_calib.sources.files.line_parts import (
     stamp_ns,
     without_empty_end,
 )
-from kf_calib.sources.tables.numbers import DECIMAL_POINT
+from kf_calib.sources.tables.numbers import DECIMAL_POINT, written
 
 _FROM_UNIT = {"c": (1.0, 0.0), "k": (1.0, -273.15), "f": (1.0 / 1.8, -32.0 / 1.8)}
 
@@ -68,7 +68,7 @@ class CsvLines(LineReader):
     def with_readings(self, line: str, readings_mps2: Sequence[float]) -> str:
         decimal = (self._numbers or DECIMAL_POINT).decimal
         texts = [
-            repr(value / unit).replace(".", decimal)
+            repr(written(value / unit)).replace(".", decimal)
             for value, unit in zip(readings_mps2, self._columns.written_mps2, strict=True)
         ]
         return self._replaced(line, dict(zip(self._accel.at, texts, strict=True)))
@@ -185,7 +185,7 @@ class JsonLines(LineReader):
         entry = json.loads(line)
         names = {self._columns.get(key, key): key for key in entry}
         name = next(each for each in (*_ACCEL, *_BARE) if each in names and entry[names[each]] is not None)
-        values = json.dumps([value / _ACCEL.get(name, 1.0) for value in readings_mps2])
+        values = json.dumps([written(value / _ACCEL.get(name, 1.0)) for value in readings_mps2])
         (key_start, key_end), (start, end) = _spans(line)[names[name]]
         key = line[key_start:key_end] if name in _ACCEL else '"accel_mps2"'
         return line[:key_start] + key + line[key_end:start] + values + line[end:]

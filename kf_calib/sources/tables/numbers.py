@@ -204,3 +204,8 @@ def stamp_of(text: str, month_first: bool) -> datetime:
     micro = f".{(fraction + '000000')[:6]}" if fraction else ""
     clock = f"{hours:02d}:{minute or '00'}:{second_s or '00'}{micro}{offset}"
     return datetime.fromisoformat(f"{years:04d}-{int(month):02d}-{int(day):02d}T{clock}")
+
+
+def written(value: float) -> float:
+    """A reading as it is written as text: digits below 1e-12 are those of rounding, and differ between processors."""
+    return round(value, 12)
