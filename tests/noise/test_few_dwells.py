@@ -50,7 +50,7 @@ def test_how_uncertain_the_sigmas_are_is_said() -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(not REAL.is_dir(), reason="the recordings of others are not there")
 def test_a_dozen_poses_of_a_real_sensor_agree_with_all_others_within_their_sigmas() -> None:
-    """Within 1.96 sigma are 86 % by Student's t of three degrees of freedom, and 63 % were where scatter was left out."""
+    """Within 1.96 sigma are 86 % by Student's t of 3 degrees of freedom, and 63 % were where scatter was left out."""
     source, rng = (
         open_log(REAL / "xsens_mti.csv.gz", {"gravity_mps2": "9.80665"}, angles=False),
         np.random.default_rng(0),
