@@ -38,7 +38,7 @@ from kf_calib.estimation.kalman_filterpy import Samples, samples_of
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.observability import visibility_of
 from kf_calib.estimation.outlying_dwell import outlying_dwells, outlying_in_words
-from kf_calib.estimation.remarks import misfit_remark, remarks_on
+from kf_calib.estimation.remarks import is_gross, misfit_remark, remarks_on
 from kf_calib.estimation.results import Calibration, Consistency, OutlyingDwell, Visit, consistency
 from kf_calib.estimation.settings import Settings
 from kf_calib.noise.noise_model import considered_information, mean_covariances
@@ -47,6 +47,7 @@ from kf_calib.noise.reml import FEWEST, degrees_of_freedom
 from kf_calib.sources.opening import opened
 from kf_calib.support import stage
 from kf_calib.support.tail_probabilities import LEVEL
+from kf_calib.support.units import shown
 
 
 def calibrate(
@@ -238,6 +239,12 @@ def _refuse_absent(left_out: Sequence[int], dwells: Sequence[DwellFactor]) -> No
 def refuse_unseen(result: Calibration) -> None:
     """Raise UnobservableError if the orientations determine none of the twelve parameters."""
     if result.estimate.unseen.all():
+        if is_gross(result.noise, result.bench):
+            raise UnobservableError(
+                f"the {len(result.visits)} dwells disagree with every calibration, by about "
+                f"{shown('m/s^2').text(float(result.noise.scatter_mps2.max()), 2)}, so that none of the parameters can "
+                "be seen: a pose, a channel or a gimbal axis is not what it is taken for."
+            )
         dwells = (
             "1 dwell of this run shows" if len(result.visits) == 1 else f"{len(result.visits)} dwells of this run show"
         )

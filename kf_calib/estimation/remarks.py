@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -20,6 +21,8 @@ from kf_calib.noise.noise_model import TOO_SHORT, Noise
 from kf_calib.noise.reml import ENOUGH_DIRECTIONS, FEWEST, degrees_of_freedom, directions
 from kf_calib.noise.temperature_course import temperature_course
 from kf_calib.support.units import shown
+
+_GROSS = 0.05  # g; scatter beyond this is a blunder
 
 MISSING_OR_NOISE = "the dwells scatter about the model by more than the noise: an effect is missing in the model, or "
 """How the sentence begins on a misfit of which no more is known."""
@@ -87,7 +90,11 @@ def remarks_on(
     if not model.bench.angles:
         yield from _without_angles(linearised, noise, judged)
     elif unseen:
-        yield f"these orientations do not determine {', '.join(unseen)}: visit more, spread over the sphere."
+        names = ", ".join(unseen)
+        if is_gross(noise, model.bench):
+            yield f"the dwells scatter too much to determine {names}: poses, channels or axes are not what they seem."
+        else:
+            yield f"these orientations do not determine {names}: visit more, spread over the sphere."
     for effect in model.effects:
         exact = effect.degeneracy(model.bench)
         if exact and any(coefficient.symbol in unseen for coefficient in effect.coefficients):
@@ -133,7 +140,8 @@ def remarks_on(
             f"and their whole misfit ({shown('m/s^2').text(noise.scatter_mps2[0], 2)}) enters every sigma. Visit "
             f"{ENOUGH_DIRECTIONS} spread directions to distinguish them."
         )
-    if model.bench.angles and unstated(noise) and degrees_of_freedom(linearised.means) < FEWEST:
+    few = model.bench.angles and degrees_of_freedom(linearised.means) < FEWEST
+    if few and unstated(noise) and not noise.scatter_mps2.any():
         yield (
             f"{len(dwells)} dwell{'s are' if len(dwells) > 1 else ' is'} too few to estimate what was not stated "
             f"({' and '.join(unstated(noise))}): it is taken as zero; if it is not zero, the sigmas are too small."
@@ -149,6 +157,11 @@ def remarks_on(
             f"angle_sigma_deg was not stated; {np.degrees(noise.setting_rad):.2g} deg was estimated from the misfit "
             "between dwells, which an effect not in the model could also cause."
         )
+
+
+def is_gross(noise: Noise, bench: Bench) -> bool:
+    """Tell whether dwells scatter, by an amount that nobody stated, as no sensor does."""
+    return not noise.scatter_stated and float(noise.scatter_mps2.max()) > _GROSS * bench.gravity_mps2
 
 
 def _on_held(effect: Effect, unknown: Unknown) -> str:
@@ -173,6 +186,13 @@ def _without_angles(linearised: LinearisedDwells, noise: Noise, judged: Consiste
         yield (
             f"these poses do not tell the angles between the axes (nu1, theta3, phi3), which are taken for square to "
             f"{np.degrees(model.bench.square_rad):.3g} deg (--square-sigma), as sigmas allow for: {turn}."
+        )
+    elif 0 < judged.dof < FEWEST and noise.scatter_mps2.any() and not noise.scatter_stated:
+        known = math.sqrt(0.5 / judged.dof)
+        yield (
+            f"scatter between poses, {shown('m/s^2').text(noise.scatter_mps2[0], 2)}, was estimated from "
+            f"{judged.dof} degree{'s' * (judged.dof > 1)} of freedom that {count} poses leave, so that every sigma is "
+            f"itself uncertain by {known:.0%}: {turn}."
         )
     elif judged.dof < FEWEST:
         yield f"{count} poses leave {judged.dof} degrees of freedom, too few to see scatter between poses: {turn}."

@@ -30,7 +30,7 @@ from kf_calib.noise.restricted_likelihood import Point, Restricted
 from kf_calib.support.tail_probabilities import chi_squared_tail
 
 FEWEST = 6
-"""With fewer degrees of freedom between dwells than this, nothing is estimated."""
+"""With fewer degrees of freedom between dwells than this, only scatter of one size is estimated."""
 
 ENOUGH_DIRECTIONS = 12
 """With this many directions of gravity, if spread, it can be checked that a setting error only turns the force."""
@@ -91,10 +91,11 @@ class VarianceComponents:
 
         Of the combinations of the parts that are not stated (scatter as one number for all accelerometers or one for
         each), the one with the largest restricted likelihood is taken, less a charge per number of the scatter: the 1 %
-        point of its likelihood ratio against zero. A walk has a smaller charge, a setting error none. Nothing is
-        estimated with fewer than 6 degrees of freedom between dwells. If there are too few orientations to tell a
-        setting error from scatter, the whole misfit counts as scatter. Where attitudes are not known, a dwell tells one
-        number, and scatter has one size for all accelerometers.
+        point of its likelihood ratio against zero. A walk has a smaller charge, a setting error none. With fewer than
+        6 degrees of freedom between dwells nothing is estimated but scatter of one size: it is uncertain, but without
+        it sigmas would be too small by any factor.
+        If there are too few orientations to tell a setting error from scatter, the whole misfit counts as scatter.
+        Where attitudes are not known, a dwell tells one number, and scatter has one size for all accelerometers.
 
         - means: the dwells' means; state (p,): where they are linearised.
         - prior: rows of prior knowledge about the coefficients, those of ``with_shared_noise``.
@@ -105,9 +106,9 @@ class VarianceComponents:
         reduced = _reduce(means, prior)
         measured = len(means.readings) if within.attitude_unknown else means.readings.size
         free = measured + len(reduced.prior) - reduced.means.design.shape[2]
-        if free < FEWEST:
+        combinations = self._combinations(stated, free)
+        if not combinations:
             return stated
-        combinations = _combinations(stated, self.walks)
         likelihood = _likelihood(stated.weights, {part for parts in combinations for part in parts}, reduced, state)
         without = likelihood.without()
         if not self.walks and chi_squared_tail(free, without.misfit) > 0.1:  # the model already fits
@@ -116,6 +117,12 @@ class VarianceComponents:
             return stated
         best = self._likeliest(likelihood, combinations, without)
         return _with_estimates(stated, likelihood, best, self.sizes[best], without) if best else stated
+
+    def _combinations(self, stated: Noise, free: int) -> list[Parts]:
+        """Return the combinations of parts that may be estimated from so many degrees of freedom."""
+        if free < FEWEST:
+            return [("common",)] if free > 0 and not stated.scatter_stated else []
+        return _combinations(stated, self.walks)
 
     def _stated(self, within: Noise, means: Means) -> Noise:
         """Return the noise within dwells with the parts that are stated, and zeros for the others."""

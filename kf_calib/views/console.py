@@ -160,10 +160,12 @@ def noise_table(result: Calibration) -> ConsoleTable:
 def noise_origins(result: Calibration) -> tuple[str, str]:
     """Whether scatter and setting error were stated, estimated or not estimated, in words."""
     noise, few = result.noise, degrees_of_freedom(result.linearised.means, not result.bench.angles) < FEWEST
-    scatter = "stated" if noise.scatter_stated else _NOT_ESTIMATED if few else "estimated"
     if noise.attitude_unknown:
         few = len(result.visits) - len(paper_parameters.SYMBOLS) + len(result.fixed) < FEWEST
-        return "stated" if noise.scatter_stated else _NOT_ESTIMATED if few else "estimated", _NOT_USED
+    estimated = noise.scatter_mps2.any() or not few
+    scatter = "stated" if noise.scatter_stated else "estimated" if estimated else _NOT_ESTIMATED
+    if noise.attitude_unknown:
+        return scatter, _NOT_USED
     if not noise.setting_stated:
         return scatter, _NOT_ESTIMATED if few or not noise.checked else "estimated"
     return scatter, "with the angles' noise" if beyond_stated(noise, result.bench) else "stated"

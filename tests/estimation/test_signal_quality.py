@@ -15,6 +15,7 @@ from helpers.synthetic import Run
 
 from kf_calib.bench.streams import Stream
 from kf_calib.diagnosis.refits import Refits
+from kf_calib.errors import UnobservableError
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.signal_quality import (
     Readings,
@@ -217,11 +218,15 @@ def test_a_step_is_found_through_rounding_that_adds_up_over_many_steps() -> None
 
 
 def test_degenerate_readings_say_nothing_wrong() -> None:
-    short, holed, one = Run(seed=8, count=40, dwells=6), Run(seed=8), Run(seed=8, dwells=5)
+    short, holed, one = Run(seed=8, count=40, dwells=6), Run(seed=8), Run(seed=8, dwells=8)
     holed.accel.values[::7] = np.nan
     assert readings(short) == readings(holed) == Readings()
     one.accel.values[:300, 0] = 3.0  # stuck within the range is no end of it
     assert not readings(one).saturation
+    five = Run(seed=8, dwells=5)
+    five.accel.values[:300, 0] = 3.0
+    with pytest.raises(UnobservableError, match=r"the 5 dwells disagree with every calibration, by about \d+ µg"):
+        readings(five)
     crowd = Run(seed=8)
     crowd.accel.values[330, 0] = 50.0  # one outlier is neither a flat top nor a crowd
     assert not readings(crowd).warnings

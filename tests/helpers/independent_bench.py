@@ -81,13 +81,23 @@ class IndependentBench:
             moves_rad[k] = np.where(moves_rad[k] == 0.0, moves_rad[k - 1], moves_rad[k])
         return State(time_s, dwell, np.where(since_s < DWELL_S, since_s, 0.0), angles_rad, moves_rad[dwell])
 
+    def _sensors(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Unit input axes (3, 3), scale factors (3,) and biases (3,), m/s^2."""
+        axes = np.eye(3) + 1e-3 * rng.standard_normal((3, 3))
+        scales, biases = 1.0 + 3e-4 * rng.standard_normal(3), 2e-3 * rng.standard_normal(3)
+        return axes / np.linalg.norm(axes, axis=1)[:, None], scales, biases
+
+    @property
+    def biases_mps2(self) -> np.ndarray:
+        """The true biases (3,)."""
+        return self._sensors(np.random.default_rng([self.seed, 1]))[2]
+
     def __iter__(self) -> Iterator[Batch]:
         state, rng = self.state, np.random.default_rng([self.seed, 1])
+        axes, scales, biases = self._sensors(rng)
         turned = Rotation.from_euler("YZX", state.angles_rad + self.gimbals(state))
         in_bench = Rotation.from_rotvec(self.base(state)) * turned * Rotation.from_rotvec(self.mount(state))
-        axes = np.eye(3) + 1e-3 * rng.standard_normal((3, 3))
-        along = in_bench.inv().apply([0.0, G, 0.0]) @ (axes / np.linalg.norm(axes, axis=1)[:, None]).T
-        scales, biases = 1.0 + 3e-4 * rng.standard_normal(3), 2e-3 * rng.standard_normal(3)
+        along = in_bench.inv().apply([0.0, G, 0.0]) @ axes.T
         readings = (scales + self.scale(state)) * along + biases + self.bias(state)
         readings += self.white_mps2 * rng.standard_normal(readings.shape)
         time_ns = np.rint(state.time_s * 1e9).astype(np.int64) + 1_700_000_000_000_000_000
