@@ -11,6 +11,7 @@ does not grow on dwells that the row's refit leaves out.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike
 
@@ -196,7 +197,8 @@ def _decided(refits: Refits, diagnosis: Diagnosis) -> Diagnosis:
         if retest.consistent is False:
             final_test = retest.with_vibration(test.lines.vibration)
             diagnosis, test = replace(diagnosis, before_in_noise_left=before_in_noise_left, test=final_test), retest
-    why_not = unearned(first, before, test.effects.walk) or behind_nothing(first, table)
+    why_not = unearned(first, before, test.effects.walk) or _worse_alone(refits, before, first)
+    why_not = why_not or behind_nothing(first, table)
     certain = _certain_part(first, table, before, test.effects.walk) if why_not else None
     if certain is not None:
         table, first, why_not = replace(table, certain=certain), certain, ""
@@ -226,6 +228,14 @@ def _certain_part(first: Hypothesis, table: HypothesisTable, before: Calibration
     parts = [row for row in table.rows if row.refit is not None and row.effects and not row.formulas]
     parts = [row for row in parts if set(row.effects) < set(first.effects) and table.probability(row.effects) >= SURE]
     return next((row for row in parts if not unearned(row, before, walk)), None)
+
+
+def _worse_alone(refits: Refits, before: Calibration, first: Hypothesis) -> str:
+    """Why the effects of a row must not be named where only the formula beside them keeps the held-out error from
+    growing; "" elsewhere."""
+    if not (first.effects and first.formulas):
+        return ""
+    return _grown(before, refits.with_effects(before, first.effects), first.effects)
 
 
 def behind_nothing(first: Hypothesis, table: HypothesisTable) -> str:
@@ -305,12 +315,11 @@ def unearned(row: Hypothesis, before: Calibration, walk: str) -> str:
             continue
         beside = f" of what is left, which is {left:.2g} times the noise" if _is_seen(after, name, 1.0) else ""
         return f"no coefficient of {name} is beyond {SEEN:g} sigma{beside}"
+    if grown := _grown(before, after, row.effects):
+        return grown
     errors = before.held_out_rms_mps2, after.held_out_rms_mps2
     if errors[0] is None or errors[1] is None:
         return ""
-    if errors[1] > _GROWN * errors[0]:
-        what = "they make" if len(row.effects) > 1 else "it makes"
-        return f"{what} the held-out error {errors[1] / errors[0]:.3g} times as large"
     floor_mps2 = after.held_out_floor_mps2
     if floor_mps2 is not None and errors[1] > max(_AS_IT_WAS * errors[0], _FAILS * floor_mps2):
         named = [effect for effect in after.model.effects if str(effect) in row.effects]
@@ -319,6 +328,15 @@ def unearned(row: Hypothesis, before: Calibration, walk: str) -> str:
         what = "they leave" if len(row.effects) > 1 else "it leaves"
         return f"{what} the error of orientations left out as it was"
     return ""
+
+
+def _grown(before: Calibration, after: Calibration, effects: Sequence[str]) -> str:
+    """In words that follow "but": that the error of orientations left out grows with these effects; "" if not."""
+    errors = before.held_out_rms_mps2, after.held_out_rms_mps2
+    if errors[0] is None or errors[1] is None or errors[1] <= _GROWN * errors[0]:
+        return ""
+    what = "they make" if len(effects) > 1 else "it makes"
+    return f"{what} the held-out error {errors[1] / errors[0]:.3g} times as large"
 
 
 def _is_seen(after: Calibration, name: str, left: float) -> bool:

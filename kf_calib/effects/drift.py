@@ -87,7 +87,7 @@ class WarmUp(_Decay):
     drawn_against = _TIME
     confused_with = "bias-drift; needs an early long dwell"
     symbol, unit, scale = "B", "m/s^2", 1e-2
-    unknown = Unknown("tauWarm", "s", 30.0, 10800.0, "min", 1.0 / 60.0)
+    unknown = Unknown("tauWarm", "s", 5.0, 10800.0, "min", 1.0 / 60.0)
     typical = Typical((10 * MICRO_G, 200 * MICRO_G), (1 * MILLI_G, 10 * MILLI_G))
 
     def terms(self, s: Stimulus) -> Floats:
@@ -105,7 +105,7 @@ class ScaleWarmUp(WarmUp):
     drawn_against = None
     confused_with = "scale-drift, warm-up; needs early orientations of both signs"
     symbol, unit, scale = "S", "1", 1e-3
-    unknown = Unknown("tauScale", "s", 30.0, 10800.0, "min", 1.0 / 60.0)
+    unknown = Unknown("tauScale", "s", 5.0, 10800.0, "min", 1.0 / 60.0)
     typical = Typical((1e-6, 100e-6), (0.1e-3, 10e-3))
     prior = 0.25  # in a run that is short beside its time constant it is a scale-drift, and cannot be told from it
 
