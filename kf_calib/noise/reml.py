@@ -93,9 +93,9 @@ class VarianceComponents:
         each), the one with the largest restricted likelihood is taken, less a charge per number of the scatter: the 1 %
         point of its likelihood ratio against zero. A walk has a smaller charge, a setting error none. With fewer than
         6 degrees of freedom between dwells nothing is estimated but scatter of one size: it is uncertain, but without
-        it sigmas would be too small by any factor.
-        If there are too few orientations to tell a setting error from scatter, the whole misfit counts as scatter.
-        Where attitudes are not known, a dwell tells one number, and scatter has one size for all accelerometers.
+        it sigmas would be too small by any factor. If there are too few orientations to tell a setting error from
+        scatter, the whole misfit counts as scatter. Where attitudes are not known, a dwell tells one number, and
+        scatter has one size for all accelerometers.
 
         - means: the dwells' means; state (p,): where they are linearised.
         - prior: rows of prior knowledge about the coefficients, those of ``with_shared_noise``.
