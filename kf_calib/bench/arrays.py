@@ -38,7 +38,7 @@ def first_least(values: Floats, tie: float = 1e-9) -> int:
     Processors round differently. By ``argmin`` one of several equal choices would be another on each.
     """
     least = float(values.min())
-    return int(np.argmax(values <= least + tie * max(abs(least), 1.0)))
+    return int(np.argmax(values <= (least + tie * max(abs(least), 1.0) if np.isfinite(least) else least)))
 
 
 def crossed(one: Floats, other: Floats) -> Floats:

@@ -197,8 +197,11 @@ def _decided(refits: Refits, diagnosis: Diagnosis) -> Diagnosis:
         if retest.consistent is False:
             final_test = retest.with_vibration(test.lines.vibration)
             diagnosis, test = replace(diagnosis, before_in_noise_left=before_in_noise_left, test=final_test), retest
-    why_not = unearned(first, before, test.effects.walk) or _worse_alone(refits, before, first)
-    why_not = why_not or behind_nothing(first, table)
+    why_not = (
+        unearned(first, before, test.effects.walk)
+        or _worse_alone(refits, before, first)
+        or behind_nothing(first, table)
+    )
     certain = _certain_part(first, table, before, test.effects.walk) if why_not else None
     if certain is not None:
         table, first, why_not = replace(table, certain=certain), certain, ""

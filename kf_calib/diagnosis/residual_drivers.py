@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats, one_blas_thread
+from kf_calib.bench.arrays import Floats, one_blas_thread, sign
 from kf_calib.effects.formula import formula, quantities
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.residual_table import mean_sigmas, quantity_means
@@ -21,7 +21,7 @@ from kf_calib.estimation.score_test import joint_delta_chi2
 from kf_calib.support.tail_probabilities import f_tail
 
 _OF_FORCE = ("{0}*{0}", "{0}**3", "{0}**4")
-_OF_STEP = ("{0}", "{0}*abs({0})", "tanh({0}/(0.01*m/s**2))")  # a sign, but for rounding
+_OF_STEP = ("{0}", "{0}*abs({0})", "tanh({0}/(0.01*m/s**2))")  # the last is a sign, but for small steps
 _WAVES = tuple(f"{wave}({turns}*{{0}})" for turns in (1, 2, 3) for wave in ("sin", "cos"))
 _OF_TIME = ("{0}", "{0}*{0}", "{0}**3")
 _FUNCTIONS = {"a": _OF_FORCE, "p": _OF_FORCE, "o": _OF_FORCE, "da": _OF_STEP, "t": _OF_TIME, "T": _OF_TIME,
@@ -139,7 +139,7 @@ def _is_function(x: Floats, y: Floats, of_an_angle: bool) -> bool:
     known = np.isfinite(x) & np.isfinite(y)
     x, y = x[known], y[known]
     unit = x / max(np.abs(x).max(initial=0.0), 1e-300)
-    columns = [np.ones_like(x), x, np.where(np.abs(unit) > _ROUNDING, np.sign(x), 0.0)]
+    columns = [np.ones_like(x), x, sign(unit, _ROUNDING)]
     if of_an_angle:
         columns += [wave(turns * x) for turns in (1, 2, 3, 4) for wave in (np.sin, np.cos)]
     else:

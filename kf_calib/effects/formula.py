@@ -89,14 +89,17 @@ QUANTITIES: dict[str, FormulaQuantity] = {
 
 
 def _angle(s: Stimulus, gimbal: int) -> Floats:
+    """Return the angle of a gimbal (m, 1), rad."""
     return s.pose[:, gimbal : gimbal + 1]
 
 
 def _angle_before(s: Stimulus, gimbal: int) -> Floats:
+    """Return the same in the dwell before."""
     return s.previous_pose[:, gimbal : gimbal + 1]
 
 
 def _move(s: Stimulus, gimbal: int) -> Floats:
+    """Return the last move of a gimbal (m, 1), rad; 0 where it stood still."""
     return s.move(gimbal)[:, None]
 
 

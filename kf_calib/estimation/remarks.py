@@ -133,15 +133,14 @@ def remarks_on(
             "the run: each dwell has the weight of its own."
         )
     if not noise.checked and noise.scatter_mps2.any() and not noise.scatter_stated:
-        known = directions(linearised.means.force_mps2)
+        known, freedom = directions(linearised.means.force_mps2), degrees_of_freedom(linearised.means)
         yield (
             f"these orientations have gravity in {known} different direction{'s' * (known != 1)}, too few to "
             "distinguish a setting error of the angles from scatter of the sensors: all dwells have the same weight, "
-            f"and their whole misfit ({shown('m/s^2').text(noise.scatter_mps2[0], 2)}) enters every sigma. Visit "
+            f"and their whole misfit ({_scatter_in_words(noise, freedom)}) enters every sigma. Visit "
             f"{ENOUGH_DIRECTIONS} spread directions to distinguish them."
         )
-    few = model.bench.angles and degrees_of_freedom(linearised.means) < FEWEST
-    if few and unstated(noise) and not noise.scatter_mps2.any():
+    elif model.bench.angles and unstated(noise) and degrees_of_freedom(linearised.means) < FEWEST:
         yield (
             f"{len(dwells)} dwell{'s are' if len(dwells) > 1 else ' is'} too few to estimate what was not stated "
             f"({' and '.join(unstated(noise))}): it is taken as zero; if it is not zero, the sigmas are too small."
@@ -162,6 +161,16 @@ def remarks_on(
 def is_gross(noise: Noise, bench: Bench) -> bool:
     """Tell whether dwells scatter, by an amount that nobody stated, as no sensor does."""
     return not noise.scatter_stated and float(noise.scatter_mps2.max()) > _GROSS * bench.gravity_mps2
+
+
+def _scatter_in_words(noise: Noise, freedom: int) -> str:
+    """Return the size of scatter that was estimated; from few degrees of freedom, with how uncertain it is itself: by 1
+    / sqrt(2 nu), the standard deviation of a root of chi-squared with nu degrees of freedom."""
+    size = shown("m/s^2").text(noise.scatter_mps2[0], 2)
+    if freedom >= FEWEST:
+        return size
+    percent = 100.0 * math.sqrt(0.5 / max(freedom, 1))
+    return f"{size}, itself uncertain by {percent:.0f} % with {freedom} degree{'s' * (freedom != 1)} of freedom"
 
 
 def _on_held(effect: Effect, unknown: Unknown) -> str:
@@ -187,12 +196,10 @@ def _without_angles(linearised: LinearisedDwells, noise: Noise, judged: Consiste
             f"these poses do not tell the angles between the axes (nu1, theta3, phi3), which are taken for square to "
             f"{np.degrees(model.bench.square_rad):.3g} deg (--square-sigma), as sigmas allow for: {turn}."
         )
-    elif 0 < judged.dof < FEWEST and noise.scatter_mps2.any() and not noise.scatter_stated:
-        known = math.sqrt(0.5 / judged.dof)
+    elif judged.dof < FEWEST and noise.scatter_mps2.any() and not noise.scatter_stated:
         yield (
-            f"scatter between poses, {shown('m/s^2').text(noise.scatter_mps2[0], 2)}, was estimated from "
-            f"{judged.dof} degree{'s' * (judged.dof > 1)} of freedom that {count} poses leave, so that every sigma is "
-            f"itself uncertain by {known:.0%}: {turn}."
+            f"scatter between poses ({_scatter_in_words(noise, judged.dof)}) was estimated from the misfit of {count} "
+            f"poses and enters every sigma: {turn}."
         )
     elif judged.dof < FEWEST:
         yield f"{count} poses leave {judged.dof} degrees of freedom, too few to see scatter between poses: {turn}."

@@ -93,9 +93,9 @@ class VarianceComponents:
         each), the one with the largest restricted likelihood is taken, less a charge per number of the scatter: the 1 %
         point of its likelihood ratio against zero. A walk has a smaller charge, a setting error none. With fewer than
         6 degrees of freedom between dwells nothing is estimated but scatter of one size: it is uncertain, but without
-        it sigmas would be too small by any factor.
-        If there are too few orientations to tell a setting error from scatter, the whole misfit counts as scatter.
-        Where attitudes are not known, a dwell tells one number, and scatter has one size for all accelerometers.
+        it sigmas would be too small by any factor. If there are too few orientations to tell a setting error from
+        scatter, the whole misfit counts as scatter. Where attitudes are not known, a dwell tells one number, and
+        scatter has one size for all accelerometers.
 
         - means: the dwells' means; state (p,): where they are linearised.
         - prior: rows of prior knowledge about the coefficients, those of ``with_shared_noise``.
@@ -106,7 +106,7 @@ class VarianceComponents:
         reduced = _reduce(means, prior)
         measured = len(means.readings) if within.attitude_unknown else means.readings.size
         free = measured + len(reduced.prior) - reduced.means.design.shape[2]
-        combinations = self._combinations(stated, free)
+        combinations = _combinations(stated, self.walks, free)
         if not combinations:
             return stated
         likelihood = _likelihood(stated.weights, {part for parts in combinations for part in parts}, reduced, state)
@@ -117,12 +117,6 @@ class VarianceComponents:
             return stated
         best = self._likeliest(likelihood, combinations, without)
         return _with_estimates(stated, likelihood, best, self.sizes[best], without) if best else stated
-
-    def _combinations(self, stated: Noise, free: int) -> list[Parts]:
-        """Return the combinations of parts that may be estimated from so many degrees of freedom."""
-        if free < FEWEST:
-            return [("common",)] if free > 0 and not stated.scatter_stated else []
-        return _combinations(stated, self.walks)
 
     def _stated(self, within: Noise, means: Means) -> Noise:
         """Return the noise within dwells with the parts that are stated, and zeros for the others."""
@@ -159,8 +153,11 @@ class VarianceComponents:
         return best
 
 
-def _combinations(stated: Noise, walks: bool) -> list[Parts]:
-    """Return the combinations of parts that may be estimated; the last one contains all others."""
+def _combinations(stated: Noise, walks: bool, free: int) -> list[Parts]:
+    """Return the combinations of parts that may be estimated from so many degrees of freedom; the last one contains all
+    others."""
+    if free < FEWEST:
+        return [("common",)] if free > 0 and not stated.scatter_stated else []
     settings: list[Parts] = [()] if stated.setting_stated or not stated.checked else [(), ("setting",)]
     scatters: list[Parts] = [()] if stated.scatter_stated else [(), ("common",)]
     if stated.checked and not (stated.scatter_stated or stated.attitude_unknown):

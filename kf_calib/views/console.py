@@ -159,11 +159,14 @@ def noise_table(result: Calibration) -> ConsoleTable:
 
 def noise_origins(result: Calibration) -> tuple[str, str]:
     """Whether scatter and setting error were stated, estimated or not estimated, in words."""
-    noise, few = result.noise, degrees_of_freedom(result.linearised.means, not result.bench.angles) < FEWEST
+    noise = result.noise
     if noise.attitude_unknown:
-        few = len(result.visits) - len(paper_parameters.SYMBOLS) + len(result.fixed) < FEWEST
-    estimated = noise.scatter_mps2.any() or not few
-    scatter = "stated" if noise.scatter_stated else "estimated" if estimated else _NOT_ESTIMATED
+        freedom = len(result.visits) - len(paper_parameters.SYMBOLS) + len(result.fixed)
+    else:
+        freedom = degrees_of_freedom(result.linearised.means, not result.bench.angles)
+    few = freedom < FEWEST
+    is_estimated = noise.scatter_mps2.any() or not few
+    scatter = "stated" if noise.scatter_stated else "estimated" if is_estimated else _NOT_ESTIMATED
     if noise.attitude_unknown:
         return scatter, _NOT_USED
     if not noise.setting_stated:

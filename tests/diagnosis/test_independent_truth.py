@@ -136,11 +136,11 @@ def test_a_sound_bench_agrees(seeds: Sequence[int], most: int) -> None:
     assert sum(p_value < 0.01 for p_value in p_values) <= most
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3, 9, 10, 11))])
+@pytest.mark.parametrize("seed", [2, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (0, 3, 9, 10, 11))])
 def test_a_fit_that_runs_away_names_nothing(seed: int) -> None:
     """Beside a drift of the scale factors their warm-up has no time constant: scale factors of thousands left a misfit
-    of 1e8, and the pair was named with 99.5 %. Such a fit is refused, if it does not end at a warm-up that is over soon.
-    """
+    of 1e8, and the pair was named with 99.5 %. Such a fit is refused, if it does not end at a warm-up that is
+    over soon."""
     settings = np.radians(0.02) * np.random.default_rng(seed + 99).standard_normal((18, 3))
     bench = IndependentBench(
         seed, dwells=18, white_mps2=4e-3, bench=replace(BENCH, angle_sigma_deg=0.02),

@@ -215,7 +215,7 @@ def test_memory_in_proportion_to_the_last_step_is_not_surely_settling() -> None:
     assert any(row.driver == "previous orientation" and row.probability > 0.05 for row in diagnosis.table.rows)
 
 
-@pytest.mark.parametrize(("dwell_s", "decays"), [(7.0, {10}), (20.0, {10, 30}), (200.0, {10, 30, 100, 300})])
+@pytest.mark.parametrize(("dwell_s", "decays"), [(7.0, {3, 10}), (20.0, {3, 10, 30}), (200.0, {3, 10, 30, 100, 300})])
 def test_no_decay_since_the_arrival_is_much_longer_than_the_dwells(dwell_s: float, decays: set[int]) -> None:
     dwells = [SimpleNamespace(start_s=300.0 * k, end_s=300.0 * k + dwell_s) for k in range(12)]
     texts = [text for driver, texts in _of_time(dwells) if driver == ARRIVAL for text in texts]

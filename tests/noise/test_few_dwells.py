@@ -43,18 +43,19 @@ def test_without_scatter_none_is_estimated() -> None:
 
 def test_how_uncertain_the_sigmas_are_is_said() -> None:
     result = calibrate(scattering(1, 5))
-    assert any("their whole misfit" in warning for warning in result.warnings)
+    (said,) = [warning for warning in result.warnings if "their whole misfit" in warning]
+    assert ", itself uncertain by 41 % with 3 degrees of freedom) enters every sigma" in said
     assert not any("it is taken as zero" in warning for warning in result.warnings)
+    stated = replace(scattering(1, 5), bench=replace(UNSTATED, scatter_sigma_mps2=SCATTER_MPS2))
+    assert any("(angle_sigma_deg): it is taken as zero" in warning for warning in calibrate(stated).warnings)
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not REAL.is_dir(), reason="the recordings of others are not there")
 def test_a_dozen_poses_of_a_real_sensor_agree_with_all_others_within_their_sigmas() -> None:
     """Within 1.96 sigma are 86 % by Student's t of 3 degrees of freedom, and 63 % were where scatter was left out."""
-    source, rng = (
-        open_log(REAL / "xsens_mti.csv.gz", {"gravity_mps2": "9.80665"}, angles=False),
-        np.random.default_rng(0),
-    )
+    source = open_log(REAL / "xsens_mti.csv.gz", {"gravity_mps2": "9.80665"}, angles=False)
+    rng = np.random.default_rng(0)
     numbers, ratios = [dwell.number for dwell in calibrate(source).fit.dwells], list[float]()
     for _ in range(25):
         twelve = set(rng.choice(numbers, 12, replace=False).tolist())

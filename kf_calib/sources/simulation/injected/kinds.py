@@ -238,10 +238,6 @@ def added(
     return register
 
 
-_NO_SIGN_MPS2 = 1e-9
-"""Below this an acceleration is rounding noise and has no sign."""
-
-
 def pendulous(state: TrueState) -> Floats:
     """a_p of the three accelerometers: platform y, z, x."""
     return state.force_mps2[:, [1, 2, 0]]
@@ -255,11 +251,6 @@ def output(state: TrueState) -> Floats:
 def above(state: TrueState, reference_c: float) -> Floats:
     """T (n, 1), the true temperature above the reference."""
     return column(state.temperature_c - reference_c)
-
-
-def sign(values: Floats, least: float = _NO_SIGN_MPS2) -> Floats:
-    """-1, 0 or 1; 0 below ``least``."""
-    return np.where(np.abs(values) < least, 0.0, np.sign(values))
 
 
 def column(values: Floats) -> Floats:

@@ -11,8 +11,8 @@ import math
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats
-from kf_calib.sources.simulation.injected.kinds import Rig, above, added, adding, column, made, output, pendulous, sign
+from kf_calib.bench.arrays import Floats, sign
+from kf_calib.sources.simulation.injected.kinds import Rig, above, added, adding, column, made, output, pendulous
 from kf_calib.sources.simulation.physics import TrueState, TrueStep, WalkingBias
 from kf_calib.sources.simulation.sensors import FirstOrder
 
