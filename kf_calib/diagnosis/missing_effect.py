@@ -20,7 +20,9 @@ import numpy as np
 from kf_calib.bench.arrays import one_blas_thread
 from kf_calib.bench.streams import Source
 from kf_calib.diagnosis.candidate_tests import CandidateTests, overlap_matrix
-from kf_calib.diagnosis.hypotheses import Hypotheses, log_odds_of
+import os
+from kf_calib.diagnosis.hypotheses import Hypotheses as _Old, log_odds_of
+from kf_calib.diagnosis.posterior import Posterior
 from kf_calib.diagnosis.hypothesis_table import (
     ALIKE,
     LISTED,
@@ -47,6 +49,10 @@ from kf_calib.effects import effect_named
 from kf_calib.estimation.outlying_dwell import outlying_in_words
 from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.support.tail_probabilities import chi_squared_tail
+
+def Hypotheses(*a):
+    return Posterior(*a) if os.environ.get("KF_NEW") else _Old(*a)
+
 
 _SHOWN = 6  # number of suspects that are shown
 _DOUBT = 0.01  # probability from which noise that was not stated is named as a rival
@@ -146,7 +152,7 @@ def _explained(refits: Refits, before: Calibration, test: CandidateTests) -> Dia
     if test.consistent is None:
         return diagnosis
     if test.consistent and dwell_noise_is_stated(before):
-        return replace(diagnosis, table=Hypotheses(refits, before, test).quick_table())
+        return replace(diagnosis, table=Hypotheses(refits, before, test).table(False) if os.environ.get('KF_NEW') else _Old(refits, before, test).quick_table())
     if test.consistent:  # noise that is estimated from all of the misfit explains as much of it as an effect does
         table = Hypotheses(refits, before, test).table()
         diagnosis = replace(diagnosis, test=replace(test, noise_p=noise_p(table)), table=table)
@@ -166,7 +172,7 @@ def _beside_lines(refits: Refits, before: Calibration, test: CandidateTests) -> 
     log_odds = log_odds_of(test.effects.p_values[test.lines.oscillation])
     family = with_oscillation.model.effects[-1].family
     hypotheses = Hypotheses(refits, with_oscillation, test_beside)
-    table = hypotheses.table() if test_beside.consistent is False else hypotheses.quick_table()
+    table = hypotheses.table() if test_beside.consistent is False else hypotheses.table(False)
     rows = [row for row in table.rows if row.driver != ALIKE]
     logs_without = [row.log_evidence for row in rows if not row.effects and not row.driver]
     both = [
