@@ -8,6 +8,7 @@ among its members.
 from __future__ import annotations
 
 import contextlib
+import os
 import itertools
 import math
 from collections.abc import Sequence
@@ -16,6 +17,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+
+from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.candidate_tests import CandidateTests
@@ -34,6 +37,8 @@ from kf_calib.diagnosis.hypotheses import log_odds_of
 from kf_calib.estimation.results import Calibration
 from kf_calib.noise.reml import OF_ONE
 
+Ints = NDArray[np.intp]
+
 PRIOR = {"nothing": 0.4, "effect": 0.38, "pair": 0.08, "unknown": 0.1, "beside": 0.02, "dwell": 0.02}
 """Prior probability of each kind of explanation; ``beside``: an effect beside an unknown function."""
 
@@ -44,7 +49,7 @@ _DECADES = 7.0  # of the sizes of what has no usual size
 _NODES = 40
 _REFITTED = 8
 _BEHIND = 10.0  # in log evidence: rows further behind are not fitted
-_MOST = 4  # effects beside which all others are tried
+_MOST = 3  # effects beside which all others are tried
 _WITHIN = 0.97  # share of a known effect's column in the span of an unknown function, which is then without it
 _SHORT = 0.01  # prior probability of irregular changes that show within dwells only
 _NO_NOISE = 0.1  # share of an unknown cause in scatter that was not stated
@@ -67,6 +72,20 @@ class _Group:
     log_share: float
     effect: Effect | None = None
     alternative: int = 0
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Groups of q columns each: their numbers (n,) and columns (n, q); G^T G (n, q, q) and G^T z (n, q) of the rows
+    within dwells; squares (n, m) of their sizes, logs (n, m) of the probabilities of these, and centres (n,)."""
+
+    numbers: Ints
+    places: Ints
+    gram: Floats
+    along: Floats
+    squares: Floats
+    log_weights: Floats
+    centres: Floats
 
 
 class Posterior:
@@ -146,27 +165,29 @@ class Posterior:
             if weights is not None and row != self.walk:
                 scales[part] = weights / np.where(rms[part] > 0.0, rms[part], np.inf)
         self.likelihood.rescaled(scales)
-        plain = self.likelihood.projected(None)
-        catalogue = [p for p, (row, e, *_) in zip(parts, entries, strict=True) if e is not None]
-        known = np.concatenate([plain.columns[:, p] for p in catalogue], axis=1)
+        plain = self.likelihood.whole()
+        catalogue = [p for p, (_, effect, *_) in zip(parts, entries, strict=True) if effect is not None]
+        known = np.concatenate([plain[:, p] for p in catalogue], axis=1)
         places = np.concatenate([np.arange(p.start, p.stop) for p in catalogue])
+        starts = np.cumsum([0, *(p.stop - p.start for p in catalogue)])[:-1]
+        widths = [p.stop - p.start for p in catalogue]
         lengths = np.linalg.norm(known, axis=0)
         known = known / np.where(lengths > 0.0, lengths, np.inf)
-        for part, (row, effect, share, weights, number) in zip(parts, entries, strict=True):
+        for part, (row, _, _, weights, _) in zip(parts, entries, strict=True):
             if weights is None or row == self.walk:
                 continue
-            columns = plain.columns[:, part]
-            left, singular, _ = np.linalg.svd(columns, full_matrices=False)
+            left, singular, _ = np.linalg.svd(plain[:, part], full_matrices=False)
             span = left[:, singular > 1e-6 * singular.max(initial=1e-300)]
-            inside = np.linalg.norm(span.T @ known, axis=0) > _WITHIN
-            if inside.any():
-                chosen = places[inside]
-                coefficients, *_ = np.linalg.lstsq(plain.columns[:, chosen] / lengths[inside], columns, rcond=1e-6)
-                self.likelihood.without(part, chosen, coefficients / lengths[inside, None])
-        plain = self.likelihood.projected(None)
+            cosines = np.where(lengths > 0.0, np.linalg.norm(span.T @ known, axis=0), 0.0)
+            inside = np.repeat(np.minimum.reduceat(cosines, starts) > _WITHIN, widths)  # all columns of an effect
+            if inside.any() and os.environ.get("KF_PROJ"):
+                scaled = plain[:, places[inside]] / lengths[inside]
+                coefficients, *_ = np.linalg.lstsq(scaled, plain[:, part], rcond=1e-6)
+                self.likelihood.without(part, places[inside], coefficients / lengths[inside, None])
+        plain = self.likelihood.whole()
         groups = list[_Group]()
         for part, (row, effect, share, weights, number) in zip(parts, entries, strict=True):
-            columns = plain.columns[:, part]
+            columns = plain[:, part]
             least = best_sigma(columns)
             if least > 1e19:
                 continue
@@ -222,7 +243,7 @@ class Posterior:
         of_families = np.array([k for k, _, _ in self._noises])
         parts = [logs[:, of_families == 0][:, 0] + self._families[0][2]]
         for k, (_, _, prior) in enumerate(self._families[1:], start=1):
-            parts.append(integrated(logs[:, of_families == k]) - _RANGE + prior)
+            parts.append(integrated(logs[:, of_families == k], self.likelihood.step) - _RANGE + prior)
         return np.stack(parts, axis=1)
 
     # -- rows ----------------------------------------------------------------------------------------------------
@@ -239,23 +260,40 @@ class Posterior:
         return np.array(base), np.array(bayes).T, np.array(dwell)
 
     def _bayes_of(self, rows: Projected) -> Floats:
-        logs = np.zeros(len(self.groups))
-        for width, numbers in self._by_width.items():
-            places = np.array([np.arange(g.columns.start, g.columns.stop) for g in (self.groups[k] for k in numbers)])
-            columns = rows.columns.T[places]
-            gram, along = columns @ np.swapaxes(columns, 1, 2), columns @ rows.readings
-            logs[numbers] = log_bayes(gram, along, [self.groups[k].sizes for k in numbers])
+        """Log Bayes factors (groups,) of all terms in one noise."""
+        logs, columns = np.zeros(len(self.groups)), np.ascontiguousarray(rows.columns.T)
+        for block in self._blocks:
+            own = columns[block.places]
+            gram, along = own @ np.swapaxes(own, 1, 2), own @ rows.readings
+            if rows.more:
+                gram, along = gram + block.gram, along + block.along
+            logs[block.numbers] = log_bayes(gram, along, block.squares, block.log_weights, block.centres)
         return logs
 
+    @cached_property
+    def _blocks(self) -> list[_Block]:
+        """The groups of equal width."""
+        more, readings = self.likelihood.more
+        blocks, transposed = list[_Block](), np.ascontiguousarray(more.T)
+        for numbers in self._by_width.values():
+            groups = [self.groups[k] for k in numbers]
+            places = np.array([np.arange(group.columns.start, group.columns.stop) for group in groups])
+            own = transposed[places]
+            blocks.append(
+                _Block(
+                    np.array(numbers), places, own @ np.swapaxes(own, 1, 2), own @ readings,
+                    np.stack([group.sizes.values for group in groups]) ** 2,
+                    np.stack([group.sizes.logs for group in groups]), np.array([g.sizes.centre for g in groups]),
+                )
+            )  # fmt: skip
+        return blocks
+
     def _of_one_dwell(self, rows: Projected) -> float:
+        """Log Bayes factor of an offset of any size in one dwell alone."""
         gram, along = rows.of_dwells()
-        logs = log_bayes(gram, along, [self._any_size(gram)] * len(gram))
+        logs = _log_bayes_of_any(gram, along)
         self._last_dwell = int(np.argmax(logs))
         return float(np.logaddexp.reduce(logs)) - math.log(len(logs))
-
-    def _any_size(self, gram: Floats) -> Sizes:
-        return _sizes(1.0 / math.sqrt(max(float(np.einsum("nqq->nq", gram).max()), 1e-300)), None)
-
 
     # -- the table -----------------------------------------------------------------------------------------------
 
@@ -299,7 +337,7 @@ class Posterior:
         for part in OF_ONE:
             shapes = self.likelihood.shapes_of(part)
             base = np.array([[self.likelihood.bare(size**2 * shapes) for size in sizes.tolist()]])
-            logs.append(((part,), float(integrated(base)[0]) - _RANGE + prior))
+            logs.append(((part,), float(integrated(base, self.likelihood.step)[0]) - _RANGE + prior))
         return logs
 
     def _scattering(self) -> int:
@@ -448,12 +486,12 @@ class Posterior:
         places = [model.parts[str(effect)].start - known + np.arange(len(effect.coefficients)) for effect in effects]
         usual = [usual_sizes(effect, self.grade) for effect in effects]
         related = [*itertools.product(*([*effect.relations] or [np.eye(len(effect.coefficients))] for effect in effects))]
-        plain = likelihood.projected(None)
+        plain = likelihood.whole()
         logs = np.full((len(related), len(self._noises)), -math.inf)
-        sizes = [[_sizes(best_sigma(plain.columns[:, p] @ matrix), u, _NODES_OF_PAIR) for p, u, matrix in
+        sizes = [[_sizes(best_sigma(plain[:, p] @ matrix), u, _NODES_OF_PAIR) for p, u, matrix in
                   zip(places, usual, matrices, strict=True)] for matrices in related]  # fmt: skip
         for k, (_, _, covariance) in enumerate(self._noises):
-            rows = likelihood.projected(covariance)
+            rows = likelihood.projected(covariance, whole=True)
             for j, matrices in enumerate(related):
                 parts = [rows.columns[:, p] @ matrix for p, matrix in zip(places, matrices, strict=True)]
                 logs[j, k] = rows.log + log_bayes_together(parts, rows.readings, sizes[j])
@@ -506,9 +544,11 @@ class Posterior:
 
     def _bayes(self, places: slice | Floats, rows: Projected) -> float:
         """Log Bayes factor of some columns of any size."""
-        columns = rows.columns[:, places]
-        gram = columns.T @ columns
-        return float(log_bayes(gram[None], (columns.T @ rows.readings)[None], [self._any_size(gram[None])])[0])
+        columns, more = rows.columns[:, places], self.likelihood.more
+        gram, along = columns.T @ columns, columns.T @ rows.readings
+        if rows.more:
+            gram, along = gram + more[0][:, places].T @ more[0][:, places], along + more[0][:, places].T @ more[1]
+        return float(_log_bayes_of_any(gram[None], along[None])[0])
 
     def _places_of(self, name: str) -> range:
         """Columns of an effect at its likeliest constant."""
@@ -549,6 +589,13 @@ def _sizes(least: float, usual: SizePrior | None, nodes: int = _NODES) -> Sizes:
     shares = np.diff(usual.below(edges))
     shares[-1] += 1.0 - float(usual.below(edges[-1:])[0])
     return Sizes(np.sqrt(edges[1:] * edges[:-1]), np.log(np.maximum(shares, 1e-300)))
+
+
+def _log_bayes_of_any(gram: Floats, along: Floats) -> Floats:
+    """Log Bayes factors (n,) of terms of any size."""
+    sizes = _sizes(1.0 / math.sqrt(max(float(np.einsum("nqq->nq", gram).max()), 1e-40)), None)
+    squares, logs = (np.broadcast_to(values, (len(gram), _NODES)) for values in (sizes.values**2, sizes.logs))
+    return log_bayes(gram, along, squares, logs, np.zeros(len(gram)))
 
 
 def _named(text: str, number: int = 0) -> str:

@@ -21,6 +21,7 @@ from functools import cached_property
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.pieces import OfPieces, of_all_pieces
 from kf_calib.effects import Effect
 from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns
@@ -32,7 +33,6 @@ from kf_calib.noise.temperature_course import thermometer_errors
 
 _IMMENSE_MPS2 = 1e3  # scatter so large that nothing is left of a dwell's mean
 _SEEN = 1e-7  # share of a column that the model must leave for it to be seen
-_STEP = 0.35  # of the logarithm of the size of noise
 _FINE = 8  # parts of a step over which the likelihood is integrated
 _LEAST = 0.1  # sigma of a mean: noise that is smaller shows nothing
 _SIZES = 40  # sizes of a term that are tried
@@ -50,13 +50,15 @@ class Sizes:
 @dataclass(frozen=True)
 class Projected:
     """Rows in one noise, projected off the model: columns (r, C), readings (r,); log: of the restricted likelihood
-    without any term; basis (r, k) of what was projected off; root (D, 3, 3): what whitens the means in this noise."""
+    without any term; basis (r, k) of what was projected off; root (D, 3, 3): what whitens the means in this noise;
+    more: whether rows within dwells are left out, since they are the same in every noise."""
 
     columns: Floats
     readings: Floats
     log: float
     basis: Floats
     root: Floats
+    more: bool
 
     def of_dwells(self) -> tuple[Floats, Floats]:
         """G^T G (D, 3, 3) and G^T z (D, 3) of offsets of the three accelerometers in one dwell alone."""
@@ -143,7 +145,7 @@ class RunLikelihood:
         last = model.count + added.shape[3]
         thermometer = full[:, last:]
         of_model = np.zeros((len(rows), known + shared))
-        of_model[:, :known] = full[:, :known]
+        of_model[:, STATE_COUNT:known] = full[:, STATE_COUNT:known]  # the twelve have none, but for noise of the angles
         if thermometer.shape[1]:
             of_model[:, -thermometer.shape[1] :] = thermometer
         readings = rows[:, -1] + full[:, known : model.count] @ linearised.state[known:]
@@ -174,41 +176,63 @@ class RunLikelihood:
 
     def bare(self, covariances: Floats | None) -> float:
         """Log of the restricted likelihood with further noise, without any term."""
-        model, readings, log = self._model, self._readings, -self._log_root
-        if covariances is not None:
-            lower = np.linalg.cholesky(np.eye(3) + covariances)
-            root = np.linalg.inv(lower)
-            model, readings = root @ model, (root @ readings[..., None])[..., 0]
-            log -= float(np.log(np.einsum("dii->di", lower)).sum())
-        whole = np.concatenate([model.reshape(-1, model.shape[2]), self._more_model]) @ self._seen
-        z = np.append(readings.ravel(), self._more_readings)
+        model, _, readings, _, log = self._in_noise(covariances, columns=False)
+        whole = np.concatenate([model, self._more_model]) @ self._seen
+        z = np.append(readings, self._more_readings)
         basis, upper = np.linalg.qr(whole)
         z = z - basis @ (basis.T @ z)
         return log - float(np.log(np.abs(np.diag(upper))).sum()) - 0.5 * float(z @ z)
 
-    def projected(self, covariances: Floats | None, flat: Sequence[int] = ()) -> Projected:
+    def whole(self) -> Floats:
+        """The columns (r, C) of the terms in the noise that was stated, projected off the model, in all rows."""
+        return self.projected(None, whole=True).columns
+
+    def projected(self, covariances: Floats | None, flat: Sequence[int] = (), whole: bool = False) -> Projected:
         """The rows with further noise, (D, 3, 3) in units of that stated, projected off the model, and off the columns
-        ``flat`` of the terms."""
-        root = np.broadcast_to(np.eye(3), self._root.shape)
-        model, columns, readings, log = self._model, self._columns, self._readings, -self._log_root
-        if covariances is not None:
-            lower = np.linalg.cholesky(np.eye(3) + covariances)
-            root = np.linalg.inv(lower)
-            model, columns, readings = root @ model, root @ columns, (root @ readings[..., None])[..., 0]
-            log -= float(np.log(np.einsum("dii->di", lower)).sum())
-        whole = np.concatenate([model.reshape(-1, model.shape[2]), self._more_model])
-        terms = np.concatenate([columns.reshape(-1, columns.shape[2]), self._more_columns])
-        z = np.append(readings.ravel(), self._more_readings)
-        basis, upper = np.linalg.qr(whole @ self._seen)
+        ``flat`` of the terms.
+
+        Rows within dwells in which neither the model nor these have columns are the same in every noise: they are left
+        out, and ``more`` says so.
+        """
+        model, terms, z, root, log = self._in_noise(covariances)
+        more = not (whole or self._has_more_model or self._more_columns[:, flat].any())
+        if not more:
+            model, z = np.concatenate([model, self._more_model]), np.append(z, self._more_readings)
+            terms = np.concatenate([terms, self._more_columns])
+        basis, upper = np.linalg.qr(model @ self._seen)
         log -= float(np.log(np.abs(np.diag(upper))).sum())
         terms, z = terms - basis @ (basis.T @ terms), z - basis @ (basis.T @ z)
         if len(flat):
             lengths = np.linalg.norm(terms[:, flat], axis=0)
-            left, singular, _ = np.linalg.svd(terms[:, flat] / np.where(lengths > 0.0, lengths, 1.0), full_matrices=False)
+            own = terms[:, flat] / np.where(lengths > 0.0, lengths, 1.0)
+            left, singular, _ = np.linalg.svd(own, full_matrices=False)
             left = left[:, singular > _SEEN]
             terms, z = terms - left @ (left.T @ terms), z - left @ (left.T @ z)
             basis = np.hstack([basis, left])
-        return Projected(terms, z, log - 0.5 * float(z @ z), basis, root)
+        log -= 0.5 * float(z @ z) + (0.5 * float(self._more_readings @ self._more_readings) if more else 0.0)
+        return Projected(terms, z, log, basis, root, more)
+
+    def _in_noise(self, covariances: Floats | None, columns: bool = True) -> tuple[Floats, Floats, Floats, Floats, float]:
+        """The rows of the means with further noise: of the model, the terms, and readings; what whitens them, and the
+        log of their density."""
+        count = len(self._root)
+        root, log = np.broadcast_to(np.eye(3), self._root.shape), -self._log_root
+        parts = [self._model, self._columns if columns else self._columns[..., :0], self._readings[..., None]]
+        if covariances is not None:
+            lower = np.linalg.cholesky(np.eye(3) + covariances)
+            root = np.linalg.inv(lower)
+            parts = [root @ part for part in parts]
+            log -= float(np.log(np.einsum("dii->di", lower)).sum())
+        return parts[0].reshape(3 * count, -1), parts[1].reshape(3 * count, -1), parts[2].ravel(), root, log
+
+    @property
+    def _has_more_model(self) -> bool:
+        return bool(self._more_model.any())
+
+    @property
+    def more(self) -> tuple[Floats, Floats]:
+        """Rows within dwells and of prior knowledge: of the terms (r, C), and readings (r,)."""
+        return self._more_columns, self._more_readings
 
     @cached_property
     def _seen(self) -> Floats:
@@ -223,10 +247,22 @@ class RunLikelihood:
     def sizes_of_scatter(self) -> Floats:
         """Sizes (k,) of noise that are tried, in units of ``shapes_of``: from one that shows nothing to all of the
         misfit."""
-        left = self.projected(None)
-        most = math.sqrt(float(left.readings @ left.readings) / max(self.rows - self._model.shape[2], 1))
-        count = int(math.log(max(3.0 * most, 30.0) / _LEAST) / _STEP) + 4
-        return _LEAST * np.exp(_STEP * np.arange(count))
+        most = math.sqrt(self.misfit / max(self.rows - self._model.shape[2], 1))
+        step = self.step
+        return _LEAST * np.exp(step * np.arange(int(math.log(max(3.0 * most, 30.0) / _LEAST) / step) + 4))
+
+    @cached_property
+    def misfit(self) -> float:
+        """Chi-squared of the means without any term, in the noise that was stated."""
+        model, _, z, _, _ = self._in_noise(None, columns=False)
+        basis = np.linalg.qr(model @ self._seen)[0]
+        return float(np.sum((z - basis @ (basis.T @ z)) ** 2))
+
+    @property
+    def step(self) -> float:
+        """Step of the logarithm of a size of noise: cubic interpolation of the likelihood of n rows, whose derivatives
+        are about n, errs by n step^4 / 100 or so."""
+        return min((10.0 / self.rows) ** 0.25, 0.6)
 
     def shapes_of(self, kind: str) -> Floats:
         """Covariances (D, 3, 3) of scatter ("common"; "first" ... of one accelerometer) or of a setting error, of unit
@@ -251,20 +287,19 @@ def _differ(values: Floats, ends: Floats) -> Floats:
     return np.abs(values - first).max(axis=(0, 1, 2)) > 1e-12 * largest
 
 
-def log_bayes(gram: Floats, along: Floats, sizes: Sequence[Sizes]) -> Floats:
+def log_bayes(gram: Floats, along: Floats, squares: Floats, log_weights: Floats, centres: Floats) -> Floats:
     """Log Bayes factors (n,) of n terms of q columns: gram (n, q, q), along (n, q) = G^T z, each averaged over its
-    sizes."""
+    sizes, of which the squares (n, m), the logs (n, m) of their probabilities and the centres (n,) are given."""
     scales = np.sqrt(np.maximum(np.einsum("nqq->nq", gram).max(axis=1), 1e-300))
     values, vectors = np.linalg.eigh(gram / scales[:, None, None] ** 2)
     values = np.where(values > 1e-13, values, 0.0)
-    centres = np.array([each.centre for each in sizes])
     shifted = along - (gram @ np.ones(gram.shape[1])) * centres[:, None] if centres.any() else along
     shift = along.sum(axis=1) * centres - 0.5 * gram.sum(axis=(1, 2)) * centres**2 if centres.any() else 0.0
     turned = np.einsum("nqk,nq->nk", vectors, shifted / scales[:, None]) ** 2 * (values > 0.0)
-    squares = (np.stack([each.values for each in sizes]) * scales[:, None])[:, :, None] ** 2
+    squares = (squares * scales[:, None] ** 2)[:, :, None]
     spread = squares * values[:, None]
     logs = 0.5 * np.sum(squares * turned[:, None] / (1.0 + spread) - np.log1p(spread), axis=2)
-    return np.logaddexp.reduce(logs + np.stack([each.logs for each in sizes]), axis=1) + shift
+    return np.logaddexp.reduce(logs + log_weights, axis=1) + shift
 
 
 def log_bayes_together(parts: Sequence[Floats], readings: Floats, sizes: Sequence[Sizes]) -> float:
@@ -284,8 +319,8 @@ def log_bayes_together(parts: Sequence[Floats], readings: Floats, sizes: Sequenc
     return float(np.logaddexp.reduce(terms)) + 0.5 * float(readings @ readings - shifted @ shifted)
 
 
-def integrated(logs: Floats) -> Floats:
-    """Log of the integral (n,) of exp(logs) over the logarithm of a size, from its values (n, k) at steps ``_STEP``,
+def integrated(logs: Floats, step: float) -> Floats:
+    """Log of the integral (n,) of exp(logs) over the logarithm of a size, from its values (n, k) at equal steps,
     between which it is cubic (Lagrange's polynomials through four neighbours)."""
     count = logs.shape[1]
     at = np.arange((count - 1) * _FINE + 1) / _FINE
@@ -296,4 +331,4 @@ def integrated(logs: Floats) -> Floats:
         u * (u - 1) * (u - 2) / 6,
     ])  # fmt: skip
     fine = sum(weights[k] * logs[:, first + k] for k in range(4))
-    return np.logaddexp.reduce(fine, axis=1) + math.log(_STEP / _FINE)
+    return np.logaddexp.reduce(fine, axis=1) + math.log(step / _FINE)
