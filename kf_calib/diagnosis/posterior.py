@@ -7,14 +7,11 @@ among its members.
 
 from __future__ import annotations
 
-import contextlib
-import os
 import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -29,6 +26,7 @@ from kf_calib.diagnosis.hypothesis_table import (
 from kf_calib.diagnosis.refits import Refits, dwell_noise_is_stated
 from kf_calib.diagnosis.run_likelihood import Projected, RunLikelihood, Sizes, integrated, log_bayes, log_bayes_together
 from kf_calib.diagnosis.unknown_terms import UnknownTerm, unknown_terms
+from kf_calib.dwells.qr import orthonormal
 from kf_calib.effects import Coefficient, Effect, Stimulus, effect_named, walk_named
 from kf_calib.effects.formula import formula
 from kf_calib.errors import InputError, UnobservableError
@@ -47,10 +45,13 @@ _OF_ONE = 0.1  # share of one accelerometer alone in scatter
 _RANGE = math.log(1e4)  # of the sizes of noise
 _DECADES = 7.0  # of the sizes of what has no usual size
 _NODES = 40
+_SPARSE = 0.5  # share of one summand alone in the functions of a driver
+_SAME = 0.99  # cosine above which a summand is a known effect
+_HIDDEN = 1e19  # sigma of columns of which rounding alone is seen
+_WAVES = 40  # of a random walk
 _REFITTED = 8
 _BEHIND = 10.0  # in log evidence: rows further behind are not fitted
 _MOST = 3  # effects beside which all others are tried
-_WITHIN = 0.97  # share of a known effect's column in the span of an unknown function, which is then without it
 _SHORT = 0.01  # prior probability of irregular changes that show within dwells only
 _NO_NOISE = 0.1  # share of an unknown cause in scatter that was not stated
 _AGAINST_STATED = 0.5  # the same of noise that contradicts what was stated
@@ -63,15 +64,50 @@ _SUMMANDS = 3  # most formulas that describe an unknown function
 
 @dataclass(frozen=True)
 class _Group:
-    """Columns of one term: their combinations ``span`` of the columns of the likelihood, its sizes, and the log of its
-    share in its row."""
+    """Columns of one term, the sizes of their coefficients, and the log of its share in its row, which is an effect or
+    ``?`` and the number of an unknown term; summands: which of this term's."""
 
     row: str
-    columns: slice
-    sizes: Sizes
+    columns: Ints
     log_share: float
     effect: Effect | None = None
-    alternative: int = 0
+    summands: tuple[int, ...] = ()
+    sizes: Sizes = Sizes(np.zeros(0), np.zeros(0))
+
+
+class _Columns:
+    """The columns of all terms while they are put together: effects that make them, blocks of combinations of these,
+    the weights of the blocks' columns (0: as they are), and groups of blocks."""
+
+    def __init__(self) -> None:
+        self.effects, self.blocks, self.groups = list[Effect](), list[tuple[slice, Floats | None]](), list[_Group]()
+        self._weights, self._made, self._places = list[Floats](), 0, list[Ints]()
+        self._count = 0
+
+    @property
+    def weights(self) -> Floats:
+        return np.concatenate(self._weights)
+
+    def add(self, effects: Sequence[Effect]) -> slice:
+        """Add the columns of effects, and say where they are."""
+        first, self._made = self._made, self._made + sum(len(effect.coefficients) for effect in effects)
+        self.effects += effects
+        return slice(first, self._made)
+
+    def block(self, part: slice, matrix: Floats | None, weight: float = 0.0) -> int:
+        """Add combinations of columns, and return their number."""
+        width = part.stop - part.start if matrix is None else matrix.shape[1]
+        self.blocks.append((part, matrix))
+        self._weights.append(np.full(width, weight))
+        self._places.append(np.arange(self._count, self._count + width))
+        self._count += width
+        return len(self.blocks) - 1
+
+    def group(self, row: str, blocks: Sequence[int], log_share: float, effect: Effect | None = None,
+              summands: tuple[int, ...] = ()) -> None:  # fmt: skip
+        """Add the columns of some blocks as one term."""
+        places = np.concatenate([self._places[block] for block in blocks])
+        self.groups.append(_Group(row, places, log_share, effect, summands))
 
 
 @dataclass(frozen=True)
@@ -112,91 +148,69 @@ class Posterior:
 
     def _make_columns(self) -> None:
         """Make the columns of all terms, and group them by row."""
-        bench, axes, gravity = self.before.bench, self.before.bench.axes, self.before.bench.gravity_mps2
-        effects, blocks, entries = [*self.candidates], list[tuple[slice, Floats | None]](), list[Any]()
-        stop = 0
-        log_priors = [-math.log(max(e.value / e.acts_for_s(self._stimulus), 1.0)) for e in effects]
-        of_name = dict[str, list[int]]()
-        for k, effect in enumerate(effects):
-            of_name.setdefault(str(effect), []).append(k)
-        shares = np.zeros(len(effects))
-        for numbers in of_name.values():
-            tried = max(len(numbers), *(self.tried[k] for k in numbers)) if len(numbers) == 1 else len(numbers)
-            norm = float(np.logaddexp.reduce([log_priors[k] for k in numbers])) + math.log(tried / len(numbers))
-            for k in numbers:
-                shares[k] = log_priors[k] - norm
-        for k, effect in enumerate(effects):
-            part = slice(stop, stop := stop + len(effect.coefficients))
-            relations = effect.relations or [None]
+        axes, gravity = self.before.bench.axes, self.before.bench.gravity_mps2
+        columns, shares = _Columns(), self._log_shares_of_values()
+        for k, effect in enumerate(self.candidates):
+            part = columns.add([effect])
+            relations = [*effect.relations] or [None]
             for matrix in relations:
-                blocks.append((part, matrix))
-                entries.append((str(effect), effect, shares[k] - math.log(len(relations)), None, k))
+                columns.group(str(effect), [columns.block(part, matrix)], shares[k] - math.log(len(relations)), effect)
         for number, term in enumerate(self.terms):
-            for alternative, texts in enumerate(term.alternatives):
-                made = list[Effect]()
-                for text in texts:
-                    with contextlib.suppress(InputError):
-                        made.append(formula(_named(text), axes, gravity, checked=False))
-                widths = [len(each.coefficients) for each in made]
-                if not made:
-                    continue
-                weights = np.repeat([term.weight(k) for k in range(len(made))], widths)
-                part = slice(stop, stop := stop + sum(widths))
-                effects += made
-                blocks.append((part, None))
-                entries.append((f"?{number}", None, -math.log(len(term.alternatives)), weights, alternative))
+            blocks = [
+                columns.block(columns.add([formula(_named(t), axes, gravity, checked=False) for t in texts]), None,
+                              term.weight(k))
+                for k, texts in enumerate(term.summands)
+            ]  # fmt: skip
+            share = math.log((1.0 if term.exclusive or len(blocks) == 1 else _SPARSE) / len(blocks))
+            for k, block in enumerate(blocks):
+                columns.group(f"?{number}", [block], share, summands=(k,))
+            if not term.exclusive and len(blocks) > 1:
+                columns.group(f"?{number}", blocks, math.log(1.0 - _SPARSE), summands=(*range(len(blocks)),))
         if self.walk:
-            waves = _Walk(self.before.fit.dwells[-1].end_s, min(len(self.before.fit.dwells), 40))
-            part = slice(stop, stop := stop + len(waves.coefficients))
-            effects.append(waves)
-            blocks.append((part, None))
-            entries.append((self.walk, None, 0.0, np.ones(part.stop - part.start), 0))
-        self.likelihood = RunLikelihood(self.before.linearised, self.noise, effects)
-        self.likelihood.recombined(blocks)
-        self._group(entries, [part.stop - part.start if m is None else m.shape[1] for part, m in blocks])
-
-    def _group(self, entries: Sequence[Any], widths: Sequence[int]) -> None:
-        """Scale the columns of unknown functions, take what known effects explain off them, and find all sizes."""
-        ends = np.cumsum([0, *widths])
-        parts = [slice(a, b) for a, b in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True)]
-        scales = np.ones(ends[-1])
+            waves = _Walk(self.before.fit.dwells[-1].end_s, min(len(self.before.fit.dwells), _WAVES))
+            columns.group(self.walk, [columns.block(columns.add([waves]), None)], 0.0)
+        self.likelihood = RunLikelihood(self.before.linearised, self.noise, columns.effects)
+        self.likelihood.recombined(columns.blocks)
         rms = self.likelihood.column_rms()
-        for part, (row, effect, share, weights, number) in zip(parts, entries, strict=True):
-            if weights is not None and row != self.walk:
-                scales[part] = weights / np.where(rms[part] > 0.0, rms[part], np.inf)
-        self.likelihood.rescaled(scales)
+        self.likelihood.rescaled(np.where(columns.weights > 0.0, columns.weights / np.where(rms > 0, rms, np.inf), 1.0))
+        self.groups = self._seen_groups(columns.groups)
+
+    def _log_shares_of_values(self) -> list[float]:
+        """Log of the share of each value of a constant in its effect: the density falls by as much as a time constant is
+        longer than the effect goes on in this run."""
+        of_name = dict[str, list[int]]()
+        for k, effect in enumerate(self.candidates):
+            of_name.setdefault(str(effect), []).append(k)
+        logs = np.array([-math.log(max(e.value / e.acts_for_s(self._stimulus), 1.0)) for e in self.candidates])
+        for numbers in of_name.values():
+            tried = max(len(numbers), *(self.tried[k] for k in numbers))
+            logs[numbers] -= float(np.logaddexp.reduce(logs[numbers])) + math.log(tried / len(numbers))
+        return logs.tolist()
+
+    def _seen_groups(self, drafts: Sequence[_Group]) -> list[_Group]:
+        """The groups of which something is seen, with their sizes; a summand that is a known effect is no unknown
+        function."""
         plain = self.likelihood.whole()
-        catalogue = [p for p, (_, effect, *_) in zip(parts, entries, strict=True) if effect is not None]
-        known = np.concatenate([plain[:, p] for p in catalogue], axis=1)
-        places = np.concatenate([np.arange(p.start, p.stop) for p in catalogue])
-        starts = np.cumsum([0, *(p.stop - p.start for p in catalogue)])[:-1]
-        widths = [p.stop - p.start for p in catalogue]
-        lengths = np.linalg.norm(known, axis=0)
-        known = known / np.where(lengths > 0.0, lengths, np.inf)
-        for part, (row, _, _, weights, _) in zip(parts, entries, strict=True):
-            if weights is None or row == self.walk:
-                continue
-            left, singular, _ = np.linalg.svd(plain[:, part], full_matrices=False)
-            span = left[:, singular > 1e-6 * singular.max(initial=1e-300)]
-            cosines = np.where(lengths > 0.0, np.linalg.norm(span.T @ known, axis=0), 0.0)
-            inside = np.repeat(np.minimum.reduceat(cosines, starts) > _WITHIN, widths)  # all columns of an effect
-            if inside.any() and os.environ.get("KF_PROJ"):
-                scaled = plain[:, places[inside]] / lengths[inside]
-                coefficients, *_ = np.linalg.lstsq(scaled, plain[:, part], rcond=1e-6)
-                self.likelihood.without(part, places[inside], coefficients / lengths[inside, None])
-        plain = self.likelihood.whole()
+        known = dict[int, list[Floats]]()
         groups = list[_Group]()
-        for part, (row, effect, share, weights, number) in zip(parts, entries, strict=True):
-            columns = plain[:, part]
-            least = best_sigma(columns)
-            if least > 1e19:
+        for draft in drafts:
+            own = plain[:, draft.columns]
+            least = best_sigma(own)
+            if least > _HIDDEN:
                 continue
-            usual = None if effect is None else usual_sizes(effect, self.grade)
-            groups.append(_Group(row, part, _sizes(least, usual), share, effect, number))
-        self.groups = groups
-        self._by_width = dict[int, list[int]]()
-        for k, group in enumerate(groups):
-            self._by_width.setdefault(group.columns.stop - group.columns.start, []).append(k)
+            width = len(draft.columns)
+            if draft.row[0] != "?":
+                usual = None if draft.effect is None else usual_sizes(draft.effect, self.grade)
+                known.setdefault(width, []).append(orthonormal(own / np.linalg.norm(own, axis=0).max())[0])
+                groups.append(replace(draft, sizes=_sizes(least, usual)))
+                continue
+            if len(draft.summands) == 1 and len(known.get(width, ())):
+                basis = orthonormal(own / np.linalg.norm(own, axis=0).max())[0]
+                bases = [each for each in known[width] if each.shape == basis.shape]
+                if bases and float(np.linalg.norm(np.stack(bases).swapaxes(1, 2) @ basis, -2, (1, 2)).max()) > _SAME:
+                    continue
+            groups.append(replace(draft, sizes=_sizes(least, None)))
+        return groups
 
     @cached_property
     def _stimulus(self) -> Stimulus:
@@ -248,7 +262,7 @@ class Posterior:
 
     # -- rows ----------------------------------------------------------------------------------------------------
 
-    def _scan(self, flat: Sequence[int] = ()) -> tuple[Floats, Floats, Floats]:
+    def _scan(self, flat: Ints | None = None) -> tuple[Floats, Floats, Floats]:
         """Log likelihoods without terms (noises,), log Bayes factors of all groups (groups, noises), and those of one
         wrong dwell (noises,)."""
         base, bayes, dwell = list[float](), list[Floats](), list[float]()
@@ -275,13 +289,15 @@ class Posterior:
         """The groups of equal width."""
         more, readings = self.likelihood.more
         blocks, transposed = list[_Block](), np.ascontiguousarray(more.T)
-        for numbers in self._by_width.values():
-            groups = [self.groups[k] for k in numbers]
-            places = np.array([np.arange(group.columns.start, group.columns.stop) for group in groups])
+        widths = np.array([len(group.columns) for group in self.groups])
+        for width in np.unique(widths).tolist():
+            numbers = np.flatnonzero(widths == width)
+            groups = [self.groups[k] for k in numbers.tolist()]
+            places = np.array([group.columns for group in groups])
             own = transposed[places]
             blocks.append(
                 _Block(
-                    np.array(numbers), places, own @ np.swapaxes(own, 1, 2), own @ readings,
+                    numbers, places, own @ np.swapaxes(own, 1, 2), own @ readings,
                     np.stack([group.sizes.values for group in groups]) ** 2,
                     np.stack([group.sizes.logs for group in groups]), np.array([g.sizes.centre for g in groups]),
                 )
@@ -413,7 +429,7 @@ class Posterior:
         unknown, pairs = len(self.terms), dict[tuple[str, str], float]()
         for name in order:
             group = self.groups[best[name]]
-            _, beside, _ = self._scan(range(group.columns.start, group.columns.stop))
+            _, beside, _ = self._scan(group.columns)
             with_name = base + bayes[best[name]] + self._log_rest(name)
             logs = np.logaddexp.reduce(self._integrated(with_name + beside), axis=1)
             of_rows = dict[str, list[float]]()
@@ -520,27 +536,33 @@ class Posterior:
 
     def _formulas(self, number: int, beside: Sequence[str]) -> list[str]:
         """The formulas of an unknown function that the readings ask for, those first that explain most."""
-        flat = [place for name in beside for place in self._places_of(name)]
-        groups = [group for group in self.groups if group.row == f"?{number}"]
+        flat = np.concatenate([np.zeros(0, np.intp), *(self.groups[self._best_of[name]].columns for name in beside)])
+        groups, term = [group for group in self.groups if group.row == f"?{number}"], self.terms[number]
         noises = [self.likelihood.projected(covariance, flat) for _, _, covariance in self._noises]
-        scores = np.array([[rows.log + self._bayes(group.columns, rows) for group in groups] for rows in noises])
+        scores = np.array(
+            [[rows.log + self._bayes(group.columns, rows) + group.log_share for group in groups] for rows in noises]
+        )
         at, which = np.unravel_index(int(np.argmax(scores)), scores.shape)
-        rows, group, term = noises[at], groups[which], self.terms[number]
-        texts = term.alternatives[group.alternative]
-        width = (group.columns.stop - group.columns.start) // len(texts)
-        parts = [np.arange(width) + group.columns.start + width * k for k in range(len(texts))]
-        if len(term.alternatives) > 1:
-            return [*texts]
+        rows, best = noises[int(at)], groups[int(which)]
+        if len(best.summands) == 1:
+            return [*term.summands[best.summands[0]]]
+        ends = np.cumsum([self._width(texts) for texts in term.summands])[:-1]
+        parts = np.split(best.columns, ends)
         chosen, log = list[int](), 0.0
-        while len(chosen) < min(_SUMMANDS, len(texts)):
+        while len(chosen) < min(_SUMMANDS, len(parts)):
             logs = {k: self._bayes(np.concatenate([parts[j] for j in (*chosen, k)]), rows)
-                    for k in range(len(texts)) if k not in chosen}  # fmt: skip
-            best = max(logs, key=lambda k: logs[k])
-            if chosen and logs[best] < log + _MORE:
+                    for k in range(len(parts)) if k not in chosen}  # fmt: skip
+            likeliest = max(logs, key=lambda k: logs[k])
+            if chosen and logs[likeliest] < log + _MORE:
                 break
-            chosen.append(best)
-            log = logs[best]
-        return [texts[k] for k in chosen]
+            chosen.append(likeliest)
+            log = logs[likeliest]
+        return [text for k in chosen for text in term.summands[k]]
+
+    def _width(self, texts: Sequence[str]) -> int:
+        """Number of columns of formulas."""
+        bench = self.before.bench
+        return sum(len(formula(_named(t), bench.axes, bench.gravity_mps2, checked=False).coefficients) for t in texts)
 
     def _bayes(self, places: slice | Floats, rows: Projected) -> float:
         """Log Bayes factor of some columns of any size."""
@@ -549,11 +571,6 @@ class Posterior:
         if rows.more:
             gram, along = gram + more[0][:, places].T @ more[0][:, places], along + more[0][:, places].T @ more[1]
         return float(_log_bayes_of_any(gram[None], along[None])[0])
-
-    def _places_of(self, name: str) -> range:
-        """Columns of an effect at its likeliest constant."""
-        part = self.groups[self._best_of[name]].columns
-        return range(part.start, part.stop)
 
 
 class _Walk(Effect):

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
@@ -168,12 +169,6 @@ class RunLikelihood:
         """Multiply the columns of the terms by these (C,)."""
         self._columns, self._more_columns = self._columns * scales, self._more_columns * scales
 
-    def without(self, part: slice, others: Sequence[int] | Floats, coefficients: Floats) -> None:
-        """Take combinations (k, q) of other columns off those of a term."""
-        for name in ("_columns", "_more_columns"):
-            columns = getattr(self, name)
-            columns[..., part] -= columns[..., others] @ coefficients
-
     def bare(self, covariances: Floats | None) -> float:
         """Log of the restricted likelihood with further noise, without any term."""
         model, _, readings, _, log = self._in_noise(covariances, columns=False)
@@ -187,7 +182,7 @@ class RunLikelihood:
         """The columns (r, C) of the terms in the noise that was stated, projected off the model, in all rows."""
         return self.projected(None, whole=True).columns
 
-    def projected(self, covariances: Floats | None, flat: Sequence[int] = (), whole: bool = False) -> Projected:
+    def projected(self, covariances: Floats | None, flat: NDArray[np.intp] | None = None, whole: bool = False) -> Projected:
         """The rows with further noise, (D, 3, 3) in units of that stated, projected off the model, and off the columns
         ``flat`` of the terms.
 
@@ -195,14 +190,14 @@ class RunLikelihood:
         out, and ``more`` says so.
         """
         model, terms, z, root, log = self._in_noise(covariances)
-        more = not (whole or self._has_more_model or self._more_columns[:, flat].any())
+        more = not (whole or self._has_more_model or (flat is not None and self._more_columns[:, flat].any()))
         if not more:
             model, z = np.concatenate([model, self._more_model]), np.append(z, self._more_readings)
             terms = np.concatenate([terms, self._more_columns])
         basis, upper = np.linalg.qr(model @ self._seen)
         log -= float(np.log(np.abs(np.diag(upper))).sum())
         terms, z = terms - basis @ (basis.T @ terms), z - basis @ (basis.T @ z)
-        if len(flat):
+        if flat is not None and len(flat):
             lengths = np.linalg.norm(terms[:, flat], axis=0)
             own = terms[:, flat] / np.where(lengths > 0.0, lengths, 1.0)
             left, singular, _ = np.linalg.svd(own, full_matrices=False)

@@ -23,15 +23,16 @@ _TURNS = (0.5, 1, 1.5, 2, 3, 4, 6, 8)  # of what is periodic, in a run
 class UnknownTerm:
     """Unknown functions of one driver.
 
-    driver: in words. family: the physical class of effects to which such functions belong; "" for none. alternatives:
-    formulas, of which the functions of one alternative are sums; ``:place = ...`` stands for a rotation. weights: the
-    usual sizes of the summands, of as many columns of equal rms.
+    driver: in words. family: the physical class of effects to which such functions belong; "" for none. summands:
+    formulas that belong together, as sine and cosine; ``:place = ...`` stands for a rotation. weights: the usual sizes
+    of the summands, of as many columns of equal rms. exclusive: only one of the summands is true; else one or all.
     """
 
     driver: str
     family: str
-    alternatives: tuple[tuple[str, ...], ...]
+    summands: tuple[tuple[str, ...], ...]
     weights: tuple[float, ...] = ()
+    exclusive: bool = False
 
     def weight(self, k: int) -> float:
         """The usual size of one of the summands."""
@@ -48,8 +49,16 @@ def unknown_terms(bench: Bench, dwells: Sequence[DwellFactor]) -> Iterator[Unkno
     yield from _of_surroundings(len(bench.axes), bench.angles)
 
 
-def _term(driver: str, family: str, texts: Sequence[str], weights: Sequence[float] = ()) -> UnknownTerm:
-    return UnknownTerm(driver, family, (tuple(texts),), tuple(weights))
+def _term(
+    driver: str, family: str, texts: Sequence[str | tuple[str, ...]], weights: Sequence[float] = ()
+) -> UnknownTerm:
+    """A term whose functions are sums of these formulas, or pairs of them."""
+    return UnknownTerm(driver, family, tuple((t,) if isinstance(t, str) else t for t in texts), tuple(weights))
+
+
+def _one_of(driver: str, family: str, alternatives: Sequence[tuple[str, ...]]) -> UnknownTerm:
+    """A term of which one alternative is true."""
+    return UnknownTerm(driver, family, tuple(alternatives), exclusive=True)
 
 
 def _of_force() -> Iterator[UnknownTerm]:
@@ -70,22 +79,30 @@ def _of_force() -> Iterator[UnknownTerm]:
 
 def _of_gimbals(count: int) -> Iterator[UnknownTerm]:
     for k in range(1, count + 1):
-        waves = {n: [f"{wave}({n}*q{k})" for wave in ("sin", "cos")] for n in (1, 2, 3, 4, 6)}
-        texts = [text for of_one in waves.values() for text in of_one]
-        weights = [n**-0.5 for n, of_one in waves.items() for _ in of_one]
-        yield _term(f"angle of gimbal {k}", "", texts, weights)
-        products = [f"{wave}*{force}" for n in (1, 2) for wave in waves[n] for force in ("a", "p", "o")]
+        waves = {n: (f"sin({n}*q{k})", f"cos({n}*q{k})") for n in (1, 2, 3, 4, 6)}
+        weights = [n**-0.5 for n in waves]
+        yield _term(f"angle of gimbal {k}", "", [*waves.values()], weights)
+        products = [_times(waves[n], force) for n in (1, 2) for force in ("a", "p", "o")]
         yield _term(f"angle of gimbal {k} and specific force", "", products)
-        yield _term(f"angle of gimbal {k} and temperature", "", [f"{wave}*T" for wave in waves[1]])
-        yield _term(f"previous orientation (angle of gimbal {k})", "memory", [f"sin(q{k}_before)", f"cos(q{k}_before)"])
-        turning = [f"q{k}", *texts]
+        yield _term(f"angle of gimbal {k} and temperature", "", [_times(waves[1], "T")])
+        yield _term(f"previous orientation (angle of gimbal {k})", "memory", [(f"sin(q{k}_before)", f"cos(q{k}_before)")])
+        turning = [(f"q{k}",), *waves.values()]
         for j in range(1, count + 1):
-            words = f"angle of gimbal {k}" + ("" if j == k else f" (a rotation of gimbal {j})")
-            yield _term(f"{words}, as an error of its encoder" if j == k else words, "gimbal and encoder",
-                        [f":{j} = {text}" for text in turning], (1.0, *weights))  # fmt: skip
+            words = "as an error of its encoder" if j == k else f"a rotation of gimbal {j}"
+            yield _term(f"angle of gimbal {k} ({words})", "gimbal and encoder",
+                        [_turning(str(j), texts) for texts in turning], (1.0, *weights))  # fmt: skip
         for place, words in (("base", "a tilt of the base"), ("platform", "a rotation of the platform")):
             yield _term(f"angle of gimbal {k} ({words})", "gimbal and encoder",
-                        [f":{place} = {text}" for text in turning[:5]], (1.0, *weights[:4]))  # fmt: skip
+                        [_turning(place, texts) for texts in turning[:3]], (1.0, *weights[:2]))  # fmt: skip
+
+
+def _times(texts: Sequence[str], force: str) -> tuple[str, ...]:
+    return tuple(f"{text}*{force}" for text in texts)
+
+
+def _turning(place: str, texts: Sequence[str]) -> tuple[str, ...]:
+    """Rotations of a gimbal, the base or the platform by these functions."""
+    return tuple(f":{place} = {text}" for text in texts)
 
 
 def _of_time(dwells: Sequence[DwellFactor], turns: bool) -> Iterator[UnknownTerm]:
@@ -97,15 +114,15 @@ def _of_time(dwells: Sequence[DwellFactor], turns: bool) -> Iterator[UnknownTerm
     products += [f"t*{force}" for force in ("a*a", "p*p", "a*p", "a*o", "p*o")]
     yield _term("time and specific force", "scale in time", products)
     decays = tuple((f"exp(-t/({10 * decay_s}*s))",) for decay_s in _DECAYS_S if decay_s <= dwells[-1].end_s)
-    yield UnknownTerm("time (a decay)", "bias in time", decays or (("exp(-t/(30*s))",),))
+    yield _one_of("time (a decay)", "bias in time", decays or (("exp(-t/(30*s))",),))
     waves = [tuple(f"{wave}({n}*2*pi*t/{run_s})" for wave in ("sin", "cos")) for n in _TURNS]
-    yield UnknownTerm("time (periodic)", "bias in time", tuple(waves))
+    yield _one_of("time (periodic)", "bias in time", waves)
     if turns:
         for place, words in (("base", "a tilt of the base"), ("platform", "a rotation of the platform")):
             turning = [f":{place} = {text}" for text in texts[:6]]
             yield _term(f"time ({words})", "base and platform", turning, weights[:6])
-        tilts = tuple(tuple(f":base = {wave}" for wave in pair) for pair in waves)
-        yield UnknownTerm("time (a periodic tilt of the base)", "base and platform", tilts)
+        tilts = [_turning("base", pair) for pair in waves]
+        yield _one_of("time (a periodic tilt of the base)", "base and platform", tilts)
 
 
 def _of_jumps(dwells: Sequence[DwellFactor], turns: bool) -> Iterator[UnknownTerm]:
@@ -116,29 +133,29 @@ def _of_jumps(dwells: Sequence[DwellFactor], turns: bool) -> Iterator[UnknownTer
     moments_s, between_s = (each[:: len(each) // _MOST_MOMENTS + 1] for each in (moments_s, between_s))
     if not between_s:
         return
-    yield UnknownTerm("time (a jump)", "bias in time", tuple((f"t > {s:.6g}*s",) for s in moments_s))
+    yield _one_of("time (a jump)", "bias in time", [(f"t > {s:.6g}*s",) for s in moments_s])
     steps = [f"(t > {s:.6g}*s)" for s in between_s]
-    yield UnknownTerm("time (a jump of the scale factors)", "scale in time", tuple((f"a*{step}",) for step in steps))
-    across = tuple((f"p*{step}", f"o*{step}") for step in steps)
-    yield UnknownTerm("time (a jump of the alignment)", "base and platform", across)
+    yield _one_of("time (a jump of the scale factors)", "scale in time", [(f"a*{step}",) for step in steps])
+    across = [(f"p*{step}", f"o*{step}") for step in steps]
+    yield _one_of("time (a jump of the alignment)", "base and platform", across)
     if turns:
         for place, words in (("base", "a jump of the tilt of the base"), ("platform", "a jump of the mounting")):
-            turned = tuple((f":{place} = {step[1:-1]}",) for step in steps)
-            yield UnknownTerm(f"time ({words})", "base and platform", turned)
+            turned = [(f":{place} = {step[1:-1]}",) for step in steps]
+            yield _one_of(f"time ({words})", "base and platform", turned)
 
 
 def _of_arrival(gimbals: int, dwells: Sequence[DwellFactor]) -> Iterator[UnknownTerm]:
     longest_s = max(dwell.end_s - dwell.start_s for dwell in dwells)
     decays_s = [decay_s for decay_s in _DECAYS_S if decay_s <= 2.0 * longest_s] or [_DECAYS_S[0]]
-    yield UnknownTerm("time since arrival", "memory", tuple((f"exp(-tau/({each}*s))",) for each in decays_s))
-    creeps = tuple(tuple(f"{f}*exp(-tau/({each}*s))" for f in ("fx", "fy", "fz")) for each in decays_s)
-    yield UnknownTerm("time since arrival and specific force", "memory", creeps)
+    yield _one_of("time since arrival", "memory", [(f"exp(-tau/({each}*s))",) for each in decays_s])
+    creeps = [tuple(f"{f}*exp(-tau/({each}*s))" for f in ("fx", "fy", "fz")) for each in decays_s]
+    yield _one_of("time since arrival and specific force", "memory", creeps)
     for k in range(1, gimbals + 1):
         sizes = (f"q{k}_move", f"sign(q{k}_move)")
         texts = [(f":{k} = {size}*exp(-tau/({each}*s))",) for each in _CREEPS_S for size in sizes
                  if each <= 2.0 * longest_s]  # fmt: skip
         if texts:
-            yield UnknownTerm(f"time since arrival and last move of gimbal {k}", "gimbal and encoder", tuple(texts))
+            yield _one_of(f"time since arrival and last move of gimbal {k}", "gimbal and encoder", texts)
 
 
 def _of_surroundings(gimbals: int, turns: bool) -> Iterator[UnknownTerm]:
