@@ -14,24 +14,29 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.candidate_tests import CandidateTests
 from kf_calib.diagnosis.coefficient_sizes import SizePrior, best_sigma, sensor_grade, usual_sizes
+from kf_calib.diagnosis.hypotheses import log_odds_of
 from kf_calib.diagnosis.hypothesis_table import (
-    IRREGULAR, NOISE, NONE, NOTHING, Hypothesis, HypothesisTable, table_of,
+    IRREGULAR,
+    NOISE,
+    NONE,
+    NOTHING,
+    Hypothesis,
+    HypothesisTable,
+    table_of,
 )
-from kf_calib.diagnosis.refits import Refits, dwell_noise_is_stated
+from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.run_likelihood import Projected, RunLikelihood, Sizes, integrated, log_bayes, log_bayes_together
-from kf_calib.diagnosis.unknown_terms import UnknownTerm, unknown_terms
+from kf_calib.diagnosis.unknown_terms import unknown_terms
 from kf_calib.dwells.qr import orthonormal
 from kf_calib.effects import Coefficient, Effect, Stimulus, effect_named, walk_named
 from kf_calib.effects.formula import formula
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.dwell_columns import stimulus_of
-from kf_calib.diagnosis.hypotheses import log_odds_of
 from kf_calib.estimation.results import Calibration
 from kf_calib.noise.reml import OF_ONE
 
@@ -47,6 +52,7 @@ _DECADES = 7.0  # of the sizes of what has no usual size
 _NODES = 40
 _SPARSE = 0.5  # share of one summand alone in the functions of a driver
 _SAME = 0.99  # cosine above which a summand is a known effect
+_END = 0.99  # of the range of a constant
 _HIDDEN = 1e19  # sigma of columns of which rounding alone is seen
 _WAVES = 40  # of a random walk
 _REFITTED = 8
@@ -201,7 +207,8 @@ class Posterior:
             width = len(draft.columns)
             if draft.row[0] != "?":
                 usual = None if draft.effect is None else usual_sizes(draft.effect, self.grade)
-                known.setdefault(width, []).append(orthonormal(own / np.linalg.norm(own, axis=0).max())[0])
+                if not _is_limit(draft.effect):
+                    known.setdefault(width, []).append(orthonormal(own / np.linalg.norm(own, axis=0).max())[0])
                 groups.append(replace(draft, sizes=_sizes(least, usual)))
                 continue
             if len(draft.summands) == 1 and len(known.get(width, ())):
@@ -591,6 +598,12 @@ class _Walk(Effect):
         columns = np.zeros((len(s), 3, 3, self.count))
         columns[:, range(3), range(3)] = waves[:, None]
         return columns.reshape(len(s), 3, -1)
+
+
+def _is_limit(effect: Effect | None) -> bool:
+    """Whether an effect is at the end of the range of its constant, where it is the limit of another one, which may be
+    an unknown function."""
+    return effect is not None and effect.unknown is not None and effect.value >= _END * effect.unknown.high
 
 
 def _sizes(least: float, usual: SizePrior | None, nodes: int = _NODES) -> Sizes:
