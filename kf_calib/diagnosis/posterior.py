@@ -269,16 +269,29 @@ class Posterior:
 
     # -- rows ----------------------------------------------------------------------------------------------------
 
-    def _scan(self, flat: Ints | None = None) -> tuple[Floats, Floats, Floats]:
+    def _scan(self) -> tuple[Floats, Floats, Floats]:
         """Log likelihoods without terms (noises,), log Bayes factors of all groups (groups, noises), and those of one
         wrong dwell (noises,)."""
         base, bayes, dwell = list[float](), list[Floats](), list[float]()
         for _, _, covariance in self._noises:
-            rows = self.likelihood.projected(covariance, flat)
+            rows = self.likelihood.projected(covariance)
             base.append(rows.log)
             bayes.append(self._bayes_of(rows))
             dwell.append(self._of_one_dwell(rows))
         return np.array(base), np.array(bayes).T, np.array(dwell)
+
+    def _scan_beside(self, flat: Ints, logs: Floats) -> Floats:
+        """Log Bayes factors (groups, noises) of all groups beside a term with the columns ``flat`` and the log
+        likelihoods ``logs`` (noises,).
+
+        What is beside it makes less noise likelier, not more: noise larger than is likeliest without is left out.
+        """
+        bayes, families = np.zeros((len(self.groups), len(logs))), np.array([k for k, _, _ in self._noises])
+        for family in np.unique(families).tolist():
+            places = np.flatnonzero(families == family)
+            for k in places[: int(np.argmax(logs[places])) + 2].tolist():
+                bayes[:, k] = self._bayes_of(self.likelihood.projected(self._noises[k][2], flat))
+        return bayes
 
     def _bayes_of(self, rows: Projected) -> Floats:
         """Log Bayes factors (groups,) of all terms in one noise."""
@@ -436,8 +449,8 @@ class Posterior:
         unknown, pairs = len(self.terms), dict[tuple[str, str], float]()
         for name in order:
             group = self.groups[best[name]]
-            _, beside, _ = self._scan(group.columns)
             with_name = base + bayes[best[name]] + self._log_rest(name)
+            beside = self._scan_beside(group.columns, with_name)
             logs = np.logaddexp.reduce(self._integrated(with_name + beside), axis=1)
             of_rows = dict[str, list[float]]()
             for other, log in zip(self.groups, logs.tolist(), strict=True):

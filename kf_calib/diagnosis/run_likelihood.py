@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.pieces import OfPieces, of_all_pieces
+from kf_calib.dwells.qr import triangle
 from kf_calib.effects import Effect
 from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns
 from kf_calib.estimation.whitened_rows import flicker_of_scatter, whiten
@@ -34,6 +35,7 @@ from kf_calib.noise.temperature_course import thermometer_errors
 
 _IMMENSE_MPS2 = 1e3  # scatter so large that nothing is left of a dwell's mean
 _SEEN = 1e-7  # share of a column that the model must leave for it to be seen
+_CHANGES = 1e-3  # share of a column's largest value by which it changes within a dwell
 _FINE = 8  # parts of a step over which the likelihood is integrated
 _LEAST = 0.1  # sigma of a mean: noise that is smaller shows nothing
 _SIZES = 40  # sizes of a term that are tried
@@ -129,8 +131,7 @@ class RunLikelihood:
             parts.append(of_all_pieces(thermometer_errors(dwells, noise.sensitivity_mps2_per_k)))
         nodes = min(part.shape[1] for part in parts)
         both = np.concatenate([np.broadcast_to(p[:, :nodes], (len(p), nodes, *p.shape[2:])) for p in parts], axis=3)
-        moving = np.ptp(both, axis=1).max(axis=(0, 1)) > 1e-12 * np.maximum(np.abs(both).max(axis=(0, 1, 2)), 1e-300)
-        moving |= _differ(both, dwells.folded.ends)
+        moving = _changing(both, dwells.folded.ends)
         moving[: model.count] = True
         about = np.zeros(int(moving.sum()))
         about[: model.count] = linearised.state
@@ -141,6 +142,8 @@ class RunLikelihood:
                 flicker, reduced=False,
             )
         )  # fmt: skip
+        if len(rows) > rows.shape[1]:
+            rows = triangle(rows)
         full = np.zeros((len(rows), both.shape[3]))
         full[:, moving] = rows[:, :-1]
         last = model.count + added.shape[3]
@@ -273,13 +276,11 @@ class RunLikelihood:
         return shapes / max(float(np.einsum("dii->di", shapes).max(axis=1).mean()), 1e-300)
 
 
-def _differ(values: Floats, ends: Floats) -> Floats:
-    """Tell of each column (pieces, K, 3, C) whether it differs from piece to piece of one dwell."""
-    if len(ends) - 1 == len(values):
-        return np.zeros(values.shape[3], bool)
-    first = np.repeat(values[ends[:-1]], np.diff(ends), axis=0)
-    largest = np.maximum(np.abs(values).max(axis=(0, 1, 2)), 1e-300)
-    return np.abs(values - first).max(axis=(0, 1, 2)) > 1e-12 * largest
+def _changing(values: Floats, ends: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Tell of each column (pieces, K, 3, C) whether it changes within dwells, by more than noise of the angles makes."""
+    starts, largest = ends[:-1], np.maximum(np.abs(values).max(axis=(0, 1, 2)), 1e-300)
+    most = np.maximum.reduceat(values.max(axis=1), starts, axis=0) - np.minimum.reduceat(values.min(axis=1), starts, axis=0)
+    return most.max(axis=(0, 1)) > _CHANGES * largest
 
 
 def log_bayes(gram: Floats, along: Floats, squares: Floats, log_weights: Floats, centres: Floats) -> Floats:
