@@ -57,7 +57,7 @@ _HIDDEN = 1e19  # sigma of columns of which rounding alone is seen
 _WAVES = 40  # of a random walk
 _REFITTED = 8
 _BEHIND = 10.0  # in log evidence: rows further behind are not fitted
-_MOST = 3  # effects beside which all others are tried
+_HEADS = 3  # effects beside which all others are tried, in the noise of the run and in none beyond that stated
 _SHORT = 0.01  # prior probability of irregular changes that show within dwells only
 _NO_NOISE = 0.1  # share of an unknown cause in scatter that was not stated
 _AGAINST_STATED = 0.5  # the same of noise that contradicts what was stated
@@ -444,7 +444,9 @@ class Posterior:
     def _beside(self, base: Floats, bayes: Floats) -> list[Hypothesis]:
         """The rows of pairs: the likeliest effects, each with any other term beside it."""
         best = {name: k for name, k in self._best_of.items() if name[0] != "?" and name != self.walk}
-        order = sorted(best, key=lambda name: -self._log_of_groups[best[name]])[:_MOST]
+        of_noise = sorted(best, key=lambda name: -self._log_of_groups[best[name]])[:_HEADS]
+        of_none = sorted(best, key=lambda name: -bayes[best[name], 0])[:_HEADS]
+        order = dict.fromkeys([*of_noise, *of_none])  # beside another effect the noise is less than with one alone
         names = self._number_of_names
         unknown, pairs = len(self.terms), dict[tuple[str, str], float]()
         for name in order:
