@@ -264,7 +264,7 @@ class Posterior:
         of_families = np.array([k for k, _, _ in self._noises])
         parts = [logs[:, of_families == 0][:, 0] + self._families[0][2]]
         for k, (_, _, prior) in enumerate(self._families[1:], start=1):
-            parts.append(integrated(logs[:, of_families == k], self.likelihood.step) - _RANGE + prior)
+            parts.append(integrated(logs[:, of_families == k], self.likelihood.step) - math.log(_RANGE) + prior)
         return np.stack(parts, axis=1)
 
     # -- rows ----------------------------------------------------------------------------------------------------
@@ -373,7 +373,7 @@ class Posterior:
         for part in OF_ONE:
             shapes = self.likelihood.shapes_of(part)
             base = np.array([[self.likelihood.bare(size**2 * shapes) for size in sizes.tolist()]])
-            logs.append(((part,), float(integrated(base, self.likelihood.step)[0]) - _RANGE + prior))
+            logs.append(((part,), float(integrated(base, self.likelihood.step)[0]) - math.log(_RANGE) + prior))
         return logs
 
     def _scattering(self) -> int:
