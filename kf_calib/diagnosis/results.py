@@ -17,7 +17,7 @@ from kf_calib.diagnosis.hypothesis_table import SURE, Hypothesis, HypothesisTabl
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.replication import Replication
 from kf_calib.diagnosis.residual_drivers import Driver, drivers_of
-from kf_calib.diagnosis.unknown_effect import Description, channel_of, describe, explained_share
+from kf_calib.diagnosis.unknown_effect import Description, channel_of, describe_irregular, explained_share
 from kf_calib.effects.effect import Grade
 from kf_calib.estimation.results import Calibration, Parameter
 from kf_calib.noise.noise_model import mean_covariances
@@ -116,7 +116,7 @@ class Diagnosis:
             return None
         first, residuals = self.likeliest, self.before.residuals_mps2
         if first is None or not first.formulas or first.refit is None:
-            return describe(self.before.fit, residuals, self.test.trend)
+            return describe_irregular(self.before.fit, residuals, self.test.trend)
         share = explained_share(self.before.fit, first.refit.fit)
         return Description(channel_of(residuals), first.driver, share, first.formulas)
 

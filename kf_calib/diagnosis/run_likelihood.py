@@ -19,9 +19,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import Floats, Indices, Mask
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.pieces import OfPieces, of_all_pieces
 from kf_calib.dwells.qr import triangle
@@ -54,14 +53,14 @@ class Sizes:
 class Projected:
     """Rows in one noise, projected off the model: columns (r, C), readings (r,); log: of the restricted likelihood
     without any term; basis (r, k) of what was projected off; root (D, 3, 3): what whitens the means in this noise;
-    more: whether rows within dwells are left out, since they are the same in every noise."""
+    means_only: whether rows within dwells are left out, since they are the same in every noise."""
 
     columns: Floats
     readings: Floats
     log: float
     basis: Floats
     root: Floats
-    more: bool
+    means_only: bool
 
     def of_dwells(self) -> tuple[Floats, Floats]:
         """G^T G (D, 3, 3) and G^T z (D, 3) of offsets of the three accelerometers in one dwell alone."""
@@ -155,7 +154,7 @@ class RunLikelihood:
         readings = rows[:, -1] + full[:, known : model.count] @ linearised.state[known:]
         return of_model, full[:, known:last], readings
 
-    def recombined(self, blocks: Sequence[tuple[slice, Floats | None]]) -> None:
+    def recombine(self, blocks: Sequence[tuple[slice, Floats | None]]) -> None:
         """Replace the columns of the terms by blocks of combinations of them."""
         for name in ("_columns", "_more_columns"):
             columns = getattr(self, name)
@@ -168,7 +167,7 @@ class RunLikelihood:
         squares = np.einsum("dic,dic->c", self._columns, self._columns) + np.sum(self._more_columns**2, axis=0)
         return np.sqrt(squares / max(count, 1))
 
-    def rescaled(self, scales: Floats) -> None:
+    def rescale(self, scales: Floats) -> None:
         """Multiply the columns of the terms by these (C,)."""
         self._columns, self._more_columns = self._columns * scales, self._more_columns * scales
 
@@ -185,16 +184,16 @@ class RunLikelihood:
         """The columns (r, C) of the terms in the noise that was stated, projected off the model, in all rows."""
         return self.projected(None, whole=True).columns
 
-    def projected(self, covariances: Floats | None, flat: NDArray[np.intp] | None = None, whole: bool = False) -> Projected:
+    def projected(self, covariances: Floats | None, flat: Indices | None = None, whole: bool = False) -> Projected:
         """The rows with further noise, (D, 3, 3) in units of that stated, projected off the model, and off the columns
         ``flat`` of the terms.
 
         Rows within dwells in which neither the model nor these have columns are the same in every noise: they are left
-        out, and ``more`` says so.
+        out, and ``means_only`` says so.
         """
         model, terms, z, root, log = self._in_noise(covariances)
-        more = not (whole or self._has_more_model or (flat is not None and self._more_columns[:, flat].any()))
-        if not more:
+        means_only = not (whole or self._has_more_model or (flat is not None and self._more_columns[:, flat].any()))
+        if not means_only:
             model, z = np.concatenate([model, self._more_model]), np.append(z, self._more_readings)
             terms = np.concatenate([terms, self._more_columns])
         basis, upper = np.linalg.qr(model @ self._seen)
@@ -207,18 +206,21 @@ class RunLikelihood:
             left = left[:, singular > _SEEN]
             terms, z = terms - left @ (left.T @ terms), z - left @ (left.T @ z)
             basis = np.hstack([basis, left])
-        log -= 0.5 * float(z @ z) + (0.5 * float(self._more_readings @ self._more_readings) if more else 0.0)
-        return Projected(terms, z, log, basis, root, more)
+        log -= 0.5 * float(z @ z) + (0.5 * float(self._more_readings @ self._more_readings) if means_only else 0.0)
+        return Projected(terms, z, log, basis, root, means_only)
 
-    def _in_noise(self, covariances: Floats | None, columns: bool = True) -> tuple[Floats, Floats, Floats, Floats, float]:
+    def _in_noise(
+        self, covariances: Floats | None, columns: bool = True
+    ) -> tuple[Floats, Floats, Floats, Floats, float]:
         """The rows of the means with further noise: of the model, the terms, and readings; what whitens them, and the
         log of their density."""
         count = len(self._root)
-        root, log = np.broadcast_to(np.eye(3), self._root.shape), -self._log_root
+        root: Floats = np.broadcast_to(np.eye(3), self._root.shape)
+        log = -self._log_root
         parts = [self._model, self._columns if columns else self._columns[..., :0], self._readings[..., None]]
         if covariances is not None:
             lower = np.linalg.cholesky(np.eye(3) + covariances)
-            root = np.linalg.inv(lower)
+            root = np.asarray(np.linalg.inv(lower), float)
             parts = [root @ part for part in parts]
             log -= float(np.log(np.einsum("dii->di", lower)).sum())
         return parts[0].reshape(3 * count, -1), parts[1].reshape(3 * count, -1), parts[2].ravel(), root, log
@@ -242,7 +244,7 @@ class RunLikelihood:
         kept = singular > 1e-9 * singular.max(initial=1e-300)
         return (right[kept] / singular[kept, None]).T / sizes[:, None]
 
-    def sizes_of_scatter(self) -> Floats:
+    def sizes_of_noise(self) -> Floats:
         """Sizes (k,) of noise that are tried, in units of ``shapes_of``: from one that shows nothing to all of the
         misfit."""
         most = math.sqrt(self.misfit / max(self.rows - self._model.shape[2], 1))
@@ -276,11 +278,12 @@ class RunLikelihood:
         return shapes / max(float(np.einsum("dii->di", shapes).max(axis=1).mean()), 1e-300)
 
 
-def _changing(values: Floats, ends: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Tell of each column (pieces, K, 3, C) whether it changes within dwells, by more than noise of the angles makes."""
+def _changing(values: Floats, ends: Indices) -> Mask:
+    """Tell of each column (pieces, K, 3, C) whether it changes within dwells by more than noise of the angles makes."""
     starts, largest = ends[:-1], np.maximum(np.abs(values).max(axis=(0, 1, 2)), 1e-300)
-    most = np.maximum.reduceat(values.max(axis=1), starts, axis=0) - np.minimum.reduceat(values.min(axis=1), starts, axis=0)
-    return most.max(axis=(0, 1)) > _CHANGES * largest
+    highest = np.maximum.reduceat(values.max(axis=1), starts, axis=0)
+    lowest = np.minimum.reduceat(values.min(axis=1), starts, axis=0)
+    return np.asarray((highest - lowest).max(axis=(0, 1)) > _CHANGES * largest, bool)
 
 
 def log_bayes(gram: Floats, along: Floats, squares: Floats, log_weights: Floats, centres: Floats) -> Floats:
@@ -306,7 +309,7 @@ def log_bayes_together(parts: Sequence[Floats], readings: Floats, sizes: Sequenc
     shifted = readings - columns @ centre
     gram, along = columns.T @ columns, columns.T @ shifted
     mesh = np.stack([each.ravel() for each in np.meshgrid(*(s.values for s in sizes), indexing="ij")], axis=1)
-    logs = sum(np.meshgrid(*(s.logs for s in sizes), indexing="ij")).ravel()
+    logs = np.sum([each.ravel() for each in np.meshgrid(*(s.logs for s in sizes), indexing="ij")], axis=0)
     scaled = mesh[:, groups]
     spread = np.eye(len(gram)) + scaled[:, :, None] * gram * scaled[:, None]
     right = scaled * along

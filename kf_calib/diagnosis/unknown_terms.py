@@ -85,7 +85,8 @@ def _of_gimbals(count: int) -> Iterator[UnknownTerm]:
         products = [_times(waves[n], force) for n in (1, 2) for force in ("a", "p", "o")]
         yield _term(f"angle of gimbal {k} and specific force", "", products)
         yield _term(f"angle of gimbal {k} and temperature", "", [_times(waves[1], "T")])
-        yield _term(f"previous orientation (angle of gimbal {k})", "memory", [(f"sin(q{k}_before)", f"cos(q{k}_before)")])
+        before = (f"sin(q{k}_before)", f"cos(q{k}_before)")
+        yield _term(f"previous orientation (angle of gimbal {k})", "memory", [before])
         turning = [(f"q{k}",), *waves.values()]
         for j in range(1, count + 1):
             words = "as an error of its encoder" if j == k else f"a rotation of gimbal {j}"
@@ -171,3 +172,14 @@ def _of_surroundings(gimbals: int, turns: bool) -> Iterator[UnknownTerm]:
     yield _term("previous orientation", "memory", [*texts, "a-da", "(a-da)**2"])
     steps = [f"{step}*{force}" for step in ("da", "abs(da)") for force in ("a", "p", "o")]
     yield _term("previous orientation and specific force", "memory", steps)
+
+
+def name_of_formula(number: int) -> str:
+    """Names of formulas: mine, mine2, mine3 ..."""
+    return f"mine{number + 1}" if number else "mine"
+
+
+def text_named(text: str, number: int = 0) -> str:
+    """A formula with a name in front, from ``:z = sin(q1)`` or ``sin(q1)``."""
+    name = name_of_formula(number)
+    return f"{name}{text}" if text.startswith(":") else f"{name} = {text}"
