@@ -18,6 +18,7 @@ from kf_calib.noise.reml import OF_ONE
 
 _STATED, _UNSTATED = 0.02, 0.5  # prior probability of noise beyond what was stated, and where nothing was stated
 _OF_ONE = 0.1  # share of one accelerometer alone in scatter
+_FEWEST = 4  # sizes of noise over which is integrated
 _RANGE = math.log(1e4)  # width of the flat prior of the logarithm of a size of noise
 
 
@@ -81,22 +82,22 @@ class NoiseSizes:
         squares = (self._sizes**2).tolist()
         return [None, *(square * family.shapes for family in self.families[1:] for square in squares)]
 
-    def up_to(self, logs: Floats) -> list[int]:
-        """Numbers of the noises that are not much larger than the likeliest of their family by log likelihoods
+    def up_to(self, logs: Floats) -> list[list[int]]:
+        """Numbers of the noises of each family that are not much larger than the likeliest by log likelihoods
         (noises,)."""
-        numbers, count = [0], len(self._sizes)
-        for first in range(1, len(logs), count):
-            numbers += range(first, first + min(int(np.argmax(logs[first : first + count])) + 2, count))
-        return numbers
-
-    def evidence(self, logs: Floats) -> Floats:
-        """Log evidence (n, families) from log likelihoods (n, noises), with the priors of the noise."""
         count = len(self._sizes)
-        parts = [logs[:, 0] + self.families[0].log_prior]
-        for k, family in enumerate(self.families[1:]):
-            of_family = logs[:, 1 + k * count : 1 + (k + 1) * count]
-            parts.append(self._over_sizes(of_family) + family.log_prior)
-        return np.stack(parts, axis=1)
+        firsts = range(1, len(logs), count)
+        ends = [max(int(np.argmax(logs[first : first + count])) + 2, _FEWEST) for first in firsts]
+        return [[0], *([*range(first, first + min(end, count))] for first, end in zip(firsts, ends, strict=True))]
+
+    def evidence(self, logs: Floats, numbers: Sequence[Sequence[int]] | None = None) -> Floats:
+        """Log evidence (n, families) from log likelihoods (n, noises), with the priors of the noise.
+
+        numbers: those of each family that count (``up_to``); None: all.
+        """
+        numbers = numbers or self.up_to(np.append(0.0, np.tile(np.arange(len(self._sizes)), len(self.families) - 1)))
+        parts = [logs[:, 0], *(self._over_sizes(logs[:, of_family]) for of_family in numbers[1:])]
+        return np.stack(parts, axis=1) + [family.log_prior for family in self.families]
 
     def _over_sizes(self, logs: Floats) -> Floats:
         """Return the log mean (n,) of likelihoods over the sizes of a family."""

@@ -71,6 +71,7 @@ class Posterior:
         measured = (1 if noise.attitude_unknown else 3) * len(before.fit.dwells)
         self._sizes = NoiseSizes(self._run.likelihood, self._noise, measured - model.count + len(model.fixed))
         self._disturbed: DisturbedDwell | None = None
+        self._no_oscillation = set[str]()
 
     def table(self, refitted: bool = True) -> HypothesisTable:
         """All rows with their probabilities; the likeliest are fitted if ``refitted``."""
@@ -197,12 +198,12 @@ class Posterior:
         for name in self._heads():
             term = self._run.terms[self._best[name]]
             alone = self._base + self._log_bayes[self._best[name]] + self._log_share_of_best(name)
-            # beside one more term less noise is likely, not more
+            numbers = self._sizes.up_to(alone)  # beside one more term less noise is likely, not more
             beside = np.zeros((len(self._run.terms), len(alone)))
-            for k in self._sizes.up_to(alone):
+            for k in itertools.chain(*numbers):
                 rows = self._run.likelihood.projected(self._sizes.covariances[k], term.columns)
                 beside[:, k] = self._run.log_bayes(rows)
-            logs = np.logaddexp.reduce(self._sizes.evidence(alone + beside), axis=1)
+            logs = np.logaddexp.reduce(self._sizes.evidence(alone + beside, numbers), axis=1)
             for other, log in self._by_row(logs).items():
                 key = (other, name) if (other, name) in pairs else (name, other)
                 if other != name:
@@ -240,8 +241,10 @@ class Posterior:
         best = max(row.log_evidence for row in rows)
         least = best - _BEHIND - _BENT * max(best - float(self._without.max()), 0.0)
         effects = sorted((row for row in rows if row.effects and not row.driver), key=lambda row: -row.log_evidence)
-        likeliest = {id(row) for row in effects[:_REFITTED] if row.log_evidence > least}
+        single = [row for row in effects if len(row.effects) == 1][:_HEADS]  # large effects are far from linear
+        likeliest = {id(row) for row in [*single, *(row for row in effects[:_REFITTED] if row.log_evidence > least)]}
         fitted = [self._refitted(row) if id(row) in likeliest else row for row in rows]
+        fitted = [row for row in fitted if not self._no_oscillation & {*row.effects}]
         first = max(row.log_evidence for row in fitted) - _DESCRIBED
         return [self._described(row) if row.driver and row.log_evidence > first else row for row in fitted]
 
@@ -255,7 +258,8 @@ class Posterior:
             disturbed = disturbed_dwell(refit.fit)
             if disturbed.p_value < _APART:
                 self._disturbed = self._disturbed or disturbed
-                return replace(row, log_evidence=-math.inf)
+                self._no_oscillation |= {str(effect) for effect in refit.model.effects if effect.oscillates}
+                return row
         folded, before = refit.fit.dwells[0], self._before.fit.dwells[0]
         otherwise = (folded.carrier_hz, folded.averaged) != (before.carrier_hz, before.averaged)
         if self._run.walk in row.effects or otherwise:
