@@ -34,7 +34,7 @@ from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.run_likelihood import Projected, RunLikelihood, log_bayes_together
 from kf_calib.diagnosis.run_terms import RunTerms, log_bayes_of_any_size, sizes_of
 from kf_calib.diagnosis.unknown_terms import name_of_formula, text_named
-from kf_calib.diagnosis.within_dwell_trend import DisturbedDwell, disturbed_dwell
+from kf_calib.diagnosis.within_dwell_trend import DisturbedDwell, disturbed_dwell, trend
 from kf_calib.effects import effect_named
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.results import Calibration
@@ -78,6 +78,7 @@ class Posterior:
         rows = [*self._without_terms(), *self._singles(), self._one_dwell()]
         if refitted:
             rows = self._fitted([*rows, *self._pairs()])
+            rows = [self._with_changes_beside_walk(row, rows) if row.driver == IRREGULAR else row for row in rows]
         rows = [row for row in rows if math.isfinite(row.log_evidence)]
         return replace(table_of(rows), disturbed=self._disturbed, scattering=self._scattering)
 
@@ -119,10 +120,10 @@ class Posterior:
             share = self._share_of_unknown(family)
             of_noise.append(log + prior + math.log(1.0 - share))
             irregular += [log + prior + math.log(share)] if share else []
-        trend = log_odds_of(self._test.trend.p_value) if self._test.trend else 0.0
+        within = log_odds_of(self._test.trend.p_value) if self._test.trend else 0.0
         rows = [
             Hypothesis(families=(NOTHING,), log_evidence=noises[0][1] + prior),
-            Hypothesis(driver=IRREGULAR, families=(NONE,), log_evidence=_log_sum(irregular) + trend),
+            Hypothesis(driver=IRREGULAR, families=(NONE,), log_evidence=_log_sum(irregular) + within),
         ]
         return [*rows, Hypothesis(families=(NOISE,), log_evidence=_log_sum(of_noise))] if of_noise else rows
 
@@ -243,10 +244,15 @@ class Posterior:
         effects = sorted((row for row in rows if row.effects and not row.driver), key=lambda row: -row.log_evidence)
         single = [row for row in effects if len(row.effects) == 1][:_HEADS]  # large effects are far from linear
         likeliest = {id(row) for row in [*single, *(row for row in effects[:_REFITTED] if row.log_evidence > least)]}
-        fitted = [self._refitted(row) if id(row) in likeliest else row for row in rows]
-        fitted = [row for row in fitted if not self._no_oscillation & {*row.effects}]
-        first = max(row.log_evidence for row in fitted) - _DESCRIBED
-        return [self._described(row) if row.driver and row.log_evidence > first else row for row in fitted]
+        fitted = self._rid_of_disturbed([self._refitted(row) if id(row) in likeliest else row for row in rows])
+        while not (first := max(fitted, key=lambda row: row.log_evidence)).driver and first.effects and not first.refit:
+            fitted = self._rid_of_disturbed([self._refitted(row) if row is first else row for row in fitted])
+        least = first.log_evidence - _DESCRIBED
+        return [self._described(row) if row.driver and row.log_evidence > least else row for row in fitted]
+
+    def _rid_of_disturbed(self, rows: Sequence[Hypothesis]) -> list[Hypothesis]:
+        """Return the rows without an oscillation that does not go on alike in all dwells."""
+        return [row for row in rows if not self._no_oscillation & {*row.effects}]
 
     def _refitted(self, row: Hypothesis) -> Hypothesis:
         """Return a row of effects with its fit, weighed there unless dwells were folded otherwise for it."""
@@ -266,6 +272,15 @@ class Posterior:
             return replace(row, refit=refit)
         log = self._log_of_fit(refit) + sum(self._log_share_of_best(name) for name in row.effects)
         return replace(row, refit=refit, log_evidence=log + self._log_prior(row.effects))
+
+    def _with_changes_beside_walk(self, irregular: Hypothesis, rows: Sequence[Hypothesis]) -> Hypothesis:
+        """Return the row of irregular changes with those beside a random walk of the biases: what this leaves within
+        dwells speaks for them, too."""
+        logs = [irregular.log_evidence]
+        for row in (row for row in rows if self._run.walk in row.effects and row.refit is not None):
+            left = trend(row.refit.fit) if self._test.trend and row.refit else None
+            logs += [row.log_evidence + log_odds_of(left.p_value) + math.log(_WITHIN)] if left else []
+        return replace(irregular, log_evidence=_log_sum(logs))
 
     def _log_of_fit(self, refit: Calibration) -> float:
         """Return the log evidence of the effects that a refit has in addition, at the values of their constants."""
