@@ -334,7 +334,7 @@ class Posterior:
         at, likeliest = np.unravel_index(int(np.argmax(scores)), scores.shape)
         term = terms[int(likeliest)]
         widths = [sum(len(run.formula_of(text).coefficients) for text in unknown.summands[k]) for k in term.summands]
-        parts = np.split(term.columns, np.cumsum(widths)[:-1])
+        parts = np.split(term.spanned, np.cumsum(widths)[:-1])
         return [text for k in self._summands(parts, noises[int(at)]) for text in unknown.summands[term.summands[k]]]
 
     def _summands(self, parts: Sequence[Indices], rows: Projected) -> list[int]:

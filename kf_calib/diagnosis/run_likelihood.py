@@ -161,11 +161,17 @@ class RunLikelihood:
             parts = [columns[..., part] if matrix is None else columns[..., part] @ matrix for part, matrix in blocks]
             setattr(self, name, np.concatenate(parts, axis=-1))
 
-    def column_rms(self) -> Floats:
-        """The root mean square (C,) of each column, in units of the noise of a mean or of a row within dwells."""
-        count = self.rows + np.count_nonzero(np.abs(self._more_columns).sum(axis=0))
+    def append(self, combinations: Sequence[tuple[Indices, Floats]]) -> None:
+        """Add combinations of columns of the terms, each behind the others."""
+        for name in ("_columns", "_more_columns"):
+            columns = getattr(self, name)
+            parts = [columns[..., places] @ matrix for places, matrix in combinations]
+            setattr(self, name, np.concatenate([columns, *parts], axis=-1))
+
+    def column_lengths(self) -> Floats:
+        """The length (C,) of each column, in units of the noise."""
         squares = np.einsum("dic,dic->c", self._columns, self._columns) + np.sum(self._more_columns**2, axis=0)
-        return np.sqrt(squares / max(count, 1))
+        return np.sqrt(squares)
 
     def rescale(self, scales: Floats) -> None:
         """Multiply the columns of the terms by these (C,)."""

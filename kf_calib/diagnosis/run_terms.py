@@ -29,7 +29,8 @@ _NODES = 40  # sizes that are tried
 _SPARSE = 0.5  # share of one summand alone in the unknown functions of a driver
 _SAME = 0.99  # cosine above which a summand is a known effect
 _END = 0.99  # of the range of a constant
-_HIDDEN = 1e19  # sigma of columns of which rounding alone is seen
+_SEEN = 1e-7  # share of a column that the model must leave for it to be seen
+_LEADING, _LEAST = 24, 1e-3  # combinations of the columns of an unknown function, and the least size of one
 _WAVES = 40  # of a random walk
 
 
@@ -39,7 +40,7 @@ class Term:
 
     row: the name of an effect, or ``?`` and the number of an unknown function. log_share: log of its share in the prior
     of its row. effect: with the constant at which it has these columns. summands: of the unknown function, those that
-    it has. sizes: of its coefficients.
+    it has. sizes: of its coefficients. spanned: the columns of its formulas, of which its own are combinations.
     """
 
     row: str
@@ -48,6 +49,7 @@ class Term:
     effect: Effect | None = None
     summands: tuple[int, ...] = ()
     sizes: Sizes = field(default_factory=lambda: Sizes(np.zeros(0), np.zeros(0)))
+    spanned: Indices = field(default_factory=lambda: np.zeros(0, np.intp))
 
     @property
     def is_known(self) -> bool:
@@ -88,7 +90,7 @@ class RunTerms:
             columns.term(self.walk, [columns.block(columns.add([waves]))], 0.0)
         self.likelihood = RunLikelihood(self._linearised, noise, columns.effects)
         self.likelihood.recombine(columns.blocks)
-        rms = self.likelihood.column_rms()
+        rms = self.likelihood.column_lengths() / math.sqrt(self.likelihood.rows)
         unknown = np.where(rms > 0.0, columns.weights / np.where(rms > 0.0, rms, 1.0), 0.0)
         self.likelihood.rescale(np.where(columns.weights > 0.0, unknown, 1.0))
         self.terms = self._seen(columns.terms)
@@ -130,21 +132,28 @@ class RunTerms:
 
     def _seen(self, drafts: Sequence[Term]) -> list[Term]:
         """Return the terms of which something is seen, with their sizes; a summand that is a known effect is none."""
-        whole, known, terms = self.likelihood.whole(), dict[tuple[int, ...], list[Floats]](), list[Term]()
+        whole, raw = self.likelihood.whole(), self.likelihood.column_lengths()
+        known, terms, matrices = dict[tuple[int, ...], list[Floats]](), list[Term](), list[tuple[Indices, Floats]]()
         for draft in drafts:
             columns = whole[:, draft.columns]
-            least = best_sigma(columns)
-            if least > _HIDDEN:
+            if not (np.linalg.norm(columns, axis=0) > _SEEN * raw[draft.columns]).any():
                 continue
-            if draft.is_known or len(draft.summands) == 1:
-                basis = orthonormal(columns / np.linalg.norm(columns, axis=0).max())[0]
-                alike = known.setdefault(basis.shape, [])
-                if draft.is_known and not _is_limit(draft.effect):
-                    alike.append(basis)
-                elif not draft.is_known and alike and _largest_cosine(alike, basis) > _SAME:
-                    continue
+            if len(draft.summands) > 1:
+                spanned, matrix = draft.columns, _leading(columns)
+                matrices.append((spanned, matrix))
+                place = self.likelihood.count + _LEADING * (len(matrices) - 1) + np.arange(_LEADING)
+                sizes = sizes_of(best_sigma(columns @ matrix), None)
+                terms.append(replace(draft, columns=place, spanned=spanned, sizes=sizes))
+                continue
+            basis = orthonormal(columns / np.linalg.norm(columns, axis=0).max())[0]
+            alike = known.setdefault(basis.shape, [])
+            if draft.is_known and not _is_limit(draft.effect):
+                alike.append(basis)
+            elif not draft.is_known and alike and _largest_cosine(alike, basis) > _SAME:
+                continue
             usual = None if draft.effect is None else usual_sizes(draft.effect, self.grade)
-            terms.append(replace(draft, sizes=sizes_of(least, usual)))
+            terms.append(replace(draft, spanned=draft.columns, sizes=sizes_of(best_sigma(columns), usual)))
+        self.likelihood.append(matrices)
         return terms
 
     @cached_property
@@ -241,6 +250,14 @@ class _Walk(Effect):
         columns = np.zeros((len(s), 3, 3, self.count))
         columns[:, range(3), range(3)] = waves[:, None]
         return columns.reshape(len(s), 3, -1)
+
+
+def _leading(columns: Floats) -> Floats:
+    """Return the combinations (q, ``_LEADING``) of columns (r, q) of an unknown function that show most, orthonormal in
+    its coefficients, so that these keep their prior; zeros where there are fewer."""
+    _, singular, right = np.linalg.svd(columns, full_matrices=False)
+    kept = right[: int((singular > _LEAST * singular[0]).sum())][:_LEADING]
+    return np.hstack([kept.T, np.zeros((columns.shape[1], _LEADING - len(kept)))])
 
 
 def _is_limit(effect: Effect | None) -> bool:
