@@ -44,8 +44,8 @@ _IRREGULAR = 0.1  # share of an unknown cause in scatter that was not stated
 _AGAINST_STATED = 0.5  # the same of scatter beyond what was stated
 _WITHIN = 0.01  # prior probability of irregular changes that show within dwells only
 _APART = 1e-4  # p-value of an oscillation that does not go on alike in all dwells
-_HEADS = 3  # effects beside which all other terms are tried, in the noise of the run and in none beyond that stated
-_REFITTED = 8  # rows of effects that are fitted at most
+_HEADS = 2  # effects beside which all other terms are tried, in the noise of the run and in none beyond that stated
+_REFITTED, _ALWAYS = 8, 3  # rows of effects that are fitted at most, and single ones that always are
 _BEHIND, _BENT = 10.0, 0.02  # in log evidence, and share of the gain: rows further behind are not fitted
 _DESCRIBED = 5.0  # in log evidence: rows of unknown functions further behind get no formula
 _NODES_OF_PAIR = 16  # sizes of each of two effects
@@ -242,7 +242,7 @@ class Posterior:
         best = max(row.log_evidence for row in rows)
         least = best - _BEHIND - _BENT * max(best - float(self._without.max()), 0.0)
         effects = sorted((row for row in rows if row.effects and not row.driver), key=lambda row: -row.log_evidence)
-        single = [row for row in effects if len(row.effects) == 1][:_HEADS]  # large effects are far from linear
+        single = [row for row in effects if len(row.effects) == 1][:_ALWAYS]  # large effects are far from linear
         likeliest = {id(row) for row in [*single, *(row for row in effects[:_REFITTED] if row.log_evidence > least)]}
         fitted = self._rid_of_disturbed([self._refitted(row) if id(row) in likeliest else row for row in rows])
         while not (first := max(fitted, key=lambda row: row.log_evidence)).driver and first.effects and not first.refit:

@@ -269,7 +269,8 @@ def _is_limit(effect: Effect | None) -> bool:
 def _largest_cosine(bases: Sequence[Floats], basis: Floats) -> float:
     """Return the cosine of the smallest of the largest angles between a basis and each of some others."""
     products = np.swapaxes(np.stack(bases), 1, 2) @ basis
-    return float(np.linalg.svd(products, compute_uv=False).min(axis=1).max())
+    close = products[np.einsum("nij,nij->n", products, products) > _SAME**2 * basis.shape[1]]
+    return float(np.linalg.svd(close, compute_uv=False).min(axis=1).max(initial=0.0))
 
 
 def sizes_of(least: float, usual: SizePrior | None, nodes: int = _NODES) -> Sizes:
