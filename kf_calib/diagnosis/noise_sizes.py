@@ -18,6 +18,7 @@ from kf_calib.noise.reml import OF_ONE
 
 _STATED, _UNSTATED = 0.02, 0.5  # prior probability of noise beyond what was stated, and where nothing was stated
 _OF_ONE = 0.1  # share of one accelerometer alone in scatter
+_HOPELESS = 30.0  # in log likelihood
 _FEWEST = 4  # sizes of noise over which is integrated
 _RANGE = math.log(1e4)  # width of the flat prior of the logarithm of a size of noise
 
@@ -82,20 +83,24 @@ class NoiseSizes:
         squares = (self._sizes**2).tolist()
         return [None, *(square * family.shapes for family in self.families[1:] for square in squares)]
 
-    def up_to(self, logs: Floats) -> list[list[int]]:
+    def likely(self, logs: Floats, most: Floats) -> list[list[int]]:
         """Numbers of the noises of each family that are not much larger than the likeliest by log likelihoods
-        (noises,)."""
-        count = len(self._sizes)
-        firsts = range(1, len(logs), count)
-        ends = [max(int(np.argmax(logs[first : first + count])) + 2, _FEWEST) for first in firsts]
-        return [[0], *([*range(first, first + min(end, count))] for first, end in zip(firsts, ends, strict=True))]
+        (noises,), nor so small that even these with the most (noises,) that a term gains are hopeless."""
+        count, numbers, best = len(self._sizes), [[0]], float((logs + most).max())
+        for first in range(1, len(logs), count):
+            end = max(int(np.argmax(logs[first : first + count])) + 2, _FEWEST)
+            hopeful = np.flatnonzero((logs + most)[first : first + count] > best - _HOPELESS)
+            begin = min(max(int(hopeful[0]) - 1, 0) if hopeful.size else count, min(end, count) - _FEWEST)
+            numbers.append([*range(first + begin, first + min(end, count))])
+        return numbers
 
     def evidence(self, logs: Floats, numbers: Sequence[Sequence[int]] | None = None) -> Floats:
         """Log evidence (n, families) from log likelihoods (n, noises), with the priors of the noise.
 
-        numbers: those of each family that count (``up_to``); None: all.
+        numbers: those of each family that count (``likely``); None: all.
         """
-        numbers = numbers or self.up_to(np.append(0.0, np.tile(np.arange(len(self._sizes)), len(self.families) - 1)))
+        count = len(self._sizes)
+        numbers = numbers or [[0], *([*range(first, first + count)] for first in range(1, logs.shape[1], count))]
         parts = [logs[:, 0], *(self._over_sizes(logs[:, of_family]) for of_family in numbers[1:])]
         return np.stack(parts, axis=1) + [family.log_prior for family in self.families]
 

@@ -44,7 +44,7 @@ _IRREGULAR = 0.1  # share of an unknown cause in scatter that was not stated
 _AGAINST_STATED = 0.5  # the same of scatter beyond what was stated
 _WITHIN = 0.01  # prior probability of irregular changes that show within dwells only
 _APART = 1e-4  # p-value of an oscillation that does not go on alike in all dwells
-_HEADS = 2  # effects beside which all other terms are tried, in the noise of the run and in none beyond that stated
+_HEADS = 3  # effects beside which all other terms are tried, in the noise of the run and in none beyond that stated
 _REFITTED, _ALWAYS = 8, 3  # rows of effects that are fitted at most, and single ones that always are
 _BEHIND, _BENT = 10.0, 0.02  # in log evidence, and share of the gain: rows further behind are not fitted
 _DESCRIBED = 5.0  # in log evidence: rows of unknown functions further behind get no formula
@@ -199,7 +199,8 @@ class Posterior:
         for name in self._heads():
             term = self._run.terms[self._best[name]]
             alone = self._base + self._log_bayes[self._best[name]] + self._log_share_of_best(name)
-            numbers = self._sizes.up_to(alone)  # beside one more term less noise is likely, not more
+            # beside one more term less noise is likely, not more
+            numbers = self._sizes.likely(alone, self._log_bayes.max(axis=0))
             beside = np.zeros((len(self._run.terms), len(alone)))
             for k in itertools.chain(*numbers):
                 rows = self._run.likelihood.projected(self._sizes.covariances[k], term.columns)
