@@ -38,6 +38,7 @@ from kf_calib.diagnosis.within_dwell_trend import DisturbedDwell, disturbed_dwel
 from kf_calib.effects import effect_named
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.results import Calibration
+from kf_calib.noise.noise_model import Noise
 from kf_calib.support.tail_probabilities import log_odds_of
 
 _IRREGULAR = 0.1  # share of an unknown cause in scatter that was not stated
@@ -49,6 +50,7 @@ _REFITTED, _ALWAYS = 8, 3  # rows of effects that are fitted at most, and single
 _BEHIND, _BENT = 10.0, 0.02  # in log evidence, and share of the gain: rows further behind are not fitted
 _DESCRIBED = 5.0  # in log evidence: rows of unknown functions further behind get no formula
 _NODES_OF_PAIR = 16  # sizes of each of two effects
+_ROUNDING, _UNSEEN = 1e-6, 1e-3  # least scatter over the misfit: where noise within dwells was seen, and where not
 _SUMMANDS, _MORE = 3, 3.0  # formulas that describe an unknown function at most, and what each has to gain
 
 
@@ -60,15 +62,12 @@ class Posterior:
 
     def __init__(self, refits: Refits, before: Calibration, test: CandidateTests) -> None:
         self._refits, self._before, self._test = refits, before, test
-        noise, model = before.noise, before.model
-        self._noise = replace(
-            noise,
-            walk_mps2_per_sqrt_s=0.0,
-            scatter_mps2=noise.scatter_mps2 if noise.scatter_stated else np.zeros(3),
-            setting_rad=noise.setting_rad if noise.setting_stated or noise.attitude_unknown else 0.0,
-        )
-        self._run = RunTerms(before, self._noise, test)
-        measured = (1 if noise.attitude_unknown else 3) * len(before.fit.dwells)
+        model = before.model
+        self._noise = _stated(before.noise)
+        misfit_mps2 = float(np.sqrt(np.mean(before.residuals_mps2**2)))
+        self._least_mps2 = (_ROUNDING if before.noise.within_seen else _UNSEEN) * misfit_mps2
+        self._run = RunTerms(before, self._noise, self._least_mps2, test)
+        measured = (1 if self._noise.attitude_unknown else 3) * len(before.fit.dwells)
         self._sizes = NoiseSizes(self._run.likelihood, self._noise, measured - model.count + len(model.fixed))
         self._disturbed: DisturbedDwell | None = None
         self._no_oscillation = set[str]()
@@ -285,11 +284,12 @@ class Posterior:
 
     def _log_of_fit(self, refit: Calibration) -> float:
         """Return the log evidence of the effects that a refit has in addition, at the values of their constants."""
-        known, noise, model = self._before.model.count, self._noise, refit.model
+        noise, model = self._noise, refit.model
         if refit.noise.sensitivity_mps2_per_k is not None:
             noise = replace(noise, sensitivity_mps2_per_k=refit.noise.sensitivity_mps2_per_k)
-        likelihood = RunLikelihood(refit.linearised, noise, (), known)
-        effects = [effect for effect in model.effects if model.parts[str(effect)].start >= known]
+        effects = model.effects[len(self._before.model.effects) :]
+        known = model.parts[str(effects[0])].start
+        likelihood = RunLikelihood(refit.linearised, noise, self._least_mps2, known=known)
         places = [model.parts[str(effect)].start - known + np.arange(len(effect.coefficients)) for effect in effects]
         matrices = ([*effect.relations] or [np.eye(len(effect.coefficients))] for effect in effects)
         related, whole = [*itertools.product(*matrices)], likelihood.whole()
@@ -349,6 +349,16 @@ class Posterior:
             chosen.append(rest[int(np.argmax(logs))])
             log = max(logs)
         return chosen
+
+
+def _stated(noise: Noise) -> Noise:
+    """Return the noise that was stated, or seen within dwells."""
+    return replace(
+        noise,
+        walk_mps2_per_sqrt_s=0.0,
+        scatter_mps2=noise.scatter_mps2 if noise.scatter_stated else np.zeros(3),
+        setting_rad=noise.setting_rad if noise.setting_stated or noise.attitude_unknown else 0.0,
+    )
 
 
 def _log_sum(logs: Sequence[float]) -> float:

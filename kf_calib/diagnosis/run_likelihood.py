@@ -74,13 +74,19 @@ class Projected:
 class RunLikelihood:
     """The likelihood of one run, linearised where its fit is.
 
-    linearised: the dwells with the columns of the model. noise: what was stated. effects: terms that may be missing, of
+    linearised: the dwells with the columns of the model. noise: what was stated. least_mps2: scatter that there is in
+    any case, by which rounding does not decide. effects: terms that may be missing, of
     which ``columns`` are made. known: number of states of the model that have a flat prior; further ones are terms,
     whose columns come first.
     """
 
     def __init__(
-        self, linearised: LinearisedDwells, noise: Noise, effects: Sequence[Effect], known: int | None = None
+        self,
+        linearised: LinearisedDwells,
+        noise: Noise,
+        least_mps2: float,
+        effects: Sequence[Effect] = (),
+        known: int | None = None,
     ) -> None:
         self.linearised, self.noise = linearised, noise
         model = linearised.model
@@ -93,7 +99,8 @@ class RunLikelihood:
         columns = np.concatenate([means.design[..., known : model.count], of_effects], axis=2)
         readings = means.readings - means.design[..., :known] @ linearised.state[:known]
         self.means = means
-        covariances = lift_rounding(mean_covariances(noise, means, linearised.state))
+        covariances = mean_covariances(noise, means, linearised.state) + least_mps2**2 * np.eye(3)
+        covariances = lift_rounding(covariances)
         self._root = np.linalg.inv(np.linalg.cholesky(covariances))
         self._log_root = -float(np.log(np.abs(np.einsum("dii->di", self._root))).sum())
         self._model, self._columns = self._root @ design, self._root @ columns
@@ -225,7 +232,7 @@ class RunLikelihood:
         log = -self._log_root
         parts = [self._model, self._columns if columns else self._columns[..., :0], self._readings[..., None]]
         if covariances is not None:
-            lower = np.linalg.cholesky(np.eye(3) + covariances)
+            lower = np.linalg.cholesky(lift_rounding(np.eye(3) + covariances))
             root = np.asarray(np.linalg.inv(lower), float)
             parts = [root @ part for part in parts]
             log -= float(np.log(np.einsum("dii->di", lower)).sum())
@@ -261,6 +268,7 @@ class RunLikelihood:
     def misfit(self) -> float:
         """Chi-squared of the means without any term, in the noise that was stated."""
         model, _, z, _, _ = self._in_noise(None, columns=False)
+        model, z = np.concatenate([model, self._more_model]), np.append(z, self._more_readings)
         basis = np.linalg.qr(model @ self._seen)[0]
         return float(np.sum((z - basis @ (basis.T @ z)) ** 2))
 

@@ -74,10 +74,11 @@ class _Alike:
 class RunTerms:
     """All terms of a run and its likelihood.
 
-    before: the run without what is missing. noise: what was stated of it. test: its linear tests, with the candidates.
+    before: the run without what is missing. noise, least_mps2: what was stated of it, and scatter that
+    there is in any case. test: its linear tests, with the candidates.
     """
 
-    def __init__(self, before: Calibration, noise: Noise, test: CandidateTests) -> None:
+    def __init__(self, before: Calibration, noise: Noise, least_mps2: float, test: CandidateTests) -> None:
         self._linearised, self.bench = before.fit.linearised, before.bench
         self.grade: Grade = sensor_grade(before.fit)
         self.walk = "" if before.model.walks else walk_named(before.bench)
@@ -88,7 +89,7 @@ class RunTerms:
         if self.walk:
             waves = _Walk(before.fit.dwells[-1].end_s, min(len(before.fit.dwells), _WAVES))
             columns.term(self.walk, [columns.block(columns.add([waves]))], 0.0)
-        self.likelihood = RunLikelihood(self._linearised, noise, columns.effects)
+        self.likelihood = RunLikelihood(self._linearised, noise, least_mps2, columns.effects)
         self.likelihood.recombine(columns.blocks)
         rms = self.likelihood.column_lengths() / math.sqrt(self.likelihood.rows)
         unknown = np.where(rms > 0.0, columns.weights / np.where(rms > 0.0, rms, 1.0), 0.0)
