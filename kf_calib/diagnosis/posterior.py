@@ -43,6 +43,7 @@ from kf_calib.support.tail_probabilities import log_odds_of
 
 _IRREGULAR = 0.1  # share of an unknown cause in scatter that was not stated
 _AGAINST_STATED = 0.5  # the same of scatter beyond what was stated
+_OF_ORIENTATION = 0.8  # share of unknown causes that depend on the orientation alone, and come back with it
 _WITHIN = 0.01  # prior probability of irregular changes that show within dwells only
 _APART = 1e-4  # p-value of an oscillation that does not go on alike in all dwells
 _HEADS = 3  # effects beside which all other terms are tried, in the noise of the run and in none beyond that stated
@@ -130,7 +131,8 @@ class Posterior:
         """Return the share of an unknown cause in noise: in setting errors that nobody stated none, which are usual."""
         stated = {"setting": self._noise.setting_stated}
         if any(stated.get(part, self._noise.scatter_stated) for part in family.parts):
-            return _AGAINST_STATED
+            others = 1.0 - _OF_ORIENTATION if self._run.repeats else 1.0  # which has a row of its own
+            return others * _AGAINST_STATED / (others * _AGAINST_STATED + 1.0 - _AGAINST_STATED)
         return 0.0 if family.parts == ("setting",) else _IRREGULAR
 
     @property
@@ -312,7 +314,7 @@ class Posterior:
     def _described(self, row: Hypothesis) -> Hypothesis:
         """Return a row of an unknown function with the formulas that describe it, and their fit."""
         number = next((k for k, term in enumerate(self._run.unknown) if term.driver == row.driver), None)
-        if number is None:
+        if number is None or not self._run.unknown[number].summands:
             return row
         texts, taken = self._formulas(number, row.effects), {effect.name for effect in self._before.model.effects}
         first = next(k for k in itertools.count() if not {name_of_formula(k + n) for n in range(len(texts))} & taken)

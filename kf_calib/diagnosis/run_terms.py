@@ -20,6 +20,7 @@ from kf_calib.dwells.qr import orthonormal
 from kf_calib.effects import Coefficient, Effect, Stimulus, walk_named
 from kf_calib.effects.effect import Grade
 from kf_calib.effects.formula import formula
+from kf_calib.estimation.cross_validation import orientations
 from kf_calib.estimation.dwell_columns import stimulus_of
 from kf_calib.estimation.results import Calibration
 from kf_calib.noise.noise_model import Noise
@@ -32,6 +33,7 @@ _END = 0.99  # of the range of a constant
 _SEEN = 1e-7  # share of a column that the model must leave for it to be seen
 _LEADING, _LEAST = 24, 1e-3  # combinations of the columns of an unknown function, and the least size of one
 _WAVES = 40  # of a random walk
+_MOST_ORIENTATIONS = 100  # that are told apart by what comes back with each
 
 
 @dataclass(frozen=True)
@@ -86,6 +88,7 @@ class RunTerms:
         columns = _Columns()
         self._add_effects(columns, test)
         self._add_unknown(columns)
+        self._add_orientations(columns)
         if self.walk:
             waves = _Walk(before.fit.dwells[-1].end_s, min(len(before.fit.dwells), _WAVES))
             columns.term(self.walk, [columns.block(columns.add([waves]))], 0.0)
@@ -127,6 +130,19 @@ class RunTerms:
             if not alone:
                 columns.term(f"?{number}", blocks, math.log(1.0 - _SPARSE), summands=(*range(len(blocks)),))
 
+    def _add_orientations(self, columns: _Columns) -> None:
+        """Add an unknown cause that is alike at each visit of an orientation, where some are visited again."""
+        groups, dwells = orientations(self._linearised.dwells), self._linearised.dwells
+        self.repeats = self.bench.angles and len(groups) < min(len(dwells), _MOST_ORIENTATIONS)
+        if self.repeats:
+            of_dwell = np.empty(len(dwells), np.intp)
+            for k, group in enumerate(groups):
+                of_dwell[group] = k
+            pieces = [len(dwell.pieces) for dwell in dwells]
+            visits = _Visits(np.repeat(of_dwell, 3 * np.array(pieces)), len(groups))
+            self.unknown.append(UnknownTerm("the orientation alone, alike at each visit", "", ()))
+            columns.term(f"?{len(self.unknown) - 1}", [columns.block(columns.add([visits]))], 0.0)
+
     def formula_of(self, text: str) -> Effect:
         """The effect of a formula without a name."""
         return formula(text_named(text), self.bench.axes, self.bench.gravity_mps2, checked=False)
@@ -145,6 +161,9 @@ class RunTerms:
                 place = self.likelihood.count + _LEADING * (len(matrices) - 1) + np.arange(_LEADING)
                 sizes = sizes_of(best_sigma(columns @ matrix), None)
                 terms.append(replace(draft, columns=place, spanned=spanned, sizes=sizes))
+                continue
+            if not (draft.is_known or draft.summands):
+                terms.append(replace(draft, spanned=draft.columns, sizes=sizes_of(best_sigma(columns), None)))
                 continue
             basis = orthonormal(columns / np.linalg.norm(columns, axis=0).max())[0]
             alike = known.setdefault(basis.shape, [])
@@ -231,6 +250,27 @@ class _Columns:
         """Add a term with the columns of some blocks."""
         places = np.concatenate([self._places[block] for block in blocks])
         self.terms.append(Term(row, places, log_share, effect, summands))
+
+
+class _Visits(Effect):
+    """A bias of each accelerometer that is another in each orientation: numbers (m,) of the orientations of all
+    instants, and how many there are."""
+
+    name, title, source = "visits", "", ""
+
+    def __init__(self, numbers: Indices, count: int) -> None:
+        self.numbers, self.count = numbers, count
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return tuple(Coefficient(f"v{k}", "m/s^2", 1.0, "m/s^2") for k in range(3 * self.count))
+
+    def columns(self, s: Stimulus) -> Floats:
+        instants = np.arange(len(self.numbers))[s.places if s.whole is not None else slice(None)]
+        columns = np.zeros((len(s), 3, 3, self.count))
+        for i in range(3):
+            columns[np.arange(len(s)), i, i, self.numbers[instants]] = 1.0
+        return columns.reshape(len(s), 3, -1)
 
 
 class _Walk(Effect):

@@ -116,7 +116,7 @@ def test_views_work_nothing_out(monkeypatch: pytest.MonkeyPatch) -> None:
     found = unlisted()
     shown, printed = diagnosis_object(found), plain(diagnosis_report(found, details=True))
     assert shown["unknown"] and shown["detectable"] and "To try:" in printed
-    for name in ("describe", "detectable", "advise", "mean_covariances"):
+    for name in ("describe_irregular", "detectable", "advise", "mean_covariances"):
         monkeypatch.delattr(results, name)
     assert diagnosis_object(found) == shown and plain(diagnosis_report(found, details=True)) == printed
 

@@ -21,7 +21,6 @@ from kf_calib.diagnosis.hypothesis_table import NOTHING
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.results import Diagnosis
-from kf_calib.diagnosis.unknown_effect import JUMP
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.settings import Settings
 from kf_calib.sources.files.recording import Recording
@@ -362,7 +361,7 @@ def test_a_jump_is_not_called_a_walk(seed: int) -> None:
     found = diagnose(source("bias-jump=20sigma", seed=seed))
     assert found.unknown, found.verdict
     said = found.description
-    assert said is not None and said.driver == JUMP
+    assert said is not None and said.driver == "time (a jump)"
 
 
 @pytest.mark.slow
