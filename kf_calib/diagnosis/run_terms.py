@@ -15,9 +15,9 @@ from kf_calib.bench.arrays import Floats, Indices
 from kf_calib.diagnosis.candidate_tests import CandidateTests
 from kf_calib.diagnosis.coefficient_sizes import SizePrior, best_sigma, sensor_grade, usual_sizes
 from kf_calib.diagnosis.run_likelihood import Projected, RunLikelihood, Sizes, log_bayes
-from kf_calib.diagnosis.unknown_terms import UnknownTerm, text_named, unknown_terms
+from kf_calib.diagnosis.unknown_terms import RETURNING, UnknownTerm, text_named, unknown_terms
 from kf_calib.dwells.qr import orthonormal
-from kf_calib.effects import Coefficient, Effect, Stimulus, walk_named
+from kf_calib.effects import Coefficient, Effect, Stimulus, effect_named, walk_named
 from kf_calib.effects.effect import Grade
 from kf_calib.effects.formula import formula
 from kf_calib.estimation.cross_validation import orientations
@@ -33,6 +33,7 @@ _END = 0.99  # of the range of a constant
 _SEEN = 1e-7  # share of a column that the model must leave for it to be seen
 _LEADING, _LEAST = 24, 1e-3  # combinations of the columns of an unknown function, and the least size of one
 _WAVES = 40  # of a random walk
+_RETURNS, _PER_DWELL = (4, 8, 16, 32, 64), 0.75  # parts of a run within which a bias may come back, and most of them
 _MOST_ORIENTATIONS = 100  # that are told apart by what comes back with each
 
 
@@ -42,7 +43,8 @@ class Term:
 
     row: the name of an effect, or ``?`` and the number of an unknown function. log_share: log of its share in the prior
     of its row. effect: with the constant at which it has these columns. summands: of the unknown function, those that
-    it has. sizes: of its coefficients. spanned: the columns of its formulas, of which its own are combinations.
+    it has. sizes: of its coefficients. spanned: the columns of its formulas, of which its own are combinations. scales:
+    factors (q,) of its columns.
     """
 
     row: str
@@ -52,6 +54,7 @@ class Term:
     summands: tuple[int, ...] = ()
     sizes: Sizes = field(default_factory=lambda: Sizes(np.zeros(0), np.zeros(0)))
     spanned: Indices = field(default_factory=lambda: np.zeros(0, np.intp))
+    scales: Floats | None = None
 
     @property
     def is_known(self) -> bool:
@@ -61,11 +64,12 @@ class Term:
 
 @dataclass(frozen=True)
 class _Alike:
-    """Terms of q columns each: their numbers (n,) and columns (n, q); G^T G (n, q, q) and G^T z (n, q) of the rows
-    within dwells; squares (n, m) of their sizes, logs (n, m) of the probabilities of these, and centres (n,)."""
+    """Terms of q columns each: their numbers (n,), columns (n, q) and factors of these; G^T G (n, q, q) and G^T z (n, q)
+    of the rows within dwells; squares (n, m) of their sizes, logs (n, m) of the probabilities of these, and centres (n,)."""
 
     numbers: Indices
     places: Indices
+    scales: Floats
     gram: Floats
     along: Floats
     squares: Floats
@@ -90,8 +94,7 @@ class RunTerms:
         self._add_unknown(columns)
         self._add_orientations(columns)
         if self.walk:
-            waves = _Walk(before.fit.dwells[-1].end_s, min(len(before.fit.dwells), _WAVES))
-            columns.term(self.walk, [columns.block(columns.add([waves]))], 0.0)
+            self._add_walk(columns)
         self.likelihood = RunLikelihood(self._linearised, noise, least_mps2, columns.effects)
         self.likelihood.recombine(columns.blocks)
         rms = self.likelihood.column_lengths() / math.sqrt(self.likelihood.rows)
@@ -143,6 +146,19 @@ class RunTerms:
             self.unknown.append(UnknownTerm("the orientation alone, alike at each visit", "", ()))
             columns.term(f"?{len(self.unknown) - 1}", [columns.block(columns.add([visits]))], 0.0)
 
+    def _add_walk(self, columns: _Columns) -> None:
+        """Add a random walk of the biases and, unknown, biases that change as irregularly and come back: the spectrum of
+        a Gauss-Markov process of correlation time tau is that of a walk times w^2 tau^2 / (1 + w^2 tau^2)."""
+        dwells = self._linearised.dwells
+        waves = _Walk(dwells[-1].end_s, min(len(dwells), _WAVES))
+        block = columns.block(columns.add([waves]))
+        columns.term(self.walk, [block], 0.0)
+        times_s = [waves.run_s / share for share in _RETURNS if share < _PER_DWELL * len(dwells)]
+        self.unknown.append(UnknownTerm(RETURNING, effect_named(self.walk, self.bench).family, ()))
+        for time_s in times_s:
+            scales = np.tile((1.0 + (waves.rates * time_s) ** -2.0) ** -0.5, 3)
+            columns.term(f"?{len(self.unknown) - 1}", [block], -math.log(len(times_s)), scales=scales)
+
     def formula_of(self, text: str) -> Effect:
         """The effect of a formula without a name."""
         return formula(text_named(text), self.bench.axes, self.bench.gravity_mps2, checked=False)
@@ -163,7 +179,8 @@ class RunTerms:
                 terms.append(replace(draft, columns=place, spanned=spanned, sizes=sizes))
                 continue
             if not (draft.is_known or draft.summands):
-                terms.append(replace(draft, spanned=draft.columns, sizes=sizes_of(best_sigma(columns), None)))
+                scaled = columns if draft.scales is None else columns * draft.scales
+                terms.append(replace(draft, spanned=draft.columns, sizes=sizes_of(best_sigma(scaled), None)))
                 continue
             basis = orthonormal(columns / np.linalg.norm(columns, axis=0).max())[0]
             alike = known.setdefault(basis.shape, [])
@@ -186,10 +203,11 @@ class RunTerms:
             numbers = np.flatnonzero(widths == width)
             terms = [self.terms[k] for k in numbers.tolist()]
             places, sizes = np.array([term.columns for term in terms]), [term.sizes for term in terms]
-            within = transposed[places]
+            scales = np.array([np.ones(width) if term.scales is None else term.scales for term in terms])
+            within = transposed[places] * scales[:, :, None]
             alike.append(
                 _Alike(
-                    numbers, places, within @ np.swapaxes(within, 1, 2), within @ readings,
+                    numbers, places, scales, within @ np.swapaxes(within, 1, 2), within @ readings,
                     np.stack([each.values for each in sizes]) ** 2, np.stack([each.logs for each in sizes]),
                     np.array([each.centre for each in sizes]),
                 )
@@ -200,7 +218,7 @@ class RunTerms:
         """Log Bayes factors (terms,) of all terms in one noise."""
         logs, columns = np.zeros(len(self.terms)), np.ascontiguousarray(rows.columns.T)
         for alike in self._alike:
-            parts = columns[alike.places]
+            parts = columns[alike.places] * alike.scales[:, :, None]
             gram, along = parts @ np.swapaxes(parts, 1, 2), parts @ rows.readings
             if rows.means_only:
                 gram, along = gram + alike.gram, along + alike.along
@@ -246,10 +264,10 @@ class _Columns:
         return len(self.blocks) - 1
 
     def term(self, row: str, blocks: Sequence[int], log_share: float, effect: Effect | None = None,
-             summands: tuple[int, ...] = ()) -> None:  # fmt: skip
+             summands: tuple[int, ...] = (), scales: Floats | None = None) -> None:  # fmt: skip
         """Add a term with the columns of some blocks."""
         places = np.concatenate([self._places[block] for block in blocks])
-        self.terms.append(Term(row, places, log_share, effect, summands))
+        self.terms.append(Term(row, places, log_share, effect, summands, scales=scales))
 
 
 class _Visits(Effect):
@@ -280,14 +298,14 @@ class _Walk(Effect):
 
     def __init__(self, run_s: float, count: int) -> None:
         self.run_s, self.count = run_s, count
+        self.rates = (np.arange(count) + 0.5) * np.pi / run_s
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
         return tuple(Coefficient(f"w{k}", "m/s^2", 1.0, "m/s^2") for k in range(3 * self.count))
 
     def columns(self, s: Stimulus) -> Floats:
-        rates = (np.arange(self.count) + 0.5) * np.pi / self.run_s
-        waves = math.sqrt(2.0 / self.run_s) * np.sin(s.elapsed_s[:, None] * rates) / rates
+        waves = math.sqrt(2.0 / self.run_s) * np.sin(s.elapsed_s[:, None] * self.rates) / self.rates
         columns = np.zeros((len(s), 3, 3, self.count))
         columns[:, range(3), range(3)] = waves[:, None]
         return columns.reshape(len(s), 3, -1)

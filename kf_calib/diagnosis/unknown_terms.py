@@ -13,6 +13,9 @@ from dataclasses import dataclass
 from kf_calib.bench.bench import Bench
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 
+RETURNING = "time (irregular, and comes back)"
+"""What biases depend on that change as irregularly as a random walk, and return to their mean."""
+
 _DECAYS_S = (3, 10, 30, 100, 300, 1000, 3000)
 _CREEPS_S = (3, 10, 30)  # of a platform after its arrival
 _MOST_MOMENTS = 100  # at which a jump is tried
