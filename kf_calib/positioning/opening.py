@@ -27,6 +27,7 @@ from kf_calib.sources.live.feed import Feed, nothing
 from kf_calib.sources.simulation.driven import DrivenBench, Servo
 from kf_calib.sources.simulation.options import options_from_query, simulation
 from kf_calib.support import file_lock
+from kf_calib.support.text import number_from
 
 _OF_SERVO = {field.name: field.type for field in fields(Servo)}
 _NAP_S = 0.05
@@ -143,7 +144,7 @@ def open_simulated(url: str, keys: Mapping[str, str]) -> tuple[DrivenBench, floa
 
 def _number(name: str, text: str) -> float:
     try:
-        return float(text)
+        return number_from(text)
     except ValueError:
         raise InputError(f"sim://: {name}={text} is not a number.") from None
 
