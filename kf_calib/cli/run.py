@@ -155,7 +155,7 @@ def halt_in_words(outcome: Outcome) -> str:
     if not outcome.stopped:
         last = f"; it was last seen at {angles_in_words(outcome.stands_at)}" if outcome.stands_at else ""
         return (
-            f"{outcome.why}: the positioner did not take the command to stop, AND THE TABLE MAY STILL MOVE{last}. "
+            f"{outcome.why}: the table was told to stop and was not seen to stand, IT MAY STILL MOVE{last}. "
             "Press its emergency stop, and look before you start again."
         )
     where = f"The table was stopped and stands at {angles_in_words(outcome.stands_at)}"
