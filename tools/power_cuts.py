@@ -18,12 +18,14 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache
+from multiprocessing import get_context
 from pathlib import Path
 from typing import IO, Any
 
 import click
 import numpy as np
 
+from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import KfCalibError
@@ -31,6 +33,8 @@ from kf_calib.sources.files import recorder
 from kf_calib.sources.files.recording import Recording
 
 SECTOR = 512
+FLUSH_S = 0.5
+"""After how long a live run brings its readings to the disk."""
 BENCH = Bench(axes_of("yzx"), 9.81)
 START_NS = 1_750_000_000_000_000_000
 
@@ -176,6 +180,43 @@ def play(number: int, seed: int) -> str:
     return f"{len(lost)} of {safe} readings that were on the disk are lost" if len(lost) else ""
 
 
+def ages_s(seconds: float, jobs: int, path: Path) -> Floats:
+    """Age in s of the oldest reading that the disk is not known to hold, every 20 ms of a recording at 5 kHz, while so
+    many processes compute and one writes to the same disk without a break."""
+    busy = [get_context("spawn").Process(target=_compute, daemon=True) for _ in range(jobs)]
+    busy.append(get_context("spawn").Process(target=_write, args=(path.parent,), daemon=True))
+    for each in busy:
+        each.start()
+    rng, ages, began_s = np.random.default_rng(1), list[float](), time.monotonic()
+    made = recorder.Recorder(path, BENCH, flush_s=FLUSH_S, background=True)
+    due_s, count = began_s, 0
+    while due_s < began_s + seconds:
+        time_ns = START_NS + (count + np.arange(100)) * 200_000
+        made.write(Batch(Stream(time_ns, rng.normal(size=(100, 3))), Stream(time_ns[:2], rng.normal(size=(2, 3))),
+                         Stream(time_ns[:0], np.zeros((0, 1)))))  # fmt: skip
+        ages.append(time.monotonic() - made.synced_s)
+        due_s, count = due_s + 0.02, count + 100
+        time.sleep(max(due_s - time.monotonic(), 0.0))
+    made.close()
+    for each in busy:
+        each.kill()
+        each.join()
+    return np.array(ages)
+
+
+def _compute() -> None:
+    while True:
+        sum(range(100_000))
+
+
+def _write(folder: Path) -> None:
+    with tempfile.TemporaryFile(dir=folder) as file:
+        while True:
+            file.seek(0)
+            file.write(os.urandom(1 << 20) * 64)
+            os.fsync(file.fileno())
+
+
 def _played(numbers: range, seed: int) -> list[tuple[int, str]]:
     return [(number, said) for number in numbers if (said := play(number, seed))]
 
@@ -185,8 +226,19 @@ def _played(numbers: range, seed: int) -> list[tuple[int, str]]:
 @click.option("--seed", type=int, default=1, show_default=True, help="Of all cuts.")
 @click.option("--only", type=int, help="Play this cut alone.")
 @click.option("--jobs", type=click.IntRange(min=1), default=2, show_default=True, help="Number of processes.")
-def main(cuts: int, seed: int, only: int | None, jobs: int) -> None:
+@click.option(
+    "--age", type=float, help="Measure for so many s how old the oldest reading becomes that is not on the disk."
+)
+def main(cuts: int, seed: int, only: int | None, jobs: int, age: float | None) -> None:
     """Cut the power of a recorder at random moments, and count what is lost that was on the disk."""
+    if age is not None:
+        with tempfile.TemporaryDirectory(dir=".") as folder:
+            ages = ages_s(age, jobs, Path(folder, "run.mcap"))
+        half, most = np.quantile(ages, [0.5, 0.99])
+        click.echo(
+            f"the oldest reading not on the disk: {half:.2f} s (median), {most:.2f} (99 %), {ages.max():.2f} (worst)"
+        )
+        return
     if only is not None:
         click.echo(play(only, seed) or "nothing is lost, and nothing is invented")
         return

@@ -25,7 +25,7 @@ from kf_calib.errors import InputError
 from kf_calib.positioning.drive import Time, WallTime
 from kf_calib.positioning.link import device_of
 from kf_calib.positioning.positioner import HandPositioner, Positioner, PositionerError, Watchfulness
-from kf_calib.positioning.profile import CommandPositioner, LinePositioner, read_profile
+from kf_calib.positioning.profile import CommandPositioner, LinePositioner, is_shipped, read_profile
 from kf_calib.sources.live.feed import Feed, nothing
 from kf_calib.sources.simulation.driven import DrivenBench, Servo
 from kf_calib.sources.simulation.options import options_from_query, simulation
@@ -167,6 +167,17 @@ def open_simulation(name: str, keys: Mapping[str, str]) -> Opened:
     bench, speed = open_simulated(name, keys)
     feed = DrivenFeed(bench.run.bench)
     return Opened(SimulatedPositioner(bench), Watchfulness(), SimulatedTime(bench, feed, speed), feed)
+
+
+def programs_of(name: str) -> list[str]:
+    """The commands that a profile of somebody's runs, each once; none of a shipped one, or where it speaks over a link.
+    Raises InputError where there is no such profile."""
+    if name == HAND or name.startswith("sim:") or is_shipped(Path(name)):
+        return []
+    profile = read_profile(Path(name), None)
+    if profile.kind != "command":
+        return []
+    return list(dict.fromkeys([*profile.begin, *profile.move, *profile.read, *profile.stop, *profile.fault]))
 
 
 @contextmanager

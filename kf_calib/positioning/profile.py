@@ -122,10 +122,15 @@ class Profile:
         return tuple(s * (angle - zero) for s, angle, zero in zip(self.signs, degrees, self.zeros_deg, strict=True))
 
 
-def read_profile(path: Path, width: int) -> Profile:
-    """The profile of a file, or of the shipped one of this name, for so many gimbals; raises InputError."""
-    shipped = SHIPPED / f"{path}.toml"
-    path = shipped if not path.suffix and shipped.is_file() else path
+def is_shipped(path: Path) -> bool:
+    """Whether a profile is one of those that come with the package, by its name."""
+    return not path.suffix and (SHIPPED / f"{path}.toml").is_file()
+
+
+def read_profile(path: Path, width: int | None) -> Profile:
+    """The profile of a file, or of the shipped one of this name. width: how many gimbals it must name, None for any
+    number. Raises InputError."""
+    path = SHIPPED / f"{path}.toml" if is_shipped(path) else path
     try:
         content = converted(toml_table(path, 'move = "MOVE {axis} {deg:.3f}"'), _Content)
     except Misfit as error:
@@ -136,9 +141,10 @@ def read_profile(path: Path, width: int) -> Profile:
     return _checked(path, content, width)
 
 
-def _checked(path: Path, content: Mapping[str, Any], width: int) -> Profile:
+def _checked(path: Path, content: Mapping[str, Any], width: int | None) -> Profile:
     """Return the profile of these values, checked against each other."""
     gimbals = tuple(content["gimbals"])
+    width = len(gimbals) if width is None else width
     if len(gimbals) != width:
         raise InputError(f"{path}: names {len(gimbals)} gimbals, and the bench has {width}: name each, outer to inner.")
     values: dict[str, Any] = {key: value for key, value in content.items() if key in Profile.__annotations__}

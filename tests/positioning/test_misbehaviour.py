@@ -10,6 +10,7 @@ import time
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ from kf_calib.online.suggestion import Itinerary
 from kf_calib.positioning.drive import Drive
 from kf_calib.positioning.link import device_of, refuse_address
 from kf_calib.positioning.loop import Rules
-from kf_calib.positioning.opening import _locked, open_positioner
+from kf_calib.positioning.opening import _locked, open_positioner, programs_of
 from kf_calib.positioning.positioner import PositionerError
 from kf_calib.positioning.profile import SHIPPED, angles_in, read_profile
 from kf_calib.sources.simulation.driven import DrivenBench, Servo
@@ -224,6 +225,16 @@ def test_a_profile_that_cannot_tell_a_fault_is_refused(lines: str, tmp_path: Pat
     path.write_text("\n".join([*text, lines]))
     with pytest.raises(InputError, match="add no_fault"):
         read_profile(path, 3)
+
+
+def test_programs_of_a_profile_run_only_where_they_are_trusted(tmp_path: Path, run: Any) -> None:
+    """Nobody is there to be asked: the tests have no terminal."""
+    made, profile, source = tmp_path / "made", tmp_path / "p.toml", tmp_path / "in.jsonl"
+    profile.write_text((SHIPPED / "command.toml").read_text().replace("my-robot where", f"touch {made}"))
+    source.write_text('{"bench": {"axes": "y z x", "gravity_mps2": 9.81}}\n')
+    assert programs_of(str(profile))[1] == f"touch {made}" and programs_of("command") == []
+    code, _, err = run("run", "--positioner", profile, "--source", source)
+    assert code == 2 and "add --trust-profile" in err and not made.exists()
 
 
 def test_one_device_has_one_name(tmp_path: Path) -> None:

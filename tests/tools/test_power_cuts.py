@@ -36,7 +36,7 @@ def test_a_result_is_on_the_disk_before_it_has_its_name_and_the_name_after(
     sync, replace = os.fsync, Path.replace
 
     def synced(descriptor: int) -> None:
-        of_folder = os.path.isdir(f"/proc/self/fd/{descriptor}")
+        of_folder = Path(f"/proc/self/fd/{descriptor}").is_dir()
         steps.append("folder" if of_folder else "file")
         sync(descriptor)
 
