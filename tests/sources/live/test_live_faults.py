@@ -210,7 +210,7 @@ def test_a_first_block_that_is_large_is_read_to_its_end() -> None:
 def test_the_end_is_at_once_though_garbage_has_piled_up(garbage: bytes, tmp_path: Path) -> None:
     """Ctrl-C after 50 MB took 136 s."""
     piece = garbage * ((1 << 18) // len(garbage))
-    with scripted(json_rows(0, 50), *[piece] * 60, record=tmp_path / "a.mcap") as source:
+    with scripted(json_rows(0, 50), *[piece] * 240, record=tmp_path / "a.mcap") as source:
         wait_for(lambda: source.status.samples == 50 and source.status.refused > 0)
         time.sleep(0.3)
         began_s = time.monotonic()
