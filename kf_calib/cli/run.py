@@ -187,7 +187,8 @@ class DriveOptions:
     improve: Annotated[bool, _driving("--improve", help="Add a missing effect when it is named beyond doubt, and go "
                                       "on to the targets.")] = False
     dry_run: Annotated[bool, _driving("--dry-run", help="Print path and duration; nothing is moved.")] = False
-    trust_profile: Annotated[bool, _driving("--trust-profile", help="Run the programs a profile names; else you are asked.")] = False
+    trust_profile: Annotated[bool, _driving("--trust-profile", help="Run the programs that a profile names "
+                                            "unasked.")] = False
     # fmt: on
 
 
