@@ -1,7 +1,7 @@
 """The controller of an emulated positioner: lines over TCP on 127.0.0.1, as ACL has them or as plain words.
 
 It moves a ``DrivenBench``, whose readings are those of the same platform. ACL: the part that the profile
-``acutrol3000`` uses. Plain words: those of the profile ``lines``.
+``acutrol3000`` uses. Plain words: those of the profile ``lines``. On request it misbehaves (``MISBEHAVIOURS``).
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import socket
 import threading
+import time
 from collections.abc import Iterator
 
 from kf_calib.bench.bench import Bench
@@ -17,6 +18,25 @@ from kf_calib.sources.simulation.driven import DrivenBench
 
 _PLACES = ("outer", "middle", "inner")
 _COMMAND = re.compile(r"^\s*(?P<words>[:*A-Za-z]+\??)\s*(?P<rest>.*)$")
+
+
+MISBEHAVIOURS = {
+    "": "answers as it should",
+    "ignores-stop": "does not know the word that stops it",
+    "endless": "answers with bytes that have no end of line",
+    "trickle": "sends a byte of its answer every tenth of a second",
+    "slow": "answers after 1.8 s",
+    "late": "answers the first question after its deadline, and later ones at once",
+    "one-late": "answers each question with the answer to the one before",
+    "error-text": "answers about its position with ERR 0",
+    "escape": "answers with commands to a terminal around the angle",
+    "two-numbers": "answers with two numbers about one gimbal",
+    "immense": "answers 1e999",
+    "far": "answers 100000 after it was told to stop",
+    "chatter": "sends lines that nobody asked for",
+    "silent": "answers nothing",
+}
+"""Ways in which it may misbehave, and what each is."""
 
 
 class DrivenRun:
@@ -85,14 +105,18 @@ class Controller:
 
 
 class Server:
-    """Serves a controller on 127.0.0.1 to one client after another; ``url`` is the address as PyVISA names it."""
+    """Serves a controller on 127.0.0.1 to one client after another; ``url`` is the address as PyVISA names it.
 
-    def __init__(self, bench: DrivenBench, lock: threading.Lock, port: int = 0) -> None:
+    misbehaviour: one of ``MISBEHAVIOURS``, from the first line or, set later, from the next one on.
+    """
+
+    def __init__(self, bench: DrivenBench, lock: threading.Lock, port: int = 0, misbehaviour: str = "") -> None:
         self._controller = Controller(bench, lock)
         self._server = socket.create_server(("127.0.0.1", port))
         self.port = self._server.getsockname()[1]
         self.url = f"TCPIP::127.0.0.1::{self.port}::SOCKET"
-        self.lines = list[str]()
+        self.lines, self.misbehaviour = list[str](), misbehaviour
+        self._before, self._is_stopped = "", False
         threading.Thread(target=self._serve, name="positioner", daemon=True).start()
 
     def close(self) -> None:
@@ -116,7 +140,61 @@ class Server:
                 for line in lines:
                     self.lines.append(line.decode(errors="replace").strip())
                     ending = b"\r\n" if line.endswith(b"\r") else b"\n"
-                    if answer := self._controller.answer(self.lines[-1]):
-                        client.sendall(answer.encode() + ending)
+                    self._answer(client, self.lines[-1], ending)
         except (OSError, ValueError, IndexError):  # a lost link, or a line that makes no sense: it hangs up
             return
+
+    def _answer(self, client: socket.socket, line: str, ending: bytes) -> None:
+        """Send the answer to a line, as it should be or not."""
+        stops = "stop" in line.lower() or line.endswith(",0")
+        self._is_stopped = self._is_stopped or stops
+        if stops and self.misbehaviour == "ignores-stop":
+            return
+        answer = self._controller.answer(line)
+        if not answer:
+            return
+        is_position = "position?" in line.lower()
+        match self.misbehaviour:
+            case "endless":
+                for _ in range(2000):
+                    client.sendall(b"\xfe" * 16)
+                    time.sleep(0.005)
+            case "trickle":
+                for letter in answer:
+                    client.sendall(letter.encode())
+                    time.sleep(0.1)
+                client.sendall(ending)
+            case "slow":
+                time.sleep(1.8)
+                client.sendall(answer.encode() + ending)
+            case "late":
+                self.misbehaviour = ""
+                time.sleep(0.6)
+                client.sendall(answer.encode() + ending)
+            case "one-late":
+                client.sendall((self._before or "0.0").encode() + ending)
+            case "silent":
+                pass
+            case _:
+                client.sendall(self._spoilt(answer, is_position).encode() + ending)
+        self._before = answer
+
+    def _spoilt(self, answer: str, is_position: bool) -> str:
+        """Return an answer with what is wrong with it."""
+        if not is_position:
+            return answer
+        match self.misbehaviour:
+            case "error-text":
+                return "ERR 0"
+            case "escape":
+                return f"\x1b[2m{answer}\x1b[0m"
+            case "two-numbers":
+                return f"{answer} 0.0"
+            case "immense":
+                return "1e999"
+            case "far":
+                return "100000" if self._is_stopped else answer
+            case "chatter":
+                return f"{answer}\nSTATUS 3\n17.5"
+            case _:
+                return answer

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.raw_input import CONVERTED, RESTATE, UNITS, text_of
 from kf_calib.errors import BenchError, how_to_write
-from kf_calib.support.text import COMMANDS, LONGEST, cut, parse_date
+from kf_calib.support.text import COMMANDS, LONGEST, cut, number_from, parse_date
 
 FORMAT_VERSION = "1"
 UP = ("y", "z", "x", "-y", "-z", "-x")
@@ -186,7 +186,7 @@ def _plain(key: str, value: Any) -> Any:
             return value.strip().lower().removeprefix("+")
         case str() if key in NUMBERS:
             try:
-                return float(value)
+                return number_from(value)
             except ValueError:
                 return value
         case Mapping():

@@ -20,7 +20,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.errors import BenchError
-from kf_calib.support.text import cut
+from kf_calib.support.text import cut, number_from
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 CHANNELS = (1, 2, 3)
@@ -54,7 +54,7 @@ def parse_scale(text: str) -> tuple[float, float, float]:
     """The size of one count of channels 1, 2, 3 from one number for all or three; raises BenchError."""
     words = text.strip("[] ").replace(",", " ").split()
     try:
-        sizes = [float(word) for word in words]
+        sizes = [number_from(word) for word in words]
     except ValueError:
         sizes = []
     sizes = sizes * 3 if len(sizes) == 1 else sizes

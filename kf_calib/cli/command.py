@@ -23,6 +23,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 import rich_click as click
 
 from kf_calib.errors import how_to_write
+from kf_calib.support.text import number_from
 
 INPUT = "Input and bench"
 MODEL = "Model and evaluation"
@@ -173,7 +174,7 @@ class NumberInRange(click.FloatRange):
 def _finite(value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
     """The number that ``value`` is, in words; one that is no word is a default, and may be infinite: never."""
     try:
-        number = float(value)
+        number = number_from(value) if isinstance(value, str) else float(value)
     except ValueError:
         raise click.BadParameter(f"{value!r} is not a number{how_to_write(str(value))}.", ctx, param) from None
     if isinstance(value, str) and not math.isfinite(number):

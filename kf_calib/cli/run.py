@@ -155,7 +155,7 @@ def halt_in_words(outcome: Outcome) -> str:
     if not outcome.stopped:
         last = f"; it was last seen at {angles_in_words(outcome.stands_at)}" if outcome.stands_at else ""
         return (
-            f"{outcome.why}: the positioner did not take the command to stop, AND THE TABLE MAY STILL MOVE{last}. "
+            f"{outcome.why}: the table was told to stop and was not seen to stand, IT MAY STILL MOVE{last}. "
             "Press its emergency stop, and look before you start again."
         )
     where = f"The table was stopped and stands at {angles_in_words(outcome.stands_at)}"
@@ -187,6 +187,8 @@ class DriveOptions:
     improve: Annotated[bool, _driving("--improve", help="Add a missing effect when it is named beyond doubt, and go "
                                       "on to the targets.")] = False
     dry_run: Annotated[bool, _driving("--dry-run", help="Print path and duration; nothing is moved.")] = False
+    trust_profile: Annotated[bool, _driving("--trust-profile", help="Run the programs that a profile names "
+                                            "unasked.")] = False
     # fmt: on
 
 
@@ -223,6 +225,8 @@ def run(
     if options.dry_run:
         _show_dry_run(positioner, keys, options, as_json)
         return
+    if not options.trust_profile:
+        _ask_for_programs(positioner)
     outputs = claimed(files_of(source) if source else [], overwrite=overwrite)
     with ExitStack() as stack:
         live, emulated = _source(positioner, source, keys, record, overwrite)
@@ -244,6 +248,23 @@ def run(
     if code:
         ctx.exit(code)
     exit_if(strict and final is not None and final.consistent is False)
+
+
+def _ask_for_programs(positioner: str) -> None:
+    """Ask on a terminal whether the programs that a profile names may run. Raises InputError where nobody is there to
+    ask, or the answer is no."""
+    from kf_calib.positioning.opening import programs_of
+    from kf_calib.support.text import printable
+
+    programs = programs_of(positioner)
+    if not programs:
+        return
+    shown = "\n".join(f"  {printable(each)}" for each in programs)
+    asked = f"The profile {positioner} runs these programs, with your rights:\n{shown}\nRun them?"
+    if not (sys.stdin.isatty() and sys.stderr.isatty()):
+        raise InputError(f"{positioner} runs programs ({printable(programs[0])}): read it, and add --trust-profile.")
+    if not click.confirm(asked, err=True):
+        raise InputError(f"{positioner}: its programs were not run.")
 
 
 def _source(positioner: str, source: str | None, keys: Mapping[str, str], record: Path | None, overwrite: bool

@@ -292,10 +292,13 @@ def _call_by_place(row: Row, path: Path, run: ListedRun) -> None:
 def local_copy(run: ListedRun) -> Iterator[Path]:
     """The path of the recording itself, or of a copy that is gone when the block ends. Raises InputError where it
     cannot be fetched."""
+    if run.refused:
+        raise InputError(run.refused)
     try:
         files, path = url_to_fs(run.place)
-    except (ValueError, ImportError) as error:
-        raise InputError(f"{run.place}: cannot be looked up ({error}): check the name and what is installed.") from None
+    except Exception as error:  # each store has errors of its own
+        said = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"{run.place}: cannot be looked up ({said}): check the name and what is installed.") from None
     if isinstance(files, LocalFileSystem):
         yield _plain(Path(str(path)))
         return

@@ -23,8 +23,13 @@ from kf_calib.bench.arrays import Mask
 from kf_calib.errors import InputError
 from kf_calib.fleet.run_factor import STATES, RunFactor
 
+_LONGEST = 4096  # characters of a name
 _RECORDINGS = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 _BAG = "metadata.yaml"
+_STORES = ("file", "s3", "gs", "gcs", "az", "abfs", "abfss")
+"""Schemes of URLs that a list may name: no other scheme of fsspec is a plain store of files. Some join a computer of a
+stranger's and run what it answers (dask), or lead to an address inside another one (``::``)."""
+
 _CHANGING = ("size", "mtime", "ETag", "etag", "LastModified", "last_modified", "updated", "md5", "version_id")
 """What stores say of a file that differs when its content does."""
 
@@ -38,6 +43,7 @@ class ListedRun:
     - version: what its store says of it (size, time, checksum): while this is the same, so is the content.
     - folder: whether it is the folder of a ROS 2 bag.
     - unit, bench, date: what a list says of it; None to take what the recording says itself.
+    - refused: why it is not read, where a list names what no list may; "" elsewhere.
     """
 
     place: str
@@ -47,6 +53,7 @@ class ListedRun:
     unit: str | None = None
     bench: str | None = None
     date: datetime | None = None
+    refused: str = ""
 
 
 def runs_of(words: Iterable[str]) -> list[ListedRun]:
@@ -84,7 +91,9 @@ def _named_by(word: str) -> Iterator[ListedRun]:
             yield _run(files, path, files.info(path))
     except FileNotFoundError:
         raise InputError(f"{word} is not there: name recordings, folders, globs, or a list of these.") from None
-    except (OSError, ValueError, ImportError) as error:
+    except InputError:
+        raise
+    except Exception as error:  # each store has errors of its own
         why = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{word}: cannot be looked up ({why}): check the name and the access.") from None
 
@@ -147,31 +156,47 @@ def _of_list(word: str, files: Any, path: str, lines: list[dict[str, str]]) -> I
         name = line["run"]
         if not name:
             continue
-        if "://" not in name and not name.startswith("/"):
+        refused = _why_not(name)
+        if not refused and "://" not in name and not name.startswith("/"):
             name = f"{folder}/{name}"
-        stated: dict[str, Any] = {
-            "unit": line.get("unit") or None,
-            "bench": line.get("bench") or None,
-            "date": _date(word, line),
-        }
+        stated: dict[str, Any] = {"unit": line.get("unit") or None, "bench": line.get("bench") or None}
+        try:
+            stated["date"] = _date(line)
+        except InputError as error:
+            refused = refused or str(error)
         if name == word or name.endswith(".txt"):
             raise InputError(f"{word}: names the list {name}: a list names recordings, folders and globs only.")
+        if refused:
+            yield ListedRun(name, refused=f"{word}: {refused}", **stated)
+            continue
         try:
             yield from (replace(run, **stated) for run in _named_by(name))
         except InputError:
             yield ListedRun(name, **stated)
 
 
-def _date(word: str, line: Mapping[str, str]) -> datetime | None:
+def _why_not(name: str) -> str:
+    """Why a list may not name this, in words; "" where it may. A list may be a stranger's."""
+    shown = ascii(name if len(name) <= _LONGEST else f"{name[:_LONGEST]}...")
+    if len(name) > _LONGEST or not name.isprintable():
+        return f"{shown} is no name of a recording: write one a line."
+    scheme, is_url, _ = name.partition("://")
+    if "::" in name or (is_url and scheme.lower() not in _STORES):
+        return (
+            f"{shown} is not opened: a list names paths and plain addresses in {', '.join(_STORES[:3])}, az or abfs; "
+            "name others on the command line."
+        )
+    return ""
+
+
+def _date(line: Mapping[str, str]) -> datetime | None:
     """Return the date that a line states, in UTC if it names no time zone."""
     if not (text := line.get("date")):
         return None
     try:
         date = datetime.fromisoformat(text)
     except ValueError:
-        raise InputError(
-            f"{word}: {text!r} of {line['run']} is no date: write it as 2026-05-31 or with the time."
-        ) from None
+        raise InputError(f"{text!r} of {line['run']} is no date: write it as 2026-05-31 or with the time.") from None
     return date if date.tzinfo else date.replace(tzinfo=UTC)
 
 

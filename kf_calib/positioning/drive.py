@@ -18,8 +18,10 @@ import numpy as np
 from kf_calib.errors import KfCalibError
 from kf_calib.online.session import Session
 from kf_calib.online.suggestion import Itinerary, Suggestion
-from kf_calib.positioning.loop import Angles, Ask, End, Halt, Move, Rules, Seen, State, step
-from kf_calib.positioning.positioner import Positioner
+from kf_calib.positioning.loop import Angles, Ask, End, Halt, Move, Rules, Seen, State, is_impossible, step
+from kf_calib.positioning.positioner import Interruptible, Positioner
+
+_REST_S = 5.0  # in which a table comes to rest after it was told to stop
 
 
 class Time(Protocol):
@@ -61,8 +63,8 @@ class Outcome:
     """How a drive ended.
 
     ended: ``targets``, ``named``, ``disagrees``, ``orientations``, ``budget`` or ``halted``. why: in words.
-    stands_at: the last read-back, deg; empty where none could be had. stopped: whether the positioner took the command
-    to stop, where it was halted. decisions: in their order.
+    stands_at: the last read-back, deg; empty where none could be had. stopped: whether the table was seen to stand,
+    where it was halted. decisions: in their order.
     """
 
     ended: str
@@ -102,6 +104,9 @@ class Drive:
         self.state = State()
         self.outcome: Outcome | None = None
         self._broken_off, self._here, self._began_s = "", Angles(()), self.clock.now_s()
+        self._is_stopping = False
+        if isinstance(positioner, Interruptible):
+            positioner.when_broken_off(lambda: bool(self._broken_off) and not self._is_stopping)
 
     def break_off(self, reason: str) -> None:
         """Stop the table and end the run, as soon as the loop looks; only sets a flag, for signal handlers."""
@@ -116,6 +121,7 @@ class Drive:
         except BaseException as error:
             stopped = self._stop()
             said = str(error) if isinstance(error, KfCalibError | OSError) else f"{type(error).__name__}: {error}"
+            said = self._broken_off if self._broken_off and isinstance(error, KfCalibError) else said
             self.outcome = self._halted(said.removesuffix("."), stopped)
             if not isinstance(error, Exception):
                 raise
@@ -155,33 +161,51 @@ class Drive:
 
     def _look(self) -> Seen:
         asked_s = self.clock.now_s()
-        self._here = tuple(self.positioner.read())
+        here = tuple(self.positioner.read())
         now_s = self.clock.now_s()
         standing = self.session.standing
         pose = None if standing.current is None else tuple(np.degrees(standing.current.pose).tolist())
         trouble, fault = self._broken_off or self._trouble(), self.positioner.fault()
-        seen = Seen(now_s, self._here, fault, trouble, standing.samples, standing.stayed_s, pose)
+        seen = Seen(now_s, here, fault, trouble, standing.samples, standing.stayed_s, pose)
+        if not is_impossible(self.state, seen, self.rules):
+            self._here = here
         return replace(seen, held_up_s=now_s - asked_s)
 
     def _stop(self) -> bool:
-        """Tell the table to stop, twice if need be; whether it took the command."""
+        """Tell the table to stop, twice if need be; whether it was then seen to stand."""
+        self._is_stopping = True
         for _ in range(2):
             with suppress(Exception):
                 self.positioner.stop()
-                self._here = tuple(self._settled())
-                return True
+                if (here := self._rest()) is not None:
+                    self._here = here
+                    return True
         return False
 
-    def _settled(self) -> Angles:
-        """Return where the table comes to rest after a stop."""
-        before = tuple(self.positioner.read())
-        for _ in range(50):
+    def _rest(self) -> Angles | None:
+        """Return where the table is seen to stand for ``stand_s`` after a stop; None where it is not.
+
+        A read-back counts only together with others like it: a controller that was told to stop may answer anything.
+        """
+        watch, began_s, track = self.rules.watch, self.clock.now_s(), list[tuple[float, Angles]]()
+        while self.clock.now_s() - began_s <= _REST_S + watch.stand_s:
+            now_s = self.clock.now_s()
+            track = [past for past in track if past[0] >= now_s - 2.0 * watch.stand_s]
+            track.append((now_s, tuple(self.positioner.read())))
+            window = [past for past in track if past[0] >= now_s - watch.stand_s - self.clock.tick_s]
+            angles, lasted_s = np.array([here for _, here in window]), now_s - window[0][0]
+            is_still = np.isfinite(angles).all() and np.ptp(angles, axis=0).max() <= watch.still_degps * lasted_s
+            if len(window) > 1 and lasted_s >= watch.stand_s and is_still and self._is_near(window[-1][1]):
+                return window[-1][1]
             self.clock.sleep(self.clock.tick_s)
-            here = tuple(self.positioner.read())
-            if np.abs(np.array(here) - np.array(before)).max() <= self.rules.watch.still_degps * self.clock.tick_s:
-                return here
-            before = here
-        return before
+        return None
+
+    def _is_near(self, here: Angles) -> bool:
+        """Tell whether the table can have come here from where it was seen last."""
+        if not self._here:
+            return True
+        run_out_deg = self.rules.watch.late_factor * self.rules.pace.rate_degps * _REST_S
+        return bool(np.abs(np.array(here) - np.array(self._here)).max() <= run_out_deg)
 
     @property
     def _elapsed_s(self) -> float:

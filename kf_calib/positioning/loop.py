@@ -25,6 +25,7 @@ from kf_calib.positioning.positioner import Watchfulness
 _FIRST_S = 8.0  # of readings where the table stands first
 _LONGER = 3.0  # times that a stay may last beyond its plan where readings come more slowly than expected
 _GRACE_S = 10.0
+_PROOF_DEG = 3.0  # of a first move of each gimbal
 Angles = tuple[float, ...]
 
 
@@ -107,7 +108,8 @@ class State:
 
     target, start: of the move under way, deg; way: where to go after it. since_s: when the phase began. track: the
     latest read-backs with their times. suggestion: the one that is carried out. heard: number of readings, and when it
-    grew last. held_up_s: how long the read-back before the latest was under way. number: of the stay.
+    grew last. held_up_s: how long the read-back before the latest was under way. number: of the stay. unproved: how
+    many stations of the way are first small moves, which the recorded angles have to show.
     """
 
     phase: Phase = Phase.BEGINNING
@@ -120,6 +122,7 @@ class State:
     heard: tuple[int, float] = (0, 0.0)
     held_up_s: float = 0.0
     number: int = 0
+    unproved: int = 0
 
 
 def step(state: State, seen: Seen, rules: Rules) -> tuple[State, Command | None]:
@@ -168,6 +171,11 @@ def _harm(state: State, seen: Seen, rules: Rules) -> str:
     return ""
 
 
+def is_impossible(state: State, seen: Seen, rules: Rules) -> bool:
+    """Whether the platform cannot be where a read-back says."""
+    return not all(np.isfinite(seen.gimbal_deg)) or _leap_deg(_noted(state, seen, rules), rules) > 0.0
+
+
 def _outside(gimbal_deg: Sequence[float], rules: Rules) -> str:
     """Return in which way a read-back is where it must not be, in words; empty where it may be there."""
     pose, margin = np.radians([gimbal_deg]), np.radians(MARGIN_DEG)
@@ -193,6 +201,8 @@ def _moving(state: State, seen: Seen, rules: Rules) -> tuple[State, Command | No
         return _halted(state, f"the move to {target} did not begin within {watch.begin_s:g} s")
     stands = lasted_s >= watch.stand_s and _stands(state, watch)
     if stands and off <= watch.tolerance_deg:
+        if state.unproved:
+            return _proving(state, seen, rules)
         if state.way:
             return _to_next_station(state, seen, rules)
         return replace(state, phase=Phase.STAYING, since_s=seen.now_s), None
@@ -201,6 +211,34 @@ def _moving(state: State, seen: Seen, rules: Rules) -> tuple[State, Command | No
             return _halted(state, f"the platform stands at {_deg(seen.gimbal_deg)} instead of {target}")
         return _halted(state, f"the move to {target} did not end within {lasted_s:.0f} s ({expected_s:.0f} s expected)")
     return state, None
+
+
+def _proving(state: State, seen: Seen, rules: Rules) -> tuple[State, Command | None]:
+    """Wait at the end of a first small move until the recorded angles show it, too."""
+    recorded, lasted_s = seen.stream_deg, seen.now_s - state.since_s
+    if recorded is not None and _apart_deg(recorded, state.target) <= rules.watch.stream_deg:
+        return _to_next_station(replace(state, unproved=state.unproved - 1), seen, rules)
+    if lasted_s > rules.watch.silent_s:
+        gimbal = int(np.abs(np.array(state.target) - np.array(state.start)).argmax()) + 1
+        shown = "no angles are recorded" if recorded is None else f"the angles recorded are {_deg(recorded)}"
+        words = f"gimbal {gimbal} was turned by a little, from {_deg(state.start)} to {_deg(state.target)}, and {shown}"
+        return _halted(state, f"{words}: check sign, zero, unit and order of the gimbals in the profile")
+    return state, None
+
+
+def _first_moves(start_deg: Angles, rules: Rules) -> list[Angles]:
+    """Return where each gimbal in turn goes by a little, to where it may, before anything moves far."""
+    here, stations = np.array(start_deg), list[Angles]()
+    for gimbal in range(len(here)):
+        for way_deg in (_PROOF_DEG, -_PROOF_DEG):
+            there = here.copy()
+            there[gimbal] += way_deg
+            end = np.radians([there])
+            if rules.reach.allowed(end)[0] and is_free(rules.reach, np.radians(here), end)[0]:
+                stations.append(tuple(there.round(6).tolist()))
+                here = there
+                break
+    return stations
 
 
 def _staying(state: State, seen: Seen, rules: Rules) -> tuple[State, Command | None]:
@@ -240,11 +278,15 @@ def _choosing(state: State, seen: Seen, rules: Rules) -> tuple[State, Command | 
         return state, None
     if suggestion.ended:
         return replace(state, phase=Phase.ENDED, suggestion=suggestion), End(suggestion)
-    way = route(rules.reach, np.radians(seen.gimbal_deg), np.radians(suggestion.gimbal_deg))
+    is_driven = rules.watch.silent_s < math.inf
+    first = _first_moves(seen.gimbal_deg, rules) if state.number == 1 and is_driven else []
+    begin_deg = first[-1] if first else seen.gimbal_deg
+    way = route(rules.reach, np.radians(begin_deg), np.radians(suggestion.gimbal_deg))
     if way is None:
         return _halted(state, f"no way to {_deg(suggestion.gimbal_deg)} keeps within the limits and out of the zones")
     stations = tuple(tuple(float(angle) for angle in np.degrees(station).round(6) + 0.0) for station in way)
-    state = replace(state, suggestion=suggestion, way=stations, number=state.number + 1)
+    way_there = (*first, *stations)
+    state = replace(state, suggestion=suggestion, way=way_there, number=state.number + 1, unproved=len(first))
     return _to_next_station(state, seen, rules)
 
 

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 import queue
+import stat
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -21,12 +23,14 @@ from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch
 from kf_calib.errors import InputError
 from kf_calib.positioning.drive import Time, WallTime
+from kf_calib.positioning.link import device_of
 from kf_calib.positioning.positioner import HandPositioner, Positioner, PositionerError, Watchfulness
-from kf_calib.positioning.profile import CommandPositioner, LinePositioner, read_profile
+from kf_calib.positioning.profile import CommandPositioner, LinePositioner, is_shipped, read_profile
 from kf_calib.sources.live.feed import Feed, nothing
 from kf_calib.sources.simulation.driven import DrivenBench, Servo
 from kf_calib.sources.simulation.options import options_from_query, simulation
 from kf_calib.support import file_lock
+from kf_calib.support.text import number_from
 
 _OF_SERVO = {field.name: field.type for field in fields(Servo)}
 _NAP_S = 0.05
@@ -143,7 +147,7 @@ def open_simulated(url: str, keys: Mapping[str, str]) -> tuple[DrivenBench, floa
 
 def _number(name: str, text: str) -> float:
     try:
-        return float(text)
+        return number_from(text)
     except ValueError:
         raise InputError(f"sim://: {name}={text} is not a number.") from None
 
@@ -165,6 +169,17 @@ def open_simulation(name: str, keys: Mapping[str, str]) -> Opened:
     return Opened(SimulatedPositioner(bench), Watchfulness(), SimulatedTime(bench, feed, speed), feed)
 
 
+def programs_of(name: str) -> list[str]:
+    """The commands that a profile of somebody's runs, each once; none of a shipped one, or where it speaks over a link.
+    Raises InputError where there is no such profile."""
+    if name == HAND or name.startswith("sim:") or is_shipped(Path(name)):
+        return []
+    profile = read_profile(Path(name), None)
+    if profile.kind != "command":
+        return []
+    return list(dict.fromkeys([*profile.begin, *profile.move, *profile.read, *profile.stop, *profile.fault]))
+
+
 @contextmanager
 def open_positioner(name: str, bench: Bench, say: Callable[[str], None]) -> Iterator[Opened]:
     """The positioner of this name for a bench, locked against other programs until the end of the block.
@@ -179,7 +194,7 @@ def open_positioner(name: str, bench: Bench, say: Callable[[str], None]) -> Iter
         yield Opened(HandPositioner([0.0] * width, say), Watchfulness().by_hand(), WallTime())
         return
     profile = read_profile(Path(name), width)
-    with _locked(profile.address or str(Path(name).resolve())):
+    with _locked(profile.address or f"command {Path(name).resolve()}"):
         kind = {"lines": LinePositioner, "command": CommandPositioner}[profile.kind]
         positioner = kind(profile)
         try:
@@ -192,10 +207,33 @@ def open_positioner(name: str, bench: Bench, say: Callable[[str], None]) -> Iter
 @contextmanager
 def _locked(address: str) -> Iterator[None]:
     """Keep other programs of this package from the same positioner."""
-    number = hashlib.sha256(address.strip().upper().encode()).hexdigest()[:16]
-    path = Path(tempfile.gettempdir()) / f"kf_calib-positioner-{number}.lock"
-    with path.open("ab") as file:
+    number = hashlib.sha256(device_of(address).encode()).hexdigest()[:16]
+    path = _own_folder() / f"positioner-{number}.lock"
+    try:
+        handle = os.open(
+            path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0), 0o600
+        )
+    except OSError as error:
+        raise InputError(f"{path}: cannot be locked ({error.strerror}): remove it.") from None
+    if not stat.S_ISREG(os.fstat(handle).st_mode):
+        os.close(handle)
+        raise InputError(f"{path}: is no plain file, as a lock must be: remove it.")
+    with os.fdopen(handle, "r+b") as file:
         if not file_lock.lock(file):
             holder = file_lock.writer(path) or "another run"
             raise InputError(f"{holder} drives the positioner at {address}: end it first.")
         yield
+
+
+def _own_folder() -> Path:
+    """Return a folder that only this user can write to; raises InputError where somebody else has put one there."""
+    place = os.environ.get("XDG_RUNTIME_DIR")
+    if place and Path(place).is_dir():
+        folder = Path(place, "kf_calib")
+    else:
+        folder = Path(tempfile.gettempdir(), f"kf_calib-{getattr(os, 'getuid', lambda: 'user')()}")
+    folder.mkdir(mode=0o700, exist_ok=True)
+    found = folder.lstat()
+    if not stat.S_ISDIR(found.st_mode) or (hasattr(os, "getuid") and found.st_uid != os.getuid()):
+        raise InputError(f"{folder}: is not a folder of yours: remove it, since locks of positioners are kept there.")
+    return folder

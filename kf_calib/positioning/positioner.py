@@ -41,6 +41,15 @@ class Positioner(Protocol):
         ...
 
 
+@runtime_checkable
+class Interruptible(Protocol):
+    """A positioner that may wait for answers."""
+
+    def when_broken_off(self, broken_off: Callable[[], bool]) -> None:
+        """Have nothing waited for once this is so: PositionerError is raised at once."""
+        ...
+
+
 @dataclass(frozen=True)
 class Watchfulness:
     """What a motion must be like; anything else stops the table.

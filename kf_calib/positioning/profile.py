@@ -22,8 +22,8 @@ import math
 import re
 import shlex
 import subprocess
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -31,7 +31,8 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, with_config
 from typing_extensions import TypedDict
 
-from kf_calib.errors import InputError, need
+from kf_calib.errors import InputError
+from kf_calib.positioning.link import LineLink, refuse_address
 from kf_calib.positioning.positioner import PositionerError, Watchfulness
 from kf_calib.support.toml_files import FINITE, TEXT, Misfit, converted, toml_table
 
@@ -58,6 +59,7 @@ class _Content(TypedDict, total=False):
     fault: _Texts
     no_fault: TEXT
     fault_word: TEXT
+    answer: TEXT
     answers: bool
     termination: Literal["lf", "crlf", "cr"]
     baud: Annotated[int, Field(gt=0)]
@@ -76,7 +78,8 @@ class Profile:
     kind: lines to a controller, or commands that are run. address: of the controller, as PyVISA names it. gimbals: its
     names of the gimbals. signs, zeros_deg: controller's angle = sign * gimbal angle + zero. unit: of its angles. begin,
     move, read, stop, fault: what to say, or the words of a command to run. no_fault: what the answer about faults holds
-    where there is none; fault_word: what it holds where there is one. answers: whether it answers commands that ask
+    where there is none; fault_word: what it holds where there is one. answer: what an
+    answer about positions looks like, with {deg} in place of the angles. answers: whether it answers commands that ask
     nothing. termination: ends of lines. baud: of a serial port. timeout_s: of an answer. watch: what a motion must be
     like.
     """
@@ -95,6 +98,7 @@ class Profile:
     unit: Literal["deg", "rad"] = "deg"
     no_fault: str = ""
     fault_word: str = ""
+    answer: str = ""
     answers: bool = False
     termination: str = "\n"
     baud: int = 9600
@@ -118,10 +122,15 @@ class Profile:
         return tuple(s * (angle - zero) for s, angle, zero in zip(self.signs, degrees, self.zeros_deg, strict=True))
 
 
-def read_profile(path: Path, width: int) -> Profile:
-    """The profile of a file, or of the shipped one of this name, for so many gimbals; raises InputError."""
-    shipped = SHIPPED / f"{path}.toml"
-    path = shipped if not path.suffix and shipped.is_file() else path
+def is_shipped(path: Path) -> bool:
+    """Whether a profile is one of those that come with the package, by its name."""
+    return not path.suffix and (SHIPPED / f"{path}.toml").is_file()
+
+
+def read_profile(path: Path, width: int | None) -> Profile:
+    """The profile of a file, or of the shipped one of this name. width: how many gimbals it must name, None for any
+    number. Raises InputError."""
+    path = SHIPPED / f"{path}.toml" if is_shipped(path) else path
     try:
         content = converted(toml_table(path, 'move = "MOVE {axis} {deg:.3f}"'), _Content)
     except Misfit as error:
@@ -132,9 +141,10 @@ def read_profile(path: Path, width: int) -> Profile:
     return _checked(path, content, width)
 
 
-def _checked(path: Path, content: Mapping[str, Any], width: int) -> Profile:
+def _checked(path: Path, content: Mapping[str, Any], width: int | None) -> Profile:
     """Return the profile of these values, checked against each other."""
     gimbals = tuple(content["gimbals"])
+    width = len(gimbals) if width is None else width
     if len(gimbals) != width:
         raise InputError(f"{path}: names {len(gimbals)} gimbals, and the bench has {width}: name each, outer to inner.")
     values: dict[str, Any] = {key: value for key, value in content.items() if key in Profile.__annotations__}
@@ -149,10 +159,24 @@ def _checked(path: Path, content: Mapping[str, Any], width: int) -> Profile:
             _refuse_unknown_fields(path, key, text)
     if content["kind"] == "lines" and not content.get("address"):
         raise InputError(f"{path}: lacks the address of the controller, such as TCPIP::192.168.53.1::9878::SOCKET.")
+    if content["kind"] == "lines":
+        refuse_address(str(path), content["address"])
+    _refuse_blind(path, content)
     values["termination"] = _ENDINGS[content.get("termination", "lf")]
     watched = {key: content[key] for key in Watchfulness.__annotations__ if key in content}
     values |= {"gimbals": gimbals, "name": path.stem, "watch": Watchfulness(**watched)}
     return Profile(**values)
+
+
+def _refuse_blind(path: Path, content: Mapping[str, Any]) -> None:
+    """Raise InputError for a profile by which a fault, or a position, cannot be told."""
+    if "fault" in content and not (content.get("no_fault", "").strip() or content.get("fault_word", "").strip()):
+        raise InputError(
+            f"{path}: asks for faults and does not say how one is told: add no_fault, what the answer holds where "
+            "there is none, or fault_word, what it holds where there is one."
+        )
+    if content.get("answer", "{deg}").count("{deg}") != 1:
+        raise InputError(f"{path}: answer = {content['answer']!r} lacks {{deg}}, where the angles stand.")
 
 
 def _refuse_unknown_fields(path: Path, key: str, text: str) -> None:
@@ -179,25 +203,49 @@ def is_for_each(text: str) -> bool:
     return "{axis}" in text or "{deg}" in text or "{deg:" in text
 
 
-_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+_FARTHEST_DEG = 1e5  # no gimbal has turned farther
+_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d{1,3})?")
+
+
+def angles_in(answer: str, pattern: str, names: Sequence[str]) -> tuple[float, ...]:
+    """The angles that an answer is, one for each of these gimbals; raises PositionerError where it is none.
+
+    The answer is the angles and nothing else, with blanks, commas or semicolons between; that about one gimbal may
+    begin with its name. pattern: how an answer looks, with {deg} in place of the angles; "" for these alone.
+    """
+    text, sides = answer.strip(), pattern.split("{deg}")
+    if pattern:
+        if not (text.startswith(sides[0]) and text.endswith(sides[1])):
+            raise PositionerError(f"the answer {_shown(answer)} is not {pattern!r}")
+        text = text[len(sides[0]) : len(text) - len(sides[1])]
+    words = [word for word in re.split(r"[\s,;]+", text.strip("[]() ")) if word]
+    if len(names) == 1 and len(words) == 2 and words[0].rstrip(":=").lower() == names[0].lower():
+        words = words[1:]
+    angles = tuple(float(word) if _NUMBER.fullmatch(word) else math.nan for word in words)
+    if len(angles) != len(names) or not all(abs(angle) < _FARTHEST_DEG for angle in angles):
+        wanted = "an angle" if len(names) == 1 else f"{len(names)} angles"
+        raise PositionerError(
+            f"the answer {_shown(answer)} is not {wanted} (key answer of a profile: what stands around)"
+        )
+    return angles
+
+
+def _shown(answer: str) -> str:
+    """Return an answer as it may be shown: no commands to the terminal, and not too much."""
+    return ascii(answer[:60])
 
 
 class LinePositioner:
     """A controller that is spoken to as its profile says. Raises PositionerError where it does not answer."""
 
     def __init__(self, profile: Profile) -> None:
-        need("pyvisa", "positioner", f"the positioner {profile.name}")
-        need("pyvisa_py", "positioner", f"the positioner {profile.name}")
         self.profile = profile
+        self.link = LineLink(profile.name, profile.address, profile.termination, profile.baud, profile.timeout_s)
         self._is_moved = False
-        with _told(profile, "opened"):
-            import pyvisa
 
-            self._link: Any = pyvisa.ResourceManager("@py").open_resource(profile.address)
-            self._link.read_termination = self._link.write_termination = profile.termination
-            self._link.timeout = 1000.0 * profile.timeout_s
-            if profile.address.upper().startswith("ASRL"):
-                self._link.baud_rate = profile.baud
+    def when_broken_off(self, broken_off: Callable[[], bool]) -> None:
+        """Have no answer waited for once this is so."""
+        self.link.broken_off = broken_off
 
     def move_to(self, gimbal_deg: Sequence[float]) -> None:
         angles = self.profile.to_controller(gimbal_deg)
@@ -207,13 +255,13 @@ class LinePositioner:
             self._say(text, angles)
 
     def read(self) -> tuple[float, ...]:
-        angles, wanted = list[float](), len(self.profile.gimbals)
+        angles, names = list[float](), self.profile.gimbals
         for text in self.profile.read:
-            for answer in self._ask(text):
-                numbers = _numbers(answer)
-                angles += numbers[-1:] if is_for_each(text) else numbers  # some name the gimbal before its angle
-        if len(angles) != wanted:
-            said = f"the answers about the position have {len(angles)} numbers, and there are {wanted} gimbals"
+            of_answers = [[name] for name in names] if is_for_each(text) else [names]
+            for answer, of_answer in zip(self._ask(text), of_answers, strict=True):
+                angles += angles_in(answer, self.profile.answer, of_answer)
+        if len(angles) != len(names):
+            said = f"the answers about the position have {len(angles)} numbers, and there are {len(names)} gimbals"
             raise PositionerError(f"the positioner {self.profile.name}: {said}")
         return self.profile.from_controller(angles)
 
@@ -226,47 +274,27 @@ class LinePositioner:
         for text in self.profile.fault:
             for answer in self._ask(text):
                 if self.profile.is_fault(answer):
-                    return answer
+                    return _shown(answer).strip("'\"")
         return ""
 
     def close(self) -> None:
         """Let go of the link."""
-        self._link.close()
+        self.link.close()
 
     def _say(self, text: str, angles: Sequence[float]) -> None:
-        count = len(self.profile.gimbals) if is_for_each(text) else 1
-        for gimbal in range(count):
+        for gimbal in range(len(self.profile.gimbals) if is_for_each(text) else 1):
             line = said_for(self.profile, text, angles, gimbal)
-            with _told(self.profile, f"told {line!r}"):
-                if self.profile.answers:
-                    self._link.query(line)
-                else:
-                    self._link.write(line)
+            if self.profile.answers:
+                self.link.ask(line)
+            else:
+                self.link.say(line)
 
     def _ask(self, text: str) -> list[str]:
-        answers = list[str]()
-        for gimbal in range(len(self.profile.gimbals) if is_for_each(text) else 1):
-            line = said_for(self.profile, text, [], gimbal)
-            with _told(self.profile, f"asked {line!r}"):
-                answers.append(str(self._link.query(line)).strip())
-        return answers
+        count = len(self.profile.gimbals) if is_for_each(text) else 1
+        return [self.link.ask(said_for(self.profile, text, [], gimbal)) for gimbal in range(count)]
 
 
-def _numbers(answer: str) -> list[float]:
-    """Return the numbers of an answer."""
-    return [float(number) for number in _NUMBER.findall(answer)]
-
-
-@contextmanager
-def _told(profile: Profile, what: str) -> Iterator[None]:
-    """Turn whatever a link raises into an error of the positioner."""
-    try:
-        yield
-    except PositionerError:
-        raise
-    except Exception as error:  # of PyVISA, of the system, of a library below
-        said = " ".join(str(error).split()) or type(error).__name__
-        raise PositionerError(f"the positioner {profile.name} at {profile.address}, {what}: {said}") from error
+_SLICE_S = 0.05  # of waiting, after which is looked whether the run is broken off
 
 
 class CommandPositioner:
@@ -278,6 +306,11 @@ class CommandPositioner:
     def __init__(self, profile: Profile) -> None:
         self.profile = profile
         self._moving: subprocess.Popen[str] | None = None
+        self._broken_off: Callable[[], bool] = lambda: False
+
+    def when_broken_off(self, broken_off: Callable[[], bool]) -> None:
+        """Have no command waited for once this is so."""
+        self._broken_off = broken_off
 
     def move_to(self, gimbal_deg: Sequence[float]) -> None:
         words = self._words(self.profile.move[0], self.profile.to_controller(gimbal_deg))
@@ -289,11 +322,8 @@ class CommandPositioner:
             raise PositionerError(f"{words[0]} cannot be run ({error.strerror})") from error
 
     def read(self) -> tuple[float, ...]:
-        numbers = _numbers(self._run(self.profile.read[0]))
-        if len(numbers) != len(self.profile.gimbals):
-            wanted = len(self.profile.gimbals)
-            raise PositionerError(f"{self.profile.read[0]} printed {len(numbers)} numbers, not {wanted} angles")
-        return self.profile.from_controller(numbers)
+        angles = angles_in(self._run(self.profile.read[0]), self.profile.answer, self.profile.gimbals)
+        return self.profile.from_controller(angles)
 
     def stop(self) -> None:
         self._end_move()
@@ -329,12 +359,27 @@ class CommandPositioner:
     def _run(self, text: str) -> str:
         words = self._words(text, [])
         try:
-            done = subprocess.run(words, stdin=subprocess.DEVNULL, capture_output=True, text=True,
-                                  timeout=self.profile.timeout_s)  # fmt: skip
-        except subprocess.TimeoutExpired:
-            raise PositionerError(f"{words[0]} did not end within {self.profile.timeout_s:g} s") from None
+            ran = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
         except OSError as error:
             raise PositionerError(f"{words[0]} cannot be run ({error.strerror})") from error
-        if done.returncode:
-            raise PositionerError(f"{text} ended with exit code {done.returncode}: {done.stderr.strip()[:200]}")
-        return done.stdout
+        with ran:
+            printed, complained = self._waited_for(ran, words[0])
+        if ran.returncode:
+            said = complained.decode(errors="replace").strip()[:200]
+            raise PositionerError(f"{text} ended with exit code {ran.returncode}: {said}")
+        return printed.decode(errors="backslashreplace")
+
+    def _waited_for(self, ran: subprocess.Popen[bytes], name: str) -> tuple[bytes, bytes]:
+        """Return what a command prints; it is killed where it takes too long, or where the run is broken off."""
+        until_s = time.monotonic() + self.profile.timeout_s
+        while True:
+            try:
+                return ran.communicate(timeout=_SLICE_S)
+            except subprocess.TimeoutExpired:
+                if self._broken_off() or time.monotonic() > until_s:
+                    ran.kill()
+                    ran.communicate()
+                    why = f"did not end within {self.profile.timeout_s:g} s"
+                    raise PositionerError(
+                        f"{name} {why if time.monotonic() > until_s else 'is not waited for'}"
+                    ) from None

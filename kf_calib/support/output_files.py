@@ -4,9 +4,10 @@
 - A file is replaced only with ``--overwrite``; a folder, a device or a write-protected file is never replaced. A link
   stays, and the file that it points to is written.
 - All this, and whether the folder is writable, is checked before the work begins.
-- A file is written under a temporary name in the same folder and renamed when it is complete (``whole``), so that
-  others see either the old or the new content. If two runs write the same name without ``--overwrite``, the second to
-  finish gets an error. Temporary files of killed runs are removed by the next run.
+- A file is written under a temporary name in the same folder, brought to the disk and renamed when it is complete
+  (``whole``), so that others see either the old or the new content, after a power cut, too. If two runs write the same
+  name without ``--overwrite``, the second to finish gets an error. Temporary files of killed runs are removed by the
+  next run.
 - A file that grows during the whole run (``Growing``) must survive if the run is killed. It has its final name from the
   start; where it replaces an earlier file, it is renamed as soon as its first readings are on the disk, and until then
   the earlier file stays. If no reading came, no file is left. Both files are locked, so that no other run can write
@@ -133,6 +134,22 @@ def target_of(path: Path) -> Path:
     return Path(os.path.realpath(path))
 
 
+def bring_to_disk(path: Path) -> None:
+    """Wait until the disk has a file, or the names in a folder: till then a power cut may take them. Raises OSError
+    where the disk refuses a file; a file system that cannot say it of a folder is taken at its word."""
+    is_folder = path.is_dir()
+    if is_folder and sys.platform == "win32":  # it has no such call, and keeps the order of names
+        return
+    descriptor = os.open(path, os.O_RDONLY if is_folder else os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    except OSError:
+        if not is_folder:
+            raise
+    finally:
+        os.close(descriptor)
+
+
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
     """A name to write under; ``path`` is the file when the block ends, and stays as it was where the block fails.
@@ -147,10 +164,12 @@ def whole(path: Path) -> Iterator[Path]:
         _refuse_device(path, target.lstat())
     try:
         yield part
+        bring_to_disk(part)
         if target in _new.get():
             _give_new_name(part, path, target)
         else:
             _rename(part, target)
+        bring_to_disk(target.parent)
     except OSError as error:
         raise InputError(
             f"{path} cannot be written ({error.strerror or error}): make room, or give another place."
@@ -199,6 +218,7 @@ class Growing:
         if not lock(file):
             file.close()
             self._refuse()
+        bring_to_disk(self.at.parent)  # else a power cut may lose its name, whatever is brought there of its content
         return file
 
     def settle(self) -> None:
@@ -207,6 +227,7 @@ class Growing:
             return
         if _RENAMES_OPEN_FILES:
             _rename(self._temporary, self._target)
+            bring_to_disk(self._target.parent)
         else:
             self._temporary.unlink()
         self._temporary = None

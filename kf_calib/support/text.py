@@ -26,6 +26,14 @@ CONTROLS = COMMANDS.replace(r"\x00-\x08\x0b-\x1f", r"\x00-\x1f")
 _END = 300  # of a message that is cut: its last words say what to do
 
 
+def number_from(text: str) -> float:
+    """The number that a text is, as instruments and people write it. Raises ValueError: Python would take ``0_1.5``,
+    too, and digits of other scripts."""
+    if "_" in text or not text.isascii():
+        raise ValueError(f"could not convert string to float: {text!r}")
+    return float(text)
+
+
 def printable(text: str) -> str:
     """The text with all but its line ends printable."""
     if text.isprintable():

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from kf_calib.errors import InputError
 from kf_calib.fleet.batch import local_copy
-from kf_calib.fleet.run_list import ListedRun, runs_of
+from kf_calib.fleet.run_list import _STORES, ListedRun, runs_of
 
 
 @pytest.fixture
@@ -108,3 +111,50 @@ def test_an_object_store_is_read_as_a_folder_is(bucket: str, folder: Path) -> No
         local_copy(ListedRun(f"{bucket}/gone.mcap")),
     ):
         pass
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "dask://127.0.0.1:9::file:///x/a.mcap", "http://127.0.0.1:1/a.mcap", "reference://::data:,x", "dask://",
+        "simplecache::s3://bucket/a.mcap", "zip://*.mcap::file:///x.zip", "memory://a.mcap", "ftp://host/a.mcap",
+        "DASK://host:1/a", "a\x1b[2Jb.mcap", "x" * 5000,
+    ],
+)  # fmt: skip
+def test_a_list_opens_no_address_but_those_of_plain_stores(
+    line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is left of such a line is one row that says so; the other runs are evaluated."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("a connection was opened")
+
+    monkeypatch.setattr(socket.socket, "connect", refuse)
+    monkeypatch.setattr(socket, "getaddrinfo", refuse)
+    (tmp_path / "a.mcap").write_bytes(b"")
+    (tmp_path / "list.txt").write_text(f"a.mcap\n{line}\n", encoding="utf-8")
+    good, bad = runs_of([str(tmp_path / "list.txt")])
+    assert good.place.endswith("a.mcap") and not good.refused and bad.refused
+    assert "list.txt: '" in bad.refused and "\x1b" not in bad.refused and len(bad.refused) < 5000
+    with pytest.raises(InputError, match="list"), local_copy(bad):
+        pass
+
+
+def test_a_date_that_is_none_costs_one_row(tmp_path: Path) -> None:
+    for name in "ab":
+        (tmp_path / f"{name}.mcap").write_bytes(b"")
+    (tmp_path / "list.csv").write_text("run,date\na.mcap,yesterday\nb.mcap,2026-05-31\n")
+    bad, good = runs_of([str(tmp_path / "list.csv")])
+    assert "is no date" in bad.refused and good.date is not None and not good.refused
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.text(alphabet=st.characters(exclude_characters="\r\n"), max_size=40), max_size=6))
+def test_whatever_stands_in_a_list_is_a_row_each(tmp_path_factory: pytest.TempPathFactory, lines: list[str]) -> None:
+    folder = tmp_path_factory.mktemp("list")
+    (folder / "list.txt").write_text("\n".join(["://".join(lines[:2]), *lines]), encoding="utf-8", errors="replace")
+    try:
+        for run in runs_of([str(folder / "list.txt")]):
+            assert run.refused or "://" not in run.place or run.place.partition("://")[0].lower() in _STORES
+    except InputError as error:
+        assert "list.txt" in str(error)

@@ -21,8 +21,8 @@ GOING = Suggestion("opening", "why", (90.0, 0.0, 90.0), 5.0)
 TICK_S = 0.1
 
 
-def begun(now_s: float = 0.0, rules: Rules = RULES) -> State:
-    """A loop that has asked for a suggestion at zero."""
+def begun(now_s: float = 0.0, rules: Rules = RULES, first: bool = False) -> State:
+    """A loop that has asked for a suggestion at zero, after its first small moves unless ``first``."""
     state, command = State(), None
     for samples in range(200):
         seen = Seen(now_s, (0.0, 0.0, 0.0), samples=samples, stay_s=samples * TICK_S, stream_deg=(0.0, 0.0, 0.0))
@@ -31,7 +31,7 @@ def begun(now_s: float = 0.0, rules: Rules = RULES) -> State:
         if command is not None:
             break
     assert command == Ask() and state.phase is Phase.ASKING
-    return state
+    return state if first else replace(state, number=2)
 
 
 def told(state: State, now_s: float = 20.0) -> State:
@@ -155,3 +155,53 @@ def test_a_way_enters_no_zone_however_fast_each_gimbal_goes(start: tuple, end: t
         assert is_free(reach, before, after[None])[0]
         between = before + rng.random((200, 3)) * (after - before)
         assert reach.allowed(between).all()
+
+
+def played(gains: np.ndarray, silent: bool = False) -> tuple[list[object], list[tuple[float, ...]]]:
+    """Commands and places of a loop whose platform turns by ``gains`` (3, 3) of what the read-back says."""
+    rules, state, now_s, here = Rules(Reach.of(Bench(axes_of("yzx"), 9.81))), begun(first=True), 20.0, np.zeros(3)
+    commands, places = list[object](), list[tuple[float, ...]]()
+    state, command = step(state, Seen(now_s, tuple(here), suggestion=GOING), rules)
+    for _ in range(1500):
+        if command is not None:
+            commands.append(command)
+            if not isinstance(command, Move):
+                break
+            target = np.array(command.gimbal_deg)
+        now_s += TICK_S
+        here = here + np.clip(target - here, -2.0, 2.0)
+        true_deg = tuple((gains @ here).tolist())
+        places.append(true_deg)
+        still = bool(np.abs(target - here).max() < 1e-9) and not silent
+        seen = Seen(now_s, tuple(here.tolist()), samples=len(places), stream_deg=true_deg if still else None)
+        state, command = step(state, seen, rules)
+        if state.phase is Phase.STAYING:
+            break
+    return commands, places
+
+
+def test_each_gimbal_goes_by_a_little_before_anything_goes_far() -> None:
+    commands, places = played(np.eye(3))
+    moves = [command.gimbal_deg for command in commands if isinstance(command, Move)]
+    assert moves[:3] == [(3.0, 0.0, 0.0), (3.0, 3.0, 0.0), (3.0, 3.0, 3.0)] and moves[-1] == GOING.gimbal_deg
+    assert places[-1] == pytest.approx(GOING.gimbal_deg)
+
+
+@pytest.mark.parametrize(("gains", "gimbal"), [
+    (np.diag([-1.0, 1.0, 1.0]), 1), (np.diag([1.0, -1.0, 1.0]), 2), (np.diag([1.0, 1.0, np.pi / 180.0]), 3),
+    (np.eye(3)[[1, 0, 2]], 1), (np.diag([1.0, 1.0, 2.0]), 3),
+])  # fmt: skip
+def test_a_gimbal_that_turns_otherwise_than_it_is_told_is_stopped_within_a_few_degrees(
+    gains: np.ndarray, gimbal: int
+) -> None:
+    """A wrong sign, unit, size, or gimbals that are exchanged in the profile."""
+    commands, places = played(gains)
+    halt = commands[-1]
+    assert isinstance(halt, Halt) and f"gimbal {gimbal} was turned by a little" in halt.reason
+    assert np.abs(places).max() < 7.0
+
+
+def test_without_recorded_angles_nothing_goes_far() -> None:
+    commands, places = played(np.eye(3), silent=True)
+    halt = commands[-1]
+    assert isinstance(halt, Halt) and "no angles are recorded" in halt.reason and np.abs(places).max() < 4.0

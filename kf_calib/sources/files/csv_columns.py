@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -150,7 +151,8 @@ class CsvColumns:
         header = heading.header
         names = ["" if stated.get(name) == "-" else stated.get(name, name) for name in header]
         lower = [name.lower() for name in names]
-        if repeated := next((name for name in lower if name and lower.count(name) > 1), None):
+        times = Counter(lower)
+        if repeated := next((name for name in lower if name and times[name] > 1), None):
             raise InputError(f"two columns are named {repeated!r}: rename or remove one of them.")
         if are_numbers(header):
             raise InputError(f"{NO_HEADER}: {cut(','.join(header), 60)!r}.")

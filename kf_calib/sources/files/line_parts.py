@@ -24,6 +24,7 @@ from kf_calib.bench.raw_input import RawInput
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.sources.tables.grid import delimiter_of
 from kf_calib.sources.tables.words import is_unit
+from kf_calib.support.text import number_from
 from kf_calib.support.units import WORDS
 
 ACCEL_UNITS = {unit: WORDS["m/s^2"][unit] for unit in ("mps2", "g", "mg")}
@@ -155,7 +156,7 @@ class LineReader(ABC):
 def number_of(text: str) -> float:
     """The number that a text says. Raises LineError where it is too small for one, as when two have run together:
     1.234e-01700001234567 is no zero."""
-    value = float(text)
+    value = number_from(text)
     if value == 0.0 and float(text.lower().partition("e")[0]):
         raise LineError("a number is out of range")
     return value

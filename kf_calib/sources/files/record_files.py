@@ -35,7 +35,7 @@ from kf_calib.sources.files.mcap_records import (
     parse_record,
 )
 from kf_calib.sources.files.sqlite_bag import SqliteBag
-from kf_calib.support.text import cut
+from kf_calib.support.text import cut, number_from
 
 _USUAL_RATIO = 20  # sizes of a recording unpacked and packed, at most
 SQLITE, _ZSTD = b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
@@ -244,7 +244,7 @@ def decision_records(path: Path, name: str = DECISION_RECORD) -> list[Mapping[st
 def number_of(record: Mapping[str, str], key: str) -> float:
     """A number of a record; NaN where there is none."""
     try:
-        return float(record[key])
+        return number_from(record[key])
     except (KeyError, ValueError):
         return math.nan
 
@@ -253,5 +253,5 @@ def angles_of(text: str) -> tuple[float, ...]:
     """The angles of a record, deg; none where the text is no list of numbers."""
     try:
         return tuple(float(angle) for angle in json.loads(text))
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, RecursionError):
         return ()

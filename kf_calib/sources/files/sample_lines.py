@@ -142,6 +142,7 @@ def _quote_end(line: str, at: int) -> int:
     return len(line)
 
 
+_MARK = "\ufeff"  # some write it before the first line
 _ACCEL = {f"accel_{unit}": factor for unit, factor in ACCEL_UNITS.items()}
 _BARE = ("accel", "accel_counts", "accel_raw")
 """Readings whose name tells no unit: options state it."""
@@ -182,7 +183,7 @@ class JsonLines(LineReader):
         return "name the readings accel_mps2 or accel_g, and the poses angles_rad, angles_deg or attitude_xyzw"
 
     def with_readings(self, line: str, readings_mps2: Sequence[float]) -> str:
-        entry = json.loads(line)
+        entry = json.loads(line.lstrip(_MARK))
         names = {self._columns.get(key, key): key for key in entry}
         name = next(each for each in (*_ACCEL, *_BARE) if each in names and entry[names[each]] is not None)
         values = json.dumps([written(value / _ACCEL.get(name, 1.0)) for value in readings_mps2])
@@ -191,6 +192,7 @@ class JsonLines(LineReader):
         return line[:key_start] + key + line[key_end:start] + values + line[end:]
 
     def _read_line(self, line: str, accel: LineRows, pose: LineRows, temperature: LineRows) -> None:
+        line = line.lstrip(_MARK) if self._is_first else line
         if not line.lstrip().startswith("{"):  # found out at a tenth of the cost, where a link brings much of it
             raise LineError("it is not a JSON object")
         is_tiny = ("e-" in line or "E-" in line) and _find_tiny(line)
@@ -213,14 +215,22 @@ class JsonLines(LineReader):
             self._account.leave_out(key for key in entry if key not in _KNOWN)
 
     def _takes_bench(self, entry: dict[str, Any]) -> bool:
-        """Whether this is the first line and describes the bench, which is then kept."""
+        """Whether the line describes the bench: the first one is kept, and no other may contradict it."""
         is_first, self._is_first = self._is_first, False
-        if not is_first or "bench" not in entry:
+        if "bench" not in entry or not (is_first or TIME_DECIMALS.keys().isdisjoint(entry)):
             return False
         bench = entry["bench"]
         if not isinstance(bench, dict):
             raise LineError("bench is not a JSON object")
-        self.metadata = metadata_of({key: value for key, value in bench.items() if value is not None})
+        metadata = metadata_of({key: value for key, value in bench.items() if value is not None})
+        if is_first:
+            self.metadata = metadata
+        elif changed := [key for key, value in metadata.items() if self.metadata.get(key) != value]:
+            before, after = (ascii(each.get(changed[0]))[:40] for each in (self.metadata, metadata))
+            raise LineError(
+                f"it describes another bench than the first line ({changed[0]}: {after}, first {before}), which counts "
+                "for the whole run: begin a new run where the bench changes"
+            )
         return True
 
     def _time_ns(self, entry: dict[str, Any], line: str) -> int:

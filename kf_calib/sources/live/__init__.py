@@ -29,6 +29,7 @@ from kf_calib.sources.live.streamed import StreamedFeed
 from kf_calib.sources.simulation.simulator import Simulation
 from kf_calib.sources.tables.grid import EXCEL_SUFFIXES
 from kf_calib.support.output_files import Outputs
+from kf_calib.support.text import number_from
 
 __all__ = ["LiveSource", "Status", "files_of", "open_live"]
 
@@ -175,7 +176,7 @@ def _simulated_feed(rest: str, overrides: Mapping[str, str], angles: bool) -> Fe
 
 def _positive(name: str, text: str) -> float:
     try:
-        value = float(text)
+        value = number_from(text)
     except ValueError:
         value = math.nan
     if not value > 0.0:

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from kf_calib.bench.arrays import Floats, Times
 from kf_calib.bench.bench import Vector
 from kf_calib.errors import InputError
+from kf_calib.support.text import number_from
 
 YZX: tuple[Vector, ...] = ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
 """A vertical outer axis and two horizontal ones: every attitude can be reached."""
@@ -62,7 +63,7 @@ def angles_from_csv(path: Path, width: int) -> list[list[float]]:
     for number, line in enumerate(lines, start=1):
         cells = line.split("#")[0].replace(",", " ").split()
         try:
-            row = [float(cell) for cell in cells]
+            row = [number_from(cell) for cell in cells]
         except ValueError:
             if rows or number > 1:
                 raise InputError(f"{path}, line {number}: {line!r} is not {width} angles in deg.") from None

@@ -391,3 +391,38 @@ def test_the_same_rows_written_in_another_way_are_the_same(text: str) -> None:
     assert batch.accel.time_ns.tolist() == [1_500_000_000, 2_500_000_000]
     np.testing.assert_allclose(batch.accel.values / 9.80665, [[0.25, 1.0, -0.5]] * 2, rtol=1e-12)
     assert not any("malformed" in said for said in source.warnings)
+
+
+# -- what other programs write --
+
+
+@pytest.mark.parametrize("first", [OBJECT, {"bench": BENCH}])
+def test_a_byte_order_mark_costs_no_line(first):
+    stated = BENCH if first is OBJECT else {}
+    lines = lines_of(b"\xef\xbb\xbf" + json_text(first, OBJECT | {"time_ns": 1_600_000_000}).encode(), stated)
+    assert len(read(lines).accel) == 1 + (first is OBJECT) and not lines.warnings
+
+
+def test_a_bench_that_changes_in_the_run_is_told_as_that():
+    lines = lines_of(json_text({"bench": BENCH}, OBJECT, {"bench": BENCH}, {"bench": BENCH | {"gravity_mps2": "9.7"}},
+                               OBJECT | {"time_ns": 1_600_000_000}), {})  # fmt: skip
+    assert len(read(lines).accel) == 2
+    (said,) = lines.warnings
+    assert "another bench than the first line (gravity_mps2: '9.7', first '9.81')" in said and "line 4" in said
+    assert "time stamp" not in said
+
+
+@pytest.mark.parametrize("text", ["0_1.1_0", "1_0"])
+def test_what_python_alone_takes_for_a_number_is_none(text):
+    good = ROW.replace("1.5,0.1", "1.6,0.1")
+    lines = lines_of(f"{HEADER}\n{ROW.replace('0.1', text, 1)}\n{good}\n")
+    assert len(read(lines).accel) == 1 and len(lines.warnings) == 1
+
+
+def test_a_heading_of_many_columns_is_read_in_a_moment():
+    names = [f"c{k}" for k in range(32_000)]
+    text = f"{HEADER},{','.join(names)}\n{ROW}{',1' * len(names)}\n"
+    began_s = time.process_time()
+    lines = lines_of(text)
+    assert len(read(lines).accel) == 1
+    assert time.process_time() - began_s < 5.0  # it took 35 s, by the square of their number
