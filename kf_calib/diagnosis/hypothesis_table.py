@@ -53,7 +53,7 @@ class Hypothesis:
     - families: the physical classes of the effects.
     - log_evidence: of the row with its prior, natural logarithm. probability: its share in all rows.
     - statistic, dof: fall of chi-squared in the likeliest noise, and the number of coefficients; of a random walk alone
-      twice its gain in likelihood.
+      twice its gain in likelihood; 0 of what was not fitted.
     - refit: the calibration with it; None where none was made.
     """
 

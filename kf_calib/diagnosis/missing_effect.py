@@ -47,7 +47,6 @@ from kf_calib.support.tail_probabilities import chi_squared_tail, log_odds_of
 _SHOWN = 6  # number of suspects that are shown
 _DOUBT = 0.01  # probability from which noise that was not stated is named as a rival
 _NOISE = 1e-6  # p-value below which readings within dwells hold more than an oscillation and noise
-_RETURNS = 1.36  # gain in log-likelihood that 1 of 20 true random walks exceeds with a time constant to return in
 
 
 def diagnose(
@@ -112,7 +111,6 @@ def _oscillating(refits: Refits, before: Calibration) -> Diagnosis | None:
 
 def _in_words(diagnosis: Diagnosis) -> Diagnosis:
     """Return a diagnosis with its verdict."""
-    diagnosis = replace(diagnosis, restoring_time_s=_restoring_time_s(diagnosis))
     words = verdict_in_words(diagnosis) + second_pass_in_words(diagnosis) + disturbance_in_words(diagnosis)
     return replace(diagnosis, verdict=words)
 
@@ -266,16 +264,6 @@ def _suspects(diagnosis: Diagnosis, table: HypothesisTable) -> tuple[Suspect, ..
         shares = row.probability, table.probability(row.effects)
         suspects.append(Suspect(name, statistic, dof, p_value, fits, row.refit, symbols_before, *shares))
     return tuple(suspects)
-
-
-def _restoring_time_s(diagnosis: Diagnosis) -> float | None:
-    """Return the time constant of a drift that returns, in s, where that explains the run better than the random walk
-    named; None where no walk was named, or where 1 of 20 true random walks gains as much likelihood."""
-    after, named = diagnosis.after, diagnosis.test.effects.walk in diagnosis.missing
-    if after is None or not named or not after.noise.walk_mps2_per_sqrt_s:
-        return None
-    gain, restoring_time_s = after.fit.gauss_markov_gain
-    return restoring_time_s if gain > _RETURNS else None
 
 
 _GROWN = 1.05  # the held-out error with effects over that without them; what shows only within dwells changes little

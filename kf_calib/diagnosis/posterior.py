@@ -35,6 +35,7 @@ from kf_calib.diagnosis.run_likelihood import Projected, RunLikelihood, log_baye
 from kf_calib.diagnosis.run_terms import RunTerms, log_bayes_of_any_size, sizes_of
 from kf_calib.diagnosis.unknown_terms import name_of_formula, text_named
 from kf_calib.diagnosis.within_dwell_trend import DisturbedDwell, disturbed_dwell, trend
+from kf_calib.dwells.qr import orthonormal
 from kf_calib.effects import effect_named
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.results import Calibration
@@ -166,7 +167,8 @@ class Posterior:
             families.append(term.family or NONE)
             driver = term.driver
         log += self._log_prior(effects, bool(unknown))
-        statistic, dof = self._tested(effects[0]) if len(effects) == 1 and not unknown else (0.0, 0)
+        tested = [self._tested(name) for name in effects]
+        statistic, dof = tested[0][0] if len(effects) == 1 and not unknown else 0.0, sum(dof for _, dof in tested)
         return Hypothesis(effects, (), driver, tuple(dict.fromkeys(families)), log, statistic, dof)
 
     def _log_prior(self, effects: Sequence[str], beside_unknown: bool = False) -> float:
@@ -272,8 +274,9 @@ class Posterior:
         otherwise = (folded.carrier_hz, folded.averaged) != (before.carrier_hz, before.averaged)
         if self._run.walk in row.effects or otherwise:
             return replace(row, refit=refit)
-        log = self._log_of_fit(refit) + sum(self._log_share_of_best(name) for name in row.effects)
-        return replace(row, refit=refit, log_evidence=log + self._log_prior(row.effects))
+        log, statistic = self._log_of_fit(refit)
+        log += self._log_prior(row.effects) + sum(self._log_share_of_best(name) for name in row.effects)
+        return replace(row, refit=refit, log_evidence=log, statistic=row.statistic or statistic)
 
     def _with_changes_beside_walk(self, irregular: Hypothesis, rows: Sequence[Hypothesis]) -> Hypothesis:
         """Return the row of irregular changes with those beside a random walk of the biases: what this leaves within
@@ -284,8 +287,9 @@ class Posterior:
             logs += [row.log_evidence + log_odds_of(left.p_value) + math.log(_WITHIN)] if left else []
         return replace(irregular, log_evidence=_log_sum(logs))
 
-    def _log_of_fit(self, refit: Calibration) -> float:
-        """Return the log evidence of the effects that a refit has in addition, at the values of their constants."""
+    def _log_of_fit(self, refit: Calibration) -> tuple[float, float]:
+        """Return the log evidence of the effects that a refit has in addition, at the values of their constants, and
+        the fall of chi-squared by them in the likeliest noise."""
         noise, model = self._noise, refit.model
         if refit.noise.sensitivity_mps2_per_k is not None:
             noise = replace(noise, sensitivity_mps2_per_k=refit.noise.sensitivity_mps2_per_k)
@@ -307,7 +311,10 @@ class Posterior:
             for j, relation in enumerate(related):
                 columns = [rows.columns[:, place] @ matrix for place, matrix in zip(places, relation, strict=True)]
                 logs[j, k] = rows.log + log_bayes_together(columns, rows.readings, sizes[j])
-        return float(np.logaddexp.reduce(self._sizes.evidence(logs), axis=None)) - math.log(len(related))
+        rows = likelihood.projected(self._sizes.covariances[int(np.argmax(logs.max(axis=0)))], whole=True)
+        explained = orthonormal(rows.columns[:, np.concatenate(places)])[0].T @ rows.readings
+        log = float(np.logaddexp.reduce(self._sizes.evidence(logs), axis=None)) - math.log(len(related))
+        return log, float(explained @ explained)
 
     # What an unknown function looks like
 

@@ -156,7 +156,7 @@ class RunTerms:
         times_s = [waves.run_s / share for share in _RETURNS if share < _PER_DWELL * len(dwells)]
         self.unknown.append(UnknownTerm(RETURNING, effect_named(self.walk, self.bench).family, ()))
         for time_s in times_s:
-            scales = np.tile((1.0 + (waves.rates * time_s) ** -2.0) ** -0.5, 3)
+            scales = np.tile(1.0 / np.sqrt(1.0 + 1.0 / np.square(waves.rates * time_s)), 3)
             columns.term(f"?{len(self.unknown) - 1}", [block], -math.log(len(times_s)), scales=scales)
 
     def formula_of(self, text: str) -> Effect:

@@ -8,12 +8,10 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.within_dwell_trend import Trend
-from kf_calib.effects import effect_named, walk_named
+from kf_calib.effects import walk_named
 from kf_calib.estimation.fit import Fit
-from kf_calib.estimation.iterated_fit import fit
 from kf_calib.estimation.results import consistency
 
-_EQUAL = 6.63  # chi-squared that one constant more has to gain (1 %)
 _WITHIN = 0.01  # significance level of trends within dwells
 
 BETWEEN_DWELLS = "nothing that was recorded (irregular from dwell to dwell)"
@@ -39,11 +37,14 @@ class Description:
         return self.formulas[0]
 
 
-def describe_irregular(fitted: Fit, residuals: Floats, trend: Trend | None = None) -> Description | None:
+def describe_irregular(
+    fitted: Fit, residuals: Floats, trend: Trend | None = None, driver: str = ""
+) -> Description | None:
     """Description of a misfit that changes irregularly, with the random walk of the biases as the formula to try; None
     where that is in the model.
 
     fitted: the fit whose misfit is described. residuals: of the dwell means, (D, 3). trend: its test within dwells.
+    driver: what it depends on; "" for nothing that is known.
     """
     name = "" if fitted.linearised.model.walks else walk_named(fitted.linearised.model.bench)
     if not name:
@@ -51,28 +52,8 @@ def describe_irregular(fitted: Fit, residuals: Floats, trend: Trend | None = Non
     misfit, walk, scatter = consistency(fitted), fitted.walk_gain, fitted.scatter_gain
     irregular, excess = 2.0 * max(walk, scatter), misfit.statistic - misfit.dof
     within = trend is not None and trend.p_value < _WITHIN
-    restoring_time_s = _restoring_time_s(fitted, name) if 2.0 * (walk - scatter) > _EQUAL else None
-    driver = WITHIN_DWELLS if within else BETWEEN_DWELLS
-    if restoring_time_s:
-        driver = f"time (irregular, back within about {one_digit_seconds(restoring_time_s)})"
+    driver = driver or (WITHIN_DWELLS if within else BETWEEN_DWELLS)
     return Description(channel_of(residuals), driver, irregular / max(excess, irregular, 1.0), (name,))
-
-
-def one_digit_seconds(duration_s: float) -> str:
-    """A duration as text to one significant digit, as 30 s."""
-    return f"{float(f'{duration_s:.1g}'):g} s"
-
-
-def _restoring_time_s(fitted: Fit, walk: str) -> float | None:
-    """Return the time constant, s, with which an irregular drift returns, or None if it is no different from a walk."""
-    model = fitted.linearised.model
-    with_walk = fit(
-        fitted.dwells, model + effect_named(walk, model.bench), 0.0, fitted.linearised.slews, must_settle=False
-    )
-    if not with_walk.noise.walk_mps2_per_sqrt_s:
-        return None
-    gain, restoring_time_s = with_walk.gauss_markov_gain
-    return restoring_time_s if 2.0 * gain > _EQUAL else None
 
 
 def explained_share(fitted: Fit, refit: Fit) -> float:
