@@ -8,6 +8,7 @@ are not named.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike
 
@@ -191,7 +192,8 @@ def _decided(refits: Refits, diagnosis: Diagnosis) -> Diagnosis:
         if retest.consistent is False:
             final_test = retest.with_vibration(test.lines.vibration)
             diagnosis, test = replace(diagnosis, before_in_noise_left=before_in_noise_left, test=final_test), retest
-    why_not = _grown(before, first) or behind_nothing(first, table)
+    after = _after(refits, before, first) if first.effects else None
+    why_not = _grown(before, first.effects, after) or behind_nothing(first, table)
     certain = _certain_part(first, table, before)
     if certain is not None:
         table, first, why_not = replace(table, certain=certain), certain, ""
@@ -218,11 +220,15 @@ def _decided(refits: Refits, diagnosis: Diagnosis) -> Diagnosis:
 def _certain_part(first: Hypothesis, table: HypothesisTable, before: Calibration) -> Hypothesis | None:
     """Return the row of some of the effects of the likeliest row that are missing with 95 % probability, alone or with
     others, where all of them are not; None where there is none."""
-    if table.probability(first.effects) >= SURE and not first.formulas and not _grown(before, first):
+    if (
+        table.probability(first.effects) >= SURE
+        and not first.formulas
+        and not _grown(before, first.effects, first.refit)
+    ):
         return None
     parts = [row for row in table.rows if row.refit is not None and row.effects and not row.formulas]
     parts = [row for row in parts if set(row.effects) < set(first.effects) and table.probability(row.effects) >= SURE]
-    return next((row for row in parts if not _grown(before, row)), None)
+    return next((row for row in parts if not _grown(before, row.effects, row.refit)), None)
 
 
 def behind_nothing(first: Hypothesis, table: HypothesisTable) -> str:
@@ -269,13 +275,13 @@ def _suspects(diagnosis: Diagnosis, table: HypothesisTable) -> tuple[Suspect, ..
 _GROWN = 1.05  # the held-out error with effects over that without them; what shows only within dwells changes little
 
 
-def _grown(before: Calibration, row: Hypothesis) -> str:
-    """In words that follow "but": that the error of orientations left out grows with the effects of a row; "" where it
-    does not, or where no fit was made."""
-    if row.refit is None or not row.effects:
+def _grown(before: Calibration, effects: Sequence[str], after: Calibration | None) -> str:
+    """In words that follow "but": that the error of orientations left out grows with effects; "" where it does not, or
+    where no fit was made."""
+    if after is None or not effects:
         return ""
-    errors = before.held_out_rms_mps2, row.refit.held_out_rms_mps2
+    errors = before.held_out_rms_mps2, after.held_out_rms_mps2
     if errors[0] is None or errors[1] is None or errors[1] <= _GROWN * errors[0]:
         return ""
-    what = "they make" if len(row.effects) > 1 else "it makes"
+    what = "they make" if len(effects) > 1 else "it makes"
     return f"{what} the held-out error {errors[1] / errors[0]:.3g} times as large"

@@ -47,7 +47,8 @@ _AGAINST_STATED = 0.5  # the same of scatter beyond what was stated
 _OF_ORIENTATION = 0.8  # share of unknown causes that depend on the orientation alone, and come back with it
 _WITHIN = 0.01  # prior probability of irregular changes that show within dwells only
 _APART = 1e-4  # p-value of an oscillation that does not go on alike in all dwells
-_HEADS = 3  # effects beside which all other terms are tried, in the noise of the run and in none beyond that stated
+_HEADS = 3  # effects beside which all other terms are tried: likeliest in any noise, in that stated, and in pairs
+_SAME = 1e-6  # squared sine of the angle below which two effects are one
 _REFITTED, _ALWAYS = 8, 3  # rows of effects that are fitted at most, and single ones that always are
 _BEHIND, _BENT = 10.0, 0.02  # in log evidence, and share of the gain: rows further behind are not fitted
 _DESCRIBED = 5.0  # in log evidence: rows of unknown functions further behind get no formula
@@ -224,7 +225,24 @@ class Posterior:
         best = {name: k for name, k in self._best.items() if not name.startswith("?") and name != self._run.walk}
         in_noise = sorted(best, key=lambda name: -self._log_evidence[best[name]])[:_HEADS]
         in_none = sorted(best, key=lambda name: -self._log_bayes[best[name], 0])[:_HEADS]
-        return list(dict.fromkeys([*in_noise, *in_none]))
+        heads = list(dict.fromkeys([*in_noise, *in_none]))
+        return [*heads, *dict.fromkeys(self._ahead_of_pairs(list(best), heads))]
+
+    def _ahead_of_pairs(self, names: Sequence[str], heads: Sequence[str]) -> list[str]:
+        """Return the likelier effect of each pair that, in the noise that was stated, lets chi-squared fall nearly as
+        much as a head with any other effect, without being such a pair: alone neither of the two need stand out."""
+        bases, readings = self._run.bases([self._best[name] for name in names], self._rows[0])
+        along, products = bases @ readings, np.einsum("iqr,jpr->ijqp", bases, bases)
+        left = along - np.einsum("ijqp,iq->ijp", products, along)
+        beside = np.eye(along.shape[1]) * (1.0 + _SAME) - np.einsum("ijqp,ijqs->ijps", products, products)
+        more = np.sum(left * np.linalg.solve(beside, left[..., None])[..., 0], axis=2)
+        gains = np.triu(np.sum(along**2, axis=1)[:, None] + more, 1)
+        least = gains.max() - 2.0 * _BEHIND
+        of_heads = np.isin(names, heads)
+        gains[of_heads[:, None] | of_heads] = -np.inf
+        pairs = [divmod(k, len(names)) for k in np.argsort(-gains, axis=None)[:_HEADS].tolist()]
+        likely = [(names[i], names[j]) for i, j in pairs if gains[i, j] > least]
+        return [max(pair, key=lambda name: self._log_evidence[self._best[name]]) for pair in likely]
 
     @cached_property
     def _best(self) -> dict[str, int]:

@@ -64,8 +64,8 @@ class Term:
 
 @dataclass(frozen=True)
 class _Alike:
-    """Terms of q columns each: their numbers (n,), columns (n, q) and factors of these; G^T G (n, q, q) and G^T z (n, q)
-    of the rows within dwells; squares (n, m) of their sizes, logs (n, m) of the probabilities of these, and centres (n,)."""
+    """Terms of q columns: their numbers (n,), columns (n, q) and factors of these; G^T G (n, q, q) and G^T z (n, q) of
+    the rows within dwells; squares (n, m) of their sizes, logs (n, m) of their probabilities, and centres (n,)."""
 
     numbers: Indices
     places: Indices
@@ -147,8 +147,8 @@ class RunTerms:
             columns.term(f"?{len(self.unknown) - 1}", [columns.block(columns.add([visits]))], 0.0)
 
     def _add_walk(self, columns: _Columns) -> None:
-        """Add a random walk of the biases and, unknown, biases that change as irregularly and come back: the spectrum of
-        a Gauss-Markov process of correlation time tau is that of a walk times w^2 tau^2 / (1 + w^2 tau^2)."""
+        """Add a random walk of the biases and, unknown, biases that change as irregularly and come back: the spectrum
+        of a Gauss-Markov process of correlation time tau is that of a walk times w^2 tau^2 / (1 + w^2 tau^2)."""
         dwells = self._linearised.dwells
         waves = _Walk(dwells[-1].end_s, min(len(dwells), _WAVES))
         block = columns.block(columns.add([waves]))
@@ -224,6 +224,19 @@ class RunTerms:
                 gram, along = gram + alike.gram, along + alike.along
             logs[alike.numbers] = log_bayes(gram, along, alike.squares, alike.log_weights, alike.centres)
         return logs
+
+    def bases(self, numbers: Sequence[int], rows: Projected) -> tuple[Floats, Floats]:
+        """Orthonormal bases (n, q, r) of some terms in one noise, filled up with zeros, and the readings (r,)."""
+        more, readings = self.likelihood.more
+        columns, z = rows.columns, rows.readings
+        if rows.means_only:
+            columns, z = np.vstack([columns, more]), np.concatenate([z, readings])
+        places = [self.terms[k].columns for k in numbers]
+        bases = np.zeros((len(places), max(map(len, places)), len(z)))
+        for basis, place in zip(bases, places, strict=True):
+            left, sizes, _ = np.linalg.svd(columns[:, place], full_matrices=False)
+            basis[: len(place)] = np.where(sizes > _LEAST * sizes[0], left, 0.0).T
+        return bases, z
 
     def log_bayes_of(self, places: Indices, rows: Projected) -> float:
         """Log Bayes factor of some columns of any size in one noise."""

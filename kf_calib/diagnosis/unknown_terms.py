@@ -16,7 +16,7 @@ from kf_calib.dwells.sufficient_statistics import DwellFactor
 RETURNING = "time (irregular, and comes back)"
 """What biases depend on that change as irregularly as a random walk, and return to their mean."""
 
-_DECAYS_S = (3, 10, 30, 100, 300, 1000, 3000)
+_DECAYS_S = (1, 3, 10, 30, 100, 300, 1000, 3000)
 _CREEPS_S = (3, 10, 30)  # of a platform after its arrival
 _MOST_MOMENTS = 100  # at which a jump is tried
 _TURNS = (0.5, 1, 1.5, 2, 3, 4, 6, 8)  # of what is periodic, in a run
@@ -100,6 +100,11 @@ def _of_gimbals(count: int) -> Iterator[UnknownTerm]:
                         [_turning(place, texts) for texts in turning[:3]], (1.0, *weights[:2]))  # fmt: skip
 
 
+def _neighbours(texts: Sequence[str]) -> list[tuple[str, ...]]:
+    """Decays of two neighbouring time constants together: all between them are sums of these, to one per cent."""
+    return [*itertools.pairwise(texts)] if len(texts) > 1 else [(text,) for text in texts]
+
+
 def _times(texts: Sequence[str], force: str) -> tuple[str, ...]:
     return tuple(f"{text}*{force}" for text in texts)
 
@@ -115,10 +120,15 @@ def _of_time(dwells: Sequence[DwellFactor], turns: bool) -> Iterator[UnknownTerm
     weights = (1.0, 0.5, *(1.0 / n for n in range(1, 9)))
     yield _term("time", "bias in time", texts, weights)
     products = [f"{power}*{force}" for power in ("t", "t*t") for force in ("a", "p", "o")]
-    products += [f"t*{force}" for force in ("a*a", "p*p", "a*p", "a*o", "p*o")]
+    products += [f"{power}*{force}" for power in ("t", "t*t") for force in ("a*a", "p*p", "a*p", "a*o", "p*o")]
     yield _term("time and specific force", "scale in time", products)
-    decays = tuple((f"exp(-t/({10 * decay_s}*s))",) for decay_s in _DECAYS_S if decay_s <= dwells[-1].end_s)
-    yield _one_of("time (a decay)", "bias in time", decays or (("exp(-t/(30*s))",),))
+    decays = [f"exp(-t/({10 * decay_s}*s))" for decay_s in _DECAYS_S if decay_s <= dwells[-1].end_s]
+    decays = decays or ["exp(-t/(30*s))"]
+    yield _one_of("time (a decay)", "bias in time", _neighbours(decays))
+    forces = [("a",), ("p", "o")]
+    yield _one_of("time and specific force (a decay)", "scale in time",
+                  [tuple(f"{decay}*{f}" for f in force for decay in pair)
+                   for pair in _neighbours(decays) for force in forces])  # fmt: skip
     waves = [tuple(f"{wave}({n}*2*pi*t/{run_s})" for wave in ("sin", "cos")) for n in _TURNS]
     yield _one_of("time (periodic)", "bias in time", waves)
     if turns:
@@ -151,7 +161,7 @@ def _of_jumps(dwells: Sequence[DwellFactor], turns: bool) -> Iterator[UnknownTer
 def _of_arrival(gimbals: int, dwells: Sequence[DwellFactor]) -> Iterator[UnknownTerm]:
     longest_s = max(dwell.end_s - dwell.start_s for dwell in dwells)
     decays_s = [decay_s for decay_s in _DECAYS_S if decay_s <= 2.0 * longest_s] or [_DECAYS_S[0]]
-    yield _one_of("time since arrival", "memory", [(f"exp(-tau/({each}*s))",) for each in decays_s])
+    yield _one_of("time since arrival", "memory", _neighbours([f"exp(-tau/({each}*s))" for each in decays_s]))
     creeps = [tuple(f"{f}*exp(-tau/({each}*s))" for f in ("fx", "fy", "fz")) for each in decays_s]
     yield _one_of("time since arrival and specific force", "memory", creeps)
     for k in range(1, gimbals + 1):
@@ -165,13 +175,22 @@ def _of_arrival(gimbals: int, dwells: Sequence[DwellFactor]) -> Iterator[Unknown
 def _of_surroundings(gimbals: int, turns: bool) -> Iterator[UnknownTerm]:
     yield _term("temperature", "temperature", ["T", "T*T", "T**3"])
     products = [f"{power}*{force}" for power in ("T", "T*T") for force in ("a", "p", "o")]
-    products += [f"T*{force}" for force in ("a*a", "p*p", "a*p", "a*o", "p*o")]
+    products += [f"{power}*{force}" for power in ("T", "T*T") for force in ("a*a", "p*p", "a*p", "a*o", "p*o")]
     yield _term("temperature and specific force", "temperature", products)
     yield _term("rate of temperature", "temperature", ["dT", "a*dT"])
     if turns:
         for place, words in (("base", "a tilt of the base"), ("platform", "a rotation of the platform")):
             yield _term(f"temperature ({words})", "temperature", [f":{place} = T", f":{place} = T*T"])
-    texts = ["da", "da*abs(da)", "abs(da)", "tanh(da/(5*m/s**2))", "play3", "play6"]
+    texts = [
+        "da",
+        "da*abs(da)",
+        "abs(da)",
+        "tanh(da/(2*m/s**2))",
+        "tanh(da/(5*m/s**2))",
+        "tanh(da/(15*m/s**2))",
+        "play3",
+        "play6",
+    ]
     yield _term("previous orientation", "memory", [*texts, "a-da", "(a-da)**2"])
     steps = [f"{step}*{force}" for step in ("da", "abs(da)") for force in ("a", "p", "o")]
     yield _term("previous orientation and specific force", "memory", steps)
