@@ -28,7 +28,7 @@ from kf_calib.diagnosis.hypothesis_table import (
     noise_p,
     table_of,
 )
-from kf_calib.diagnosis.posterior import Posterior
+from kf_calib.diagnosis.posterior import RunPosterior
 from kf_calib.diagnosis.refits import (
     Refits,
     calibration_of,
@@ -141,14 +141,14 @@ def _explained(refits: Refits, before: Calibration, test: CandidateTests) -> Dia
     if test.consistent is None:
         return diagnosis
     if test.consistent and dwell_noise_is_stated(before):
-        return replace(diagnosis, table=Posterior(refits, before, test).table(refitted=False))
+        return replace(diagnosis, table=RunPosterior(refits, before, test).table(refitted=False))
     if test.consistent:  # noise that is estimated from all of the misfit explains as much of it as an effect does
-        table = Posterior(refits, before, test).table()
+        table = RunPosterior(refits, before, test).table()
         diagnosis = replace(diagnosis, test=replace(test, noise_p=noise_p(table)), table=table)
         return diagnosis if diagnosis.test.consistent else _decided(refits, diagnosis)
     if test.lines.oscillation:
         return _decided(refits, replace(diagnosis, table=_beside_lines(refits, before, test)))
-    return _decided(refits, replace(diagnosis, table=Posterior(refits, before, test).table()))
+    return _decided(refits, replace(diagnosis, table=RunPosterior(refits, before, test).table()))
 
 
 def _beside_lines(refits: Refits, before: Calibration, test: CandidateTests) -> HypothesisTable:
@@ -160,7 +160,7 @@ def _beside_lines(refits: Refits, before: Calibration, test: CandidateTests) -> 
     test_beside = refits.assess(with_oscillation, test.effects.independent_tests)
     log_odds = log_odds_of(test.effects.p_values[test.lines.oscillation])
     family = with_oscillation.model.effects[-1].family
-    posterior = Posterior(refits, with_oscillation, test_beside)
+    posterior = RunPosterior(refits, with_oscillation, test_beside)
     table = posterior.table() if test_beside.consistent is False else posterior.table(refitted=False)
     rows = [row for row in table.rows if row.driver != ALIKE]
     logs_without = [row.log_evidence for row in rows if not row.effects and not row.driver]

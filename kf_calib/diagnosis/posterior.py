@@ -40,6 +40,7 @@ from kf_calib.effects import effect_named
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.results import Calibration
 from kf_calib.noise.noise_model import Noise
+from kf_calib.support import stage
 from kf_calib.support.tail_probabilities import log_odds_of
 
 _IRREGULAR = 0.1  # share of an unknown cause in scatter that was not stated
@@ -57,7 +58,7 @@ _ROUNDING, _UNSEEN = 1e-6, 1e-3  # least scatter over the misfit: where noise wi
 _SUMMANDS, _MORE = 3, 3.0  # formulas that describe an unknown function at most, and what each has to gain
 
 
-class Posterior:
+class RunPosterior:
     """The posterior of one run.
 
     refits: those of the run. before: the run without what is missing. test: its linear tests.
@@ -77,6 +78,7 @@ class Posterior:
 
     def table(self, refitted: bool = True) -> HypothesisTable:
         """All rows with their probabilities; the likeliest are fitted if ``refitted``."""
+        stage.say(f"weighing {len(self._run.terms)} explanations in {len(self._sizes.covariances)} noises")
         rows = [*self._without_terms(), *self._singles(), self._one_dwell()]
         if refitted:
             rows = self._fitted([*rows, *self._pairs()])
@@ -201,6 +203,7 @@ class Posterior:
         """Return the rows of the likeliest effects, each with any other term beside it."""
         pairs = dict[tuple[str, str], float]()
         for name in self._heads():
+            stage.say(f"weighing all beside {name}")
             term = self._run.terms[self._best[name]]
             alone = self._base + self._log_bayes[self._best[name]] + self._log_share_of_best(name)
             # beside one more term less noise is likely, not more
@@ -241,8 +244,8 @@ class Posterior:
         of_heads = np.isin(names, heads)
         gains[of_heads[:, None] | of_heads] = -np.inf
         pairs = [divmod(k, len(names)) for k in np.argsort(-gains, axis=None)[:_HEADS].tolist()]
-        likely = [(names[i], names[j]) for i, j in pairs if gains[i, j] > least]
-        return [max(pair, key=lambda name: self._log_evidence[self._best[name]]) for pair in likely]
+        evidence = [float(self._log_evidence[self._best[name]]) for name in names]
+        return [names[i if evidence[i] > evidence[j] else j] for i, j in pairs if gains[i, j] > least]
 
     @cached_property
     def _best(self) -> dict[str, int]:

@@ -38,7 +38,7 @@ _MOST_ORIENTATIONS = 100  # that are told apart by what comes back with each
 
 
 @dataclass(frozen=True)
-class Term:
+class RunTerm:
     """Columns (q,) of one term in the likelihood.
 
     row: the name of an effect, or ``?`` and the number of an unknown function. log_share: log of its share in the prior
@@ -163,10 +163,10 @@ class RunTerms:
         """The effect of a formula without a name."""
         return formula(text_named(text), self.bench.axes, self.bench.gravity_mps2, checked=False)
 
-    def _seen(self, drafts: Sequence[Term]) -> list[Term]:
+    def _seen(self, drafts: Sequence[RunTerm]) -> list[RunTerm]:
         """Return the terms of which something is seen, with their sizes; a summand that is a known effect is none."""
         whole, raw = self.likelihood.whole(), self.likelihood.column_lengths()
-        known, terms, matrices = dict[tuple[int, ...], list[Floats]](), list[Term](), list[tuple[Indices, Floats]]()
+        known, terms, matrices = dict[tuple[int, ...], list[Floats]](), list[RunTerm](), list[tuple[Indices, Floats]]()
         for draft in drafts:
             columns = whole[:, draft.columns]
             if not (np.linalg.norm(columns, axis=0) > _SEEN * raw[draft.columns]).any():
@@ -252,7 +252,7 @@ class _Columns:
     the weights of the blocks' columns (0: as they are), and terms of blocks."""
 
     def __init__(self) -> None:
-        self.effects, self.blocks, self.terms = list[Effect](), list[tuple[slice, Floats | None]](), list[Term]()
+        self.effects, self.blocks, self.terms = list[Effect](), list[tuple[slice, Floats | None]](), list[RunTerm]()
         self._weights, self._places = list[Floats](), list[Indices]()
         self._made = self._count = 0
 
@@ -280,7 +280,7 @@ class _Columns:
              summands: tuple[int, ...] = (), scales: Floats | None = None) -> None:  # fmt: skip
         """Add a term with the columns of some blocks."""
         places = np.concatenate([self._places[block] for block in blocks])
-        self.terms.append(Term(row, places, log_share, effect, summands, scales=scales))
+        self.terms.append(RunTerm(row, places, log_share, effect, summands, scales=scales))
 
 
 class _Visits(Effect):

@@ -14,7 +14,6 @@ import kf_calib
 from kf_calib.diagnosis.hypothesis_table import IRREGULAR, NONE, NOTHING, Hypothesis, table_of
 from kf_calib.diagnosis.missing_effect import _grown, behind_nothing, diagnose
 from kf_calib.effects import walk_named
-from kf_calib.views.diagnosis import found_object
 
 
 def _result(held_out: float | None) -> Any:

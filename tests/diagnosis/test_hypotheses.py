@@ -13,7 +13,7 @@ from helpers.synthetic import plan_of
 
 from kf_calib.diagnosis.hypothesis_table import ALIKE, IRREGULAR, NOISE, NONE, NOTHING, Hypothesis, table_of
 from kf_calib.diagnosis.missing_effect import diagnose
-from kf_calib.diagnosis.posterior import Posterior
+from kf_calib.diagnosis.posterior import RunPosterior
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.effects import effect_named, names
@@ -187,7 +187,7 @@ def test_noise_from_dwell_to_dwell_may_be_an_unknown_cause(
     """The odds are 1 to 9 where nobody stated the scatter, and even where it contradicts what was stated and no
     orientation is repeated; a setting error that nobody stated is a setting error."""
     run, refits = noisy_run(dwells=24, states=states, seed=3, **noise), Refits()
-    table = Posterior(refits, run, refits.assess(run)).table(refitted=False)
+    table = RunPosterior(refits, run, refits.assess(run)).table(refitted=False)
     irregular = sum(row.probability for row in table.rows if row.driver == IRREGULAR)
     assert least <= irregular / table.families[NOISE] <= most
 

@@ -131,11 +131,13 @@ def scattered(repeated: int, with_orientation: bool) -> Diagnosis:
 
 
 def shares(diagnosis: Diagnosis) -> tuple[float, float]:
-    """Probabilities of noise beyond what was stated, and of changes of an unknown cause, irregular or alike at each visit
-    of an orientation."""
+    """Probabilities of noise beyond what was stated, and of changes of an unknown cause: irregular, or alike at each
+    visit of an orientation."""
     assert diagnosis.table is not None
     noise = diagnosis.table.families.get(NOISE, 0.0)
-    unknown = [row for row in diagnosis.table.rows if row.driver == IRREGULAR or row.driver.startswith("the orientation")]
+    unknown = [
+        row for row in diagnosis.table.rows if row.driver == IRREGULAR or row.driver.startswith("the orientation")
+    ]
     return noise, sum(row.probability for row in unknown)
 
 
