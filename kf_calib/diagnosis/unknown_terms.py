@@ -181,16 +181,7 @@ def _of_surroundings(gimbals: int, turns: bool) -> Iterator[UnknownTerm]:
     if turns:
         for place, words in (("base", "a tilt of the base"), ("platform", "a rotation of the platform")):
             yield _term(f"temperature ({words})", "temperature", [f":{place} = T", f":{place} = T*T"])
-    texts = [
-        "da",
-        "da*abs(da)",
-        "abs(da)",
-        "tanh(da/(2*m/s**2))",
-        "tanh(da/(5*m/s**2))",
-        "tanh(da/(15*m/s**2))",
-        "play3",
-        "play6",
-    ]
+    texts = ["da", "da*abs(da)", "abs(da)", *(f"tanh(da/({width}*m/s**2))" for width in (2, 5)), "play3", "play6"]
     yield _term("previous orientation", "memory", [*texts, "a-da", "(a-da)**2"])
     steps = [f"{step}*{force}" for step in ("da", "abs(da)") for force in ("a", "p", "o")]
     yield _term("previous orientation and specific force", "memory", steps)
