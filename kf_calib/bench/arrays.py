@@ -19,6 +19,7 @@ Times = NDArray[np.int64]
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+Indices = NDArray[np.intp]
 
 
 def lengths(vectors: Floats) -> Floats:

@@ -22,10 +22,10 @@ from kf_calib.estimation.dwell_columns import stimulus_of
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.observability import is_seen, smallest_size
-from kf_calib.estimation.results import consistency
+from kf_calib.estimation.results import Consistency, consistency
 from kf_calib.estimation.score_test import Frame
 from kf_calib.support import stage
-from kf_calib.support.tail_probabilities import LEVEL, sidak
+from kf_calib.support.tail_probabilities import LEVEL, f_tail, sidak
 
 SHARE = 0.4
 """Share of the false-alarm probability that is given to the test of the misfit, and as much to the scan."""
@@ -186,7 +186,7 @@ def assess_candidates(
         if name not in best or score > scores.get(name, -np.inf) + _TIE:
             best[name] = k
             if candidate.dof:
-                p_alone = sidak(float(chdtrc(candidate.dof, statistics[k])), candidate.tried)
+                p_alone = sidak(_p_alone(fitted, candidate.dof, float(statistics[k]), agreed), candidate.tried)
                 scores[name], p_values[name] = score, sidak(p_alone, tests)
     name = _walk_to_test(fitted)
     if name:
@@ -197,6 +197,17 @@ def assess_candidates(
         scores[name] = delta_chi2 - threshold(1, tests)
     effects = EffectTests(scan, best, scores, p_values, name, tests, slew_effects(model.bench))
     return _with_lines(CandidateTests(effects, agreed.p_value), fitted, frame)
+
+
+def _p_alone(fitted: Fit, dof: int, delta_chi2: float, agreed: Consistency) -> float:
+    """Return the p-value of a fall of chi-squared; by F, where all noise was estimated from what the model leaves."""
+    from scipy.special import chdtrc
+
+    if fitted.noise.within_seen:
+        return float(chdtrc(dof, delta_chi2))
+    rest = agreed.dof - dof
+    left = max(agreed.statistic - delta_chi2, 1e-12 * agreed.statistic)
+    return f_tail(dof, rest, delta_chi2 / dof / (left / rest)) if rest > 0 and left > 0.0 else 1.0
 
 
 def candidate_frame(fitted: Fit, frame: Frame | None = None) -> Frame:

@@ -13,14 +13,10 @@ The smallest size at which an effect would be found is computed from its columns
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.linalg import block_diag
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.candidate_tests import CandidateTests
@@ -32,10 +28,6 @@ from kf_calib.estimation.measurement_model import effect_columns
 
 _TAIL = 1.0  # decades beyond the usual sizes in which the density falls by a factor e
 _SHARPER = 100.0  # where only the greatest usual size is known, the least one is smaller by this factor
-_UNKNOWN_DECADES = 7.0  # above one sigma: where no usual size is known
-_STEPS = {1: 120, 2: 40, 3: 16}  # sizes that are tried, by number of effects
-_HIDDEN = 1e20  # SI: sigma of a coefficient of which rounding alone is seen
-_ABOVE = 300.0  # times the estimate: beyond it, sizes differ no more in evidence
 _SIZES = np.exp(np.linspace(0.0, math.log(1e14), 120))  # prior variance of a coefficient over that of its estimate
 
 QUIET = 1e-4
@@ -85,10 +77,6 @@ class SizePrior:
         return np.asarray((before + np.clip(at - low, 0.0, high - low) + after) / (high - low + 2.0 * self.tail), float)
 
 
-_ANY_SIZE = SizePrior(1.0, 10.0**_UNKNOWN_DECADES, 0.1)
-"""Where no usual size is known, of coefficients that are determined to one."""
-
-
 def usual_sizes(effect: Effect, grade: Grade) -> SizePrior | None:
     """The prior of an effect from the sizes that its coefficients usually have; None where these are not known."""
     if effect.expected is not None:
@@ -96,119 +84,6 @@ def usual_sizes(effect: Effect, grade: Grade) -> SizePrior | None:
         return SizePrior(spread, spread, 0.01, value)
     usual = effect.typical.of(grade)
     return None if usual is None else SizePrior(usual[0] or usual[1] / _SHARPER, usual[1])
-
-
-def log_bayes_of_sizes(
-    delta_chi2: float, root: Floats, estimate: Floats, groups: NDArray[np.intp], priors: Sequence[SizePrior]
-) -> float:
-    """Log Bayes factor of effects whose sizes are averaged over their priors, against no effect.
-
-      B = exp(F / 2) mean over s of N(c; m, C + S^2) / N(c; c, C),  C = (R^T R)^-1
-
-    - delta_chi2: the decrease F of chi-squared with them.
-    - root (r, q): a root R of the information on their coefficients, all else averaged out.
-    - estimate (q,): the coefficients c, in any directions that R does not see.
-    - groups (q,): the number of the effect that each coefficient belongs to. priors: of these effects.
-    """
-    centre = np.array([prior.value for prior in priors])[groups]
-    left = root @ (estimate - centre)
-    nodes = [_nodes(root[:, groups == k], estimate[groups == k], prior, len(priors)) for k, prior in enumerate(priors)]
-    if len(nodes) == 1:
-        return 0.5 * delta_chi2 + _log_density(root, left, *nodes[0])
-    mesh = np.meshgrid(*(sizes for sizes, _ in nodes), indexing="ij")
-    log_weights = sum(np.meshgrid(*(np.log(weights) for _, weights in nodes), indexing="ij"))
-    sizes = np.stack([each.ravel() for each in mesh], axis=1)[:, groups]
-    scaled = root * sizes[:, None, :]  # (n, r, q)
-    spread = np.eye(len(groups)) + np.swapaxes(scaled, 1, 2) @ scaled
-    along = left @ scaled
-    misfit = left @ left - np.einsum("nq,nq->n", along, np.linalg.solve(spread, along[..., None])[..., 0])
-    logs = np.ravel(log_weights) - 0.5 * (np.linalg.slogdet(spread)[1] + misfit)
-    return 0.5 * delta_chi2 + float(np.logaddexp.reduce(logs))
-
-
-def _log_density(root: Floats, left: Floats, sizes: Floats, weights: Floats) -> float:
-    """Return log mean over s of N(c; m, C + s^2) / N(c; c, C) of the coefficients of one effect, which share their
-    size s, from the singular values w of R: C + s^2 has the information w^2 / (1 + s^2 w^2) along their directions."""
-    along, singular, _ = np.linalg.svd(root, full_matrices=False)
-    scaled = (sizes[:, None] * singular) ** 2
-    misfit = left @ left - np.sum((left @ along) ** 2 * scaled / (1.0 + scaled), axis=1)
-    return float(np.logaddexp.reduce(np.log(weights) - 0.5 * (np.log1p(scaled).sum(axis=1) + misfit)))
-
-
-def _nodes(root: Floats, estimate: Floats, prior: SizePrior, effects: int) -> tuple[Floats, Floats]:
-    """Return sizes (n,) and their prior probabilities (n,), of all sizes from one sigma of the coefficient that is
-    determined best: an effect that is smaller shows nothing, and belongs to the explanation without it. One of which
-    nothing is seen beside the others changes nothing: its size is zero."""
-    least = best_sigma(root)
-    if least > _HIDDEN:
-        return np.zeros(1), np.ones(1)
-    if prior.value:
-        return np.array([prior.low]), np.ones(1)
-    most = _ABOVE * max(float(np.abs(estimate).max(initial=0.0)), least)
-    edges = np.geomspace(least, most, _STEPS.get(effects, 8) + 1)
-    sizes = np.sqrt(edges[1:] * edges[:-1])
-    weights = np.diff(prior.below(edges))
-    weights[-1] += 1.0 - prior.below(edges[-1:])[0]
-    return sizes, np.maximum(weights, 1e-300)
-
-
-@dataclass(frozen=True)
-class AddedEffects:
-    """What is known beforehand of the coefficients of effects that are added to a model.
-
-    - effects: those of them that have coefficients. grade: of the sensors.
-    - dof: the number of coefficients that are seen.
-    """
-
-    effects: Sequence[Effect]
-    grade: Grade
-    dof: int
-
-    def log_bayes(self, delta_chi2: float, root: Floats, readings: Floats) -> float:
-        """The log Bayes factor of the effects against none, averaged over all relations that the coefficients may have.
-
-        delta_chi2: decrease of chi-squared with them. root (r, q), readings (r,): what the run says of the coefficients
-        is root @ c = readings, in noise of unit size.
-        """
-        blocks = [effect.relations or [np.eye(len(effect.coefficients))] for effect in self.effects]
-        readings = root @ _solved(root, readings)
-        logs = [self._log_bayes(delta_chi2, root, readings, relation) for relation in itertools.product(*blocks)]
-        return float(np.logaddexp.reduce(logs)) - math.log(len(logs))
-
-    def _log_bayes(self, delta_chi2: float, root: Floats, readings: Floats, relation: Sequence[Floats]) -> float:
-        """Return the log Bayes factor where the coefficients of each effect are a matrix times free numbers."""
-        widths = [matrix.shape[1] for matrix in relation]
-        usual = [usual_sizes(effect, self.grade) for effect in self.effects]
-        related, groups = root @ np.asarray(block_diag(*relation), float), np.repeat(np.arange(len(widths)), widths)
-        sized, priors = [k for k, prior in enumerate(usual) if prior], [*filter(None, usual)]
-        others = ~np.isin(groups, sized)
-        if sized and others.any():
-            shared = _directions(related[:, others])
-            groups = np.append(np.searchsorted(sized, groups[~others]), np.full(shared.shape[1], len(sized)))
-            related = np.column_stack([related[:, ~others], shared])
-            priors += [_ANY_SIZE] if shared.shape[1] else []
-        estimate = _solved(related, readings)
-        left = readings - related @ estimate
-        delta_chi2 = max(delta_chi2 - float(left @ left), 0.0)
-        if not sized:
-            return float(size_evidence(min(self.dof, sum(widths)), delta_chi2))
-        return log_bayes_of_sizes(delta_chi2, related, estimate, groups, priors)
-
-
-def _directions(root: Floats) -> Floats:
-    """Return orthonormal columns (r, k) that span those of a root (r, q): coefficients of one sigma each, whatever the
-    units were, so that one size of them all is that of the g-prior (``size_evidence``)."""
-    lengths = np.linalg.norm(root, axis=0)
-    left, singular, _ = np.linalg.svd(root / np.where(lengths > 0.0, lengths, 1.0), full_matrices=False)
-    return left[:, singular > 1e-9]
-
-
-def _solved(root: Floats, readings: Floats) -> Floats:
-    """Return the shortest least-squares solution of root @ x = readings, with columns of any scale; zero where
-    rounding alone is seen."""
-    lengths = np.linalg.norm(root, axis=0)
-    lengths = np.where(lengths * _HIDDEN > 1.0, lengths, 1.0)
-    return np.asarray(np.linalg.lstsq(root / lengths, readings, rcond=1e-9)[0] / lengths, float)
 
 
 def best_sigma(root: Floats) -> float:

@@ -1,6 +1,6 @@
 """Explanations of a misfit with their probabilities, as one table.
 
-Its rows are made and weighed by ``hypotheses``.
+Its rows are made and weighed by ``posterior``.
 """
 
 from __future__ import annotations
@@ -35,10 +35,11 @@ CREDIBLE = 0.99
 LISTED = 0.01
 """Least probability of an explanation that has a line of its own where the table is shown."""
 
-KINDS = {"nothing": 0.4, "effect": 0.4, "pair": 0.08, "beside": 0.02, "formula": 0.1}
-"""Prior probability of each kind of explanation; ``beside``: a known effect beside a formula."""
+PRIOR = {"nothing": 0.4, "effect": 0.38, "pair": 0.08, "unknown": 0.1, "beside": 0.02, "dwell": 0.02}
+"""Prior probability of each kind of explanation; ``beside``: an effect beside an unknown function; ``dwell``: one dwell
+alone is off."""
 
-_ALIKE = 0.05 * KINDS["formula"]  # of what has a known effect's look: what is in no catalogue, and 1 of 20 looks so
+_ALIKE = 0.05 * PRIOR["unknown"]  # of what has a known effect's look: what is in no catalogue, and 1 of 20 looks so
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ class Hypothesis:
     - families: the physical classes of the effects.
     - log_evidence: of the row with its prior, natural logarithm. probability: its share in all rows.
     - statistic, dof: fall of chi-squared in the likeliest noise, and the number of coefficients; of a random walk alone
-      twice its gain in likelihood.
+      twice its gain in likelihood; 0 of what was not fitted.
     - refit: the calibration with it; None where none was made.
     """
 
@@ -168,5 +169,5 @@ def noise_p(table: HypothesisTable) -> float:
     with a probability of p at most (Markov's inequality).
     """
     alone = table.families.get(NOTHING, 0.0) + table.families.get(NOISE, 0.0)
-    before = KINDS["nothing"] / (1.0 - KINDS["nothing"])
+    before = PRIOR["nothing"] / (1.0 - PRIOR["nothing"])
     return min(1.0, alone / max(1.0 - alone, 1e-300) / before)

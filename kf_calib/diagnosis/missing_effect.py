@@ -1,12 +1,9 @@
 """Diagnosis of a calibration: which physical effect is missing in its model, and which others explain it, too.
 
 Whether anything is missing is decided by ``candidate_tests``, with a false-alarm rate that holds for the run. What it
-is, is decided by the table of ``hypotheses``: the likeliest row gives the verdict, and the rows that have 99 % of the
-probability together are the set that is named.
-
-The table compares explanations with each other, so that its first row may have all of the probability although it shows
-nothing by itself. A name must therefore be earned (``unearned``): by a coefficient that is seen, and by an error that
-does not grow on dwells that the row's refit leaves out.
+is, is decided by the ``posterior`` over all explanations: the likeliest row gives the verdict, and the rows that have
+99 % of the probability together are the set that is named. Effects that make the error of orientations left out larger
+are not named.
 """
 
 from __future__ import annotations
@@ -20,7 +17,6 @@ import numpy as np
 from kf_calib.bench.arrays import one_blas_thread
 from kf_calib.bench.streams import Source
 from kf_calib.diagnosis.candidate_tests import CandidateTests, overlap_matrix
-from kf_calib.diagnosis.hypotheses import Hypotheses, log_odds_of
 from kf_calib.diagnosis.hypothesis_table import (
     ALIKE,
     LISTED,
@@ -32,6 +28,7 @@ from kf_calib.diagnosis.hypothesis_table import (
     noise_p,
     table_of,
 )
+from kf_calib.diagnosis.posterior import RunPosterior
 from kf_calib.diagnosis.refits import (
     Refits,
     calibration_of,
@@ -46,12 +43,11 @@ from kf_calib.dwells import window_average
 from kf_calib.effects import effect_named
 from kf_calib.estimation.outlying_dwell import outlying_in_words
 from kf_calib.estimation.results import Calibration, format_p
-from kf_calib.support.tail_probabilities import chi_squared_tail
+from kf_calib.support.tail_probabilities import chi_squared_tail, log_odds_of
 
 _SHOWN = 6  # number of suspects that are shown
 _DOUBT = 0.01  # probability from which noise that was not stated is named as a rival
 _NOISE = 1e-6  # p-value below which readings within dwells hold more than an oscillation and noise
-_RETURNS = 1.36  # gain in log-likelihood that 1 of 20 true random walks exceeds with a time constant to return in
 
 
 def diagnose(
@@ -116,7 +112,6 @@ def _oscillating(refits: Refits, before: Calibration) -> Diagnosis | None:
 
 def _in_words(diagnosis: Diagnosis) -> Diagnosis:
     """Return a diagnosis with its verdict."""
-    diagnosis = replace(diagnosis, restoring_time_s=_restoring_time_s(diagnosis))
     words = verdict_in_words(diagnosis) + second_pass_in_words(diagnosis) + disturbance_in_words(diagnosis)
     return replace(diagnosis, verdict=words)
 
@@ -146,14 +141,14 @@ def _explained(refits: Refits, before: Calibration, test: CandidateTests) -> Dia
     if test.consistent is None:
         return diagnosis
     if test.consistent and dwell_noise_is_stated(before):
-        return replace(diagnosis, table=Hypotheses(refits, before, test).quick_table())
+        return replace(diagnosis, table=RunPosterior(refits, before, test).table(refitted=False))
     if test.consistent:  # noise that is estimated from all of the misfit explains as much of it as an effect does
-        table = Hypotheses(refits, before, test).table()
+        table = RunPosterior(refits, before, test).table()
         diagnosis = replace(diagnosis, test=replace(test, noise_p=noise_p(table)), table=table)
         return diagnosis if diagnosis.test.consistent else _decided(refits, diagnosis)
     if test.lines.oscillation:
         return _decided(refits, replace(diagnosis, table=_beside_lines(refits, before, test)))
-    return _decided(refits, replace(diagnosis, table=Hypotheses(refits, before, test).table()))
+    return _decided(refits, replace(diagnosis, table=RunPosterior(refits, before, test).table()))
 
 
 def _beside_lines(refits: Refits, before: Calibration, test: CandidateTests) -> HypothesisTable:
@@ -165,8 +160,8 @@ def _beside_lines(refits: Refits, before: Calibration, test: CandidateTests) -> 
     test_beside = refits.assess(with_oscillation, test.effects.independent_tests)
     log_odds = log_odds_of(test.effects.p_values[test.lines.oscillation])
     family = with_oscillation.model.effects[-1].family
-    hypotheses = Hypotheses(refits, with_oscillation, test_beside)
-    table = hypotheses.table() if test_beside.consistent is False else hypotheses.quick_table()
+    posterior = RunPosterior(refits, with_oscillation, test_beside)
+    table = posterior.table() if test_beside.consistent is False else posterior.table(refitted=False)
     rows = [row for row in table.rows if row.driver != ALIKE]
     logs_without = [row.log_evidence for row in rows if not row.effects and not row.driver]
     both = [
@@ -197,12 +192,9 @@ def _decided(refits: Refits, diagnosis: Diagnosis) -> Diagnosis:
         if retest.consistent is False:
             final_test = retest.with_vibration(test.lines.vibration)
             diagnosis, test = replace(diagnosis, before_in_noise_left=before_in_noise_left, test=final_test), retest
-    why_not = (
-        unearned(first, before, test.effects.walk)
-        or _worse_alone(refits, before, first)
-        or behind_nothing(first, table)
-    )
-    certain = _certain_part(first, table, before, test.effects.walk) if why_not else None
+    after = _after(refits, before, first) if first.effects else None
+    why_not = _grown(before, first.effects, after) or behind_nothing(first, table)
+    certain = _certain_part(first, table, before)
     if certain is not None:
         table, first, why_not = replace(table, certain=certain), certain, ""
         diagnosis = replace(diagnosis, table=table)
@@ -225,20 +217,18 @@ def _decided(refits: Refits, diagnosis: Diagnosis) -> Diagnosis:
     )
 
 
-def _certain_part(first: Hypothesis, table: HypothesisTable, before: Calibration, walk: str) -> Hypothesis | None:
-    """Return the row of some of the effects of the likeliest row that have earned their name and are missing with 95 %
-    probability, alone or with others; None where there is none."""
+def _certain_part(first: Hypothesis, table: HypothesisTable, before: Calibration) -> Hypothesis | None:
+    """Return the row of some of the effects of the likeliest row that are missing with 95 % probability, alone or with
+    others, where all of them are not; None where there is none."""
+    if (
+        table.probability(first.effects) >= SURE
+        and not first.formulas
+        and not _grown(before, first.effects, first.refit)
+    ):
+        return None
     parts = [row for row in table.rows if row.refit is not None and row.effects and not row.formulas]
     parts = [row for row in parts if set(row.effects) < set(first.effects) and table.probability(row.effects) >= SURE]
-    return next((row for row in parts if not unearned(row, before, walk)), None)
-
-
-def _worse_alone(refits: Refits, before: Calibration, first: Hypothesis) -> str:
-    """Why the effects of a row must not be named where only the formula beside them keeps the held-out error from
-    growing; "" elsewhere."""
-    if not (first.effects and first.formulas):
-        return ""
-    return _grown(before, refits.with_effects(before, first.effects), first.effects)
+    return next((row for row in parts if not _grown(before, row.effects, row.refit)), None)
 
 
 def behind_nothing(first: Hypothesis, table: HypothesisTable) -> str:
@@ -282,92 +272,16 @@ def _suspects(diagnosis: Diagnosis, table: HypothesisTable) -> tuple[Suspect, ..
     return tuple(suspects)
 
 
-def _restoring_time_s(diagnosis: Diagnosis) -> float | None:
-    """Return the time constant of a drift that returns, in s, where that explains the run better than the random walk
-    named; None where no walk was named, or where 1 of 20 true random walks gains as much likelihood."""
-    after, named = diagnosis.after, diagnosis.test.effects.walk in diagnosis.missing
-    if after is None or not named or not after.noise.walk_mps2_per_sqrt_s:
-        return None
-    gain, restoring_time_s = after.fit.gauss_markov_gain
-    return restoring_time_s if gain > _RETURNS else None
+_GROWN = 1.05  # the held-out error with effects over that without them; what shows only within dwells changes little
 
 
-SEEN = 3.0
-"""In sigmas of its refit: the least size of the largest coefficient of an effect that is named."""
-
-_TOGETHER_P = 6e-7  # of 5 sigma: of coefficients that are all determined, but clear only together
-_AS_IT_WAS = 0.98  # the held-out error with an effect over that without it, above which it has not fallen
-_GROWN = 1.05  # the same, above which it has grown; what shows only within dwells, or in slews, changes little
-_FAILS = 1.2  # the held-out error over what noise gives, above which orientations that are left out are not explained
-
-
-def unearned(row: Hypothesis, before: Calibration, walk: str) -> str:
-    """Why the effects of a row must not be named, or its formulas not be believed, in words that follow "but"; "" where
-    they may, or where no refit was made.
-
-    before: the calibration without them. walk: the name of the random walk, which has no coefficient.
-    """
-    after = row.refit
-    if after is None:
+def _grown(before: Calibration, effects: Sequence[str], after: Calibration | None) -> str:
+    """In words that follow "but": that the error of orientations left out grows with effects; "" where it does not, or
+    where no fit was made."""
+    if after is None or not effects:
         return ""
-    left = after.consistency.overdispersion**0.5
-    for name in row.effects:
-        if name == walk and _walk_sigma(before) < SEEN:
-            return f"{name} is below {SEEN:g} sigma"
-        if name == walk or _is_seen(after, name, left):
-            continue
-        beside = f" of what is left, which is {left:.2g} times the noise" if _is_seen(after, name, 1.0) else ""
-        return f"no coefficient of {name} is beyond {SEEN:g} sigma{beside}"
-    if grown := _grown(before, after, row.effects):
-        return grown
-    errors = before.held_out_rms_mps2, after.held_out_rms_mps2
-    if errors[0] is None or errors[1] is None:
-        return ""
-    floor_mps2 = after.held_out_floor_mps2
-    if floor_mps2 is not None and errors[1] > max(_AS_IT_WAS * errors[0], _FAILS * floor_mps2):
-        named = [effect for effect in after.model.effects if str(effect) in row.effects]
-        if named and all(effect.oscillates for effect in named):
-            return "it goes on within the orientations, and leaves the misfit between them as it was"
-        what = "they leave" if len(row.effects) > 1 else "it leaves"
-        return f"{what} the error of orientations left out as it was"
-    return ""
-
-
-def _grown(before: Calibration, after: Calibration, effects: Sequence[str]) -> str:
-    """In words that follow "but": that the error of orientations left out grows with these effects; "" if not."""
     errors = before.held_out_rms_mps2, after.held_out_rms_mps2
     if errors[0] is None or errors[1] is None or errors[1] <= _GROWN * errors[0]:
         return ""
     what = "they make" if len(effects) > 1 else "it makes"
     return f"{what} the held-out error {errors[1] / errors[0]:.3g} times as large"
-
-
-def _is_seen(after: Calibration, name: str, left: float) -> bool:
-    """Tell whether a coefficient of an effect is beyond three sigmas, or all together are beyond doubt, in a noise that
-    is ``left`` times as large."""
-    return _largest_ratio(after, name) >= SEEN * left or _clear_together(after, name, left)
-
-
-def _largest_ratio(after: Calibration, name: str) -> float:
-    """Return the largest of an effect's coefficients over its sigma; 0 where none is determined."""
-    effect = next(each for each in after.model.effects if str(each) == name)
-    known = [after.parameters[coefficient.symbol] for coefficient in effect.parameters]
-    return max((abs(p.value) / p.sigma for p in known if p.value is not None and p.sigma), default=0.0)
-
-
-def _clear_together(after: Calibration, name: str, left: float) -> bool:
-    """Tell whether the coefficients of an effect are beyond doubt by their joint covariance, though none is alone, as
-    of columns that are alike; in a noise that is ``left`` times as large."""
-    effect = next(each for each in after.model.effects if str(each) == name)
-    if any(after.parameters[coefficient.symbol].value is None for coefficient in effect.coefficients):
-        return False
-    first = after.model.parts[name].start
-    places = slice(first, first + len(effect.coefficients))
-    state, covariance = after.estimate.state[places], after.estimate.covariance[places, places]
-    statistic = float(state @ np.linalg.lstsq(covariance, state, rcond=None)[0])
-    return chi_squared_tail(len(state), statistic / left**2) < _TOGETHER_P
-
-
-def _walk_sigma(before: Calibration) -> float:
-    """Return the significance of a random walk in sigmas: the square root of what it takes from chi-squared."""
-    return float(max(2.0 * before.fit.walk_gain, 0.0)) ** 0.5

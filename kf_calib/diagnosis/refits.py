@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike
 
@@ -11,8 +11,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats, one_blas_thread
 from kf_calib.bench.streams import Source, Table
 from kf_calib.diagnosis.candidate_tests import CandidateTests, assess_candidates, candidate_frame
-from kf_calib.diagnosis.unknown_effect import FormulaFamily, families
-from kf_calib.effects import Effect, oscillation_of
+from kf_calib.effects import oscillation_of
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.calibration import calibrate, evaluate_fit
 from kf_calib.estimation.dwell_pass import holds_its_oscillation
@@ -42,10 +41,8 @@ class Refits:
         source = None if source is None else opened(source)
         self.source = None if isinstance(source, Table) else source
         self._frame: Frame | None = None  # only the last one is kept, to save memory
-        self._frame_beside_walk: Frame | None = None
         # with each value what its key is made of, since the id of an object that is gone may be used again
         self._refits = dict[tuple[int, tuple[str, ...]], tuple[Calibration, Calibration]]()
-        self._families = dict[Hashable, tuple[Fit, list[FormulaFamily]]]()
 
     def of(self, before: Calibration, effects: Sequence[str]) -> Calibration:
         """The run of a calibration with these effects in the model instead of those it had."""
@@ -65,18 +62,6 @@ class Refits:
     def assess(self, result: Calibration, tests: float | None = None) -> CandidateTests:
         """Score tests of all candidates against a calibration, see ``assess_candidates``."""
         return assess_candidates(result.fit, tests, frame=self.frame_of(result.fit))
-
-    def assess_beside_walk(self, result: Calibration, tests: float) -> CandidateTests:
-        """The same against a calibration with a random walk of the biases, whose frame is kept apart."""
-        self._frame_beside_walk = candidate_frame(result.fit, self._frame_beside_walk)
-        return assess_candidates(result.fit, tests, frame=self._frame_beside_walk)
-
-    def families(self, fitted: Fit, known: Sequence[Effect]) -> list[FormulaFamily]:
-        """All families of formulas, each tested on what the fit leaves and compared with the effects ``known``."""
-        key = id(fitted), tuple((str(effect), effect.value) for effect in known)
-        if key not in self._families:
-            self._families[key] = fitted, families(fitted, known, self.frame_of(fitted))
-        return self._families[key][1]
 
     def frame_of(self, fitted: Fit) -> Frame:
         """The columns of all candidates in the noise of a fit: those of the last fit if they serve."""

@@ -13,11 +13,11 @@ from kf_calib.design.next_orientation import Advice
 from kf_calib.diagnosis.candidate_tests import CandidateTests
 from kf_calib.diagnosis.coefficient_sizes import Detectable, Unseen, detectable, sensor_grade, unseen
 from kf_calib.diagnosis.explanation import Explanation
-from kf_calib.diagnosis.hypothesis_table import SURE, Hypothesis, HypothesisTable
+from kf_calib.diagnosis.hypothesis_table import ALIKE, IRREGULAR, SURE, Hypothesis, HypothesisTable
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.replication import Replication
 from kf_calib.diagnosis.residual_drivers import Driver, drivers_of
-from kf_calib.diagnosis.unknown_effect import Description, channel_of, describe, explained_share
+from kf_calib.diagnosis.unknown_effect import Description, channel_of, describe_irregular, explained_share
 from kf_calib.effects.effect import Grade
 from kf_calib.estimation.results import Calibration, Parameter
 from kf_calib.noise.noise_model import mean_covariances
@@ -69,10 +69,9 @@ class Diagnosis:
     that was not stated has more than 1 %. after: the calibration with the missing effects. suspects: single effects
     that were refitted, the likeliest first.
 
-    restoring_time_s: time constant with which the biases may return, s, in place of the random walk that is named
-    (None: they do not). before_in_noise_left: ``before`` in the noise that the likeliest explanation leaves, where
-    noise was estimated (None: it is that of ``before``). replication: how what is named predicts dwells that choosing
-    it never saw (None: nothing is named, or it was not asked for).
+    before_in_noise_left: ``before`` in the noise that the likeliest explanation leaves, where noise was estimated
+    (None: it is that of ``before``). replication: how what is named predicts dwells that choosing it never saw (None:
+    nothing is named, or it was not asked for).
     """
 
     before: Calibration
@@ -89,7 +88,6 @@ class Diagnosis:
     after: Calibration | None = None
     together: tuple[tuple[str, str], ...] = ()
     as_scatter: bool = False
-    restoring_time_s: float | None = None
     before_in_noise_left: Calibration | None = None
     replication: Replication | None = None
 
@@ -116,7 +114,8 @@ class Diagnosis:
             return None
         first, residuals = self.likeliest, self.before.residuals_mps2
         if first is None or not first.formulas or first.refit is None:
-            return describe(self.before.fit, residuals, self.test.trend)
+            driver = "" if first is None or first.driver in (IRREGULAR, ALIKE) else first.driver
+            return describe_irregular(self.before.fit, residuals, self.test.trend, driver)
         share = explained_share(self.before.fit, first.refit.fit)
         return Description(channel_of(residuals), first.driver, share, first.formulas)
 

@@ -10,7 +10,6 @@ from kf_calib.diagnosis.candidate_tests import CandidateTests
 from kf_calib.diagnosis.hypothesis_table import IRREGULAR, NOISE, NONE, NOTHING, SURE, Hypothesis
 from kf_calib.diagnosis.refits import dwell_noise_is_stated
 from kf_calib.diagnosis.results import Diagnosis
-from kf_calib.diagnosis.unknown_effect import one_digit_seconds
 from kf_calib.estimation.dwell_pass import holds_its_oscillation
 from kf_calib.estimation.results import Parameter, format_p
 from kf_calib.support.units import shown, significant
@@ -52,7 +51,7 @@ def verdict_in_words(diagnosis: Diagnosis) -> str:
     if first.effects and diagnosis.unearned:
         return f"{start} {_not_named(diagnosis, first)}."
     if first.effects:
-        return f"{start} {_named(diagnosis, first)}{_returning(diagnosis)}.{_held_out(diagnosis)}{_unusual(diagnosis)}"
+        return f"{start} {_named(diagnosis, first)}.{_held_out(diagnosis)}{_unusual(diagnosis)}"
     said = _noise(diagnosis, first) if diagnosis.noise else _unknown(diagnosis, first)
     if not _may_be_chance(diagnosis, first):
         return f"{start} {said}"
@@ -257,13 +256,6 @@ def format_probability(probability: float) -> str:
     if percent > 99.9 or percent < 0.1:
         return "over 99.9 %" if percent > 50.0 else "under 0.1 %"
     return f"{percent:.1f} %" if percent > 99.0 or percent < 1.0 else f"{percent:.0f} %"
-
-
-def _returning(diagnosis: Diagnosis) -> str:
-    """Return the words for biases that return, as an alternative to a walk."""
-    if not diagnosis.restoring_time_s:
-        return ""
-    return f"; biases that return to their mean within about {one_digit_seconds(diagnosis.restoring_time_s)} fit better"
 
 
 def _size(diagnosis: Diagnosis) -> str:

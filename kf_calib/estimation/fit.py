@@ -18,7 +18,7 @@ from kf_calib.estimation import free_attitude, square_root_information, whitened
 from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise, flicker_sigma, slow_waves, steps
-from kf_calib.noise.reml import Part, gain_of, gauss_markov_gains, misfit, with_shared_noise
+from kf_calib.noise.reml import Part, gain_of, misfit, with_shared_noise
 from kf_calib.noise.temperature_course import thermometer_errors
 
 _DETERMINED = 1e-9  # share of a state in combinations that are not determined
@@ -211,23 +211,6 @@ class Fit:
         """Return the noise without a walk, the means with columns for slow scatter, and the prior of these columns."""
         noise, linearised = replace(self.noise.for_goodness_of_fit, walk_mps2_per_sqrt_s=0.0), self.linearised
         return noise, *with_shared_noise(linearised.dwells, noise, linearised.means)
-
-    @cached_property
-    def gauss_markov_gains(self) -> tuple[Floats, Floats]:
-        """Gains in log-likelihood (k,) of mean-reverting (Gauss-Markov) walks over the likeliest random walk, and their
-        time constants (k,), s.
-
-        The slow part of a stated scatter is allowed for.
-        """
-        _, means, prior = self._wandering
-        return gauss_markov_gains(self.noise.for_goodness_of_fit, means, self.linearised.state, prior)
-
-    @property
-    def gauss_markov_gain(self) -> tuple[float, float]:
-        """The largest of these gains, 0 where none gains anything, and its time constant, s."""
-        gains, times_s = self.gauss_markov_gains
-        best = int(np.argmax(gains))
-        return max(float(gains[best]), 0.0), float(times_s[best])
 
     def rows(self, noise: Noise | None = None) -> Sequence[Floats]:
         """Whitened rows [H | z] of each dwell, with the weights of the fit or with another noise."""

@@ -16,8 +16,7 @@ orthonormal once, and each group is reduced to a small triangle of its own.
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,16 +24,15 @@ from numpy.typing import NDArray
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.line_spectrum import SpectralLine
-from kf_calib.dwells.qr import orthonormal, triangle
+from kf_calib.dwells.qr import orthonormal
 from kf_calib.dwells.sufficient_statistics import DwellFactor, lines_of
 from kf_calib.effects import Effect, Stimulus
 from kf_calib.estimation import square_root_information, whitened_rows
-from kf_calib.estimation.candidate_scan import SEEN, Complement, Scan, counts_of, is_within, project, scan_of, slices
+from kf_calib.estimation.candidate_scan import SEEN, Complement, Scan, counts_of, project, slices
 from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns, piece_columns, stimulus_of
 from kf_calib.estimation.periodogram import Periodogram
 from kf_calib.estimation.whitened_rows import MisfitColumns
 from kf_calib.noise import random_walk
-from kf_calib.noise.means import means_of
 from kf_calib.noise.noise_model import Noise, steps
 
 _TOGETHER = 24  # least number of columns that are whitened at a time; more would take more memory
@@ -201,29 +199,6 @@ def delta_chi2(linearised: LinearisedDwells, noise: Noise, effects: Sequence[Eff
     return np.concatenate(deltas)
 
 
-def unweighted_left(linearised: LinearisedDwells, effects: Sequence[Effect]) -> Floats:
-    """The share (n,) of the sum of squares of the residuals of the dwells' means that each effect, added alone, leaves;
-    all means of all accelerometers have the same weight."""
-    means, state = linearised.means, linearised.state
-    added = means_of(
-        linearised.dwells_at_state,
-        candidate_columns(linearised.dwells_at_state, effects, linearised.model.bench, state),
-    ).design
-    design = means.design.reshape(-1, means.design.shape[2])
-    columns = np.hstack([added.reshape(len(design), -1), means.readings.reshape(-1, 1)])
-    basis, sizes = _spanned(design / linearised.sizes), np.linalg.norm(columns, axis=0)
-    rest = columns - basis @ (basis.T @ columns)
-    left, rest = rest[:, -1], rest / np.where(sizes > 0, sizes, 1.0)
-    explained = (np.sum((_spanned(rest[:, part]).T @ left) ** 2) for part in slices(counts_of(effects)))
-    return 1.0 - np.array([*explained]) / max(float(left @ left), 1e-300)
-
-
-def _spanned(columns: Floats) -> Floats:
-    """Return an orthonormal basis of columns of about unit length, without directions that are rounding."""
-    left, singular, _ = np.linalg.svd(columns, full_matrices=False)
-    return left[:, singular > SEEN]
-
-
 def joint_delta_chi2(
     linearised: LinearisedDwells, noise: Noise, groups: Sequence[Sequence[Effect]]
 ) -> list[tuple[float, int]]:
@@ -302,74 +277,3 @@ def _with_and_without_walk(
 def _inside(noise: Noise) -> int:
     """Number of leading columns of a dwell's rows that belong to the steps of the biases within the dwell."""
     return 3 if noise.walk_mps2_per_sqrt_s else 0
-
-
-class FurtherEffects:
-    """Tests of groups of effects beside the model in ``linearised``, compared with ``known`` effects.
-
-    An effect counts as known if the cosine of the largest angle between it and one of these is above ``cosine``.
-    """
-
-    def __init__(self, frame: Frame, linearised: LinearisedDwells, known: Sequence[Effect], cosine: float) -> None:
-        self._frame, self._carried, self._cosine = frame, linearised, cosine
-        rows, width = frame.whitened_model(linearised)
-        self._beside = Complement(rows, width)
-        self._residual = self._beside.of(rows[:, -1])
-        self._known, self._parts = self._bases(known)
-
-    def _bases(self, known: Sequence[Effect]) -> tuple[Floats, list[slice]]:
-        """Return orthonormal bases (m, k) of what the model leaves of each known effect, and the columns of each."""
-        bases, parts, last = np.empty((len(self._residual), sum(counts_of(known)))), list[slice](), 0
-        for some, columns in self._columns(known):
-            rest = self._beside.of(columns)
-            for effect, part in zip(some, slices(counts_of(some)), strict=True):
-                candidate = self._scan([effect], columns[:, part], rest[:, part]).candidates[0]
-                if candidate.dof:
-                    parts.append(slice(last, last + candidate.dof))
-                    bases[:, parts[-1]], last = rest[:, part] @ candidate.inverse, parts[-1].stop
-        return bases[:, :last], parts
-
-    def _columns(self, known: Sequence[Effect]) -> Iterator[tuple[list[Effect], Floats]]:
-        """Yield a few of the known effects at a time with their whitened columns (m, q)."""
-        held = [effect for effect in known if self._frame.has(effect)]
-        for part in batches(counts_of(held), columns_at_once(self._carried)):
-            some = [held[k] for k in part]
-            yield some, self._frame.columns(some)
-        others = [effect for effect in known if effect not in held]
-        yield others, self._frame.whitened(self._carried, others)
-
-    def scans(self, groups: Sequence[Sequence[Effect]]) -> Iterator[tuple[Scan, list[bool]]]:
-        """Scan each group alone, and tell of each of its effects whether it is known."""
-        widths = [sum(counts_of(group)) for group in groups]
-        for part in batches(widths, columns_at_once(self._carried)):
-            some = [groups[k] for k in part]
-            columns = self._frame.whitened(self._carried, [effect for group in some for effect in group])
-            rest = self._beside.of(columns)
-            cosines = self._known.T @ rest
-            for group, own in zip(some, slices([widths[k] for k in part]), strict=True):
-                found = self._scan(group, columns[:, own], rest[:, own])
-                yield found, self._are_known(found, cosines[:, own])
-
-    def _scan(self, effects: Sequence[Effect], columns: Floats, rest: Floats) -> Scan:
-        """Scan effects by their columns (m, q) and what the model leaves of these."""
-        upper = triangle(np.column_stack([rest, self._residual]))
-        return scan_of(upper, np.linalg.norm(columns, axis=0), effects, counts_of(effects))
-
-    def _are_known(self, scan: Scan, products: Floats) -> list[bool]:
-        """Tell whether each candidate lies within a known effect; products (k, q): of the bases of these with the
-        columns."""
-        known = list[bool]()
-        for candidate, columns in zip(
-            scan.candidates, slices(counts_of([candidate.effect for candidate in scan.candidates])), strict=True
-        ):
-            cosines = (products[:, columns] @ candidate.inverse).T
-            known.append(any(is_within(cosines[:, part], self._cosine) for part in self._near(cosines)))
-        return known
-
-    def _near(self, cosines: Floats) -> Iterator[slice]:
-        """Yield the parts of the columns of ``cosines`` (k, l) whose root mean square is not below the limit: as a
-        rule none, and no smallest cosine is larger."""
-        starts = [part.start for part in self._parts]
-        squares = np.add.reduceat(np.sum(cosines**2, axis=0), starts) if starts else np.empty(0)
-        least = (1.0 - 1e-9) * len(cosines) * self._cosine**2
-        return itertools.compress(self._parts, (squares > least).tolist())

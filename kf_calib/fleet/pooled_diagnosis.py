@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, one_blas_thread
-from kf_calib.diagnosis.missing_effect import SEEN
 from kf_calib.effects import described
 from kf_calib.errors import InputError
 from kf_calib.fleet.attribution import Attributed, AttributionTable, attributed, chosen
@@ -25,6 +24,7 @@ _ABSURD = (
     "the runs cannot be diagnosed together, as the factor of at least one has numbers that no run has: evaluate them "
     "again into a new folder (-o)."
 )
+_SEEN = 3.0  # sigmas from which a coefficient is told
 _MAY_BE = 0.05  # of the probability of an effect: above it all units may have it
 _LEVEL = 0.95
 _LIKELY = 1e-3  # of a part of a campaign: above it the part is looked at run by run
@@ -74,9 +74,9 @@ class UnitFigures:
 
     @property
     def is_seen(self) -> bool:
-        """Whether a coefficient is beyond ``SEEN`` sigma."""
+        """Whether a coefficient is beyond three sigma."""
         known = [(each.value, each.sigma) for each in self.coefficients]
-        return any(value is not None and sigma is not None and abs(value) > SEEN * sigma for value, sigma in known)
+        return any(value is not None and sigma is not None and abs(value) > _SEEN * sigma for value, sigma in known)
 
 
 @dataclass(frozen=True)

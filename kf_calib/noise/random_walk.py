@@ -6,7 +6,6 @@ the biases take within it (``dwells.pieces``).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -30,14 +29,8 @@ class Links:
     beside: Floats
 
 
-def mean_links(ends_s: Floats, held_s: float = math.inf) -> Links:
-    """The links for dwells that begin and end at ``ends_s`` (D, 2); ``held_s`` is the time constant of a mean-reverting
-    walk."""
-    return _free(ends_s) if math.isinf(held_s) else _held(ends_s, held_s)
-
-
-def _free(ends_s: Floats) -> Links:
-    """Return the links of a random walk.
+def mean_links(ends_s: Floats) -> Links:
+    """The links of a random walk for dwells that begin and end at ``ends_s`` (D, 2).
 
     Over a dwell of length T, the difference of its mean from its first value has the variance T / 3, so has that from
     its last value, and the two have the covariance T / 6.
@@ -46,24 +39,6 @@ def _free(ends_s: Floats) -> Links:
     alone = pauses + spans / 3.0
     alone[1:] += spans[:-1] / 3.0
     return Links(np.ones(len(spans) - 1), alone, spans[:-1] / 6.0)
-
-
-def _held(ends_s: Floats, held_s: float) -> Links:
-    """Return the links of a mean-reverting walk with the time constant tau and the covariance tau / 2 exp(-|t - s| /
-    tau).
-
-    The covariance of its mean over a dwell of length T with its value at either end is tau / T (1 - exp(-T / tau))
-    times tau / 2.
-    """
-    spans = np.maximum(ends_s[:, 1] - ends_s[:, 0], 1e-6 * held_s) / held_s
-    correlated = -np.expm1(-spans) / spans
-    variances = held_s * (1.0 - correlated) / spans
-    share = correlated[1:] / correlated[:-1] * np.exp(-np.diff(ends_s[:, 0]) / held_s)
-    pauses = np.maximum(ends_s[1:, 0] - ends_s[:-1, 1], 0.0) / held_s
-    across = 0.5 * held_s * correlated[1:] * correlated[:-1] * np.exp(-pauses)
-    alone = variances.copy()
-    alone[1:] += share**2 * variances[:-1] - 2.0 * share * across
-    return Links(share, alone, across - share * variances[:-1])
 
 
 def variances(begins_s: Floats, ends_s: Floats, intensity: float) -> Floats:

@@ -237,23 +237,6 @@ def gain_of(part: Part, noise: Noise, means: Means, state: Floats, prior: Floats
     return max(likelihood.without().cost - point.cost, 0.0)
 
 
-def gauss_markov_gains(noise: Noise, means: Means, state: Floats, prior: Floats) -> tuple[Floats, Floats]:
-    """Gains in log-likelihood (k,) of mean-reverting walks over the likeliest random walk, and their time constants
-    (k,), s.
-
-    A mean-reverting walk is a Gauss-Markov process of any variance; with an infinite time constant it is the random
-    walk, with a short one scatter. ``means`` and ``prior`` are those that ``with_shared_noise`` returns.
-    """
-    reduced, still = _reduce(means, prior), replace(noise, walk_mps2_per_sqrt_s=0.0)
-    spans_s, run_s = means.ends_s[:, 1] - means.ends_s[:, 0], float(means.ends_s[-1, 1] - means.ends_s[0, 0])
-    times_s = np.geomspace(max(float(np.median(spans_s)) / 4.0, run_s * 1e-4), 2.0 * run_s, HELD)
-    costs = np.array([
-        _likelihood(still, {"walk"}, reduced, state, held_s).of(("walk",)).most_likely()[1].cost
-        for held_s in (math.inf, *times_s.tolist())
-    ])  # fmt: skip
-    return costs[0] - costs[1:], times_s
-
-
 def with_shared_noise(dwells: Sequence[DwellFactor], noise: Noise, means: Means) -> tuple[Means, Floats]:
     """Means with additional columns for the noise that dwells have in common (``noise_model.shared_noise``), and the
     rows (q, p + q + 1) of the prior of their coefficients."""
@@ -304,13 +287,8 @@ def _reduce(means: Means, prior: Floats | None = None, apart: slice = slice(0)) 
     return _Reduced(means, np.hstack([np.zeros((len(prior), basis.shape[1])), prior[:, np.append(known, True)]]))
 
 
-def _likelihood(
-    noise: Noise, parts: Collection[Part], reduced: _Reduced, state: Floats, held_s: float = math.inf
-) -> Likelihood:
-    """Return the likelihood of the means, with the parts that may be added.
-
-    held_s: time constant with which a walk of the biases reverts to its mean; infinite for a random walk.
-    """
+def _likelihood(noise: Noise, parts: Collection[Part], reduced: _Reduced, state: Floats) -> Likelihood:
+    """Return the likelihood of the means, with the parts that may be added."""
     means, count, units = reduced.means, len(reduced.means.counts), _units(reduced.means)
     standing = "walk" not in parts and not noise.walk_mps2_per_sqrt_s
     rows = np.concatenate([means.design, means.readings[:, :, None]], axis=2)
@@ -319,7 +297,7 @@ def _likelihood(
         shapes: dict[Part, Floats] = {part: _shapes(part, means, state) for part in parts}
         alone = Restricted(rows.reshape(3 * count, -1), reduced.prior, fixed, ())
         return Likelihood(alone, _scaled(shapes, units), units)
-    path = mean_links(means.ends_s, held_s)
+    path = mean_links(means.ends_s)
     rows[1:] -= path.share[:, None, None] * rows[:-1].copy()
     walk = np.zeros((1, count, 6, 3))
     walk[0, :, :3] = path.alone[:, None, None] * np.eye(3)

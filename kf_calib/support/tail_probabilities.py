@@ -50,6 +50,13 @@ def sidak(p_value: float, tests: float) -> float:
     return float(-np.expm1(tests * np.log1p(-min(p_value, 1.0 - 1e-16))))
 
 
+def log_odds_of(p_value: float) -> float:
+    """The largest log odds that a p-value gives against what it tests: -ln(-e p ln p), 0 above 1/e (T. Sellke, M.
+    Bayarri, J. Berger, 2001)."""
+    p_value = max(p_value, 1e-300)
+    return -math.log(-math.e * p_value * math.log(p_value)) if p_value < 1.0 / math.e else 0.0
+
+
 def _fraction(a: float, b: float, x: float, distance: float) -> float:
     """The continued fraction that divides x^a (1 - x)^b / B(a, b), by Lentz's method; away: a - (a + b) x >= 0."""
     value = upper = a * (distance + 1.0) / (a + 1.0)

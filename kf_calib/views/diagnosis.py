@@ -28,6 +28,7 @@ from kf_calib.views.console import plain, symbol
 from kf_calib.views.json import clean, outlying_object, readings_object
 from kf_calib.views.terminal import ConsoleTable, TextPlot, note
 
+_ANY = 1e-6  # probability of rows that are in the JSON object
 _MOST = 5
 """Explanations in the table on one screen."""
 _TELLS = 1.0  # sigma; an orientation that separates explanations by less tells nothing
@@ -95,7 +96,7 @@ def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
 
 
 def _hypotheses_object(table: HypothesisTable | None) -> list[dict[str, Any]]:
-    """Return the rows of the table of hypotheses as JSON objects, the likeliest first."""
+    """Return the rows of the table of hypotheses that have any probability as JSON objects, the likeliest first."""
     rows = () if table is None else zip(table.rows, table.log10_odds, strict=True)
     return [
         {
@@ -110,6 +111,7 @@ def _hypotheses_object(table: HypothesisTable | None) -> list[dict[str, Any]]:
             "dof": row.dof,
         }
         for row, odds in rows
+        if row.probability > _ANY
     ]
 
 

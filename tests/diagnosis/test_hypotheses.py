@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,15 +11,15 @@ from helpers.hidden_effects import noisy_run, noisy_source, run, source
 from helpers.known_runs import diagnosed
 from helpers.synthetic import plan_of
 
-from kf_calib.diagnosis import hypotheses
-from kf_calib.diagnosis.hypotheses import Hypotheses, dispersed, log_odds_of
 from kf_calib.diagnosis.hypothesis_table import ALIKE, IRREGULAR, NOISE, NONE, NOTHING, Hypothesis, table_of
 from kf_calib.diagnosis.missing_effect import diagnose
+from kf_calib.diagnosis.posterior import RunPosterior
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.effects import effect_named, names
 from kf_calib.errors import UnobservableError
-from kf_calib.estimation.results import Calibration, Consistency
+from kf_calib.estimation.results import Calibration
+from kf_calib.support.tail_probabilities import log_odds_of
 from kf_calib.views.diagnosis import diagnosis_object
 
 FAMILIES = {
@@ -37,47 +35,6 @@ def rows() -> list[Hypothesis]:
         Hypothesis(effects, families=("memory",) if effects else (NOTHING,), log_evidence=float(np.log(share)) - 900.0)
         for effects, share in shares
     ]
-
-
-def refit_that_leaves(per_dof: float, fits: bool | None = False, oscillates: bool = False) -> Any:
-    """A refit with an effect, of which the misfit has 60 degrees of freedom."""
-
-    class Effect:
-        def __init__(self) -> None:
-            self.oscillates = oscillates
-
-        def __str__(self) -> str:
-            return "b"
-
-    consistency = Consistency(60.0 * per_dof, 60, None if fits is None else 0.5, fits)
-    return SimpleNamespace(consistency=consistency, model=SimpleNamespace(effects=[Effect()]))
-
-
-@pytest.mark.parametrize(
-    ("per_dof", "fits", "divided_by"),
-    [(4.0, False, 4.0), (25.0, False, 10.0), (1.3, True, 1.0), (0.5, False, 1.0), (1.3, None, 1.0)],
-)
-def test_a_misfit_beside_a_formula_weakens_the_evidence(per_dof: float, fits: bool | None, divided_by: float) -> None:
-    """Log-likelihoods over the noise variance are those over one that is as large as what is left."""
-    refit, logs = refit_that_leaves(per_dof, fits), {"a": -310.0, "b": -300.0, "c": -340.0}
-    rows = [Hypothesis((name,), ("mine = t",), "time", log_evidence=log, refit=refit) for name, log in logs.items()]
-    evidence = [row.log_evidence for row in dispersed(rows)]
-    assert evidence == pytest.approx([-300.0 + (log + 300.0) / divided_by for log in logs.values()])
-
-
-@pytest.mark.parametrize(
-    ("effects", "formulas", "oscillates", "weakened"),
-    [
-        (("b",), (), True, False), (("b",), (), False, False), ((), ("mine = t",), False, False),
-        (("a", "b"), (), False, False), (("a", "b"), (), True, True), (("b",), ("mine = t",), False, True),
-    ],
-)  # fmt: skip
-def test_only_beside_formulas_and_oscillations(
-    effects: tuple[str, ...], formulas: tuple[str, ...], oscillates: bool, weakened: bool
-) -> None:
-    refit = refit_that_leaves(4.0, oscillates=oscillates)
-    rows = [Hypothesis(effects, formulas, log_evidence=-1.0, refit=refit), Hypothesis(("c",), log_evidence=-9.0)]
-    assert [row.log_evidence for row in dispersed(rows)] == [-1.0, -3.0 if weakened else -9.0]
 
 
 def test_probabilities_are_evidence_over_the_sum_of_all() -> None:
@@ -113,22 +70,8 @@ def test_a_pair_that_the_run_does_not_determine_is_no_explanation(monkeypatch: p
 
     monkeypatch.setattr(Refits, "of", of)
     found = diagnose(source("second-order=8sigma", plan=plan_of(10, dwell_s=4.0, seed=5)))
-    assert found.table and found.table.first.effects and all(len(row.effects) < 2 for row in found.table.rows)
-
-
-def test_a_coefficient_far_beyond_the_usual_is_that_of_another_effect(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By two sigma at least; the variance of the readings followed one dwell with 2e10 µg/g²."""
-    before, refits = run("second-order=15sigma"), Refits()
-    rows_of = Hypotheses(refits, before, refits.assess(before))
-    refit = refits.with_effects(before, ("second-order",))
-    (effect,) = refit.model.effects
-    usual = effect.typical.of(rows_of.evidence.grade)
-    assert usual is not None
-    found = [refit.parameters[each.symbol] for each in effect.coefficients]
-    times = max((abs(each.value or 0.0) - 2.0 * (each.sigma or 0.0)) / usual[1] for each in found)
-    for limit, possible in ((1.001 * times, True), (0.999 * times, False)):
-        monkeypatch.setattr(hypotheses, "_UNHEARD_OF", limit)
-        assert np.isfinite(rows_of._row(("second-order",), 0.0).log_evidence) == possible
+    assert found.table and len(found.table.first.effects) == 1
+    assert all(row.refit is None for row in found.table.rows if len(row.effects) > 1)
 
 
 @pytest.mark.parametrize(("probability", "text"), [
@@ -197,7 +140,7 @@ def test_an_error_that_no_known_effect_is_does_not_pass_as_noise_that_nobody_sta
     assert Refits().assess(run).consistent  # the other tests see nothing
     found = diagnose(run)
     assert found.test.consistent is False and found.unknown
-    assert found.table is not None and found.table.rows[0].driver == "angle of gimbal 2, 3 a turn"
+    assert found.table is not None and found.table.rows[0].driver == "angle of gimbal 2 (as an error of its encoder)"
 
 
 @pytest.mark.slow
@@ -244,7 +187,7 @@ def test_noise_from_dwell_to_dwell_may_be_an_unknown_cause(
     """The odds are 1 to 9 where nobody stated the scatter, and even where it contradicts what was stated and no
     orientation is repeated; a setting error that nobody stated is a setting error."""
     run, refits = noisy_run(dwells=24, states=states, seed=3, **noise), Refits()
-    table = Hypotheses(refits, run, refits.assess(run)).quick_table()
+    table = RunPosterior(refits, run, refits.assess(run)).table(refitted=False)
     irregular = sum(row.probability for row in table.rows if row.driver == IRREGULAR)
     assert least <= irregular / table.families[NOISE] <= most
 

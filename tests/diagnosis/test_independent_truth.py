@@ -52,14 +52,14 @@ def test_play_of_a_gimbal_is_no_error_of_its_encoder(gimbal: int, seed: int) -> 
 
 SLIPS = {
     "a jump of the tilt of the base": {"base": [1.0, 0.0, -0.7]},
-    "a jump of the alignment": {"mount": [0.6, 0.8, -0.5]},
+    "a jump of the mounting": {"mount": [0.6, 0.8, -0.5]},
     "a jump of the scale factors": {"scale": [1.0, -0.6, 0.8]},
 }
 
 
 @pytest.mark.parametrize("what, bench", [("a jump of the tilt of the base", ROBOT), *(
     pytest.param(what, BENCH, marks=pytest.mark.slow) for what in SLIPS),
-    pytest.param("a jump of the alignment", ROBOT, marks=pytest.mark.slow)])  # fmt: skip
+    pytest.param("a jump of the mounting", ROBOT, marks=pytest.mark.slow)])  # fmt: skip
 def test_a_bump_is_told_with_its_moment(what: str, bench: Bench) -> None:
     """It comes on the way to the tenth orientation; a drift is nine tenths of it. Gimbals, or a robot's attitude."""
     ((where, direction),) = SLIPS[what].items()
@@ -80,7 +80,7 @@ OTHERS = {
     "time (a periodic tilt of the base)": {
         "base": lambda s: WITHIN_RAD * np.column_stack([np.sin(wave(s)), 0.0 * wave(s), np.cos(wave(s))])
     },
-    "angle of gimbal 1, 2 a turn (a tilt of the base)": {
+    "angle of gimbal 1 (a tilt of the base)": {
         "base": lambda s: WITHIN_RAD * np.column_stack([np.cos(twice(s)), 0.0 * twice(s), np.sin(twice(s))])
     },
 }  # fmt: skip

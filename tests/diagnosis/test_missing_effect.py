@@ -79,7 +79,6 @@ def test_vibration_is_averaged_once_and_lines_that_are_left_are_vibration_too(
 
     monkeypatch.setattr(missing_effect, "_explained", remember)
     monkeypatch.setattr(missing_effect, "_without_vibration", lambda refits, run, test: test)
-    monkeypatch.setattr(missing_effect, "_restoring_time_s", lambda diagnosis: None)
     monkeypatch.setattr(missing_effect, "replace", lambda diagnosis, **changes: diagnosis)
     for name in [name for name in vars(missing_effect) if name.endswith("_in_words")]:
         monkeypatch.setattr(missing_effect, name, lambda *_: "")

@@ -24,7 +24,7 @@ def test_an_unknown_misfit_is_described_by_the_formulas_that_were_refitted_or_lo
     unknown: bool, outlying: tuple[str, ...], likeliest: dict[str, Any] | None, expected: Description | str | None,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    monkeypatch.setattr(results, "describe", lambda *_: "looked for")
+    monkeypatch.setattr(results, "describe_irregular", lambda *_: "looked for")
     monkeypatch.setattr(results, "explained_share", lambda *_: 0.8)
     monkeypatch.setattr(results, "channel_of", lambda _: "z")
     before: Any = SimpleNamespace(outlying=outlying, residuals_mps2=None, fit=None)

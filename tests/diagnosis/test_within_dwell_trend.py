@@ -16,6 +16,7 @@ from kf_calib.bench.streams import Stream
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.unknown_effect import WITHIN_DWELLS
+from kf_calib.diagnosis.unknown_terms import RETURNING
 from kf_calib.diagnosis.within_dwell_trend import DisturbedDwell, Trend, disturbed_dwell, shapes, trend, variances
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.results import Calibration
@@ -91,7 +92,7 @@ def test_what_dwells_hide_shows_within_them() -> None:
     found = diagnose(noisy_source("chirp=25sigma;frequency=0.02;chirp=2e-4", seed=4, dwells=12))
     assert found.unknown and found.test.trend is not None and found.test.trend.p_value < 1e-6, found.verdict
     told = found.description
-    assert told is not None and told.driver == WITHIN_DWELLS and told.formula == "bias-walk"
+    assert told is not None and told.driver in (WITHIN_DWELLS, RETURNING) and told.formula == "bias-walk"
     dwell, channel = found.test.trend.most
     assert diagnosis_object(found)["trend"] == {
         "ratio": found.test.trend.ratio, "p_value": found.test.trend.p_value, "dwell": dwell, "channel": channel,

@@ -68,7 +68,7 @@ def noises() -> Numbers:
     sizes = allan.cluster_sizes(300)
     ends = np.cumsum(rng.uniform(1.0, 9.0, 24)).reshape(12, 2)
     steps, rows = rng.uniform(0.0, 1.0, (12, 2)), [rng.normal(size=(6, 16)) for _ in range(12)]
-    links = [random_walk.mean_links(ends, held_s) for held_s in (np.inf, 1.0, 100.0)]
+    links = [random_walk.mean_links(ends)]
     whitened, factor = random_walk.whiten_walk(rows, steps), np.triu(rng.normal(size=(12, 13)))
     advanced = [random_walk.advance(factor, steps[0], rows[0])[0], random_walk.recede(factor, steps[0], rows[0])]
     advanced += [random_walk.predict(factor, variance) for variance in (0.0, 0.4)]

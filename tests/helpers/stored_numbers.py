@@ -33,9 +33,8 @@ LOOSE: Mapping[str, float] = {"position_feedback": 30.0, "without_angles": 1000.
 likelihood ends, to 3e-5 of itself; a fit without angles ends where its steps are below a thousandth of a sigma; a plan
 is the best that a search meets. Of these, 1e-5 is not reached on another processor (measured: 1e-4, 2e-3, 1e-3)."""
 _LOOSE_NAMES: Mapping[str, float] = {
-    "log10_odds_to_next": 1e3, "minimum": 10.0, "Fit.scatter_gain": 1e3, "Fit.gauss_markov_gain": 1e3,
-    "Fit.gauss_markov_gains": 1e3, "EffectRow.no_one": 1e3, "Folded.spreads": 10.0,
-    "EffectTests.independent_tests": 100.0, "EffectTests.p_values": 100.0,
+    "log10_odds_to_next": 1e3, "minimum": 10.0, "Fit.scatter_gain": 1e3, "EffectRow.no_one": 1e3,
+    "Folded.spreads": 10.0, "EffectTests.independent_tests": 100.0, "EffectTests.p_values": 100.0,
 }  # fmt: skip
 """The same for numbers that are small differences of large ones, or so large that nothing was determined."""
 

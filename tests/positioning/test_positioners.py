@@ -137,7 +137,10 @@ ROBOT = """
 import json, pathlib, sys
 place = pathlib.Path({place!r})
 match sys.argv[1:]:
-    case ["move", *angles]: place.write_text(json.dumps([float(angle) for angle in angles]))
+    case ["move", *angles]:
+        new = place.with_suffix(".new")
+        new.write_text(json.dumps([float(angle) for angle in angles]))
+        new.replace(place)
     case ["where"]: print(*json.loads(place.read_text()) if place.exists() else (0, 0, 0))
     case ["stop"]: place.with_suffix(".stopped").touch()
     case ["fault"]: print("none")

@@ -1,0 +1,115 @@
+"""The noise from dwell to dwell of unknown size beside which all explanations are weighed: none beyond what was stated,
+scatter, setting errors, and both.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.diagnosis.run_likelihood import RunLikelihood, integrated
+from kf_calib.noise.noise_model import Noise
+from kf_calib.noise.reml import OF_ONE
+
+_STATED, _UNSTATED = 0.02, 0.5  # prior probability of noise beyond what was stated, and where nothing was stated
+_OF_ONE = 0.1  # share of one accelerometer alone in scatter
+_HOPELESS = 30.0  # in log likelihood
+_FEWEST = 4  # sizes of noise over which is integrated
+_RANGE = math.log(1e4)  # width of the flat prior of the logarithm of a size of noise
+
+
+@dataclass(frozen=True)
+class NoiseFamily:
+    """Noise of which some parts are free.
+
+    parts: "setting", "common" (scatter) or those of one accelerometer alone. shapes: covariances (D, 3, 3) per unit of
+    the squared size, in units of the noise that was stated. log_prior: log of its prior probability.
+    """
+
+    parts: tuple[str, ...]
+    shapes: Floats
+    log_prior: float
+
+
+class NoiseSizes:
+    """All noises in which a run is weighed.
+
+    noise: what was stated. spare: degrees of freedom that the model leaves of the dwells' means.
+    """
+
+    def __init__(self, likelihood: RunLikelihood, noise: Noise, spare: int) -> None:
+        self._likelihood, self._noise, self._spare = likelihood, noise, spare
+        self._sizes = likelihood.sizes_of_noise()
+
+    @cached_property
+    def families(self) -> list[NoiseFamily]:
+        """The families, that with no free part first."""
+        families = [NoiseFamily((), np.zeros((0, 3, 3)), self._log_prior(()))]
+        if self._spare <= 0:
+            return families
+        common = self._likelihood.shapes_of("common")
+        families.append(NoiseFamily(("common",), common, self._log_prior(("common",))))
+        if self._noise.attitude_unknown:  # a rotation of the dwells has no limit anyway
+            return families
+        setting = self._likelihood.shapes_of("setting")
+        families.append(NoiseFamily(("setting",), setting, self._log_prior(("setting",))))
+        if not (self._noise.setting_stated and self._noise.scatter_stated):
+            both = ("setting", "common")
+            families.append(NoiseFamily(both, setting + common, self._log_prior(both)))
+        return families
+
+    @cached_property
+    def of_one(self) -> list[tuple[NoiseFamily, float]]:
+        """Scatter of one accelerometer alone, with its log evidence without any term. It stands against all effects:
+        beside one it would hide what else is missing, which often shows in one accelerometer."""
+        if len(self.families) < 2 or self._noise.attitude_unknown:
+            return []
+        prior = self.families[1].log_prior + math.log(_OF_ONE / len(OF_ONE))
+        evidence = list[tuple[NoiseFamily, float]]()
+        for part in OF_ONE:
+            shapes = self._likelihood.shapes_of(part)
+            logs = np.array([[self._likelihood.bare(size**2 * shapes) for size in self._sizes.tolist()]])
+            evidence.append((NoiseFamily((part,), shapes, prior), float(self._over_sizes(logs)[0]) + prior))
+        return evidence
+
+    @cached_property
+    def covariances(self) -> list[Floats | None]:
+        """Covariances (D, 3, 3) of all noises; None for none beyond what was stated."""
+        squares = (self._sizes**2).tolist()
+        return [None, *(square * family.shapes for family in self.families[1:] for square in squares)]
+
+    def likely(self, logs: Floats, most: Floats) -> list[list[int]]:
+        """Numbers of the noises of each family that are not much larger than the likeliest by log likelihoods
+        (noises,), nor so small that even these with the most (noises,) that a term gains are hopeless."""
+        count, numbers, best = len(self._sizes), [[0]], float((logs + most).max())
+        for first in range(1, len(logs), count):
+            end = max(int(np.argmax(logs[first : first + count])) + 2, _FEWEST)
+            hopeful = np.flatnonzero((logs + most)[first : first + count] > best - _HOPELESS)
+            begin = min(max(int(hopeful[0]) - 1, 0) if hopeful.size else count, min(end, count) - _FEWEST)
+            numbers.append([*range(first + begin, first + min(end, count))])
+        return numbers
+
+    def evidence(self, logs: Floats, numbers: Sequence[Sequence[int]] | None = None) -> Floats:
+        """Log evidence (n, families) from log likelihoods (n, noises), with the priors of the noise.
+
+        numbers: those of each family that count (``likely``); None: all.
+        """
+        count = len(self._sizes)
+        numbers = numbers or [[0], *([*range(first, first + count)] for first in range(1, logs.shape[1], count))]
+        parts = [logs[:, 0], *(self._over_sizes(logs[:, of_family]) for of_family in numbers[1:])]
+        return np.stack(parts, axis=1) + [family.log_prior for family in self.families]
+
+    def _over_sizes(self, logs: Floats) -> Floats:
+        """Return the log mean (n,) of likelihoods over the sizes of a family."""
+        return integrated(logs, self._likelihood.step) - math.log(_RANGE)
+
+    def _log_prior(self, parts: Sequence[str]) -> float:
+        """Return the log of the prior probability that these parts of the noise are free, and no others."""
+        stated = {"setting": self._noise.setting_stated, "common": self._noise.scatter_stated}
+        priors = {part: _STATED if is_stated else _UNSTATED for part, is_stated in stated.items()}
+        return sum(math.log(prior if part in parts else 1.0 - prior) for part, prior in priors.items())

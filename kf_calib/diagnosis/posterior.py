@@ -1,0 +1,396 @@
+"""The posterior over explanations of a misfit: nothing, noise, effects, pairs of them, unknown functions, one dwell.
+
+Each explanation is a set of terms in one likelihood (``run_likelihood``), averaged over their sizes and over the noise
+from dwell to dwell. All are weighed where the run was fitted, and the likeliest again where their own fit is, because
+large effects are not linear. The prior of a kind is shared among its members, so that a hundred unknown functions do
+not outvote one effect.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats, Indices
+from kf_calib.diagnosis.candidate_tests import CandidateTests
+from kf_calib.diagnosis.coefficient_sizes import best_sigma, usual_sizes
+from kf_calib.diagnosis.hypothesis_table import (
+    IRREGULAR,
+    NOISE,
+    NONE,
+    NOTHING,
+    PRIOR,
+    Hypothesis,
+    HypothesisTable,
+    table_of,
+)
+from kf_calib.diagnosis.noise_sizes import NoiseFamily, NoiseSizes
+from kf_calib.diagnosis.refits import Refits
+from kf_calib.diagnosis.run_likelihood import Projected, RunLikelihood, log_bayes_together
+from kf_calib.diagnosis.run_terms import RunTerms, log_bayes_of_any_size, sizes_of
+from kf_calib.diagnosis.unknown_terms import name_of_formula, text_named
+from kf_calib.diagnosis.within_dwell_trend import DisturbedDwell, disturbed_dwell, trend
+from kf_calib.dwells.qr import orthonormal
+from kf_calib.effects import effect_named
+from kf_calib.errors import InputError, UnobservableError
+from kf_calib.estimation.results import Calibration
+from kf_calib.noise.noise_model import Noise
+from kf_calib.support import stage
+from kf_calib.support.tail_probabilities import log_odds_of
+
+_IRREGULAR = 0.1  # share of an unknown cause in scatter that was not stated
+_AGAINST_STATED = 0.5  # the same of scatter beyond what was stated
+_OF_ORIENTATION = 0.8  # share of unknown causes that depend on the orientation alone, and come back with it
+_WITHIN = 0.01  # prior probability of irregular changes that show within dwells only
+_APART = 1e-4  # p-value of an oscillation that does not go on alike in all dwells
+_HEADS = 3  # effects beside which all other terms are tried: likeliest in any noise, in that stated, and in pairs
+_SAME = 1e-6  # squared sine of the angle below which two effects are one
+_REFITTED, _ALWAYS = 8, 3  # rows of effects that are fitted at most, and single ones that always are
+_BEHIND, _BENT = 10.0, 0.02  # in log evidence, and share of the gain: rows further behind are not fitted
+_DESCRIBED = 5.0  # in log evidence: rows of unknown functions further behind get no formula
+_NODES_OF_PAIR = 16  # sizes of each of two effects
+_ROUNDING, _UNSEEN = 1e-6, 1e-3  # least scatter over the misfit: where noise within dwells was seen, and where not
+_SUMMANDS, _MORE = 3, 3.0  # formulas that describe an unknown function at most, and what each has to gain
+
+
+class RunPosterior:
+    """The posterior of one run.
+
+    refits: those of the run. before: the run without what is missing. test: its linear tests.
+    """
+
+    def __init__(self, refits: Refits, before: Calibration, test: CandidateTests) -> None:
+        self._refits, self._before, self._test = refits, before, test
+        model = before.model
+        self._noise = _stated(before.noise)
+        misfit_mps2 = float(np.sqrt(np.mean(before.residuals_mps2**2)))
+        self._least_mps2 = (_ROUNDING if before.noise.within_seen else _UNSEEN) * misfit_mps2
+        self._run = RunTerms(before, self._noise, self._least_mps2, test)
+        measured = (1 if self._noise.attitude_unknown else 3) * len(before.fit.dwells)
+        self._sizes = NoiseSizes(self._run.likelihood, self._noise, measured - model.count + len(model.fixed))
+        self._disturbed: DisturbedDwell | None = None
+        self._no_oscillation = set[str]()
+
+    def table(self, refitted: bool = True) -> HypothesisTable:
+        """All rows with their probabilities; the likeliest are fitted if ``refitted``."""
+        stage.say(f"weighing {len(self._run.terms)} explanations in {len(self._sizes.covariances)} noises")
+        rows = [*self._without_terms(), *self._singles(), self._one_dwell()]
+        if refitted:
+            rows = self._fitted([*rows, *self._pairs()])
+            rows = [self._with_changes_beside_walk(row, rows) if row.driver == IRREGULAR else row for row in rows]
+        rows = [row for row in rows if math.isfinite(row.log_evidence)]
+        return replace(table_of(rows), disturbed=self._disturbed, scattering=self._scattering)
+
+    # The noise in which rows are weighed
+
+    @cached_property
+    def _rows(self) -> list[Projected]:
+        """The rows of the run in all noises."""
+        return [self._run.likelihood.projected(covariance) for covariance in self._sizes.covariances]
+
+    @cached_property
+    def _base(self) -> Floats:
+        """Log likelihoods (noises,) without any term."""
+        return np.array([rows.log for rows in self._rows])
+
+    @cached_property
+    def _log_bayes(self) -> Floats:
+        """Log Bayes factors (terms, noises) of all terms."""
+        return np.array([self._run.log_bayes(rows) for rows in self._rows]).T
+
+    @cached_property
+    def _log_evidence(self) -> Floats:
+        """Log evidence (terms,) of all terms, without their priors."""
+        return np.logaddexp.reduce(self._sizes.evidence(self._base + self._log_bayes), axis=1)
+
+    @cached_property
+    def _without(self) -> Floats:
+        """Log evidence (families,) of no term."""
+        return self._sizes.evidence(self._base[None])[0]
+
+    # Rows
+
+    def _without_terms(self) -> list[Hypothesis]:
+        """Return the rows without a term: nothing, noise, and causes that change irregularly from dwell to dwell."""
+        prior, of_noise, irregular = math.log(PRIOR["nothing"]), list[float](), list[float]()
+        noises = [(family, float(log)) for family, log in zip(self._sizes.families, self._without, strict=True)]
+        irregular.append(noises[0][1] + prior + math.log(_WITHIN))
+        for family, log in (*noises[1:], *self._sizes.of_one):
+            share = self._share_of_unknown(family)
+            of_noise.append(log + prior + math.log(1.0 - share))
+            irregular += [log + prior + math.log(share)] if share else []
+        within = log_odds_of(self._test.trend.p_value) if self._test.trend else 0.0
+        rows = [
+            Hypothesis(families=(NOTHING,), log_evidence=noises[0][1] + prior),
+            Hypothesis(driver=IRREGULAR, families=(NONE,), log_evidence=_log_sum(irregular) + within),
+        ]
+        return [*rows, Hypothesis(families=(NOISE,), log_evidence=_log_sum(of_noise))] if of_noise else rows
+
+    def _share_of_unknown(self, family: NoiseFamily) -> float:
+        """Return the share of an unknown cause in noise: in setting errors that nobody stated none, which are usual."""
+        stated = {"setting": self._noise.setting_stated}
+        if any(stated.get(part, self._noise.scatter_stated) for part in family.parts):
+            others = 1.0 - _OF_ORIENTATION if self._run.repeats else 1.0  # which has a row of its own
+            return others * _AGAINST_STATED / (others * _AGAINST_STATED + 1.0 - _AGAINST_STATED)
+        return 0.0 if family.parts == ("setting",) else _IRREGULAR
+
+    @property
+    def _scattering(self) -> int:
+        """The number of the accelerometer that alone scatters, where that is the likeliest noise; else 0."""
+        logs = [log for _, log in self._sizes.of_one]
+        return int(np.argmax(logs)) + 1 if logs and max(logs) > self._without[1:].max() else 0
+
+    def _singles(self) -> list[Hypothesis]:
+        """Return the rows of one term each."""
+        logs, rows = self._by_row(self._log_evidence), list[Hypothesis]()
+        for row, log in logs.items():
+            if row.startswith("?"):
+                rows.append(self._row((), row, log))
+            else:
+                rows.append(self._row((row,), "", log))
+        return rows
+
+    def _by_row(self, logs: Floats) -> dict[str, float]:
+        """Return the log evidence of each row from those of its terms."""
+        of_row = dict[str, list[float]]()
+        for term, log in zip(self._run.terms, logs.tolist(), strict=True):
+            of_row.setdefault(term.row, []).append(log + term.log_share)
+        return {row: _log_sum(values) for row, values in of_row.items()}
+
+    def _row(self, effects: tuple[str, ...], unknown: str, log: float) -> Hypothesis:
+        """Return the row of some effects and, beside them, an unknown function, with its prior."""
+        families, driver = [effect_named(name, self._before.bench).family for name in effects], ""
+        if unknown:
+            term = self._run.unknown[int(unknown[1:])]
+            families.append(term.family or NONE)
+            driver = term.driver
+        log += self._log_prior(effects, bool(unknown))
+        tested = [self._tested(name) for name in effects]
+        statistic, dof = tested[0][0] if len(effects) == 1 and not unknown else 0.0, sum(dof for _, dof in tested)
+        return Hypothesis(effects, (), driver, tuple(dict.fromkeys(families)), log, statistic, dof)
+
+    def _log_prior(self, effects: Sequence[str], beside_unknown: bool = False) -> float:
+        """Return the log of the prior probability of some effects and, if so, an unknown function."""
+        names, unknown = max(len(self._run.names), 2), len(self._run.unknown)
+        prior = math.prod(effect_named(name, self._before.bench).prior for name in effects)
+        if beside_unknown:
+            kind, among = ("beside", names * unknown) if effects else ("unknown", unknown)
+        else:
+            kind, among = ("effect", names) if len(effects) == 1 else ("pair", math.comb(names, 2))
+        return math.log(PRIOR[kind] * prior / among)
+
+    def _tested(self, name: str) -> tuple[float, int]:
+        """Return the fall of chi-squared by an effect in the linear tests, and its degrees of freedom."""
+        effects = self._test.effects
+        if name in effects.best:
+            return float(effects.scan.statistics[effects.best[name]]), effects.candidate(name).dof
+        return 2.0 * self._before.fit.walk_gain, 1
+
+    def _one_dwell(self) -> Hypothesis:
+        """Return the row of one dwell that alone is off, by any amount."""
+        of_dwells = np.array([log_bayes_of_any_size(*rows.of_dwells()) for rows in self._rows]).T
+        logs = np.logaddexp.reduce(self._sizes.evidence(self._base + of_dwells), axis=1)
+        number = self._before.fit.dwells[int(np.argmax(logs))].number
+        log = _log_sum(logs.tolist()) - math.log(len(logs)) + math.log(PRIOR["dwell"])
+        return Hypothesis(driver=f"dwell {number} alone", families=(NONE,), log_evidence=log)
+
+    def _pairs(self) -> list[Hypothesis]:
+        """Return the rows of the likeliest effects, each with any other term beside it."""
+        pairs = dict[tuple[str, str], float]()
+        for name in self._heads():
+            stage.say(f"weighing all beside {name}")
+            term = self._run.terms[self._best[name]]
+            alone = self._base + self._log_bayes[self._best[name]] + self._log_share_of_best(name)
+            # beside one more term less noise is likely, not more
+            numbers = self._sizes.likely(alone, self._log_bayes.max(axis=0))
+            beside = np.zeros((len(self._run.terms), len(alone)))
+            for k in itertools.chain(*numbers):
+                rows = self._run.likelihood.projected(self._sizes.covariances[k], term.columns)
+                beside[:, k] = self._run.log_bayes(rows)
+            logs = np.logaddexp.reduce(self._sizes.evidence(alone + beside, numbers), axis=1)
+            for other, log in self._by_row(logs).items():
+                key = (other, name) if (other, name) in pairs else (name, other)
+                if other != name:
+                    pairs[key] = max(pairs.get(key, -math.inf), log)
+        return [
+            self._row((name,), other, log) if other.startswith("?") else self._row((name, other), "", log)
+            for (name, other), log in pairs.items()
+        ]
+
+    def _heads(self) -> list[str]:
+        """Return the effects that are likeliest: in noise that is averaged over and, since beside another effect the
+        noise is less than with one alone, in none beyond what was stated."""
+        best = {name: k for name, k in self._best.items() if not name.startswith("?") and name != self._run.walk}
+        in_noise = sorted(best, key=lambda name: -self._log_evidence[best[name]])[:_HEADS]
+        in_none = sorted(best, key=lambda name: -self._log_bayes[best[name], 0])[:_HEADS]
+        heads = list(dict.fromkeys([*in_noise, *in_none]))
+        return [*heads, *dict.fromkeys(self._ahead_of_pairs(list(best), heads))]
+
+    def _ahead_of_pairs(self, names: Sequence[str], heads: Sequence[str]) -> list[str]:
+        """Return the likelier effect of each pair that, in the noise that was stated, lets chi-squared fall nearly as
+        much as a head with any other effect, without being such a pair: alone neither of the two need stand out."""
+        bases, readings = self._run.bases([self._best[name] for name in names], self._rows[0])
+        along, products = bases @ readings, np.einsum("iqr,jpr->ijqp", bases, bases)
+        left = along - np.einsum("ijqp,iq->ijp", products, along)
+        beside = np.eye(along.shape[1]) * (1.0 + _SAME) - np.einsum("ijqp,ijqs->ijps", products, products)
+        more = np.sum(left * np.linalg.solve(beside, left[..., None])[..., 0], axis=2)
+        gains = np.triu(np.sum(along**2, axis=1)[:, None] + more, 1)
+        least = gains.max() - 2.0 * _BEHIND
+        of_heads = np.isin(names, heads)
+        gains[of_heads[:, None] | of_heads] = -np.inf
+        pairs = [divmod(k, len(names)) for k in np.argsort(-gains, axis=None)[:_HEADS].tolist()]
+        evidence = [float(self._log_evidence[self._best[name]]) for name in names]
+        return [names[i if evidence[i] > evidence[j] else j] for i, j in pairs if gains[i, j] > least]
+
+    @cached_property
+    def _best(self) -> dict[str, int]:
+        """The number of the likeliest term of each row."""
+        best = dict[str, int]()
+        for k, term in enumerate(self._run.terms):
+            if term.row not in best or self._log_evidence[k] > self._log_evidence[best[term.row]]:
+                best[term.row] = k
+        return best
+
+    def _log_share_of_best(self, name: str) -> float:
+        """Return the log of the mean likelihood over all values of an effect's constant, over that at the best."""
+        return self._by_row(self._log_evidence)[name] - float(self._log_evidence[self._best[name]])
+
+    # Rows where their own fit is
+
+    def _fitted(self, rows: Sequence[Hypothesis]) -> list[Hypothesis]:
+        """Return the rows with the likeliest of them fitted, and weighed where their fit is."""
+        best = max(row.log_evidence for row in rows)
+        least = best - _BEHIND - _BENT * max(best - float(self._without.max()), 0.0)
+        effects = sorted((row for row in rows if row.effects and not row.driver), key=lambda row: -row.log_evidence)
+        single = [row for row in effects if len(row.effects) == 1][:_ALWAYS]  # large effects are far from linear
+        likeliest = {id(row) for row in [*single, *(row for row in effects[:_REFITTED] if row.log_evidence > least)]}
+        fitted = self._rid_of_disturbed([self._refitted(row) if id(row) in likeliest else row for row in rows])
+        while not (first := max(fitted, key=lambda row: row.log_evidence)).driver and first.effects and not first.refit:
+            fitted = self._rid_of_disturbed([self._refitted(row) if row is first else row for row in fitted])
+        least = first.log_evidence - _DESCRIBED
+        return [self._described(row) if row.driver and row.log_evidence > least else row for row in fitted]
+
+    def _rid_of_disturbed(self, rows: Sequence[Hypothesis]) -> list[Hypothesis]:
+        """Return the rows without an oscillation that does not go on alike in all dwells."""
+        return [row for row in rows if not self._no_oscillation & {*row.effects}]
+
+    def _refitted(self, row: Hypothesis) -> Hypothesis:
+        """Return a row of effects with its fit, weighed there unless dwells were folded otherwise for it."""
+        try:
+            refit = self._refits.with_effects(self._before, row.effects)
+        except UnobservableError:  # the run does not tell its coefficients: nothing speaks for it
+            return replace(row, log_evidence=-math.inf)
+        if refit.model.oscillates and not self._before.model.oscillates:
+            disturbed = disturbed_dwell(refit.fit)
+            if disturbed.p_value < _APART:
+                self._disturbed = self._disturbed or disturbed
+                self._no_oscillation |= {str(effect) for effect in refit.model.effects if effect.oscillates}
+                return row
+        folded, before = refit.fit.dwells[0], self._before.fit.dwells[0]
+        otherwise = (folded.carrier_hz, folded.averaged) != (before.carrier_hz, before.averaged)
+        if self._run.walk in row.effects or otherwise:
+            return replace(row, refit=refit)
+        log, statistic = self._log_of_fit(refit)
+        log += self._log_prior(row.effects) + sum(self._log_share_of_best(name) for name in row.effects)
+        return replace(row, refit=refit, log_evidence=log, statistic=row.statistic or statistic)
+
+    def _with_changes_beside_walk(self, irregular: Hypothesis, rows: Sequence[Hypothesis]) -> Hypothesis:
+        """Return the row of irregular changes with those beside a random walk of the biases: what this leaves within
+        dwells speaks for them, too."""
+        logs = [irregular.log_evidence]
+        for row in (row for row in rows if self._run.walk in row.effects and row.refit is not None):
+            left = trend(row.refit.fit) if self._test.trend and row.refit else None
+            logs += [row.log_evidence + log_odds_of(left.p_value) + math.log(_WITHIN)] if left else []
+        return replace(irregular, log_evidence=_log_sum(logs))
+
+    def _log_of_fit(self, refit: Calibration) -> tuple[float, float]:
+        """Return the log evidence of the effects that a refit has in addition, at the values of their constants, and
+        the fall of chi-squared by them in the likeliest noise."""
+        noise, model = self._noise, refit.model
+        if refit.noise.sensitivity_mps2_per_k is not None:
+            noise = replace(noise, sensitivity_mps2_per_k=refit.noise.sensitivity_mps2_per_k)
+        effects = model.effects[len(self._before.model.effects) :]
+        known = model.parts[str(effects[0])].start
+        likelihood = RunLikelihood(refit.linearised, noise, self._least_mps2, known=known)
+        places = [model.parts[str(effect)].start - known + np.arange(len(effect.coefficients)) for effect in effects]
+        matrices = ([*effect.relations] or [np.eye(len(effect.coefficients))] for effect in effects)
+        related, whole = [*itertools.product(*matrices)], likelihood.whole()
+        usual = [usual_sizes(effect, self._run.grade) for effect in effects]
+        sizes = [
+            [sizes_of(best_sigma(whole[:, place] @ matrix), prior, _NODES_OF_PAIR)
+             for place, matrix, prior in zip(places, relation, usual, strict=True)]
+            for relation in related
+        ]  # fmt: skip
+        logs = np.empty((len(related), len(self._sizes.covariances)))
+        for k, covariance in enumerate(self._sizes.covariances):
+            rows = likelihood.projected(covariance, whole=True)
+            for j, relation in enumerate(related):
+                columns = [rows.columns[:, place] @ matrix for place, matrix in zip(places, relation, strict=True)]
+                logs[j, k] = rows.log + log_bayes_together(columns, rows.readings, sizes[j])
+        rows = likelihood.projected(self._sizes.covariances[int(np.argmax(logs.max(axis=0)))], whole=True)
+        explained = orthonormal(rows.columns[:, np.concatenate(places)])[0].T @ rows.readings
+        log = float(np.logaddexp.reduce(self._sizes.evidence(logs), axis=None)) - math.log(len(related))
+        return log, float(explained @ explained)
+
+    # What an unknown function looks like
+
+    def _described(self, row: Hypothesis) -> Hypothesis:
+        """Return a row of an unknown function with the formulas that describe it, and their fit."""
+        number = next((k for k, term in enumerate(self._run.unknown) if term.driver == row.driver), None)
+        if number is None or not self._run.unknown[number].summands:
+            return row
+        texts, taken = self._formulas(number, row.effects), {effect.name for effect in self._before.model.effects}
+        first = next(k for k in itertools.count() if not {name_of_formula(k + n) for n in range(len(texts))} & taken)
+        formulas = tuple(text_named(text, first + n) for n, text in enumerate(texts))
+        try:
+            refit = self._refits.with_effects(self._before, (*row.effects, *formulas))
+        except (UnobservableError, InputError):
+            return replace(row, formulas=formulas)
+        return replace(row, formulas=formulas, refit=refit)
+
+    def _formulas(self, number: int, beside: Sequence[str]) -> list[str]:
+        """Return the formulas of an unknown function that the readings ask for, those that explain most first."""
+        run, unknown = self._run, self._run.unknown[number]
+        flat = np.concatenate([np.zeros(0, np.intp), *(run.terms[self._best[name]].columns for name in beside)])
+        terms = [term for term in run.terms if term.row == f"?{number}"]
+        noises = [run.likelihood.projected(covariance, flat) for covariance in self._sizes.covariances]
+        scores = np.array([
+            [rows.log + run.log_bayes_of(term.columns, rows) + term.log_share for term in terms] for rows in noises
+        ])  # fmt: skip
+        at, likeliest = np.unravel_index(int(np.argmax(scores)), scores.shape)
+        term = terms[int(likeliest)]
+        widths = [sum(len(run.formula_of(text).coefficients) for text in unknown.summands[k]) for k in term.summands]
+        parts = np.split(term.spanned, np.cumsum(widths)[:-1])
+        return [text for k in self._summands(parts, noises[int(at)]) for text in unknown.summands[term.summands[k]]]
+
+    def _summands(self, parts: Sequence[Indices], rows: Projected) -> list[int]:
+        """Return the summands, by their columns, that explain most together, each of which gains evidence."""
+        chosen, log = list[int](), -math.inf
+        while len(chosen) < min(_SUMMANDS, len(parts)):
+            rest = [k for k in range(len(parts)) if k not in chosen]
+            logs = [self._run.log_bayes_of(np.concatenate([parts[j] for j in (*chosen, k)]), rows) for k in rest]
+            if max(logs) < log + _MORE:
+                break
+            chosen.append(rest[int(np.argmax(logs))])
+            log = max(logs)
+        return chosen
+
+
+def _stated(noise: Noise) -> Noise:
+    """Return the noise that was stated, or seen within dwells."""
+    return replace(
+        noise,
+        walk_mps2_per_sqrt_s=0.0,
+        scatter_mps2=noise.scatter_mps2 if noise.scatter_stated else np.zeros(3),
+        setting_rad=noise.setting_rad if noise.setting_stated or noise.attitude_unknown else 0.0,
+    )
+
+
+def _log_sum(logs: Sequence[float]) -> float:
+    """Return the log of a sum from the logs of its terms."""
+    return float(np.logaddexp.reduce([-math.inf, *logs]))

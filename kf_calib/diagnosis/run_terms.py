@@ -1,0 +1,370 @@
+"""The terms that a run may have, as columns of its likelihood: effects at each value of their constant, unknown
+functions, a random walk of the biases. Each has sizes with a prior, and a share in the prior of its row.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats, Indices
+from kf_calib.diagnosis.candidate_tests import CandidateTests
+from kf_calib.diagnosis.coefficient_sizes import SizePrior, best_sigma, sensor_grade, usual_sizes
+from kf_calib.diagnosis.run_likelihood import Projected, RunLikelihood, Sizes, log_bayes
+from kf_calib.diagnosis.unknown_terms import RETURNING, UnknownTerm, text_named, unknown_terms
+from kf_calib.dwells.qr import orthonormal
+from kf_calib.effects import Coefficient, Effect, Stimulus, effect_named, walk_named
+from kf_calib.effects.effect import Grade
+from kf_calib.effects.formula import formula
+from kf_calib.estimation.cross_validation import orientations
+from kf_calib.estimation.dwell_columns import stimulus_of
+from kf_calib.estimation.results import Calibration
+from kf_calib.noise.noise_model import Noise
+
+_DECADES = 7.0  # above one sigma: sizes of what has no usual size
+_NODES = 40  # sizes that are tried
+_SPARSE = 0.5  # share of one summand alone in the unknown functions of a driver
+_SAME = 0.99  # cosine above which a summand is a known effect
+_END = 0.99  # of the range of a constant
+_SEEN = 1e-7  # share of a column that the model must leave for it to be seen
+_LEADING, _LEAST = 24, 1e-3  # combinations of the columns of an unknown function, and the least size of one
+_WAVES = 40  # of a random walk
+_RETURNS, _PER_DWELL = (4, 8, 16, 32, 64), 0.75  # parts of a run within which a bias may come back, and most of them
+_MOST_ORIENTATIONS = 100  # that are told apart by what comes back with each
+
+
+@dataclass(frozen=True)
+class RunTerm:
+    """Columns (q,) of one term in the likelihood.
+
+    row: the name of an effect, or ``?`` and the number of an unknown function. log_share: log of its share in the prior
+    of its row. effect: with the constant at which it has these columns. summands: of the unknown function, those that
+    it has. sizes: of its coefficients. spanned: the columns of its formulas, of which its own are combinations. scales:
+    factors (q,) of its columns.
+    """
+
+    row: str
+    columns: Indices
+    log_share: float
+    effect: Effect | None = None
+    summands: tuple[int, ...] = ()
+    sizes: Sizes = field(default_factory=lambda: Sizes(np.zeros(0), np.zeros(0)))
+    spanned: Indices = field(default_factory=lambda: np.zeros(0, np.intp))
+    scales: Floats | None = None
+
+    @property
+    def is_known(self) -> bool:
+        """Whether it is an effect of the catalogue."""
+        return not self.row.startswith("?")
+
+
+@dataclass(frozen=True)
+class _Alike:
+    """Terms of q columns: their numbers (n,), columns (n, q) and factors of these; G^T G (n, q, q) and G^T z (n, q) of
+    the rows within dwells; squares (n, m) of their sizes, logs (n, m) of their probabilities, and centres (n,)."""
+
+    numbers: Indices
+    places: Indices
+    scales: Floats
+    gram: Floats
+    along: Floats
+    squares: Floats
+    log_weights: Floats
+    centres: Floats
+
+
+class RunTerms:
+    """All terms of a run and its likelihood.
+
+    before: the run without what is missing. noise, least_mps2: what was stated of it, and scatter that
+    there is in any case. test: its linear tests, with the candidates.
+    """
+
+    def __init__(self, before: Calibration, noise: Noise, least_mps2: float, test: CandidateTests) -> None:
+        self._linearised, self.bench = before.fit.linearised, before.bench
+        self.grade: Grade = sensor_grade(before.fit)
+        self.walk = "" if before.model.walks else walk_named(before.bench)
+        self.unknown: list[UnknownTerm] = [*unknown_terms(before.bench, before.fit.dwells)]
+        columns = _Columns()
+        self._add_effects(columns, test)
+        self._add_unknown(columns)
+        self._add_orientations(columns)
+        if self.walk:
+            self._add_walk(columns)
+        self.likelihood = RunLikelihood(self._linearised, noise, least_mps2, columns.effects)
+        self.likelihood.recombine(columns.blocks)
+        rms = self.likelihood.column_lengths() / math.sqrt(self.likelihood.rows)
+        unknown = np.where(rms > 0.0, columns.weights / np.where(rms > 0.0, rms, 1.0), 0.0)
+        self.likelihood.rescale(np.where(columns.weights > 0.0, unknown, 1.0))
+        self.terms = self._seen(columns.terms)
+        self.names = tuple(dict.fromkeys(term.row for term in self.terms if term.is_known))
+
+    def _add_effects(self, columns: _Columns, test: CandidateTests) -> None:
+        """Add the candidates, each with every relation that its coefficients may have."""
+        candidates = test.effects.scan.candidates
+        effects, tried = [each.effect for each in candidates], [each.tried for each in candidates]
+        stimulus = stimulus_of(self._linearised.dwells, self.bench, self._linearised.state)
+        # a time constant longer than the effect goes on in this run is less likely by as much
+        logs = np.array([-math.log(max(effect.value / effect.acts_for_s(stimulus), 1.0)) for effect in effects])
+        for name in dict.fromkeys(map(str, effects)):
+            numbers = [k for k, effect in enumerate(effects) if str(effect) == name]
+            most = max(len(numbers), *(tried[k] for k in numbers))
+            logs[numbers] -= float(np.logaddexp.reduce(logs[numbers])) + math.log(most / len(numbers))
+        for effect, log in zip(effects, logs.tolist(), strict=True):
+            part, relations = columns.add([effect]), [*effect.relations] or [None]
+            for matrix in relations:
+                columns.term(str(effect), [columns.block(part, matrix)], log - math.log(len(relations)), effect)
+
+    def _add_unknown(self, columns: _Columns) -> None:
+        """Add the unknown functions: each summand alone, and all together."""
+        for number, unknown in enumerate(self.unknown):
+            blocks = [
+                columns.block(columns.add([self.formula_of(text) for text in texts]), weight=unknown.weight(k))
+                for k, texts in enumerate(unknown.summands)
+            ]
+            alone = unknown.exclusive or len(blocks) == 1
+            share = math.log((1.0 if alone else _SPARSE) / len(blocks))
+            for k, block in enumerate(blocks):
+                columns.term(f"?{number}", [block], share, summands=(k,))
+            if not alone:
+                columns.term(f"?{number}", blocks, math.log(1.0 - _SPARSE), summands=(*range(len(blocks)),))
+
+    def _add_orientations(self, columns: _Columns) -> None:
+        """Add an unknown cause that is alike at each visit of an orientation, where some are visited again."""
+        groups, dwells = orientations(self._linearised.dwells), self._linearised.dwells
+        self.repeats = self.bench.angles and len(groups) < min(len(dwells), _MOST_ORIENTATIONS)
+        if self.repeats:
+            of_dwell = np.empty(len(dwells), np.intp)
+            for k, group in enumerate(groups):
+                of_dwell[group] = k
+            pieces = [len(dwell.pieces) for dwell in dwells]
+            visits = _Visits(np.repeat(of_dwell, 3 * np.array(pieces)), len(groups))
+            self.unknown.append(UnknownTerm("the orientation alone, alike at each visit", "", ()))
+            columns.term(f"?{len(self.unknown) - 1}", [columns.block(columns.add([visits]))], 0.0)
+
+    def _add_walk(self, columns: _Columns) -> None:
+        """Add a random walk of the biases and, unknown, biases that change as irregularly and come back: the spectrum
+        of a Gauss-Markov process of correlation time tau is that of a walk times w^2 tau^2 / (1 + w^2 tau^2)."""
+        dwells = self._linearised.dwells
+        waves = _Walk(dwells[-1].end_s, min(len(dwells), _WAVES))
+        block = columns.block(columns.add([waves]))
+        columns.term(self.walk, [block], 0.0)
+        times_s = [waves.run_s / share for share in _RETURNS if share < _PER_DWELL * len(dwells)]
+        self.unknown.append(UnknownTerm(RETURNING, effect_named(self.walk, self.bench).family, ()))
+        for time_s in times_s:
+            scales = np.tile(1.0 / np.sqrt(1.0 + 1.0 / np.square(waves.rates * time_s)), 3)
+            columns.term(f"?{len(self.unknown) - 1}", [block], -math.log(len(times_s)), scales=scales)
+
+    def formula_of(self, text: str) -> Effect:
+        """The effect of a formula without a name."""
+        return formula(text_named(text), self.bench.axes, self.bench.gravity_mps2, checked=False)
+
+    def _seen(self, drafts: Sequence[RunTerm]) -> list[RunTerm]:
+        """Return the terms of which something is seen, with their sizes; a summand that is a known effect is none."""
+        whole, raw = self.likelihood.whole(), self.likelihood.column_lengths()
+        known, terms, matrices = dict[tuple[int, ...], list[Floats]](), list[RunTerm](), list[tuple[Indices, Floats]]()
+        for draft in drafts:
+            columns = whole[:, draft.columns]
+            if not (np.linalg.norm(columns, axis=0) > _SEEN * raw[draft.columns]).any():
+                continue
+            if len(draft.summands) > 1:
+                spanned, matrix = draft.columns, _leading(columns)
+                matrices.append((spanned, matrix))
+                place = self.likelihood.count + _LEADING * (len(matrices) - 1) + np.arange(_LEADING)
+                sizes = sizes_of(best_sigma(columns @ matrix), None)
+                terms.append(replace(draft, columns=place, spanned=spanned, sizes=sizes))
+                continue
+            if not (draft.is_known or draft.summands):
+                scaled = columns if draft.scales is None else columns * draft.scales
+                terms.append(replace(draft, spanned=draft.columns, sizes=sizes_of(best_sigma(scaled), None)))
+                continue
+            basis = orthonormal(columns / np.linalg.norm(columns, axis=0).max())[0]
+            alike = known.setdefault(basis.shape, [])
+            if draft.is_known and not _is_limit(draft.effect):
+                alike.append(basis)
+            elif not draft.is_known and alike and _largest_cosine(alike, basis) > _SAME:
+                continue
+            usual = None if draft.effect is None else usual_sizes(draft.effect, self.grade)
+            terms.append(replace(draft, spanned=draft.columns, sizes=sizes_of(best_sigma(columns), usual)))
+        self.likelihood.append(matrices)
+        return terms
+
+    @cached_property
+    def _alike(self) -> list[_Alike]:
+        """The terms of equal numbers of columns."""
+        more, readings = self.likelihood.more
+        transposed, widths = np.ascontiguousarray(more.T), np.array([len(term.columns) for term in self.terms])
+        alike = list[_Alike]()
+        for width in np.unique(widths).tolist():
+            numbers = np.flatnonzero(widths == width)
+            terms = [self.terms[k] for k in numbers.tolist()]
+            places, sizes = np.array([term.columns for term in terms]), [term.sizes for term in terms]
+            scales = np.array([np.ones(width) if term.scales is None else term.scales for term in terms])
+            within = transposed[places] * scales[:, :, None]
+            alike.append(
+                _Alike(
+                    numbers, places, scales, within @ np.swapaxes(within, 1, 2), within @ readings,
+                    np.stack([each.values for each in sizes]) ** 2, np.stack([each.logs for each in sizes]),
+                    np.array([each.centre for each in sizes]),
+                )
+            )  # fmt: skip
+        return alike
+
+    def log_bayes(self, rows: Projected) -> Floats:
+        """Log Bayes factors (terms,) of all terms in one noise."""
+        logs, columns = np.zeros(len(self.terms)), np.ascontiguousarray(rows.columns.T)
+        for alike in self._alike:
+            parts = columns[alike.places] * alike.scales[:, :, None]
+            gram, along = parts @ np.swapaxes(parts, 1, 2), parts @ rows.readings
+            if rows.means_only:
+                gram, along = gram + alike.gram, along + alike.along
+            logs[alike.numbers] = log_bayes(gram, along, alike.squares, alike.log_weights, alike.centres)
+        return logs
+
+    def bases(self, numbers: Sequence[int], rows: Projected) -> tuple[Floats, Floats]:
+        """Orthonormal bases (n, q, r) of some terms in one noise, filled up with zeros, and the readings (r,)."""
+        more, readings = self.likelihood.more
+        columns, z = rows.columns, rows.readings
+        if rows.means_only:
+            columns, z = np.vstack([columns, more]), np.concatenate([z, readings])
+        places = [self.terms[k].columns for k in numbers]
+        bases = np.zeros((len(places), max(map(len, places)), len(z)))
+        for basis, place in zip(bases, places, strict=True):
+            left, sizes, _ = np.linalg.svd(columns[:, place], full_matrices=False)
+            basis[: len(place)] = np.where(sizes > _LEAST * sizes[0], left, 0.0).T
+        return bases, z
+
+    def log_bayes_of(self, places: Indices, rows: Projected) -> float:
+        """Log Bayes factor of some columns of any size in one noise."""
+        columns, (more, readings) = rows.columns[:, places], self.likelihood.more
+        gram, along = columns.T @ columns, columns.T @ rows.readings
+        if rows.means_only:
+            gram, along = gram + more[:, places].T @ more[:, places], along + more[:, places].T @ readings
+        return float(log_bayes_of_any_size(gram[None], along[None])[0])
+
+
+class _Columns:
+    """The columns of all terms while they are put together: effects that make them, blocks of combinations of these,
+    the weights of the blocks' columns (0: as they are), and terms of blocks."""
+
+    def __init__(self) -> None:
+        self.effects, self.blocks, self.terms = list[Effect](), list[tuple[slice, Floats | None]](), list[RunTerm]()
+        self._weights, self._places = list[Floats](), list[Indices]()
+        self._made = self._count = 0
+
+    @property
+    def weights(self) -> Floats:
+        """Usual sizes (C,) of the columns of unknown functions, relative to each other."""
+        return np.concatenate(self._weights)
+
+    def add(self, effects: Sequence[Effect]) -> slice:
+        """Add the columns of effects; returns where they are."""
+        first, self._made = self._made, self._made + sum(len(effect.coefficients) for effect in effects)
+        self.effects += effects
+        return slice(first, self._made)
+
+    def block(self, part: slice, matrix: Floats | None = None, weight: float = 0.0) -> int:
+        """Add combinations of columns; returns their number."""
+        width = part.stop - part.start if matrix is None else matrix.shape[1]
+        self.blocks.append((part, matrix))
+        self._weights.append(np.full(width, weight))
+        self._places.append(np.arange(self._count, self._count + width))
+        self._count += width
+        return len(self.blocks) - 1
+
+    def term(self, row: str, blocks: Sequence[int], log_share: float, effect: Effect | None = None,
+             summands: tuple[int, ...] = (), scales: Floats | None = None) -> None:  # fmt: skip
+        """Add a term with the columns of some blocks."""
+        places = np.concatenate([self._places[block] for block in blocks])
+        self.terms.append(RunTerm(row, places, log_share, effect, summands, scales=scales))
+
+
+class _Visits(Effect):
+    """A bias of each accelerometer that is another in each orientation: numbers (m,) of the orientations of all
+    instants, and how many there are."""
+
+    name, title, source = "visits", "", ""
+
+    def __init__(self, numbers: Indices, count: int) -> None:
+        self.numbers, self.count = numbers, count
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return tuple(Coefficient(f"v{k}", "m/s^2", 1.0, "m/s^2") for k in range(3 * self.count))
+
+    def columns(self, s: Stimulus) -> Floats:
+        instants = np.arange(len(self.numbers))[s.places if s.whole is not None else slice(None)]
+        columns = np.zeros((len(s), 3, 3, self.count))
+        for i in range(3):
+            columns[np.arange(len(s)), i, i, self.numbers[instants]] = 1.0
+        return columns.reshape(len(s), 3, -1)
+
+
+class _Walk(Effect):
+    """The path of a random walk of the biases from its beginning: sums of waves (Karhunen and Loeve)."""
+
+    name, title, source = "walk", "", ""
+
+    def __init__(self, run_s: float, count: int) -> None:
+        self.run_s, self.count = run_s, count
+        self.rates = (np.arange(count) + 0.5) * np.pi / run_s
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return tuple(Coefficient(f"w{k}", "m/s^2", 1.0, "m/s^2") for k in range(3 * self.count))
+
+    def columns(self, s: Stimulus) -> Floats:
+        waves = math.sqrt(2.0 / self.run_s) * np.sin(s.elapsed_s[:, None] * self.rates) / self.rates
+        columns = np.zeros((len(s), 3, 3, self.count))
+        columns[:, range(3), range(3)] = waves[:, None]
+        return columns.reshape(len(s), 3, -1)
+
+
+def _leading(columns: Floats) -> Floats:
+    """Return the combinations (q, ``_LEADING``) of columns (r, q) of an unknown function that show most, orthonormal in
+    its coefficients, so that these keep their prior; zeros where there are fewer."""
+    _, singular, right = np.linalg.svd(columns, full_matrices=False)
+    kept = right[: int((singular > _LEAST * singular[0]).sum())][:_LEADING]
+    return np.hstack([kept.T, np.zeros((columns.shape[1], _LEADING - len(kept)))])
+
+
+def _is_limit(effect: Effect | None) -> bool:
+    """Tell whether an effect is at the end of the range of its constant, where it is the limit of another one, which
+    may be an unknown function."""
+    return effect is not None and effect.unknown is not None and effect.value >= _END * effect.unknown.high
+
+
+def _largest_cosine(bases: Sequence[Floats], basis: Floats) -> float:
+    """Return the cosine of the smallest of the largest angles between a basis and each of some others."""
+    products = np.swapaxes(np.stack(bases), 1, 2) @ basis
+    close = products[np.einsum("nij,nij->n", products, products) > _SAME**2 * basis.shape[1]]
+    return float(np.linalg.svd(close, compute_uv=False).min(axis=1).max(initial=0.0))
+
+
+def sizes_of(least: float, usual: SizePrior | None, nodes: int = _NODES) -> Sizes:
+    """Sizes from one sigma of what is determined best, each with its prior probability: smaller ones show nothing.
+
+    usual: the prior of the sizes; None: all decades above are as likely.
+    """
+    if usual is None:
+        values = least * 10.0 ** (_DECADES * (np.arange(nodes) + 0.5) / nodes)
+        return Sizes(values, np.full(nodes, -math.log(nodes)))
+    if usual.value:
+        logs = np.full(nodes, -1e300)
+        logs[0] = 0.0
+        return Sizes(np.full(nodes, usual.low), logs, usual.value)
+    edges = np.geomspace(least, max(1e3 * usual.high, 1e4 * least), nodes + 1)
+    shares = np.diff(usual.below(edges))
+    shares[-1] += 1.0 - float(usual.below(edges[-1:])[0])
+    return Sizes(np.sqrt(edges[1:] * edges[:-1]), np.log(np.maximum(shares, 1e-300)))
+
+
+def log_bayes_of_any_size(gram: Floats, along: Floats) -> Floats:
+    """Log Bayes factors (n,) of terms of any size from G^T G (n, q, q) and G^T z (n, q)."""
+    sizes = sizes_of(1.0 / math.sqrt(max(float(np.einsum("nqq->nq", gram).max()), 1e-40)), None)
+    squares, logs = (np.broadcast_to(values, (len(gram), _NODES)) for values in (sizes.values**2, sizes.logs))
+    return log_bayes(gram, along, squares, logs, np.zeros(len(gram)))

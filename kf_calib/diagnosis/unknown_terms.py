@@ -1,0 +1,198 @@
+"""Terms of unknown form: smooth functions of one driver, in each accelerometer or as a rotation.
+
+Each is a Gaussian prior over the span of some formulas of its driver, so that its formula can be read off. A driver may
+have alternatives, as the moments of a jump, of which one is true.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from kf_calib.bench.bench import Bench
+from kf_calib.dwells.sufficient_statistics import DwellFactor
+
+RETURNING = "time (irregular, and comes back)"
+"""What biases depend on that change as irregularly as a random walk, and return to their mean."""
+
+_DECAYS_S = (1, 3, 10, 30, 100, 300, 1000, 3000)
+_CREEPS_S = (3, 10, 30)  # of a platform after its arrival
+_MOST_MOMENTS = 100  # at which a jump is tried
+_TURNS = (0.5, 1, 1.5, 2, 3, 4, 6, 8)  # of what is periodic, in a run
+
+
+@dataclass(frozen=True)
+class UnknownTerm:
+    """Unknown functions of one driver.
+
+    driver: in words. family: the physical class of effects to which such functions belong; "" for none. summands:
+    formulas that belong together, as sine and cosine; ``:place = ...`` stands for a rotation. weights: the usual sizes
+    of the summands, of as many columns of equal rms. exclusive: only one of the summands is true; else one or all.
+    """
+
+    driver: str
+    family: str
+    summands: tuple[tuple[str, ...], ...]
+    weights: tuple[float, ...] = ()
+    exclusive: bool = False
+
+    def weight(self, k: int) -> float:
+        """The usual size of one of the summands."""
+        return self.weights[k] if self.weights else 1.0
+
+
+def unknown_terms(bench: Bench, dwells: Sequence[DwellFactor]) -> Iterator[UnknownTerm]:
+    """All terms of unknown form that a run of these dwells may show."""
+    yield from _of_force()
+    yield from _of_gimbals(len(bench.axes))
+    yield from _of_time(dwells, bench.angles)
+    yield from _of_jumps(dwells, bench.angles)
+    yield from _of_arrival(len(bench.axes), dwells)
+    yield from _of_surroundings(len(bench.axes), bench.angles)
+
+
+def _term(
+    driver: str, family: str, texts: Sequence[str | tuple[str, ...]], weights: Sequence[float] = ()
+) -> UnknownTerm:
+    """A term whose functions are sums of these formulas, or pairs of them."""
+    return UnknownTerm(driver, family, tuple((t,) if isinstance(t, str) else t for t in texts), tuple(weights))
+
+
+def _one_of(driver: str, family: str, alternatives: Sequence[tuple[str, ...]]) -> UnknownTerm:
+    """A term of which one alternative is true."""
+    return UnknownTerm(driver, family, tuple(alternatives), exclusive=True)
+
+
+def _of_force() -> Iterator[UnknownTerm]:
+    powers = ["{0}*{0}", "{0}**3", "abs({0})", "{0}*abs({0})", "{0}**4", "{0}**5", "{0}**6"]
+    weights = (1.0, 1.0, 0.7, 0.7, 0.7, 0.5, 0.4)
+    for axis, words, family in (("a", "input", "nonlinearity"), ("p", "pendulous", "cross-axis"),
+                                ("o", "output", "cross-axis")):  # fmt: skip
+        yield _term(f"specific force along the {words} axis", family, [each.format(axis) for each in powers], weights)
+    of_degree = {
+        2: ["a*a", "a*p", "a*o", "p*o", "p*p"],
+        3: ["a**3", "a*a*p", "a*a*o", "a*p*o", "a*p*p", "p**3", "o**3"],
+        4: ["a**4", "a**3*p", "a**3*o", "a*a*p*p", "a*a*p*o", "a*p**3", "a*p*p*o", "p**4", "p**3*o"],
+    }
+    texts = [text for of_one in of_degree.values() for text in of_one]
+    weights = tuple(2.0 / degree for degree, of_one in of_degree.items() for _ in of_one)
+    yield _term("direction of the specific force", "cross-axis", texts, weights)
+
+
+def _of_gimbals(count: int) -> Iterator[UnknownTerm]:
+    for k in range(1, count + 1):
+        waves = {n: (f"sin({n}*q{k})", f"cos({n}*q{k})") for n in (1, 2, 3, 4, 6)}
+        weights = [n**-0.5 for n in waves]
+        yield _term(f"angle of gimbal {k}", "", [*waves.values()], weights)
+        products = [_times(waves[n], force) for n in (1, 2) for force in ("a", "p", "o")]
+        yield _term(f"angle of gimbal {k} and specific force", "", products)
+        yield _term(f"angle of gimbal {k} and temperature", "", [_times(waves[1], "T")])
+        before = (f"sin(q{k}_before)", f"cos(q{k}_before)")
+        yield _term(f"previous orientation (angle of gimbal {k})", "memory", [before])
+        turning = [(f"q{k}",), *waves.values()]
+        for j in range(1, count + 1):
+            words = "as an error of its encoder" if j == k else f"a rotation of gimbal {j}"
+            yield _term(f"angle of gimbal {k} ({words})", "gimbal and encoder",
+                        [_turning(str(j), texts) for texts in turning], (1.0, *weights))  # fmt: skip
+        for place, words in (("base", "a tilt of the base"), ("platform", "a rotation of the platform")):
+            yield _term(f"angle of gimbal {k} ({words})", "gimbal and encoder",
+                        [_turning(place, texts) for texts in turning[:3]], (1.0, *weights[:2]))  # fmt: skip
+
+
+def _neighbours(texts: Sequence[str]) -> list[tuple[str, ...]]:
+    """Decays of two neighbouring time constants together: all between them are sums of these, to one per cent."""
+    return [*itertools.pairwise(texts)] if len(texts) > 1 else [(text,) for text in texts]
+
+
+def _times(texts: Sequence[str], force: str) -> tuple[str, ...]:
+    return tuple(f"{text}*{force}" for text in texts)
+
+
+def _turning(place: str, texts: Sequence[str]) -> tuple[str, ...]:
+    """Rotations of a gimbal, the base or the platform by these functions."""
+    return tuple(f":{place} = {text}" for text in texts)
+
+
+def _of_time(dwells: Sequence[DwellFactor], turns: bool) -> Iterator[UnknownTerm]:
+    run_s = f"({dwells[-1].end_s:.0f}*s)"
+    texts = ["t", "t*t", *(f"cos({n}*pi*t/{run_s})" for n in range(1, 9))]
+    weights = (1.0, 0.5, *(1.0 / n for n in range(1, 9)))
+    yield _term("time", "bias in time", texts, weights)
+    products = [f"{power}*{force}" for power in ("t", "t*t") for force in ("a", "p", "o")]
+    products += [f"{power}*{force}" for power in ("t", "t*t") for force in ("a*a", "p*p", "a*p", "a*o", "p*o")]
+    yield _term("time and specific force", "scale in time", products)
+    decays = [f"exp(-t/({10 * decay_s}*s))" for decay_s in _DECAYS_S if decay_s <= dwells[-1].end_s]
+    decays = decays or ["exp(-t/(30*s))"]
+    yield _one_of("time (a decay)", "bias in time", _neighbours(decays))
+    forces = [("a",), ("p", "o")]
+    yield _one_of("time and specific force (a decay)", "scale in time",
+                  [tuple(f"{decay}*{f}" for f in force for decay in pair)
+                   for pair in _neighbours(decays) for force in forces])  # fmt: skip
+    waves = [tuple(f"{wave}({n}*2*pi*t/{run_s})" for wave in ("sin", "cos")) for n in _TURNS]
+    yield _one_of("time (periodic)", "bias in time", waves)
+    if turns:
+        for place, words in (("base", "a tilt of the base"), ("platform", "a rotation of the platform")):
+            turning = [f":{place} = {text}" for text in texts[:6]]
+            yield _term(f"time ({words})", "base and platform", turning, weights[:6])
+        tilts = [_turning("base", pair) for pair in waves]
+        yield _one_of("time (a periodic tilt of the base)", "base and platform", tilts)
+
+
+def _of_jumps(dwells: Sequence[DwellFactor], turns: bool) -> Iterator[UnknownTerm]:
+    """Jumps of biases at any time; of scale factors, alignment and base between dwells, in the middle of the way."""
+    within_s = [0.5 * (dwell.start_s + dwell.end_s) for dwell in dwells]
+    between_s = [0.5 * (before.end_s + dwell.start_s) for before, dwell in itertools.pairwise(dwells)]
+    moments_s = sorted(within_s + between_s)
+    moments_s, between_s = (each[:: len(each) // _MOST_MOMENTS + 1] for each in (moments_s, between_s))
+    if not between_s:
+        return
+    yield _one_of("time (a jump)", "bias in time", [(f"t > {s:.6g}*s",) for s in moments_s])
+    steps = [f"(t > {s:.6g}*s)" for s in between_s]
+    yield _one_of("time (a jump of the scale factors)", "scale in time", [(f"a*{step}",) for step in steps])
+    across = [(f"p*{step}", f"o*{step}") for step in steps]
+    yield _one_of("time (a jump of the alignment)", "base and platform", across)
+    if turns:
+        for place, words in (("base", "a jump of the tilt of the base"), ("platform", "a jump of the mounting")):
+            turned = [(f":{place} = {step[1:-1]}",) for step in steps]
+            yield _one_of(f"time ({words})", "base and platform", turned)
+
+
+def _of_arrival(gimbals: int, dwells: Sequence[DwellFactor]) -> Iterator[UnknownTerm]:
+    longest_s = max(dwell.end_s - dwell.start_s for dwell in dwells)
+    decays_s = [decay_s for decay_s in _DECAYS_S if decay_s <= 2.0 * longest_s] or [_DECAYS_S[0]]
+    yield _one_of("time since arrival", "memory", _neighbours([f"exp(-tau/({each}*s))" for each in decays_s]))
+    creeps = [tuple(f"{f}*exp(-tau/({each}*s))" for f in ("fx", "fy", "fz")) for each in decays_s]
+    yield _one_of("time since arrival and specific force", "memory", creeps)
+    for k in range(1, gimbals + 1):
+        sizes = (f"q{k}_move", f"sign(q{k}_move)")
+        texts = [(f":{k} = {size}*exp(-tau/({each}*s))",) for each in _CREEPS_S for size in sizes
+                 if each <= 2.0 * longest_s]  # fmt: skip
+        if texts:
+            yield _one_of(f"time since arrival and last move of gimbal {k}", "gimbal and encoder", texts)
+
+
+def _of_surroundings(gimbals: int, turns: bool) -> Iterator[UnknownTerm]:
+    yield _term("temperature", "temperature", ["T", "T*T", "T**3"])
+    products = [f"{power}*{force}" for power in ("T", "T*T") for force in ("a", "p", "o")]
+    products += [f"{power}*{force}" for power in ("T", "T*T") for force in ("a*a", "p*p", "a*p", "a*o", "p*o")]
+    yield _term("temperature and specific force", "temperature", products)
+    yield _term("rate of temperature", "temperature", ["dT", "a*dT"])
+    if turns:
+        for place, words in (("base", "a tilt of the base"), ("platform", "a rotation of the platform")):
+            yield _term(f"temperature ({words})", "temperature", [f":{place} = T", f":{place} = T*T"])
+    texts = ["da", "da*abs(da)", "abs(da)", *(f"tanh(da/({width}*m/s**2))" for width in (2, 5)), "play3", "play6"]
+    yield _term("previous orientation", "memory", [*texts, "a-da", "(a-da)**2"])
+    steps = [f"{step}*{force}" for step in ("da", "abs(da)") for force in ("a", "p", "o")]
+    yield _term("previous orientation and specific force", "memory", steps)
+
+
+def name_of_formula(number: int) -> str:
+    """Names of formulas: mine, mine2, mine3 ..."""
+    return f"mine{number + 1}" if number else "mine"
+
+
+def text_named(text: str, number: int = 0) -> str:
+    """A formula with a name in front, from ``:z = sin(q1)`` or ``sin(q1)``."""
+    name = name_of_formula(number)
+    return f"{name}{text}" if text.startswith(":") else f"{name} = {text}"
