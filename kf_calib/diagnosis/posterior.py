@@ -245,7 +245,8 @@ class RunPosterior:
         gains[of_heads[:, None] | of_heads] = -np.inf
         pairs = [divmod(k, len(names)) for k in np.argsort(-gains, axis=None)[:_HEADS].tolist()]
         evidence = [float(self._log_evidence[self._best[name]]) for name in names]
-        return [names[i if evidence[i] > evidence[j] else j] for i, j in pairs if gains[i, j] > least]
+        likely = [i if evidence[i] > evidence[j] else j for i, j in pairs if gains[i, j] > least]
+        return [str(names[k]) for k in likely]
 
     @cached_property
     def _best(self) -> dict[str, int]:
