@@ -125,12 +125,12 @@ def _refuse_reversed_in_plane(means: DwellMeans, stated: Mounting) -> None:
     opposite = (np.linalg.norm(nominal, axis=1) > _FARTHEST) & (cosines < -_FARTHEST) & (left < _UNEXPLAINED)
     if not opposite.any():
         return
-    channels: Channels = tuple(-k if wrong else k for k, wrong in zip(CHANNELS, opposite.tolist(), strict=True))
+    one, two, three = (-k if wrong else k for k, wrong in zip(CHANNELS, opposite.tolist(), strict=True))
     numbers = [abs(channel) for channel, wrong in zip(bench.input.channels, opposite.tolist(), strict=True) if wrong]
+    wired = _wired(bench, (one, two, three)) + bench.input.restating("channels")
     raise BlunderError(
-        f"{_channels(numbers)} -g where +g is expected, and gravity stays in one plane, which does not tell why: either "
-        f"{_question(bench, [Mending(stated, channels)]).removesuffix('.')} or the gimbal turns the other way: then "
-        "write its axis with a minus in --axes."
+        f"{_channels(numbers)} -g where +g is expected. Gravity stays in one plane, which does not tell why: the channel "
+        f"is reversed (--channels {wired}), or the gimbal turns the other way (a minus before its axis in --axes)."
     )
 
 
