@@ -289,6 +289,36 @@ class Stimulus:
         solve: Any = get_blas_funcs("tbsv", dtype=np.float64)  # scipy.signal.lfilter would take 0.7 s to load
         return np.interp(self.elapsed_s, grid, solve(1, bands, driven, lower=1))
 
+    def remembered(self, tau_s: float) -> Floats:
+        """x (m, 3), m/s^2: tau dx/dt = a_i - x, in balance at first; a_i in straight lines from instant to instant."""
+        if self.whole is not None:
+            return self.whole.remembered(tau_s)[self.places]
+        from scipy.linalg import get_blas_funcs
+
+        order = np.argsort(self.elapsed_s, kind="stable")
+        along, ratio = self.along[order], np.maximum(np.diff(self.elapsed_s[order]), 0.0) / tau_s
+        decay, mean = np.exp(-ratio), np.where(ratio > 0.0, -np.expm1(-ratio) / np.where(ratio > 0.0, ratio, 1.0), 1.0)
+        driven = (1.0 - mean)[:, None] * along[1:] + (mean - decay)[:, None] * along[:-1]
+        bands = np.asfortranarray(np.vstack([np.ones(len(along)), np.append(-decay, 0.0)]))
+        solve: Any = get_blas_funcs("tbsv", dtype=np.float64)
+        through = np.empty_like(along)
+        for i in range(3):
+            through[order, i] = solve(1, bands, np.append(along[0, i], driven[:, i]), lower=1)
+        return through
+
+    def played_warmth(self, half_width_k: float) -> Floats:
+        """T (m,), K, through a play of this half-width, from the first T on."""
+        if self.whole is not None:
+            return self.whole.played_warmth(half_width_k)[self.places]
+        order = np.argsort(self.elapsed_s, kind="stable")
+        warm = self.warmth[order].tolist()
+        follow = itertools.accumulate(
+            warm, lambda held, now: min(max(held, now - half_width_k), now + half_width_k), initial=warm[0]
+        )
+        through = np.empty(len(warm))
+        through[order] = list(follow)[1:]
+        return through
+
     def to_platform(self, vector: Floats) -> Floats:
         """A bench vector (3,) seen in the platform, (m, 3)."""
         return np.broadcast_to(self.bench.to_platform(vector, self.pose), (len(self), 3))

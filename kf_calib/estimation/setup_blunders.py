@@ -129,8 +129,8 @@ def _refuse_reversed_in_plane(means: DwellMeans, stated: Mounting) -> None:
     numbers = [abs(channel) for channel, wrong in zip(bench.input.channels, opposite.tolist(), strict=True) if wrong]
     wired = _wired(bench, (one, two, three)) + bench.input.restating("channels")
     raise BlunderError(
-        f"{_channels(numbers)} -g where +g is expected. Gravity stays in one plane, which does not tell why: the channel "
-        f"is reversed (--channels {wired}), or the gimbal turns the other way (a minus before its axis in --axes)."
+        f"{_channels(numbers)} -g where +g is expected. Gravity stays in one plane, which does not tell why: the "
+        f"channel is reversed (--channels {wired}), or the gimbal turns the other way (a minus before its axis in --axes)."
     )
 
 
