@@ -130,7 +130,7 @@ def _refuse_reversed_in_plane(means: DwellMeans, stated: Mounting) -> None:
     wired = _wired(bench, (one, two, three)) + bench.input.restating("channels")
     raise BlunderError(
         f"{_channels(numbers)} -g where +g is expected. Gravity stays in one plane, which does not tell why: the "
-        f"channel is reversed (--channels {wired}), or the gimbal turns the other way (a minus before its axis in --axes)."
+        f"channel is reversed (--channels {wired}), or the gimbal turns the other way (a minus in --axes)."
     )
 
 

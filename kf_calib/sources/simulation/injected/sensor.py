@@ -69,7 +69,7 @@ def thermal_lag(alpha: Floats, rig: Rig, *, tau: float = 600.0, reference: float
 
 @made("thermal-hysteresis", "m/s^2/K", ("5ug/K", "30ug/K"), ("0.15mg/K", "1mg/K"))
 def thermal_hysteresis(alpha: Floats, rig: Rig, *, play: float = 2.0, reference: float = 25.0) -> TrueStep:
-    """Temperature sensitivity with hysteresis: alpha times a temperature that follows the true one with a play of so
+    """Thermal hysteresis: alpha times a temperature that follows the true one with a play of so
     many K, up and down each, as glued and clamped parts do (Prandtl's play operator); without history at first."""
     followed_c: float | None = None
 
