@@ -240,7 +240,7 @@ def report(
     verdict = diagnosis.verdict(diagnosed) if pair is None else console.difference_in_words(pair)
     if as_json:
         table = {"report": str(output), "recording": measured.name, "sha256": measured.sha256,
-                 "consistent": diagnosed.test.consistent, "p_value": diagnosed.test.p_value,
+                 "consistent": diagnosed.consistent, "p_value": diagnosed.test.p_value,
                  "verdict": diagnosis.verdict(diagnosed)}  # fmt: skip
         beside_it = {"against": None, "differences": [], "differences_p_value": None}
         print_json(clean(table | (beside_it if pair is None else side_by_side_object(pair))))

@@ -55,6 +55,7 @@ class Hypothesis:
     - statistic, dof: fall of chi-squared in the likeliest noise, and the number of coefficients; of a random walk alone
       twice its gain in likelihood; 0 of what was not fitted.
     - refit: the calibration with it; None where none was made.
+    - dwell: the number of the dwell that alone is off; 0 for none.
     """
 
     effects: tuple[str, ...] = ()
@@ -66,6 +67,7 @@ class Hypothesis:
     dof: int = 0
     refit: Calibration | None = None
     probability: float = 0.0
+    dwell: int = 0
 
     @property
     def unknown(self) -> bool:

@@ -43,7 +43,7 @@ from kf_calib.dwells import window_average
 from kf_calib.effects import effect_named
 from kf_calib.estimation.outlying_dwell import outlying_in_words
 from kf_calib.estimation.results import Calibration, format_p
-from kf_calib.support.tail_probabilities import chi_squared_tail, log_odds_of
+from kf_calib.support.tail_probabilities import LEVEL, chi_squared_tail, log_odds_of
 
 _SHOWN = 6  # number of suspects that are shown
 _DOUBT = 0.01  # probability from which noise that was not stated is named as a rival
@@ -140,10 +140,12 @@ def _explained(refits: Refits, before: Calibration, test: CandidateTests) -> Dia
     diagnosis = Diagnosis(before=before, test=test)
     if test.consistent is None:
         return diagnosis
-    if test.consistent and dwell_noise_is_stated(before):
-        return replace(diagnosis, table=RunPosterior(refits, before, test).table(refitted=False))
     if test.consistent:  # noise that is estimated from all of the misfit explains as much of it as an effect does
-        table = RunPosterior(refits, before, test).table()
+        posterior, stated = RunPosterior(refits, before, test), dwell_noise_is_stated(before)
+        table = posterior.table(refitted=not stated)
+        if stated and noise_p(table) >= LEVEL:
+            return replace(diagnosis, table=table)
+        table = posterior.table() if stated else table
         diagnosis = replace(diagnosis, test=replace(test, noise_p=noise_p(table)), table=table)
         return diagnosis if diagnosis.test.consistent else _decided(refits, diagnosis)
     if test.lines.oscillation:

@@ -125,8 +125,13 @@ class RunPosterior:
             of_noise.append(log + prior + math.log(1.0 - share))
             irregular += [log + prior + math.log(share)] if share else []
         within = log_odds_of(self._test.trend.p_value) if self._test.trend else 0.0
+        log_nothing = noises[0][1] + prior
+        if self._test.consistent is False:  # chance, or a cause of which there is no term: as p has it
+            odds = log_odds_of(self._test.p_value or 0.0) + math.log(PRIOR["unknown"] / PRIOR["nothing"])
+            irregular.append(log_nothing - float(np.logaddexp(0.0, -odds)))
+            log_nothing -= float(np.logaddexp(0.0, odds))
         rows = [
-            Hypothesis(families=(NOTHING,), log_evidence=noises[0][1] + prior),
+            Hypothesis(families=(NOTHING,), log_evidence=log_nothing),
             Hypothesis(driver=IRREGULAR, families=(NONE,), log_evidence=_log_sum(irregular) + within),
         ]
         return [*rows, Hypothesis(families=(NOISE,), log_evidence=_log_sum(of_noise))] if of_noise else rows
@@ -197,7 +202,7 @@ class RunPosterior:
         logs = np.logaddexp.reduce(self._sizes.evidence(self._base + of_dwells), axis=1)
         number = self._before.fit.dwells[int(np.argmax(logs))].number
         log = _log_sum(logs.tolist()) - math.log(len(logs)) + math.log(PRIOR["dwell"])
-        return Hypothesis(driver=f"dwell {number} alone", families=(NONE,), log_evidence=log)
+        return Hypothesis(driver=f"dwell {number} alone", families=(NONE,), log_evidence=log, dwell=number)
 
     def _pairs(self) -> list[Hypothesis]:
         """Return the rows of the likeliest effects, each with any other term beside it."""
@@ -245,7 +250,8 @@ class RunPosterior:
         gains[of_heads[:, None] | of_heads] = -np.inf
         pairs = [divmod(k, len(names)) for k in np.argsort(-gains, axis=None)[:_HEADS].tolist()]
         evidence = [float(self._log_evidence[self._best[name]]) for name in names]
-        return [names[i if evidence[i] > evidence[j] else j] for i, j in pairs if gains[i, j] > least]
+        likely = [i if evidence[i] > evidence[j] else j for i, j in pairs if gains[i, j] > least]
+        return [str(names[k]) for k in likely]
 
     @cached_property
     def _best(self) -> dict[str, int]:

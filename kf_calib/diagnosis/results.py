@@ -19,7 +19,7 @@ from kf_calib.diagnosis.replication import Replication
 from kf_calib.diagnosis.residual_drivers import Driver, drivers_of
 from kf_calib.diagnosis.unknown_effect import Description, channel_of, describe_irregular, explained_share
 from kf_calib.effects.effect import Grade
-from kf_calib.estimation.results import Calibration, Parameter
+from kf_calib.estimation.results import Calibration, Condition, Parameter
 from kf_calib.noise.noise_model import mean_covariances
 from kf_calib.support.tail_probabilities import chi_squared_tail
 from kf_calib.support.text import as_html, printed
@@ -99,6 +99,16 @@ class Diagnosis:
 
     def _repr_html_(self) -> str | None:
         return as_html(self)
+
+    @property
+    def condition(self) -> Condition | None:
+        """What was not stated and the agreement rests on; None where there is none, or nothing agrees."""
+        return self.before.consistency.condition if self.test.consistent else None
+
+    @property
+    def consistent(self) -> bool | None:
+        """Whether model and run agree; None where nothing could be tested, or where it rests on what was not stated."""
+        return None if self.condition else self.test.consistent
 
     @cached_property
     def residual_ratios(self) -> Floats:

@@ -108,8 +108,7 @@ class RunTerms:
         candidates = test.effects.scan.candidates
         effects, tried = [each.effect for each in candidates], [each.tried for each in candidates]
         stimulus = stimulus_of(self._linearised.dwells, self.bench, self._linearised.state)
-        # a time constant longer than the effect goes on in this run is less likely by as much
-        logs = np.array([-math.log(max(effect.value / effect.acts_for_s(stimulus), 1.0)) for effect in effects])
+        logs = np.array([effect.log_share(stimulus) for effect in effects])
         for name in dict.fromkeys(map(str, effects)):
             numbers = [k for k, effect in enumerate(effects) if str(effect) == name]
             most = max(len(numbers), *(tried[k] for k in numbers))

@@ -37,11 +37,10 @@ def verdict_in_words(diagnosis: Diagnosis) -> str:
     if test.consistent:
         effects = test.effects
         blind = f" This run cannot show {len(effects.unseen)} of {effects.count} effects." if effects.unseen else ""
-        noise = diagnosis.before.noise
-        if not (noise.within_seen or noise.scatter_stated):
+        if diagnosis.condition is not None:
             return (
-                f"No effect explains a significant part of the scatter of the dwells (p {format_p(test.p_value)}), "
-                f"from which all noise was estimated.{blind}"
+                f"The model agrees with the measurements if {diagnosis.condition}: this was estimated from their "
+                f"misfit (p {format_p(test.p_value)}), which no known effect explains beyond it.{blind}"
             )
         agreed = f"The model agrees with the measurements (p {format_p(test.p_value)})"
         return f"{agreed}: no effect is missing that this run could show.{blind}"
@@ -152,6 +151,11 @@ def _unexplained(diagnosis: Diagnosis) -> str:
 
 def _unknown(diagnosis: Diagnosis, first: Hypothesis) -> str:
     """Return a sentence on a misfit that no known effect explains."""
+    if first.dwell:
+        return (
+            f"One dwell is wrong: dwell {first.dwell} alone does not fit ({format_probability(first.probability)}"
+            f"{_others(diagnosis)}): look at its pose and its readings, or leave it out (--leave-out {first.dwell})."
+        )
     what = "it changes irregularly" if first.driver == IRREGULAR else f"it goes with {first.driver}"
     assert diagnosis.table is not None
     share, noise = first.probability, diagnosis.table.families.get(NOISE, 0.0)

@@ -32,11 +32,12 @@ _PLAIN: dict[str, type[Effect]] = {
     for kind in (
         sensor.BiasAsymmetry, sensor.ScaleAsymmetry, sensor.SecondOrder, sensor.ThirdOrder, sensor.OddQuadratic,
         sensor.CrossCouplingIP, sensor.CrossCouplingIO, sensor.CrossCouplingPO, sensor.CrossAxisSquare,
+        sensor.OutputSquare,
         sensor.VibrationRectification, sensor.DeadZone,
         drift.BiasDrift, drift.BiasWalk, drift.ScaleDrift, drift.WarmUp, drift.ScaleWarmUp, drift.Settling,
-        drift.Hysteresis, drift.Sinusoid,
+        drift.Hysteresis, drift.Memory, drift.Sinusoid,
         drift.ThermalBias, drift.ThermalBias2, drift.ThermalScale, drift.ThermalRate,
-        drift.ThermalMisalignment, drift.ThermalLag, drift.Magnetic,
+        drift.ThermalMisalignment, drift.ThermalLag, drift.ThermalHysteresis, drift.Magnetic,
         frame.BaseTilt, frame.BaseTiltDrift, frame.PlatformDrift, frame.GravityError,
         frame.EarthRotation, frame.Flexure, frame.UnevenFlexure, frame.CrossTalk, frame.Latency, frame.LeverArm,
     )

@@ -4,6 +4,7 @@ surroundings do to the sensors: magnetic fields, and temperature T, counted from
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -129,6 +130,27 @@ class Settling(_Decay):
 
     def acts_for_s(self, s: Stimulus) -> float:
         return float(s.since_arrival_s.max())
+
+
+class Memory(_Decay):
+    """c (a_i - x), tau dx/dt = a_i - x: what came before is forgotten over several dwells; x begins at a_i."""
+
+    family = "memory"
+    name, title, source = "memory", "slow response to a change of the input", "anelastic relaxation; IEEE Std 1293"
+    confused_with = "settling, which is over with the next step; bias-walk; needs the same pose after different ones"
+    symbol, unit, scale = "c", "1", 1e-3
+    unknown = Unknown("tauMemory", "s", 3.0, 7200.0, "s", 1.0)
+    typical = Typical((1e-6, 100e-6), (0.1e-3, 3e-3))
+
+    def terms(self, s: Stimulus) -> Floats:
+        return s.along - s.remembered(self.value)
+
+    def acts_for_s(self, s: Stimulus) -> float:
+        return s.span_s
+
+    def log_share(self, s: Stimulus) -> float:
+        dwell_s = float(s.since_arrival_s.max())  # what is forgotten within a dwell is a settling
+        return super().log_share(s) + 4.0 * math.log(min(self.value / max(dwell_s, 1e-9), 1.0))
 
 
 class Sinusoid(Effect):
@@ -343,3 +365,26 @@ class ThermalLag(SensorEffect):
 
     def terms(self, s: Stimulus) -> Floats:
         return np.repeat(s.lagged_warmth(self.value)[:, None], 3, axis=1)
+
+
+class ThermalHysteresis(SensorEffect):
+    """alpha P, P the temperature through a play of a half-width: it follows T only where that pushes it."""
+
+    family = "temperature"
+    name, title = "thermal-hysteresis", "bias that depends on whether it became warmer or colder"
+    source = "IEEE Std 1293, thermal hysteresis"
+    drawn_against = _TEMPERATURE
+    confused_with = "thermal-bias, thermal-lag; needs the same temperature from two sides"
+    symbol, unit, scale = "alphaH", "m/s^2/K", 1e-3
+    typical = ThermalBias.typical
+    unknown = Unknown("playT", "K", 0.02, 20.0, "K", 1.0)
+
+    def __init__(self) -> None:
+        self.value = 1.0
+
+    def terms(self, s: Stimulus) -> Floats:
+        return np.repeat(s.played_warmth(self.value)[:, None], 3, axis=1)
+
+    def log_share(self, s: Stimulus) -> float:
+        swing_k = float(np.ptp(s.warmth))  # a play of less than a tenth of the swing is a thermal-bias
+        return 4.0 * math.log(min(max(self.value / max(0.1 * swing_k, 1e-9), 1e-9), 1.0))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -245,8 +246,13 @@ class Effect(ABC):
         assert self.unknown is not None
         return self.unknown.grid()
 
+    def log_share(self, s: Stimulus) -> float:
+        """Log of the prior of the value of its constant in this run, over that of values that are its own: a time
+        constant longer than it goes on without a break would be another effect's."""
+        return -math.log(max(self.value / self.acts_for_s(s), 1.0)) if self.unknown is not None else 0.0
+
     def acts_for_s(self, s: Stimulus) -> float:
-        """How long it goes on without a break: longer than that, its time constant would be another effect's."""
+        """How long it goes on without a break."""
         return np.inf
 
     def edges(self, s: Stimulus) -> Floats:

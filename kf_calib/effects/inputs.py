@@ -68,9 +68,8 @@ def beyond_force_and_temperature(effect: Effect, bench: Bench) -> str:
         values = own + rng.uniform(0.1, 1.0, own.shape) * (100.0 if name.endswith("_s") else 1.0)
         if not np.array_equal(effect.columns(replace(still, **{name: np.sort(values, axis=0)})), before):
             return f"it depends on {words}"
-    if effect.oscillates:
-        return "it depends on the course of time"
-    return ""
+    backwards = effect.columns(replace(still, elapsed_s=still.elapsed_s[::-1]))
+    return "it depends on the course of time" if effect.oscillates or not np.array_equal(backwards, before) else ""
 
 
 def depends_on_temperature(effect: Effect, bench: Bench) -> bool:

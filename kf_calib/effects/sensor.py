@@ -145,16 +145,29 @@ class CrossCouplingPO(_CrossCoupling):
 
 
 class CrossAxisSquare(_CrossCoupling):
-    """Kpp a_p^2; Koo a_o^2 is then redundant, because the squares sum to g^2."""
+    """Kpp a_p^2."""
 
     name, title, symbol = "cross-axis-square", "square of the pendulous acceleration", "Kpp"
     drawn_against = Regressor("p", "force along the pendulous axis", "m/s^2")
     formulas = ("p**2",)
-    confused_with = "second-order, bias"
+    confused_with = "second-order, output-square, bias"
     typical = Typical((1 * MICRO_PER_G, 20 * MICRO_PER_G), (0.0, MILLI_PER_G))
 
     def terms(self, s: Stimulus) -> Floats:
         return s.pendulous**2
+
+
+class OutputSquare(_CrossCoupling):
+    """Koo a_o^2; beside K2, Kpp and a bias it is redundant, because the squares sum to g^2, alone it is not."""
+
+    name, title, symbol = "output-square", "square of the acceleration along the output axis", "Koo"
+    drawn_against = Regressor("o", "force along the output axis", "m/s^2")
+    formulas = ("o**2",)
+    confused_with = "second-order and cross-axis-square together"
+    typical = Typical((1 * MICRO_PER_G, 10 * MICRO_PER_G), (0.0, MILLI_PER_G))
+
+    def terms(self, s: Stimulus) -> Floats:
+        return s.output**2
 
 
 class VibrationRectification(SensorEffect):

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.polynomial import legendre
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import Floats, Indices
 from kf_calib.bench.bench import Bench, turn
 
 REFERENCE_TEMPERATURE_C = 25.0
@@ -23,6 +23,7 @@ _RATE_WINDOW_S = 5.0  # at least: a thermometer of 0.01 K noise then shows rates
 _RATE_STILL = 0.02
 _UNSURE = 5.0  # sigmas of a setting error
 _LEAST_MOVE_RAD = 1e-4  # of a gimbal: less is noise of its encoder, or creep
+_ON_WAY = 8  # parts of a way from dwell to dwell
 _OF_ALL = ("bench", "sensitivity", "carrier_hz", "part", "whole", "places")  # is the same at all instants
 
 
@@ -288,6 +289,61 @@ class Stimulus:
         bands = np.asfortranarray(np.repeat([[1.0], [-decay]], len(grid), axis=1))
         solve: Any = get_blas_funcs("tbsv", dtype=np.float64)  # scipy.signal.lfilter would take 0.7 s to load
         return np.interp(self.elapsed_s, grid, solve(1, bands, driven, lower=1))
+
+    def remembered(self, tau_s: float) -> Floats:
+        """x (m, 3), m/s^2: tau dx/dt = a_i - x, in balance at first; a_i in straight lines from instant to instant."""
+        if self.whole is not None:
+            return self.whole.remembered(tau_s)[self.places]
+        from scipy.linalg import get_blas_funcs
+
+        at_s, along, places = self._way
+        ratio = np.maximum(np.diff(at_s), 0.0) / tau_s
+        decay, mean = np.exp(-ratio), np.where(ratio > 0.0, -np.expm1(-ratio) / np.where(ratio > 0.0, ratio, 1.0), 1.0)
+        driven = (1.0 - mean)[:, None] * along[1:] + (mean - decay)[:, None] * along[:-1]
+        bands = np.asfortranarray(np.vstack([np.ones(len(along)), np.append(-decay, 0.0)]))
+        solve: Any = get_blas_funcs("tbsv", dtype=np.float64)
+        through = [solve(1, bands, np.append(along[0, i], driven[:, i]), lower=1)[places] for i in range(3)]
+        return np.stack(through, axis=1)
+
+    @cached_property
+    def _way(self) -> tuple[Floats, Floats, Indices]:
+        """Rising instants (n,), a_i (n, 3) at these, and which of them the instants of this are: on the way from dwell
+        to dwell the platform turns from pose to pose until it has arrived, all gimbals at once, slowly at both ends."""
+        order = np.argsort(self.elapsed_s, kind="stable")
+        times_s, since_s, along = self.elapsed_s[order], self.since_arrival_s[order], self.along[order]
+        arrived = np.flatnonzero(np.diff(since_s) < 0.0) + 1
+        left_s, pose, before = times_s[arrived - 1], self.pose[order][arrived], self.previous_pose[order][arrived]
+        arrived_s = np.maximum(times_s[arrived] - since_s[arrived], left_s)
+        if not self.bench.axes:  # a quaternion and its negative are the same
+            before = np.where(np.sum(before * pose, axis=1, keepdims=True) < 0.0, -before, before)
+        on_way_s, on_way = list[Floats](), list[Floats]()
+        for share in np.arange(1, _ON_WAY + 1) / _ON_WAY:
+            at_s = left_s + share * (arrived_s - left_s)
+            turned = share**2 * (3.0 - 2.0 * share)
+            force = along[arrived - 1] + turned * (along[arrived] - along[arrived - 1])
+            if self.bench.angles and np.isfinite(before).all() and share < 1.0:
+                force = self.bench.specific_force(at_s, before + turned * (pose - before)) @ self.axes.T
+            on_way_s.append(at_s)
+            on_way.append(force)
+        all_s = np.concatenate([times_s, *on_way_s])
+        in_time = np.lexsort((np.arange(len(all_s)) < len(order), all_s))  # at the same time the way comes first
+        rank, places = np.empty(len(all_s), np.intp), np.empty(len(order), np.intp)
+        rank[in_time] = np.arange(len(all_s))
+        places[order] = rank[: len(order)]
+        return all_s[in_time], np.concatenate([along, *on_way])[in_time], places
+
+    def played_warmth(self, half_width_k: float) -> Floats:
+        """T (m,), K, through a play of this half-width, from the first T on."""
+        if self.whole is not None:
+            return self.whole.played_warmth(half_width_k)[self.places]
+        order = np.argsort(self.elapsed_s, kind="stable")
+        warm = self.warmth[order].tolist()
+        follow = itertools.accumulate(
+            warm, lambda held, now: min(max(held, now - half_width_k), now + half_width_k), initial=warm[0]
+        )
+        through = np.empty(len(warm))
+        through[order] = list(follow)[1:]
+        return through
 
     def to_platform(self, vector: Floats) -> Floats:
         """A bench vector (3,) seen in the platform, (m, 3)."""

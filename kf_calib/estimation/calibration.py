@@ -111,13 +111,28 @@ def conclude(
         passed, fitted = on_carrier(replace(passed, source=again), dwells, plain, on_progress)
     else:
         fitted = fitted_to(passed, dwells)
-    result = evaluate_fit(fitted, settings)
+    result = _with_coarse_steps(evaluate_fit(fitted, settings), passed)
     refuse_unseen(result)
     _refuse_without_noise(result)
     if again is not None and settings.engine == "filterpy":
         stage.say("filterpy, reading by reading")
         result = replace(result, estimate=filterpy_estimate(again, result, on_progress=on_progress))
     return with_remarks(result, passed)
+
+
+def _with_coarse_steps(result: Calibration, passed: Pass) -> Calibration:
+    """The result with the error of means by steps of the readings that noise does not spread: as scatter from dwell to
+    dwell, since averaging does not reduce it, nor does a pose that is visited again."""
+    coarse_mps2 = passed.watch.judged(result.fit.dwells, result.noise).scatter_mps2
+    if not coarse_mps2:
+        return result
+    means = np.round(result.linearised.means.readings / coarse_mps2)
+    coarse_mps2 *= math.sqrt(len(means) / len(np.unique(means, axis=0)))
+    scatter_mps2 = math.hypot(coarse_mps2, result.bench.scatter_sigma_mps2 or 0.0)
+    model = replace(result.model, bench=replace(result.bench, scatter_sigma_mps2=scatter_mps2))
+    walk_mps2_per_sqrt_s = result.settings.walk_mps2_per_sqrt_s
+    fitted = fit(result.fit.dwells, model, walk_mps2_per_sqrt_s, result.linearised.slews, must_settle=False)
+    return evaluate_fit(fitted, result.settings)
 
 
 def with_remarks(result: Calibration, passed: Pass) -> Calibration:

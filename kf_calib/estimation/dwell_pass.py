@@ -148,7 +148,10 @@ def refuse_unusable(dwells: Sequence[DwellFactor], tally: Tally, bench: Bench) -
             f"{tally.not_finite} not finite, {tally.too_large} too large, {tally.without_pose} without an angle): the "
             f"platform must stand still; if it did, raise --still-deg or lower --settle-s{unit}."
         )
-    level = float(np.median(lengths(DwellStack.of(dwells).means[:, 4:]))) / bench.gravity_mps2
+    means_mps2 = DwellStack.of(dwells).means[:, 4:]
+    if not means_mps2.any():
+        raise InputError("all readings are zero: check that this is the accelerometer, and that it is on.")
+    level = float(np.median(lengths(means_mps2))) / bench.gravity_mps2
     if LEVELS[0] <= level <= LEVELS[1]:
         if bench.angles:
             setup_blunders.refuse(dwells, bench)

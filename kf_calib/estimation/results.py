@@ -59,19 +59,43 @@ class Visit:
 
 
 @dataclass(frozen=True)
+class Condition:
+    """What was not stated of a bench, and was estimated from the misfit that it explains: the key that states it, its
+    size and unit."""
+
+    name: str
+    value: float
+    unit: str
+
+    def __str__(self) -> str:
+        """What has to be true of the bench, after "if"."""
+        if self.name == "angle_sigma_deg":
+            angle = shown("rad")
+            return f"your table sets angles no better than {angle.text(math.radians(self.value), 2)}"
+        return f"your dwells scatter by {shown('m/s^2').text(self.value, 2)}"
+
+
+@dataclass(frozen=True)
 class Consistency:
     """A test of whether the dwells agree with the model within the noise.
 
     The statistic is the sum of the normalised innovations squared, chi-squared distributed with ``dof`` degrees of
     freedom; its quotient by ``dof`` is tested against an F distribution, because the noise itself was estimated from
     finitely many readings. Scatter that was estimated from the same misfit is left out. ``p_value`` and ``consistent``
-    are None if there are no degrees of freedom, or if all of the noise was estimated from the misfit.
+    are None if there are no degrees of freedom, or if all of the noise was estimated from the misfit. condition: what
+    was estimated from the misfit, without which they would not agree; None where nothing was.
     """
 
     statistic: float
     dof: int
     p_value: float | None
     consistent: bool | None
+    condition: Condition | None = None
+
+    @property
+    def unconditional(self) -> bool | None:
+        """Whether they agree; None where that rests on what was not stated, too."""
+        return None if self.consistent and self.condition else self.consistent
 
     @property
     def quiet(self) -> bool:
@@ -362,7 +386,8 @@ def consistency(fitted: Fit) -> Consistency:
     if dof <= 0:
         return Consistency(statistic, 0, None, None)
     if not noise.within_seen and not noise.scatter_stated:  # the noise was taken from this misfit
-        return Consistency(statistic, dof, None, None)
+        scatter_mps2 = float(np.sqrt(np.mean(noise.scatter_mps2**2)))
+        return Consistency(statistic, dof, None, None, Condition("scatter_sigma_mps2", scatter_mps2, "m/s^2"))
     noise_dof = float(np.maximum(dwells.folded.counts - 4, 1).sum() / noise.inflation.mean())
     left, tested = statistic, dof
     if estimated and (along := _dof_along_force(fitted)):
@@ -370,7 +395,12 @@ def consistency(fitted: Fit) -> Consistency:
         # its degrees of freedom whatever the model is, and the misfit along the force alone is left to be tested.
         left, tested = max(statistic - (dof - along), 0.0), along
     p_value = f_tail(tested, max(noise_dof, 1.0), left / tested)
-    return Consistency(statistic, dof, p_value, p_value >= LEVEL)
+    condition = None
+    if estimated and p_value >= LEVEL:
+        stated = replace(fitted, noise=replace(noise, setting_rad=0.0, setting_stated=True))
+        if consistency(stated).consistent is False:
+            condition = Condition("angle_sigma_deg", math.degrees(noise.setting_rad), "deg")
+    return Consistency(statistic, dof, p_value, p_value >= LEVEL, condition)
 
 
 def _dof_along_force(fitted: Fit) -> int:

@@ -53,6 +53,7 @@ _MOST_NAMED = 3  # largest number of equally good changes in a message
 _ALIKE = 0.05  # three scale factors share a deviation if they differ by less than this share of it
 _LITTLE = 20e-6  # a smaller deviation of the scale factors is not reported
 _FEW_DWELLS = 8  # with more, the other dwells tell the noise, and so a dwell that does not fit
+_IN_PLANE = 0.3  # g; gravity has to turn by as much in a plane to show the axes that lie in it
 _STUCK = 1e-9  # readings with a smaller relative difference are equal
 
 
@@ -66,6 +67,7 @@ def refuse(dwells: Sequence[DwellFactor], bench: Bench) -> None:
     _refuse_silent(means, stated)
     affine = fit_affine(means, stated)
     if affine is None and not determines_axes(means.readings / bench.gravity_mps2):
+        _refuse_reversed_in_plane(means, stated)
         return
     if affine is not None and affine.left < _UNEXPLAINED:
         if affine.is_near():
@@ -103,6 +105,33 @@ def _refuse_silent(means: DwellMeans, stated: Mounting) -> None:
                 f"channel {channel} is dead: its mean stays within {spread_mps2:.2g} m/s^2 in {count} dwells in which "
                 "gravity along it should change by more than g; check that it is connected and on."
             )
+
+
+def _refuse_reversed_in_plane(means: DwellMeans, stated: Mounting) -> None:
+    """Refuse a run whose gravity stays in one plane, and in which a channel that lies near this plane follows gravity
+    with the opposite sign: the plane shows so much of its axis."""
+    force, bench = means.force(stated), stated.bench
+    readings, count = means.readings / bench.gravity_mps2, len(means.readings)
+    _, sizes, directions = np.linalg.svd(force - force.mean(axis=0), full_matrices=False)
+    plane = directions[:2]
+    if count < 4 or sizes[1] < _IN_PLANE * math.sqrt(count):
+        return
+    columns = np.column_stack([force @ plane.T, np.ones(count)])
+    solution = np.linalg.lstsq(columns, readings, rcond=None)[0]
+    left = np.sqrt(np.mean((readings - columns @ solution) ** 2, axis=0))
+    nominal = nominal_sensitivity(bench) @ plane.T
+    sizes_of = np.linalg.norm(nominal, axis=1) * np.linalg.norm(solution[:2], axis=0)
+    cosines = np.sum(nominal * solution[:2].T, axis=1) / np.where(sizes_of > 0.0, sizes_of, np.inf)
+    opposite = (np.linalg.norm(nominal, axis=1) > _FARTHEST) & (cosines < -_FARTHEST) & (left < _UNEXPLAINED)
+    if not opposite.any():
+        return
+    one, two, three = (-k if wrong else k for k, wrong in zip(CHANNELS, opposite.tolist(), strict=True))
+    numbers = [abs(channel) for channel, wrong in zip(bench.input.channels, opposite.tolist(), strict=True) if wrong]
+    wired = _wired(bench, (one, two, three)) + bench.input.restating("channels")
+    raise BlunderError(
+        f"{_channels(numbers)} -g where +g is expected. Gravity stays in one plane, which does not tell why: the "
+        f"channel is reversed (--channels {wired}), or the gimbal turns the other way (a minus in --axes)."
+    )
 
 
 def _refuse_wrong_gain(fitted: AffineFit, bench: Bench) -> None:

@@ -60,7 +60,7 @@ class Quantisation:
             return f"{told} (rms {rms}, within a noise of {noise}): harmless."
         return (
             f"{told}, too coarse for their noise of {noise}: the mean of a dwell can be off by {error}, and averaging "
-            "does not help; record with a finer step."
+            "does not help; it counts as scatter from dwell to dwell; record with a finer step."
         )
 
 
@@ -126,6 +126,11 @@ class Readings:
     def biasing(self) -> list[str]:
         """One sentence on each defect that biases the estimate."""
         return [*map(str, self.saturation), *(str(each) for each in self.quantisation if each.matters)]
+
+    @property
+    def scatter_mps2(self) -> float:
+        """Sigma of the error of a dwell's mean by coarse steps, evenly distributed up to its largest; 0 for none."""
+        return max((each.mean_error_mps2 for each in self.quantisation if each.matters), default=0.0) / math.sqrt(3.0)
 
     @property
     def warnings(self) -> list[str]:

@@ -163,7 +163,7 @@ class Judgement:
     def consistent(self) -> bool | None:
         """Whether the model agrees with the run; None while it is not judged."""
         if self.final:
-            return self.diagnosis.test.consistent
+            return self.diagnosis.consistent
         return None if self.watch is None or self.watch.p_value is None else not self.alarm
 
     @property
@@ -191,6 +191,8 @@ class Judgement:
     @cached_property
     def verdict(self) -> str:
         """The verdict in a few words, for a screen."""
+        if self.final and self.diagnosis.condition is not None:
+            return f"model consistent (p {format_p(self.p_value)}) if {self.diagnosis.condition}"
         if self.consistent is None:
             seen, least = len(self.result.visits), _least(self.result)
             return (

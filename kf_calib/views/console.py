@@ -182,6 +182,7 @@ def verdict(result: Calibration) -> str:
         text = taken if judged.dof else "Nothing is left over to judge the model by."
     else:
         word = "agree" if judged.consistent else "DISAGREE"
+        word += f" if {judged.condition} (estimated from their misfit)" if judged.condition else ""
         text = (
             f"Model and measurements {word}: noise alone gives a misfit this large with probability "
             f"p {format_p(judged.p_value)} (NIS/dof = {judged.nis_per_dof:.3g})."
@@ -206,7 +207,7 @@ def summary(result: Calibration) -> RenderableType:
         head, *([] if result.bench.input.is_plain else [Text(f"Made of {result.bench.input}.")]),
         parameter_table(result),
         *([effect_table(result)] if result.model.effects else []), noise_table(result),
-        Text(verdict(result), style="bold green" if result.consistency.consistent else "bold yellow"),
+        Text(verdict(result), style="bold green" if result.consistency.unconditional else "bold yellow"),
     ]  # fmt: skip
     parts += [note(warning) for warning in result.warnings]
     parts += [without_table(result, found) for found in result.outlying]

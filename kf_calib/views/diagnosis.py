@@ -21,7 +21,7 @@ from kf_calib.diagnosis.results import Diagnosis, Suspect
 from kf_calib.diagnosis.unknown_effect import Description
 from kf_calib.diagnosis.verdict import format_probability, replication_in_words
 from kf_calib.estimation.remarks import MISSING_OR_NOISE
-from kf_calib.estimation.results import Calibration, format_p
+from kf_calib.estimation.results import Calibration, Condition, format_p
 from kf_calib.support.text import printed
 from kf_calib.support.units import shown
 from kf_calib.views.console import plain, symbol
@@ -58,7 +58,8 @@ def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
     trend, disturbed = diagnosis.test.trend, diagnosis.table.disturbed if diagnosis.table else None
     return clean(
         {
-            "consistent": diagnosis.test.consistent,
+            "consistent": diagnosis.consistent,
+            "conditional_on": None if diagnosis.condition is None else vars(diagnosis.condition),
             "p_value": diagnosis.test.p_value,
             "verdict": verdict(diagnosis),
             "model": [str(effect) for effect in diagnosis.before.model.effects],
@@ -81,6 +82,7 @@ def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
             "trend": None
             if trend is None
             else {"ratio": trend.ratio, "p_value": trend.p_value, "dwell": trend.most[0], "channel": trend.most[1]},
+            "disturbed_dwells": _disturbed_dwells(diagnosis),
             "disturbed_dwell": None if disturbed is None else vars(disturbed),
             "detectable": [
                 {"effect": each.name, "minimum": each.minimum, "unit": each.unit} for each in diagnosis.detectable
@@ -93,6 +95,15 @@ def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
             "warnings": list(diagnosis.before.warnings),
         }
     )
+
+
+def _disturbed_dwells(diagnosis: Diagnosis) -> list[int]:
+    """Return the numbers of the dwells that something disturbed, as any test has it."""
+    before, table, first = diagnosis.before, diagnosis.table, diagnosis.likeliest
+    numbers = {each.number for each in before.outlying}
+    numbers |= {*before.readings.outliers.dwells} if before.readings.outliers.clustered else set()
+    numbers |= {table.disturbed.number} if table and table.disturbed else set()
+    return sorted(numbers | ({first.dwell} if first is not None and first.dwell else set()))
 
 
 def _hypotheses_object(table: HypothesisTable | None) -> list[dict[str, Any]]:
@@ -165,8 +176,11 @@ def _suspect_object(suspect: Suspect) -> dict[str, Any]:
 
 
 def verdict(diagnosis: Diagnosis) -> str:
-    """The verdict in one or two sentences; if the model is rejected, faults of the readings that bias it come first."""
-    first = diagnosis.before.readings.biasing if diagnosis.test.consistent is False else []
+    """The verdict in one or two sentences; what disturbed the run comes first and, if the model is rejected, faults of
+    the readings that bias it."""
+    readings = diagnosis.before.readings
+    first = readings.biasing if diagnosis.test.consistent is False else []
+    first = [*first, *([str(readings.outliers)] if readings.outliers.clustered else [])]
     return " ".join([*(sentence[0].upper() + sentence[1:] for sentence in first), diagnosis.verdict])
 
 
@@ -175,7 +189,7 @@ def diagnosis_report(diagnosis: Diagnosis, typed: str = "", details: bool = Fals
 
     typed: recording and options of the command, which the next ones have, too. details: with the evidence below.
     """
-    style = {True: "bold green", False: "bold yellow", None: "bold"}[diagnosis.test.consistent]
+    style = {True: "bold green", False: "bold yellow", None: "bold"}[diagnosis.consistent]
     parts: list[RenderableType] = [Text(verdict(diagnosis), style=style)]
     if replicates := replication_in_words(diagnosis):
         parts.append(Text(replicates))
@@ -368,15 +382,32 @@ def _steps(diagnosis: Diagnosis, typed: str) -> Iterator[NextStep]:
     test, before = diagnosis.test, diagnosis.before
     if test.consistent is None:
         yield NextStep("Find orientations that determine the model", f"kf-calib plan {typed} --count 24")
+    elif diagnosis.condition is not None:
+        yield from _of_condition(diagnosis.condition, typed)
     elif test.consistent:
         yield NextStep("Keep this calibration", f"kf-calib replay {typed} --save calibration.json")
     elif before.outlying:
         number = before.outlying[0].number
         yield NextStep(f"Try the run without dwell {number}", f"kf-calib diagnose {typed} --leave-out {number}")
+    elif diagnosis.likeliest is not None and (number := diagnosis.likeliest.dwell):
+        yield NextStep(f"Try the run without dwell {number}", f"kf-calib diagnose {typed} --leave-out {number}")
     elif diagnosis.sure:
         yield NextStep("Add it and see the error fall", f"kf-calib improve {typed}")
     else:
         yield from _unsure(diagnosis, typed)
+
+
+def _of_condition(condition: Condition, typed: str) -> Iterator[NextStep]:
+    """Yield how to find out whether what the agreement rests on is true."""
+    if condition.name == "angle_sigma_deg":
+        yield NextStep("State what your table can do, from its data sheet, for example of 1 arcsec",
+                       f"kf-calib diagnose {typed} --angle-sigma 0.00028")  # fmt: skip
+    else:
+        yield NextStep("State how your dwells scatter, for example by 0.001 m/s^2",
+                       f"kf-calib diagnose {typed} --scatter-sigma 0.001")  # fmt: skip
+    yield NextStep(
+        "Or visit some orientations again: what differs between the visits is noise, what comes back is none"
+    )
 
 
 def _unsure(diagnosis: Diagnosis, typed: str) -> Iterator[NextStep]:

@@ -91,7 +91,8 @@ def _figures(diagnosis: Diagnosis) -> dict[str, Any]:
     result = diagnosis.before
     return {
         "p_value": diagnosis.test.p_value,
-        "consistent": diagnosis.test.consistent,
+        "consistent": diagnosis.consistent,
+        "conditional_on": None if diagnosis.condition is None else vars(diagnosis.condition),
         "residual_rms_mps2": result.residual_rms_mps2,
         "held_out_rms_mps2": result.held_out_rms_mps2,
         "held_out_floor_mps2": result.held_out_floor_mps2,

@@ -38,7 +38,8 @@ def replay_object(result: Calibration) -> dict[str, Any]:
                 "angle_sigma_stated": noise.setting_stated and not noise.attitude_unknown,
             },
             "consistency": {
-                "consistent": judged.consistent,
+                "consistent": judged.unconditional,
+                "conditional_on": None if judged.condition is None else vars(judged.condition),
                 "p_value": judged.p_value,
                 "nis_per_dof": judged.nis_per_dof,
                 "dof": judged.dof,
@@ -124,7 +125,7 @@ def side_by_side_object(pair: SideBySide) -> dict[str, Any]:
     return clean(
         {
             "against": {
-                "consistent": pair.first.test.consistent,
+                "consistent": pair.first.consistent,
                 "p_value": pair.first.test.p_value,
                 "verdict": pair.first.verdict,
             },

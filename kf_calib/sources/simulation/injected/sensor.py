@@ -8,6 +8,7 @@ degC unless told otherwise. t: since the first sample. Delta a_i: the last step 
 from __future__ import annotations
 
 import math
+from itertools import accumulate
 
 import numpy as np
 
@@ -64,6 +65,23 @@ def thermal_lag(alpha: Floats, rig: Rig, *, tau: float = 600.0, reference: float
     """Thermal lag: alpha L, where tau dL/dt = T - L, the sensor follows the thermometer; L = T at the first sample."""
     lag = Lag(rig.period_s, tau)
     return adding(lambda state: alpha * column(lag(state.temperature_c - reference)))
+
+
+@made("thermal-hysteresis", "m/s^2/K", ("5ug/K", "30ug/K"), ("0.15mg/K", "1mg/K"))
+def thermal_hysteresis(alpha: Floats, rig: Rig, *, play: float = 2.0, reference: float = 25.0) -> TrueStep:
+    """Thermal hysteresis: alpha times a temperature that follows the true one with a play of so
+    many K, up and down each, as glued and clamped parts do (Prandtl's play operator); without history at first."""
+    followed_c: float | None = None
+
+    def contribution(state: TrueState) -> Floats:
+        nonlocal followed_c
+        true_c = state.temperature_c.tolist()
+        start_c = true_c[0] if followed_c is None else followed_c
+        followed = list(accumulate(true_c, lambda own, true: min(max(own, true - play), true + play), initial=start_c))
+        followed_c = followed[-1]
+        return alpha * column(np.array(followed[1:]) - reference)
+
+    return adding(contribution)
 
 
 class Lag:
@@ -149,6 +167,12 @@ def cross_coupling_po(k: Floats, state: TrueState) -> Floats:
 def cross_axis_square(k: Floats, state: TrueState) -> Floats:
     """Cross-axis nonlinearity: K_pp a_p^2 (IEEE Std 1293)."""
     return k * pendulous(state) ** 2
+
+
+@added("output-square", "1/(m/s^2)", ("1ug/g^2", "10ug/g^2"), ("0.1mg/g^2", "1mg/g^2"))
+def output_square(k: Floats, state: TrueState) -> Floats:
+    """Output-axis nonlinearity: K_oo a_o^2 (IEEE Std 1293)."""
+    return k * output(state) ** 2
 
 
 @added("bias-drift", "m/s^2/s", ("1ug/h", "10ug/h"), ("10ug/min", "1mg/min"))
@@ -253,6 +277,18 @@ def settling(c: Floats, rig: Rig, *, tau: float = 60.0) -> TrueStep:
     def contribution(state: TrueState) -> Floats:
         rested = np.zeros(1) if state.moving else state.since_arrival_s
         return c * last(state) * column(np.exp(-rested / tau))
+
+    return adding(contribution)
+
+
+@made("memory", "1", ("1ug/g", "100ug/g"), ("0.1mg/g", "3mg/g"))
+def memory(c: Floats, rig: Rig, *, tau: float = 100.0) -> TrueStep:
+    """Memory: c (a_i - x), where tau dx/dt = a_i - x, relaxation over several dwells; x = a_i at the first sample."""
+    lags = [Lag(rig.period_s, tau) for _ in range(3)]
+
+    def contribution(state: TrueState) -> Floats:
+        inputs = np.broadcast_to(state.input_mps2, (len(state.time_s), 3))
+        return c * (inputs - np.column_stack([lag(inputs[:, i]) for i, lag in enumerate(lags)]))
 
     return adding(contribution)
 
