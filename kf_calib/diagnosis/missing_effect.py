@@ -202,7 +202,7 @@ def _decided(refits: Refits, diagnosis: Diagnosis) -> Diagnosis:
         diagnosis = replace(diagnosis, table=table)
     credible = (first, *table.rivals) if first.effects else ()
     named = first if first.effects and not why_not else None
-    names = tuple(dict.fromkeys(name for row in credible for name in row.effects))
+    names = tuple(dict.fromkeys([*(name for row in credible for name in row.effects), *(table.same if named else ())]))
     pairs = [row.effects for row in credible[1:] if len(row.effects) > 1 and not set(first.effects) & set(row.effects)]
     return replace(
         diagnosis,

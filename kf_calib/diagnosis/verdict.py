@@ -79,10 +79,7 @@ def second_pass_in_words(diagnosis: Diagnosis) -> str:
         names.append("the lines in their spectrum")
     if not names:
         return ""
-    return (
-        f" A second pass over the readings is needed to judge {' and '.join(names)}: diagnose the recording, or give "
-        "its Refits to diagnose."
-    )
+    return f" A second pass over the readings is needed to judge {' and '.join(names)}: diagnose the recording itself."
 
 
 def disturbance_in_words(diagnosis: Diagnosis) -> str:
@@ -100,8 +97,15 @@ def disturbance_in_words(diagnosis: Diagnosis) -> str:
 def _named(diagnosis: Diagnosis, first: Hypothesis) -> str:
     """Return the likeliest effects in words, with the other explanations and their probabilities."""
     assert diagnosis.table is not None
-    share, rest = diagnosis.table.probability(first.effects), _beside(diagnosis, first) or _unexplained(diagnosis)
+    share, rest = (
+        diagnosis.table.probability_of_class(first.effects),
+        _beside(diagnosis, first) or _unexplained(diagnosis),
+    )
     named, others = f"{_effects_of(first)}{_size(diagnosis)} ({_share(diagnosis)})", _others(diagnosis) + rest
+    if diagnosis.table.same:
+        *many, last = diagnosis.table.same
+        listed = f"{', '.join(many)} and {last}" if many else last
+        named += f", which is the same as {listed} here ({format_probability(share)} together)"
     if share >= SURE:
         return f"{'Part of it' if rest else 'Missing'}: {named}{others}"
     family, of_family = next(each for each in diagnosis.table.families.items() if each[0] not in (NOTHING, NOISE, NONE))
