@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from kf_calib.diagnosis.candidate_tests import CandidateTests
 from kf_calib.diagnosis.hypothesis_table import IRREGULAR, NOISE, NONE, NOTHING, SURE, Hypothesis
 from kf_calib.diagnosis.refits import dwell_noise_is_stated
 from kf_calib.diagnosis.results import Diagnosis
@@ -44,7 +43,8 @@ def verdict_in_words(diagnosis: Diagnosis) -> str:
             )
         agreed = f"The model agrees with the measurements (p {format_p(test.p_value)})"
         return f"{agreed}: no effect is missing that this run could show.{blind}"
-    start, first = f"{_what_fails(test)} (p {format_p(test.p_value)}).", diagnosis.likeliest
+    first = diagnosis.likeliest
+    start = f"{_what_fails(diagnosis)} (p {format_p(test.p_value)})."
     if first is None:
         return start
     if first.effects and diagnosis.unearned:
@@ -65,8 +65,11 @@ def _may_be_chance(diagnosis: Diagnosis, first: Hypothesis) -> bool:
     return not first.effects and diagnosis.table.families.get(NOTHING, 0.0) > first.probability
 
 
-def _what_fails(test: CandidateTests) -> str:
-    """Return what fails: the size of the residuals, or, where no noise was stated, how they scatter."""
+def _what_fails(diagnosis: Diagnosis) -> str:
+    """Return what fails: the size of the residuals, or how they scatter, or what shows while the platform turns."""
+    test, first = diagnosis.test, diagnosis.likeliest
+    if first is not None and first.refit is not None and first.refit.model.dynamic:
+        return "The model agrees at rest; while the platform turns the readings fail"
     scattering = test.noise_p is not None and test.noise_p == test.p_value
     return "The dwells do not scatter as noise does" if scattering else "Residuals fail"
 
@@ -284,6 +287,8 @@ def _held_out(diagnosis: Diagnosis) -> str:
     """Return a sentence about the change of the held-out error, or "" where it is not known."""
     before, after = diagnosis.before, diagnosis.after
     assert after is not None
+    if after.model.dynamic and not before.model.dynamic:
+        return " It changes no reading at rest: the twelve parameters are the same with it."
     if before.held_out_rms_mps2 is None or after.held_out_rms_mps2 is None or not after.held_out_floor_mps2:
         return ""
     floor = after.held_out_floor_mps2
