@@ -288,7 +288,7 @@ def _held_out(diagnosis: Diagnosis) -> str:
     before, after = diagnosis.before, diagnosis.after
     assert after is not None
     if after.model.dynamic and not before.model.dynamic:
-        return " It changes no reading at rest: the twelve parameters are the same with it."
+        return " It changes no reading at rest."
     if before.held_out_rms_mps2 is None or after.held_out_rms_mps2 is None or not after.held_out_floor_mps2:
         return ""
     floor = after.held_out_floor_mps2
