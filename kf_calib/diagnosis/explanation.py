@@ -79,9 +79,9 @@ class EffectShape:
 
 
 def shapes_of(before: Calibration, after: Calibration) -> list[EffectShape]:
-    """The shapes of the effects that a calibration has beyond another, in the order of its model; formulas beside each
-    other have one."""
-    added = [effect for effect in after.model.effects if str(effect) not in before.model.parts]
+    """The shapes of the effects that a calibration has beyond another and dwells show, in the order of its model;
+    formulas beside each other have one."""
+    added = [effect for effect in after.model.effects if not (str(effect) in before.model.parts or effect.dynamic)]
     return [_shape(before, after, list(group)) for _, group in itertools.groupby(added, _drawn_together)]
 
 

@@ -82,13 +82,14 @@ class HypothesisTable:
     disturbed: the dwell in which an oscillation would be the likeliest of all, if other dwells had it, too. certain:
     the row of effects that are missing for sure, where the likeliest row has further ones that nothing shows.
     scattering: the number of the accelerometer that alone scatters from dwell to dwell, if something does; 0 where
-    others do, too.
+    others do, too. same: effects that explain in this run just what the one of the likeliest row does.
     """
 
     rows: tuple[Hypothesis, ...]
     disturbed: DisturbedDwell | None = None
     certain: Hypothesis | None = None
     scattering: int = 0
+    same: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         def name(row: Hypothesis) -> str:
@@ -109,6 +110,13 @@ class HypothesisTable:
     def probability(self, effects: Sequence[str]) -> float:
         """Probability that all these effects are missing, alone or with others."""
         return sum(row.probability for row in self.rows if set(effects) <= set(row.effects))
+
+    def probability_of_class(self, effects: Sequence[str]) -> float:
+        """Probability that all these effects are missing, alone or with others, or what is the same as the first."""
+        if tuple(effects) != self.first.effects or not self.same:
+            return self.probability(effects)
+        names = {*effects, *self.same}
+        return sum(row.probability for row in self.rows if names & {*row.effects})
 
     def probability_of_just(self, effects: Sequence[str]) -> float:
         """Probability that these effects are missing, and no others: that of their row."""
@@ -150,7 +158,9 @@ class HypothesisTable:
         first, rows = self.first, [row for row in self.rows if row.families != (NOTHING,) and row.driver != ALIKE]
         before = np.cumsum([0.0, *(row.probability for row in rows)]) / sum(row.probability for row in rows)
         credible = [row for k, row in enumerate(rows) if before[k] < CREDIBLE and row is not first]
-        return tuple(row for row in credible if not (first.effects and set(first.effects) <= set(row.effects)))
+        same = [{name} for name in self.same]
+        rivals = [row for row in credible if not (first.effects and set(first.effects) <= set(row.effects))]
+        return tuple(row for row in rivals if row.formulas or not any(each <= {*row.effects} for each in same))
 
 
 def table_of(rows: Iterable[Hypothesis]) -> HypothesisTable:

@@ -38,6 +38,7 @@ from kf_calib.diagnosis.refits import (
 )
 from kf_calib.diagnosis.replication import Replication, replication
 from kf_calib.diagnosis.results import Diagnosis, Suspect
+from kf_calib.diagnosis.slew_effects import of_slews
 from kf_calib.diagnosis.verdict import disturbance_in_words, format_probability, second_pass_in_words, verdict_in_words
 from kf_calib.dwells import window_average
 from kf_calib.effects import effect_named
@@ -69,7 +70,7 @@ def diagnose(
 
 def _replication(refits: Refits, diagnosis: Diagnosis) -> Replication | None:
     """Return the replication of what a diagnosis names; None where it names nothing."""
-    if not diagnosis.missing or diagnosis.after is None:
+    if not diagnosis.missing or diagnosis.after is None or diagnosis.after.model.dynamic:
         return None
     before = diagnosis.before_in_noise_left or diagnosis.before
     count = len({*diagnosis.missing} & {*diagnosis.test.effects.best})
@@ -143,11 +144,17 @@ def _explained(refits: Refits, before: Calibration, test: CandidateTests) -> Dia
     if test.consistent:  # noise that is estimated from all of the misfit explains as much of it as an effect does
         posterior, stated = RunPosterior(refits, before, test), dwell_noise_is_stated(before)
         table = posterior.table(refitted=not stated)
-        if stated and noise_p(table) >= LEVEL:
-            return replace(diagnosis, table=table)
-        table = posterior.table() if stated else table
-        diagnosis = replace(diagnosis, test=replace(test, noise_p=noise_p(table)), table=table)
-        return diagnosis if diagnosis.test.consistent else _decided(refits, diagnosis)
+        if not (stated and noise_p(table) >= LEVEL):
+            table = posterior.table() if stated else table
+            diagnosis = replace(diagnosis, test=replace(test, noise_p=noise_p(table)))
+        diagnosis = replace(diagnosis, table=table)
+        if not diagnosis.test.consistent:
+            return _decided(refits, diagnosis)
+        turning = of_slews(refits, before)
+        if turning is None:
+            return diagnosis
+        table, p_value = turning
+        return _decided(refits, replace(diagnosis, test=replace(test, noise_p=p_value), table=table))
     if test.lines.oscillation:
         return _decided(refits, replace(diagnosis, table=_beside_lines(refits, before, test)))
     return _decided(refits, replace(diagnosis, table=RunPosterior(refits, before, test).table()))
@@ -202,7 +209,7 @@ def _decided(refits: Refits, diagnosis: Diagnosis) -> Diagnosis:
         diagnosis = replace(diagnosis, table=table)
     credible = (first, *table.rivals) if first.effects else ()
     named = first if first.effects and not why_not else None
-    names = tuple(dict.fromkeys(name for row in credible for name in row.effects))
+    names = tuple(dict.fromkeys([*(name for row in credible for name in row.effects), *(table.same if named else ())]))
     pairs = [row.effects for row in credible[1:] if len(row.effects) > 1 and not set(first.effects) & set(row.effects)]
     return replace(
         diagnosis,

@@ -49,6 +49,7 @@ _OF_ORIENTATION = 0.8  # share of unknown causes that depend on the orientation 
 _WITHIN = 0.01  # prior probability of irregular changes that show within dwells only
 _APART = 1e-4  # p-value of an oscillation that does not go on alike in all dwells
 _HEADS = 3  # effects beside which all other terms are tried: likeliest in any noise, in that stated, and in pairs
+_NO_SIGN = 0.5  # of chi-squared: what is left of an effect beside one that is the same
 _SAME = 1e-6  # squared sine of the angle below which two effects are one
 _REFITTED, _ALWAYS = 8, 3  # rows of effects that are fitted at most, and single ones that always are
 _BEHIND, _BENT = 10.0, 0.02  # in log evidence, and share of the gain: rows further behind are not fitted
@@ -84,7 +85,27 @@ class RunPosterior:
             rows = self._fitted([*rows, *self._pairs()])
             rows = [self._with_changes_beside_walk(row, rows) if row.driver == IRREGULAR else row for row in rows]
         rows = [row for row in rows if math.isfinite(row.log_evidence)]
-        return replace(table_of(rows), disturbed=self._disturbed, scattering=self._scattering)
+        table = replace(table_of(rows), disturbed=self._disturbed, scattering=self._scattering)
+        return replace(table, same=self._same_as(table.first)) if refitted else table
+
+    def _same_as(self, first: Hypothesis) -> tuple[str, ...]:
+        """Return the effects that explain just what a single effect does: of what it explains they leave nothing that
+        shows, whether they have it as their only column or as one of several."""
+        if len(first.effects) != 1 or first.formulas or first.effects[0] not in self._best:
+            return ()
+        (name,) = first.effects
+        number = self._best[name]
+        rows = self._rows[int(np.argmax(self._base + self._log_bayes[number]))]
+        others = [
+            other for other in self._run.names if other != name and other != self._run.walk and other in self._best
+        ]
+        bases, readings = self._run.bases([number, *(self._best[other] for other in others)], rows)
+        explained = bases[0].T @ (bases[0] @ readings)
+        whole = float(explained @ explained)
+        left = whole - np.sum((bases[1:] @ explained) ** 2, axis=1)
+        return tuple(
+            other for other, own in zip(others, left.tolist(), strict=True) if own < min(_NO_SIGN, 1e-3 * whole)
+        )
 
     # The noise in which rows are weighed
 

@@ -177,8 +177,8 @@ class Diagnosis:
 
     @property
     def sure(self) -> bool:
-        """Whether the effects that are named are missing with 95 % probability, alone or with others."""
-        return bool(self.missing) and self.table is not None and self.table.probability(self.missing) >= SURE
+        """Whether the effects that are named, or what is the same here, are missing with 95 % probability."""
+        return bool(self.missing) and self.table is not None and self.table.probability_of_class(self.missing) >= SURE
 
     @property
     def grade(self) -> Grade:

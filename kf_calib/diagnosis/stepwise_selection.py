@@ -316,7 +316,7 @@ def take_step(
     where the effect cannot be added, or where one to be dropped is not in the model.
     """
     if added is not None:
-        _refuse(state.result, added)
+        _refuse(state.result, added, can_read=refits.source is not None)
     result = state.result if added is None else refits.with_effects(state.result, (added,))
     protected = state.protected | ({_name(added, result)} if added is not None else set[str]())
     removed = list[Removal]()
@@ -390,11 +390,11 @@ def _name(text: str, result: Calibration) -> str:
     return str(effect_named(text, result.bench))
 
 
-def _refuse(result: Calibration, text: str) -> None:
-    """Raise InputError where an effect cannot be added to the model."""
+def _refuse(result: Calibration, text: str, can_read: bool) -> None:
+    """Raise InputError where an effect cannot be added to the model; can_read: whether slews can still be read."""
     refuse_unknown(text)
     effect = effect_named(text, result.bench)
     if len(merged(result.settings.effects, [text])) == len(result.settings.effects):
         raise InputError(f"{effect} is in the model already: choose another, or drop it first.")
-    if Model(result.bench, (effect,)).dynamic and not result.linearised.slews:
+    if Model(result.bench, (effect,)).dynamic and not (result.linearised.slews or can_read):
         raise InputError(f"{effect} shows in slews only, which were not read: start with --with '{as_text(effect)}'.")

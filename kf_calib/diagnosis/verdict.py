@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from kf_calib.diagnosis.candidate_tests import CandidateTests
 from kf_calib.diagnosis.hypothesis_table import IRREGULAR, NOISE, NONE, NOTHING, SURE, Hypothesis
 from kf_calib.diagnosis.refits import dwell_noise_is_stated
 from kf_calib.diagnosis.results import Diagnosis
@@ -44,7 +43,8 @@ def verdict_in_words(diagnosis: Diagnosis) -> str:
             )
         agreed = f"The model agrees with the measurements (p {format_p(test.p_value)})"
         return f"{agreed}: no effect is missing that this run could show.{blind}"
-    start, first = f"{_what_fails(test)} (p {format_p(test.p_value)}).", diagnosis.likeliest
+    first = diagnosis.likeliest
+    start = f"{_what_fails(diagnosis)} (p {format_p(test.p_value)})."
     if first is None:
         return start
     if first.effects and diagnosis.unearned:
@@ -65,8 +65,11 @@ def _may_be_chance(diagnosis: Diagnosis, first: Hypothesis) -> bool:
     return not first.effects and diagnosis.table.families.get(NOTHING, 0.0) > first.probability
 
 
-def _what_fails(test: CandidateTests) -> str:
-    """Return what fails: the size of the residuals, or, where no noise was stated, how they scatter."""
+def _what_fails(diagnosis: Diagnosis) -> str:
+    """Return what fails: the size of the residuals, or how they scatter, or what shows while the platform turns."""
+    test, first = diagnosis.test, diagnosis.likeliest
+    if first is not None and first.refit is not None and first.refit.model.dynamic:
+        return "The model agrees at rest; while the platform turns the readings fail"
     scattering = test.noise_p is not None and test.noise_p == test.p_value
     return "The dwells do not scatter as noise does" if scattering else "Residuals fail"
 
@@ -79,10 +82,7 @@ def second_pass_in_words(diagnosis: Diagnosis) -> str:
         names.append("the lines in their spectrum")
     if not names:
         return ""
-    return (
-        f" A second pass over the readings is needed to judge {' and '.join(names)}: diagnose the recording, or give "
-        "its Refits to diagnose."
-    )
+    return f" A second pass over the readings is needed to judge {' and '.join(names)}: diagnose the recording itself."
 
 
 def disturbance_in_words(diagnosis: Diagnosis) -> str:
@@ -100,8 +100,15 @@ def disturbance_in_words(diagnosis: Diagnosis) -> str:
 def _named(diagnosis: Diagnosis, first: Hypothesis) -> str:
     """Return the likeliest effects in words, with the other explanations and their probabilities."""
     assert diagnosis.table is not None
-    share, rest = diagnosis.table.probability(first.effects), _beside(diagnosis, first) or _unexplained(diagnosis)
+    share, rest = (
+        diagnosis.table.probability_of_class(first.effects),
+        _beside(diagnosis, first) or _unexplained(diagnosis),
+    )
     named, others = f"{_effects_of(first)}{_size(diagnosis)} ({_share(diagnosis)})", _others(diagnosis) + rest
+    if diagnosis.table.same:
+        *many, last = diagnosis.table.same
+        listed = f"{', '.join(many)} and {last}" if many else last
+        named += f", which is the same as {listed} here ({format_probability(share)} together)"
     if share >= SURE:
         return f"{'Part of it' if rest else 'Missing'}: {named}{others}"
     family, of_family = next(each for each in diagnosis.table.families.items() if each[0] not in (NOTHING, NOISE, NONE))
@@ -280,6 +287,8 @@ def _held_out(diagnosis: Diagnosis) -> str:
     """Return a sentence about the change of the held-out error, or "" where it is not known."""
     before, after = diagnosis.before, diagnosis.after
     assert after is not None
+    if after.model.dynamic and not before.model.dynamic:
+        return " It changes no reading at rest."
     if before.held_out_rms_mps2 is None or after.held_out_rms_mps2 is None or not after.held_out_floor_mps2:
         return ""
     floor = after.held_out_floor_mps2

@@ -135,7 +135,7 @@ class Folded:
     def shaking(self) -> tuple[Floats, Floats]:
         """Variance of the readings at the nodes of all pieces, (pieces, 3, 3), and the number of readings behind it,
         (pieces,)."""
-        if self.dwells[0].averaged:
+        if all(dwell.averaged for dwell in self.dwells):  # a slew may be shorter than a window
             pieces = [piece for dwell in self.dwells for piece in dwell.pieces]
             return np.array([piece.nodes.variance_mps2_2 for piece in pieces], float), self.reading_counts
         freedom = np.maximum(self.piece_counts - np.repeat(self.widths, self.piece_numbers), 0.0)[:, None]

@@ -95,7 +95,10 @@ def fit(
         moved, held = _with_constants_moved(fitted, constant_steps, reach, number)
         linearised = _moved_to(fitted, moved, np.delete(state, held))
         fitted = replace(fitted, linearised=linearised)
-        fitted = replace(fitted, noise=_noise_at(linearised, before, within, components, number < _PASSES - 1))
+        slews_at = state if held else linearised.state  # a constant that is held leaves the model
+        slew_sigma_mps2 = _slew_sigma(before, slews_at) if before else None
+        fitted = replace(fitted, noise=_noise_at(linearised, within, components, number < _PASSES - 1))
+        fitted = replace(fitted, noise=replace(fitted.noise, slew_sigma_mps2=slew_sigma_mps2))
         within = _within_again(fitted, within)
         # a constant without a derivative holds the input axes near their linearisation, so that convergence is slow
         still = (np.abs(constant_steps) <= _STILL * reach).all() and not model.stepped
@@ -152,17 +155,14 @@ def _with_constants_moved(fitted: Fit, constant_steps: Floats, reach: Floats, nu
     return (held, places) if places else (model.moved(np.clip(constant_steps, -reach, reach)), [])
 
 
-def _noise_at(
-    linearised: LinearisedDwells, before: Fit | None, within: Noise, components: VarianceComponents, roughly: bool
-) -> Noise:
-    """Return the noise within dwells completed by all that is estimated from the residuals of a linearisation; by the
-    noise of slews in the fit before it where there are any. Of very many dwells, some tell ``roughly`` what it is."""
+def _noise_at(linearised: LinearisedDwells, within: Noise, components: VarianceComponents, roughly: bool) -> Noise:
+    """Return the noise within dwells completed by all that is estimated from the residuals of a linearisation. Of very
+    many dwells, some tell ``roughly`` what it is."""
     within = replace(within, sensitivity_mps2_per_k=_sensitivity_to_temperature(linearised, within))
     means, prior = with_shared_noise(linearised.dwells, within, linearised.means)
     if roughly and not prior.size:
         means = means[:: max(len(means.counts) // _MANY, 1)]
     noise = components.completed(within, means, linearised.state, prior)
-    noise = replace(noise, slew_sigma_mps2=_slew_sigma(before, linearised.state) if before else None)
     flicker_mps2 = flicker_within(linearised.dwells_at_state, linearised.columns, linearised.state, noise)
     return replace(noise, flicker_mps2=flicker_mps2 if flicker_mps2.any() else None)
 

@@ -22,6 +22,7 @@ from kf_calib.estimation.cross_validation import HeldOut, held_out
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.estimate import Estimate, Parameter, Parameters, enlarged, estimate_of
 from kf_calib.estimation.fit import Fit
+from kf_calib.estimation.intervals import sigmas_of_interval
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.residual_table import residual_table, table_as
 from kf_calib.estimation.settings import Settings
@@ -223,6 +224,28 @@ class Calibration:
     def model(self) -> Model:
         """The fitted model."""
         return self.linearised.model
+
+    @cached_property
+    def interval_sigmas(self) -> float:
+        """Half the length of the interval of 95 % of a parameter, in units of its sigma: 1.96, or more where noise that
+        was not stated is known from few dwells only."""
+        noise = self.noise
+        known = replace(
+            noise,
+            setting_rad=noise.setting_rad if noise.setting_stated else 0.0, setting_judged=False,
+            scatter_mps2=noise.scatter_mps2 if noise.scatter_stated else np.zeros(3),
+        )  # fmt: skip
+        if noise.setting_stated and noise.scatter_stated:
+            return sigmas_of_interval(self.fit, 0.0, 0)
+        judged = consistency(replace(self.fit, noise=known))
+        return sigmas_of_interval(self.fit, judged.statistic, judged.dof)
+
+    def interval(self, parameter: Parameter) -> tuple[float, float] | tuple[None, None]:
+        """The interval of 95 % of a parameter in SI units; None, None where it is not determined."""
+        if parameter.value is None or parameter.sigma is None:
+            return None, None
+        half = self.interval_sigmas * parameter.sigma
+        return parameter.value - half, parameter.value + half
 
     @property
     def parameters(self) -> Parameters:

@@ -27,6 +27,7 @@ from kf_calib.views.terminal import ConsoleTable, PlainConsole, note
 if TYPE_CHECKING:
     from kf_calib.diagnosis.results import Difference, SideBySide
 
+_WIDER = 2.0  # sigma; an interval of known noise is 1.96
 _NOT_ESTIMATED, _NOT_USED = "not estimated", "not used"
 _GREEK = {"theta": "θ", "phi": "φ", "nu": "ν"}
 GRADES: dict[Grade, str] = {"navigation": "navigation grade", "mems": "MEMS"}
@@ -196,6 +197,14 @@ def verdict(result: Calibration) -> str:
     return text
 
 
+def intervals_in_words(result: Calibration) -> list[Text]:
+    """A sentence on intervals that are wider than those of known noise; none where they are not."""
+    if result.interval_sigmas < _WIDER:
+        return []
+    said = f"Intervals of 95 % are ± {result.interval_sigmas:.2f} sigma: {len(result.fit.dwells)} dwells tell roughly"
+    return [Text(f"{said} how large the noise is that was not stated.")]
+
+
 def summary(result: Calibration) -> RenderableType:
     """The report that ``replay`` prints."""
     tally, dwells = result.tally, result.fit.dwells
@@ -205,7 +214,7 @@ def summary(result: Calibration) -> RenderableType:
     )
     parts: list[RenderableType] = [
         head, *([] if result.bench.input.is_plain else [Text(f"Made of {result.bench.input}.")]),
-        parameter_table(result),
+        parameter_table(result), *intervals_in_words(result),
         *([effect_table(result)] if result.model.effects else []), noise_table(result),
         Text(verdict(result), style="bold green" if result.consistency.unconditional else "bold yellow"),
     ]  # fmt: skip

@@ -71,6 +71,7 @@ def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
             else [],
             "suspects": [_suspect_object(each) for each in diagnosis.suspects],
             "ambiguity_set": list(diagnosis.ambiguity),
+            "same_here": list(diagnosis.table.same) if diagnosis.table and diagnosis.missing else [],
             "overlaps": diagnosis.overlaps,
             "replicates": diagnosis.replication.answer if diagnosis.replication else None,
             "replication": _replication_object(diagnosis.replication),

@@ -17,7 +17,7 @@ from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.support.units import shown
 from kf_calib.views.console import effect_table, parameter_table, symbol
 from kf_calib.views.diagnosis import description_object, description_sentence, held_out_ratio, orientation_object
-from kf_calib.views.json import clean
+from kf_calib.views.json import clean, parameters_object
 from kf_calib.views.terminal import Bar, ConsoleTable, note
 
 _WIDTH = 30  # length of the longest bar in characters
@@ -128,9 +128,8 @@ def _removal_object(removal: Removal) -> dict[str, Any]:
 
 
 def _parameters(result: Calibration) -> list[dict[str, Any]]:
-    """Return all parameters of a calibration with their sigmas as JSON objects."""
-    keys = ("symbol", "value", "sigma", "unit")
-    return [{key: getattr(parameter, key) for key in keys} for parameter in result.parameters.values()]
+    """Return all parameters of a calibration with their sigmas and intervals as JSON objects."""
+    return [{key: own[key] for key in own if key != "nominal"} for own in parameters_object(result)]
 
 
 def improvement_report(

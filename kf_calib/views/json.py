@@ -58,9 +58,13 @@ def replay_object(result: Calibration) -> dict[str, Any]:
 def parameters_object(result: Calibration) -> list[dict[str, Any]]:
     """All parameters of a calibration as JSON objects, in SI units."""
     return [
-        {"symbol": p.symbol, "value": p.value, "sigma": p.sigma, "unit": p.unit, "nominal": p.nominal}
+        {
+            "symbol": p.symbol, "value": p.value, "sigma": p.sigma, "low": low, "high": high, "unit": p.unit,
+            "nominal": p.nominal,
+        }
         for p in result.parameters.values()
-    ]
+        for low, high in [result.interval(p)]
+    ]  # fmt: skip
 
 
 def frame_object(result: Calibration) -> dict[str, Any] | None:
