@@ -62,6 +62,7 @@ def test_what_goes_on_beside_a_known_effect_gets_no_known_name(known: str, name:
 
 
 @pytest.mark.slow
+@pytest.mark.xfail(strict=True, reason="a settling that hardly decays stands for what a formula lacks: docs/limits.md")
 @pytest.mark.parametrize("seed", [700, 701])
 def test_a_known_effect_that_mends_the_shape_of_a_formula_of_its_family_is_not_named(seed: int) -> None:
     """Of a step through a hyperbolic tangent; the formula has another width, and settling makes up for it."""
@@ -176,6 +177,7 @@ def test_a_pose_after_a_whole_turn_is_the_same_orientation() -> None:
 
 
 @pytest.mark.slow  # what goes with the last step and is unknown: above
+@pytest.mark.xfail(strict=True, reason="a settling that hardly decays is the same: docs/limits.md")
 def test_memory_in_proportion_to_the_last_step_is_not_surely_settling() -> None:
     """With time constants far beyond the dwells it is the same: the catalogue does not hold its limit."""
     diagnosis = diagnosed("in proportion to the last step", 15.0, 1)

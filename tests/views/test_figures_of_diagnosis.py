@@ -73,7 +73,7 @@ def test_bars_of_suspects_are_their_shares_and_those_that_do_not_fit_are_hatched
     assert [bar.get_hatch() is None for bar in bars] == [each.fits for each in explained]
     assert [label.get_text() for label in axes.get_yticklabels()] == [each.name for each in explained]
     said = [text.get_text() for text in axes.texts]
-    assert said[0].startswith("fits, p = 7.1e-30")
+    assert said[0].startswith("fits, p = 7.9e-30")
     assert said[1].startswith("fits, p =" if explained[1].fits else "does not fit, p =")
     assert axes.get_xlabel().endswith("%")
 

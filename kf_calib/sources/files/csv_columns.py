@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from decimal import Decimal
@@ -39,6 +39,7 @@ _OF_EPOCH = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 """From which size on a stamp without a unit is one since 1970 in this unit."""
 _FASTEST_TABLE_S = 1.0
 _MANY, _ALIKE_RAD, _MOST = 500, 0.1, 0.9
+_FEWEST_ROWS, _MOST_UNITS, _APART = 20, 8, 5.0  # rows and labels of several sensors, and sigmas between these
 _MARKS_OF_TABLES = ("count", "face", "sd", *SPREADS)
 
 CsvRow = Sequence[str]
@@ -325,6 +326,37 @@ class CsvColumns:
     def _places(self, ours: str) -> list[int]:
         """Return the columns whose names say that quantity."""
         return [at for at, own in enumerate(self._meanings) if own.ours == ours]
+
+    def refuse_several_units(self, used: Container[int]) -> None:
+        """Raise InputError where a column that means nothing to us tells several sensors apart, whose rows take turns.
+
+        used: columns that have a meaning. Labels are few, each has a tenth of the rows, they change in three of ten
+        rows, and readings under different ones differ by more than their scatter lets them.
+        """
+        places = [at for ours in READINGS for at in self._places(ours)]
+        if len(places) != 3 or len(self.rows) < _FEWEST_ROWS:
+            return
+        for at, name in enumerate(self.names):
+            labels = [] if at in used or not name else [row[at].strip() for row in self.rows]
+            shares = Counter(labels)
+            turns = [k for k in range(len(labels) - 1) if labels[k] != labels[k + 1]]
+            if not 2 <= len(shares) <= _MOST_UNITS or min(shares.values()) < 0.1 * len(labels):
+                continue
+            if len(turns) < 0.3 * len(labels) or not all(label and len(label) <= 16 for label in shares):
+                continue
+            values, first = self._values(places), min(shares)
+            signs = np.array([1.0 if labels[k] == first else -1.0 for k in turns])
+            steps = (values[np.array(turns) + 1] - values[turns]) * signs[:, None]
+            middle = np.nanmedian(steps, axis=0)  # between poses the readings leap
+            spread = 1.86 * np.nanmedian(np.abs(steps - middle), axis=0) / math.sqrt(len(turns))
+            if not (np.abs(middle) > _APART * np.maximum(spread, 1e-300)).any():
+                continue
+            shown = ", ".join(sorted(shares)[:4])
+            raise InputError(
+                f"the rows are of several sensors, told apart by the column {cut(self.header[at], 40)!r} ({shown}): "
+                f"keep those of one, as by awk -F'{self.delimiter}' 'NR == 1 || ${at + 1} == \"{first}\"', or leave "
+                f"the column out if it means something else (--column {cut(self.header[at], 40) + '=-'!r})."
+            )
 
     def _values(self, places: Sequence[int], rows: Sequence[CsvRow] | None = None) -> Floats:
         """Return the numbers (n, k) in columns of rows (None: of the first), NaN where there is none."""

@@ -58,6 +58,7 @@ class CsvLines(LineReader):
         self._warmth = _FROM_UNIT[unit]
         self.said = columns.said
         used = {*self._time.at, *self._accel.at, *self._pose.at, *self._temperature.at}
+        columns.refuse_several_units(used)
         self._account.leave_out(name for at, name in enumerate(columns.names) if at not in used)
 
     @property

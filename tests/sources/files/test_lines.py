@@ -9,6 +9,7 @@ import os
 import threading
 import time
 import tracemalloc
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -426,3 +427,23 @@ def test_a_heading_of_many_columns_is_read_in_a_moment():
     lines = lines_of(text)
     assert len(read(lines).accel) == 1
     assert time.process_time() - began_s < 5.0  # it took 35 s, by the square of their number
+
+
+def rows_of_units(bias_mps2: float, label: str = "I") -> str:
+    """Two sensors whose rows take turns, the second with another bias, in poses that follow each other."""
+    rng, rows = np.random.default_rng(1), [f"TimeUS,{label},AccX,AccY,AccZ"]
+    for k in range(800):
+        level = np.roll([0.0, 0.0, 9.81], k // 200) + rng.normal(0.0, 0.05, 3) + (k % 2) * bias_mps2
+        rows.append(f"{1_000_000 + 5000 * k},{k % 2},{level[0]:.5f},{level[1]:.5f},{level[2]:.5f}")
+    return "\n".join(rows) + "\n"
+
+
+def test_rows_of_several_sensors_are_told_and_no_other_column_is(tmp_path: Path) -> None:
+    path = tmp_path / "two.csv"
+    path.write_text(rows_of_units(0.03))
+    with pytest.raises(InputError, match=r"several sensors, told apart by the column 'I' \(0, 1\).*\$2 == \"0\""):
+        list(Lines(path, angles=False))
+    path.write_text(rows_of_units(0.0, label="flag"))
+    assert sum(len(batch.accel) for batch in Lines(path, angles=False)) == 800
+    path.write_text(rows_of_units(0.03))
+    assert sum(len(batch.accel) for batch in Lines(path, columns={"I": "-"}, angles=False)) == 800
