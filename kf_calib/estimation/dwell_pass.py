@@ -151,6 +151,12 @@ def refuse_unusable(dwells: Sequence[DwellFactor], tally: Tally, bench: Bench) -
     means_mps2 = DwellStack.of(dwells).means[:, 4:]
     if not means_mps2.any():
         raise InputError("all readings are zero: check that this is the accelerometer, and that it is on.")
+    still = not np.ptp(means_mps2, axis=0).any() and all(not dwell.squares.any() for dwell in dwells)
+    if still and sum(dwell.count for dwell in dwells) >= LEAST_READINGS * len(dwells):
+        raise InputError(
+            "the readings never change, not even by noise: the sensor or what logs it has stopped, or a channel is at "
+            "the end of its range."
+        )
     level = float(np.median(lengths(means_mps2))) / bench.gravity_mps2
     if LEVELS[0] <= level <= LEVELS[1]:
         if bench.angles:

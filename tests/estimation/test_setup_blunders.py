@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import permutations, product
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from kf_calib.errors import BlunderError, InputError
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.dwell_pass import refuse_unusable
 from kf_calib.estimation.setup_blunders import common_scale
+from kf_calib.sources.opening import opened
 from kf_calib.sources.tables.opening import open_table
 
 
@@ -276,3 +278,12 @@ def test_channels_that_are_exchanged_late_are_still_a_change_in_the_course_of_th
     told = rf"up to dwell {last} channels are as stated, from dwell {last + 1} on .* exchanged"
     with pytest.raises(BlunderError, match=told):
         calibrate(open_table(columns, {"gravity_mps2": "9.81"}))
+
+
+@pytest.mark.parametrize("level, said", [(0.0, "all readings are zero"), (9.81, "the readings never change")])
+def test_readings_of_a_sensor_that_stands_still_in_itself_are_told(level: float, said: str, tmp_path: Path) -> None:
+    path = tmp_path / "still.csv"
+    rows = [f"{0.01 * k:.2f},0,0,{level}" for k in range(600)]
+    path.write_text("\n".join(["time_s,ax_mps2,ay_mps2,az_mps2", *rows]) + "\n")
+    with pytest.raises(InputError, match=said):
+        calibrate(opened(path, angles=False))
