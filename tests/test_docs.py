@@ -113,8 +113,9 @@ def test_a_browser_shows_every_page_without_an_error_and_asks_nobody(browser: An
 def test_the_search_of_the_site_finds_a_page(browser: Any, site: Path) -> None:
     shown = browser.new_page()
     shown.goto(f"{(site / 'search.html').as_uri()}?q=innovation")
-    shown.wait_for_selector("#search-results li a")
-    assert "From a reading to the posterior" in shown.locator("#search-results").inner_text()
+    found = shown.locator("#search-results li a", has_text="From a reading to the posterior")
+    found.first.wait_for()  # results come one after the other
+    assert found.first.is_visible()
 
 
 def _leads_somewhere(page: Path, link: str, pages: dict[Path, Page]) -> bool:

@@ -39,7 +39,6 @@ from kf_calib.dwells.qr import orthonormal
 from kf_calib.effects import effect_named
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.results import Calibration
-from kf_calib.noise.noise_model import Noise
 from kf_calib.support import stage
 from kf_calib.support.tail_probabilities import log_odds_of
 
@@ -68,7 +67,7 @@ class RunPosterior:
     def __init__(self, refits: Refits, before: Calibration, test: CandidateTests) -> None:
         self._refits, self._before, self._test = refits, before, test
         model = before.model
-        self._noise = _stated(before.noise)
+        self._noise = replace(before.noise.without_estimates(), walk_mps2_per_sqrt_s=0.0)
         misfit_mps2 = float(np.sqrt(np.mean(before.residuals_mps2**2)))
         self._least_mps2 = (_ROUNDING if before.noise.within_seen else _UNSEEN) * misfit_mps2
         self._run = RunTerms(before, self._noise, self._least_mps2, test)
@@ -406,16 +405,6 @@ class RunPosterior:
             chosen.append(rest[int(np.argmax(logs))])
             log = max(logs)
         return chosen
-
-
-def _stated(noise: Noise) -> Noise:
-    """Return the noise that was stated, or seen within dwells."""
-    return replace(
-        noise,
-        walk_mps2_per_sqrt_s=0.0,
-        scatter_mps2=noise.scatter_mps2 if noise.scatter_stated else np.zeros(3),
-        setting_rad=noise.setting_rad if noise.setting_stated or noise.attitude_unknown else 0.0,
-    )
 
 
 def _log_sum(logs: Sequence[float]) -> float:

@@ -37,7 +37,6 @@ _SEEN = 1e-7  # share of a column that the model must leave for it to be seen
 _CHANGES = 1e-3  # share of a column's largest value by which it changes within a dwell
 _FINE = 8  # parts of a step over which the likelihood is integrated
 _LEAST = 0.1  # sigma of a mean: noise that is smaller shows nothing
-_SIZES = 40  # sizes of a term that are tried
 
 
 @dataclass(frozen=True)
@@ -186,12 +185,16 @@ class RunLikelihood:
 
     def bare(self, covariances: Floats | None) -> float:
         """Log of the restricted likelihood with further noise, without any term."""
+        log, chi2 = self._without_terms(covariances)
+        return log - 0.5 * chi2
+
+    def _without_terms(self, covariances: Floats | None) -> tuple[float, float]:
+        """Return the log of the density of the rows that the model leaves, but for its exponent, and chi-squared."""
         model, _, readings, _, log = self._in_noise(covariances, columns=False)
-        whole = np.concatenate([model, self._more_model]) @ self._seen
         z = np.append(readings, self._more_readings)
-        basis, upper = np.linalg.qr(whole)
-        z = z - basis @ (basis.T @ z)
-        return log - float(np.log(np.abs(np.diag(upper))).sum()) - 0.5 * float(z @ z)
+        basis, upper = np.linalg.qr(np.concatenate([model, self._more_model]) @ self._seen)
+        left = z - basis @ (basis.T @ z)
+        return log - float(np.log(np.abs(np.diag(upper))).sum()), float(left @ left)
 
     def whole(self) -> Floats:
         """The columns (r, C) of the terms in the noise that was stated, projected off the model, in all rows."""
@@ -267,10 +270,7 @@ class RunLikelihood:
     @cached_property
     def misfit(self) -> float:
         """Chi-squared of the means without any term, in the noise that was stated."""
-        model, _, z, _, _ = self._in_noise(None, columns=False)
-        model, z = np.concatenate([model, self._more_model]), np.append(z, self._more_readings)
-        basis = np.linalg.qr(model @ self._seen)[0]
-        return float(np.sum((z - basis @ (basis.T @ z)) ** 2))
+        return self._without_terms(None)[1]
 
     @property
     def step(self) -> float:

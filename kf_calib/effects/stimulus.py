@@ -54,6 +54,30 @@ def smooth_between(times: Floats, values: Floats, at: Floats) -> Floats:
     return values[k] + u * (slopes[k] + u * (bend + u * twist))
 
 
+def lagged(at_s: Floats, values: Floats, tau_s: float) -> Floats:
+    """L (n,) at instants that do not fall: tau dL/dt = values - L, in balance at first; values in straight lines.
+
+    With steps h, r = h / tau: L_n = p L_(n-1) + (c - p) v_(n-1) + (1 - c) v_n, p = e^-r, c = (1 - p)/r.
+    """
+    from scipy.linalg import get_blas_funcs
+
+    ratio = np.maximum(np.diff(at_s), 0.0) / tau_s
+    decay, mean = np.exp(-ratio), np.where(ratio > 0.0, -np.expm1(-ratio) / np.where(ratio > 0.0, ratio, 1.0), 1.0)
+    driven = np.append(values[0], (1.0 - mean) * values[1:] + (mean - decay) * values[:-1])
+    bands = np.asfortranarray(np.vstack([np.ones(len(values)), np.append(-decay, 0.0)]))
+    solve: Any = get_blas_funcs("tbsv", dtype=np.float64)  # scipy.signal.lfilter would take 0.7 s to load
+    return solve(1, bands, driven, lower=1)
+
+
+def through_play(values: Floats, half_width: float, start: float) -> list[float]:
+    """Values (n,) through a play that begins at ``start``: y_n = max(v_n - r, min(v_n + r, y_(n-1))), the operator of
+    Prandtl and Ishlinskii."""
+    followed = itertools.accumulate(
+        values.tolist(), lambda held, now: max(now - half_width, min(now + half_width, held)), initial=start
+    )
+    return list(followed)[1:]
+
+
 @dataclass(frozen=True)
 class Stimulus:
     """The state of the bench at m instants of dwells.
@@ -161,19 +185,13 @@ class Stimulus:
         return (self.force_mps2 - self.previous_force_mps2) @ self.axes.T
 
     def played(self, half_width_mps2: float) -> Floats:
-        """a_i (m, 3) through a play of this half-width, m/s^2: it follows only where it is pushed.
-
-        The operator of Prandtl and Ishlinskii, y_n = max(a_n - r, min(a_n + r, y_(n-1))), from the orientation before.
-        """
+        """a_i (m, 3) through a play of this half-width, m/s^2, from the orientation before: it follows only where it is
+        pushed."""
         if self.whole is not None:
             return self.whole.played(half_width_mps2)[self.places]
-        along, through = self.along, np.empty_like(self.along)
-        held = (along - self.step)[0]
-        moved = np.append(True, np.any(np.diff(along, axis=0) != 0.0, axis=1))
-        for first, last in itertools.pairwise([*np.flatnonzero(moved).tolist(), len(along)]):
-            held = np.maximum(along[first] - half_width_mps2, np.minimum(along[first] + half_width_mps2, held))
-            through[first:last] = held
-        return through
+        before = (self.along - self.step)[0]
+        columns = [through_play(self.along[:, i], half_width_mps2, float(before[i])) for i in range(3)]
+        return np.stack(columns, axis=1)
 
     def move(self, gimbal: int) -> Floats:
         """The move (m,) of a gimbal since the dwell before, rad; 0 where it is no larger than what setting errors, the
@@ -270,40 +288,20 @@ class Stimulus:
         return np.array([[cos, 0.0, -sin], [sin, 0.0, cos]])
 
     def lagged_warmth(self, tau_s: float) -> Floats:
-        """L (m,), K: tau dL/dt = T - L, in balance at first; T passes smoothly through the middles of the pieces.
-
-        With equal steps h, r = h / tau: L_n = p L_(n-1) + (c - p) T_(n-1) + (1 - c) T_n, p = e^-r, c = (1 - p)/r.
-        """
+        """L (m,), K: tau dL/dt = T - L, in balance at first; T passes smoothly through the middles of the pieces."""
         if self.whole is not None:
             return self.whole.lagged_warmth(tau_s)[self.places]
-        from scipy.linalg import get_blas_funcs
-
         times, values = self._smooth_warmth
         span = max(times[-1] - times[0], 1e-9)
         grid = np.linspace(times[0], times[-1], int(np.clip(20.0 * span / tau_s, 1000, 20_000)))
-        ratio = (grid[1] - grid[0]) / tau_s
-        decay, mean = np.exp(-ratio), -np.expm1(-ratio) / ratio
-        warm = smooth_between(times, values, grid)
-        driven = (1.0 - mean) * warm
-        driven[0], driven[1:] = warm[0], driven[1:] + (mean - decay) * warm[:-1]
-        bands = np.asfortranarray(np.repeat([[1.0], [-decay]], len(grid), axis=1))
-        solve: Any = get_blas_funcs("tbsv", dtype=np.float64)  # scipy.signal.lfilter would take 0.7 s to load
-        return np.interp(self.elapsed_s, grid, solve(1, bands, driven, lower=1))
+        return np.interp(self.elapsed_s, grid, lagged(grid, smooth_between(times, values, grid), tau_s))
 
     def remembered(self, tau_s: float) -> Floats:
         """x (m, 3), m/s^2: tau dx/dt = a_i - x, in balance at first; a_i in straight lines from instant to instant."""
         if self.whole is not None:
             return self.whole.remembered(tau_s)[self.places]
-        from scipy.linalg import get_blas_funcs
-
         at_s, along, places = self._way
-        ratio = np.maximum(np.diff(at_s), 0.0) / tau_s
-        decay, mean = np.exp(-ratio), np.where(ratio > 0.0, -np.expm1(-ratio) / np.where(ratio > 0.0, ratio, 1.0), 1.0)
-        driven = (1.0 - mean)[:, None] * along[1:] + (mean - decay)[:, None] * along[:-1]
-        bands = np.asfortranarray(np.vstack([np.ones(len(along)), np.append(-decay, 0.0)]))
-        solve: Any = get_blas_funcs("tbsv", dtype=np.float64)
-        through = [solve(1, bands, np.append(along[0, i], driven[:, i]), lower=1)[places] for i in range(3)]
-        return np.stack(through, axis=1)
+        return np.stack([lagged(at_s, along[:, i], tau_s)[places] for i in range(3)], axis=1)
 
     @cached_property
     def _way(self) -> tuple[Floats, Floats, Indices]:
@@ -337,12 +335,9 @@ class Stimulus:
         if self.whole is not None:
             return self.whole.played_warmth(half_width_k)[self.places]
         order = np.argsort(self.elapsed_s, kind="stable")
-        warm = self.warmth[order].tolist()
-        follow = itertools.accumulate(
-            warm, lambda held, now: min(max(held, now - half_width_k), now + half_width_k), initial=warm[0]
-        )
+        warm = self.warmth[order]
         through = np.empty(len(warm))
-        through[order] = list(follow)[1:]
+        through[order] = through_play(warm, half_width_k, float(warm[0]))
         return through
 
     def to_platform(self, vector: Floats) -> Floats:

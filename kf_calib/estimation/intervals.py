@@ -11,7 +11,6 @@ degrees of freedom.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -39,10 +38,8 @@ def sigmas_of_interval(fitted: Fit, misfit: float, dof: int) -> float:
     if not noise.within_seen and not noise.scatter_stated:
         return _student(dof)
     linearised = fitted.linearised
-    known = replace(noise, scatter_mps2=noise.scatter_mps2 if noise.scatter_stated else np.zeros(3),
-                    setting_rad=noise.setting_rad if noise.setting_stated else 0.0)  # fmt: skip
     traces = [np.einsum("dii->d", mean_covariances(each.of_readings, linearised.means, linearised.state))
-              for each in (noise, known)]  # fmt: skip
+              for each in (noise, noise.without_estimates())]  # fmt: skip
     return max(_NORMAL, _averaged(dof, misfit / dof, float(np.mean(traces[0] / np.maximum(traces[1], 1e-300)))))
 
 

@@ -230,14 +230,8 @@ class Calibration:
         """Half the length of the interval of 95 % of a parameter, in units of its sigma: 1.96, or more where noise that
         was not stated is known from few dwells only."""
         noise = self.noise
-        known = replace(
-            noise,
-            setting_rad=noise.setting_rad if noise.setting_stated else 0.0, setting_judged=False,
-            scatter_mps2=noise.scatter_mps2 if noise.scatter_stated else np.zeros(3),
-        )  # fmt: skip
-        if noise.setting_stated and noise.scatter_stated:
-            return sigmas_of_interval(self.fit, 0.0, 0)
-        judged = consistency(replace(self.fit, noise=known))
+        is_stated = noise.setting_stated and noise.scatter_stated
+        judged = self.consistency if is_stated else consistency(replace(self.fit, noise=noise.without_estimates()))
         return sigmas_of_interval(self.fit, judged.statistic, judged.dof)
 
     def interval(self, parameter: Parameter) -> tuple[float, float] | tuple[None, None]:
@@ -418,11 +412,9 @@ def consistency(fitted: Fit) -> Consistency:
         # its degrees of freedom whatever the model is, and the misfit along the force alone is left to be tested.
         left, tested = max(statistic - (dof - along), 0.0), along
     p_value = f_tail(tested, max(noise_dof, 1.0), left / tested)
-    condition = None
-    if estimated and p_value >= LEVEL:
-        stated = replace(fitted, noise=replace(noise, setting_rad=0.0, setting_stated=True))
-        if consistency(stated).consistent is False:
-            condition = Condition("angle_sigma_deg", math.degrees(noise.setting_rad), "deg")
+    condition, known = None, replace(fitted, noise=noise.without_estimates())
+    if estimated and p_value >= LEVEL and consistency(known).consistent is False:
+        condition = Condition("angle_sigma_deg", math.degrees(noise.setting_rad), "deg")
     return Consistency(statistic, dof, p_value, p_value >= LEVEL, condition)
 
 

@@ -74,15 +74,6 @@ class Frame:
         walk of the biases makes the rows of all dwells one."""
         return None if self._whitening is None else self._whitening.ends
 
-    def has(self, effect: Effect) -> bool:
-        """Tell whether the frame contains this effect with its unknown constant at this value."""
-        return _key(effect) in map(_key, self.effects)
-
-    def columns(self, effects: Sequence[Effect]) -> Floats:
-        """Whitened columns (m, q) of effects that the frame contains."""
-        own = dict(zip(map(_key, self.effects), self.parts, strict=True))
-        return self.basis @ np.concatenate([self.coordinates[:, own[_key(each)]] for each in effects], axis=1)
-
     def whitened(self, linearised: LinearisedDwells, effects: Sequence[Effect]) -> Floats:
         """Whitened columns (m, q) of any effects, computed for a few at a time, which saves memory."""
         sizes, whitened, first = counts_of(effects), np.zeros((0, 0)), 0

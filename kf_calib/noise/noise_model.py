@@ -108,6 +108,14 @@ class Noise:
         setting_rad = self.setting_rad if self.setting_stated or self.setting_judged else 0.0
         return replace(self, scatter_mps2=scatter_mps2, setting_rad=setting_rad)
 
+    def without_estimates(self) -> Noise:
+        """The noise without scatter and a setting error that were estimated from the misfit, which they explain."""
+        return replace(
+            self,
+            scatter_mps2=self.scatter_mps2 if self.scatter_stated else np.zeros(3),
+            setting_rad=self.setting_rad if self.setting_stated or self.attitude_unknown else 0.0,
+        )
+
     def of(self, moving: bool) -> Noise:
         """The noise that applies in slews if ``moving``, else the noise in dwells."""
         if not moving or self.slew_sigma_mps2 is None:

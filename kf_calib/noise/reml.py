@@ -35,9 +35,6 @@ FEWEST = 6
 ENOUGH_DIRECTIONS = 12
 """With this many directions of gravity, if spread, it can be checked that a setting error only turns the force."""
 
-HELD = 12
-"""Number of time constants that are tried for a mean-reverting walk."""
-
 _SIGNIFICANT = 5.41  # 1 % point of the likelihood-ratio statistic of a variance against zero, half of a chi2 with 1 dof
 _WALK = 0.5  # a walk has to gain at least this much log-likelihood
 _JUDGED = 3.84  # 2.5 % point of that statistic: a setting error that is clearer belongs to the noise that judges
@@ -216,23 +213,12 @@ def degrees_of_freedom(means: Means, free: bool = False) -> int:
     return (len(means.readings) if free else means.readings.size) - _reduce(means).means.design.shape[2]
 
 
-def likelihood_of(
-    noise: Noise, parts: Collection[Part], means: Means, state: Floats, prior: Floats, apart: slice = slice(0)
-) -> Likelihood:
-    """The likelihood of the dwells' means in a noise to which these parts may be added.
-
-    ``means`` and ``prior`` are those that ``with_shared_noise`` returns; further rows may be added to ``prior``. The
-    columns ``apart`` stay as they are, before those that have a prior and no others after them.
-    """
-    return _likelihood(noise, parts, _reduce(means, prior, apart), state)
-
-
 def gain_of(part: Part, noise: Noise, means: Means, state: Floats, prior: Floats) -> float:
     """Gain in log-likelihood if a part of the noise is raised to its most likely size.
 
     ``means`` and ``prior`` are those that ``with_shared_noise`` returns.
     """
-    likelihood = likelihood_of(noise, (part,), means, state, prior)
+    likelihood = _likelihood(noise, (part,), _reduce(means, prior), state)
     _, point = likelihood.of((part,)).most_likely()
     return max(likelihood.without().cost - point.cost, 0.0)
 
@@ -265,8 +251,8 @@ class _Reduced:
     prior: Floats
 
 
-def _reduce(means: Means, prior: Floats | None = None, apart: slice = slice(0)) -> _Reduced:
-    """Return the means about the basis of those columns that have no prior and are not to stay ``apart``.
+def _reduce(means: Means, prior: Floats | None = None) -> _Reduced:
+    """Return the means about the basis of those columns that have no prior.
 
     What the basis explains is subtracted from the readings. The change of basis alters the likelihood only by a
     constant, and the rounding of readings of size g no longer matters.
@@ -274,7 +260,6 @@ def _reduce(means: Means, prior: Floats | None = None, apart: slice = slice(0)) 
     design = means.design.reshape(-1, means.design.shape[2])
     prior = np.zeros((0, design.shape[1] + 1)) if prior is None else prior
     known: Mask = np.array(prior[:, :-1].any(axis=0))
-    known[apart] = True
     free = design[:, ~known]  # a copy, which the basis may overwrite
     scale = np.sqrt(np.einsum("ij,ij->j", free, free))
     free /= np.where(scale > 0, scale, 1.0)

@@ -95,15 +95,6 @@ class Restricted:
         """Minus the log-likelihood at ``variances`` (k,)."""
         return self._level(variances).cost
 
-    def root_of(self, variances: Floats, places: slice) -> tuple[Floats, Floats]:
-        """A root (q, q) of the information on the coefficients of some columns at ``variances`` (k,), all others
-        integrated out, and the readings (q,) in its rows: root @ x is what the readings say of them."""
-        columns = np.arange(self.rows.shape[1] - 1)
-        chosen = columns[places]
-        order = np.concatenate([np.setdiff1d(columns, chosen), chosen, [len(columns)]])
-        upper, first = triangle(self._level(variances).upper[:, order]), len(columns) - len(chosen)
-        return upper[first:-1, first:-1], upper[first:-1, -1]
-
     @cached_property
     def _parts(self) -> list[slice]:
         """The means that are worked on together: all where they are correlated, else as many as stay in the cache."""

@@ -25,7 +25,7 @@ from kf_calib.estimation.results import Calibration, Condition, format_p
 from kf_calib.support.text import printed
 from kf_calib.support.units import shown
 from kf_calib.views.console import plain, symbol
-from kf_calib.views.json import clean, outlying_object, readings_object
+from kf_calib.views.json import clean, condition_object, outlying_object, readings_object
 from kf_calib.views.terminal import ConsoleTable, TextPlot, note
 
 _ANY = 1e-6  # probability of rows that are in the JSON object
@@ -59,7 +59,7 @@ def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
     return clean(
         {
             "consistent": diagnosis.consistent,
-            "conditional_on": None if diagnosis.condition is None else vars(diagnosis.condition),
+            "conditional_on": condition_object(diagnosis.condition),
             "p_value": diagnosis.test.p_value,
             "verdict": verdict(diagnosis),
             "model": [str(effect) for effect in diagnosis.before.model.effects],

@@ -17,7 +17,7 @@ from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.support.units import shown
 from kf_calib.views.console import effect_table, parameter_table, symbol
 from kf_calib.views.diagnosis import description_object, description_sentence, held_out_ratio, orientation_object
-from kf_calib.views.json import clean, parameters_object
+from kf_calib.views.json import clean, condition_object, parameters_object
 from kf_calib.views.terminal import Bar, ConsoleTable, note
 
 _WIDTH = 30  # length of the longest bar in characters
@@ -92,7 +92,7 @@ def _figures(diagnosis: Diagnosis) -> dict[str, Any]:
     return {
         "p_value": diagnosis.test.p_value,
         "consistent": diagnosis.consistent,
-        "conditional_on": None if diagnosis.condition is None else vars(diagnosis.condition),
+        "conditional_on": condition_object(diagnosis.condition),
         "residual_rms_mps2": result.residual_rms_mps2,
         "held_out_rms_mps2": result.held_out_rms_mps2,
         "held_out_floor_mps2": result.held_out_floor_mps2,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kf_calib.estimation.cross_validation import orientations
-from kf_calib.estimation.results import Calibration, OutlyingDwell
+from kf_calib.estimation.results import Calibration, Condition, OutlyingDwell
 from kf_calib.estimation.signal_quality import Readings
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def replay_object(result: Calibration) -> dict[str, Any]:
             },
             "consistency": {
                 "consistent": judged.unconditional,
-                "conditional_on": None if judged.condition is None else vars(judged.condition),
+                "conditional_on": condition_object(judged.condition),
                 "p_value": judged.p_value,
                 "nis_per_dof": judged.nis_per_dof,
                 "dof": judged.dof,
@@ -53,6 +53,11 @@ def replay_object(result: Calibration) -> dict[str, Any]:
             "warnings": list(result.warnings),
         }
     )
+
+
+def condition_object(condition: Condition | None) -> dict[str, Any] | None:
+    """What was not stated and an agreement rests on, as a JSON object, or None."""
+    return None if condition is None else vars(condition)
 
 
 def parameters_object(result: Calibration) -> list[dict[str, Any]]:

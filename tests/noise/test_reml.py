@@ -94,22 +94,6 @@ def test_the_restricted_likelihood_is_that_of_dense_matrices(known: int, beside:
     np.testing.assert_allclose(point.information, 0.5 * moved.T @ project[known:, known:] @ moved, rtol=1e-8)
 
 
-@pytest.mark.parametrize("places", [slice(0, 1), slice(1, 3)])
-@pytest.mark.parametrize("known", [0, 2])
-def test_what_it_says_of_some_coefficients_is_that_of_dense_matrices(known: int, places: slice) -> None:
-    """All others integrated out: their estimates with the inverse of their covariance."""
-    made, variances = problem(5, 1.0, known), np.array([0.3, 2.0, 0.7])
-    full = np.eye(len(made.rows) + known)
-    full[known:, known:] = dense(made.fixed + np.tensordot(variances, np.concatenate(made.shapes), 1))
-    rows = np.vstack([made.prior, made.rows])
-    design, weight = rows[:, :-1], np.linalg.inv(full)
-    covariance = np.linalg.inv(design.T @ weight @ design)
-    estimate = covariance @ design.T @ weight @ rows[:, -1]
-    root, readings = made.root_of(variances, places)
-    np.testing.assert_allclose(np.linalg.inv(root.T @ root), covariance[places, places], rtol=1e-8)
-    np.testing.assert_allclose(np.linalg.solve(root, readings), estimate[places], rtol=1e-8)
-
-
 @pytest.mark.parametrize("beside", [0.0, 1.0])
 @pytest.mark.parametrize("known", [0, 2])
 def test_its_slope_is_that_of_differences(known: int, beside: float) -> None:
