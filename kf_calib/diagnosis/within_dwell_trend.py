@@ -121,7 +121,7 @@ def trend_beside(linearised: LinearisedDwells, noise: Noise, state: Floats) -> T
     count = 3 * int(determined.sum())
     if not count:
         return None
-    unsure = float(np.mean((4.0 * noise.inflation - 2.0) / folded.counts.sum())) / 3.0
+    unsure = float(np.mean((4.0 * noise.correlation_length - 2.0) / folded.counts.sum())) / 3.0
     unsure += (2.0 * (noise.walk_spread or 0.0) * float(np.mean(by_walk / expected))) ** 2
     ratio = float(ratios.sum() / count)
     shown = np.broadcast_to(determined[:, None, :], squares.shape)

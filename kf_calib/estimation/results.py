@@ -405,7 +405,7 @@ def consistency(fitted: Fit) -> Consistency:
     if not noise.within_seen and not noise.scatter_stated:  # the noise was taken from this misfit
         scatter_mps2 = float(np.sqrt(np.mean(noise.scatter_mps2**2)))
         return Consistency(statistic, dof, None, None, Condition("scatter_sigma_mps2", scatter_mps2, "m/s^2"))
-    noise_dof = float(np.maximum(dwells.folded.counts - 4, 1).sum() / noise.inflation.mean())
+    noise_dof = float(np.maximum(dwells.folded.counts - 4, 1).sum() / noise.correlation_length.mean())
     left, tested = statistic, dof
     if estimated and (along := _dof_along_force(fitted)):
         # What lies across the force has the size of the setting error that was estimated from it: it is as large as

@@ -319,9 +319,9 @@ def _saturations(
         if width > 2.0 * sigma:
             continue  # a dwell may then have a single value at any level
         sigma, at = math.sqrt(sigma**2 - width**2 / 12.0), reached[:, side]
-        if stuck[at, side].sum() <= _CROWDED * float(noise.inflation[i]):
+        if stuck[at, side].sum() <= _CROWDED * float(noise.correlation_length[i]):
             continue  # no more can be missing above a value than are at it
-        missing = missing_above(stuck[:, side], counts, width / sigma) / float(noise.inflation[i])
+        missing = missing_above(stuck[:, side], counts, width / sigma) / float(noise.correlation_length[i])
         usual = float(np.median(missing[inside]))  # non-Gaussian noise has flat tops at every level
         if missing[at].sum() > _CROWDED and missing[at].mean() > 4.0 * usual:
             level = float(ends[at, side][0]) * (1.0 if side < 3 else -1.0)

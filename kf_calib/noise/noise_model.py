@@ -24,7 +24,7 @@ from kf_calib.dwells.stack import DwellStack, Folded
 from kf_calib.dwells.sufficient_statistics import Autocovariance, DwellFactor
 from kf_calib.noise import random_walk
 from kf_calib.noise.means import Means
-from kf_calib.noise.noise_of_readings import expected_products, unbiased
+from kf_calib.noise.noise_of_readings import are_alike, expected_products, unbiased
 from kf_calib.noise.temperature_course import thermometer_errors
 
 FLOOR_MPS2 = 1e-9
@@ -32,7 +32,7 @@ FLOOR_MPS2 = 1e-9
 
 _MAX_ORDER = 20
 _LONGEST = 2.0  # kappa is at most the readings in a block divided by this
-_SHORT = 8.0  # if blocks are shorter than this times kappa, the three channels share one correlation
+_SHORT = 8.0  # if blocks are shorter than this times kappa, channels that are alike share one correlation
 TOO_SHORT = 4.0
 """If blocks are shorter than this times kappa, they do not determine how slow their noise is."""
 
@@ -92,6 +92,11 @@ class Noise:
     def effective_sigma_mps2(self) -> Floats:
         """Sigma (3,) of white readings whose mean has the same variance as the mean of the correlated readings."""
         return np.maximum(self.sigma_mps2, FLOOR_MPS2) * np.sqrt(self.inflation)
+
+    @property
+    def correlation_length(self) -> Floats:
+        """The readings (3,) that count as one where variances are estimated: kappa, but at least one."""
+        return np.maximum(self.inflation, 1.0)
 
     @property
     def weights(self) -> Noise:
@@ -180,9 +185,11 @@ def _correlation(folded: Folded, walk_mps2_per_sqrt_s: float) -> tuple[Floats, F
         total = replace(total, products=total.products - walk_mps2_per_sqrt_s**2 * _walk_products(dwells))
     known = _of_averages if dwells[0].averaged else _inflation
     inflation, variance = np.array([known(total, i) for i in range(3)]).T
-    if not dwells[0].averaged and total.count < _SHORT * inflation.max() * total.blocks:
+    if dwells[0].averaged or total.count >= _SHORT * inflation.max() * total.blocks:
+        return inflation, variance
+    if are_alike(total):
         return _alike(total)
-    return inflation, variance
+    return np.maximum(inflation, _too_short(inflation, total.count / total.blocks)), variance
 
 
 def _sigma_along(stack: DwellStack, along: Floats, inflation: Floats) -> Floats:
@@ -222,8 +229,8 @@ def _inflation(total: Autocovariance, channel: int) -> tuple[float, float]:
     """Return kappa and the variance of one channel from an autoregression fitted to its autocovariance
     (``autoregression``).
 
-    kappa is limited from below to 1, so that noise whose average falls faster than that of white noise is not relied
-    on, and from above to what blocks of this length can show.
+    kappa is limited from above to what blocks of this length can show. It is below 1 where averages fall faster than
+    those of white noise, but above 1/n: that is what is left of n differences when they are added up.
     """
     if total.count < 64 or total.products[0, channel] <= 0:
         return 1.0, 0.0
@@ -231,7 +238,7 @@ def _inflation(total: Autocovariance, channel: int) -> tuple[float, float]:
     lags = min(_MAX_ORDER, total.count // 16, size // 4)
     raw = total.products[: lags + 1, channel] / np.maximum(total.pairs[: lags + 1], 1.0)
     model, variance = unbiased(raw, total.count, size)
-    return min(max(model.inflation, 1.0), max(size / _LONGEST, 1.0)), variance
+    return min(max(model.inflation, 1.0 / size), max(size / _LONGEST, 1.0)), variance
 
 
 def _alike(total: Autocovariance) -> tuple[Floats, Floats]:
@@ -246,8 +253,13 @@ def _alike(total: Autocovariance) -> tuple[Floats, Floats]:
     shape = np.mean(total.products[:, varying] / total.products[0, varying], axis=1, keepdims=True)
     pooled = Autocovariance(shape * total.pairs[0], total.pairs, total.count * channels, total.blocks * channels)
     kappa, variance = _inflation(pooled, 0)
-    kappa = max(kappa, size / _LONGEST) if size < TOO_SHORT * kappa else kappa
+    kappa = np.maximum(kappa, _too_short(np.array(kappa), size))
     return np.where(varying, kappa, 1.0), variance * total.products[0] / total.pairs[0]
+
+
+def _too_short(inflation: Floats, size: float) -> Floats:
+    """Return the least kappa that blocks of this size allow where they are too short to determine it, else zeros."""
+    return np.where(size < TOO_SHORT * inflation, size / _LONGEST, 0.0)
 
 
 def _of_averages(total: Autocovariance, channel: int) -> tuple[float, float]:

@@ -126,6 +126,21 @@ def _unbiased(raw_bytes: bytes, count: int, size: int) -> tuple[Autoregression, 
     return model, float(gamma[0])
 
 
+def are_alike(total: Autocovariance) -> bool:
+    """Whether the readings of all channels may have one autocorrelation, by those from reading to reading.
+
+    atanh r of n readings is normal with the variance 1/n about one value, whatever that is (R. A. Fisher, 1921); the
+    correlation of slow noise leaves fewer readings that count.
+    """
+    varying = total.products[0] > 0.0
+    if varying.sum() < 2 or len(total.products) < 2:
+        return True
+    r = total.products[1, varying] / total.products[0, varying] * total.pairs[0] / max(total.pairs[1], 1.0)
+    places, freedom = np.arctanh(np.clip(r, -0.999, 0.999)), total.count / _lost_to_correlation(total)[varying]
+    common = np.average(places, weights=freedom)
+    return chi_squared_tail(len(r) - 1, float(freedom @ (places - common) ** 2)) >= _CLEAR_P
+
+
 _CLEAR_P = 1e-4  # of equal noise; with p-values above it, dwells keep one noise
 _FEWEST = 4  # dwells whose noise is known
 _LEAST_FREEDOM = 2.0  # of a dwell whose own noise counts

@@ -491,7 +491,7 @@ def test_a_signal_finishes_the_file_and_prints_the_summary(tmp_path: Path, how: 
         process.send_signal(how)
         said, errors = process.communicate(timeout=120)
     assert process.returncode == 0, errors
-    assert "Parameters (1σ)" in said and "Model and measurements agree" in said
+    assert "Parameters (1σ)" in said and "The model agrees with the measurements" in said
     assert finished(replayed("replay", str(out)))
 
 
