@@ -22,7 +22,7 @@ from kf_calib.estimation.cross_validation import HeldOut, held_out
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.estimate import Estimate, Parameter, Parameters, enlarged, estimate_of
 from kf_calib.estimation.fit import Fit
-from kf_calib.estimation.intervals import sigmas_of_interval
+from kf_calib.estimation.intervals import NORMAL, sigmas_of_interval
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.residual_table import residual_table, table_as
 from kf_calib.estimation.settings import Settings
@@ -233,6 +233,10 @@ class Calibration:
         is_stated = noise.setting_stated and noise.scatter_stated
         judged = self.consistency if is_stated else consistency(replace(self.fit, noise=noise.without_estimates()))
         return sigmas_of_interval(self.fit, judged.statistic, judged.dof)
+
+    def aims(self, wanted: Floats) -> Floats:
+        """The sigmas (12,) whose intervals are as long as those of ``wanted`` sigmas if all noise were known."""
+        return wanted * (NORMAL / self.interval_sigmas)
 
     def interval(self, parameter: Parameter) -> tuple[float, float] | tuple[None, None]:
         """The interval of 95 % of a parameter in SI units; None, None where it is not determined."""

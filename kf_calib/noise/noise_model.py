@@ -165,11 +165,11 @@ def within_dwells(
         inflation, variance = stack.folded.known["correlation"]
     if along is not None:
         return Noise(_sigma_along(stack, along, inflation), inflation, within_seen=within_seen)
-    counts, of_pieces = stack.folded.piece_counts, np.repeat(stack.folded.weights, stack.folded.piece_numbers)
-    squares = of_pieces[:, None] * stack.folded.squares
+    counts, of_pieces = stack.folded.piece_counts, np.repeat(stack.folded.weights, stack.folded.piece_numbers, axis=0)
+    squares = of_pieces * stack.folded.squares
     if walk_mps2_per_sqrt_s:
-        rest = np.concatenate([dwell.weight * dwell.walk.about_parabola for dwell in dwells])
-        squares = np.maximum(squares - walk_mps2_per_sqrt_s**2 * rest[:, None], 0.0)
+        rest = of_pieces * np.concatenate([dwell.walk.about_parabola for dwell in dwells])[:, None]
+        squares = np.maximum(squares - walk_mps2_per_sqrt_s**2 * rest, 0.0)
     on_carrier = dwells[0].width - 3
     long = counts[:, None] >= np.where(variance > 0, 40.0 * inflation, 0.0)
     freedom = np.where(long, np.maximum(counts[:, None] - 3.0 * inflation - on_carrier, 0.0), 0.0).sum(axis=0)
@@ -199,7 +199,7 @@ def _sigma_along(stack: DwellStack, along: Floats, inflation: Floats) -> Floats:
     The likeliest variances of such gamma distributed sums, by steps that keep them positive.
     """
     weights, folded = along**2, stack.folded
-    squares = folded.weights * folded.squares_along(along)
+    squares = folded.weights[:, 0] * folded.squares_along(along)
     freedom = np.add.reduceat(np.maximum(folded.piece_counts - 3.0 * inflation.mean(), 0.0), folded.ends[:-1])
     if not freedom.any():
         freedom = np.maximum(folded.counts - 1.0, 0.0)
@@ -213,16 +213,15 @@ def _sigma_along(stack: DwellStack, along: Floats, inflation: Floats) -> Floats:
 
 
 def _walk_products(dwells: Sequence[DwellFactor]) -> Floats:
-    """Return what a random walk of intensity q = 1 contributes to the sums of lagged products (L + 1, 1) of all
+    """Return what a random walk of intensity q = 1 contributes to the sums of lagged products (L + 1, 3) of all
     dwells."""
-    products = 0.0 * dwells[0].autocovariance.pairs
+    products = 0.0 * dwells[0].autocovariance.products
     for dwell in dwells:
         known, period_s = dwell.autocovariance, (dwell.end_s - dwell.start_s) / max(dwell.count - 1, 1)
         if known.blocks:
-            products += dwell.weight * lagged_walk_products(
-                period_s, max(round(known.count / known.blocks), 1), known.pairs
-            )
-    return products[:, None]
+            own = lagged_walk_products(period_s, max(round(known.count / known.blocks), 1), known.pairs)
+            products = products + own[:, None] * dwell.weights
+    return products
 
 
 def _inflation(total: Autocovariance, channel: int) -> tuple[float, float]:
@@ -328,7 +327,7 @@ def mean_covariances(noise: Noise, means: Means, state: Floats, misfit_mps2: flo
     counts as a sigma_alpha so large that it leaves the size of f alone, also where the noise is not known yet and is to
     be estimated from a misfit of this rms size.
     """
-    variances = noise.effective_sigma_mps2**2 / means.counts[:, None] + noise.scatter_mps2**2
+    variances = noise.effective_sigma_mps2**2 / means.counts + noise.scatter_mps2**2
     size = np.linalg.norm(means.force_mps2, axis=1).max()
     unknown_rad = _TURNED * max(float(np.sqrt(variances.max())), misfit_mps2) / size
     setting_rad = unknown_rad if noise.attitude_unknown else noise.setting_rad

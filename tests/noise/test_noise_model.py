@@ -87,9 +87,7 @@ def test_ar2_resonance_is_followed_too() -> None:
         [1.0], a, np.random.default_rng(0).normal(size=run.accel.values.shape), axis=0
     )
     response = lfilter([1.0], a, np.eye(1, 4000)[0])
-    np.testing.assert_allclose(
-        calibrate(run).noise.inflation, response.sum() ** 2 / np.sum(response**2), rtol=0.15
-    )
+    np.testing.assert_allclose(calibrate(run).noise.inflation, response.sum() ** 2 / np.sum(response**2), rtol=0.15)
 
 
 @pytest.mark.parametrize("theta", [-0.6, -0.9])
