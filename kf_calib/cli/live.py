@@ -262,8 +262,9 @@ def outcome(run: LiveRun, as_json: bool) -> Judgement | HandJudgement | None:
         from kf_calib.views.console import summary
 
         assert final.result is not None
-        parts: list[RenderableType] = [summary(final.result)]
-        if isinstance(final, Judgement):
+        diagnosed = isinstance(final, Judgement)
+        parts: list[RenderableType] = [summary(final.result, diagnosed)]
+        if diagnosed:
             style = {True: "bold green", False: "bold yellow", None: "bold"}[final.consistent]
             parts.append(Text(diagnosis.verdict(final.diagnosis), style=style))
         run.print(rendered(Group(*parts)), end=False)

@@ -181,7 +181,7 @@ class Prospect:
     def whiten(self, design: Floats, stimulus: Stimulus) -> Floats:
         """The design (n, 3, p) of dwells' means, whitened by their noise."""
         count = len(stimulus)
-        means = Means(design, np.zeros((count, 3)), stimulus.force_mps2, np.full(count, self.readings),
+        means = Means(design, np.zeros((count, 3)), stimulus.force_mps2, np.full((count, 3), self.readings),
                       np.zeros((count, 2)))  # fmt: skip
         root = np.linalg.cholesky(lift_rounding(mean_covariances(self.noise, means, self.state)))
         return np.asarray(np.linalg.solve(root, design), float)

@@ -164,6 +164,11 @@ class Improvement:
         return self.diagnosis.before
 
     @property
+    def floor_mps2(self) -> float | None:
+        """What noise alone gives as held-out error, by the diagnosis of the current model: one for all steps."""
+        return self.diagnosis.floor_mps2
+
+    @property
     def effects(self) -> tuple[str, ...]:
         """The effects of the current model, as text that ``effect_named`` accepts."""
         return tuple(self.result.settings.effects)

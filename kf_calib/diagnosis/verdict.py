@@ -289,9 +289,9 @@ def _held_out(diagnosis: Diagnosis) -> str:
     assert after is not None
     if after.model.dynamic and not before.model.dynamic:
         return " It changes no reading at rest."
-    if before.held_out_rms_mps2 is None or after.held_out_rms_mps2 is None or not after.held_out_floor_mps2:
+    floor = diagnosis.floor_mps2
+    if before.held_out_rms_mps2 is None or after.held_out_rms_mps2 is None or not floor:
         return ""
-    floor = after.held_out_floor_mps2
     return (
         f" Adding it takes the error on orientations left out from {before.held_out_rms_mps2 / floor:.2f} to "
         f"{after.held_out_rms_mps2 / floor:.2f} times what noise gives."

@@ -112,7 +112,7 @@ def trend_beside(linearised: LinearisedDwells, noise: Noise, state: Floats) -> T
         return None
     sigma, lengths_s = noise.effective_sigma_mps2, folded.ends_s[:, 1] - folded.ends_s[:, 0]
     squares, determined = _squares(dwells, _residuals(linearised, state))
-    by_readings = (sigma**2 / (folded.weights * folded.counts)[:, None])[:, :, None]
+    by_readings = (sigma**2 / (folded.weights * folded.counts[:, None]))[:, :, None]
     walk_shapes, flicker_shapes = _of_shapes()
     by_walk = noise.walk_mps2_per_sqrt_s**2 * lengths_s[:, None, None] * walk_shapes
     by_noise = by_readings + by_walk + flicker_sigma(noise, len(dwells))[:, None] ** 2 * flicker_shapes
@@ -121,7 +121,7 @@ def trend_beside(linearised: LinearisedDwells, noise: Noise, state: Floats) -> T
     count = 3 * int(determined.sum())
     if not count:
         return None
-    unsure = float(np.mean((4.0 * noise.inflation - 2.0) / folded.counts.sum())) / 3.0
+    unsure = float(np.mean((4.0 * noise.correlation_length - 2.0) / folded.counts.sum())) / 3.0
     unsure += (2.0 * (noise.walk_spread or 0.0) * float(np.mean(by_walk / expected))) ** 2
     ratio = float(ratios.sum() / count)
     shown = np.broadcast_to(determined[:, None, :], squares.shape)

@@ -210,7 +210,7 @@ class FoldedTable(Folded):
 
     @cached_property
     def weights(self) -> Floats:
-        return np.ones(len(self.dwells))
+        return np.ones((len(self.dwells), 3))
 
     @cached_property
     def moving(self) -> Mask:

@@ -65,11 +65,11 @@ class Spectrum:
         shared = {length: self.sums[length] + other.sums[length] for length in self.sums.keys() & other.sums.keys()}
         return Spectrum({**self.sums, **other.sums, **shared})
 
-    def times(self, weight: float) -> Spectrum:
-        """The spectrum of readings of this weight: the power of each segment counts by it."""
-        if weight == 1.0:
+    def times(self, weights: tuple[float, ...]) -> Spectrum:
+        """The spectrum of readings of these weights: the power of each segment counts by that of its channel."""
+        if set(weights) == {1.0}:
             return self
-        return Spectrum({length: replace(each, power=weight * each.power) for length, each in self.sums.items()})
+        return Spectrum({length: replace(each, power=weights * each.power) for length, each in self.sums.items()})
 
     @classmethod
     def of(cls, residuals: Floats, elapsed_s: Floats) -> Spectrum:

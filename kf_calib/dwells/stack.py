@@ -64,9 +64,9 @@ class Folded:
     @cached_property
     def autocovariance(self) -> Autocovariance:
         """The sums of lagged products of all dwells, by the weights of their readings."""
-        total = self.dwells[0].autocovariance.times(self.dwells[0].weight)
+        total = self.dwells[0].autocovariance.times(self.dwells[0].weights)
         for dwell in self.dwells[1:]:
-            total = total + dwell.autocovariance.times(dwell.weight) if dwell.autocovariance.count else total
+            total = total + dwell.autocovariance.times(dwell.weights) if dwell.autocovariance.count else total
         return total
 
     @cached_property
@@ -111,8 +111,8 @@ class Folded:
 
     @cached_property
     def weights(self) -> Floats:
-        """Weights (D,) of the readings of each dwell."""
-        return np.fromiter((dwell.weight for dwell in self.dwells), float, len(self.dwells))
+        """Weights (D, 3) of the readings of each channel in each dwell."""
+        return np.array([dwell.weights for dwell in self.dwells])
 
     @cached_property
     def squares(self) -> Floats:

@@ -81,9 +81,9 @@ class Autocovariance:
             self.blocks + other.blocks,
         )
 
-    def times(self, weight: float) -> Autocovariance:
-        """The sums with products times a weight."""
-        return self if weight == 1.0 else replace(self, products=weight * self.products)
+    def times(self, weights: tuple[float, ...]) -> Autocovariance:
+        """The sums with the products of each channel times its weight."""
+        return self if set(weights) == {1.0} else replace(self, products=weights * self.products)
 
     @classmethod
     def of(cls, residuals: Floats) -> Autocovariance:
@@ -102,7 +102,7 @@ _OF_CONDITIONS = ("nodes", "squares", "counts", "variances", "walk", "shaking", 
 _OF_READINGS = (*_OF_CONDITIONS, "triangles", "factor", "means")
 """Cached properties of a dwell that stay if its force is turned."""
 _OF_ALL = (*_OF_READINGS, "spread", "regressors")
-"""Cached properties of a dwell that stay if nothing but its weight changes."""
+"""Cached properties of a dwell that stay if nothing but its weights change."""
 _OF_TRIANGLES = ("triangles", "squares", "counts", "variances", "walk", "shaking", "count", "spread")
 """Cached properties of a dwell that stay if the force and the pose at its nodes are others."""
 
@@ -122,7 +122,7 @@ class DwellFactor:
     - turned_rad: rotation vector (3,) by which effects of a model turn the specific force that its pose shows; None
       where they do not.
     - attitude: what is known of its setting error beyond the prior; None where none is allowed for.
-    - weight: of its readings, the variance of a reading of the run over that of one of this dwell.
+    - weights (3,): of the readings of each channel, the variance of one of the run over that of one of this dwell.
     """
 
     number: int
@@ -136,7 +136,7 @@ class DwellFactor:
     turns: tuple[int, ...] = ()
     turned_rad: Floats | None = None
     attitude: AttitudeError | None = None
-    weight: float = 1.0
+    weights: tuple[float, ...] = (1.0, 1.0, 1.0)
 
     @property
     def carrier_hz(self) -> float:
@@ -162,9 +162,9 @@ class DwellFactor:
         """The same dwell about a force that is turned otherwise."""
         return self._replaced(_OF_READINGS, turned_rad=turned_rad, attitude=attitude)
 
-    def weighted(self, weight: float) -> DwellFactor:
-        """The same dwell with another weight of its readings."""
-        return self._replaced(_OF_ALL, weight=weight)
+    def weighted(self, weights: Sequence[float]) -> DwellFactor:
+        """The same dwell with other weights of its readings."""
+        return self._replaced(_OF_ALL, weights=tuple(weights))
 
     def with_force(
         self, force_mps2: Floats, pose: Floats, attitude: AttitudeError | None, came_from: DwellFactor | None
@@ -363,7 +363,7 @@ def lines_of(dwells: Sequence[DwellFactor], level: float = 0.01) -> tuple[Spectr
     there but keeps its phase from dwell to dwell. The p-values account for both tests. In the averaged spectrum dwells
     count by their weights: the power of one that is louder than the others would have few degrees of freedom.
     """
-    spectral_lines = lines((dwell.spectrum.times(dwell.weight) for dwell in dwells), 0.5 * level)
+    spectral_lines = lines((dwell.spectrum.times(dwell.weights) for dwell in dwells), 0.5 * level)
     steady = None if spectral_lines else tone([dwell.trace for dwell in dwells], 0.5 * level)
     oscillations = spectral_lines or ((steady,) if steady else ())
     return tuple(replace(line, p_value=min(1.0, 2.0 * line.p_value)) for line in oscillations)

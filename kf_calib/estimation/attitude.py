@@ -123,7 +123,7 @@ def _posterior_rotations(means: Means, noise: Noise, state: Floats, bendings: Fl
     axes = tangents(means.force_mps2)
     sensitivities = state[:STATE_COUNT].reshape(3, 4)[:, :3] + bendings
     columns = rotation_map(means.force_mps2, sensitivities, axes)
-    weights = 1.0 / (noise.effective_sigma_mps2**2 / means.counts[:, None] + noise.scatter_mps2**2)
+    weights = 1.0 / (noise.effective_sigma_mps2**2 / means.counts + noise.scatter_mps2**2)
     weighted = np.swapaxes(columns * weights[:, :, None], 1, 2)
     prior = 0.0 if noise.attitude_unknown else 1.0 / noise.setting_rad**2
     covariances = np.linalg.inv(weighted @ columns + prior * np.eye(2))

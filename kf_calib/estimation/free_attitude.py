@@ -65,7 +65,7 @@ def covariance_of(linearised: LinearisedDwells, noise: Noise, square_rad: float 
     means = linearised.means
     across = weights_of_size(means, linearised.state)
     design = np.einsum("di,dip->dp", across, regressors_of(means))
-    variance = across**2 @ (noise.scatter_mps2**2) + ((across * noise.effective_sigma_mps2) ** 2).sum(1) / means.counts
+    variance = across**2 @ (noise.scatter_mps2**2) + ((across * noise.effective_sigma_mps2) ** 2 / means.counts).sum(1)
     nine = np.ix_(_NINE, _NINE)
     information = ((design.T / variance) @ design)[nine] + np.linalg.inv(weak_covariance(square_rad)[nine])
     out = np.zeros((STATE_COUNT, STATE_COUNT))

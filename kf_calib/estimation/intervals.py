@@ -21,7 +21,9 @@ from kf_calib.noise.noise_model import mean_covariances
 LEVEL = 0.95
 """Probability with which an interval holds a parameter."""
 
-_NORMAL = 1.959963984540054
+NORMAL = 1.959963984540054
+"""Half the length of the interval in sigmas where all noise is known."""
+
 _MORE = 0.75  # prior probability that there is more noise than is known
 _LARGEST = 1e2  # of R
 _NODES = 400
@@ -34,13 +36,13 @@ def sigmas_of_interval(fitted: Fit, misfit: float, dof: int) -> float:
     """
     noise = fitted.noise
     if dof <= 0 or (noise.setting_stated and noise.scatter_stated):
-        return _NORMAL
+        return NORMAL
     if not noise.within_seen and not noise.scatter_stated:
         return _student(dof)
     linearised = fitted.linearised
     traces = [np.einsum("dii->d", mean_covariances(each.of_readings, linearised.means, linearised.state))
               for each in (noise, noise.without_estimates())]  # fmt: skip
-    return max(_NORMAL, _averaged(dof, misfit / dof, float(np.mean(traces[0] / np.maximum(traces[1], 1e-300)))))
+    return max(NORMAL, _averaged(dof, misfit / dof, float(np.mean(traces[0] / np.maximum(traces[1], 1e-300)))))
 
 
 @lru_cache(maxsize=256)
@@ -62,7 +64,7 @@ def _averaged(dof: int, misfit: float, taken: float) -> float:
     weights[0] += (1.0 - _MORE) * math.exp(logs[0] - logs.max())
     weights /= weights.sum()
     shrink = np.sqrt(taken * np.exp(-log_ratios) / 2.0)
-    low, high = 0.0, 100.0 * _NORMAL
+    low, high = 0.0, 100.0 * NORMAL
     for _ in range(60):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if weights @ erf(middle * shrink) < LEVEL else (low, middle)

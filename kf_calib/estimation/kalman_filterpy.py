@@ -109,7 +109,7 @@ def samples_of(rows: Iterable[Rows], linearised: LinearisedDwells, noise: Noise)
                 course = functions[:3].T @ on_basis(waves)
                 slow = np.eye(3)[None, :, :, None] * course[:, None, None, :]  # those of each accelerometer its own
                 nuisances = np.concatenate([nuisances, slow.reshape(len(u), 3, -1)], axis=2)
-            sigma_mps2 = noise.of(block.moving).effective_sigma_mps2 / math.sqrt(dwell.weight)
+            sigma_mps2 = noise.of(block.moving).effective_sigma_mps2 / np.sqrt(dwell.weights)
             residual_mps2 = readings - observation @ linearised.state
             samples = Samples(
                 block.dwell, block.elapsed_s[part], observation, nuisances, sigmas, readings, residual_mps2,

@@ -22,7 +22,7 @@ from kf_calib.estimation.cross_validation import HeldOut, held_out
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.estimate import Estimate, Parameter, Parameters, enlarged, estimate_of
 from kf_calib.estimation.fit import Fit
-from kf_calib.estimation.intervals import sigmas_of_interval
+from kf_calib.estimation.intervals import NORMAL, sigmas_of_interval
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.residual_table import residual_table, table_as
 from kf_calib.estimation.settings import Settings
@@ -234,6 +234,10 @@ class Calibration:
         judged = self.consistency if is_stated else consistency(replace(self.fit, noise=noise.without_estimates()))
         return sigmas_of_interval(self.fit, judged.statistic, judged.dof)
 
+    def aims(self, wanted: Floats) -> Floats:
+        """The sigmas (12,) whose intervals are as long as those of ``wanted`` sigmas if all noise were known."""
+        return wanted * (NORMAL / self.interval_sigmas)
+
     def interval(self, parameter: Parameter) -> tuple[float, float] | tuple[None, None]:
         """The interval of 95 % of a parameter in SI units; None, None where it is not determined."""
         if parameter.value is None or parameter.sigma is None:
@@ -405,7 +409,7 @@ def consistency(fitted: Fit) -> Consistency:
     if not noise.within_seen and not noise.scatter_stated:  # the noise was taken from this misfit
         scatter_mps2 = float(np.sqrt(np.mean(noise.scatter_mps2**2)))
         return Consistency(statistic, dof, None, None, Condition("scatter_sigma_mps2", scatter_mps2, "m/s^2"))
-    noise_dof = float(np.maximum(dwells.folded.counts - 4, 1).sum() / noise.inflation.mean())
+    noise_dof = float(np.maximum(dwells.folded.counts - 4, 1).sum() / noise.correlation_length.mean())
     left, tested = statistic, dof
     if estimated and (along := _dof_along_force(fitted)):
         # What lies across the force has the size of the setting error that was estimated from it: it is as large as

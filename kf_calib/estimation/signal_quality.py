@@ -204,7 +204,9 @@ class ReadingsMonitor:
             return Readings()
         seen = [self._dwells[dwell.number] for dwell in dwells]
         steps = [_step(seen, channel) for channel in range(3)]
-        grids = [_quantisation(i, q, noise, seen) for i, q in enumerate(steps) if q is not None]
+        # Of all readings alike: by weights, dwells that stay on one step would seem to be those without noise.
+        levels = np.median(1.0 / np.array([dwell.weights for dwell in dwells]), axis=0) * noise.sigma_mps2**2
+        grids = [_quantisation(i, q, levels[i], noise, seen) for i, q in enumerate(steps) if q is not None]
         grids = [each for each in grids if each.matters or each.step_mps2 > 8.0 * _storage(seen, each.channel - 1)]
         flat = tuple(_saturations(seen, steps, np.array([_spread(dwell) for dwell in dwells]), noise))
         outliers = _outliers(seen)
@@ -290,9 +292,8 @@ def common_step(values: Floats, tolerance: float) -> float | None:
     return None
 
 
-def _quantisation(index: int, step: float, noise: Noise, seen: Sequence[_Seen]) -> Quantisation:
-    """Judge the quantisation of one channel."""
-    variance = float(noise.sigma_mps2[index]) ** 2
+def _quantisation(index: int, step: float, variance: float, noise: Noise, seen: Sequence[_Seen]) -> Quantisation:
+    """Judge the quantisation of one channel whose readings have this variance."""
     dither = max(variance - step**2 / 12.0, 0.0)  # noise that spreads the readings over several steps
     error = 0.5 * step * math.exp(-2.0 * math.pi**2 * dither / step**2)
     count = float(np.median([each.count for each in seen]))
@@ -319,9 +320,9 @@ def _saturations(
         if width > 2.0 * sigma:
             continue  # a dwell may then have a single value at any level
         sigma, at = math.sqrt(sigma**2 - width**2 / 12.0), reached[:, side]
-        if stuck[at, side].sum() <= _CROWDED * float(noise.inflation[i]):
+        if stuck[at, side].sum() <= _CROWDED * float(noise.correlation_length[i]):
             continue  # no more can be missing above a value than are at it
-        missing = missing_above(stuck[:, side], counts, width / sigma) / float(noise.inflation[i])
+        missing = missing_above(stuck[:, side], counts, width / sigma) / float(noise.correlation_length[i])
         usual = float(np.median(missing[inside]))  # non-Gaussian noise has flat tops at every level
         if missing[at].sum() > _CROWDED and missing[at].mean() > 4.0 * usual:
             level = float(ends[at, side][0]) * (1.0 if side < 3 else -1.0)

@@ -213,8 +213,8 @@ def _weighted(batch: _Batch, columns: Floats, about: _About) -> tuple[Floats, in
     parts = _channels(batch, columns, blocks, about, columns.shape[2])
     sigma = noise.effective_sigma_mps2
     roots = np.sqrt(batch.stack.folded.weights[batch.dwells])
-    parts /= sigma[:, None, None] / roots[:, None, None, None]
-    walks = roots[:, None] * (noise.walk_mps2_per_sqrt_s / sigma)
+    parts /= (sigma / roots)[:, :, None, None]
+    walks = roots * (noise.walk_mps2_per_sqrt_s / sigma)
     if noise.attitude_unknown:
         along = _unit_along(batch, noise, about.state)
         parts, walks = _combined(parts, along), np.sqrt((along**2)[:, None] @ (walks**2)[:, :, None])[:, :, 0]
@@ -249,7 +249,7 @@ def _of_means(batch: _Batch, columns: Floats, about: _About) -> Floats:
     """
     blocks, priors = _blocks_of(about, columns.shape[-1]), _priors(about)
     roots = batch.triangles[:, :, 0, 0]
-    sigmas = about.noise.effective_sigma_mps2 / np.sqrt(batch.stack.folded.weights[batch.dwells])[:, None]
+    sigmas = about.noise.effective_sigma_mps2 / np.sqrt(batch.stack.folded.weights[batch.dwells])
     along = (roots / np.linalg.norm(roots, axis=1, keepdims=True))[:, None, None, :]
     rows = (along @ _channels(batch, columns, blocks, about, 1))[:, :, 0] / sigmas[:, :, None]
     scaled = rows[..., : blocks.nuisances] * priors
@@ -388,7 +388,7 @@ class MisfitColumns:
             stacked = columns[group.pieces]  # (d, pieces, K, 3, q)
             many, pieces, width, _, count = stacked.shape
             on_triangles = group.triangles @ on_basis(stacked.reshape(many, pieces, width, 3 * count))
-            sigma = self._sigma[:, None] / group.roots[:, None, None, None, None]
+            sigma = (self._sigma / group.roots)[:, None, None, :, None]
             parts = np.moveaxis(on_triangles.reshape(stacked.shape) / sigma, 3, 1)
             parts = parts.reshape(many, 3, pieces * width, count)
             if group.along is not None:

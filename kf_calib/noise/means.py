@@ -22,7 +22,7 @@ class Means:
 
     - design (D, 3, p): the model's columns.
     - readings (D, 3), force_mps2 (D, 3): readings and specific force.
-    - counts (D,): number of readings, each as many as its weight says.
+    - counts (D, 3): number of readings of each channel, each as many as its weight says.
     - ends_s (D, 2): when each dwell begins and ends.
     - bending (D, 3, 3): by how much effects change the readings per unit of force (``AttitudeError``).
     """
@@ -53,7 +53,7 @@ def means_of(dwells: Sequence[DwellFactor], columns: Sequence[Floats]) -> Means:
     else:
         design = _design(stack, values)
     return Means(
-        design, stack.means[:, 4:], stack.felt_means_mps2, stack.folded.weights * stack.folded.counts,
+        design, stack.means[:, 4:], stack.felt_means_mps2, stack.folded.weights * stack.folded.counts[:, None],
         stack.folded.ends_s, stack.bendings,
     )  # fmt: skip
 

@@ -24,7 +24,7 @@ from kf_calib.dwells.stack import DwellStack, Folded
 from kf_calib.dwells.sufficient_statistics import Autocovariance, DwellFactor
 from kf_calib.noise import random_walk
 from kf_calib.noise.means import Means
-from kf_calib.noise.noise_of_readings import expected_products, unbiased
+from kf_calib.noise.noise_of_readings import are_alike, expected_products, unbiased
 from kf_calib.noise.temperature_course import thermometer_errors
 
 FLOOR_MPS2 = 1e-9
@@ -32,7 +32,7 @@ FLOOR_MPS2 = 1e-9
 
 _MAX_ORDER = 20
 _LONGEST = 2.0  # kappa is at most the readings in a block divided by this
-_SHORT = 8.0  # if blocks are shorter than this times kappa, the three channels share one correlation
+_SHORT = 8.0  # if blocks are shorter than this times kappa, channels that are alike share one correlation
 TOO_SHORT = 4.0
 """If blocks are shorter than this times kappa, they do not determine how slow their noise is."""
 
@@ -92,6 +92,11 @@ class Noise:
     def effective_sigma_mps2(self) -> Floats:
         """Sigma (3,) of white readings whose mean has the same variance as the mean of the correlated readings."""
         return np.maximum(self.sigma_mps2, FLOOR_MPS2) * np.sqrt(self.inflation)
+
+    @property
+    def correlation_length(self) -> Floats:
+        """The readings (3,) that count as one where variances are estimated: kappa, but at least one."""
+        return np.maximum(self.inflation, 1.0)
 
     @property
     def weights(self) -> Noise:
@@ -160,11 +165,11 @@ def within_dwells(
         inflation, variance = stack.folded.known["correlation"]
     if along is not None:
         return Noise(_sigma_along(stack, along, inflation), inflation, within_seen=within_seen)
-    counts, of_pieces = stack.folded.piece_counts, np.repeat(stack.folded.weights, stack.folded.piece_numbers)
-    squares = of_pieces[:, None] * stack.folded.squares
+    counts, of_pieces = stack.folded.piece_counts, np.repeat(stack.folded.weights, stack.folded.piece_numbers, axis=0)
+    squares = of_pieces * stack.folded.squares
     if walk_mps2_per_sqrt_s:
-        rest = np.concatenate([dwell.weight * dwell.walk.about_parabola for dwell in dwells])
-        squares = np.maximum(squares - walk_mps2_per_sqrt_s**2 * rest[:, None], 0.0)
+        rest = of_pieces * np.concatenate([dwell.walk.about_parabola for dwell in dwells])[:, None]
+        squares = np.maximum(squares - walk_mps2_per_sqrt_s**2 * rest, 0.0)
     on_carrier = dwells[0].width - 3
     long = counts[:, None] >= np.where(variance > 0, 40.0 * inflation, 0.0)
     freedom = np.where(long, np.maximum(counts[:, None] - 3.0 * inflation - on_carrier, 0.0), 0.0).sum(axis=0)
@@ -180,9 +185,11 @@ def _correlation(folded: Folded, walk_mps2_per_sqrt_s: float) -> tuple[Floats, F
         total = replace(total, products=total.products - walk_mps2_per_sqrt_s**2 * _walk_products(dwells))
     known = _of_averages if dwells[0].averaged else _inflation
     inflation, variance = np.array([known(total, i) for i in range(3)]).T
-    if not dwells[0].averaged and total.count < _SHORT * inflation.max() * total.blocks:
+    if dwells[0].averaged or total.count >= _SHORT * inflation.max() * total.blocks:
+        return inflation, variance
+    if are_alike(total):
         return _alike(total)
-    return inflation, variance
+    return np.maximum(inflation, _too_short(inflation, total.count / total.blocks)), variance
 
 
 def _sigma_along(stack: DwellStack, along: Floats, inflation: Floats) -> Floats:
@@ -192,7 +199,7 @@ def _sigma_along(stack: DwellStack, along: Floats, inflation: Floats) -> Floats:
     The likeliest variances of such gamma distributed sums, by steps that keep them positive.
     """
     weights, folded = along**2, stack.folded
-    squares = folded.weights * folded.squares_along(along)
+    squares = folded.weights[:, 0] * folded.squares_along(along)
     freedom = np.add.reduceat(np.maximum(folded.piece_counts - 3.0 * inflation.mean(), 0.0), folded.ends[:-1])
     if not freedom.any():
         freedom = np.maximum(folded.counts - 1.0, 0.0)
@@ -206,24 +213,23 @@ def _sigma_along(stack: DwellStack, along: Floats, inflation: Floats) -> Floats:
 
 
 def _walk_products(dwells: Sequence[DwellFactor]) -> Floats:
-    """Return what a random walk of intensity q = 1 contributes to the sums of lagged products (L + 1, 1) of all
+    """Return what a random walk of intensity q = 1 contributes to the sums of lagged products (L + 1, 3) of all
     dwells."""
-    products = 0.0 * dwells[0].autocovariance.pairs
+    products = 0.0 * dwells[0].autocovariance.products
     for dwell in dwells:
         known, period_s = dwell.autocovariance, (dwell.end_s - dwell.start_s) / max(dwell.count - 1, 1)
         if known.blocks:
-            products += dwell.weight * lagged_walk_products(
-                period_s, max(round(known.count / known.blocks), 1), known.pairs
-            )
-    return products[:, None]
+            own = lagged_walk_products(period_s, max(round(known.count / known.blocks), 1), known.pairs)
+            products = products + own[:, None] * dwell.weights
+    return products
 
 
 def _inflation(total: Autocovariance, channel: int) -> tuple[float, float]:
     """Return kappa and the variance of one channel from an autoregression fitted to its autocovariance
     (``autoregression``).
 
-    kappa is limited from below to 1, so that noise whose average falls faster than that of white noise is not relied
-    on, and from above to what blocks of this length can show.
+    kappa is limited from above to what blocks of this length can show. It is below 1 where averages fall faster than
+    those of white noise, but above 1/n: that is what is left of n differences when they are added up.
     """
     if total.count < 64 or total.products[0, channel] <= 0:
         return 1.0, 0.0
@@ -231,7 +237,7 @@ def _inflation(total: Autocovariance, channel: int) -> tuple[float, float]:
     lags = min(_MAX_ORDER, total.count // 16, size // 4)
     raw = total.products[: lags + 1, channel] / np.maximum(total.pairs[: lags + 1], 1.0)
     model, variance = unbiased(raw, total.count, size)
-    return min(max(model.inflation, 1.0), max(size / _LONGEST, 1.0)), variance
+    return min(max(model.inflation, 1.0 / size), max(size / _LONGEST, 1.0)), variance
 
 
 def _alike(total: Autocovariance) -> tuple[Floats, Floats]:
@@ -246,8 +252,13 @@ def _alike(total: Autocovariance) -> tuple[Floats, Floats]:
     shape = np.mean(total.products[:, varying] / total.products[0, varying], axis=1, keepdims=True)
     pooled = Autocovariance(shape * total.pairs[0], total.pairs, total.count * channels, total.blocks * channels)
     kappa, variance = _inflation(pooled, 0)
-    kappa = max(kappa, size / _LONGEST) if size < TOO_SHORT * kappa else kappa
+    kappa = np.maximum(kappa, _too_short(np.array(kappa), size))
     return np.where(varying, kappa, 1.0), variance * total.products[0] / total.pairs[0]
+
+
+def _too_short(inflation: Floats, size: float) -> Floats:
+    """Return the least kappa that blocks of this size allow where they are too short to determine it, else zeros."""
+    return np.where(size < TOO_SHORT * inflation, size / _LONGEST, 0.0)
 
 
 def _of_averages(total: Autocovariance, channel: int) -> tuple[float, float]:
@@ -316,7 +327,7 @@ def mean_covariances(noise: Noise, means: Means, state: Floats, misfit_mps2: flo
     counts as a sigma_alpha so large that it leaves the size of f alone, also where the noise is not known yet and is to
     be estimated from a misfit of this rms size.
     """
-    variances = noise.effective_sigma_mps2**2 / means.counts[:, None] + noise.scatter_mps2**2
+    variances = noise.effective_sigma_mps2**2 / means.counts + noise.scatter_mps2**2
     size = np.linalg.norm(means.force_mps2, axis=1).max()
     unknown_rad = _TURNED * max(float(np.sqrt(variances.max())), misfit_mps2) / size
     setting_rad = unknown_rad if noise.attitude_unknown else noise.setting_rad

@@ -115,7 +115,9 @@ def _unbiased(raw_bytes: bytes, count: int, size: int) -> tuple[Autoregression, 
     """Compute ``unbiased`` from the bytes of ``raw``, which can be cached."""
     raw = np.frombuffer(raw_bytes)
     gamma, kappa, lags, model = raw, 0.0, len(raw) - 1, Autoregression.of(raw, count)
-    if not len(model.coefficients) and size > _LONG:  # white noise, of which a parabola removes almost nothing
+    if size <= _LONG:  # what a parabola leaves of white noise in a short block is correlated
+        model = Autoregression()
+    elif not len(model.coefficients):  # white noise, of which it removes almost nothing
         return model, float(raw[0])
     for _ in range(_ITERATIONS):
         if abs(model.inflation - kappa) < _STILL * model.inflation:
@@ -124,6 +126,21 @@ def _unbiased(raw_bytes: bytes, count: int, size: int) -> tuple[Autoregression, 
         gamma = raw + whole[: lags + 1] - expected_products(whole, lags) / (size - np.arange(lags + 1))
         model = Autoregression.of(gamma, count)
     return model, float(gamma[0])
+
+
+def are_alike(total: Autocovariance) -> bool:
+    """Whether the readings of all channels may have one autocorrelation, by those from reading to reading.
+
+    atanh r of n readings is normal with the variance 1/n about one value, whatever that is (R. A. Fisher, 1921); the
+    correlation of slow noise leaves fewer readings that count.
+    """
+    varying = total.products[0] > 0.0
+    if varying.sum() < 2 or len(total.products) < 2:
+        return True
+    r = total.products[1, varying] / total.products[0, varying] * total.pairs[0] / max(total.pairs[1], 1.0)
+    places, freedom = np.arctanh(np.clip(r, -0.999, 0.999)), total.count / _lost_to_correlation(total)[varying]
+    common = np.average(places, weights=freedom)
+    return chi_squared_tail(len(r) - 1, float(freedom @ (places - common) ** 2)) >= _CLEAR_P
 
 
 _CLEAR_P = 1e-4  # of equal noise; with p-values above it, dwells keep one noise
@@ -135,20 +152,24 @@ _QUIETEST = 0.1  # variance of a dwell, in the median of all
 
 
 def with_own_noise(dwells: DwellStack, along: Floats | None = None) -> DwellStack:
-    """The dwells, each with the weight that its own noise gives its readings, 1 where all have one noise.
+    """The dwells, each with the weights that its own noise gives the readings of its channels, 1 where all have one.
 
     along (D, 3): the weights of the channels in the size of the force, where nothing else is known in a dwell.
     """
     folded, free = dwells.folded, np.ones(3)
     if folded.dwells[0].averaged or not folded.autocovariance.blocks:  # as of a table: no reading is known
         return dwells
-    if np.all(weights_of(*_variances(folded, along, free)) == 1.0):  # equal even if no reading told what the next says
-        weights = np.ones(len(dwells))
-    else:
-        weights = weights_of(*_variances(folded, along, _lost_to_correlation(folded.autocovariance)))
+    weights = _of_channels(*_variances(folded, along, free))
+    if not np.all(weights == 1.0):  # unequal if each reading told what no other says
+        weights = _of_channels(*_variances(folded, along, _lost_to_correlation(folded.autocovariance)))
     if np.array_equal(weights, folded.weights):
         return dwells
-    return DwellStack.of([dwell.weighted(float(weight)) for dwell, weight in zip(dwells, weights, strict=True)])
+    return DwellStack.of([dwell.weighted(own) for dwell, own in zip(dwells, weights.tolist(), strict=True)])
+
+
+def _of_channels(variances: Floats, freedom: Floats) -> Floats:
+    """Return the weights (D, 3) of the channels, each by itself, from their variances (D, 3) and degrees of freedom."""
+    return np.stack([weights_of(variances[:, i], freedom[:, i]) for i in range(3)], axis=1)
 
 
 def weights_of(variances: Floats, freedom: Floats) -> Floats:
@@ -193,21 +214,19 @@ def _prior(variances: Floats, freedom: Floats) -> tuple[float, float]:
 
 
 def _variances(folded: Folded, along: Floats | None, lost: Floats) -> tuple[Floats, Floats]:
-    """Return the variances (D,) of the readings of each dwell about their course, relative to those of the run, and
-    their degrees of freedom (D,), of which autocorrelation takes a part: ``lost`` (3,) as ``_lost_to_correlation``."""
+    """Return the variances (D, 3) of the readings of each dwell about their course, relative to those of the run, and
+    their degrees of freedom (D, 3), of which autocorrelation takes a part: ``lost`` (3,) as ``_lost_to_correlation``.
+    Those along the force, where nothing else is known, are the same for all channels."""
     first = folded.ends[:-1]
     widths = np.repeat(folded.widths, folded.piece_numbers)
     freedom = np.add.reduceat(np.maximum(folded.piece_counts - widths, 0.0), first)
     if along is not None:
-        return folded.squares_along(along) / np.maximum(freedom, 1.0), freedom / lost.mean()
+        relative = folded.squares_along(along) / np.maximum(freedom, 1.0)
+        return np.tile(relative[:, None], 3), np.tile(freedom[:, None] / lost.mean(), 3)
     squares = np.add.reduceat(folded.squares, first)
     levels = squares.sum(axis=0) / max(freedom.sum(), 1.0)
-    varying = levels > 0.0
-    if not varying.any():
-        return np.zeros(len(freedom)), freedom
-    shares = freedom[:, None] / lost[varying]
-    relative = squares[:, varying] / np.maximum(freedom, 1.0)[:, None] / levels[varying]
-    return np.sum(shares * relative, axis=1) / np.maximum(shares.sum(axis=1), 1e-300), shares.sum(axis=1)
+    relative = squares / np.maximum(freedom, 1.0)[:, None] / np.where(levels > 0.0, levels, 1.0)
+    return relative, freedom[:, None] / lost
 
 
 def _lost_to_correlation(total: Autocovariance) -> Floats:

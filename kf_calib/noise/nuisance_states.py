@@ -142,8 +142,8 @@ def _amplitudes(stack: DwellStack, predicted: Floats, sigma: Floats, weights: Fl
         waves, left = waves - unit @ (along @ waves), left - unit @ (along @ left)
         back = np.swapaxes(waves, 1, 2)
         inverse = np.linalg.pinv(back @ waves, rcond=1e-9, hermitian=True)
-        spreads = np.maximum(np.einsum("dkk->dk", inverse), 1e-300)[:, :, None] * (ours**2 @ sigma**2)[:, None]
-        spreads /= stack.folded.weights[shape.dwells, None, None]
+        by_readings = np.einsum("dci,di->dc", ours**2, sigma**2 / stack.folded.weights[shape.dwells])
+        spreads = np.maximum(np.einsum("dkk->dk", inverse), 1e-300)[:, :, None] * by_readings[:, None]
         amplitudes[shape.dwells], variances[shape.dwells] = inverse @ (back @ left), spreads
     return amplitudes, variances
 

@@ -183,7 +183,8 @@ class HandJudgement:
     def reached(self) -> bool:
         """Whether there are targets of parameters that are left without angles, and every one is reached."""
         aimed = np.isfinite(self.wanted) & ~np.isin(paper_parameters.SYMBOLS, ("theta1", "phi1", "nu2"))
-        return bool(aimed.any() and (self.sigma <= self.wanted)[aimed].all())
+        reached = self.result is not None and (self.sigma <= self.result.aims(self.wanted))[aimed].all()
+        return bool(aimed.any() and reached and self.consistent is not None)
 
     @property
     def consistent(self) -> bool | None:

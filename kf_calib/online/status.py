@@ -228,6 +228,16 @@ class Judgement:
         return self.course.gimbal_deg, f"lowers sigma of {symbol} by {100.0 * (1.0 - factor):.0f} %"
 
     @cached_property
+    def aims(self) -> Floats:
+        """The sigmas (12,) by which targets are reached: below them where noise is known from few dwells only."""
+        return self.result.aims(self.wanted)
+
+    def reached(self, sigma: Floats) -> bool:
+        """Whether there are targets, every one is reached by these sigmas (12,), and the model was judged."""
+        given = np.isfinite(self.wanted)
+        return bool(given.any() and (sigma <= self.aims)[given].all() and self.consistent is not None)
+
+    @cached_property
     def worst(self) -> Floats:
         """Scales (12,) by which the sigmas are compared to find the worst."""
         return _sizes(self.result, self.wanted)
@@ -370,7 +380,7 @@ def current(dwell: DwellFactor, judgement: Judgement | None) -> Current:
     here = Current(dwell.number, dwell.recorded_pose, dwell.count, seconds, unknown, None, unknown)
     if judgement is None:
         return here
-    result, wanted = judgement.result, judgement.wanted
+    result, wanted = judgement.result, judgement.aims
     sigma, longer = result.during(dwell).sigma, {k: result.during(dwell.repeat(k)).sigma for k in _STAYING}
     stay_s = np.full(12, np.inf)
     for k in reversed(_STAYING):
@@ -383,7 +393,7 @@ def current(dwell: DwellFactor, judgement: Judgement | None) -> Current:
 def _quiet(dwell: DwellFactor, result: Calibration) -> bool:
     """Tell whether the noise of the dwell's mean is well below the scatter from dwell to dwell."""
     noise, means = result.noise, result.linearised.means[[-1]]
-    means = replace(means, counts=np.array([float(dwell.count)]))
+    means = replace(means, counts=np.full((1, 3), float(dwell.count)))
     whole = np.diag(mean_covariances(noise, means, result.linearised.state)[0])
     own = noise.effective_sigma_mps2**2 / dwell.count
     return bool((own < _QUIET * (whole - own)).all())

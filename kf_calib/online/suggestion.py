@@ -146,7 +146,7 @@ STAY_LEAST_S = 2.0
 
 
 def _outlook(itinerary: Itinerary, visited: Visited, judgement: Judgement) -> Outlook:
-    wanted = np.where(np.isfinite(judgement.wanted), judgement.wanted, np.inf)
+    wanted = np.where(np.isfinite(judgement.wanted), judgement.aims, np.inf)
     if not np.isfinite(judgement.wanted).any():
         gravity = judgement.result.bench.gravity_mps2
         wanted = _UNREACHABLE * np.array([gravity if u == "m/s^2" else 1.0 for u in paper_parameters.UNITS])
@@ -155,7 +155,7 @@ def _outlook(itinerary: Itinerary, visited: Visited, judgement: Judgement) -> Ou
 
 def _is_reached(outlook: Outlook, judgement: Judgement) -> bool:
     """Tell whether there are targets, and all are reached with the stays that are not judged yet."""
-    return bool(np.isfinite(judgement.wanted).any() and (outlook.sigma <= outlook.wanted).all())
+    return judgement.reached(outlook.sigma)
 
 
 def _end(itinerary: Itinerary, visited: Visited, judgement: Judgement, is_reached: bool) -> Suggestion | None:

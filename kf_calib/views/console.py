@@ -175,10 +175,15 @@ def noise_origins(result: Calibration) -> tuple[str, str]:
     return scatter, "with the angles' noise" if beyond_stated(noise, result.bench) else "stated"
 
 
-def verdict(result: Calibration) -> str:
-    """One or two sentences: whether model and measurements agree, and the held-out error beside the noise floor."""
+def verdict(result: Calibration, diagnosed: bool = False) -> str:
+    """One or two sentences: whether model and measurements agree, and the held-out error beside the noise floor.
+
+    Where a diagnosis, which tests more, is told after it, whether they agree is left to that: a run has one p.
+    """
     judged = result.consistency
-    if judged.p_value is None:
+    if diagnosed:
+        text = ""
+    elif judged.p_value is None:
         taken = "All noise was estimated from the misfit, so that the misfit itself cannot be judged."
         text = taken if judged.dof else "Nothing is left over to judge the model by."
     else:
@@ -194,7 +199,7 @@ def verdict(result: Calibration) -> str:
             f" Orientations left out are predicted to {unit.text(result.held_out_rms_mps2, 2)} rms; "
             f"noise alone gives {unit.number(result.held_out_floor_mps2, 2)}."
         )
-    return text
+    return text.lstrip()
 
 
 def intervals_in_words(result: Calibration) -> list[Text]:
@@ -205,8 +210,8 @@ def intervals_in_words(result: Calibration) -> list[Text]:
     return [Text(f"{said} how large the noise is that was not stated.")]
 
 
-def summary(result: Calibration) -> RenderableType:
-    """The report that ``replay`` prints."""
+def summary(result: Calibration, diagnosed: bool = False) -> RenderableType:
+    """The report that ``replay`` prints; diagnosed: whether a diagnosis is told after it."""
     tally, dwells = result.tally, result.fit.dwells
     head = (
         f"{tally.used - tally.gated} of {tally.read} readings used, {len(dwells)} dwells in "
@@ -216,7 +221,7 @@ def summary(result: Calibration) -> RenderableType:
         head, *([] if result.bench.input.is_plain else [Text(f"Made of {result.bench.input}.")]),
         parameter_table(result), *intervals_in_words(result),
         *([effect_table(result)] if result.model.effects else []), noise_table(result),
-        Text(verdict(result), style="bold green" if result.consistency.unconditional else "bold yellow"),
+        Text(verdict(result, diagnosed), style="bold green" if result.consistency.unconditional else "bold yellow"),
     ]  # fmt: skip
     parts += [note(warning) for warning in result.warnings]
     parts += [without_table(result, found) for found in result.outlying]

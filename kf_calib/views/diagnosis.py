@@ -69,7 +69,7 @@ def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
             "families": [{"family": name, "probability": p} for name, p in diagnosis.table.families.items()]
             if diagnosis.table
             else [],
-            "suspects": [_suspect_object(each) for each in diagnosis.suspects],
+            "suspects": [_suspect_object(each, diagnosis.floor_mps2) for each in diagnosis.suspects],
             "ambiguity_set": list(diagnosis.ambiguity),
             "same_here": list(diagnosis.table.same) if diagnosis.table and diagnosis.missing else [],
             "overlaps": diagnosis.overlaps,
@@ -90,7 +90,7 @@ def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
             ],
             "unknown": description_object(diagnosis.description),
             "held_out_rms_mps2": diagnosis.before.held_out_rms_mps2,
-            "held_out_floor_mps2": diagnosis.before.held_out_floor_mps2,
+            "held_out_floor_mps2": diagnosis.floor_mps2,
             "readings": readings_object(diagnosis.before.readings),
             "outlying_dwells": [outlying_object(each) for each in diagnosis.before.outlying],
             "warnings": list(diagnosis.before.warnings),
@@ -158,7 +158,7 @@ def description_sentence(unknown: Description, formulas: Sequence[str]) -> str:
     )
 
 
-def _suspect_object(suspect: Suspect) -> dict[str, Any]:
+def _suspect_object(suspect: Suspect, floor_mps2: float | None) -> dict[str, Any]:
     """Return one suspect as a JSON object."""
     return {
         "effect": suspect.name,
@@ -172,7 +172,7 @@ def _suspect_object(suspect: Suspect) -> dict[str, Any]:
             {"symbol": p.symbol, "value": p.value, "sigma": p.sigma, "unit": p.unit} for p in suspect.coefficients
         ],
         "held_out_rms_mps2": suspect.refit.held_out_rms_mps2,
-        "held_out_floor_mps2": suspect.refit.held_out_floor_mps2,
+        "held_out_floor_mps2": floor_mps2,
     }
 
 
@@ -195,7 +195,7 @@ def diagnosis_report(diagnosis: Diagnosis, typed: str = "", details: bool = Fals
     if replicates := replication_in_words(diagnosis):
         parts.append(Text(replicates))
     if diagnosis.table and diagnosis.test.consistent is False and not details:
-        parts.append(_hypothesis_table(diagnosis.table, _MOST))
+        parts.append(_hypothesis_table(diagnosis.table, diagnosis.floor_mps2, _MOST))
         if more := diagnosis.table.listed[_MOST:]:
             share = format_probability(sum(row.probability for row in more))
             parts.append(Text(f"{len(more)} more have {share} together: --details."))
@@ -216,7 +216,7 @@ def details_of(diagnosis: Diagnosis) -> list[RenderableType]:
     parts: list[RenderableType] = [*map(Text, of_what_p_is(diagnosis))]
     readings, trend = diagnosis.before.readings, diagnosis.test.trend
     if diagnosis.table and diagnosis.test.consistent is False:
-        parts.append(_hypothesis_table(diagnosis.table))
+        parts.append(_hypothesis_table(diagnosis.table, diagnosis.floor_mps2))
     if readings.findings:
         parts.append(Text(f"In the readings: {'; '.join(readings.findings)}."))
     if diagnosis.suspects:
@@ -265,7 +265,7 @@ def plain_report(diagnosis: Diagnosis) -> str:
     return plain(diagnosis_report(diagnosis))
 
 
-def _hypothesis_table(table: HypothesisTable, most: int | None = None) -> ConsoleTable:
+def _hypothesis_table(table: HypothesisTable, floor_mps2: float | None, most: int | None = None) -> ConsoleTable:
     """Return the table of the explanations that have 1 % of the probability or more, at most ``most`` of them, with
     what their refits say."""
     shown_ = ConsoleTable(title="What it may be", title_justify="left")
@@ -273,7 +273,8 @@ def _hypothesis_table(table: HypothesisTable, most: int | None = None) -> Consol
         left = heading in ("explanation", "family")
         shown_.add_column(heading, justify="left" if left else "right")
     for row in table.listed[:most]:
-        cells = (format_probability(row.probability), _largest_coefficient(row), held_out_ratio(row.refit))
+        ratio = held_out_ratio(row.refit, floor_mps2)
+        cells = (format_probability(row.probability), _largest_coefficient(row), ratio)
         shown_.add_row(name_of(row), ", ".join(row.families), *cells)
     return shown_
 
@@ -292,11 +293,11 @@ def _largest_coefficient(row: Hypothesis) -> str:
     return f"{symbol(largest.symbol)} = {value} ± {sigma} {unit.label}"
 
 
-def held_out_ratio(refit: Calibration | None) -> str:
+def held_out_ratio(refit: Calibration | None, floor_mps2: float | None) -> str:
     """The held-out rms over the noise floor; "" where it is not known."""
-    if refit is None or refit.held_out_rms_mps2 is None or not refit.held_out_floor_mps2:
+    if refit is None or refit.held_out_rms_mps2 is None or not floor_mps2:
         return ""
-    return f"{refit.held_out_rms_mps2 / refit.held_out_floor_mps2:.2f}"
+    return f"{refit.held_out_rms_mps2 / floor_mps2:.2f}"
 
 
 def name_of(row: Hypothesis) -> str:
@@ -314,7 +315,7 @@ def _suspect_table(diagnosis: Diagnosis) -> ConsoleTable:
         left = heading in ("effect", "fits", "symbol", "unit")
         table.add_column(heading, justify="left" if left else "right", no_wrap=heading == "effect")
     for suspect in diagnosis.suspects:
-        ratio = held_out_ratio(suspect.refit)
+        ratio = held_out_ratio(suspect.refit, diagnosis.floor_mps2)
         head = [suspect.name, format_p(suspect.p_value).removeprefix("= "), f"{suspect.statistic:.1f} / {suspect.dof}",
                 "yes" if suspect.fits else "no"]  # fmt: skip
         for k, p in enumerate(suspect.coefficients):

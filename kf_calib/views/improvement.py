@@ -40,9 +40,9 @@ def improvement_object(
     unknown, going = state.diagnosis.description, state.diagnosis.next_orientation
     return clean(
         {
-            "start": _figures(state.start),
+            "start": _figures(state.start, state.floor_mps2),
             "steps": [
-                _step_object(step, before)
+                _step_object(step, before, state.floor_mps2)
                 for step, before in zip(
                     state.steps, [state.start, *(step.diagnosis for step in state.steps)], strict=False
                 )
@@ -51,7 +51,7 @@ def improvement_object(
             "stopped_because": state.because,
             "reason": state.reason,
             "verdict": state.diagnosis.verdict,
-            **_figures(state.diagnosis),
+            **_figures(state.diagnosis, state.floor_mps2),
             "parameters": _parameters(state.result),
             "tests": [_removal_object(each) for each in state.removals],
             "ambiguity_set": [each.name for each in state.alternatives],
@@ -60,7 +60,7 @@ def improvement_object(
                     "effect": alternative.name,
                     "residual_rms_mps2": alternative.result.residual_rms_mps2,
                     "held_out_rms_mps2": alternative.result.held_out_rms_mps2,
-                    "held_out_floor_mps2": alternative.result.held_out_floor_mps2,
+                    "held_out_floor_mps2": state.floor_mps2,
                     "parameters": _parameters(alternative.result),
                 }
                 for alternative in state.alternatives
@@ -86,7 +86,7 @@ def improvement_object(
     )
 
 
-def _figures(diagnosis: Diagnosis) -> dict[str, Any]:
+def _figures(diagnosis: Diagnosis, floor_mps2: float | None) -> dict[str, Any]:
     """Return the p-value and the errors of a diagnosed model."""
     result = diagnosis.before
     return {
@@ -95,11 +95,11 @@ def _figures(diagnosis: Diagnosis) -> dict[str, Any]:
         "conditional_on": condition_object(diagnosis.condition),
         "residual_rms_mps2": result.residual_rms_mps2,
         "held_out_rms_mps2": result.held_out_rms_mps2,
-        "held_out_floor_mps2": result.held_out_floor_mps2,
+        "held_out_floor_mps2": floor_mps2,
     }
 
 
-def _step_object(step: SelectionStep, before: Diagnosis) -> dict[str, Any]:
+def _step_object(step: SelectionStep, before: Diagnosis, floor_mps2: float | None) -> dict[str, Any]:
     """Return one step as a JSON object.
 
     The keys probability and p_value are those of the added effect in the diagnosis before the step; p_value_after is
@@ -109,7 +109,7 @@ def _step_object(step: SelectionStep, before: Diagnosis) -> dict[str, Any]:
         "added": step.added,
         "by": step.by,
         "probability": step.probability,
-        **_figures(step.diagnosis),
+        **_figures(step.diagnosis, floor_mps2),
         "p_value": None if step.name is None else before.test.effects.p_values.get(step.name),
         "p_value_after": step.diagnosis.test.p_value,
         "dropped": [_removal_object(each) for each in step.dropped],
@@ -170,7 +170,7 @@ def last_parameters(state: Improvement) -> RenderableType:
 
 def story(state: Improvement) -> list[str]:
     """What was wrong, what was added, how far the error fell where it was left out of the fit, and what is left."""
-    start, floor = state.start, state.result.held_out_floor_mps2
+    start, floor = state.start, state.floor_mps2
     if start.test.consistent is not False:
         return [state.reason]
     errors = [_errors(each, floor)[0] for each in (start.before, state.result)]
@@ -205,7 +205,7 @@ def _told(step: SelectionStep) -> str:
 
 def progress(state: Improvement) -> RenderableType:
     """The steps as a table: held-out and in-sample rms over the noise floor as numbers and bars, with remarks below."""
-    floor = state.result.held_out_floor_mps2
+    floor = state.floor_mps2
     rows = [("start", state.start.before, None, state.start.test.p_value)]
     rows += [(_label(step), step.result, step.probability, step.diagnosis.test.p_value) for step in state.steps]
     others = [each for each in state.alternatives if each.result is not state.result]
@@ -322,5 +322,7 @@ def _numbered(diagnosis: Diagnosis, choices: Sequence[tuple[str, ...]]) -> list[
         p_value = "" if suspect is None else format_p(suspect.p_value).removeprefix("= ")
         fits = "yes" if suspect is None or suspect.fits else "no"
         share = "" if diagnosis.table is None else format_probability(diagnosis.table.probability_of_just(names))
-        table.add_row(str(number), " + ".join(names), share, p_value, fits, held_out_ratio(result))
+        table.add_row(
+            str(number), " + ".join(names), share, p_value, fits, held_out_ratio(result, diagnosis.floor_mps2)
+        )
     return [table]

@@ -146,7 +146,7 @@ def _to_do(standing: Standing) -> Panel:
     going = None if judgement is None else judgement.next_orientation
     there = "the next orientation of your plan" if going is None else f"{_angles(going[0])} deg"
     then = "" if going is None else f": {going[1]}"
-    if judgement is not None and _all_reached(standing, judgement):
+    if judgement is not None and judgement.reached(standing.sigma):
         return _frame("STOP: EVERY TARGET IS REACHED", f"going on to {there} {then.lstrip(': ')}".strip(), "green")
     if here is None:
         moved = f"{standing.dwells} orientations in {span(standing.elapsed_s)}; the platform moves or settles"
@@ -165,17 +165,11 @@ def _frame(what: str, below: str, colour: str) -> Panel:
     return Panel(text, border_style=colour, padding=(0, 1))
 
 
-def _all_reached(standing: Standing, judgement: Judgement) -> bool:
-    """Tell whether there are targets, and every one is reached."""
-    given = np.isfinite(judgement.wanted)
-    return bool(given.any() and (standing.sigma <= judgement.wanted)[given].all())
-
-
 def _sigmas(standing: Standing) -> RenderableType:
     """Return the table of the twelve sigmas with what they are to come down to, in what time: their targets, or where
     none is set half of what they were after the last orientation."""
     table = ConsoleTable.grid(padding=(0, 1))
-    wanted = np.full(12, np.nan) if standing.judgement is None else standing.judgement.wanted
+    wanted = np.full(12, np.nan) if standing.judgement is None else standing.judgement.aims
     targets = bool(np.isfinite(wanted).any())
     for justify in ("left", "right", "left", "right", "left", "right", "left"):
         table.add_column(justify=justify, no_wrap=True)

@@ -122,7 +122,7 @@ def test_dwells_that_are_noisier_than_others_show_no_trend_by_it() -> None:
         values[part] += 8e-4 * np.random.default_rng(dwell).standard_normal(values[part].shape)
     made.accel = Stream(made.accel.time_ns, values)
     result = calibrate(made)
-    assert np.ptp([dwell.weight for dwell in result.fit.dwells]) > 0.5
+    assert np.ptp([dwell.weights for dwell in result.fit.dwells]) > 0.5
     assert 0.7 < found_in(result).ratio < 1.4
 
 

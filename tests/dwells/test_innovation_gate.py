@@ -28,7 +28,7 @@ def test_outliers_are_rejected_counted_and_harmless(share: float) -> None:
     shift = np.abs(other.estimate.parameters - one.estimate.parameters) / one.estimate.sigma
     assert shift.max() < 2.5
     spoiled = calibrate(dirty, Settings(gate_sigma=None))
-    weights = np.array([dwell.weight for dwell in spoiled.fit.dwells])
+    weights = np.array([dwell.weights for dwell in spoiled.fit.dwells])
     spoilt = hit.reshape(-1, 300)[:, 20:288].any(axis=1)
     if spoilt.all():
         assert np.median(spoiled.estimate.sigma / one.estimate.sigma) > 2

@@ -246,7 +246,7 @@ def test_a_dwell_on_one_or_two_messages_of_a_noisy_encoder_is_left_out(seed: int
 def test_a_dwell_whose_columns_are_constant_tells_its_mean_alone() -> None:
     """Three rows have all that its readings tell of the states, of any number of pieces, weight and scatter."""
     dwells = Pass(Run(dwells=14, count=200, setting_deg=0.01, encoder_deg=0.0), Settings()).fold()
-    dwells = [replace(next(iter(dwell.prefixes())) if k % 3 else dwell, weight=1.0 + 0.1 * k)
+    dwells = [replace(next(iter(dwell.prefixes())) if k % 3 else dwell, weights=(1.0 + 0.1 * k,) * 3)
               for k, dwell in enumerate(dwells)]  # fmt: skip
     fitted = fit(dwells, Model.of(Run(dwells=1).bench, ("second-order",)))
     columns, state = fitted.linearised.columns, fitted.linearised.state

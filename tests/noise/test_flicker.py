@@ -147,7 +147,7 @@ def test_amplitudes_of_white_noise_have_the_variances_that_are_said() -> None:
     run = Run(seed=3, dwells=200)
     run.accel.values[:, 1] += 2e-4 * np.random.default_rng(1).normal(size=len(run.accel.values))
     result = calibrate(run, Settings(effects=()))
-    dwells = [dwell.weighted(2.0 if k % 2 else 1.0) for k, dwell in enumerate(result.fit.dwells)]
+    dwells = [dwell.weighted([2.0 if k % 2 else 1.0] * 3) for k, dwell in enumerate(result.fit.dwells)]
     stack, columns = DwellStack.of(dwells), of_all_pieces(result.linearised.columns) @ result.estimate.state
     sigma = np.array([1e-4, np.hypot(1e-4, 2e-4), 1e-4])
     for channels in (np.eye(3), np.array([[0.5, 0.5, np.sqrt(0.5)]])):

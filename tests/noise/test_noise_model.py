@@ -80,13 +80,41 @@ def test_channels_of_short_blocks_have_one_correlation_and_variances_of_their_si
 
 
 def test_ar2_resonance_is_followed_too() -> None:
-    """A noise with a spectral line averages faster near zero frequency than its variance says: never below white."""
+    """A noise with a spectral line averages down faster than white noise: kappa = var(e) / (var(x) (1 - a1 - a2)^2)."""
     run = Run(seed=2, dwells=12, count=2000, rate_hz=100.0, white_mps2=0.0)
     a = [1.0, -2 * 0.95 * np.cos(1.0), 0.95**2]
     run.accel.values[:] += 1e-4 * lfilter(
         [1.0], a, np.random.default_rng(0).normal(size=run.accel.values.shape), axis=0
     )
-    np.testing.assert_allclose(calibrate(run).noise.inflation, 1.0)
+    response = lfilter([1.0], a, np.eye(1, 4000)[0])
+    np.testing.assert_allclose(calibrate(run).noise.inflation, response.sum() ** 2 / np.sum(response**2), rtol=0.15)
+
+
+@pytest.mark.parametrize("theta", [-0.6, -0.9])
+def test_noise_that_averages_down_faster_than_white_noise_is_judged_by_what_it_leaves(theta: float) -> None:
+    """Readings e_t + theta e_(t-1), whose means have (1 + theta)^2 / (1 + theta^2) of the variance of white noise."""
+    ratios = list[float]()
+    for seed in range(24):
+        run = Run(seed=seed, dwells=24, count=600, white_mps2=0.0)
+        moved = np.random.default_rng(seed).normal(size=run.accel.values.shape)
+        run.accel.values[:] += 1e-4 * lfilter([1.0, theta], [1.0], moved, axis=0)
+        judged = calibrate(run).consistency
+        assert judged.dof == 60
+        ratios.append(judged.statistic / judged.dof)
+    # The mean of 24 chi-squared of 60 degrees of freedom is within 3 sigma of them; kappa is known to some per cent.
+    assert np.mean(ratios) == pytest.approx(1.0, abs=3.0 * np.sqrt(2.0 / 60 / 24) + 0.25)
+
+
+def test_one_channel_that_is_correlated_leaves_the_others_as_they_are() -> None:
+    """AR(0.95) in channel 1 of dwells too short to tell it well: 2 and 3 are white."""
+    run = Run(seed=5, dwells=24, count=240, white_mps2=0.0)
+    white = np.random.default_rng(5).normal(size=run.accel.values.shape)
+    run.accel.values[:] += 1e-4 * white * [0.0, 1.0, 1.0]
+    slow = lfilter([1.0], [1.0, -0.95], white[:, 0])
+    run.accel.values[:, 0] += 1e-4 * slow
+    kappa = calibrate(run).noise.inflation
+    assert kappa[1:] == pytest.approx(1.0, abs=0.1)
+    assert 25.0 < kappa[0] < 80.0  # 39 is right
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 from helpers.long_runs import slow
+from helpers.synthetic import Run
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
@@ -145,7 +146,7 @@ def test_sigmas_cover_and_alarms_are_rare_where_dwells_tremble_unequally(seeds: 
     for seed in seeds:
         run = Drawn(seed, 6.0, angles)
         result = calibrate(run)
-        assert {dwell.weight for dwell in result.fit.dwells} != {1.0}
+        assert {weight for dwell in result.fit.dwells for weight in dwell.weights} != {1.0}
         sigma = np.sqrt(np.diag(result.estimate.covariance)).reshape(3, 4)
         known = sigma > 0.0
         errors = (result.estimate.state.reshape(3, 4) - run.truth)[known] / sigma[known]
@@ -154,3 +155,20 @@ def test_sigmas_cover_and_alarms_are_rare_where_dwells_tremble_unequally(seeds: 
     spread = float(np.std(inside, ddof=1)) / len(inside) ** 0.5
     assert 0.93 - 2.0 * spread < np.mean(inside) < 0.97 + 2.0 * spread
     assert binom.sf(alarms - 1, len(seeds), 0.02) > 0.01
+
+
+@pytest.mark.parametrize("seeds", [range(12), *slow(range(100, 300))], ids=len)
+def test_noise_in_proportion_to_the_load_of_each_channel_is_covered(seeds: range) -> None:
+    """sigma (0.05 + |a_i| / g): the scale factors have what they need, and the biases no more than that."""
+    inside = list[list[bool]]()
+    for seed in seeds:
+        run = Run(seed=seed, dwells=24, count=240, white_mps2=0.0)
+        drawn = np.random.default_rng([7, seed]).normal(size=run.accel.values.shape)
+        run.accel.values[:] += 1e-4 * drawn * (0.05 + np.abs(run.accel.values) / 9.8)
+        result = calibrate(run)
+        assert np.ptp([dwell.weights for dwell in result.fit.dwells], axis=0).min() > 1.0, "each channel has its own"
+        intervals = [result.interval(each) for each in result.parameters.values()]
+        inside.append([low <= truth <= high for (low, high), truth in zip(intervals, run.truth, strict=True)])  # type: ignore[operator]
+    held, scales = np.mean(inside), np.mean(np.array(inside)[:, 2::4])
+    rough = 3.0 * np.sqrt(0.05 * 0.95 / len(inside) / 3)
+    assert abs(held - 0.95) < 0.02 + rough and scales > 0.93 - rough

@@ -187,7 +187,7 @@ def _known_columns(model: Model, stimulus: Stimulus) -> tuple[list[int], tuple[s
 
 def _gain(saved: SavedCalibration, design: Floats, stimulus: Stimulus) -> Floats:
     """The change (12, D, 3) of the affine state per unit of each mean reading, by weighted least squares."""
-    stated_noise, counts = saved.noise, np.array([float(each.readings) for each in saved.conditions.dwells])
+    stated_noise, counts = saved.noise, np.array([[float(each.readings)] for each in saved.conditions.dwells])
     noise = Noise(
         np.array(stated_noise.sigma_mps2), np.array(stated_noise.inflation), math.radians(stated_noise.angle_sigma_deg),
         np.array(stated_noise.dwell_sigma_mps2), checked=stated_noise.dwell_sigma_stated,

@@ -66,7 +66,7 @@ def draw_improvement(figure: FigureBase, state: Improvement) -> None:
     points = _points(state)
     if not any(each.result.consistency.dof for each in points):
         return say(figure, "The parameters take up every mean reading of this run: there is no error to be seen.")
-    floor, effects = state.result.held_out_floor_mps2, _effects(points)
+    floor, effects = state.floor_mps2, _effects(points)
     if effects:
         rows = -(-min(len(effects), _COEFFICIENTS) // _WIDE)
         halves: Any = figure.subfigures(2, 1, height_ratios=(1.25, float(rows)))
@@ -237,9 +237,7 @@ def draw_residuals_of_steps(figure: FigureBase, state: Improvement, drivers: Seq
     panels = figure.subplots(3, len(drawn), sharex=True, sharey=True, squeeze=False)
     for column, (words, diagnosis) in enumerate(drawn):
         ratios = unexplained_mps2(diagnosis.before) / sigmas
-        panels[0, column].set_title(
-            f"{wrapped(words, 28)}\n{_fate(diagnosis, state.result.held_out_floor_mps2)}", fontsize=8.5
-        )
+        panels[0, column].set_title(f"{wrapped(words, 28)}\n{_fate(diagnosis, state.floor_mps2)}", fontsize=8.5)
         for i, axes in enumerate(panels[:, column]):
             for bound in (-2.0, 2.0):
                 axes.axhline(bound, color=GREY, linewidth=0.7, linestyle=":")

@@ -198,7 +198,8 @@ def _verdict(result: Calibration) -> str:
     else:
         yes = "agree with the model" if judged.consistent else "**disagree with the model**"
         per_dof = significant(judged.statistic / judged.dof)
-        words = f"the dwells {yes}: p {format_p(judged.p_value)}, NIS/dof = {per_dof}, dof = {judged.dof}"
+        words = f"the dwells {yes} by the size of their misfit: p {format_p(judged.p_value)}, "
+        words += f"NIS/dof = {per_dof}, dof = {judged.dof}"
     held, unit = "", shown("m/s^2")
     if result.held_out_rms_mps2 is not None and result.held_out_floor_mps2 is not None:
         rms, floor = map(unit.number, (result.held_out_rms_mps2, result.held_out_floor_mps2))

@@ -53,7 +53,7 @@ class View:
         return {
             "held_out": ("held out", _shown([each.held_out_rms_mps2 for each in every]), WHITE),
             "within_run": ("within the run", _shown([each.residual_rms_mps2 for each in every]), MAUVE),
-            "noise_alone": ("noise alone, held out", _shown([each.held_out_floor_mps2 for each in every]), GREY),
+            "noise_alone": ("noise alone, held out", _shown([self.improvement.floor_mps2] * len(every)), GREY),
         }
 
     @property
