@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import io
 import struct
-from codecs import BOM_UTF8
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,13 +26,14 @@ from kf_calib.sources.files import cdr
 from kf_calib.sources.files.contents import CALIBRATED_TOPIC
 from kf_calib.sources.files.mcap_append import TopicAppender, source_file
 from kf_calib.sources.files.recording import Recording
-from kf_calib.sources.files.sample_lines import cell_spans
 from kf_calib.sources.tables.columns import READINGS, Columns
-from kf_calib.sources.tables.grid import Grid, delimiter_of, grid_of
+from kf_calib.sources.tables.grid import Grid, grid_of
 from kf_calib.sources.tables.numbers import Numbers, written
 from kf_calib.sources.tables.opening import Opening
 from kf_calib.sources.tables.spreadsheet import sheets_of, workbook_of
 from kf_calib.sources.tables.words import Units
+from kf_calib.sources.text.encoding import encoding_of, unpacked
+from kf_calib.sources.text.heading import cell_spans, delimiter_in
 from kf_calib.support.output_files import whole, write_whole
 
 FRAME_ID = "block"
@@ -234,12 +234,12 @@ def _to_excel(path: Path, copy: Path, grid: Grid, places: list[int], force: Floa
 
 def _to_text(path: Path, copy: Path, grid: Grid, places: list[int], force: Floats) -> None:
     """Write a copy of a text."""
-    content = path.read_bytes()
-    utf16, marked = content.startswith((b"\xff\xfe", b"\xfe\xff")), content.startswith(BOM_UTF8)
-    codec, errors = ("utf-16", "strict") if utf16 else ("utf-8-sig" if marked else "utf-8", "surrogateescape")
+    content = unpacked(path)
+    encoding = encoding_of(content)
+    codec, errors = (encoding, "strict") if encoding.startswith("utf-16") else ("utf-8", "surrogateescape")
     lines = content.decode(codec, errors).splitlines(keepends=True)
     plain = [line.rstrip("\r\n") for line in lines]
-    delimiter = delimiter_of([line for line in plain if line.strip() and not line.startswith("#")])
+    delimiter, _ = delimiter_in(plain)
     decimal = "," if delimiter != "," and not any("." in plain[k - 1] for k in grid.numbers) else "."
     new = {number: [repr(written(value)).replace(".", decimal) for value in own]
            for number, own in zip(grid.numbers, force.tolist(), strict=True)}  # fmt: skip

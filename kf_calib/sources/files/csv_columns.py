@@ -22,10 +22,11 @@ import numpy as np
 from kf_calib.bench.arrays import Floats, lengths
 from kf_calib.bench.raw_input import PLAIN, UNITS, RawInput
 from kf_calib.errors import CountsError, InputError
-from kf_calib.sources.files.line_parts import CsvHeading, LineError, number_of, stamp_ns
+from kf_calib.sources.files.line_parts import LineError, number_of, stamp_ns
 from kf_calib.sources.tables.columns import QUATERNION, READINGS, SPREADS
 from kf_calib.sources.tables.numbers import DECIMAL_POINT, Numbers, month_comes_first, stamp_of
-from kf_calib.sources.tables.words import ANGLE, NO_HEADER, TIME, Meaning, Units, are_numbers, meaning_of, reading_units
+from kf_calib.sources.tables.words import ANGLE, TIME, Meaning, Units, meaning_of, reading_units
+from kf_calib.sources.text.heading import TextHeading
 from kf_calib.support.text import cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
@@ -121,10 +122,11 @@ class Stamps:
 class CsvColumns:
     """The columns of a log by its header and, where the header does not tell, its first rows.
 
-    header: names as they stand in the file; names: as they are to be understood. delimiter: between cells. said: what
-    was taken for what, where that is not plain from the names. raw: what the readings are in. written_mps2: the unit in
-    which specific force takes the place of readings, m/s^2: that of their names; without_unit: columns of counts whose
-    names tell none, which then are in m/s^2.
+    header: names as they stand in the file; names: as they are to be understood. delimiter: between cells.
+    lines_of_names: numbers, from 0, of the lines of names and units. said: what was taken for what, where that is not
+    plain from the names. raw: what the readings are in. written_mps2: the unit in which specific force takes the place
+    of readings, m/s^2: that of their names; without_unit: columns of counts whose names tell none, which then are in
+    m/s^2.
     """
 
     header: Sequence[str]
@@ -133,6 +135,7 @@ class CsvColumns:
     rows: Sequence[CsvRow]
     units: Units
     local_mps2: float
+    lines_of_names: tuple[int, ...] = ()
     said: list[str] = field(default_factory=list[str])
     raw: RawInput = PLAIN
     written_mps2: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -142,7 +145,7 @@ class CsvColumns:
     @classmethod
     def of(
         cls,
-        heading: CsvHeading,
+        heading: TextHeading,
         stated: Mapping[str, str],
         units: Units | None = None,
         local_mps2: float = STANDARD_GRAVITY_MPS2,
@@ -155,10 +158,8 @@ class CsvColumns:
         times = Counter(lower)
         if repeated := next((name for name in lower if name and times[name] > 1), None):
             raise InputError(f"two columns are named {repeated!r}: rename or remove one of them.")
-        if are_numbers(header):
-            raise InputError(f"{NO_HEADER}: {cut(','.join(header), 60)!r}.")
         full = [row for row in heading.rows if len(row) == len(names)]
-        columns = cls(header, names, heading.delimiter, full, units or Units(), local_mps2)
+        columns = cls(header, names, heading.delimiter, full, units or Units(), local_mps2, heading.lines_of_names)
         columns._meanings = [meaning_of(name) for name in names]
         return columns
 

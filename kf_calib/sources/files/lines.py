@@ -21,10 +21,12 @@ from kf_calib.bench.streams import Batch, bench_without_angles, with_accel, with
 from kf_calib.errors import BenchError, CountsError, InputError
 from kf_calib.sources.files.csv_columns import CsvColumns
 from kf_calib.sources.files.fields import as_columns
-from kf_calib.sources.files.line_parts import Account, CsvHeading, Cutter, LineReader, TextFile
+from kf_calib.sources.files.line_parts import Account, LineReader
 from kf_calib.sources.files.sample_lines import CsvLines, JsonLines
 from kf_calib.sources.tables.columns import HOW
 from kf_calib.sources.tables.words import Units
+from kf_calib.sources.text.encoding import Cutter, TextFile
+from kf_calib.sources.text.heading import TextHeading
 from kf_calib.support.text import cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
@@ -131,7 +133,7 @@ class Lines:
 
     def _open_reader(self, lines: Sequence[str], account: Account) -> tuple[LineReader, int]:
         if self._stated and not is_json(lines[0]):
-            _refuse_absent(self._stated, CsvHeading.of(lines).header)
+            _refuse_absent(self._stated, TextHeading.of(lines).header)
         local_mps2 = STANDARD_GRAVITY_MPS2
         if self._units.g == "local":
             local_mps2 = bench_without_angles(self.name, self._overrides)[0].gravity_mps2
@@ -221,7 +223,7 @@ def reader_for(
     """
     if is_json(lines[0]):
         return JsonLines(columns, account), 0
-    heading = CsvHeading.of(lines)
+    heading = TextHeading.of(lines)
     return CsvLines(CsvColumns.of(heading, columns, units, local_mps2), account, angles), heading.lines
 
 
@@ -339,7 +341,7 @@ class _Passage:
 
     def _split(self, stream: BinaryIO | TextFile) -> Iterator[list[str]]:
         """Whole lines, block by block as they arrive."""
-        cutter = Cutter(self.account)
+        cutter = Cutter(self.account.refuse)
         for block in self._read(stream):
             if lines := cutter.push(block):
                 self.fraction = self._file.fraction if self._file else math.nan

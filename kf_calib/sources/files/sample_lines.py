@@ -23,12 +23,11 @@ from kf_calib.sources.files.line_parts import (
     LineError,
     LineReader,
     LineRows,
-    cells_of,
     number_of,
     stamp_ns,
-    without_empty_end,
 )
 from kf_calib.sources.tables.numbers import DECIMAL_POINT, written
+from kf_calib.sources.text.heading import BLANK, cell_spans, cells_of, without_empty_end
 
 _FROM_UNIT = {"c": (1.0, 0.0), "k": (1.0, -273.15), "f": (1.0 / 1.8, -32.0 / 1.8)}
 
@@ -76,13 +75,12 @@ class CsvLines(LineReader):
 
     def heading_of_forces(self, heading: Sequence[str]) -> list[str]:
         names = {at: f"a{'xyz'[self._accel.at.index(at)]}_mps2" for at in self._columns.without_unit}
-        lines, is_named = list(heading), False
-        for k, line in enumerate(heading):
-            cells = cells_of(line.lstrip("\ufeff"), self._delimiter)
-            if not names or len(cells) < len(self._header) or not cells[self._accel.at[0]]:
-                continue
-            lines[k] = self._replaced(line, dict.fromkeys(names, "m/s^2") if is_named else names)
-            is_named = True
+        lines = list(heading)
+        for k in self._columns.lines_of_names if names else ():
+            cells = cells_of(lines[k].lstrip("\ufeff"), self._delimiter)
+            if len(cells) >= len(self._header) and cells[self._accel.at[0]]:
+                is_first = k == self._columns.lines_of_names[0]
+                lines[k] = self._replaced(lines[k], names if is_first else dict.fromkeys(names, "m/s^2"))
         return lines
 
     def _replaced(self, line: str, texts: Mapping[int, str]) -> str:
@@ -98,7 +96,7 @@ class CsvLines(LineReader):
             self._numbers = self._columns.numbers_in([self._cells(line) for line in lines])
 
     def _cells(self, line: str) -> list[str]:
-        is_plain = '"' not in line and " " not in line
+        is_plain = '"' not in line and " " not in line and self._delimiter != BLANK
         return line.split(self._delimiter) if is_plain else cells_of(line, self._delimiter)
 
     def _read_line(self, line: str, accel: LineRows, pose: LineRows, temperature: LineRows) -> None:
@@ -118,29 +116,6 @@ class CsvLines(LineReader):
         accel.add(time_ns, readings)
         pose.add(time_ns, angles)
         temperature.add(time_ns, degrees)
-
-
-def cell_spans(line: str, delimiter: str) -> list[tuple[int, int]]:
-    """Where the cells of a line stand, with their quotes and without blanks around them."""
-    spans, at = list[tuple[int, int]](), 0
-    while True:
-        end = _quote_end(line, at) if line[at : at + 1] == '"' else at
-        end = line.find(delimiter, end)
-        end = len(line) if end < 0 else end
-        cell = line[at:end]
-        spans.append((at + len(cell) - len(cell.lstrip()), end - len(cell) + len(cell.rstrip())))
-        if end == len(line):
-            return spans
-        at = end + 1
-
-
-def _quote_end(line: str, at: int) -> int:
-    """The place behind the quote that ends what the one at ``at`` begins; the end of the line where none does."""
-    while (at := line.find('"', at + 1)) >= 0:
-        if line[at + 1 : at + 2] != '"':
-            return at + 1
-        at += 1
-    return len(line)
 
 
 _MARK = "\ufeff"  # some write it before the first line

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -13,12 +12,12 @@ from typing import Any
 
 from kf_calib.errors import InputError
 from kf_calib.sources.tables.spreadsheet import sheets_of
-from kf_calib.sources.tables.words import is_unit
+from kf_calib.sources.text.encoding import text_of, too_large
+from kf_calib.sources.text.heading import delimiter_in, header_in, is_comment
 from kf_calib.support.text import cut
 
 Cell = str | float | datetime | None
 """A cell as it was read; text is not interpreted yet, an empty cell is None."""
-_CYRILLIC = re.compile(rb"[\xc0-\xff]{3}")
 ZIP = b"PK\x03\x04"
 TEXT_SUFFIXES = (".csv", ".tsv", ".txt")
 EXCEL_SUFFIXES = (".xlsx", ".xlsm")
@@ -27,8 +26,7 @@ _LARGEST = (50_000_000, 50_000_000)  # bytes, of text and of a spreadsheet, whic
 _SHOWN = 6  # rows in a message
 _LONGEST_CELL = 300  # characters; a longer one is a remark, of which the middle is left out
 _MOST_COLUMNS, _MOST_CELLS = 1000, 2_000_000
-_DELIMITERS = ";\t,|"
-_TELLING = 200  # lines by which the delimiter is told
+_FEWEST = 3  # columns
 
 
 @dataclass(frozen=True)
@@ -71,60 +69,21 @@ def grid_of(table: Any) -> Grid:
             raise InputError(f"{path}: files of the kind {path.suffix} are not read: save it as .xlsx or .csv.")
         is_excel = start.startswith(ZIP)
         if path.stat().st_size > _LARGEST[is_excel]:
-            raise InputError(
-                f"{path}: is larger than a table of orientations can be: leave out what is not part of it; if it holds "
-                "samples, save them as CSV with a column of time (docs/own_csv.md)."
-            )
+            raise too_large(path)
         return replace(_of_excel(path) if is_excel else _of_text(path), path=path)
     return _of_columns(table)
 
 
 def _of_text(path: Path) -> Grid:
     """Return the cells of a CSV file: any usual encoding and delimiter, with or without lines above the header."""
-    text = _decoded(path, path.read_bytes())
-    delimiter, skipped = "", 0
-    first, _, rest = text.partition("\n")
-    if first.lower().startswith("sep=") and len(first.strip()) == 5:
-        delimiter, text, skipped = first.strip()[-1], rest, 1
-    delimiter = delimiter or delimiter_of(
-        [line for line in text.splitlines()[:200] if line.strip() and not line.startswith("#")]
-    )
+    lines = text_of(path, _LARGEST[0]).splitlines()
+    delimiter, skipped = delimiter_in(lines)
     try:
-        reader = csv.reader(text.splitlines(), delimiter=delimiter, skipinitialspace=True)
-        lines = [(reader.line_num + skipped, _texts(row)) for row in reader]
+        reader = csv.reader(lines[skipped:], delimiter=delimiter, skipinitialspace=True)
+        rows = [(reader.line_num + skipped, _texts(row)) for row in reader]
     except csv.Error as error:
         raise InputError(f"{path}: is no CSV file ({error}): save the table as CSV or .xlsx.") from None
-    lines = [line for line in lines if not (line[1] and str(line[1][0] or "").startswith("#"))]
-    grid = _headed(str(path), lines)
-    return replace(grid, is_semicolon=delimiter == ";")
-
-
-def _decoded(path: Path, content: bytes) -> str:
-    """Return the text of a file in UTF-8 or UTF-16 with or without a byte-order mark, or in a code page of Windows.
-
-    It is Cyrillic (1251) where three letters beyond ASCII follow each other, as in no Western language, or else 1252.
-    """
-    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
-        return content.decode("utf-16", errors="replace")
-    if b"\0" in content:
-        raise InputError(f"{path}: is no text (it has bytes of zero): save the table as CSV or .xlsx.")
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        return content.decode("cp1251" if _CYRILLIC.search(content) else "cp1252", errors="replace")
-
-
-def delimiter_of(lines: Sequence[str]) -> str:
-    """The delimiter with which the most of some lines have the same number of cells, two or more."""
-
-    def fitness(delimiter: str) -> int:
-        widths = [len(row) for row in csv.reader(lines[:_TELLING], delimiter=delimiter) if len(row) > 1]
-        return max(map(widths.count, set(widths)), default=0)
-
-    try:
-        return max(_DELIMITERS, key=fitness)
-    except csv.Error:
-        return ","
+    return replace(_headed(str(path), rows), is_semicolon=delimiter == ";")
 
 
 def _of_excel(path: Path) -> Grid:
@@ -205,23 +164,16 @@ def _text(cell: str) -> str | None:
 
 
 def _headed(name: str, lines: Sequence[tuple[int, Sequence[Cell]]]) -> Grid:
-    """Return the grid of lines: the header is the first with more than two cells, a line of units may follow it."""
+    """Return the grid of lines, with the number that each has in the file."""
     filled = [(number, list(cells)) for number, cells in lines if cells.count(None) < len(cells)]
-    while filled and sum(cell is not None for cell in filled[0][1]) <= 2:  # a title, a date, a serial number
-        del filled[0]
-    if not filled:
+    header, begin, named = header_in([cells for _, cells in filled]) if filled else ([], 0, ())
+    if not header or (begin == len(filled) and len(header) < _FEWEST):
         raise InputError(f"{name}: has no table: write a header and a row for each orientation (docs/tables.md).")
-    cells = filled[0][1]
-    width = max(k + 1 for k, cell in enumerate(cells) if cell is not None)
-    header = ["" if cell is None else str(cell) for cell in cells[:width]]
-    rows, head = filled[1:], [filled[0][0]]
+    width, head = len(header), tuple(filled[k][0] for k in named)
+    rows = [line for line in filled[begin:] if not is_comment(line[1])]
     if width > _MOST_COLUMNS or width * len(rows) > _MOST_CELLS:
         raise InputError(f"{name}: has {width} columns and {len(rows)} rows, more than any table of orientations: "
                          "leave out what is not part of it.")  # fmt: skip
-    if rows and all(cell is None or (isinstance(cell, str) and is_unit(cell)) for cell in rows[0][1]):
-        units = [*rows[0][1], *[None] * width]
-        header = [f"{title} [{unit}]" if unit else title for title, unit in zip(header, units, strict=False)]
-        head.append(rows.pop(0)[0])
     for number, cells in rows:
         beyond = [cell for cell in cells[width:] if cell is not None]
         if beyond:
@@ -232,7 +184,7 @@ def _headed(name: str, lines: Sequence[tuple[int, Sequence[Cell]]]) -> Grid:
             )
     _refuse_without_rows(name, rows)
     full = tuple(tuple([*own[:width], *[None] * (width - len(own))]) for _, own in rows)
-    return Grid(name, tuple(header), tuple(number for number, _ in rows), full, tuple(head))
+    return Grid(name, tuple(header), tuple(number for number, _ in rows), full, head)
 
 
 def _refuse_without_rows(name: str, rows: Sequence[object]) -> None:

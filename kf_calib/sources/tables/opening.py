@@ -18,8 +18,7 @@ from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.tables.columns import HOW, KNOWN, QUATERNION, READINGS, SPREADS, Columns, RowTimes
 from kf_calib.sources.tables.grid import grid_of
 from kf_calib.sources.tables.numbers import Numbers
-from kf_calib.sources.tables.words import ANGLE, NO_HEADER, Units, are_numbers, face_of, mps2_per, reading_units
-from kf_calib.support.text import cut
+from kf_calib.sources.tables.words import ANGLE, Units, face_of, mps2_per, reading_units
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 _SAMPLES, _FAST_S = 50, 1.0
@@ -139,8 +138,6 @@ class Opening:
 
     def _refuse_missing(self) -> None:
         columns, header = self.columns, ", ".join(map(repr, self.grid.header))
-        if are_numbers(self.grid.header):
-            raise InputError(f"{self.grid.name}: {NO_HEADER}: {cut(','.join(self.grid.header), 60)!r}.")
         missing = [ours for ours in READINGS if not columns.has(ours)]
         if missing:
             raise InputError(

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -90,14 +90,6 @@ class Meaning(NamedTuple):
 def is_unit(text: str) -> bool:
     """Whether a cell is nothing but a unit, or a dash."""
     return text.strip("[]() ").lower() in _OF_WORD or text.strip() in ("-", "1")
-
-
-NO_HEADER = "has no header: name the columns in a first line, such as time_s,ax_g,ay_g,az_g; it begins with"
-
-
-def are_numbers(header: Iterable[str]) -> bool:
-    """Whether what should be names of columns are numbers: there is no header."""
-    return all(re.fullmatch(r"[+\-−]?[\d.,]+(?:[eE][+\-]?\d+)?", name.strip()) for name in header)
 
 
 def meaning_of(name: str) -> Meaning:
