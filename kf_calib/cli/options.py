@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from kf_calib.sources.files.lines import Lines
     from kf_calib.sources.files.recording import Recording
     from kf_calib.sources.opening import FileKind
-    from kf_calib.sources.tables.words import Units
+    from kf_calib.sources.text.units import Units
 
 _of_input, _of_model, _of_output = (partial(option, panel=panel) for panel in (INPUT, MODEL, OUTPUT))
 
@@ -184,7 +184,7 @@ class ReadingOptions:
 
     def units(self, input: RawInput | None = None) -> Units:
         """Units of a table or a log."""
-        from kf_calib.sources.tables.words import Units
+        from kf_calib.sources.text.units import Units
 
         return Units.of(self.keys, self.angle_unit, self.g_unit, input)
 

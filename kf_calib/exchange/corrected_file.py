@@ -31,9 +31,9 @@ from kf_calib.sources.tables.grid import Grid, grid_of
 from kf_calib.sources.tables.numbers import Numbers, written
 from kf_calib.sources.tables.opening import Opening
 from kf_calib.sources.tables.spreadsheet import sheets_of, workbook_of
-from kf_calib.sources.tables.words import Units
 from kf_calib.sources.text.encoding import encoding_of, unpacked
 from kf_calib.sources.text.heading import cell_spans, delimiter_in
+from kf_calib.sources.text.units import Units
 from kf_calib.support.output_files import whole, write_whole
 
 FRAME_ID = "block"

@@ -25,8 +25,9 @@ from kf_calib.errors import CountsError, InputError
 from kf_calib.sources.files.line_parts import LineError, number_of, stamp_ns
 from kf_calib.sources.tables.columns import QUATERNION, READINGS, SPREADS
 from kf_calib.sources.tables.numbers import DECIMAL_POINT, Numbers, month_comes_first, stamp_of
-from kf_calib.sources.tables.words import ANGLE, TIME, Meaning, Units, meaning_of, reading_units
 from kf_calib.sources.text.heading import TextHeading
+from kf_calib.sources.text.names import ANGLE, TIME, Meaning, meaning_of
+from kf_calib.sources.text.units import Units, reading_units
 from kf_calib.support.text import cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 

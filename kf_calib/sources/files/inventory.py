@@ -20,7 +20,7 @@ from kf_calib.sources.files.mcap_file import McapFile, Warn
 from kf_calib.sources.files.mcap_records import MAX_CHUNK_MB, MessageFinder
 from kf_calib.sources.files.record_files import RecordFile, files_of, open_record_file
 from kf_calib.sources.files.sqlite_bag import SqliteBag
-from kf_calib.sources.tables.words import Units
+from kf_calib.sources.text.units import Units
 
 TopicTimes = NDArray[np.int64]
 _GAP = 5  # times the usual interval

@@ -24,9 +24,9 @@ from kf_calib.sources.files.fields import as_columns
 from kf_calib.sources.files.line_parts import Account, LineReader
 from kf_calib.sources.files.sample_lines import CsvLines, JsonLines
 from kf_calib.sources.tables.columns import HOW
-from kf_calib.sources.tables.words import Units
 from kf_calib.sources.text.encoding import Cutter, TextFile
 from kf_calib.sources.text.heading import TextHeading
+from kf_calib.sources.text.units import Units
 from kf_calib.support.text import cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 

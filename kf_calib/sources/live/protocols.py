@@ -12,9 +12,9 @@ from kf_calib.sources.files.line_parts import Account, LineReader
 from kf_calib.sources.files.sample_lines import CsvLines, JsonLines
 from kf_calib.sources.live.feed import nothing
 from kf_calib.sources.live.frames import FrameReader
-from kf_calib.sources.tables.words import Units
 from kf_calib.sources.text.encoding import Cutter
 from kf_calib.sources.text.heading import TextHeading
+from kf_calib.sources.text.units import Units
 
 _FEWEST_CELLS = 5  # time, readings and an angle
 _MOST_LINES = 2000  # without a beginning among them

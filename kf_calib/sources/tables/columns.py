@@ -15,7 +15,7 @@ from kf_calib.bench.arrays import Floats, Mask, lengths
 from kf_calib.errors import InputError
 from kf_calib.sources.tables.grid import Cell, Grid
 from kf_calib.sources.tables.numbers import Numbers, stamps_of
-from kf_calib.sources.tables.words import TIME, Meaning, face_of, meaning_of
+from kf_calib.sources.text.names import TIME, Meaning, face_of, meaning_of
 from kf_calib.support.text import cut
 
 READINGS, SPREADS, QUATERNION = ("ax", "ay", "az"), ("sx", "sy", "sz"), ("qx", "qy", "qz", "qw")

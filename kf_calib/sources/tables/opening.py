@@ -18,7 +18,8 @@ from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.tables.columns import HOW, KNOWN, QUATERNION, READINGS, SPREADS, Columns, RowTimes
 from kf_calib.sources.tables.grid import grid_of
 from kf_calib.sources.tables.numbers import Numbers
-from kf_calib.sources.tables.words import ANGLE, Units, face_of, mps2_per, reading_units
+from kf_calib.sources.text.names import ANGLE, face_of
+from kf_calib.sources.text.units import Units, mps2_per, reading_units
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 _SAMPLES, _FAST_S = 50, 1.0

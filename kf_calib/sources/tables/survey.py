@@ -16,7 +16,7 @@ from kf_calib.sources.tables.columns import Columns
 from kf_calib.sources.tables.grid import grid_of
 from kf_calib.sources.tables.numbers import Numbers
 from kf_calib.sources.tables.opening import Opening
-from kf_calib.sources.tables.words import Units
+from kf_calib.sources.text.units import Units
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 LEAST = 4

@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from kf_calib.sources.tables.words import face_of, is_unit
+from kf_calib.sources.text.names import face_of, is_unit
 
 _DELIMITERS = ";\t,|"
 BLANK = " "
