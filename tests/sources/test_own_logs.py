@@ -222,7 +222,7 @@ BROKEN = {
     "a word": (ANGLES + rows(lambda t, f, q: (t, "broken", *(f[1:] / G), *q)),
                "first line 2: column 'ax_g' is 'broken', which is no number"),
     "a column twice": ("time_s,ax,ay,az,acc_x,outer_deg\n" + rows(lambda t, f, _: (t, *f, 0.0, 0.0)),
-                       "columns 'ax', 'acc_x' are all taken for ax: leave out"),
+                       "columns 'ax', 'acc_x' are all taken for ax: say which it is, for example by --column 'ax=ax'"),
 }  # fmt: skip
 
 

@@ -8,7 +8,6 @@ size, that of a time by its steps, the sign before decimals.
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,26 +19,21 @@ from operator import mul
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, lengths
-from kf_calib.bench.raw_input import PLAIN, UNITS, RawInput
+from kf_calib.bench.raw_input import PLAIN, RawInput
 from kf_calib.errors import CountsError, InputError
 from kf_calib.sources.files.line_parts import LineError, number_of, stamp_ns
-from kf_calib.sources.tables.columns import QUATERNION, READINGS, SPREADS
+from kf_calib.sources.tables.columns import READINGS, SPREADS
 from kf_calib.sources.tables.numbers import DECIMAL_POINT, Numbers, month_comes_first, stamp_of
 from kf_calib.sources.text.heading import TextHeading
-from kf_calib.sources.text.names import ANGLE, TIME, Meaning, meaning_of
-from kf_calib.sources.text.units import Units, reading_units
+from kf_calib.sources.text.names import ACCEL, ANGLE, QUATERNION, TIME, Meaning, is_exact, meanings_of, unit_of_epoch
+from kf_calib.sources.text.units import Units, reading_units, usual_norm
 from kf_calib.support.text import cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 EXAMPLE = "time_s,ax_mps2,ay_mps2,az_mps2,outer_deg,middle_deg,inner_deg,temperature_c"
-_EXACT = re.compile(
-    r"time_(ns|us|ms|s)|a[xyz]_(mps2|g|mg|ug)|q[xyzw]|(outer|middle|inner)_(deg|rad)|temperature_c", re.IGNORECASE
-)
-_LIKELY = re.compile(r"a|x|y|z|raw", re.IGNORECASE)
 _TIME_ALONE = ("t", "sec", "secs", "millis", "micros")
-_OF_EPOCH = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
-"""From which size on a stamp without a unit is one since 1970 in this unit."""
-_FASTEST_TABLE_S = 1.0
+_OF_STEPS = ((0.0, 1.0, "s"), (1e3, 1e6, "us"), (1e6, 1e9, "ns"))
+"""Steps that tell the unit of stamps: between them and in another unit, rows would be no samples."""
 _MANY, _ALIKE_RAD, _MOST = 500, 0.1, 0.9
 _FEWEST_ROWS, _MOST_UNITS, _APART = 20, 8, 5.0  # rows and labels of several sensors, and sigmas between these
 _MARKS_OF_TABLES = ("count", "face", "sd", *SPREADS)
@@ -161,7 +155,7 @@ class CsvColumns:
             raise InputError(f"two columns are named {repeated!r}: rename or remove one of them.")
         full = [row for row in heading.rows if len(row) == len(names)]
         columns = cls(header, names, heading.delimiter, full, units or Units(), local_mps2, heading.lines_of_names)
-        columns._meanings = [meaning_of(name) for name in names]
+        columns._meanings = meanings_of(header, stated)
         return columns
 
     @property
@@ -215,9 +209,9 @@ class CsvColumns:
         ]
         if not places:
             raise InputError(f"no column gives the time: name it time_s or time_ns; {self.wanted}, not {self._seen}.")
-        exact = [at for at in places if _EXACT.fullmatch(self.names[at])]
+        exact = [at for at in places if is_exact(self.names[at])]
         united = [at for at in places if self._meanings[at].unit]
-        place = (exact or united or places)[0]
+        place = self._most_even(exact or united or places)
         unit = self._meanings[place].unit or {"millis": "ms", "micros": "us"}.get(self.names[place].strip().lower(), "")
         values = self._values([place], [row for row in self.rows if row[place]])[:, 0]
         if not unit and len(values) and math.isnan(values[0]):
@@ -227,6 +221,17 @@ class CsvColumns:
         if not exact:
             self.said.append(f"time from {self._quoted([place])} in {unit}")
         return Stamps((place,), decimals, round(TIME[unit]) if decimals == 9 else 1)
+
+    def _most_even(self, places: list[int]) -> int:
+        """Return that of several columns of stamps which goes up most evenly; the first where none has numbers."""
+
+        def unevenness(steps: Floats) -> float:
+            steps = steps[np.isfinite(steps)]
+            usual = float(np.median(steps)) if len(steps) else 0.0
+            return float(np.median(np.abs(steps - usual))) / usual if usual > 0.0 else math.inf
+
+        steps = np.diff(self._values(places), axis=0) if len(places) > 1 else np.zeros((0, 1))
+        return places[int(np.argmin([unevenness(own) for own in steps.T]))]
 
     def accel(self) -> QuantityColumns:
         """The three readings as they are written; ``raw`` tells then what in.
@@ -239,13 +244,14 @@ class CsvColumns:
             raise InputError(f"no columns give the three readings with their unit: {advice}.")
         by_name = [self._meanings[at].unit for at in places]
         named = self.units.told_by([self.header[at] for at in places], by_name)
-        norm = self._usual_norm(places)
+        values = self._values(places)
+        norm = usual_norm(values)
         if "" in named and not (self.units.accel or self.units.as_default(named, norm)) and math.isnan(norm):
             raise InputError(
                 f"no columns give the three readings with their unit: {advice}, or state it by --accel-unit, and the "
                 "size of counts by --accel-scale."
             )
-        told = reading_units(named, norm, self.units, self.local_mps2)
+        told = reading_units(named, values, self.units, self.local_mps2)
         if not told.is_known:
             scale = STANDARD_GRAVITY_MPS2 / norm if norm > 0.0 else math.nan
             raise CountsError(
@@ -253,13 +259,13 @@ class CsvColumns:
                 "of one by --accel-scale, in m/s^2 or what --accel-unit says.", scale
             )  # fmt: skip
         is_stated = self.units.accel is not None or self.units.accel_scale != 1.0
-        if is_stated or not all(_EXACT.fullmatch(self.names[at]) for at in places):
+        if is_stated or not all(is_exact(self.names[at]) for at in places):
             self.said.insert(0, f"readings from {self._quoted(places)} in {told.words}")
         self.raw, scale = told.raw, self.units.accel_scale
         is_rewritten = scale != 1.0 or named != by_name or "count" in named or self.raw.sizes != PLAIN.sizes
-        written = [UNITS.get(unit, 1.0) for unit in by_name] if is_rewritten else self.raw.factors.tolist()
+        written = [ACCEL.get(unit, 1.0) for unit in by_name] if is_rewritten else self.raw.factors.tolist()
         self.written_mps2 = (written[0], written[1], written[2])
-        bare = [at for at, unit in zip(places, by_name, strict=True) if unit not in UNITS]
+        bare = [at for at, unit in zip(places, by_name, strict=True) if unit in ("", "count")]
         self.without_unit = tuple(bare) if is_rewritten else ()
         return QuantityColumns(tuple(places), (1.0, 1.0, 1.0))
 
@@ -290,7 +296,7 @@ class CsvColumns:
                 f"{self._quoted(places)} are in {' and '.join(sorted(set(units)))} by their names, and --angle-unit is "
                 f"{self.units.angle}: leave out --angle-unit."
             )
-        elif not all(_EXACT.fullmatch(self.names[at]) for at in places):
+        elif not all(is_exact(self.names[at]) for at in places):
             self.said.append(f"gimbal angles, outer to inner, from {self._quoted(places)}")
         return QuantityColumns(tuple(places), tuple(ANGLE[unit] for unit in units))
 
@@ -305,7 +311,7 @@ class CsvColumns:
         at = self._one("temperature")
         if at is None:
             return QuantityColumns(), "c"
-        if not _EXACT.fullmatch(self.names[at]):
+        if not is_exact(self.names[at]):
             self.said.append(f"temperature from {self._quoted([at])} in {(self._meanings[at].unit or 'c').upper()}")
         return QuantityColumns((at,), (1.0,)), self._meanings[at].unit or "c"
 
@@ -367,33 +373,26 @@ class CsvColumns:
         return np.array(values, float).reshape(-1, len(places))
 
     def _one(self, ours: str) -> int | None:
-        """Return the column of a quantity that is there once; names of the format go before others, then such as begin
-        like one of readings. Raises InputError where two are left."""
+        """Return the column of a quantity that is there once; names of the format go before others. Raises InputError
+        where two are left."""
         places = self._places(ours)
-        for likely in (_EXACT.fullmatch, _LIKELY.match):
-            places = [at for at in places if likely(self.names[at].strip())] or places
+        places = [at for at in places if is_exact(self.names[at])] or places
         if len(places) > 1:
-            other = self.header[places[1]]
             raise InputError(
-                f"columns {self._quoted(places)} are all taken for {ours}: leave out what it is not by "
-                f"--column {other + '=-'!r}."
+                f"columns {self._quoted(places)} are all taken for {ours}: say which it is, for example by "
+                f"--column {f'{self.header[places[0]]}={ours}'!r}."
             )
         return places[0] if places else None
-
-    def _usual_norm(self, places: Sequence[int]) -> float:
-        """Return the median size of the readings in the first rows, NaN where there are none."""
-        norms = lengths(self._values(places))
-        norms = norms[np.isfinite(norms)]
-        return float(np.median(norms)) if len(norms) else math.nan
 
     def _unit_of_time(self, place: int, values: Floats) -> str:
         """Return the unit of stamps (n,) whose name tells none, by their size or their steps."""
         known = values[np.isfinite(values)]
         size = float(np.abs(known).max(initial=0.0))
-        if unit := next((unit for least, unit in _OF_EPOCH if size >= least), ""):
+        if unit := unit_of_epoch(size):
             return unit
-        if len(known) > 1 and 0.0 < float(np.median(np.abs(np.diff(known)))) < _FASTEST_TABLE_S:
-            return "s"
+        step = float(np.median(np.abs(np.diff(known)))) if len(known) > 1 else 0.0
+        if unit := next((unit for low, high, unit in _OF_STEPS if low < step < high), ""):
+            return unit
         name = self.header[place]
         raise InputError(
             f"no column gives the time with its unit: say which {name!r} has, for example --column '{name}=time_ms'; "

@@ -15,10 +15,10 @@ from kf_calib.bench.arrays import Floats, Mask, lengths
 from kf_calib.errors import InputError
 from kf_calib.sources.tables.grid import Cell, Grid
 from kf_calib.sources.tables.numbers import Numbers, stamps_of
-from kf_calib.sources.text.names import TIME, Meaning, face_of, meaning_of
+from kf_calib.sources.text.names import QUATERNION, TIME, Meaning, face_of, meaning_of, meanings_of, unit_of_epoch
 from kf_calib.support.text import cut
 
-READINGS, SPREADS, QUATERNION = ("ax", "ay", "az"), ("sx", "sy", "sz"), ("qx", "qy", "qz", "qw")
+READINGS, SPREADS = ("ax", "ay", "az"), ("sx", "sy", "sz")
 _OPTIONAL = ("time", "count", "temperature", "sd", *SPREADS)
 _SEVERAL = ("angle", "time", "")
 _ALIKE = 1.3  # of the norms of readings at rest, largest to smallest
@@ -126,7 +126,7 @@ class Columns:
                 self._guess(k, "time")
         if self.places(*READINGS):
             return
-        left = [k for k in range(len(self.meanings)) if not self.meanings[k].ours and k not in stated]
+        left = [k for k, own in enumerate(self.meanings) if not own.ours and not own.other and k not in stated]
         if len(numeric := [k for k in left if self._are_numbers(k, _MOST)]) == 3:
             whole = np.array([all(self.is_number(row[k]) for k in numeric) for row in self.grid.rows])
             norms = lengths(np.column_stack([self.values(k, only=whole)[whole] for k in numeric]))
@@ -161,8 +161,8 @@ class Columns:
             if ours not in _SEVERAL and first != k:
                 one, other = self.grid.header[first], self.grid.header[k]
                 raise InputError(
-                    f"{self.grid.name}: columns {one!r} and {other!r} are both taken for {ours}: leave one out by "
-                    f"--column {other + '=-'!r}; {HOW}."
+                    f"{self.grid.name}: columns {one!r} and {other!r} are both taken for {ours}: say which it is, for "
+                    f"example by --column {f'{one}={ours}'!r}; {HOW}."
                 )
 
 
@@ -180,12 +180,7 @@ def _meanings(grid: Grid, stated: Mapping[str, str]) -> list[Meaning]:
             )
         if ours != "-" and not meaning_of(ours).ours:
             raise InputError(f"--column {theirs}={ours}: {cut(ours, 60)!r} is not known: use {KNOWN}, or - for none.")
-    meanings = [meaning_of(name) for name in grid.header]
-    for k, name in enumerate(grid.header):
-        if name in stated:
-            own = meaning_of(stated[name])
-            meanings[k] = own if own.unit else own._replace(unit=meanings[k].unit)
-    return meanings
+    return meanings_of(grid.header, stated)
 
 
 _USUAL_PAUSE_S = 60.0
@@ -206,7 +201,7 @@ class RowTimes:
     @classmethod
     def of(cls, columns: Columns) -> RowTimes:
         """Raises InputError for a cell that is no time, and for rows that are out of order."""
-        places, count = columns.places("time"), len(columns.grid.rows)
+        places, count = _of_rising_numbers(columns, columns.places("time")), len(columns.grid.rows)
         if not places:
             return cls(_USUAL_PAUSE_S * np.arange(count, dtype=np.float64), None, "")
         unit, cells = columns.meanings[places[0]].unit, columns.grid.column(places[0])
@@ -215,8 +210,10 @@ class RowTimes:
             columns.numbers.values(cells) is not None or all(cell is None or columns.is_number(cell) for cell in cells)
         )
         if are_numbers or (len(places) == 1 and unit in TIME):
-            said += f" in {unit or 's'}"
-            elapsed_s = TIME[unit or "s"] * columns.values(places[0], "a time", optional=True)
+            values = columns.values(places[0], "a time", optional=True)
+            unit = unit or unit_of_epoch(float(np.abs(values).max(initial=0.0))) or "s"
+            said += f" in {unit}"
+            elapsed_s = TIME[unit] * (values - values[0])
         else:
             stamps = _stamps(columns, places)
             elapsed_s = np.array([(stamp - stamps[0]).total_seconds() for stamp in stamps])
@@ -224,6 +221,15 @@ class RowTimes:
             start_ns = round((_in_utc(stamps[0]) - _FIRST).total_seconds()) * 10**9
         _refuse_disorder(columns, elapsed_s, places[0])
         return cls(elapsed_s - elapsed_s[0], start_ns, said)
+
+
+def _of_rising_numbers(columns: Columns, places: list[int]) -> list[int]:
+    """Return the first of several columns of numbers that go up, where there is one; else all, as of date and time."""
+    for place in places if len(places) > 1 else ():
+        values = columns.numbers.values(columns.grid.column(place))
+        if values is not None and bool((np.diff(values) > 0.0).all()):
+            return [place]
+    return places
 
 
 def _stamps(columns: Columns, places: list[int]) -> list[datetime]:

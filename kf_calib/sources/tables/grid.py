@@ -167,7 +167,7 @@ def _headed(name: str, lines: Sequence[tuple[int, Sequence[Cell]]]) -> Grid:
     """Return the grid of lines, with the number that each has in the file."""
     filled = [(number, list(cells)) for number, cells in lines if cells.count(None) < len(cells)]
     header, begin, named = header_in([cells for _, cells in filled]) if filled else ([], 0, ())
-    if not header or (begin == len(filled) and len(header) < _FEWEST):
+    if len(header) < _FEWEST:
         raise InputError(f"{name}: has no table: write a header and a row for each orientation (docs/tables.md).")
     width, head = len(header), tuple(filled[k][0] for k in named)
     rows = [line for line in filled[begin:] if not is_comment(line[1])]

@@ -15,10 +15,10 @@ from kf_calib.bench.bench import Bench, parse_axes
 from kf_calib.bench.raw_input import PLAIN, RawInput, merged_metadata
 from kf_calib.bench.streams import Orientations, Table, bench_without_angles
 from kf_calib.errors import BenchError, InputError
-from kf_calib.sources.tables.columns import HOW, KNOWN, QUATERNION, READINGS, SPREADS, Columns, RowTimes
+from kf_calib.sources.tables.columns import HOW, KNOWN, READINGS, SPREADS, Columns, RowTimes
 from kf_calib.sources.tables.grid import grid_of
 from kf_calib.sources.tables.numbers import Numbers
-from kf_calib.sources.text.names import ANGLE, face_of
+from kf_calib.sources.text.names import ANGLE, QUATERNION, face_of
 from kf_calib.sources.text.units import Units, mps2_per, reading_units
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
@@ -241,8 +241,7 @@ class Opening:
             named = self.units.told_by([self.grid.header[place] for place in places], by_name)
         except InputError as error:
             raise InputError(f"{self.grid.name}: {error}") from None
-        norm = float(np.median(lengths(values)))
-        told = reading_units(named, norm, self.units, bench.gravity_mps2)
+        told = reading_units(named, values, self.units, bench.gravity_mps2)
         self.has_unit = told.is_known
         self.raw = told.raw
         if told.by_size:

@@ -11,13 +11,13 @@ import re
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import BinaryIO, Self, cast
+from typing import Self
 
 from kf_calib.errors import InputError
 
 LONGEST_LINE_BYTES = 1 << 20
 GZIP, _UTF16 = b"\x1f\x8b", (b"\xff\xfe", b"\xfe\xff")
-_HEAD_BYTES = 1 << 16
+_HEAD_BYTES = 1 << 18
 _CYRILLIC = re.compile(rb"[\xc0-\xff]{3}")
 _BLOCK_BYTES = 1 << 20
 
@@ -30,7 +30,7 @@ class TextFile:
         self._raw = path.open("rb")
         try:
             packed = self._raw.peek(2).startswith(GZIP)
-            self._file = cast("BinaryIO", gzip.GzipFile(fileobj=self._raw)) if packed else self._raw
+            self._file = gzip.GzipFile(fileobj=self._raw) if packed else self._raw
             self.trouble, self._has_ended = "", False
             self._head = self._unpacked(_HEAD_BYTES)
         except BaseException:
@@ -62,14 +62,16 @@ class TextFile:
         self._raw.close()
 
     def _unpacked(self, size: int) -> bytes:
-        if self._has_ended:
-            return b""
+        block = bytearray()
         try:
-            block = self._file.read(size)
+            while len(block) < size and not self._has_ended:
+                piece = self._file.read1(size - len(block))
+                block += piece
+                self._has_ended = not piece
         except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-            block, self.trouble = b"", f"its end cannot be unpacked ({error}): copy it anew, what comes before is used."
-        self._has_ended = not block
-        return block
+            self.trouble = f"its end cannot be unpacked ({error}): copy it anew, what comes before is used."
+            self._has_ended = True
+        return bytes(block)
 
 
 def head_of(path: Path) -> bytes:

@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from kf_calib.sources.text.names import face_of, is_unit
+from kf_calib.sources.text.names import is_unit
 
 _DELIMITERS = ";\t,|"
 BLANK = " "
@@ -19,7 +19,6 @@ _ROWS = 1000  # that are looked at
 _MARK = re.compile(r"\s*(?:#|%|//)+\s*")
 """Before a comment, or before names."""
 _NUMBER = re.compile(r"[+\-−]?[\d.,]*\d[\d.,]*(?:[eE][+\-]?\d+)?|[+\-]?nan", re.IGNORECASE)
-_STAMP = re.compile(r"[\d.:/+ -]*\d[\d.:/+ -]*(?:T[\d:.+-]+)?Z?|\d\S*\s*[AP]M", re.IGNORECASE)
 NAMELESS = "column {}"
 """The name of a column of a text without a heading, counted from 1."""
 
@@ -95,13 +94,12 @@ def header_in(rows: Sequence[Sequence[object]]) -> tuple[list[str], int, tuple[i
 
 
 def are_values(cells: Sequence[str]) -> bool:
-    """Whether cells are the values of a row and no names: numbers, and at most stamps and faces beside them. Numbers
-    that count from 0 or 1 on are names, as libraries give them to columns without any."""
+    """Whether cells are the values of a row and no names: most are numbers. Those that count from 0 or 1 on are names,
+    as libraries give them to columns without any."""
     filled = [cell for cell in cells if cell]
     numbers = [cell for cell in filled if _NUMBER.fullmatch(cell)]
-    if not numbers or any(numbers == [str(k + first) for k in range(len(numbers))] for first in (0, 1)):
-        return False
-    return all(cell in numbers or _STAMP.fullmatch(cell) or face_of(cell) for cell in filled)
+    are_counted = any(numbers == [str(k + first) for k in range(len(numbers))] for first in (0, 1))
+    return 2 * len(numbers) > len(filled) and not are_counted
 
 
 def _filled(row: Sequence[object]) -> int:

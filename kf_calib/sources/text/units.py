@@ -9,17 +9,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import Floats, lengths
 from kf_calib.bench.raw_input import CHANNELS, PLAIN, RESTATE, UNITS, RawInput
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.text.names import ACCEL
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
-_BY_SIZE = (("g", 0.5, 2.0), ("m/s2", 5.0, 20.0), ("mg", 500.0, 2000.0))
-"""Units in which the size of gravity lies between two numbers."""
+_BY_SIZE = (("g", 0.5, 2.0), ("m/s2", 5.0, 20.0), ("mg", 500.0, 2000.0), ("mm/s2", 5e3, 2e4))
+"""Units in which the size of gravity lies between two numbers; the last where these have decimals, as counts have none.
+"""
 _NEAR = (0.2, 5.0)
 """The norm in g of a sensor that is not shaken hard."""
-_IN_WORDS = {"m/s2": "m/s^2", "count": "counts"}
+_IN_WORDS = {"m/s2": "m/s^2", "mm/s2": "mm/s^2", "count": "counts"}
 
 
 @dataclass(frozen=True)
@@ -100,18 +101,21 @@ class ReadingUnits(NamedTuple):
     is_known: bool
 
 
-def reading_units(named: Sequence[str], norm: float, stated: Units, local_mps2: float) -> ReadingUnits:
+def reading_units(named: Sequence[str], values: Floats, stated: Units, local_mps2: float) -> ReadingUnits:
     """The units of three readings.
 
-    named: units by the names of their columns, empty where these tell none. norm: size of the readings at rest as they
-    are written, from which a unit is told that neither a name nor ``stated`` tells.
+    named: units by the names of their columns, empty where these tell none. values (n, 3): readings as they are
+    written, whose size at rest tells a unit that neither a name nor ``stated`` tells.
     """
+    values = values[np.isfinite(values).all(axis=1)]
+    norm = usual_norm(values)
     if stated.as_default(named, norm):
         assert stated.input is not None
         default = replace(stated.input, channels=CHANNELS)
         return ReadingUnits((default.unit,) * 3, default, f"{default.unit_words}, as of the calibration", False, True)
     size = norm * stated.accel_scale
-    by_size = next((unit for unit, low, high in _BY_SIZE if low < size < high), "count")
+    are_counts = bool((values == np.rint(values)).all()) or stated.accel_scale != 1.0
+    by_size = next((unit for unit, low, high in _BY_SIZE[: 3 if are_counts else 4] if low < size < high), "count")
     units = [unit if unit not in ("", "count") else stated.accel or ("m/s2" if unit else by_size) for unit in named]
     is_guessed = "" in named and not stated.accel
     words = " and ".join(dict.fromkeys(_IN_WORDS.get(unit, unit) for unit in units))
@@ -123,6 +127,13 @@ def reading_units(named: Sequence[str], norm: float, stated: Units, local_mps2: 
     is_known = bool(stated.accel) or stated.accel_scale != 1.0 or "count" not in (*units, *named)
     raw = _raw(units, stated, mps2_per(units, stated, local_mps2))
     return ReadingUnits(tuple(units), raw, words, is_guessed, is_known)
+
+
+def usual_norm(values: Floats) -> float:
+    """The median size of readings (n, 3), NaN where there are none."""
+    norms = lengths(values)
+    norms = norms[np.isfinite(norms)]
+    return float(np.median(norms)) if len(norms) else math.nan
 
 
 def _raw(units: Sequence[str], stated: Units, mps2: Floats) -> RawInput:
