@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import rich_click as click
@@ -125,6 +126,10 @@ class DeviceOptions:
     accel_scale: Annotated[float | None, _of_input(
         "--accel-scale", type=POSITIVE, show_default="1",
         help="Size of one count, in the unit of the readings; a calibration remembers it.")] = None
+    counts: Annotated[str | None, _of_input(
+        "--counts", metavar="HOW", show_default="signed",
+        help="How raw numbers are to be read: unsigned16 (or so many bits), wrap=4.096 (what negative ones are too "
+        "large by), offset=512 (the number at no force); a calibration remembers it.")] = None
     restate_input: Annotated[bool, _of_input(
         "--restate-input",
         help="What is stated of channels, unit and count was wrong: the options go before it.")] = False
@@ -133,7 +138,7 @@ class DeviceOptions:
     @property
     def keys(self) -> dict[str, str]:
         """The same as bench keys."""
-        stated = {"accel_unit": self.accel_unit, "accel_scale": self.accel_scale}
+        stated = {"accel_unit": self.accel_unit, "accel_scale": self.accel_scale, "counts": self.counts}
         keys = {key: str(value) for key, value in stated.items() if value is not None}
         return keys | ({"restate_input": "true"} if self.restate_input else {})
 
@@ -182,11 +187,11 @@ class ReadingOptions:
 
         return kind_of(path, self.renamed)
 
-    def units(self, input: RawInput | None = None) -> Units:
-        """Units of a table or a log."""
+    def units(self, input: RawInput | None = None, told: Mapping[str, str] = MappingProxyType({})) -> Units:
+        """Units of a table or a log; told: bench keys beside those of the options."""
         from kf_calib.sources.text.units import Units
 
-        return Units.of(self.keys, self.angle_unit, self.g_unit, input)
+        return Units.of({**self.keys, **told}, self.angle_unit, self.g_unit, input)
 
     def messages(self, path: Path, angles: bool, input: RawInput | None = None) -> Recording:
         """The recording of samples at a path; angles: whether it must have angles."""

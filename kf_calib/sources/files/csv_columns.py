@@ -19,14 +19,15 @@ from operator import mul
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, lengths
-from kf_calib.bench.raw_input import PLAIN, RawInput
+from kf_calib.bench.counts import SIGNED, parse_counts
+from kf_calib.bench.raw_input import OPTIONS, PLAIN, RawInput
 from kf_calib.errors import CountsError, InputError
 from kf_calib.sources.files.line_parts import LineError, number_of, stamp_ns
 from kf_calib.sources.tables.columns import READINGS, SPREADS
 from kf_calib.sources.tables.numbers import DECIMAL_POINT, Numbers, month_comes_first, stamp_of
 from kf_calib.sources.text.heading import TextHeading
 from kf_calib.sources.text.names import ACCEL, ANGLE, QUATERNION, TIME, Meaning, is_exact, meanings_of, unit_of_epoch
-from kf_calib.sources.text.units import Units, reading_units, usual_norm
+from kf_calib.sources.text.units import Units, reading_units, size_of_count, usual_norm
 from kf_calib.support.text import cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
@@ -253,16 +254,20 @@ class CsvColumns:
             )
         told = reading_units(named, values, self.units, self.local_mps2)
         if not told.is_known:
-            scale = STANDARD_GRAVITY_MPS2 / norm if norm > 0.0 else math.nan
+            signed = usual_norm(parse_counts(self.units.counts).signed(values))
+            keys = size_of_count(signed)
+            example = " ".join(f"{OPTIONS[key]} {value}" for key, value in keys.items())
             raise CountsError(
-                f"the readings in {self._quoted(places)} have a size of {norm:.3g}, so they are counts: give the size "
-                "of one by --accel-scale, in m/s^2 or what --accel-unit says.", scale
+                f"the readings in {self._quoted(places)} have a size of {signed:.3g}, so they are counts: give the "
+                "size of one by --accel-scale, in m/s^2 or what --accel-unit says, which is by gravity about "
+                f"{example}.", keys
             )  # fmt: skip
         is_stated = self.units.accel is not None or self.units.accel_scale != 1.0
         if is_stated or not all(is_exact(self.names[at]) for at in places):
             self.said.insert(0, f"readings from {self._quoted(places)} in {told.words}")
         self.raw, scale = told.raw, self.units.accel_scale
         is_rewritten = scale != 1.0 or named != by_name or "count" in named or self.raw.sizes != PLAIN.sizes
+        is_rewritten |= self.raw.counts != SIGNED
         written = [ACCEL.get(unit, 1.0) for unit in by_name] if is_rewritten else self.raw.factors.tolist()
         self.written_mps2 = (written[0], written[1], written[2])
         bare = [at for at, unit in zip(places, by_name, strict=True) if unit in ("", "count")]

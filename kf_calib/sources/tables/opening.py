@@ -19,7 +19,7 @@ from kf_calib.sources.tables.columns import HOW, KNOWN, READINGS, SPREADS, Colum
 from kf_calib.sources.tables.grid import grid_of
 from kf_calib.sources.tables.numbers import Numbers
 from kf_calib.sources.text.names import ANGLE, QUATERNION, face_of
-from kf_calib.sources.text.units import Units, mps2_per, reading_units
+from kf_calib.sources.text.units import Units, mps2_per, reading_units, refuse_unread
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 _SAMPLES, _FAST_S = 50, 1.0
@@ -232,7 +232,8 @@ class Opening:
         values = np.column_stack([self.columns.values(place, "a reading") for place in places])
         factors, unit = self._accel_factors(places, values, bench)
         self.said.insert(0, f"mean readings from {self.columns.named(places)} in {unit}")
-        return values * factors
+        refuse_unread(values, self.raw.counts, self.grid.name)
+        return self.raw.signed(values) * factors
 
     def _accel_factors(self, places: list[int], values: Floats, bench: Bench) -> tuple[Floats, str]:
         """Return the factors (3,) from columns of readings to m/s^2, and the unit in words."""

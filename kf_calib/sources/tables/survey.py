@@ -11,7 +11,7 @@ import numpy as np
 
 from kf_calib.bench.raw_input import RawInput
 from kf_calib.bench.streams import Table
-from kf_calib.errors import InputError
+from kf_calib.errors import CountsError, InputError
 from kf_calib.sources.tables.columns import Columns
 from kf_calib.sources.tables.grid import grid_of
 from kf_calib.sources.tables.numbers import Numbers
@@ -106,6 +106,8 @@ def survey(
     table, trouble = None, ""
     try:
         table = opening.table()
+    except CountsError:
+        raise
     except InputError as error:
         trouble = str(error)
     kind = table_columns.orientation if angles else ""

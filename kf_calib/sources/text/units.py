@@ -10,14 +10,17 @@ from typing import NamedTuple
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, lengths
+from kf_calib.bench.counts import SIGNED, counts_in, parse_counts
 from kf_calib.bench.raw_input import CHANNELS, PLAIN, RESTATE, UNITS, RawInput
-from kf_calib.errors import BenchError, InputError
+from kf_calib.errors import BenchError, CountsError, InputError
 from kf_calib.sources.text.names import ACCEL
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 _BY_SIZE = (("g", 0.5, 2.0), ("m/s2", 5.0, 20.0), ("mg", 500.0, 2000.0), ("mm/s2", 5e3, 2e4))
 """Units in which the size of gravity lies between two numbers; the last where these have decimals, as counts have none.
 """
+_FEWEST_BITS, _NEAR_POWER = 6, 0.1
+"""Sensors have 64 counts to 1 g or more, most a power of two; readings at rest are as near to it."""
 _NEAR = (0.2, 5.0)
 """The norm in g of a sensor that is not shaken hard."""
 _IN_WORDS = {"m/s2": "m/s^2", "mm/s2": "mm/s^2", "count": "counts"}
@@ -29,7 +32,7 @@ class Units:
 
     accel_scale: size of one count, in ``accel`` (m/s^2 if that is None). g: m/s^2 that 1 g stands for, or ``local``.
     input: what the device of a calibration sends, which holds where none of this is stated. is_restated: whether
-    ``accel`` goes before the names of columns.
+    ``accel`` goes before the names of columns. counts: how the numbers are to be read.
     """
 
     accel: str | None = None
@@ -38,6 +41,7 @@ class Units:
     g: str | float = STANDARD_GRAVITY_MPS2
     input: RawInput | None = None
     is_restated: bool = False
+    counts: str = SIGNED
 
     @classmethod
     def of(
@@ -50,7 +54,8 @@ class Units:
             raise BenchError("accel_scale has a size for each channel: in lines and tables, state one for all.")
         unit = stated.unit if "accel_unit" in keys else None
         default = None if {"accel_unit", "accel_scale"} & set(keys) else input
-        return cls(unit, stated.sizes[0], angle, g, default, keys.get(RESTATE) == "true")
+        return cls(unit, stated.sizes[0], angle, g, default, keys.get(RESTATE) == "true",
+                   stated.counts)  # fmt: skip
 
     def told_by(self, names: Sequence[str], named: Sequence[str]) -> Sequence[str]:
         """The units of readings (``named``) by the names of their columns, empty where these tell none, or an option
@@ -107,7 +112,7 @@ def reading_units(named: Sequence[str], values: Floats, stated: Units, local_mps
     named: units by the names of their columns, empty where these tell none. values (n, 3): readings as they are
     written, whose size at rest tells a unit that neither a name nor ``stated`` tells.
     """
-    values = values[np.isfinite(values).all(axis=1)]
+    values = parse_counts(stated.counts).signed(values[np.isfinite(values).all(axis=1)])
     norm = usual_norm(values)
     if stated.as_default(named, norm):
         assert stated.input is not None
@@ -136,11 +141,31 @@ def usual_norm(values: Floats) -> float:
     return float(np.median(norms)) if len(norms) else math.nan
 
 
+def size_of_count(norm: float) -> dict[str, str]:
+    """Bench keys for the size of a count, of which gravity has so many: a power of two to one g where that is near."""
+    bits = round(math.log2(norm)) if 0.0 < norm < math.inf else 0
+    if bits >= _FEWEST_BITS and abs(norm / 2.0**bits - 1.0) < _NEAR_POWER:
+        return {"accel_unit": "g", "accel_scale": repr(2.0**-bits)}
+    return {"accel_scale": f"{STANDARD_GRAVITY_MPS2 / norm if norm > 0.0 else math.nan:.3g}"}
+
+
+def refuse_unread(numbers: Floats, stated: str, name: str) -> None:
+    """Raise CountsError where the numbers (n, 3) of readings show that they are to be read otherwise than is stated."""
+    if stated == SIGNED and (told := counts_in(numbers)):
+        exact = ": state exactly what the converter has, such as 2^20 counts of 3.9e-6" if "wrap" in told else ""
+        raise CountsError(
+            f"{name}: the readings are about as large in every direction only where their numbers are read as {told} "
+            f"(of a converter without a sign, or about another code than 0): add --counts {told}{exact}.",
+            {"counts": told},
+        )
+
+
 def _raw(units: Sequence[str], stated: Units, mps2: Floats) -> RawInput:
     """Return the sizes of the numbers: in the unit that they are written in, where that is one for all."""
     if len(set(units)) == 1 and UNITS.get(units[0]) == mps2[0]:
-        return RawInput(sizes=(stated.accel_scale, stated.accel_scale, stated.accel_scale), unit=units[0])
-    return RawInput.of_factors((stated.accel_scale * mps2).tolist())
+        sizes = (stated.accel_scale, stated.accel_scale, stated.accel_scale)
+        return RawInput(sizes=sizes, unit=units[0], counts=stated.counts)
+    return replace(RawInput.of_factors((stated.accel_scale * mps2).tolist()), counts=stated.counts)
 
 
 def mps2_per(units: Sequence[str], stated: Units, local_mps2: float) -> Floats:
