@@ -158,6 +158,9 @@ class ReadingOptions:
         "--g-unit", metavar="M/S^2",
         help="What 1 g stands for in a table or a log in lines; local: gravity of the bench.")] = "9.80665"
     columns: ForeignColumns = ()
+    rate_hz: Annotated[float | None, _of_input(
+        "--rate", type=POSITIVE, metavar="HZ",
+        help="Rows a second of a log in lines that has no column of time.")] = None
     accel_topic: Annotated[str | None, _of_input(
         "--accel-topic", metavar="TOPIC", help="Topic of the accelerometer, where there are several.")] = None
     pose_topic: Annotated[str | None, _of_input(
@@ -185,13 +188,13 @@ class ReadingOptions:
     def kind(self, path: Path) -> FileKind:
         from kf_calib.sources.opening import kind_of
 
-        return kind_of(path, self.renamed)
+        return kind_of(path, self.renamed, has_rate=self.rate_hz is not None)
 
     def units(self, input: RawInput | None = None, told: Mapping[str, str] = MappingProxyType({})) -> Units:
         """Units of a table or a log; told: bench keys beside those of the options."""
         from kf_calib.sources.text.units import Units
 
-        return Units.of({**self.keys, **told}, self.angle_unit, self.g_unit, input)
+        return replace(Units.of({**self.keys, **told}, self.angle_unit, self.g_unit, input), rate_hz=self.rate_hz)
 
     def messages(self, path: Path, angles: bool, input: RawInput | None = None) -> Recording:
         """The recording of samples at a path; angles: whether it must have angles."""
@@ -374,7 +377,7 @@ def _bench_from_toml(path: Path) -> dict[str, str]:
     return keys
 
 
-_OF_TEXT = ("columns", "g_unit")
+_OF_TEXT = ("columns", "g_unit", "rate_hz")
 OF_MESSAGES = ("accel_topic", "pose_topic", "temperature_topic", "fields", "max_chunk_mb")
 OF_DWELLS = ("joints", "settle_s", "still_deg", "gate", "gate_sigma")
 """Options that act on text and spreadsheets only, on files of messages only, and where dwells are to be found."""

@@ -48,6 +48,7 @@ _HOLD_NS = SECOND_NS  # a reading up to this far outside the first or last angle
 _SLEW_READINGS = 8  # least number of readings of a slew that is used
 _REST_NS = 2 * SECOND_NS  # least length of a dwell that is recognised from readings alone
 _PENDING_SAMPLES = 1 << 22  # readings that may wait for an angle; 32 B each
+_TELLING = 1000  # first readings, which tell whether two sensors take turns
 _FEWEST_FOR_NOISE = 3  # fewer messages do not determine the noise of an encoder
 
 
@@ -72,7 +73,7 @@ class Segmenter:
             )
         self.first_ns: int | None = None
         self.dwell_count = 0  # number of dwells that have begun, and the number of the latest
-        self._accel = Stream.empty(3)
+        self._accel, self._first = Stream.empty(3), np.empty((0, 3))
         self._pose = Stream.empty(self.bench.pose_width)
         self._turns = np.empty((0, len(self.bench.axes) or 1))  # whole turns that were added to each recorded pose
         self._noise, self._noise_rad = EncoderNoise(not self.bench.axes), np.empty(0)  # of each recorded pose
@@ -146,6 +147,11 @@ class Segmenter:
         accel = self._orders[0](accel, self.tally, self.first_ns)
         if self.first_ns is None and len(accel):
             self.first_ns = int(accel.time_ns[0])
+        if len(accel):
+            self.tally.lasted_s = (int(accel.time_ns[-1]) - (self.first_ns or 0)) / SECOND_NS
+            if len(self._first) < _TELLING:
+                self._first = np.concatenate([self._first, accel.values[: _TELLING - len(self._first)]])
+                self.tally.look_at(self._first)
         self._accel += accel
 
     def _take_poses(self, pose: Stream, final: bool) -> None:

@@ -46,8 +46,11 @@ class FileKind(Enum):
     CALIBRATION = "calibration"
 
 
-def kind_of(path: str | PathLike[str], columns: Mapping[str, str] = MappingProxyType({})) -> FileKind:
-    """What a file is, by its beginning; columns: our names of foreign ones, as far as they are stated."""
+def kind_of(
+    path: str | PathLike[str], columns: Mapping[str, str] = MappingProxyType({}), *, has_rate: bool = False
+) -> FileKind:
+    """What a file is, by its beginning; columns: our names of foreign ones, as far as they are stated. has_rate:
+    whether a rate of its rows is stated, which only samples have."""
     file = Path(path)
     if not file.is_file():
         return FileKind.RECORDING
@@ -70,7 +73,7 @@ def kind_of(path: str | PathLike[str], columns: Mapping[str, str] = MappingProxy
         return FileKind.CALIBRATION
     if is_json(lines[first]):
         return FileKind.SAMPLES
-    return FileKind.SAMPLES if _are_samples(lines[first:-1] or lines[first:], columns) else FileKind.TABLE
+    return FileKind.SAMPLES if has_rate or _are_samples(lines[first:-1] or lines[first:], columns) else FileKind.TABLE
 
 
 def _are_samples(lines: list[str], stated: Mapping[str, str]) -> bool:

@@ -90,7 +90,7 @@ class Stamps:
     """How a row's time is written: a number of a unit, or the stamp of a calendar, in one column or in two.
 
     decimals: of a unit in nanoseconds; factor: how many of it one is. is_date: whether it is a stamp; month_first: how
-    it is written.
+    it is written. rate_hz: of the rows, which have no time then.
     """
 
     at: tuple[int, ...]
@@ -98,9 +98,12 @@ class Stamps:
     factor: int = 1
     is_date: bool = False
     month_first: bool = False
+    rate_hz: float | None = None
 
-    def ns(self, row: CsvRow, header: Sequence[str], numbers: Numbers) -> int:
-        """The stamp of a row in nanoseconds. Raises LineError where it has none."""
+    def ns(self, row: CsvRow, header: Sequence[str], numbers: Numbers, number: int = 0) -> int:
+        """The stamp of a row in nanoseconds; number: of the row, from 0. Raises LineError where it has none."""
+        if self.rate_hz is not None:
+            return round(number * 1e9 / self.rate_hz)
         cell = row[self.at[0]] if len(self.at) == 1 else " ".join(row[at] for at in self.at)
         try:
             if self.is_date:
@@ -181,9 +184,9 @@ class CsvColumns:
         try:
             time = self.time()
             stamps, numbers = list[int](), self.numbers or DECIMAL_POINT
-            for row in self.rows:
+            for number, row in enumerate(self.rows):
                 try:
-                    stamps.append(time.ns(row, self.header, numbers))
+                    stamps.append(time.ns(row, self.header, numbers, number))
                 except LineError:
                     continue
         except InputError:
@@ -205,11 +208,17 @@ class CsvColumns:
 
     def time(self) -> Stamps:
         """How the time is written. Raises InputError where no column tells it, or not in which unit."""
+        if self.units.rate_hz is not None:
+            self.said.append(f"time from the numbers of the rows, {self.units.rate_hz:g} of them a second (--rate)")
+            return Stamps((), rate_hz=self.units.rate_hz)
         places = self._places("time") or [
             at for at, name in enumerate(self.names) if name.strip().lower() in _TIME_ALONE
         ]
         if not places:
-            raise InputError(f"no column gives the time: name it time_s or time_ns; {self.wanted}, not {self._seen}.")
+            raise InputError(
+                "no column gives the time: name it time_s or time_ns, or give the rate of the rows, for example "
+                f"--rate 100; {self.wanted}, not {self._seen}."
+            )
         exact = [at for at in places if is_exact(self.names[at])]
         united = [at for at in places if self._meanings[at].unit]
         place = self._most_even(exact or united or places)

@@ -29,6 +29,7 @@ from kf_calib.sources.files.line_parts import (
 from kf_calib.sources.tables.numbers import DECIMAL_POINT, written
 from kf_calib.sources.text.heading import BLANK, cell_spans, cells_of, without_empty_end
 
+_MINUTE_NS, _HOUR_NS = 60 * 10**9, 3600 * 10**9
 _FROM_UNIT = {"c": (1.0, 0.0), "k": (1.0, -273.15), "f": (1.0 / 1.8, -32.0 / 1.8)}
 
 
@@ -45,6 +46,7 @@ class CsvLines(LineReader):
         super().__init__(account)
         self._columns, self._delimiter, self._header = columns, columns.delimiter, columns.header
         self._time, self._accel = columns.time(), columns.accel()
+        self._row, self._added_ns, self._last_ns = -1, 0, -(2**63)
         self.raw = columns.raw
         self._numbers = columns.numbers
         attitude = columns.quaternion()
@@ -91,6 +93,16 @@ class CsvLines(LineReader):
             line = line[:start] + texts[at] + line[end:]
         return line
 
+    def _of_even_clock(self, time_ns: int) -> int:
+        """Return a stamp of a calendar with the hour by which local clocks go back at the end of summer time."""
+        time_ns += self._added_ns
+        if _HOUR_NS - _MINUTE_NS < self._last_ns - time_ns <= _HOUR_NS:
+            self._added_ns += _HOUR_NS
+            time_ns += _HOUR_NS
+            self.said.append("its stamps go back by an hour, as at the end of summer time: those after it count on")
+        self._last_ns = max(self._last_ns, time_ns)
+        return time_ns
+
     def _begin_block(self, lines: Sequence[str]) -> None:
         if self._numbers is None:
             self._numbers = self._columns.numbers_in([self._cells(line) for line in lines])
@@ -100,11 +112,14 @@ class CsvLines(LineReader):
         return line.split(self._delimiter) if is_plain else cells_of(line, self._delimiter)
 
     def _read_line(self, line: str, accel: LineRows, pose: LineRows, temperature: LineRows) -> None:
+        self._row += 1
         row = without_empty_end(self._cells(line), len(self._header))
         if len(row) != len(self._header):
             raise LineError(f"it has {len(row)} cells, the header has {len(self._header)}")
         numbers = self._numbers or DECIMAL_POINT
-        time_ns = self._time.ns(row, self._header, numbers)
+        time_ns = self._time.ns(row, self._header, numbers, self._row)
+        if self._time.is_date:
+            time_ns = self._of_even_clock(time_ns)
         # everything on the line is understood before any of it is used
         readings, angles, degrees = (
             quantity.values(row, self._header, numbers) for quantity in (self._accel, self._pose, self._temperature)

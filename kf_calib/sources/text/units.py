@@ -33,6 +33,7 @@ class Units:
     accel_scale: size of one count, in ``accel`` (m/s^2 if that is None). g: m/s^2 that 1 g stands for, or ``local``.
     input: what the device of a calibration sends, which holds where none of this is stated. is_restated: whether
     ``accel`` goes before the names of columns. counts: how the numbers are to be read.
+    rate_hz: of rows without a time.
     """
 
     accel: str | None = None
@@ -42,6 +43,7 @@ class Units:
     input: RawInput | None = None
     is_restated: bool = False
     counts: str = SIGNED
+    rate_hz: float | None = None
 
     @classmethod
     def of(
