@@ -55,8 +55,8 @@ class TimeOrder:
 
 def _fill_gaps(time_ns: Times, order: Integers, late_ns: Times) -> bool:
     """Return whether most late samples stand apart from their neighbours once all are in order."""
-    if not len(late_ns):
-        return True
+    if not len(late_ns) or len(time_ns) < 2:
+        return not len(late_ns)
     in_order = time_ns[order]
     steps = np.diff(in_order)
     at = np.searchsorted(in_order, late_ns)
