@@ -25,6 +25,7 @@ from kf_calib.errors import CountsError, InputError
 from kf_calib.sources.files.line_parts import LineError, number_of, stamp_ns
 from kf_calib.sources.tables.columns import READINGS, SPREADS
 from kf_calib.sources.tables.numbers import DECIMAL_POINT, Numbers, month_comes_first, stamp_of
+from kf_calib.sources.text.contents import is_nameless, meanings_by_numbers
 from kf_calib.sources.text.heading import TextHeading
 from kf_calib.sources.text.names import ACCEL, ANGLE, QUATERNION, TIME, Meaning, is_exact, meanings_of, unit_of_epoch
 from kf_calib.sources.text.units import Units, reading_units, size_of_count, usual_norm
@@ -125,7 +126,7 @@ class CsvColumns:
     lines_of_names: numbers, from 0, of the lines of names and units. said: what was taken for what, where that is not
     plain from the names. raw: what the readings are in. written_mps2: the unit in which specific force takes the place
     of readings, m/s^2: that of their names; without_unit: columns of counts whose names tell none, which then are in
-    m/s^2.
+    m/s^2. labelled: whether each cell has its name before its value.
     """
 
     header: Sequence[str]
@@ -139,6 +140,7 @@ class CsvColumns:
     raw: RawInput = PLAIN
     written_mps2: tuple[float, float, float] = (1.0, 1.0, 1.0)
     without_unit: tuple[int, ...] = ()
+    labelled: bool = False
     _meanings: list[Meaning] = field(default_factory=list[Meaning])
 
     @classmethod
@@ -159,7 +161,11 @@ class CsvColumns:
             raise InputError(f"two columns are named {repeated!r}: rename or remove one of them.")
         full = [row for row in heading.rows if len(row) == len(names)]
         columns = cls(header, names, heading.delimiter, full, units or Units(), local_mps2, heading.lines_of_names)
+        columns.labelled = heading.labelled
         columns._meanings = meanings_of(header, stated)
+        if is_nameless(header) and not stated:
+            columns._meanings = meanings_by_numbers(columns._values(range(len(header))))
+            columns.said.append("columns without names are told by their numbers")
         return columns
 
     @property

@@ -27,7 +27,7 @@ from kf_calib.sources.files.line_parts import (
     stamp_ns,
 )
 from kf_calib.sources.tables.numbers import DECIMAL_POINT, written
-from kf_calib.sources.text.heading import BLANK, cell_spans, cells_of, without_empty_end
+from kf_calib.sources.text.heading import BLANK, cell_spans, cells_of, unlabelled, without_empty_end
 
 _MINUTE_NS, _HOUR_NS = 60 * 10**9, 3600 * 10**9
 _FROM_UNIT = {"c": (1.0, 0.0), "k": (1.0, -273.15), "f": (1.0 / 1.8, -32.0 / 1.8)}
@@ -108,8 +108,10 @@ class CsvLines(LineReader):
             self._numbers = self._columns.numbers_in([self._cells(line) for line in lines])
 
     def _cells(self, line: str) -> list[str]:
-        is_plain = '"' not in line and " " not in line and self._delimiter != BLANK
-        return line.split(self._delimiter) if is_plain else cells_of(line, self._delimiter)
+        if '"' not in line and " " not in line and self._delimiter != BLANK:
+            return line.split(self._delimiter)
+        cells = cells_of(line, self._delimiter)
+        return unlabelled(cells) if self._columns.labelled else cells
 
     def _read_line(self, line: str, accel: LineRows, pose: LineRows, temperature: LineRows) -> None:
         self._row += 1

@@ -5,7 +5,8 @@ When the orientations of a table were measured.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
@@ -15,6 +16,7 @@ from kf_calib.bench.arrays import Floats, Mask, lengths
 from kf_calib.errors import InputError
 from kf_calib.sources.tables.grid import Cell, Grid
 from kf_calib.sources.tables.numbers import Numbers, stamps_of
+from kf_calib.sources.text.contents import is_nameless, meanings_by_numbers
 from kf_calib.sources.text.names import QUATERNION, TIME, Meaning, face_of, meaning_of, meanings_of, unit_of_epoch
 from kf_calib.support.text import cut
 
@@ -43,6 +45,8 @@ class Columns:
     def of(cls, grid: Grid, stated: Mapping[str, str], numbers: Numbers) -> Columns:
         """The columns of a grid; ``stated`` are those that the user names, theirs to ours. Raises InputError."""
         columns = cls(grid, numbers, _meanings(grid, stated))
+        if is_nameless(grid.header) and not stated:
+            columns._recognise_numbers()
         columns._leave_out_empty(set(stated))
         columns._recognise_contents({k for k, name in enumerate(grid.header) if name in stated})
         columns._refuse_doubles()
@@ -134,6 +138,17 @@ class Columns:
                 for k, ours in zip(numeric, READINGS, strict=True):
                     self._guess(k, ours)
 
+    def _recognise_numbers(self) -> None:
+        """Find time and readings in columns without names."""
+        places = [k for k in range(len(self.meanings)) if self._are_numbers(k, _MOST)]
+        if len(places) < 3:
+            return
+        whole = np.array([all(self.is_number(row[k]) for k in places) for row in self.grid.rows])
+        told = meanings_by_numbers(np.column_stack([self.values(k, only=whole)[whole] for k in places]))
+        for place, meaning in zip(places, told, strict=True):
+            if meaning.ours:
+                self._guess(place, meaning.ours)
+
     def _guess(self, place: int, ours: str) -> None:
         self.meanings[place] = Meaning(ours, self.meanings[place].unit)
         self.guessed.append(self.grid.header[place])
@@ -181,6 +196,37 @@ def _meanings(grid: Grid, stated: Mapping[str, str]) -> list[Meaning]:
         if ours != "-" and not meaning_of(ours).ours:
             raise InputError(f"--column {theirs}={ours}: {cut(ours, 60)!r} is not known: use {KNOWN}, or - for none.")
     return meanings_of(grid.header, stated)
+
+
+_MOST_OWN = 6  # rows of a table of own axes
+_UP_DOWN = re.compile(r"([+\-−])\s*1\s*g", re.IGNORECASE)
+
+
+def own_axes(columns: Columns) -> Floats | None:
+    """What each axis reads up and down (3, 2), where a table holds no more than that: a row for each face with the
+    reading of its own axis alone, or a row for each axis with those at +1 g and -1 g. None where it is another."""
+    extremes = np.full((3, 2), np.nan)
+    if len(columns.grid.rows) > _MOST_OWN:
+        return None
+    for axis, is_down, cell in _own_cells(columns):
+        if not columns.is_number(cell):
+            return None
+        extremes[axis, int(is_down)] = columns.numbers.value(cell)
+    return extremes if np.isfinite(extremes).all() else None
+
+
+def _own_cells(columns: Columns) -> Iterator[tuple[int, bool, Cell]]:
+    """Yield axis, whether it is down, and the reading of it."""
+    grid, readings = columns.grid, columns.places(*READINGS)
+    signs = {k: match[1] != "+" for k, name in enumerate(grid.header) if (match := _UP_DOWN.fullmatch(name.strip()))}
+    for row in grid.rows:
+        face = next((told for cell in row if isinstance(cell, str) and (told := face_of(cell))), None)
+        if face and len(signs) == 2:
+            yield from ((face[0], is_down, row[k]) for k, is_down in signs.items())
+        elif face and len(readings) == 3:
+            others = [row[k] for axis, k in enumerate(readings) if axis != face[0]]
+            alone = all(cell is None or cell in ("-", "–", "—") for cell in others)
+            yield face[0], face[1] < 0, row[readings[face[0]]] if alone else None
 
 
 _USUAL_PAUSE_S = 60.0

@@ -13,7 +13,8 @@ from typing import Any
 from kf_calib.errors import InputError
 from kf_calib.sources.tables.spreadsheet import sheets_of
 from kf_calib.sources.text.encoding import text_of, too_large
-from kf_calib.sources.text.heading import delimiter_in, header_in, is_comment
+from kf_calib.sources.text.heading import are_labelled, delimiter_in, header_in, is_comment, labels_in, unlabelled
+from kf_calib.sources.text.names import face_of
 from kf_calib.support.text import cut
 
 Cell = str | float | datetime | None
@@ -166,10 +167,11 @@ def _text(cell: str) -> str | None:
 def _headed(name: str, lines: Sequence[tuple[int, Sequence[Cell]]]) -> Grid:
     """Return the grid of lines, with the number that each has in the file."""
     filled = [(number, list(cells)) for number, cells in lines if cells.count(None) < len(cells)]
+    filled = _without_labels(filled)
     header, begin, named = header_in([cells for _, cells in filled]) if filled else ([], 0, ())
     if len(header) < _FEWEST:
         raise InputError(f"{name}: has no table: write a header and a row for each orientation (docs/tables.md).")
-    width, head = len(header), tuple(filled[k][0] for k in named)
+    width, head = len(header), tuple(filled[k][0] for k in named if filled[k][0])
     rows = [line for line in filled[begin:] if not is_comment(line[1])]
     if width > _MOST_COLUMNS or width * len(rows) > _MOST_CELLS:
         raise InputError(f"{name}: has {width} columns and {len(rows)} rows, more than any table of orientations: "
@@ -185,6 +187,22 @@ def _headed(name: str, lines: Sequence[tuple[int, Sequence[Cell]]]) -> Grid:
     _refuse_without_rows(name, rows)
     full = tuple(tuple([*own[:width], *[None] * (width - len(own))]) for _, own in rows)
     return Grid(name, tuple(header), tuple(number for number, _ in rows), full, head)
+
+
+def _without_labels(lines: list[tuple[int, list[Cell]]]) -> list[tuple[int, list[Cell]]]:
+    """Return lines whose cells are labelled under a header of these labels, with the face that a line before them
+    names where all have one; other lines as they are."""
+    if not (labels := labels_in([cells for _, cells in lines])):
+        return lines
+    rows, face = list[tuple[int, list[Cell]]](), None
+    for number, cells in lines:
+        if are_labelled(cells):
+            rows.append((number, [face, *unlabelled([str(cell) for cell in cells])]))
+        elif len(cells) == 1 and face_of(str(cells[0]).rstrip(": ")):
+            face = str(cells[0]).rstrip(": ")
+    if any(cells[0] is None for _, cells in rows):
+        return [(0, list[Cell](labels)), *((number, cells[1:]) for number, cells in rows)]
+    return [(0, ["face", *labels]), *rows]
 
 
 def _refuse_without_rows(name: str, rows: Sequence[object]) -> None:

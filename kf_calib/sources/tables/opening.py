@@ -15,7 +15,7 @@ from kf_calib.bench.bench import Bench, parse_axes
 from kf_calib.bench.raw_input import PLAIN, RawInput, merged_metadata
 from kf_calib.bench.streams import Orientations, Table, bench_without_angles
 from kf_calib.errors import BenchError, InputError
-from kf_calib.sources.tables.columns import HOW, KNOWN, READINGS, SPREADS, Columns, RowTimes
+from kf_calib.sources.tables.columns import HOW, KNOWN, READINGS, SPREADS, Columns, RowTimes, own_axes
 from kf_calib.sources.tables.grid import grid_of
 from kf_calib.sources.tables.numbers import Numbers
 from kf_calib.sources.text.names import ANGLE, QUATERNION, face_of
@@ -84,6 +84,7 @@ class Opening:
         """The table; what is read first is what is most often missing."""
         elapsed_s = self.times.elapsed_s
         self.refuse_samples()
+        self._refuse_own_axes()
         self._refuse_missing()
         self._say_times()
         pose = self._poses()
@@ -127,6 +128,23 @@ class Opening:
                 f"{self.grid.name}: its {len(self.grid.rows)} rows are samples, {self._step_s:.3g} s apart, and no "
                 "table with a row a dwell: evaluate them as a log of samples in a CSV file (docs/own_csv.md)."
             )
+
+    def _refuse_own_axes(self) -> None:
+        """Raise InputError, with what they tell, for readings of each axis along gravity and against it alone."""
+        extremes = own_axes(self.columns)
+        if extremes is None:
+            return
+        half = (extremes[:, 0] - extremes[:, 1]) / 2.0
+        told = reading_units(["", "", ""], np.diag(half), self.units, STANDARD_GRAVITY_MPS2)
+        unit = half.mean() if not told.is_known else STANDARD_GRAVITY_MPS2 / told.raw.factors[0]
+        scales = ", ".join(f"K{k + 1} = {size / unit:.4f}" for k, size in enumerate(half))
+        biases = ", ".join(f"b{k + 1} = {middle:g}" for k, middle in enumerate(extremes.mean(axis=1)))
+        of_mean = "" if told.is_known else " of their mean, as no unit is known"
+        raise InputError(
+            f"{self.grid.name}: has of each axis only what it reads up and down: six numbers for six unknowns, {scales}"
+            f"{of_mean}, and {biases} as written, with no degree of freedom to judge them or to tell angles: write all "
+            "three readings in each row."
+        )
 
     def _say_times(self) -> None:
         if self.times.said:
