@@ -91,6 +91,18 @@ def _with_counts(show: Callable[[Stated, str], AnyOverview]) -> AnyOverview:
             stated, reason = {**kept, **error.keys}, " ".join([reason, str(error)]).strip()
 
 
+def _options(told: Stated) -> list[str]:
+    """The options that state what the readings tell."""
+    from kf_calib.bench.raw_input import OPTIONS
+
+    return [f"{OPTIONS.get(key, f'--{key}')} {_quoted(value)}" for key, value in told.items()]
+
+
+def _bench_keys(told: Stated) -> dict[str, str]:
+    """What of it is of the bench: not which rows count."""
+    return {key: value for key, value in told.items() if key != "where"}
+
+
 def _of_messages(ctx: click.Context, path: Path, reading: ReadingOptions, tick: Tick) -> Overview:
     """What is in files of messages."""
     from kf_calib.sources.files.inventory import inventory_of
@@ -125,15 +137,14 @@ def _of_lines(
 
     told: bench keys that nobody states and the readings tell, with the ``reason``.
     """
-    from kf_calib.bench.raw_input import OPTIONS
     from kf_calib.sources.files.inventory import inventory_of_lines
     from kf_calib.sources.files.lines import Lines
 
     missing, words = {"accel_scale": reason} if reason else {}, _given(ctx, _not_of(ctx, OF_MESSAGES))
-    words += [f"{OPTIONS[key]} {value}" for key, value in told.items()]
+    words += _options(told)
     units = reading.units(told=told)
     inventory = inventory_of_lines(path, reading.renamed, units)
-    bench, angles = {**inventory.bench, **reading.keys, **told}, not reading.no_angles
+    bench, angles = {**inventory.bench, **reading.keys, **_bench_keys(told)}, not reading.no_angles
     if angles and inventory.has_angles is None:
         angles, missing["angles"] = False, _BY_HAND[1].format(or_else=" or attitude")
         words.append(_BY_HAND[0])
@@ -219,13 +230,13 @@ def _of_table(ctx: click.Context, path: Path, reading: ReadingOptions, told: Sta
     from kf_calib.sources.text.units import size_of_count
     from kf_calib.views.overview import TableOverview
 
-    bench = {**reading.keys, **told}
+    bench = {**reading.keys, **_bench_keys(told)}
     table = survey(path, bench, reading.renamed, reading.units(told=told), angles=not reading.no_angles)
     lacking = _lacks(bench, table.orientation == "angles")
     least = LEAST if table.has_sigma else LEAST_WITHOUT_SIGMA
     missing = [each for each in (reason, table.trouble) if each]
     words = _given(ctx, _not_of(ctx, OF_MESSAGES + OF_DWELLS))
-    words += [f"{OPTIONS[key]} {value}" for key, value in told.items()]
+    words += _options(told)
     if table.is_by_hand and not reading.no_angles:
         words.append(_BY_HAND[0])
         missing.append(_BY_HAND[1].format(or_else=", attitude or face"))

@@ -161,6 +161,9 @@ class ReadingOptions:
     rate_hz: Annotated[float | None, _of_input(
         "--rate", type=POSITIVE, metavar="HZ",
         help="Rows a second of a log in lines that has no column of time.")] = None
+    where: Annotated[str | None, _of_input(
+        "--where", metavar="COLUMN=VALUE",
+        help="The rows of a log in lines that count, where it has several sensors: --where I=0.")] = None
     accel_topic: Annotated[str | None, _of_input(
         "--accel-topic", metavar="TOPIC", help="Topic of the accelerometer, where there are several.")] = None
     pose_topic: Annotated[str | None, _of_input(
@@ -194,7 +197,8 @@ class ReadingOptions:
         """Units of a table or a log; told: bench keys beside those of the options."""
         from kf_calib.sources.text.units import Units
 
-        return replace(Units.of({**self.keys, **told}, self.angle_unit, self.g_unit, input), rate_hz=self.rate_hz)
+        return replace(Units.of({**self.keys, **told}, self.angle_unit, self.g_unit, input),
+                       rate_hz=self.rate_hz, where=told.get("where", self.where or ""))  # fmt: skip
 
     def messages(self, path: Path, angles: bool, input: RawInput | None = None) -> Recording:
         """The recording of samples at a path; angles: whether it must have angles."""
@@ -222,7 +226,7 @@ class ReadingOptions:
         columns, angles = self.renamed, not self.no_angles
         match self.kind(path):
             case FileKind.TABLE:
-                refuse_given(OF_MESSAGES + OF_DWELLS, f"{path} is a table of mean readings")
+                refuse_given(OF_MESSAGES + OF_DWELLS + _OF_LINES, f"{path} is a table of mean readings")
                 return open_table(path, self.keys, columns=columns, angles=angles, input=input,
                                   angle_unit=self.angle_unit, g_unit=self.g_unit)  # fmt: skip
             case FileKind.SAMPLES:
@@ -377,10 +381,12 @@ def _bench_from_toml(path: Path) -> dict[str, str]:
     return keys
 
 
-_OF_TEXT = ("columns", "g_unit", "rate_hz")
+_OF_TEXT = ("columns", "g_unit", "rate_hz", "where")
+_OF_LINES = ("rate_hz", "where")
 OF_MESSAGES = ("accel_topic", "pose_topic", "temperature_topic", "fields", "max_chunk_mb")
 OF_DWELLS = ("joints", "settle_s", "still_deg", "gate", "gate_sigma")
-"""Options that act on text and spreadsheets only, on files of messages only, and where dwells are to be found."""
+"""Options that act on text and spreadsheets only, on logs in lines only, on files of messages only, and where dwells
+are to be found."""
 
 
 def refuse_given(names: Sequence[str], what: str) -> None:

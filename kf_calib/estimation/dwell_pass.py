@@ -172,8 +172,11 @@ def _refuse_restless(dwells: Sequence[DwellFactor], tally: Tally) -> None:
         raise InputError(
             f"no dwell was found in {tally.read} readings ({tally.moving} moving, {tally.settling} settling, "
             f"{tally.not_finite} not finite, {tally.too_large} too large): "
-            + (tally.restless or "it never lay still: without angles it must, for at least a second and a half on each "
-               "side; if it did, raise --still-deg or lower --settle-s")
+            + (
+                tally.restless
+                or "it never lay still: without angles it must, for at least a second and a half on each "
+                "side; if it did, raise --still-deg or lower --settle-s"
+            )
             + "."
         )
 

@@ -126,7 +126,8 @@ class CsvColumns:
     lines_of_names: numbers, from 0, of the lines of names and units. said: what was taken for what, where that is not
     plain from the names. raw: what the readings are in. written_mps2: the unit in which specific force takes the place
     of readings, m/s^2: that of their names; without_unit: columns of counts whose names tell none, which then are in
-    m/s^2. labelled: whether each cell has its name before its value.
+    m/s^2. labelled: whether each cell has its name before its value. chosen: a column, and the
+    cell in it of the rows that count; None where all do.
     """
 
     header: Sequence[str]
@@ -141,6 +142,7 @@ class CsvColumns:
     written_mps2: tuple[float, float, float] = (1.0, 1.0, 1.0)
     without_unit: tuple[int, ...] = ()
     labelled: bool = False
+    chosen: tuple[int, str] | None = None
     _meanings: list[Meaning] = field(default_factory=list[Meaning])
 
     @classmethod
@@ -162,6 +164,8 @@ class CsvColumns:
         full = [row for row in heading.rows if len(row) == len(names)]
         columns = cls(header, names, heading.delimiter, full, units or Units(), local_mps2, heading.lines_of_names)
         columns.labelled = heading.labelled
+        if columns.units.where:
+            columns._choose(columns.units.where)
         columns._meanings = meanings_of(header, stated)
         if is_nameless(header) and not stated:
             columns._meanings = meanings_by_numbers(columns._values(range(len(header))))
@@ -356,7 +360,7 @@ class CsvColumns:
         return [at for at, own in enumerate(self._meanings) if own.ours == ours]
 
     def refuse_several_units(self, used: Container[int]) -> None:
-        """Raise InputError where a column that means nothing to us tells several sensors apart, whose rows take turns.
+        """Raise CountsError where a column that means nothing to us tells several sensors apart, whose rows take turns.
 
         used: columns that have a meaning. Labels are few, each has a tenth of the rows, they change in three of ten
         rows, and readings under different ones differ by more than their scatter lets them.
@@ -365,7 +369,8 @@ class CsvColumns:
         if len(places) != 3 or len(self.rows) < _FEWEST_ROWS:
             return
         for at, name in enumerate(self.names):
-            labels = [] if at in used or not name else [row[at].strip() for row in self.rows]
+            is_told = at in used or not name or (self.chosen is not None and at == self.chosen[0])
+            labels = [] if is_told else [row[at].strip() for row in self.rows]
             shares = Counter(labels)
             turns = [k for k in range(len(labels) - 1) if labels[k] != labels[k + 1]]
             if not 2 <= len(shares) <= _MOST_UNITS or min(shares.values()) < 0.1 * len(labels):
@@ -380,11 +385,28 @@ class CsvColumns:
             if not (np.abs(middle) > _APART * np.maximum(spread, 1e-300)).any():
                 continue
             shown = ", ".join(sorted(shares)[:4])
-            raise InputError(
+            example = f"{cut(name, 40)}={first}"
+            raise CountsError(
                 f"the rows are of several sensors, told apart by the column {cut(self.header[at], 40)!r} ({shown}): "
-                f"keep those of one, as by awk -F'{self.delimiter}' 'NR == 1 || ${at + 1} == \"{first}\"', or leave "
-                f"the column out if it means something else (--column {cut(self.header[at], 40) + '=-'!r})."
+                f"choose one, for example by --where {example!r}, or leave the column out if it means something else "
+                f"(--column {cut(self.header[at], 40) + '=-'!r}).",
+                {"where": example},
             )
+
+    def _choose(self, where: str) -> None:
+        """Keep the rows whose cell in a column is the one stated, as ``I=0``; raises InputError where there is none."""
+        name, _, value = where.rpartition("=")
+        if name not in self.header:
+            raise InputError(
+                f"has no column {cut(name, 60)!r} (--where), it has {cut(', '.join(map(repr, self.header)), 300)}."
+            )
+        at = list(self.header).index(name)
+        labels = [row[at].strip() for row in self.rows]
+        if value not in labels:
+            seen = ", ".join(sorted(set(labels))[:8])
+            raise InputError(f"no row among the first has {value!r} in column {name!r} (--where), they have {seen}.")
+        self.chosen = (at, value)
+        self.rows = [row for row, label in zip(self.rows, labels, strict=True) if label == value]
 
     def _values(self, places: Sequence[int], rows: Sequence[CsvRow] | None = None) -> Floats:
         """Return the numbers (n, k) in columns of rows (None: of the first), NaN where there is none."""

@@ -46,6 +46,7 @@ class CsvLines(LineReader):
         super().__init__(account)
         self._columns, self._delimiter, self._header = columns, columns.delimiter, columns.header
         self._time, self._accel = columns.time(), columns.accel()
+        self._chosen = columns.chosen
         self._row, self._added_ns, self._last_ns = -1, 0, -(2**63)
         self.raw = columns.raw
         self._numbers = columns.numbers
@@ -58,7 +59,13 @@ class CsvLines(LineReader):
         self._temperature, unit = columns.temperature()
         self._warmth = _FROM_UNIT[unit]
         self.said = columns.said
-        used = {*self._time.at, *self._accel.at, *self._pose.at, *self._temperature.at}
+        used = {
+            *([self._chosen[0]] if self._chosen else []),
+            *self._time.at,
+            *self._accel.at,
+            *self._pose.at,
+            *self._temperature.at,
+        }
         columns.refuse_several_units(used)
         self._account.leave_out(name for at, name in enumerate(columns.names) if at not in used)
 
@@ -119,6 +126,9 @@ class CsvLines(LineReader):
         if len(row) != len(self._header):
             raise LineError(f"it has {len(row)} cells, the header has {len(self._header)}")
         numbers = self._numbers or DECIMAL_POINT
+        if self._chosen is not None and row[self._chosen[0]].strip() != self._chosen[1]:
+            self._row -= 1
+            return
         time_ns = self._time.ns(row, self._header, numbers, self._row)
         if self._time.is_date:
             time_ns = self._of_even_clock(time_ns)
