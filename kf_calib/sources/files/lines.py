@@ -349,7 +349,7 @@ class _Passage:
         self.account.lines += len(lines)
         if count := len(batch.accel):
             self._has_accel = True
-            self._sampled.append(batch.accel.values[:: count // _SAMPLED + 1])
+            self._sampled.append(batch.accel.values[:: count // _SAMPLED + 1].copy())
         self._has_pose |= len(batch.pose) > 0
         return batch
 
