@@ -68,7 +68,7 @@ def counts_in(numbers: Floats) -> str:
     """How numbers (n, 3) of a sensor that mostly rests are to be read, as ``parse_counts`` takes it; empty where they
     are right as they are, or nothing tells."""
     numbers = numbers[np.isfinite(numbers).all(axis=1)]
-    if len(numbers) < _FEWEST or numbers.min() < 0.0:
+    if len(numbers) < _FEWEST or numbers.min() < 0.0 or not numbers.any():
         return ""
     return _offset_in(numbers) if _rests(numbers).mean() > _MOST else _wrapped_in(numbers) or _offset_in(numbers)
 

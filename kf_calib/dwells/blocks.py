@@ -125,8 +125,7 @@ class Tally:
     - short_dwells: dwells too short for the whole margin after the arrival; least_settling_s: the shortest margin used.
     - turned_deg: largest rotation of the platform within a block that counts as still.
     - noise_rad: largest noise of angles from message to message, by which more than the tolerance counts as still.
-    - lasted_s: from the first reading to the last; step_mps2_2, double_step_mps2_2: squares of the changes of readings
-      from one to the next, and to the next but one, summed over the first thousand.
+    - restless: why no dwell would be found, as far as stamps and readings tell, and what to do; known at the end.
     """
 
     read: int = 0
@@ -150,36 +149,28 @@ class Tally:
     least_settling_s: float = math.inf
     turned_deg: float = 0.0
     noise_rad: float = 0.0
-    lasted_s: float = 0.0
-    step_mps2_2: float = 0.0
-    double_step_mps2_2: float = 0.0
+    restless: str = ""
 
-    def look_at(self, first: Floats) -> None:
-        """Keep the squares of the changes of the first readings (n, 3), from one to the next and the next but one."""
-        self.step_mps2_2 = float(np.sum(np.diff(first, axis=0) ** 2))
-        self.double_step_mps2_2 = float(np.sum((first[2:] - first[:-2]) ** 2))
-
-    @property
-    def restless(self) -> str:
-        """Why no dwell was found, as far as stamps and readings tell, and what to do."""
-        period_s = self.lasted_s / max(self.read - 1, 1)
+    def look_for_trouble(self, first: Floats, lasted_s: float) -> None:
+        """Say in ``restless`` what the first readings (n, 3), and how long all lasted, tell of a run without dwells."""
+        period_s = lasted_s / max(self.read - 1, 1)
+        step, double_step = (float(np.sum((first[lag:] - first[:-lag]) ** 2)) for lag in (1, 2))
         if self.repeated + self.backward > 0.1 * self.read:
-            return (
+            self.restless = (
                 f"the stamps of {self.repeated} repeat the one before and those of {self.backward} jump back, so that "
                 "these are dropped: name another column or topic for the time, or give the rate of the rows of a text "
                 "by --rate"
             )
-        if self.double_step_mps2_2 < _ALTERNATING * self.step_mps2_2:
-            return (
+        elif double_step < _ALTERNATING * step:
+            self.restless = (
                 "each reading is more like the next but one than like the next, as of two sensors that take turns: "
                 "choose one, by --where COLUMN=VALUE or its topic"
             )
-        if self.lasted_s and not _PERIODS_S[0] < period_s < _PERIODS_S[1]:
-            return (
+        elif lasted_s and not _PERIODS_S[0] < period_s < _PERIODS_S[1]:
+            self.restless = (
                 f"the readings are {period_s:.3g} s apart by their stamps: if these are in a unit that is a thousand "
                 "times smaller or larger, say so, for example by --column 'THEIRS=time_ms'"
             )
-        return ""
 
     def sentences(self) -> list[str]:
         """One sentence for each kind of sample that was dropped or rejected."""

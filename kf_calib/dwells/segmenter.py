@@ -125,6 +125,9 @@ class Segmenter:
         if not final:
             self.tally.read += len(batch.accel)
         self._take_readings(batch.accel)
+        if final:
+            lasted_ns = (self._orders[0].last_ns or 0) - (self.first_ns or 0)
+            self.tally.look_for_trouble(self._first, lasted_ns / SECOND_NS)
         self._take_poses(batch.pose, final)
         if len(batch.temperature):
             warm = batch.temperature
@@ -147,11 +150,8 @@ class Segmenter:
         accel = self._orders[0](accel, self.tally, self.first_ns)
         if self.first_ns is None and len(accel):
             self.first_ns = int(accel.time_ns[0])
-        if len(accel):
-            self.tally.lasted_s = (int(accel.time_ns[-1]) - (self.first_ns or 0)) / SECOND_NS
-            if len(self._first) < _TELLING:
-                self._first = np.concatenate([self._first, accel.values[: _TELLING - len(self._first)]])
-                self.tally.look_at(self._first)
+        if len(self._first) < _TELLING:
+            self._first = np.concatenate([self._first, accel.values[: _TELLING - len(self._first)]])
         self._accel += accel
 
     def _take_poses(self, pose: Stream, final: bool) -> None:

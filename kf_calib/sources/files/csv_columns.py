@@ -27,6 +27,7 @@ from kf_calib.sources.tables.columns import READINGS, SPREADS
 from kf_calib.sources.tables.numbers import DECIMAL_POINT, Numbers, month_comes_first, stamp_of
 from kf_calib.sources.text.contents import is_nameless, meanings_by_numbers
 from kf_calib.sources.text.heading import TextHeading
+from kf_calib.sources.text.labels import Labels
 from kf_calib.sources.text.names import ACCEL, ANGLE, QUATERNION, TIME, Meaning, is_exact, meanings_of, unit_of_epoch
 from kf_calib.sources.text.units import Units, reading_units, size_of_count, usual_norm
 from kf_calib.support.text import cut
@@ -126,7 +127,7 @@ class CsvColumns:
     lines_of_names: numbers, from 0, of the lines of names and units. said: what was taken for what, where that is not
     plain from the names. raw: what the readings are in. written_mps2: the unit in which specific force takes the place
     of readings, m/s^2: that of their names; without_unit: columns of counts whose names tell none, which then are in
-    m/s^2. labelled: whether each cell has its name before its value. chosen: a column, and the
+    m/s^2. labels: where each value has its name before it. chosen: a column, and the
     cell in it of the rows that count; None where all do.
     """
 
@@ -141,7 +142,7 @@ class CsvColumns:
     raw: RawInput = PLAIN
     written_mps2: tuple[float, float, float] = (1.0, 1.0, 1.0)
     without_unit: tuple[int, ...] = ()
-    labelled: bool = False
+    labels: Labels | None = None
     chosen: tuple[int, str] | None = None
     _meanings: list[Meaning] = field(default_factory=list[Meaning])
 
@@ -163,7 +164,7 @@ class CsvColumns:
             raise InputError(f"two columns are named {repeated!r}: rename or remove one of them.")
         full = [row for row in heading.rows if len(row) == len(names)]
         columns = cls(header, names, heading.delimiter, full, units or Units(), local_mps2, heading.lines_of_names)
-        columns.labelled = heading.labelled
+        columns.labels = heading.labels
         if columns.units.where:
             columns._choose(columns.units.where)
         columns._meanings = meanings_of(header, stated)

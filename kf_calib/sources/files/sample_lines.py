@@ -27,7 +27,7 @@ from kf_calib.sources.files.line_parts import (
     stamp_ns,
 )
 from kf_calib.sources.tables.numbers import DECIMAL_POINT, written
-from kf_calib.sources.text.heading import BLANK, cell_spans, cells_of, unlabelled, without_empty_end
+from kf_calib.sources.text.heading import BLANK, cell_spans, cells_of, without_empty_end
 
 _MINUTE_NS, _HOUR_NS = 60 * 10**9, 3600 * 10**9
 _FROM_UNIT = {"c": (1.0, 0.0), "k": (1.0, -273.15), "f": (1.0 / 1.8, -32.0 / 1.8)}
@@ -94,7 +94,8 @@ class CsvLines(LineReader):
 
     def _replaced(self, line: str, texts: Mapping[int, str]) -> str:
         """A line with other texts in these cells, and all else as it stands."""
-        spans = cell_spans(line, self._delimiter)
+        labels = self._columns.labels
+        spans = cell_spans(line, self._delimiter) if labels is None else labels.spans(line)
         for at in sorted(texts, reverse=True):
             start, end = spans[at]
             line = line[:start] + texts[at] + line[end:]
@@ -115,14 +116,17 @@ class CsvLines(LineReader):
             self._numbers = self._columns.numbers_in([self._cells(line) for line in lines])
 
     def _cells(self, line: str) -> list[str]:
+        if self._columns.labels is not None:
+            return self._columns.labels.values(line)
         if '"' not in line and " " not in line and self._delimiter != BLANK:
             return line.split(self._delimiter)
-        cells = cells_of(line, self._delimiter)
-        return unlabelled(cells) if self._columns.labelled else cells
+        return cells_of(line, self._delimiter)
 
     def _read_line(self, line: str, accel: LineRows, pose: LineRows, temperature: LineRows) -> None:
+        if not (cells := self._cells(line)) and self._columns.labels is not None:
+            return  # of something else than readings
         self._row += 1
-        row = without_empty_end(self._cells(line), len(self._header))
+        row = without_empty_end(cells, len(self._header))
         if len(row) != len(self._header):
             raise LineError(f"it has {len(row)} cells, the header has {len(self._header)}")
         numbers = self._numbers or DECIMAL_POINT

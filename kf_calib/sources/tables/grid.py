@@ -13,7 +13,8 @@ from typing import Any
 from kf_calib.errors import InputError
 from kf_calib.sources.tables.spreadsheet import sheets_of
 from kf_calib.sources.text.encoding import text_of, too_large
-from kf_calib.sources.text.heading import are_labelled, delimiter_in, header_in, is_comment, labels_in, unlabelled
+from kf_calib.sources.text.heading import delimiter_in, header_in, is_comment
+from kf_calib.sources.text.labels import Labels
 from kf_calib.sources.text.names import face_of
 from kf_calib.support.text import cut
 
@@ -78,6 +79,8 @@ def grid_of(table: Any) -> Grid:
 def _of_text(path: Path) -> Grid:
     """Return the cells of a CSV file: any usual encoding and delimiter, with or without lines above the header."""
     lines = text_of(path, _LARGEST[0]).splitlines()
+    if labels := Labels.of(lines):
+        return _headed(str(path), _labelled(lines, labels))
     delimiter, skipped = delimiter_in(lines)
     try:
         reader = csv.reader(lines[skipped:], delimiter=delimiter, skipinitialspace=True)
@@ -167,7 +170,6 @@ def _text(cell: str) -> str | None:
 def _headed(name: str, lines: Sequence[tuple[int, Sequence[Cell]]]) -> Grid:
     """Return the grid of lines, with the number that each has in the file."""
     filled = [(number, list(cells)) for number, cells in lines if cells.count(None) < len(cells)]
-    filled = _without_labels(filled)
     header, begin, named = header_in([cells for _, cells in filled]) if filled else ([], 0, ())
     if len(header) < _FEWEST:
         raise InputError(f"{name}: has no table: write a header and a row for each orientation (docs/tables.md).")
@@ -189,20 +191,17 @@ def _headed(name: str, lines: Sequence[tuple[int, Sequence[Cell]]]) -> Grid:
     return Grid(name, tuple(header), tuple(number for number, _ in rows), full, head)
 
 
-def _without_labels(lines: list[tuple[int, list[Cell]]]) -> list[tuple[int, list[Cell]]]:
-    """Return lines whose cells are labelled under a header of these labels, with the face that a line before them
-    names where all have one; other lines as they are."""
-    if not (labels := labels_in([cells for _, cells in lines])):
-        return lines
+def _labelled(lines: Sequence[str], labels: Labels) -> list[tuple[int, list[Cell]]]:
+    """Return labelled lines as rows under a header, with the face that a line before them names where all have one."""
     rows, face = list[tuple[int, list[Cell]]](), None
-    for number, cells in lines:
-        if are_labelled(cells):
-            rows.append((number, [face, *unlabelled([str(cell) for cell in cells])]))
-        elif len(cells) == 1 and face_of(str(cells[0]).rstrip(": ")):
-            face = str(cells[0]).rstrip(": ")
+    for number, line in enumerate(lines, start=1):
+        if values := labels.values(line):
+            rows.append((number, [face, *values]))
+        elif face_of(line.strip().rstrip(": ")):
+            face = line.strip().rstrip(": ")
     if any(cells[0] is None for _, cells in rows):
-        return [(0, list[Cell](labels)), *((number, cells[1:]) for number, cells in rows)]
-    return [(0, ["face", *labels]), *rows]
+        return [(0, list[Cell](labels.header)), *((number, cells[1:]) for number, cells in rows)]
+    return [(0, ["face", *labels.header]), *rows]
 
 
 def _refuse_without_rows(name: str, rows: Sequence[object]) -> None:

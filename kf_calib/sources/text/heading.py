@@ -7,6 +7,7 @@ import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from kf_calib.sources.text.labels import Labels
 from kf_calib.sources.text.names import is_unit
 
 _DELIMITERS = ";\t,|"
@@ -19,9 +20,6 @@ _ROWS = 1000  # that are looked at
 _MARK = re.compile(r"\s*(?:#|%|//)+\s*")
 """Before a comment, or before names."""
 _NUMBER = re.compile(r"[+\-−]?[\d.,]*\d[\d.,]*(?:[eE][+\-]?\d+)?|[+\-]?nan", re.IGNORECASE)
-_LABELLED = re.compile(
-    r"\s*([^\W\d][^:=]*?)\s*[:=]\s*([+\-−]?[\d.,]*\d[\d.,]*(?:[eE][+\-]?\d+)?)\s*([^\d\s][^\d]*\^?\d?|)\s*"
-)
 NAMELESS = "column {}"
 """The name of a column of a text without a heading, counted from 1."""
 
@@ -29,8 +27,8 @@ NAMELESS = "column {}"
 class TextHeading(NamedTuple):
     """The names of the columns, what is between cells, how many lines go before the first row, and the first rows.
 
-    lines_of_names: numbers, from 0, of the line with the names and, where there is one, of that with units. labelled:
-    whether each cell has its name before its value.
+    lines_of_names: numbers, from 0, of the line with the names and, where there is one, of that with units. labels:
+    where each value has its name before it.
     """
 
     header: Sequence[str]
@@ -38,17 +36,16 @@ class TextHeading(NamedTuple):
     lines: int
     rows: Sequence[Sequence[str]]
     lines_of_names: tuple[int, ...] = ()
-    labelled: bool = False
+    labels: Labels | None = None
 
     @classmethod
     def of(cls, lines: Sequence[str]) -> TextHeading:
         """The heading of lines from the beginning of a file or a stream, of which there is at least one."""
+        if labels := Labels.of(lines[:_ROWS]):
+            values = [(k, own) for k, line in enumerate(lines[: 2 * _ROWS]) if (own := labels.values(line))]
+            return cls(labels.header, ",", values[0][0], [own for _, own in values], labels=labels)
         delimiter, start = delimiter_in(lines[:_ROWS])
         cells = [cells_of(line.lstrip("\ufeff"), delimiter) for line in lines[start : start + 2 * _ROWS]]
-        if labels := labels_in(cells):
-            begin = next(k for k, row in enumerate(cells) if are_labelled(row))
-            rows = [unlabelled(row) for row in cells[begin : begin + _ROWS]]
-            return cls(labels, delimiter, start + begin, rows, labelled=True)
         header, begin, named = header_in(cells)
         rows = [without_empty_end(row, len(header)) for row in cells[begin : begin + _ROWS]]
         return cls(header, delimiter, start + begin, rows, tuple(start + k for k in named))
@@ -76,27 +73,6 @@ def _delimiter_of(lines: Sequence[str]) -> str:
         return best if fitness(best) or fitness(BLANK) < 2 else BLANK
     except csv.Error:
         return ","
-
-
-def labels_in(rows: Sequence[Sequence[object]]) -> list[str]:
-    """The names of columns whose cells are all labelled, as ``X: -0.06, Y: 0.00, Z: 8.44 m/s^2``; none where these are
-    not."""
-    first = next((row for row in rows if _filled(row) >= _FEWEST_CELLS), ())
-    if not are_labelled(first):
-        return []
-    parts = [match.groups() for cell in first if (match := _LABELLED.fullmatch(str(cell)))]
-    unit = parts[-1][2] if is_unit(parts[-1][2]) else ""
-    return [f"{name.strip()} [{own or unit}]" if is_unit(own or unit) else name.strip() for name, _, own in parts]
-
-
-def are_labelled(row: Sequence[object]) -> bool:
-    """Whether each cell of a row, of which there are some, has its name before its value."""
-    return _filled(row) >= _FEWEST_CELLS and all(isinstance(cell, str) and _LABELLED.fullmatch(cell) for cell in row)
-
-
-def unlabelled(row: Sequence[str]) -> list[str]:
-    """The values of labelled cells."""
-    return [match[2] if (match := _LABELLED.fullmatch(cell)) else cell for cell in row]
 
 
 def header_in(rows: Sequence[Sequence[object]]) -> tuple[list[str], int, tuple[int, ...]]:

@@ -61,13 +61,32 @@ def test_labelled_lines_of_a_serial_port_are_a_table_with_their_faces(run: Any, 
     check(found(run, path))
 
 
-def test_labelled_lines_are_a_log_with_a_rate(run: Any, tmp_path: Path) -> None:
+@pytest.mark.parametrize("between", ["; ", " ", "\t", " | "])
+def test_labelled_lines_are_a_log_with_a_rate(between: str, run: Any, tmp_path: Path) -> None:
+    """Lines of something else among them are passed over, as of the gyroscope and the thermometer."""
     rng = np.random.default_rng(2)
     forces = np.repeat(DIRECTIONS * K + BIAS, 200, axis=0)
     forces += rng.normal(0, 1e-4, forces.shape)
     path = tmp_path / "serial.log.csv"
-    path.write_text("".join(f"aX = {x:.6f} g; aY = {y:.6f} g; aZ = {z:.6f} g\n" for x, y, z in forces))
+    other = between.join(["Rotation X: 0.03", "Y: -0.01", "Z: 0.00 rad/s"]) + "\nTemperature: 25.3 degC\n\n"
+    rows = (between.join([f"aX = {x:.6f} g", f"aY = {y:.6f} g", f"aZ = {z:.6f} g"]) for x, y, z in forces)
+    path.write_text("".join(f"{row}\n{other}" for row in rows))
     check(found(run, path, "--rate", 50))
+
+
+def test_a_copy_of_labelled_lines_keeps_its_labels(run: Any, tmp_path: Path) -> None:
+    rows = G * (DIRECTIONS * K + BIAS)
+    path, copy = tmp_path / "serial.txt", tmp_path / "copy.txt"
+    path.write_text("".join(f"X: {x:.4f}, Y: {y:.4f}, Z: {z:.4f} m/s^2\n" for x, y, z in rows))
+    saved = tmp_path / "cal.json"
+    options = ("--gravity", G, "--no-angles", "--scatter-sigma", 0.001)
+    assert run("replay", path, *options, "--save", saved)[0] == 0
+    code, _, err = run("apply", saved, path, "-o", copy)
+    assert code == 0, err
+    lines = copy.read_text().splitlines()
+    assert len(lines) == len(rows) and all(line.startswith("X: ") and line.endswith(" m/s^2") for line in lines)
+    values = np.array([[float(part.split(":")[1].split()[0]) for part in line.split(",")] for line in lines])
+    np.testing.assert_allclose(np.linalg.norm(values, axis=1), G, atol=0.01)
 
 
 OWN = {
