@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from kf_calib.bench.streams import Table
-from kf_calib.errors import InputError
+from kf_calib.errors import CountsError, InputError
 from kf_calib.sources.opening import opened
 from kf_calib.sources.text.names import Meaning, meaning_of, meanings_of
 
@@ -109,6 +109,22 @@ def test_the_accelerometer_is_found_in_the_logs_of_others(layout: str, tmp_path:
     assert len(readings) == COUNT
     times = np.concatenate([batch.accel.time_ns for batch in batches])
     np.testing.assert_allclose(np.diff(times), 1e7, atol=1e3)  # of two stamps the even one
+
+
+def test_a_blackbox_gets_the_size_of_its_counts_by_option(tmp_path: Path) -> None:
+    path = tmp_path / "LOG00001.01.csv"
+    columns = {"loopIteration": cells(range(COUNT), "{}"), " time (us)": cells(1e6 * SECONDS + 2e7, "{:.0f}"),
+               **constant("0", " axisP[0]", " axisP[1]", " axisP[2]"), **three(" gyroADC[{}]", 9 * OTHER, "012"),
+               **three(" accSmooth[{}]", np.rint(2048 * FORCE / G), "012"),
+               **constant("IDLE", " failsafePhase (flags)"),
+               **three(" {}", OTHER, ("roll", "pitch", "heading"))}  # fmt: skip
+    path.write_text("\n".join([",".join(columns), *map(",".join, zip(*columns.values(), strict=True)), ""]))
+    option = {"accel_unit": "g", "accel_scale": "0.00048828125"}
+    with pytest.raises(CountsError, match=r"--accel-unit g --accel-scale 0\.00048828125") as caught:
+        opened(path, {"gravity_mps2": str(G)}, angles=False).bench  # noqa: B018 (the bench is read by the asking)
+    assert caught.value.keys == option
+    source = opened(path, {"gravity_mps2": str(G), **option}, angles=False)
+    np.testing.assert_allclose(np.concatenate([batch.accel.values for batch in source]), FORCE, atol=G / 4000)
 
 
 def test_a_table_of_nine_axes_is_of_the_accelerometer_alone(tmp_path: Path) -> None:
