@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, Mask, lengths
-from kf_calib.errors import BenchError
+from kf_calib.errors import BenchError, CountsError
 from kf_calib.support.text import cut, number_from
 
 SIGNED = "signed"
@@ -71,6 +71,17 @@ def counts_in(numbers: Floats) -> str:
     if len(numbers) < _FEWEST or numbers.min() < 0.0 or not numbers.any():
         return ""
     return _offset_in(numbers) if _rests(numbers).mean() > _MOST else _wrapped_in(numbers) or _offset_in(numbers)
+
+
+def refuse_unread(numbers: Floats, stated: str, name: str = "the run") -> None:
+    """Raise CountsError where the numbers (n, 3) of readings show that they are to be read otherwise than is stated."""
+    if stated == SIGNED and (told := counts_in(numbers)):
+        exact = ": state exactly what the converter has, such as 2^20 counts of 3.9e-6" if "wrap" in told else ""
+        raise CountsError(
+            f"{name}: the readings are about as large in every direction only where their numbers are read as {told} "
+            f"(of a converter without a sign, or about another code than 0): add --counts {told}{exact}.",
+            {"counts": told},
+        )
 
 
 def _wrapped_in(numbers: Floats) -> str:

@@ -15,6 +15,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import lengths
 from kf_calib.bench.bench import Bench
+from kf_calib.bench.counts import refuse_unread
 from kf_calib.bench.raw_input import LEVELS, wrong_unit
 from kf_calib.bench.streams import Source, Table
 from kf_calib.dwells import window_average
@@ -158,6 +159,7 @@ def refuse_unusable(dwells: Sequence[DwellFactor], tally: Tally, bench: Bench) -
             "the readings never change, not even by noise: the sensor or what logs it has stopped, or a channel is at "
             "the end of its range."
         )
+    refuse_unread(bench.input.raw(means_mps2), bench.input.counts)
     level = float(np.median(lengths(means_mps2))) / bench.gravity_mps2
     if LEVELS[0] <= level <= LEVELS[1]:
         if bench.angles:

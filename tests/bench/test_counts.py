@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kf_calib.bench.counts import counts_in, parse_counts
+from kf_calib.bench.counts import counts_in, parse_counts, refuse_unread
 from kf_calib.bench.raw_input import RawInput
-from kf_calib.errors import BenchError
+from kf_calib.errors import BenchError, CountsError
 
 FACES = np.array([(0, 0, 1), (0, 0, -1), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)])
 NAMES = ("+z", "-z", "+x", "-x", "+y", "-y")
@@ -100,6 +100,14 @@ def test_what_info_proposes_for_a_log_without_a_sign_works(run: Any, tmp_path: P
     assert [found[f"K{k}"] for k in (1, 2, 3)] == pytest.approx(K.tolist(), abs=3e-3)
     code, _, err = run("replay", path, "--gravity", G, "--no-angles", "--accel-unit", "g", "--accel-scale", 1 / 256)
     assert code == 2 and "add --counts unsigned16" in err
+
+
+def test_a_recording_without_a_sign_is_told_by_its_dwells() -> None:
+    counts = np.mod(np.rint(256.0 * in_g(FACES)), 65536.0)
+    with pytest.raises(CountsError, match=r"^the run: .* add --counts unsigned16\.$") as caught:
+        refuse_unread(counts, "signed")
+    assert caught.value.keys == {"counts": "unsigned16"}
+    refuse_unread(counts, "unsigned16")
 
 
 @pytest.mark.parametrize(("names", "numbers", "option"), [

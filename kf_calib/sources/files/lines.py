@@ -20,6 +20,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
+from kf_calib.bench.counts import refuse_unread
 from kf_calib.bench.raw_input import CONVERTED, PLAIN, RESTATE, RawInput, merged_metadata
 from kf_calib.bench.streams import Batch, bench_without_angles, with_accel, without_poses
 from kf_calib.errors import BenchError, CountsError, InputError
@@ -30,7 +31,7 @@ from kf_calib.sources.files.sample_lines import CsvLines, JsonLines
 from kf_calib.sources.tables.columns import HOW
 from kf_calib.sources.text.encoding import Cutter, TextFile
 from kf_calib.sources.text.heading import TextHeading
-from kf_calib.sources.text.units import Units, refuse_unread
+from kf_calib.sources.text.units import Units
 from kf_calib.support.text import cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, lengths
 from kf_calib.bench.bench import Bench, parse_axes
+from kf_calib.bench.counts import refuse_unread
 from kf_calib.bench.raw_input import PLAIN, RawInput, merged_metadata
 from kf_calib.bench.streams import Orientations, Table, bench_without_angles
 from kf_calib.errors import BenchError, InputError
@@ -19,7 +20,7 @@ from kf_calib.sources.tables.columns import HOW, KNOWN, READINGS, SPREADS, Colum
 from kf_calib.sources.tables.grid import grid_of
 from kf_calib.sources.tables.numbers import Numbers
 from kf_calib.sources.text.names import ANGLE, QUATERNION, face_of
-from kf_calib.sources.text.units import Units, mps2_per, reading_units, refuse_unread
+from kf_calib.sources.text.units import Units, mps2_per, reading_units
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 _SAMPLES, _FAST_S = 50, 1.0

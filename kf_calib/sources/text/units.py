@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, lengths
-from kf_calib.bench.counts import SIGNED, counts_in, parse_counts
+from kf_calib.bench.counts import SIGNED, parse_counts
 from kf_calib.bench.raw_input import CHANNELS, PLAIN, RESTATE, UNITS, RawInput
-from kf_calib.errors import BenchError, CountsError, InputError
+from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.text.names import ACCEL
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
@@ -150,17 +150,6 @@ def size_of_count(norm: float) -> dict[str, str]:
     if bits >= _FEWEST_BITS and abs(norm / 2.0**bits - 1.0) < _NEAR_POWER:
         return {"accel_unit": "g", "accel_scale": repr(2.0**-bits)}
     return {"accel_scale": f"{STANDARD_GRAVITY_MPS2 / norm if norm > 0.0 else math.nan:.3g}"}
-
-
-def refuse_unread(numbers: Floats, stated: str, name: str) -> None:
-    """Raise CountsError where the numbers (n, 3) of readings show that they are to be read otherwise than is stated."""
-    if stated == SIGNED and (told := counts_in(numbers)):
-        exact = ": state exactly what the converter has, such as 2^20 counts of 3.9e-6" if "wrap" in told else ""
-        raise CountsError(
-            f"{name}: the readings are about as large in every direction only where their numbers are read as {told} "
-            f"(of a converter without a sign, or about another code than 0): add --counts {told}{exact}.",
-            {"counts": told},
-        )
 
 
 def _raw(units: Sequence[str], stated: Units, mps2: Floats) -> RawInput:
