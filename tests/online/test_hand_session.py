@@ -160,8 +160,10 @@ def test_a_verdict_waits_for_poses_that_test_each_other() -> None:
     waiting = (none, judged(None, square=("nu1",)), judged(None))
     assert [each.consistent for each in waiting] == [None, None, None]
     told = [each.verdict for each in (*waiting, judged(0.5), judged(1e-9), judged(1e-9, square=("nu1",)))]
-    beginnings = ("x up not determined", "these angles are not told yet, and taken for square: nu1",
-                  "too few poses", "the sizes of gravity agree", "the sizes of gravity differ", "the sizes of gravity differ")  # fmt: skip
+    beginnings = [
+        "x up not determined", "these angles are not told yet, and taken for square: nu1", "too few poses",
+        "the sizes of gravity agree", "the sizes of gravity differ", "the sizes of gravity differ",
+    ]  # fmt: skip
     assert all(one.startswith(other) for one, other in zip(told, beginnings, strict=True))
 
 
