@@ -326,7 +326,6 @@ def _sigmas_by_hand(judgement: HandJudgement | None) -> RenderableType:
 def _found(judgement: HandJudgement) -> str:
     """Return the line about sides and misfit."""
     sides = judgement.sides.count
-    result = judgement.result  # axes that are only taken for square would dominate the misfit
-    nis = None if result is None or result.model.square else result.consistency.nis_per_dof
+    nis = None if judgement.result is None else judgement.result.consistency.nis_per_dof
     misfit = "" if nis is None else f"NIS/dof {nis:.3g}; "
     return f"{sides} side{'s' * (sides != 1)} seen; {misfit}{judgement.verdict}"
