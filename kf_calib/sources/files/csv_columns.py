@@ -25,7 +25,17 @@ from kf_calib.errors import CountsError, InputError
 from kf_calib.sources.files.line_parts import CsvHeading, LineError, number_of, stamp_ns
 from kf_calib.sources.tables.columns import QUATERNION, READINGS, SPREADS
 from kf_calib.sources.tables.numbers import DECIMAL_POINT, Numbers, month_comes_first, stamp_of
-from kf_calib.sources.tables.words import ANGLE, NO_HEADER, TIME, Meaning, Units, are_numbers, meaning_of, reading_units
+from kf_calib.sources.tables.words import (
+    ANGLE,
+    NO_HEADER,
+    TIME,
+    Meaning,
+    Units,
+    are_numbers,
+    likely_count,
+    meanings_of,
+    reading_units,
+)
 from kf_calib.support.text import cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
@@ -159,7 +169,7 @@ class CsvColumns:
             raise InputError(f"{NO_HEADER}: {cut(','.join(header), 60)!r}.")
         full = [row for row in heading.rows if len(row) == len(names)]
         columns = cls(header, names, heading.delimiter, full, units or Units(), local_mps2)
-        columns._meanings = [meaning_of(name) for name in names]
+        columns._meanings = meanings_of(names)
         return columns
 
     @property
@@ -215,7 +225,7 @@ class CsvColumns:
             raise InputError(f"no column gives the time: name it time_s or time_ns; {self.wanted}, not {self._seen}.")
         exact = [at for at in places if _EXACT.fullmatch(self.names[at])]
         united = [at for at in places if self._meanings[at].unit]
-        place = (exact or united or places)[0]
+        place = max(exact or united or places, key=self._evenness)  # of equal ones the first
         unit = self._meanings[place].unit or {"millis": "ms", "micros": "us"}.get(self.names[place].strip().lower(), "")
         values = self._values([place], [row for row in self.rows if row[place]])[:, 0]
         if not unit and len(values) and math.isnan(values[0]):
@@ -245,10 +255,11 @@ class CsvColumns:
             )
         told = reading_units(named, norm, self.units, self.local_mps2)
         if not told.is_known:
-            scale = STANDARD_GRAVITY_MPS2 / norm if norm > 0.0 else math.nan
+            scale, usual = likely_count(norm)
+            said = f" It may be {usual}: --accel-scale {scale:.6g}." if usual else ""
             raise CountsError(
                 f"the readings in {self._quoted(places)} have a size of {norm:.3g}, so they are counts: give the size "
-                "of one by --accel-scale, in m/s^2 or what --accel-unit says.", scale
+                f"of one by --accel-scale, in m/s^2 or what --accel-unit says.{said}", scale
             )  # fmt: skip
         is_stated = self.units.accel is not None or self.units.accel_scale != 1.0
         if is_stated or not all(_EXACT.fullmatch(self.names[at]) for at in places):
@@ -322,6 +333,13 @@ class CsvColumns:
             f"outer_rad ..., outer gimbal first{example} (or the attitude qx, qy, qz, qw), not {self._seen}; or use "
             "none (--no-angles)."
         )
+
+    def _evenness(self, place: int) -> float:
+        """Return the share of steps of a time that go up by about the usual one; 0 where they are no numbers."""
+        stamps = self._values([place])[:, 0]
+        steps = np.diff(stamps[np.isfinite(stamps)])
+        usual = float(np.median(steps)) if len(steps) else 0.0
+        return round(float(np.mean((steps > 0.5 * usual) & (steps < 2.0 * usual))), 3) if usual > 0.0 else 0.0
 
     def _places(self, ours: str) -> list[int]:
         """Return the columns whose names say that quantity."""

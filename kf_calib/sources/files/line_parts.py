@@ -17,7 +17,7 @@ import numpy as np
 
 from kf_calib.bench.raw_input import RawInput
 from kf_calib.bench.streams import Batch, Stream
-from kf_calib.sources.tables.grid import delimiter_of
+from kf_calib.sources.tables.grid import delimiter_of, with_commented_header
 from kf_calib.sources.tables.words import is_unit
 from kf_calib.support.text import number_from
 from kf_calib.support.units import WORDS
@@ -186,7 +186,8 @@ class CsvHeading(NamedTuple):
     @classmethod
     def of(cls, lines: Sequence[str]) -> CsvHeading:
         """The heading of lines from the beginning of a file or a stream, of which there is at least one."""
-        first = lines[0].lstrip("\ufeff").strip()
+        lines = with_commented_header([lines[0].lstrip("\ufeff"), *lines[1:]])
+        first = lines[0].strip()
         stated = first[-1] if first.lower().startswith("sep=") and len(first) == 5 else ""
         plain = [line for line in lines[bool(stated) : _ROWS] if line.strip() and not line.startswith("#")]
         delimiter = stated or delimiter_of(plain)

@@ -15,7 +15,7 @@ from kf_calib.bench.arrays import Floats, Mask, lengths
 from kf_calib.errors import InputError
 from kf_calib.sources.tables.grid import Cell, Grid
 from kf_calib.sources.tables.numbers import Numbers, stamps_of
-from kf_calib.sources.tables.words import TIME, Meaning, face_of, meaning_of
+from kf_calib.sources.tables.words import TIME, Meaning, face_of, meaning_of, meanings_of
 from kf_calib.support.text import cut
 
 READINGS, SPREADS, QUATERNION = ("ax", "ay", "az"), ("sx", "sy", "sz"), ("qx", "qy", "qz", "qw")
@@ -180,7 +180,7 @@ def _meanings(grid: Grid, stated: Mapping[str, str]) -> list[Meaning]:
             )
         if ours != "-" and not meaning_of(ours).ours:
             raise InputError(f"--column {theirs}={ours}: {cut(ours, 60)!r} is not known: use {KNOWN}, or - for none.")
-    meanings = [meaning_of(name) for name in grid.header]
+    meanings = meanings_of(grid.header)
     for k, name in enumerate(grid.header):
         if name in stated:
             own = meaning_of(stated[name])

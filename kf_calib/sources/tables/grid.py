@@ -12,7 +12,7 @@ from typing import Any
 
 from kf_calib.errors import InputError
 from kf_calib.sources.tables.spreadsheet import sheets_of
-from kf_calib.sources.tables.words import is_unit
+from kf_calib.sources.tables.words import are_numbers, is_unit
 from kf_calib.sources.text.text_file import text_of
 from kf_calib.support.text import cut
 
@@ -27,6 +27,7 @@ _SHOWN = 6  # rows in a message
 _LONGEST_CELL = 300  # characters; a longer one is a remark, of which the middle is left out
 _MOST_COLUMNS, _MOST_CELLS = 1000, 2_000_000
 _DELIMITERS = ";\t,|"
+_FEWEST_NAMES = 3
 _TELLING = 200  # lines by which the delimiter is told
 
 
@@ -94,11 +95,12 @@ def _of_text(path: Path) -> Grid:
     first, _, rest = text.partition("\n")
     if first.lower().startswith("sep=") and len(first.strip()) == 5:
         delimiter, text, skipped = first.strip()[-1], rest, 1
+    written = with_commented_header(text.splitlines())
     delimiter = delimiter or delimiter_of(
-        [line for line in text.splitlines()[:200] if line.strip() and not line.startswith("#")]
+        [line for line in written[:_TELLING] if line.strip() and not line.startswith("#")]
     )
     try:
-        reader = csv.reader(text.splitlines(), delimiter=delimiter, skipinitialspace=True)
+        reader = csv.reader(written, delimiter=delimiter, skipinitialspace=True)
         lines = [(reader.line_num + skipped, _texts(row)) for row in reader]
     except csv.Error as error:
         raise InputError(f"{path}: is no CSV file ({error}): save the table as CSV or .xlsx.") from None
@@ -119,6 +121,25 @@ def delimiter_of(lines: Sequence[str]) -> str:
         return max(_DELIMITERS, key=fitness)
     except csv.Error:
         return ","
+
+
+def with_commented_header(lines: Sequence[str]) -> Sequence[str]:
+    """The lines, of which the last comment above the first row is the header, without its mark, where it has as many
+    names as the row has cells, most of them numbers."""
+    row = next((k for k, line in enumerate(lines[:_TELLING]) if line.strip() and not line.startswith("#")), None)
+    above = next((k for k in range((row or 0) - 1, -1, -1) if lines[k].strip("# \t\r\n")), None)
+    if row is None or above is None:
+        return lines
+    header = lines[above].lstrip("# \t")
+    delimiter = delimiter_of([header, *(line for line in lines[row : row + _TELLING] if line.strip())])
+    try:
+        names, cells = csv.reader([header, lines[row]], delimiter=delimiter)
+    except csv.Error:
+        return lines
+    numbers = sum(are_numbers([cell]) for cell in cells if cell.strip())
+    if len(names) != len(cells) or len(names) < _FEWEST_NAMES or are_numbers(names) or 2 * numbers < len(cells):
+        return lines
+    return [*lines[:above], header, *lines[above + 1 :]]
 
 
 def _of_excel(path: Path) -> Grid:
