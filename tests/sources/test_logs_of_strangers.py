@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from kf_calib.errors import CountsError
+from kf_calib.errors import CountsError, InputError
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.sources.opening import FileKind, kind_of, opened
+from kf_calib.sources.tables.opening import open_table
 from kf_calib.sources.tables.words import meanings_of
 
 G = 9.80665
@@ -110,3 +113,39 @@ def test_the_usual_size_of_a_count_is_told_and_right(
 )  # fmt: skip
 def test_names_are_understood_together(header: str, ours: str) -> None:
     assert " ".join(own.ours for own in meanings_of(header.split(","))) == ours
+
+
+def two_units(path: Path) -> Path:
+    """Rows of two sensors in turns, told apart by a column; the second has another bias."""
+    lines = ["time_s,unit,ax (g),ay (g),az (g)"]
+    for k, (x, y, z) in enumerate((readings() / G).tolist()):
+        lines += [
+            f"{0.01 * k:.4f},0,{x:.5f},{y:.5f},{z:.5f}",
+            f"{0.01 * k + 0.003:.4f},b,{x + 0.1:.5f},{y:.5f},{z:.5f}",
+        ]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_one_of_several_sensors_is_chosen(tmp_path: Path, run: Any) -> None:
+    path = two_units(tmp_path / "two.csv")
+    code, _, err = run("replay", path, "--no-angles", "--gravity", G)
+    assert code == 2 and "told apart by the column 'unit' (0, b): choose one, as by --where 'unit=0'" in err
+    for unit, bias in (("0", B[0]), ("b", B[0] + 0.1 * G)):
+        code, out, err = run("replay", path, "--no-angles", "--gravity", G, "--where", f"unit={unit}", "--json")
+        assert code == 0, err
+        found = {each["symbol"]: each["value"] for each in json.loads(out)["parameters"]}
+        assert found["K1"] == pytest.approx(K[0], abs=5e-4) and found["b1"] == pytest.approx(bias, abs=5e-3)
+    code, _, err = run("replay", path, "--no-angles", "--gravity", G, "--where", "unit")
+    assert code == 2 and "write --where COLUMN=VALUE" in err
+
+
+def test_rows_of_a_table_are_chosen(tmp_path: Path) -> None:
+    path, rows = tmp_path / "poses.csv", ["unit,ax (g),ay (g),az (g)"]
+    for x, y, z in (K * UP + B / G).tolist():
+        rows += [f"7,{x},{y},{z}", f"8,{x + 1},{y},{z}"]
+    path.write_text("\n".join(rows))
+    table = open_table(path, {"gravity_mps2": str(G)}, columns={"unit": "=7"}, angles=False)
+    np.testing.assert_allclose(table.orientations.mean_mps2, G * (K * UP) + B, rtol=1e-9)
+    with pytest.raises(InputError, match="has no row of unit=9"):
+        open_table(path, {"gravity_mps2": str(G)}, columns={"unit": "=9"}, angles=False)

@@ -77,6 +77,11 @@ class QuantityColumns:
         return list(map(mul, values, self.factors))
 
 
+def has_texts(row: CsvRow, chosen: Mapping[int, str]) -> bool:
+    """Whether a row has these texts in its columns."""
+    return all(at < len(row) and row[at].strip() == text for at, text in chosen.items())
+
+
 def _number(cell: str, numbers: Numbers) -> float:
     """Return the number in a cell, NaN where there is none."""
     try:
@@ -134,7 +139,7 @@ class CsvColumns:
     header: names as they stand in the file; names: as they are to be understood. delimiter: between cells. said: what
     was taken for what, where that is not plain from the names. raw: what the readings are in. written_mps2: the unit in
     which specific force takes the place of readings, m/s^2: that of their names; without_unit: columns of counts whose
-    names tell none, which then are in m/s^2.
+    names tell none, which then are in m/s^2. chosen: texts that the rows have in columns by which they are chosen.
     """
 
     header: Sequence[str]
@@ -147,6 +152,7 @@ class CsvColumns:
     raw: RawInput = PLAIN
     written_mps2: tuple[float, float, float] = (1.0, 1.0, 1.0)
     without_unit: tuple[int, ...] = ()
+    chosen: Mapping[int, str] = field(default_factory=dict[int, str])
     _meanings: list[Meaning] = field(default_factory=list[Meaning])
 
     @classmethod
@@ -157,18 +163,20 @@ class CsvColumns:
         units: Units | None = None,
         local_mps2: float = STANDARD_GRAVITY_MPS2,
     ) -> CsvColumns:
-        """stated: our name for each foreign one; ``-`` leaves a column out. local_mps2: gravity of the place, where a g
-        is that. Raises InputError for names used twice."""
+        """stated: our name for each foreign one; ``-`` leaves a column out, ``=VALUE`` chooses rows. local_mps2:
+        gravity of the place, where a g is that. Raises InputError for names used twice."""
         header = heading.header
-        names = ["" if stated.get(name) == "-" else stated.get(name, name) for name in header]
+        ours = [stated.get(name, name) for name in header]
+        chosen = {at: text[1:] for at, text in enumerate(ours) if header[at] in stated and text.startswith("=")}
+        names = ["" if text == "-" or at in chosen else text for at, text in enumerate(ours)]
         lower = [name.lower() for name in names]
         times = Counter(lower)
         if repeated := next((name for name in lower if name and times[name] > 1), None):
             raise InputError(f"two columns are named {repeated!r}: rename or remove one of them.")
         if are_numbers(header):
             raise InputError(f"{NO_HEADER}: {cut(','.join(header), 60)!r}.")
-        full = [row for row in heading.rows if len(row) == len(names)]
-        columns = cls(header, names, heading.delimiter, full, units or Units(), local_mps2)
+        full = [row for row in heading.rows if len(row) == len(names) and has_texts(row, chosen)]
+        columns = cls(header, names, heading.delimiter, full, units or Units(), local_mps2, chosen=chosen)
         columns._meanings = meanings_of(names)
         return columns
 
@@ -372,8 +380,8 @@ class CsvColumns:
             shown = ", ".join(sorted(shares)[:4])
             raise InputError(
                 f"the rows are of several sensors, told apart by the column {cut(self.header[at], 40)!r} ({shown}): "
-                f"keep those of one, as by awk -F'{self.delimiter}' 'NR == 1 || ${at + 1} == \"{first}\"', or leave "
-                f"the column out if it means something else (--column {cut(self.header[at], 40) + '=-'!r})."
+                f"choose one, as by --where {cut(self.header[at], 40) + '=' + first!r}, or leave the column out if it "
+                f"means something else (--column {cut(self.header[at], 40) + '=-'!r})."
             )
 
     def _values(self, places: Sequence[int], rows: Sequence[CsvRow] | None = None) -> Floats:
