@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from kf_calib.exchange.certificate.statement import Statement
     from kf_calib.exchange.corrected_file import Applied
     from kf_calib.exchange.corrected_lines import CorrectedLines
-    from kf_calib.sources.files.line_parts import TextFile
+    from kf_calib.sources.text.text_file import TextFile
     from kf_calib.support.output_files import Outputs
 
 _BLOCK_BYTES = 1 << 16
@@ -144,13 +144,15 @@ def _table_keys(keys: dict[str, str], path: Path, input: RawInput) -> dict[str, 
 
 
 def _bytes_of(path: Path) -> BinaryIO | TextFile:
-    """A log as it is, byte for byte; one that is packed, or written in UTF-16, in UTF-8."""
-    from kf_calib.sources.files.line_parts import TextFile
+    """A log as it is, byte for byte; one that is packed, or written in another encoding, in UTF-8."""
+    from kf_calib.sources.text.text_file import TextFile
 
     try:
-        with path.open("rb") as file:
-            start = file.read(2)
-        return TextFile(path) if start in (b"\x1f\x8b", b"\xff\xfe", b"\xfe\xff") else path.open("rb")
+        file = TextFile(path)
+        if not file.is_as_read:
+            return file
+        file.close()
+        return path.open("rb")
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
 

@@ -110,7 +110,7 @@ def _of_lines(ctx: click.Context, path: Path, reading: ReadingOptions, tick: Tic
     try:
         inventory = inventory_of_lines(path, reading.renamed, units)
     except CountsError as error:
-        missing["accel_scale"], size = str(error), f"{error.scale:.3g}"
+        missing["accel_scale"], size = str(error), f"{error.scale:.6g}"
         words.append(f"--accel-scale {size}")
         units = replace(units, accel_scale=float(size))
         inventory = inventory_of_lines(path, reading.renamed, units)

@@ -153,6 +153,10 @@ class ReadingOptions:
         "--g-unit", metavar="M/S^2",
         help="What 1 g stands for in a table or a log in lines; local: gravity of the bench.")] = "9.80665"
     columns: ForeignColumns = ()
+    where: Annotated[str | None, _of_input(
+        "--where", metavar="COLUMN=VALUE",
+        help='Only the rows of a table or a log that have this in a column, as of one of several sensors: '
+        '--where "unit=0".')] = None
     accel_topic: Annotated[str | None, _of_input(
         "--accel-topic", metavar="TOPIC", help="Topic of the accelerometer, where there are several.")] = None
     pose_topic: Annotated[str | None, _of_input(
@@ -174,8 +178,8 @@ class ReadingOptions:
 
     @property
     def renamed(self) -> dict[str, str]:
-        """Ours of each foreign column."""
-        return renamed(self.columns)
+        """Ours of each foreign column; "=VALUE" for one by which rows are chosen."""
+        return renamed(self.columns) | chosen_by(self.where)
 
     def kind(self, path: Path) -> FileKind:
         from kf_calib.sources.opening import kind_of
@@ -352,6 +356,16 @@ def renamed(columns: Sequence[str]) -> dict[str, str]:
     return pairs
 
 
+def chosen_by(where: str | None) -> dict[str, str]:
+    """The column by which rows are chosen, and behind a sign of equality the text that these have in it."""
+    if where is None:
+        return {}
+    column, equals, value = where.partition("=")
+    if not (column.strip() and equals and value.strip()):
+        raise InputError(f"--where {where!r} names no column and value: write --where COLUMN=VALUE, as unit=0.")
+    return {column.strip(): f"={value.strip()}"}
+
+
 def _bench_from_toml(path: Path) -> dict[str, str]:
     from kf_calib.bench.bench import metadata_of
     from kf_calib.bench.keys import checked_keys
@@ -369,7 +383,7 @@ def _bench_from_toml(path: Path) -> dict[str, str]:
     return keys
 
 
-_OF_TEXT = ("columns", "g_unit")
+_OF_TEXT = ("columns", "where", "g_unit")
 OF_MESSAGES = ("accel_topic", "pose_topic", "temperature_topic", "fields", "max_chunk_mb")
 OF_DWELLS = ("joints", "settle_s", "still_deg", "gate", "gate_sigma")
 """Options that act on text and spreadsheets only, on files of messages only, and where dwells are to be found."""

@@ -225,6 +225,21 @@ class RunLikelihood:
         log -= 0.5 * float(z @ z) + (0.5 * float(self._more_readings @ self._more_readings) if means_only else 0.0)
         return Projected(terms, z, log, basis, root, means_only)
 
+    def explained_by(self, places: Indices, rows: Projected) -> tuple[Floats, Floats]:
+        """What some columns explain of all columns, (f, C), and of the readings, (f,): products with an orthonormal
+        basis of f vectors."""
+        own, count = rows.columns[:, places], len(rows.columns)
+        if rows.means_only:
+            own = np.concatenate([own, self._more_columns[:, places]])
+        lengths = np.linalg.norm(own, axis=0)
+        left, singular, _ = np.linalg.svd(own / np.where(lengths > 0.0, lengths, 1.0), full_matrices=False)
+        left = left[:, singular > _SEEN].T
+        columns, readings = left[:, :count] @ rows.columns, left[:, :count] @ rows.readings
+        if left.shape[1] > count:
+            columns = columns + left[:, count:] @ self._more_columns
+            readings = readings + left[:, count:] @ self._more_readings
+        return columns, readings
+
     def _in_noise(
         self, covariances: Floats | None, columns: bool = True
     ) -> tuple[Floats, Floats, Floats, Floats, float]:

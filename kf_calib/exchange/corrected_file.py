@@ -34,6 +34,7 @@ from kf_calib.sources.tables.numbers import Numbers, written
 from kf_calib.sources.tables.opening import Opening
 from kf_calib.sources.tables.spreadsheet import sheets_of, workbook_of
 from kf_calib.sources.tables.words import Units
+from kf_calib.sources.text.text_file import encoding_of, unpacked
 from kf_calib.support.output_files import whole, write_whole
 
 FRAME_ID = "block"
@@ -234,9 +235,10 @@ def _to_excel(path: Path, copy: Path, grid: Grid, places: list[int], force: Floa
 
 def _to_text(path: Path, copy: Path, grid: Grid, places: list[int], force: Floats) -> None:
     """Write a copy of a text."""
-    content = path.read_bytes()
-    utf16, marked = content.startswith((b"\xff\xfe", b"\xfe\xff")), content.startswith(BOM_UTF8)
-    codec, errors = ("utf-16", "strict") if utf16 else ("utf-8-sig" if marked else "utf-8", "surrogateescape")
+    content = unpacked(path)
+    encoding = encoding_of(content)
+    of_bytes = "utf-8-sig" if content.startswith(BOM_UTF8) else "utf-8"  # what is not UTF-8 stays as it is
+    codec, errors = (encoding, "strict") if encoding.startswith("utf-16") else (of_bytes, "surrogateescape")
     lines = content.decode(codec, errors).splitlines(keepends=True)
     plain = [line.rstrip("\r\n") for line in lines]
     delimiter = delimiter_of([line for line in plain if line.strip() and not line.startswith("#")])

@@ -14,7 +14,7 @@ from kf_calib.bench.streams import Source
 from kf_calib.errors import InputError
 from kf_calib.sources.files.contents import CALIBRATION_FORMAT
 from kf_calib.sources.files.csv_columns import CsvColumns
-from kf_calib.sources.files.line_parts import CsvHeading, head_of
+from kf_calib.sources.files.line_parts import CsvHeading
 from kf_calib.sources.files.lines import Lines, is_json
 from kf_calib.sources.files.mcap_file import HEAD_BYTES, is_lines
 from kf_calib.sources.files.mcap_records import MAGIC
@@ -22,6 +22,7 @@ from kf_calib.sources.files.record_files import SQLITE, first_bytes
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.tables.grid import OLD_SUFFIXES, TEXT_SUFFIXES, ZIP
 from kf_calib.sources.tables.opening import open_table
+from kf_calib.sources.text.text_file import head_of
 from kf_calib.support.text import date_of_stamp, parse_date
 
 _OF_CALIBRATION = 200  # first bytes of a calibration, which name its format

@@ -128,7 +128,7 @@ def link(standing: Progress, status: Status | None, name: str, recording: str) -
     for word, count in counts.items():
         style = "red" if word in ("missing", "left out", "dropped") else "yellow"
         if count or word in ("gaps", "refused"):
-            text.append(f"  {count} {word}", style if count else "")
+            text.append(f"  {count} {word.removesuffix('s') if count == 1 else word}", style if count else "")
     for trouble in (status.trouble, status.clock_trouble):
         if trouble:
             text.append(f"\n{sentence(trouble)}", "bold red")

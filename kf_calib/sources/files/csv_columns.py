@@ -25,7 +25,17 @@ from kf_calib.errors import CountsError, InputError
 from kf_calib.sources.files.line_parts import CsvHeading, LineError, number_of, stamp_ns
 from kf_calib.sources.tables.columns import QUATERNION, READINGS, SPREADS
 from kf_calib.sources.tables.numbers import DECIMAL_POINT, Numbers, month_comes_first, stamp_of
-from kf_calib.sources.tables.words import ANGLE, NO_HEADER, TIME, Meaning, Units, are_numbers, meaning_of, reading_units
+from kf_calib.sources.tables.words import (
+    ANGLE,
+    NO_HEADER,
+    TIME,
+    Meaning,
+    Units,
+    are_numbers,
+    likely_count,
+    meanings_of,
+    reading_units,
+)
 from kf_calib.support.text import cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
@@ -65,6 +75,11 @@ class QuantityColumns:
                 if not math.isfinite(value):
                     raise LineError(f"column {cut(header[at], 40)!r} is {cut(cell, 40)!r}, which is no number")
         return list(map(mul, values, self.factors))
+
+
+def has_texts(row: CsvRow, chosen: Mapping[int, str]) -> bool:
+    """Whether a row has these texts in its columns."""
+    return all(at < len(row) and row[at].strip() == text for at, text in chosen.items())
 
 
 def _number(cell: str, numbers: Numbers) -> float:
@@ -124,7 +139,7 @@ class CsvColumns:
     header: names as they stand in the file; names: as they are to be understood. delimiter: between cells. said: what
     was taken for what, where that is not plain from the names. raw: what the readings are in. written_mps2: the unit in
     which specific force takes the place of readings, m/s^2: that of their names; without_unit: columns of counts whose
-    names tell none, which then are in m/s^2.
+    names tell none, which then are in m/s^2. chosen: texts that the rows have in columns by which they are chosen.
     """
 
     header: Sequence[str]
@@ -137,6 +152,7 @@ class CsvColumns:
     raw: RawInput = PLAIN
     written_mps2: tuple[float, float, float] = (1.0, 1.0, 1.0)
     without_unit: tuple[int, ...] = ()
+    chosen: Mapping[int, str] = field(default_factory=dict[int, str])
     _meanings: list[Meaning] = field(default_factory=list[Meaning])
 
     @classmethod
@@ -147,19 +163,21 @@ class CsvColumns:
         units: Units | None = None,
         local_mps2: float = STANDARD_GRAVITY_MPS2,
     ) -> CsvColumns:
-        """stated: our name for each foreign one; ``-`` leaves a column out. local_mps2: gravity of the place, where a g
-        is that. Raises InputError for names used twice."""
+        """stated: our name for each foreign one; ``-`` leaves a column out, ``=VALUE`` chooses rows. local_mps2:
+        gravity of the place, where a g is that. Raises InputError for names used twice."""
         header = heading.header
-        names = ["" if stated.get(name) == "-" else stated.get(name, name) for name in header]
+        ours = [stated.get(name, name) for name in header]
+        chosen = {at: text[1:] for at, text in enumerate(ours) if header[at] in stated and text.startswith("=")}
+        names = ["" if text == "-" or at in chosen else text for at, text in enumerate(ours)]
         lower = [name.lower() for name in names]
         times = Counter(lower)
         if repeated := next((name for name in lower if name and times[name] > 1), None):
             raise InputError(f"two columns are named {repeated!r}: rename or remove one of them.")
         if are_numbers(header):
             raise InputError(f"{NO_HEADER}: {cut(','.join(header), 60)!r}.")
-        full = [row for row in heading.rows if len(row) == len(names)]
-        columns = cls(header, names, heading.delimiter, full, units or Units(), local_mps2)
-        columns._meanings = [meaning_of(name) for name in names]
+        full = [row for row in heading.rows if len(row) == len(names) and has_texts(row, chosen)]
+        columns = cls(header, names, heading.delimiter, full, units or Units(), local_mps2, chosen=chosen)
+        columns._meanings = meanings_of(names)
         return columns
 
     @property
@@ -215,7 +233,7 @@ class CsvColumns:
             raise InputError(f"no column gives the time: name it time_s or time_ns; {self.wanted}, not {self._seen}.")
         exact = [at for at in places if _EXACT.fullmatch(self.names[at])]
         united = [at for at in places if self._meanings[at].unit]
-        place = (exact or united or places)[0]
+        place = max(exact or united or places, key=self._evenness)  # of equal ones the first
         unit = self._meanings[place].unit or {"millis": "ms", "micros": "us"}.get(self.names[place].strip().lower(), "")
         values = self._values([place], [row for row in self.rows if row[place]])[:, 0]
         if not unit and len(values) and math.isnan(values[0]):
@@ -245,10 +263,11 @@ class CsvColumns:
             )
         told = reading_units(named, norm, self.units, self.local_mps2)
         if not told.is_known:
-            scale = STANDARD_GRAVITY_MPS2 / norm if norm > 0.0 else math.nan
+            scale, usual = likely_count(norm)
+            said = f" It may be {usual}: --accel-scale {scale:.6g}." if usual else ""
             raise CountsError(
                 f"the readings in {self._quoted(places)} have a size of {norm:.3g}, so they are counts: give the size "
-                "of one by --accel-scale, in m/s^2 or what --accel-unit says.", scale
+                f"of one by --accel-scale, in m/s^2 or what --accel-unit says.{said}", scale
             )  # fmt: skip
         is_stated = self.units.accel is not None or self.units.accel_scale != 1.0
         if is_stated or not all(_EXACT.fullmatch(self.names[at]) for at in places):
@@ -323,6 +342,13 @@ class CsvColumns:
             "none (--no-angles)."
         )
 
+    def _evenness(self, place: int) -> float:
+        """Return the share of steps of a time that go up by about the usual one; 0 where they are no numbers."""
+        stamps = self._values([place])[:, 0]
+        steps = np.diff(stamps[np.isfinite(stamps)])
+        usual = float(np.median(steps)) if len(steps) else 0.0
+        return round(float(np.mean((steps > 0.5 * usual) & (steps < 2.0 * usual))), 3) if usual > 0.0 else 0.0
+
     def _places(self, ours: str) -> list[int]:
         """Return the columns whose names say that quantity."""
         return [at for at, own in enumerate(self._meanings) if own.ours == ours]
@@ -354,8 +380,8 @@ class CsvColumns:
             shown = ", ".join(sorted(shares)[:4])
             raise InputError(
                 f"the rows are of several sensors, told apart by the column {cut(self.header[at], 40)!r} ({shown}): "
-                f"keep those of one, as by awk -F'{self.delimiter}' 'NR == 1 || ${at + 1} == \"{first}\"', or leave "
-                f"the column out if it means something else (--column {cut(self.header[at], 40) + '=-'!r})."
+                f"choose one, as by --where {cut(self.header[at], 40) + '=' + first!r}, or leave the column out if it "
+                f"means something else (--column {cut(self.header[at], 40) + '=-'!r})."
             )
 
     def _values(self, places: Sequence[int], rows: Sequence[CsvRow] | None = None) -> Floats:

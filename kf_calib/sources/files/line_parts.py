@@ -1,28 +1,23 @@
 """What the readers of JSON and CSV lines share: units, exact stamps, rows, and an account of what was not used.
 
-A file of text is given as bytes in UTF-8, piece by piece, whether gzip has packed it or not, and in whichever encoding
-it is written. A CSV file begins with a heading: comments and titles, the names of the columns, perhaps their units.
+A CSV file begins with a heading: comments and titles, the names of the columns, perhaps their units.
 """
 
 from __future__ import annotations
 
-import codecs
 import csv
-import gzip
-import zlib
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
-from pathlib import Path
-from typing import BinaryIO, ClassVar, NamedTuple, Self, cast
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from kf_calib.bench.raw_input import RawInput
 from kf_calib.bench.streams import Batch, Stream
-from kf_calib.sources.tables.grid import delimiter_of
+from kf_calib.sources.tables.grid import delimiter_of, with_commented_header
 from kf_calib.sources.tables.words import is_unit
 from kf_calib.support.text import number_from
 from kf_calib.support.units import WORDS
@@ -191,7 +186,8 @@ class CsvHeading(NamedTuple):
     @classmethod
     def of(cls, lines: Sequence[str]) -> CsvHeading:
         """The heading of lines from the beginning of a file or a stream, of which there is at least one."""
-        first = lines[0].lstrip("\ufeff").strip()
+        lines = with_commented_header([lines[0].lstrip("\ufeff"), *lines[1:]])
+        first = lines[0].strip()
         stated = first[-1] if first.lower().startswith("sep=") and len(first) == 5 else ""
         plain = [line for line in lines[bool(stated) : _ROWS] if line.strip() and not line.startswith("#")]
         delimiter = stated or delimiter_of(plain)
@@ -235,77 +231,6 @@ def cells_of(line: str, delimiter: str) -> list[str]:
 
 
 LONGEST_LINE_BYTES = 1 << 20
-
-_GZIP, _UTF16 = b"\x1f\x8b", (b"\xff\xfe", b"\xfe\xff")
-_HEAD_BYTES = 1 << 16
-
-
-class TextFile:
-    """Opened to be read once. trouble: a sentence if its end cannot be unpacked. Raises OSError."""
-
-    def __init__(self, path: Path) -> None:
-        self._size = max(path.stat().st_size, 1)
-        self._raw = path.open("rb")
-        try:
-            packed = self._raw.peek(2).startswith(_GZIP)
-            self._file = cast("BinaryIO", gzip.GzipFile(fileobj=self._raw)) if packed else self._raw
-            self.trouble, self._has_ended = "", False
-            self._head = self._unpacked(_HEAD_BYTES)
-        except BaseException:
-            self._raw.close()
-            raise
-        encoding = _encoding(self._head)
-        self._decoder = None if encoding == "utf-8" else codecs.getincrementaldecoder(encoding)("replace")
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    @property
-    def fraction(self) -> float:
-        """The share of the file that has been read."""
-        return min(self._raw.tell() / self._size, 1.0)
-
-    def read(self, size: int) -> bytes:
-        """The next bytes, about so many; none at the end."""
-        block, self._head = self._head or self._unpacked(size), b""
-        if self._decoder is None:
-            return block
-        text = self._decoder.decode(block, final=not block)
-        return text.encode() or (self.read(size) if block else b"")
-
-    def close(self) -> None:
-        self._raw.close()
-
-    def _unpacked(self, size: int) -> bytes:
-        if self._has_ended:
-            return b""
-        try:
-            block = self._file.read(size)
-        except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-            block, self.trouble = b"", f"its end cannot be unpacked ({error}): copy it anew, what comes before is used."
-        self._has_ended = not block
-        return block
-
-
-def head_of(path: Path) -> bytes:
-    """The beginning of a file: of one that is packed by gzip, of what is in it. Raises OSError."""
-    with TextFile(path) as file:
-        return file.read(_HEAD_BYTES)
-
-
-def _encoding(head: bytes) -> str:
-    """Return UTF-8 or UTF-16 with or without a byte-order mark, or else Windows-1252."""
-    if head.startswith(_UTF16):
-        return "utf-16"
-    whole = head[: head.rfind(b"\n") + 1] or head
-    try:
-        whole.decode("utf-8")
-    except UnicodeDecodeError:
-        return "cp1252"
-    return "utf-8"
 
 
 class Cutter:

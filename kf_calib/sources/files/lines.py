@@ -21,10 +21,11 @@ from kf_calib.bench.streams import Batch, bench_without_angles, with_accel, with
 from kf_calib.errors import BenchError, CountsError, InputError
 from kf_calib.sources.files.csv_columns import CsvColumns
 from kf_calib.sources.files.fields import as_columns
-from kf_calib.sources.files.line_parts import Account, CsvHeading, Cutter, LineReader, TextFile
+from kf_calib.sources.files.line_parts import Account, CsvHeading, Cutter, LineReader
 from kf_calib.sources.files.sample_lines import CsvLines, JsonLines
 from kf_calib.sources.tables.columns import HOW
 from kf_calib.sources.tables.words import Units
+from kf_calib.sources.text.text_file import TextFile
 from kf_calib.support.text import cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 

@@ -15,7 +15,7 @@ from typing import Any
 
 from kf_calib.bench.bench import metadata_of
 from kf_calib.bench.raw_input import UNITS, parse_unit
-from kf_calib.sources.files.csv_columns import CsvColumns
+from kf_calib.sources.files.csv_columns import CsvColumns, has_texts
 from kf_calib.sources.files.line_parts import (
     ACCEL_UNITS,
     TIME_DECIMALS,
@@ -58,7 +58,7 @@ class CsvLines(LineReader):
         self._warmth = _FROM_UNIT[unit]
         self.said = columns.said
         used = {*self._time.at, *self._accel.at, *self._pose.at, *self._temperature.at}
-        columns.refuse_several_units(used)
+        columns.refuse_several_units({*used, *columns.chosen})
         self._account.leave_out(name for at, name in enumerate(columns.names) if at not in used)
 
     @property
@@ -105,6 +105,8 @@ class CsvLines(LineReader):
         row = without_empty_end(self._cells(line), len(self._header))
         if len(row) != len(self._header):
             raise LineError(f"it has {len(row)} cells, the header has {len(self._header)}")
+        if not has_texts(row, self._columns.chosen):
+            return
         numbers = self._numbers or DECIMAL_POINT
         time_ns = self._time.ns(row, self._header, numbers)
         # everything on the line is understood before any of it is used

@@ -6,7 +6,7 @@ When the orientations of a table were measured.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 
 import numpy as np
@@ -15,7 +15,7 @@ from kf_calib.bench.arrays import Floats, Mask, lengths
 from kf_calib.errors import InputError
 from kf_calib.sources.tables.grid import Cell, Grid
 from kf_calib.sources.tables.numbers import Numbers, stamps_of
-from kf_calib.sources.tables.words import TIME, Meaning, face_of, meaning_of
+from kf_calib.sources.tables.words import TIME, Meaning, face_of, meaning_of, meanings_of
 from kf_calib.support.text import cut
 
 READINGS, SPREADS, QUATERNION = ("ax", "ay", "az"), ("sx", "sy", "sz"), ("qx", "qy", "qz", "qw")
@@ -41,7 +41,9 @@ class Columns:
 
     @classmethod
     def of(cls, grid: Grid, stated: Mapping[str, str], numbers: Numbers) -> Columns:
-        """The columns of a grid; ``stated`` are those that the user names, theirs to ours. Raises InputError."""
+        """The columns of a grid; ``stated`` are those that the user names, theirs to ours, ``=VALUE`` for one by which
+        rows are chosen. Raises InputError."""
+        grid, stated = _chosen(grid, stated)
         columns = cls(grid, numbers, _meanings(grid, stated))
         columns._leave_out_empty(set(stated))
         columns._recognise_contents({k for k, name in enumerate(grid.header) if name in stated})
@@ -166,6 +168,26 @@ class Columns:
                 )
 
 
+def _chosen(grid: Grid, stated: Mapping[str, str]) -> tuple[Grid, dict[str, str]]:
+    """Return the grid of the rows that are chosen, and what else is stated; their column then means nothing."""
+    wanted = {theirs: ours[1:] for theirs, ours in stated.items() if ours.startswith("=")}
+    places = {grid.header.index(name): value for name, value in wanted.items() if name in grid.header}
+    kept = [k for k, row in enumerate(grid.rows) if all(_as_text(row[at]) == value for at, value in places.items())]
+    if not kept:
+        said = " and ".join(f"{name}={value}" for name, value in wanted.items())
+        raise InputError(f"{grid.name}: has no row of {said} (--where): give what stands in the column.")
+    others = {theirs: "-" if theirs in wanted else ours for theirs, ours in stated.items()}
+    if len(kept) == len(grid.rows):
+        return grid, others
+    rows, numbers = tuple(grid.rows[k] for k in kept), tuple(grid.numbers[k] for k in kept)
+    return replace(grid, rows=rows, numbers=numbers), others
+
+
+def _as_text(cell: Cell) -> str:
+    """Return the text of a cell; a whole number of a spreadsheet without decimals."""
+    return f"{cell:g}" if isinstance(cell, float) else str(cell if cell is not None else "").strip()
+
+
 def _is_face(cell: Cell) -> bool:
     return isinstance(cell, str) and face_of(cell) is not None
 
@@ -180,7 +202,7 @@ def _meanings(grid: Grid, stated: Mapping[str, str]) -> list[Meaning]:
             )
         if ours != "-" and not meaning_of(ours).ours:
             raise InputError(f"--column {theirs}={ours}: {cut(ours, 60)!r} is not known: use {KNOWN}, or - for none.")
-    meanings = [meaning_of(name) for name in grid.header]
+    meanings = meanings_of(grid.header)
     for k, name in enumerate(grid.header):
         if name in stated:
             own = meaning_of(stated[name])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -13,12 +12,12 @@ from typing import Any
 
 from kf_calib.errors import InputError
 from kf_calib.sources.tables.spreadsheet import sheets_of
-from kf_calib.sources.tables.words import is_unit
+from kf_calib.sources.tables.words import are_numbers, is_unit
+from kf_calib.sources.text.text_file import text_of
 from kf_calib.support.text import cut
 
 Cell = str | float | datetime | None
 """A cell as it was read; text is not interpreted yet, an empty cell is None."""
-_CYRILLIC = re.compile(rb"[\xc0-\xff]{3}")
 ZIP = b"PK\x03\x04"
 TEXT_SUFFIXES = (".csv", ".tsv", ".txt")
 EXCEL_SUFFIXES = (".xlsx", ".xlsm")
@@ -28,6 +27,7 @@ _SHOWN = 6  # rows in a message
 _LONGEST_CELL = 300  # characters; a longer one is a remark, of which the middle is left out
 _MOST_COLUMNS, _MOST_CELLS = 1000, 2_000_000
 _DELIMITERS = ";\t,|"
+_FEWEST_NAMES = 3
 _TELLING = 200  # lines by which the delimiter is told
 
 
@@ -71,47 +71,43 @@ def grid_of(table: Any) -> Grid:
             raise InputError(f"{path}: files of the kind {path.suffix} are not read: save it as .xlsx or .csv.")
         is_excel = start.startswith(ZIP)
         if path.stat().st_size > _LARGEST[is_excel]:
-            raise InputError(
-                f"{path}: is larger than a table of orientations can be: leave out what is not part of it; if it holds "
-                "samples, save them as CSV with a column of time (docs/own_csv.md)."
-            )
+            raise _too_large(path)
         return replace(_of_excel(path) if is_excel else _of_text(path), path=path)
     return _of_columns(table)
 
 
+def _too_large(path: Path) -> InputError:
+    return InputError(
+        f"{path}: is larger than a table of orientations can be: leave out what is not part of it; if it holds "
+        "samples, save them as CSV with a column of time (docs/own_csv.md)."
+    )
+
+
 def _of_text(path: Path) -> Grid:
     """Return the cells of a CSV file: any usual encoding and delimiter, with or without lines above the header."""
-    text = _decoded(path, path.read_bytes())
+    try:
+        text, trouble = text_of(path, _LARGEST[0])
+    except OverflowError:
+        raise _too_large(path) from None
+    if "\0" in text:
+        raise InputError(f"{path}: is no text (it has bytes of zero): save the table as CSV or .xlsx.")
     delimiter, skipped = "", 0
     first, _, rest = text.partition("\n")
     if first.lower().startswith("sep=") and len(first.strip()) == 5:
         delimiter, text, skipped = first.strip()[-1], rest, 1
+    written = with_commented_header(text.splitlines())
     delimiter = delimiter or delimiter_of(
-        [line for line in text.splitlines()[:200] if line.strip() and not line.startswith("#")]
+        [line for line in written[:_TELLING] if line.strip() and not line.startswith("#")]
     )
     try:
-        reader = csv.reader(text.splitlines(), delimiter=delimiter, skipinitialspace=True)
+        reader = csv.reader(written, delimiter=delimiter, skipinitialspace=True)
         lines = [(reader.line_num + skipped, _texts(row)) for row in reader]
     except csv.Error as error:
         raise InputError(f"{path}: is no CSV file ({error}): save the table as CSV or .xlsx.") from None
     lines = [line for line in lines if not (line[1] and str(line[1][0] or "").startswith("#"))]
     grid = _headed(str(path), lines)
-    return replace(grid, is_semicolon=delimiter == ";")
-
-
-def _decoded(path: Path, content: bytes) -> str:
-    """Return the text of a file in UTF-8 or UTF-16 with or without a byte-order mark, or in a code page of Windows.
-
-    It is Cyrillic (1251) where three letters beyond ASCII follow each other, as in no Western language, or else 1252.
-    """
-    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
-        return content.decode("utf-16", errors="replace")
-    if b"\0" in content:
-        raise InputError(f"{path}: is no text (it has bytes of zero): save the table as CSV or .xlsx.")
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        return content.decode("cp1251" if _CYRILLIC.search(content) else "cp1252", errors="replace")
+    remarks = (*grid.remarks, *([trouble.removesuffix(".")] if trouble else []))
+    return replace(grid, is_semicolon=delimiter == ";", remarks=remarks)
 
 
 def delimiter_of(lines: Sequence[str]) -> str:
@@ -125,6 +121,25 @@ def delimiter_of(lines: Sequence[str]) -> str:
         return max(_DELIMITERS, key=fitness)
     except csv.Error:
         return ","
+
+
+def with_commented_header(lines: Sequence[str]) -> Sequence[str]:
+    """The lines, of which the last comment above the first row is the header, without its mark, where it has as many
+    names as the row has cells, most of them numbers."""
+    row = next((k for k, line in enumerate(lines[:_TELLING]) if line.strip() and not line.startswith("#")), None)
+    above = next((k for k in range((row or 0) - 1, -1, -1) if lines[k].strip("# \t\r\n")), None)
+    if row is None or above is None:
+        return lines
+    header = lines[above].lstrip("# \t")
+    delimiter = delimiter_of([header, *(line for line in lines[row : row + _TELLING] if line.strip())])
+    try:
+        names, cells = csv.reader([header, lines[row]], delimiter=delimiter)
+    except csv.Error:
+        return lines
+    numbers = sum(are_numbers([cell]) for cell in cells if cell.strip())
+    if len(names) != len(cells) or len(names) < _FEWEST_NAMES or are_numbers(names) or 2 * numbers < len(cells):
+        return lines
+    return [*lines[:above], header, *lines[above + 1 :]]
 
 
 def _of_excel(path: Path) -> Grid:

@@ -25,7 +25,7 @@ ANGLE = {"rad": 1.0, "mrad": 1e-3, "deg": WORDS["rad"]["deg"]}
 TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 TEMPERATURE = ("c", "k", "f")
 _UNITS = {
-    "m/s2": "m/s2 m/s^2 m/s² m/s/s mps2 ms-2 ms^-2 m/s**2 m·s⁻² m·s-2 ms⁻² м/с2 м/с^2 м/с²",
+    "m/s2": "m/s2 m/s^2 m/s² m/s/s mps2 ms-2 ms^-2 m.s^-2 m*s^-2 m/s**2 m·s⁻² m·s-2 ms⁻² м/с2 м/с^2 м/с²",
     "g": "g gn g0 g_n", "mg": "mg мg", "ug": "ug µg μg мкg",
     "count": "count counts lsb digit digits raw adc",
     "rad": "rad radian radians рад", "mrad": "mrad мрад", "deg": "deg degree degrees grad град град. ° º",
@@ -50,10 +50,20 @@ _SPREAD = _words(
     "ско отклонение сигма разброс шум"
 )
 _READING = _words(
-    "a acc accl accel acceleration accelerometer accelerometers beschleunigung beschl f force specific reading "
-    "readings imu linear mean avg average mittel mittelwert m sensor channel ch kanal messwert out output signal "
-    "value wert raw ускорение ускорения акселерометр среднее средние показание показания датчик канал значение сигнал"
+    "a ac acc accl accel alpha acceleration accelerometer accelerometers beschleunigung beschl f force specific "
+    "reading readings imu linear mean avg average mittel mittelwert m sensor channel ch kanal messwert out output "
+    "signal value wert raw ускорение ускорения акселерометр среднее средние показание показания датчик канал "
+    "значение сигнал"
 )
+_OTHER = _words(
+    "gyro gyr gy gyroscope omega angular velocity rate dps mag magn magnet magnetometer magnetic compass covariance "
+    "cov true truth reference groundtruth jerk гироскоп магнитометр"
+)
+"""Words of quantities that stand beside the readings and are none of ours."""
+_OF_READINGS = _words(
+    "a ac acc accl accel acceleration accelerometer beschleunigung specific force ускорение акселерометр"
+)
+"""Words that readings have, and nothing else."""
 _ANGLE = _words(
     "outer middle inner aussen mitte mittlerer innen innere innerer aeussere ausserer angle winkel gimbal roll pitch "
     "yaw azimuth elevation tilt achse axis q phi theta psi rotation rot table rahmen "
@@ -71,7 +81,9 @@ _RANKS = (
 )
 _CHANNELS = frozenset("xyz123ху")
 _AXES = str.maketrans("123ху", "xyzxy")  # the last two are Cyrillic letters
-_RATE = re.compile(r"(?:deg|degrees?|rad|radians?|°)\s*(?:/|p|per)\s*s|dps")
+_RATE = re.compile(r"(?:deg|degrees?|rad|radians?|°)\s*(?:/|p|per)\s*s|(?:deg|rad)[\s.*·]*s\s*\^?[-−⁻]|dps")
+_ATTITUDE = re.compile(r"(.*?)(?:quaternion|quat|orientation|attitude|rotation|q)[\W_]*(?:q[\W_]*)?([0-3wxyz])\W*")
+_INDEX = re.compile(r"(.*)\[([012])\]\s*")
 _CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z])")
 _LONGEST = 300  # characters of a name: it is looked at in many ways
 _FACES = re.compile(r"['’]?([+\-−–]?)\s*([xyz123])\s*([+\-−–]?|up|down|oben|unten)", re.IGNORECASE)
@@ -107,6 +119,41 @@ def meaning_of(name: str) -> Meaning:
     return told if told.ours or not _CAMEL.search(name) else _meaning_of(_CAMEL.sub(" ", name))
 
 
+def meanings_of(header: Sequence[str]) -> list[Meaning]:
+    """What the names of all columns say together.
+
+    Of several columns that are taken for one reading, those count whose names are those of readings alone. Four columns
+    of an attitude, by w x y z or 0 to 3 with the real part first, are a quaternion and no gimbals; indices in brackets
+    count from 0.
+    """
+    stems = {match[1] for name in header if (match := _INDEX.fullmatch(name)) and match[2] == "0"}
+    named = [
+        f"{match[1]} {'xyz'[int(match[2])]}" if (match := _INDEX.fullmatch(name)) and match[1] in stems else name
+        for name in header
+    ]
+    meanings = [meaning_of(name) for name in named]
+    for at, part in _quaternion_in(header).items():
+        meanings[at] = Meaning(part, "")
+    for ours in ("ax", "ay", "az"):
+        rivals = [at for at, own in enumerate(meanings) if own.ours == ours]
+        likely = [at for at in rivals if {*_tokens(_CAMEL.sub(" ", named[at]).lower())} & _OF_READINGS]
+        for at in {*rivals} - {*(likely or rivals)}:
+            meanings[at] = Meaning("", "")
+    return meanings
+
+
+def _quaternion_in(header: Sequence[str]) -> dict[int, str]:
+    """Return which columns are the parts of a quaternion; none where no four belong together."""
+    groups = dict[tuple[str, bool], dict[str, int]]()
+    for at, name in enumerate(header):
+        if len(name) <= _LONGEST and (match := _ATTITUDE.fullmatch(name.strip().lower())):
+            groups.setdefault((match[1], match[2].isdigit()), {}).setdefault(match[2], at)
+    for (_, by_number), places in groups.items():
+        if len(places) == 4:
+            return {at: f"q{'wxyz'[int(part)] if by_number else part}" for part, at in places.items()}
+    return {}
+
+
 def _meaning_of(name: str) -> Meaning:
     lowered = name.strip().lower()
     if lowered in ("qx", "qy", "qz", "qw", "-"):
@@ -117,6 +164,8 @@ def _meaning_of(name: str) -> Meaning:
     tokens = _tokens(text)
     channel = next((each for each in tokens if each in _CHANNELS), "").translate(_AXES)
     words = set(tokens) - _CHANNELS
+    if words & _OTHER:
+        return Meaning("", "")
     if words & _LENGTH:
         return Meaning("", unit)
     if (words & _TIME and (not unit or unit in TIME)) or (unit in TIME and not channel):
@@ -126,7 +175,9 @@ def _meaning_of(name: str) -> Meaning:
     if unit in ANGLE or (words & _ANGLE and unit not in ACCEL):
         rank = next((k + 1 for k, known in enumerate(_RANKS) if words & known), 0)
         return Meaning("angle", unit if unit in ANGLE else "", rank)
-    if words & _SPREAD or {"standard", "deviation"} <= words:
+    # a letter s amid a name is no deviation: a_RS_S_x is that of the sensor
+    spread = words & (_SPREAD if tokens[:1] == ["s"] or words == {"s"} else _SPREAD - {"s"})
+    if spread or {"standard", "deviation"} <= words:
         return Meaning(f"s{channel}" if channel else "sd", unit if unit in ACCEL else "")
     if channel and (words & _READING or not words or unit in ACCEL):
         return Meaning(f"a{channel}", unit if unit in ACCEL else "")
@@ -153,8 +204,8 @@ def face_of(text: str) -> tuple[int, int] | None:
 def _unit_of(name: str) -> tuple[str, str]:
     """Return a name without its unit, and the unit: in brackets, or after a slash, a comma, ``in`` or an underscore."""
     match = re.fullmatch(r"(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]", name)
-    if match and match[2] in _OF_WORD:
-        return match[1], _OF_WORD[match[2]]
+    if match and (unit := match[2].replace(" ", "") if match[2] not in _OF_WORD else match[2]) in _OF_WORD:
+        return match[1], _OF_WORD[unit]
     for pattern in (r"(.+)\s+in\s+(\S+)", r"(.+?)\s*,\s*(\S+)", r"(.+)[_ ](\S+)", r"(.+?)\s*/\s*(\S+)"):
         match = re.fullmatch(pattern, name)
         if match and match[2] in _OF_WORD and _is_unit_of(match[2], match[1]):
@@ -172,13 +223,19 @@ def _tokens(text: str) -> list[str]:
     tokens = list[str]()
     for word in re.findall(r"[a-zа-я]+|\d+", _plain(text)):
         stem, last = word[:-1], word[-1]
-        known = stem in _SPREAD | _READING | {"grav"}
+        known = stem in _SPREAD | _READING | _OTHER | {"grav"}
         tokens += [stem, last] if last in "xyz" and known else [word]
     return tokens
 
 
 _BY_SIZE = (("g", 0.5, 2.0), ("m/s2", 5.0, 20.0), ("mg", 500.0, 2000.0))
 """Units in which the size of gravity lies between two numbers."""
+_COUNTS = {
+    "1 mm/s^2": 1e-3, "1 cm/s^2": 1e-2,
+    **{f"1/{2**k} g": STANDARD_GRAVITY_MPS2 / 2**k for k in range(6, 21)},
+}  # fmt: skip
+"""Sizes of counts that devices have, m/s^2."""
+_ABOUT = 0.07  # of the size of gravity, by which scale factor and bias of a sensor change it
 _NEAR = (0.2, 5.0)
 """The norm in g of a sensor that is not shaken hard."""
 _IN_WORDS = {"m/s2": "m/s^2", "count": "counts"}
@@ -246,6 +303,16 @@ class Units:
         if not 9.0 < size < 10.0:
             raise InputError(f"--g-unit is {self.g!r}: give m/s^2 from 9 to 10, such as 9.80665, or local.")
         return size
+
+
+def likely_count(norm: float) -> tuple[float, str]:
+    """The size of one count, m/s^2, if gravity has the size ``norm`` in counts, and which usual one it is; "" and
+    gravity over the norm where it is none."""
+    if not norm > 0.0:
+        return math.nan, ""
+    nearest = min(_COUNTS, key=lambda name: abs(math.log(norm * _COUNTS[name] / STANDARD_GRAVITY_MPS2)))
+    is_near = abs(norm * _COUNTS[nearest] / STANDARD_GRAVITY_MPS2 - 1.0) < _ABOUT
+    return (_COUNTS[nearest], nearest) if is_near else (STANDARD_GRAVITY_MPS2 / norm, "")
 
 
 class ReadingUnits(NamedTuple):

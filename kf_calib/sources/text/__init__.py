@@ -1,0 +1,1 @@
+"""What is written in letters: files of text in any usual encoding."""
