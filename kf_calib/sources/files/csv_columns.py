@@ -32,6 +32,7 @@ from kf_calib.sources.tables.words import (
     Meaning,
     Units,
     are_numbers,
+    choices_in,
     likely_count,
     meanings_of,
     reading_units,
@@ -166,9 +167,9 @@ class CsvColumns:
         """stated: our name for each foreign one; ``-`` leaves a column out, ``=VALUE`` chooses rows. local_mps2:
         gravity of the place, where a g is that. Raises InputError for names used twice."""
         header = heading.header
+        chosen = choices_in(header, stated)
         ours = [stated.get(name, name) for name in header]
-        chosen = {at: text[1:] for at, text in enumerate(ours) if header[at] in stated and text.startswith("=")}
-        names = ["" if text == "-" or at in chosen else text for at, text in enumerate(ours)]
+        names = ["" if stated.get(header[at]) == "-" or at in chosen else text for at, text in enumerate(ours)]
         lower = [name.lower() for name in names]
         times = Counter(lower)
         if repeated := next((name for name in lower if name and times[name] > 1), None):

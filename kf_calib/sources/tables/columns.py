@@ -15,7 +15,7 @@ from kf_calib.bench.arrays import Floats, Mask, lengths
 from kf_calib.errors import InputError
 from kf_calib.sources.tables.grid import Cell, Grid
 from kf_calib.sources.tables.numbers import Numbers, stamps_of
-from kf_calib.sources.tables.words import TIME, Meaning, face_of, meaning_of, meanings_of
+from kf_calib.sources.tables.words import TIME, Meaning, choices_in, face_of, meaning_of, meanings_of
 from kf_calib.support.text import cut
 
 READINGS, SPREADS, QUATERNION = ("ax", "ay", "az"), ("sx", "sy", "sz"), ("qx", "qy", "qz", "qw")
@@ -170,13 +170,12 @@ class Columns:
 
 def _chosen(grid: Grid, stated: Mapping[str, str]) -> tuple[Grid, dict[str, str]]:
     """Return the grid of the rows that are chosen, and what else is stated; their column then means nothing."""
-    wanted = {theirs: ours[1:] for theirs, ours in stated.items() if ours.startswith("=")}
-    places = {grid.header.index(name): value for name, value in wanted.items() if name in grid.header}
+    places = choices_in(grid.header, stated)
     kept = [k for k, row in enumerate(grid.rows) if all(_as_text(row[at]) == value for at, value in places.items())]
     if not kept:
-        said = " and ".join(f"{name}={value}" for name, value in wanted.items())
+        said = " and ".join(f"{grid.header[at]}={value}" for at, value in places.items())
         raise InputError(f"{grid.name}: has no row of {said} (--where): give what stands in the column.")
-    others = {theirs: "-" if theirs in wanted else ours for theirs, ours in stated.items()}
+    others = {theirs: "-" if ours.startswith("=") else ours for theirs, ours in stated.items()}
     if len(kept) == len(grid.rows):
         return grid, others
     rows, numbers = tuple(grid.rows[k] for k in kept), tuple(grid.numbers[k] for k in kept)

@@ -305,6 +305,12 @@ class Units:
         return size
 
 
+def choices_in(header: Sequence[str], stated: Mapping[str, str]) -> dict[int, str]:
+    """The texts that rows have in the columns by which they are chosen, by the places of these: of what is stated of
+    foreign columns, those of ``=VALUE``."""
+    return {at: stated[name][1:] for at, name in enumerate(header) if stated.get(name, "").startswith("=")}
+
+
 def likely_count(norm: float) -> tuple[float, str]:
     """The size of one count, m/s^2, if gravity has the size ``norm`` in counts, and which usual one it is; "" and
     gravity over the norm where it is none."""

@@ -13,11 +13,14 @@ import zlib
 from pathlib import Path
 from typing import BinaryIO, Self, cast
 
+from kf_calib.errors import InputError
+
 _GZIP = b"\x1f\x8b"
 _UTF16 = (b"\xff\xfe", b"\xfe\xff")
 _CYRILLIC = re.compile(rb"[\xc0-\xff]{3}")
 _HEAD_BYTES = 1 << 16
 _MARK = "\ufeff"
+_NOT_UNPACKED = (EOFError, zlib.error, gzip.BadGzipFile)
 
 
 class TextFile:
@@ -72,7 +75,7 @@ class TextFile:
             return b""
         try:
             block = self._file.read(size)
-        except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        except _NOT_UNPACKED as error:
             block, self.trouble = b"", f"its end cannot be unpacked ({error}): copy it anew, what comes before is used."
         self._has_ended = not block
         return block
@@ -85,9 +88,13 @@ def head_of(path: Path) -> bytes:
 
 
 def unpacked(path: Path) -> bytes:
-    """The whole content of a file, of one that is packed by gzip what is in it. Raises OSError."""
+    """The whole content of a file, of one that is packed by gzip what is in it. Raises OSError, and InputError where
+    its end cannot be unpacked."""
     content = path.read_bytes()
-    return gzip.decompress(content) if content.startswith(_GZIP) else content
+    try:
+        return gzip.decompress(content) if content.startswith(_GZIP) else content
+    except _NOT_UNPACKED as error:
+        raise InputError(f"{path}: its end cannot be unpacked ({error}): copy it anew.") from None
 
 
 def text_of(path: Path, most: int) -> tuple[str, str]:
