@@ -163,7 +163,7 @@ class ReadingOptions:
         help="Rows a second of a log in lines that has no column of time.")] = None
     where: Annotated[str | None, _of_input(
         "--where", metavar="COLUMN=VALUE",
-        help="The rows of a log in lines that count, where it has several sensors: --where I=0.")] = None
+        help="The rows of a table or a log in lines that count, where it has several sensors: --where I=0.")] = None
     accel_topic: Annotated[str | None, _of_input(
         "--accel-topic", metavar="TOPIC", help="Topic of the accelerometer, where there are several.")] = None
     pose_topic: Annotated[str | None, _of_input(
@@ -228,7 +228,7 @@ class ReadingOptions:
             case FileKind.TABLE:
                 refuse_given(OF_MESSAGES + OF_DWELLS + _OF_LINES, f"{path} is a table of mean readings")
                 return open_table(path, self.keys, columns=columns, angles=angles, input=input,
-                                  angle_unit=self.angle_unit, g_unit=self.g_unit)  # fmt: skip
+                                  angle_unit=self.angle_unit, g_unit=self.g_unit, where=self.where or "")  # fmt: skip
             case FileKind.SAMPLES:
                 refuse_given(OF_MESSAGES, f"{path} is a log in lines of text")
                 return Lines(path, self.keys, columns, units=self.units(input), angles=angles)
@@ -382,7 +382,7 @@ def _bench_from_toml(path: Path) -> dict[str, str]:
 
 
 _OF_TEXT = ("columns", "g_unit", "rate_hz", "where")
-_OF_LINES = ("rate_hz", "where")
+_OF_LINES = ("rate_hz",)
 OF_MESSAGES = ("accel_topic", "pose_topic", "temperature_topic", "fields", "max_chunk_mb")
 OF_DWELLS = ("joints", "settle_s", "still_deg", "gate", "gate_sigma")
 """Options that act on text and spreadsheets only, on logs in lines only, on files of messages only, and where dwells

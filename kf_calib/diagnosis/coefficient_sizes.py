@@ -88,7 +88,7 @@ def usual_sizes(effect: Effect, grade: Grade) -> SizePrior | None:
 
 def best_sigma(root: Floats) -> float:
     """Sigma of the coefficient that is determined best, from a root (r, q) of the information on them all."""
-    return float(1.0 / max(np.linalg.norm(root, axis=0).max(initial=0.0), 1e-300))
+    return float(1.0 / max(np.linalg.norm(root, axis=0).max(initial=0.0), 1e-100))
 
 
 @dataclass(frozen=True)

@@ -114,6 +114,11 @@ class RunPosterior:
         return [self._run.likelihood.projected(covariance) for covariance in self._sizes.covariances]
 
     @cached_property
+    def _grams(self) -> list[list[tuple[Floats, Floats]]]:
+        """The products of the columns of all terms in all noises."""
+        return [self._run.grams(rows) for rows in self._rows]
+
+    @cached_property
     def _base(self) -> Floats:
         """Log likelihoods (noises,) without any term."""
         return np.array([rows.log for rows in self._rows])
@@ -121,7 +126,7 @@ class RunPosterior:
     @cached_property
     def _log_bayes(self) -> Floats:
         """Log Bayes factors (terms, noises) of all terms."""
-        return np.array([self._run.log_bayes(rows) for rows in self._rows]).T
+        return np.array([self._run.log_bayes(grams) for grams in self._grams]).T
 
     @cached_property
     def _log_evidence(self) -> Floats:
@@ -229,14 +234,12 @@ class RunPosterior:
         pairs = dict[tuple[str, str], float]()
         for name in self._heads():
             stage.say(f"weighing all beside {name}")
-            term = self._run.terms[self._best[name]]
             alone = self._base + self._log_bayes[self._best[name]] + self._log_share_of_best(name)
             # beside one more term less noise is likely, not more
             numbers = self._sizes.likely(alone, self._log_bayes.max(axis=0))
             beside = np.zeros((len(self._run.terms), len(alone)))
             for k in itertools.chain(*numbers):
-                rows = self._run.likelihood.projected(self._sizes.covariances[k], term.columns)
-                beside[:, k] = self._run.log_bayes(rows)
+                beside[:, k] = self._run.log_bayes_beside(self._best[name], self._rows[k], self._grams[k])
             logs = np.logaddexp.reduce(self._sizes.evidence(alone + beside, numbers), axis=1)
             for other, log in self._by_row(logs).items():
                 key = (other, name) if (other, name) in pairs else (name, other)

@@ -112,9 +112,10 @@ class Diagnosis:
 
     @cached_property
     def floor_mps2(self) -> float | None:
-        """What noise alone gives as held-out error: in the model with what is missing, else in the noise that the
-        likeliest explanation leaves. A model that fails takes for noise what it lacks. None where nothing tells it."""
-        return (self.after or self.before_in_noise_left or self.before).held_out_floor_mps2
+        """What noise alone gives as held-out error: in the model with what is missing, else in that of the likeliest
+        explanation. A model that fails takes for noise what it lacks. None where nothing tells it."""
+        first = self.likeliest
+        return (self.after or (first and first.refit) or self.before).held_out_floor_mps2
 
     @cached_property
     def residual_ratios(self) -> Floats:

@@ -213,16 +213,30 @@ class RunTerms:
             )  # fmt: skip
         return alike
 
-    def log_bayes(self, rows: Projected) -> Floats:
-        """Log Bayes factors (terms,) of all terms in one noise."""
-        logs, columns = np.zeros(len(self.terms)), np.ascontiguousarray(rows.columns.T)
+    def grams(self, rows: Projected) -> list[tuple[Floats, Floats]]:
+        """G^T G (n, q, q) and G^T z (n, q) of all terms in one noise, those of equal numbers of columns together."""
+        grams, columns = list[tuple[Floats, Floats]](), np.ascontiguousarray(rows.columns.T)
         for alike in self._alike:
             parts = columns[alike.places] * alike.scales[:, :, None]
             gram, along = parts @ np.swapaxes(parts, 1, 2), parts @ rows.readings
-            if rows.means_only:
-                gram, along = gram + alike.gram, along + alike.along
+            grams.append((gram + alike.gram, along + alike.along) if rows.means_only else (gram, along))
+        return grams
+
+    def log_bayes(self, grams: Sequence[tuple[Floats, Floats]]) -> Floats:
+        """Log Bayes factors (terms,) of all terms in the noise of ``grams``."""
+        logs = np.zeros(len(self.terms))
+        for alike, (gram, along) in zip(self._alike, grams, strict=True):
             logs[alike.numbers] = log_bayes(gram, along, alike.squares, alike.log_weights, alike.centres)
         return logs
+
+    def log_bayes_beside(self, number: int, rows: Projected, grams: Sequence[tuple[Floats, Floats]]) -> Floats:
+        """Log Bayes factors (terms,) of all terms beside one whose columns may have any size."""
+        explained, of_readings = self.likelihood.explained_by(self.terms[number].columns, rows)
+        left = list[tuple[Floats, Floats]]()
+        for alike, (gram, along) in zip(self._alike, grams, strict=True):
+            parts = np.moveaxis(explained[:, alike.places] * alike.scales, 0, 2)  # (n, q, f)
+            left.append((gram - parts @ np.swapaxes(parts, 1, 2), along - parts @ of_readings))
+        return self.log_bayes(left)
 
     def bases(self, numbers: Sequence[int], rows: Projected) -> tuple[Floats, Floats]:
         """Orthonormal bases (n, q, r) of some terms in one noise, filled up with zeros, and the readings (r,)."""

@@ -270,12 +270,15 @@ def format_probability(probability: float) -> str:
 
 
 def _size(diagnosis: Diagnosis) -> str:
-    """Return, as text, the most significant coefficient of the first missing effect and its constant, with sigmas."""
+    """Return, as text, the most significant coefficient of the missing effects and the constant of its effect, with
+    sigmas."""
     assert diagnosis.after is not None
     parameters = diagnosis.after.parameters
-    first = next(each for each in diagnosis.after.model.effects if str(each) == diagnosis.missing[0])
-    parameters_named = [_clearest([parameters[c.symbol] for c in first.parameters])]
-    parameters_named += [parameters[first.unknown.symbol]] if first.unknown else []
+    missing = [each for each in diagnosis.after.model.effects if str(each) in diagnosis.missing]
+    largest = _clearest([parameters[c.symbol] for each in missing for c in each.parameters])
+    its_own = next(each for each in missing if largest.symbol in {c.symbol for c in each.parameters})
+    constant = its_own.unknown
+    parameters_named = [largest, *([parameters[constant.symbol]] if constant else [])]
     return "".join(
         f", {p.symbol} = {shown(p).number(p.value)} ± {shown(p).text(p.sigma, 2)}"
         for p in parameters_named

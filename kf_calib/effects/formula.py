@@ -175,10 +175,13 @@ class Reading:
         except InputError:
             return ""
 
-    def typical(self, stimulus: Stimulus) -> float:
-        """Rms on a trial run, to a power of ten."""
+    def typical(self, stimulus: Stimulus, checked: bool) -> float:
+        """Rms on a trial run, to a power of ten; 1 where the program has written a formula that is none there, as a
+        decay of another run is."""
         size = np.abs(self(stimulus))
         largest = float(size.max())
+        if not checked and not largest:
+            return 1.0
         if not 1e-60 < largest < 1e60:
             raise InputError(f"{self.name} has values up to {largest:.1e}: multiply the formula by a constant.")
         return 10.0 ** round(math.log10(largest * np.sqrt(np.mean((size / largest) ** 2))))
@@ -215,7 +218,7 @@ class Formula(SensorEffect):
         self.text = f"{name} = {expression}"
         stimulus = _trial(bench.axes, bench.gravity_mps2)
         self.remarks = checks.check_effect(self, stimulus) if checked else ()
-        vars(self).update(scale=_LARGE_MPS2 / self.reading.typical(stimulus))
+        vars(self).update(scale=_LARGE_MPS2 / self.reading.typical(stimulus, checked))
 
     def terms(self, s: Stimulus) -> Floats:
         terms = np.array(np.broadcast_to(self.reading(s), (len(s), 3)), dtype=float)
@@ -248,7 +251,7 @@ class FrameFormula(FrameEffect):
         symbols = [f"{symbol_stem(name)}{axis}" for axis in axes]
         self._coefficients = tuple(Coefficient(symbol, unit, 1.0, *shown) for symbol in symbols)
         self.remarks = checks.check_effect(self, stimulus) if checked else ()
-        scale = _LARGE_RAD / self.reading.typical(stimulus)
+        scale = _LARGE_RAD / self.reading.typical(stimulus, checked)
         self._coefficients = tuple(replace(each, scale=scale) for each in self._coefficients)
 
     @property

@@ -107,14 +107,17 @@ class HeldOut:
 
 
 def held_out(fitted: Fit) -> HeldOut | None:
-    """The held-out errors of all dwells; None if the fit without some orientation would be undetermined.
+    """The held-out errors of all dwells; None if the fit without some orientation would be undetermined, or predict
+    readings to no better than gravity.
 
     Slews are not left out of any fit. Without angles the errors are those of |f|, one a dwell.
     """
     predicted = (_beside if fitted.noise.walk_mps2_per_sqrt_s else _without)(fitted, orientations(fitted.dwells))
     if predicted is None:
         return None
-    return told_of(*predicted, fitted.linearised.means, fitted.linearised.state, fitted.noise.attitude_unknown)
+    means, state = fitted.linearised.means, fitted.linearised.state
+    told = told_of(*predicted, means, state, fitted.noise.attitude_unknown)
+    return told if told.floor_mps2 < fitted.linearised.model.bench.gravity_mps2 else None
 
 
 def told_of(errors_mps2: Floats, covariance: Floats, means: Means, state: Floats, free: bool) -> HeldOut:

@@ -17,7 +17,7 @@ from kf_calib.dwells.stack import DwellStack
 from kf_calib.estimation import free_attitude, square_root_information, whitened_rows
 from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns
 from kf_calib.noise.means import Means
-from kf_calib.noise.noise_model import Noise, flicker_sigma, slow_waves, steps
+from kf_calib.noise.noise_model import Noise, changes_by_square_axes, flicker_sigma, slow_waves, steps
 from kf_calib.noise.reml import Part, gain_of, misfit, with_shared_noise
 from kf_calib.noise.temperature_course import thermometer_errors
 
@@ -117,8 +117,10 @@ class Fit:
         estimated (Schmidt-Kalman filter).
         """
         linearised, information = self.linearised, np.zeros((self.linearised.model.count,) * 2)
-        if linearised.model.square:
-            information += self._considered(free_attitude.square_changes(linearised))
+        if self.noise.square_sigmas is not None:
+            information += self._considered(
+                changes_by_square_axes(linearised.dwells_at_state, self.noise.square_sigmas)
+            )
         if not linearised.model.bench.angles and linearised.model.effects:
             information += self._considered(free_attitude.triad_changes(linearised))
         if self.noise.sensitivity_mps2_per_k is not None:

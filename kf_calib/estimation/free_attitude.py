@@ -26,7 +26,7 @@ from kf_calib.errors import UnobservableError
 from kf_calib.estimation.attitude import added_by, bent_effects, matrix_of
 from kf_calib.estimation.dwell_columns import LinearisedDwells, stimulus_of
 from kf_calib.estimation.kalman_filterpy import Samples, all_nuisance_sigmas
-from kf_calib.estimation.measurement_model import FRAME, SQUARE
+from kf_calib.estimation.measurement_model import FRAME, SQUARE, Model
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise
 
@@ -59,9 +59,9 @@ def regressors_of(means: Means) -> Floats:
     return regressors
 
 
-def covariance_of(linearised: LinearisedDwells, noise: Noise, square_rad: float = 1.0) -> Floats:
+def covariance_of(linearised: LinearisedDwells, noise: Noise, square_rad: float | Floats = 1.0) -> Floats:
     """Covariance (12, 12) that the dwells give of the nine parameters, with weak knowledge of each: 100 % of a scale
-    factor, 10 m/s^2 of a bias, and ``square_rad`` of each angle between axes."""
+    factor, 10 m/s^2 of a bias, and ``square_rad`` of each angle between axes, of all or of each of ``SQUARE``."""
     means = linearised.means
     across = weights_of_size(means, linearised.state)
     design = np.einsum("di,dip->dp", across, regressors_of(means))
@@ -73,10 +73,10 @@ def covariance_of(linearised: LinearisedDwells, noise: Noise, square_rad: float 
     return out
 
 
-def weak_covariance(square_rad: float = 1.0) -> Floats:
+def weak_covariance(square_rad: float | Floats = 1.0) -> Floats:
     """Covariance (12, 12) of the nine parameters before any dwell, see ``covariance_of``; zeros for the frame."""
     sizes = np.ones(STATE_COUNT)
-    sizes[3::4], sizes[list(SQUARE)], sizes[list(FRAME)] = 10.0, square_rad, 0.0
+    sizes[3::4], sizes[[*SQUARE.values()]], sizes[list(FRAME)] = 10.0, square_rad, 0.0
     return np.diag(sizes**2)
 
 
@@ -89,23 +89,29 @@ def row_of(up: str, state: Floats, gravity_mps2: float) -> tuple[Floats, Floats]
     return row, np.asarray(across, float)
 
 
-def tells_angles(linearised: LinearisedDwells, noise: Noise) -> bool:
-    """Whether the dwells tell every angle between the axes better than they are known to be square."""
-    covariance, places = covariance_of(linearised, noise), list(SQUARE)
+def untold_angles(linearised: LinearisedDwells, noise: Noise) -> tuple[str, ...]:
+    """The angles between the axes, of ``SQUARE``, that the dwells tell no better than they are known to be square.
+
+    The one that is told worst is taken for square first, which may tell others.
+    """
+    known_rad, sigma_rad = linearised.model.bench.square_rad, np.ones(len(SQUARE))
     scale = linearised.state[:STATE_COUNT].reshape(3, 4)[:, :3].diagonal()[[1, 2, 2]]
-    spread = covariance[np.ix_(places, places)] / np.outer(scale, scale)
-    return float(np.linalg.eigvalsh(spread)[-1]) < linearised.model.bench.square_rad**2
+    for _ in SQUARE:
+        variances = np.diag(covariance_of(linearised, noise, sigma_rad))[[*SQUARE.values()]] / scale**2
+        worst = int(np.argmax(np.where(sigma_rad == 1.0, variances, 0.0)))
+        if sigma_rad[worst] != 1.0 or variances[worst] < known_rad**2:
+            break
+        sigma_rad[worst] = known_rad
+    return tuple(angle for angle, sigma in zip(SQUARE, sigma_rad, strict=True) if sigma != 1.0)
 
 
-def square_changes(linearised: LinearisedDwells) -> OfPieces:
-    """Changes (pieces, nodes, 3, 3) of each dwell's readings if one of the three angles between the axes is 1 sigma
-    from square."""
-    affine = linearised.state[:STATE_COUNT].reshape(3, 4)
-    force_mps2 = linearised.dwells.force_mps2
-    changes = np.zeros((len(force_mps2), 3, len(SQUARE)))
-    for k, (channel, axis) in enumerate(divmod(place, 4) for place in SQUARE):
-        changes[:, channel, k] = force_mps2[:, axis] * affine[channel, channel] * linearised.model.bench.square_rad
-    return _by_dwell(changes, linearised)
+def square_sigmas(model: Model, state: Floats) -> Floats | None:
+    """One sigma (3, 3) of the sensitivity of each channel to the force along each axis, by the angles that are taken
+    for square; None where there are none."""
+    sigmas, affine = np.zeros((3, 3)), state[:STATE_COUNT].reshape(3, 4)
+    for channel, axis in (divmod(SQUARE[angle], 4) for angle in model.square):
+        sigmas[channel, axis] = affine[channel, channel] * model.bench.square_rad
+    return sigmas if model.square else None
 
 
 def triad_changes(linearised: LinearisedDwells) -> OfPieces:
@@ -133,16 +139,7 @@ def triad_changes(linearised: LinearisedDwells) -> OfPieces:
             )  # fmt: skip
             ends.append(added_by(bent_effects(model, state), turned, model, state))
         changes[:, :, axis] = (ends[0] - ends[1]) * (0.5 * sigma_rad / _TRIAD_STEP_RAD)
-    return _by_dwell(changes, linearised)
-
-
-def _by_dwell(changes: Floats, linearised: LinearisedDwells) -> OfPieces:
-    """Split changes (m, 3, c) at the nodes of all dwells into those of each, (pieces, K nodes, 3, c); zeros on a
-    carrier."""
-    shaped = changes.reshape(-1, 3, *changes.shape[1:])
-    width = linearised.columns[0].shape[1]
-    padded = np.concatenate([shaped, np.zeros((len(shaped), width - 3, *changes.shape[1:]))], axis=1)
-    return OfPieces(padded, linearised.dwells.folded.ends)
+    return linearised.dwells.folded.at_nodes(changes)
 
 
 def undetermined(covariance: Floats) -> list[str]:

@@ -37,7 +37,7 @@ from kf_calib.estimation.attitude import (
 )
 from kf_calib.estimation.dwell_columns import LinearisedDwells, change_by_temperature, stimulus_of
 from kf_calib.estimation.fit import Fit
-from kf_calib.estimation.measurement_model import Model
+from kf_calib.estimation.measurement_model import SQUARE, Model
 from kf_calib.estimation.score_test import delta_chi2
 from kf_calib.noise.noise_model import ATTITUDE_UNKNOWN_RAD, FLOOR_MPS2, Noise, within_dwells
 from kf_calib.noise.noise_of_readings import with_own_noise
@@ -255,15 +255,17 @@ def _nine_parameters(dwells: Sequence[DwellFactor], bench: Bench, walk_mps2_per_
         within, walk_mps2_per_sqrt_s=walk_mps2_per_sqrt_s, setting_rad=ATTITUDE_UNKNOWN_RAD, setting_stated=True,
         scatter_mps2=np.full(3, stated or 0.0), scatter_stated=stated is not None,
     )  # fmt: skip
-    bare = Model(bench, square=True)
+    bare = Model(bench, square=tuple(SQUARE))
     facing = facing_readings(dwells, bare.nominal_state(), bare.bench.gravity_mps2)
     begun = Fit(LinearisedDwells(facing, bare, bare.nominal_state()), noise)
     free_attitude.refuse_poses(begun.linearised, noise)
     settled = _settled(begun)
-    if free_attitude.tells_angles(settled.linearised, noise):
-        bare = Model(bench)
+    untold = free_attitude.untold_angles(settled.linearised, noise)
+    if untold != bare.square:
+        bare = Model(bench, square=untold)
         settled = _settled(Fit(relinearised(settled.linearised, noise, bare, settled.linearised.state), noise))
-    return settled
+    sigmas = free_attitude.square_sigmas(bare, settled.linearised.state)
+    return replace(settled, noise=replace(noise, square_sigmas=sigmas))
 
 
 def _settled(fitted: Fit) -> Fit:

@@ -29,8 +29,8 @@ if TYPE_CHECKING:  # a replay without a bench model does not import what reads o
 _ROUNDING_MPS2 = 1e-13
 FRAME = (1, 2, 6)
 """s1y, s1z, s2z: without angles the frame is that in which accelerometer 1 is x and 2 lies in the plane of x and y."""
-SQUARE = (4, 8, 9)
-"""s2x, s3x, s3y: by how much the axes are not square, in that frame."""
+SQUARE = {"nu1": 4, "phi3": 8, "theta3": 9}
+"""s2x, s3x, s3y, by the angle that each is: by how much the axes are not square, in that frame."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ class Model:
 
     bench: Bench
     effects: tuple[Effect, ...] = ()
-    square: bool = False
-    """Without angles: whether the input axes are taken for square to each other."""
+    square: tuple[str, ...] = ()
+    """Without angles: the angles of ``SQUARE`` by which the input axes are taken for square to each other."""
     known: tuple[KnownEffect, ...] = ()
     """Effects whose coefficients are known, which the readings no longer contain (``without_known``)."""
 
@@ -177,9 +177,9 @@ class Model:
 
     @property
     def fixed(self) -> tuple[int, ...]:
-        """The states that are zero by convention: those of the frame where no angles are used, and the three others
-        across the axes where these are taken for square."""
-        return () if self.bench.angles else FRAME + SQUARE if self.square else FRAME
+        """The states that are zero by convention: those of the frame where no angles are used, and those by which axes
+        are taken for square."""
+        return () if self.bench.angles else (*FRAME, *(SQUARE[angle] for angle in self.square))
 
     def columns(self, stimulus: Stimulus, state: Floats) -> Floats:
         """The design H (m, 3, p): the change of each accelerometer's reading per unit of each state, linearised at

@@ -193,8 +193,8 @@ def _without_angles(linearised: LinearisedDwells, noise: Noise, judged: Consiste
     turn = f"next, turn it so that {free_attitude.next_in_words(linearised, noise)}"
     if model.square:
         yield (
-            f"these poses do not tell the angles between the axes (nu1, theta3, phi3), which are taken for square to "
-            f"{np.degrees(model.bench.square_rad):.3g} deg (--square-sigma), as sigmas allow for: {turn}."
+            f"these poses do not tell all angles between the axes: {', '.join(model.square)} taken for square to "
+            f"{np.degrees(model.bench.square_rad):.3g} deg (--square-sigma), as sigmas and misfit allow for: {turn}."
         )
     elif judged.dof < FEWEST and noise.scatter_mps2.any() and not noise.scatter_stated:
         yield (

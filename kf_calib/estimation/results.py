@@ -190,8 +190,8 @@ class Calibration:
         if self.bench.angles:
             return {}
         fixed: dict[str, Literal["frame", "square"]] = {"theta1": "frame", "phi1": "frame", "nu2": "frame"}
-        if self.model.square:
-            fixed |= {"nu1": "square", "theta3": "square", "phi3": "square"}
+        for angle in self.model.square:
+            fixed[angle] = "square"
         return fixed
 
     @cached_property

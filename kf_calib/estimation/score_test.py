@@ -41,7 +41,7 @@ _OF_ONE_KIND = 400  # columns whitened at a time if there are many effects of on
 _MANY = 100  # above this number of oscillations, a periodogram is faster
 
 _OF_NOISE = ("sigma_mps2", "inflation", "setting_rad", "scatter_mps2", "walk_mps2_per_sqrt_s",
-             "sensitivity_mps2_per_k")  # fmt: skip
+             "sensitivity_mps2_per_k", "square_sigmas")  # fmt: skip
 
 
 class Frame:

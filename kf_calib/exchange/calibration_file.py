@@ -115,6 +115,11 @@ class SavedCalibration(FilePart):
         return replace(bench, angles=False) if self.fixed else bench
 
     @property
+    def square(self) -> tuple[str, ...]:
+        """The angles by which axes were taken for square."""
+        return tuple(angle for angle, by in self.fixed.items() if by == "square")
+
+    @property
     def twelve(self) -> tuple[Floats, Floats]:
         """The twelve parameters (12,) and their covariance (12, 12)."""
         state = np.array(self.state.values[:STATE_COUNT])
@@ -140,7 +145,7 @@ class SavedCalibration(FilePart):
         """
         origin, bench = origin or Path(CALIBRATION_FORMAT), bench or self.bench
         self.model_file(origin).load(named, trust)
-        model = Model(bench, square="square" in self.fixed.values())
+        model = Model(bench, square=self.square)
         for own in self.effects:
             effect = effects.effect_named(own.text, bench)
             model += _at_constant(effect, own.constant, origin, self.state.symbols)

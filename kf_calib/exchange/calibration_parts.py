@@ -146,7 +146,6 @@ _EXACT, _ROUNDED = 1e-9, 1e-6  # of values, of sigmas
 _ROUNDED_ANGLE = 1e-12  # rad, of one that is near zero
 _YEARS = range(1900, 9000)
 _FRAME = {"theta1", "phi1", "nu2"}
-_SQUARE = {"nu1", "theta3", "phi3"}
 
 
 def refuse_state(state: SavedState, fixed: Collection[str]) -> None:
@@ -158,7 +157,7 @@ def refuse_state(state: SavedState, fixed: Collection[str]) -> None:
     unknown = set(state.undetermined) - {*paper_parameters.SYMBOLS, *state.symbols[STATE_COUNT:]}
     if unknown:
         raise ValueError(f"state.undetermined names {min(unknown)}, which is no parameter of this calibration")
-    if set(fixed) not in (set(), _FRAME, _FRAME | _SQUARE):
+    if fixed and not _FRAME <= set(fixed) <= _FRAME | {*SQUARE}:
         raise ValueError("fixed names other parameters than those of the frame, or of square axes")
     covariance = np.array(state.covariance) if all(len(row) == count for row in state.covariance) else np.zeros(0)
     if covariance.shape != (count, count) or not np.allclose(covariance, covariance.T, rtol=_EXACT, atol=0.0):
@@ -175,7 +174,7 @@ def _refuse_variances(covariance: Floats, state: SavedState, fixed: Collection[s
     if _lacks_some_of_the_twelve(state):
         estimated[:STATE_COUNT] = False
     elif fixed:
-        estimated[[*FRAME, *(SQUARE if set(fixed) & _SQUARE else ())]] = False
+        estimated[[*FRAME, *(SQUARE[angle] for angle in fixed if angle in SQUARE)]] = False
     if (variances[estimated] <= 0.0).any():
         symbol = state.symbols[int(np.flatnonzero(estimated & (variances <= 0.0))[0])]
         raise ValueError(f"state.covariance is no covariance: it has no positive variance of {symbol}")

@@ -188,6 +188,8 @@ def apply_to_table(
     unchecked: bool = False,
 ) -> Applied:
     """Write the ``copy``, wholly or not at all; arguments as of ``open_table`` and ``apply_to_file``."""
+    if units.where:
+        raise InputError(f"{path}: a corrected copy has every row, of one sensor: put its rows in a file (--where).")
     grid = grid_of(path)
     meanings = Columns.of(grid, columns, Numbers.of(grid))
     table = Opening(meanings, overrides, units, angles=False).table()

@@ -191,9 +191,8 @@ def _least_misfit(
 
 def _square(saved: SavedCalibration) -> Floats:
     """Return the covariance (p, p) of how square the axes are where they were taken for square."""
-    covariance, places = np.zeros((len(saved.state.values),) * 2), list(SQUARE)
-    if "square" in saved.fixed.values():
-        covariance[places, places] = saved.bench.square_rad**2
+    covariance, places = np.zeros((len(saved.state.values),) * 2), [SQUARE[angle] for angle in saved.square]
+    covariance[places, places] = saved.bench.square_rad**2
     return covariance
 
 
@@ -209,7 +208,7 @@ def _moves(saved: SavedCalibration, new: Calibration, free: Sequence[str]) -> tu
 
     A scale factor by axes that were taken for square is K cos(angle off square), wrong by about K angle^2 / 2.
     """
-    off_square = saved.bench.square_rad**2 if "square" in saved.fixed.values() and not new.model.square else 0.0
+    off_square = saved.bench.square_rad**2 if {*saved.square} - {*new.model.square} else 0.0
     skipped = {symbol for each in new.model.effects if str(each) in free for symbol in _symbols(each)}
     before = {each.symbol: each for each in saved.parameters}
     differences = list[tuple[str, str, float, float, float]]()

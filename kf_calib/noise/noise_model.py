@@ -65,6 +65,8 @@ class Noise:
     - walk_spread: the sigma of ln q; None if q was stated or is zero.
     - sensitivity_mps2_per_k (3, 8): change of the readings per K on the regressors 1, f and T, T f
       (``temperature_course``); None where the noise of the thermometer does not matter.
+    - square_sigmas (3, 3): sigma of the sensitivity of each channel to the force along each axis, by angles between
+      axes that the dwells do not tell (``free_attitude``); None where all are told.
     - flicker_mps2 (3,): sqrt(h) of 1/f noise within dwells (``nuisance_states``); None for none.
     - within_seen: whether readings within dwells showed their noise; in a table of means alone they do not.
     """
@@ -83,6 +85,7 @@ class Noise:
     within_seen: bool = True
     sensitivity_mps2_per_k: Floats | None = None
     flicker_mps2: Floats | None = None
+    square_sigmas: Floats | None = None
 
     def __post_init__(self) -> None:
         if self.scatter_mps2 is None:  # pyright: ignore[reportUnnecessaryComparison]
@@ -109,9 +112,8 @@ class Noise:
         from this misfit itself, unless no other noise is known."""
         if not self.within_seen:
             return self
-        scatter_mps2 = self.scatter_mps2 if self.scatter_stated else np.zeros(3)
-        setting_rad = self.setting_rad if self.setting_stated or self.setting_judged else 0.0
-        return replace(self, scatter_mps2=scatter_mps2, setting_rad=setting_rad)
+        known = self.without_estimates()
+        return replace(known, setting_rad=self.setting_rad) if self.setting_judged else known
 
     def without_estimates(self) -> Noise:
         """The noise without scatter and a setting error that were estimated from the misfit, which they explain."""
@@ -196,7 +198,8 @@ def _sigma_along(stack: DwellStack, along: Floats, inflation: Floats) -> Floats:
     """Return sigma_w (3,) of the accelerometers from the readings along the force alone, which have the variance sum of
     (m_i sigma_i)^2 with m = ``along`` (D, 3).
 
-    The likeliest variances of such gamma distributed sums, by steps that keep them positive.
+    The likeliest variances of such gamma distributed sums, by steps that keep them positive. The readings of a dwell
+    then have one weight in all channels.
     """
     weights, folded = along**2, stack.folded
     squares = folded.weights[:, 0] * folded.squares_along(along)
@@ -304,13 +307,26 @@ def slow_waves(dwells: Sequence[DwellFactor], flicker_mps2: Floats) -> tuple[OfP
 
 
 def shared_noise(dwells: Sequence[DwellFactor], noise: Noise) -> tuple[OfPieces, Floats]:
-    """Columns (pieces, nodes, 3, q) of all noise that dwells have in common, the slow part of a stated scatter and the
-    error of the temperature, and the prior sigmas (q,) of their coefficients."""
+    """Columns (pieces, nodes, 3, q) of all noise that dwells have in common, the slow part of a stated scatter, angles
+    that are taken for square and the error of the temperature, and the prior sigmas (q,) of their coefficients."""
     slow, sigma = slow_scatter(dwells, noise)
+    if noise.square_sigmas is not None:
+        untold = changes_by_square_axes(dwells, noise.square_sigmas)
+        slow, sigma = slow.beside(untold), np.append(sigma, np.ones(untold.values.shape[3]))
     if noise.sensitivity_mps2_per_k is None:
         return slow, sigma
     errors = thermometer_errors(dwells, noise.sensitivity_mps2_per_k)
     return slow.beside(errors), np.append(sigma, np.ones(errors.values.shape[3]))
+
+
+def changes_by_square_axes(dwells: Sequence[DwellFactor], square_sigmas: Floats) -> OfPieces:
+    """Changes (pieces, nodes, 3, k) of each dwell's readings if one of k angles that are taken for square is 1 sigma
+    off."""
+    stack, places = DwellStack.of(dwells), np.argwhere(square_sigmas > 0.0)
+    changes = np.zeros((len(stack.force_mps2), 3, len(places)))
+    for k, (channel, axis) in enumerate(places.tolist()):
+        changes[:, channel, k] = stack.force_mps2[:, axis] * square_sigmas[channel, axis]
+    return stack.folded.at_nodes(changes)
 
 
 def flicker_sigma(noise: Noise, dwells: int) -> Floats:

@@ -183,8 +183,12 @@ class HandJudgement:
     def reached(self) -> bool:
         """Whether there are targets of parameters that are left without angles, and every one is reached."""
         aimed = np.isfinite(self.wanted) & ~np.isin(paper_parameters.SYMBOLS, ("theta1", "phi1", "nu2"))
-        reached = self.result is not None and (self.sigma <= self.result.aims(self.wanted))[aimed].all()
-        return bool(aimed.any() and reached and self.consistent is not None)
+        return bool(aimed.any() and (self.sigma <= self.aims)[aimed].all() and self.consistent is not None)
+
+    @property
+    def aims(self) -> Floats:
+        """The sigmas (12,) by which targets are reached: below them where noise is known from few poses only."""
+        return self.wanted if self.result is None else self.result.aims(self.wanted)
 
     @property
     def consistent(self) -> bool | None:
@@ -195,7 +199,7 @@ class HandJudgement:
         """
         if self.final and self.result is not None:
             return self.result.consistency.consistent
-        if self.result is None or self.result.consistency.p_value is None or self.result.model.square:
+        if self.result is None or self.result.consistency.p_value is None:
             return None
         return self.result.consistency.p_value >= LEVEL / (self.looks * (self.looks + 1))
 
@@ -204,13 +208,11 @@ class HandJudgement:
         """What the poses tell, in a few words."""
         if self.result is None:
             return f"{', '.join(self.sides.missing)} not determined yet"
+        if self.consistent is False:
+            return "the sizes of gravity differ by more than noise: was it held still?"
         if self.result.model.square:
-            return "the angles between the axes are not told yet: they are taken for square"
-        if self.consistent is None:
-            return "too few poses to test them by each other"
-        if self.consistent:
-            return "the sizes of gravity agree"
-        return "the sizes of gravity differ by more than noise: was it held still?"
+            return f"these angles are not told yet, and taken for square: {', '.join(self.result.model.square)}"
+        return "the sizes of gravity agree" if self.consistent else "too few poses to test them by each other"
 
 
 @dataclass(frozen=True)
@@ -270,7 +272,7 @@ def judge_poses(passed: Pass, wanted: Floats, before: HandJudgement | None = Non
         except UnobservableError:
             result = None
         sides = Sides.of(dwells, passed.source.bench, None if result is None else result.fit)
-    tested = result is not None and result.consistency.p_value is not None and not result.model.square
+    tested = result is not None and result.consistency.p_value is not None
     return HandJudgement(result, dwells, sides, wanted, (before.looks if before else 0) + tested)
 
 

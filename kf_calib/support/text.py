@@ -60,6 +60,11 @@ def cut(text: str, longest: int) -> str:
 _loaders = list[Callable[[], object]]()
 
 
+def counted(count: int, what: str) -> str:
+    """So many of something: 1 gap, 2 gaps."""
+    return f"{count} {what}{'s' * (count != 1)}"
+
+
 def shown_by(load: Callable[[], object]) -> None:
     """Have ``load`` called before the first result is shown: it imports the modules that register how."""
     _loaders.append(load)

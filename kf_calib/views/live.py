@@ -128,7 +128,7 @@ def link(standing: Progress, status: Status | None, name: str, recording: str) -
     for word, count in counts.items():
         style = "red" if word in ("missing", "left out", "dropped") else "yellow"
         if count or word in ("gaps", "refused"):
-            text.append(f"  {count} {word}", style if count else "")
+            text.append(f"  {count} {word.removesuffix('s') if count == 1 else word}", style if count else "")
     for trouble in (status.trouble, status.clock_trouble):
         if trouble:
             text.append(f"\n{sentence(trouble)}", "bold red")
@@ -316,7 +316,7 @@ def _sigmas_by_hand(judgement: HandJudgement | None) -> RenderableType:
         if judgement is None or result is None or parameter is None or parameter.value is None:
             table.add_row(symbol(name), "square" if result else "-", "", unit.label, "", Bar(""))
             continue
-        sigma, wanted = float(judgement.sigma[k]), float(judgement.wanted[k])
+        sigma, wanted = float(judgement.sigma[k]), float(judgement.aims[k])
         off, spread = unit.rounded(parameter.value - parameter.nominal, sigma)
         target = unit.number(wanted) if math.isfinite(wanted) else ""
         table.add_row(symbol(name), off, f"± {spread}", unit.label, target, bar(sigma, wanted, k))
@@ -326,7 +326,6 @@ def _sigmas_by_hand(judgement: HandJudgement | None) -> RenderableType:
 def _found(judgement: HandJudgement) -> str:
     """Return the line about sides and misfit."""
     sides = judgement.sides.count
-    result = judgement.result  # axes that are only taken for square would dominate the misfit
-    nis = None if result is None or result.model.square else result.consistency.nis_per_dof
+    nis = None if judgement.result is None else judgement.result.consistency.nis_per_dof
     misfit = "" if nis is None else f"NIS/dof {nis:.3g}; "
     return f"{sides} side{'s' * (sides != 1)} seen; {misfit}{judgement.verdict}"

@@ -17,7 +17,7 @@ from rich.text import Text
 from kf_calib.dwells.rest_in_readings import DwellSummary
 from kf_calib.sources.files.inventory import Inventory, Topic
 from kf_calib.sources.tables.survey import ColumnFound, Survey
-from kf_calib.support.text import cut
+from kf_calib.support.text import counted, cut
 from kf_calib.views.json import clean
 from kf_calib.views.terminal import ConsoleTable, note
 
@@ -188,13 +188,13 @@ def table_report(overview: TableOverview) -> RenderableType:
     """What ``info`` prints of a table."""
     survey = overview.survey
     parts: list[RenderableType] = [
-        Text(f"{survey.path}: a table of orientations, {_counted(survey.count, 'row')}"),
+        Text(f"{survey.path}: a table of orientations, {counted(survey.count, 'row')}"),
         _column_table(survey.columns),
     ]
     bench = ", ".join(f"{key} = {value}" for key, value in overview.bench.items())
     parts.append(Text(f"Bench: {bench or 'nothing is said of it'}"))
     if survey.rows:
-        parts += [Text(f"{_counted(len(survey.rows), 'orientation')}:"), _row_table(survey)]
+        parts += [Text(f"{counted(len(survey.rows), 'orientation')}:"), _row_table(survey)]
         if len(survey.rows) > _SHOWN_ROWS:
             parts.append(Text(f"and {len(survey.rows) - _SHOWN_ROWS} more, all of them by --json"))
     parts += [note(said) for said in survey.warnings]
@@ -208,10 +208,6 @@ def table_report(overview: TableOverview) -> RenderableType:
     parts += [Text(f"Missing: {said}") for said in overview.missing]
     parts.append(Text(f"{'Then try' if overview.missing else 'Try'}: {overview.command}"))
     return Group(*parts)
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count} {what}{'s' * (count != 1)}"
 
 
 def _column_table(columns: Sequence[ColumnFound]) -> ConsoleTable:

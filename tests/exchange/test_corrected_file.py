@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import gzip
 from pathlib import Path
 from typing import Any
 
@@ -129,7 +130,7 @@ def test_a_row_that_goes_over_several_lines_is_refused(
     assert not copy.exists()
 
 
-@pytest.mark.parametrize("codec", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
+@pytest.mark.parametrize("codec", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "cp1252"])
 def test_a_copy_has_the_encoding_of_the_table(codec: str, correction: Correction, tmp_path: Path) -> None:
     path, copy = tmp_path / "poses.csv", tmp_path / "corrected.csv"
     faces = np.vstack([np.eye(3), -np.eye(3)]).tolist()
@@ -140,3 +141,13 @@ def test_a_copy_has_the_encoding_of_the_table(codec: str, correction: Correction
     assert copy.read_bytes()[:2] == path.read_bytes()[:2]
     first, *others = copy.read_text(codec).splitlines()
     assert first == "ax_mps2,ay_mps2,az_mps2,Prüfung" and all(other.endswith(",außen") for other in others)
+
+
+def test_a_copy_of_a_packed_table_is_plain(correction: Correction, tmp_path: Path) -> None:
+    path, copy = tmp_path / "poses.csv.gz", tmp_path / "corrected.csv"
+    faces = np.vstack([np.eye(3), -np.eye(3)]).tolist()
+    path.write_bytes(
+        gzip.compress("\n".join(["ax [g],ay [g],az [g]", *(f"{x},{y},{z}" for x, y, z in faces)]).encode())
+    )
+    apply_to_table(correction, path, copy, {}, {}, Units())
+    assert copy.read_text().splitlines()[0] == "ax_mps2,ay_mps2,az_mps2" and len(copy.read_text().splitlines()) == 7

@@ -31,7 +31,8 @@ DWELLS, DWELL_S, GAP_S, RATE_HZ, POSE_HZ = 24, 60.0, 5.0, 5.0, 0.5
 UG = 1e-6 * G
 UNSEEN = {
     "vibration-rectification", "bias-walk", "dead-zone", "sinusoid", "gravity-error", "cross-talk", "encoder-offset:y",
-    "encoder-offset:x", "encoder-scale:y", "encoder-harmonic-1:y", "encoder-harmonic-2:y", "warm-up", "thermal-lag",
+    "encoder-offset:x", "encoder-scale:y", "encoder-harmonic-1:y", "encoder-harmonic-2:y", "backlash:y", "warm-up",
+    "thermal-lag",
 }  # fmt: skip
 """Without coefficients that such a run shows; or, where the effect is not there, with a constant of which nothing is
 known."""

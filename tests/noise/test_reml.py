@@ -150,7 +150,7 @@ def test_nothing_is_estimated_where_the_misfit_is_one_that_noise_exceeds_once_in
     """All of it in one accelerometer, in which it is far beyond noise; of the others nothing is left at all."""
     means, state, noise = walked.linearised.means, walked.linearised.state, walked.noise
     within = Noise(noise.sigma_mps2, noise.inflation)
-    design, sigma = means.design[:, 1], within.effective_sigma_mps2[1] / np.sqrt(means.counts)
+    design, sigma = means.design[:, 1], within.effective_sigma_mps2[1] / np.sqrt(means.counts[:, 1])
     columns = design[:, np.abs(design).any(axis=0)] / sigma[:, None]
     left = np.random.default_rng(3).normal(size=len(sigma))
     left -= columns @ np.linalg.lstsq(columns, left)[0]

@@ -142,7 +142,7 @@ def test_a_poor_set_of_sides_is_told_and_not_fitted() -> None:
     assert "the side of pose 1 again" in line and "3 sides seen" in line and "not determined yet" in line
 
 
-def judged(p_value: float | None, looks: int = 1, square: bool = False, final: bool = False) -> HandJudgement:
+def judged(p_value: float | None, looks: int = 1, square: tuple[str, ...] = (), final: bool = False) -> HandJudgement:
     consistency = SimpleNamespace(p_value=p_value, consistent=p_value is not None and p_value >= LEVEL)
     result: Any = SimpleNamespace(consistency=consistency, model=SimpleNamespace(square=square))
     return HandJudgement(result, [], SimpleNamespace(missing=["x up"]), np.ones(12), looks, final)  # type: ignore[arg-type]
@@ -157,11 +157,13 @@ def test_all_looks_together_raise_a_false_alarm_as_often_as_one() -> None:
 
 def test_a_verdict_waits_for_poses_that_test_each_other() -> None:
     none = HandJudgement(None, [], judged(0.5).sides, np.ones(12))
-    waiting = (none, judged(0.5, square=True), judged(None))
+    waiting = (none, judged(None, square=("nu1",)), judged(None))
     assert [each.consistent for each in waiting] == [None, None, None]
-    told = [each.verdict for each in (*waiting, judged(0.5), judged(1e-9))]
-    beginnings = ("x up not determined", "the angles between", "too few poses", "the sizes of gravity agree",
-                  "the sizes of gravity differ")  # fmt: skip
+    told = [each.verdict for each in (*waiting, judged(0.5), judged(1e-9), judged(1e-9, square=("nu1",)))]
+    beginnings = [
+        "x up not determined", "these angles are not told yet, and taken for square: nu1", "too few poses",
+        "the sizes of gravity agree", "the sizes of gravity differ", "the sizes of gravity differ",
+    ]  # fmt: skip
     assert all(one.startswith(other) for one, other in zip(told, beginnings, strict=True))
 
 

@@ -29,7 +29,7 @@ from kf_calib.sources.text.contents import is_nameless, meanings_by_numbers
 from kf_calib.sources.text.heading import TextHeading
 from kf_calib.sources.text.labels import Labels
 from kf_calib.sources.text.names import ACCEL, ANGLE, QUATERNION, TIME, Meaning, is_exact, meanings_of, unit_of_epoch
-from kf_calib.sources.text.units import Units, reading_units, size_of_count, usual_norm
+from kf_calib.sources.text.units import Units, choice_of, reading_units, size_of_count, usual_norm
 from kf_calib.support.text import cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
@@ -396,7 +396,7 @@ class CsvColumns:
 
     def _choose(self, where: str) -> None:
         """Keep the rows whose cell in a column is the one stated, as ``I=0``; raises InputError where there is none."""
-        name, _, value = where.rpartition("=")
+        name, value = choice_of(where)
         if name not in self.header:
             raise InputError(
                 f"has no column {cut(name, 60)!r} (--where), it has {cut(', '.join(map(repr, self.header)), 300)}."

@@ -23,6 +23,7 @@ from typing import Any
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.sources.files.line_parts import Account
+from kf_calib.support.text import counted
 
 IDLE_S = 0.02
 """How long is waited for more where nothing has come."""
@@ -127,8 +128,8 @@ class Status:
     def sentences(self) -> list[str]:
         """What a user must know once the run has ended."""
         said = [
-            (self.reconnects, f"the link was lost and regained {self.reconnects} times"),
-            (self.missing, f"{self.missing} readings were lost on the way, in {self.gaps} gaps"),
+            (self.reconnects, f"the link was lost and regained {counted(self.reconnects, 'time')}"),
+            (self.missing, f"{counted(self.missing, 'reading')} lost on the way, in {counted(self.gaps, 'gap')}"),
             (self.clock_trouble, self.clock_trouble),
             (
                 self.left_out,

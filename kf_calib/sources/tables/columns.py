@@ -189,10 +189,7 @@ def _meanings(grid: Grid, stated: Mapping[str, str]) -> list[Meaning]:
     """Return what the header and the user say; raises InputError for names that are not known."""
     for theirs, ours in stated.items():
         if theirs not in grid.header:
-            raise InputError(
-                f"{grid.name}: has no column {cut(theirs, 60)!r} (--column), it has "
-                f"{cut(', '.join(map(repr, grid.header)), 300)}."
-            )
+            raise InputError(f"{grid.name}: has no column {cut(theirs, 60)!r} (--column), it has {grid.names}.")
         if ours != "-" and not meaning_of(ours).ours:
             raise InputError(f"--column {theirs}={ours}: {cut(ours, 60)!r} is not known: use {KNOWN}, or - for none.")
     return meanings_of(grid.header, stated)

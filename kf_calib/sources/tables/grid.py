@@ -16,6 +16,7 @@ from kf_calib.sources.text.encoding import text_of, too_large
 from kf_calib.sources.text.heading import delimiter_in, header_in, is_comment
 from kf_calib.sources.text.labels import Labels
 from kf_calib.sources.text.names import face_of
+from kf_calib.sources.text.units import choice_of
 from kf_calib.support.text import cut
 
 Cell = str | float | datetime | None
@@ -52,10 +53,34 @@ class Grid:
         """The cells of one column."""
         return [row[index] for row in self.rows]
 
+    def chosen(self, where: str) -> Grid:
+        """The rows that have a text in a column, as ``unit=7``; all for an empty one. Raises InputError for none."""
+        if not where:
+            return self
+        name, value = choice_of(where)
+        if name not in self.header:
+            raise InputError(f"{self.name}: has no column {cut(name, 60)!r} (--where), it has {self.names}.")
+        labels = [_as_text(cell) for cell in self.column(self.header.index(name))]
+        kept = [k for k, label in enumerate(labels) if label == value]
+        if not kept:
+            seen = cut(", ".join(dict.fromkeys(labels)), 100)
+            raise InputError(f"{self.name}: no row has {value!r} in column {name!r} (--where), they have {seen}.")
+        return replace(self, rows=tuple(self.rows[k] for k in kept), numbers=tuple(self.numbers[k] for k in kept))
+
+    @property
+    def names(self) -> str:
+        """The names of the columns, quoted."""
+        return cut(", ".join(map(repr, self.header)), 300)
+
     def refuse(self, row: int, column: str, value: Cell, wanted: str) -> InputError:
         """The error that names a cell (row counted from 0), its value, and what would be read."""
         said = "is empty" if value is None else f"is {cut(str(value), 60)!r}"
         return InputError(f"{self.name}: row {self.numbers[row]}, column {column!r} {said}: {wanted}.")
+
+
+def _as_text(cell: Cell) -> str:
+    """Return the text of a cell; a whole number of a spreadsheet without decimals."""
+    return f"{cell:g}" if isinstance(cell, float) else str("" if cell is None else cell).strip()
 
 
 def grid_of(table: Any) -> Grid:

@@ -43,6 +43,7 @@ def open_table(
     g_unit: str | float = STANDARD_GRAVITY_MPS2,
     angles: bool = True,
     input: RawInput | None = None,
+    where: str = "",
 ) -> Table:
     """A table of orientations as a source: a row a dwell, with its mean readings and its angles, attitude or face.
 
@@ -53,11 +54,12 @@ def open_table(
     - accel_scale: size of one count, in ``accel_unit`` (m/s^2 if that is None).
     - g_unit: m/s^2 that 1 g in the table stands for, or ``local`` for the gravity of the bench.
     - input: what the device sends, where neither the header nor the other arguments say it.
+    - where: column and text in it of the rows that count, as ``unit=7``; all if it is empty.
     - angles: False to do without angles, attitudes and faces; those that the table has are not used.
 
     Raises InputError where a cell, or what the columns are, cannot be understood.
     """
-    grid = grid_of(table)
+    grid = grid_of(table).chosen(where)
     numbers = Numbers.of(grid)
     meanings = Columns.of(grid, columns, numbers)
     given = {"accel_unit": accel_unit, "accel_scale": accel_scale}

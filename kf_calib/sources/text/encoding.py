@@ -20,6 +20,7 @@ GZIP, _UTF16 = b"\x1f\x8b", (b"\xff\xfe", b"\xfe\xff")
 _HEAD_BYTES = 1 << 18
 _CYRILLIC = re.compile(rb"[\xc0-\xff]{3}")
 _BLOCK_BYTES = 1 << 20
+_NOT_UNPACKED = (EOFError, zlib.error, gzip.BadGzipFile)
 
 
 class TextFile:
@@ -68,7 +69,7 @@ class TextFile:
                 piece = self._file.read1(size - len(block))
                 block += piece
                 self._has_ended = not piece
-        except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        except _NOT_UNPACKED as error:
             self.trouble = f"its end cannot be unpacked ({error}): copy it anew, what comes before is used."
             self._has_ended = True
         return bytes(block)
@@ -100,9 +101,13 @@ def text_of(path: Path, largest: int) -> str:
 
 
 def unpacked(path: Path) -> bytes:
-    """The bytes of a file of text as they stand in it, or in what gzip has packed there."""
+    """The bytes of a file of text as they stand in it, or in what gzip has packed there. Raises OSError, and InputError
+    where its end cannot be unpacked."""
     content = path.read_bytes()
-    return gzip.decompress(content) if content.startswith(GZIP) else content
+    try:
+        return gzip.decompress(content) if content.startswith(GZIP) else content
+    except _NOT_UNPACKED as error:
+        raise InputError(f"{path}: its end cannot be unpacked ({error}): copy it anew.") from None
 
 
 def too_large(path: Path) -> InputError:

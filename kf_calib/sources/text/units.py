@@ -19,8 +19,12 @@ from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 _BY_SIZE = (("g", 0.5, 2.0), ("m/s2", 5.0, 20.0), ("mg", 500.0, 2000.0), ("mm/s2", 5e3, 2e4))
 """Units in which the size of gravity lies between two numbers; the last where these have decimals, as counts have none.
 """
-_FEWEST_BITS, _NEAR_POWER = 6, 0.1
-"""Sensors have 64 counts to 1 g or more, most a power of two; readings at rest are as near to it."""
+_USUAL = {
+    **{2.0**bits: {"accel_unit": "g", "accel_scale": repr(2.0**-bits)} for bits in range(6, 25)},
+    **{STANDARD_GRAVITY_MPS2 / size: {"accel_scale": f"{size:g}"} for size in (1e-2, 1e-3)},
+}
+"""Bench keys of counts by their number in 1 g, which is a power of two for most sensors; 1 mm/s^2 is as usual."""
+_NEAR_USUAL = 0.1  # as readings at rest are to it
 _NEAR = (0.2, 5.0)
 """The norm in g of a sensor that is not shaken hard."""
 _IN_WORDS = {"m/s2": "m/s^2", "mm/s2": "mm/s^2", "count": "counts"}
@@ -95,6 +99,14 @@ class Units:
         return size
 
 
+def choice_of(where: str) -> tuple[str, str]:
+    """The column and the text in it by which rows are chosen; raises InputError."""
+    name, _, value = where.rpartition("=")
+    if not (name.strip() and value.strip()):
+        raise InputError(f"--where is {where!r}: write --where COLUMN=VALUE, as --where unit=0.")
+    return name.strip(), value.strip()
+
+
 class ReadingUnits(NamedTuple):
     """Units of the three readings.
 
@@ -145,10 +157,11 @@ def usual_norm(values: Floats) -> float:
 
 
 def size_of_count(norm: float) -> dict[str, str]:
-    """Bench keys for the size of a count, of which gravity has so many: a power of two to one g where that is near."""
-    bits = round(math.log2(norm)) if 0.0 < norm < math.inf else 0
-    if bits >= _FEWEST_BITS and abs(norm / 2.0**bits - 1.0) < _NEAR_POWER:
-        return {"accel_unit": "g", "accel_scale": repr(2.0**-bits)}
+    """Bench keys for the size of a count, of which gravity has so many: that of the usual ones which is nearest, where
+    one is near."""
+    usual = min(_USUAL, key=lambda counts: abs(norm / counts - 1.0))
+    if abs(norm / usual - 1.0) < _NEAR_USUAL:
+        return _USUAL[usual]
     return {"accel_scale": f"{STANDARD_GRAVITY_MPS2 / norm if norm > 0.0 else math.nan:.3g}"}
 
 
