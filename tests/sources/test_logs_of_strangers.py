@@ -43,12 +43,7 @@ def written(
         at = 1_700_000_000 * time + 0.01 * time * k if time > 1.0 else 0.01 * k
         row, time_text = ",".join(cells), f"{at:.6f}" if time == 1.0 else str(round(at))
         xyz = [f"{value:.{digits}f}" for value in (x, y, z)]
-        lines.append(
-            row.format(
-                t=f"{at:.6f}" if time == 1.0 else round(at),
-                **{k: f"{v:.{digits}f}" for k, v in zip("xyz", (x, y, z), strict=True)},
-            )
-        )
+        lines.append(row.format(t=time_text, x=xyz[0], y=xyz[1], z=xyz[2]))
     path.write_text("\n".join(lines) + "\n")
     return path
 
