@@ -33,7 +33,12 @@ class UnobservableError(KfCalibError):
 
 
 class BlunderError(InputError):
-    """The run is no calibration of the bench as it is stated: a channel reversed, a gimbal's sense, a unit ..."""
+    """The run is no calibration of the bench as it is stated: a channel reversed, a gimbal's sense, a unit ...;
+    ``options`` mend it, where the cause is known."""
+
+    def __init__(self, said: str, options: str = "") -> None:
+        super().__init__(said)
+        self.options = options
 
 
 class MissingExtraError(KfCalibError):

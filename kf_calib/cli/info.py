@@ -15,7 +15,7 @@ from click.core import ParameterSource
 from kf_calib.cli.command import argument, command
 from kf_calib.cli.echo import print_result, progress
 from kf_calib.cli.options import OF_DWELLS, OF_MESSAGES, Json, ReadingOptions
-from kf_calib.errors import BenchError, CountsError, KfCalibError
+from kf_calib.errors import BenchError, BlunderError, CountsError, KfCalibError
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 if TYPE_CHECKING:
@@ -158,7 +158,7 @@ def _of_lines(
     is_bare = inventory.is_bare and not {"accel_unit", "accel_scale"} & bench.keys()
     if is_bare:
         provisional["accel_unit"] = "m/s2"
-    dwells, warnings, wrong = None, list(inventory.warnings), None
+    dwells, warnings, wrong, source = None, list(inventory.warnings), None, None
     try:
         source = Lines(path, {**provisional, **bench}, reading.renamed, units=units, angles=angles)
         dwells = _dwells(source, tick)
@@ -173,7 +173,24 @@ def _of_lines(
         words.append("--accel-unit m/s2" if wrong is None else wrong.option)
     else:
         missing, words = _with_unit(missing, words, wrong)
+    if source is not None and dwells and wrong is None:
+        missing, words = _tried(source, missing, words)
     return _overview(inventory, bench, dwells, missing, words, warnings)
+
+
+def _tried(source: Source, missing: dict[str, str], words: list[str]) -> tuple[dict[str, str], list[str] | None]:
+    """What is missing, and the words of the command to try, after it was tried; None where no option would do."""
+    from kf_calib.estimation.calibration import calibrate
+
+    try:
+        calibrate(source)
+    except BlunderError as error:
+        if "axes" in missing:  # those that were tried are an example
+            return missing, words
+        return {"": str(error), **missing}, [*words, error.options] if error.options else None
+    except KfCalibError as error:
+        return {"": str(error), **missing}, None
+    return missing, words
 
 
 def _wrong_unit(norms_mps2: Sequence[float], taken: RawInput, *, are_named: bool = False) -> WrongUnit | None:
@@ -204,15 +221,19 @@ def _overview(
     bench: dict[str, str],
     dwells: list[DwellSummary] | None,
     missing: dict[str, str],
-    words: list[str],
+    words: list[str] | None,
     warnings: list[str],
 ) -> Overview:
     from kf_calib.views.overview import Overview
 
     if dwells is not None and not dwells:
         missing[""] = "a stretch in which the platform stands still: --still-deg says what counts as standing still"
-    command = " ".join(["kf-calib replay", _quoted(str(inventory.path)), *words])
-    return Overview(inventory, bench, dwells, list(missing.values()), command, warnings)
+    return Overview(inventory, bench, dwells, list(missing.values()), _replay(inventory.path, words), warnings)
+
+
+def _replay(path: Path, words: Sequence[str] | None) -> str:
+    """The command to try with these options; empty where there is none."""
+    return "" if words is None else " ".join(["kf-calib replay", _quoted(str(path)), *words])
 
 
 def _show_table(ctx: click.Context, path: Path, reading: ReadingOptions, as_json: bool) -> None:
@@ -226,33 +247,37 @@ def _show_table(ctx: click.Context, path: Path, reading: ReadingOptions, as_json
 def _of_table(ctx: click.Context, path: Path, reading: ReadingOptions, told: Stated, reason: str) -> TableOverview:
     """What is in a table of orientations; told, reason: as of ``_of_lines``."""
     from kf_calib.bench.raw_input import OPTIONS
-    from kf_calib.sources.tables.survey import LEAST, LEAST_WITHOUT_SIGMA, survey
+    from kf_calib.sources.tables.survey import survey
     from kf_calib.sources.text.units import size_of_count
     from kf_calib.views.overview import TableOverview
 
     bench = {**reading.keys, **_bench_keys(told)}
     table = survey(path, bench, reading.renamed, reading.units(told=told), angles=not reading.no_angles)
     lacking = _lacks(bench, table.orientation == "angles")
-    least = LEAST if table.has_sigma else LEAST_WITHOUT_SIGMA
-    missing = [each for each in (reason, table.trouble) if each]
+    missing = {"counts": reason} if reason else {}
     words = _given(ctx, _not_of(ctx, OF_MESSAGES + OF_DWELLS))
     words += _options(told)
     if table.is_by_hand and not reading.no_angles:
         words.append(_BY_HAND[0])
-        missing.append(_BY_HAND[1].format(or_else=", attitude or face"))
-    missing += [_NAMED[key][1] for key in lacking]
-    words += [_AXES.get(table.angles, _NAMED[key][0]) if key == "axes" else _NAMED[key][0] for key in lacking]
-    if table.count < least:
-        missing.append(f"orientations: {table.count} rows are there, and {least} are the least")
+        missing["angles"] = _BY_HAND[1].format(or_else=", attitude or face")
+    missing |= {key: _NAMED[key][1] for key in lacking}
+    axes = _AXES.get(table.angles, _NAMED["axes"][0])
+    words += [axes if key == "axes" else _NAMED[key][0] for key in lacking]
+    wrong = None
     if table.rows and not table.has_unit:
-        missing.append("the size of one count of the readings: --accel-scale, in m/s^2 or what --accel-unit says")
+        missing["accel_scale"] = "the size of one count of the readings: --accel-scale, in m/s^2 or --accel-unit's unit"
         size = size_of_count(median(row.norm_mps2 for row in table.rows))
-        words += [f"{OPTIONS[key]} {value}" for key, value in size.items() if key not in bench]
+        told = {**told, **{key: value for key, value in size.items() if key not in bench}}
+        words += [f"{OPTIONS[key]} {told[key]}" for key in size if key not in bench]
     elif wrong := _wrong_unit([row.norm_mps2 for row in table.rows], table.input, are_named=True):
-        told, words = _with_unit({}, words, wrong)
-        missing += told.values()
-    command = " ".join(["kf-calib replay", _quoted(str(table.path)), *words])
-    return TableOverview(table, bench, missing, command)
+        missing, words = _with_unit(missing, words, wrong)
+    if table.trouble:
+        missing, words = {"": table.trouble, **missing}, None
+    elif wrong is None:
+        examples = {"axes": shlex.split(axes)[1], "gravity_mps2": str(STANDARD_GRAVITY_MPS2)}
+        keys = {key: examples[key] for key in lacking} | _bench_keys(told)
+        missing, words = _tried(reading.table(path, keys, bool(table.orientation)), missing, words)
+    return TableOverview(table, bench, list(missing.values()), _replay(path, words))
 
 
 def _lacks(bench: Mapping[str, str], has_angles: bool) -> list[str]:

@@ -217,18 +217,23 @@ class ReadingOptions:
             angles=angles,
         )
 
+    def table(self, path: Path, told: Mapping[str, str], angles: bool, input: RawInput | None = None) -> Table:
+        """The table at a path; told: bench keys beside those of the options. angles: whether orientations count."""
+        from kf_calib.sources.tables.opening import open_table
+
+        return open_table(path, {**told, **self.keys}, columns=self.renamed, angles=angles, input=input,
+                          angle_unit=self.angle_unit, g_unit=self.g_unit, where=self.where or "")  # fmt: skip
+
     def opened(self, path: Path, input: RawInput | None = None) -> Recording | Lines | Table:
         """The recording, log or table at a path; input: what the device sends, where nothing else states it."""
         from kf_calib.sources.files.lines import Lines
         from kf_calib.sources.opening import FileKind, no_recording
-        from kf_calib.sources.tables.opening import open_table
 
         columns, angles = self.renamed, not self.no_angles
         match self.kind(path):
             case FileKind.TABLE:
                 refuse_given(OF_MESSAGES + OF_DWELLS + _OF_LINES, f"{path} is a table of mean readings")
-                return open_table(path, self.keys, columns=columns, angles=angles, input=input,
-                                  angle_unit=self.angle_unit, g_unit=self.g_unit, where=self.where or "")  # fmt: skip
+                return self.table(path, {}, angles, input)
             case FileKind.SAMPLES:
                 refuse_given(OF_MESSAGES, f"{path} is a log in lines of text")
                 return Lines(path, self.keys, columns, units=self.units(input), angles=angles)

@@ -109,7 +109,7 @@ def test_the_usual_size_of_a_count_is_told_and_right(
     ("header", "ours"),
     [("q0,q1,q2,q3", "qw qx qy qz"), ("Quat_q0,Quat_q1,Quat_q2,Quat_q3", "qw qx qy qz"),
      ("QuatW,QuatX,QuatY,QuatZ", "qw qx qy qz"), ("s_ax,s_ay,w_RS_S_x", "sx sy "),
-     ("orientation.x,orientation.y,orientation.z,orientation.w", "qx qy qz qw"),
+     ("orientation.x,orientation.y,orientation.z,orientation.w", "   "),
      ("q1,q2,q3", "angle angle angle"), ("a_x,a_y,a_z,s_x,s_y,s_z", "ax ay az sx sy sz"),
      ("ax,ay,az,mx,my,mz", "ax ay az   "), ("m1,m2,m3", "ax ay az"),
      ("accSmooth[0],accSmooth[1],accSmooth[2],debug[0]", "ax ay az ")],

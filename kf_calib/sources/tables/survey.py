@@ -19,11 +19,6 @@ from kf_calib.sources.tables.opening import Opening
 from kf_calib.sources.text.units import Units
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
-LEAST = 4
-"""Orientations that twelve parameters need: each accelerometer has four, and reads once in each."""
-LEAST_WITHOUT_SIGMA = 6
-"""The same where the noise has to come from the misfit."""
-
 
 @dataclass(frozen=True)
 class ColumnFound:

@@ -61,7 +61,6 @@ _FIELD = _words("mag magn magnetometer magnetometers magnetic magneto magnetfeld
 _APART = _words("cov covariance covariances variance variances kovarianz")
 _TRUTH = _words("true truth ref reference wahr soll expected истинное эталон")
 _QUATERNION = _words("q quat quaternion quaternions кватернион")
-_ATTITUDE = _words("orientation attitude rotation")
 _ESTIMATED = _words("roll pitch yaw heading euler attitude крен тангаж курс")
 _ANGLE = _words(
     "outer middle inner aussen mitte mittlerer innen innere innerer aeussere ausserer angle winkel gimbal roll pitch "
@@ -196,7 +195,7 @@ def _tell_families(names: Sequence[str], meanings: list[Meaning]) -> None:
         families.setdefault(tuple(stem), {}).setdefault(last, k)
     for stem, places in families.items():
         parts = next((each for each in ("xyzw", "1230") if set(places) >= set(each)), "")
-        if parts and set(stem) & (_QUATERNION | _ATTITUDE):
+        if parts and set(stem) & _QUATERNION:
             for part, ours in zip(parts, QUATERNION, strict=True):
                 meanings[places[part]] = Meaning(ours, "")
         elif set(filter(str.isdigit, places)) == {"0", "1", "2"}:

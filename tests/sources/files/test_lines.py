@@ -462,4 +462,6 @@ def test_info_proposes_one_of_several_sensors(run, tmp_path: Path) -> None:
     path = tmp_path / "two.csv"
     path.write_text(rows_of_units(0.5))
     code, out, _ = run("info", path, "--gravity", "9.81", "--no-angles", "--json")
-    assert code == 0 and json.loads(out)["command"].endswith("--where I=0")
+    said = json.loads(out)
+    assert code == 0 and "--where 'I=0'" in " ".join(said["missing"])
+    assert not said["command"], "one pose, which no option makes a calibration of"
