@@ -185,7 +185,7 @@ class CsvColumns:
 
     def numbers_in(self, rows: Sequence[CsvRow]) -> Numbers | None:
         """How the numbers in rows are written; None where these do not tell."""
-        used = [at for at, own in enumerate(self._meanings) if own.ours]
+        used = [at for at, own in enumerate(self._meanings) if own.ours] or range(len(self.names))
         cells = (row[at] for row in rows if len(row) == len(self.names) for at in used)
         return Numbers.told_by(cells, commas_count=self.delimiter != ",")
 
