@@ -16,11 +16,12 @@ class InputError(KfCalibError):
 
 
 class CountsError(InputError):
-    """Readings are in counts, and the size of one is not stated; ``scale`` is a guess at it by gravity, m/s^2."""
+    """Readings are in counts, of which something is not stated; ``keys``: bench keys that state it, as the readings
+    tell them."""
 
-    def __init__(self, said: str, scale: float) -> None:
+    def __init__(self, said: str, keys: dict[str, str]) -> None:
         super().__init__(said)
-        self.scale = scale
+        self.keys = keys
 
 
 class BenchError(InputError):
@@ -32,7 +33,12 @@ class UnobservableError(KfCalibError):
 
 
 class BlunderError(InputError):
-    """The run is no calibration of the bench as it is stated: a channel reversed, a gimbal's sense, a unit ..."""
+    """The run is no calibration of the bench as it is stated: a channel reversed, a gimbal's sense, a unit ...;
+    ``options`` mend it, where the cause is known."""
+
+    def __init__(self, said: str, options: str = "") -> None:
+        super().__init__(said)
+        self.options = options
 
 
 class MissingExtraError(KfCalibError):

@@ -118,6 +118,7 @@ KEYS: Mapping[str, Key] = {
     "channels": Key(partial(text_of, "channels"), 'the channels of accelerometers 1, 2, 3, such as "1,-2,3"'),
     "accel_scale": Key(partial(text_of, "accel_scale"), "the size of one count, positive, or one for each channel"),
     "accel_unit": Key(partial(text_of, "accel_unit"), f"the unit of the raw readings, one of {', '.join(UNITS)}"),
+    "counts": Key(partial(text_of, "counts"), "how the raw numbers are to be read, such as unsigned16 or offset=512"),
     CONVERTED: Key(partial(_one_of, ("true",)), "true, or left out: the samples are readings of the accelerometers "
                    "already, and no raw input"),
     RESTATE: Key(partial(_one_of, ("true",)), "true, or left out: a raw input that is stated goes before the file's"),

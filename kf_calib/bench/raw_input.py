@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.bench.counts import SIGNED, ConverterCodes, parse_counts
 from kf_calib.errors import BenchError
 from kf_calib.support.text import cut, number_from
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
@@ -29,7 +30,7 @@ UNITS = {
 }  # fmt: skip
 """Units of raw readings, in m/s^2."""
 LABELS = {"m/s2": "m/s^2", "g": "g", "mg": "mg", "ug": "ug"}
-OPTIONS = {"channels": "--channels", "accel_scale": "--accel-scale", "accel_unit": "--accel-unit"}
+OPTIONS = {"channels": "--channels", "accel_scale": "--accel-scale", "accel_unit": "--accel-unit", "counts": "--counts"}
 """The bench keys that state a raw input, and the options that do."""
 CONVERTED, RESTATE, RESTATING = "converted", "restate_input", " --restate-input"
 
@@ -81,16 +82,19 @@ class RawInput:
     - channels: for accelerometers 1, 2, 3 the channel that it is read on, negative where its sign is reversed.
     - sizes: of one count of channels 1, 2, 3, in ``unit``; 1 where the numbers are in the unit itself.
     - unit: one of ``UNITS``.
+    - counts: how the numbers are to be read, as ``parse_counts`` takes it.
     """
 
     channels: tuple[int, int, int] = CHANNELS
     sizes: tuple[float, float, float] = (1.0, 1.0, 1.0)
     unit: str = "m/s2"
+    counts: str = SIGNED
 
     def __post_init__(self) -> None:
         parse_channels(",".join(map(str, self.channels)))
         parse_scale(",".join(map(repr, self.sizes)))
         parse_unit(self.unit)
+        parse_counts(self.counts)
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, Any]) -> RawInput:
@@ -99,6 +103,7 @@ class RawInput:
             parse_channels(str(metadata.get("channels", "1,2,3"))),
             parse_scale(str(metadata.get("accel_scale", "1"))),
             parse_unit(str(metadata.get("accel_unit", "m/s2"))),
+            str(metadata.get("counts", SIGNED)).strip(),
         )
 
     @classmethod
@@ -115,7 +120,8 @@ class RawInput:
     def scale_metadata(self) -> dict[str, str]:
         """The bench keys that state the size of a count, and which channel is which only where that is said, too."""
         order = {} if self.channels == CHANNELS else {"channels": self.order}
-        return order | {"accel_scale": self.scale, "accel_unit": self.unit}
+        counts = {} if self.counts == SIGNED else {"counts": self.counts}
+        return order | {"accel_scale": self.scale, "accel_unit": self.unit} | counts
 
     @property
     def is_plain(self) -> bool:
@@ -155,7 +161,15 @@ class RawInput:
         if self.is_plain:
             return raw
         with np.errstate(over="ignore"):  # what damage has made too large becomes infinite, and is counted as such
-            return self.ordered(raw * self.factors)
+            return self.ordered(self.signed(raw) * self.factors)
+
+    def signed(self, raw: Floats) -> Floats:
+        """Raw numbers (n, 3) of channels 1, 2, 3 about zero."""
+        return raw if self.counts == SIGNED else self._counts.signed(raw)
+
+    @cached_property
+    def _counts(self) -> ConverterCodes:
+        return parse_counts(self.counts)
 
     def ordered(self, channels: Floats) -> Floats:
         """Channels (n, 3) in the order and with the signs of the accelerometers, not scaled."""
@@ -169,12 +183,13 @@ class RawInput:
         numbers = np.empty_like(readings)
         for accelerometer, channel in enumerate(self.channels):
             numbers[:, abs(channel) - 1] = math.copysign(1.0, channel) * readings[:, accelerometer]
-        return numbers / self.factors
+        numbers = numbers / self.factors
+        return numbers if self.counts == SIGNED else self._counts.unsigned(numbers)
 
     @property
     def unit_words(self) -> str:
         """What one raw number is: a unit, or a count of a size."""
-        label = LABELS[self.unit]
+        label = LABELS[self.unit] + ("" if self.counts == SIGNED else f", {self.counts}")
         if self.sizes == (1.0, 1.0, 1.0):
             return label
         one = len(set(self.sizes)) == 1
@@ -216,7 +231,10 @@ def text_of(key: str, value: Any) -> str:
         raw_input = RawInput.from_metadata({key: value.strip()})
     except BenchError as error:
         raise ValueError(str(error)) from None
-    return {"channels": raw_input.order, "accel_scale": raw_input.scale, "accel_unit": raw_input.unit}[key]
+    return {
+        "channels": raw_input.order, "accel_scale": raw_input.scale, "accel_unit": raw_input.unit,
+        "counts": raw_input.counts,
+    }[key]  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from kf_calib.exchange.certificate.statement import Statement
     from kf_calib.exchange.corrected_file import Applied
     from kf_calib.exchange.corrected_lines import CorrectedLines
-    from kf_calib.sources.text.text_file import TextFile
+    from kf_calib.sources.text.encoding import TextFile
     from kf_calib.support.output_files import Outputs
 
 _BLOCK_BYTES = 1 << 16
@@ -145,14 +145,12 @@ def _table_keys(keys: dict[str, str], path: Path, input: RawInput) -> dict[str, 
 
 def _bytes_of(path: Path) -> BinaryIO | TextFile:
     """A log as it is, byte for byte; one that is packed, or written in another encoding, in UTF-8."""
-    from kf_calib.sources.text.text_file import TextFile
+    from kf_calib.sources.text.encoding import GZIP, TextFile, encoding_of
 
     try:
-        file = TextFile(path)
-        if not file.is_as_read:
-            return file
-        file.close()
-        return path.open("rb")
+        with path.open("rb") as file:
+            start = file.read(_BLOCK_BYTES)
+        return TextFile(path) if start[:2] == GZIP or encoding_of(start) != "utf-8" else path.open("rb")
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
 

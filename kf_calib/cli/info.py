@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable, Mapping, Sequence, Set
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import rich_click as click
 from click.core import ParameterSource
@@ -15,7 +15,7 @@ from click.core import ParameterSource
 from kf_calib.cli.command import argument, command
 from kf_calib.cli.echo import print_result, progress
 from kf_calib.cli.options import OF_DWELLS, OF_MESSAGES, Json, ReadingOptions
-from kf_calib.errors import BenchError, CountsError, KfCalibError
+from kf_calib.errors import BenchError, BlunderError, CountsError, KfCalibError
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from kf_calib.bench.streams import Source
     from kf_calib.dwells.rest_in_readings import DwellSummary
     from kf_calib.sources.files.inventory import Inventory
-    from kf_calib.views.overview import Overview
+    from kf_calib.views.overview import Overview, TableOverview
 
 Tick = Callable[[float], None]
 
@@ -66,12 +66,41 @@ def info(
         return
     with progress(f"reading {recording.name}", as_json) as tick:
         if kind is FileKind.SAMPLES:
-            overview = _of_lines(ctx, recording, reading, tick)
+            overview = _with_counts(partial(_of_lines, ctx, recording, reading, tick))
         else:
             overview = _of_messages(ctx, recording, reading, tick)
     from kf_calib.views.overview import overview_object, overview_report
 
     print_result(as_json, overview_object, overview_report, overview)
+
+
+Stated = Mapping[str, str]
+AnyOverview = TypeVar("AnyOverview")
+
+
+def _with_counts(show: Callable[[Stated, str], AnyOverview]) -> AnyOverview:
+    """What is shown of a file, with what its readings tell of their counts; that is missing then, and has a reason."""
+    stated, reason = dict[str, str](), ""
+    while True:
+        try:
+            return show(stated, reason)
+        except CountsError as error:
+            if not error.keys.keys() - stated.keys():
+                raise
+            kept = {} if "counts" in error.keys else stated  # by which their size is another one
+            stated, reason = {**kept, **error.keys}, " ".join([reason, str(error)]).strip()
+
+
+def _options(told: Stated) -> list[str]:
+    """The options that state what the readings tell."""
+    from kf_calib.bench.raw_input import OPTIONS
+
+    return [f"{OPTIONS.get(key, f'--{key}')} {_quoted(value)}" for key, value in told.items()]
+
+
+def _bench_keys(told: Stated) -> dict[str, str]:
+    """What of it is of the bench: not which rows count."""
+    return {key: value for key, value in told.items() if key != "where"}
 
 
 def _of_messages(ctx: click.Context, path: Path, reading: ReadingOptions, tick: Tick) -> Overview:
@@ -101,20 +130,21 @@ def _of_messages(ctx: click.Context, path: Path, reading: ReadingOptions, tick: 
     return _overview(inventory, bench, dwells, missing, words, warnings)
 
 
-def _of_lines(ctx: click.Context, path: Path, reading: ReadingOptions, tick: Tick) -> Overview:
-    """What is in a log of samples; what is not stated of the bench does not matter for what stands still."""
+def _of_lines(
+    ctx: click.Context, path: Path, reading: ReadingOptions, tick: Tick, told: Stated, reason: str
+) -> Overview:
+    """What is in a log of samples; what is not stated of the bench does not matter for what stands still.
+
+    told: bench keys that nobody states and the readings tell, with the ``reason``.
+    """
     from kf_calib.sources.files.inventory import inventory_of_lines
     from kf_calib.sources.files.lines import Lines
 
-    units, missing, words = reading.units(), dict[str, str](), _given(ctx, _not_of(ctx, OF_MESSAGES))
-    try:
-        inventory = inventory_of_lines(path, reading.renamed, units)
-    except CountsError as error:
-        missing["accel_scale"], size = str(error), f"{error.scale:.6g}"
-        words.append(f"--accel-scale {size}")
-        units = replace(units, accel_scale=float(size))
-        inventory = inventory_of_lines(path, reading.renamed, units)
-    bench, angles = {**inventory.bench, **reading.keys}, not reading.no_angles
+    missing, words = {"accel_scale": reason} if reason else {}, _given(ctx, _not_of(ctx, OF_MESSAGES))
+    words += _options(told)
+    units = reading.units(told=told)
+    inventory = inventory_of_lines(path, reading.renamed, units)
+    bench, angles = {**inventory.bench, **reading.keys, **_bench_keys(told)}, not reading.no_angles
     if angles and inventory.has_angles is None:
         angles, missing["angles"] = False, _BY_HAND[1].format(or_else=" or attitude")
         words.append(_BY_HAND[0])
@@ -128,12 +158,14 @@ def _of_lines(ctx: click.Context, path: Path, reading: ReadingOptions, tick: Tic
     is_bare = inventory.is_bare and not {"accel_unit", "accel_scale"} & bench.keys()
     if is_bare:
         provisional["accel_unit"] = "m/s2"
-    dwells, warnings, wrong = None, list(inventory.warnings), None
+    dwells, warnings, wrong, source = None, list(inventory.warnings), None, None
     try:
         source = Lines(path, {**provisional, **bench}, reading.renamed, units=units, angles=angles)
         dwells = _dwells(source, tick)
         warnings = list(dict.fromkeys([*warnings, *source.warnings]))
         wrong = _wrong_unit([dwell.norm_mps2 for dwell in dwells], source.bench.input, are_named=not is_bare)
+    except CountsError:
+        raise
     except KfCalibError as error:
         missing = {"": str(error), **missing}
     if is_bare:
@@ -141,7 +173,24 @@ def _of_lines(ctx: click.Context, path: Path, reading: ReadingOptions, tick: Tic
         words.append("--accel-unit m/s2" if wrong is None else wrong.option)
     else:
         missing, words = _with_unit(missing, words, wrong)
+    if source is not None and dwells and wrong is None:
+        missing, words = _tried(source, missing, words)
     return _overview(inventory, bench, dwells, missing, words, warnings)
+
+
+def _tried(source: Source, missing: dict[str, str], words: list[str]) -> tuple[dict[str, str], list[str] | None]:
+    """What is missing, and the words of the command to try, after it was tried; None where no option would do."""
+    from kf_calib.estimation.calibration import calibrate
+
+    try:
+        calibrate(source)
+    except BlunderError as error:
+        if "axes" in missing:  # those that were tried are an example
+            return missing, words
+        return {"": str(error), **missing}, [*words, error.options] if error.options else None
+    except KfCalibError as error:
+        return {"": str(error), **missing}, None
+    return missing, words
 
 
 def _wrong_unit(norms_mps2: Sequence[float], taken: RawInput, *, are_named: bool = False) -> WrongUnit | None:
@@ -172,45 +221,63 @@ def _overview(
     bench: dict[str, str],
     dwells: list[DwellSummary] | None,
     missing: dict[str, str],
-    words: list[str],
+    words: list[str] | None,
     warnings: list[str],
 ) -> Overview:
     from kf_calib.views.overview import Overview
 
     if dwells is not None and not dwells:
         missing[""] = "a stretch in which the platform stands still: --still-deg says what counts as standing still"
-    command = " ".join(["kf-calib replay", _quoted(str(inventory.path)), *words])
-    return Overview(inventory, bench, dwells, list(missing.values()), command, warnings)
+    return Overview(inventory, bench, dwells, list(missing.values()), _replay(inventory.path, words), warnings)
+
+
+def _replay(path: Path, words: Sequence[str] | None) -> str:
+    """The command to try with these options; empty where there is none."""
+    return "" if words is None else " ".join(["kf-calib replay", _quoted(str(path)), *words])
 
 
 def _show_table(ctx: click.Context, path: Path, reading: ReadingOptions, as_json: bool) -> None:
     """Print what is in a table of orientations."""
-    from kf_calib.sources.tables.survey import LEAST, LEAST_WITHOUT_SIGMA, survey
-    from kf_calib.views.overview import TableOverview, table_object, table_report
+    from kf_calib.views.overview import table_object, table_report
 
-    bench = reading.keys
-    table = survey(path, bench, reading.renamed, reading.units(), angles=not reading.no_angles)
+    overview = _with_counts(partial(_of_table, ctx, path, reading))
+    print_result(as_json, table_object, table_report, overview)
+
+
+def _of_table(ctx: click.Context, path: Path, reading: ReadingOptions, told: Stated, reason: str) -> TableOverview:
+    """What is in a table of orientations; told, reason: as of ``_of_lines``."""
+    from kf_calib.bench.raw_input import OPTIONS
+    from kf_calib.sources.tables.survey import survey
+    from kf_calib.sources.text.units import size_of_count
+    from kf_calib.views.overview import TableOverview
+
+    bench = {**reading.keys, **_bench_keys(told)}
+    table = survey(path, bench, reading.renamed, reading.units(told=told), angles=not reading.no_angles)
     lacking = _lacks(bench, table.orientation == "angles")
-    least = LEAST if table.has_sigma else LEAST_WITHOUT_SIGMA
-    missing = [table.trouble] if table.trouble else []
+    missing = {"counts": reason} if reason else {}
     words = _given(ctx, _not_of(ctx, OF_MESSAGES + OF_DWELLS))
+    words += _options(told)
     if table.is_by_hand and not reading.no_angles:
         words.append(_BY_HAND[0])
-        missing.append(_BY_HAND[1].format(or_else=", attitude or face"))
-    missing += [_NAMED[key][1] for key in lacking]
-    words += [_AXES.get(table.angles, _NAMED[key][0]) if key == "axes" else _NAMED[key][0] for key in lacking]
-    if table.count < least:
-        missing.append(f"orientations: {table.count} rows are there, and {least} are the least")
+        missing["angles"] = _BY_HAND[1].format(or_else=", attitude or face")
+    missing |= {key: _NAMED[key][1] for key in lacking}
+    axes = _AXES.get(table.angles, _NAMED["axes"][0])
+    words += [axes if key == "axes" else _NAMED[key][0] for key in lacking]
+    wrong = None
     if table.rows and not table.has_unit:
-        missing.append("the size of one count of the readings: --accel-scale, in m/s^2 or what --accel-unit says")
-        level = median(row.norm_mps2 for row in table.rows)
-        words.append(f"--accel-scale {STANDARD_GRAVITY_MPS2 / level:.3g}")
+        missing["accel_scale"] = "the size of one count of the readings: --accel-scale, in m/s^2 or --accel-unit's unit"
+        size = size_of_count(median(row.norm_mps2 for row in table.rows))
+        told = {**told, **{key: value for key, value in size.items() if key not in bench}}
+        words += [f"{OPTIONS[key]} {told[key]}" for key in size if key not in bench]
     elif wrong := _wrong_unit([row.norm_mps2 for row in table.rows], table.input, are_named=True):
-        told, words = _with_unit({}, words, wrong)
-        missing += told.values()
-    command = " ".join(["kf-calib replay", _quoted(str(table.path)), *words])
-    overview = TableOverview(table, bench, missing, command)
-    print_result(as_json, table_object, table_report, overview)
+        missing, words = _with_unit(missing, words, wrong)
+    if table.trouble:
+        missing, words = {"": table.trouble, **missing}, None
+    elif wrong is None:
+        examples = {"axes": shlex.split(axes)[1], "gravity_mps2": str(STANDARD_GRAVITY_MPS2)}
+        keys = {key: examples[key] for key in lacking} | _bench_keys(told)
+        missing, words = _tried(reading.table(path, keys, bool(table.orientation)), missing, words)
+    return TableOverview(table, bench, list(missing.values()), _replay(path, words))
 
 
 def _lacks(bench: Mapping[str, str], has_angles: bool) -> list[str]:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import rich_click as click
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from kf_calib.sources.files.lines import Lines
     from kf_calib.sources.files.recording import Recording
     from kf_calib.sources.opening import FileKind
-    from kf_calib.sources.tables.words import Units
+    from kf_calib.sources.text.units import Units
 
 _of_input, _of_model, _of_output = (partial(option, panel=panel) for panel in (INPUT, MODEL, OUTPUT))
 
@@ -125,6 +126,10 @@ class DeviceOptions:
     accel_scale: Annotated[float | None, _of_input(
         "--accel-scale", type=POSITIVE, show_default="1",
         help="Size of one count, in the unit of the readings; a calibration remembers it.")] = None
+    counts: Annotated[str | None, _of_input(
+        "--counts", metavar="HOW", show_default="signed",
+        help="How raw numbers are to be read: unsigned16 (or so many bits), wrap=4.096 (what negative ones are too "
+        "large by), offset=512 (the number at no force); a calibration remembers it.")] = None
     restate_input: Annotated[bool, _of_input(
         "--restate-input",
         help="What is stated of channels, unit and count was wrong: the options go before it.")] = False
@@ -133,7 +138,7 @@ class DeviceOptions:
     @property
     def keys(self) -> dict[str, str]:
         """The same as bench keys."""
-        stated = {"accel_unit": self.accel_unit, "accel_scale": self.accel_scale}
+        stated = {"accel_unit": self.accel_unit, "accel_scale": self.accel_scale, "counts": self.counts}
         keys = {key: str(value) for key, value in stated.items() if value is not None}
         return keys | ({"restate_input": "true"} if self.restate_input else {})
 
@@ -153,10 +158,12 @@ class ReadingOptions:
         "--g-unit", metavar="M/S^2",
         help="What 1 g stands for in a table or a log in lines; local: gravity of the bench.")] = "9.80665"
     columns: ForeignColumns = ()
+    rate_hz: Annotated[float | None, _of_input(
+        "--rate", type=POSITIVE, metavar="HZ",
+        help="Rows a second of a log in lines that has no column of time.")] = None
     where: Annotated[str | None, _of_input(
         "--where", metavar="COLUMN=VALUE",
-        help='Only the rows of a table or a log that have this in a column, as of one of several sensors: '
-        '--where "unit=0".')] = None
+        help="The rows of a table or a log in lines that count, where it has several sensors: --where I=0.")] = None
     accel_topic: Annotated[str | None, _of_input(
         "--accel-topic", metavar="TOPIC", help="Topic of the accelerometer, where there are several.")] = None
     pose_topic: Annotated[str | None, _of_input(
@@ -178,19 +185,20 @@ class ReadingOptions:
 
     @property
     def renamed(self) -> dict[str, str]:
-        """Ours of each foreign column; "=VALUE" for one by which rows are chosen."""
-        return renamed(self.columns) | chosen_by(self.where)
+        """Ours of each foreign column."""
+        return renamed(self.columns)
 
     def kind(self, path: Path) -> FileKind:
         from kf_calib.sources.opening import kind_of
 
-        return kind_of(path, self.renamed)
+        return kind_of(path, self.renamed, has_rate=self.rate_hz is not None)
 
-    def units(self, input: RawInput | None = None) -> Units:
-        """Units of a table or a log."""
-        from kf_calib.sources.tables.words import Units
+    def units(self, input: RawInput | None = None, told: Mapping[str, str] = MappingProxyType({})) -> Units:
+        """Units of a table or a log; told: bench keys beside those of the options."""
+        from kf_calib.sources.text.units import Units
 
-        return Units.of(self.keys, self.angle_unit, self.g_unit, input)
+        return replace(Units.of({**self.keys, **told}, self.angle_unit, self.g_unit, input),
+                       rate_hz=self.rate_hz, where=told.get("where", self.where or ""))  # fmt: skip
 
     def messages(self, path: Path, angles: bool, input: RawInput | None = None) -> Recording:
         """The recording of samples at a path; angles: whether it must have angles."""
@@ -209,18 +217,23 @@ class ReadingOptions:
             angles=angles,
         )
 
+    def table(self, path: Path, told: Mapping[str, str], angles: bool, input: RawInput | None = None) -> Table:
+        """The table at a path; told: bench keys beside those of the options. angles: whether orientations count."""
+        from kf_calib.sources.tables.opening import open_table
+
+        return open_table(path, {**told, **self.keys}, columns=self.renamed, angles=angles, input=input,
+                          angle_unit=self.angle_unit, g_unit=self.g_unit, where=self.where or "")  # fmt: skip
+
     def opened(self, path: Path, input: RawInput | None = None) -> Recording | Lines | Table:
         """The recording, log or table at a path; input: what the device sends, where nothing else states it."""
         from kf_calib.sources.files.lines import Lines
         from kf_calib.sources.opening import FileKind, no_recording
-        from kf_calib.sources.tables.opening import open_table
 
         columns, angles = self.renamed, not self.no_angles
         match self.kind(path):
             case FileKind.TABLE:
-                refuse_given(OF_MESSAGES + OF_DWELLS, f"{path} is a table of mean readings")
-                return open_table(path, self.keys, columns=columns, angles=angles, input=input,
-                                  angle_unit=self.angle_unit, g_unit=self.g_unit)  # fmt: skip
+                refuse_given(OF_MESSAGES + OF_DWELLS + _OF_LINES, f"{path} is a table of mean readings")
+                return self.table(path, {}, angles, input)
             case FileKind.SAMPLES:
                 refuse_given(OF_MESSAGES, f"{path} is a log in lines of text")
                 return Lines(path, self.keys, columns, units=self.units(input), angles=angles)
@@ -356,16 +369,6 @@ def renamed(columns: Sequence[str]) -> dict[str, str]:
     return pairs
 
 
-def chosen_by(where: str | None) -> dict[str, str]:
-    """The column by which rows are chosen, and behind a sign of equality the text that these have in it."""
-    if where is None:
-        return {}
-    column, equals, value = where.partition("=")
-    if not (column.strip() and equals and value.strip()):
-        raise InputError(f"--where {where!r} names no column and value: write --where COLUMN=VALUE, as unit=0.")
-    return {column.strip(): f"={value.strip()}"}
-
-
 def _bench_from_toml(path: Path) -> dict[str, str]:
     from kf_calib.bench.bench import metadata_of
     from kf_calib.bench.keys import checked_keys
@@ -383,10 +386,12 @@ def _bench_from_toml(path: Path) -> dict[str, str]:
     return keys
 
 
-_OF_TEXT = ("columns", "where", "g_unit")
+_OF_TEXT = ("columns", "g_unit", "rate_hz", "where")
+_OF_LINES = ("rate_hz",)
 OF_MESSAGES = ("accel_topic", "pose_topic", "temperature_topic", "fields", "max_chunk_mb")
 OF_DWELLS = ("joints", "settle_s", "still_deg", "gate", "gate_sigma")
-"""Options that act on text and spreadsheets only, on files of messages only, and where dwells are to be found."""
+"""Options that act on text and spreadsheets only, on logs in lines only, on files of messages only, and where dwells
+are to be found."""
 
 
 def refuse_given(names: Sequence[str], what: str) -> None:

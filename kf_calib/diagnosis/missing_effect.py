@@ -64,7 +64,7 @@ def diagnose(
     """
     before, refits = calibration_of(run, refits)
     with one_blas_thread():
-        diagnosis = _diagnosed(refits, before)
+        diagnosis = refits.once(before, lambda: _diagnosed(refits, before))
         return replace(diagnosis, replication=_replication(refits, diagnosis)) if replicate else diagnosis
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from os import PathLike
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from kf_calib.noise.noise_model import Noise
 from kf_calib.sources.opening import opened
 from kf_calib.support import stage
 
+_Result = TypeVar("_Result")
 _QUIETER = 0.25  # share of the noise that an oscillation leaves, of that which it was taken for
 
 
@@ -43,6 +45,13 @@ class Refits:
         self._frame: Frame | None = None  # only the last one is kept, to save memory
         # with each value what its key is made of, since the id of an object that is gone may be used again
         self._refits = dict[tuple[int, tuple[str, ...]], tuple[Calibration, Calibration]]()
+        self._diagnosed = dict[int, tuple[Calibration, Any]]()
+
+    def once(self, before: Calibration, diagnosed: Callable[[], _Result]) -> _Result:
+        """What is found of a calibration, computed if it was not yet."""
+        if id(before) not in self._diagnosed:
+            self._diagnosed[id(before)] = before, diagnosed()
+        return self._diagnosed[id(before)][1]
 
     def of(self, before: Calibration, effects: Sequence[str]) -> Calibration:
         """The run of a calibration with these effects in the model instead of those it had."""

@@ -216,10 +216,7 @@ class RunLikelihood:
         log -= float(np.log(np.abs(np.diag(upper))).sum())
         terms, z = terms - basis @ (basis.T @ terms), z - basis @ (basis.T @ z)
         if flat is not None and len(flat):
-            lengths = np.linalg.norm(terms[:, flat], axis=0)
-            own = terms[:, flat] / np.where(lengths > 0.0, lengths, 1.0)
-            left, singular, _ = np.linalg.svd(own, full_matrices=False)
-            left = left[:, singular > _SEEN]
+            left = _directions(terms[:, flat])
             terms, z = terms - left @ (left.T @ terms), z - left @ (left.T @ z)
             basis = np.hstack([basis, left])
         log -= 0.5 * float(z @ z) + (0.5 * float(self._more_readings @ self._more_readings) if means_only else 0.0)
@@ -228,12 +225,10 @@ class RunLikelihood:
     def explained_by(self, places: Indices, rows: Projected) -> tuple[Floats, Floats]:
         """What some columns explain of all columns, (f, C), and of the readings, (f,): products with an orthonormal
         basis of f vectors."""
-        own, count = rows.columns[:, places], len(rows.columns)
+        some, count = rows.columns[:, places], len(rows.columns)
         if rows.means_only:
-            own = np.concatenate([own, self._more_columns[:, places]])
-        lengths = np.linalg.norm(own, axis=0)
-        left, singular, _ = np.linalg.svd(own / np.where(lengths > 0.0, lengths, 1.0), full_matrices=False)
-        left = left[:, singular > _SEEN].T
+            some = np.concatenate([some, self._more_columns[:, places]])
+        left = _directions(some).T
         columns, readings = left[:, :count] @ rows.columns, left[:, :count] @ rows.readings
         if left.shape[1] > count:
             columns = columns + left[:, count:] @ self._more_columns
@@ -305,6 +300,13 @@ class RunLikelihood:
             covariances = np.broadcast_to(np.diag(diagonal), (len(self._root), 3, 3))
         shapes = self._root @ covariances @ np.swapaxes(self._root, 1, 2)
         return shapes / max(float(np.einsum("dii->di", shapes).max(axis=1).mean()), 1e-300)
+
+
+def _directions(columns: Floats) -> Floats:
+    """Return an orthonormal basis (r, f) of columns (r, q), without what is none but for rounding."""
+    lengths = np.linalg.norm(columns, axis=0)
+    left, singular, _ = np.linalg.svd(columns / np.where(lengths > 0.0, lengths, 1.0), full_matrices=False)
+    return np.asarray(left[:, singular > _SEEN], float)
 
 
 def _changing(values: Floats, ends: Indices) -> Mask:

@@ -79,6 +79,8 @@ LARGEST_RAD = 1e6
 """Angles beyond this are dropped: 160 000 turns, of which a double keeps the fraction to 1e-10 rad."""
 LARGEST_C = 1e6
 """Temperatures beyond this are dropped."""
+_ALTERNATING = 0.2  # squares of every second step over those of every step, which noise makes equal
+_PERIODS_S = (2e-5, 0.5)  # of accelerometers
 _TURNING_DEG = 1.0  # within one block; a platform that only creeps turns by less
 
 
@@ -123,6 +125,7 @@ class Tally:
     - short_dwells: dwells too short for the whole margin after the arrival; least_settling_s: the shortest margin used.
     - turned_deg: largest rotation of the platform within a block that counts as still.
     - noise_rad: largest noise of angles from message to message, by which more than the tolerance counts as still.
+    - restless: why no dwell would be found, as far as stamps and readings tell, and what to do; known at the end.
     """
 
     read: int = 0
@@ -146,6 +149,28 @@ class Tally:
     least_settling_s: float = math.inf
     turned_deg: float = 0.0
     noise_rad: float = 0.0
+    restless: str = ""
+
+    def look_for_trouble(self, first: Floats, lasted_s: float) -> None:
+        """Say in ``restless`` what the first readings (n, 3), and how long all lasted, tell of a run without dwells."""
+        period_s = lasted_s / max(self.read - 1, 1)
+        step, double_step = (float(np.sum((first[lag:] - first[:-lag]) ** 2)) for lag in (1, 2))
+        if self.repeated + self.backward > 0.1 * self.read:
+            self.restless = (
+                f"the stamps of {self.repeated} repeat the one before and those of {self.backward} jump back, so that "
+                "these are dropped: name another column or topic for the time, or give the rate of the rows of a text "
+                "by --rate"
+            )
+        elif double_step < _ALTERNATING * step:
+            self.restless = (
+                "each reading is more like the next but one than like the next, as of two sensors that take turns: "
+                "choose one, by --where COLUMN=VALUE or its topic"
+            )
+        elif lasted_s and not _PERIODS_S[0] < period_s < _PERIODS_S[1]:
+            self.restless = (
+                f"the readings are {period_s:.3g} s apart by their stamps: if these are in a unit that is a thousand "
+                "times smaller or larger, say so, for example by --column 'THEIRS=time_ms'"
+            )
 
     def sentences(self) -> list[str]:
         """One sentence for each kind of sample that was dropped or rejected."""

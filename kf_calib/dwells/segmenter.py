@@ -48,6 +48,7 @@ _HOLD_NS = SECOND_NS  # a reading up to this far outside the first or last angle
 _SLEW_READINGS = 8  # least number of readings of a slew that is used
 _REST_NS = 2 * SECOND_NS  # least length of a dwell that is recognised from readings alone
 _PENDING_SAMPLES = 1 << 22  # readings that may wait for an angle; 32 B each
+_TELLING = 1000  # first readings, which tell whether two sensors take turns
 _FEWEST_FOR_NOISE = 3  # fewer messages do not determine the noise of an encoder
 
 
@@ -72,7 +73,7 @@ class Segmenter:
             )
         self.first_ns: int | None = None
         self.dwell_count = 0  # number of dwells that have begun, and the number of the latest
-        self._accel = Stream.empty(3)
+        self._accel, self._first = Stream.empty(3), np.empty((0, 3))
         self._pose = Stream.empty(self.bench.pose_width)
         self._turns = np.empty((0, len(self.bench.axes) or 1))  # whole turns that were added to each recorded pose
         self._noise, self._noise_rad = EncoderNoise(not self.bench.axes), np.empty(0)  # of each recorded pose
@@ -124,6 +125,9 @@ class Segmenter:
         if not final:
             self.tally.read += len(batch.accel)
         self._take_readings(batch.accel)
+        if final:
+            lasted_ns = (self._orders[0].last_ns or 0) - (self.first_ns or 0)
+            self.tally.look_for_trouble(self._first, lasted_ns / SECOND_NS)
         self._take_poses(batch.pose, final)
         if len(batch.temperature):
             warm = batch.temperature
@@ -146,6 +150,8 @@ class Segmenter:
         accel = self._orders[0](accel, self.tally, self.first_ns)
         if self.first_ns is None and len(accel):
             self.first_ns = int(accel.time_ns[0])
+        if len(self._first) < _TELLING:
+            self._first = np.concatenate([self._first, accel.values[: _TELLING - len(self._first)]])
         self._accel += accel
 
     def _take_poses(self, pose: Stream, final: bool) -> None:

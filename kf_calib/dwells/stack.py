@@ -16,7 +16,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import ComputedSequence, Floats, Mask
 from kf_calib.bench.bench import turned
-from kf_calib.dwells.pieces import PieceIndices
+from kf_calib.dwells.pieces import OfPieces, PieceIndices
 from kf_calib.dwells.rows import parabola
 from kf_calib.dwells.sufficient_statistics import (
     LEAST_FREEDOM,
@@ -188,6 +188,12 @@ class Folded:
     def came_from(self) -> dict[int, DwellFactor]:
         """The dwell before, by index, where that one has been left out of the fit."""
         return {k: dwell.came_from for k, dwell in enumerate(self.dwells) if dwell.came_from is not None}
+
+    def at_nodes(self, values: Floats) -> OfPieces:
+        """Columns (pieces, K nodes, 3, c) of all dwells from values (m, 3, c) at their nodes; zeros on a carrier."""
+        columns = np.zeros((self.ends[-1], self.dwells[0].width, *values.shape[1:]))
+        columns[:, :3] = values.reshape(-1, 3, *values.shape[1:])
+        return OfPieces(columns, self.ends)
 
     def weighted(self, of_pieces: Floats) -> Floats:
         """Means (D, ...) over each dwell of values of its pieces, (pieces, ...)."""

@@ -15,6 +15,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import lengths
 from kf_calib.bench.bench import Bench
+from kf_calib.bench.counts import refuse_unread
 from kf_calib.bench.raw_input import LEVELS, wrong_unit
 from kf_calib.bench.streams import Source, Table
 from kf_calib.dwells import window_average
@@ -145,8 +146,9 @@ def refuse_unusable(dwells: Sequence[DwellFactor], tally: Tally, bench: Bench) -
         unit = f"; angles of up to {turns:.0f} turns look like degrees (--angle-unit deg)" if turns > 3.0 else ""
         raise InputError(
             f"no dwell was found in {tally.read} readings ({tally.moving} moving, {tally.settling} settling, "
-            f"{tally.not_finite} not finite, {tally.too_large} too large, {tally.without_pose} without an angle): the "
-            f"platform must stand still; if it did, raise --still-deg or lower --settle-s{unit}."
+            f"{tally.not_finite} not finite, {tally.too_large} too large, {tally.without_pose} without an angle): "
+            + (tally.restless or "the platform must stand still; if it did, raise --still-deg or lower --settle-s")
+            + f"{unit}."
         )
     means_mps2 = DwellStack.of(dwells).means[:, 4:]
     if not means_mps2.any():
@@ -157,6 +159,7 @@ def refuse_unusable(dwells: Sequence[DwellFactor], tally: Tally, bench: Bench) -
             "the readings never change, not even by noise: the sensor or what logs it has stopped, or a channel is at "
             "the end of its range."
         )
+    refuse_unread(bench.input.raw(means_mps2), bench.input.counts)
     level = float(np.median(lengths(means_mps2))) / bench.gravity_mps2
     if LEVELS[0] <= level <= LEVELS[1]:
         if bench.angles:
@@ -170,8 +173,13 @@ def _refuse_restless(dwells: Sequence[DwellFactor], tally: Tally) -> None:
     if not dwells:
         raise InputError(
             f"no dwell was found in {tally.read} readings ({tally.moving} moving, {tally.settling} settling, "
-            f"{tally.not_finite} not finite, {tally.too_large} too large): without angles it must lie still for at "
-            "least a second and a half on each side; if it did, raise --still-deg or lower --settle-s."
+            f"{tally.not_finite} not finite, {tally.too_large} too large): "
+            + (
+                tally.restless
+                or "it never lay still: without angles it must, for at least a second and a half on each "
+                "side; if it did, raise --still-deg or lower --settle-s"
+            )
+            + "."
         )
 
 

@@ -139,16 +139,7 @@ def triad_changes(linearised: LinearisedDwells) -> OfPieces:
             )  # fmt: skip
             ends.append(added_by(bent_effects(model, state), turned, model, state))
         changes[:, :, axis] = (ends[0] - ends[1]) * (0.5 * sigma_rad / _TRIAD_STEP_RAD)
-    return _by_dwell(changes, linearised)
-
-
-def _by_dwell(changes: Floats, linearised: LinearisedDwells) -> OfPieces:
-    """Split changes (m, 3, c) at the nodes of all dwells into those of each, (pieces, K nodes, 3, c); zeros on a
-    carrier."""
-    shaped = changes.reshape(-1, 3, *changes.shape[1:])
-    width = linearised.columns[0].shape[1]
-    padded = np.concatenate([shaped, np.zeros((len(shaped), width - 3, *changes.shape[1:]))], axis=1)
-    return OfPieces(padded, linearised.dwells.folded.ends)
+    return linearised.dwells.folded.at_nodes(changes)
 
 
 def undetermined(covariance: Floats) -> list[str]:

@@ -78,7 +78,9 @@ def refuse(dwells: Sequence[DwellFactor], bench: Bench) -> None:
     _refuse_exchange(means, stated)
     mending = _mendings(means, stated, affine)
     if mending:
-        raise BlunderError(f"{wrong}: {_question(bench, mending)}")
+        one = mending[0] if len({_advice(bench, each) for each in mending}) == 1 else None
+        options = "" if one is None or _words(bench, one) else " ".join(_options(bench, one))
+        raise BlunderError(f"{wrong}: {_question(bench, mending)}", options)
     if (affine is None or not affine.is_near()) and not _one_dwell(means, stated):
         raise BlunderError(
             f"{wrong}, and no order or sign of channels, gimbals or angles brings all axes near nominal: check what "
@@ -256,7 +258,13 @@ def _wired(stated: Bench, channels: Channels) -> str:
 
 def _advice(stated: Bench, mending: Mending) -> str:
     """Return the options that state a mounting and, where there is no option, what to do."""
-    mounting, options, words = mending.mounting, list[str](), list[str]()
+    options = _options(stated, mending)
+    return " and ".join([*([" ".join(options)] if options else []), *_words(stated, mending)])
+
+
+def _options(stated: Bench, mending: Mending) -> list[str]:
+    """Return the options that state a mounting."""
+    mounting, options = mending.mounting, list[str]()
     if mounting.bench.axes != stated.axes:
         options.append(f'--axes "{mounting.bench.to_metadata()["axes"]}"')
     if mounting.bench.up != stated.up:
@@ -265,13 +273,19 @@ def _advice(stated: Bench, mending: Mending) -> str:
         options.append("--angle-unit deg")
     if mending.channels != CHANNELS:
         options.append(f"--channels {_wired(stated, mending.channels)}{stated.input.restating('channels')}")
+    return options
+
+
+def _words(stated: Bench, mending: Mending) -> list[str]:
+    """Return what to do where no option states a mounting."""
+    mounting, words = mending.mounting, list[str]()
     if stated.axes and mounting.order != tuple(range(len(stated.axes))):
         words.append("--joints with the names of the angles, outer to inner")
     if mounting.angle_unit > 1.0:
         words.append("angles that are converted once")
     if mounting.conjugate or mounting.real_first:
         words.append("quaternions of the platform in the bench, x y z w")
-    return " and ".join([*([" ".join(options)] if options else []), *words])
+    return words
 
 
 def _refuse_one_sign(means: DwellMeans, stated: Mounting) -> None:

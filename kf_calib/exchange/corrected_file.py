@@ -27,14 +27,15 @@ from kf_calib.sources.files import cdr
 from kf_calib.sources.files.contents import CALIBRATED_TOPIC
 from kf_calib.sources.files.mcap_append import TopicAppender, source_file
 from kf_calib.sources.files.recording import Recording
-from kf_calib.sources.files.sample_lines import cell_spans
 from kf_calib.sources.tables.columns import READINGS, Columns
-from kf_calib.sources.tables.grid import Grid, delimiter_of, grid_of
+from kf_calib.sources.tables.grid import Grid, grid_of
 from kf_calib.sources.tables.numbers import Numbers, written
 from kf_calib.sources.tables.opening import Opening
 from kf_calib.sources.tables.spreadsheet import sheets_of, workbook_of
-from kf_calib.sources.tables.words import Units
-from kf_calib.sources.text.text_file import encoding_of, unpacked
+from kf_calib.sources.text.encoding import encoding_of, unpacked
+from kf_calib.sources.text.heading import cell_spans, delimiter_in
+from kf_calib.sources.text.labels import Labels
+from kf_calib.sources.text.units import Units
 from kf_calib.support.output_files import whole, write_whole
 
 FRAME_ID = "block"
@@ -187,6 +188,8 @@ def apply_to_table(
     unchecked: bool = False,
 ) -> Applied:
     """Write the ``copy``, wholly or not at all; arguments as of ``open_table`` and ``apply_to_file``."""
+    if units.where:
+        raise InputError(f"{path}: a corrected copy has every row, of one sensor: put its rows in a file (--where).")
     grid = grid_of(path)
     meanings = Columns.of(grid, columns, Numbers.of(grid))
     table = Opening(meanings, overrides, units, angles=False).table()
@@ -236,18 +239,19 @@ def _to_excel(path: Path, copy: Path, grid: Grid, places: list[int], force: Floa
 def _to_text(path: Path, copy: Path, grid: Grid, places: list[int], force: Floats) -> None:
     """Write a copy of a text."""
     content = unpacked(path)
-    encoding = encoding_of(content)
-    of_bytes = "utf-8-sig" if content.startswith(BOM_UTF8) else "utf-8"  # what is not UTF-8 stays as it is
-    codec, errors = (encoding, "strict") if encoding.startswith("utf-16") else (of_bytes, "surrogateescape")
+    encoding, plain_codec = encoding_of(content), "utf-8-sig" if content.startswith(BOM_UTF8) else "utf-8"
+    codec, errors = (encoding, "strict") if encoding.startswith("utf-16") else (plain_codec, "surrogateescape")
     lines = content.decode(codec, errors).splitlines(keepends=True)
     plain = [line.rstrip("\r\n") for line in lines]
-    delimiter = delimiter_of([line for line in plain if line.strip() and not line.startswith("#")])
+    (delimiter, _), labels = delimiter_in(plain), Labels.of(plain)
     decimal = "," if delimiter != "," and not any("." in plain[k - 1] for k in grid.numbers) else "."
     new = {number: [repr(written(value)).replace(".", decimal) for value in own]
            for number, own in zip(grid.numbers, force.tolist(), strict=True)}  # fmt: skip
     for number, texts in (*new.items(), *_new_heads(grid)):
         line, is_units = lines[number - 1], number in grid.head[1:]
         spans = cell_spans(plain[number - 1], delimiter)
+        if labels:  # among which a face may stand in a line of its own
+            spans = [(0, 0)] * (len(grid.header) - len(labels.names)) + labels.spans(plain[number - 1])
         cells = [line[start:end] for start, end in spans]
         if _is_part(cells) or not (is_units or len(spans) > max(places)):
             raise InputError(f"{path}: the row that ends in line {number} goes over several lines: write it in one, "

@@ -22,9 +22,10 @@ from kf_calib.bench.raw_input import CHANNELS, PLAIN, RESTATING, RawInput, wrong
 from kf_calib.bench.streams import Stream
 from kf_calib.errors import InputError
 from kf_calib.estimation.correction import Correction
-from kf_calib.sources.files.line_parts import LONGEST_LINE_BYTES, Account, LineReader
+from kf_calib.sources.files.line_parts import Account, LineReader
 from kf_calib.sources.files.lines import is_json, reader_for, stated_of
-from kf_calib.sources.tables.words import Units
+from kf_calib.sources.text.encoding import LONGEST_LINE_BYTES, line_end_of
+from kf_calib.sources.text.units import Units
 
 _WINDOW_NS = 500_000_000
 _FEWEST = 8  # readings of a window
@@ -272,18 +273,20 @@ class _Cutter:
     """Bytes as they come, cut into lines that keep their ends; one that is too long is left out and counted."""
 
     def __init__(self, account: Account) -> None:
-        self._account, self._tail, self._is_cut = account, bytearray(), False
+        self._account, self._tail, self._is_cut, self._end = account, bytearray(), False, b""
         self.number = 0
         """Lines that have ended."""
 
     def push(self, block: bytes) -> list[RawLine]:
         """The lines that end in ``block``."""
-        first, *others = block.split(b"\n")
+        self._end = self._end or line_end_of(block)
+        end = self._end or b"\n"
+        first, *others = block.split(end)
         if not others:
             self._keep(first)
             return []
         *whole, last = others
-        lines = [self._line(bytes(self._tail) + first, b"\n"), *(self._line(line, b"\n") for line in whole)]
+        lines = [self._line(bytes(self._tail) + first, end), *(self._line(line, end) for line in whole)]
         self._tail.clear()
         self._keep(last)
         return [line for line in lines if line is not None]

@@ -112,9 +112,8 @@ class Noise:
         from this misfit itself, unless no other noise is known."""
         if not self.within_seen:
             return self
-        scatter_mps2 = self.scatter_mps2 if self.scatter_stated else np.zeros(3)
-        setting_rad = self.setting_rad if self.setting_stated or self.setting_judged else 0.0
-        return replace(self, scatter_mps2=scatter_mps2, setting_rad=setting_rad)
+        known = self.without_estimates()
+        return replace(known, setting_rad=self.setting_rad) if self.setting_judged else known
 
     def without_estimates(self) -> Noise:
         """The noise without scatter and a setting error that were estimated from the misfit, which they explain."""
@@ -199,7 +198,8 @@ def _sigma_along(stack: DwellStack, along: Floats, inflation: Floats) -> Floats:
     """Return sigma_w (3,) of the accelerometers from the readings along the force alone, which have the variance sum of
     (m_i sigma_i)^2 with m = ``along`` (D, 3).
 
-    The likeliest variances of such gamma distributed sums, by steps that keep them positive.
+    The likeliest variances of such gamma distributed sums, by steps that keep them positive. The readings of a dwell
+    then have one weight in all channels.
     """
     weights, folded = along**2, stack.folded
     squares = folded.weights[:, 0] * folded.squares_along(along)
@@ -326,9 +326,7 @@ def changes_by_square_axes(dwells: Sequence[DwellFactor], square_sigmas: Floats)
     changes = np.zeros((len(stack.force_mps2), 3, len(places)))
     for k, (channel, axis) in enumerate(places.tolist()):
         changes[:, channel, k] = stack.force_mps2[:, axis] * square_sigmas[channel, axis]
-    columns = np.zeros((stack.folded.ends[-1], stack.folded.dwells[0].width, 3, len(places)))
-    columns[:, :3] = changes.reshape(-1, 3, *changes.shape[1:])
-    return OfPieces(columns, stack.folded.ends)
+    return stack.folded.at_nodes(changes)
 
 
 def flicker_sigma(noise: Noise, dwells: int) -> Floats:

@@ -209,9 +209,7 @@ def thermometer_errors(dwells: Sequence[DwellFactor], sensitivity_mps2_per_k: Fl
     folded = DwellStack.of(dwells).folded
     errors_c = temperature_course(folded).errors_c
     change = (_regressors(dwells) @ sensitivity_mps2_per_k.T)[:, :, None] * errors_c[:, None, :]
-    columns = np.zeros((folded.ends[-1], folded.dwells[0].width, 3, errors_c.shape[1]))
-    columns[:, :3] = change.reshape(-1, 3, *change.shape[1:])
-    return OfPieces(columns, folded.ends)
+    return folded.at_nodes(change)
 
 
 def _regressors(dwells: Sequence[DwellFactor]) -> Floats:

@@ -183,8 +183,12 @@ class HandJudgement:
     def reached(self) -> bool:
         """Whether there are targets of parameters that are left without angles, and every one is reached."""
         aimed = np.isfinite(self.wanted) & ~np.isin(paper_parameters.SYMBOLS, ("theta1", "phi1", "nu2"))
-        reached = self.result is not None and (self.sigma <= self.result.aims(self.wanted))[aimed].all()
-        return bool(aimed.any() and reached and self.consistent is not None)
+        return bool(aimed.any() and (self.sigma <= self.aims)[aimed].all() and self.consistent is not None)
+
+    @property
+    def aims(self) -> Floats:
+        """The sigmas (12,) by which targets are reached: below them where noise is known from few poses only."""
+        return self.wanted if self.result is None else self.result.aims(self.wanted)
 
     @property
     def consistent(self) -> bool | None:

@@ -14,7 +14,6 @@ from kf_calib.bench.streams import Source
 from kf_calib.errors import InputError
 from kf_calib.sources.files.contents import CALIBRATION_FORMAT
 from kf_calib.sources.files.csv_columns import CsvColumns
-from kf_calib.sources.files.line_parts import CsvHeading
 from kf_calib.sources.files.lines import Lines, is_json
 from kf_calib.sources.files.mcap_file import HEAD_BYTES, is_lines
 from kf_calib.sources.files.mcap_records import MAGIC
@@ -22,7 +21,8 @@ from kf_calib.sources.files.record_files import SQLITE, first_bytes
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.tables.grid import OLD_SUFFIXES, TEXT_SUFFIXES, ZIP
 from kf_calib.sources.tables.opening import open_table
-from kf_calib.sources.text.text_file import head_of
+from kf_calib.sources.text.encoding import head_of
+from kf_calib.sources.text.heading import TextHeading
 from kf_calib.support.text import date_of_stamp, parse_date
 
 _OF_CALIBRATION = 200  # first bytes of a calibration, which name its format
@@ -46,8 +46,11 @@ class FileKind(Enum):
     CALIBRATION = "calibration"
 
 
-def kind_of(path: str | PathLike[str], columns: Mapping[str, str] = MappingProxyType({})) -> FileKind:
-    """What a file is, by its beginning; columns: our names of foreign ones, as far as they are stated."""
+def kind_of(
+    path: str | PathLike[str], columns: Mapping[str, str] = MappingProxyType({}), *, has_rate: bool = False
+) -> FileKind:
+    """What a file is, by its beginning; columns: our names of foreign ones, as far as they are stated. has_rate:
+    whether a rate of its rows is stated, which only samples have."""
     file = Path(path)
     if not file.is_file():
         return FileKind.RECORDING
@@ -70,13 +73,13 @@ def kind_of(path: str | PathLike[str], columns: Mapping[str, str] = MappingProxy
         return FileKind.CALIBRATION
     if is_json(lines[first]):
         return FileKind.SAMPLES
-    return FileKind.SAMPLES if _are_samples(lines[first:-1] or lines[first:], columns) else FileKind.TABLE
+    return FileKind.SAMPLES if has_rate or _are_samples(lines[first:-1] or lines[first:], columns) else FileKind.TABLE
 
 
 def _are_samples(lines: list[str], stated: Mapping[str, str]) -> bool:
     """Whether the rows under a header are a time series: many, and close in time."""
     try:
-        columns = CsvColumns.of(CsvHeading.of(lines), stated)
+        columns = CsvColumns.of(TextHeading.of(lines), stated)
     except InputError:
         return False
     if columns.marks_of_a_table or len(columns.rows) <= _FEWEST_SAMPLES:

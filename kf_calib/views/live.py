@@ -316,7 +316,7 @@ def _sigmas_by_hand(judgement: HandJudgement | None) -> RenderableType:
         if judgement is None or result is None or parameter is None or parameter.value is None:
             table.add_row(symbol(name), "square" if result else "-", "", unit.label, "", Bar(""))
             continue
-        sigma, wanted = float(judgement.sigma[k]), float(judgement.wanted[k])
+        sigma, wanted = float(judgement.sigma[k]), float(judgement.aims[k])
         off, spread = unit.rounded(parameter.value - parameter.nominal, sigma)
         target = unit.number(wanted) if math.isfinite(wanted) else ""
         table.add_row(symbol(name), off, f"± {spread}", unit.label, target, bar(sigma, wanted, k))

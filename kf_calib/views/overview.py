@@ -83,7 +83,8 @@ def overview_report(overview: Overview) -> RenderableType:
         parts += _dwell_parts(overview.dwells)
     parts += [note(said) for said in overview.warnings]
     parts += [Text(f"Missing: {said}") for said in overview.missing]
-    parts.append(Text(f"{'Then try' if overview.missing else 'Try'}: {overview.command}"))
+    if overview.command:
+        parts.append(Text(f"{'Then try' if overview.missing else 'Try'}: {overview.command}"))
     return Group(*parts)
 
 
@@ -206,7 +207,8 @@ def table_report(overview: TableOverview) -> RenderableType:
             )
         )
     parts += [Text(f"Missing: {said}") for said in overview.missing]
-    parts.append(Text(f"{'Then try' if overview.missing else 'Try'}: {overview.command}"))
+    if overview.command:
+        parts.append(Text(f"{'Then try' if overview.missing else 'Try'}: {overview.command}"))
     return Group(*parts)
 
 

@@ -19,7 +19,7 @@ from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.correction import Correction
 from kf_calib.exchange.calibration_file import saved
 from kf_calib.exchange.corrected_file import _Thermometer, apply_to_table
-from kf_calib.sources.tables.words import Units
+from kf_calib.sources.text.units import Units
 
 
 def streams(rng: np.random.Generator) -> tuple[Stream, Stream]:

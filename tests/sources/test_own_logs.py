@@ -214,7 +214,6 @@ def test_two_angles_get_two_axes(run: Any, tmp_path: Path) -> None:
 ANGLES = "time_s,ax_g,ay_g,az_g,outer_deg,middle_deg,inner_deg\n"
 BROKEN = {
     "no time": ("ax,ay,az\n" + rows(lambda _, f, q: f / G), "no column gives the time: name it time_s"),
-    "no header": (rows(lambda t, f, _: (t, *f)), "has no header: name the columns in a first line"),
     "whole numbers for a time": ("t,ax,ay,az\n" + rows(lambda t, f, _: (str(round(50 * t) * 20), *f)),
                                  "say which 't' has, for example --column 't=time_ms'"),
     "angles of no unit": ("time_s,ax_g,ay_g,az_g,outer,inner\n" + rows(lambda t, f, _: (t, *(f / G), 1.0, 2.0)),
@@ -222,7 +221,7 @@ BROKEN = {
     "a word": (ANGLES + rows(lambda t, f, q: (t, "broken", *(f[1:] / G), *q)),
                "first line 2: column 'ax_g' is 'broken', which is no number"),
     "a column twice": ("time_s,ax,ay,az,acc_x,outer_deg\n" + rows(lambda t, f, _: (t, *f, 0.0, 0.0)),
-                       "columns 'ax', 'acc_x' are all taken for ax: leave out"),
+                       "columns 'ax', 'acc_x' are all taken for ax: say which it is, for example by --column 'ax=ax'"),
 }  # fmt: skip
 
 

@@ -8,6 +8,7 @@ no room for order, sign and size take readings in m/s^2, and say how to make the
 
 from __future__ import annotations
 
+from kf_calib.bench.counts import SIGNED
 from kf_calib.errors import InputError
 from kf_calib.estimation.correction import Correction
 from kf_calib.exchange.calibration_file import SavedCalibration
@@ -28,6 +29,11 @@ def exported(saved: SavedCalibration, correction: Correction, to: str, lossy: bo
     Raises InputError where the program cannot hold all of it, with the size of the error that is left, unless
     ``lossy``.
     """
+    if correction.input.counts != SIGNED:
+        raise InputError(
+            f"the device sends {correction.input}, and what is exported takes numbers about zero: have the device send "
+            "such, and calibrate with those; apply takes what it sends now."
+        )
     target = TARGETS[to](saved, correction)
     if target.to_be_done_before and not lossy:
         raise InputError(

@@ -8,7 +8,6 @@ size, that of a time by its steps, the sign before decimals.
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,34 +19,24 @@ from operator import mul
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, lengths
-from kf_calib.bench.raw_input import PLAIN, UNITS, RawInput
+from kf_calib.bench.counts import SIGNED, parse_counts
+from kf_calib.bench.raw_input import OPTIONS, PLAIN, RawInput
 from kf_calib.errors import CountsError, InputError
-from kf_calib.sources.files.line_parts import CsvHeading, LineError, number_of, stamp_ns
-from kf_calib.sources.tables.columns import QUATERNION, READINGS, SPREADS
+from kf_calib.sources.files.line_parts import LineError, number_of, stamp_ns
+from kf_calib.sources.tables.columns import READINGS, SPREADS
 from kf_calib.sources.tables.numbers import DECIMAL_POINT, Numbers, month_comes_first, stamp_of
-from kf_calib.sources.tables.words import (
-    ANGLE,
-    NO_HEADER,
-    TIME,
-    Meaning,
-    Units,
-    are_numbers,
-    likely_count,
-    meanings_of,
-    reading_units,
-)
+from kf_calib.sources.text.contents import is_nameless, meanings_by_numbers
+from kf_calib.sources.text.heading import TextHeading
+from kf_calib.sources.text.labels import Labels
+from kf_calib.sources.text.names import ACCEL, ANGLE, QUATERNION, TIME, Meaning, is_exact, meanings_of, unit_of_epoch
+from kf_calib.sources.text.units import Units, choice_of, reading_units, size_of_count, usual_norm
 from kf_calib.support.text import cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 EXAMPLE = "time_s,ax_mps2,ay_mps2,az_mps2,outer_deg,middle_deg,inner_deg,temperature_c"
-_EXACT = re.compile(
-    r"time_(ns|us|ms|s)|a[xyz]_(mps2|g|mg|ug)|q[xyzw]|(outer|middle|inner)_(deg|rad)|temperature_c", re.IGNORECASE
-)
-_LIKELY = re.compile(r"a|x|y|z|raw", re.IGNORECASE)
 _TIME_ALONE = ("t", "sec", "secs", "millis", "micros")
-_OF_EPOCH = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
-"""From which size on a stamp without a unit is one since 1970 in this unit."""
-_FASTEST_TABLE_S = 1.0
+_OF_STEPS = ((0.0, 1.0, "s"), (1e3, 1e6, "us"), (1e6, 1e9, "ns"))
+"""Steps that tell the unit of stamps: between them and in another unit, rows would be no samples."""
 _MANY, _ALIKE_RAD, _MOST = 500, 0.1, 0.9
 _FEWEST_ROWS, _MOST_UNITS, _APART = 20, 8, 5.0  # rows and labels of several sensors, and sigmas between these
 _MARKS_OF_TABLES = ("count", "face", "sd", *SPREADS)
@@ -77,11 +66,6 @@ class QuantityColumns:
         return list(map(mul, values, self.factors))
 
 
-def has_texts(row: CsvRow, chosen: Mapping[int, str]) -> bool:
-    """Whether a row has these texts in its columns."""
-    return all(at < len(row) and row[at].strip() == text for at, text in chosen.items())
-
-
 def _number(cell: str, numbers: Numbers) -> float:
     """Return the number in a cell, NaN where there is none."""
     try:
@@ -108,7 +92,7 @@ class Stamps:
     """How a row's time is written: a number of a unit, or the stamp of a calendar, in one column or in two.
 
     decimals: of a unit in nanoseconds; factor: how many of it one is. is_date: whether it is a stamp; month_first: how
-    it is written.
+    it is written. rate_hz: of the rows, which have no time then.
     """
 
     at: tuple[int, ...]
@@ -116,9 +100,12 @@ class Stamps:
     factor: int = 1
     is_date: bool = False
     month_first: bool = False
+    rate_hz: float | None = None
 
-    def ns(self, row: CsvRow, header: Sequence[str], numbers: Numbers) -> int:
-        """The stamp of a row in nanoseconds. Raises LineError where it has none."""
+    def ns(self, row: CsvRow, header: Sequence[str], numbers: Numbers, number: int = 0) -> int:
+        """The stamp of a row in nanoseconds; number: of the row, from 0. Raises LineError where it has none."""
+        if self.rate_hz is not None:
+            return round(number * 1e9 / self.rate_hz)
         cell = row[self.at[0]] if len(self.at) == 1 else " ".join(row[at] for at in self.at)
         try:
             if self.is_date:
@@ -136,10 +123,12 @@ class Stamps:
 class CsvColumns:
     """The columns of a log by its header and, where the header does not tell, its first rows.
 
-    header: names as they stand in the file; names: as they are to be understood. delimiter: between cells. said: what
-    was taken for what, where that is not plain from the names. raw: what the readings are in. written_mps2: the unit in
-    which specific force takes the place of readings, m/s^2: that of their names; without_unit: columns of counts whose
-    names tell none, which then are in m/s^2. chosen: texts that the rows have in columns by which they are chosen.
+    header: names as they stand in the file; names: as they are to be understood. delimiter: between cells.
+    lines_of_names: numbers, from 0, of the lines of names and units. said: what was taken for what, where that is not
+    plain from the names. raw: what the readings are in. written_mps2: the unit in which specific force takes the place
+    of readings, m/s^2: that of their names; without_unit: columns of counts whose names tell none, which then are in
+    m/s^2. labels: where each value has its name before it. chosen: a column, and the
+    cell in it of the rows that count; None where all do.
     """
 
     header: Sequence[str]
@@ -148,36 +137,40 @@ class CsvColumns:
     rows: Sequence[CsvRow]
     units: Units
     local_mps2: float
+    lines_of_names: tuple[int, ...] = ()
     said: list[str] = field(default_factory=list[str])
     raw: RawInput = PLAIN
     written_mps2: tuple[float, float, float] = (1.0, 1.0, 1.0)
     without_unit: tuple[int, ...] = ()
-    chosen: Mapping[int, str] = field(default_factory=dict[int, str])
+    labels: Labels | None = None
+    chosen: tuple[int, str] | None = None
     _meanings: list[Meaning] = field(default_factory=list[Meaning])
 
     @classmethod
     def of(
         cls,
-        heading: CsvHeading,
+        heading: TextHeading,
         stated: Mapping[str, str],
         units: Units | None = None,
         local_mps2: float = STANDARD_GRAVITY_MPS2,
     ) -> CsvColumns:
-        """stated: our name for each foreign one; ``-`` leaves a column out, ``=VALUE`` chooses rows. local_mps2:
-        gravity of the place, where a g is that. Raises InputError for names used twice."""
+        """stated: our name for each foreign one; ``-`` leaves a column out. local_mps2: gravity of the place, where a g
+        is that. Raises InputError for names used twice."""
         header = heading.header
-        ours = [stated.get(name, name) for name in header]
-        chosen = {at: text[1:] for at, text in enumerate(ours) if header[at] in stated and text.startswith("=")}
-        names = ["" if text == "-" or at in chosen else text for at, text in enumerate(ours)]
+        names = ["" if stated.get(name) == "-" else stated.get(name, name) for name in header]
         lower = [name.lower() for name in names]
         times = Counter(lower)
         if repeated := next((name for name in lower if name and times[name] > 1), None):
             raise InputError(f"two columns are named {repeated!r}: rename or remove one of them.")
-        if are_numbers(header):
-            raise InputError(f"{NO_HEADER}: {cut(','.join(header), 60)!r}.")
-        full = [row for row in heading.rows if len(row) == len(names) and has_texts(row, chosen)]
-        columns = cls(header, names, heading.delimiter, full, units or Units(), local_mps2, chosen=chosen)
-        columns._meanings = meanings_of(names)
+        full = [row for row in heading.rows if len(row) == len(names)]
+        columns = cls(header, names, heading.delimiter, full, units or Units(), local_mps2, heading.lines_of_names)
+        columns.labels = heading.labels
+        if columns.units.where:
+            columns._choose(columns.units.where)
+        columns._meanings = meanings_of(header, stated)
+        if is_nameless(header) and not stated:
+            columns._meanings = meanings_by_numbers(columns._values(range(len(header))))
+            columns.said.append("columns without names are told by their numbers")
         return columns
 
     @property
@@ -192,7 +185,7 @@ class CsvColumns:
 
     def numbers_in(self, rows: Sequence[CsvRow]) -> Numbers | None:
         """How the numbers in rows are written; None where these do not tell."""
-        used = [at for at, own in enumerate(self._meanings) if own.ours]
+        used = [at for at, own in enumerate(self._meanings) if own.ours] or range(len(self.names))
         cells = (row[at] for row in rows if len(row) == len(self.names) for at in used)
         return Numbers.told_by(cells, commas_count=self.delimiter != ",")
 
@@ -202,9 +195,9 @@ class CsvColumns:
         try:
             time = self.time()
             stamps, numbers = list[int](), self.numbers or DECIMAL_POINT
-            for row in self.rows:
+            for number, row in enumerate(self.rows):
                 try:
-                    stamps.append(time.ns(row, self.header, numbers))
+                    stamps.append(time.ns(row, self.header, numbers, number))
                 except LineError:
                     continue
         except InputError:
@@ -226,14 +219,20 @@ class CsvColumns:
 
     def time(self) -> Stamps:
         """How the time is written. Raises InputError where no column tells it, or not in which unit."""
+        if self.units.rate_hz is not None:
+            self.said.append(f"time from the numbers of the rows, {self.units.rate_hz:g} of them a second (--rate)")
+            return Stamps((), rate_hz=self.units.rate_hz)
         places = self._places("time") or [
             at for at, name in enumerate(self.names) if name.strip().lower() in _TIME_ALONE
         ]
         if not places:
-            raise InputError(f"no column gives the time: name it time_s or time_ns; {self.wanted}, not {self._seen}.")
-        exact = [at for at in places if _EXACT.fullmatch(self.names[at])]
+            raise InputError(
+                "no column gives the time: name it time_s or time_ns, or give the rate of the rows, for example "
+                f"--rate 100; {self.wanted}, not {self._seen}."
+            )
+        exact = [at for at in places if is_exact(self.names[at])]
         united = [at for at in places if self._meanings[at].unit]
-        place = max(exact or united or places, key=self._evenness)  # of equal ones the first
+        place = self._most_even(exact or united or places)
         unit = self._meanings[place].unit or {"millis": "ms", "micros": "us"}.get(self.names[place].strip().lower(), "")
         values = self._values([place], [row for row in self.rows if row[place]])[:, 0]
         if not unit and len(values) and math.isnan(values[0]):
@@ -243,6 +242,17 @@ class CsvColumns:
         if not exact:
             self.said.append(f"time from {self._quoted([place])} in {unit}")
         return Stamps((place,), decimals, round(TIME[unit]) if decimals == 9 else 1)
+
+    def _most_even(self, places: list[int]) -> int:
+        """Return that of several columns of stamps which goes up most evenly; the first where none has numbers."""
+
+        def unevenness(steps: Floats) -> float:
+            steps = steps[np.isfinite(steps)]
+            usual = float(np.median(steps)) if len(steps) else 0.0
+            return float(np.median(np.abs(steps - usual))) / usual if usual > 0.0 else math.inf
+
+        steps = np.diff(self._values(places), axis=0) if len(places) > 1 else np.zeros((0, 1))
+        return places[int(np.argmin([unevenness(own) for own in steps.T]))]
 
     def accel(self) -> QuantityColumns:
         """The three readings as they are written; ``raw`` tells then what in.
@@ -255,28 +265,32 @@ class CsvColumns:
             raise InputError(f"no columns give the three readings with their unit: {advice}.")
         by_name = [self._meanings[at].unit for at in places]
         named = self.units.told_by([self.header[at] for at in places], by_name)
-        norm = self._usual_norm(places)
+        values = self._values(places)
+        norm = usual_norm(values)
         if "" in named and not (self.units.accel or self.units.as_default(named, norm)) and math.isnan(norm):
             raise InputError(
                 f"no columns give the three readings with their unit: {advice}, or state it by --accel-unit, and the "
                 "size of counts by --accel-scale."
             )
-        told = reading_units(named, norm, self.units, self.local_mps2)
+        told = reading_units(named, values, self.units, self.local_mps2)
         if not told.is_known:
-            scale, usual = likely_count(norm)
-            said = f" It may be {usual}: --accel-scale {scale:.6g}." if usual else ""
+            signed = usual_norm(parse_counts(self.units.counts).signed(values))
+            keys = size_of_count(signed)
+            example = " ".join(f"{OPTIONS[key]} {value}" for key, value in keys.items())
             raise CountsError(
-                f"the readings in {self._quoted(places)} have a size of {norm:.3g}, so they are counts: give the size "
-                f"of one by --accel-scale, in m/s^2 or what --accel-unit says.{said}", scale
+                f"the readings in {self._quoted(places)} have a size of {signed:.3g}, so they are counts: give the "
+                "size of one by --accel-scale, in m/s^2 or what --accel-unit says, which is by gravity about "
+                f"{example}.", keys
             )  # fmt: skip
         is_stated = self.units.accel is not None or self.units.accel_scale != 1.0
-        if is_stated or not all(_EXACT.fullmatch(self.names[at]) for at in places):
+        if is_stated or not all(is_exact(self.names[at]) for at in places):
             self.said.insert(0, f"readings from {self._quoted(places)} in {told.words}")
         self.raw, scale = told.raw, self.units.accel_scale
         is_rewritten = scale != 1.0 or named != by_name or "count" in named or self.raw.sizes != PLAIN.sizes
-        written = [UNITS.get(unit, 1.0) for unit in by_name] if is_rewritten else self.raw.factors.tolist()
+        is_rewritten |= self.raw.counts != SIGNED
+        written = [ACCEL.get(unit, 1.0) for unit in by_name] if is_rewritten else self.raw.factors.tolist()
         self.written_mps2 = (written[0], written[1], written[2])
-        bare = [at for at, unit in zip(places, by_name, strict=True) if unit not in UNITS]
+        bare = [at for at, unit in zip(places, by_name, strict=True) if unit in ("", "count")]
         self.without_unit = tuple(bare) if is_rewritten else ()
         return QuantityColumns(tuple(places), (1.0, 1.0, 1.0))
 
@@ -307,7 +321,7 @@ class CsvColumns:
                 f"{self._quoted(places)} are in {' and '.join(sorted(set(units)))} by their names, and --angle-unit is "
                 f"{self.units.angle}: leave out --angle-unit."
             )
-        elif not all(_EXACT.fullmatch(self.names[at]) for at in places):
+        elif not all(is_exact(self.names[at]) for at in places):
             self.said.append(f"gimbal angles, outer to inner, from {self._quoted(places)}")
         return QuantityColumns(tuple(places), tuple(ANGLE[unit] for unit in units))
 
@@ -322,7 +336,7 @@ class CsvColumns:
         at = self._one("temperature")
         if at is None:
             return QuantityColumns(), "c"
-        if not _EXACT.fullmatch(self.names[at]):
+        if not is_exact(self.names[at]):
             self.said.append(f"temperature from {self._quoted([at])} in {(self._meanings[at].unit or 'c').upper()}")
         return QuantityColumns((at,), (1.0,)), self._meanings[at].unit or "c"
 
@@ -342,19 +356,12 @@ class CsvColumns:
             "none (--no-angles)."
         )
 
-    def _evenness(self, place: int) -> float:
-        """Return the share of steps of a time that go up by about the usual one; 0 where they are no numbers."""
-        stamps = self._values([place])[:, 0]
-        steps = np.diff(stamps[np.isfinite(stamps)])
-        usual = float(np.median(steps)) if len(steps) else 0.0
-        return round(float(np.mean((steps > 0.5 * usual) & (steps < 2.0 * usual))), 3) if usual > 0.0 else 0.0
-
     def _places(self, ours: str) -> list[int]:
         """Return the columns whose names say that quantity."""
         return [at for at, own in enumerate(self._meanings) if own.ours == ours]
 
     def refuse_several_units(self, used: Container[int]) -> None:
-        """Raise InputError where a column that means nothing to us tells several sensors apart, whose rows take turns.
+        """Raise CountsError where a column that means nothing to us tells several sensors apart, whose rows take turns.
 
         used: columns that have a meaning. Labels are few, each has a tenth of the rows, they change in three of ten
         rows, and readings under different ones differ by more than their scatter lets them.
@@ -363,7 +370,8 @@ class CsvColumns:
         if len(places) != 3 or len(self.rows) < _FEWEST_ROWS:
             return
         for at, name in enumerate(self.names):
-            labels = [] if at in used or not name else [row[at].strip() for row in self.rows]
+            is_told = at in used or not name or (self.chosen is not None and at == self.chosen[0])
+            labels = [] if is_told else [row[at].strip() for row in self.rows]
             shares = Counter(labels)
             turns = [k for k in range(len(labels) - 1) if labels[k] != labels[k + 1]]
             if not 2 <= len(shares) <= _MOST_UNITS or min(shares.values()) < 0.1 * len(labels):
@@ -378,11 +386,28 @@ class CsvColumns:
             if not (np.abs(middle) > _APART * np.maximum(spread, 1e-300)).any():
                 continue
             shown = ", ".join(sorted(shares)[:4])
-            raise InputError(
+            example = f"{cut(name, 40)}={first}"
+            raise CountsError(
                 f"the rows are of several sensors, told apart by the column {cut(self.header[at], 40)!r} ({shown}): "
-                f"choose one, as by --where {cut(self.header[at], 40) + '=' + first!r}, or leave the column out if it "
-                f"means something else (--column {cut(self.header[at], 40) + '=-'!r})."
+                f"choose one, for example by --where {example!r}, or leave the column out if it means something else "
+                f"(--column {cut(self.header[at], 40) + '=-'!r}).",
+                {"where": example},
             )
+
+    def _choose(self, where: str) -> None:
+        """Keep the rows whose cell in a column is the one stated, as ``I=0``; raises InputError where there is none."""
+        name, value = choice_of(where)
+        if name not in self.header:
+            raise InputError(
+                f"has no column {cut(name, 60)!r} (--where), it has {cut(', '.join(map(repr, self.header)), 300)}."
+            )
+        at = list(self.header).index(name)
+        labels = [row[at].strip() for row in self.rows]
+        if value not in labels:
+            seen = ", ".join(sorted(set(labels))[:8])
+            raise InputError(f"no row among the first has {value!r} in column {name!r} (--where), they have {seen}.")
+        self.chosen = (at, value)
+        self.rows = [row for row, label in zip(self.rows, labels, strict=True) if label == value]
 
     def _values(self, places: Sequence[int], rows: Sequence[CsvRow] | None = None) -> Floats:
         """Return the numbers (n, k) in columns of rows (None: of the first), NaN where there is none."""
@@ -391,33 +416,26 @@ class CsvColumns:
         return np.array(values, float).reshape(-1, len(places))
 
     def _one(self, ours: str) -> int | None:
-        """Return the column of a quantity that is there once; names of the format go before others, then such as begin
-        like one of readings. Raises InputError where two are left."""
+        """Return the column of a quantity that is there once; names of the format go before others. Raises InputError
+        where two are left."""
         places = self._places(ours)
-        for likely in (_EXACT.fullmatch, _LIKELY.match):
-            places = [at for at in places if likely(self.names[at].strip())] or places
+        places = [at for at in places if is_exact(self.names[at])] or places
         if len(places) > 1:
-            other = self.header[places[1]]
             raise InputError(
-                f"columns {self._quoted(places)} are all taken for {ours}: leave out what it is not by "
-                f"--column {other + '=-'!r}."
+                f"columns {self._quoted(places)} are all taken for {ours}: say which it is, for example by "
+                f"--column {f'{self.header[places[0]]}={ours}'!r}."
             )
         return places[0] if places else None
-
-    def _usual_norm(self, places: Sequence[int]) -> float:
-        """Return the median size of the readings in the first rows, NaN where there are none."""
-        norms = lengths(self._values(places))
-        norms = norms[np.isfinite(norms)]
-        return float(np.median(norms)) if len(norms) else math.nan
 
     def _unit_of_time(self, place: int, values: Floats) -> str:
         """Return the unit of stamps (n,) whose name tells none, by their size or their steps."""
         known = values[np.isfinite(values)]
         size = float(np.abs(known).max(initial=0.0))
-        if unit := next((unit for least, unit in _OF_EPOCH if size >= least), ""):
+        if unit := unit_of_epoch(size):
             return unit
-        if len(known) > 1 and 0.0 < float(np.median(np.abs(np.diff(known)))) < _FASTEST_TABLE_S:
-            return "s"
+        step = float(np.median(np.abs(np.diff(known)))) if len(known) > 1 else 0.0
+        if unit := next((unit for low, high, unit in _OF_STEPS if low < step < high), ""):
+            return unit
         name = self.header[place]
         raise InputError(
             f"no column gives the time with its unit: say which {name!r} has, for example --column '{name}=time_ms'; "

@@ -22,7 +22,7 @@ ENCODINGS = ("json", "protobuf")
 CDR = "cdr"
 _ANEW = "record it anew, or name another topic"
 _LOG_TIME = struct.Struct("<Q")
-_LOG_TIME_BEFORE = 16  # bytes from a record's log time to its message
+LOG_TIME_BEFORE = 16  # bytes from a record's log time to its message
 _Parse = Callable[[bytes], Any]
 _DEFINED = {name: kind.schema.encode() for kind in (IMU, JOINT_STATE, QUATERNION, TEMPERATURE) for name in kind.names}
 """Definitions of types that bags may leave out."""
@@ -107,7 +107,7 @@ class FieldDecoder:
                 )
         if self._time != LOG_TIME:
             return time_ns(message, self._time)
-        return min(_LOG_TIME.unpack_from(buffer, start - _LOG_TIME_BEFORE)[0], (1 << 63) - 1)
+        return min(_LOG_TIME.unpack_from(buffer, start - LOG_TIME_BEFORE)[0], (1 << 63) - 1)
 
 
 def parser_of(encoding: str, schema: Schema | None) -> Callable[[bytes], Any]:

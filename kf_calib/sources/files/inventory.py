@@ -13,20 +13,19 @@ from numpy.typing import NDArray
 
 from kf_calib.errors import MissingExtraError
 from kf_calib.sources.files.contents import POSES, READINGS, USABLE_SCHEMAS, Contents, fields_by_role
-from kf_calib.sources.files.field_messages import CDR, ENCODINGS, parser_of
+from kf_calib.sources.files.field_messages import CDR, ENCODINGS, LOG_TIME_BEFORE, parser_of
 from kf_calib.sources.files.fields import FieldError, paths_of
 from kf_calib.sources.files.lines import Lines
 from kf_calib.sources.files.mcap_file import McapFile, Warn
 from kf_calib.sources.files.mcap_records import MAX_CHUNK_MB, MessageFinder
 from kf_calib.sources.files.record_files import RecordFile, files_of, open_record_file
 from kf_calib.sources.files.sqlite_bag import SqliteBag
-from kf_calib.sources.tables.words import Units
+from kf_calib.sources.text.units import Units
 
 TopicTimes = NDArray[np.int64]
 _GAP = 5  # times the usual interval
 _USUAL = 1000  # intervals from which the usual one is taken
 _LEAST = 10  # intervals, for one to be usual
-_LOG_TIME_BEFORE = 16  # bytes from a record's log time to its message
 _LATEST = (1 << 63) - 1
 
 
@@ -215,7 +214,7 @@ def _from_blocks(
             groups = [group for group in messages.groups if group.channel == number and len(group.at)]
             at = np.sort(np.concatenate([group.at for group in groups]))
             every = np.ndarray((len(block.data) - 7,), "<u8", block.data, strides=(1,))
-            yield number, np.minimum(every[at - _LOG_TIME_BEFORE], _LATEST).astype(np.int64)
+            yield number, np.minimum(every[at - LOG_TIME_BEFORE], _LATEST).astype(np.int64)
             first = block.data[int(groups[0].at[0]) : int(groups[0].at[0]) + groups[0].size]
             _look_into(first, number, contents, topics)
 

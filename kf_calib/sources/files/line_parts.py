@@ -1,24 +1,18 @@
-"""What the readers of JSON and CSV lines share: units, exact stamps, rows, and an account of what was not used.
-
-A CSV file begins with a heading: comments and titles, the names of the columns, perhaps their units.
-"""
+"""What the readers of JSON and CSV lines share: units, exact stamps, rows, and an account of what was not used."""
 
 from __future__ import annotations
 
-import csv
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 
 from kf_calib.bench.raw_input import RawInput
 from kf_calib.bench.streams import Batch, Stream
-from kf_calib.sources.tables.grid import delimiter_of, with_commented_header
-from kf_calib.sources.tables.words import is_unit
 from kf_calib.support.text import number_from
 from kf_calib.support.units import WORDS
 
@@ -168,104 +162,3 @@ def stamp_ns(number: int | Decimal, decimals: int) -> int:
     if not -(2**63) <= nanoseconds < 2**63:
         raise LineError("the time stamp is out of range")
     return nanoseconds
-
-
-_FEWEST_CELLS = 3
-"""Of a header; a line of fewer is a title, a date or a serial number."""
-_ROWS = 1000  # that are looked at
-
-
-class CsvHeading(NamedTuple):
-    """The names of the columns, what is between cells, how many lines go before the first row, and the first rows."""
-
-    header: Sequence[str]
-    delimiter: str
-    lines: int
-    rows: Sequence[Sequence[str]]
-
-    @classmethod
-    def of(cls, lines: Sequence[str]) -> CsvHeading:
-        """The heading of lines from the beginning of a file or a stream, of which there is at least one."""
-        lines = with_commented_header([lines[0].lstrip("\ufeff"), *lines[1:]])
-        first = lines[0].strip()
-        stated = first[-1] if first.lower().startswith("sep=") and len(first) == 5 else ""
-        plain = [line for line in lines[bool(stated) : _ROWS] if line.strip() and not line.startswith("#")]
-        delimiter = stated or delimiter_of(plain)
-        at = next((k for k, line in enumerate(lines) if _is_header(line, delimiter)), None)
-        if at is None:  # whatever it is, it is told by its first line
-            at = next((k for k, line in enumerate(lines) if line.strip()), 0)
-        header = cells_of(lines[at].lstrip("\ufeff"), delimiter)
-        rows = [cells_of(line, delimiter) for line in lines[at + 1 : at + 1 + _ROWS]]
-        if rows and _are_units(rows[0]):
-            units, at = [*rows.pop(0), *[""] * len(header)], at + 1
-            header = [f"{name} [{unit}]" if unit else name for name, unit in zip(header, units, strict=False)]
-        while header and not header[-1]:  # a delimiter at the end of the line
-            header.pop()
-        return cls(header, delimiter, at + 1, [without_empty_end(row, len(header)) for row in rows])
-
-
-def _is_header(line: str, delimiter: str) -> bool:
-    text = line.lstrip("\ufeff").strip()
-    if not text or text.startswith("#"):
-        return False
-    return sum(bool(cell) for cell in cells_of(text, delimiter)) >= _FEWEST_CELLS
-
-
-def _are_units(cells: Sequence[str]) -> bool:
-    has_letters = any(character.isalpha() for cell in cells for character in cell)
-    return has_letters and all(not cell or is_unit(cell) for cell in cells)
-
-
-def without_empty_end(row: list[str], count: int) -> list[str]:
-    """A row without empty cells beyond so many, as of a delimiter at the end of the line."""
-    return row[:count] if len(row) > count and not any(cell.strip() for cell in row[count:]) else row
-
-
-def cells_of(line: str, delimiter: str) -> list[str]:
-    """The cells of one line without blanks and quotes around them; a quote left open ends with the line."""
-    try:
-        cells = next(csv.reader([line], delimiter=delimiter), [])
-    except csv.Error:  # a cell beyond csv's own limit
-        cells = line.split(delimiter)
-    return [cell.strip() for cell in cells]
-
-
-LONGEST_LINE_BYTES = 1 << 20
-
-
-class Cutter:
-    """Bytes as they come, cut into lines; a line that is too long is refused and left empty."""
-
-    def __init__(self, account: Account) -> None:
-        self._account, self._tail, self._cut = account, bytearray(), 0
-
-    @property
-    def is_amid(self) -> bool:
-        """Whether the last line has not ended yet."""
-        return bool(self._tail)
-
-    def push(self, block: bytes) -> list[str]:
-        """The lines that end in ``block``."""
-        end, lines = block.rfind(b"\n") + 1, list[str]()
-        if end:
-            lines = self._decode(bytes(self._tail) + block[: end - 1])
-            self._tail.clear()
-        if len(self._tail) <= LONGEST_LINE_BYTES:  # else what comes up to the next end of line is not kept
-            self._tail += block[end:]
-        return lines
-
-    def rest(self) -> list[str]:
-        """The line without an end, if there is one."""
-        block = bytes(self._tail)
-        self._tail.clear()
-        return self._decode(block) if block else []
-
-    def _decode(self, block: bytes) -> list[str]:
-        lines = block.replace(b"\r\n", b"\n").removesuffix(b"\r").split(b"\n")
-        if len(block) > LONGEST_LINE_BYTES:
-            for i, line in enumerate(lines):
-                if len(line) > LONGEST_LINE_BYTES:
-                    self._account.refuse(self._cut + i + 1, "it is longer than 1 MiB")
-                    lines[i] = b""
-        self._cut += len(lines)
-        return b"\n".join(lines).decode("utf-8", errors="replace").split("\n")

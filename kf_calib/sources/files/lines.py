@@ -7,6 +7,7 @@ Bytes are taken as they arrive and cut into lines here; memory is that of one bl
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -15,21 +16,27 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import BinaryIO, Protocol
 
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
+from kf_calib.bench.counts import refuse_unread
 from kf_calib.bench.raw_input import CONVERTED, PLAIN, RESTATE, RawInput, merged_metadata
 from kf_calib.bench.streams import Batch, bench_without_angles, with_accel, without_poses
 from kf_calib.errors import BenchError, CountsError, InputError
 from kf_calib.sources.files.csv_columns import CsvColumns
 from kf_calib.sources.files.fields import as_columns
-from kf_calib.sources.files.line_parts import Account, CsvHeading, Cutter, LineReader
+from kf_calib.sources.files.line_parts import Account, LineReader
 from kf_calib.sources.files.sample_lines import CsvLines, JsonLines
 from kf_calib.sources.tables.columns import HOW
-from kf_calib.sources.tables.words import Units
-from kf_calib.sources.text.text_file import TextFile
+from kf_calib.sources.text.encoding import Cutter, TextFile
+from kf_calib.sources.text.heading import TextHeading
+from kf_calib.sources.text.units import Units
 from kf_calib.support.text import cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 _BLOCK_BYTES = 1 << 18
+_SAMPLED, _BLOCKS_SAMPLED = 64, 1000  # readings of a block that tell how numbers are to be read, and blocks
 _TELLING_ROWS = 8  # of CSV, at the beginning of a stream
 OpenReader = Callable[[Sequence[str], Account], tuple[LineReader, int]]
 _SURVEY_LINES = 1_000_000  # without a pose in them, none will come
@@ -93,7 +100,9 @@ class Lines:
     def __iter__(self) -> Iterator[Batch]:
         readings = self.bench.input.readings  # here, so that a bench that cannot be used is told first
         converted = (with_accel(batch, readings(batch.accel.values)) for batch in self.batches())
-        return converted if self._angles else map(without_poses, converted)
+        yield from converted if self._angles else map(without_poses, converted)
+        if self.path and self._latest:
+            refuse_unread(self._latest.sample(), self.bench.input.counts, self.name)
 
     def batches(self) -> Iterator[Batch]:
         """What the lines hold, whatever the bench may be: raw readings."""
@@ -132,7 +141,7 @@ class Lines:
 
     def _open_reader(self, lines: Sequence[str], account: Account) -> tuple[LineReader, int]:
         if self._stated and not is_json(lines[0]):
-            _refuse_absent(self._stated, CsvHeading.of(lines).header)
+            _refuse_absent(self._stated, TextHeading.of(lines).header)
         local_mps2 = STANDARD_GRAVITY_MPS2
         if self._units.g == "local":
             local_mps2 = bench_without_angles(self.name, self._overrides)[0].gravity_mps2
@@ -222,7 +231,7 @@ def reader_for(
     """
     if is_json(lines[0]):
         return JsonLines(columns, account), 0
-    heading = CsvHeading.of(lines)
+    heading = TextHeading.of(lines)
     return CsvLines(CsvColumns.of(heading, columns, units, local_mps2), account, angles), heading.lines
 
 
@@ -251,6 +260,7 @@ class _Passage:
         self._blocks = self._split(stream)
         self._ahead, self._said = list[Batch](), list[str]()
         self._has_accel = self._has_pose = False
+        self._sampled = deque[Floats](maxlen=_BLOCKS_SAMPLED)
 
     def sentences(self) -> list[str]:
         """What was taken for what, where that is not plain, and what was not used."""
@@ -288,6 +298,10 @@ class _Passage:
             return "platform angles"
         return "" if self._has_accel else "readings"
 
+    def sample(self) -> Floats:
+        """Some of the readings (n, 3) as they stand in the lines."""
+        return np.concatenate([np.zeros((0, 3)), *self._sampled])
+
     def __iter__(self) -> Iterator[Batch]:
         try:
             while self._ahead:
@@ -320,7 +334,7 @@ class _Passage:
         try:
             self.parser, heading = self._open_reader(lines, self.account)
         except CountsError as error:
-            raise CountsError(f"{self._name}: {error}", error.scale) from None
+            raise CountsError(f"{self._name}: {error}", error.keys) from None
         except InputError as error:
             raise InputError(f"{self._name}: {error}") from None
         self._said = self.parser.said
@@ -334,13 +348,15 @@ class _Passage:
     def _parse(self, lines: list[str]) -> Batch:
         batch = self.parser.read(lines, self.account.lines + 1)
         self.account.lines += len(lines)
-        self._has_accel |= len(batch.accel) > 0
+        if count := len(batch.accel):
+            self._has_accel = True
+            self._sampled.append(batch.accel.values[:: count // _SAMPLED + 1].copy())
         self._has_pose |= len(batch.pose) > 0
         return batch
 
     def _split(self, stream: BinaryIO | TextFile) -> Iterator[list[str]]:
         """Whole lines, block by block as they arrive."""
-        cutter = Cutter(self.account)
+        cutter = Cutter(self.account.refuse)
         for block in self._read(stream):
             if lines := cutter.push(block):
                 self.fraction = self._file.fraction if self._file else math.nan

@@ -35,12 +35,13 @@ from kf_calib.sources.files.contents import (
     Role,
     fields_by_role,
 )
-from kf_calib.sources.files.field_messages import FieldDecoder
+from kf_calib.sources.files.field_messages import LOG_TIME_BEFORE, FieldDecoder
 from kf_calib.sources.files.fields import FieldError, Joints
 from kf_calib.sources.files.mcap_file import Warn
 from kf_calib.sources.files.mcap_records import (
     MAX_CHUNK_MB,
     DamagedError,
+    Integers,
     MessageFinder,
     Messages,
     RecordBlock,
@@ -49,6 +50,7 @@ from kf_calib.sources.files.mcap_records import (
     unpacked,
 )
 from kf_calib.sources.files.record_files import RecordFile, files_of, open_record_file
+from kf_calib.sources.files.time_order import TimeOrder
 from kf_calib.support.text import parse_date
 
 _MOST_DAMAGES = 100  # told one by one; a file can be made that has a million
@@ -148,7 +150,8 @@ class Recording:
         decoders = _Decoders(parts, self.bench.pose_width, joints, self.warnings.append)
         for file, contents in zip(parts.files, parts.contents, strict=True):
             passage = _Passage(contents, self._limit, self._warn_of_damage)
-            for end, batch in self._part(file, passage, decoders, growing and file is parts.files[-1]):
+            batches = self._part(file, passage, decoders, growing and file is parts.files[-1])
+            for end, batch in batches if growing else self._ordered(batches, file.size):
                 self.fraction = math.nan if growing else min((begun + end) / parts.size, 1.0)
                 if self._begin_ns is None and len(batch.accel):
                     self._begin_ns, self.received = int(batch.accel.time_ns[0]), passage.received
@@ -180,6 +183,15 @@ class Recording:
                 temperature.read(block, messages) if temperature else Stream.empty(1),
             )
             yield block.end, batch
+
+    def _ordered(self, batches: Iterator[tuple[int, Batch]], size: int) -> Iterator[tuple[int, Batch]]:
+        """The batches with the samples of each topic in order of time, as far as a short memory can bring them."""
+        accel, pose, temperature = orders = TimeOrder(), TimeOrder(), TimeOrder()
+        for end, batch in batches:
+            yield end, Batch(accel(batch.accel), pose(batch.pose), temperature(batch.temperature))
+        yield size, Batch(accel.rest(3), pose.rest(self.bench.pose_width), temperature.rest(1))
+        if late := sum(order.late for order in orders):
+            self.warnings.append(f"{self.path}: {late} messages came after later ones of their topic, and were sorted.")
 
     def _converted(self, stream: Stream) -> Stream:
         return Stream(stream.time_ns, self._convert(stream.values))
@@ -347,6 +359,11 @@ class _Passage:
             if isinstance(track.decode, FieldDecoder) and (unread := track.decode.take_unread()):
                 said = f"{self.contents.path}: topic {track.topic}"
                 warn(f"{said}: {len(unread)} messages are left out (first: {unread[0]}).")
+            if track.by_receipt:
+                warn(
+                    f"{self.contents.path}: topic {track.topic}: its stamps (header.stamp) are all 0, so the times of "
+                    "receipt (log_time) are used."
+                )
             ids = self.contents.ids(track.topic)
             total = sum(stated.get(channel, 0) for channel in ids)
             lost = total - sum(self._met[channel] for channel in ids)
@@ -357,13 +374,14 @@ class _Passage:
             warn(f"{self.contents.path}: {stray} messages belong to no topic the file defines and are left out.")
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Track:
-    """One topic on its way from blocks to a stream."""
+    """One topic on its way from blocks to a stream. by_receipt: whether its messages have no stamps of their own."""
 
     contents: Contents
     topic: str
     decode: Decoder | FieldDecoder
+    by_receipt: bool = False
 
     def read(self, block: RecordBlock, messages: Messages) -> Stream:
         """The topic's samples in ``block``. Raises InputError where a message is not what its schema says."""
@@ -371,6 +389,7 @@ class _Track:
         groups = [group for group in messages.groups if group.channel in ids]
         try:
             parts = [self.decode.stream_with_offsets(block.data, group.at, group.size) for group in groups]
+            parts = [(at, self._stamped(stream, at, block.data)) for at, stream in parts]
         except (CdrError, FieldError) as error:
             raise InputError(f"{self.contents.path}: topic {self.topic} cannot be used: {error}.") from error
         if len(parts) == 1:
@@ -378,6 +397,15 @@ class _Track:
         joined = sum((stream for _, stream in parts), Stream.empty(self.decode.width))
         order = np.argsort(np.concatenate([np.empty(0, np.int64), *(at for at, _ in parts)]))
         return Stream(joined.time_ns[order], joined.values[order])
+
+    def _stamped(self, stream: Stream, at: Integers, data: bytes) -> Stream:
+        """The stream, stamped by the times of receipt where nobody has filled its own stamps: all of them are 0."""
+        self.by_receipt |= len(stream) > 1 and not stream.time_ns.any()
+        if not self.by_receipt:
+            return stream
+        every = np.ndarray((max(len(data) - 7, 0),), "<u8", data, strides=(1,))
+        receipts = np.minimum(every[at - LOG_TIME_BEFORE], np.iinfo(np.int64).max).astype(np.int64)
+        return Stream(np.where(stream.time_ns == 0, receipts, stream.time_ns), stream.values)
 
 
 def _scaled(stream: Stream, scale: float) -> Stream:

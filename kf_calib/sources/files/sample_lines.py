@@ -15,7 +15,7 @@ from typing import Any
 
 from kf_calib.bench.bench import metadata_of
 from kf_calib.bench.raw_input import UNITS, parse_unit
-from kf_calib.sources.files.csv_columns import CsvColumns, has_texts
+from kf_calib.sources.files.csv_columns import CsvColumns
 from kf_calib.sources.files.line_parts import (
     ACCEL_UNITS,
     TIME_DECIMALS,
@@ -23,13 +23,13 @@ from kf_calib.sources.files.line_parts import (
     LineError,
     LineReader,
     LineRows,
-    cells_of,
     number_of,
     stamp_ns,
-    without_empty_end,
 )
 from kf_calib.sources.tables.numbers import DECIMAL_POINT, written
+from kf_calib.sources.text.heading import BLANK, cell_spans, cells_of, without_empty_end
 
+_MINUTE_NS, _HOUR_NS = 60 * 10**9, 3600 * 10**9
 _FROM_UNIT = {"c": (1.0, 0.0), "k": (1.0, -273.15), "f": (1.0 / 1.8, -32.0 / 1.8)}
 
 
@@ -46,6 +46,8 @@ class CsvLines(LineReader):
         super().__init__(account)
         self._columns, self._delimiter, self._header = columns, columns.delimiter, columns.header
         self._time, self._accel = columns.time(), columns.accel()
+        self._chosen = columns.chosen
+        self._row, self._added_ns, self._last_ns = -1, 0, -(2**63)
         self.raw = columns.raw
         self._numbers = columns.numbers
         attitude = columns.quaternion()
@@ -57,8 +59,14 @@ class CsvLines(LineReader):
         self._temperature, unit = columns.temperature()
         self._warmth = _FROM_UNIT[unit]
         self.said = columns.said
-        used = {*self._time.at, *self._accel.at, *self._pose.at, *self._temperature.at}
-        columns.refuse_several_units({*used, *columns.chosen})
+        used = {
+            *([self._chosen[0]] if self._chosen else []),
+            *self._time.at,
+            *self._accel.at,
+            *self._pose.at,
+            *self._temperature.at,
+        }
+        columns.refuse_several_units(used)
         self._account.leave_out(name for at, name in enumerate(columns.names) if at not in used)
 
     @property
@@ -76,39 +84,58 @@ class CsvLines(LineReader):
 
     def heading_of_forces(self, heading: Sequence[str]) -> list[str]:
         names = {at: f"a{'xyz'[self._accel.at.index(at)]}_mps2" for at in self._columns.without_unit}
-        lines, is_named = list(heading), False
-        for k, line in enumerate(heading):
-            cells = cells_of(line.lstrip("\ufeff"), self._delimiter)
-            if not names or len(cells) < len(self._header) or not cells[self._accel.at[0]]:
-                continue
-            lines[k] = self._replaced(line, dict.fromkeys(names, "m/s^2") if is_named else names)
-            is_named = True
+        lines = list(heading)
+        for k in self._columns.lines_of_names if names else ():
+            cells = cells_of(lines[k].lstrip("\ufeff"), self._delimiter)
+            if len(cells) >= len(self._header) and cells[self._accel.at[0]]:
+                is_first = k == self._columns.lines_of_names[0]
+                lines[k] = self._replaced(lines[k], names if is_first else dict.fromkeys(names, "m/s^2"))
         return lines
 
     def _replaced(self, line: str, texts: Mapping[int, str]) -> str:
         """A line with other texts in these cells, and all else as it stands."""
-        spans = cell_spans(line, self._delimiter)
+        labels = self._columns.labels
+        spans = cell_spans(line, self._delimiter) if labels is None else labels.spans(line)
         for at in sorted(texts, reverse=True):
             start, end = spans[at]
             line = line[:start] + texts[at] + line[end:]
         return line
+
+    def _of_even_clock(self, time_ns: int) -> int:
+        """Return a stamp of a calendar with the hour by which local clocks go back at the end of summer time."""
+        time_ns += self._added_ns
+        if _HOUR_NS - _MINUTE_NS < self._last_ns - time_ns <= _HOUR_NS:
+            self._added_ns += _HOUR_NS
+            time_ns += _HOUR_NS
+            self.said.append("its stamps go back by an hour, as at the end of summer time: those after it count on")
+        self._last_ns = max(self._last_ns, time_ns)
+        return time_ns
 
     def _begin_block(self, lines: Sequence[str]) -> None:
         if self._numbers is None:
             self._numbers = self._columns.numbers_in([self._cells(line) for line in lines])
 
     def _cells(self, line: str) -> list[str]:
-        is_plain = '"' not in line and " " not in line
-        return line.split(self._delimiter) if is_plain else cells_of(line, self._delimiter)
+        if self._columns.labels is not None:
+            return self._columns.labels.values(line)
+        if '"' not in line and " " not in line and self._delimiter != BLANK:
+            return line.split(self._delimiter)
+        return cells_of(line, self._delimiter)
 
     def _read_line(self, line: str, accel: LineRows, pose: LineRows, temperature: LineRows) -> None:
-        row = without_empty_end(self._cells(line), len(self._header))
+        if not (cells := self._cells(line)) and self._columns.labels is not None:
+            return  # of something else than readings
+        self._row += 1
+        row = without_empty_end(cells, len(self._header))
         if len(row) != len(self._header):
             raise LineError(f"it has {len(row)} cells, the header has {len(self._header)}")
-        if not has_texts(row, self._columns.chosen):
-            return
         numbers = self._numbers or DECIMAL_POINT
-        time_ns = self._time.ns(row, self._header, numbers)
+        if self._chosen is not None and row[self._chosen[0]].strip() != self._chosen[1]:
+            self._row -= 1
+            return
+        time_ns = self._time.ns(row, self._header, numbers, self._row)
+        if self._time.is_date:
+            time_ns = self._of_even_clock(time_ns)
         # everything on the line is understood before any of it is used
         readings, angles, degrees = (
             quantity.values(row, self._header, numbers) for quantity in (self._accel, self._pose, self._temperature)
@@ -120,29 +147,6 @@ class CsvLines(LineReader):
         accel.add(time_ns, readings)
         pose.add(time_ns, angles)
         temperature.add(time_ns, degrees)
-
-
-def cell_spans(line: str, delimiter: str) -> list[tuple[int, int]]:
-    """Where the cells of a line stand, with their quotes and without blanks around them."""
-    spans, at = list[tuple[int, int]](), 0
-    while True:
-        end = _quote_end(line, at) if line[at : at + 1] == '"' else at
-        end = line.find(delimiter, end)
-        end = len(line) if end < 0 else end
-        cell = line[at:end]
-        spans.append((at + len(cell) - len(cell.lstrip()), end - len(cell) + len(cell.rstrip())))
-        if end == len(line):
-            return spans
-        at = end + 1
-
-
-def _quote_end(line: str, at: int) -> int:
-    """The place behind the quote that ends what the one at ``at`` begins; the end of the line where none does."""
-    while (at := line.find('"', at + 1)) >= 0:
-        if line[at + 1 : at + 2] != '"':
-            return at + 1
-        at += 1
-    return len(line)
 
 
 _MARK = "\ufeff"  # some write it before the first line

@@ -8,11 +8,13 @@ from collections.abc import Mapping
 from kf_calib.bench.streams import Batch
 from kf_calib.errors import InputError
 from kf_calib.sources.files.csv_columns import CsvColumns
-from kf_calib.sources.files.line_parts import Account, CsvHeading, Cutter, LineReader
+from kf_calib.sources.files.line_parts import Account, LineReader
 from kf_calib.sources.files.sample_lines import CsvLines, JsonLines
 from kf_calib.sources.live.feed import nothing
 from kf_calib.sources.live.frames import FrameReader
-from kf_calib.sources.tables.words import Units
+from kf_calib.sources.text.encoding import Cutter
+from kf_calib.sources.text.heading import TextHeading
+from kf_calib.sources.text.units import Units
 
 _FEWEST_CELLS = 5  # time, readings and an angle
 _MOST_LINES = 2000  # without a beginning among them
@@ -32,7 +34,7 @@ class LineProtocol:
     ) -> None:  # fmt: skip
         self._name, self._columns, self._account, self._angles = name, columns, account, angles
         self._units = units
-        self._cutter = Cutter(account)
+        self._cutter = Cutter(account.refuse)
         self._heading = [header.strip()] if header.strip() else []
         self._waiting = list[str]()
         self.reader: LineReader | None = None
@@ -96,7 +98,7 @@ class LineProtocol:
         return []
 
     def _csv(self, heading: list[str], account: Account, angles: bool) -> CsvLines:
-        return CsvLines(CsvColumns.of(CsvHeading.of(heading), self._columns, self._units), account, angles)
+        return CsvLines(CsvColumns.of(TextHeading.of(heading), self._columns, self._units), account, angles)
 
     def _has_readings(self, heading: list[str]) -> bool:
         """Whether a header lacks nothing but angles."""
@@ -123,7 +125,7 @@ class LineProtocol:
         ):
             return False
         both, lacks = [text, following or ""], None
-        for heading in ([text], both[: CsvHeading.of(both).lines]):  # what says all by itself is not asked for more
+        for heading in ([text], both[: TextHeading.of(both).lines]):  # what says all by itself is not asked for more
             if self._angles and len(cells) < _FEWEST_CELLS and not self._has_readings(heading):
                 continue
             try:

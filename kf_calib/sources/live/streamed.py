@@ -17,7 +17,7 @@ from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.files.lines import bench_of, stated_of
 from kf_calib.sources.live.feed import IDLE_S, Feed, Link, Lost, Regained, nothing
 from kf_calib.sources.live.protocols import Protocol
-from kf_calib.sources.tables.words import Units
+from kf_calib.sources.text.units import Units
 
 _PACE_S = 0.012  # between reads: many small ones cost more than they bring; a serial port holds 4 KB meanwhile
 _INBOX_BYTES = 1 << 25

@@ -5,8 +5,9 @@ When the orientations of a table were measured.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
 import numpy as np
@@ -15,10 +16,11 @@ from kf_calib.bench.arrays import Floats, Mask, lengths
 from kf_calib.errors import InputError
 from kf_calib.sources.tables.grid import Cell, Grid
 from kf_calib.sources.tables.numbers import Numbers, stamps_of
-from kf_calib.sources.tables.words import TIME, Meaning, face_of, meaning_of, meanings_of
+from kf_calib.sources.text.contents import is_nameless, meanings_by_numbers
+from kf_calib.sources.text.names import QUATERNION, TIME, Meaning, face_of, meaning_of, meanings_of, unit_of_epoch
 from kf_calib.support.text import cut
 
-READINGS, SPREADS, QUATERNION = ("ax", "ay", "az"), ("sx", "sy", "sz"), ("qx", "qy", "qz", "qw")
+READINGS, SPREADS = ("ax", "ay", "az"), ("sx", "sy", "sz")
 _OPTIONAL = ("time", "count", "temperature", "sd", *SPREADS)
 _SEVERAL = ("angle", "time", "")
 _ALIKE = 1.3  # of the norms of readings at rest, largest to smallest
@@ -41,10 +43,10 @@ class Columns:
 
     @classmethod
     def of(cls, grid: Grid, stated: Mapping[str, str], numbers: Numbers) -> Columns:
-        """The columns of a grid; ``stated`` are those that the user names, theirs to ours, ``=VALUE`` for one by which
-        rows are chosen. Raises InputError."""
-        grid, stated = _chosen(grid, stated)
+        """The columns of a grid; ``stated`` are those that the user names, theirs to ours. Raises InputError."""
         columns = cls(grid, numbers, _meanings(grid, stated))
+        if is_nameless(grid.header) and not stated:
+            columns._recognise_numbers()
         columns._leave_out_empty(set(stated))
         columns._recognise_contents({k for k, name in enumerate(grid.header) if name in stated})
         columns._refuse_doubles()
@@ -128,13 +130,24 @@ class Columns:
                 self._guess(k, "time")
         if self.places(*READINGS):
             return
-        left = [k for k in range(len(self.meanings)) if not self.meanings[k].ours and k not in stated]
+        left = [k for k, own in enumerate(self.meanings) if not own.ours and not own.other and k not in stated]
         if len(numeric := [k for k in left if self._are_numbers(k, _MOST)]) == 3:
             whole = np.array([all(self.is_number(row[k]) for k in numeric) for row in self.grid.rows])
             norms = lengths(np.column_stack([self.values(k, only=whole)[whole] for k in numeric]))
             if norms.size and 0 < norms.max() < _ALIKE * norms.min():
                 for k, ours in zip(numeric, READINGS, strict=True):
                     self._guess(k, ours)
+
+    def _recognise_numbers(self) -> None:
+        """Find time and readings in columns without names."""
+        places = [k for k in range(len(self.meanings)) if self._are_numbers(k, _MOST)]
+        if len(places) < 3:
+            return
+        whole = np.array([all(self.is_number(row[k]) for k in places) for row in self.grid.rows])
+        told = meanings_by_numbers(np.column_stack([self.values(k, only=whole)[whole] for k in places]))
+        for place, meaning in zip(places, told, strict=True):
+            if meaning.ours:
+                self._guess(place, meaning.ours)
 
     def _guess(self, place: int, ours: str) -> None:
         self.meanings[place] = Meaning(ours, self.meanings[place].unit)
@@ -163,29 +176,9 @@ class Columns:
             if ours not in _SEVERAL and first != k:
                 one, other = self.grid.header[first], self.grid.header[k]
                 raise InputError(
-                    f"{self.grid.name}: columns {one!r} and {other!r} are both taken for {ours}: leave one out by "
-                    f"--column {other + '=-'!r}; {HOW}."
+                    f"{self.grid.name}: columns {one!r} and {other!r} are both taken for {ours}: say which it is, for "
+                    f"example by --column {f'{one}={ours}'!r}; {HOW}."
                 )
-
-
-def _chosen(grid: Grid, stated: Mapping[str, str]) -> tuple[Grid, dict[str, str]]:
-    """Return the grid of the rows that are chosen, and what else is stated; their column then means nothing."""
-    wanted = {theirs: ours[1:] for theirs, ours in stated.items() if ours.startswith("=")}
-    places = {grid.header.index(name): value for name, value in wanted.items() if name in grid.header}
-    kept = [k for k, row in enumerate(grid.rows) if all(_as_text(row[at]) == value for at, value in places.items())]
-    if not kept:
-        said = " and ".join(f"{name}={value}" for name, value in wanted.items())
-        raise InputError(f"{grid.name}: has no row of {said} (--where): give what stands in the column.")
-    others = {theirs: "-" if theirs in wanted else ours for theirs, ours in stated.items()}
-    if len(kept) == len(grid.rows):
-        return grid, others
-    rows, numbers = tuple(grid.rows[k] for k in kept), tuple(grid.numbers[k] for k in kept)
-    return replace(grid, rows=rows, numbers=numbers), others
-
-
-def _as_text(cell: Cell) -> str:
-    """Return the text of a cell; a whole number of a spreadsheet without decimals."""
-    return f"{cell:g}" if isinstance(cell, float) else str(cell if cell is not None else "").strip()
 
 
 def _is_face(cell: Cell) -> bool:
@@ -196,18 +189,41 @@ def _meanings(grid: Grid, stated: Mapping[str, str]) -> list[Meaning]:
     """Return what the header and the user say; raises InputError for names that are not known."""
     for theirs, ours in stated.items():
         if theirs not in grid.header:
-            raise InputError(
-                f"{grid.name}: has no column {cut(theirs, 60)!r} (--column), it has "
-                f"{cut(', '.join(map(repr, grid.header)), 300)}."
-            )
+            raise InputError(f"{grid.name}: has no column {cut(theirs, 60)!r} (--column), it has {grid.names}.")
         if ours != "-" and not meaning_of(ours).ours:
             raise InputError(f"--column {theirs}={ours}: {cut(ours, 60)!r} is not known: use {KNOWN}, or - for none.")
-    meanings = meanings_of(grid.header)
-    for k, name in enumerate(grid.header):
-        if name in stated:
-            own = meaning_of(stated[name])
-            meanings[k] = own if own.unit else own._replace(unit=meanings[k].unit)
-    return meanings
+    return meanings_of(grid.header, stated)
+
+
+_MOST_OWN = 6  # rows of a table of own axes
+_UP_DOWN = re.compile(r"([+\-−])\s*1\s*g", re.IGNORECASE)
+
+
+def own_axes(columns: Columns) -> Floats | None:
+    """What each axis reads up and down (3, 2), where a table holds no more than that: a row for each face with the
+    reading of its own axis alone, or a row for each axis with those at +1 g and -1 g. None where it is another."""
+    extremes = np.full((3, 2), np.nan)
+    if len(columns.grid.rows) > _MOST_OWN:
+        return None
+    for axis, is_down, cell in _own_cells(columns):
+        if not columns.is_number(cell):
+            return None
+        extremes[axis, int(is_down)] = columns.numbers.value(cell)
+    return extremes if np.isfinite(extremes).all() else None
+
+
+def _own_cells(columns: Columns) -> Iterator[tuple[int, bool, Cell]]:
+    """Yield axis, whether it is down, and the reading of it."""
+    grid, readings = columns.grid, columns.places(*READINGS)
+    signs = {k: match[1] != "+" for k, name in enumerate(grid.header) if (match := _UP_DOWN.fullmatch(name.strip()))}
+    for row in grid.rows:
+        face = next((told for cell in row if isinstance(cell, str) and (told := face_of(cell))), None)
+        if face and len(signs) == 2:
+            yield from ((face[0], is_down, row[k]) for k, is_down in signs.items())
+        elif face and len(readings) == 3:
+            others = [row[k] for axis, k in enumerate(readings) if axis != face[0]]
+            alone = all(cell is None or cell in ("-", "–", "—") for cell in others)
+            yield face[0], face[1] < 0, row[readings[face[0]]] if alone else None
 
 
 _USUAL_PAUSE_S = 60.0
@@ -228,7 +244,7 @@ class RowTimes:
     @classmethod
     def of(cls, columns: Columns) -> RowTimes:
         """Raises InputError for a cell that is no time, and for rows that are out of order."""
-        places, count = columns.places("time"), len(columns.grid.rows)
+        places, count = _of_rising_numbers(columns, columns.places("time")), len(columns.grid.rows)
         if not places:
             return cls(_USUAL_PAUSE_S * np.arange(count, dtype=np.float64), None, "")
         unit, cells = columns.meanings[places[0]].unit, columns.grid.column(places[0])
@@ -237,8 +253,10 @@ class RowTimes:
             columns.numbers.values(cells) is not None or all(cell is None or columns.is_number(cell) for cell in cells)
         )
         if are_numbers or (len(places) == 1 and unit in TIME):
-            said += f" in {unit or 's'}"
-            elapsed_s = TIME[unit or "s"] * columns.values(places[0], "a time", optional=True)
+            values = columns.values(places[0], "a time", optional=True)
+            unit = unit or unit_of_epoch(float(np.abs(values).max(initial=0.0))) or "s"
+            said += f" in {unit}"
+            elapsed_s = TIME[unit] * (values - values[0])
         else:
             stamps = _stamps(columns, places)
             elapsed_s = np.array([(stamp - stamps[0]).total_seconds() for stamp in stamps])
@@ -246,6 +264,15 @@ class RowTimes:
             start_ns = round((_in_utc(stamps[0]) - _FIRST).total_seconds()) * 10**9
         _refuse_disorder(columns, elapsed_s, places[0])
         return cls(elapsed_s - elapsed_s[0], start_ns, said)
+
+
+def _of_rising_numbers(columns: Columns, places: list[int]) -> list[int]:
+    """Return the first of several columns of numbers that go up, where there is one; else all, as of date and time."""
+    for place in places if len(places) > 1 else ():
+        values = columns.numbers.values(columns.grid.column(place))
+        if values is not None and bool((np.diff(values) > 0.0).all()):
+            return [place]
+    return places
 
 
 def _stamps(columns: Columns, places: list[int]) -> list[datetime]:

@@ -12,8 +12,11 @@ from typing import Any
 
 from kf_calib.errors import InputError
 from kf_calib.sources.tables.spreadsheet import sheets_of
-from kf_calib.sources.tables.words import are_numbers, is_unit
-from kf_calib.sources.text.text_file import text_of
+from kf_calib.sources.text.encoding import text_of, too_large
+from kf_calib.sources.text.heading import delimiter_in, header_in, is_comment
+from kf_calib.sources.text.labels import Labels
+from kf_calib.sources.text.names import face_of
+from kf_calib.sources.text.units import choice_of
 from kf_calib.support.text import cut
 
 Cell = str | float | datetime | None
@@ -26,9 +29,7 @@ _LARGEST = (50_000_000, 50_000_000)  # bytes, of text and of a spreadsheet, whic
 _SHOWN = 6  # rows in a message
 _LONGEST_CELL = 300  # characters; a longer one is a remark, of which the middle is left out
 _MOST_COLUMNS, _MOST_CELLS = 1000, 2_000_000
-_DELIMITERS = ";\t,|"
-_FEWEST_NAMES = 3
-_TELLING = 200  # lines by which the delimiter is told
+_FEWEST = 3  # columns
 
 
 @dataclass(frozen=True)
@@ -52,10 +53,34 @@ class Grid:
         """The cells of one column."""
         return [row[index] for row in self.rows]
 
+    def chosen(self, where: str) -> Grid:
+        """The rows that have a text in a column, as ``unit=7``; all for an empty one. Raises InputError for none."""
+        if not where:
+            return self
+        name, value = choice_of(where)
+        if name not in self.header:
+            raise InputError(f"{self.name}: has no column {cut(name, 60)!r} (--where), it has {self.names}.")
+        labels = [_as_text(cell) for cell in self.column(self.header.index(name))]
+        kept = [k for k, label in enumerate(labels) if label == value]
+        if not kept:
+            seen = cut(", ".join(dict.fromkeys(labels)), 100)
+            raise InputError(f"{self.name}: no row has {value!r} in column {name!r} (--where), they have {seen}.")
+        return replace(self, rows=tuple(self.rows[k] for k in kept), numbers=tuple(self.numbers[k] for k in kept))
+
+    @property
+    def names(self) -> str:
+        """The names of the columns, quoted."""
+        return cut(", ".join(map(repr, self.header)), 300)
+
     def refuse(self, row: int, column: str, value: Cell, wanted: str) -> InputError:
         """The error that names a cell (row counted from 0), its value, and what would be read."""
         said = "is empty" if value is None else f"is {cut(str(value), 60)!r}"
         return InputError(f"{self.name}: row {self.numbers[row]}, column {column!r} {said}: {wanted}.")
+
+
+def _as_text(cell: Cell) -> str:
+    """Return the text of a cell; a whole number of a spreadsheet without decimals."""
+    return f"{cell:g}" if isinstance(cell, float) else str("" if cell is None else cell).strip()
 
 
 def grid_of(table: Any) -> Grid:
@@ -71,75 +96,23 @@ def grid_of(table: Any) -> Grid:
             raise InputError(f"{path}: files of the kind {path.suffix} are not read: save it as .xlsx or .csv.")
         is_excel = start.startswith(ZIP)
         if path.stat().st_size > _LARGEST[is_excel]:
-            raise _too_large(path)
+            raise too_large(path)
         return replace(_of_excel(path) if is_excel else _of_text(path), path=path)
     return _of_columns(table)
 
 
-def _too_large(path: Path) -> InputError:
-    return InputError(
-        f"{path}: is larger than a table of orientations can be: leave out what is not part of it; if it holds "
-        "samples, save them as CSV with a column of time (docs/own_csv.md)."
-    )
-
-
 def _of_text(path: Path) -> Grid:
     """Return the cells of a CSV file: any usual encoding and delimiter, with or without lines above the header."""
+    lines = text_of(path, _LARGEST[0]).splitlines()
+    if labels := Labels.of(lines):
+        return _headed(str(path), _labelled(lines, labels))
+    delimiter, skipped = delimiter_in(lines)
     try:
-        text, trouble = text_of(path, _LARGEST[0])
-    except OverflowError:
-        raise _too_large(path) from None
-    if "\0" in text:
-        raise InputError(f"{path}: is no text (it has bytes of zero): save the table as CSV or .xlsx.")
-    delimiter, skipped = "", 0
-    first, _, rest = text.partition("\n")
-    if first.lower().startswith("sep=") and len(first.strip()) == 5:
-        delimiter, text, skipped = first.strip()[-1], rest, 1
-    written = with_commented_header(text.splitlines())
-    delimiter = delimiter or delimiter_of(
-        [line for line in written[:_TELLING] if line.strip() and not line.startswith("#")]
-    )
-    try:
-        reader = csv.reader(written, delimiter=delimiter, skipinitialspace=True)
-        lines = [(reader.line_num + skipped, _texts(row)) for row in reader]
+        reader = csv.reader(lines[skipped:], delimiter=delimiter, skipinitialspace=True)
+        rows = [(reader.line_num + skipped, _texts(row)) for row in reader]
     except csv.Error as error:
         raise InputError(f"{path}: is no CSV file ({error}): save the table as CSV or .xlsx.") from None
-    lines = [line for line in lines if not (line[1] and str(line[1][0] or "").startswith("#"))]
-    grid = _headed(str(path), lines)
-    remarks = (*grid.remarks, *([trouble.removesuffix(".")] if trouble else []))
-    return replace(grid, is_semicolon=delimiter == ";", remarks=remarks)
-
-
-def delimiter_of(lines: Sequence[str]) -> str:
-    """The delimiter with which the most of some lines have the same number of cells, two or more."""
-
-    def fitness(delimiter: str) -> int:
-        widths = [len(row) for row in csv.reader(lines[:_TELLING], delimiter=delimiter) if len(row) > 1]
-        return max(map(widths.count, set(widths)), default=0)
-
-    try:
-        return max(_DELIMITERS, key=fitness)
-    except csv.Error:
-        return ","
-
-
-def with_commented_header(lines: Sequence[str]) -> Sequence[str]:
-    """The lines, of which the last comment above the first row is the header, without its mark, where it has as many
-    names as the row has cells, most of them numbers."""
-    row = next((k for k, line in enumerate(lines[:_TELLING]) if line.strip() and not line.startswith("#")), None)
-    above = next((k for k in range((row or 0) - 1, -1, -1) if lines[k].strip("# \t\r\n")), None)
-    if row is None or above is None:
-        return lines
-    header = lines[above].lstrip("# \t")
-    delimiter = delimiter_of([header, *(line for line in lines[row : row + _TELLING] if line.strip())])
-    try:
-        names, cells = csv.reader([header, lines[row]], delimiter=delimiter)
-    except csv.Error:
-        return lines
-    numbers = sum(are_numbers([cell]) for cell in cells if cell.strip())
-    if len(names) != len(cells) or len(names) < _FEWEST_NAMES or are_numbers(names) or 2 * numbers < len(cells):
-        return lines
-    return [*lines[:above], header, *lines[above + 1 :]]
+    return replace(_headed(str(path), rows), is_semicolon=delimiter == ";")
 
 
 def _of_excel(path: Path) -> Grid:
@@ -220,23 +193,16 @@ def _text(cell: str) -> str | None:
 
 
 def _headed(name: str, lines: Sequence[tuple[int, Sequence[Cell]]]) -> Grid:
-    """Return the grid of lines: the header is the first with more than two cells, a line of units may follow it."""
+    """Return the grid of lines, with the number that each has in the file."""
     filled = [(number, list(cells)) for number, cells in lines if cells.count(None) < len(cells)]
-    while filled and sum(cell is not None for cell in filled[0][1]) <= 2:  # a title, a date, a serial number
-        del filled[0]
-    if not filled:
+    header, begin, named = header_in([cells for _, cells in filled]) if filled else ([], 0, ())
+    if len(header) < _FEWEST:
         raise InputError(f"{name}: has no table: write a header and a row for each orientation (docs/tables.md).")
-    cells = filled[0][1]
-    width = max(k + 1 for k, cell in enumerate(cells) if cell is not None)
-    header = ["" if cell is None else str(cell) for cell in cells[:width]]
-    rows, head = filled[1:], [filled[0][0]]
+    width, head = len(header), tuple(filled[k][0] for k in named if filled[k][0])
+    rows = [line for line in filled[begin:] if not is_comment(line[1])]
     if width > _MOST_COLUMNS or width * len(rows) > _MOST_CELLS:
         raise InputError(f"{name}: has {width} columns and {len(rows)} rows, more than any table of orientations: "
                          "leave out what is not part of it.")  # fmt: skip
-    if rows and all(cell is None or (isinstance(cell, str) and is_unit(cell)) for cell in rows[0][1]):
-        units = [*rows[0][1], *[None] * width]
-        header = [f"{title} [{unit}]" if unit else title for title, unit in zip(header, units, strict=False)]
-        head.append(rows.pop(0)[0])
     for number, cells in rows:
         beyond = [cell for cell in cells[width:] if cell is not None]
         if beyond:
@@ -247,7 +213,20 @@ def _headed(name: str, lines: Sequence[tuple[int, Sequence[Cell]]]) -> Grid:
             )
     _refuse_without_rows(name, rows)
     full = tuple(tuple([*own[:width], *[None] * (width - len(own))]) for _, own in rows)
-    return Grid(name, tuple(header), tuple(number for number, _ in rows), full, tuple(head))
+    return Grid(name, tuple(header), tuple(number for number, _ in rows), full, head)
+
+
+def _labelled(lines: Sequence[str], labels: Labels) -> list[tuple[int, list[Cell]]]:
+    """Return labelled lines as rows under a header, with the face that a line before them names where all have one."""
+    rows, face = list[tuple[int, list[Cell]]](), None
+    for number, line in enumerate(lines, start=1):
+        if values := labels.values(line):
+            rows.append((number, [face, *values]))
+        elif face_of(line.strip().rstrip(": ")):
+            face = line.strip().rstrip(": ")
+    if any(cells[0] is None for _, cells in rows):
+        return [(0, list[Cell](labels.header)), *((number, cells[1:]) for number, cells in rows)]
+    return [(0, ["face", *labels.header]), *rows]
 
 
 def _refuse_without_rows(name: str, rows: Sequence[object]) -> None:

@@ -12,14 +12,15 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, lengths
 from kf_calib.bench.bench import Bench, parse_axes
+from kf_calib.bench.counts import refuse_unread
 from kf_calib.bench.raw_input import PLAIN, RawInput, merged_metadata
 from kf_calib.bench.streams import Orientations, Table, bench_without_angles
 from kf_calib.errors import BenchError, InputError
-from kf_calib.sources.tables.columns import HOW, KNOWN, QUATERNION, READINGS, SPREADS, Columns, RowTimes
+from kf_calib.sources.tables.columns import HOW, KNOWN, READINGS, SPREADS, Columns, RowTimes, own_axes
 from kf_calib.sources.tables.grid import grid_of
 from kf_calib.sources.tables.numbers import Numbers
-from kf_calib.sources.tables.words import ANGLE, NO_HEADER, Units, are_numbers, face_of, mps2_per, reading_units
-from kf_calib.support.text import cut
+from kf_calib.sources.text.names import ANGLE, QUATERNION, face_of
+from kf_calib.sources.text.units import Units, mps2_per, reading_units
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 _SAMPLES, _FAST_S = 50, 1.0
@@ -42,6 +43,7 @@ def open_table(
     g_unit: str | float = STANDARD_GRAVITY_MPS2,
     angles: bool = True,
     input: RawInput | None = None,
+    where: str = "",
 ) -> Table:
     """A table of orientations as a source: a row a dwell, with its mean readings and its angles, attitude or face.
 
@@ -52,11 +54,12 @@ def open_table(
     - accel_scale: size of one count, in ``accel_unit`` (m/s^2 if that is None).
     - g_unit: m/s^2 that 1 g in the table stands for, or ``local`` for the gravity of the bench.
     - input: what the device sends, where neither the header nor the other arguments say it.
+    - where: column and text in it of the rows that count, as ``unit=7``; all if it is empty.
     - angles: False to do without angles, attitudes and faces; those that the table has are not used.
 
     Raises InputError where a cell, or what the columns are, cannot be understood.
     """
-    grid = grid_of(table)
+    grid = grid_of(table).chosen(where)
     numbers = Numbers.of(grid)
     meanings = Columns.of(grid, columns, numbers)
     given = {"accel_unit": accel_unit, "accel_scale": accel_scale}
@@ -84,6 +87,7 @@ class Opening:
         """The table; what is read first is what is most often missing."""
         elapsed_s = self.times.elapsed_s
         self.refuse_samples()
+        self._refuse_own_axes()
         self._refuse_missing()
         self._say_times()
         pose = self._poses()
@@ -128,6 +132,23 @@ class Opening:
                 "table with a row a dwell: evaluate them as a log of samples in a CSV file (docs/own_csv.md)."
             )
 
+    def _refuse_own_axes(self) -> None:
+        """Raise InputError, with what they tell, for readings of each axis along gravity and against it alone."""
+        extremes = own_axes(self.columns)
+        if extremes is None:
+            return
+        half = (extremes[:, 0] - extremes[:, 1]) / 2.0
+        told = reading_units(["", "", ""], np.diag(half), self.units, STANDARD_GRAVITY_MPS2)
+        unit = half.mean() if not told.is_known else STANDARD_GRAVITY_MPS2 / told.raw.factors[0]
+        scales = ", ".join(f"K{k + 1} = {size / unit:.4f}" for k, size in enumerate(half))
+        biases = ", ".join(f"b{k + 1} = {middle:g}" for k, middle in enumerate(extremes.mean(axis=1)))
+        of_mean = "" if told.is_known else " of their mean, as no unit is known"
+        raise InputError(
+            f"{self.grid.name}: has of each axis only what it reads up and down: six numbers for six unknowns, {scales}"
+            f"{of_mean}, and {biases} as written, with no degree of freedom to judge them or to tell angles: write all "
+            "three readings in each row."
+        )
+
     def _say_times(self) -> None:
         if self.times.said:
             self.said.append(self.times.said)
@@ -139,8 +160,6 @@ class Opening:
 
     def _refuse_missing(self) -> None:
         columns, header = self.columns, ", ".join(map(repr, self.grid.header))
-        if are_numbers(self.grid.header):
-            raise InputError(f"{self.grid.name}: {NO_HEADER}: {cut(','.join(self.grid.header), 60)!r}.")
         missing = [ours for ours in READINGS if not columns.has(ours)]
         if missing:
             raise InputError(
@@ -234,7 +253,8 @@ class Opening:
         values = np.column_stack([self.columns.values(place, "a reading") for place in places])
         factors, unit = self._accel_factors(places, values, bench)
         self.said.insert(0, f"mean readings from {self.columns.named(places)} in {unit}")
-        return values * factors
+        refuse_unread(values, self.raw.counts, self.grid.name)
+        return self.raw.signed(values) * factors
 
     def _accel_factors(self, places: list[int], values: Floats, bench: Bench) -> tuple[Floats, str]:
         """Return the factors (3,) from columns of readings to m/s^2, and the unit in words."""
@@ -243,8 +263,7 @@ class Opening:
             named = self.units.told_by([self.grid.header[place] for place in places], by_name)
         except InputError as error:
             raise InputError(f"{self.grid.name}: {error}") from None
-        norm = float(np.median(lengths(values)))
-        told = reading_units(named, norm, self.units, bench.gravity_mps2)
+        told = reading_units(named, values, self.units, bench.gravity_mps2)
         self.has_unit = told.is_known
         self.raw = told.raw
         if told.by_size:

@@ -11,18 +11,13 @@ import numpy as np
 
 from kf_calib.bench.raw_input import RawInput
 from kf_calib.bench.streams import Table
-from kf_calib.errors import InputError
+from kf_calib.errors import CountsError, InputError
 from kf_calib.sources.tables.columns import Columns
 from kf_calib.sources.tables.grid import grid_of
 from kf_calib.sources.tables.numbers import Numbers
 from kf_calib.sources.tables.opening import Opening
-from kf_calib.sources.tables.words import Units
+from kf_calib.sources.text.units import Units
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
-
-LEAST = 4
-"""Orientations that twelve parameters need: each accelerometer has four, and reads once in each."""
-LEAST_WITHOUT_SIGMA = 6
-"""The same where the noise has to come from the misfit."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +93,7 @@ def survey(
     Raises InputError where not even the columns can be understood, or the rows are samples.
     """
     units = units or Units()
-    grid = grid_of(path)
+    grid = grid_of(path).chosen(units.where)
     table_columns = Columns.of(grid, columns, Numbers.of(grid))
     angles = angles and bool(table_columns.orientation)
     opening = Opening(table_columns, _complete(overrides, len(table_columns.angles)), units, angles=angles)
@@ -106,6 +101,8 @@ def survey(
     table, trouble = None, ""
     try:
         table = opening.table()
+    except CountsError:
+        raise
     except InputError as error:
         trouble = str(error)
     kind = table_columns.orientation if angles else ""

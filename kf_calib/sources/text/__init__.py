@@ -1,1 +1,1 @@
-"""What is written in letters: files of text in any usual encoding."""
+"""Whatever is written in letters, logs of samples and tables of means alike: from bytes to lines and their heading."""

@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from kf_calib.bench.streams import Batch
 from kf_calib.errors import InputError
 from kf_calib.sources.files.lines import Lines
+from kf_calib.sources.text.units import Units
 
 BENCH = {"axes": "y z x", "gravity_mps2": "9.81"}
 HEADER = "time_s,ax_mps2,ay_mps2,az_mps2,outer_deg,middle_deg,inner_deg,temperature_c"
@@ -447,3 +448,20 @@ def test_rows_of_several_sensors_are_told_and_no_other_column_is(tmp_path: Path)
     assert sum(len(batch.accel) for batch in Lines(path, angles=False)) == 800
     path.write_text(rows_of_units(0.03))
     assert sum(len(batch.accel) for batch in Lines(path, columns={"I": "-"}, angles=False)) == 800
+    for unit in "01":
+        lines = Lines(path, units=Units(where=f"I={unit}"), angles=False)
+        means = np.concatenate([batch.accel.values for batch in lines]).sum(axis=1)
+        assert len(means) == 400 and means.mean() == pytest.approx(9.81 + 0.09 * int(unit), abs=0.02)
+    with pytest.raises(InputError, match=r"no row among the first has '7' in column 'I' \(--where\), they have 0, 1\."):
+        list(Lines(path, units=Units(where="I=7"), angles=False))
+    with pytest.raises(InputError, match=r"has no column 'J' \(--where\)"):
+        list(Lines(path, units=Units(where="J=7"), angles=False))
+
+
+def test_info_proposes_one_of_several_sensors(run, tmp_path: Path) -> None:
+    path = tmp_path / "two.csv"
+    path.write_text(rows_of_units(0.5))
+    code, out, _ = run("info", path, "--gravity", "9.81", "--no-angles", "--json")
+    said = json.loads(out)
+    assert code == 0 and "--where 'I=0'" in " ".join(said["missing"])
+    assert not said["command"], "one pose, which no option makes a calibration of"

@@ -64,7 +64,7 @@ BROKEN: dict[str, tuple[str | bytes, dict[str, Any], str]] = {
     "an angle missing": (without(2), {}, "has 1 column of angles ('outer [deg]') where --axes names 2 gimbals"),
     "two units of angles": (PLAIN.replace("inner [deg]", "inner [rad]"), {}, "angles are in deg and rad"),
     "two columns for one": (PLAIN.replace("sd [mg]", "acc x [g]"), {}, "columns 'ax [g]' and 'acc x [g]' are both "
-                            "taken for ax: leave one out by --column 'acc x [g]=-'"),
+                            "taken for ax: say which it is, for example by --column 'ax [g]=ax'"),
     "a face nobody knows": (FACES, {}, "row 3, column 'side' is 'sideways': write the axis that points up"),
     "half a quaternion": (QUATERNIONS, {}, "row 3, column 'qx, qy, qz, qw' is '0, 0, 1, 1': its length is 1.41"),
     "samples": (SAMPLES, {}, "its 100 rows are samples, 0.01 s apart, and no table with a row a dwell"),

@@ -17,7 +17,7 @@ from kf_calib.bench.streams import Orientation, Table
 from kf_calib.dwells.folding import dwells_of_table
 from kf_calib.errors import InputError
 from kf_calib.estimation.calibration import filterpy_estimate
-from kf_calib.sources.tables.words import face_of, meaning_of
+from kf_calib.sources.text.names import face_of, meaning_of
 
 pytestmark = pytest.mark.usefixtures("unmeasured")
 

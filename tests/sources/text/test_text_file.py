@@ -11,7 +11,7 @@ import pytest
 
 from kf_calib.errors import InputError
 from kf_calib.sources.opening import opened
-from kf_calib.sources.text.text_file import TextFile, encoding_of
+from kf_calib.sources.text.encoding import TextFile, encoding_of, unpacked
 
 UP = [(0, 1, 0), (0, -1, 0), (1, 0, 0), (-1, 0, 0), (0, 0, 1), (0, 0, -1), (0.6, 0.8, 0), (0, 0.6, -0.8), (0.8, 0, 0.6)]
 ENGLISH = ["time_s", "ax_mps2", "ay_mps2", "az_mps2"]
@@ -93,3 +93,10 @@ def test_zeros_amid_a_table_are_told(tmp_path: Path) -> None:
 )  # fmt: skip
 def test_the_encoding_is_told_by_the_beginning(content: bytes, encoding: str) -> None:
     assert encoding_of(content) == encoding
+
+
+def test_a_packed_file_without_its_end_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "cut.csv.gz"
+    path.write_bytes(gzip.compress(text(table()).encode())[:-20])
+    with pytest.raises(InputError, match=r"its end cannot be unpacked .*: copy it anew"):
+        unpacked(path)

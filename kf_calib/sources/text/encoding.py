@@ -1,0 +1,187 @@
+"""From bytes to lines, in whichever encoding, with whichever line ends, packed by gzip or not.
+
+A file of text is given as bytes in UTF-8, piece by piece; memory is that of a piece and a line, whatever comes.
+"""
+
+from __future__ import annotations
+
+import codecs
+import gzip
+import re
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Self
+
+from kf_calib.errors import InputError
+
+LONGEST_LINE_BYTES = 1 << 20
+GZIP, _UTF16 = b"\x1f\x8b", (b"\xff\xfe", b"\xfe\xff")
+_HEAD_BYTES = 1 << 18
+_CYRILLIC = re.compile(rb"[\xc0-\xff]{3}")
+_BLOCK_BYTES = 1 << 20
+_NOT_UNPACKED = (EOFError, zlib.error, gzip.BadGzipFile)
+
+
+class TextFile:
+    """Opened to be read once. trouble: a sentence if its end cannot be unpacked. Raises OSError."""
+
+    def __init__(self, path: Path) -> None:
+        self._size = max(path.stat().st_size, 1)
+        self._raw = path.open("rb")
+        try:
+            packed = self._raw.peek(2).startswith(GZIP)
+            self._file = gzip.GzipFile(fileobj=self._raw) if packed else self._raw
+            self.trouble, self._has_ended = "", False
+            self._head = self._unpacked(_HEAD_BYTES)
+        except BaseException:
+            self._raw.close()
+            raise
+        encoding = encoding_of(self._head)
+        self._decoder = None if encoding == "utf-8" else codecs.getincrementaldecoder(encoding)("replace")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def fraction(self) -> float:
+        """The share of the file that has been read."""
+        return min(self._raw.tell() / self._size, 1.0)
+
+    def read(self, size: int) -> bytes:
+        """The next bytes, about so many; none at the end."""
+        block, self._head = self._head or self._unpacked(size), b""
+        if self._decoder is None:
+            return block
+        text = self._decoder.decode(block, final=not block)
+        return text.encode() or (self.read(size) if block else b"")
+
+    def close(self) -> None:
+        self._raw.close()
+
+    def _unpacked(self, size: int) -> bytes:
+        block = bytearray()
+        try:
+            while len(block) < size and not self._has_ended:
+                piece = self._file.read1(size - len(block))
+                block += piece
+                self._has_ended = not piece
+        except _NOT_UNPACKED as error:
+            self.trouble = f"its end cannot be unpacked ({error}): copy it anew, what comes before is used."
+            self._has_ended = True
+        return bytes(block)
+
+
+def head_of(path: Path) -> bytes:
+    """The beginning of a file: of one that is packed by gzip, of what is in it. Raises OSError."""
+    with TextFile(path) as file:
+        return file.read(_HEAD_BYTES)
+
+
+def text_of(path: Path, largest: int) -> str:
+    """The whole text of a file, without bytes of zero at its end, as a power cut leaves them.
+
+    Raises InputError where it has more bytes than ``largest`` or is no text, OSError where it cannot be read.
+    """
+    content = bytearray()
+    with TextFile(path) as file:
+        while len(content) <= largest and (block := file.read(_BLOCK_BYTES)):
+            content += block
+    if len(content) > largest:
+        raise too_large(path)
+    if file.trouble:
+        raise InputError(f"{path}: {file.trouble.partition(': ')[0]}: copy it anew.")
+    content = content.rstrip(b"\0")
+    if b"\0" in content:
+        raise InputError(f"{path}: is no text (it has bytes of zero): save the table as CSV or .xlsx.")
+    return content.decode("utf-8", errors="replace").removeprefix("\ufeff")
+
+
+def unpacked(path: Path) -> bytes:
+    """The bytes of a file of text as they stand in it, or in what gzip has packed there. Raises OSError, and InputError
+    where its end cannot be unpacked."""
+    content = path.read_bytes()
+    try:
+        return gzip.decompress(content) if content.startswith(GZIP) else content
+    except _NOT_UNPACKED as error:
+        raise InputError(f"{path}: its end cannot be unpacked ({error}): copy it anew.") from None
+
+
+def too_large(path: Path) -> InputError:
+    """That a file has more bytes than a table of orientations."""
+    return InputError(
+        f"{path}: is larger than a table of orientations can be: leave out what is not part of it; if it holds "
+        "samples, save them as CSV with a column of time (docs/own_csv.md)."
+    )
+
+
+def encoding_of(head: bytes) -> str:
+    """UTF-8 or UTF-16, each with or without a byte-order mark, or else a code page of Windows.
+
+    It is Cyrillic (1251) where three letters beyond ASCII follow each other, as in no Western language, or else 1252.
+    """
+    if head.startswith(_UTF16):
+        return "utf-16"
+    plain = head.rstrip(b"\0")
+    for at, encoding in ((1, "utf-16-le"), (0, "utf-16-be")):
+        if plain[at::2].count(0) > len(plain) // 4:  # of every second byte more than half
+            return encoding
+    try:
+        codecs.getincrementaldecoder("utf-8")().decode(head)
+    except UnicodeDecodeError:
+        return "cp1251" if _CYRILLIC.search(head) else "cp1252"
+    return "utf-8"
+
+
+def line_end_of(block: bytes) -> bytes:
+    """What ends the lines of a text that begins so: a carriage return alone, else a line feed; empty while nothing
+    tells, as where a carriage return comes last."""
+    if b"\n" in block:
+        return b"\n"
+    return b"\r" if b"\r" in block[:-1] else b""
+
+
+class Cutter:
+    """Bytes as they come, cut into lines; a line that is too long is left empty, and refused with its number."""
+
+    def __init__(self, refuse: Callable[[int, str], None]) -> None:
+        self._refuse, self._tail, self._cut, self._end = refuse, bytearray(), 0, b""
+
+    @property
+    def is_amid(self) -> bool:
+        """Whether the last line has not ended yet."""
+        return bool(self._tail)
+
+    def push(self, block: bytes) -> list[str]:
+        """The lines that end in ``block``."""
+        if self._tail.endswith(b"\r") and not self._end:  # what follows tells whether it ends a line alone
+            block = bytes(self._tail) + block
+            self._tail.clear()
+        self._end = self._end or line_end_of(block)
+        block = block.replace(b"\r", b"\n") if self._end == b"\r" else block
+        end, lines = block.rfind(b"\n") + 1, list[str]()
+        if end:
+            lines = self._decode(bytes(self._tail) + block[: end - 1])
+            self._tail.clear()
+        if len(self._tail) <= LONGEST_LINE_BYTES:  # else what comes up to the next end of line is not kept
+            self._tail += block[end:]
+        return lines
+
+    def rest(self) -> list[str]:
+        """The line without an end, if there is one."""
+        block = bytes(self._tail)
+        self._tail.clear()
+        return self._decode(block) if block else []
+
+    def _decode(self, block: bytes) -> list[str]:
+        lines = block.replace(b"\r\n", b"\n").removesuffix(b"\r").split(b"\n")
+        if len(block) > LONGEST_LINE_BYTES:
+            for i, line in enumerate(lines):
+                if len(line) > LONGEST_LINE_BYTES:
+                    self._refuse(self._cut + i + 1, "it is longer than 1 MiB")
+                    lines[i] = b""
+        self._cut += len(lines)
+        return b"\n".join(lines).decode("utf-8", errors="replace").split("\n")

@@ -1,0 +1,279 @@
+"""What names of columns mean: quantity, channel and unit, in English, German and Russian.
+
+A name tells by its words; what it leaves open, the others beside it tell: a number that counts from 0 is a channel, of
+two sets of readings one is of the accelerometer, and angles beside a gyroscope are what the device itself estimates.
+"""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from kf_calib.support.units import WORDS
+
+ACCEL = {"m/s2": 1.0, **{unit: WORDS["m/s^2"][unit] for unit in ("g", "mg", "ug")}, "mm/s2": 1e-3, "count": 1.0}
+"""Units of readings in m/s^2; counts as they are."""
+ANGLE = {"rad": 1.0, "mrad": 1e-3, "deg": WORDS["rad"]["deg"]}
+TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
+TEMPERATURE = ("c", "k", "f")
+_UNITS = {
+    "m/s2": "m/s2 m/s^2 m/s² m/s/s mps2 ms-2 ms^-2 m/s**2 m·s⁻² m·s-2 ms⁻² м/с2 м/с^2 м/с² m_s2 m·s^-2 m·s-2",
+    "mm/s2": "mm/s2 mm/s^2 mm/s² mm/s**2 mm·s^-2",
+    "g": "g gn g0 g_n", "mg": "mg мg", "ug": "ug µg μg мкg",
+    "count": "count counts lsb digit digits raw adc",
+    "rad": "rad radian radians рад", "mrad": "mrad мрад", "deg": "deg degree degrees grad град град. ° º",
+    "s": "s sec second seconds sekunden с сек", "ms": "ms мс", "us": "us µs μs мкс", "ns": "ns", "min": "min мин",
+    "h": "h hours ч", "c": "°c ºc c degc deg_c celsius ℃ °с", "k": "k kelvin", "f": "°f f degf fahrenheit",
+}  # fmt: skip
+
+
+def _plain(text: str) -> str:
+    """Return a text without accents, the two dots of ä and ё among them."""
+    decomposed = unicodedata.normalize("NFKD", text.replace("ß", "ss"))
+    return "".join(letter for letter in decomposed if not unicodedata.combining(letter))
+
+
+def _words(text: str) -> frozenset[str]:
+    return frozenset(_plain(text).split())
+
+
+_OF_WORD = {word: unit for unit, words in _UNITS.items() for word in words.split()}
+_SPREAD = _words(
+    "sd std stdev stddev sigma s rms dev deviation standardabweichung streuung stabw stdabw noise rauschen "
+    "ско отклонение сигма разброс шум"
+)
+_FORCE = _words(
+    "a ac acc accl accel acceleration accelerometer accelerometers alpha beschleunigung beschl f force specific "
+    "ускорение ускорения акселерометр"
+)
+_READING = _FORCE | _words(
+    "reading readings imu linear mean avg average mittel mittelwert m sensor channel ch kanal messwert out output "
+    "signal value wert raw среднее средние показание показания датчик канал значение сигнал"
+)
+_WITHOUT_GRAVITY = _words("linear free user gravity schwerkraft")
+"""Of two accelerations, that which is not the accelerometer's own: without gravity, or gravity alone."""
+_GYROSCOPE = _words(
+    "gyro gyr gy gx gz gyroscope gyroscopes angular omega velocity rate rates kreisel drehrate гироскоп гироскопа"
+)
+_FIELD = _words("mag magn magnetometer magnetometers magnetic magneto magnetfeld compass магнитометр магнитометра")
+_APART = _words("cov covariance covariances variance variances kovarianz")
+_TRUTH = _words("true truth ref reference wahr soll expected истинное эталон")
+_QUATERNION = _words("q quat quaternion quaternions кватернион")
+_ESTIMATED = _words("roll pitch yaw heading euler attitude крен тангаж курс")
+_ANGLE = _words(
+    "outer middle inner aussen mitte mittlerer innen innere innerer aeussere ausserer angle winkel gimbal roll pitch "
+    "yaw heading azimuth elevation tilt achse axis q phi theta psi rotation rot table rahmen "
+    "угол рамка рамки ось наружный наружная внешний внешняя внутренний внутренняя крен тангаж курс азимут"
+)
+_TIME = _words("time zeit date datum stamp timestamp uhrzeit datetime elapsed zeitstempel время дата")
+_LENGTH = _words("dwell duration dauer length lange длительность")
+_AXIS = _words("achse axis ось")
+"""Of a gimbal only where no other word stands beside it."""
+_TEMPERATURE = _words("temp tmp temperature temperatur t температура темп")
+_COUNT = _words("count counts n samples num number anzahl messungen stichprobe readings werte число количество")
+_FACE = _words("face side seite position pose orientation lage richtung direction flache положение грань")
+_PREFIXES = _SPREAD | _READING | {"grav"}
+_RANKS = (
+    _words("outer aussen aeussere ausserer наружный наружная внешний внешняя"),
+    _words("middle mitte mittlerer средний средняя"),
+    _words("inner innen innere innerer внутренний внутренняя"),
+)
+_CHANNELS = frozenset("xyz123ху")
+_AXES = str.maketrans("123ху", "xyzxy")  # the last two are Cyrillic letters
+_RATE = re.compile(r"(?:deg|degrees?|rad|radians?|°)(?:\s*(?:/|p|per)\s*s|[\s·]*s\s*\^?-1)|dps")
+_OF_EPOCH = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
+"""From which size on a stamp without a unit is one since 1970 in this unit."""
+_CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z])")
+_LONGEST = 300  # characters of a name: it is looked at in many ways
+_FACES = re.compile(r"['’]?([+\-−–]?)\s*([xyz123])\s*([+\-−–]?|up|down|oben|unten)", re.IGNORECASE)
+
+
+class Meaning(NamedTuple):
+    """ours: ax ay az (readings), sx sy sz or sd (standard deviations), angle, qx qy qz qw, face, time, count,
+    temperature; empty if the name means nothing. unit: as the name states it; empty if it does not."""
+
+    ours: str
+    unit: str
+    rank: int = 0
+    """Place of a gimbal whose name tells it: 1 outer, 2 middle, 3 inner; 0 for others."""
+    other: str = ""
+    """What it is that is of no use here: ``rate`` and ``field`` of a gyroscope and a magnetometer, ``attitude`` that
+    the device itself estimates, ``true`` for what readings should be, or ``covariance``."""
+
+
+def is_unit(text: str) -> bool:
+    """Whether a cell is nothing but a unit, or a dash."""
+    return text.strip("[]() ").lower() in _OF_WORD or text.strip() in ("-", "1")
+
+
+def meaning_of(name: str) -> Meaning:
+    """What the name of a column says; nothing, where it is longer than any name."""
+    name = name if len(name) <= _LONGEST else ""
+    told = _meaning_of(name)
+    return told if told.ours or told.other or not _CAMEL.search(name) else _meaning_of(_CAMEL.sub(" ", name))
+
+
+def _meaning_of(name: str) -> Meaning:
+    lowered = name.strip().lower()
+    if lowered in QUATERNION or lowered == "-":
+        return Meaning(lowered.strip("-"), "")
+    text, unit = _unit_of(lowered)
+    tokens = _tokens(text)
+    channels = sorted(filter(_CHANNELS.__contains__, tokens), key=str.isdigit)  # acc2_x is the x of a second one
+    channel = "".join(channels[:1]).translate(_AXES)
+    words = set(tokens) - _CHANNELS
+    if other := _other(lowered, words, channel):
+        return Meaning("", "", 0, other)
+    if words & _LENGTH:
+        return Meaning("", unit)
+    if (words & _TIME and (not unit or unit in TIME)) or (unit in TIME and not channel):
+        return Meaning("time", unit)
+    if words & (_TEMPERATURE - {"t"}) or ("t" in words and unit in (*TEMPERATURE, "deg")) or unit == "c":
+        return Meaning("temperature", unit if unit in TEMPERATURE else "")
+    if unit in ANGLE or (words & _ANGLE and unit not in ACCEL and (words - _AXIS & _ANGLE or words <= _ANGLE)):
+        rank = next((k + 1 for k, known in enumerate(_RANKS) if words & known), 0)
+        return Meaning("angle", unit if unit in ANGLE else "", rank)
+    if words & (_SPREAD - {"s"}) or ("s" in words and words <= _READING | {"s"}):
+        return Meaning(f"s{channel}" if channel else "sd", unit if unit in ACCEL else "")
+    if channel and (words & _READING or not words or unit in ACCEL):
+        if words & _TRUTH:
+            return Meaning("", unit, 0, "true")
+        return Meaning(f"a{channel}", unit if unit in ACCEL else "")
+    if words & _FACE:
+        return Meaning("face", "")
+    if words & _COUNT or lowered in _COUNT:
+        return Meaning("count", "")
+    return Meaning("", unit)
+
+
+def _other(lowered: str, words: set[str], channel: str) -> str:
+    """Return what of no use here a name says, see ``Meaning.other``; nothing where it does not."""
+    if words & _APART:
+        return "covariance"
+    if _RATE.search(lowered) or words & _GYROSCOPE or ("w" in words and channel and not words & (_FACE | _QUATERNION)):
+        return "rate"
+    if words & _FIELD or ("mg" in words and not words & _FORCE):
+        return "field"
+    return "attitude" if words & _FACE and (channel or "w" in words) else ""
+
+
+QUATERNION = ("qx", "qy", "qz", "qw")
+_EXACT = re.compile(
+    r"time_(ns|us|ms|s)|a[xyz]_(mps2|g|mg|ug)|q[xyzw]|(outer|middle|inner)_(deg|rad)|temperature_c", re.IGNORECASE
+)
+
+
+def is_exact(name: str) -> bool:
+    """Whether a name is one of docs/format.md, to the letter: it goes before all others."""
+    return _EXACT.fullmatch(name.strip()) is not None
+
+
+def meanings_of(names: Sequence[str], stated: Mapping[str, str]) -> list[Meaning]:
+    """What the names of the columns of one file say together; stated: ours of theirs, which go before all others."""
+    meanings = [meaning_of(name) for name in names]
+    _tell_families(names, meanings)
+    if any(own.other in ("rate", "field") for own in meanings):
+        _leave_out_estimates(names, meanings)
+    for ours in ("ax", "ay", "az"):
+        _keep_strongest(names, meanings, ours)
+    said = {k: meaning_of(stated[name]) for k, name in enumerate(names) if name in stated}
+    kinds = {own.ours for own in said.values()} - {"", "angle", "time"}
+    meanings = [Meaning("", own.unit) if own.ours in kinds else own for own in meanings]
+    for k, own in said.items():
+        meanings[k] = own if own.unit or not own.ours else own._replace(unit=meanings[k].unit)
+    return meanings
+
+
+def _tell_families(names: Sequence[str], meanings: list[Meaning]) -> None:
+    """Tell names that differ in their last word alone: the four parts of a quaternion, and channels that count from 0
+    on."""
+    families = dict[tuple[str, ...], dict[str, int]]()
+    for k, name in enumerate(names):
+        *stem, last = _tokens(_unit_of(_CAMEL.sub(" ", name[:_LONGEST]).strip().lower())[0]) or [""]
+        families.setdefault(tuple(stem), {}).setdefault(last, k)
+    for stem, places in families.items():
+        parts = next((each for each in ("xyzw", "1230") if set(places) >= set(each)), "")
+        if parts and set(stem) & _QUATERNION:
+            for part, ours in zip(parts, QUATERNION, strict=True):
+                meanings[places[part]] = Meaning(ours, "")
+        elif set(filter(str.isdigit, places)) == {"0", "1", "2"}:
+            for channel, last in zip("xyz", "012", strict=True):
+                own = meanings[places[last]]
+                told = _meaning_of(" ".join((*stem, channel)))
+                meanings[places[last]] = told._replace(unit=own.unit or told.unit) if not own.other else own
+
+
+def _leave_out_estimates(names: Sequence[str], meanings: list[Meaning]) -> None:
+    """Leave out angles and attitudes beside a gyroscope that are not named as the platform's: the device has estimated
+    them from these very readings."""
+    for k, name in enumerate(names):
+        words = set(_tokens(_CAMEL.sub(" ", name[:_LONGEST]).lower()))
+        is_angle = meanings[k].ours == "angle" and not meanings[k].rank and bool(words & (_ESTIMATED | set("xyz")))
+        if is_angle or (meanings[k].ours in QUATERNION and not is_exact(name)):
+            meanings[k] = Meaning("", "", 0, "attitude")
+
+
+def _keep_strongest(names: Sequence[str], meanings: list[Meaning], ours: str) -> None:
+    """Of several columns taken for a reading, keep those whose names say most that they are the accelerometer's."""
+
+    def strength(place: int) -> tuple[bool, bool, bool]:
+        name = names[place]
+        words = set(_tokens(_CAMEL.sub(" ", name[:_LONGEST]).lower())) | set(_tokens(name[:_LONGEST].lower()))
+        return is_exact(name), not words & _WITHOUT_GRAVITY, bool(words & _FORCE)
+
+    places = [k for k, own in enumerate(meanings) if own.ours == ours]
+    best = max(map(strength, places), default=None)
+    for place in places:
+        if strength(place) != best:
+            meanings[place] = Meaning("", meanings[place].unit)
+
+
+def unit_of_epoch(size: float) -> str:
+    """The unit of a stamp of that size that counts since 1970; empty where it is too small to."""
+    return next((unit for least, unit in _OF_EPOCH if size >= least), "")
+
+
+def face_of(text: str) -> tuple[int, int] | None:
+    """Axis (0, 1, 2) and sign of a named face such as +x, -z, ``y up`` or ``z down``; None if it names none."""
+    match = _FACES.fullmatch(text.strip())
+    if not match:
+        return None
+    before, axis, after = match.groups()
+    if (before and after in tuple("+-−–")) or (axis.isdigit() and not (before or after)):
+        return None  # a number alone is one of a list
+    reversed_by = [mark in "-−–" if len(mark) == 1 else mark.lower() in ("down", "unten")
+                   for mark in (before, after) if mark]  # fmt: skip
+    return "xyz123".index(axis.lower()) % 3, -1 if sum(reversed_by) % 2 else 1
+
+
+def _unit_of(name: str) -> tuple[str, str]:
+    """Return a name without its unit, and the unit: in brackets, or after a slash, a comma, ``in`` or an underscore."""
+    match = re.fullmatch(r"(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]", name)
+    if match and (unit := _OF_WORD.get("·".join(match[2].split()))):
+        return match[1], unit
+    if match and match[2].isdigit():  # the number of a channel, which a unit may stand before
+        text, unit = _unit_of(match[1])
+        return f"{text}[{match[2]}]", unit
+    for pattern in (r"(.+)\s+in\s+(\S+)", r"(.+?)\s*,\s*(\S+)", r"(.+)[_ ](\S+)", r"(.+?)[_ ](\S+)",
+                    r"(.+?)\s*/\s*(\S+)"):  # fmt: skip
+        match = re.fullmatch(pattern, name)
+        if match and match[2] in _OF_WORD and _is_unit_of(match[2], match[1]):
+            return match[1], _OF_WORD[match[2]]
+    return name, ""
+
+
+def _is_unit_of(letter: str, name: str) -> bool:
+    """Whether the end of a name is a unit: C, K and F are units of temperatures only, since channels have letters."""
+    return letter not in TEMPERATURE or bool(_TEMPERATURE & set(_tokens(name)))
+
+
+def _tokens(text: str) -> list[str]:
+    """Return the words of a name, without accents; a channel that ends a known word becomes a word of its own."""
+    tokens = list[str]()
+    for word in re.findall(r"[a-zа-я]+|\d+", _plain(text)):
+        stem, last = word[:-1], word[-1]
+        known = (last in "xyz" and stem in _PREFIXES) or (last in "wxyz" and stem in _QUATERNION - {"q"})
+        tokens += [stem, last] if known else [word]
+    return tokens
