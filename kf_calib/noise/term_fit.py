@@ -1,0 +1,195 @@
+"""Sizes of the noise terms of a channel with 95 % intervals, in two ways, from differences of block means.
+
+- ``AllanFit``: generalised least squares of the logarithms of the overlapping Allan variances. With nu = 2 s^4 / var(s^2)
+  effective degrees of freedom, ln s^2 has the mean ln sigma^2 + psi(nu / 2) - ln(nu / 2) and the variance psi'(nu / 2);
+  correlations are those of ``power_laws.allan_covariance``.
+- ``LikelihoodFit``: the likelihood of the readings as a Gaussian process, in an orthogonal transform in which the terms
+  are nearly uncorrelated: Haar differences of blocks of all lengths, and the cosine transform of the longest block means,
+
+    -2 ln L = sum_k w_k (ln lambda_k + s_k / lambda_k),   lambda = columns . theta,
+
+  with squares s_k of w_k degrees of freedom and their expectation lambda_k, linear in theta = (Q^2, N^2, B^2, K^2): a
+  Whittle likelihood with exact expectations (A. Sykulski et al., 2019), of wavelets for short times (S. Guerrier et al.,
+  2013).
+
+Both are minimised over theta >= 0 by Fisher's scoring; an interval has its ends where the profile of the objective is
+3.84 above its minimum. A term is seen where the minimum without it lies 5.41 higher (1 % point of half chi-squared); of
+one that is not, an upper limit is told, at 2.71 (95 % one-sided).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats, Mask
+
+_INTERVAL, _SEEN, _LIMIT = 3.84, 5.41, 2.71
+_ROUNDS, _CONVERGED = 60, 1e-7
+_HALVINGS = 12
+_STEPS = 60  # of a search for an end of an interval
+_WIDTH = 2e-3  # relative, of an end
+
+
+class Size(NamedTuple):
+    """Size of a term, and its 95 % interval: value is None where it is not seen, low is then 0 and high a limit."""
+
+    value: float | None
+    low: float
+    high: float
+
+
+class Objective(Protocol):
+    """-2 ln L but for a constant, at squares theta (4,): its value, gradient (4,) and expected curvature (4, 4)."""
+
+    def __call__(self, squares: Floats) -> tuple[float, Floats, Floats]: ...
+    def start(self) -> Floats:
+        """Squares (4,) to begin with, all positive."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class AllanFit:
+    """columns (m, 4): Allan variance of each term of size 1. logs (m,): of the variances, free of bias. weight (m, m):
+    inverse of their covariance."""
+
+    columns: Floats
+    logs: Floats
+    weight: Floats
+
+    @classmethod
+    def of(cls, columns: Floats, variance: Floats, covariance: Floats, model: Floats) -> AllanFit:
+        """From variances (m,); covariance (m, m): of these where their expectation is ``model`` (m,)."""
+        from scipy.special import polygamma, psi
+
+        sigma = np.sqrt(np.diag(covariance))
+        half = (model / sigma) ** 2  # nu / 2
+        logs = np.log(variance) - psi(half) + np.log(half)
+        values, vectors = np.linalg.eigh(covariance / np.outer(sigma, sigma))
+        correlation = (vectors * np.maximum(values, 1e-3)) @ vectors.T  # far octaves are taken for uncorrelated
+        spread = np.sqrt(polygamma(1, half))
+        return cls(columns, logs, np.linalg.inv(correlation * np.outer(spread, spread)))
+
+    def __call__(self, squares: Floats) -> tuple[float, Floats, Floats]:
+        model = self.columns @ squares
+        residual, slopes = np.log(model) - self.logs, self.columns / model[:, None]
+        weighted = self.weight @ residual
+        return float(residual @ weighted), 2.0 * slopes.T @ weighted, 2.0 * slopes.T @ self.weight @ slopes
+
+    def start(self) -> Floats:
+        return _least(self.columns, np.exp(self.logs))
+
+
+@dataclass(frozen=True, eq=False)
+class LikelihoodFit:
+    """columns (k, 4): expectation of each square where a term is of size 1. squares (k,), and weights (k,): their
+    degrees of freedom."""
+
+    columns: Floats
+    squares: Floats
+    weights: Floats
+
+    def __call__(self, squares: Floats) -> tuple[float, Floats, Floats]:
+        model = self.columns @ squares
+        ratio, slopes = self.squares / model, self.columns / model[:, None]
+        value = float(self.weights @ (np.log(model) + ratio))
+        return value, slopes.T @ (self.weights * (1.0 - ratio)), (slopes.T * self.weights) @ slopes
+
+    def start(self) -> Floats:
+        return _least(self.columns, self.squares)
+
+
+def _least(columns: Floats, variances: Floats) -> Floats:
+    """Squares of the terms of which each alone gives the least of the variances at most, and a share of it."""
+    shares = variances[:, None] / np.maximum(columns, np.finfo(float).tiny)
+    return 0.5 * np.maximum(shares.min(axis=0), 1e-12 * np.median(shares, axis=0)) + np.finfo(float).tiny
+
+
+class Minimum(NamedTuple):
+    """Where the objective is least, and its value there."""
+
+    squares: Floats
+    value: float
+
+
+def minimum(objective: Objective, start: Floats, free: Mask | None = None) -> Minimum:
+    """The least value over the free squares, which are not negative; the others stay as they are at the start.
+
+    Each step is that of a quadratic objective within the same bounds, halved as long as the value does not fall.
+    """
+    from scipy.optimize import nnls
+
+    squares = start.copy()
+    places = np.flatnonzero(np.ones(len(start), bool) if free is None else free)
+    value, gradient, curvature = objective(squares)
+    for _ in range(_ROUNDS):
+        inner, scale = curvature[np.ix_(places, places)], 1.0 / np.sqrt(np.diag(curvature)[places])
+        factor = np.linalg.cholesky(inner * np.outer(scale, scale) + 1e-10 * np.eye(len(places)))
+        target = factor.T @ (squares[places] / scale) - np.linalg.solve(factor, gradient[places] * scale)
+        step = nnls(factor.T, target)[0] * scale - squares[places]
+        for halving in range(_HALVINGS):
+            trial = squares.copy()
+            trial[places] = np.maximum(squares[places] + step * 0.5**halving, 0.0)
+            if not trial.any():
+                continue
+            new = objective(trial)
+            if new[0] <= value:
+                break
+        else:
+            break
+        fall, squares = value - new[0], trial
+        value, gradient, curvature = new
+        if fall < _CONVERGED:
+            break
+    return Minimum(squares, value)
+
+
+def sizes(objective: Objective, best: Minimum, inflation: float = 1.0) -> list[Size]:
+    """The sizes of the terms (the roots of the squares) with their intervals.
+
+    inflation: of all variances, where the model does not fit; the objective counts that much less.
+    """
+    return [_size(objective, best, term, inflation) for term in range(len(best.squares))]
+
+
+def _size(objective: Objective, best: Minimum, term: int, inflation: float) -> Size:
+    free = np.arange(len(best.squares)) != term
+    warm = np.maximum(best.squares, 1e-3 * objective.start())
+
+    def rise(square: float) -> float:
+        """By how much the objective is higher with this square of the term."""
+        start = warm.copy()
+        start[term] = square
+        return (minimum(objective, start, free).value - best.value) / inflation
+
+    square = float(best.squares[term])
+    without = rise(0.0)
+    is_seen = without > _SEEN
+    scale = square if square > 0.0 else float(objective.start()[term])
+    high = math.sqrt(_end(rise, square, scale, _INTERVAL if is_seen else _LIMIT))
+    if not is_seen:
+        return Size(None, 0.0, high)
+    return Size(math.sqrt(square), math.sqrt(_between(rise, square, 0.0, _INTERVAL)), high)
+
+
+def _end(rise: Callable[[float], float], square: float, scale: float, level: float) -> float:
+    """The square above the estimate where the objective has risen to a level."""
+    inside, factor = square, 1e-4
+    for _ in range(_STEPS):
+        outside = square + factor * scale
+        if rise(outside) >= level:
+            return _between(rise, inside, outside, level)
+        inside, factor = outside, 4.0 * factor
+    return math.inf
+
+
+def _between(rise: Callable[[float], float], inside: float, outside: float, level: float) -> float:
+    """The square where the objective has risen to a level, between one where it is lower and one where it is higher."""
+    from scipy.optimize import brentq
+
+    accuracy = _WIDTH * max(abs(outside - inside), np.finfo(float).tiny)
+    return float(brentq(lambda square: rise(square) - level, inside, outside, xtol=accuracy, rtol=1e-6, maxiter=_STEPS))
