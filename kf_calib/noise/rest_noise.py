@@ -242,7 +242,7 @@ def _fitted(
 
 
 def _named(objective: Objective, best: Minimum, inflation: float) -> SizesOfTerms:
-    return dict(zip(TERMS, sizes(objective, best, inflation), strict=True))
+    return dict(zip(TERMS, sizes(objective, best, inflation).sizes, strict=True))
 
 
 def _fit_allan(

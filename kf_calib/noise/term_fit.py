@@ -14,7 +14,7 @@
 
 Both are minimised over theta >= 0 by Fisher's scoring; an interval has its ends where the profile of the objective is
 3.84 above its minimum. A term is seen where the minimum without it lies 5.41 higher (1 % point of half chi-squared); of
-one that is not, an upper limit is told, at 2.71 (95 % one-sided).
+one that is not, an upper limit is told.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, Mask
 
-_INTERVAL, _SEEN, _LIMIT = 3.84, 5.41, 2.71
+_INTERVAL, _SEEN = 3.84, 5.41
 _ROUNDS, _CONVERGED = 60, 1e-7
 _HALVINGS = 12
 _STEPS = 60  # of a search for an end of an interval
@@ -148,48 +148,104 @@ def minimum(objective: Objective, start: Floats, free: Mask | None = None) -> Mi
     return Minimum(squares, value)
 
 
-def sizes(objective: Objective, best: Minimum, inflation: float = 1.0) -> list[Size]:
+class Sizes(NamedTuple):
+    """The sizes of the terms, and the places of those that explain the data together and of which none can be left out.
+
+    A place in ``needed`` whose size has no value can be left out where another one takes its part.
+    """
+
+    sizes: list[Size]
+    needed: list[int]
+
+
+def sizes(objective: Objective, best: Minimum, inflation: float = 1.0) -> Sizes:
     """The sizes of the terms (the roots of the squares) with their intervals.
+
+    Values are those of the model that is left when terms that are not needed are taken out one by one. As a square
+    cannot be negative, a term that is absent takes a part of its neighbours' in half of all data; so an interval
+    reaches over both, that of the model with all terms and that of the terms that are needed.
 
     inflation: of all variances, where the model does not fit; the objective counts that much less.
     """
-    return [_size(objective, best, term, inflation) for term in range(len(best.squares))]
+    count = len(best.squares)
+    everything = _Profile(objective, best, np.ones(count, bool), inflation)
+    needed = everything
+    while True:
+        rises = {term: needed.rise(term, 0.0) for term in np.flatnonzero(needed.free).tolist()}
+        weakest = min(rises, key=lambda term: rises[term])
+        if rises[weakest] > _SEEN or len(rises) == 1:
+            break
+        needed = needed.without(weakest)
+    found = [_size(everything, needed, term) for term in range(count)]
+    return Sizes(found, list(rises))
 
 
-def _size(objective: Objective, best: Minimum, term: int, inflation: float) -> Size:
-    free = np.arange(len(best.squares)) != term
-    warm = np.maximum(best.squares, 1e-3 * objective.start())
-
-    def rise(square: float) -> float:
-        """By how much the objective is higher with this square of the term."""
-        start = warm.copy()
-        start[term] = square
-        return (minimum(objective, start, free).value - best.value) / inflation
-
-    square = float(best.squares[term])
-    without = rise(0.0)
-    is_seen = without > _SEEN
-    scale = square if square > 0.0 else float(objective.start()[term])
-    high = math.sqrt(_end(rise, square, scale, _INTERVAL if is_seen else _LIMIT))
-    if not is_seen:
+def _size(everything: _Profile, needed: _Profile, term: int) -> Size:
+    low, high = everything.interval(term)
+    if low == 0.0 or not needed.free[term]:
         return Size(None, 0.0, high)
-    return Size(math.sqrt(square), math.sqrt(_between(rise, square, 0.0, _INTERVAL)), high)
+    lower, higher = needed.interval(term)
+    return Size(math.sqrt(needed.best.squares[term]), min(low, lower), max(high, higher))
 
 
-def _end(rise: Callable[[float], float], square: float, scale: float, level: float) -> float:
-    """The square above the estimate where the objective has risen to a level."""
+@dataclass(frozen=True, eq=False)
+class _Profile:
+    """The objective over the squares of some terms (4,), and where it is least; the others are zero."""
+
+    objective: Objective
+    best: Minimum
+    free: Mask
+    inflation: float
+
+    def without(self, term: int) -> _Profile:
+        """The same with one term less."""
+        free = self.free & (np.arange(len(self.free)) != term)
+        return _Profile(self.objective, minimum(self.objective, self._start(term, 0.0), free), free, self.inflation)
+
+    def rise(self, term: int, square: float) -> float:
+        """By how much the objective is higher with this square of the term."""
+        free = self.free & (np.arange(len(self.free)) != term)
+        if not free.any():
+            start = self._start(term, square)
+            value = self.objective(start)[0] if square else math.inf
+        else:
+            value = minimum(self.objective, self._start(term, square), free).value
+        return (value - self.best.value) / self.inflation
+
+    def _start(self, term: int, square: float) -> Floats:
+        """Squares to begin with: all that are free are positive."""
+        start = np.where(self.free, np.maximum(self.best.squares, 1e-3 * self.objective.start()), 0.0)
+        start[term] = square
+        return start
+
+    def interval(self, term: int) -> tuple[float, float]:
+        """The ends of the interval of a size; the lower one is 0 where the term is not seen."""
+        square = float(self.best.squares[term])
+        scale = square if square > 0.0 else float(self.objective.start()[term])
+
+        def above(trial: float) -> float:
+            return self.rise(term, trial) - _INTERVAL
+
+        high = math.sqrt(_end(above, square, scale))
+        if self.rise(term, 0.0) <= _SEEN:
+            return 0.0, high
+        return math.sqrt(_between(above, square, 0.0)), high
+
+
+def _end(above: Callable[[float], float], square: float, scale: float) -> float:
+    """The square above the estimate where a function that rises with it becomes positive."""
     inside, factor = square, 1e-4
     for _ in range(_STEPS):
         outside = square + factor * scale
-        if rise(outside) >= level:
-            return _between(rise, inside, outside, level)
+        if above(outside) >= 0.0:
+            return _between(above, inside, outside)
         inside, factor = outside, 4.0 * factor
     return math.inf
 
 
-def _between(rise: Callable[[float], float], inside: float, outside: float, level: float) -> float:
-    """The square where the objective has risen to a level, between one where it is lower and one where it is higher."""
+def _between(above: Callable[[float], float], inside: float, outside: float) -> float:
+    """The square where a function is zero, between one where it is negative and one where it is positive."""
     from scipy.optimize import brentq
 
     accuracy = _WIDTH * max(abs(outside - inside), np.finfo(float).tiny)
-    return float(brentq(lambda square: rise(square) - level, inside, outside, xtol=accuracy, rtol=1e-6, maxiter=_STEPS))
+    return float(brentq(above, inside, outside, xtol=accuracy, rtol=1e-6, maxiter=_STEPS))
