@@ -9,7 +9,7 @@ Each level of a cascade halves the rate: level j has the means of blocks of 2^j 
   at m = 2^i. Up to ``EVERY`` readings k is every reading, as in the textbook; beyond, every m / ``EVERY`` readings, so
   that clusters of a week take no more memory than those of a second and have the same expectation.
 - the Haar variance: the same where clusters do not overlap, half the mean square difference of the two halves of each
-  block. Haar differences of all lengths and the means of the longest blocks are an orthogonal transform of the readings.
+  block. Haar differences of all lengths and the means of the longest blocks are an orthogonal transform of readings.
 - the means of blocks of the least length of which there are no more than ``KEPT``.
 
 Readings come in stretches without a gap; no block and no difference reaches from one stretch into another.
@@ -144,9 +144,10 @@ class BlockDifferences:
             self.lengths.append(0)
         if self._origin is None:
             self._origin = readings[0].copy()  # sums of what is left are small, so that rounding is
+        origin = self._origin
         self.lengths[-1] += len(readings)
         for begin in range(0, len(readings), 4 * _AT_ONCE):
-            self._pass_on(0, np.ascontiguousarray((readings[begin : begin + 4 * _AT_ONCE] - self._origin).T))
+            self._pass_on(0, np.ascontiguousarray((readings[begin : begin + 4 * _AT_ONCE] - origin).T))
 
     def end_stretch(self) -> None:
         """What comes next does not follow on what came: there is a gap, or it is the end."""

@@ -60,6 +60,13 @@ def _second_differences(lag: Floats, ratio: float) -> Floats:
     return total / ratio
 
 
+def cosine_transform(values: Floats) -> Floats:
+    """Cosine transform of type II, orthonormal, over the first axis (n, ...)."""
+    from scipy.fft import dct
+
+    return np.asarray(dct(values, axis=0, norm="ortho"), float)
+
+
 @lru_cache(maxsize=64)
 def block_spectrum(count: int) -> Floats:
     """Variances (count - 1, 4) of the cosine transform (type II, orthonormal, but for its constant) of ``count``
@@ -67,14 +74,12 @@ def block_spectrum(count: int) -> Floats:
 
     For white noise and a walk that steps between blocks the transform is uncorrelated, for the others nearly so.
     """
-    from scipy.fft import dct
-
     lags = np.arange(count, dtype=float)
     covariance = 2.0 * _generalised(lags) - _generalised(lags + 1.0) - _generalised(lags - 1.0)
     places = np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
     variances = []
     for own in covariance:
-        transformed = dct(dct(own[places], axis=0, norm="ortho"), axis=1, norm="ortho")
+        transformed = cosine_transform(cosine_transform(own[places]).T)
         variances.append(np.diag(transformed)[1:])
     return np.maximum(np.array(variances).T, 0.0)
 
@@ -82,7 +87,7 @@ def block_spectrum(count: int) -> Floats:
 @lru_cache(maxsize=1)
 def _haar_correlations() -> Floats:
     """Covariance (4, lags) of Haar differences of blocks of one length, of which the first is with itself."""
-    lags = 2.0 * np.arange(_HAAR_LAGS)
+    lags = 2.0 * np.arange(_HAAR_LAGS, dtype=float)
     return 0.5 * _second_differences(lags, 1.0)
 
 

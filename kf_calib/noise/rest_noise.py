@@ -16,8 +16,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, Ints, Times
-from kf_calib.bench.streams import Batch, Source, Stream
-from kf_calib.dwells.blocks import SECOND_NS, Tally
+from kf_calib.bench.streams import Source, Table
+from kf_calib.dwells.blocks import SECOND_NS, Block, Tally
 from kf_calib.dwells.rest_in_readings import RestSegmenter
 from kf_calib.dwells.stationarity import Stillness
 from kf_calib.errors import InputError
@@ -28,10 +28,11 @@ from kf_calib.noise.power_laws import (
     allan_covariance,
     allan_variance,
     block_spectrum,
+    cosine_transform,
     haar_freedom,
     histogram,
 )
-from kf_calib.noise.term_fit import AllanFit, LikelihoodFit, Minimum, Objective, Size, minimum, sizes
+from kf_calib.noise.term_fit import AllanFit, LikelihoodFit, Minimum, Size, minimum, sizes
 from kf_calib.support.tail_probabilities import LEVEL, chi_squared_tail
 
 _CLUSTERS = 3  # fewest in the longest stretch, for a variance to be used
@@ -52,9 +53,10 @@ class ChannelNoise:
     """The noise of a channel; all in ``unit`` and s.
 
     - tau_s (m,), deviation (m,), low (m,), high (m,): overlapping Allan deviation of clusters, and its 95 % interval.
-    - terms: sizes by the likelihood; by_allan: by least squares of the Allan variances. Empty where ``why_not`` says why.
+    - terms: sizes by the likelihood; by_allan: by least squares of the Allan variances. None where ``why_not`` has why.
     - from_s: the shortest clusters that the terms describe; shorter ones are not in the fits.
     - p_value: of the misfit of the Allan variances from there on. inflation: of the variances of all estimates for it.
+    - unclear: terms of which some are there, but any one of which may be another one; they have no value.
     - step: smallest difference between readings where all are multiples of it; 0 where they are not.
     - white_sigma: sigma of a single reading, the Allan deviation of neighbours.
     """
@@ -71,6 +73,7 @@ class ChannelNoise:
     from_s: float = math.nan
     p_value: float = math.nan
     inflation: float = 1.0
+    unclear: tuple[str, ...] = ()
     step: float = 0.0
     why_not: str = ""
 
@@ -174,7 +177,7 @@ class ChannelGroup:
         self.differences.end_stretch()
 
     def step(self, channel: int) -> float:
-        """Smallest difference of a channel's first readings, of which all others are multiples; 0 where they are not."""
+        """Smallest difference of a channel's first readings, where all others are multiples of it; else 0."""
         values = np.concatenate([each[:, channel] for each in self._first]) if self._first else np.zeros(0)
         levels = np.unique(values)
         if len(levels) < 2:
@@ -230,24 +233,21 @@ def _fitted(
     period_s, lengths = bare.period_s, histogram(differences.lengths)
     outcome = _fit_allan(variances, cluster_sizes, lengths, period_s)
     likelihood = _likelihood(differences, channel, period_s, int(cluster_sizes[outcome.first]), outcome.best.squares)
-    by_likelihood = minimum(likelihood, np.maximum(outcome.best.squares, likelihood.start()))
-    spread = np.sqrt(np.diag(outcome.covariance)) / variances
-    low, high = _deviation_interval(np.sqrt(variances), spread)
+    by_likelihood = sizes(
+        likelihood, minimum(likelihood, np.maximum(outcome.best.squares, likelihood.start())), outcome.inflation
+    )
+    by_allan = sizes(outcome.objective, outcome.best, outcome.inflation)
+    low, high = _deviation_interval(np.sqrt(variances), np.sqrt(np.diag(outcome.covariance)) / variances)
+    unclear = tuple(TERMS[place] for place in by_likelihood.needed if by_likelihood.sizes[place].value is None)
     return replace(
         bare, tau_s=period_s * cluster_sizes, deviation=np.sqrt(variances), low=low, high=high,
-        terms=_named(likelihood, by_likelihood, outcome.inflation),
-        by_allan=_named(outcome.objective, outcome.best, outcome.inflation),
+        terms=dict(zip(TERMS, by_likelihood.sizes, strict=True)), unclear=unclear,
+        by_allan=dict(zip(TERMS, by_allan.sizes, strict=True)),
         from_s=float(period_s * cluster_sizes[outcome.first]), p_value=outcome.p_value, inflation=outcome.inflation,
     )  # fmt: skip
 
 
-def _named(objective: Objective, best: Minimum, inflation: float) -> SizesOfTerms:
-    return dict(zip(TERMS, sizes(objective, best, inflation).sizes, strict=True))
-
-
-def _fit_allan(
-    variances: Floats, cluster_sizes: Ints, lengths: Mapping[int, int], period_s: float
-) -> _AllanOutcome:
+def _fit_allan(variances: Floats, cluster_sizes: Ints, lengths: Mapping[int, int], period_s: float) -> _AllanOutcome:
     """The fit that leaves out as few of the shortest clusters as it must to agree; where none does, the best one."""
     outcomes = list[_AllanOutcome]()
     for first in range(len(cluster_sizes) - _FEWEST_SIZES + 1):
@@ -260,7 +260,7 @@ def _fit_allan(
 def _fit_allan_from(
     first: int, variances: Floats, cluster_sizes: Ints, lengths: Mapping[int, int], period_s: float
 ) -> _AllanOutcome:
-    columns = allan_variance(period_s * cluster_sizes)
+    columns = allan_variance(period_s * cluster_sizes.astype(float))
     weight = np.diag(1.0 / cluster_sizes[first:].astype(float))
     objective = AllanFit(columns[first:], np.log(variances[first:]), weight)
     best, covariance = minimum(objective, objective.start()), np.zeros((0, 0))
@@ -281,13 +281,11 @@ def _likelihood(
     block, stretches = differences.block_means(shortest.bit_length() - 1)
     haar = differences.haar()
     fine = (haar.sizes >= shortest) & (haar.sizes < block) & (haar.variance[:, channel] > 0.0)
-    tau_s = period_s * haar.sizes[fine]
+    tau_s = period_s * haar.sizes[fine].astype(float)
     rows = [allan_variance(tau_s)]
     found, weights = [haar.variance[fine, channel]], [haar_freedom(tau_s, haar.counts[fine], squares)]
-    from scipy.fft import dct
-
     for means in stretches:
-        transformed = dct(means[:, channel], norm="ortho")[1:]
+        transformed = cosine_transform(means[:, channel])[1:]
         rows.append(block_spectrum(len(means)) * (period_s * block) ** POWERS)
         found.append(transformed**2)
         weights.append(np.ones(len(transformed)))
@@ -300,3 +298,103 @@ def _deviation_interval(deviation: Floats, spread: Floats) -> tuple[Floats, Floa
     ninth = spread**2 / 9.0
     ends = [np.maximum(1.0 - ninth + sign * _NORMAL * np.sqrt(ninth), 1e-2) ** 1.5 for sign in (1.0, -1.0)]
     return deviation / ends[0], deviation / ends[1]
+
+
+ACCELEROMETERS, GYROSCOPES, THERMOMETER = ("1", "2", "3"), ("x", "y", "z"), ("temperature",)
+"""Names of channels, as far as their units do not tell them apart."""
+
+
+@dataclass
+class _Rests:
+    """When it rested: begin and end of each rest, s since the first reading, which came at ``first_ns``."""
+
+    first_ns: int = 0
+    begins_s: list[float] = field(default_factory=list[float])
+    ends_s: list[float] = field(default_factory=list[float])
+
+    def split(self, time_ns: Times) -> Iterator[tuple[slice, int]]:
+        """The parts of stamps in ascending order that are in a rest, and the number of that."""
+        begins_ns = np.round(np.array(self.begins_s) * SECOND_NS).astype(np.int64) + self.first_ns
+        ends_ns = np.round(np.array(self.ends_s) * SECOND_NS).astype(np.int64) + self.first_ns
+        first, last = np.searchsorted(ends_ns, time_ns[[0, -1]])
+        for number in range(int(first), min(int(last) + 1, len(begins_ns))):
+            begin = int(np.searchsorted(time_ns, begins_ns[number]))
+            end = int(np.searchsorted(time_ns, ends_ns[number], side="right"))
+            if begin < end:
+                yield slice(begin, end), number
+
+
+def noise_at_rest(
+    source: Source, stillness: Stillness | None = None, *, gyroscopes: Source | None = None,
+    with_temperature: bool = False, on_progress: Callable[[float], None] = lambda _: None,
+) -> RestNoise:  # fmt: skip
+    """The noise of a source's accelerometers at rest, and of what was recorded beside them.
+
+    stillness: the margins that are left out about motions. gyroscopes: the same recording with angular rates, rad/s, in
+    place of the readings. with_temperature: whether the thermometer is a channel, too, over the whole recording.
+    Raises InputError where nothing rests, or the source has means only.
+    """
+    if isinstance(source, Table):
+        source.refuse("their noise")
+    accel, thermometer = ChannelGroup(ACCELEROMETERS, "m/s^2"), ChannelGroup(THERMOMETER, "K")
+    tally, rests = Tally(), _Rests()
+    segmenter = RestSegmenter(source.bench, stillness or Stillness(), tally)
+    latest = 0
+    for block in _blocks(source, segmenter, thermometer if with_temperature else None):
+        on_progress(source.fraction)
+        if not len(block.elapsed_s):
+            continue
+        if block.dwell != latest:
+            accel.end_rest()
+            rests.begins_s.append(float(block.elapsed_s[0]))
+            rests.ends_s.append(0.0)
+            latest = block.dwell
+        rests.ends_s[-1] = float(block.elapsed_s[-1])
+        accel.push(block.elapsed_s, block.accel_mps2)
+    accel.end_rest()
+    thermometer.end_rest()
+    if not accel.differences.count:
+        raise InputError("it never stands still for a second: noise is told from readings at rest.")
+    groups = [accel]
+    if gyroscopes is not None:
+        rests.first_ns = segmenter.first_ns or 0
+        groups.append(_rates(gyroscopes, rests))
+    if with_temperature:
+        groups.append(thermometer)
+    channels = tuple(channel for group in groups for channel in group.noise())
+    return RestNoise(
+        channels, 1.0 / accel.period_s, accel.differences.count, len(accel.differences.lengths), accel.gaps,
+        accel.total_s, accel.longest_s, tally.moving, tally.settling,
+        tally.not_finite + tally.too_large + tally.repeated + tally.backward + tally.leaping, tuple(source.warnings),
+    )  # fmt: skip
+
+
+def _blocks(source: Source, segmenter: RestSegmenter, thermometer: ChannelGroup | None) -> Iterator[Block]:
+    """The blocks of all rests; temperatures go to the thermometer as they pass by."""
+    first_ns, last_ns = None, -(1 << 62)
+    for batch in source:
+        stream = batch.temperature
+        if thermometer is not None and len(stream):
+            first_ns = int(stream.time_ns[0]) if first_ns is None else first_ns
+            later = np.diff(stream.time_ns, prepend=last_ns) > 0
+            last_ns = max(last_ns, int(stream.time_ns.max()))
+            kept = stream[later & np.isfinite(stream.values[:, 0])]
+            thermometer.push((kept.time_ns - first_ns) / SECOND_NS, kept.values)
+        yield from segmenter.push(batch)
+    yield from segmenter.finish()
+
+
+def _rates(source: Source, rests: _Rests) -> ChannelGroup:
+    """The gyroscopes of a recording in the same rests."""
+    group, latest = ChannelGroup(GYROSCOPES, "rad/s"), -1
+    for batch in source:
+        stream = batch.accel[np.asarray(np.isfinite(batch.accel.values).all(axis=1))]
+        if not len(stream) or not rests.begins_s:
+            continue
+        for part, number in rests.split(stream.time_ns):
+            if number != latest:
+                group.end_rest()
+                latest = number
+            group.push((stream.time_ns[part] - rests.first_ns) / SECOND_NS, stream.values[part])
+    group.end_rest()
+    return group

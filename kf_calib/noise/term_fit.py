@@ -1,16 +1,16 @@
 """Sizes of the noise terms of a channel with 95 % intervals, in two ways, from differences of block means.
 
-- ``AllanFit``: generalised least squares of the logarithms of the overlapping Allan variances. With nu = 2 s^4 / var(s^2)
-  effective degrees of freedom, ln s^2 has the mean ln sigma^2 + psi(nu / 2) - ln(nu / 2) and the variance psi'(nu / 2);
-  correlations are those of ``power_laws.allan_covariance``.
+- ``AllanFit``: generalised least squares of the logarithms of the overlapping Allan variances. With the effective
+  degrees of freedom nu = 2 s^4 / var(s^2), ln s^2 has the mean ln sigma^2 + psi(nu / 2) - ln(nu / 2) and the variance
+  psi'(nu / 2); correlations are those of ``power_laws.allan_covariance``.
 - ``LikelihoodFit``: the likelihood of the readings as a Gaussian process, in an orthogonal transform in which the terms
-  are nearly uncorrelated: Haar differences of blocks of all lengths, and the cosine transform of the longest block means,
+  are nearly uncorrelated: Haar differences of blocks of all lengths, cosine transform of the longest blocks' means,
 
     -2 ln L = sum_k w_k (ln lambda_k + s_k / lambda_k),   lambda = columns . theta,
 
   with squares s_k of w_k degrees of freedom and their expectation lambda_k, linear in theta = (Q^2, N^2, B^2, K^2): a
-  Whittle likelihood with exact expectations (A. Sykulski et al., 2019), of wavelets for short times (S. Guerrier et al.,
-  2013).
+  Whittle likelihood with exact expectations (A. Sykulski et al., 2019), of wavelets for short times (S. Guerrier et
+  al., 2013).
 
 Both are minimised over theta >= 0 by Fisher's scoring; an interval has its ends where the profile of the objective is
 3.84 above its minimum. A term is seen where the minimum without it lies 5.41 higher (1 % point of half chi-squared); of
@@ -22,7 +22,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -248,4 +248,5 @@ def _between(above: Callable[[float], float], inside: float, outside: float) -> 
     from scipy.optimize import brentq
 
     accuracy = _WIDTH * max(abs(outside - inside), np.finfo(float).tiny)
-    return float(brentq(above, inside, outside, xtol=accuracy, rtol=1e-6, maxiter=_STEPS))
+    root: Any = brentq(above, inside, outside, xtol=accuracy, maxiter=_STEPS)
+    return float(root)
