@@ -142,9 +142,8 @@ class BlockDifferences:
         if not self._is_open:
             self._is_open = True
             self.lengths.append(0)
-        if self._origin is None:
-            self._origin = readings[0].copy()  # sums of what is left are small, so that rounding is
-        origin = self._origin
+        origin = readings[0].copy() if self._origin is None else self._origin
+        self._origin = origin  # sums of what is left are small, so that rounding is
         self.lengths[-1] += len(readings)
         for begin in range(0, len(readings), 4 * _AT_ONCE):
             self._pass_on(0, np.ascontiguousarray((readings[begin : begin + 4 * _AT_ONCE] - origin).T))

@@ -56,9 +56,10 @@ class ChannelNoise:
     - terms: sizes by the likelihood; by_allan: by least squares of the Allan variances. None where ``why_not`` has why.
     - from_s: the shortest clusters that the terms describe; shorter ones are not in the fits.
     - p_value: of the misfit of the Allan variances from there on. inflation: of the variances of all estimates for it.
+    - squares (4,): of the terms that are needed to explain the data, 0 of the others.
     - unclear: terms of which some are there, but any one of which may be another one; they have no value.
     - step: smallest difference between readings where all are multiples of it; 0 where they are not.
-    - white_sigma: sigma of a single reading, the Allan deviation of neighbours.
+    - reading_sigma: sigma of a single reading, the Allan deviation of neighbours.
     """
 
     name: str
@@ -73,23 +74,23 @@ class ChannelNoise:
     from_s: float = math.nan
     p_value: float = math.nan
     inflation: float = 1.0
+    squares: Floats = field(default_factory=lambda: np.zeros(len(TERMS)))
     unclear: tuple[str, ...] = ()
     step: float = 0.0
     why_not: str = ""
 
     @property
-    def white_sigma(self) -> float:
+    def reading_sigma(self) -> float:
         return float(self.deviation[0]) if len(self.deviation) else math.nan
 
     @property
     def is_coarse(self) -> bool:
         """Whether the noise of a reading is so much smaller than a step that rounding hides it."""
-        return self.step > _COARSE * self.white_sigma
+        return self.step > _COARSE * self.reading_sigma
 
     def model(self, tau_s: Floats) -> Floats:
-        """Allan deviation (m,) of the terms that are seen together."""
-        squares = np.array([(self.terms[name].value or 0.0) ** 2 for name in TERMS])
-        return np.sqrt(allan_variance(tau_s) @ squares)
+        """Allan deviation (m,) of the terms that are needed, together."""
+        return np.sqrt(allan_variance(tau_s) @ self.squares)
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,11 +238,12 @@ def _fitted(
         likelihood, minimum(likelihood, np.maximum(outcome.best.squares, likelihood.start())), outcome.inflation
     )
     by_allan = sizes(outcome.objective, outcome.best, outcome.inflation)
-    low, high = _deviation_interval(np.sqrt(variances), np.sqrt(np.diag(outcome.covariance)) / variances)
+    expected = allan_variance(period_s * cluster_sizes.astype(float)) @ outcome.best.squares
+    low, high = _deviation_interval(np.sqrt(variances), np.sqrt(np.diag(outcome.covariance)) / expected)
     unclear = tuple(TERMS[place] for place in by_likelihood.needed if by_likelihood.sizes[place].value is None)
     return replace(
         bare, tau_s=period_s * cluster_sizes, deviation=np.sqrt(variances), low=low, high=high,
-        terms=dict(zip(TERMS, by_likelihood.sizes, strict=True)), unclear=unclear,
+        terms=dict(zip(TERMS, by_likelihood.sizes, strict=True)), unclear=unclear, squares=by_likelihood.squares,
         by_allan=dict(zip(TERMS, by_allan.sizes, strict=True)),
         from_s=float(period_s * cluster_sizes[outcome.first]), p_value=outcome.p_value, inflation=outcome.inflation,
     )  # fmt: skip

@@ -151,11 +151,13 @@ def minimum(objective: Objective, start: Floats, free: Mask | None = None) -> Mi
 class Sizes(NamedTuple):
     """The sizes of the terms, and the places of those that explain the data together and of which none can be left out.
 
-    A place in ``needed`` whose size has no value can be left out where another one takes its part.
+    A place in ``needed`` whose size has no value can be left out where another one takes its part. squares (4,): of the
+    terms that are needed, where these alone are fitted; 0 of the others.
     """
 
     sizes: list[Size]
     needed: list[int]
+    squares: Floats
 
 
 def sizes(objective: Objective, best: Minimum, inflation: float = 1.0) -> Sizes:
@@ -177,7 +179,7 @@ def sizes(objective: Objective, best: Minimum, inflation: float = 1.0) -> Sizes:
             break
         needed = needed.without(weakest)
     found = [_size(everything, needed, term) for term in range(count)]
-    return Sizes(found, list(rises))
+    return Sizes(found, list(rises), needed.best.squares)
 
 
 def _size(everything: _Profile, needed: _Profile, term: int) -> Size:
