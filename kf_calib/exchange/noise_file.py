@@ -83,11 +83,6 @@ class SavedRestNoise(FilePart):
     created: Text
     program: Text
 
-    @property
-    def origin(self) -> str:
-        """Where the numbers come from."""
-        return f"noise of {self.recording or 'a recording'} by kf_calib {self.program}, {self.created}"
-
     def of_unit(self, unit: str) -> list[SavedChannel]:
         """The channels in a unit that have sizes."""
         return [channel for channel in self.channels if channel.unit == unit and channel.terms is not None]

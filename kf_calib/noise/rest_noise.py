@@ -59,7 +59,7 @@ class ChannelNoise:
     - squares (4,): of the terms that are needed to explain the data, 0 of the others.
     - unclear: terms of which some are there, but any one of which may be another one; they have no value.
     - step: smallest difference between readings where all are multiples of it; 0 where they are not.
-    - reading_sigma: sigma of a single reading, the Allan deviation of neighbours.
+    - reading_sigma: Allan deviation of neighbours, the sigma of a single reading where readings are independent.
     """
 
     name: str

@@ -9,8 +9,9 @@ trusts a sensor more than the recording shows.
 - PX4: EKF2 adds (NOISE dt)^2 to the variance of a velocity and (B_NOISE dt)^2 to that of a bias in each step
   (src/modules/ekf2/EKF/covariance.cpp). With the step dt = 10 ms of EKF2_PREDICT_US that is N^2 dt and K^2 dt where
   NOISE = N / √dt and B_NOISE = K / √dt. A sensor at rest on a table: vibration of a vehicle comes on top.
-- robot_localization: takes the covariance that each message brings, row by row: that of a single reading, whatever its
-  correlation. Its value is the square of the Allan deviation of neighbours.
+- robot_localization: takes the covariance that each message brings, row by row, and messages for independent. A filter
+  in the sensor makes neighbours alike, so it is N^2 times the rate, or the Allan variance of neighbours where that is
+  larger.
 """
 
 from __future__ import annotations
@@ -92,13 +93,19 @@ class NoiseExport:
         return self.noise.of_unit("m/s^2")[0].rate_hz
 
     @property
+    def origin(self) -> str:
+        """Where the numbers come from, fit for a comment of any of the formats."""
+        name = in_comment(self.noise.recording) or "a recording"
+        return f"noise of {name} by kf_calib {in_comment(self.noise.program)}, {in_comment(self.noise.created)}"
+
+    @property
     def parameter_lines(self) -> list[str]:
         """The lines of a list of PX4's parameters."""
         return [f"1\t1\t{key.name}\t{key.value:.9g}\t9" for key in self.keys]
 
     def text(self) -> str:
         """The content of a file that has the noise alone."""
-        head = [f"# {in_comment(self.noise.origin)}.", *(f"# {in_words}." for in_words in self.remarks)]
+        head = [f"# {self.origin}.", *(f"# {in_words}." for in_words in self.remarks)]
         match self.to:
             case "kalibr":
                 lines = self.yaml_lines
@@ -116,9 +123,15 @@ class NoiseExport:
         for unit, name in (("m/s^2", "linear_acceleration"), ("rad/s", "angular_velocity")):
             channels = self.noise.of_unit(unit)
             if len(channels) == 3:
-                diagonal = [(channel.reading_sigma or 0.0) ** 2 for channel in channels]
+                diagonal = [_reading_variance(channel) for channel in channels]
                 cells = [f"{diagonal[i]:.6e}" if i == j else "0.0" for i in range(3) for j in range(3)]
                 yield f"{name}_covariance: [{', '.join(cells)}]"
+
+
+def _reading_variance(channel: SavedChannel) -> float:
+    """Variance of a reading, if readings were independent and had the channel's white noise."""
+    white = _largest([channel], "white")[0]
+    return max(white**2 * channel.rate_hz, (channel.reading_sigma or 0.0) ** 2)
 
 
 def _largest(channels: Sequence[SavedChannel], term: TermName) -> tuple[float, bool]:
