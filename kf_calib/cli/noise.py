@@ -88,7 +88,7 @@ def _gyroscopes(path: Path, reading: ReadingOptions, gyro: str, size: float) -> 
     header = _header(path)
     absent = [name for name in names if name not in header]
     if len(names) != len(_AXES) or absent:
-        lacking = f"there is no column {absent[0]!r}" if absent else "it takes three names"
+        lacking = f"there is no column {absent[0]!r}" if len(names) == len(_AXES) else "it takes three names"
         raise InputError(f"--gyro {gyro!r}: {lacking}; the columns are {', '.join(header)}.")
     stated = {theirs: ours for theirs, ours in renamed(reading.columns).items() if ours.startswith("time")}
     others = {name: "-" for name in header if name not in names and name not in stated and not _TIME.search(name)}

@@ -11,7 +11,6 @@ import pytest
 import yaml
 from helpers.paths import ROOT
 from helpers.resting import PERIOD_S, level, noisy
-from mcap.writer import Writer
 
 import kf_calib
 from kf_calib import plot
@@ -65,33 +64,32 @@ def test_gyroscopes_and_thermometer_are_taken_along(run: Any, rest: Path, unit: 
     assert channels["accelerometer 3"]["white_mps2_per_sqrt_hz"] == pytest.approx(1e-3, rel=0.05)
 
 
-@pytest.mark.parametrize(("gyro", "said"), [("wx,wy", "three names"), ("wx,wy,w", "no column 'w'"), ("a", "three")])
+@pytest.mark.parametrize(
+    ("gyro", "said"),
+    [("wx,wy", "three names"), ("a", "three names"), ("wx,wy,w", "no column 'w'"), ("wx,wy,wz,wx", "three")],
+)
 def test_gyroscopes_that_are_not_there_are_refused(run: Any, rest: Path, gyro: str, said: str) -> None:
     code, _, err = run("noise", rest, "--gyro", gyro)
     assert code == 2 and said in err
 
 
 def imu_bag(path: Path) -> Path:
-    """A minute of sensor_msgs/msg/Imu at 100 Hz."""
+    """A minute of sensor_msgs/msg/Imu at 100 Hz, by ROS's own way of writing."""
+    ros = pytest.importorskip("mcap_ros2.writer", reason="mcap-ros2-support is not there")
     rng, count = np.random.default_rng(5), 6000
     accel = level(np.array([noisy(rng, count, 1e-3) for _ in range(3)]).T)
     rates = np.array([noisy(rng, count, 1e-4) for _ in range(3)]).T
     with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start("ros2")
-        schema = writer.register_schema(cdr.IMU.name, "ros2msg", cdr.IMU.definition.encode())
-        channel = writer.register_channel("/imu", "cdr", schema)
+        writer = ros.Writer(file)
+        schema = writer.register_msgdef(cdr.IMU.name, cdr.IMU.schema)
         for k in range(count):
             stamp = 1_750_000_000_000_000_000 + k * 10_000_000
-            writer.add_message(channel, stamp, imu_message(stamp, rates[k], accel[k]), stamp)
+            header = {"stamp": {"sec": stamp // 10**9, "nanosec": stamp % 10**9}, "frame_id": "imu"}
+            vectors = {"angular_velocity": rates[k], "linear_acceleration": accel[k]}
+            named = {name: dict(zip("xyz", own.tolist(), strict=True)) for name, own in vectors.items()}
+            writer.write_message("/imu", schema, {"header": header, **named}, stamp, stamp)
         writer.finish()
     return path
-
-
-def imu_message(stamp: int, rates: np.ndarray, accel: np.ndarray) -> bytes:
-    head = np.array([stamp // 10**9, stamp % 10**9, 1], "<u4").tobytes() + b"\0\0\0\0"
-    numbers = [0.0, 0.0, 0.0, 1.0, *[0.0] * 9, *rates, *[0.0] * 9, *accel, *[0.0] * 9]
-    return b"\0\1\0\0" + head + b"\0\0\0\0" * (len(head) % 8 != 0) + np.array(numbers, "<f8").tobytes()
 
 
 def test_gyroscopes_of_a_bag_are_named_by_their_paths(run: Any, tmp_path: Path) -> None:
@@ -160,7 +158,6 @@ def test_the_figure_has_the_deviations_and_the_lines_through_them(run: Any, rest
     assert run("noise", rest, "--png", "noise.png")[0] == 0 and Path("noise.png").read_bytes()[:4] == b"\x89PNG"
     found = noise_at_rest(Lines(rest, angles=False), with_temperature=True)
     figure = plot.noise(found)
-    panels = [axes for axes in figure.axes if axes.get_title() or axes.axison]
     panels = [axes for axes in figure.axes if axes.axison]
     assert [axes.get_title(loc="left") for axes in panels] == [
         "accelerometer 1", "accelerometer 2", "accelerometer 3", "temperature",
@@ -171,7 +168,7 @@ def test_the_figure_has_the_deviations_and_the_lines_through_them(run: Any, rest
     assert total.get_ydata() == pytest.approx(channel.model(channel.tau_s) / 9.80665e-6)
     assert white.get_label() == "white noise N, slope −½"
     assert first.get_xscale() == first.get_yscale() == "log"
-    assert "slope −½" in [text.get_text() for text in figure.legends[0].get_texts()][-2:][0] or len(figure.legends)
+    assert white.get_label() in [text.get_text() for text in figure.legends[0].get_texts()]
 
 
 def test_remarks_are_told_once_for_channels_that_are_alike() -> None:
