@@ -60,7 +60,8 @@ def noise(
             source, Stillness(tolerance_deg=still_deg, settle_s=settle_s), gyroscopes=gyroscopes,
             with_temperature=temperature, on_progress=tick,
         )  # fmt: skip
-    rest_noise = replace(rest_noise, warnings=tuple(each for each in rest_noise.warnings if not each.startswith("gravity is taken")))
+    told = tuple(each for each in rest_noise.warnings if not each.startswith("gravity is taken"))  # it does not matter
+    rest_noise = replace(rest_noise, warnings=told)
     print_result(as_json, views.noise_object, views.noise_report, rest_noise)
     with delivery(outputs, as_json) as deliver:
         if save is not None:
