@@ -53,8 +53,10 @@ def noise(
 
     outputs = claimed(overwrite=overwrite)
     reading = replace(reading, no_angles=True)
-    source = reading.opened(recording)
     gyroscopes = None if gyro is None else _gyroscopes(recording, reading, gyro, _SIZES[gyro_unit])
+    if gyro is not None and ":" not in gyro:
+        reading = replace(reading, columns=(*reading.columns, *(f"{name.strip()}=-" for name in gyro.split(","))))
+    source = reading.opened(recording)
     with progress(f"reading {recording.name}", as_json) as tick:
         rest_noise = noise_at_rest(
             source, Stillness(tolerance_deg=still_deg, settle_s=settle_s), gyroscopes=gyroscopes,

@@ -60,7 +60,7 @@ def noise_object(noise: RestNoise) -> dict[str, Any]:
             "stretches": noise.stretches,
             "longest_s": noise.longest_s,
             "gaps": noise.gaps,
-            "left_out": {"moving": noise.moving, "settling": noise.settling, "unusable": noise.unusable},
+            "left_out": {"moving": noise.moving, "next_to_motion": noise.settling, "unusable": noise.unusable},
             "channels": [_channel_object(channel) for channel in noise.channels],
             "warnings": [*noise.warnings, *remarks(noise)],
         }
