@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from kf_calib.exchange.calibration_file import SavedCalibration, open_calibration, save_calibration
     from kf_calib.fleet.results import Fleet
     from kf_calib.fleet.results import Fleet as open_fleet
+    from kf_calib.noise.rest_noise import RestNoise, noise_at_rest
     from kf_calib.online.sequential_test import Running, Watch
     from kf_calib.online.session import Session
     from kf_calib.sources.files.lines import Lines as open_log
@@ -74,6 +75,8 @@ _HOMES = {
     "Improvement": ("diagnosis.stepwise_selection", "Improvement"),
     "improve": ("diagnosis.stepwise_selection", "improve"),
     "Refits": ("diagnosis.refits", "Refits"),
+    "RestNoise": ("noise.rest_noise", "RestNoise"),
+    "noise_at_rest": ("noise.rest_noise", "noise_at_rest"),
     "InputError": ("errors", "InputError"),
     "KfCalibError": ("errors", "KfCalibError"),
     "UnobservableError": ("errors", "UnobservableError"),
@@ -92,9 +95,10 @@ shown_by(lambda: import_module("kf_calib.views.report.page"))
 
 __all__ = [
     "Bench", "Calibration", "Corrected", "Correction", "Diagnosis", "Fleet", "Improvement", "InputError",
-    "KfCalibError", "Parameter", "Recorder", "Refits", "Running", "SavedCalibration", "Session", "Settings",
-    "UnobservableError", "Watch", "calibrate", "compare", "diagnose", "improve", "open_calibration", "open_fleet",
-    "open_log", "open_recording", "open_table", "plot", "save_calibration", "save_view", "shown_in",
+    "KfCalibError", "Parameter", "Recorder", "Refits", "RestNoise", "Running", "SavedCalibration", "Session",
+    "Settings", "UnobservableError", "Watch", "calibrate", "compare", "diagnose", "improve", "noise_at_rest",
+    "open_calibration", "open_fleet", "open_log", "open_recording", "open_table", "plot", "save_calibration",
+    "save_view", "shown_in",
 ]  # fmt: skip
 
 

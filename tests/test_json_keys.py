@@ -33,6 +33,7 @@ COMMANDS: dict[str, tuple[object, ...]] = {
     "export": ("cal.json", "--to", "px4", "-o", "px4.params", "--lossy"),
     "effects": (),
     "info": (HIDDEN,),
+    "noise": (HIDDEN,),
     "plan": ("--count", 4),
     "paper": ("--repetitions", 2),
     "apply": ("cal.json", HIDDEN, "-o", "corrected.mcap"),

@@ -98,17 +98,25 @@ class Source(Protocol):
 _SQUARE = {"theta1": 0.0, "theta3": 0.0}
 
 
-def bench_without_angles(name: str, metadata: Mapping[str, str]) -> tuple[Bench, list[str]]:
+_NO_ORIENTATIONS = (
+    "nothing in it tells orientations, so only the size of gravity counts, as with --no-angles: nine parameters."
+)
+
+
+def bench_without_angles(
+    name: str, metadata: Mapping[str, str], *, are_lacking: bool = False
+) -> tuple[Bench, list[str]]:
     """The bench by the keys that are stated, and what to know of it; gravity is the standard one where none is stated.
 
-    name: of the source. Raises BenchError for a key that cannot be.
+    name: of the source. are_lacking: whether it has no angles, though nobody said that it need not. Raises BenchError
+    for a key that cannot be.
     """
     gravity = {} if "latitude_deg" in metadata else {"gravity_mps2": str(STANDARD_GRAVITY_MPS2)}
     try:
         bench = Bench.from_metadata({**gravity, **metadata}, has_angles=False)
     except BenchError as error:
         raise BenchError(f"{name}: {error}") from error
-    remarks = list[str]()
+    remarks = [f"{name}: {_NO_ORIENTATIONS}"] if are_lacking else []
     if bench.gravity_mps2 == STANDARD_GRAVITY_MPS2:  # as also a recording made by it states
         remarks.append(
             f"gravity is taken as the standard {STANDARD_GRAVITY_MPS2} m/s^2; the local value differs by up to "

@@ -19,7 +19,7 @@ from kf_calib.support import late_modules
 SECTIONS = {
     "Evaluate a recording": {"replay": "evaluate.replay", "diagnose": "evaluate.diagnose",
                              "improve": "improve.improve", "compare": "evaluate.compare",
-                             "report": "evaluate.report"},
+                             "report": "evaluate.report", "noise": "noise.noise"},
     "Evaluate many": {"fleet": "fleet.fleet"},
     "Use a calibration": {"apply": "exchange.apply", "verify": "exchange.verify", "history": "exchange.history",
                           "export": "exchange.export", "certificate": "exchange.certificate"},

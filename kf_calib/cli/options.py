@@ -188,6 +188,14 @@ class ReadingOptions:
         """Ours of each foreign column."""
         return renamed(self.columns)
 
+    @property
+    def angles(self) -> bool | None:
+        """Whether platform angles count; None: where there are any, as no gimbals are stated."""
+        if self.no_angles:
+            return False
+        is_stated = self.pose_topic or self.angle_unit or self.bench.keys.keys() & _OF_GIMBALS
+        return True if is_stated else None
+
     def kind(self, path: Path) -> FileKind:
         from kf_calib.sources.opening import kind_of
 
@@ -200,7 +208,7 @@ class ReadingOptions:
         return replace(Units.of({**self.keys, **told}, self.angle_unit, self.g_unit, input),
                        rate_hz=self.rate_hz, where=told.get("where", self.where or ""))  # fmt: skip
 
-    def messages(self, path: Path, angles: bool, input: RawInput | None = None) -> Recording:
+    def messages(self, path: Path, angles: bool | None, input: RawInput | None = None) -> Recording:
         """The recording of samples at a path; angles: whether it must have angles."""
         from kf_calib.sources.files.recording import Recording
 
@@ -217,7 +225,7 @@ class ReadingOptions:
             angles=angles,
         )
 
-    def table(self, path: Path, told: Mapping[str, str], angles: bool, input: RawInput | None = None) -> Table:
+    def table(self, path: Path, told: Mapping[str, str], angles: bool | None, input: RawInput | None = None) -> Table:
         """The table at a path; told: bench keys beside those of the options. angles: whether orientations count."""
         from kf_calib.sources.tables.opening import open_table
 
@@ -229,7 +237,7 @@ class ReadingOptions:
         from kf_calib.sources.files.lines import Lines
         from kf_calib.sources.opening import FileKind, no_recording
 
-        columns, angles = self.renamed, not self.no_angles
+        columns, angles = self.renamed, self.angles
         match self.kind(path):
             case FileKind.TABLE:
                 refuse_given(OF_MESSAGES + OF_DWELLS + _OF_LINES, f"{path} is a table of mean readings")
@@ -388,6 +396,8 @@ def _bench_from_toml(path: Path) -> dict[str, str]:
 
 _OF_TEXT = ("columns", "g_unit", "rate_hz", "where")
 _OF_LINES = ("rate_hz",)
+_OF_GIMBALS = {"axes", "joints", "up", "reference", "azimuth_deg", "angle_sigma_deg"}
+"""Keys of a bench by which its orientations must be known."""
 OF_MESSAGES = ("accel_topic", "pose_topic", "temperature_topic", "fields", "max_chunk_mb")
 OF_DWELLS = ("joints", "settle_s", "still_deg", "gate", "gate_sigma")
 """Options that act on text and spreadsheets only, on logs in lines only, on files of messages only, and where dwells

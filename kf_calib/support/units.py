@@ -81,6 +81,13 @@ _FIELD = {
     "rad/K": Unit("µrad/K", _MICRO),
     "m s^-1/K": Unit("µg per K/min", _MICRO / _G / 60.0),
     "m/s^2/s^(1/2)": Unit("µg/√s", _MICRO / _G),
+    "m/s^2/Hz^(1/2)": Unit("µg/√Hz", _MICRO / _G),
+    "rad/s/Hz^(1/2)": Unit("°/√h", math.degrees(60.0)),
+    "rad/s^2/Hz^(1/2)": Unit("°/h/√h", math.degrees(3600.0 * 60.0)),
+    "K/Hz^(1/2)": Unit("mK/√Hz", 1e3),
+    "m/s^2 s": Unit("µg·s", _MICRO / _G),
+    "K s": Unit("mK·s", 1e3),
+    "K/s^(1/2)": Unit("mK/√s", 1e3),
 }
 """SI unit -> unit of the field. One unit for all sizes: a bias is in µg, be it of a quartz accelerometer or a chip."""
 

@@ -217,7 +217,7 @@ def exported_object(target: Target, to: str, path: Path) -> dict[str, Any]:
             "to_be_done_before": target.to_be_done_before or None,
             "error_left_rms_mps2": None if left is None else left.rms_mps2,
             "error_left_worst_mps2": None if left is None else left.worst_mps2,
-            "warnings": list(target.remarks),
+            "warnings": [*target.remarks, *(target.noise.remarks if target.noise else ())],
         }
     )
 
@@ -236,7 +236,7 @@ def exported_report(target: Target, path: Path) -> RenderableType:
         lines.append(note(f"it does not hold {', '.join(target.lost)}: corrected readings are wrong by "
                           f"{unit.text(rms)} rms, {unit.text(worst)} at worst"))  # fmt: skip
     lines += [note(f"{name} is not corrected: {why}") for name, why in target.correction.left_out.items()]
-    return Group(*lines, *map(note, target.remarks))
+    return Group(*lines, *map(note, [*target.remarks, *(target.noise.remarks if target.noise else ())]))
 
 
 def calibration_object(saved: SavedCalibration, path: Path) -> dict[str, Any]:

@@ -176,7 +176,7 @@ def test_a_cell_never_begins_a_formula(text: str) -> None:
 
 def test_the_command_names_the_programs_there_are() -> None:
     (option,) = [each for each in command.params if each.name == "to"]
-    assert set(option.type.choices) == TARGETS.keys() == {*READERS, "c"}
+    assert set(option.type.choices) == {*TARGETS, "robot_localization"} and TARGETS.keys() == {*READERS, "c"}
 
 
 @pytest.mark.parametrize("to", READERS)

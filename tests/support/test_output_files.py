@@ -146,6 +146,7 @@ WRITING = [
     ("live sim://?speed=100", ["--record", "--rrd", "--save-model", "--save"]),
     ("run --positioner sim://", ["--record", "--save-model", "--save"]),
     ("history cal.json", FIGURES),
+    ("noise run.mcap", [*FIGURES, "--save"]),
     ("fleet run.mcap -o fleet", [*FIGURES, "--report"]),
     ("record", [""]),
     ("simulate", [""]),
@@ -175,7 +176,7 @@ def idle(monkeypatch: pytest.MonkeyPatch) -> None:
         pytest.fail("the work began")
 
     for place in ("kf_calib.estimation.calibration.calibrate", "kf_calib.design.orientation_plan.plan",
-                  "kf_calib.reproduction.grebenkin2019.repeat",
+                  "kf_calib.reproduction.grebenkin2019.repeat", "kf_calib.noise.rest_noise.noise_at_rest",
                   "kf_calib.sources.live.open_live", "kf_calib.sources.files.lines.Lines.__iter__",
                   "kf_calib.sources.simulation.simulator.Simulation.__iter__"):  # fmt: skip
         monkeypatch.setattr(place, begun)

@@ -196,7 +196,7 @@ class Kalibr(AffineTarget):
 
     The file has no place for the bias: who reads it estimates it (kalibr_imu_camera_calibration/IccSensors.py,
     ``IccScaledMisalignedImu``). Kalibr turns its frame so that M is lower triangular; here M is full, and f in the
-    frame of the block. Units: none. Noise and gyroscopes, of which a calibration knows nothing, are to be added.
+    frame of the block. Units: none. Noise is in it where ``noise`` is given; the gyroscopes are to be added.
     """
 
     title, bias = "Kalibr", False
@@ -211,7 +211,8 @@ class Kalibr(AffineTarget):
             "    M:",
             *(f"    - {row}" for row in rows),
         ]
-        return "\n".join([*lines, "  model: scale-misalignment", ""])
+        noise = [f"  {line}" for line in self.noise.yaml_lines] if self.noise else []
+        return "\n".join([*lines, "  model: scale-misalignment", *noise, ""])
 
 
 class OpenVins(AffineTarget):
@@ -221,8 +222,8 @@ class OpenVins(AffineTarget):
 
     Of Ta^-1 OpenVINS keeps the lower triangle (VioManagerOptions.h), hence the rotation: S^-1 = Q L, Ta = L^-1,
     R_IMUtoACC = Q^T. The bias is a state of its filter, which begins at zero: the file has no place for it
-    (Propagator.cpp: ``a_hat = R_ACCtoIMU * Da * (am - bias_a)``). Units: none. Noise and gyroscopes, of which a
-    calibration knows nothing, are to be added.
+    (Propagator.cpp: ``a_hat = R_ACCtoIMU * Da * (am - bias_a)``). Units: none. Noise is in it
+    where ``noise`` is given; the gyroscopes are to be added.
     """
 
     title, bias = "OpenVINS", False
@@ -233,7 +234,8 @@ class OpenVins(AffineTarget):
         lines = [
             line for name, own in matrices.items() for line in (f"  {name}:", *(f"    - {r}" for r in own.tolist()))
         ]
-        return "\n".join(["%YAML:1.0", *self.heading, "imu0:", '  model: "kalibr"', *lines, ""])
+        noise = [f"  {line}" for line in self.noise.yaml_lines] if self.noise else []
+        return "\n".join(["%YAML:1.0", *self.heading, "imu0:", '  model: "kalibr"', *lines, *noise, ""])
 
 
 def rotation_and_lower(matrix: Floats) -> tuple[Floats, Floats]:
@@ -323,7 +325,7 @@ class Px4(AffineTarget):
         lines = [f"1\t1\t{name}\t{value:.9g}\t{6 if isinstance(value, int) else 9}" for name, value in self._values()]
         head = [*self.heading, "# For the accelerometer whose device id is in CAL_ACC0_ID (and TC_A0_ID).",
                 "#", "# Vehicle-Id Component-Id Name Value Type"]  # fmt: skip
-        return "\n".join([*head, *lines, ""])
+        return "\n".join([*head, *lines, *(self.noise.parameter_lines if self.noise else []), ""])
 
     @property
     def remarks(self) -> tuple[str, ...]:

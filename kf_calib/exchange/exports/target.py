@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
@@ -21,11 +21,23 @@ from kf_calib.estimation.correction import Correction
 from kf_calib.exchange.calibration_file import SavedCalibration
 
 
+class NoiseLines(Protocol):
+    """The noise in the keys of a program: lines of a mapping in YAML, or of a list of parameters, and what to know."""
+
+    @property
+    def yaml_lines(self) -> list[str]: ...
+    @property
+    def parameter_lines(self) -> list[str]: ...
+    @property
+    def remarks(self) -> tuple[str, ...]: ...
+
+
 class Target(ABC):
     """A calibration in the form of another program.
 
     title: the program. lost: what of the calibration it cannot hold, by name; nothing, unless a subclass says so.
-    folds: whether it has room for order, sign and size of the device's raw readings.
+    folds: whether it has room for order, sign and size of the device's raw readings. noise: what is to go into the
+    file besides, of programs that have keys for it.
     """
 
     title: ClassVar[str]
@@ -33,6 +45,7 @@ class Target(ABC):
 
     def __init__(self, saved: SavedCalibration, correction: Correction) -> None:
         self.saved, self.correction = saved, correction
+        self.noise: NoiseLines | None = None
 
     @abstractmethod
     def text(self) -> str:

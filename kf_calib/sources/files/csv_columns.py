@@ -299,6 +299,11 @@ class CsvColumns:
         """Whether a column is named as a gimbal or in a unit of angles, so that it goes before an attitude."""
         return any(own.ours == "angle" and (own.rank or own.unit) for own in self._meanings)
 
+    @property
+    def has_orientations(self) -> bool:
+        """Whether columns may be gimbal angles, in whatever unit, or an attitude."""
+        return bool(self._places("angle")) or all(self._places(part) for part in QUATERNION)
+
     def gimbals(self, *, needed: bool) -> QuantityColumns:
         """The angles by the usual names, else every column of an angle in the order of the header; none where there is
         none. Raises InputError where their unit is not told and they are needed."""

@@ -29,7 +29,7 @@ from kf_calib.sources.files.fields import as_columns
 from kf_calib.sources.files.line_parts import Account, LineReader
 from kf_calib.sources.files.sample_lines import CsvLines, JsonLines
 from kf_calib.sources.tables.columns import HOW
-from kf_calib.sources.text.encoding import Cutter, TextFile
+from kf_calib.sources.text.encoding import Cutter, TextFile, head_of
 from kf_calib.sources.text.heading import TextHeading
 from kf_calib.sources.text.units import Units
 from kf_calib.support.text import cut
@@ -48,8 +48,8 @@ class Lines:
     source: path of a file, or a binary stream, which is read as data arrive. overrides: bench metadata keys that win
     over those on the first line. columns: our name for each foreign column or key, for example
     ``{"acc_x[g]": "ax_g"}``. name: what messages call a stream. units: where the header names none, and the size of a
-    count. angles: False to do without platform angles; poses that come are then left out. Raises InputError where the
-    lines cannot be used.
+    count. angles: False to do without platform angles; poses that come are then left out; None to do so where a file
+    of CSV has no column of them. Raises InputError where the lines cannot be used.
     """
 
     def __init__(
@@ -60,15 +60,16 @@ class Lines:
         name: str = "standard input",
         *,
         units: Units | None = None,
-        angles: bool = True,
+        angles: bool | None = True,
     ) -> None:
         self.path = Path(source) if isinstance(source, str | PathLike) else None
         self._stream = None if isinstance(source, str | PathLike) else source
         self.name = str(self.path) if self.path else name
-        self._angles, self._said = angles, list[str]()
-        self._overrides, self._stated = overrides, columns
+        self._said, self._overrides, self._stated = list[str](), overrides, columns
         self._columns = {**as_columns(overrides.get("joints", "")), **columns}
         self._units = units or Units.of(overrides)
+        self._are_lacking = angles is None and self.path is not None and not _has_orientations(self.path, self._columns)
+        self._angles = angles is not False and not self._are_lacking
         self._begin_ns: int | None = None
         self._bench: Bench | None = None
         self._waiting: _Passage | None = None  # begun to learn of the bench, not yet iterated
@@ -152,7 +153,7 @@ class Lines:
         if self._angles:
             return bench_of(self.name, passage.parser, self._overrides, default)
         stated = stated_of(self.name, passage.parser, self._overrides, default)
-        bench, self._said = bench_without_angles(self.name, stated)
+        bench, self._said = bench_without_angles(self.name, stated, are_lacking=self._are_lacking)
         return bench
 
 
@@ -238,6 +239,17 @@ def reader_for(
 def is_json(first: str) -> bool:
     """Whether the first line that is not empty begins JSON lines."""
     return first.lstrip("\ufeff \t")[:1] in ("{", "[")
+
+
+def _has_orientations(path: Path, columns: Mapping[str, str]) -> bool:
+    """Whether a log may tell them: it is of JSON, or its columns may be angles or an attitude; also one that cannot be
+    read, which is said elsewhere."""
+    try:
+        lines = head_of(path).decode(errors="replace").splitlines()
+        first = next((line for line in lines if line.strip("\ufeff \t")), "{")
+        return is_json(first) or CsvColumns.of(TextHeading.of(lines), columns).has_orientations
+    except (OSError, InputError):
+        return True
 
 
 def _refuse_absent(stated: Mapping[str, str], header: Sequence[str]) -> None:

@@ -75,7 +75,8 @@ class Recording:
     fields: where the numbers are in messages of another type, for example ``"accel=/imu:acc.x,acc.y,acc.z"``
     (docs/bags.md).
     max_chunk_mb: chunks that unpack to more are passed over, and told.
-    angles: False to do without angles and attitudes; the file may then have none, and the batches have none.
+    angles: False to do without angles and attitudes; the file may then have none, and the batches have none. None to
+    do so where the file has none and states no axes.
     Raises InputError where the file, or what it holds, cannot be used.
     """
 
@@ -92,7 +93,7 @@ class Recording:
         temperature_topic: str | None = None,
         fields: Sequence[str] = (),
         max_chunk_mb: float = MAX_CHUNK_MB,
-        angles: bool = True,
+        angles: bool | None = True,
     ) -> None:
         self.path = Path(path)
         self.fraction, self._begin_ns = 0.0, None
@@ -112,7 +113,8 @@ class Recording:
             READINGS, "convert the readings to sensor_msgs/msg/Imu, or say where they are by --field"
         )
         self._pose = None
-        if angles:
+        self._are_lacking = angles is None and not self._parts.topics(POSES) and not self._parts.bench[0]
+        if angles is not False and not self._are_lacking:
             advice = (
                 "record the angles too, as sensor_msgs/msg/JointState by the same clock, say where they are by "
                 "--field, or do without them (--no-angles)"
@@ -259,7 +261,7 @@ class Recording:
             self.warnings.append(f"{damage}: only what options give is used.")
         stated = self._keys_of_bench(recorded, overrides, default)
         if self._pose is None:
-            bench, said = bench_without_angles(str(self.path), stated)
+            bench, said = bench_without_angles(str(self.path), stated, are_lacking=self._are_lacking)
             self.warnings += said
             return bench, conversion(recorded, stated)
         has_angles = self._parts.having(self._pose).has_angles(self._pose)

@@ -41,7 +41,7 @@ def open_table(
     accel_scale: float | None = None,
     angle_unit: str | None = None,
     g_unit: str | float = STANDARD_GRAVITY_MPS2,
-    angles: bool = True,
+    angles: bool | None = True,
     input: RawInput | None = None,
     where: str = "",
 ) -> Table:
@@ -55,7 +55,8 @@ def open_table(
     - g_unit: m/s^2 that 1 g in the table stands for, or ``local`` for the gravity of the bench.
     - input: what the device sends, where neither the header nor the other arguments say it.
     - where: column and text in it of the rows that count, as ``unit=7``; all if it is empty.
-    - angles: False to do without angles, attitudes and faces; those that the table has are not used.
+    - angles: False to do without angles, attitudes and faces; those that the table has are not used. None to do so
+      where no column tells them.
 
     Raises InputError where a cell, or what the columns are, cannot be understood.
     """
@@ -77,10 +78,13 @@ class Opening:
     their numbers told; raw: what the readings are in; has_unit: whether that is known. angles: whether orientations
     count."""
 
-    def __init__(self, columns: Columns, overrides: Mapping[str, str], units: Units, *, angles: bool = True) -> None:
+    def __init__(
+        self, columns: Columns, overrides: Mapping[str, str], units: Units, *, angles: bool | None = True
+    ) -> None:
         self.columns, self.grid, self.said = columns, columns.grid, list[str]()
         self.overrides, self.units, self.by_size = overrides, units, dict[int, str]()
-        self.has_unit, self.angles, self.raw = True, angles, PLAIN
+        self.are_lacking = angles is None and not columns.orientation
+        self.has_unit, self.angles, self.raw = True, angles is not False and not self.are_lacking, PLAIN
         self.warnings = [f"{self.grid.name}: {remark}." for remark in self.grid.remarks]
 
     def table(self) -> Table:
@@ -232,7 +236,7 @@ class Opening:
 
     def _bench(self) -> Bench:
         if not self.angles:
-            bench, said = bench_without_angles(self.grid.name, self.overrides)
+            bench, said = bench_without_angles(self.grid.name, self.overrides, are_lacking=self.are_lacking)
             self.warnings += said
             return bench
         has_angles = self.columns.orientation == "angles"

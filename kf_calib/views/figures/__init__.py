@@ -19,6 +19,7 @@ from kf_calib.views.figures.convergence import convergence, estimates, history  
 from kf_calib.views.figures.engines import allan_deviation, three_ways, whiteness  # noqa: E402
 from kf_calib.views.figures.explanations import detection_limits, hypotheses, suspects  # noqa: E402
 from kf_calib.views.figures.improvement import improvement, residuals_of_steps  # noqa: E402
+from kf_calib.views.figures.noise import noise  # noqa: E402
 from kf_calib.views.figures.orientations import (  # noqa: E402
     correlations,
     directions,
@@ -31,7 +32,7 @@ from kf_calib.views.figures.residuals import dwell, residuals, what_they_go_with
 
 __all__ = [
     "Figures", "allan_deviation", "convergence", "correlations", "detection_limits", "directions",
-    "dwell", "estimates", "figures", "history", "hypotheses", "improvement", "information", "on_the_sphere",
-    "plan", "predicted_sigmas", "residuals", "residuals_of_steps", "save", "suspects", "three_ways",
+    "dwell", "estimates", "figures", "history", "hypotheses", "improvement", "information", "noise",
+    "on_the_sphere", "plan", "predicted_sigmas", "residuals", "residuals_of_steps", "save", "suspects", "three_ways",
     "what_they_go_with", "whiteness",
 ]  # fmt: skip

@@ -19,12 +19,14 @@ from kf_calib.errors import InputError
 from kf_calib.estimation.engine_comparison import Comparison
 from kf_calib.estimation.results import Calibration
 from kf_calib.exchange.history import History
+from kf_calib.noise.rest_noise import RestNoise
 from kf_calib.support.output_files import write_whole
 from kf_calib.views.figures import style
 from kf_calib.views.figures.convergence import convergence, estimates, history
 from kf_calib.views.figures.engines import allan_deviation, three_ways, whiteness
 from kf_calib.views.figures.explanations import detection_limits, hypotheses, suspects
 from kf_calib.views.figures.improvement import improvement, residuals_of_steps
+from kf_calib.views.figures.noise import noise
 from kf_calib.views.figures.orientations import (
     correlations,
     directions,
@@ -58,7 +60,7 @@ def figures(result: Any) -> Figures:
         import_module(leaf)
         return figures(result)
     raise TypeError(f"there is no figure of {type(result).__name__}: give the result of calibrate, diagnose, improve, "
-                    "compare, plan, history or a fleet.")  # fmt: skip
+                    "compare, plan, history, noise or a fleet.")  # fmt: skip
 
 
 @figures.register
@@ -117,6 +119,11 @@ def _(made: Plan) -> Figures:
 @figures.register
 def _(calibrations: History) -> Figures:
     return {"The calibrations over time": lambda: history(calibrations)}
+
+
+@figures.register
+def _(found: RestNoise) -> Figures:
+    return {"Allan deviation at rest": lambda: noise(found)}
 
 
 def save(what: Figure | Figures, path: str | Path, kind: str = "", width_px: int | None = None) -> Path:
