@@ -117,7 +117,7 @@ def _applied(
     match reading.kind(path):
         case FileKind.SAMPLES:
             lines = _lines(correction, reading, str(path), unchecked)
-            with whole(copy) as part, part.open("wb") as file, _bytes_of(path) as source:
+            with whole(copy) as part, part.open("wb") as file, _bytes_of(path, reading.accel_topic or "") as source:
                 while block := source.read(_BLOCK_BYTES):
                     file.write(lines.push(block))
                 file.write(lines.rest())
@@ -144,14 +144,17 @@ def _table_keys(keys: dict[str, str], path: Path, input: RawInput) -> dict[str, 
     return keys if order is None else keys | {"channels": order}
 
 
-def _bytes_of(path: Path) -> BinaryIO | TextFile:
-    """A log as it is, byte for byte; one that is packed, or written in another encoding, in UTF-8."""
+def _bytes_of(path: Path, dataset: str) -> BinaryIO | TextFile:
+    """A log as it is, byte for byte; one that is packed, or written in another encoding, in UTF-8; of a container the
+    lines of a dataset."""
+    from kf_calib.sources.containers.opening import kind_of_container
     from kf_calib.sources.text.encoding import GZIP, TextFile, encoding_of
 
     try:
         with path.open("rb") as file:
             start = file.read(_BLOCK_BYTES)
-        return TextFile(path) if start[:2] == GZIP or encoding_of(start) != "utf-8" else path.open("rb")
+        is_plain = not kind_of_container(path) and start[:2] != GZIP and encoding_of(start) == "utf-8"
+        return path.open("rb") if is_plain else TextFile(path, dataset)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
 

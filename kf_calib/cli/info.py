@@ -14,7 +14,7 @@ from click.core import ParameterSource
 
 from kf_calib.cli.command import argument, command
 from kf_calib.cli.echo import print_result, progress
-from kf_calib.cli.options import OF_DWELLS, OF_MESSAGES, Json, ReadingOptions
+from kf_calib.cli.options import OF_DWELLS, Json, ReadingOptions, not_of_text
 from kf_calib.errors import BenchError, BlunderError, CountsError, KfCalibError
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
@@ -109,8 +109,8 @@ def _of_messages(ctx: click.Context, path: Path, reading: ReadingOptions, tick: 
 
     inventory = inventory_of(path, reading.fields)
     bench = {**inventory.bench, **reading.keys}
-    by_hand = inventory.has_readings and inventory.has_angles is None and not any(t.paths for t in inventory.topics)
     fields = _fields(inventory)
+    by_hand = inventory.has_readings and inventory.has_angles is None and not fields
     is_attitude = inventory.has_angles is False or any(" attitude=" in field for field in fields)
     lacking = _lacks(bench, not (is_attitude or by_hand or reading.no_angles))
     missing = {key: _NAMED[key][1] for key in lacking}
@@ -140,7 +140,7 @@ def _of_lines(
     from kf_calib.sources.files.inventory import inventory_of_lines
     from kf_calib.sources.files.lines import Lines
 
-    missing, words = {"accel_scale": reason} if reason else {}, _given(ctx, _not_of(ctx, OF_MESSAGES))
+    missing, words = {"accel_scale": reason} if reason else {}, _given(ctx, _not_of(ctx, not_of_text(path)))
     words += _options(told)
     units = reading.units(told=told)
     inventory = inventory_of_lines(path, reading.renamed, units)
@@ -173,7 +173,7 @@ def _of_lines(
         words.append("--accel-unit m/s2" if wrong is None else wrong.option)
     else:
         missing, words = _with_unit(missing, words, wrong)
-    if source is not None and dwells and wrong is None:
+    if source is not None and dwells is not None and wrong is None:
         missing, words = _tried(source, missing, words)
     return _overview(inventory, bench, dwells, missing, words, warnings)
 
@@ -227,7 +227,8 @@ def _overview(
     from kf_calib.views.overview import Overview
 
     if dwells is not None and not dwells:
-        missing[""] = "a stretch in which the platform stands still: --still-deg says what counts as standing still"
+        said = "a stretch in which the platform stands still: --still-deg says what counts as standing still"
+        missing.setdefault("", said)
     return Overview(inventory, bench, dwells, list(missing.values()), _replay(inventory.path, words), warnings)
 
 
@@ -255,7 +256,7 @@ def _of_table(ctx: click.Context, path: Path, reading: ReadingOptions, told: Sta
     table = survey(path, bench, reading.renamed, reading.units(told=told), angles=not reading.no_angles)
     lacking = _lacks(bench, table.orientation == "angles")
     missing = {"counts": reason} if reason else {}
-    words = _given(ctx, _not_of(ctx, OF_MESSAGES + OF_DWELLS))
+    words = _given(ctx, _not_of(ctx, not_of_text(path) + OF_DWELLS))
     words += _options(told)
     if table.is_by_hand and not reading.no_angles:
         words.append(_BY_HAND[0])
@@ -324,6 +325,7 @@ def _fields(inventory: Inventory) -> list[str]:
     """How the numbers would be named that are in messages which tell what they have, but not what it is; a quaternion
     in them is taken for the attitude."""
     from kf_calib.sources.files.fields import attitude_in, has_time, known_fields
+    from kf_calib.sources.text.names import meaning_of
 
     if not any(topic.paths for topic in inventory.topics):
         return []
@@ -333,6 +335,7 @@ def _fields(inventory: Inventory) -> list[str]:
     unknown = [topic for topic in inventory.topics if known_fields(topic.schema) is None]  # an Imu has its own attitude
     quaternions = [(topic.name, path, has_time(topic.paths)) for topic in unknown if (path := attitude_in(topic.paths))]
     if not quaternions:
-        return [*accel, "--field angles=TOPIC:OUTER,MIDDLE,INNER@TIME"]
+        may_be_angles = accel or any(meaning_of(path).ours == "angle" for each in unknown for path in each.paths)
+        return [*accel, *(["--field angles=TOPIC:OUTER,MIDDLE,INNER@TIME"] if may_be_angles else [])]
     name, path, is_timed = max(quaternions, key=lambda each: each[2])
     return [*accel, f"--field attitude={name}:{path}{'' if is_timed else '@TIME'}"]

@@ -165,7 +165,8 @@ class ReadingOptions:
         "--where", metavar="COLUMN=VALUE",
         help="The rows of a table or a log in lines that count, where it has several sensors: --where I=0.")] = None
     accel_topic: Annotated[str | None, _of_input(
-        "--accel-topic", metavar="TOPIC", help="Topic of the accelerometer, where there are several.")] = None
+        "--accel-topic", metavar="TOPIC", help="Topic of the accelerometer, where there "
+        "are several; or dataset of a container.")] = None
     pose_topic: Annotated[str | None, _of_input(
         "--pose-topic", metavar="TOPIC", help="Topic of the platform's angles or attitude.")] = None
     temperature_topic: Annotated[str | None, _of_input(
@@ -199,14 +200,16 @@ class ReadingOptions:
     def kind(self, path: Path) -> FileKind:
         from kf_calib.sources.opening import kind_of
 
-        return kind_of(path, self.renamed, has_rate=self.rate_hz is not None)
+        dataset = self.accel_topic or ""
+        return kind_of(path, self.renamed, has_rate=self.rate_hz is not None, dataset=dataset)
 
     def units(self, input: RawInput | None = None, told: Mapping[str, str] = MappingProxyType({})) -> Units:
         """Units of a table or a log; told: bench keys beside those of the options."""
         from kf_calib.sources.text.units import Units
 
         return replace(Units.of({**self.keys, **told}, self.angle_unit, self.g_unit, input),
-                       rate_hz=self.rate_hz, where=told.get("where", self.where or ""))  # fmt: skip
+                       rate_hz=self.rate_hz, where=told.get("where", self.where or ""),
+                       dataset=self.accel_topic or "")  # fmt: skip
 
     def messages(self, path: Path, angles: bool | None, input: RawInput | None = None) -> Recording:
         """The recording of samples at a path; angles: whether it must have angles."""
@@ -230,7 +233,8 @@ class ReadingOptions:
         from kf_calib.sources.tables.opening import open_table
 
         return open_table(path, {**told, **self.keys}, columns=self.renamed, angles=angles, input=input,
-                          angle_unit=self.angle_unit, g_unit=self.g_unit, where=self.where or "")  # fmt: skip
+                          angle_unit=self.angle_unit, g_unit=self.g_unit, where=self.where or "",
+                          dataset=self.accel_topic or "")  # fmt: skip
 
     def opened(self, path: Path, input: RawInput | None = None) -> Recording | Lines | Table:
         """The recording, log or table at a path; input: what the device sends, where nothing else states it."""
@@ -240,10 +244,10 @@ class ReadingOptions:
         columns, angles = self.renamed, self.angles
         match self.kind(path):
             case FileKind.TABLE:
-                refuse_given(OF_MESSAGES + OF_DWELLS + _OF_LINES, f"{path} is a table of mean readings")
+                refuse_given(not_of_text(path) + OF_DWELLS + _OF_LINES, f"{path} is a table of mean readings")
                 return self.table(path, {}, angles, input)
             case FileKind.SAMPLES:
-                refuse_given(OF_MESSAGES, f"{path} is a log in lines of text")
+                refuse_given(not_of_text(path), f"{path} is a log in lines of text")
                 return Lines(path, self.keys, columns, units=self.units(input), angles=angles)
             case FileKind.RECORDING:
                 refuse_given(_OF_TEXT, f"{path} is no table (.csv, .xlsx) and no log in lines of text")
@@ -402,6 +406,13 @@ OF_MESSAGES = ("accel_topic", "pose_topic", "temperature_topic", "fields", "max_
 OF_DWELLS = ("joints", "settle_s", "still_deg", "gate", "gate_sigma")
 """Options that act on text and spreadsheets only, on logs in lines only, on files of messages only, and where dwells
 are to be found."""
+
+
+def not_of_text(path: Path) -> tuple[str, ...]:
+    """Options of messages, but for that by which the dataset of a container is chosen."""
+    from kf_calib.sources.containers.opening import kind_of_container
+
+    return OF_MESSAGES[kind_of_container(path) is not None :]
 
 
 def refuse_given(names: Sequence[str], what: str) -> None:

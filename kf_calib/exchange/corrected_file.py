@@ -190,7 +190,7 @@ def apply_to_table(
     """Write the ``copy``, wholly or not at all; arguments as of ``open_table`` and ``apply_to_file``."""
     if units.where:
         raise InputError(f"{path}: a corrected copy has every row, of one sensor: put its rows in a file (--where).")
-    grid = grid_of(path)
+    grid = grid_of(path, units.dataset)
     meanings = Columns.of(grid, columns, Numbers.of(grid))
     table = Opening(meanings, overrides, units, angles=False).table()
     means = table.orientations.mean_mps2
@@ -203,8 +203,10 @@ def apply_to_table(
         raise InputError(f"{path}: {said}.")
     force = correction.of_readings(means, warmth if correction.needs_temperature else None)
     places = meanings.places(*READINGS)
-    write = _to_excel if path.suffix.lower() in (".xlsx", ".xlsm") else _to_text
-    write(path, copy, grid, places, force)
+    if path.suffix.lower() in (".xlsx", ".xlsm"):
+        _to_excel(path, copy, grid, places, force)
+    else:
+        _to_text(unpacked(path, units.dataset), path, copy, grid, places, force)
     known = warmth[np.isfinite(warmth)]
     used = (float(known.min()), float(known.max())) if correction.needs_temperature else None
     return Applied(len(force), int(np.count_nonzero(~np.isfinite(force).all(axis=1))), used)
@@ -236,9 +238,8 @@ def _to_excel(path: Path, copy: Path, grid: Grid, places: list[int], force: Floa
     write_whole(copy, content.getvalue())
 
 
-def _to_text(path: Path, copy: Path, grid: Grid, places: list[int], force: Floats) -> None:
+def _to_text(content: bytes, path: Path, copy: Path, grid: Grid, places: list[int], force: Floats) -> None:
     """Write a copy of a text."""
-    content = unpacked(path)
     encoding, plain_codec = encoding_of(content), "utf-8-sig" if content.startswith(BOM_UTF8) else "utf-8"
     codec, errors = (encoding, "strict") if encoding.startswith("utf-16") else (plain_codec, "surrogateescape")
     lines = content.decode(codec, errors).splitlines(keepends=True)

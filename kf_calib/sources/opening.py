@@ -12,6 +12,7 @@ from types import MappingProxyType
 
 from kf_calib.bench.streams import Source
 from kf_calib.errors import InputError
+from kf_calib.sources.containers.opening import dataset_of, kind_of_container
 from kf_calib.sources.files.contents import CALIBRATION_FORMAT
 from kf_calib.sources.files.csv_columns import CsvColumns
 from kf_calib.sources.files.lines import Lines, is_json
@@ -19,6 +20,7 @@ from kf_calib.sources.files.mcap_file import HEAD_BYTES, is_lines
 from kf_calib.sources.files.mcap_records import MAGIC
 from kf_calib.sources.files.record_files import SQLITE, first_bytes
 from kf_calib.sources.files.recording import Recording
+from kf_calib.sources.files.ros1_bag import ROS1_BAG
 from kf_calib.sources.tables.grid import OLD_SUFFIXES, TEXT_SUFFIXES, ZIP
 from kf_calib.sources.tables.opening import open_table
 from kf_calib.sources.text.encoding import head_of
@@ -47,23 +49,30 @@ class FileKind(Enum):
 
 
 def kind_of(
-    path: str | PathLike[str], columns: Mapping[str, str] = MappingProxyType({}), *, has_rate: bool = False
+    path: str | PathLike[str],
+    columns: Mapping[str, str] = MappingProxyType({}),
+    *,
+    has_rate: bool = False,
+    dataset: str = "",
 ) -> FileKind:
     """What a file is, by its beginning; columns: our names of foreign ones, as far as they are stated. has_rate:
-    whether a rate of its rows is stated, which only samples have."""
+    whether a rate of its rows is stated, which only samples have. dataset: of a container, the one that is meant."""
     file = Path(path)
     if not file.is_file():
         return FileKind.RECORDING
-    if first_bytes(file).startswith((MAGIC, SQLITE)):  # whatever its name ends in
+    if first_bytes(file).startswith((MAGIC, SQLITE, ROS1_BAG)):  # whatever its name ends in
         return FileKind.RECORDING
+    is_container = kind_of_container(file) is not None
     try:
-        head = head_of(file)
+        if is_container and dataset_of(file, dataset).is_log:
+            return FileKind.SAMPLES
+        head = head_of(file, dataset)
     except OSError:  # said where the file is opened to be read
         return FileKind.RECORDING
     suffix = Path(file.stem if file.suffix.lower() == ".gz" else file).suffix.lower()
-    if head.startswith(ZIP) or suffix in OLD_SUFFIXES:
+    if not is_container and (head.startswith(ZIP) or suffix in OLD_SUFFIXES):
         return FileKind.TABLE
-    if not (suffix in TEXT_SUFFIXES or is_lines(head[:HEAD_BYTES])):
+    if not (is_container or suffix in TEXT_SUFFIXES or is_lines(head[:HEAD_BYTES])):
         return FileKind.RECORDING
     lines = head.decode("utf-8", errors="replace").splitlines()
     first = next((k for k, line in enumerate(lines) if line.lstrip("\ufeff").strip()), None)

@@ -15,6 +15,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from kf_calib.dwells.rest_in_readings import DwellSummary
+from kf_calib.sources.containers.opening import ContainerKind
 from kf_calib.sources.files.inventory import Inventory, Topic
 from kf_calib.sources.tables.survey import ColumnFound, Survey
 from kf_calib.support.text import counted, cut
@@ -22,6 +23,7 @@ from kf_calib.views.json import clean
 from kf_calib.views.terminal import ConsoleTable, note
 
 _FORMATS = {"mcap": "MCAP", "db3": "SQLite of ROS 2", "lines": "lines of text", "mcap+db3": "MCAP and SQLite of ROS 2"}
+_FORMATS |= {"bag": "bag of ROS 1"} | {kind.name.lower(): f"a file of {kind.value}" for kind in ContainerKind}
 _SHOWN = 40  # dwells
 _PATHS = 12  # of a message
 

@@ -361,6 +361,11 @@ class CsvColumns:
             "none (--no-angles)."
         )
 
+    def unknown(self, used: Container[int]) -> list[str]:
+        """The names of columns that nothing here knows: not those of a gyroscope, say, which are of no use here."""
+        return [name for at, (name, own) in enumerate(zip(self.names, self._meanings, strict=True))
+                if name and at not in used and not own.other]  # fmt: skip
+
     def _places(self, ours: str) -> list[int]:
         """Return the columns whose names say that quantity."""
         return [at for at, own in enumerate(self._meanings) if own.ours == ours]

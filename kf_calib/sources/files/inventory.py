@@ -12,13 +12,15 @@ from mcap.records import Channel
 from numpy.typing import NDArray
 
 from kf_calib.errors import MissingExtraError
+from kf_calib.sources.containers.opening import dataset_of, datasets_in, kind_of_container
 from kf_calib.sources.files.contents import POSES, READINGS, USABLE_SCHEMAS, Contents, fields_by_role
 from kf_calib.sources.files.field_messages import CDR, ENCODINGS, LOG_TIME_BEFORE, parser_of
 from kf_calib.sources.files.fields import FieldError, paths_of
 from kf_calib.sources.files.lines import Lines
 from kf_calib.sources.files.mcap_file import McapFile, Warn
 from kf_calib.sources.files.mcap_records import MAX_CHUNK_MB, MessageFinder
-from kf_calib.sources.files.record_files import RecordFile, files_of, open_record_file
+from kf_calib.sources.files.record_files import RecordFile, files_of, first_bytes, open_record_file
+from kf_calib.sources.files.ros1_bag import ROS1_BAG
 from kf_calib.sources.files.sqlite_bag import SqliteBag
 from kf_calib.sources.text.units import Units
 
@@ -111,10 +113,6 @@ class Inventory:
     angles: int | None = None
     is_bare: bool = False
 
-    @property
-    def is_lines(self) -> bool:
-        return self.format == "lines"
-
 
 def inventory_of(path: Path, fields: Sequence[str] = ()) -> Inventory:
     """All of a file or a bag's folder, read once. fields: as of a ``Recording``.
@@ -136,9 +134,15 @@ def inventory_of(path: Path, fields: Sequence[str] = ()) -> Inventory:
         has_angles = contents.has_angles(poses[0]) if poses and has_angles is None else has_angles
     for topic in topics.values():
         topic.settle()
-    kind = "+".join(dict.fromkeys("db3" if isinstance(part, SqliteBag) else "mcap" for part in parts))
+    kind = "+".join(dict.fromkeys(map(_kind, parts)))
     size = sum(part.size for part in parts)
     return Inventory(path, kind, files, size, list(topics.values()), bench, has_readings, has_angles, warnings)
+
+
+def _kind(part: RecordFile) -> str:
+    if isinstance(part, SqliteBag):
+        return "db3"
+    return "bag" if first_bytes(part.path).startswith(ROS1_BAG) else "mcap"
 
 
 def inventory_of_lines(
@@ -160,8 +164,22 @@ def inventory_of_lines(
     has_angles = said.has_angles if topics[1].count else None
     topics[1].name = "platform angles" if has_angles else "platform attitude"
     met = [topic for topic in topics if topic.count]
-    return Inventory(path, "lines", [path], path.stat().st_size, met, said.metadata, True, has_angles, lines.warnings,
+    kind = kind_of_container(path)
+    form, met = (kind.name.lower(), [*met, *_other_datasets(path, units)]) if kind else ("lines", met)
+    return Inventory(path, form, [path], path.stat().st_size, met, said.metadata, True, has_angles, lines.warnings,
                      said.pose_width if has_angles else None, said.is_bare)  # fmt: skip
+
+
+def _other_datasets(path: Path, units: Units | None) -> Iterator[Topic]:
+    """Return the datasets of a container beside that which is read, by their names."""
+    read = dataset_of(path, units.dataset if units else "").name
+    for dataset in datasets_in(path):
+        if dataset.name != read:
+            topic = Topic(dataset.name, "", "")
+            topic.add(dataset.times_ns())
+            topic.settle()
+            topic.count = len(dataset)
+            yield topic
 
 
 def _count(file: RecordFile, contents: Contents, topics: dict[str, Topic], warn: Warn) -> None:

@@ -68,7 +68,7 @@ class Lines:
         self._said, self._overrides, self._stated = list[str](), overrides, columns
         self._columns = {**as_columns(overrides.get("joints", "")), **columns}
         self._units = units or Units.of(overrides)
-        self._are_lacking = angles is None and self.path is not None and not _has_orientations(self.path, self._columns)
+        self._are_lacking = angles is None and self.path is not None and not self._has_orientations(self.path)
         self._angles = angles is not False and not self._are_lacking
         self._begin_ns: int | None = None
         self._bench: Bench | None = None
@@ -128,7 +128,7 @@ class Lines:
     def _begin(self) -> _Passage:
         try:
             if self.path:
-                stream: BinaryIO | TextFile = TextFile(self.path)
+                stream: BinaryIO | TextFile = TextFile(self.path, self._units.dataset)
             elif self._stream is not None:
                 stream, self._stream = self._stream, None
             else:
@@ -147,6 +147,16 @@ class Lines:
         if self._units.g == "local":
             local_mps2 = bench_without_angles(self.name, self._overrides)[0].gravity_mps2
         return reader_for(lines, self._columns, account, angles=self._angles, units=self._units, local_mps2=local_mps2)
+
+    def _has_orientations(self, path: Path) -> bool:
+        """Whether a log may tell them: it is of JSON, or its columns may be angles or an attitude; also one that cannot
+        be read, which is said elsewhere."""
+        try:
+            lines = head_of(path, self._units.dataset).decode(errors="replace").splitlines()
+            first = next((line for line in lines if line.strip("\ufeff \t")), "{")
+            return is_json(first) or CsvColumns.of(TextHeading.of(lines), self._columns).has_orientations
+        except (OSError, InputError):
+            return True
 
     def _describe_bench(self, passage: _Passage) -> Bench:
         default = self._units.input
@@ -241,17 +251,6 @@ def is_json(first: str) -> bool:
     return first.lstrip("\ufeff \t")[:1] in ("{", "[")
 
 
-def _has_orientations(path: Path, columns: Mapping[str, str]) -> bool:
-    """Whether a log may tell them: it is of JSON, or its columns may be angles or an attitude; also one that cannot be
-    read, which is said elsewhere."""
-    try:
-        lines = head_of(path).decode(errors="replace").splitlines()
-        first = next((line for line in lines if line.strip("\ufeff \t")), "{")
-        return is_json(first) or CsvColumns.of(TextHeading.of(lines), columns).has_orientations
-    except (OSError, InputError):
-        return True
-
-
 def _refuse_absent(stated: Mapping[str, str], header: Sequence[str]) -> None:
     if absent := next((theirs for theirs in stated if theirs not in header), None):
         raise InputError(
@@ -278,7 +277,8 @@ class _Passage:
         """What was taken for what, where that is not plain, and what was not used."""
         told = f"{'; '.join(self._said)}. {HOW}." if self._said else ""
         trouble = self._file.trouble if self._file else ""
-        return [sentence for sentence in (told, trouble) if sentence] + self.account.sentences()
+        chosen = [f"{said}." for said in (self._file.said if self._file else ())]
+        return chosen + [sentence for sentence in (told, trouble) if sentence] + self.account.sentences()
 
     @contextmanager
     def closed_on_failure(self) -> Iterator[None]:

@@ -349,15 +349,13 @@ def _span(first_ns: int, last_ns: int) -> str:
     return f", about {seconds:.3g} s of readings," if 0 <= seconds < _LONGEST_SPAN_S else ""
 
 
-_ROS1, _GZIP = b"#ROSBAG V", b"\x1f\x8b"
+_GZIP = b"\x1f\x8b"
 HEAD_BYTES = 1024
 """Bytes from its start by which a file is known."""
 
 
 def advice(path: Path, head: bytes) -> str:
     """What a file is that begins with ``head``, and how to make a recording of it."""
-    if head.startswith(_ROS1):
-        return f"{path} is a bag of ROS 1: convert it by {_by_rosbags(path)}, and give OUT."
     if is_lines(head):
         made = path.with_suffix(".mcap") if path.suffix != ".mcap" else path.with_name(f"{path.stem}_recorded.mcap")
         return (
@@ -370,10 +368,6 @@ def advice(path: Path, head: bytes) -> str:
         f"{path} is not an MCAP file (its first bytes differ): give one, or have kf-calib record make one of CSV or "
         "JSON lines."
     )
-
-
-def _by_rosbags(bag: Path) -> str:
-    return f"`rosbags-convert --src {bag} --dst OUT --dst-storage mcap` (after `pip install rosbags`)"
 
 
 def is_lines(head: bytes) -> bool:

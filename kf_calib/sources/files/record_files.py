@@ -34,6 +34,7 @@ from kf_calib.sources.files.mcap_records import (
     allowed_sizes,
     parse_record,
 )
+from kf_calib.sources.files.ros1_bag import ROS1_BAG, mcap_of_bag
 from kf_calib.sources.files.sqlite_bag import SqliteBag
 from kf_calib.support.text import cut, number_from
 
@@ -57,13 +58,15 @@ class RecordFile(Protocol):
 
 
 def open_record_file(path: Path, max_chunk: int, usable: frozenset[str]) -> RecordFile:
-    """The MCAP or .db3 file at ``path``. usable: types of messages wanted, and topics.
+    """The MCAP or .db3 file at ``path``, or a bag of ROS 1. usable: types of messages wanted, and topics.
 
-    Raises InputError where it is neither.
+    Raises InputError where it is none of these.
     """
-    place = path
+    place, said = path, ""
     if first_bytes(path).startswith(_ZSTD):
         place = _unpacked(path, max_chunk)
+    elif first_bytes(path).startswith(ROS1_BAG):
+        place, said = mcap_of_bag(path)
     file: RecordFile
     try:
         if first_bytes(place).startswith(SQLITE):
@@ -73,6 +76,7 @@ def open_record_file(path: Path, max_chunk: int, usable: frozenset[str]) -> Reco
     except BaseException:
         _remover(place, path)()
         raise
+    file.trouble = " ".join(filter(None, (file.trouble, said)))
     weakref.finalize(file, _remover(place, path))
     return file
 

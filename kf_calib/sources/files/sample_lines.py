@@ -67,7 +67,7 @@ class CsvLines(LineReader):
             *self._temperature.at,
         }
         columns.refuse_several_units(used)
-        self._account.leave_out(name for at, name in enumerate(columns.names) if name and at not in used)
+        self._account.leave_out(columns.unknown(used))
 
     @property
     def advice(self) -> str:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from kf_calib.errors import InputError
+from kf_calib.sources.containers.opening import kind_of_container
 from kf_calib.sources.tables.spreadsheet import sheets_of
 from kf_calib.sources.text.encoding import text_of, too_large
 from kf_calib.sources.text.heading import delimiter_in, header_in, is_comment
@@ -83,8 +84,8 @@ def _as_text(cell: Cell) -> str:
     return f"{cell:g}" if isinstance(cell, float) else str("" if cell is None else cell).strip()
 
 
-def grid_of(table: Any) -> Grid:
-    """The cells of a file, a structured array, a DataFrame or a mapping of columns."""
+def grid_of(table: Any, dataset: str = "") -> Grid:
+    """The cells of a file, a structured array, a DataFrame or a mapping of columns; dataset: of a container."""
     if isinstance(table, str | PathLike):
         path = Path(table)
         try:
@@ -94,6 +95,8 @@ def grid_of(table: Any) -> Grid:
             raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
         if path.suffix.lower() in OLD_SUFFIXES:
             raise InputError(f"{path}: files of the kind {path.suffix} are not read: save it as .xlsx or .csv.")
+        if kind_of_container(path):
+            return replace(_of_text(path, dataset), path=path)
         is_excel = start.startswith(ZIP)
         if path.stat().st_size > _LARGEST[is_excel]:
             raise too_large(path)
@@ -101,9 +104,9 @@ def grid_of(table: Any) -> Grid:
     return _of_columns(table)
 
 
-def _of_text(path: Path) -> Grid:
+def _of_text(path: Path, dataset: str = "") -> Grid:
     """Return the cells of a CSV file: any usual encoding and delimiter, with or without lines above the header."""
-    lines = text_of(path, _LARGEST[0]).splitlines()
+    lines = text_of(path, _LARGEST[0], dataset).splitlines()
     if labels := Labels.of(lines):
         return _headed(str(path), _labelled(lines, labels))
     delimiter, skipped = delimiter_in(lines)

@@ -44,6 +44,7 @@ def open_table(
     angles: bool | None = True,
     input: RawInput | None = None,
     where: str = "",
+    dataset: str = "",
 ) -> Table:
     """A table of orientations as a source: a row a dwell, with its mean readings and its angles, attitude or face.
 
@@ -55,12 +56,13 @@ def open_table(
     - g_unit: m/s^2 that 1 g in the table stands for, or ``local`` for the gravity of the bench.
     - input: what the device sends, where neither the header nor the other arguments say it.
     - where: column and text in it of the rows that count, as ``unit=7``; all if it is empty.
+    - dataset: of a file that holds several; the largest with readings if it is empty.
     - angles: False to do without angles, attitudes and faces; those that the table has are not used. None to do so
       where no column tells them.
 
     Raises InputError where a cell, or what the columns are, cannot be understood.
     """
-    grid = grid_of(table).chosen(where)
+    grid = grid_of(table, dataset).chosen(where)
     numbers = Numbers.of(grid)
     meanings = Columns.of(grid, columns, numbers)
     given = {"accel_unit": accel_unit, "accel_scale": accel_scale}

@@ -35,7 +35,7 @@ _FORMULA = rb"<f(?:%b)*+(?: ?/>|>%b*+</f>)" % (_ATTRIBUTE, _TEXT)
 _NUMBER = rb"(?!-0*<)-?\d{1,20}(?:\.\d{0,25})?+(?:[eE][+-]?\d{1,3})?+"  # -0 is the whole number 0 for a parser
 _CELL = (
     rb'<c r="([A-Z]{1,3})[1-9]\d{0,6}"(?: s="(0|[1-9]\d{0,5})")?+'
-    rb'(?:(?: t="([ns])")?+(?: ?/>|>(?:%b)?+<v>(%b)</v></c>)'
+    rb'(?:(?: t="([ns])")?+(?: ?/>|></c>|>(?:%b)?+<v>(%b)</v></c>)'
     rb'| t="inlineStr"><is><t(?: xml:space="preserve")?+>(%b++)</t></is></c>)'
 ) % (_FORMULA, _NUMBER, _TEXT)  # column, style, kind, number and text
 _CELLS, _NO_GROUPS = re.compile(_CELL), re.sub(rb"\((?!\?)", rb"(?:", _CELL)

@@ -93,7 +93,7 @@ def survey(
     Raises InputError where not even the columns can be understood, or the rows are samples.
     """
     units = units or Units()
-    grid = grid_of(path).chosen(units.where)
+    grid = grid_of(path, units.dataset).chosen(units.where)
     table_columns = Columns.of(grid, columns, Numbers.of(grid))
     angles = angles and bool(table_columns.orientation)
     opening = Opening(table_columns, _complete(overrides, len(table_columns.angles)), units, angles=angles)

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Self
 
 from kf_calib.errors import InputError
+from kf_calib.sources.containers.opening import DatasetText, dataset_of, kind_of_container
 
 LONGEST_LINE_BYTES = 1 << 20
 GZIP, _UTF16 = b"\x1f\x8b", (b"\xff\xfe", b"\xfe\xff")
@@ -24,15 +25,21 @@ _NOT_UNPACKED = (EOFError, zlib.error, gzip.BadGzipFile)
 
 
 class TextFile:
-    """Opened to be read once. trouble: a sentence if its end cannot be unpacked. Raises OSError."""
+    """Opened to be read once. dataset: of a container, that which is read, or the one that is taken where it is empty.
 
-    def __init__(self, path: Path) -> None:
+    trouble: a sentence if its end cannot be unpacked. said: what of a container was taken, where that was a choice.
+    Raises OSError, and InputError of a container.
+    """
+
+    def __init__(self, path: Path, dataset: str = "") -> None:
         self._size = max(path.stat().st_size, 1)
+        arrays = dataset_of(path, dataset) if kind_of_container(path) else None
+        self.trouble, self._has_ended, self.said = "", False, arrays.said if arrays else ()
         self._raw = path.open("rb")
         try:
+            self._text = DatasetText(arrays) if arrays else None
             packed = self._raw.peek(2).startswith(GZIP)
-            self._file = gzip.GzipFile(fileobj=self._raw) if packed else self._raw
-            self.trouble, self._has_ended = "", False
+            self._file = self._text or (gzip.GzipFile(fileobj=self._raw) if packed else self._raw)
             self._head = self._unpacked(_HEAD_BYTES)
         except BaseException:
             self._raw.close()
@@ -49,7 +56,7 @@ class TextFile:
     @property
     def fraction(self) -> float:
         """The share of the file that has been read."""
-        return min(self._raw.tell() / self._size, 1.0)
+        return self._text.fraction if self._text else min(self._raw.tell() / self._size, 1.0)
 
     def read(self, size: int) -> bytes:
         """The next bytes, about so many; none at the end."""
@@ -75,19 +82,19 @@ class TextFile:
         return bytes(block)
 
 
-def head_of(path: Path) -> bytes:
-    """The beginning of a file: of one that is packed by gzip, of what is in it. Raises OSError."""
-    with TextFile(path) as file:
+def head_of(path: Path, dataset: str = "") -> bytes:
+    """The beginning of a file: of one that is packed by gzip, of what is in it. dataset, raises: as of ``TextFile``."""
+    with TextFile(path, dataset) as file:
         return file.read(_HEAD_BYTES)
 
 
-def text_of(path: Path, largest: int) -> str:
-    """The whole text of a file, without bytes of zero at its end, as a power cut leaves them.
+def text_of(path: Path, largest: int, dataset: str = "") -> str:
+    """The whole text of a file, without bytes of zero at its end, as a power cut leaves them; dataset: of a container.
 
     Raises InputError where it has more bytes than ``largest`` or is no text, OSError where it cannot be read.
     """
     content = bytearray()
-    with TextFile(path) as file:
+    with TextFile(path, dataset) as file:
         while len(content) <= largest and (block := file.read(_BLOCK_BYTES)):
             content += block
     if len(content) > largest:
@@ -100,9 +107,11 @@ def text_of(path: Path, largest: int) -> str:
     return content.decode("utf-8", errors="replace").removeprefix("\ufeff")
 
 
-def unpacked(path: Path) -> bytes:
-    """The bytes of a file of text as they stand in it, or in what gzip has packed there. Raises OSError, and InputError
-    where its end cannot be unpacked."""
+def unpacked(path: Path, dataset: str = "") -> bytes:
+    """The bytes of a file of text as they stand in it, or in what gzip has packed there; of a container the lines of a
+    dataset. Raises OSError, and InputError where its end cannot be unpacked."""
+    if kind_of_container(path):
+        return b"".join(dataset_of(path, dataset).lines())
     content = path.read_bytes()
     try:
         return gzip.decompress(content) if content.startswith(GZIP) else content

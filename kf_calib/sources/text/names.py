@@ -63,11 +63,13 @@ _TRUTH = _words("true truth ref reference wahr soll expected истинное э
 _QUATERNION = _words("q quat quaternion quaternions кватернион")
 _ESTIMATED = _words("roll pitch yaw heading euler attitude крен тангаж курс")
 _ANGLE = _words(
-    "outer middle inner aussen mitte mittlerer innen innere innerer aeussere ausserer angle winkel gimbal roll pitch "
-    "yaw heading azimuth elevation tilt achse axis q phi theta psi rotation rot table rahmen "
+    "outer middle inner aussen mitte mittlerer innen innere innerer aeussere ausserer angle angles winkel gimbal roll "
+    "pitch yaw heading azimuth elevation tilt achse axis q phi theta psi rotation rot table rahmen "
     "угол рамка рамки ось наружный наружная внешний внешняя внутренний внутренняя крен тангаж курс азимут"
 )
-_TIME = _words("time zeit date datum stamp timestamp uhrzeit datetime elapsed zeitstempel время дата")
+_TIME = _words(
+    "time times zeit date datum stamp stamps timestamp timestamps uhrzeit datetime elapsed zeitstempel время дата"
+)
 _LENGTH = _words("dwell duration dauer length lange длительность")
 _AXIS = _words("achse axis ось")
 """Of a gimbal only where no other word stands beside it."""

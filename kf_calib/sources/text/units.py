@@ -37,7 +37,7 @@ class Units:
     accel_scale: size of one count, in ``accel`` (m/s^2 if that is None). g: m/s^2 that 1 g stands for, or ``local``.
     input: what the device of a calibration sends, which holds where none of this is stated. is_restated: whether
     ``accel`` goes before the names of columns. counts: how the numbers are to be read.
-    rate_hz: of rows without a time. where: column and cell of the rows that count, as ``I=0``.
+    rate_hz: of rows without a time. where: column and cell of the rows that count, as ``I=0``. dataset: of a container.
     """
 
     accel: str | None = None
@@ -49,6 +49,7 @@ class Units:
     counts: str = SIGNED
     rate_hz: float | None = None
     where: str = ""
+    dataset: str = ""
 
     @classmethod
     def of(

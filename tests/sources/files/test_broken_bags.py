@@ -127,7 +127,7 @@ BROKEN: dict[str, tuple[Callable[[Path], Path], tuple[str, ...], str]] = {
     "a compressed file cut short": (packed, (), "run.db3.zstd does not decompress"),
     "an empty file": (content(b""), (), "is empty"),
     "zeros": (content(bytes(4000)), (), "is not an MCAP file"),
-    "a bag of ROS 1": (content(b"#ROSBAG V2.0\n....", "old.bag"), (), "is a bag of ROS 1: convert it by"),
+    "a bag of ROS 1": (content(b"#ROSBAG V2.0\n....", "old.bag"), (), "is a bag of ROS 1 that cannot be read"),
     "the head of an MCAP file": (content(b"\x89MCAP0\r\n"), (), "has no accelerometer topic"),
     "an MCAP file cut short": (cut(0.01, sqlite=False), (), "and is not whole"),
     "lines of text": (content(b'{"time_s": 1}\n', "a.jsonl"), (), "no platform angles in 1 lines: name"),
