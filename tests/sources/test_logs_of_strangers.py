@@ -3,119 +3,172 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from helpers.foreign_logs import (
+    COMMA_TABLES,
+    FOREIGN_LOGS,
+    RATE_HZ,
+    SECONDS,
+    UP,
+    B,
+    Columns,
+    G,
+    K,
+    comma_table,
+    constant,
+    rates,
+    readings,
+    texts,
+    three,
+)
+from helpers.long_runs import slow
+from logs_page import COMMAND, PAGE, VERDICT, page
 
+from kf_calib.bench.streams import Table
 from kf_calib.errors import CountsError, InputError
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.sources.opening import FileKind, kind_of, opened
 from kf_calib.sources.tables.opening import open_table
-from kf_calib.sources.text.names import meanings_of
+from kf_calib.sources.text.names import Meaning, meaning_of, meanings_of
 
-G = 9.80665
-K, B = np.array([1.01, 0.99, 1.005]), np.array([0.2, -0.15, 0.3])
-UP = np.array([*np.eye(3), *-np.eye(3), [0.6, 0.8, 0], [0, 0.6, -0.8], [-0.8, 0, 0.6], [0.6, -0.8, 0], [0, 0.6, 0.8],
-               [0.8, 0, 0.6]])  # fmt: skip
-GYRO, MAG, ATTITUDE = ["0.01", "-0.02", "0.005"], ["20.1", "-3.2", "44.0"], ["0", "0", "0", "1"]
-STILL, TURNING = 300, 60
+GRAVITY = {"gravity_mps2": str(G)}
+IN_BRIEF = "rostopic echo -p", "Klipper", "groups of HDF5", "a bag of ROS 1"
 
 
-@cache
-def readings() -> np.ndarray:
-    rng, parts = np.random.default_rng(3), list[np.ndarray]()
-    for up in UP:
-        force = K * G * up / np.linalg.norm(up) + B
-        parts += [force + rng.normal(0.0, 0.02, (STILL, 3)), force + rng.normal(0.0, 3.0, (TURNING, 3))]
-    return np.concatenate(parts)
-
-
-def written(
-    path: Path, header: str, cells: Sequence[str], unit_mps2: float = 1.0, time: float = 1.0, digits: int = 5
-) -> Path:
-    """Write a log: cells of a row in which {t} is the time and {x} {y} {z} are the readings, in this unit."""
-    lines = [header]
-    for k, (x, y, z) in enumerate((readings() / unit_mps2).tolist()):
-        at = 1_700_000_000 * time + 0.01 * time * k if time > 1.0 else 0.01 * k
-        row, time_text = ",".join(cells), f"{at:.6f}" if time == 1.0 else str(round(at))
-        xyz = [f"{value:.{digits}f}" for value in (x, y, z)]
-        lines.append(row.format(t=time_text, x=xyz[0], y=xyz[1], z=xyz[2]))
-    path.write_text("\n".join(lines) + "\n")
+def written(path: Path, columns: Columns) -> Path:
+    path.write_text(comma_table(columns))
     return path
 
 
-XYZ = ["{x}", "{y}", "{z}"]
-LAYOUTS = {
-    "Kalibr": ("timestamp,omega_x,omega_y,omega_z,alpha_x,alpha_y,alpha_z", ["{t}", *GYRO, *XYZ], 1.0, 1e9),
-    "EuRoC": (
-        "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
-        "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]", ["{t}", *GYRO, *XYZ], 1.0, 1e9,
-    ),
-    "EuRoC without units": (
-        "timestamp,w_RS_S_x,w_RS_S_y,w_RS_S_z,a_RS_S_x,a_RS_S_y,a_RS_S_z", ["{t}", *GYRO, *XYZ], 1.0, 1e9,
-    ),
-    "rostopic echo -p": (
-        "%time,field.header.seq,field.header.stamp,field.orientation.x,field.orientation.y,field.orientation.z,"
-        "field.orientation.w,field.orientation_covariance0,field.angular_velocity.x,field.angular_velocity.y,"
-        "field.angular_velocity.z,field.linear_acceleration.x,field.linear_acceleration.y,"
-        "field.linear_acceleration.z,field.linear_acceleration_covariance0,field.linear_acceleration_covariance1",
-        ["{t}", "7", "{t}", *ATTITUDE, "-1.0", *GYRO, *XYZ, "0.0", "0.1"], 1.0, 1e9,
-    ),
-    "bagpy": (
-        "Time,header.seq,orientation.x,orientation.y,orientation.z,orientation.w,angular_velocity.x,angular_velocity.y,"
-        "angular_velocity.z,linear_acceleration.x,linear_acceleration.y,linear_acceleration.z",
-        ["{t}", "7", *ATTITUDE, *GYRO, *XYZ], 1.0, 1.0,
-    ),
-    "nine axes": ("time_s,ax,ay,az,gx,gy,gz,mx,my,mz", ["{t}", *XYZ, *GYRO, *MAG], 1.0, 1.0),
-    "MPU-6050": ("millis,AcX,AcY,AcZ,Tmp,GyX,GyY,GyZ", ["{t}", *XYZ, "25.3", *GYRO], G, 1e3),
-    "true beside": ("time_s,x_true (g),y_true (g),z_true (g),x_mean (g),y_mean (g),z_mean (g)",
-                    ["{t}", "0", "0", "1", *XYZ], G, 1.0),
-    "two stamps": ("time_arrival,time_device,ax (g),ay (g),az (g)", ["5", "{t}", *XYZ], G, 1.0),
+def values(path: Path) -> np.ndarray:
+    found = calibrate(opened(path, GRAVITY, angles=False)).parameters
+    return np.array([found[name].value for name in ("K1", "K2", "K3", "b1", "b2", "b3", "nu1", "theta3", "phi3")])
+
+
+@cache
+def plain_values(folder: Path) -> np.ndarray:
+    """Of a file in our own names."""
+    columns = {"time_s": texts(SECONDS, "{:.2f}"), **three("a{}_mps2", readings())}
+    return values(written(folder / "plain.csv", columns))
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
+    return plain_values(tmp_path_factory.getbasetemp())
+
+
+@pytest.mark.parametrize("name", FOREIGN_LOGS)
+def test_a_log_has_the_calibration_of_the_same_run_in_our_own_names(
+    name: str, plain: np.ndarray, tmp_path: Path
+) -> None:
+    log = FOREIGN_LOGS[name]
+    found = values(log.at(tmp_path))
+    np.testing.assert_allclose(found, plain, rtol=0.0, atol=10.0 * log.digits)
+    assert found[:3] == pytest.approx(K, abs=5e-4) and found[3:6] == pytest.approx(B, abs=5e-3)
+
+
+@pytest.mark.parametrize("name", COMMA_TABLES)
+def test_readings_and_times_are_those_of_the_file(name: str, tmp_path: Path) -> None:
+    path = FOREIGN_LOGS[name].at(tmp_path)
+    assert kind_of(path) is FileKind.SAMPLES
+    batches = list(opened(path, GRAVITY, angles=False))
+    np.testing.assert_allclose(np.concatenate([batch.accel.values for batch in batches]), readings(), atol=2e-9)
+    times = np.concatenate([batch.accel.time_ns for batch in batches])
+    np.testing.assert_allclose(np.diff(times), 1e9 / RATE_HZ, atol=1e3)  # of two stamps the even one
+
+
+@pytest.mark.parametrize("name", [*IN_BRIEF, *slow(*(name for name in FOREIGN_LOGS if name not in IN_BRIEF))])
+def test_the_command_of_the_page_gives_its_verdict(name: str, run: Any, tmp_path: Path) -> None:
+    log = FOREIGN_LOGS[name]
+    path = log.at(tmp_path)
+    command = COMMAND.format(log.file)
+    assert f"```sh\n{command}\n```" in PAGE.read_text(encoding="utf-8")
+    code, out, err = run(*[path if word == log.file else word for word in command.split()[1:]])
+    assert code == 0, err
+    assert " ".join(VERDICT.split()) in " ".join(out.split())
+
+
+@pytest.mark.parametrize("name", [*IN_BRIEF, *slow(*(name for name in FOREIGN_LOGS if name not in IN_BRIEF))])
+def test_the_command_that_info_proposes_works(name: str, run: Any, tmp_path: Path) -> None:
+    path = FOREIGN_LOGS[name].at(tmp_path)
+    code, out, err = run("info", path, "--gravity", G, "--json")
+    assert code == 0, err
+    code, out, err = run(*json.loads(out)["command"].split()[1:])
+    assert code == 0 and " ".join(VERDICT.split()) in " ".join(out.split()), err
+
+
+def test_the_page_is_that_of_these_files() -> None:
+    assert PAGE.read_text(encoding="utf-8") == page(), "python tools/logs_page.py renews it"
+
+
+COUNTED = {
+    "Klipper": ({"#time": texts(SECONDS), **three("accel_{}", 1e3 * readings(), form="{:.0f}")},
+                "--accel-scale 0.001"),
+    "blackbox": ({"loopIteration": texts(range(len(SECONDS)), "{}"), " time (us)": texts(1e6 * SECONDS + 2e7, "{:.0f}"),
+                  **constant("0", " axisP[0]", " axisP[1]", " axisP[2]"), **rates(" gyroADC[{}]", "012"),
+                  **three(" accSmooth[{}]", 2048 * readings() / G, "012", "{:.0f}"),
+                  **constant("IDLE", " failsafePhase (flags)"), **rates(" {}", ("roll", "pitch", "heading"))},
+                 f"--accel-unit g --accel-scale {1 / 2048}"),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_a_log_is_read_without_an_option(layout: str, tmp_path: Path) -> None:
-    path = written(tmp_path / "log.csv", *LAYOUTS[layout])
-    assert kind_of(path) is FileKind.SAMPLES
-    result = calibrate(opened(path, {"gravity_mps2": str(G)}, angles=False))
-    found = result.parameters
-    assert [found[f"K{i}"].value for i in (1, 2, 3)] == pytest.approx(K, abs=5e-4)
-    assert [found[f"b{i}"].value for i in (1, 2, 3)] == pytest.approx(B, abs=5e-3)
-
-
-@pytest.mark.parametrize(
-    ("header", "cells", "unit_mps2", "option"),
-    [("#time,accel_x,accel_y,accel_z", ["{t}", *XYZ], 1e-3, "--accel-scale 0.001"),
-     ("loopIteration, time (us), gyroADC[0], gyroADC[1], gyroADC[2], accSmooth[0], accSmooth[1], accSmooth[2]",
-      ["0", "{t}", *GYRO, *XYZ], G / 2048, f"--accel-unit g --accel-scale {1 / 2048}")],
-)  # fmt: skip
-def test_the_usual_size_of_a_count_is_told_and_right(
-    header: str, cells: list[str], unit_mps2: float, option: str, tmp_path: Path
-) -> None:
-    path = written(tmp_path / "log.csv", header, cells, unit_mps2, 1e6 if "us" in header else 1.0, digits=0)
-    keys = {"gravity_mps2": str(G)}
+@pytest.mark.parametrize("name", COUNTED)
+def test_the_usual_size_of_a_count_is_told_and_right(name: str, tmp_path: Path) -> None:
+    columns, option = COUNTED[name]
+    path = written(tmp_path / "log.csv", columns)
     with pytest.raises(CountsError, match=option) as told:
-        opened(path, keys, angles=False).bench  # noqa: B018
-    found = calibrate(opened(path, keys | told.value.keys, angles=False)).parameters
+        opened(path, GRAVITY, angles=False).bench  # noqa: B018 (the bench is read by the asking)
+    found = calibrate(opened(path, GRAVITY | told.value.keys, angles=False)).parameters
     assert [found[f"K{i}"].value for i in (1, 2, 3)] == pytest.approx(K, abs=5e-4)
 
 
 @pytest.mark.parametrize(
     ("header", "ours"),
     [("q0,q1,q2,q3", "qw qx qy qz"), ("Quat_q0,Quat_q1,Quat_q2,Quat_q3", "qw qx qy qz"),
-     ("QuatW,QuatX,QuatY,QuatZ", "qw qx qy qz"), ("s_ax,s_ay,w_RS_S_x", "sx sy "),
+     ("QuatW,QuatX,QuatY,QuatZ", "qw qx qy qz"), ("quat_w,quat_x,quat_y,quat_z", "qw qx qy qz"),
+     ("Quaternion.w,Quaternion.x,Quaternion.y,Quaternion.z", "qw qx qy qz"), ("s_ax,s_ay,w_RS_S_x", "sx sy "),
      ("orientation.x,orientation.y,orientation.z,orientation.w", "   "),
      ("q1,q2,q3", "angle angle angle"), ("a_x,a_y,a_z,s_x,s_y,s_z", "ax ay az sx sy sz"),
      ("ax,ay,az,mx,my,mz", "ax ay az   "), ("m1,m2,m3", "ax ay az"),
-     ("accSmooth[0],accSmooth[1],accSmooth[2],debug[0]", "ax ay az ")],
+     ("accSmooth[0],accSmooth[1],accSmooth[2],debug[0]", "ax ay az "),
+     ("timestamps,f_x,f_y,f_z", "time ax ay az"), ("angles_1,angles_2,angles_3", "angle angle angle")],
 )  # fmt: skip
 def test_names_are_understood_together(header: str, ours: str) -> None:
     assert " ".join(own.ours for own in meanings_of(header.split(","), {})) == ours
+
+
+def test_joints_of_a_robot_are_gimbals_still() -> None:
+    names = ("q1 [deg]", "q2 [deg]", "q3 [deg]", "axis 1", "Achse 2")
+    assert {own.ours for own in meanings_of(names, {})} == {"angle"}
+    assert meaning_of("axisP[1]").ours == ""
+
+
+def test_what_is_stated_goes_before_what_is_guessed() -> None:
+    names = ("acc1_x [g]", "acc2_x [g]", "Roll", "gyro_x")
+    assert [own.ours for own in meanings_of(names, {})] == ["ax", "ax", "", ""]
+    stated = meanings_of(names, {"acc2_x [g]": "ax", "Roll": "outer_deg"})
+    assert stated[:3] == [Meaning("", "g"), Meaning("ax", "g"), Meaning("angle", "deg", 1)]
+
+
+def test_two_accelerometers_are_a_choice_that_a_hint_makes_possible(tmp_path: Path) -> None:
+    columns = {"time_s": texts(SECONDS), **three("acc1_{}", readings()), **three("acc2_{}", readings())}
+    path = written(tmp_path / "log.csv", columns)
+    with pytest.raises(InputError, match="say which it is, for example by --column 'acc1_x=ax'"):
+        opened(path, {"gravity_mps2": "9.81"}, angles=False).bench  # noqa: B018 (the bench is read by the asking)
+
+
+def test_a_table_of_nine_axes_is_of_the_accelerometer_alone(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    rows = [[G * x for x in up] + [0.1, 0.2, 0.3, 20.0, 3.0, 44.0] for up in UP[:3].tolist()]
+    path.write_text("ax,ay,az,gx,gy,gz,mx,my,mz\n" + "\n".join(",".join(map(str, row)) for row in rows))
+    source = opened(path, GRAVITY, angles=False)
+    assert isinstance(source, Table)
+    np.testing.assert_allclose(source.orientations.mean_mps2, G * UP[:3], atol=1e-9)
 
 
 def two_units(path: Path) -> Path:
@@ -148,7 +201,7 @@ def test_rows_of_a_table_are_chosen(tmp_path: Path) -> None:
     for x, y, z in (K * UP + B / G).tolist():
         rows += [f"7,{x},{y},{z}", f"8,{x + 1},{y},{z}"]
     path.write_text("\n".join(rows))
-    table = open_table(path, {"gravity_mps2": str(G)}, where="unit=7", angles=False)
+    table = open_table(path, GRAVITY, where="unit=7", angles=False)
     np.testing.assert_allclose(table.orientations.mean_mps2, G * (K * UP) + B, rtol=1e-9)
     with pytest.raises(InputError, match="no row has '9' in column"):
-        open_table(path, {"gravity_mps2": str(G)}, where="unit=9", angles=False)
+        open_table(path, GRAVITY, where="unit=9", angles=False)

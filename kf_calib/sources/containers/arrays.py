@@ -104,12 +104,12 @@ def _name_pandas_blocks(group: ArrayGroup) -> None:
 def numpy_arrays(path: Path) -> ArrayGroup:
     """The arrays of a .npy or .npz file; objects in them are not read, for that could run code."""
     root = ArrayGroup()
-    loaded: Any = np.load(path, allow_pickle=False, mmap_mode="r" if path.suffix == ".npy" else None)
-    if isinstance(loaded, np.ndarray):
-        root.put(() if loaded.dtype.names else (path.stem,), loaded)
-        return root
-    with loaded:
-        _refuse_large(path, sum(each.file_size for each in loaded.zip.infolist()))
+    with path.open("rb") as file:  # NumPy leaves its own open where it is damaged
+        loaded: Any = np.load(file, allow_pickle=False)
+        if isinstance(loaded, np.ndarray):
+            root.put(() if loaded.dtype.names else (path.stem,), loaded)
+            return root
+        _refuse_large(path, sum(part.file_size for part in loaded.zip.infolist()))
         for name in loaded.files:
             root.put((name,), loaded[name])
     return root

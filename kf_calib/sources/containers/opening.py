@@ -40,7 +40,7 @@ def kind_of_container(path: Path) -> ContainerKind | None:
         return ContainerKind.HDF5
     if start.startswith(b"MATLAB 5.0") or (path.suffix.lower() == ".mat" and start[:1] in (b"\0", b"\xe8")):
         return ContainerKind.MATLAB
-    if start.startswith(b"\x93NUMPY") or (start.startswith(b"PK\x03\x04") and path.suffix.lower() == ".npz"):
+    if start.startswith(b"\x93NUMPY") or (start.startswith(b"PK") and path.suffix.lower() == ".npz"):
         return ContainerKind.NUMPY
     if start.startswith(b"ULog\x01\x12\x35"):
         return ContainerKind.ULOG

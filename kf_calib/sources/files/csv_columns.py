@@ -37,7 +37,7 @@ EXAMPLE = "time_s,ax_mps2,ay_mps2,az_mps2,outer_deg,middle_deg,inner_deg,tempera
 _TIME_ALONE = ("t", "sec", "secs", "millis", "micros")
 _OF_STEPS = ((0.0, 1.0, "s"), (1e3, 1e6, "us"), (1e6, 1e9, "ns"))
 """Steps that tell the unit of stamps: between them and in another unit, rows would be no samples."""
-_MANY, _ALIKE_RAD, _MOST = 500, 0.1, 0.9
+_MANY, _ALIKE_RAD, _MOST = 500, 0.1, 0.5
 _FEWEST_ROWS, _MOST_UNITS, _APART = 20, 8, 5.0  # rows and labels of several sensors, and sigmas between these
 _MARKS_OF_TABLES = ("count", "face", "sd", *SPREADS)
 
@@ -207,7 +207,7 @@ class CsvColumns:
 
     @property
     def are_alike(self) -> bool:
-        """Whether the readings of nearly all rows are as those before, as of a sensor that lies still between turns; a
+        """Whether the readings of most rows are as those before, as of a sensor that lies still between turns; a
         row a dwell would change from one to the next."""
         places = [at for ours in READINGS for at in self._places(ours)]
         if len(places) != 3 or len(self.rows) < _MANY:

@@ -27,9 +27,9 @@ from kf_calib.errors import BenchError, CountsError, InputError
 from kf_calib.sources.files.csv_columns import CsvColumns
 from kf_calib.sources.files.fields import as_columns
 from kf_calib.sources.files.line_parts import Account, LineReader
-from kf_calib.sources.files.sample_lines import CsvLines, JsonLines
+from kf_calib.sources.files.sample_lines import POSE_KEYS, CsvLines, JsonLines
 from kf_calib.sources.tables.columns import HOW
-from kf_calib.sources.text.encoding import Cutter, TextFile, head_of
+from kf_calib.sources.text.encoding import Cutter, TextFile, head_of, holds_any
 from kf_calib.sources.text.heading import TextHeading
 from kf_calib.sources.text.units import Units
 from kf_calib.support.text import cut
@@ -149,12 +149,15 @@ class Lines:
         return reader_for(lines, self._columns, account, angles=self._angles, units=self._units, local_mps2=local_mps2)
 
     def _has_orientations(self, path: Path) -> bool:
-        """Whether a log may tell them: it is of JSON, or its columns may be angles or an attitude; also one that cannot
-        be read, which is said elsewhere."""
+        """Whether a log may tell them: its columns may be angles or an attitude, or a key of JSON names these; also of
+        one that cannot be read, which is said elsewhere."""
         try:
             lines = head_of(path, self._units.dataset).decode(errors="replace").splitlines()
             first = next((line for line in lines if line.strip("\ufeff \t")), "{")
-            return is_json(first) or CsvColumns.of(TextHeading.of(lines), self._columns).has_orientations
+            if is_json(first):
+                theirs = [name for name, ours in self._columns.items() if ours in POSE_KEYS]
+                return holds_any(path, [f'"{name}"'.encode() for name in (*POSE_KEYS, *theirs)])
+            return CsvColumns.of(TextHeading.of(lines), self._columns).has_orientations
         except (OSError, InputError):
             return True
 

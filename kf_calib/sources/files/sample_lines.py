@@ -155,6 +155,8 @@ _BARE = ("accel", "accel_counts", "accel_raw")
 """Readings whose name tells no unit: options state it."""
 _ANGLES = {"angles_rad": 1.0, "angles_deg": math.pi / 180.0}
 _ATTITUDE = "attitude_xyzw"
+POSE_KEYS = (*_ANGLES, _ATTITUDE)
+"""Under which a line of JSON has an orientation."""
 _TEMPERATURE = "temperature_c"
 _KNOWN = frozenset([*TIME_DECIMALS, *_ACCEL, *_BARE, *_ANGLES, _ATTITUDE, _TEMPERATURE])
 

@@ -9,7 +9,7 @@ import codecs
 import gzip
 import re
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Self
 
@@ -86,6 +86,18 @@ def head_of(path: Path, dataset: str = "") -> bytes:
     """The beginning of a file: of one that is packed by gzip, of what is in it. dataset, raises: as of ``TextFile``."""
     with TextFile(path, dataset) as file:
         return file.read(_HEAD_BYTES)
+
+
+def holds_any(path: Path, words: Sequence[bytes]) -> bool:
+    """Whether any of these words, in UTF-8, is in a text. Raises OSError."""
+    longest, tail = max(map(len, words)), b""
+    with TextFile(path) as file:
+        while block := file.read(_BLOCK_BYTES):
+            tail += block
+            if any(word in tail for word in words):
+                return True
+            tail = tail[-longest:]
+    return False
 
 
 def text_of(path: Path, largest: int, dataset: str = "") -> str:
