@@ -81,6 +81,25 @@ def parameters_of(state: Floats) -> Floats:
     return parameters
 
 
+def frame_turn(state: Floats, reference: Floats) -> Floats:
+    """The small rotation (3,) in rad of the platform's frame that brings an affine state (12,) nearest to another.
+
+    A frame turned by w has the sensitivities s_i + s_i × w, so that w solves Σ |s_i + s_i × w − r_i|² = min. Which
+    frame the platform's angles refer to is a choice, and turns all three axes alike.
+    """
+    axes, wanted = (each.reshape(3, 4)[:, :3] for each in (state, reference))
+    crossed = np.cross(axes[:, None, :], np.eye(3)[None]).transpose(0, 2, 1)  # s × w is this matrix times w
+    solved = np.linalg.lstsq(crossed.reshape(9, 3), (wanted - axes).ravel(), rcond=None)[0]
+    return np.asarray(solved, np.float64)
+
+
+def turned(state: Floats, turn_rad: Floats) -> Floats:
+    """The affine state (12,) in a platform's frame that is turned by a small rotation (3,)."""
+    result = state.copy().reshape(3, 4)
+    result[:, :3] += np.cross(result[:, :3], turn_rad)
+    return result.ravel()
+
+
 def jacobian(state: Floats) -> Floats:
     """The Jacobian d parameters / d state (12, 12) at an affine state in closed form, by which covariances are
     transformed."""

@@ -20,6 +20,7 @@ from typing import Literal
 import numpy as np
 
 from kf_calib.bench import paper_parameters
+from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import Source
 from kf_calib.diagnosis.hypothesis_table import SURE
 from kf_calib.diagnosis.missing_effect import diagnose
@@ -33,9 +34,11 @@ from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.results import Calibration, Parameter, format_p
 from kf_calib.support.text import as_html
+from kf_calib.support.units import si
 
 _NEEDED = 0.01  # an effect is needed where its removal raises chi-squared significantly at this level
 _NEAR_THRESHOLD = 8.0  # sigma; an effect near the threshold is found only if noise enlarges it: estimates are too large
+_TURNS = 0.5  # sigma of an angle, by which explanations turn the frame where that is said
 
 Because = Literal["consistent", "unknown", "ambiguous", "asked", "undetermined"]
 By = Literal["diagnosis", "user"]
@@ -113,7 +116,7 @@ class Alternative:
 
 @dataclass(frozen=True)
 class Spread:
-    """The range of one of the twelve parameters over equally good explanations (SI).
+    """The range of one of the twelve parameters over equally good explanations (SI), all in one frame of the platform.
 
     parameter: the one with the largest sigma among them. lowest, highest: its extreme values.
     """
@@ -209,8 +212,7 @@ class Improvement:
     def reason(self) -> str:
         """The same in one or two sentences."""
         verdict, names = self.diagnosis.verdict, " and ".join(each.name for each in self.alternatives)
-        widest = max(self.spreads, key=lambda spread: spread.sigmas, default=None)
-        differ = f"; the twelve differ by up to {widest.sigmas:.1f} sigma ({widest.parameter.symbol})" if widest else ""
+        differ = self._difference
         rivals = _rivals(self.diagnosis)
         if rivals and self.because == "ambiguous":
             addition = "none was added (--accept-first takes the likeliest)"
@@ -224,13 +226,43 @@ class Improvement:
             return f"{verdict} No effect is sure: none was added (--accept-first takes the likeliest).{equals}"
         return f"{verdict}{equals}"
 
+    @property
+    def _difference(self) -> str:
+        """Return how far the equally good explanations are apart in the twelve, as the end of a sentence."""
+        widest = max(self.spreads, key=lambda spread: spread.sigmas, default=None)
+        if widest is None:
+            return ""
+        differ = f"the twelve differ by up to {widest.sigmas:.1f} sigma ({widest.parameter.symbol})"
+        sigmas = [each.parameter.sigma or 0.0 for each in self.spreads if each.parameter.unit == "rad"]
+        turn_rad = max((float(np.linalg.norm(turn)) for turn in self._frame_turns), default=0.0)
+        if turn_rad < _TURNS * max(sigmas, default=np.inf):
+            return f"; {differ}"
+        turn_arcsec = turn_rad / si("1 arcsec")
+        return f"; they turn the platform's frame by {turn_arcsec:.2g} arcsec, a choice, and beyond that {differ}"
+
+    @cached_property
+    def _frame_turns(self) -> list[Floats]:
+        """Return how far the platform's frame of each alternative is turned to that of the first, rad; none where not
+        all of the twelve are determined."""
+        parameters = [[each.result.parameters[symbol].value for symbol in paper_parameters.SYMBOLS]
+                      for each in self.alternatives]  # fmt: skip
+        if not parameters or any(value is None for own in parameters for value in own):
+            return []
+        states = [paper_parameters.state_of(np.array(own, float)) for own in parameters]
+        return [paper_parameters.frame_turn(state, states[0]) for state in states]
+
     @cached_property
     def spreads(self) -> tuple[Spread, ...]:
-        """The range over all alternatives of each of the twelve parameters that all of them determine."""
-        spreads = list[Spread]()
-        for symbol in paper_parameters.SYMBOLS if self.alternatives else ():
+        """The range over all alternatives of each of the twelve parameters that all of them determine; in the frame of
+        the first."""
+        spreads, turned = list[Spread](), list[Floats]()
+        for alternative, turn in zip(self.alternatives, self._frame_turns, strict=False):
+            values = [alternative.result.parameters[symbol].value for symbol in paper_parameters.SYMBOLS]
+            state = paper_parameters.turned(paper_parameters.state_of(np.array(values, float)), turn)
+            turned.append(paper_parameters.parameters_of(state))
+        for k, symbol in enumerate(paper_parameters.SYMBOLS if self.alternatives else ()):
             parameters = [each.result.parameters[symbol] for each in self.alternatives]
-            values = [p.value for p in parameters if p.value is not None]
+            values = [float(own[k]) for own in turned] or [p.value for p in parameters if p.value is not None]
             if len(values) == len(parameters):
                 spreads.append(Spread(max(parameters, key=lambda p: p.sigma or 0.0), min(values), max(values)))
         return tuple(spreads)

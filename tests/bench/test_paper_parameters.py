@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.synthetic import NOMINAL, sensitivities
+from scipy.spatial.transform import Rotation
 
 from kf_calib.bench import paper_parameters
 from kf_calib.errors import BenchError
@@ -61,3 +62,20 @@ def test_parameters_and_state_are_one_to_one_whatever_way_the_axes_point() -> No
             paper_parameters.parameters_of(state + steps) - paper_parameters.parameters_of(state - steps)
         ).T / 2e-6
         np.testing.assert_allclose(paper_parameters.jacobian(state), differences, rtol=1e-4, atol=1e-4)
+
+
+def test_a_turn_of_the_frame_is_found_and_undone() -> None:
+    """Against scipy's rotations: turning the frame changes angles alone, and comparing in one frame leaves nothing."""
+    rng = np.random.default_rng(2)
+    parameters = paper_parameters.nominal() + rng.normal(0.0, 1e-3, 12)
+    state = paper_parameters.state_of(parameters)
+    turn = np.array([5e-5, -2e-5, 3e-5])
+    moved = state.reshape(3, 4).copy()
+    moved[:, :3] = Rotation.from_rotvec(-turn).apply(moved[:, :3])
+    found = paper_parameters.frame_turn(moved.ravel(), state)
+    np.testing.assert_allclose(found, -turn, rtol=1e-3)
+    back = paper_parameters.parameters_of(paper_parameters.turned(moved.ravel(), found))
+    np.testing.assert_allclose(back, parameters, atol=1e-8)
+    other = paper_parameters.parameters_of(moved.ravel())
+    assert abs(other - parameters)[[0, 1, 4, 5, 8, 9]].max() > 1e-5
+    np.testing.assert_allclose(other[[2, 3, 6, 7, 10, 11]], parameters[[2, 3, 6, 7, 10, 11]], rtol=1e-12)
