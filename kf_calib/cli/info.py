@@ -127,7 +127,7 @@ def _of_messages(ctx: click.Context, path: Path, reading: ReadingOptions, tick: 
     words = _given(ctx, _not_of(ctx, ("columns", "g_unit"))) + fields + [_NAMED[key][0] for key in lacking]
     words += ["--no-angles"] if by_hand and not reading.no_angles else []
     missing, words = _with_unit(missing, words, wrong)
-    return _overview(inventory, bench, dwells, missing, words, warnings)
+    return _overview(inventory, bench, dwells, missing, words, warnings, lacking)
 
 
 def _of_lines(
@@ -149,7 +149,8 @@ def _of_lines(
         angles, missing["angles"] = False, _BY_HAND[1].format(or_else=" or attitude")
         words.append(_BY_HAND[0])
     axes = _AXES.get(inventory.angles or 0, _NAMED["axes"][0])
-    for key in _lacks(bench, bool(inventory.has_angles) and angles):
+    lacking = _lacks(bench, bool(inventory.has_angles) and angles)
+    for key in lacking:
         missing[key] = _NAMED[key][1]
         words.append(axes if key == "axes" else _NAMED[key][0])
     provisional = {"axes": shlex.split(axes)[1]} if angles and inventory.has_angles else {}
@@ -175,7 +176,7 @@ def _of_lines(
         missing, words = _with_unit(missing, words, wrong)
     if source is not None and dwells is not None and wrong is None:
         missing, words = _tried(source, missing, words)
-    return _overview(inventory, bench, dwells, missing, words, warnings)
+    return _overview(inventory, bench, dwells, missing, words, warnings, lacking)
 
 
 def _tried(source: Source, missing: dict[str, str], words: list[str]) -> tuple[dict[str, str], list[str] | None]:
@@ -223,13 +224,20 @@ def _overview(
     missing: dict[str, str],
     words: list[str] | None,
     warnings: list[str],
+    lacking: Sequence[str],
 ) -> Overview:
     from kf_calib.views.overview import Overview
 
     if dwells is not None and not dwells:
         said = "a stretch in which the platform stands still: --still-deg says what counts as standing still"
         missing.setdefault("", said)
-    return Overview(inventory, bench, dwells, list(missing.values()), _replay(inventory.path, words), warnings)
+    command = _replay(inventory.path, words)
+    return Overview(inventory, bench, dwells, list(missing.values()), command, warnings, _examples(command, lacking))
+
+
+def _examples(command: str, lacking: Sequence[str]) -> tuple[str, ...]:
+    """Return the options of a command that have example values."""
+    return tuple(option for key in lacking if (option := _NAMED[key][0].split()[0]) in command)
 
 
 def _replay(path: Path, words: Sequence[str] | None) -> str:
@@ -278,7 +286,8 @@ def _of_table(ctx: click.Context, path: Path, reading: ReadingOptions, told: Sta
         examples = {"axes": shlex.split(axes)[1], "gravity_mps2": str(STANDARD_GRAVITY_MPS2)}
         keys = {key: examples[key] for key in lacking} | _bench_keys(told)
         missing, words = _tried(reading.table(path, keys, bool(table.orientation)), missing, words)
-    return TableOverview(table, bench, list(missing.values()), _replay(path, words))
+    command = _replay(path, words)
+    return TableOverview(table, bench, list(missing.values()), command, _examples(command, lacking))
 
 
 def _lacks(bench: Mapping[str, str], has_angles: bool) -> list[str]:

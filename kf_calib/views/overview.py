@@ -33,6 +33,7 @@ class Overview:
     """What is in a recording, what it lacks to be evaluated, and the command that evaluates it then.
 
     dwells: None where it cannot be said which there are. bench: keys of the file's record with those of options.
+    examples: options of the command whose values nobody stated.
     """
 
     inventory: Inventory
@@ -41,6 +42,7 @@ class Overview:
     missing: list[str]
     command: str
     warnings: list[str] = field(default_factory=list[str])
+    examples: tuple[str, ...] = ()
 
 
 def overview_object(overview: Overview) -> dict[str, Any]:
@@ -52,7 +54,8 @@ def overview_object(overview: Overview) -> dict[str, Any]:
             "files": [str(file) for file in inventory.files], "bytes": inventory.size,
             "topics": [_topic_object(topic) for topic in inventory.topics], "bench": overview.bench,
             "dwells": None if overview.dwells is None else [vars(dwell) for dwell in overview.dwells],
-            "missing": overview.missing, "command": overview.command, "warnings": overview.warnings,
+            "missing": overview.missing, "command": overview.command, "examples": list(overview.examples),
+            "warnings": overview.warnings,
         }
     )  # fmt: skip
 
@@ -86,8 +89,15 @@ def overview_report(overview: Overview) -> RenderableType:
     parts += [note(said) for said in overview.warnings]
     parts += [Text(f"Missing: {said}") for said in overview.missing]
     if overview.command:
-        parts.append(Text(f"{'Then try' if overview.missing else 'Try'}: {overview.command}"))
+        parts.append(Text(_proposal(overview)))
     return Group(*parts)
+
+
+def _proposal(overview: Overview | TableOverview) -> str:
+    """Return the command to try, with what in it is only an example."""
+    if not overview.examples:
+        return f"{'Then try' if overview.missing else 'Try'}: {overview.command}"
+    return f"Then try, with your own {' and '.join(overview.examples)}:\n{overview.command}"
 
 
 def _topic_table(topics: Sequence[Topic]) -> ConsoleTable:
@@ -164,12 +174,13 @@ _UNITS = {"c": "°C", "k": "K", "f": "°F", "count": "counts", "m/s2": "m/s^2"}
 @dataclass(frozen=True)
 class TableOverview:
     """What is in a table, what it lacks to be evaluated, and the command that evaluates it then. bench: its keys as
-    options state them."""
+    options state them. examples: as of an ``Overview``."""
 
     survey: Survey
     bench: dict[str, str]
     missing: list[str]
     command: str
+    examples: tuple[str, ...] = ()
 
 
 def table_object(overview: TableOverview) -> dict[str, Any]:
@@ -182,7 +193,7 @@ def table_object(overview: TableOverview) -> dict[str, Any]:
             "orientation": survey.orientation or None, "bench": overview.bench,
             "dwells": [vars(row) | {"pose": list(row.pose), "up": list(row.up)} for row in survey.rows],
             "missing": overview.missing,
-            "command": overview.command, "warnings": survey.warnings,
+            "command": overview.command, "examples": list(overview.examples), "warnings": survey.warnings,
         }
     )  # fmt: skip
 
@@ -210,7 +221,7 @@ def table_report(overview: TableOverview) -> RenderableType:
         )
     parts += [Text(f"Missing: {said}") for said in overview.missing]
     if overview.command:
-        parts.append(Text(f"{'Then try' if overview.missing else 'Try'}: {overview.command}"))
+        parts.append(Text(_proposal(overview)))
     return Group(*parts)
 
 
