@@ -27,6 +27,7 @@ from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.nuisance_states import rotation_map, tangents
 
 _STEP = 1e-6  # relative to g, of the differences that give the bending
+_ROUNDING = 1e-7  # of differences, and of constants that follow the force: below it an effect is linear in it
 _ABRUPT = 0.5  # a bending beyond this is a jump of an effect's column, which has no derivative
 _FARTHEST_RAD = 0.3  # of one step of an attitude
 _UNTOLD = 10.0  # setting errors: where the poses spread less, the attitudes would tell as much as they
@@ -148,7 +149,8 @@ def bendings_of(linearised: LinearisedDwells, state: Floats) -> Floats:
             for step in (step_mps2, -step_mps2)
         )
         bendings[:, :, axis] = np.add.reduceat((more - less) / (2.0 * step_mps2), firsts, axis=0) / counts
-    return np.where(np.abs(bendings) < _ABRUPT, bendings, 0.0)
+    sizes = np.abs(bendings)
+    return np.where((sizes > _ROUNDING) & (sizes < _ABRUPT), bendings, 0.0)
 
 
 def bent_effects(model: Model, state: Floats) -> list[Effect]:

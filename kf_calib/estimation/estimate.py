@@ -79,9 +79,8 @@ class Estimate:
         """Sigmas (q,) of the coefficients of effects; NaN where not determined."""
         sigma = np.sqrt(np.diag(self.covariance)[STATE_COUNT:])
         if self.undetermined.size:
-            lost = np.abs(self.undetermined[STATE_COUNT:]).max(axis=1)
-            largest = np.abs(self.undetermined).max()
-            sigma = np.where(lost > 1e-9 * largest, np.nan, sigma)
+            lost = np.abs(self.undetermined[STATE_COUNT:]).max(axis=1)  # in the unit of the coefficient, as sigma
+            sigma = np.where(lost > 1e-9 * sigma, np.nan, sigma)
         return sigma
 
 
