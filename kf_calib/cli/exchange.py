@@ -348,6 +348,9 @@ def certificate(
     statement: StatementFile,
     schema: Annotated[Path | None, option("--schema", metavar="DCC.xsd", panel=INPUT,
                                           help="Validate the XML against this copy of the DCC's schema.")],
+    draws: Annotated[int | None, option(
+        "--monte-carlo", metavar="DRAWS", type=click.IntRange(min=10_000, max=10_000_000), panel=OUTPUT,
+        help="Check the expanded uncertainties by so many draws, 1000000 for example (JCGM 101).")],
     programs: ProgramOptions, overwrite: Overwrite, as_json: Json,
 ) -> None:  # fmt: skip
     """A calibration certificate as ISO/IEC 17025 asks: results, expanded uncertainties, budget, traceability.
@@ -356,6 +359,7 @@ def certificate(
     """
     from kf_calib.exchange import calibration_file
     from kf_calib.exchange.certificate import statement as statements
+    from kf_calib.exchange.certificate.monte_carlo import monte_carlo
     from kf_calib.views import exchange as views
 
     stated = statements.read_statement(statement)
@@ -366,7 +370,8 @@ def certificate(
             saved = calibration_file.open_calibration(path)
             calibrations.append((saved, saved.model(path, programs.effects_from, programs.trust)))
     written, standing = write_certificate(outputs, output, stated, *calibrations, xml=xml, schema=schema)
-    print_result(as_json, views.certificate_object, views.certificate_report, written, standing, output, xml)
+    check = None if draws is None else monte_carlo(written.budget, draws)
+    print_result(as_json, views.certificate_object, views.certificate_report, written, standing, check, output, xml)
 
 
 def stated_in(certificate: Path | None, statement: Path | None) -> Statement | None:

@@ -183,7 +183,7 @@ def test_the_examples_lack_nothing_but_their_bench(name: str, run) -> None:
         pytest.importorskip("openpyxl", reason="openpyxl is not there")
     code, out, _ = run("info", RECORDINGS / name)
     assert code == 0 and "Missing: local gravity" in out
-    assert f"with your own --gravity:\nkf-calib replay {RECORDINGS / name}" in out
+    assert f"--gravity:\nkf-calib replay {RECORDINGS / name}" in out and "Then try, with your own" in out
     bench = ("--axes", "y z x", "--gravity", "9.81")
     code, out, _ = run("info", RECORDINGS / name, *bench, "--json")
     found = json.loads(out)

@@ -22,6 +22,7 @@ from kf_calib import calibrate
 from kf_calib.errors import InputError, MissingExtraError
 from kf_calib.exchange import calibration_file
 from kf_calib.exchange.certificate import budget, dcc, document, statement
+from kf_calib.exchange.certificate.intrinsic import intrinsic
 from kf_calib.support.units import field_unit
 
 sets = pytest.mark.skipif(find_spec("typst") is None, reason="typst is not there: no PDF is made")
@@ -167,7 +168,7 @@ def test_a_sensitivity_is_shown_with_three_digits_at_least(cal: Path, lab: Path,
     per_si = field_unit(own.results[0].unit).per_si / field_unit(line.unit).per_si
     values = np.zeros(12)
     values[0] = largest / per_si
-    row = document._sensitivity(own, replace(line, sensitivity=values))
+    row = document._sensitivity(own, replace(line, per_dwell=values[:, None]))
     assert row["values"][0] == shown
 
 
@@ -285,6 +286,41 @@ def test_the_command_writes_both_files(run: Any, cal: Path, lab: Path, tmp_path:
         assert code == 2 and "is read by this very command" in err
 
 
+def test_the_xml_has_the_covariance_of_the_twelve_and_of_the_nine(cal: Path, lab: Path) -> None:
+    own = made(cal, lab)
+    root, names = ET.fromstring(dcc.xml(own)), {"dcc": dcc.DCC, "si": dcc.SI}
+    vectors = root.findall(".//si:realListXMLList", names)
+    assert [len(each.findtext("si:labelXMLList", "", names).split()) for each in vectors] == [12, 9]
+    for vector, values, covariance in zip(
+        vectors,
+        [own.twelve[0], [each.value for each in own.intrinsic]],
+        [own.budget.covariance, intrinsic(*own.twelve).covariance],
+        strict=True,
+    ):
+        told = [float(text) for text in vector.findtext("si:valueXMLList", "", names).split()]
+        np.testing.assert_array_equal(told, values)
+        columns = vector.findall(".//si:covarianceXMLList", names)
+        matrix = [[float(text) for text in each.findtext("si:valueXMLList", "", names).split()] for each in columns]
+        np.testing.assert_array_equal(np.array(matrix).T, covariance)
+        units = [each.findtext("si:unitXMLList", "", names).split() for each in columns]
+        assert all(len(row) == len(told) for row in units) and units[0][0] != units[0][-1]
+    assert [row["values"][k] for k, row in enumerate(document.content(own, "")["correlations"])] == ["1.000"] * 12
+    assert len(document.content(own, "")["intrinsic"]) == 9
+
+
+@sets
+def test_a_monte_carlo_check_is_printed_and_in_the_json(run: Any, cal: Path, lab: Path, tmp_path: Path) -> None:
+    words = ("certificate", cal, "--statement", lab, "-o", tmp_path / "c.pdf", "--monte-carlo", "20000")
+    code, out, err = run(*words)
+    assert code == 0 and "U by Monte Carlo" in out and "JCGM 101" in out + err
+    code, out, err = run(*words, "--overwrite", "--json")
+    told = json.loads(out)
+    assert told["monte_carlo"]["draws"] == 20000 and len(told["covariance"]) == 12
+    assert [each["symbol"] for each in told["intrinsic"]][:4] == ["S1", "S2", "S3", "angle12"]
+    standard = np.sqrt(np.diag(np.array(told["covariance"])))
+    np.testing.assert_allclose(standard, [each["standard"] for each in told["parameters"]], rtol=1e-9)
+
+
 def test_what_the_run_does_not_determine_has_no_number(cal: Path) -> None:
     saved = calibration_file.open_calibration(cal)
     first = saved.parameters[0].model_copy(update={"value": None, "sigma": None})
@@ -317,10 +353,13 @@ ORDER = {
     "usedMethod": "name description norm",
     "influenceCondition": "name data",
     "result": "name data",
-    "quantity": "name noQuantity real measurementMetaData",
+    "quantity": "name noQuantity real realListXMLList measurementMetaData",
     "metaData": "name conformity",
     "real": "label value unit measurementUncertaintyUnivariate",
     "expandedMU": "valueExpandedMU coverageFactor coverageProbability",
+    "realListXMLList": "labelXMLList valueXMLList unitXMLList measurementUncertaintyMultivariateXMLList",
+    "ellipsoidalRegionMUXMLList": "covarianceMatrixXMLList coverageFactorXMLList coverageProbabilityXMLList",
+    "covarianceXMLList": "valueXMLList unitXMLList",
 }
 """Elements in the order in which DCC 3.3.0 and D-SI 2.2.1 want them."""
 

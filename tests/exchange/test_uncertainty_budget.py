@@ -118,7 +118,7 @@ def test_what_needs_temperatures_of_dwells_is_left_out_and_said(saved: SavedCali
 
 
 def line(parts: float, dof: float) -> Contribution:
-    return Contribution("u", "", "B", None, "", "normal", dof, None, None, np.full(12, parts))
+    return Contribution("u", "", "B", None, "", "normal", dof, None, parts**2 * np.eye(12))
 
 
 def test_effective_degrees_of_freedom_are_those_of_welch_and_satterthwaite() -> None:

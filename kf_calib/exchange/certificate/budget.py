@@ -35,6 +35,7 @@ from kf_calib.errors import InputError
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.exchange import calibration_file
 from kf_calib.exchange.calibration_file import SavedCalibration, SavedParameter
+from kf_calib.exchange.certificate.intrinsic import SYMBOLS, UNITS, intrinsic
 from kf_calib.exchange.certificate.statement import DIVISORS, Rule, Statement, TypeB
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise, lift_rounding, mean_covariances
@@ -49,8 +50,9 @@ class Contribution:
     """One line of the budget.
 
     name, title: symbol and words. kind: A or B. standard: standard uncertainty of the input quantity in ``unit``, None
-    for type A. sensitivity (12,): change of each parameter per unit of it. parts (12,): contribution to the standard
-    uncertainty of each parameter. dof: degrees of freedom, may be infinite.
+    for type A. per_dwell (12, D): change of each parameter per unit of it in each dwell; None for type A. is_common:
+    whether it is the same in all dwells, or drawn anew in each. covariance (12, 12): what it adds to that of the
+    parameters. dof: degrees of freedom, may be infinite.
     """
 
     name: str
@@ -61,8 +63,22 @@ class Contribution:
     distribution: str
     dof: float
     source: str | None
-    sensitivity: Floats | None
-    parts: Floats
+    covariance: Floats
+    per_dwell: Floats | None = None
+    is_common: bool = True
+
+    @property
+    def parts(self) -> Floats:
+        """The contribution (12,) to the standard uncertainty of each parameter."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+    @property
+    def sensitivity(self) -> Floats | None:
+        """The change (12,) of each parameter per unit of it; the root of the sum of the squares where it is drawn anew
+        in each dwell."""
+        if self.per_dwell is None:
+            return None
+        return self.per_dwell.sum(axis=1) if self.is_common else np.sqrt((self.per_dwell**2).sum(axis=1))
 
 
 @dataclass(frozen=True)
@@ -77,9 +93,14 @@ class Budget:
     left_out: tuple[str, ...] = ()
 
     @property
+    def covariance(self) -> Floats:
+        """The covariance (12, 12) of the twelve parameters."""
+        return sum((own.covariance for own in self.contributions), np.zeros((STATE_COUNT, STATE_COUNT)))
+
+    @property
     def combined(self) -> Floats:
         """Root of the sum of the squares of the contributions."""
-        return np.sqrt(sum((own.parts**2 for own in self.contributions), np.zeros(STATE_COUNT)))
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
     @property
     def dof(self) -> Floats:
@@ -112,6 +133,16 @@ def coverage_factor(dof: Floats) -> Floats:
     return np.where(np.isinf(dof), 2.0, stdtrit(np.where(np.isinf(dof), 1e12, whole), 0.5 + 0.5 * COVERAGE))
 
 
+def ellipsoid_factor(count: int, dof: float) -> float:
+    """The factor k of an ellipsoid of so many quantities that holds ``COVERAGE`` of them (JCGM 102, 6.5): the root of
+    the quantile of chi-squared or, where the size of the covariance has finite degrees of freedom, of n F(n, dof)."""
+    from scipy.special import chdtri, fdtri
+
+    if math.isinf(dof):
+        return float(np.sqrt(chdtri(count, 1.0 - COVERAGE)))
+    return float(np.sqrt(count * fdtri(count, max(math.floor(dof), 1.0), COVERAGE)))
+
+
 def budget(saved: SavedCalibration, model: Model, stated: Sequence[TypeB]) -> Budget:
     """The budget of a calibration; model: that of it (``saved.model()``). Raises InputError for what cannot be had."""
     first = _type_a(saved)
@@ -139,8 +170,7 @@ def _type_a(saved: SavedCalibration) -> Contribution:
                          "known: state --angle-sigma-deg and --scatter-sigma, or visit more orientations.")  # fmt: skip
     return Contribution(
         "u_A", "noise of the readings, of the dwells and of the setting of angles", "A", None, "", "normal",
-        math.inf if stated else float(judged.dof), "covariance of the filter", None,
-        np.sqrt(np.diag(saved.twelve[1])),
+        math.inf if stated else float(judged.dof), "covariance of the filter", saved.twelve[1],
     )  # fmt: skip
 
 
@@ -206,13 +236,9 @@ def _type_b(uncertainty: TypeB, saved: SavedCalibration, stimulus: Stimulus, cha
     effect = effects.effect_named(uncertainty.effect, saved.bench)
     columns = _columns(effect, uncertainty, stimulus)
     per_dwell = np.einsum("pdi,diq->qpd", changes, columns)  # q: coefficient, p: parameter, d: dwell
-    if uncertainty.varies == "run":
-        sensitivity = per_dwell.sum(axis=2)
-    else:
-        sensitivity = np.sqrt((per_dwell**2).sum(axis=2))
     divisor = uncertainty.k if uncertainty.distribution == "normal" else DIVISORS[uncertainty.distribution]
     return [
-        _line(uncertainty, effect, coefficient, quantity(uncertainty.size, coefficient.unit) / divisor, sensitivity[q])
+        _line(uncertainty, effect, coefficient, quantity(uncertainty.size, coefficient.unit) / divisor, per_dwell[q])
         for q, coefficient in enumerate(effect.coefficients)
     ]
 
@@ -232,14 +258,16 @@ def _columns(effect: Effect, uncertainty: TypeB, stimulus: Stimulus) -> Floats:
 
 
 def _line(
-    uncertainty: TypeB, effect: Effect, coefficient: Coefficient, standard: float, sensitivity: Floats
+    uncertainty: TypeB, effect: Effect, coefficient: Coefficient, standard: float, per_dwell: Floats
 ) -> Contribution:
     words = {"run": "", "dwell": ", another in each dwell"}[uncertainty.varies]
     at = f", at {uncertainty.temperature}" if uncertainty.temperature else ""
+    is_common = uncertainty.varies == "run"
+    by_input = per_dwell.sum(axis=1, keepdims=True) if is_common else per_dwell
     return Contribution(
         coefficient.symbol, f"{effect.title} ({effect}){words}{at}", "B", abs(standard), coefficient.unit,
-        uncertainty.distribution, uncertainty.dof or math.inf, uncertainty.source, sensitivity,
-        abs(standard * sensitivity),
+        uncertainty.distribution, uncertainty.dof or math.inf, uncertainty.source,
+        standard**2 * by_input @ by_input.T, per_dwell, is_common,
     )  # fmt: skip
 
 
@@ -288,6 +316,29 @@ class Certificate:
     def serial(self) -> str | None:
         """The serial number of the item: as stated, or as the recording has it."""
         return self.statement.item.serial or self.saved.provenance.bench.get("block_serial")
+
+    @property
+    def twelve(self) -> tuple[Floats, Floats] | None:
+        """Values (12,) and covariance (12, 12) of the parameters; None where not all of them are determined."""
+        values = [result.value for result in self.results]
+        if any(value is None for value in values):
+            return None
+        return np.array(values, float), self.budget.covariance
+
+    @property
+    def intrinsic(self) -> tuple[CertifiedResult, ...]:
+        """The nine that no choice of a frame changes, with the fewest degrees of freedom that any of the twelve has;
+        none where not all of the twelve are determined."""
+        if self.twelve is None:
+            return ()
+        nine, dof = intrinsic(*self.twelve), float(self.budget.dof.min())
+        nominal = intrinsic(np.array([each.nominal for each in self.results]), np.zeros((12, 12))).values.tolist()
+        k, standard = float(coverage_factor(np.array(dof))), np.sqrt(np.diag(nine.covariance)).tolist()
+        return tuple(
+            CertifiedResult(name, unit, usual, value, u, k * u, k, dof)
+            for name, unit, usual, value, u in zip(
+                SYMBOLS, UNITS, nominal, nine.values.tolist(), standard, strict=True)
+        )  # fmt: skip
 
     @property
     def further(self) -> list[SavedParameter]:

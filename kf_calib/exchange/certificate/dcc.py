@@ -9,19 +9,25 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 from datetime import date
 from importlib.metadata import version
 from pathlib import Path
 
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.arrays import Floats
 from kf_calib.errors import InputError, need
-from kf_calib.exchange.certificate.budget import COVERAGE, Certificate, CertifiedResult
+from kf_calib.exchange.certificate.budget import COVERAGE, Certificate, CertifiedResult, ellipsoid_factor
+from kf_calib.exchange.certificate.intrinsic import SYMBOLS, intrinsic
+from kf_calib.exchange.certificate.intrinsic import UNITS as INTRINSIC_UNITS
 from kf_calib.exchange.certificate.statement import Party
 from kf_calib.support.text import cut
 
 DCC, SI = "https://ptb.de/dcc", "https://ptb.de/si"
 VERSION, SCHEMA = "3.3.0", f"{DCC}/v3.3.0/dcc.xsd"
 UNITS = {"rad": r"\radian", "1": r"\one", "m/s^2": r"\metre\second\tothe{-2}"}
-"""Units of the twelve parameters as D-SI writes them."""
+SQUARES = {"rad": r"\radian\tothe{2}", "1": r"\one", "m/s^2": r"\metre\tothe{2}\second\tothe{-4}"}
+"""Units of the twelve parameters, and of their variances, as D-SI writes them."""
 
 MODEL = "reading_i = K_i E_i . f + b_i"
 AXES = ("E_1, E_3 = (cos phi cos theta, sin theta, -sin phi cos theta)",
@@ -171,11 +177,55 @@ def _measurement(parent: ET.Element, certificate: Certificate) -> None:
         _given(method, "norm", norm)
     _software(_in(parent, "usedSoftware"))
     _conditions(_in(parent, "influenceConditions"), certificate)
-    result = _in(_in(parent, "results"), "result")
-    _words(result, "name", "Parameters of the accelerometers")
-    data = _in(result, "data")
+    results = _in(parent, "results")
+    data = _result(results, "Parameters of the accelerometers")
     for each in certificate.results:
         _quantity(data, each)
+    twelve = certificate.twelve
+    if twelve is not None:
+        _multivariate(data, "all parameters with their covariance", paper_parameters.SYMBOLS, paper_parameters.UNITS,
+                      *twelve, float(certificate.budget.dof.min()))  # fmt: skip
+        nine = intrinsic(*twelve)
+        own_data = _result(results, "Intrinsic parameters, which no choice of a frame changes: sensitivities, angles "
+                           "between the input axes, offsets")  # fmt: skip
+        _multivariate(own_data, "all intrinsic parameters with their covariance", SYMBOLS, INTRINSIC_UNITS,
+                      nine.values, nine.covariance, float(certificate.budget.dof.min()))  # fmt: skip
+
+
+def _result(parent: ET.Element, name: str) -> ET.Element:
+    result = _in(parent, "result")
+    _words(result, "name", name)
+    return _in(result, "data")
+
+
+def _multivariate(
+    parent: ET.Element, name: str, symbols: Sequence[str], units: Sequence[str], values: Floats, covariance: Floats,
+    dof: float,
+) -> None:  # fmt: skip
+    """A vector of quantities with its covariance matrix and the ellipsoid that holds it with ``COVERAGE``; dof: degrees
+    of freedom of the covariance."""
+    element = _in(parent, "quantity")
+    _words(element, "name", name)
+    listed = _in(element, "realListXMLList", space=SI)
+    _in(listed, "labelXMLList", " ".join(symbols), SI)
+    _in(listed, "valueXMLList", " ".join(map(repr, values.tolist())), SI)
+    _in(listed, "unitXMLList", " ".join(UNITS[unit] for unit in units), SI)
+    region = _in(_in(listed, "measurementUncertaintyMultivariateXMLList", space=SI), "ellipsoidalRegionMUXMLList",
+                 space=SI)  # fmt: skip
+    matrix = _in(region, "covarianceMatrixXMLList", space=SI)
+    for unit, column in zip(units, covariance.T.tolist(), strict=True):
+        own = _in(_in(matrix, "columnXMLList", space=SI), "covarianceXMLList", space=SI)
+        _in(own, "valueXMLList", " ".join(map(repr, column)), SI)
+        _in(own, "unitXMLList", " ".join(_product(unit, other) for other in units), SI)
+    _in(region, "coverageFactorXMLList", repr(ellipsoid_factor(len(values), dof)), SI)
+    _in(region, "coverageProbabilityXMLList", f"{COVERAGE:.4f}", SI)
+
+
+def _product(one: str, other: str) -> str:
+    """The unit of a covariance."""
+    if one == other:
+        return SQUARES[one]
+    return "".join(UNITS[unit] for unit in (one, other) if unit != "1")
 
 
 def _conditions(parent: ET.Element, certificate: Certificate) -> None:

@@ -73,6 +73,8 @@ def content(certificate: Certificate, standing: str) -> TableRow:
         "facts": _facts(certificate),
         "method": _method(certificate),
         "results": _results(certificate.results),
+        "intrinsic": _results(certificate.intrinsic),
+        "correlations": _correlations(certificate),
         "adjustment": _adjustment(certificate.results),
         "rule": dcc.rule(certificate),
         "conformity": _conformity(certificate.results),
@@ -159,6 +161,17 @@ def _results(results: Sequence[CertifiedResult]) -> list[TableRow]:
             "k": f"{result.k:.2f}", "dof": _count(result.dof),
         })  # fmt: skip
     return _aligned(rows, "value", "expanded", "small")
+
+
+def _correlations(certificate: Certificate) -> list[TableRow]:
+    """Rows of the correlations of the parameters, of type A and type B together; none where one is not determined."""
+    if certificate.twelve is None:
+        return []
+    covariance = certificate.twelve[1]
+    sigma = np.sqrt(np.diag(covariance))
+    rows = (covariance / np.outer(sigma, sigma)).tolist()
+    return [{"symbol": _name(result.symbol), "values": [_minus(f"{value:.3f}") for value in row]}
+            for result, row in zip(certificate.results, rows, strict=True)]  # fmt: skip
 
 
 def _adjustment(results: Sequence[CertifiedResult]) -> list[TableRow]:
