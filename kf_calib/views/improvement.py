@@ -178,7 +178,7 @@ def story(state: Improvement) -> list[str]:
     p_value = format_p(start.test.p_value) if start.test.p_value is not None else "unknown"
     said = [f"What was wrong: {start.before.model.sum} do not describe this run (p {p_value}){times}."]
     if state.steps:
-        said.append(f"What was added: {'; '.join(map(_told, state.steps))}.")
+        said.append(f"What was added: {'; '.join(_told(step, state.result) for step in state.steps)}.")
     if state.steps and None not in errors:
         said.append(
             f"What it brought: the error on orientations left out of the fit went from {errors[0]:.2f} to "
@@ -187,13 +187,14 @@ def story(state: Improvement) -> list[str]:
     return [*said, f"What is left: {state.reason}"]
 
 
-def _told(step: SelectionStep) -> str:
-    """Return what a step added, with its clearest coefficient, and what it took out."""
+def _told(step: SelectionStep, final: Calibration) -> str:
+    """Return what a step added, with its clearest coefficient as the final model has it, and what it took out."""
     told = [f"{each.name} was taken out" for each in step.dropped]
     if step.name is None:
         return ", ".join(told)
-    (own,) = (effect.parameters for effect in step.result.model.effects if str(effect) == step.name)
-    sized = [step.result.parameters[each.symbol] for each in own]
+    result = final if step.name in map(str, final.model.effects) else step.result
+    (own,) = (effect.parameters for effect in result.model.effects if str(effect) == step.name)
+    sized = [result.parameters[each.symbol] for each in own]
     clearest = max(sized, key=lambda each: abs(each.value or 0.0) / (each.sigma or float("inf")))
     size = ""
     if clearest.value is not None and clearest.sigma:
