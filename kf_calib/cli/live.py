@@ -217,6 +217,7 @@ def _on_screen(run: LiveRun, name: str, record: Path | None) -> None:
     from kf_calib.views.terminal import PlainConsole
 
     display = Live(console=PlainConsole(), auto_refresh=False, transient=True, redirect_stderr=sys.stderr.isatty())
+    size = display.console.size
     with pressed_keys(use=name != "-") as pressed, display:
         while run.going:
             with contextlib.suppress(queue.Empty):
@@ -228,8 +229,10 @@ def _on_screen(run: LiveRun, name: str, record: Path | None) -> None:
                 shown = hand_screen(standing, run.source.status, name, str(record or ""), hint)
             else:
                 hint = "ending ..." if run.stopped else "a: accept what is missing   q: end the run"
-                lines = "\n".join(filter(None, (run.doing(), hint)))
-                shown = screen(standing, run.source.status, name, str(record or ""), lines)
+                shown = screen(standing, run.source.status, name, str(record or ""), hint, run.doing())
+            if display.console.size != size:  # what was drawn for another width would stay in pieces
+                size = display.console.size
+                display.console.clear()
             display.update(shown, refresh=True)
             key = pressed(_REFRESH_S)
             if key == "a":

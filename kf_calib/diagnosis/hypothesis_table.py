@@ -153,14 +153,17 @@ class HypothesisTable:
 
     @cached_property
     def rivals(self) -> tuple[Hypothesis, ...]:
-        """The explanations other than the first that have ``CREDIBLE`` of the probability together with it, without
-        those that only add to its effects or look like them."""
+        """The explanations in place of the first that have ``CREDIBLE`` of the probability together with it and with
+        those that only add to its effects; without those that look like it."""
         first, rows = self.first, [row for row in self.rows if row.families != (NOTHING,) and row.driver != ALIKE]
-        before = np.cumsum([0.0, *(row.probability for row in rows)]) / sum(row.probability for row in rows)
-        credible = [row for k, row in enumerate(rows) if before[k] < CREDIBLE and row is not first]
+        agreeing = [row for row in rows
+                    if row is first or (first.effects and set(first.effects) <= set(row.effects))]  # fmt: skip
+        others = [row for row in rows if all(row is not each for each in agreeing)]
+        shares = [sum(row.probability for row in agreeing), *(row.probability for row in others)]
+        before = np.cumsum(shares) / sum(shares)
         same = [{name} for name in self.same]
-        rivals = [row for row in credible if not (first.effects and set(first.effects) <= set(row.effects))]
-        return tuple(row for row in rivals if row.formulas or not any(each <= {*row.effects} for each in same))
+        credible = [row for row, share in zip(others, before[:-1], strict=True) if share < CREDIBLE]
+        return tuple(row for row in credible if row.formulas or not any(each <= {*row.effects} for each in same))
 
 
 def table_of(rows: Iterable[Hypothesis]) -> HypothesisTable:

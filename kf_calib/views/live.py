@@ -93,24 +93,31 @@ def line(judgement: Judgement) -> str:
     )
 
 
-def screen(standing: Standing, status: Status | None, name: str, recording: str = "", hint: str = "") -> RenderableType:
-    """All that is known of a run now, for a terminal of 80 x 24 characters.
+def screen(
+    standing: Standing, status: Status | None, name: str, recording: str = "", hint: str = "", doing: str = ""
+) -> RenderableType:
+    """All that is known of a run now, for a terminal of 80 x 24 characters; of a smaller one, what stands last is cut
+    off: what to do and the verdict stand first.
 
     standing: what is known. status: of the source (None: it has none). name: of the source. recording: path of the file
-    that is written. hint: line at the bottom.
+    that is written. hint: line at the bottom. doing: what a bench that drives itself does.
     """
     judgement = standing.judgement
-    parts: list[RenderableType] = [_to_do(standing), link(standing, status, name, recording), _sigmas(standing)]
+    parts: list[RenderableType] = [_to_do(standing, by_itself=bool(doing))]
     if judgement is not None:
         style = {True: "bold green", False: "bold yellow", None: "bold"}[judgement.consistent]
-        parts += [_fit(judgement), Text(judgement.verdict, style=style)]
+        parts.append(Text(judgement.verdict, style=style))
+    parts += [Text(sentence(text), style="yellow") for text in (standing.problem, standing.notice) if text]
+    parts += [Text(doing)] if doing else []
+    parts += [link(standing, status, name, recording), _sigmas(standing)]
+    if judgement is not None:
+        parts.append(_fit(judgement))
         if judgement.risen is not None:
             risen, factor = judgement.risen
             parts.append(Text(
                 f"σ of {symbol(risen)} rose {factor:.1f} times with the last orientation: the orientations scatter "
                 "more than was known before, or the model has more to determine.", style="yellow",
             ))  # fmt: skip
-    parts += [Text(sentence(text), style="yellow") for text in (standing.problem, standing.notice) if text]
     if hint:
         parts.append(Text(hint, style="dim"))
     return Group(*parts)
@@ -140,13 +147,16 @@ def link(standing: Progress, status: Status | None, name: str, recording: str) -
     return text
 
 
-def _to_do(standing: Standing) -> Panel:
-    """Return what to do now in a frame, in capitals, and below it where the platform stands and where it goes next."""
+def _to_do(standing: Standing, *, by_itself: bool) -> Panel:
+    """Return what to do now in a frame, in capitals, and below it where the platform stands and where it goes next;
+    by_itself: whether the bench does it."""
     judgement, here = standing.judgement, standing.current
     going = None if judgement is None else judgement.next_orientation
     there = "the next orientation of your plan" if going is None else f"{_angles(going[0])} deg"
     then = "" if going is None else f": {going[1]}"
     if judgement is not None and judgement.reached(standing.sigma):
+        if by_itself:
+            return _frame("EVERY TARGET IS REACHED", "the bench ends the run by itself", "green")
         return _frame("STOP: EVERY TARGET IS REACHED", f"going on to {there} {then.lstrip(': ')}".strip(), "green")
     if here is None:
         moved = f"{standing.dwells} orientations in {span(standing.elapsed_s)}; the platform moves or settles"
@@ -272,7 +282,7 @@ def hand_line(judgement: HandJudgement) -> str:
 def hand_screen(
     standing: HandStanding, status: Status | None, name: str, recording: str = "", hint: str = ""
 ) -> RenderableType:
-    """All that is known of a run now, for a terminal of 80 x 24 characters.
+    """All that is known of a run now, as ``screen``.
 
     standing: what is known. status: of the source (None: it has none). name: of the source. recording: path of the file
     that is written. hint: line at the bottom.
@@ -280,13 +290,11 @@ def hand_screen(
     judgement = standing.judgement
     resting = f"still for {standing.rest_s:.0f} s of {standing.enough_s:g} s" if standing.rest_s else "it moves"
     style = "bold green" if standing.rest_s >= standing.enough_s else "bold"
-    parts: list[RenderableType] = [
-        link(standing, status, name, recording), _rest(standing, resting), Text(sentence(standing.task), style=style),
-        _sigmas_by_hand(judgement),
-    ]  # fmt: skip
+    parts: list[RenderableType] = [Text(sentence(standing.task), style=style), _rest(standing, resting)]
     if judgement is not None:
         parts.append(Text(_found(judgement)))
     parts += [Text(sentence(text), style="yellow") for text in (standing.problem, standing.notice) if text]
+    parts += [link(standing, status, name, recording), _sigmas_by_hand(judgement)]
     if hint:
         parts.append(Text(hint, style="dim"))
     return Group(*parts)

@@ -361,6 +361,14 @@ def test_screen_lines_and_objects_of_a_standing(monkeypatch: pytest.MonkeyPatch)
     ):
         assert part in shown
     assert len(shown.splitlines()) <= 24
+    lost = Status(link="lost", trouble="nothing has come for 12 s, it is opened again.", gaps=1)
+    small = plain(views.screen(replace(session.standing, notice="taken"), lost, "sim://", "run.mcap"), width=60)
+    assert "disagrees: accelerometer" in "\n".join(small.splitlines()[:16]) and "1 gap " in small
+    last = session.standing.judgement
+    done = replace(session.standing, judgement=replace(last, wanted=np.full(12, 1.0)))
+    assert "STOP: EVERY TARGET IS REACHED" in plain(views.screen(done, None, "sim://"), width=80)
+    driven = plain(views.screen(done, None, "sim://", doing="the bench, stay 7: resting"), width=80)
+    assert "STOP" not in driven and "the bench ends the run by itself" in driven and "stay 7: resting" in driven
     told = views.line(found[-1])
     assert told.startswith("dwell 6 to") and "worst sigma K1" in told and "\n" not in told
     empty = plain(views.screen(Session(bench()).standing, None, "sim://"), width=80)
