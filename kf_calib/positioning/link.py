@@ -113,9 +113,11 @@ class LineLink:
         until_s, quiet_since_s, count = time.monotonic() + 2.0 * self._timeout_s, time.monotonic(), 0
         self._link.timeout = 1000.0 * min(quiet_s, _SLICE_S)
         try:
-            while time.monotonic() - quiet_since_s < quiet_s:
+            while True:
                 if self._byte():
                     count, quiet_since_s = count + 1, time.monotonic()
+                elif time.monotonic() - quiet_since_s >= quiet_s:  # seen empty: a busy computer alone is no silence
+                    break
                 if count > _DRAINED or time.monotonic() > until_s:
                     raise PositionerError("bytes come without end, and nobody asked for them: check the baud rate")
         finally:
