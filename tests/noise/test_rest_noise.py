@@ -43,7 +43,7 @@ def coverage(truth: dict[str, float], seeds: int, count: int, dwells: int = 1) -
     """Share of the seeds in which the interval of a term holds the truth, by the likelihood and by Allan variances."""
     held = defaultdict[str, list[bool]](list)
     for seed in range(seeds):
-        rng = np.random.default_rng(1000 + seed)
+        rng = np.random.default_rng(9000 + seed)
         values = noisy(rng, count, truth["white"], truth["random_walk"], truth["quantisation"])
         values += flicker(rng, count, truth["bias_instability"])
         channel = of_stretches(*np.array_split(values, dwells))
@@ -67,9 +67,10 @@ TRUTHS = {
     ("name", "count", "dwells"),
     slow(("walk", 20_000, 1), ("strong walk", 20_000, 12), ("flicker", 20_000, 1), ("all", 50_000, 1)),
 )
-def test_intervals_of_95_percent_hold_the_truth_in_two_hundred_runs(name: str, count: int, dwells: int) -> None:
-    shares = coverage(TRUTHS[name], 200, count, dwells)
-    assert min(shares.values()) >= 0.90, shares
+def test_intervals_of_95_percent_hold_the_truth_in_three_hundred_runs(name: str, count: int, dwells: int) -> None:
+    """Those of a weak walk hold 93 % of the truths (docs/limits.md); 300 runs tell a share to 1.5 %."""
+    shares = coverage(TRUTHS[name], 300, count, dwells)
+    assert min(shares.values()) >= 0.91, shares
     for way in ("likelihood", "allan"):
         assert shares[f"{way} white"] <= 0.99
 
