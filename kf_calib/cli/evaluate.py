@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import rich_click as click
 
@@ -38,6 +38,7 @@ from kf_calib.cli.options import (
 )
 
 if TYPE_CHECKING:
+    from kf_calib.diagnosis.refits import Refits
     from kf_calib.diagnosis.results import Diagnosis
     from kf_calib.views.report.contents import Measured
 
@@ -215,14 +216,20 @@ def report(
         "--certificate", metavar="OUT.pdf",
         help="Save a calibration certificate here, too; kf-calib certificate makes one of a saved calibration.",
     )],
-    statement: StatementFile, overwrite: Overwrite, units: ShownUnits, strict: Strict, as_json: Json,
+    statement: StatementFile,
+    standard: Annotated[Literal["ieee1293"] | None, option(
+        "--standard", panel=OUTPUT,
+        help="With a data sheet: the coefficients of the model equation by the symbols of that standard.")],
+    overwrite: Overwrite, units: ShownUnits, strict: Strict, as_json: Json,
 ) -> None:  # fmt: skip
     """A page for the engineer: verdict, figures, residuals to explore, tables, commands to get the numbers again."""
     from kf_calib.cli.exchange import stated_in, write_certificate
+    from kf_calib.diagnosis.data_sheet import data_sheet
     from kf_calib.diagnosis.results import SideBySide
     from kf_calib.views import console, diagnosis
+    from kf_calib.views.data_sheet import data_sheet_object, data_sheet_report
     from kf_calib.views.json import clean, side_by_side_object
-    from kf_calib.views.report.contents import page_of
+    from kf_calib.views.report.contents import page_of, with_data_sheet
     from kf_calib.views.report.page import save
 
     outputs, stated = claimed(overwrite=overwrite), stated_in(certificate, statement)
@@ -231,24 +238,29 @@ def report(
     if has_other_model:
         outputs.spare(_programs_of(against))
         other_evaluation.effects_of_model()  # refused, as that of --model, before any reading is read
-    diagnosed, measured = _diagnosed(recording, reading, evaluation, as_json)
+    diagnosed, refits, measured = _diagnosed(recording, reading, evaluation, as_json)
+    sheet = None if standard is None else data_sheet(diagnosed, refits)
     pair, sources = None, [measured]
     if against is not None:
         path = recording if has_other_model else against
-        other, beside = _diagnosed(path, reading, other_evaluation, as_json)
+        other, _, beside = _diagnosed(path, reading, other_evaluation, as_json)
         pair, sources = SideBySide(other, diagnosed, has_other_model), [beside, measured]
     verdict = diagnosis.verdict(diagnosed) if pair is None else console.difference_in_words(pair)
     if as_json:
-        table = {"report": str(output), "recording": measured.name, "sha256": measured.sha256,
+        table: dict[str, Any] = {"report": str(output), "recording": measured.name, "sha256": measured.sha256,
                  "consistent": diagnosed.consistent, "p_value": diagnosed.test.p_value,
                  "verdict": diagnosis.verdict(diagnosed)}  # fmt: skip
+        table["data_sheet"] = None if sheet is None else data_sheet_object(sheet)
         beside_it = {"against": None, "differences": [], "differences_p_value": None}
         print_json(clean(table | (beside_it if pair is None else side_by_side_object(pair))))
     else:
         show(verdict)
+        if sheet is not None:
+            show(data_sheet_report(sheet))
     with delivery(outputs, as_json) as deliver, progress("drawing the page", as_json):
-        result = diagnosed if pair is None else pair
-        deliver.file(output, lambda path: save(page_of(result, sources, commands_of(ctx)), path))
+        page = page_of(diagnosed if pair is None else pair, sources, commands_of(ctx))
+        page = page if sheet is None else with_data_sheet(page, sheet)
+        deliver.file(output, lambda path: save(page, path))
     if certificate is not None and stated is not None:
         from kf_calib.exchange import calibration_file
 
@@ -261,8 +273,8 @@ def report(
 
 def _diagnosed(
     recording: Path, reading: ReadingOptions, evaluation: EvaluationOptions, quiet: bool
-) -> tuple[Diagnosis, Measured]:
-    """Return the diagnosis of a recording, and what a page says of its file."""
+) -> tuple[Diagnosis, Refits, Measured]:
+    """Return the diagnosis of a recording with its refits, and what a page says of its file."""
     from kf_calib.diagnosis.missing_effect import diagnose
     from kf_calib.diagnosis.refits import Refits
     from kf_calib.estimation.calibration import calibrate
@@ -270,7 +282,8 @@ def _diagnosed(
     measured = measured_of(recording, reading.opened(recording))
     source, settings = opened(recording, reading, evaluation)
     with progress(f"diagnosing {recording.name}", quiet) as tick:
-        return diagnose(calibrate(source, settings, tick), Refits(source)), measured
+        refits = Refits(source)
+        return diagnose(calibrate(source, settings, tick), refits), refits, measured
 
 
 def _programs_of(model: Path | None) -> list[Path]:

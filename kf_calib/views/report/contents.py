@@ -6,20 +6,21 @@ What was measured: the recording, its fingerprint, bench, dwells and noise, as r
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import singledispatch
 from typing import Any
 
 from rich.console import Group, RenderableType
 
+from kf_calib.diagnosis.data_sheet import DataSheet
 from kf_calib.diagnosis.explanation import Explanation
 from kf_calib.diagnosis.results import Diagnosis, SideBySide, differences
 from kf_calib.diagnosis.stepwise_selection import Improvement
 from kf_calib.estimation.cross_validation import orientations
 from kf_calib.estimation.engine_comparison import Comparison
 from kf_calib.estimation.results import Calibration
-from kf_calib.views import console, diagnosis, improvement, run
+from kf_calib.views import console, data_sheet, diagnosis, improvement, run
 from kf_calib.views.figures import figures
 from kf_calib.views.figures.collection import DIRECTIONS, FALL, NO_FALL, ON_THEIR_WAY, PROBABILITIES
 from kf_calib.views.report.drawing import Drawing
@@ -203,6 +204,14 @@ def _(pair: SideBySide, measured: Sequence[Measured], commands: Sequence[str], r
             *(_run(name, each, f"found{k}-") for k, (name, each) in enumerate(zip(names, both, strict=True))),
         ), tuple(commands),
     )  # fmt: skip
+
+
+def with_data_sheet(page: Page, sheet: DataSheet) -> Page:
+    """The page with a data sheet after its tables of parameters, or at the end."""
+    section = Section(data_sheet.TITLE, in_text(data_sheet.data_sheet_report(sheet)))
+    places = [k for k, each in enumerate(page.sections) if each.title.startswith("Parameters")]
+    at = places[0] + 1 if places else len(page.sections)
+    return replace(page, sections=(*page.sections[:at], section, *page.sections[at:]))
 
 
 def measured_section(rows: Iterable[tuple[str, str]]) -> Section:
