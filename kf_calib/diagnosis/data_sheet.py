@@ -20,24 +20,11 @@ import numpy as np
 
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.results import Diagnosis
-from kf_calib.effects import effect_named
+from kf_calib.effects import effect_named, names
+from kf_calib.effects.effect import SensorEffect
 from kf_calib.errors import KfCalibError
 from kf_calib.estimation.results import Calibration
 
-TOGETHER = ("second-order", "third-order", "cross-coupling-ip", "cross-coupling-io", "cross-coupling-po")
-ALONE = (
-    "bias-asymmetry", "scale-asymmetry", "odd-quadratic", "cross-axis-square", "output-square", "hysteresis",
-    "bias-drift", "scale-drift", "thermal-bias", "thermal-scale", "vibration-rectification",
-)  # fmt: skip
-_WORDS = {
-    "K0": "bias", "K1": "scale factor", "second-order": "second order", "third-order": "third order",
-    "cross-coupling-ip": "coupling i × p", "cross-coupling-io": "coupling i × o",
-    "cross-coupling-po": "coupling p × o", "bias-asymmetry": "bias asymmetry",
-    "scale-asymmetry": "scale asymmetry", "odd-quadratic": "odd quadratic", "cross-axis-square": "pendulous square",
-    "output-square": "output square", "hysteresis": "hysteresis", "bias-drift": "bias drift",
-    "scale-drift": "scale drift", "thermal-bias": "bias per kelvin", "thermal-scale": "scale per kelvin",
-    "vibration-rectification": "vibration bias",
-}  # fmt: skip
 _BESIDE = 3  # degrees of freedom that a fit must leave
 _VAGUE = 100.0  # times a large size, beyond which a sigma tells nothing
 
@@ -68,16 +55,18 @@ class DataSheet:
 def data_sheet(diagnosed: Diagnosis, refits: Refits) -> DataSheet:
     """The data sheet of a run; refits: those of the diagnosis."""
     result = diagnosed.after or diagnosed.before
-    own = {str(effect) for effect in result.model.effects}
-    polynomial = _refit(refits, result, [name for name in TOGETHER if name not in own])
+    own, bench = {str(effect) for effect in result.model.effects}, result.bench
+    effects = [each for name in names(bench) if isinstance(each := effect_named(name, bench), SensorEffect)]
+    listed = [each for each in effects if each.on_data_sheet]
+    polynomial = _refit(refits, result, [str(each) for each in listed if each.in_polynomial and str(each) not in own])
     rows = [*_parameters(result)]
-    for name in (*TOGETHER, *ALONE):
-        if name in own:
-            rows.append(_row(name, result, result, "found"))
-        elif name in TOGETHER:
-            rows.append(_row(name, result, polynomial, "together"))
+    for effect in listed:
+        if str(effect) in own:
+            rows.append(_row(effect, result, "found"))
+        elif effect.in_polynomial:
+            rows.append(_row(effect, polynomial, "together"))
         else:
-            rows.append(_row(name, result, _refit(refits, result, [name]), "alone"))
+            rows.append(_row(effect, _refit(refits, result, [str(effect)]), "alone"))
     return DataSheet(result, tuple(rows))
 
 
@@ -104,15 +93,15 @@ def _parameters(result: Calibration) -> list[DataSheetRow]:
         own = covariance[4 * k + 2 : 4 * k + 4, 4 * k + 2 : 4 * k + 4]
         values.append(bias.value / scale.value)
         sigmas.append(math.sqrt(max(float(gradient @ own @ gradient), 0.0)))
-    k0 = DataSheetRow("K0", _WORDS["K0"], "m/s^2", tuple(values), tuple(sigmas), "parameter")
-    k1 = DataSheetRow("K1", _WORDS["K1"], "1", tuple(each.value for each in scales),
+    k0 = DataSheetRow("K0", "bias", "m/s^2", tuple(values), tuple(sigmas), "parameter")
+    k1 = DataSheetRow("K1", "scale factor", "1", tuple(each.value for each in scales),
                       tuple(each.sigma for each in scales), "parameter")  # fmt: skip
     return [k1, k0]
 
 
-def _row(name: str, result: Calibration, fitted: Calibration | None, how: str) -> DataSheetRow:
-    """Return the row of an effect whose coefficients are one for each accelerometer, as a fit has them."""
-    coefficients = effect_named(name, result.bench).coefficients
+def _row(effect: SensorEffect, fitted: Calibration | None, how: str) -> DataSheetRow:
+    """Return the row of an effect, whose coefficients are one for each accelerometer, as a fit has them."""
+    coefficients = effect.coefficients
     symbol = coefficients[0].symbol.rstrip("123").rstrip("_")
     values, sigmas = list[float | None](), list[float | None]()
     for each in coefficients:
@@ -120,4 +109,4 @@ def _row(name: str, result: Calibration, fitted: Calibration | None, how: str) -
         is_known = found is not None and found.sigma is not None and found.sigma < _VAGUE * each.scale
         values.append(found.value if found is not None and is_known else None)
         sigmas.append(found.sigma if found is not None and is_known else None)
-    return DataSheetRow(symbol, _WORDS[name], coefficients[0].unit, tuple(values), tuple(sigmas), how)
+    return DataSheetRow(symbol, effect.on_data_sheet, coefficients[0].unit, tuple(values), tuple(sigmas), how)

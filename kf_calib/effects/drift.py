@@ -34,6 +34,7 @@ class BiasDrift(SensorEffect):
 
     family = "bias in time"
     name, title, source = "bias-drift", "bias that drifts with time", "IEEE Std 1293, drift"
+    on_data_sheet = "bias drift"
     drawn_against = _TIME
     confused_with = "warm-up; a monotone order of poses mixes it with angle"
     symbol, unit, scale = "beta", "m/s^3", 1e-6
@@ -48,6 +49,7 @@ class ScaleDrift(SensorEffect):
 
     family = "scale in time"
     name, title, source = "scale-drift", "scale factor that drifts with time", "IEEE Std 1293, drift"
+    on_data_sheet = "scale drift"
     drawn_against = Regressor("t*a", "time times force along the input axis", "m/s")
     confused_with = "base-tilt-drift"
     symbol, unit, scale = "kappa", "1/s", 1e-7
@@ -62,6 +64,7 @@ class Hysteresis(SensorEffect):
 
     family = "memory"
     name, title, source = "hysteresis", "reading that depends on the side it was come from", "IEEE Std 1293, hysteresis"
+    on_data_sheet = "hysteresis"
     drawn_against = _STEP
     confused_with = "needs the same pose from two sides"
     symbol, unit, scale = "h", "m/s^2", 1e-3
@@ -276,6 +279,7 @@ class ThermalBias(SensorEffect):
 
     family = "temperature"
     name, title, source = "thermal-bias", "bias that follows the temperature", IEEE
+    on_data_sheet = "bias per kelvin"
     drawn_against = _TEMPERATURE
     formulas = ("T",)
     confused_with = "needs a temperature swing"
@@ -304,6 +308,7 @@ class ThermalScale(SensorEffect):
 
     family = "temperature"
     name, title, source = "thermal-scale", "scale factor that follows the temperature", IEEE
+    on_data_sheet = "scale per kelvin"
     drawn_against = Regressor("T*a", "temperature less 25 °C, times force along the input axis", "K m/s^2")
     formulas = ("T*a",)
     confused_with = "needs both signs of the input at two temperatures"

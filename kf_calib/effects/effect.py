@@ -287,9 +287,13 @@ class SensorEffect(Effect):
     """One coefficient for each accelerometer; ``terms`` (m, 3) is what each reads more per unit of its own.
 
     shown: a unit of the field and how many of it make one SI unit, where it is not that of ``support.units``.
+    on_data_sheet: words for it on a data sheet; empty where it is on none. in_polynomial: whether it is estimated there
+    together with others of the model equation.
     """
 
     borne_by = Bearer.SENSORS
+    on_data_sheet: ClassVar[str] = ""
+    in_polynomial: ClassVar[bool] = False
     symbol: ClassVar[str]
     unit: ClassVar[str]
     scale: ClassVar[float]

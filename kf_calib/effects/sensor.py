@@ -28,6 +28,7 @@ class BiasAsymmetry(SensorEffect):
 
     family = "nonlinearity"
     name, title, source = "bias-asymmetry", "bias that changes sign with the input", IEEE
+    on_data_sheet = "bias asymmetry"
     drawn_against = _INPUT
     formulas = ("0.5*sign(a)",)
     confused_with = "odd-quadratic; invisible in six faces"
@@ -43,6 +44,7 @@ class ScaleAsymmetry(SensorEffect):
 
     family = "nonlinearity"
     name, title, source = "scale-asymmetry", "scale factor that differs with the sign of the input", IEEE
+    on_data_sheet = "scale asymmetry"
     drawn_against = _INPUT
     formulas = ("0.5*abs(a)",)
     confused_with = "second-order"
@@ -58,6 +60,7 @@ class SecondOrder(SensorEffect):
 
     family = "nonlinearity"
     name, title, source = "second-order", "second-order nonlinearity", IEEE
+    on_data_sheet, in_polynomial = "second order", True
     drawn_against = _INPUT
     formulas = ("a**2",)
     confused_with = "scale-asymmetry"
@@ -73,6 +76,7 @@ class ThirdOrder(SensorEffect):
 
     family = "nonlinearity"
     name, title, source = "third-order", "third-order nonlinearity", IEEE
+    on_data_sheet, in_polynomial = "third order", True
     drawn_against = _INPUT
     formulas = ("a**3",)
     confused_with = "odd-quadratic; invisible in six faces"
@@ -94,6 +98,7 @@ class OddQuadratic(SensorEffect):
 
     family = "nonlinearity"
     name, title, source = "odd-quadratic", "odd quadratic nonlinearity", IEEE
+    on_data_sheet = "odd quadratic"
     drawn_against = _INPUT
     formulas = ("a*abs(a)",)
     confused_with = "third-order; invisible in six faces"
@@ -115,6 +120,7 @@ class CrossCouplingIP(_CrossCoupling):
     """Kip a_i a_p."""
 
     name, title, symbol = "cross-coupling-ip", "input-pendulous cross-coupling", "Kip"
+    on_data_sheet, in_polynomial = "coupling i × p", True
     drawn_against = Regressor("a*p", "force along the input axis times that along the pendulous axis", "m^2/s^4")
     formulas = ("a*p",)
 
@@ -126,6 +132,7 @@ class CrossCouplingIO(_CrossCoupling):
     """Kio a_i a_o."""
 
     name, title, symbol = "cross-coupling-io", "input-output cross-coupling", "Kio"
+    on_data_sheet, in_polynomial = "coupling i × o", True
     drawn_against = Regressor("a*o", "force along the input axis times that along the output axis", "m^2/s^4")
     formulas = ("a*o",)
 
@@ -137,6 +144,7 @@ class CrossCouplingPO(_CrossCoupling):
     """Kpo a_p a_o."""
 
     name, title, symbol = "cross-coupling-po", "pendulous-output cross-coupling", "Kpo"
+    on_data_sheet, in_polynomial = "coupling p × o", True
     drawn_against = Regressor("p*o", "force along the pendulous axis times that along the output axis", "m^2/s^4")
     formulas = ("p*o",)
 
@@ -148,6 +156,7 @@ class CrossAxisSquare(_CrossCoupling):
     """Kpp a_p^2."""
 
     name, title, symbol = "cross-axis-square", "square of the pendulous acceleration", "Kpp"
+    on_data_sheet = "pendulous square"
     drawn_against = Regressor("p", "force along the pendulous axis", "m/s^2")
     formulas = ("p**2",)
     confused_with = "second-order, output-square, bias"
@@ -161,6 +170,7 @@ class OutputSquare(_CrossCoupling):
     """Koo a_o^2; beside K2, Kpp and a bias it is redundant, because the squares sum to g^2, alone it is not."""
 
     name, title, symbol = "output-square", "square of the acceleration along the output axis", "Koo"
+    on_data_sheet = "output square"
     drawn_against = Regressor("o", "force along the output axis", "m/s^2")
     formulas = ("o**2",)
     confused_with = "second-order and cross-axis-square together"
@@ -175,6 +185,7 @@ class VibrationRectification(SensorEffect):
 
     family = "surroundings"
     name, title, source = "vibration-rectification", "shift of the bias under vibration", IEEE
+    on_data_sheet = "vibration bias"
     drawn_against = Regressor("", "variance of the readings", "m^2/s^4")
     borne_by = Bearer.EITHER  # the sensor rectifies what the bench shakes
     confused_with = "needs vibration that varies"
