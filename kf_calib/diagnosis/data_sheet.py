@@ -55,13 +55,13 @@ class DataSheet:
 def data_sheet(diagnosed: Diagnosis, refits: Refits) -> DataSheet:
     """The data sheet of a run; refits: those of the diagnosis."""
     result = diagnosed.after or diagnosed.before
-    own, bench = {str(effect) for effect in result.model.effects}, result.bench
+    modelled, bench = {str(effect) for effect in result.model.effects}, result.bench
     effects = [each for name in names(bench) if isinstance(each := effect_named(name, bench), SensorEffect)]
     listed = [each for each in effects if each.on_data_sheet]
-    polynomial = _refit(refits, result, [str(each) for each in listed if each.in_polynomial and str(each) not in own])
+    polynomial = _refit(refits, result, [str(each) for each in listed if each.in_polynomial and str(each) not in modelled])
     rows = [*_parameters(result)]
     for effect in listed:
-        if str(effect) in own:
+        if str(effect) in modelled:
             rows.append(_row(effect, result, "found"))
         elif effect.in_polynomial:
             rows.append(_row(effect, polynomial, "together"))
