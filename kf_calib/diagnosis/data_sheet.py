@@ -58,7 +58,8 @@ def data_sheet(diagnosed: Diagnosis, refits: Refits) -> DataSheet:
     modelled, bench = {str(effect) for effect in result.model.effects}, result.bench
     effects = [each for name in names(bench) if isinstance(each := effect_named(name, bench), SensorEffect)]
     listed = [each for each in effects if each.on_data_sheet]
-    polynomial = _refit(refits, result, [str(each) for each in listed if each.in_polynomial and str(each) not in modelled])
+    together = [str(each) for each in listed if each.in_polynomial and str(each) not in modelled]
+    polynomial = _refit(refits, result, together)
     rows = [*_parameters(result)]
     for effect in listed:
         if str(effect) in modelled:
