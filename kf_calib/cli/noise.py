@@ -88,7 +88,8 @@ def _gyroscopes(path: Path, reading: ReadingOptions, gyro: str, size: float) -> 
             raise InputError(f"--gyro {gyro!r} names no topic: write --gyro TOPIC:X,Y,Z with the paths of the rates.")
         return Recording(path, keys, fields=(f"accel={gyro}",), max_chunk_mb=reading.max_chunk_mb, angles=False)
     names = [name.strip() for name in gyro.split(",")]
-    header = _header(path)
+    dataset = reading.accel_topic or ""
+    header = _header(path, dataset)
     absent = [name for name in names if name not in header]
     if len(names) != len(_AXES) or absent:
         lacking = f"there is no column {absent[0]!r}" if len(names) == len(_AXES) else "it takes three names"
@@ -96,15 +97,15 @@ def _gyroscopes(path: Path, reading: ReadingOptions, gyro: str, size: float) -> 
     stated = {theirs: ours for theirs, ours in renamed(reading.columns).items() if ours.startswith("time")}
     others = {name: "-" for name in header if name not in names and name not in stated and not _TIME.search(name)}
     columns = others | dict(zip(names, _AXES, strict=True)) | stated
-    return Lines(path, keys, columns, units=Units.of(keys), angles=False)
+    return Lines(path, keys, columns, units=replace(Units.of(keys), dataset=dataset), angles=False)
 
 
-def _header(path: Path) -> list[str]:
-    """The names of a log's columns."""
+def _header(path: Path, dataset: str) -> list[str]:
+    """The names of a log's columns; dataset: of a container."""
     from kf_calib.sources.text.encoding import head_of
     from kf_calib.sources.text.heading import TextHeading
 
-    lines = [line for line in head_of(path).decode(errors="replace").splitlines() if line.strip()]
+    lines = [line for line in head_of(path, dataset).decode(errors="replace").splitlines() if line.strip()]
     if not lines or lines[0].lstrip("\ufeff \t").startswith(("{", "[")):
         raise InputError(f"{path}: --gyro is for columns of CSV and for bags, and this has neither.")
     return [name for name in TextHeading.of(lines).header if name]

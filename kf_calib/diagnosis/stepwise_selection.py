@@ -241,25 +241,26 @@ class Improvement:
         return f"; they turn the platform's frame by {turn_arcsec:.2g} arcsec, a choice, and beyond that {differ}"
 
     @cached_property
-    def _frame_turns(self) -> list[Floats]:
-        """Return how far the platform's frame of each alternative is turned to that of the first, rad; none where not
-        all of the twelve are determined."""
+    def _states(self) -> list[Floats]:
+        """Return the affine states (12,) of the alternatives; none where not all of the twelve are determined."""
         parameters = [[each.result.parameters[symbol].value for symbol in paper_parameters.SYMBOLS]
                       for each in self.alternatives]  # fmt: skip
-        if not parameters or any(value is None for own in parameters for value in own):
+        if any(value is None for values in parameters for value in values):
             return []
-        states = [paper_parameters.state_of(np.array(own, float)) for own in parameters]
-        return [paper_parameters.frame_turn(state, states[0]) for state in states]
+        return [paper_parameters.state_of(np.array(values, float)) for values in parameters]
+
+    @cached_property
+    def _frame_turns(self) -> list[Floats]:
+        """Return how far the platform's frame of each alternative is turned to that of the first, rad."""
+        return [paper_parameters.frame_turn(state, self._states[0]) for state in self._states]
 
     @cached_property
     def spreads(self) -> tuple[Spread, ...]:
         """The range over all alternatives of each of the twelve parameters that all of them determine; in the frame of
         the first."""
-        spreads, turned = list[Spread](), list[Floats]()
-        for alternative, turn in zip(self.alternatives, self._frame_turns, strict=False):
-            values = [alternative.result.parameters[symbol].value for symbol in paper_parameters.SYMBOLS]
-            state = paper_parameters.turned(paper_parameters.state_of(np.array(values, float)), turn)
-            turned.append(paper_parameters.parameters_of(state))
+        spreads = list[Spread]()
+        turned = [paper_parameters.parameters_of(paper_parameters.turned(state, turn))
+                  for state, turn in zip(self._states, self._frame_turns, strict=True)]  # fmt: skip
         for k, symbol in enumerate(paper_parameters.SYMBOLS if self.alternatives else ()):
             parameters = [each.result.parameters[symbol] for each in self.alternatives]
             values = [float(own[k]) for own in turned] or [p.value for p in parameters if p.value is not None]

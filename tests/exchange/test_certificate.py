@@ -168,7 +168,7 @@ def test_a_sensitivity_is_shown_with_three_digits_at_least(cal: Path, lab: Path,
     per_si = field_unit(own.results[0].unit).per_si / field_unit(line.unit).per_si
     values = np.zeros(12)
     values[0] = largest / per_si
-    row = document._sensitivity(own, replace(line, per_dwell=values[:, None]))
+    row = document._sensitivity(own, replace(line, changes=values[:, None]))
     assert row["values"][0] == shown
 
 

@@ -68,9 +68,8 @@ def test_an_ellipsoid_holds_what_it_says(count: int) -> None:
 
 def line(standard: float, distribution: str, dof: float = math.inf, dwells: int = 0) -> Contribution:
     """One that moves all of the twelve alike: in common, or anew in each of so many dwells."""
-    per_dwell = np.full((12, max(dwells, 1)), 1.0 / math.sqrt(max(dwells, 1)))
-    return Contribution("e", "", "B", standard, "", distribution, dof, None, standard**2 * np.ones((12, 12)),
-                        per_dwell, not dwells)  # fmt: skip
+    changes = np.full((12, max(dwells, 1)), 1.0 / math.sqrt(max(dwells, 1)))
+    return Contribution("e", "", "B", standard, "", distribution, dof, None, standard**2 * np.ones((12, 12)), changes)
 
 
 @pytest.mark.parametrize(

@@ -50,9 +50,9 @@ class Contribution:
     """One line of the budget.
 
     name, title: symbol and words. kind: A or B. standard: standard uncertainty of the input quantity in ``unit``, None
-    for type A. per_dwell (12, D): change of each parameter per unit of it in each dwell; None for type A. is_common:
-    whether it is the same in all dwells, or drawn anew in each. covariance (12, 12): what it adds to that of the
-    parameters. dof: degrees of freedom, may be infinite.
+    for type A. covariance (12, 12): what it adds to that of the parameters. changes (12, k): change of each parameter
+    per unit of it, one column where it is the same in all dwells, one for each where it is drawn anew; None for type A.
+    dof: degrees of freedom, may be infinite.
     """
 
     name: str
@@ -64,8 +64,7 @@ class Contribution:
     dof: float
     source: str | None
     covariance: Floats
-    per_dwell: Floats | None = None
-    is_common: bool = True
+    changes: Floats | None = None
 
     @property
     def parts(self) -> Floats:
@@ -76,9 +75,9 @@ class Contribution:
     def sensitivity(self) -> Floats | None:
         """The change (12,) of each parameter per unit of it; the root of the sum of the squares where it is drawn anew
         in each dwell."""
-        if self.per_dwell is None:
+        if self.changes is None:
             return None
-        return self.per_dwell.sum(axis=1) if self.is_common else np.sqrt((self.per_dwell**2).sum(axis=1))
+        return self.changes[:, 0] if self.changes.shape[1] == 1 else np.sqrt((self.changes**2).sum(axis=1))
 
 
 @dataclass(frozen=True)
@@ -236,9 +235,10 @@ def _type_b(uncertainty: TypeB, saved: SavedCalibration, stimulus: Stimulus, cha
     effect = effects.effect_named(uncertainty.effect, saved.bench)
     columns = _columns(effect, uncertainty, stimulus)
     per_dwell = np.einsum("pdi,diq->qpd", changes, columns)  # q: coefficient, p: parameter, d: dwell
+    changes = per_dwell.sum(axis=2, keepdims=True) if uncertainty.varies == "run" else per_dwell
     divisor = uncertainty.k if uncertainty.distribution == "normal" else DIVISORS[uncertainty.distribution]
     return [
-        _line(uncertainty, effect, coefficient, quantity(uncertainty.size, coefficient.unit) / divisor, per_dwell[q])
+        _line(uncertainty, effect, coefficient, quantity(uncertainty.size, coefficient.unit) / divisor, changes[q])
         for q, coefficient in enumerate(effect.coefficients)
     ]
 
@@ -258,16 +258,14 @@ def _columns(effect: Effect, uncertainty: TypeB, stimulus: Stimulus) -> Floats:
 
 
 def _line(
-    uncertainty: TypeB, effect: Effect, coefficient: Coefficient, standard: float, per_dwell: Floats
+    uncertainty: TypeB, effect: Effect, coefficient: Coefficient, standard: float, changes: Floats
 ) -> Contribution:
     words = {"run": "", "dwell": ", another in each dwell"}[uncertainty.varies]
     at = f", at {uncertainty.temperature}" if uncertainty.temperature else ""
-    is_common = uncertainty.varies == "run"
-    by_input = per_dwell.sum(axis=1, keepdims=True) if is_common else per_dwell
     return Contribution(
         coefficient.symbol, f"{effect.title} ({effect}){words}{at}", "B", abs(standard), coefficient.unit,
         uncertainty.distribution, uncertainty.dof or math.inf, uncertainty.source,
-        standard**2 * by_input @ by_input.T, per_dwell, is_common,
+        standard**2 * changes @ changes.T, changes,
     )  # fmt: skip
 
 

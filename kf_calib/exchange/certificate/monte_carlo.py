@@ -10,6 +10,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.exchange.certificate.budget import COVERAGE, Budget, Contribution
+from kf_calib.exchange.certificate.statement import DIVISORS
 
 _BLOCK = 20_000  # draws at once
 _SEED = 101
@@ -39,16 +40,13 @@ def monte_carlo(budget: Budget, draws: int) -> MonteCarloCheck:
 
 def _drawn(line: Contribution, rng: np.random.Generator, count: int) -> Floats:
     """Return what a line of the budget adds to the twelve, (count, 12)."""
-    if line.per_dwell is None:  # of the filter: one size of all noise that was estimated
+    scales = _scales(line.dof, rng, count)[:, None]
+    if line.changes is None:  # of the filter: one size of all noise that was estimated
         values, vectors = np.linalg.eigh(line.covariance)
-        root = vectors * np.sqrt(np.maximum(values, 0.0))
-        return (rng.standard_normal((count, len(values))) @ root.T) * _scales(line.dof, rng, count)[:, None]
+        return (rng.standard_normal((count, len(values))) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T) * scales
     assert line.standard is not None
-    independent = 1 if line.is_common else line.per_dwell.shape[1]
-    inputs = line.standard * _standardised(line.distribution, rng, (count, independent))
-    inputs *= _scales(line.dof, rng, count)[:, None]
-    by_input = line.per_dwell.sum(axis=1, keepdims=True) if line.is_common else line.per_dwell
-    return inputs @ by_input.T
+    inputs = line.standard * _standardised(line.distribution, rng, (count, line.changes.shape[1]))
+    return (inputs * scales) @ line.changes.T
 
 
 def _scales(dof: float, rng: np.random.Generator, count: int) -> Floats:
@@ -59,12 +57,11 @@ def _scales(dof: float, rng: np.random.Generator, count: int) -> Floats:
 
 def _standardised(distribution: str, rng: np.random.Generator, shape: tuple[int, int]) -> Floats:
     """Return draws with mean 0 and standard deviation 1."""
-    match distribution:
-        case "rectangular":
-            return math.sqrt(3.0) * rng.uniform(-1.0, 1.0, shape)
-        case "triangular":
-            return math.sqrt(6.0) * rng.triangular(-1.0, 0.0, 1.0, shape)
-        case "arcsine":
-            return math.sqrt(2.0) * np.sin(2.0 * math.pi * rng.uniform(size=shape))
-        case _:
-            return rng.standard_normal(shape)
+    if distribution not in DIVISORS:
+        return rng.standard_normal(shape)
+    of_half_width_1 = {
+        "rectangular": lambda: rng.uniform(-1.0, 1.0, shape),
+        "triangular": lambda: rng.triangular(-1.0, 0.0, 1.0, shape),
+        "arcsine": lambda: np.sin(2.0 * math.pi * rng.uniform(size=shape)),
+    }
+    return DIVISORS[distribution] * of_half_width_1[distribution]()

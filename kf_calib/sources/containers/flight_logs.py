@@ -9,6 +9,8 @@ import numpy as np
 
 from kf_calib.sources.containers.dataset import ArrayColumn, Dataset
 
+DATAFLASH = b"\xa3\x95"
+"""First bytes of a file of ArduPilot, unless it is written in letters."""
 _ULOG_SENSORS = "sensor_accel", "sensor_combined"
 """Messages with what a sensor reads; others with accelerations are estimates."""
 _DATAFLASH_SENSORS = "ACC", "IMU"
@@ -38,8 +40,9 @@ def dataflash_datasets(path: Path) -> list[Dataset]:
     """The messages of accelerometers in a DataFlash file, those of each instance (``I``) for themselves."""
     from pymavlink.DFReader import DFReader_binary, DFReader_text
 
-    is_text = path.open("rb").read(2) != b"\xa3\x95"
-    reader = DFReader_text(str(path)) if is_text else DFReader_binary(str(path))
+    with path.open("rb") as file:
+        is_binary = file.read(len(DATAFLASH)) == DATAFLASH
+    reader = DFReader_binary(str(path)) if is_binary else DFReader_text(str(path))
     rows = dict[str, list[list[float]]]()
     fields = dict[str, list[str]]()
     try:

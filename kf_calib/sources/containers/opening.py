@@ -11,7 +11,7 @@ from pathlib import Path
 from kf_calib.errors import InputError, KfCalibError, need
 from kf_calib.sources.containers.arrays import hdf5_arrays, matlab_arrays, numpy_arrays
 from kf_calib.sources.containers.dataset import Dataset, chosen
-from kf_calib.sources.containers.flight_logs import dataflash_datasets, ulog_datasets
+from kf_calib.sources.containers.flight_logs import DATAFLASH, dataflash_datasets, ulog_datasets
 from kf_calib.sources.containers.groups import ArrayGroup, datasets_of
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -44,7 +44,7 @@ def kind_of_container(path: Path) -> ContainerKind | None:
         return ContainerKind.NUMPY
     if start.startswith(b"ULog\x01\x12\x35"):
         return ContainerKind.ULOG
-    return ContainerKind.DATAFLASH if start.startswith((b"\xa3\x95", b"FMT, 128,")) else None
+    return ContainerKind.DATAFLASH if start.startswith((DATAFLASH, b"FMT, 128,")) else None
 
 
 def datasets_in(path: Path) -> tuple[Dataset, ...]:

@@ -268,3 +268,16 @@ def test_a_dataset_that_is_changed_on_the_disk_is_read_anew(tmp_path: Path) -> N
     assert len(dataset_of(path)) == 50
     with pytest.raises(InputError, match="no dataset 'x'"):
         dataset_of(path, "x")
+
+
+def test_gyroscopes_are_those_of_the_dataset_that_is_chosen(tmp_path: Path, run: Any) -> None:
+    unit = {"t": SECONDS, "accel": np.tile([0.0, 0.0, G], (len(SECONDS), 1)) + 0.1 * others(), "gyro": others()}
+    savemat(tmp_path / "two.mat", {"imu0": unit, "imu1": unit | {"gyro": 3.0 * others()}})
+    white = list[float]()
+    for dataset in ("/imu0", "/imu1"):
+        code, out, err = run("noise", tmp_path / "two.mat", "--accel-topic", dataset, "--gyro", "gyro_x,gyro_y,gyro_z",
+                             "--json")  # fmt: skip
+        assert code == 0, err
+        channel = next(each for each in json.loads(out)["channels"] if each["unit"] == "rad/s")
+        white.append(channel["intervals"]["white"]["value"])
+    assert white[1] == pytest.approx(3.0 * white[0])
