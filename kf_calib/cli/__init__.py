@@ -14,7 +14,6 @@ import rich_click
 
 from kf_calib.cli.echo import fall_silent, open_streams
 from kf_calib.cli.failures import tell
-from kf_calib.support import late_modules
 
 SECTIONS = {
     "Evaluate a recording": {"replay": "evaluate.replay", "diagnose": "evaluate.diagnose",
@@ -65,7 +64,6 @@ def cli() -> None:
 def main() -> None:
     """Entry point of ``kf-calib``."""
     open_streams()
-    late_modules.put_off()
     try:
         code = cli.main(standalone_mode=False)
         sys.stdout.flush()
