@@ -71,8 +71,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 def _why_nothing_is_drawn() -> str:
     """What the viewer says for want of a graphics driver; empty where it draws."""
     import rerun as rr
-
-    from kf_calib.views.screenshot import ScreenshotError, screenshot
+    from screenshot import ScreenshotError, screenshot
 
     with tempfile.TemporaryDirectory() as folder:
         rrd = Path(folder, "empty.rrd")

@@ -26,9 +26,9 @@ import right_pictures
 import run_picture
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
+from screenshot import screenshot
 
 import kf_calib
-from kf_calib.views.screenshot import screenshot
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"

@@ -35,7 +35,6 @@ _SELDOM = (
     "reference", "azimuth_deg", "date", "nominal", "accel_scale", "counts", "restate_input", "g_unit", "rate_hz",
     "where", "accel_topic", "pose_topic", "temperature_topic", "fields", "max_chunk_mb", "effects_from", "trust",
     "settle_s", "still_deg", "gate", "gate_sigma", "prior", "bias_walk", "engine", "bench_model", "svg", "pdf",
-    "screenshot",
 )  # fmt: skip
 """Options that few runs need: a bench or a file that is unusual."""
 _MOST_OPTIONS = 22

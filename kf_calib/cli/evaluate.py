@@ -45,7 +45,6 @@ if TYPE_CHECKING:
 _OF_DIAGNOSE_ALONE = (
     "details",
     "rrd",
-    "screenshot",
     "png",
     "svg",
     "pdf",

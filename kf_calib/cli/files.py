@@ -1,12 +1,11 @@
 """The files that commands write: which they are, and their turn, which comes when the result has been printed.
 
-Among them are pictures (the Rerun view, a screenshot of it, figures) and the page of a report.
+Among them are pictures (the Rerun view, figures) and the page of a report.
 """
 
 from __future__ import annotations
 
 import shlex
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from click import get_current_context  # rich_click declares that there may be n
 from click.core import ParameterSource
 
 from kf_calib.cli.command import OUTPUT, option
-from kf_calib.cli.echo import complain, echo
+from kf_calib.cli.echo import echo
 from kf_calib.cli.failures import tell
 from kf_calib.support.output_files import Outputs
 
@@ -145,33 +144,10 @@ class Pictures:
 
     rrd: RerunFile = None
     figures: FigureFiles = FigureFiles()
-    screenshot: Annotated[Path | None, output_option(
-        "--screenshot", metavar="FILE.png",
-        help="Save a screenshot of the Rerun view here; needs a graphics driver.",
-    )] = None  # fmt: skip
 
     def save(self, deliver: Delivery, result: Any) -> None:
-        """Save what was asked for of a result; Rerun and matplotlib are imported when they have something to draw.
-
-        A viewer that finds no graphics driver is a complaint; all else that fails is told as for any other file.
-        """
-        from kf_calib.views.screenshot import ScreenshotError, screenshot
-
+        """Save what was asked for of a result; Rerun and matplotlib are imported when they have something to draw."""
         deliver.file(self.rrd, lambda path: write_view(result, path))
-        rrd = None if self.rrd in deliver.failures else self.rrd
-
-        def draw(path: Path) -> None:
-            with tempfile.TemporaryDirectory() as folder:
-                drawn = rrd or Path(folder) / "view.rrd"
-                if rrd is None:
-                    write_view(result, drawn)
-                screenshot(drawn, path)
-
-        deliver.file(self.screenshot, draw)
-        error = None if self.screenshot is None else deliver.failures.get(self.screenshot)
-        if isinstance(error, ScreenshotError) and self.screenshot is not None:
-            complain(f"the screenshot could not be taken: {error}")
-            del deliver.failures[self.screenshot]
         self.figures.save(deliver, result)
 
 

@@ -288,8 +288,9 @@ def certificate_object(
             "left_out": list(certificate.budget.left_out),
             "covariance": None if certificate.twelve is None else certificate.twelve[1].tolist(),
             "intrinsic": [_intrinsic_object(each) for each in certificate.intrinsic],
-            "monte_carlo": None if check is None else {
-                "draws": check.draws, "expanded": check.expanded.tolist(), "agrees": list(check.agrees)},
+            "monte_carlo": None
+            if check is None
+            else {"draws": check.draws, "expanded": check.expanded.tolist(), "agrees": list(check.agrees)},
         }
     )
 

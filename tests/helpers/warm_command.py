@@ -154,6 +154,7 @@ def become(told: dict, streams: list[int]) -> None:
     os.environ.update(told["env"])
     os.chdir(told["cwd"])
     resource.setrlimit(resource.RLIMIT_FSIZE, tuple(told["file_bytes"]))
+    sys.dont_write_bytecode = "PYTHONDONTWRITEBYTECODE" in os.environ  # which Python reads when it starts
     at_once = bool(os.environ.get("PYTHONUNBUFFERED"))
     for name, stream, mode in (("stdin", 0, "rb"), ("stdout", 1, "wb"), ("stderr", 2, "wb")):
         was, written = getattr(sys, name), mode == "wb"

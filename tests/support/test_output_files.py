@@ -33,7 +33,6 @@ from kf_calib.errors import InputError, KfCalibError
 from kf_calib.sources.files.recorder import Recorder
 from kf_calib.sources.files.recording import Recording
 from kf_calib.support.output_files import Growing, Outputs, whole, write_whole
-from kf_calib.views.screenshot import ScreenshotError
 
 QUICK = ["--orientations", "12", "--dwell-s", "6", "--slew-degps", "360", "--sample-hz", "50", "--seed", "3"]
 MINE = b"the user's own"
@@ -130,7 +129,7 @@ def test_the_file_of_a_standard_stream_is_not_written(here: Path, words: str, st
 
 
 FIGURES = ["--png", "--svg", "--pdf"]
-PICTURES = ["--rrd", *FIGURES, "--screenshot"]
+PICTURES = ["--rrd", *FIGURES]
 WRITING = [
     ("replay run.mcap", [*PICTURES, "--save", "--save-model"]),
     ("diagnose run.mcap", PICTURES),
@@ -366,16 +365,6 @@ def test_one_file_that_fails_does_not_keep_others_from_being_written(
     code, out, err = run("improve", "run.mcap", "--journal", "j.toml", "--save-model", "m.toml", "--unattended")
     assert code == 2 and err.count("no room") == 1 and "Stopped" in out and "saved m.toml" in out
     assert Path("m.toml").exists() and "saved j.toml" not in out
-
-
-def test_a_picture_that_cannot_be_drawn_is_a_warning(run, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def draw(*_: object) -> None:
-        raise ScreenshotError("no graphics driver.")
-
-    monkeypatch.setattr("kf_calib.views.screenshot.screenshot", draw)
-    code, out, err = run("replay", "run.mcap", "--json", "--screenshot", "x.png", "--rrd", "x.rrd")
-    assert code == 0 and out.count("\n") == 1 and json.loads(out)["dwells"] == 12 and Path("x.rrd").exists()
-    assert err == "kf-calib: the screenshot could not be taken: no graphics driver.\n"
 
 
 def test_files_are_written_where_nobody_reads_the_result(here: Path) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from screenshot import ScreenshotError, screenshot, viewer
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
@@ -25,7 +26,6 @@ from kf_calib.views.rerun import markdown_summary
 from kf_calib.views.rerun.names import number, path_of
 from kf_calib.views.rerun.series import nis_band
 from kf_calib.views.rerun.spheres import FINAL_SIZE, ellipsoids_of, magnification
-from kf_calib.views.screenshot import ScreenshotError, screenshot
 
 STEP_NS = 10_000_000
 MOVE_NS = 2_000_000_000
@@ -234,7 +234,7 @@ def test_without_a_graphics_driver_it_says_what_to_install(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As it is for any test that does not say that it draws."""
-    monkeypatch.setattr("kf_calib.views.screenshot._IDLE_S", 0.0)  # as on a busy machine: it listens, and ends later
+    monkeypatch.setattr("screenshot._IDLE_S", 0.0)  # as on a busy machine: it listens, and ends later
     with pytest.raises(ScreenshotError, match="mesa-vulkan-drivers"):
         screenshot(recording, tmp_path / "x.png")
 
@@ -275,9 +275,7 @@ def test_the_picture_is_not_that_of_an_empty_file(recording: Path, tmp_path: Pat
 def test_no_panel_complains(recording: Path) -> None:
     from rerun.experimental import ViewerClient
 
-    from kf_calib.views import screenshot as module
-
-    with module.viewer(recording, (1200, 800)) as client:
+    with viewer(recording, (1200, 800)) as client:
         assert isinstance(client, ViewerClient)
         client.take_screenshot()
         state = client.get_state()

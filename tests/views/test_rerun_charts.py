@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from helpers.known_runs import hidden_diagnosed, hidden_improved
 from helpers.paths import RECORDINGS
+from screenshot import screenshot, viewer
 
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.stepwise_selection import Improvement
@@ -29,7 +30,6 @@ from kf_calib.views.rerun.growing import GrowingView
 from kf_calib.views.rerun.names import new_stream
 from kf_calib.views.rerun.series import VisitHistory, predicted
 from kf_calib.views.rerun.spheres import signed
-from kf_calib.views.screenshot import screenshot, viewer
 
 
 def run(name: str, *effects: str, **settings: object) -> Calibration:

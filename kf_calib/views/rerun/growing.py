@@ -12,6 +12,7 @@ import queue
 import socket
 import struct
 import subprocess
+import sys
 import tempfile
 import threading
 from contextlib import suppress
@@ -25,7 +26,6 @@ from kf_calib.online.status import Judgement
 from kf_calib.support.output_files import Growing
 from kf_calib.views.rerun import grow
 from kf_calib.views.rerun.names import new_stream
-from kf_calib.views.screenshot import binary, obituary
 
 PORT = 9876
 _HEADER = 12  # bytes before the first message of what Rerun encoded
@@ -174,6 +174,25 @@ def messages(data: bytes) -> bytes:
             break
         at += 16 + size
     return data[_HEADER:at]
+
+
+def binary() -> str:
+    """Path of the viewer itself; the script of the same name would start it as a process that outlives a kill."""
+    import rerun_cli
+
+    return str(Path(rerun_cli.__file__).with_name("rerun.exe" if sys.platform == "win32" else "rerun"))
+
+
+def obituary(log: str) -> str:
+    """Why the viewer ended, from its log, in one sentence."""
+    if any(word in log for word in ("render context", "graphics adapter", "Vulkan")):
+        return (
+            "the Rerun viewer found no graphics driver: install Vulkan's software driver "
+            "(Debian and Ubuntu: apt-get install mesa-vulkan-drivers)."
+        )
+    lines = [line.strip() for line in log.splitlines() if line.strip() and "XDG_RUNTIME_DIR" not in line]
+    said = next((line for line in lines if "panicked" in line), lines[0] if lines else "it said nothing")
+    return f"the Rerun viewer ended before it drew anything ({said[:200]}): open the .rrd file with `rerun` to see why."
 
 
 def _listens(port: int) -> bool:

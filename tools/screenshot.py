@@ -1,4 +1,4 @@
-"""A picture of a Rerun recording, rendered without a window, for reports and for machines with no display.
+"""A picture of a Rerun recording, rendered without a window: for the pages of the docs, and for tests.
 
 The viewer of Rerun runs headless on a free port of this machine, loads the file, gives its picture, and is ended. It
 draws with Vulkan, by the software driver of Mesa where there is no graphics card.
@@ -10,7 +10,6 @@ import io
 import os
 import socket
 import subprocess
-import sys
 import tempfile
 import time as clock
 from collections.abc import Iterator
@@ -18,8 +17,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kf_calib.errors import KfCalibError
-from kf_calib.support.output_files import whole
+from PIL import Image
+
+from kf_calib.views.rerun.growing import binary, obituary
 
 if TYPE_CHECKING:
     from rerun.experimental import ViewerClient
@@ -31,7 +31,7 @@ _POLL_S = 0.05
 _SETTLED = 2  # equal pictures in a row that are needed, as views still size their axes in the first frames
 
 
-class ScreenshotError(KfCalibError):
+class ScreenshotError(RuntimeError):
     """The viewer could not draw the recording."""
 
 
@@ -45,8 +45,7 @@ def screenshot(
     """Draw a recording into a PNG file of ``size`` (width, height) pixels, and return its path.
 
     ``timeline`` and ``time`` move the cursor first (s on a timeline of durations, a count on a sequence); without them
-    the picture shows the recording as it opens. Raises ScreenshotError where the viewer cannot draw it, and InputError
-    where the PNG file cannot be written.
+    the picture shows the recording as it opens. Raises ScreenshotError where the viewer cannot draw it.
     """
     rrd, png = Path(rrd_path).resolve(), Path(png_path).resolve()
     if not rrd.is_file():
@@ -56,7 +55,8 @@ def screenshot(
         if timeline is not None:
             _seek(client, timeline, time)
         picture = _steady_picture(client)
-    _write(picture, png)
+    window = Image.open(io.BytesIO(picture))
+    window.crop((0, _MENU_PX, window.width, window.height)).save(png)
     return png
 
 
@@ -84,13 +84,6 @@ def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
-
-
-def binary() -> str:
-    """Path of the viewer itself; the script of the same name would start it as a process that outlives a kill."""
-    import rerun_cli
-
-    return str(Path(rerun_cli.__file__).with_name("rerun.exe" if sys.platform == "win32" else "rerun"))
 
 
 def _viewer_with_file(process: subprocess.Popen[bytes], port: int, log: Path) -> ViewerClient:
@@ -122,18 +115,6 @@ def _viewer_with_file(process: subprocess.Popen[bytes], port: int, log: Path) ->
     raise ScreenshotError(f"the Rerun viewer did not load the recording within {_PATIENCE_S:g} s: try again.")
 
 
-def obituary(log: str) -> str:
-    """Why the viewer ended, from its log, in one sentence."""
-    if any(word in log for word in ("render context", "graphics adapter", "Vulkan")):
-        return (
-            "the Rerun viewer found no graphics driver: install Vulkan's software driver "
-            "(Debian and Ubuntu: apt-get install mesa-vulkan-drivers)."
-        )
-    lines = [line.strip() for line in log.splitlines() if line.strip() and "XDG_RUNTIME_DIR" not in line]
-    said = next((line for line in lines if "panicked" in line), lines[0] if lines else "it said nothing")
-    return f"the Rerun viewer ended before it drew anything ({said[:200]}): open the .rrd file with `rerun` to see why."
-
-
 def _seek(client: ViewerClient, timeline: str, time: float | None) -> None:
     """Show a timeline with its cursor at ``time`` (None: the cursor is not moved)."""
     known = {line.name: line.time_type for line in client.get_state().recordings[0].timelines}
@@ -158,12 +139,3 @@ def _steady_picture(client: ViewerClient) -> bytes:
         equal = equal + 1 if following == picture else 0
         picture = following
     return picture
-
-
-def _write(picture: bytes, png: Path) -> None:
-    """Write the picture without the window's top bar."""
-    from PIL import Image
-
-    window = Image.open(io.BytesIO(picture))
-    with whole(png) as part:
-        window.crop((0, _MENU_PX, window.width, window.height)).save(part, "PNG")
