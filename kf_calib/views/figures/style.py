@@ -65,8 +65,6 @@ _RULES: Any = {
     "legend.frameon": False,
     "legend.fontsize": 8.5,
     "figure.titlesize": 11.0,
-    "svg.fonttype": "path",
-    "svg.hashsalt": "kf_calib",  # the same figure is the same file
     "path.simplify": True,
     "text.parse_math": False,  # names and formulas come from recordings: a $ in them is a $
 }
@@ -96,16 +94,19 @@ def blank(width_in: float = 11.0, height_in: float = 7.0) -> Figure:
     return figure
 
 
-def content_of(figure: Figure, kind: str, dpi: float = DPI, letters_as: Literal["path", "none"] = "path") -> bytes:
+def content_of(
+    figure: Figure, kind: str, dpi: float = DPI, letters_as: Literal["path", "none"] = "path", names: str = "kf_calib"
+) -> bytes:
     """A figure as the bytes of a file of this kind: png, svg or pdf; without date, program or user.
 
-    letters_as: of an SVG, ``path`` draws letters as they are here, ``none`` leaves them text, in the reader's typeface.
+    Of an SVG: letters_as ``path`` draws letters as they are here, ``none`` leaves them text, in the reader's typeface;
+    names of its parts are made from ``names``, so that a page can have several.
     """
     nothing = {"svg": {"Date": None, "Creator": None}, "pdf": {"CreationDate": None, "Creator": None, "Producer": None},
                "png": {"Software": None}}  # fmt: skip
     memory = io.BytesIO()
     with styled():
-        matplotlib.rcParams["svg.fonttype"] = letters_as
+        matplotlib.rcParams.update({"svg.fonttype": letters_as, "svg.hashsalt": names})  # the same each time
         figure.savefig(memory, format=kind, dpi=dpi, metadata=nothing[kind])
     return memory.getvalue()
 
