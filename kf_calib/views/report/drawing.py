@@ -107,4 +107,4 @@ def _markup(draw: Callable[[], Figure], prefix: str) -> tuple[str, bool]:
 def _has_many_points(artist: Artist) -> bool:
     if isinstance(artist, Line2D):
         return artist.get_marker() not in ("None", "none", "", " ", None) and np.size(artist.get_xdata()) > _MANY
-    return isinstance(artist, Collection) and max(len(artist.get_paths()), len(artist.get_offsets())) > _MANY
+    return isinstance(artist, Collection) and max(len(artist.get_paths()), np.shape(artist.get_offsets())[0]) > _MANY
