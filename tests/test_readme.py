@@ -35,7 +35,7 @@ OF_LONG_COMMANDS = {
 each run of .ci/run."""
 IN_SHORT = [page for page in WITH_COMMANDS if page.name not in OF_LONG_COMMANDS]
 BLOCK = re.compile(r"^```(\S*)(?: \S+)?\n(.*?)^```", re.DOTALL | re.MULTILINE)
-OF_OTHER_TESTS = ("--honest", "--from-journal")
+OF_OTHER_TESTS = ("--honest",)
 """Options of commands that take long, and do what tests/diagnosis/test_stepwise_selection.py proves."""
 FILE = re.compile(r"^:caption: (\S+)\n\n(.*)", re.DOTALL)
 

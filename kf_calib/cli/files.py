@@ -186,15 +186,13 @@ def measured_of(recording: Path, source: Source) -> Measured:
     """What a page says of a recording's file, which ``source`` reads; raises MissingExtraError where no page can be
     made."""
     import kf_calib.views.figures  # noqa: F401  # which a page needs
-    from kf_calib.diagnosis.selection_journal import Origin
-    from kf_calib.sources.files.record_files import END_RECORD, decision_records
+    from kf_calib.sources.files.record_files import END_RECORD, decision_records, fingerprint
     from kf_calib.sources.opening import run_date
     from kf_calib.views.report.contents import Measured
 
-    fingerprint, began = Origin.of(recording).sha256, run_date(source)
     is_driven = recording.suffix == ".mcap" and recording.is_file()
     decided, ends = (decision_records(recording), decision_records(recording, END_RECORD)) if is_driven else ((), ())
-    return Measured(recording.name, fingerprint, began, decided, ends)
+    return Measured(recording.name, fingerprint(recording), run_date(source), decided, ends)
 
 
 _HOW_IT_ENDS = ("overwrite", "strict", "as_json")

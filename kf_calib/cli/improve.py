@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import rich_click as click
 
-from kf_calib.cli.command import argument, command, grouped, option, values_of
-from kf_calib.cli.echo import complain, print_json, progress, show
+from kf_calib.cli.command import argument, command, option, values_of
+from kf_calib.cli.echo import print_json, progress, show
 from kf_calib.cli.files import Pictures, ReportFile, claimed, delivery, measured_of, output_option, save_report
 from kf_calib.cli.options import (
     BenchOptions,
@@ -50,8 +50,6 @@ class StepOptions:
         "--accept-first", panel=STEPS, help="Where no effect has 95 % probability, take the likeliest.")] = False
     honest: Annotated[bool, option("--honest", panel=STEPS, help="Held-out error with the choice of effects repeated "
                                    "without what is held out, in 6 folds.")] = False
-    from_journal: Annotated[Path | None, option(
-        "--from-journal", metavar="FILE", panel=STEPS, help="First take the steps of this journal again.")] = None
     # fmt: on
 
     def asks(self, as_json: bool) -> bool:
@@ -70,9 +68,8 @@ class StepOptions:
     "improve run.mcap --interactive",
     seldom=("accel_unit", "angle_unit", "columns", "left_out"),
 )
-@click.pass_context
 def improve(
-    ctx: click.Context, recording: Annotated[Path, argument()], steps: StepOptions, reading: ReadingOptions,
+    recording: Annotated[Path, argument()], steps: StepOptions, reading: ReadingOptions,
     evaluation: EvaluationOptions, save: Save,
     save_model: Annotated[Path | None, output_option(
         "--save-model", "--out-model", metavar="FILE.toml", help="Save the last model here.")],
@@ -87,15 +84,9 @@ def improve(
     from kf_calib.views import improvement as views
 
     interactive, outputs = steps.asks(as_json), claimed(overwrite=overwrite)
-    earlier = selection_journal.read_journal(steps.from_journal) if steps.from_journal else None
-    origin = selection_journal.Origin.of(recording)
-    if earlier is not None and steps.from_journal is not None:
-        earlier.refuse_other(origin, steps.from_journal)
-        reading, evaluation = _of_journal(ctx, earlier.origin, steps.from_journal)
-        outputs.spare(evaluation.programs.effects_from)
     _refuse_engine(evaluation)
     settings = evaluation.settings()
-    origin = _for_journal(origin, reading, evaluation, settings.effects)
+    origin = _for_journal(recording, reading, evaluation, settings.effects)
     measured = measured_of(recording, reading.opened(recording)) if report else None
 
     with delivery(outputs, as_json) as deliver:
@@ -103,13 +94,10 @@ def improve(
         def keep(state: stepwise_selection.Improvement) -> None:
             deliver.keep(journal_file, lambda path: selection_journal.write_journal(path, state, origin))
 
-        difference = None
         with progress(f"improving on {recording.name}", as_json) as tick:
             source = reading.opened(recording)
             start, refits = calibrate(source, settings, tick), Refits(source)
-            if earlier is not None:
-                state, difference = selection_journal.replay_journal(earlier, start, refits)
-            elif interactive:
+            if interactive:
                 state = stepwise_selection.begin(start, refits)
             else:
                 state = stepwise_selection.improve(start, steps.accept_first, keep, refits)
@@ -119,9 +107,9 @@ def improve(
             checked = nested_cross_validation.nested_cross_validation(start, on_fold=tick) if steps.honest else None
         if as_json:
             files = {"saved_model": save_model, "journal": journal_file}
-            print_json(views.improvement_object(state, checked, difference, files))
+            print_json(views.improvement_object(state, checked, files))
         else:
-            show(views.improvement_report(state, checked, difference))
+            show(views.improvement_report(state, checked))
         deliver.calibration(save, state.result, source)
         deliver.model(save_model, state.result)
         deliver.file(journal_file, lambda path: selection_journal.write_journal(path, state, origin))
@@ -144,12 +132,14 @@ def _refuse_engine(evaluation: EvaluationOptions) -> None:
 
 
 def _for_journal(
-    origin: Origin, reading: ReadingOptions, evaluation: EvaluationOptions, effects: Sequence[str]
+    recording: Path, reading: ReadingOptions, evaluation: EvaluationOptions, effects: Sequence[str]
 ) -> Origin:
-    """An origin with all that numbers depend on: options and programs; files of bench keys and of models by what they
-    say."""
+    """What the improvement is made from, with all that numbers depend on: options and programs; files of bench keys and
+    of models by what they say."""
+    from kf_calib.diagnosis.selection_journal import Origin
     from kf_calib.effects import loaded
     from kf_calib.exchange import calibration_file
+    from kf_calib.sources.files.record_files import fingerprint
 
     programs = evaluation.programs
     files = [*programs.effects_from]
@@ -159,42 +149,7 @@ def _for_journal(
     others = (*_BY_CONTENT, *_LEAVE)
     kept = {key: value for key, value in values_of(reading, evaluation) if value is not None and key not in others}
     options = kept | reading.keys | {"effects": list(effects)}
-    return replace(origin, options=options, programs=tuple(loaded(files)))
-
-
-def _of_journal(ctx: click.Context, origin: Origin, path: Path) -> tuple[ReadingOptions, EvaluationOptions]:
-    """The options of a journal, as if they had been given, with the Python files that may be run for it.
-
-    Raises UsageError where some are given as well, and InputError where the journal's make no sense.
-    """
-    from click.core import ParameterSource
-
-    from kf_calib.effects.user import allowed
-
-    names = {name for name, _ in values_of(ReadingOptions(), EvaluationOptions())} - {*_LEAVE}
-    params = [param for param in ctx.command.params if param.name in names]
-    given = [
-        param.opts[0] for param in params if ctx.get_parameter_source(param.name or "") is ParameterSource.COMMANDLINE
-    ]
-    if given:
-        raise click.UsageError(f"--from-journal has its options from the journal: leave out {', '.join(given)}.")
-    journalled = {key: value for key, value in origin.options.items() if key not in ("bench_file", "model_file")}
-    values = ctx.params.copy()
-    values.update(dict.fromkeys(key for key in _BY_CONTENT if key not in journalled))
-    for param in params:
-        if (name := param.name or "") in journalled:
-            try:
-                if isinstance(journalled[name], list | tuple) != bool(getattr(param, "multiple", False)):
-                    raise TypeError
-                values[name] = param.type_cast_value(ctx, journalled[name])
-            except (click.BadParameter, TypeError, ValueError) as error:
-                why = error.message if isinstance(error, click.BadParameter) else f"{journalled[name]!r}"
-                raise InputError(f"{path}: is no journal of improve (option {name}: {why}).") from None
-    programs = allowed(path, origin.programs, values["effects_from"], values["trust"])
-    for change in programs.changes:
-        complain(f"{change}")
-    values["effects_from"] = (*values["effects_from"], *programs.files)
-    return grouped(ReadingOptions, values), grouped(EvaluationOptions, values)
+    return Origin(recording.name, fingerprint(recording), options, tuple(loaded(files)))
 
 
 HOW = "number: add it; a NAME, f FORMULA: add that; d NAME: drop; u: undo; q: finish"

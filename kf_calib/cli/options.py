@@ -264,7 +264,7 @@ class ProgramOptions:
     effects_from: Annotated[tuple[Path, ...], _of_model(
         "--effects-from", metavar="FILE.py",
         help="A Python file with effect classes of your own, for --with to name; repeatable. It is run.")] = ()
-    trust: Annotated[bool, _of_model("--trust", help="Run the Python files that a model, a calibration or a journal "
+    trust: Annotated[bool, _of_model("--trust", help="Run the Python files that a model or a calibration "
                                      "names: they can do all that you can.")] = False
 
 

@@ -13,7 +13,7 @@ A file needs no more than this (ten lines at most)::
 What a class leaves out is filled in: name ``mine``, title, source ``user``, symbols ``mine1 mine2 mine3``, scale 1, and
 the unit of the field that it is shown in (``support.units``). Reading such a file runs it, as Python runs any module.
 
-Python files that a model file or a journal names: the classes of effects it needs are in them.
+Python files that a model file names: the classes of effects it needs are in them.
 
 Loading such a file runs it, and whoever wrote it can then do all that the user can. Files from others are therefore
 only loaded where the user named the file himself, or says that he trusts what came with it.
@@ -149,7 +149,7 @@ _LARGEST_BYTES = 10_000_000
 
 @dataclass(frozen=True)
 class Program:
-    """A Python file; sha256: of its content when the model or journal was saved, empty where that is not known."""
+    """A Python file; sha256: of its content when the model was saved, empty where that is not known."""
 
     path: Path
     sha256: str = ""

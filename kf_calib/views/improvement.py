@@ -27,15 +27,13 @@ _EIGHTHS = " ▏▎▍▌▋▊▉"
 def improvement_object(
     state: Improvement,
     honest: NestedCrossValidation | None,
-    replay_difference: float | None,
     files: Mapping[str, Path | None],
 ) -> dict[str, Any]:
     """The JSON object of ``improve``.
 
     The errors of a step are those after it, and p-values are family-wise.
 
-    state: the improvement. honest: its nested cross-validation (None: not made). replay_difference: largest relative
-    difference from the figures of the journal that was replayed (None: no replay). files: paths written, by their keys.
+    state: the improvement. honest: its nested cross-validation (None: not made). files: paths written, by their keys.
     """
     unknown, going = state.diagnosis.description, state.diagnosis.next_orientation
     return clean(
@@ -79,7 +77,6 @@ def improvement_object(
             "unknown": description_object(unknown),
             "next_orientation": None if going is None else orientation_object(*going),
             "honest": None if honest is None else vars(honest),
-            "replay_difference": replay_difference,
             **{key: None if path is None else str(path) for key, path in files.items()},
             "warnings": state.warnings,
         }
@@ -132,13 +129,10 @@ def _parameters(result: Calibration) -> list[dict[str, Any]]:
     return [{key: own[key] for key in own if key != "nominal"} for own in parameters_object(result)]
 
 
-def improvement_report(
-    state: Improvement, honest: NestedCrossValidation | None, replay_difference: float | None
-) -> RenderableType:
+def improvement_report(state: Improvement, honest: NestedCrossValidation | None) -> RenderableType:
     """The report that ``improve`` prints: the fall of the errors, why it stopped, what would help, and the parameters.
 
-    state: the improvement. honest: its nested cross-validation (None: not made). replay_difference: largest relative
-    difference from the figures of the journal that was replayed (None: no replay).
+    state: the improvement. honest: its nested cross-validation (None: not made).
     """
     style = "bold green" if state.because == "consistent" else "bold yellow"
     parts: list[RenderableType] = [
@@ -149,9 +143,6 @@ def improvement_report(
     parts.append(last_parameters(state))
     if honest is not None:
         parts.append(Text(honest_sentence(honest)))
-    if replay_difference is not None:
-        same = "to the last bit" if replay_difference == 0 else f"to within {replay_difference:.1g} of each figure"
-        parts.append(Text(f"The steps of the journal gave the same figures, {same}."))
     parts += map(note, state.warnings)
     return Group(*parts)
 

@@ -16,7 +16,6 @@ from kf_calib import effects
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.bench.streams import Batch
 from kf_calib.cli import cli
-from kf_calib.diagnosis import selection_journal
 from kf_calib.errors import InputError
 from kf_calib.estimation import model_file
 from kf_calib.sources.files.recorder import Recorder
@@ -49,7 +48,7 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def received(tmp_path: Path, original: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with a recording, and a model file and a journal that name a Python file beside them."""
+    """A folder with a recording, and a model file that names a Python file beside it."""
     monkeypatch.setattr(effects, "_registered", {})
     folder = tmp_path / "received"
     folder.mkdir()
@@ -60,12 +59,6 @@ def received(tmp_path: Path, original: Path, monkeypatch: pytest.MonkeyPatch) ->
     (folder / "model.toml").write_text(
         f'effects = ["bend"]\neffects_from = ["own.txt"]\n[sha256]\n"own.txt" = "{digest}"\n'
     )
-    sha256 = hashlib.sha256((folder / "run.mcap").read_bytes()).hexdigest()
-    (folder / "journal.toml").write_text(
-        f'version = "1"\nstopped_because = "asked"\nsteps = []\n'
-        f'recording = {{name = "run.mcap", sha256 = "{sha256}"}}\n'
-        f'[start]\n[options]\neffects = ["bend"]\neffects_from = ["{own}"]\n[sha256]\n"{own}" = "{digest}"\n'
-    )
     return folder
 
 
@@ -73,7 +66,7 @@ COMMANDS = [
     "replay {f}/run.mcap --model {f}/model.toml", "compare {f}/run.mcap --model {f}/model.toml",
     "diagnose {f}/run.mcap --model {f}/model.toml", "effects --model {f}/model.toml",
     "improve {f}/run.mcap --unattended --model {f}/model.toml", "live sim://?speed=100 --model {f}/model.toml",
-    "plan --recording {f}/run.mcap --model {f}/model.toml", "improve {f}/run.mcap --from-journal {f}/journal.toml",
+    "plan --recording {f}/run.mcap --model {f}/model.toml",
 ]  # fmt: skip
 
 
@@ -90,7 +83,7 @@ def test_a_received_file_runs_no_code(run, received: Path, command: str) -> None
     "words", [["--trust"], ["--effects-from", "{f}/own.txt"], ["--effects-from", "{f}/../copy.py"]]
 )
 @pytest.mark.parametrize("command", ["effects --model {f}/model.toml --json",
-                                     "improve {f}/run.mcap --json --from-journal {f}/journal.toml"])  # fmt: skip
+                                     "improve {f}/run.mcap --json --model {f}/model.toml"])  # fmt: skip
 def test_code_runs_where_the_user_says_so(run, received: Path, words: list[str], command: str) -> None:
     (received.parent / "copy.py").write_text(ALARM)
     code, out, err = run(*(f"{command} {' '.join(words)}").format(f=received).split())
@@ -121,28 +114,10 @@ def test_the_rest_of_a_file_is_checked_first(received: Path, line: str) -> None:
 
 def test_in_python_too(received: Path) -> None:
     found = model_file.read_model_file(received / "model.toml")
-    assert selection_journal.read_journal(received / "journal.toml").origin.programs[0].path == received / "own.txt"
     with pytest.raises(InputError, match="would run"):
         found.load()
     assert not (received / "RAN").exists()
     assert found.load(named=[received / "own.txt"]) == () and (received / "RAN").exists()
-
-
-def test_a_journal_of_another_recording_runs_nothing(run, received: Path) -> None:
-    path, digest = received / "journal.toml", hashlib.sha256((received / "run.mcap").read_bytes()).hexdigest()
-    path.write_text(path.read_text().replace(digest, "0" * 64))
-    code, _, err = run("improve", received / "run.mcap", "--from-journal", path, "--trust")
-    assert code == 2 and "is the journal of another recording" in err and not (received / "RAN").exists()
-
-
-@pytest.mark.parametrize("option", ["still_deg = [1]", "gate = [1, 2]", "effects = 3", "left_out = 'x'", "prior = 'y'",
-                                    "model_file = '/dev/zero'\nstill_deg = 'x'"])  # fmt: skip
-def test_a_journals_options_are_checked(run, received: Path, option: str) -> None:
-    path = received / "journal.toml"
-    text = path.read_text().split("[options]")[0]
-    path.write_text(f"{text}[options]\n{option}\n")
-    code, out, err = run("improve", received / "run.mcap", "--from-journal", path)
-    assert (code, out) == (2, "") and err.count("\n") == 1 and "is no journal of improve" in err, err
 
 
 def hostile(path: Path, original: Path) -> Path:

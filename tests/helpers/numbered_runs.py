@@ -38,7 +38,7 @@ def of_diagnosis(diagnosis: Diagnosis) -> Numbers:
 
 def of_improvement(improvement: Improvement) -> Numbers:
     """Of ``improve``."""
-    told = {"improve": improvement_object(improvement, None, None, {})}
+    told = {"improve": improvement_object(improvement, None, {})}
     return told | {"figures": ResultNumbers().add(improvement, "improve").figures}
 
 

@@ -91,7 +91,7 @@ ITS_INPUT = [
     "replay run.mcap --effects-from own.py --save-model own.py",
     "improve run.mcap --journal run.mcap",
     "improve run.mcap --save-model run.mcap",
-    "improve run.mcap --from-journal model.toml --journal model.toml",
+    "improve run.mcap --model model.toml --journal model.toml",
     "plan --recording run.mcap --csv run.mcap",
     "plan --positions angles.csv --csv angles.csv",
     "record lines.csv lines.csv",

@@ -71,7 +71,7 @@ SAID: dict[str, Callable[[Calibration], RenderableType]] = {
     "model": lambda result: console.model_table(result.model),
     "compare": _compared,
     "diagnose": lambda result: diagnosis.diagnosis_report(diagnose(result, REFITS)),
-    "improve": lambda result: improvement.improvement_report(improve(result, refits=REFITS), None, None),
+    "improve": lambda result: improvement.improvement_report(improve(result, refits=REFITS), None),
     "effects": lambda result: catalogue.overview([effect_named(name, BENCH) for name in names(BENCH)]),
     "effects NAME": lambda result: catalogue.details([effect_named("warm-up", BENCH)]),
     "effects --recording": _visible,

@@ -311,7 +311,7 @@ def _(found: Diagnosis) -> str | None:
 
 @as_html.register
 def _(state: Improvement) -> str | None:
-    return _html(improvement.improvement_report(state, None, None))
+    return _html(improvement.improvement_report(state, None))
 
 
 def _html(drawn: RenderableType) -> str | None:
