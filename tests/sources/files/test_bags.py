@@ -10,8 +10,8 @@ from helpers.recordings import ACCEL, ANGLES, BATCH, BENCH, HEAT, Topic, assert_
 from mcap.writer import Writer
 
 from kf_calib.bench.streams import Stream
-from kf_calib.sources.files.record_files import fingerprint
 from kf_calib.errors import InputError
+from kf_calib.sources.files.record_files import fingerprint
 from kf_calib.sources.files.recording import Recording
 
 METADATA = """rosbag2_bagfile_information:
