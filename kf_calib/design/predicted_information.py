@@ -29,6 +29,7 @@ from kf_calib.estimation.settings import Prior
 from kf_calib.noise import random_walk
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise, considered_information, lift_rounding, mean_covariances
+from kf_calib.noise.terms import Scatter, SettingError
 
 PAUSE_S = 60.0
 """Pause before the first dwell of a plan that continues a run, and between dwells if the run has a single dwell."""
@@ -89,7 +90,8 @@ class Prospect:
         model = Model(bench)
         scatter = np.full(3, bench.scatter_sigma_mps2 or 0.0)
         setting_rad = math.radians(bench.angle_sigma_deg or 0.0)
-        noise = Noise(np.full(3, sigma_mps2), np.ones(3), setting_rad, scatter, True, True)
+        terms = SettingError(setting_rad, stated=True), Scatter(scatter, stated=True)
+        noise = Noise(np.full(3, sigma_mps2), np.ones(3), terms)
         return cls(model, model.nominal_state(), noise, readings, dwell_s, np.zeros((model.count, model.count)))
 
     @classmethod

@@ -27,7 +27,7 @@ from kf_calib.estimation.free_attitude import (
     weak_covariance,
 )
 from kf_calib.estimation.measurement_model import Model
-from kf_calib.noise.noise_model import within_dwells
+from kf_calib.noise.within_dwells import within_dwells
 
 SAME_SIDE_DEG = 10.0
 """Poses whose directions of gravity differ by less than this are of one side: the second tells little that is new."""

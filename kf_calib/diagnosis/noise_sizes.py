@@ -14,7 +14,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.run_likelihood import RunLikelihood, integrated
 from kf_calib.noise.noise_model import Noise
-from kf_calib.noise.reml import OF_ONE
+from kf_calib.noise.reml import OF_ONE, Parts
 
 _STATED, _UNSTATED = 0.02, 0.5  # prior probability of noise beyond what was stated, and where nothing was stated
 _OF_ONE = 0.1  # share of one accelerometer alone in scatter
@@ -31,7 +31,7 @@ class NoiseFamily:
     the squared size, in units of the noise that was stated. log_prior: log of its prior probability.
     """
 
-    parts: tuple[str, ...]
+    parts: Parts
     shapes: Floats
     log_prior: float
 
@@ -58,7 +58,7 @@ class NoiseSizes:
             return families
         setting = self._likelihood.shapes_of("setting")
         families.append(NoiseFamily(("setting",), setting, self._log_prior(("setting",))))
-        if not (self._noise.setting_stated and self._noise.scatter_stated):
+        if not (self._noise.setting.stated and self._noise.scatter.stated):
             both = ("setting", "common")
             families.append(NoiseFamily(both, setting + common, self._log_prior(both)))
         return families
@@ -108,8 +108,8 @@ class NoiseSizes:
         """Return the log mean (n,) of likelihoods over the sizes of a family."""
         return integrated(logs, self._likelihood.step) - math.log(_RANGE)
 
-    def _log_prior(self, parts: Sequence[str]) -> float:
+    def _log_prior(self, parts: Parts) -> float:
         """Return the log of the prior probability that these parts of the noise are free, and no others."""
-        stated = {"setting": self._noise.setting_stated, "common": self._noise.scatter_stated}
+        stated = {"setting": self._noise.setting.stated, "common": self._noise.scatter.stated}
         priors = {part: _STATED if is_stated else _UNSTATED for part, is_stated in stated.items()}
         return sum(math.log(prior if part in parts else 1.0 - prior) for part, prior in priors.items())

@@ -39,6 +39,7 @@ from kf_calib.dwells.qr import orthonormal
 from kf_calib.effects import effect_named
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.results import Calibration
+from kf_calib.noise.terms import RandomWalk, ThermometerError
 from kf_calib.support import stage
 from kf_calib.support.tail_probabilities import log_odds_of
 
@@ -67,7 +68,7 @@ class RunPosterior:
     def __init__(self, refits: Refits, before: Calibration, test: CandidateTests) -> None:
         self._refits, self._before, self._test = refits, before, test
         model = before.model
-        self._noise = replace(before.noise.without_estimates(), walk_mps2_per_sqrt_s=0.0)
+        self._noise = before.noise.without_estimates().without(RandomWalk)
         misfit_mps2 = float(np.sqrt(np.mean(before.residuals_mps2**2)))
         self._least_mps2 = (_ROUNDING if before.noise.within_seen else _UNSEEN) * misfit_mps2
         self._run = RunTerms(before, self._noise, self._least_mps2, test)
@@ -163,8 +164,8 @@ class RunPosterior:
 
     def _share_of_unknown(self, family: NoiseFamily) -> float:
         """Return the share of an unknown cause in noise: in setting errors that nobody stated none, which are usual."""
-        stated = {"setting": self._noise.setting_stated}
-        if any(stated.get(part, self._noise.scatter_stated) for part in family.parts):
+        stated = {"setting": self._noise.setting.stated}
+        if any(stated.get(part, self._noise.scatter.stated) for part in family.parts):
             others = 1.0 - _OF_ORIENTATION if self._run.repeats else 1.0  # which has a row of its own
             return others * _AGAINST_STATED / (others * _AGAINST_STATED + 1.0 - _AGAINST_STATED)
         return 0.0 if family.parts == ("setting",) else _IRREGULAR
@@ -341,8 +342,8 @@ class RunPosterior:
         """Return the log evidence of the effects that a refit has in addition, at the values of their constants, and
         the fall of chi-squared by them in the likeliest noise."""
         noise, model = self._noise, refit.model
-        if refit.noise.sensitivity_mps2_per_k is not None:
-            noise = replace(noise, sensitivity_mps2_per_k=refit.noise.sensitivity_mps2_per_k)
+        if (thermometer := refit.noise.term(ThermometerError)) is not None:
+            noise = noise.with_terms(thermometer)
         effects = model.effects[len(self._before.model.effects) :]
         known = model.parts[str(effects[0])].start
         likelihood = RunLikelihood(refit.linearised, noise, self._least_mps2, known=known)

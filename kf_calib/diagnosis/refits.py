@@ -105,7 +105,7 @@ def calibration_of(
         source = opened(run)
         before = calibrate(source)
     noise = before.noise
-    if not (before.bench.angles or noise.within_seen or noise.scatter_stated):
+    if not (before.bench.angles or noise.within_seen or noise.scatter.stated):
         raise InputError(
             "means without angles and without standard deviations leave one number a pose, from which the size of the "
             "noise is taken, so that no misfit can be diagnosed: give standard deviation and number of readings in "
@@ -116,7 +116,7 @@ def calibration_of(
 
 def dwell_noise_is_stated(before: Calibration) -> bool:
     """Whether both scatter and setting error were stated rather than estimated."""
-    return before.noise.scatter_stated and before.noise.setting_stated
+    return before.noise.scatter.stated and before.noise.setting.stated
 
 
 def with_noise_as_stated(refits: Refits, before: Calibration, refit: Calibration) -> Calibration:
@@ -125,9 +125,9 @@ def with_noise_as_stated(refits: Refits, before: Calibration, refit: Calibration
     Estimated without the effects, the noise would be too large, as it would contain what they explain.
     """
     noise, bench = refit.noise, before.bench
-    if not noise.setting_stated:
+    if not noise.setting.stated:
         bench = replace(bench, angle_sigma_deg=float(np.degrees(noise.setting_rad)))
-    if not noise.scatter_stated:
+    if not noise.scatter.stated:
         bench = replace(bench, scatter_sigma_mps2=float(np.sqrt(np.mean(noise.scatter_mps2**2))))
     return refits.of(replace(before, bench=bench), before.settings.effects)
 

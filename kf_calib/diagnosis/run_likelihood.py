@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -26,11 +26,11 @@ from kf_calib.dwells.pieces import OfPieces, of_all_pieces
 from kf_calib.dwells.qr import triangle
 from kf_calib.effects import Effect
 from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns
-from kf_calib.estimation.whitened_rows import flicker_of_scatter, whiten
+from kf_calib.estimation.whitened_rows import whiten
 from kf_calib.noise.means import means_of
-from kf_calib.noise.noise_model import Noise, lift_rounding, mean_covariances, setting_covariances
-from kf_calib.noise.reml import with_shared_noise
-from kf_calib.noise.temperature_course import thermometer_errors
+from kf_calib.noise.noise_model import Noise, lift_rounding, mean_covariances
+from kf_calib.noise.reml import FREE, Part, with_shared_noise
+from kf_calib.noise.terms import RandomWalk, Scatter, SettingError
 
 _IMMENSE_MPS2 = 1e3  # scatter so large that nothing is left of a dwell's mean
 _SEEN = 1e-7  # share of a column that the model must leave for it to be seen
@@ -91,7 +91,7 @@ class RunLikelihood:
         model = linearised.model
         known = model.count if known is None else known
         added = candidate_columns(linearised.dwells_at_state, effects, model.bench, linearised.state).values
-        means, prior = with_shared_noise(linearised.dwells, noise, linearised.means)
+        means, prior = with_shared_noise(linearised.dwells, noise, linearised.means, linearised.state)
         shared = means.design.shape[2] - model.count
         of_effects = means_of(linearised.dwells_at_state, OfPieces(added, linearised.dwells.folded.ends)).design
         design = np.concatenate([means.design[..., :known], means.design[..., model.count :]], axis=2)
@@ -127,36 +127,26 @@ class RunLikelihood:
         values, width = of_all_pieces(linearised.columns), model.count - known + added.shape[3]
         if not noise.within_seen:
             return np.zeros((0, known + shared)), np.zeros((0, width)), np.zeros(0)
-        setting_rad = noise.setting_rad if noise.attitude_unknown else 0.0
-        without_means = replace(
-            noise, scatter_mps2=np.full(3, _IMMENSE_MPS2), setting_rad=setting_rad, walk_mps2_per_sqrt_s=0.0
-        )
-        parts = [values, added]
-        if noise.sensitivity_mps2_per_k is not None:
-            parts.append(of_all_pieces(thermometer_errors(dwells, noise.sensitivity_mps2_per_k)))
+        judging = noise.with_scatter_as_flicker(len(dwells)).without(RandomWalk)
+        without_means = judging if noise.attitude_unknown else judging.without(SettingError)
+        without_means = without_means.with_terms(Scatter(np.full(3, _IMMENSE_MPS2)))
+        parts = [values, added, judging.columns("run", dwells, linearised.state)]
         nodes = min(part.shape[1] for part in parts)
         both = np.concatenate([np.broadcast_to(p[:, :nodes], (len(p), nodes, *p.shape[2:])) for p in parts], axis=3)
         moving = _changing(both, dwells.folded.ends)
         moving[: model.count] = True
         about = np.zeros(int(moving.sum()))
         about[: model.count] = linearised.state
-        flicker = flicker_of_scatter(dwells, noise)
-        rows = np.concatenate(
-            whiten(
-                dwells, OfPieces(both[..., moving], dwells.folded.ends), without_means, linearised.state, about,
-                flicker, reduced=False,
-            )
-        )  # fmt: skip
+        moving_columns = OfPieces(both[..., moving], dwells.folded.ends)
+        rows = np.concatenate(whiten(dwells, moving_columns, without_means, linearised.state, about, reduced=False))
         if len(rows) > rows.shape[1]:
             rows = triangle(rows)
         full = np.zeros((len(rows), both.shape[3]))
         full[:, moving] = rows[:, :-1]
         last = model.count + added.shape[3]
-        thermometer = full[:, last:]
         of_model = np.zeros((len(rows), known + shared))
         of_model[:, STATE_COUNT:known] = full[:, STATE_COUNT:known]  # the twelve have none, but for noise of the angles
-        if thermometer.shape[1]:
-            of_model[:, -thermometer.shape[1] :] = thermometer
+        of_model[:, known:] = full[:, last:]
         readings = rows[:, -1] + full[:, known : model.count] @ linearised.state[known:]
         return of_model, full[:, known:last], readings
 
@@ -288,16 +278,10 @@ class RunLikelihood:
         are about n, errs by n step^4 / 100 or so."""
         return min((10.0 / self.rows) ** 0.25, 0.6)
 
-    def shapes_of(self, kind: str) -> Floats:
+    def shapes_of(self, kind: Part) -> Floats:
         """Covariances (D, 3, 3) of scatter ("common"; "first" ... of one accelerometer) or of a setting error, of unit
         size where it equals the noise that was stated in its mean."""
-        if kind == "setting":
-            covariances = setting_covariances(self.means, self.linearised.state)
-        else:
-            which = slice(None) if kind == "common" else [("first", "second", "third").index(kind)]
-            diagonal = np.zeros(3)
-            diagonal[which] = 1.0
-            covariances = np.broadcast_to(np.diag(diagonal), (len(self._root), 3, 3))
+        covariances = FREE[kind].shapes(self.means, self.linearised.state).sum(axis=0)
         shapes = self._root @ covariances @ np.swapaxes(self._root, 1, 2)
         return shapes / max(float(np.einsum("dii->di", shapes).max(axis=1).mean()), 1e-300)
 

@@ -181,7 +181,7 @@ def _unknown(diagnosis: Diagnosis, first: Hypothesis) -> str:
 def _noise(diagnosis: Diagnosis, first: Hypothesis) -> str:
     """Return a sentence on noise from dwell to dwell that was not stated, and on how to be sure of it."""
     noise = diagnosis.before.noise
-    stated = ("angle_sigma_deg", noise.setting_stated), ("scatter_sigma_mps2", noise.scatter_stated)
+    stated = ("angle_sigma_deg", noise.setting.stated), ("scatter_sigma_mps2", noise.scatter.stated)
     keys = " and ".join(key for key, is_stated in stated if not is_stated)
     what = "more than was stated" if dwell_noise_is_stated(diagnosis.before) else "by an amount that was not stated"
     advice = f"state {keys} or repeat an orientation" if keys else "repeat an orientation"

@@ -15,7 +15,7 @@ And a test of whether an oscillation goes on alike in all dwells, as the model o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -30,8 +30,8 @@ from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.square_root_information import scale_columns
 from kf_calib.estimation.whitened_rows import misfit_rows
-from kf_calib.noise.noise_model import Noise, flicker_sigma
-from kf_calib.noise.temperature_course import thermometer_errors
+from kf_calib.noise.noise_model import Noise
+from kf_calib.noise.terms import RandomWalk, ThermometerError
 from kf_calib.support.tail_probabilities import chi_squared_tail, sidak
 
 _DEGREE = 3
@@ -108,28 +108,28 @@ def trend_beside(linearised: LinearisedDwells, noise: Noise, state: Floats) -> T
     from scipy.special import fdtrc
 
     dwells, folded = linearised.dwells, linearised.dwells.folded
-    if folded.dwells[0].averaged or not noise.scatter_stated:
+    if folded.dwells[0].averaged or not noise.scatter.stated:
         return None
     sigma, lengths_s = noise.effective_sigma_mps2, folded.ends_s[:, 1] - folded.ends_s[:, 0]
     squares, determined = _squares(dwells, _residuals(linearised, state))
     by_readings = (sigma**2 / (folded.weights * folded.counts[:, None]))[:, :, None]
     walk_shapes, flicker_shapes = _of_shapes()
     by_walk = noise.walk_mps2_per_sqrt_s**2 * lengths_s[:, None, None] * walk_shapes
-    by_noise = by_readings + by_walk + flicker_sigma(noise, len(dwells))[:, None] ** 2 * flicker_shapes
+    by_noise = by_readings + by_walk + noise.scatter.flicker_mps2(len(dwells))[:, None] ** 2 * flicker_shapes
     expected = by_noise + _by_thermometer(linearised, noise)
     ratios = np.where(determined[:, None, :], squares / expected, 0.0)
     count = 3 * int(determined.sum())
     if not count:
         return None
     unsure = float(np.mean((4.0 * noise.correlation_length - 2.0) / folded.counts.sum())) / 3.0
-    unsure += (2.0 * (noise.walk_spread or 0.0) * float(np.mean(by_walk / expected))) ** 2
+    unsure += (2.0 * (noise.walk.spread or 0.0) * float(np.mean(by_walk / expected))) ** 2
     ratio = float(ratios.sum() / count)
     shown = np.broadcast_to(determined[:, None, :], squares.shape)
     log_density = _log_density(
         squares[shown],
         (expected - by_walk)[shown],
         np.broadcast_to(by_walk, squares.shape)[shown],
-        noise.walk_spread or 0.0,
+        noise.walk.spread or 0.0,
     )
     return Trend(ratio, float(fdtrc(count, 2.0 / unsure, ratio)), ratios.sum(axis=2), log_density)
 
@@ -146,10 +146,10 @@ def _log_density(squares: Floats, by_noise: Floats, by_walk: Floats, spread: flo
 
 def _by_thermometer(linearised: LinearisedDwells, noise: Noise) -> Floats | float:
     """Return the variances (D, 3, degrees) of the coefficients that the error of the temperature gives."""
-    if noise.sensitivity_mps2_per_k is None:
+    thermometer = noise.term(ThermometerError)
+    if thermometer is None:
         return 0.0
-    errors = thermometer_errors(linearised.dwells_at_state, noise.sensitivity_mps2_per_k)
-    of_errors = basis_values(errors.values)
+    of_errors = basis_values(thermometer.columns(linearised.dwells_at_state, linearised.state))
     squares, _ = _squares(linearised.dwells, _on_triangles(linearised.dwells, of_errors))
     return squares.reshape(len(squares), 3, -1, _DEGREE).sum(axis=2)
 
@@ -223,7 +223,7 @@ def disturbed_dwell(fitted: Fit) -> DisturbedDwell:
 
     fitted: a fit whose model has an oscillation. Its random walk of the biases, if it has one, is left out here.
     """
-    linearised, noise = fitted.linearised, replace(fitted.noise.for_goodness_of_fit, walk_mps2_per_sqrt_s=0.0)
+    linearised, noise = fitted.linearised, fitted.noise.for_goodness_of_fit.without(RandomWalk)
     model, dwells = linearised.model, linearised.dwells_at_state
     effect = model.oscillation
     assert effect is not None

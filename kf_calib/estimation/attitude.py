@@ -24,7 +24,7 @@ from kf_calib.estimation.dwell_columns import LinearisedDwells, stimulus_of
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise
-from kf_calib.noise.nuisance_states import rotation_map, tangents
+from kf_calib.noise.rotations import rotation_map, tangents
 
 _STEP = 1e-6  # relative to g, of the differences that give the bending
 _ROUNDING = 1e-7  # of differences, and of constants that follow the force: below it an effect is linear in it
@@ -47,7 +47,7 @@ def at_their_modes(
 ) -> DwellStack:
     """The dwells with attitudes at their posterior modes at ``state`` (p,), to first order about where they were.
 
-    Dwells stay as they are where no setting error is allowed for. Where it is only considered (``Noise.checked``),
+    Dwells stay as they are where no setting error is allowed for. Where it is only considered (``SettingError``),
     attitudes stay as recorded, and the force is shorter by what the setting error takes from its mean.
 
     untold: the ``untold_directions`` of the run, where the dwells are not all of it.
@@ -56,7 +56,7 @@ def at_their_modes(
     if not noise.setting_rad:
         return without_attitudes(stack)
     bendings = bendings_of(linearised, state)
-    if not noise.checked:
+    if noise.setting.considered:
         variances = np.full(len(stack), 2.0 * noise.setting_rad**2)
         return stack.linearised(stack.turned_rad, Attitudes(np.zeros((len(stack), 3)), variances, bendings))
     moved, variances = _posterior_rotations(linearised.means, noise, state, bendings)

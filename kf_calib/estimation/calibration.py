@@ -279,8 +279,8 @@ def refuse_unseen(result: Calibration) -> None:
 def _refuse_without_noise(result: Calibration) -> None:
     """Raise InputError if nothing at all shows how large the noise is, so that no sigma can be given."""
     noise, free = result.noise, degrees_of_freedom(result.linearised.means, not result.bench.angles)
-    setting_stated = noise.setting_stated and result.bench.angles
-    if not (noise.within_seen or noise.scatter_stated or setting_stated) and free < FEWEST:
+    setting_stated = noise.setting.stated and result.bench.angles
+    if not (noise.within_seen or noise.scatter.stated or setting_stated) and free < FEWEST:
         raise InputError(
             f"{len(result.visits)} orientations without standard deviations leave {free} degrees of freedom, too few "
             f"to estimate the noise from ({FEWEST}): give standard deviation and number of readings in each row, "

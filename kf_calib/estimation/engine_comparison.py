@@ -239,9 +239,8 @@ def _whitened(pieces: list[Samples]) -> Floats:
     rows = np.concatenate([np.concatenate([p.observation, p.readings[:, :, None]], axis=2) for p in pieces])
     sigma = np.concatenate([np.repeat(p.sigma_mps2[None], len(p.readings), axis=0) for p in pieces])[:, :, None]
     flat = (rows / sigma).reshape(-1, rows.shape[2])
-    if pieces[0].nuisance_sigmas.size:
-        shared = np.concatenate([p.nuisances * p.nuisance_sigmas for p in pieces])
-        shared = (shared / sigma).reshape(len(flat), -1)
+    if pieces[0].nuisances.shape[2]:
+        shared = (np.concatenate([p.nuisances for p in pieces]) / sigma).reshape(len(flat), -1)
         left, singular, _ = np.linalg.svd(shared, full_matrices=False)
         flat = flat - left @ ((1 - 1 / np.sqrt(1 + singular**2))[:, None] * (left.T @ flat))
     return flat

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bisect
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -17,9 +17,9 @@ from kf_calib.dwells.stack import DwellStack
 from kf_calib.estimation import free_attitude, square_root_information, whitened_rows
 from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns
 from kf_calib.noise.means import Means
-from kf_calib.noise.noise_model import Noise, changes_by_square_axes, flicker_sigma, slow_waves, steps
+from kf_calib.noise.noise_model import Noise, steps
 from kf_calib.noise.reml import Part, gain_of, misfit, with_shared_noise
-from kf_calib.noise.temperature_course import thermometer_errors
+from kf_calib.noise.terms import RandomWalk, SlowWaves, WavesOverRun
 
 _DETERMINED = 1e-9  # share of a state in combinations that are not determined
 
@@ -110,23 +110,18 @@ class Fit:
     @cached_property
     def considered(self) -> Floats:
         """Contribution B (p, p) of considered parameters to the covariance, which becomes P + P B P: constants without
-        a derivative, known effects, and the error of the temperature.
+        a derivative, known effects, and the terms of the noise that are drawn once for the run.
 
         B is the sum of b b^T with b = A^T W g, where A is the design, W the weights and g the change of the readings if
         the constant changes by 1 sigma. The constants are considered parameters: known to be uncertain, but not
         estimated (Schmidt-Kalman filter).
         """
         linearised, information = self.linearised, np.zeros((self.linearised.model.count,) * 2)
-        if self.noise.square_sigmas is not None:
-            information += self._considered(
-                changes_by_square_axes(linearised.dwells_at_state, self.noise.square_sigmas)
-            )
+        of_run = self.noise.columns("run", linearised.dwells_at_state, linearised.state)
+        if of_run.shape[3]:
+            information += self._considered(OfPieces(of_run, self.dwells.folded.ends))
         if not linearised.model.bench.angles and linearised.model.effects:
             information += self._considered(free_attitude.triad_changes(linearised))
-        if self.noise.sensitivity_mps2_per_k is not None:
-            information += self._considered(
-                thermometer_errors(linearised.dwells_at_state, self.noise.sensitivity_mps2_per_k)
-            )
         for known in linearised.model.known:
             columns = candidate_columns(
                 linearised.dwells_at_state, [known.effect], linearised.model.bench, linearised.state
@@ -142,8 +137,8 @@ class Fit:
             information += self._considered(
                 OfPieces(0.5 * (more.values - less.values) @ linearised.state[part, None], self.dwells.folded.ends)
             )
-        if (flicker_mps2 := self.noise.flicker_mps2) is not None and linearised.model.effects:
-            information += self._considered_of_effects(flicker_mps2)
+        if (waves := self.noise.term(SlowWaves)) is not None and linearised.model.effects:
+            information += self._considered_of_effects(waves.flicker_mps2)
         return information
 
     def _considered_of_effects(self, flicker_mps2: Floats) -> Floats:
@@ -154,9 +149,9 @@ class Fit:
         Where slow waves within the dwells show that the scatter is 1/f noise, the scatter tells the size of these.
         """
         dwells = self.linearised.dwells_at_state
-        of_scatter = np.where(flicker_mps2 > 0.0, flicker_sigma(self.noise, len(dwells)), 0.0)
-        columns, sigma = slow_waves(dwells, np.maximum(of_scatter, flicker_mps2))
-        extra = self._considered(OfPieces(columns.values * sigma, dwells.folded.ends))
+        of_scatter = np.where(flicker_mps2 > 0.0, self.noise.scatter.flicker_mps2(len(dwells)), 0.0)
+        waves = WavesOverRun(np.maximum(of_scatter, flicker_mps2))
+        extra = self._considered(OfPieces(waves.columns(dwells, self.linearised.state), dwells.folded.ends))
         covariance = self._solution[1]
         gained = (covariance @ extra @ covariance)[STATE_COUNT:, STATE_COUNT:]
         seen = np.zeros_like(extra)
@@ -177,7 +172,6 @@ class Fit:
             columns,
             self.noise.weights,
             linearised.state,
-            flicker_mps2=self.noise.flicker_mps2,
         )
         upper = square_root_information.accumulate(rows, self.steps)
         gains = upper[:count, :count].T @ upper[:count, count:-1]
@@ -211,8 +205,8 @@ class Fit:
     @cached_property
     def _wandering(self) -> tuple[Noise, Means, Floats]:
         """Return the noise without a walk, the means with columns for slow scatter, and the prior of these columns."""
-        noise, linearised = replace(self.noise.for_goodness_of_fit, walk_mps2_per_sqrt_s=0.0), self.linearised
-        return noise, *with_shared_noise(linearised.dwells, noise, linearised.means)
+        noise, linearised = self.noise.for_goodness_of_fit.without(RandomWalk), self.linearised
+        return noise, *with_shared_noise(linearised.dwells, noise, linearised.means, linearised.state)
 
     def rows(self, noise: Noise | None = None) -> Sequence[Floats]:
         """Whitened rows [H | z] of each dwell, with the weights of the fit or with another noise."""
@@ -224,7 +218,5 @@ class Fit:
 
     def _whitened(self, noise: Noise) -> Sequence[Floats]:
         linearised = self.linearised
-        rows = whitened_rows.whiten(
-            linearised.dwells_at_state, linearised.columns, noise, linearised.state, flicker_mps2=noise.flicker_mps2
-        )
+        rows = whitened_rows.whiten(linearised.dwells_at_state, linearised.columns, noise, linearised.state)
         return whitened_rows.with_frame(rows, linearised.model, noise)

@@ -1,7 +1,7 @@
 """Calibration without angles: of each dwell only the size of the specific force is known, |f| = g.
 
 Nothing is known of the attitude of a dwell, nor that it stays the same within the dwell, and of the three readings one
-combination is left that no rotation changes (``nuisance_states.along_force``); force and state are found in turn
+combination is left that no rotation changes (``rotations.along_force``); force and state are found in turn
 (``attitude``, ``fit``). This module says what the poses of such a run determine, and which pose would tell more.
 
 A common rotation of all axes shows in no |f|. The frame is therefore that of the sensors: accelerometer 1 is its x
@@ -25,7 +25,7 @@ from kf_calib.dwells.pieces import OfPieces
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation.attitude import added_by, bent_effects, matrix_of
 from kf_calib.estimation.dwell_columns import LinearisedDwells, stimulus_of
-from kf_calib.estimation.kalman_filterpy import Samples, all_nuisance_sigmas
+from kf_calib.estimation.kalman_filterpy import Samples
 from kf_calib.estimation.measurement_model import FRAME, SQUARE, Model
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise
@@ -190,12 +190,14 @@ def most_informative(covariance: Floats, state: Floats, gravity_mps2: float) -> 
 
 def holding_frame(samples: Iterable[Samples], linearised: LinearisedDwells, noise: Noise) -> Iterator[Samples]:
     """Yield first a reading of each state that is fixed at zero, times g, then the samples."""
-    fixed, sigmas = linearised.model.fixed, all_nuisance_sigmas(noise)
+    fixed, samples = linearised.model.fixed, iter(samples)
     if fixed:
+        first = next(samples)
         observation = np.zeros((len(fixed), 1, linearised.model.count))
         observation[np.arange(len(fixed)), 0, list(fixed)] = linearised.model.bench.gravity_mps2
         number, start_s = linearised.dwells[0].number, np.full(len(fixed), linearised.dwells[0].start_s)
-        none, readings = np.zeros((len(fixed), 1, len(sigmas))), np.zeros((len(fixed), 1))
+        none, readings = np.zeros((len(fixed), 1, first.nuisances.shape[2])), np.zeros((len(fixed), 1))
         sigma_mps2 = noise.effective_sigma_mps2[:1]
-        yield Samples(number, start_s, observation, none, sigmas, readings, np.zeros((len(fixed), 3)), sigma_mps2)
+        yield Samples(number, start_s, observation, none, readings, np.zeros((len(fixed), 3)), sigma_mps2)
+        yield first
     yield from samples

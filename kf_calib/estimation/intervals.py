@@ -35,9 +35,9 @@ def sigmas_of_interval(fitted: Fit, misfit: float, dof: int) -> float:
     misfit, dof: chi-squared of the fit by the noise that was stated or seen, and its degrees of freedom.
     """
     noise = fitted.noise
-    if dof <= 0 or (noise.setting_stated and noise.scatter_stated):
+    if dof <= 0 or (noise.setting.stated and noise.scatter.stated):
         return NORMAL
-    if not noise.within_seen and not noise.scatter_stated:
+    if not noise.within_seen and not noise.scatter.stated:
         return _student(dof)
     linearised = fitted.linearised
     traces = [np.einsum("dii->d", mean_covariances(each.of_readings, linearised.means, linearised.state))

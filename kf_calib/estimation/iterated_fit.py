@@ -39,11 +39,22 @@ from kf_calib.estimation.dwell_columns import LinearisedDwells, change_by_temper
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import SQUARE, Model
 from kf_calib.estimation.score_test import delta_chi2
-from kf_calib.noise.noise_model import ATTITUDE_UNKNOWN_RAD, FLOOR_MPS2, Noise, within_dwells
+from kf_calib.noise.flicker import with_waves_in_dwells
+from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.noise_of_readings import with_own_noise
-from kf_calib.noise.nuisance_states import along_force, flicker_within, sensitivities_of
 from kf_calib.noise.reml import VarianceComponents, with_shared_noise
+from kf_calib.noise.rotations import along_force, sensitivities_of
 from kf_calib.noise.temperature_course import sensitivity_to_temperature
+from kf_calib.noise.terms import (
+    ATTITUDE_UNKNOWN_RAD,
+    FLOOR_MPS2,
+    RandomWalk,
+    Scatter,
+    SettingError,
+    SquareAxes,
+    ThermometerError,
+)
+from kf_calib.noise.within_dwells import within_dwells
 
 _PASSES = 3
 _PASSES_WITH_UNKNOWNS = 10
@@ -158,13 +169,14 @@ def _with_constants_moved(fitted: Fit, constant_steps: Floats, reach: Floats, nu
 def _noise_at(linearised: LinearisedDwells, within: Noise, components: VarianceComponents, roughly: bool) -> Noise:
     """Return the noise within dwells completed by all that is estimated from the residuals of a linearisation. Of very
     many dwells, some tell ``roughly`` what it is."""
-    within = replace(within, sensitivity_mps2_per_k=_sensitivity_to_temperature(linearised, within))
-    means, prior = with_shared_noise(linearised.dwells, within, linearised.means)
+    sensitivity = _sensitivity_to_temperature(linearised, within)
+    within = within.without(ThermometerError)
+    within = within if sensitivity is None else within.with_terms(ThermometerError(sensitivity))
+    means, prior = with_shared_noise(linearised.dwells, within, linearised.means, linearised.state)
     if roughly and not prior.size:
         means = means[:: max(len(means.counts) // _MANY, 1)]
     noise = components.completed(within, means, linearised.state, prior)
-    flicker_mps2 = flicker_within(linearised.dwells_at_state, linearised.columns, linearised.state, noise)
-    return replace(noise, flicker_mps2=flicker_mps2 if flicker_mps2.any() else None)
+    return with_waves_in_dwells(noise, linearised.dwells_at_state, linearised.columns, linearised.state)
 
 
 def _within_again(fitted: Fit, within: Noise) -> Noise:
@@ -232,7 +244,7 @@ def _begun(
     parameters alone."""
     if model.bench.angles:
         dwells = with_own_noise(DwellStack.of(dwells))
-        within = replace(within_dwells(dwells, walk_mps2_per_sqrt_s), walk_mps2_per_sqrt_s=walk_mps2_per_sqrt_s)
+        within = within_dwells(dwells, walk_mps2_per_sqrt_s).with_terms(RandomWalk(walk_mps2_per_sqrt_s))
         return Fit(LinearisedDwells(without_attitudes(dwells), model, model.nominal_state(), slews), within)
     nine = beginning or _nine_parameters(dwells, model.bench, walk_mps2_per_sqrt_s)
     state = np.append(nine.linearised.state, np.zeros(model.count - STATE_COUNT))
@@ -251,10 +263,11 @@ def _nine_parameters(dwells: Sequence[DwellFactor], bench: Bench, walk_mps2_per_
     facing_up = readings / np.linalg.norm(readings, axis=1, keepdims=True)
     dwells = with_own_noise(dwells, facing_up)
     within = within_dwells(dwells, walk_mps2_per_sqrt_s, facing_up)
-    noise = replace(
-        within, walk_mps2_per_sqrt_s=walk_mps2_per_sqrt_s, setting_rad=ATTITUDE_UNKNOWN_RAD, setting_stated=True,
-        scatter_mps2=np.full(3, stated or 0.0), scatter_stated=stated is not None,
-    )  # fmt: skip
+    noise = within.with_terms(
+        SettingError(ATTITUDE_UNKNOWN_RAD, stated=True),
+        Scatter(np.full(3, stated or 0.0), stated=stated is not None),
+        RandomWalk(walk_mps2_per_sqrt_s),
+    )
     bare = Model(bench, square=tuple(SQUARE))
     facing = facing_readings(dwells, bare.nominal_state(), bare.bench.gravity_mps2)
     begun = Fit(LinearisedDwells(facing, bare, bare.nominal_state()), noise)
@@ -265,7 +278,7 @@ def _nine_parameters(dwells: Sequence[DwellFactor], bench: Bench, walk_mps2_per_
         bare = Model(bench, square=untold)
         settled = _settled(Fit(relinearised(settled.linearised, noise, bare, settled.linearised.state), noise))
     sigmas = free_attitude.square_sigmas(bare, settled.linearised.state)
-    return replace(settled, noise=replace(noise, square_sigmas=sigmas))
+    return settled if sigmas is None else replace(settled, noise=noise.with_terms(SquareAxes(sigmas)))
 
 
 def _settled(fitted: Fit) -> Fit:

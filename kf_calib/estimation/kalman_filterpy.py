@@ -9,6 +9,7 @@ the covariance after tens of thousands of static samples with a wide prior (``fo
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -20,23 +21,9 @@ from numpy.typing import NDArray
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.rows import Rows, basis, on_basis
-from kf_calib.dwells.stack import Folded
 from kf_calib.estimation.dwell_columns import LinearisedDwells, has_turns, turning_mps2
 from kf_calib.noise.noise_model import Noise
-from kf_calib.noise.nuisance_states import (
-    along_force,
-    flicker_sigmas,
-    flicker_waves,
-    nuisance_map,
-    nuisance_sigmas,
-    sensitivities_of,
-)
-
-
-def all_nuisance_sigmas(noise: Noise) -> Floats:
-    """Prior sigmas (q,) of the nuisance states of a dwell, those of the slow waves of 1/f noise last."""
-    sigmas = nuisance_sigmas(noise)
-    return sigmas if noise.flicker_mps2 is None else np.append(sigmas, flicker_sigmas(noise.flicker_mps2))
+from kf_calib.noise.rotations import along_force, sensitivities_of
 
 
 @dataclass(frozen=True)
@@ -47,8 +34,7 @@ class Samples:
     - elapsed_s (n,): times of the samples.
     - observation (n, c, p): the design H of the c channels: three accelerometers, or the size of the force alone where
       attitudes are not known.
-    - nuisances (n, c, q): the columns of the dwell's nuisance states.
-    - nuisance_sigmas (q,): the prior sigmas of these.
+    - nuisances (n, c, q): the columns of the dwell's nuisance states, each of unit variance before the dwell.
     - readings (n, c): the readings.
     - residual_mps2 (n, 3): the readings of the accelerometers less their prediction by the state of the linearisation.
     - sigma_mps2 (c,): sigma of white readings with the same variance of their mean.
@@ -58,7 +44,6 @@ class Samples:
     elapsed_s: Floats
     observation: Floats
     nuisances: Floats
-    nuisance_sigmas: Floats
     readings: Floats
     residual_mps2: Floats
     sigma_mps2: Floats
@@ -78,24 +63,17 @@ class Samples:
 def samples_of(rows: Iterable[Rows], linearised: LinearisedDwells, noise: Noise) -> Iterator[Samples]:
     """Yield samples from a second pass over the rows, with the columns of the first."""
     every, columns = [*linearised.dwells_at_state, *linearised.slews], [*linearised.columns, *linearised.slew_columns]
-    known = {
-        (dwell.number, dwell.moving): (dwell, iter(zip(at_nodes, flicker_waves(Folded([dwell])), strict=True)))
-        for dwell, at_nodes in zip(every, columns, strict=True)
-    }
-    sigmas = all_nuisance_sigmas(noise)
+    known = {(dwell.number, dwell.moving): (dwell, at_nodes) for dwell, at_nodes in zip(every, columns, strict=True)}
     for block in rows:
         if (block.dwell, block.moving) not in known:
             continue
-        dwell, pieces = known[block.dwell, block.moving]
+        dwell, columns_of_pieces = known[block.dwell, block.moving]
+        changes = noise.columns("dwell", [dwell], linearised.state)
         sensitivities = sensitivities_of([dwell], linearised.state)
         along = along_force([dwell], sensitivities)[0] if noise.attitude_unknown else None
-        regressor_map = nuisance_map(sensitivities, noise)[0]
-        for part, u, _ in block.pieces:
-            at_nodes, waves = next(pieces)
+        for (part, u, _), at_nodes, by_errors in zip(block.pieces, columns_of_pieces, changes, strict=True):
             functions = basis(u, block.elapsed_s[part], linearised.carrier_hz)
-            observation = (functions.T @ on_basis(at_nodes.reshape(len(at_nodes), -1))).reshape(
-                len(u), *at_nodes.shape[1:]
-            )
+            observation, nuisances = _at_samples(functions, at_nodes), _at_samples(functions, by_errors)
             regressors, readings = block.columns[part], block.readings[part]
             if not linearised.model.bench.angles:
                 regressors = np.tile(dwell.means[:4], (len(u), 1))
@@ -104,18 +82,20 @@ def samples_of(rows: Iterable[Rows], linearised: LinearisedDwells, noise: Noise)
                 regressors = np.hstack([regressors[:, :1], force])
                 if has_turns(dwell):
                     readings = readings + turning_mps2(dwell, force, linearised.state)
-            nuisances = np.einsum("nc,icq->niq", regressors, regressor_map)
-            if noise.flicker_mps2 is not None:
-                course = functions[:3].T @ on_basis(waves)
-                slow = np.eye(3)[None, :, :, None] * course[:, None, None, :]  # those of each accelerometer its own
-                nuisances = np.concatenate([nuisances, slow.reshape(len(u), 3, -1)], axis=2)
             sigma_mps2 = noise.of(block.moving).effective_sigma_mps2 / np.sqrt(dwell.weights)
             residual_mps2 = readings - observation @ linearised.state
             samples = Samples(
-                block.dwell, block.elapsed_s[part], observation, nuisances, sigmas, readings, residual_mps2,
-                sigma_mps2, block.moving,
+                block.dwell, block.elapsed_s[part], observation, nuisances, readings, residual_mps2, sigma_mps2,
+                block.moving,
             )  # fmt: skip
             yield samples.along(along) if along is not None else samples
+
+
+def _at_samples(functions: Floats, at_nodes: Floats) -> Floats:
+    """Return columns (n, 3, q) at samples with the basis functions (K, n) from those at the nodes (k, 3, q), k <= K."""
+    count = len(at_nodes)
+    values = functions[:count].T @ on_basis(at_nodes.reshape(count, at_nodes[0].size))
+    return values.reshape(len(values), *at_nodes.shape[1:])
 
 
 _DIFFUSE = 1e5
@@ -158,10 +138,11 @@ def estimate(
         root = _DIFFUSE * widest * np.eye(count)
     else:
         root = np.linalg.cholesky(prior_covariance * np.outer(scale, scale))
-    channels = 1 if noise.attitude_unknown else 3
-    kf = _Filter(form, nominal_state * scale, root, all_nuisance_sigmas(noise), channels)
+    samples = iter(samples)
+    first = next(samples)
+    kf = _Filter(form, nominal_state * scale, root, *first.nuisances.shape[:0:-1])
     place, nis, done, previous_s = (-1, False), 0.0, 0, math.nan
-    for piece in samples:
+    for piece in itertools.chain([first], samples):
         if (piece.dwell, piece.moving) != place:
             if on_dwell is not None and done and not piece.moving:
                 on_dwell(kf.state() / scale)
@@ -208,16 +189,15 @@ class _Filter:
     """Either of filterpy's two filters behind a common interface."""
 
     def __init__(
-        self, form: str, state: Floats, root: NDArray[np.floating[Any]], dwell_sigmas: Floats, channels: int
+        self, form: str, state: Floats, root: NDArray[np.floating[Any]], nuisances: int, channels: int
     ) -> None:
         from filterpy.kalman import KalmanFilter, SquareRootKalmanFilter
 
         self.plain = form == "plain"
-        self.dwell_sigmas = dwell_sigmas
         self.count = len(state)
-        size = self.count + len(dwell_sigmas)
+        size = self.count + nuisances
         kf: Any = (KalmanFilter if self.plain else SquareRootKalmanFilter)(dim_x=size, dim_z=channels)
-        kf.x = np.concatenate([state, np.zeros(len(dwell_sigmas))])  # 1-D: a column would broadcast to (n, 3)
+        kf.x = np.concatenate([state, np.zeros(nuisances)])  # 1-D: a column would broadcast to (n, 3)
         full = np.zeros((size, size))
         full[: self.count, : self.count] = root
         if self.plain:
@@ -237,12 +217,12 @@ class _Filter:
         """Reset the nuisance states to their prior, independent of everything before."""
         nuisances = slice(self.count, None)
         self.kf.x[nuisances] = 0.0
-        matrix, sigma = (self.kf.P, self.dwell_sigmas**2) if self.plain else (self.kf._P1_2, self.dwell_sigmas)
+        matrix = self.kf.P if self.plain else self.kf._P1_2
         matrix[nuisances, :] = 0.0
         matrix[:, nuisances] = (
             0.0  # the root is lower triangular: its leading block is the root of the leading covariance
         )
-        matrix[nuisances, nuisances] = np.diag(sigma)
+        matrix[nuisances, nuisances] = np.eye(len(self.kf.x) - self.count)
 
     def walk(self, variance: float) -> None:
         """Do a time update with F = I in which the biases take steps of this variance."""

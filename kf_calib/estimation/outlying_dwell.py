@@ -72,7 +72,7 @@ def _test_dwell(result: Calibration, k: int, rest: Calibration) -> OutlyingDwell
     linearised = LinearisedDwells(without_attitudes(dwells), rest.model, estimate.state)
     means = linearised.means[[k]]
     error, covariance = means.readings[0] - means.design[0] @ estimate.state, _covariance(rest, means)
-    freedom = 1e9 if noise.setting_stated and noise.scatter_stated else max(rest.consistency.dof, 1)
+    freedom = 1e9 if noise.setting.stated and noise.scatter.stated else max(rest.consistency.dof, 1)
     statistic = min(float(error @ np.linalg.solve(covariance, error)), _fall(result, rest))
     p_value = min(len(dwells) * f_tail(3.0, freedom, statistic / 3.0), 1.0)
     if p_value > _BEYOND_DOUBT:

@@ -17,9 +17,11 @@ from kf_calib.estimation import free_attitude, setup_blunders
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.estimate import Estimate
 from kf_calib.estimation.results import Consistency
-from kf_calib.noise.noise_model import TOO_SHORT, Noise
+from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.reml import ENOUGH_DIRECTIONS, FEWEST, degrees_of_freedom, directions
 from kf_calib.noise.temperature_course import temperature_course
+from kf_calib.noise.terms import ThermometerError
+from kf_calib.noise.within_dwells import TOO_SHORT
 from kf_calib.support.units import shown
 
 _GROSS = 0.05  # g; scatter beyond this is a blunder
@@ -48,7 +50,7 @@ def misfit_remark(judged: Consistency, residuals: Floats, bench: Bench, noise: N
 
 def unstated(noise: Noise) -> list[str]:
     """The bench keys of the noise from dwell to dwell that the recording does not state."""
-    known = {"angle_sigma_deg": noise.setting_stated, "scatter_sigma_mps2": noise.scatter_stated}
+    known = {"angle_sigma_deg": noise.setting.stated, "scatter_sigma_mps2": noise.scatter.stated}
     return [key for key, stated in known.items() if not stated]
 
 
@@ -76,7 +78,7 @@ def remarks_on(
             "readings and angles recorded all through the motions, angles at least every half second."
         )
     yield from (remark for effect in model.effects for remark in remarks_of(effect))
-    if noise.sensitivity_mps2_per_k is not None:
+    if noise.term(ThermometerError) is not None:
         left_c = np.sqrt(np.mean(np.sum(temperature_course(dwells.folded).errors_c ** 2, axis=1)))
         yield (
             f"the noise of the thermometer leaves the temperature uncertain by {left_c:.1g} K, which counts as noise "
@@ -132,7 +134,7 @@ def remarks_on(
             f"the noise within dwells differs, {most**-0.5:.2g} to {least**-0.5:.2g} times that of "
             "the run: each dwell has the weight of its own."
         )
-    if not noise.checked and noise.scatter_mps2.any() and not noise.scatter_stated:
+    if noise.setting.considered and noise.scatter_mps2.any() and not noise.scatter.stated:
         known, freedom = directions(linearised.means.force_mps2), degrees_of_freedom(linearised.means)
         yield (
             f"these orientations have gravity in {known} different direction{'s' * (known != 1)}, too few to "
@@ -151,7 +153,7 @@ def remarks_on(
             f"the angles are noisy themselves: together with the stated setting error of {stated_deg:g} deg, each "
             f"pose is uncertain by {np.degrees(noise.setting_rad):.2g} deg, which is used to weight the dwells."
         )
-    if not noise.setting_stated and noise.for_goodness_of_fit.setting_rad > 0:
+    if not noise.setting.stated and noise.for_goodness_of_fit.setting_rad > 0:
         yield (
             f"angle_sigma_deg was not stated; {np.degrees(noise.setting_rad):.2g} deg was estimated from the misfit "
             "between dwells, which an effect not in the model could also cause."
@@ -160,7 +162,7 @@ def remarks_on(
 
 def is_gross(noise: Noise, bench: Bench) -> bool:
     """Tell whether dwells scatter, by an amount that nobody stated, as no sensor does."""
-    return not noise.scatter_stated and float(noise.scatter_mps2.max()) > _GROSS * bench.gravity_mps2
+    return not noise.scatter.stated and float(noise.scatter_mps2.max()) > _GROSS * bench.gravity_mps2
 
 
 def _scatter_in_words(noise: Noise, freedom: int) -> str:
@@ -196,7 +198,7 @@ def _without_angles(linearised: LinearisedDwells, noise: Noise, judged: Consiste
             f"these poses do not tell all angles between the axes: {', '.join(model.square)} taken for square to "
             f"{np.degrees(model.bench.square_rad):.3g} deg (--square-sigma), as sigmas and misfit allow for: {turn}."
         )
-    elif judged.dof < FEWEST and noise.scatter_mps2.any() and not noise.scatter_stated:
+    elif judged.dof < FEWEST and noise.scatter_mps2.any() and not noise.scatter.stated:
         yield (
             f"scatter between poses ({_scatter_in_words(noise, judged.dof)}) was estimated from the misfit of {count} "
             f"poses and enters every sigma: {turn}."

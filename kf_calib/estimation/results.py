@@ -28,7 +28,8 @@ from kf_calib.estimation.residual_table import residual_table, table_as
 from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.signal_quality import Readings
 from kf_calib.noise.means import means_of
-from kf_calib.noise.noise_model import ATTITUDE_UNKNOWN_RAD, Noise, considered_information, steps
+from kf_calib.noise.noise_model import Noise, considered_information, steps
+from kf_calib.noise.terms import ATTITUDE_UNKNOWN_RAD, SettingError
 from kf_calib.support.tail_probabilities import LEVEL, f_tail
 from kf_calib.support.text import as_html, printed
 from kf_calib.support.units import field_unit, shown
@@ -230,7 +231,7 @@ class Calibration:
         """Half the length of the interval of 95 % of a parameter, in units of its sigma: 1.96, or more where noise that
         was not stated is known from few dwells only."""
         noise = self.noise
-        is_stated = noise.setting_stated and noise.scatter_stated
+        is_stated = noise.setting.stated and noise.scatter.stated
         judged = self.consistency if is_stated else consistency(replace(self.fit, noise=noise.without_estimates()))
         return sigmas_of_interval(self.fit, judged.statistic, judged.dof)
 
@@ -269,7 +270,7 @@ class Calibration:
         ]
         units = [*map(field_unit, paper_parameters.UNITS), *((c.shown_unit, c.per_si) for c in coefficients)]
         if (walk := self.model.intensity) is not None:
-            intensity, spread = self.noise.walk_mps2_per_sqrt_s, self.noise.walk_spread
+            intensity, spread = self.noise.walk_mps2_per_sqrt_s, self.noise.walk.spread
             rows.append((walk.symbol, intensity, intensity * spread if spread else math.nan, 0.0, walk.unit))
             units.append((walk.shown_unit, walk.per_si))
         for effect in self.model.constants_beside_state:
@@ -362,9 +363,7 @@ class Calibration:
             before, extra_before = factor, extra
             for part in dwell.prefixes():
                 columns_so_far = [columns[: len(part.pieces)]]
-                rows = whitened_rows.whiten(
-                    [part], columns_so_far, self.noise.weights, state, flicker_mps2=self.noise.flicker_mps2
-                )[0]
+                rows = whitened_rows.whiten([part], columns_so_far, self.noise.weights, state)[0]
                 walked = np.array([pause, steps([part], self.noise)[0, 1]])
                 factor, _ = square_root_information.update(before, rows, walked)
                 extra = extra_before + considered_information(self.noise, means_of([part], columns_so_far), state)[0]
@@ -380,9 +379,7 @@ class Calibration:
         both = [last, dwell]
         linearised = LinearisedDwells(both, self.model, state)
         dwell, last_columns = linearised.dwells_at_state[-1], linearised.columns[1:]
-        rows = whitened_rows.whiten(
-            [dwell], last_columns, self.noise.weights, state, flicker_mps2=self.noise.flicker_mps2
-        )[0]
+        rows = whitened_rows.whiten([dwell], last_columns, self.noise.weights, state)[0]
         factor, _ = square_root_information.update(factor, rows, steps(both, self.noise)[-1])
         extra = extra + considered_information(self.noise, means_of([dwell], last_columns), state)[0]
         return estimate_of(factor, self.model.nominal_state(), extra)
@@ -402,11 +399,11 @@ def consistency(fitted: Fit) -> Consistency:
     upper = square_root_information.accumulate(rows, fitted.steps)
     statistic = float(upper[-1, -1] ** 2)
     dof = square_root_information.row_ranks(rows) - square_root_information.rank(upper[:-1])
-    estimated = not noise.setting_stated and noise.for_goodness_of_fit.setting_rad > 0
+    estimated = not noise.setting.stated and noise.for_goodness_of_fit.setting_rad > 0
     dof -= int(estimated)
     if dof <= 0:
         return Consistency(statistic, 0, None, None)
-    if not noise.within_seen and not noise.scatter_stated:  # the noise was taken from this misfit
+    if not noise.within_seen and not noise.scatter.stated:  # the noise was taken from this misfit
         scatter_mps2 = float(np.sqrt(np.mean(noise.scatter_mps2**2)))
         return Consistency(statistic, dof, None, None, Condition("scatter_sigma_mps2", scatter_mps2, "m/s^2"))
     noise_dof = float(np.maximum(dwells.folded.counts - 4, 1).sum() / noise.correlation_length.mean())
@@ -424,7 +421,10 @@ def consistency(fitted: Fit) -> Consistency:
 
 def _dof_along_force(fitted: Fit) -> int:
     """Return the degrees of freedom of the sizes of the force, which no setting error changes."""
-    linearised, noise = fitted.linearised, replace(fitted.noise.for_goodness_of_fit, setting_rad=ATTITUDE_UNKNOWN_RAD)
+    linearised, noise = (
+        fitted.linearised,
+        fitted.noise.for_goodness_of_fit.with_terms(SettingError(ATTITUDE_UNKNOWN_RAD, stated=True)),
+    )
     rows = whitened_rows.whiten(linearised.dwells_at_state, linearised.columns, noise, linearised.state)
     known = square_root_information.rank(
         square_root_information.accumulate(rows)[:-1][:, -linearised.model.count - 1 :]

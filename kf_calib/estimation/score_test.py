@@ -34,14 +34,12 @@ from kf_calib.estimation.periodogram import Periodogram
 from kf_calib.estimation.whitened_rows import MisfitColumns
 from kf_calib.noise import random_walk
 from kf_calib.noise.noise_model import Noise, steps
+from kf_calib.noise.terms import SlowWaves
 
 _TOGETHER = 24  # least number of columns that are whitened at a time; more would take more memory
 _CELLS = 10_000  # columns times dwells that are whitened at a time, if this allows more columns
 _OF_ONE_KIND = 400  # columns whitened at a time if there are many effects of one kind
 _MANY = 100  # above this number of oscillations, a periodogram is faster
-
-_OF_NOISE = ("sigma_mps2", "inflation", "setting_rad", "scatter_mps2", "walk_mps2_per_sqrt_s",
-             "sensitivity_mps2_per_k", "square_sigmas")  # fmt: skip
 
 
 class Frame:
@@ -106,9 +104,7 @@ class Frame:
 
     def serves(self, linearised: LinearisedDwells, noise: Noise) -> bool:
         """Tell whether the frame was made for exactly these dwells and this noise."""
-        return linearised.dwells_at_state.is_same(self.dwells) and all(
-            np.array_equal(getattr(noise, key), getattr(self.noise, key)) for key in _OF_NOISE
-        )
+        return linearised.dwells_at_state.is_same(self.dwells) and noise.same_sizes(self.noise, without=SlowWaves)
 
     def scan(self, linearised: LinearisedDwells, more: Sequence[Effect] = ()) -> Scan:
         """Project the frame's effects, without those that the model contains, and then the effects ``more`` off the

@@ -1,7 +1,7 @@
 """Whitened rows of dwells: readings and the columns of a model, divided by the noise, so that it is of unit size.
 
-The nuisance states of a dwell (setting error, scatter, slow waves of 1/f noise) are eliminated by QR. From such rows
-the square-root information filter, the misfit and the tests of candidates are computed.
+The errors that the noise draws for each dwell (a setting error, scatter, slow waves of 1/f noise) are eliminated by QR.
+From such rows the square-root information filter, the misfit and the tests of candidates are computed.
 """
 
 from __future__ import annotations
@@ -21,19 +21,11 @@ from kf_calib.dwells.rows import on_basis
 from kf_calib.dwells.stack import AlikeDwells, DwellStack
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.estimation.measurement_model import Model
-from kf_calib.noise.noise_model import Noise, flicker_sigma, shared_noise, slow_scatter
-from kf_calib.noise.nuisance_states import (
-    SLOW,
-    along_force,
-    flicker_sigmas,
-    flicker_waves,
-    nuisance_map,
-    nuisance_sigmas,
-    sensitivities_of,
-)
+from kf_calib.noise.noise_model import Noise
+from kf_calib.noise.rotations import along_force, sensitivities_of
 
 _USUAL = 24  # columns of candidates that are whitened together in a long run
-_LARGE = 1e3  # nuisances, in sigmas of a mean, whose squares may be added to its variance
+_LARGE = 1e3  # errors, in sigmas of a mean, whose squares may be added to its variance
 _AT_ONCE = 1 << 17  # numbers that are processed together, so that they stay in the cache
 
 
@@ -43,30 +35,28 @@ def whiten(
     noise: Noise,
     state: Floats,
     about: Floats | None = None,
-    flicker_mps2: Floats | None = None,
     reduced: bool = True,
 ) -> Sequence[Floats]:
-    """Whitened rows [S | H | z] (r, s + p + 1) of each dwell, with unit noise and the dwell's nuisance states
-    eliminated by QR.
+    """Whitened rows [S | H | z] (r, s + p + 1) of each dwell, with unit noise and the errors that are drawn for each
+    dwell eliminated by QR.
 
     S are the columns of the steps that the biases take within the dwell (s = 3 if they walk, else s = 0), and H (p
     columns) refers to the biases at the end of the dwell. The rows of channel i are divided by the sigma of white
-    readings whose mean has the same variance as that of the correlated readings. The setting error (three rotations)
-    and the scatter (three offsets) are states with Gaussian priors, linearised at ``state``. The residuals within a
-    dwell, which do not depend on the states, are not in the result.
+    readings whose mean has the same variance as that of the correlated readings. The errors of the terms of the noise
+    are states with Gaussian priors, linearised at ``state``. The residuals within a dwell, which do not depend on the
+    states, are not in the result.
 
     - columns: the model's columns at the nodes of each dwell, (pieces, K, 3, p) each.
     - about (p,): if given, z is the readings less the model's prediction from this state, and the solution is a
       correction to it. Readings of size g exceed their sigma by a factor of 1e6 or more, so that this keeps their
       rounding from being the largest error of later computations.
-    - flicker_mps2 (3,): sqrt(h) of 1/f noise with spectral density h / f; its slow components within a dwell are
-      nuisance states, too.
     - reduced: reduce the rows to the rank of their columns. Without it all rows are returned, which is faster if there
       are many columns.
     """
     inside = 3 if noise.walk_mps2_per_sqrt_s else 0
     values = of_all_pieces(columns)
-    stack, noise_about = DwellStack.of(dwells), _About(noise, state, about, flicker_mps2)
+    stack = DwellStack.of(dwells)
+    noise_about = _About.of(stack, noise, state, about)
     batches = list(_batches(stack, values.shape[-1]))
     by_means = [reduced and batch.tells_means_only(values, noise_about) for batch in batches]
     if all(by_means):
@@ -84,8 +74,8 @@ def whiten(
             rows, count = _weighted(batch, of_batch, noise_about)
             if informative is None:
                 # rows (d, r, n) off their first ``count`` columns, without these columns
-                nuisances = np.linalg.qr(rows[..., :count])[0]
-                whitened = rows[..., count:] - nuisances @ (np.swapaxes(nuisances, 1, 2) @ rows[..., count:])
+                errors = np.linalg.qr(rows[..., :count])[0]
+                whitened = rows[..., count:] - errors @ (np.swapaxes(errors, 1, 2) @ rows[..., count:])
             else:
                 whitened = _informative(triangle(rows)[:, count:, count:], informative)
         for k, of_dwell in zip(batch.dwells.tolist(), whitened, strict=True):
@@ -95,13 +85,28 @@ def whiten(
 
 @dataclass(frozen=True)
 class _About:
-    """The noise by which rows are divided, the state where nuisance states are linearised, and what ``whiten`` is
-    told."""
+    """The noise by which rows are divided, the changes (pieces, nodes, 3, q) of the readings by 1 sigma of each error
+    that is drawn for a dwell, linearised at a state, and what ``whiten`` is told."""
 
     noise: Noise
+    changes: Floats
     state: Floats
     about: Floats | None
-    flicker_mps2: Floats | None
+
+    @classmethod
+    def of(cls, stack: DwellStack, noise: Noise, state: Floats, about: Floats | None = None) -> _About:
+        """That of some dwells."""
+        return cls(noise, noise.columns("dwell", stack, state), state, about)
+
+    @property
+    def steps(self) -> int:
+        """Number of columns of the steps of the biases, one for each accelerometer."""
+        return 3 if self.noise.walk_mps2_per_sqrt_s else 0
+
+    @property
+    def errors(self) -> int:
+        """Number of errors that are eliminated."""
+        return self.changes.shape[3]
 
 
 @dataclass(frozen=True)
@@ -138,12 +143,6 @@ class _Batch:
         """The specific force (d, P, 3, 3) that is felt at the nodes."""
         return self.stack.felt_force_mps2.reshape(-1, 3, 3)[self.pieces]
 
-    def regressors(self, height: int) -> Floats:
-        """The first ``height`` rows (d, P, height, 4) of the regressors 1, f_x, f_y, f_z that are felt."""
-        values = np.ones((*self.pieces.shape, 3, 4))
-        values[..., 1:] = self.force_mps2
-        return self.rows_of(values, height)
-
     def rows_of(self, values: Floats, height: int) -> Floats:
         """The first ``height`` rows (d, P, height, c) of columns given at the nodes (d, P, K, c). If it is one, only
         the means of dwells tell something, which are the values at the middle."""
@@ -158,7 +157,11 @@ class _Batch:
             return False
         if self.pieces.shape[1] == 1 and not self.triangles[:, 0, 1 : self.shape.width].any():
             return True
-        return about.flicker_mps2 is None and _is_constant(columns[self.pieces]) and _is_constant(self.force_mps2)
+        return (
+            _is_constant(columns[self.pieces])
+            and _is_constant(self.force_mps2)
+            and _is_constant(about.changes[self.pieces])
+        )
 
 
 def _batches(stack: DwellStack, width: int) -> Iterator[_Batch]:
@@ -168,49 +171,14 @@ def _batches(stack: DwellStack, width: int) -> Iterator[_Batch]:
         yield from (_Batch(stack, number, slice(k, k + most)) for k in range(0, len(shape.dwells), most))
 
 
-@dataclass(frozen=True)
-class _Blocks:
-    """The columns of whitened rows: [rotations and offsets | slow waves | steps S | model H | readings z].
-
-    - states, waves, steps, model: their numbers of columns; waves and steps are a third for each accelerometer.
-    """
-
-    states: int
-    waves: int
-    steps: int
-    model: int
-
-    @property
-    def nuisances(self) -> int:
-        """Number of columns that are eliminated."""
-        return self.states + self.waves
-
-    @property
-    def width(self) -> int:
-        """Number of all columns, readings included."""
-        return self.nuisances + self.steps + self.model + 1
-
-    def waves_of(self, channel: int) -> slice:
-        """The slow waves of one accelerometer."""
-        first = self.states + self.waves // 3 * channel
-        return slice(first, first + self.waves // 3)
-
-    def steps_of(self, channel: int) -> slice:
-        """The step of the bias of one accelerometer."""
-        first = self.nuisances + self.steps // 3 * channel
-        return slice(first, first + self.steps // 3)
-
-
 def _weighted(batch: _Batch, columns: Floats, about: _About) -> tuple[Floats, int]:
-    """Return the whitened rows [nuisances | S | H | z] (d, r, n) of dwells of one shape, and the number of nuisance
-    columns.
+    """Return the whitened rows [errors | S | H | z] (d, r, n) of dwells of one shape, and the number of errors.
 
     ``columns`` is (d, pieces, K, 3, p). The rows of the three channels follow one another; the rows of the priors come
     last.
     """
-    noise, many, priors = about.noise, len(columns), _priors(about)
-    blocks = _blocks_of(about, columns.shape[-1])
-    parts = _channels(batch, columns, blocks, about, columns.shape[2])
+    noise, many, count = about.noise, len(columns), about.errors
+    parts = _channels(batch, columns, about, columns.shape[2])
     sigma = noise.effective_sigma_mps2
     roots = np.sqrt(batch.stack.folded.weights[batch.dwells])
     parts /= (sigma / roots)[:, :, None, None]
@@ -218,73 +186,55 @@ def _weighted(batch: _Batch, columns: Floats, about: _About) -> tuple[Floats, in
     if noise.attitude_unknown:
         along = _unit_along(batch, noise, about.state)
         parts, walks = _combined(parts, along), np.sqrt((along**2)[:, None] @ (walks**2)[:, :, None])[:, :, 0]
-    if blocks.steps:
+    if about.steps:
         dwells = batch.stack.folded.dwells
         for dwell_parts, k, ratios in zip(parts, batch.dwells.tolist(), walks, strict=True):
             for part, ratio in zip(dwell_parts, ratios.tolist(), strict=True):
                 part[:] = dwells[k].walk.whiten(part, ratio)
-    measured, count = parts.reshape(many, -1, blocks.width), blocks.nuisances
-    prior = np.zeros((many, count, blocks.width))
-    prior[:, :, :count] = np.diag(1.0 / priors)
+    measured = parts.reshape(many, -1, parts.shape[-1])
+    prior = np.broadcast_to(np.eye(count, parts.shape[-1]), (many, count, parts.shape[-1]))
     return np.concatenate([measured, prior], axis=1), count
-
-
-def _priors(about: _About) -> Floats:
-    """Return the prior sigmas of all nuisance states."""
-    slow = np.zeros(0) if about.flicker_mps2 is None else flicker_sigmas(about.flicker_mps2)
-    return np.append(nuisance_sigmas(about.noise), slow)
-
-
-def _blocks_of(about: _About, count: int) -> _Blocks:
-    states = len(nuisance_sigmas(about.noise))
-    return _Blocks(states, len(_priors(about)) - states, 3 if about.noise.walk_mps2_per_sqrt_s else 0, count)
 
 
 def _of_means(batch: _Batch, columns: Floats, about: _About) -> Floats:
     """Return the whitened rows [H | z] (d, 3, p + 1) of dwells of which only the means tell something.
 
     The mean over all pieces is the combination of the first rows of their triangles by the roots of their numbers of
-    readings, which are on the diagonals. The nuisance states N with the priors s^2 give the three means the covariance
-    I + N s^2 N^T in units of their own noise; the rows are divided by its Cholesky factor.
+    readings, which are on the diagonals. Errors of unit variance that change the three means by N, in units of their
+    own noise, give them the covariance I + N N^T; the rows are divided by its Cholesky factor.
     """
-    blocks, priors = _blocks_of(about, columns.shape[-1]), _priors(about)
+    count = about.errors
     roots = batch.triangles[:, :, 0, 0]
     sigmas = about.noise.effective_sigma_mps2 / np.sqrt(batch.stack.folded.weights[batch.dwells])
     along = (roots / np.linalg.norm(roots, axis=1, keepdims=True))[:, None, None, :]
-    rows = (along @ _channels(batch, columns, blocks, about, 1))[:, :, 0] / sigmas[:, :, None]
-    scaled = rows[..., : blocks.nuisances] * priors
-    if np.abs(scaled).max(initial=0.0) > _LARGE:  # squares would lose digits: eliminate by QR
-        prior = np.broadcast_to(np.eye(blocks.nuisances, rows.shape[2]), (len(rows), blocks.nuisances, rows.shape[2]))
-        rows = np.concatenate([np.concatenate([scaled, rows[..., blocks.nuisances :]], axis=2), prior], axis=1)
-        return triangle(rows)[:, blocks.nuisances :, blocks.nuisances :]
-    lower = cast("Floats", np.linalg.cholesky(np.eye(3) + scaled @ np.swapaxes(scaled, 1, 2)))
-    return inverse_of_lower(lower) @ rows[..., blocks.nuisances :]
+    rows = (along @ _channels(batch, columns, about, 1))[:, :, 0] / sigmas[:, :, None]
+    changes = rows[..., :count]
+    if np.abs(changes).max(initial=0.0) > _LARGE:  # squares would lose digits: eliminate by QR
+        prior = np.broadcast_to(np.eye(count, rows.shape[2]), (len(rows), count, rows.shape[2]))
+        return triangle(np.concatenate([rows, prior], axis=1))[:, count:, count:]
+    lower = cast("Floats", np.linalg.cholesky(np.eye(3) + changes @ np.swapaxes(changes, 1, 2)))
+    return inverse_of_lower(lower) @ rows[..., count:]
 
 
-def _channels(batch: _Batch, columns: Floats, blocks: _Blocks, about: _About, height: int) -> Floats:
-    """Return the first ``height`` rows of each piece (d, 3, P height, n) of the three channels before they are divided
-    by their sigma."""
+def _channels(batch: _Batch, columns: Floats, about: _About, height: int) -> Floats:
+    """Return the first ``height`` rows [errors | S | H | z] of each piece (d, 3, P height, n) of the three channels
+    before they are divided by their sigma."""
     many, pieces, functions, _, _ = columns.shape
     shape, readings = (many, pieces * height, -1), batch.triangles[:, :, :height, functions:]
-    regressors = batch.regressors(height)
-    nuisances = nuisance_map(sensitivities_of(batch.stack, about.state, batch.dwells), about.noise)
-    parts = np.zeros((many, 3, pieces * height, blocks.width))
+    changes, first, last = about.changes[batch.pieces], about.errors, about.errors + about.steps
+    parts = np.zeros((many, 3, pieces * height, last + columns.shape[-1] + 1))
     for i in range(3):
         part = parts[:, i]
-        part[..., : blocks.states] = (regressors @ nuisances[:, i, None]).reshape(shape)
-        if blocks.steps:
+        if first:
+            part[..., :first] = batch.rows_of(changes[..., i, :], height).reshape(shape)
+        if about.steps:
             steps = [batch.stack.folded.dwells[k].walk.step for k in batch.dwells.tolist()]
-            part[..., blocks.steps_of(i)] = np.array(steps)[..., None]
-        part[..., blocks.nuisances + blocks.steps : -1] = batch.rows_of(columns[..., i, :], height).reshape(shape)
+            part[..., first + i : first + i + 1] = np.array(steps)[..., None]
+        part[..., last:-1] = batch.rows_of(columns[..., i, :], height).reshape(shape)
         measured = readings[..., i, None]
         if about.about is not None:
             measured = measured - batch.rows_of((columns[..., i, :] @ about.about)[..., None], height)
         part[..., -1:] = measured.reshape(shape)
-    if blocks.waves:
-        courses = flicker_waves(batch.stack.folded)[batch.pieces]
-        waves = batch.rows_of(courses, height).reshape(shape)
-        for i in range(3):
-            parts[:, i, :, blocks.waves_of(i)] = waves
     return parts
 
 
@@ -311,26 +261,19 @@ def misfit_rows(
     """Rows [H | W | G | z] by which the misfit is judged, and the number of columns before G; H is the first ``width``
     columns.
 
-    W are columns for noise that dwells have in common (``noise_model.shared_noise``): the slow part of a stated scatter
-    and the error of the temperature. Their coefficients have a prior, whose rows come first in the list. Within a dwell
-    the slow components of 1/f noise are nuisance states.
+    W are columns for noise that dwells have in common, the terms of the run; scatter that is stated may be 1/f noise,
+    which is one of them. Their coefficients have a prior, whose rows come first in the list.
     """
     dwells, values = DwellStack.of(dwells), of_all_pieces(columns)
-    shared, sigma = shared_noise(dwells, noise)
-    flicker = flicker_of_scatter(dwells, noise)
-    if not sigma.size:
-        return whiten(dwells, columns, noise, state, reduced=reduced), width
-    count, places = values.shape[3] + len(sigma) + 1, width + np.arange(len(sigma))
-    prior = np.zeros((len(sigma), count))
-    prior[np.arange(len(sigma)), places] = 1.0 / sigma
-    ends = dwells.folded.ends
-    both = OfPieces(np.concatenate([values[..., :width], shared.values, values[..., width:]], axis=3), ends)
-    return [prior, *whiten(dwells, both, noise, state, flicker_mps2=flicker, reduced=reduced)], width + len(sigma)
-
-
-def flicker_of_scatter(dwells: Sequence[DwellFactor], noise: Noise) -> Floats | None:
-    """sqrt(h) (3,) of the 1/f noise that a stated scatter may be; None where it has no slow part."""
-    return flicker_sigma(noise, len(dwells)) if slow_scatter(dwells, noise)[1].size else None
+    judging = noise.with_scatter_as_flicker(len(dwells))
+    shared = judging.columns("run", dwells, state)
+    count = shared.shape[3]
+    if not count:
+        return whiten(dwells, columns, judging, state, reduced=reduced), width
+    prior = np.eye(count, values.shape[3] + count + 1, width)
+    both = np.concatenate([values[..., :width], shared, values[..., width:]], axis=3)
+    rows = whiten(dwells, OfPieces(both, dwells.folded.ends), judging, state, reduced=reduced)
+    return [prior, *rows], width + count
 
 
 @dataclass(frozen=True)
@@ -338,7 +281,7 @@ class _Alike:
     """Dwells of one shape in ``MisfitColumns``.
 
     - pieces (d, pieces), rows (d, r): which of all pieces and rows are theirs.
-    - triangles (d, pieces, K, K): of the basis functions. nuisances (d, r, n): orthonormal basis of nuisance states.
+    - triangles (d, pieces, K, K): of the basis functions. errors (d, r, n): orthonormal basis of what errors change.
     - along (d, 3): by which whitened channels are combined where attitudes are not known; else None.
     - roots (d,): of the weights of their readings.
     """
@@ -346,7 +289,7 @@ class _Alike:
     pieces: NDArray[np.intp]
     rows: NDArray[np.intp]
     triangles: Floats
-    nuisances: Floats
+    errors: Floats
     along: Floats | None
     roots: Floats
 
@@ -358,14 +301,13 @@ class MisfitColumns:
     """
 
     def __init__(self, dwells: Sequence[DwellFactor], noise: Noise, state: Floats) -> None:
-        self._sigma, shared = noise.effective_sigma_mps2, len(shared_noise(dwells, noise)[1])
-        flicker = flicker_of_scatter(dwells, noise)
-        priors = len(nuisance_sigmas(noise)) + (0 if flicker is None else 3 * len(SLOW))
-        stack, about = DwellStack.of(dwells), _About(noise, state, None, flicker)
+        stack, judging = DwellStack.of(dwells), noise.with_scatter_as_flicker(len(dwells))
+        self._sigma, shared = noise.effective_sigma_mps2, judging.columns("run", stack, state).shape[3]
+        about = _About.of(stack, judging, state)
         channels, widths = 1 if noise.attitude_unknown else 3, np.empty(len(stack), np.intp)
         for shape in stack.folded.shapes:
             widths[shape.dwells] = shape.width
-        lengths = channels * stack.folded.piece_numbers * widths + priors
+        lengths = channels * stack.folded.piece_numbers * widths + about.errors
         self._groups, self.ends = list[_Alike](), shared + np.append(0, np.cumsum(lengths))
         """The first row of each dwell, and at last the number of rows."""
         for batch in _batches(stack, _USUAL):
@@ -396,9 +338,7 @@ class MisfitColumns:
             size = parts.shape[1] * parts.shape[2]
             rows = np.zeros((many, group.rows.shape[1], count))
             rows[:, :size] = parts.reshape(many, size, count)
-            whitened[group.rows] = rows - group.nuisances @ (
-                np.swapaxes(group.nuisances[:, :size], 1, 2) @ rows[:, :size]
-            )
+            whitened[group.rows] = rows - group.errors @ (np.swapaxes(group.errors[:, :size], 1, 2) @ rows[:, :size])
         return whitened
 
 

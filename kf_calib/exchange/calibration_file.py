@@ -213,9 +213,9 @@ def _saved(result: Calibration, recording: str, sha256: str | None, began: datet
                  for each in result.model.effects],
         noise=SavedNoise(
             sigma_mps2=noise.sigma_mps2.tolist(), inflation=noise.inflation.tolist(),
-            dwell_sigma_mps2=noise.scatter_mps2.tolist(), dwell_sigma_stated=noise.scatter_stated,
+            dwell_sigma_mps2=noise.scatter_mps2.tolist(), dwell_sigma_stated=noise.scatter.stated,
             angle_sigma_deg=0.0 if noise.attitude_unknown else math.degrees(noise.setting_rad),
-            angle_sigma_stated=noise.setting_stated and not noise.attitude_unknown,
+            angle_sigma_stated=noise.setting.stated and not noise.attitude_unknown,
             walk_mps2_per_sqrt_s=float(noise.walk_mps2_per_sqrt_s),
         ),
         consistency=SavedConsistency(

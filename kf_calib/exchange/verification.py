@@ -135,10 +135,12 @@ def verify(
 def _noise(saved: SavedCalibration, fitted: Fit) -> Noise:
     """Return the noise of the new run; what is not stated from dwell to dwell is no less than it was in the old one."""
     noise, old = fitted.noise, saved.noise
-    if not noise.scatter_stated:
-        noise = replace(noise, scatter_mps2=np.maximum(noise.scatter_mps2, old.dwell_sigma_mps2))
-    if not noise.setting_stated:
-        noise = replace(noise, setting_rad=max(noise.setting_rad, np.radians(old.angle_sigma_deg)))
+    scatter, setting = noise.scatter, noise.setting
+    if not scatter.stated:
+        scatter = replace(scatter, sizes_mps2=np.maximum(scatter.sizes_mps2, old.dwell_sigma_mps2))
+    if not setting.stated:
+        setting = replace(setting, size_rad=max(setting.size_rad, float(np.radians(old.angle_sigma_deg))))
+    noise = noise.with_terms(setting, scatter)
     return noise
 
 

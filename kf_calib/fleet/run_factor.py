@@ -154,8 +154,8 @@ def _names(effects: Sequence[Effect], states: bool = False) -> list[str]:
 
 def _has_estimated_parts(noise: Noise) -> bool:
     """Tell whether the noise has a part from dwell to dwell that was estimated from the misfit."""
-    setting = noise.setting_rad > 0.0 and not (noise.setting_stated or noise.attitude_unknown)
-    return setting or (not noise.scatter_stated and bool(noise.scatter_mps2.any()))
+    setting = noise.setting_rad > 0.0 and not (noise.setting.stated or noise.attitude_unknown)
+    return setting or (not noise.scatter.stated and bool(noise.scatter_mps2.any()))
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.sufficient_statistics import DwellFactor
-from kf_calib.noise.noise_model import Noise, flicker_sigma
+from kf_calib.noise.noise_model import Noise
 
 _DWELLS = 5  # as many of the longest are enough
 _LONG = 0.5  # of the longest dwell; shorter ones say nothing of the longest clusters
@@ -127,6 +127,6 @@ def model_lines(noise: Noise, sizes: Floats, tau_s: Floats, dwells: int) -> tupl
     """What white noise (m, 3), 1/f noise (3,) and the walk (m,) of a noise model give of the Allan deviation."""
     return (
         noise.effective_sigma_mps2 / np.sqrt(sizes)[:, None],
-        np.sqrt(2.0 * np.log(2.0)) * flicker_sigma(noise, dwells),
+        np.sqrt(2.0 * np.log(2.0)) * noise.scatter.flicker_mps2(dwells),
         noise.walk_mps2_per_sqrt_s * np.sqrt(tau_s / 3.0),
     )

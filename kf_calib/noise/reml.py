@@ -16,17 +16,27 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, Mask
+from kf_calib.dwells.pieces import OfPieces
 from kf_calib.dwells.qr import multiplied, orthonormal
+from kf_calib.dwells.stack import DwellStack
 from kf_calib.dwells.sufficient_statistics import DwellFactor
 from kf_calib.noise.means import Means, means_of
-from kf_calib.noise.noise_model import FLOOR_MPS2, Noise, mean_covariances, setting_covariances, shared_noise
+from kf_calib.noise.noise_model import Noise, mean_covariances
 from kf_calib.noise.random_walk import Links, mean_links
 from kf_calib.noise.restricted_likelihood import Point, Restricted
+from kf_calib.noise.terms import (
+    FLOOR_MPS2,
+    NoiseTerm,
+    RandomWalk,
+    Scatter,
+    SettingError,
+    setting_covariances,
+)
 from kf_calib.support.tail_probabilities import chi_squared_tail
 
 FEWEST = 6
@@ -44,6 +54,90 @@ Parts = tuple[Part, ...]
 
 OF_ONE: Parts = ("first", "second", "third")
 """The scatter of one accelerometer alone, as of a bad contact; "scatter" is that of each, "common" one of all."""
+
+
+class FreeTerm(Protocol):
+    """A term of the noise whose sizes are free.
+
+    count: how many sizes it has.
+    """
+
+    @property
+    def count(self) -> int: ...
+
+    def units(self, means: Means, misfit_mps2: Floats) -> Floats:
+        """A size (count,) at which it would explain a misfit of the means of this rms size (3,)."""
+        ...
+
+    def shapes(self, means: Means, state: Floats) -> Floats:
+        """The covariances of the means that it contributes per unit of its variances, (count, D, 3, 3), or (count, 1,
+        3, 3) where they are those of all dwells."""
+        ...
+
+    def term(self, sizes: Floats) -> NoiseTerm:
+        """The term with these sizes (count,)."""
+        ...
+
+
+class _FreeSetting:
+    count = 1
+
+    def units(self, means: Means, misfit_mps2: Floats) -> Floats:
+        return np.full(1, misfit_mps2.mean() / np.linalg.norm(means.force_mps2, axis=1).mean())
+
+    def shapes(self, means: Means, state: Floats) -> Floats:
+        return setting_covariances(means, state)[None]
+
+    def term(self, sizes: Floats) -> NoiseTerm:
+        return SettingError(float(sizes[0]))
+
+
+class _FreeScatter:
+    """Of groups of accelerometers that share a size."""
+
+    def __init__(self, *groups: tuple[int, ...]) -> None:
+        self._members = np.zeros((len(groups), 3))
+        for row, group in zip(self._members, groups, strict=True):
+            row[list(group)] = 1.0
+        self.count = len(groups)
+
+    def units(self, means: Means, misfit_mps2: Floats) -> Floats:
+        return self._members @ misfit_mps2 / self._members.sum(axis=1)
+
+    def shapes(self, means: Means, state: Floats) -> Floats:
+        return (self._members[:, :, None] * np.eye(3))[:, None]
+
+    def term(self, sizes: Floats) -> NoiseTerm:
+        return Scatter(sizes @ self._members)
+
+
+class _FreeWalk:
+    """Its covariance is that of the path, which links each dwell to the next (``random_walk.mean_links``)."""
+
+    count = 1
+
+    def units(self, means: Means, misfit_mps2: Floats) -> Floats:
+        span_s = max(float(means.ends_s[-1, 1] - means.ends_s[0, 0]), 1e-9)
+        return np.full(1, 2.0 * misfit_mps2.mean() / math.sqrt(span_s))
+
+    def shapes(self, means: Means, state: Floats) -> Floats:
+        path = mean_links(means.ends_s)
+        walk = np.zeros((1, len(means.counts), 6, 3))
+        walk[0, :, :3] = path.alone[:, None, None] * np.eye(3)
+        walk[0, :-1, 3:] = path.beside[:, None, None] * np.eye(3)
+        return walk
+
+    def term(self, sizes: Floats) -> NoiseTerm:
+        return RandomWalk(float(sizes[0]))
+
+
+FREE: Mapping[Part, FreeTerm] = {
+    "setting": _FreeSetting(),
+    "common": _FreeScatter((0, 1, 2)),
+    "scatter": _FreeScatter((0,), (1,), (2,)),
+    "walk": _FreeWalk(),
+    **{part: _FreeScatter((k,)) for k, part in enumerate(OF_ONE)},
+}
 
 
 @dataclass(frozen=True)
@@ -98,7 +192,7 @@ class VarianceComponents:
         - prior: rows of prior knowledge about the coefficients, those of ``with_shared_noise``.
         """
         stated = self._stated(within, means)
-        if stated.setting_stated and stated.scatter_stated and not self.walks:
+        if stated.setting.stated and stated.scatter.stated and not self.walks:
             return stated
         reduced = _reduce(means, prior)
         measured = len(means.readings) if within.attitude_unknown else means.readings.size
@@ -117,20 +211,16 @@ class VarianceComponents:
 
     def _stated(self, within: Noise, means: Means) -> Noise:
         """Return the noise within dwells with the parts that are stated, and zeros for the others."""
-        stated = replace(
-            within,
-            scatter_mps2=np.full(3, self.scatter_mps2 or 0.0),
-            scatter_stated=self.scatter_mps2 is not None,
-            walk_mps2_per_sqrt_s=0.0 if self.walks else within.walk_mps2_per_sqrt_s,
-        )
+        scatter = Scatter(np.full(3, self.scatter_mps2 or 0.0), stated=self.scatter_mps2 is not None)
+        within = within.without(RandomWalk) if self.walks else within
         if within.attitude_unknown:
-            return stated
-        return replace(
-            stated,
-            setting_rad=float(np.radians(self.angle_sigma_deg or 0.0)),
-            setting_stated=self.angle_sigma_deg is not None,
-            checked=self.scatter_mps2 is not None or _setting_is_checked(means.force_mps2),
+            return within.with_terms(scatter)
+        setting = SettingError(
+            float(np.radians(self.angle_sigma_deg or 0.0)),
+            stated=self.angle_sigma_deg is not None,
+            considered=not (scatter.stated or _setting_is_checked(means.force_mps2)),
         )
+        return within.with_terms(setting, scatter)
 
     def _likeliest(self, likelihood: Likelihood, combinations: Sequence[Parts], without: Point) -> Parts:
         """Return the best combination of parts, () if none earns its charge, and keep the sizes of each.
@@ -154,10 +244,11 @@ def _combinations(stated: Noise, walks: bool, free: int) -> list[Parts]:
     """Return the combinations of parts that may be estimated from so many degrees of freedom; the last one contains all
     others."""
     if free < FEWEST:
-        return [("common",)] if free > 0 and not stated.scatter_stated else []
-    settings: list[Parts] = [()] if stated.setting_stated or not stated.checked else [(), ("setting",)]
-    scatters: list[Parts] = [()] if stated.scatter_stated else [(), ("common",)]
-    if stated.checked and not (stated.scatter_stated or stated.attitude_unknown):
+        return [("common",)] if free > 0 and not stated.scatter.stated else []
+    setting, scatter = stated.setting, stated.scatter
+    settings: list[Parts] = [()] if setting.stated or setting.considered else [(), ("setting",)]
+    scatters: list[Parts] = [()] if scatter.stated else [(), ("common",)]
+    if not (setting.considered or scatter.stated or setting.is_unknown):
         scatters.append(("scatter",))
     walking: list[Parts] = [(), ("walk",)] if walks else [()]
     return [setting + scatter + walk for walk, setting, scatter in product(walking, settings, scatters)][1:]
@@ -167,12 +258,13 @@ def _with_estimates(stated: Noise, likelihood: Likelihood, parts: Parts, sizes: 
     """Return the noise with its parts at their likeliest sizes, and what is known of these."""
     noise = _with(stated, parts, np.concatenate([likelihood.units[part] for part in parts]) * sizes)
     if "walk" in parts:
-        noise = replace(noise, walk_spread=_last_spread(likelihood.of(parts).curvature(sizes)))
+        spread = _last_spread(likelihood.of(parts).curvature(sizes))
+        noise = noise.with_terms(replace(noise.walk, spread=spread))
     if "setting" in parts:
         rest: Parts = tuple(part for part in parts if part != "setting")
         cost = likelihood.of(rest).most_likely()[1].cost if rest else without.cost
         gain = cost - likelihood.of(parts).cost(sizes**2)
-        noise = replace(noise, setting_judged=2.0 * gain > _JUDGED)
+        noise = noise.with_terms(replace(noise.setting, judged=2.0 * gain > _JUDGED))
     return noise
 
 
@@ -223,16 +315,18 @@ def gain_of(part: Part, noise: Noise, means: Means, state: Floats, prior: Floats
     return max(likelihood.without().cost - point.cost, 0.0)
 
 
-def with_shared_noise(dwells: Sequence[DwellFactor], noise: Noise, means: Means) -> tuple[Means, Floats]:
-    """Means with additional columns for the noise that dwells have in common (``noise_model.shared_noise``), and the
-    rows (q, p + q + 1) of the prior of their coefficients."""
-    columns, sigma = shared_noise(dwells, noise)
-    if not sigma.size:
+def with_shared_noise(dwells: Sequence[DwellFactor], noise: Noise, means: Means, state: Floats) -> tuple[Means, Floats]:
+    """Means with additional columns for the noise that dwells have in common, the terms of the run, and the rows (q, p
+    + q + 1) of the prior of their coefficients."""
+    stack = DwellStack.of(dwells)
+    columns = noise.with_scatter_as_flicker(len(stack)).columns("run", stack, state)
+    count = columns.shape[3]
+    if not count:
         return means, np.zeros((0, means.design.shape[2] + 1))
-    design = np.concatenate([means.design, means_of(dwells, columns).design], axis=2)
-    prior = np.zeros((len(sigma), design.shape[2] + 1))
-    prior[:, means.design.shape[2] : -1] = np.diag(1.0 / sigma)
-    return replace(means, design=design), prior
+    added = means_of(stack, OfPieces(columns, stack.folded.ends)).design
+    prior = np.zeros((count, means.design.shape[2] + count + 1))
+    prior[:, means.design.shape[2] : -1] = np.eye(count)
+    return replace(means, design=np.concatenate([means.design, added], axis=2)), prior
 
 
 def misfit(noise: Noise, means: Means, state: Floats, prior: Floats | None = None) -> float:
@@ -279,14 +373,12 @@ def _likelihood(noise: Noise, parts: Collection[Part], reduced: _Reduced, state:
     rows = np.concatenate([means.design, means.readings[:, :, None]], axis=2)
     fixed = mean_covariances(noise, means, state, float(units["common"][0]))
     if standing:  # no means are correlated: only their own covariances are kept
-        shapes: dict[Part, Floats] = {part: _shapes(part, means, state) for part in parts}
+        shapes: dict[Part, Floats] = {part: FREE[part].shapes(means, state) for part in parts}
         alone = Restricted(rows.reshape(3 * count, -1), reduced.prior, fixed, ())
         return Likelihood(alone, _scaled(shapes, units), units)
     path = mean_links(means.ends_s)
     rows[1:] -= path.share[:, None, None] * rows[:-1].copy()
-    walk = np.zeros((1, count, 6, 3))
-    walk[0, :, :3] = path.alone[:, None, None] * np.eye(3)
-    walk[0, :-1, 3:] = path.beside[:, None, None] * np.eye(3)
+    walk = FREE["walk"].shapes(means, state)
     alone = Restricted(
         rows.reshape(3 * count, -1),
         reduced.prior,
@@ -294,7 +386,8 @@ def _likelihood(noise: Noise, parts: Collection[Part], reduced: _Reduced, state:
         (),
     )
     shapes: dict[Part, Floats] = {
-        part: walk if part == "walk" else _conditional_covariances(_shapes(part, means, state), path) for part in parts
+        part: walk if part == "walk" else _conditional_covariances(FREE[part].shapes(means, state), path)
+        for part in parts
     }
     return Likelihood(alone, _scaled(shapes, units), units)
 
@@ -302,17 +395,6 @@ def _likelihood(noise: Noise, parts: Collection[Part], reduced: _Reduced, state:
 def _scaled(shapes: Mapping[Part, Floats], units: Mapping[Part, Floats]) -> dict[Part, Floats]:
     """Return the covariances of parts per unit of their sizes; one for all dwells where that is the same."""
     return {part: units[part][:, None, None, None] ** 2 * of_part for part, of_part in shapes.items()}
-
-
-def _shapes(part: Part, means: Means, state: Floats) -> Floats:
-    """Return the covariances of the means that a part contributes per unit of its variances, (k, D, 3, 3), or (k, 1, 3,
-    3) where they are those of all dwells."""
-    if part == "setting":
-        return setting_covariances(means, state)[None]
-    of_each = np.eye(3)[:, None, :, None] * np.eye(3)[:, None, None, :]
-    if part in OF_ONE:
-        return of_each[[OF_ONE.index(part)]]
-    return of_each if part == "scatter" else of_each.sum(axis=0, keepdims=True)
 
 
 def _conditional_covariances(covariances: Floats, path: Links) -> Floats:
@@ -332,26 +414,14 @@ def _conditional_covariances(covariances: Floats, path: Links) -> Floats:
 def _units(means: Means) -> dict[Part, Floats]:
     """Return a size for each number of the parts at which it would explain the misfit of the reduced means."""
     size = np.sqrt(np.mean(means.readings**2, axis=0)) + FLOOR_MPS2
-    span_s = max(float(means.ends_s[-1, 1] - means.ends_s[0, 0]), 1e-9)
-    return {
-        "setting": np.full(1, size.mean() / np.linalg.norm(means.force_mps2, axis=1).mean()),
-        "common": np.full(1, size.mean()),
-        "scatter": size,
-        "walk": np.full(1, 2.0 * size.mean() / math.sqrt(span_s)),
-        **{part: size[[k]] for k, part in enumerate(OF_ONE)},
-    }
+    return {part: free.units(means, size) for part, free in FREE.items()}
 
 
-def _with(noise: Noise, parts: tuple[Part, ...], sizes: Floats) -> Noise:
-    """Return the noise with its parts at these sizes: three numbers for "scatter", one for every other part."""
-    left = iter(sizes.tolist())
+def _with(noise: Noise, parts: Parts, sizes: Floats) -> Noise:
+    """Return the noise with its parts at these sizes, those of a part after those of the part before."""
+    first = 0
     for part in parts:
-        if part == "setting":
-            noise = replace(noise, setting_rad=next(left))
-        elif part == "walk":
-            noise = replace(noise, walk_mps2_per_sqrt_s=next(left))
-        elif part == "common":
-            noise = replace(noise, scatter_mps2=np.full(3, next(left)))
-        else:
-            noise = replace(noise, scatter_mps2=np.array([next(left) for _ in range(3)]))
+        count = FREE[part].count
+        noise = noise.with_terms(FREE[part].term(sizes[first : first + count]))
+        first += count
     return noise

@@ -50,6 +50,7 @@ from kf_calib.estimation.iterated_fit import fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Prior, Settings
 from kf_calib.noise.noise_model import Noise, steps
+from kf_calib.noise.terms import SlowWaves
 from kf_calib.support.tail_probabilities import sidak
 
 
@@ -320,9 +321,8 @@ def _begun(
     """Return the filter with noise and linearisation from the dwells so far, their number, and the effective tests."""
     if fitted is None or fitted.linearised.slews or len(fitted.dwells) != len(dwells):
         fitted = fit(list(dwells), Model.of(bench, settings.effects), settings.walk_mps2_per_sqrt_s)
-    noise = replace(
-        fitted.noise.for_goodness_of_fit, checked=True
-    )  # a test of the misfit has to allow for all of a setting error
+    noise = fitted.noise.for_goodness_of_fit.without(SlowWaves)
+    noise = noise.with_terms(replace(noise.setting, considered=False))  # a test of the misfit allows for all of it
     model, state = fitted.linearised.model, fitted.linearised.state
     running = Running.over(dwells, model, noise, state, _effects_to_watch(fitted)).lean()
     return running, len(dwells), independent_tests(running.scan)

@@ -167,11 +167,11 @@ def noise_origins(result: Calibration) -> tuple[str, str]:
         freedom = degrees_of_freedom(result.linearised.means, not result.bench.angles)
     few = freedom < FEWEST
     is_estimated = noise.scatter_mps2.any() or not few
-    scatter = "stated" if noise.scatter_stated else "estimated" if is_estimated else _NOT_ESTIMATED
+    scatter = "stated" if noise.scatter.stated else "estimated" if is_estimated else _NOT_ESTIMATED
     if noise.attitude_unknown:
         return scatter, _NOT_USED
-    if not noise.setting_stated:
-        return scatter, _NOT_ESTIMATED if few or not noise.checked else "estimated"
+    if not noise.setting.stated:
+        return scatter, _NOT_ESTIMATED if few or noise.setting.considered else "estimated"
     return scatter, "with the angles' noise" if beyond_stated(noise, result.bench) else "stated"
 
 

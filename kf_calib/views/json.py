@@ -33,9 +33,9 @@ def replay_object(result: Calibration) -> dict[str, Any]:
                 "sigma_mps2": noise.sigma_mps2,
                 "inflation": noise.inflation,
                 "dwell_sigma_mps2": noise.scatter_mps2,
-                "dwell_sigma_stated": noise.scatter_stated,
+                "dwell_sigma_stated": noise.scatter.stated,
                 "angle_sigma_deg": None if noise.attitude_unknown else math.degrees(noise.setting_rad),
-                "angle_sigma_stated": noise.setting_stated and not noise.attitude_unknown,
+                "angle_sigma_stated": noise.setting.stated and not noise.attitude_unknown,
             },
             "consistency": {
                 "consistent": judged.unconditional,

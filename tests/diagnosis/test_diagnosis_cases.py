@@ -436,8 +436,8 @@ def test_a_large_effect_in_noise_that_is_not_stated_is_named_alone(name: str, dw
     """Scatter that is estimated without it is its own; where it is left out, what is little counts as much."""
     unstated = {"angle_sigma_deg": None, "scatter_sigma_mps2": None}
     found = diagnose(source(f"{name}=40sigma", seed=7, dwells=dwells, states=unstated, setting_sigma_deg=2e-4))
-    assert found.missing == (name,) and found.before.noise.setting_stated is False, found.verdict
-    assert found.after is not None and not found.after.noise.setting_stated
+    assert found.missing == (name,) and found.before.noise.setting.stated is False, found.verdict
+    assert found.after is not None and not found.after.noise.setting.stated
     assert found.after.consistency.consistent
 
 

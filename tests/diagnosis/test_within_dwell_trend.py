@@ -140,7 +140,7 @@ def test_a_watch_sees_it_while_the_run_goes_on() -> None:
 def test_nothing_is_judged_where_scatter_may_be_anything() -> None:
     """1/f noise that is not stated goes on within dwells."""
     before = run()
-    bench = dataclasses.replace(before.fit.noise, scatter_stated=False)
+    bench = before.fit.noise.with_terms(dataclasses.replace(before.fit.noise.scatter, stated=False))
     assert trend(dataclasses.replace(before.fit, noise=bench)) is None
 
 

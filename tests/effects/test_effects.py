@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import functools
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -33,7 +32,8 @@ from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import PRIORS, Settings
 from kf_calib.noise.noise_model import Noise as NoiseModel
-from kf_calib.noise.noise_model import within_dwells
+from kf_calib.noise.terms import RandomWalk
+from kf_calib.noise.within_dwells import within_dwells
 from kf_calib.online.sequential_test import Running
 from kf_calib.sources.simulation.detectability import sized
 from kf_calib.sources.simulation.injected import parse
@@ -364,7 +364,7 @@ def estimated(fitted: Fit) -> dict[str, tuple[float, float]]:
     out = {c.symbol: own for c, *own in zip(model.coefficients, found, estimate.effect_sigma * gains, strict=True)}
     if (walk := model.intensity) is not None:
         noise = fitted.noise
-        out[walk.symbol] = [noise.walk_mps2_per_sqrt_s, noise.walk_mps2_per_sqrt_s * (noise.walk_spread or np.nan)]
+        out[walk.symbol] = [noise.walk_mps2_per_sqrt_s, noise.walk_mps2_per_sqrt_s * (noise.walk.spread or np.nan)]
     return {symbol: (float(value), float(sigma)) for symbol, (value, sigma) in out.items()}
 
 
@@ -486,7 +486,7 @@ def test_a_running_filter_is_a_refit_whatever_it_carries(
 ) -> None:
     """At any dwell, with any effects in its model and those of the catalogue carried beside it."""
     dwells, noise, state = navigation
-    noise = replace(noise, walk_mps2_per_sqrt_s=walk)
+    noise = noise.with_terms(RandomWalk(walk))
     for names_in in models:
         model = Model.of(BENCH, names_in)
         others = [effect_named(name, BENCH) for name in NAMES if name not in names_in]

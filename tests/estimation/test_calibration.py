@@ -25,6 +25,7 @@ from kf_calib.estimation.iterated_fit import fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.results import consistency
 from kf_calib.estimation.settings import Settings
+from kf_calib.noise.terms import RandomWalk, Scatter, SettingError
 from kf_calib.sources.files.recording import Recording
 
 
@@ -39,7 +40,7 @@ def test_a_real_imu_placed_by_hand(ferraris: Path) -> None:
     sigmas = {symbol: p.sigma for symbol, p in result.parameters.items()}
     assert all(1e-3 < sigmas[f"K{i}"] < 5e-3 and 5e-3 < sigmas[f"b{i}"] < 0.05 for i in (1, 2, 3))
     assert sigmas["theta1"] > np.radians(0.3) / 2
-    assert result.noise.setting_stated and result.consistency.consistent
+    assert result.noise.setting.stated and result.consistency.consistent
     assert result.parameters["theta1"].nominal == 0.0
     assert any("too few to distinguish a setting error" in warning for warning in result.warnings)
 
@@ -250,7 +251,7 @@ def test_a_dwell_whose_columns_are_constant_tells_its_mean_alone() -> None:
               for k, dwell in enumerate(dwells)]  # fmt: skip
     fitted = fit(dwells, Model.of(Run(dwells=1).bench, ("second-order",)))
     columns, state = fitted.linearised.columns, fitted.linearised.state
-    for noise in (fitted.noise, replace(fitted.noise, scatter_mps2=np.array([0.0, 1e-6, 1e-3]), setting_rad=1e-3)):
+    for noise in (fitted.noise, fitted.noise.with_terms(Scatter(np.array([0.0, 1e-6, 1e-3])), SettingError(1e-3))):
         whole = whitened_rows.whiten(dwells, columns, noise, state, reduced=False)
         for all_rows, rows in zip(whole, whitened_rows.whiten(dwells, columns, noise, state), strict=True):
             assert len(rows) == 3 < len(all_rows)
@@ -278,7 +279,7 @@ def test_dwells_whitened_together_are_those_whitened_alone() -> None:
     assert len({len(dwell.pieces) for dwell in dwells}) > 1
     fitted = fit(dwells, Model.of(Run(dwells=1).bench, ("bias-drift",)))
     columns, state = fitted.linearised.columns, fitted.linearised.state
-    for noise in (fitted.noise, replace(fitted.noise, scatter_mps2=np.full(3, 1e-5), walk_mps2_per_sqrt_s=1e-5)):
+    for noise in (fitted.noise, fitted.noise.with_terms(Scatter(np.full(3, 1e-5)), RandomWalk(1e-5))):
         together = whitened_rows.whiten(dwells, columns, noise, state, reduced=False)
         for dwell, own, rows in zip(dwells, columns, together, strict=True):
             (alone,) = whitened_rows.whiten([dwell], [own], noise, state, reduced=False)

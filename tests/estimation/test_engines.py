@@ -17,7 +17,7 @@ from kf_calib.estimation import kalman_filterpy
 from kf_calib.estimation.calibration import calibrate, evaluate, filterpy_estimate
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.engine_comparison import compare
-from kf_calib.estimation.kalman_filterpy import Samples, all_nuisance_sigmas
+from kf_calib.estimation.kalman_filterpy import Samples
 from kf_calib.estimation.settings import PRIORS, Settings
 from kf_calib.noise.noise_model import Noise
 
@@ -81,9 +81,8 @@ def test_squares_of_filterpys_innovations_sum_to_the_misfit_of_batch_least_squar
     observation, readings = rng.normal(size=(20, 3, 4)), rng.normal(size=(20, 3))
     nominal, root = rng.normal(size=4), np.tril(rng.normal(size=(4, 4)))
     noise = Noise(np.full(3, sigma), np.ones(3))
-    nuisances = np.zeros((20, 3, len(all_nuisance_sigmas(noise))))
-    samples = Samples(1, np.arange(20.0), observation, nuisances, all_nuisance_sigmas(noise), readings,
-                      readings, np.full(3, sigma))  # fmt: skip
+    nuisances = np.zeros((20, 3, 0))
+    samples = Samples(1, np.arange(20.0), observation, nuisances, readings, readings, np.full(3, sigma))
     posterior = kalman_filterpy.estimate([samples], noise, nominal, root @ root.T, np.ones(4))
     rows = np.vstack([observation.reshape(-1, 4) / sigma, np.linalg.inv(root)])
     state, misfit, *_ = np.linalg.lstsq(rows, np.append(readings / sigma, np.linalg.solve(root, nominal)))

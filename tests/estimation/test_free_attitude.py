@@ -14,6 +14,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.free_attitude import DIRECTIONS, covariance_of, most_informative, row_of
 from kf_calib.estimation.results import Calibration
+from kf_calib.noise.terms import Scatter
 
 FREE = [0, 3, 4, 5, 7, 8, 9, 10, 11]
 """The states that are not fixed by the frame: s1x b1, s2x s2y b2, s3x s3y s3z b3."""
@@ -38,10 +39,8 @@ def size(readings: Floats, state: Floats) -> float:
 def test_the_covariance_is_that_of_normal_equations_of_sizes(result: Calibration) -> None:
     """Of means with noise within dwells and scatter between them, unlike in the three accelerometers, beside weak
     knowledge: 100 % of scale factors, 10 m/s^2 of biases, and one degree between the axes."""
-    noise = replace(
-        result.noise, sigma_mps2=np.array([0.02, 0.04, 0.01]), inflation=np.array([1.0, 2.0, 4.0]),
-        scatter_mps2=np.array([1e-3, 4e-3, 2e-3]),
-    )  # fmt: skip
+    noise = replace(result.noise, sigma_mps2=np.array([0.02, 0.04, 0.01]), inflation=np.array([1.0, 2.0, 4.0]))
+    noise = noise.with_terms(Scatter(np.array([1e-3, 4e-3, 2e-3])))
     state, angle = result.linearised.state, np.radians(1.0)
     weak = np.array([1.0, 10.0, angle, 1.0, 10.0, angle, angle, 1.0, 10.0])
     information = np.diag(weak**-2.0)

@@ -15,6 +15,7 @@ from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.remarks import beyond_stated, misfit_remark, remarks_on
 from kf_calib.estimation.results import Calibration, Consistency
 from kf_calib.noise.noise_model import Noise
+from kf_calib.noise.terms import SettingError
 
 UNTESTED = Consistency(0.0, 0, None, None)
 
@@ -54,9 +55,9 @@ def test_a_misfit_of_three_hundredths_of_gravity_is_one_of_the_set_up() -> None:
 
 def test_poses_are_told_to_be_uncertain_from_a_tenth_more_than_stated() -> None:
     bench, noise = Bench(axes_of("yzx"), G, angle_sigma_deg=0.02), Noise(np.full(3, 1e-4), np.ones(3))
-    size = begins_at(lambda deg: beyond_stated(replace(noise, setting_rad=np.radians(deg)), bench), 0.01, 1.0)
+    size = begins_at(lambda deg: beyond_stated(noise.with_terms(SettingError(np.radians(deg))), bench), 0.01, 1.0)
     assert size == pytest.approx(0.022)
-    assert not beyond_stated(replace(noise, setting_rad=1.0), replace(bench, angle_sigma_deg=None))
+    assert not beyond_stated(noise.with_terms(SettingError(1.0)), replace(bench, angle_sigma_deg=None))
 
 
 def test_scale_factors_of_the_result_are_compared_with_those_of_the_bench(result: Calibration) -> None:

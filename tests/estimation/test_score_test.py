@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from helpers.synthetic import plan_of
@@ -20,6 +18,7 @@ from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import Frame, scan
+from kf_calib.noise.terms import RandomWalk, SettingError
 from kf_calib.sources.simulation.injected import parse
 from kf_calib.sources.simulation.sensors import GRADES, TrueNoise
 from kf_calib.sources.simulation.simulator import Simulation
@@ -38,7 +37,7 @@ def run(*hidden: str, seed: int = 5) -> Calibration:
 @pytest.mark.parametrize("walk_mps2", [0.0, 1e-6])
 def test_a_frame_gives_what_a_scan_of_one_model_gives(walk_mps2: float) -> None:
     before = run("second-order=40ug/g^2")
-    noise = replace(before.noise.for_goodness_of_fit, walk_mps2_per_sqrt_s=walk_mps2)
+    noise = before.noise.for_goodness_of_fit.with_terms(RandomWalk(walk_mps2))
     frame = Frame(before.linearised, noise, candidates(Model(BENCH)))
     more = [effect_named("mine = a*p*o", BENCH)]
     refits = Refits()
@@ -59,7 +58,7 @@ def test_a_frame_serves_one_noise_and_one_run() -> None:
     frame = Frame(one.linearised, one.noise.for_goodness_of_fit, [])
     assert frame.serves(one.linearised, one.noise.for_goodness_of_fit)
     assert not frame.serves(other.linearised, one.noise.for_goodness_of_fit)
-    assert not frame.serves(one.linearised, replace(one.noise.for_goodness_of_fit, setting_rad=1e-5))
+    assert not frame.serves(one.linearised, one.noise.for_goodness_of_fit.with_terms(SettingError(1e-5)))
 
 
 def test_nothing_is_fitted_twice() -> None:

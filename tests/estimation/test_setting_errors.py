@@ -5,7 +5,7 @@ The truth is drawn by scipy's rotations: means of dwells that stand off their po
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -24,6 +24,7 @@ from kf_calib.estimation.calibration import calibrate, evaluate
 from kf_calib.estimation.engine_comparison import compare
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
+from kf_calib.noise.terms import Scatter, SettingError
 
 pytestmark = pytest.mark.usefixtures("unmeasured")
 
@@ -210,7 +211,7 @@ def test_the_likeliest_setting_error_is_that_of_normal_variates(scatter_mps2: fl
     """Rotations a N(0, s^2) turn readings by S (a x f), in noise and scatter R: a = s^2 C^T (s^2 C C^T + R)^-1 e, with
     C by turning forces a little. About the force the readings tell nothing."""
     fit = calibrate(Run(seed=3, dwells=12, count=100, setting_deg=2e-3)).fit
-    noise = replace(fit.noise, setting_rad=3e-5, scatter_mps2=np.full(3, scatter_mps2))
+    noise = fit.noise.with_terms(SettingError(3e-5), Scatter(np.full(3, scatter_mps2)))
     means, state = fit.linearised.means, fit.state + 1e-5 * np.random.default_rng(1).normal(size=12)
     modes, variances = _posterior_rotations(means, noise, state, np.zeros((12, 3, 3)))
     sensitivity = state.reshape(3, 4)[:, :3]

@@ -18,6 +18,7 @@ from kf_calib.estimation.engine_comparison import compare
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import Frame, delta_chi2, scan
 from kf_calib.estimation.settings import Settings
+from kf_calib.noise.terms import RandomWalk, Scatter
 from kf_calib.sources.simulation.injected import parse
 from kf_calib.sources.simulation.sensors import GRADES, TrueNoise
 from kf_calib.sources.simulation.simulator import Simulation
@@ -91,9 +92,7 @@ def test_engines_and_batch_agree() -> None:
 def test_many_frequencies_are_tried_as_a_scan_would(scatter_mps2: float, walk_mps2: float) -> None:
     fitted = calibrate(run(0.1, 1.0, dwells=10), Settings(effects=("scale-drift",))).fit
     effects = [effect_named("sinusoid", BENCH).at(value) for value in np.linspace(0.01, 0.5, 20)]
-    noise = replace(
-        fitted.noise, scatter_mps2=np.full(3, scatter_mps2), scatter_stated=True, walk_mps2_per_sqrt_s=walk_mps2
-    )
+    noise = fitted.noise.with_terms(Scatter(np.full(3, scatter_mps2), stated=True), RandomWalk(walk_mps2))
     expected = scan(fitted.linearised, noise, effects).statistics
     assert expected.max() > 10.0
     np.testing.assert_allclose(delta_chi2(fitted.linearised, noise, effects), expected, rtol=1e-6, atol=1e-6)
@@ -104,9 +103,7 @@ def test_many_frequencies_are_tried_as_a_scan_would(scatter_mps2: float, walk_mp
 def test_a_periodogram_gives_what_each_frequency_alone_does(scatter_mps2: float, walk_mps2: float) -> None:
     """Interpolated between a few frequencies, beside two models, against every frequency worked out."""
     fitted = calibrate(run(0.1, 1.0, dwells=10), Settings(effects=("scale-drift",))).fit
-    noise = replace(
-        fitted.noise, scatter_mps2=np.full(3, scatter_mps2), scatter_stated=True, walk_mps2_per_sqrt_s=walk_mps2
-    )
+    noise = fitted.noise.with_terms(Scatter(np.full(3, scatter_mps2), stated=True), RandomWalk(walk_mps2))
     values = np.linspace(0.01, 0.5, 400)
     frame = Frame(fitted.linearised, noise, [])
     twelve = LinearisedDwells(

@@ -13,6 +13,7 @@ from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.engine_comparison import compare
 from kf_calib.noise.allan import LongestDwells, cluster_sizes, deviations, model_lines
 from kf_calib.noise.noise_model import Noise
+from kf_calib.noise.terms import RandomWalk, Scatter
 
 SIZES = [1, 2, 5, 20, 100]
 
@@ -35,7 +36,7 @@ def test_a_walk_grows_with_the_root_of_the_cluster() -> None:
     intensity, period_s, sizes = 1e-5, 0.5, np.array([20, 50, 100])
     steps = np.random.default_rng(2).normal(0.0, intensity * np.sqrt(period_s), (200_000, 3))
     found, _ = deviations([np.cumsum(steps, axis=0)], sizes.tolist())
-    noise = Noise(np.full(3, 1e-4), np.ones(3), walk_mps2_per_sqrt_s=intensity)
+    noise = Noise(np.full(3, 1e-4), np.ones(3), (RandomWalk(intensity),))
     walk = model_lines(noise, sizes.astype(float), period_s * sizes, 12)[2]
     assert found == pytest.approx(walk[:, None] * np.ones(3), rel=0.08)
 
@@ -83,6 +84,6 @@ def test_the_longest_dwell_is_used_whatever_its_length(monkeypatch: pytest.Monke
 
 def test_scatter_from_dwell_to_dwell_stands_for_flicker_whose_floor_is_that_of_ieee_952() -> None:
     """1/f noise of density h / f scatters the means of n dwells by h ln n, and its Allan deviation is h 2 ln 2."""
-    noise = Noise(np.ones(3), np.ones(3), scatter_mps2=np.array([1e-5, 2e-5, 0.0]))
+    noise = Noise(np.ones(3), np.ones(3), (Scatter(np.array([1e-5, 2e-5, 0.0])),))
     floor = model_lines(noise, np.array([1.0]), np.array([1.0]), 20)[1]
     np.testing.assert_allclose(floor**2, noise.scatter_mps2**2 / np.log(20.0) * 2.0 * np.log(2.0), rtol=1e-12)

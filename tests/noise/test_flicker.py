@@ -24,7 +24,8 @@ from kf_calib.effects import effect_named, names
 from kf_calib.estimation.calibration import calibrate, evaluate
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.settings import Settings
-from kf_calib.noise.nuisance_states import SLOW, _amplitudes, _likeliest, flicker_sigmas
+from kf_calib.noise.flicker import _amplitudes, _likeliest
+from kf_calib.noise.terms import SLOW, SlowWaves
 
 BENCH = Bench(axes_of("yzx"), G, latitude_deg=50.0, angle_sigma_deg=0.0)
 DWELLS, DWELL_S, GAP_S, RATE_HZ, POSE_HZ = 24, 60.0, 5.0, 5.0, 0.5
@@ -137,7 +138,9 @@ def test_slow_waves_have_the_variance_of_their_share_of_one_over_f_noise() -> No
     at = (np.arange(count) + 0.5) / count
     waves = np.sqrt(2.0) * np.cos(np.pi * SLOW[:, None] * at)
     drawn = np.array([waves @ one_over_f(rng, h, count) / count for _ in range(2000)])
-    own = flicker_sigmas(np.array([np.sqrt(h), 0.0, 3.0])).reshape(3, len(SLOW))
+    stack = DwellStack.of(Pass(Run(dwells=4, count=60), Settings()).fold())
+    columns = SlowWaves(np.array([np.sqrt(h), 0.0, 3.0])).columns(stack, np.zeros(12))[0]  # (nodes, channels, waves)
+    own = np.abs(columns[0]).max(axis=0).reshape(3, len(SLOW)) / np.sqrt(2.0)  # the waves begin at their height
     assert drawn.std(axis=0) == pytest.approx(own[0], rel=0.18)
     np.testing.assert_allclose(own[2] * np.sqrt(SLOW), 3.0)
     assert np.all(own[1] > 0.0) and np.all(own[1] < 1.1e-9)

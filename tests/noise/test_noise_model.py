@@ -19,7 +19,8 @@ from kf_calib.dwells.rows import Nodes
 from kf_calib.dwells.stack import DwellStack
 from kf_calib.dwells.sufficient_statistics import Autocovariance, DwellFactor
 from kf_calib.estimation.calibration import calibrate
-from kf_calib.noise import noise_model
+from kf_calib.noise import within_dwells
+from kf_calib.noise.terms import Scatter, WavesOverRun
 from kf_calib.sources.simulation.sensors import GRADES
 from kf_calib.sources.simulation.sensors import TrueNoise as SimulatedNoise
 from kf_calib.sources.simulation.simulator import Simulation
@@ -52,7 +53,7 @@ def test_ar1_inflation_is_that_of_the_mean(phi: float) -> None:
 def test_a_parabola_takes_three_independent_readings_of_a_dwell(phi: float, count: int) -> None:
     """Of pieces of 40 and of 125 readings, of which it takes much: sigma is right to three standard errors."""
     dwells = calibrate(Run(seed=4, dwells=300, count=count, phi=phi)).fit.dwells
-    assert noise_model.within_dwells(dwells).sigma_mps2.mean() == pytest.approx(1e-4, rel=0.012)
+    assert within_dwells.within_dwells(dwells).sigma_mps2.mean() == pytest.approx(1e-4, rel=0.012)
 
 
 @pytest.mark.slow
@@ -62,9 +63,9 @@ def test_a_walk_of_known_intensity_is_no_noise_of_a_reading() -> None:
     steps = np.random.default_rng(2).normal(size=run.accel.values.shape) * walk / np.sqrt(run.rate_hz)
     run.accel.values[:] += np.cumsum(steps.reshape(80, 400, 3), axis=1).reshape(-1, 3)
     dwells = calibrate(run).fit.dwells
-    known = noise_model.within_dwells(dwells, walk)
+    known = within_dwells.within_dwells(dwells, walk)
     assert known.sigma_mps2 == pytest.approx(1e-4, rel=0.06)
-    assert noise_model.within_dwells(dwells).sigma_mps2.mean() > 1.07e-4
+    assert within_dwells.within_dwells(dwells).sigma_mps2.mean() > 1.07e-4
 
 
 @pytest.mark.parametrize("phi", [0.0, 0.5])
@@ -74,7 +75,7 @@ def test_channels_of_short_blocks_have_one_correlation_and_variances_of_their_si
     for _ in range(1000):
         white = rng.normal(size=(3, 160)) * np.sqrt(1.0 - phi**2)
         total += Autocovariance.of(detrended(sigmas[:, None] * lfilter([1.0], [1.0, -phi], white, axis=1)[:, 100:]))
-    kappa, variances = noise_model._alike(total)
+    kappa, variances = within_dwells._alike(total)
     assert kappa[:2] == pytest.approx((1.0 + phi) / (1.0 - phi), rel=0.1) and kappa[2] == 1.0
     assert np.sqrt(variances) == pytest.approx(sigmas, rel=0.05)
 
@@ -126,7 +127,7 @@ def test_setting_error_and_scatter_are_told_apart_and_sized() -> None:
         mistaken += bool(setting.scatter_mps2.any())
         settings.append(np.degrees(setting.setting_rad))
         scatter = calibrate(Run(seed=seed, dwells=30, scatter_mps2=5e-4)).noise
-        mistaken += scatter.setting_rad > 0 and not scatter.setting_stated
+        mistaken += scatter.setting_rad > 0 and not scatter.setting.stated
         scatters.append(scatter.scatter_mps2)
     assert mistaken <= runs // 5  # of twice as many, at the 1 % point each
     assert np.sqrt(np.mean(np.square(settings))) == pytest.approx(0.01, rel=off)
@@ -135,7 +136,7 @@ def test_setting_error_and_scatter_are_told_apart_and_sized() -> None:
 
 def test_what_is_stated_is_not_estimated() -> None:
     noise = calibrate(Run(seed=3, setting_deg=0.01)).noise
-    assert noise.setting_stated and noise.setting_rad == pytest.approx(np.radians(0.01))
+    assert noise.setting.stated and noise.setting_rad == pytest.approx(np.radians(0.01))
 
 
 @pytest.mark.parametrize("kind", [{"setting_deg": 0.01}, {"scatter_mps2": 5e-4}])
@@ -146,7 +147,9 @@ def test_no_other_size_of_the_dwell_parts_is_likelier(seed: int, kind: dict[str,
     noise, means, state = result.noise, result.linearised.means, result.linearised.state
 
     def likelihood(setting: float, scatter: float) -> float:
-        other = replace(noise, setting_rad=noise.setting_rad * setting, scatter_mps2=noise.scatter_mps2 * scatter)
+        other = noise.with_terms(
+            replace(noise.setting, size_rad=noise.setting_rad * setting), Scatter(noise.scatter_mps2 * scatter)
+        )
         return restricted_log_likelihood(other.weights, means, state)
 
     others = [likelihood(*pair) for x in (0.5, 0.9, 0.98, 1.02, 1.1, 2.0) for pair in ((x, 1.0), (1.0, x))]
@@ -198,7 +201,7 @@ def test_noise_along_the_force_has_the_likeliest_sizes_of_gamma_sums() -> None:
         return float(np.sum(freedom * np.log(expected) + squares / expected))
 
     best = minimize(cost, np.zeros(3), method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-10, "maxiter": 9999})
-    sigma = noise_model._sigma_along(DwellStack.of(dwells), along, kappa)
+    sigma = within_dwells._sigma_along(DwellStack.of(dwells), along, kappa)
     np.testing.assert_allclose(sigma**2, np.exp(best.x), rtol=1e-3)
 
 
@@ -206,10 +209,10 @@ def test_slow_waves_are_independent_of_each_other_and_their_sizes_fall_with_the_
     """Mean products of waves over dwells at equal distances are one or zero; h / k is the variance of wave k."""
     count = 40
     dwells = [DwellFactor(k + 1, (piece_of(10.0 * k, 10.0, 9, width=4),)) for k in range(count)]
-    columns, sigma = noise_model.slow_waves(dwells, np.array([2.0, 0.0, 3.0]))
-    waves = np.array(columns)[:, 0]  # (dwells, nodes, channels, waves)
+    columns = WavesOverRun(np.array([2.0, 0.0, 3.0])).columns(DwellStack.of(dwells), np.zeros(12))
+    sigma = np.concatenate([2.0 / np.sqrt(np.arange(1, 7)), 3.0 / np.sqrt(np.arange(1, 7))])
+    waves = columns / sigma  # (dwells, nodes, channels, waves)
     assert not waves[:, 3].any() and not waves[:, :, 1].any()
     first, third = waves[:, 0, 0, :6], waves[:, 1, 2, 6:]
     np.testing.assert_allclose(first, third)
     np.testing.assert_allclose(first.T @ first / count, np.eye(6), atol=1e-12)
-    np.testing.assert_allclose(sigma**2, np.concatenate([4.0 / np.arange(1, 7), 9.0 / np.arange(1, 7)]))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from helpers.long_runs import slow
@@ -21,6 +19,7 @@ from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
 from kf_calib.noise import random_walk
 from kf_calib.noise.noise_model import mean_covariances, steps
+from kf_calib.noise.terms import RandomWalk, SettingError
 
 Q = 1e-5
 
@@ -90,12 +89,12 @@ def test_the_likelihood_is_that_of_a_dense_covariance() -> None:
     rest = np.linalg.svd(design / np.linalg.norm(design, axis=0))[0][:, design.shape[1] :]
     values = []
     for q in (0.3 * Q, Q, 3.0 * Q):
-        noise = replace(result.noise, walk_mps2_per_sqrt_s=0.0)
+        noise = result.noise.without(RandomWalk)
         full = q**2 * np.kron(kernel, np.eye(3))
         for k, own in enumerate(mean_covariances(noise, means, state)):
             full[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += own
         expected = multivariate_normal(cov=rest.T @ full @ rest).logpdf(rest.T @ means.readings.ravel())
-        found = restricted_log_likelihood(replace(noise, walk_mps2_per_sqrt_s=q), means, state)
+        found = restricted_log_likelihood(noise.with_terms(RandomWalk(q)), means, state)
         values.append((expected, found))
     differences = np.diff(np.array(values), axis=0)
     np.testing.assert_allclose(differences[:, 0], differences[:, 1], atol=2e-3)
@@ -105,7 +104,7 @@ def test_the_likelihood_is_that_of_a_dense_covariance() -> None:
 def test_the_likelihood_of_a_walk_is_there_however_large_a_setting_error_is_tried_beside_it(setting_deg: float) -> None:
     """No rotation changes a reading along the force: there the covariance is that of the noise, or of rounding."""
     result = calibrate(Run(seed=3, dwells=24, count=60, white_mps2=1e-6))
-    noise = replace(result.noise, setting_rad=np.radians(setting_deg), walk_mps2_per_sqrt_s=1e-9)
+    noise = result.noise.with_terms(SettingError(np.radians(setting_deg)), RandomWalk(1e-9))
     assert np.isfinite(restricted_log_likelihood(noise, result.linearised.means, result.linearised.state))
 
 

@@ -22,6 +22,7 @@ from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.reml import Parts, VarianceComponents
 from kf_calib.noise.restricted_likelihood import Restricted
+from kf_calib.noise.terms import RandomWalk, Scatter
 
 
 def dense(columns: Floats) -> Floats:
@@ -212,7 +213,7 @@ def parts_of(noise: Noise) -> Floats:
 
 def test_sizes_that_were_found_before_lead_to_the_same_noise(walked: Calibration) -> None:
     means, state = walked.linearised.means, walked.linearised.state
-    within = replace(walked.noise, walk_mps2_per_sqrt_s=0.0, walk_spread=None)
+    within = walked.noise.without(RandomWalk)
     components = VarianceComponents(None, None, walks=True)
     noise = components.completed(within, means, state)
     moved: Means = replace(means, readings=means.readings * (1.0 + 1e-9))
@@ -221,18 +222,18 @@ def test_sizes_that_were_found_before_lead_to_the_same_noise(walked: Calibration
     for start in (components.sizes, far):
         again = VarianceComponents(None, None, walks=True, sizes=dict(start)).completed(within, moved, state)
         np.testing.assert_allclose(parts_of(again), parts_of(noise), rtol=1e-4)
-        assert again.walk_spread == pytest.approx(noise.walk_spread, rel=1e-3)
+        assert again.walk.spread == pytest.approx(noise.walk.spread, rel=1e-3)
 
 
 @pytest.mark.parametrize("walk", [0.3, 1.0])
 def test_scatter_is_found_beside_a_walk_that_is_stated(walked: Calibration, walk: float) -> None:
     means, state = walked.linearised.means, walked.linearised.state
-    within = replace(walked.noise, walk_mps2_per_sqrt_s=walk * walked.noise.walk_mps2_per_sqrt_s, walk_spread=None)
+    within = walked.noise.with_terms(RandomWalk(walk * walked.noise.walk_mps2_per_sqrt_s))
     noise = VarianceComponents(0.0, None).completed(within, means, state)
     assert noise.walk_mps2_per_sqrt_s == within.walk_mps2_per_sqrt_s
 
     def likelihood(size: float) -> float:
-        return restricted_log_likelihood(replace(noise, scatter_mps2=size * noise.scatter_mps2), means, state)
+        return restricted_log_likelihood(noise.with_terms(Scatter(size * noise.scatter_mps2)), means, state)
 
     assert max(likelihood(size) for size in (0.9, 0.99, 1.01, 1.1)) < likelihood(1.0)
 

@@ -17,6 +17,7 @@ from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.results import Calibration, consistency
 from kf_calib.estimation.settings import Settings
 from kf_calib.noise.temperature_course import temperature_course
+from kf_calib.noise.terms import ThermometerError
 from kf_calib.sources.simulation.injected import parse
 from kf_calib.sources.simulation.physics import Ambient
 from kf_calib.sources.simulation.sensors import GRADES, TrueNoise
@@ -67,7 +68,7 @@ def test_the_error_of_the_temperature_is_in_the_sigmas_and_in_the_test_of_the_mo
     noisy: tuple[Calibration, Ambient],
 ) -> None:
     run, _ = noisy
-    exact = replace(run.fit, noise=replace(run.noise, sensitivity_mps2_per_k=None))
+    exact = replace(run.fit, noise=run.noise.without(ThermometerError))
     assert consistency(exact).p_value < 1e-9
     assert run.consistency.consistent
     assert any("thermometer" in sentence for sentence in run.warnings)
@@ -77,14 +78,15 @@ def test_the_error_of_the_temperature_is_in_the_sigmas_and_in_the_test_of_the_mo
     assert (
         np.sqrt(np.mean([((run.parameters[k].value - truth[k]) / run.parameters[k].sigma) ** 2 for k in truth])) < 1.5
     )
-    np.testing.assert_allclose(run.noise.sensitivity_mps2_per_k[:, 0], [each.value for each in found], rtol=1e-6)
-    np.testing.assert_allclose(run.noise.sensitivity_mps2_per_k[:, 1:], 0.0, atol=1e-9)
+    sensitivity = run.noise.term(ThermometerError).sensitivity_mps2_per_k
+    np.testing.assert_allclose(sensitivity[:, 0], [each.value for each in found], rtol=1e-6)
+    np.testing.assert_allclose(sensitivity[:, 1:], 0.0, atol=1e-9)
 
 
 def test_the_error_of_the_temperature_is_no_trend_within_dwells(noisy: tuple[Calibration, Ambient]) -> None:
     """Where it is left out of the noise, all dwells seem to have one."""
     run, _ = noisy
-    exact = replace(run.fit, noise=replace(run.noise, sensitivity_mps2_per_k=None))
+    exact = replace(run.fit, noise=run.noise.without(ThermometerError))
     with_error, without = trend(run.fit), trend(exact)
     assert with_error is not None and with_error.p_value > 1e-3 and 0.7 < with_error.ratio < 1.4
     assert without is not None and without.p_value < 1e-40
@@ -92,7 +94,7 @@ def test_the_error_of_the_temperature_is_no_trend_within_dwells(noisy: tuple[Cal
 
 def test_an_effect_too_small_for_the_error_of_the_temperature_to_matter_has_none() -> None:
     run, _ = calibrated(1e-4 * LARGE, sigma_c=0.03)
-    assert run.noise.sensitivity_mps2_per_k is None
+    assert run.noise.term(ThermometerError) is None
     assert not any("thermometer" in sentence for sentence in run.warnings)
 
 

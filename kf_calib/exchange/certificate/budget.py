@@ -39,6 +39,7 @@ from kf_calib.exchange.certificate.intrinsic import SYMBOLS, UNITS, intrinsic
 from kf_calib.exchange.certificate.statement import DIVISORS, Rule, Statement, TypeB
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise, lift_rounding, mean_covariances
+from kf_calib.noise.terms import Scatter, SettingError
 from kf_calib.support.units import quantity
 
 COVERAGE = math.erf(math.sqrt(2.0))
@@ -217,10 +218,9 @@ def _known_columns(model: Model, stimulus: Stimulus) -> tuple[list[int], tuple[s
 def _gain(saved: SavedCalibration, design: Floats, stimulus: Stimulus) -> Floats:
     """The change (12, D, 3) of the affine state per unit of each mean reading, by weighted least squares."""
     stated_noise, counts = saved.noise, np.array([[float(each.readings)] for each in saved.conditions.dwells])
-    noise = Noise(
-        np.array(stated_noise.sigma_mps2), np.array(stated_noise.inflation), math.radians(stated_noise.angle_sigma_deg),
-        np.array(stated_noise.dwell_sigma_mps2), checked=stated_noise.dwell_sigma_stated,
-    )  # fmt: skip
+    setting = SettingError(math.radians(stated_noise.angle_sigma_deg), considered=not stated_noise.dwell_sigma_stated)
+    terms = setting, Scatter(np.array(stated_noise.dwell_sigma_mps2))
+    noise = Noise(np.array(stated_noise.sigma_mps2), np.array(stated_noise.inflation), terms)
     means = Means(design, np.zeros(design.shape[:2]), stimulus.force_mps2, counts, np.zeros((len(counts), 2)))
     covariances = lift_rounding(mean_covariances(noise.weights, means, np.array(saved.state.values)))
     whiten = np.linalg.inv(np.linalg.cholesky(covariances))

@@ -75,7 +75,7 @@ def set_attitudes(states: Sequence[TrueState], up: str) -> None:
 
 
 @dataclass(frozen=True)
-class SettingError:
+class DwellRotation:
     """The platform turned in itself by a small rotation vector in each dwell, ``rotation_rad`` (m, 3)."""
 
     rotation_rad: Floats
@@ -151,7 +151,7 @@ class Response:
 
 
 @dataclass(frozen=True)
-class Scatter:
+class DwellOffset:
     """An offset of each accelerometer in each dwell, ``offset_mps2`` (m, 3)."""
 
     offset_mps2: Floats

@@ -24,11 +24,11 @@ from kf_calib.sources.simulation.injected import Hidden, Rig, Stage, steps_of
 from kf_calib.sources.simulation.physics import (
     Ambient,
     Disturbance,
+    DwellOffset,
+    DwellRotation,
     Gravity,
     Inputs,
     Response,
-    Scatter,
-    SettingError,
     TrueState,
     TrueStep,
     WalkingBias,
@@ -183,14 +183,14 @@ class Simulation:
     def _setting_steps(self) -> list[TrueStep]:
         if not self.noise.setting_sigma_deg:
             return []
-        return [SettingError(self._drawn_per_dwell("setting", math.radians(self.noise.setting_sigma_deg)))]
+        return [DwellRotation(self._drawn_per_dwell("setting", math.radians(self.noise.setting_sigma_deg)))]
 
     def _noise_steps(self) -> list[TrueStep]:
         noise, period_s = self.noise, self._accel.period_ns * 1e-9
         processes = noise.processes(self.seed, period_s, len(self) * period_s)
         steps: list[TrueStep] = [Disturbance(process) for process in processes]
         if noise.scatter_mps2:
-            steps.append(Scatter(self._drawn_per_dwell("scatter", noise.scatter_mps2)))
+            steps.append(DwellOffset(self._drawn_per_dwell("scatter", noise.scatter_mps2)))
         if noise.vibration_mps2:
             rng = generator(self.seed, "vibration")
             steps.append(Disturbance(lambda n: noise.vibration_mps2 * rng.standard_normal((n, 3)), when_moving=True))

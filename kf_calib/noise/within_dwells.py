@@ -1,0 +1,160 @@
+"""The noise of readings within dwells: sigma_w of each accelerometer, and the inflation of the variance of means by its
+autocorrelation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.dwells import window_average
+from kf_calib.dwells.pieces import lagged_walk_products
+from kf_calib.dwells.stack import DwellStack, Folded
+from kf_calib.dwells.sufficient_statistics import Autocovariance, DwellFactor
+from kf_calib.noise.noise_model import Noise
+from kf_calib.noise.noise_of_readings import are_alike, expected_products, unbiased
+
+_MAX_ORDER = 20
+_LONGEST = 2.0  # kappa is at most the readings in a block divided by this
+_SHORT = 8.0  # if blocks are shorter than this times kappa, channels that are alike share one correlation
+TOO_SHORT = 4.0
+"""If blocks are shorter than this times kappa, they do not determine how slow their noise is."""
+
+_AVERAGES = 60  # least number of averages of a block from which their own correlation is estimated
+_STEPS_ALONG = 30
+
+
+def within_dwells(
+    dwells: Sequence[DwellFactor], walk_mps2_per_sqrt_s: float = 0.0, along: Floats | None = None
+) -> Noise:
+    """The noise within dwells, sigma_w and kappa of each accelerometer, pooled over all pieces.
+
+    along (D, 3): the weights of the channels in the size of the force, where nothing else is known in a dwell.
+
+    The contribution of a random walk of known intensity is subtracted. Over a piece of n readings, the sum of squares
+    about a parabola has the expectation sigma^2 (n - 3 kappa) if n is at least 40 kappa. If there is no such piece,
+    sigma_w is taken from the autocovariance.
+    """
+    stack = DwellStack.of(dwells)
+    dwells, within_seen = stack.folded.dwells, bool((stack.folded.counts > 1).any())
+    if walk_mps2_per_sqrt_s:
+        inflation, variance = _correlation(stack.folded, walk_mps2_per_sqrt_s)
+    else:  # the same for all fits to the dwells
+        if "correlation" not in stack.folded.known:
+            stack.folded.known["correlation"] = _correlation(stack.folded, 0.0)
+        inflation, variance = stack.folded.known["correlation"]
+    if along is not None:
+        return Noise(_sigma_along(stack, along, inflation), inflation, within_seen=within_seen)
+    counts, of_pieces = stack.folded.piece_counts, np.repeat(stack.folded.weights, stack.folded.piece_numbers, axis=0)
+    squares = of_pieces * stack.folded.squares
+    if walk_mps2_per_sqrt_s:
+        rest = of_pieces * np.concatenate([dwell.walk.about_parabola for dwell in dwells])[:, None]
+        squares = np.maximum(squares - walk_mps2_per_sqrt_s**2 * rest, 0.0)
+    on_carrier = dwells[0].width - 3
+    long = counts[:, None] >= np.where(variance > 0, 40.0 * inflation, 0.0)
+    freedom = np.where(long, np.maximum(counts[:, None] - 3.0 * inflation - on_carrier, 0.0), 0.0).sum(axis=0)
+    pooled = np.where(long, squares, 0.0).sum(axis=0) / np.maximum(freedom, 1.0)
+    sigma = np.sqrt(np.where(long.any(axis=0), pooled, variance))
+    return Noise(sigma, inflation, within_seen=within_seen)
+
+
+def _correlation(folded: Folded, walk_mps2_per_sqrt_s: float) -> tuple[Floats, Floats]:
+    """Return kappa (3,) and the variances (3,) of readings within dwells, less those of a random walk."""
+    total, dwells = folded.autocovariance, folded.dwells
+    if walk_mps2_per_sqrt_s:
+        total = replace(total, products=total.products - walk_mps2_per_sqrt_s**2 * _walk_products(dwells))
+    known = _of_averages if dwells[0].averaged else _inflation
+    inflation, variance = np.array([known(total, i) for i in range(3)]).T
+    if dwells[0].averaged or total.count >= _SHORT * inflation.max() * total.blocks:
+        return inflation, variance
+    if are_alike(total):
+        return _alike(total)
+    return np.maximum(inflation, _too_short(inflation, total.count / total.blocks)), variance
+
+
+def _sigma_along(stack: DwellStack, along: Floats, inflation: Floats) -> Floats:
+    """Return sigma_w (3,) of the accelerometers from the readings along the force alone, which have the variance sum of
+    (m_i sigma_i)^2 with m = ``along`` (D, 3).
+
+    The likeliest variances of such gamma distributed sums, by steps that keep them positive. The readings of a dwell
+    then have one weight in all channels.
+    """
+    weights, folded = along**2, stack.folded
+    squares = folded.weights[:, 0] * folded.squares_along(along)
+    freedom = np.add.reduceat(np.maximum(folded.piece_counts - 3.0 * inflation.mean(), 0.0), folded.ends[:-1])
+    if not freedom.any():
+        freedom = np.maximum(folded.counts - 1.0, 0.0)
+    if not squares.any() or not freedom.any():
+        return np.zeros(3)
+    variances = np.full(3, squares.sum() / (freedom @ weights).sum())
+    for _ in range(_STEPS_ALONG):
+        expected = weights @ variances
+        variances = variances * ((squares / expected**2) @ weights) / np.maximum((freedom / expected) @ weights, 1e-300)
+    return np.sqrt(variances)
+
+
+def _walk_products(dwells: Sequence[DwellFactor]) -> Floats:
+    """Return what a random walk of intensity q = 1 contributes to the sums of lagged products (L + 1, 3) of all
+    dwells."""
+    products = 0.0 * dwells[0].autocovariance.products
+    for dwell in dwells:
+        known, period_s = dwell.autocovariance, (dwell.end_s - dwell.start_s) / max(dwell.count - 1, 1)
+        if known.blocks:
+            own = lagged_walk_products(period_s, max(round(known.count / known.blocks), 1), known.pairs)
+            products = products + own[:, None] * dwell.weights
+    return products
+
+
+def _inflation(total: Autocovariance, channel: int) -> tuple[float, float]:
+    """Return kappa and the variance of one channel from an autoregression fitted to its autocovariance
+    (``autoregression``).
+
+    kappa is limited from above to what blocks of this length can show. It is below 1 where averages fall faster than
+    those of white noise, but above 1/n: that is what is left of n differences when they are added up.
+    """
+    if total.count < 64 or total.products[0, channel] <= 0:
+        return 1.0, 0.0
+    size = round(total.count / total.blocks)
+    lags = min(_MAX_ORDER, total.count // 16, size // 4)
+    raw = total.products[: lags + 1, channel] / np.maximum(total.pairs[: lags + 1], 1.0)
+    model, variance = unbiased(raw, total.count, size)
+    return min(max(model.inflation, 1.0 / size), max(size / _LONGEST, 1.0)), variance
+
+
+def _alike(total: Autocovariance) -> tuple[Floats, Floats]:
+    """Return kappa (3,) and the variances (3,) with one autocorrelation for all channels, for blocks that are short for
+    their correlation time.
+
+    A single channel then contains too little information. If the blocks are too short even together, kappa is set to
+    the largest value that they allow.
+    """
+    varying = total.products[0] > 0
+    channels, size = int(varying.sum()), total.count / total.blocks
+    shape = np.mean(total.products[:, varying] / total.products[0, varying], axis=1, keepdims=True)
+    pooled = Autocovariance(shape * total.pairs[0], total.pairs, total.count * channels, total.blocks * channels)
+    kappa, variance = _inflation(pooled, 0)
+    kappa = np.maximum(kappa, _too_short(np.array(kappa), size))
+    return np.where(varying, kappa, 1.0), variance * total.products[0] / total.pairs[0]
+
+
+def _too_short(inflation: Floats, size: float) -> Floats:
+    """Return the least kappa that blocks of this size allow where they are too short to determine it, else zeros."""
+    return np.where(size < TOO_SHORT * inflation, size / _LONGEST, 0.0)
+
+
+def _of_averages(total: Autocovariance, channel: int) -> tuple[float, float]:
+    """Return kappa and the variance of one channel for averages over overlapping windows.
+
+    For short blocks kappa is that of averaged white noise; for long ones it is estimated, but not below that value.
+    """
+    if not total.count:
+        return 1.0, 0.0
+    size, kappa = round(total.count / total.blocks), window_average.inflation()
+    if size >= _AVERAGES:
+        found, variance = _inflation(total, channel)
+        return max(found, kappa), variance
+    kept = expected_products(np.append(window_average.correlations(), np.zeros(size))[:size], 0)[0] / size
+    return kappa, float(total.products[0, channel] / total.pairs[0] / max(kept, 1e-3))
