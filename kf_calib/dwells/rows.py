@@ -187,24 +187,21 @@ def _direction(vector: Floats) -> Floats:
 
 
 def _slew_rows(block: Block, bench: Bench, curve: Curve) -> Rows:
-    """Return the rows of a slew, in pieces of 2 deg."""
-    pieces = tuple(
-        _slew_piece(block, slice(a, b), bench, curve) for a, b in itertools.pairwise(curve.cuts(block.elapsed_s))
-    )
-    columns = np.concatenate([basis(u).T @ parabola(nodes.regressors) for _, u, nodes in pieces])
-    return Rows(block.dwell, block.elapsed_s, columns, block.accel_mps2, block.accel_mps2.T, False, pieces, moving=True)
-
-
-def _slew_piece(block: Block, part: slice, bench: Bench, curve: Curve) -> tuple[slice, Floats, Nodes]:
-    """Return the slice, u and the nodes of one piece of a slew."""
-    elapsed_s = block.elapsed_s[part]
-    u, node_s = _node_times(elapsed_s)
+    """Return the rows of a slew, in pieces of 2 deg. What holds at the nodes is computed for all pieces at once."""
+    parts = [slice(a, b) for a, b in itertools.pairwise(curve.cuts(block.elapsed_s))]
+    times = [_node_times(block.elapsed_s[part]) for part in parts]
+    node_s = np.concatenate([of_piece for _, of_piece in times])
     pose = curve.angles(node_s)
-    nodes = Nodes(
-        node_s, node_s - block.arrival_s, bench.specific_force(node_s, pose), pose,
-        _temperatures(u, block.temperature_c[part]), curve.rate(node_s), curve.rate_change(node_s),
-    )  # fmt: skip
-    return part, u, nodes
+    force, rate, change = bench.specific_force(node_s, pose), curve.rate(node_s), curve.rate_change(node_s)
+    pieces = list[tuple[slice, Floats, Nodes]]()
+    for k, (part, (u, _)) in enumerate(zip(parts, times, strict=True)):
+        own, temperatures_c = slice(3 * k, 3 * k + 3), _temperatures(u, block.temperature_c[part])
+        pieces.append((part, u, Nodes(node_s[own], node_s[own] - block.arrival_s, force[own], pose[own],
+                                      temperatures_c, rate[own], change[own])))  # fmt: skip
+    columns = np.concatenate([basis(u).T @ parabola(nodes.regressors) for _, u, nodes in pieces])
+    return Rows(
+        block.dwell, block.elapsed_s, columns, block.accel_mps2, block.accel_mps2.T, False, tuple(pieces), moving=True
+    )
 
 
 def _node_times(elapsed_s: Floats) -> tuple[Floats, Floats]:

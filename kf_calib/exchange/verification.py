@@ -38,6 +38,7 @@ from kf_calib.estimation.settings import Settings
 from kf_calib.exchange.calibration_file import SavedCalibration
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise, mean_covariances
+from kf_calib.noise.terms import Scatter
 from kf_calib.sources.files.record_files import fingerprint
 from kf_calib.support.tail_probabilities import chi_squared_tail, sidak
 
@@ -135,12 +136,11 @@ def verify(
 def _noise(saved: SavedCalibration, fitted: Fit) -> Noise:
     """Return the noise of the new run; what is not stated from dwell to dwell is no less than it was in the old one."""
     noise, old = fitted.noise, saved.noise
-    scatter, setting = noise.scatter, noise.setting
-    if not scatter.stated:
-        scatter = replace(scatter, sizes_mps2=np.maximum(scatter.sizes_mps2, old.dwell_sigma_mps2))
-    if not setting.stated:
-        setting = replace(setting, size_rad=max(setting.size_rad, float(np.radians(old.angle_sigma_deg))))
-    noise = noise.with_terms(setting, scatter)
+    if not noise.scatter.stated:
+        noise = noise.with_terms(Scatter(np.maximum(noise.scatter_mps2, old.dwell_sigma_mps2)))
+    if not noise.setting.stated:
+        size_rad = max(noise.setting_rad, float(np.radians(old.angle_sigma_deg)))
+        noise = noise.with_terms(replace(noise.setting, size_rad=size_rad))
     return noise
 
 

@@ -178,7 +178,7 @@ class Noise:
         stack = DwellStack.of(dwells)
         columns = [term.columns(stack, state) for term in self.terms if term.scope == scope]
         if not columns:
-            return np.zeros((stack.folded.ends[-1], 3, 3, 0))
+            return np.zeros((stack.folded.ends[-1], stack.folded.dwells[0].width, 3, 0))
         return columns[0] if len(columns) == 1 else np.concatenate(columns, axis=3)
 
 

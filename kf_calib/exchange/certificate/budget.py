@@ -219,8 +219,8 @@ def _gain(saved: SavedCalibration, design: Floats, stimulus: Stimulus) -> Floats
     """The change (12, D, 3) of the affine state per unit of each mean reading, by weighted least squares."""
     stated_noise, counts = saved.noise, np.array([[float(each.readings)] for each in saved.conditions.dwells])
     setting = SettingError(math.radians(stated_noise.angle_sigma_deg), considered=not stated_noise.dwell_sigma_stated)
-    terms = setting, Scatter(np.array(stated_noise.dwell_sigma_mps2))
-    noise = Noise(np.array(stated_noise.sigma_mps2), np.array(stated_noise.inflation), terms)
+    scatter, inflation = Scatter(np.array(stated_noise.dwell_sigma_mps2)), np.array(stated_noise.inflation)
+    noise = Noise(np.array(stated_noise.sigma_mps2), inflation, (setting, scatter))
     means = Means(design, np.zeros(design.shape[:2]), stimulus.force_mps2, counts, np.zeros((len(counts), 2)))
     covariances = lift_rounding(mean_covariances(noise.weights, means, np.array(saved.state.values)))
     whiten = np.linalg.inv(np.linalg.cholesky(covariances))
