@@ -48,10 +48,10 @@ if TYPE_CHECKING:
     from kf_calib.noise.rest_noise import RestNoise, noise_at_rest
     from kf_calib.online.sequential_test import Running, Watch
     from kf_calib.online.session import Session
-    from kf_calib.sources.files.lines import Lines as open_log
     from kf_calib.sources.files.recorder import Recorder
     from kf_calib.sources.files.recording import Recording as open_recording
-    from kf_calib.sources.tables.opening import open_table
+    from kf_calib.sources.text.lines import Lines as open_log
+    from kf_calib.sources.text.means import open_table
     from kf_calib.support.units import shown_in
     from kf_calib.views import figures as plot
     from kf_calib.views.rerun import save_view
@@ -83,9 +83,9 @@ _HOMES = {
     "Running": ("online.sequential_test", "Running"),
     "Session": ("online.session", "Session"),
     "Recorder": ("sources.files.recorder", "Recorder"),
-    "open_log": ("sources.files.lines", "Lines"),
+    "open_log": ("sources.text.lines", "Lines"),
     "open_recording": ("sources.files.recording", "Recording"),
-    "open_table": ("sources.tables.opening", "open_table"),
+    "open_table": ("sources.text.means", "open_table"),
     "save_view": ("views.rerun", "save_view"),
     "shown_in": ("support.units", "shown_in"),
     "Watch": ("online.sequential_test", "Watch"),

@@ -228,7 +228,7 @@ def record(
     as_json: Json,
 ) -> None:  # fmt: skip
     """Record CSV or JSON LINES (a file, or - for standard input) to the MCAP file OUT."""
-    from kf_calib.sources.files.lines import Lines
+    from kf_calib.sources.text.lines import Lines
 
     if lines.suffix == ".mcap" and output.suffix != ".mcap":
         raise InputError(f"the recording goes before the lines: kf-calib record {lines} {output}.")
@@ -250,7 +250,7 @@ def record(
 def _told_if_table(path: Path) -> Iterator[None]:
     """Where lines cannot be recorded because they are a table of orientations, say so."""
     from kf_calib.sources.opening import FileKind, kind_of
-    from kf_calib.sources.tables.survey import survey
+    from kf_calib.sources.text.survey import survey
 
     try:
         yield

@@ -138,7 +138,7 @@ def _of_lines(
     told: bench keys that nobody states and the readings tell, with the ``reason``.
     """
     from kf_calib.sources.files.inventory import inventory_of_lines
-    from kf_calib.sources.files.lines import Lines
+    from kf_calib.sources.text.lines import Lines
 
     missing, words = {"accel_scale": reason} if reason else {}, _given(ctx, _not_of(ctx, not_of_text(path)))
     words += _options(told)
@@ -255,9 +255,7 @@ def _show_table(ctx: click.Context, path: Path, reading: ReadingOptions, as_json
 
 def _of_table(ctx: click.Context, path: Path, reading: ReadingOptions, told: Stated, reason: str) -> TableOverview:
     """What is in a table of orientations; told, reason: as of ``_of_lines``."""
-    from kf_calib.bench.raw_input import OPTIONS
-    from kf_calib.sources.tables.survey import survey
-    from kf_calib.sources.text.units import size_of_count
+    from kf_calib.sources.text.survey import survey
     from kf_calib.views.overview import TableOverview
 
     bench = {**reading.keys, **_bench_keys(told)}
@@ -272,14 +270,9 @@ def _of_table(ctx: click.Context, path: Path, reading: ReadingOptions, told: Sta
     missing |= {key: _NAMED[key][1] for key in lacking}
     axes = _AXES.get(table.angles, _NAMED["axes"][0])
     words += [axes if key == "axes" else _NAMED[key][0] for key in lacking]
-    wrong = None
-    if table.rows and not table.has_unit:
-        missing["accel_scale"] = "the size of one count of the readings: --accel-scale, in m/s^2 or --accel-unit's unit"
-        size = size_of_count(median(row.norm_mps2 for row in table.rows))
-        told = {**told, **{key: value for key, value in size.items() if key not in bench}}
-        words += [f"{OPTIONS[key]} {told[key]}" for key in size if key not in bench]
-    elif wrong := _wrong_unit([row.norm_mps2 for row in table.rows], table.input, are_named=True):
-        missing, words = _with_unit(missing, words, wrong)
+    taken = table.table.bench.input if table.table else None
+    wrong = taken and _wrong_unit([row.norm_mps2 for row in table.rows], taken, are_named=True)
+    missing, words = _with_unit(missing, words, wrong)
     if table.trouble:
         missing, words = {"": table.trouble, **missing}, None
     elif wrong is None:

@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from kf_calib.bench.raw_input import RawInput
     from kf_calib.bench.streams import Table
     from kf_calib.estimation.settings import Settings
-    from kf_calib.sources.files.lines import Lines
     from kf_calib.sources.files.recording import Recording
     from kf_calib.sources.opening import FileKind
+    from kf_calib.sources.text.lines import Lines
     from kf_calib.sources.text.units import Units
 
 _of_input, _of_model, _of_output = (partial(option, panel=panel) for panel in (INPUT, MODEL, OUTPUT))
@@ -230,7 +230,7 @@ class ReadingOptions:
 
     def table(self, path: Path, told: Mapping[str, str], angles: bool | None, input: RawInput | None = None) -> Table:
         """The table at a path; told: bench keys beside those of the options. angles: whether orientations count."""
-        from kf_calib.sources.tables.opening import open_table
+        from kf_calib.sources.text.means import open_table
 
         return open_table(path, {**told, **self.keys}, columns=self.renamed, angles=angles, input=input,
                           angle_unit=self.angle_unit, g_unit=self.g_unit, where=self.where or "",
@@ -238,8 +238,8 @@ class ReadingOptions:
 
     def opened(self, path: Path, input: RawInput | None = None) -> Recording | Lines | Table:
         """The recording, log or table at a path; input: what the device sends, where nothing else states it."""
-        from kf_calib.sources.files.lines import Lines
         from kf_calib.sources.opening import FileKind, no_recording
+        from kf_calib.sources.text.lines import Lines
 
         columns, angles = self.renamed, self.angles
         match self.kind(path):

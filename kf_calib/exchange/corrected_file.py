@@ -13,6 +13,7 @@ import struct
 from codecs import BOM_UTF8
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,18 +24,17 @@ from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C
 from kf_calib.errors import InputError
 from kf_calib.estimation.correction import Correction
 from kf_calib.exchange.corrected_lines import NormAtRest
+from kf_calib.sources.containers.spreadsheet import sheets_of, workbook_of
 from kf_calib.sources.files import cdr
 from kf_calib.sources.files.contents import CALIBRATED_TOPIC
 from kf_calib.sources.files.mcap_append import TopicAppender, source_file
 from kf_calib.sources.files.recording import Recording
-from kf_calib.sources.tables.columns import READINGS, Columns
-from kf_calib.sources.tables.grid import Grid, grid_of
-from kf_calib.sources.tables.numbers import Numbers, written
-from kf_calib.sources.tables.opening import Opening
-from kf_calib.sources.tables.spreadsheet import sheets_of, workbook_of
 from kf_calib.sources.text.encoding import encoding_of, unpacked
-from kf_calib.sources.text.heading import cell_spans, delimiter_in
-from kf_calib.sources.text.labels import Labels
+from kf_calib.sources.text.grid import Grid, grid_of
+from kf_calib.sources.text.heading import with_texts
+from kf_calib.sources.text.means import Means
+from kf_calib.sources.text.numbers import written
+from kf_calib.sources.text.reader import named
 from kf_calib.sources.text.units import Units
 from kf_calib.support.output_files import whole, write_whole
 
@@ -191,8 +191,9 @@ def apply_to_table(
     if units.where:
         raise InputError(f"{path}: a corrected copy has every row, of one sensor: put its rows in a file (--where).")
     grid = grid_of(path, units.dataset)
-    meanings = Columns.of(grid, columns, Numbers.of(grid))
-    table = Opening(meanings, overrides, units, angles=False).table()
+    with named(grid.name):
+        opening = Means(grid, columns, overrides, units, angles=False)
+        table = opening.table()
     means = table.orientations.mean_mps2
     warmth = table.orientations.temperature_c
     if correction.needs_temperature and not np.isfinite(warmth).all():
@@ -202,27 +203,25 @@ def apply_to_table(
     if not unchecked and (said := norm.misfit(table.bench.input, final=True)):
         raise InputError(f"{path}: {said}.")
     force = correction.of_readings(means, warmth if correction.needs_temperature else None)
-    places = meanings.places(*READINGS)
-    if path.suffix.lower() in (".xlsx", ".xlsm"):
-        _to_excel(path, copy, grid, places, force)
-    else:
-        _to_text(unpacked(path, units.dataset), path, copy, grid, places, force)
+    write = _to_excel if path.suffix.lower() in (".xlsx", ".xlsm") else partial(_to_text, dataset=units.dataset)
+    write(path, copy, grid, opening.columns.accel().at, force)
     known = warmth[np.isfinite(warmth)]
     used = (float(known.min()), float(known.max())) if correction.needs_temperature else None
     return Applied(len(force), int(np.count_nonzero(~np.isfinite(force).all(axis=1))), used)
 
 
-def _new_heads(grid: Grid) -> Iterator[tuple[int, Sequence[str]]]:
+def _heads(grid: Grid) -> Iterator[tuple[int, Sequence[str]]]:
     """Return the number of the row of the header, and of that of units where there is one, with what a copy has there
     for the three readings."""
-    return zip(grid.head, (_NAMES, ["m/s^2"] * 3), strict=False)
+    numbers = (line + 1 for line in grid.heading.lines_of_names)
+    return zip(numbers, (_NAMES, ["m/s^2"] * 3), strict=False)
 
 
-def _to_excel(path: Path, copy: Path, grid: Grid, places: list[int], force: Floats) -> None:
+def _to_excel(path: Path, copy: Path, grid: Grid, places: Sequence[int], force: Floats) -> None:
     """Write a copy of a workbook."""
     book = workbook_of(path)
     sheet = book[next(each.name for each in sheets_of(path) if not each.hidden)]
-    for number, texts in _new_heads(grid):
+    for number, texts in _heads(grid):
         for place, text in zip(places, texts, strict=True):
             if sheet.cell(number, place + 1).value is not None:
                 sheet.cell(number, place + 1).value = text
@@ -238,29 +237,25 @@ def _to_excel(path: Path, copy: Path, grid: Grid, places: list[int], force: Floa
     write_whole(copy, content.getvalue())
 
 
-def _to_text(content: bytes, path: Path, copy: Path, grid: Grid, places: list[int], force: Floats) -> None:
-    """Write a copy of a text."""
+def _to_text(path: Path, copy: Path, grid: Grid, places: Sequence[int], force: Floats, dataset: str) -> None:
+    """Write a copy of a text, or of a dataset of a container, in its encoding."""
+    content, heading = unpacked(path, dataset), grid.heading
     encoding, plain_codec = encoding_of(content), "utf-8-sig" if content.startswith(BOM_UTF8) else "utf-8"
     codec, errors = (encoding, "strict") if encoding.startswith("utf-16") else (plain_codec, "surrogateescape")
     lines = content.decode(codec, errors).splitlines(keepends=True)
-    plain = [line.rstrip("\r\n") for line in lines]
-    (delimiter, _), labels = delimiter_in(plain), Labels.of(plain)
-    decimal = "," if delimiter != "," and not any("." in plain[k - 1] for k in grid.numbers) else "."
-    new = {number: [repr(written(value)).replace(".", decimal) for value in own]
-           for number, own in zip(grid.numbers, force.tolist(), strict=True)}  # fmt: skip
-    for number, texts in (*new.items(), *_new_heads(grid)):
-        line, is_units = lines[number - 1], number in grid.head[1:]
-        spans = cell_spans(plain[number - 1], delimiter)
-        if labels:  # among which a face may stand in a line of its own
-            spans = [(0, 0)] * (len(grid.header) - len(labels.names)) + labels.spans(plain[number - 1])
+    are_commas = heading.delimiter != "," and not any("." in lines[number - 1] for number in grid.numbers)
+    texts = [[repr(written(value)).replace(".", "," if are_commas else ".") for value in own]
+             for own in force.tolist()]  # fmt: skip
+    for number, new in (*zip(grid.numbers, texts, strict=True), *_heads(grid)):
+        line, is_units = lines[number - 1], number - 1 in heading.lines_of_names[1:]
+        spans = heading.spans(line.rstrip("\r\n"))
         cells = [line[start:end] for start, end in spans]
         if _is_part(cells) or not (is_units or len(spans) > max(places)):
             raise InputError(f"{path}: the row that ends in line {number} goes over several lines: write it in one, "
                              "without line breaks in its cells.")  # fmt: skip
-        for place, text in sorted(zip(places, texts, strict=True), reverse=True):
-            if not is_units or (place < len(cells) and cells[place].strip('" ')):
-                line = line[: spans[place][0]] + text + line[spans[place][1] :]
-        lines[number - 1] = line
+        filled = {place: text for place, text in zip(places, new, strict=True)
+                  if not is_units or (place < len(cells) and cells[place].strip('" '))}  # fmt: skip
+        lines[number - 1] = with_texts(line, spans, filled)
     write_whole(copy, "".join(lines).encode(codec, errors))
 
 

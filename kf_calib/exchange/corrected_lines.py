@@ -22,9 +22,9 @@ from kf_calib.bench.raw_input import CHANNELS, PLAIN, RESTATING, RawInput, wrong
 from kf_calib.bench.streams import Stream
 from kf_calib.errors import InputError
 from kf_calib.estimation.correction import Correction
-from kf_calib.sources.files.line_parts import Account, LineReader
-from kf_calib.sources.files.lines import is_json, reader_for, stated_of
 from kf_calib.sources.text.encoding import LONGEST_LINE_BYTES, line_end_of
+from kf_calib.sources.text.lines import is_json, reader_for, stated_of
+from kf_calib.sources.text.reader import Account, LineReader
 from kf_calib.sources.text.units import Units
 
 _WINDOW_NS = 500_000_000

@@ -14,17 +14,17 @@ from kf_calib.bench.streams import Source
 from kf_calib.errors import InputError
 from kf_calib.sources.containers.opening import dataset_of, kind_of_container
 from kf_calib.sources.files.contents import CALIBRATION_FORMAT
-from kf_calib.sources.files.csv_columns import CsvColumns
-from kf_calib.sources.files.lines import Lines, is_json
 from kf_calib.sources.files.mcap_file import HEAD_BYTES, is_lines
 from kf_calib.sources.files.mcap_records import MAGIC
 from kf_calib.sources.files.record_files import SQLITE, first_bytes
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.files.ros1_bag import ROS1_BAG
-from kf_calib.sources.tables.grid import OLD_SUFFIXES, TEXT_SUFFIXES, ZIP
-from kf_calib.sources.tables.opening import open_table
+from kf_calib.sources.text.columns import Columns
 from kf_calib.sources.text.encoding import head_of
+from kf_calib.sources.text.grid import OLD_SUFFIXES, TEXT_SUFFIXES, ZIP
 from kf_calib.sources.text.heading import TextHeading
+from kf_calib.sources.text.lines import Lines, is_json
+from kf_calib.sources.text.means import open_table
 from kf_calib.support.text import date_of_stamp, parse_date
 
 _OF_CALIBRATION = 200  # first bytes of a calibration, which name its format
@@ -88,7 +88,7 @@ def kind_of(
 def _are_samples(lines: list[str], stated: Mapping[str, str]) -> bool:
     """Whether the rows under a header are a time series: many, and close in time."""
     try:
-        columns = CsvColumns.of(TextHeading.of(lines), stated)
+        columns = Columns.of(TextHeading.of(lines), stated)
     except InputError:
         return False
     if columns.marks_of_a_table or len(columns.rows) <= _FEWEST_SAMPLES:

@@ -17,7 +17,7 @@ from rich.text import Text
 from kf_calib.dwells.rest_in_readings import DwellSummary
 from kf_calib.sources.containers.opening import ContainerKind
 from kf_calib.sources.files.inventory import Inventory, Topic
-from kf_calib.sources.tables.survey import ColumnFound, Survey
+from kf_calib.sources.text.survey import ColumnFound, Survey
 from kf_calib.support.text import counted, cut
 from kf_calib.views.json import clean
 from kf_calib.views.terminal import ConsoleTable, note
@@ -212,7 +212,7 @@ def table_report(overview: TableOverview) -> RenderableType:
         if len(survey.rows) > _SHOWN_ROWS:
             parts.append(Text(f"and {len(survey.rows) - _SHOWN_ROWS} more, all of them by --json"))
     parts += [note(said) for said in survey.warnings]
-    if survey.rows and not survey.has_sigma:
+    if survey.rows and survey.rows[0].readings is None:
         parts.append(
             note(
                 "no standard deviation with a number of readings is given, so that the noise will be taken from the "
@@ -238,7 +238,7 @@ def _column_table(columns: Sequence[ColumnFound]) -> ConsoleTable:
 
 
 def _quantity(meaning: str) -> str:
-    """What ``words.Meaning`` and a number call a quantity, in words."""
+    """What ``names.Meaning`` and a number call a quantity, in words."""
     if not meaning:
         return "not used"
     if meaning[:1] in "asq" and len(meaning) == 2:

@@ -153,7 +153,7 @@ def test_noise_where_none_can_be_is_refused(run: Any, rest: Path) -> None:
 
 def test_the_figure_has_the_deviations_and_the_lines_through_them(run: Any, rest: Path) -> None:
     from kf_calib.noise.rest_noise import noise_at_rest
-    from kf_calib.sources.files.lines import Lines
+    from kf_calib.sources.text.lines import Lines
 
     assert run("noise", rest, "--png", "noise.png")[0] == 0 and Path("noise.png").read_bytes()[:4] == b"\x89PNG"
     found = noise_at_rest(Lines(rest, angles=False), with_temperature=True)

@@ -26,7 +26,7 @@ from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.dwell_pass import refuse_unusable
 from kf_calib.estimation.setup_blunders import common_scale
 from kf_calib.sources.opening import opened
-from kf_calib.sources.tables.opening import open_table
+from kf_calib.sources.text.means import open_table
 
 
 def reordered(*channels: int):

@@ -17,9 +17,9 @@ from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import InputError
 from kf_calib.noise.power_laws import TERMS
 from kf_calib.noise.rest_noise import ChannelGroup, ChannelNoise, RestNoise, channel_noise, noise_at_rest
-from kf_calib.sources.files.lines import Lines
 from kf_calib.sources.files.recording import Recording
-from kf_calib.sources.tables.opening import open_table
+from kf_calib.sources.text.lines import Lines
+from kf_calib.sources.text.means import open_table
 
 N, K, B, Q = 1e-3, 2e-4, 5e-4, 1e-5
 

@@ -33,7 +33,7 @@ from kf_calib.bench.streams import Table
 from kf_calib.errors import CountsError, InputError
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.sources.opening import FileKind, kind_of, opened
-from kf_calib.sources.tables.opening import open_table
+from kf_calib.sources.text.means import open_table
 from kf_calib.sources.text.names import Meaning, meaning_of, meanings_of
 
 GRAVITY = {"gravity_mps2": str(G)}

@@ -20,10 +20,10 @@ from helpers.recordings import read
 
 import kf_calib
 from kf_calib.errors import InputError
-from kf_calib.sources.files.lines import Lines
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.opening import FileKind, kind_of, opened
-from kf_calib.sources.tables.survey import survey
+from kf_calib.sources.text.lines import Lines
+from kf_calib.sources.text.survey import survey
 
 pytestmark = pytest.mark.usefixtures("unmeasured")
 

@@ -176,7 +176,7 @@ def idle(monkeypatch: pytest.MonkeyPatch) -> None:
 
     for place in ("kf_calib.estimation.calibration.calibrate", "kf_calib.design.orientation_plan.plan",
                   "kf_calib.reproduction.grebenkin2019.repeat", "kf_calib.noise.rest_noise.noise_at_rest",
-                  "kf_calib.sources.live.open_live", "kf_calib.sources.files.lines.Lines.__iter__",
+                  "kf_calib.sources.live.open_live", "kf_calib.sources.text.lines.Lines.__iter__",
                   "kf_calib.sources.simulation.simulator.Simulation.__iter__"):  # fmt: skip
         monkeypatch.setattr(place, begun)
 

@@ -16,12 +16,12 @@ from kf_calib.sources.containers.opening import dataset_of, datasets_in, kind_of
 from kf_calib.sources.files.contents import POSES, READINGS, USABLE_SCHEMAS, Contents, fields_by_role
 from kf_calib.sources.files.field_messages import CDR, ENCODINGS, LOG_TIME_BEFORE, parser_of
 from kf_calib.sources.files.fields import FieldError, paths_of
-from kf_calib.sources.files.lines import Lines
 from kf_calib.sources.files.mcap_file import McapFile, Warn
 from kf_calib.sources.files.mcap_records import MAX_CHUNK_MB, MessageFinder
 from kf_calib.sources.files.record_files import RecordFile, files_of, first_bytes, open_record_file
 from kf_calib.sources.files.ros1_bag import ROS1_BAG
 from kf_calib.sources.files.sqlite_bag import SqliteBag
+from kf_calib.sources.text.lines import Lines
 from kf_calib.sources.text.units import Units
 
 TopicTimes = NDArray[np.int64]

@@ -27,7 +27,7 @@ from kf_calib.sources.live.feed import IDLE_S, Feed, GrowingFile, Link, SerialPo
 from kf_calib.sources.live.source import QUEUED, LiveSource
 from kf_calib.sources.live.streamed import StreamedFeed
 from kf_calib.sources.simulation.simulator import Simulation
-from kf_calib.sources.tables.grid import EXCEL_SUFFIXES
+from kf_calib.sources.text.grid import EXCEL_SUFFIXES
 from kf_calib.support.output_files import Outputs
 from kf_calib.support.text import number_from
 

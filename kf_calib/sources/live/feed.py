@@ -22,7 +22,7 @@ from typing import Any
 
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Stream
-from kf_calib.sources.files.line_parts import Account
+from kf_calib.sources.text.reader import Account
 from kf_calib.support.text import counted
 
 IDLE_S = 0.02

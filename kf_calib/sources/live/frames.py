@@ -25,7 +25,7 @@ from kf_calib.bench.arrays import Floats, Mask, Times
 from kf_calib.bench.bench import metadata_of
 from kf_calib.bench.raw_input import RawInput
 from kf_calib.bench.streams import Batch, Stream
-from kf_calib.sources.files.line_parts import Account
+from kf_calib.sources.text.reader import Account
 
 FRAME_VERSION = 1
 BENCH, ACCEL, ANGLES, ATTITUDE, TEMPERATURE = b"BAGQT"

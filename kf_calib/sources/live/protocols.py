@@ -7,13 +7,14 @@ from collections.abc import Mapping
 
 from kf_calib.bench.streams import Batch
 from kf_calib.errors import InputError
-from kf_calib.sources.files.csv_columns import CsvColumns
-from kf_calib.sources.files.line_parts import Account, LineReader
-from kf_calib.sources.files.sample_lines import CsvLines, JsonLines
 from kf_calib.sources.live.feed import nothing
 from kf_calib.sources.live.frames import FrameReader
+from kf_calib.sources.text.columns import Columns
+from kf_calib.sources.text.csv_lines import CsvLines
 from kf_calib.sources.text.encoding import Cutter
 from kf_calib.sources.text.heading import TextHeading
+from kf_calib.sources.text.json_lines import JsonLines
+from kf_calib.sources.text.reader import Account, LineReader
 from kf_calib.sources.text.units import Units
 
 _FEWEST_CELLS = 5  # time, readings and an angle
@@ -98,7 +99,7 @@ class LineProtocol:
         return []
 
     def _csv(self, heading: list[str], account: Account, angles: bool) -> CsvLines:
-        return CsvLines(CsvColumns.of(TextHeading.of(heading), self._columns, self._units), account, angles)
+        return CsvLines(Columns.of(TextHeading.of(heading), self._columns, self._units), account, angles)
 
     def _has_readings(self, heading: list[str]) -> bool:
         """Whether a header lacks nothing but angles."""

@@ -14,9 +14,9 @@ from kf_calib.bench.bench import Bench
 from kf_calib.bench.raw_input import PLAIN
 from kf_calib.bench.streams import Batch, Stream, bench_without_angles, with_accel, without_poses
 from kf_calib.errors import BenchError, InputError
-from kf_calib.sources.files.lines import bench_of, stated_of
 from kf_calib.sources.live.feed import IDLE_S, Feed, Link, Lost, Regained, nothing
 from kf_calib.sources.live.protocols import Protocol
+from kf_calib.sources.text.lines import bench_of, stated_of
 from kf_calib.sources.text.units import Units
 
 _PACE_S = 0.012  # between reads: many small ones cost more than they bring; a serial port holds 4 KB meanwhile

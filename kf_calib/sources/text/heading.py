@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from kf_calib.sources.text.labels import Labels
@@ -50,6 +50,13 @@ class TextHeading(NamedTuple):
         rows = [without_empty_end(row, len(header)) for row in cells[begin : begin + _ROWS]]
         return cls(header, delimiter, start + begin, rows, tuple(start + k for k in named))
 
+    def spans(self, line: str) -> list[tuple[int, int]]:
+        """Where the cells of a line stand, those of columns that it does not have at its beginning."""
+        if self.labels is None:
+            return cell_spans(line, self.delimiter)
+        lacking = len(self.header) - len(self.labels.names)  # of a face that stands in a line of its own
+        return [(0, 0)] * lacking + self.labels.spans(line)
+
 
 def delimiter_in(lines: Sequence[str]) -> tuple[str, int]:
     """What is between the cells of lines, and how many lines state it (``sep=;``: one)."""
@@ -75,7 +82,7 @@ def _delimiter_of(lines: Sequence[str]) -> str:
         return ","
 
 
-def header_in(rows: Sequence[Sequence[object]]) -> tuple[list[str], int, tuple[int, ...]]:
+def header_in(rows: Sequence[Sequence[str]]) -> tuple[list[str], int, tuple[int, ...]]:
     """The names of the columns, the place of the first row of values, and those of names and units.
 
     rows: cells of lines. Comments and titles are passed over. The names are the first line of three cells or more, or,
@@ -93,7 +100,7 @@ def header_in(rows: Sequence[Sequence[object]]) -> tuple[list[str], int, tuple[i
             return [NAMELESS.format(k + 1) for k in range(len(first))], at, ()
         return names, at, (above,)
     if at + 1 < len(rows) and _are_units(rows[at + 1]):
-        units = [*rows[at + 1], *[None] * len(first)]
+        units = [*rows[at + 1], *[""] * len(first)]
         named = [f"{name} [{unit}]" if unit else name for name, unit in zip(first, units, strict=False)]
         return named, at + 2, (at, at + 1)
     return first, at + 1, (at,)
@@ -108,24 +115,24 @@ def are_values(cells: Sequence[str]) -> bool:
     return 2 * len(numbers) > len(filled) and not are_counted
 
 
-def _filled(row: Sequence[object]) -> int:
-    return sum(cell is not None and cell != "" for cell in row)
+def _filled(row: Sequence[str]) -> int:
+    return sum(map(bool, row))
 
 
-def _names(row: Sequence[object]) -> list[str]:
+def _names(row: Sequence[str]) -> list[str]:
     """Return the names in a row without the empty cells at its end, as of a delimiter at the end of the line."""
-    texts = ["" if cell is None else str(cell) for cell in row]
+    texts = list(row)
     while texts and not texts[-1]:
         texts.pop()
     return texts
 
 
-def is_comment(row: Sequence[object]) -> bool:
+def is_comment(row: Sequence[str]) -> bool:
     """Whether the cells of a line begin with the mark of a comment."""
-    return bool(row) and isinstance(row[0], str) and _MARK.match(row[0]) is not None
+    return bool(row) and _MARK.match(row[0]) is not None
 
 
-def _uncommented(row: Sequence[object]) -> list[str]:
+def _uncommented(row: Sequence[str]) -> list[str]:
     """Return the names in a comment; its mark may stand in a cell of its own."""
     first, *others = _names(row)
     mark = _MARK.match(first)
@@ -133,7 +140,7 @@ def _uncommented(row: Sequence[object]) -> list[str]:
     return [first, *others] if first else others
 
 
-def _are_units(row: Sequence[object]) -> bool:
+def _are_units(row: Sequence[str]) -> bool:
     texts = _names(row)
     return any(map(str.isalpha, "".join(texts))) and all(not text or is_unit(text) for text in texts)
 
@@ -170,6 +177,14 @@ def cell_spans(line: str, delimiter: str) -> list[tuple[int, int]]:
         if end == len(line):
             return spans
         at = end + 1
+
+
+def with_texts(line: str, spans: Sequence[tuple[int, int]], texts: Mapping[int, str]) -> str:
+    """A line with other texts in cells, by where these stand, and all else in it as it is."""
+    for at in sorted(texts, reverse=True):
+        start, end = spans[at]
+        line = line[:start] + texts[at] + line[end:]
+    return line
 
 
 def _is_mark(cell: str) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -14,8 +14,10 @@ from kf_calib.bench.counts import SIGNED, parse_counts
 from kf_calib.bench.raw_input import CHANNELS, PLAIN, RESTATE, UNITS, RawInput
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.text.names import ACCEL
+from kf_calib.support.text import cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
+AnyTemperature = TypeVar("AnyTemperature", float, Floats)
 _BY_SIZE = (("g", 0.5, 2.0), ("m/s2", 5.0, 20.0), ("mg", 500.0, 2000.0), ("mm/s2", 5e3, 2e4))
 """Units in which the size of gravity lies between two numbers; the last where these have decimals, as counts have none.
 """
@@ -100,12 +102,20 @@ class Units:
         return size
 
 
-def choice_of(where: str) -> tuple[str, str]:
-    """The column and the text in it by which rows are chosen; raises InputError."""
-    name, _, value = where.rpartition("=")
-    if not (name.strip() and value.strip()):
+def choice_of(where: str, header: Sequence[str], rows: Sequence[Sequence[str]], among: str) -> tuple[int, str]:
+    """The column and the text in it by which rows are chosen, as ``I=0``; raises InputError where none of the rows has
+    it. among: which rows these are."""
+    name, value = (part.strip() for part in where.rpartition("=")[::2])
+    if not (name and value):
         raise InputError(f"--where is {where!r}: write --where COLUMN=VALUE, as --where unit=0.")
-    return name.strip(), value.strip()
+    if name not in header:
+        raise InputError(f"has no column {cut(name, 60)!r} (--where), it has {cut(', '.join(map(repr, header)), 300)}.")
+    at = list(header).index(name)
+    labels = [row[at].strip() for row in rows]
+    if value not in labels:
+        seen = ", ".join(sorted(set(labels))[:8])
+        raise InputError(f"no row{among} has {value!r} in column {name!r} (--where), they have {seen}.")
+    return at, value
 
 
 class ReadingUnits(NamedTuple):
@@ -182,3 +192,8 @@ def mps2_per(units: Sequence[str], stated: Units, local_mps2: float) -> Floats:
             for unit in units
         ]
     )
+
+
+def celsius(value: AnyTemperature, unit: str) -> AnyTemperature:
+    """A temperature, or an array of them, in a unit ``c``, ``k`` or ``f``, in degrees Celsius."""
+    return value if unit == "c" else value - 273.15 if unit == "k" else (value - 32.0) / 1.8

@@ -20,8 +20,8 @@ from kf_calib import errors
 from kf_calib.bench.streams import Table
 from kf_calib.errors import InputError, KfCalibError, MissingExtraError
 from kf_calib.sources.containers.opening import ContainerKind, dataset_of, datasets_in, kind_of_container
-from kf_calib.sources.files.lines import Lines
 from kf_calib.sources.opening import opened
+from kf_calib.sources.text.lines import Lines
 from kf_calib.sources.text.units import Units
 
 GRAVITY = {"gravity_mps2": str(G)}

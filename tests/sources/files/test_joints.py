@@ -13,9 +13,9 @@ from kf_calib.bench.streams import Stream
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.files import cdr
 from kf_calib.sources.files.fields import Joints, JointsError
-from kf_calib.sources.files.lines import Lines
 from kf_calib.sources.files.recorder import Recorder
 from kf_calib.sources.files.recording import Recording
+from kf_calib.sources.text.lines import Lines
 
 POSE = BATCH.pose
 USUAL = ["outer", "middle", "inner"]

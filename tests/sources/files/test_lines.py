@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from kf_calib.bench.streams import Batch
 from kf_calib.errors import InputError
-from kf_calib.sources.files.lines import Lines
+from kf_calib.sources.text.lines import Lines
 from kf_calib.sources.text.units import Units
 
 BENCH = {"axes": "y z x", "gravity_mps2": "9.81"}

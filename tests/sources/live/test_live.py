@@ -42,7 +42,6 @@ from serial.rfc2217 import PortManager
 from kf_calib.bench.streams import Batch
 from kf_calib.errors import InputError
 from kf_calib.estimation.calibration import calibrate
-from kf_calib.sources.files.line_parts import Account
 from kf_calib.sources.files.recorder import Recorder
 from kf_calib.sources.files.recording import GAP_RECORD, Recording
 from kf_calib.sources.live import LiveSource, Status, frames, open_live
@@ -50,6 +49,7 @@ from kf_calib.sources.live.clock import Continuity
 from kf_calib.sources.live.feed import Lost, Regained
 from kf_calib.sources.live.protocols import Protocol
 from kf_calib.sources.live.streamed import StreamedFeed
+from kf_calib.sources.text.reader import Account
 
 
 def server(*conversations: bytes) -> tuple[str, threading.Thread]:

@@ -21,8 +21,8 @@ from helpers.paths import ROOT
 import kf_calib
 from kf_calib.bench.streams import Table
 from kf_calib.errors import InputError, KfCalibError
+from kf_calib.sources.containers.spreadsheet import PlainRows, sheets_of
 from kf_calib.sources.opening import FileKind, kind_of
-from kf_calib.sources.tables.spreadsheet import PlainRows, sheets_of
 from kf_calib.sources.text.names import meaning_of
 
 HEADER = ["time [s]", "outer [deg]", "inner [deg]", "ax [g]", "ay [g]", "az [g]"]

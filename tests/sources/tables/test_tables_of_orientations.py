@@ -145,6 +145,8 @@ WRITTEN = {
                                       "Среднее Y [g],Среднее Z [g],СКО [мg],Число"),
     "other order": "\n".join(",".join(line.split(",")[::-1]) for line in PLAIN.splitlines()),
     "minus of a typesetter": PLAIN.replace("-0", "−0").replace("-1", "−1"),
+    "angles of which one is in another unit": PLAIN.replace("inner [deg]", "inner [mrad]").replace(
+        ",90,0.002,", f",{500 * np.pi!r},0.002,").replace(",270,-0.001,0.001", f",{1500 * np.pi!r},-0.001,0.001"),
     "no unit at all": PLAIN.replace(" [deg]", "").replace(" [g]", ""),
 }  # fmt: skip
 

@@ -23,16 +23,15 @@ from kf_calib.bench.bench import Bench
 from kf_calib.bench.counts import refuse_unread
 from kf_calib.bench.raw_input import CONVERTED, PLAIN, RESTATE, RawInput, merged_metadata
 from kf_calib.bench.streams import Batch, bench_without_angles, with_accel, without_poses
-from kf_calib.errors import BenchError, CountsError, InputError
-from kf_calib.sources.files.csv_columns import CsvColumns
+from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.files.fields import as_columns
-from kf_calib.sources.files.line_parts import Account, LineReader
-from kf_calib.sources.files.sample_lines import POSE_KEYS, CsvLines, JsonLines
-from kf_calib.sources.tables.columns import HOW
+from kf_calib.sources.text.columns import HOW, Columns, refuse_unknown_names
+from kf_calib.sources.text.csv_lines import CsvLines
 from kf_calib.sources.text.encoding import Cutter, TextFile, head_of, holds_any
 from kf_calib.sources.text.heading import TextHeading
+from kf_calib.sources.text.json_lines import POSE_KEYS, JsonLines
+from kf_calib.sources.text.reader import Account, LineReader, named
 from kf_calib.sources.text.units import Units
-from kf_calib.support.text import cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 _BLOCK_BYTES = 1 << 18
@@ -142,7 +141,7 @@ class Lines:
 
     def _open_reader(self, lines: Sequence[str], account: Account) -> tuple[LineReader, int]:
         if self._stated and not is_json(lines[0]):
-            _refuse_absent(self._stated, TextHeading.of(lines).header)
+            refuse_unknown_names(self._stated, TextHeading.of(lines).header)
         local_mps2 = STANDARD_GRAVITY_MPS2
         if self._units.g == "local":
             local_mps2 = bench_without_angles(self.name, self._overrides)[0].gravity_mps2
@@ -157,7 +156,7 @@ class Lines:
             if is_json(first):
                 theirs = [name for name, ours in self._columns.items() if ours in POSE_KEYS]
                 return holds_any(path, [f'"{name}"'.encode() for name in (*POSE_KEYS, *theirs)])
-            return CsvColumns.of(TextHeading.of(lines), self._columns).has_orientations
+            return bool(Columns.of(TextHeading.of(lines), self._columns).orientation)
         except (OSError, InputError):
             return True
 
@@ -246,19 +245,12 @@ def reader_for(
     if is_json(lines[0]):
         return JsonLines(columns, account), 0
     heading = TextHeading.of(lines)
-    return CsvLines(CsvColumns.of(heading, columns, units, local_mps2), account, angles), heading.lines
+    return CsvLines(Columns.of(heading, columns, units, local_mps2), account, angles), heading.lines
 
 
 def is_json(first: str) -> bool:
     """Whether the first line that is not empty begins JSON lines."""
     return first.lstrip("\ufeff \t")[:1] in ("{", "[")
-
-
-def _refuse_absent(stated: Mapping[str, str], header: Sequence[str]) -> None:
-    if absent := next((theirs for theirs in stated if theirs not in header), None):
-        raise InputError(
-            f"has no column {cut(absent, 60)!r} (--column), it has {cut(', '.join(map(repr, header)), 300)}."
-        )
 
 
 class _Passage:
@@ -346,12 +338,8 @@ class _Passage:
 
     def _start(self, lines: list[str]) -> None:
         """Chooses the parser by the first lines and has it read the rest of the first block."""
-        try:
+        with named(self._name):
             self.parser, heading = self._open_reader(lines, self.account)
-        except CountsError as error:
-            raise CountsError(f"{self._name}: {error}", error.keys) from None
-        except InputError as error:
-            raise InputError(f"{self._name}: {error}") from None
         self._said = self.parser.said
         self.account.lines += heading
         self._ahead.append(self._parse(lines[heading:]))

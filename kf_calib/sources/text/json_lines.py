@@ -1,8 +1,4 @@
-"""Batches from lines (docs/format.md), by a reader for each form.
-
-CSV: a header that names quantity and unit, then rows; empty: not measured. JSON: one object a line, readings and poses
-together or on lines of their own.
-"""
+"""Lines of JSON: one object a line, readings and poses together or on lines of their own (docs/format.md)."""
 
 from __future__ import annotations
 
@@ -15,142 +11,15 @@ from typing import Any
 
 from kf_calib.bench.bench import metadata_of
 from kf_calib.bench.raw_input import UNITS, parse_unit
-from kf_calib.sources.files.csv_columns import CsvColumns
-from kf_calib.sources.files.line_parts import (
-    ACCEL_UNITS,
-    TIME_DECIMALS,
-    Account,
-    LineError,
-    LineReader,
-    LineRows,
-    number_of,
-    stamp_ns,
-)
-from kf_calib.sources.tables.numbers import DECIMAL_POINT, written
-from kf_calib.sources.text.heading import BLANK, cell_spans, cells_of, without_empty_end
-
-_MINUTE_NS, _HOUR_NS = 60 * 10**9, 3600 * 10**9
-_FROM_UNIT = {"c": (1.0, 0.0), "k": (1.0, -273.15), "f": (1.0 / 1.8, -32.0 / 1.8)}
-
-
-class CsvLines(LineReader):
-    """Reads the rows under one header, block by block.
-
-    Poses are gimbal angles (``has_angles``), or the quaternion qx qy qz qw; angles: whether there must be any.
-    Raises InputError where the columns do not say what is needed.
-    """
-
-    _faults = ((ValueError, "a cell is not a number"), (ArithmeticError, "a cell is not a number"))
-
-    def __init__(self, columns: CsvColumns, account: Account, angles: bool = True) -> None:
-        super().__init__(account)
-        self._columns, self._delimiter, self._header = columns, columns.delimiter, columns.header
-        self._time, self._accel = columns.time(), columns.accel()
-        self._chosen = columns.chosen
-        self._row, self._added_ns, self._last_ns = -1, 0, -(2**63)
-        self.raw = columns.raw
-        self._numbers = columns.numbers
-        attitude = columns.quaternion()
-        self.has_angles = columns.has_usual_gimbals or not attitude.at
-        self._pose = columns.gimbals(needed=angles) if self.has_angles else attitude
-        if angles and not self._pose.at:
-            raise columns.without_angles()
-        self.pose_width = len(self._pose.at)
-        self._temperature, unit = columns.temperature()
-        self._warmth = _FROM_UNIT[unit]
-        self.said = columns.said
-        used = {
-            *([self._chosen[0]] if self._chosen else []),
-            *self._time.at,
-            *self._accel.at,
-            *self._pose.at,
-            *self._temperature.at,
-        }
-        columns.refuse_several_units(used)
-        self._account.leave_out(columns.unknown(used))
-
-    @property
-    def advice(self) -> str:
-        """How columns have to be named."""
-        return self._columns.wanted
-
-    def with_readings(self, line: str, readings_mps2: Sequence[float]) -> str:
-        decimal = (self._numbers or DECIMAL_POINT).decimal
-        texts = [
-            repr(written(value / unit)).replace(".", decimal)
-            for value, unit in zip(readings_mps2, self._columns.written_mps2, strict=True)
-        ]
-        return self._replaced(line, dict(zip(self._accel.at, texts, strict=True)))
-
-    def heading_of_forces(self, heading: Sequence[str]) -> list[str]:
-        names = {at: f"a{'xyz'[self._accel.at.index(at)]}_mps2" for at in self._columns.without_unit}
-        lines = list(heading)
-        for k in self._columns.lines_of_names if names else ():
-            cells = cells_of(lines[k].lstrip("\ufeff"), self._delimiter)
-            if len(cells) >= len(self._header) and cells[self._accel.at[0]]:
-                is_first = k == self._columns.lines_of_names[0]
-                lines[k] = self._replaced(lines[k], names if is_first else dict.fromkeys(names, "m/s^2"))
-        return lines
-
-    def _replaced(self, line: str, texts: Mapping[int, str]) -> str:
-        """A line with other texts in these cells, and all else as it stands."""
-        labels = self._columns.labels
-        spans = cell_spans(line, self._delimiter) if labels is None else labels.spans(line)
-        for at in sorted(texts, reverse=True):
-            start, end = spans[at]
-            line = line[:start] + texts[at] + line[end:]
-        return line
-
-    def _of_even_clock(self, time_ns: int) -> int:
-        """Return a stamp of a calendar with the hour by which local clocks go back at the end of summer time."""
-        time_ns += self._added_ns
-        if _HOUR_NS - _MINUTE_NS < self._last_ns - time_ns <= _HOUR_NS:
-            self._added_ns += _HOUR_NS
-            time_ns += _HOUR_NS
-            self.said.append("its stamps go back by an hour, as at the end of summer time: those after it count on")
-        self._last_ns = max(self._last_ns, time_ns)
-        return time_ns
-
-    def _begin_block(self, lines: Sequence[str]) -> None:
-        if self._numbers is None:
-            self._numbers = self._columns.numbers_in([self._cells(line) for line in lines])
-
-    def _cells(self, line: str) -> list[str]:
-        if self._columns.labels is not None:
-            return self._columns.labels.values(line)
-        if '"' not in line and " " not in line and self._delimiter != BLANK:
-            return line.split(self._delimiter)
-        return cells_of(line, self._delimiter)
-
-    def _read_line(self, line: str, accel: LineRows, pose: LineRows, temperature: LineRows) -> None:
-        if not (cells := self._cells(line)) and self._columns.labels is not None:
-            return  # of something else than readings
-        self._row += 1
-        row = without_empty_end(cells, len(self._header))
-        if len(row) != len(self._header):
-            raise LineError(f"it has {len(row)} cells, the header has {len(self._header)}")
-        numbers = self._numbers or DECIMAL_POINT
-        if self._chosen is not None and row[self._chosen[0]].strip() != self._chosen[1]:
-            self._row -= 1
-            return
-        time_ns = self._time.ns(row, self._header, numbers, self._row)
-        if self._time.is_date:
-            time_ns = self._of_even_clock(time_ns)
-        # everything on the line is understood before any of it is used
-        readings, angles, degrees = (
-            quantity.values(row, self._header, numbers) for quantity in (self._accel, self._pose, self._temperature)
-        )
-        if angles and not self.has_angles and not any(angles):
-            raise LineError("the quaternion is zero")
-        if degrees:
-            degrees = [self._warmth[0] * degrees[0] + self._warmth[1]]
-        accel.add(time_ns, readings)
-        pose.add(time_ns, angles)
-        temperature.add(time_ns, degrees)
-
+from kf_calib.sources.text.numbers import LineError, number_of, written
+from kf_calib.sources.text.reader import Account, LineReader, LineRows
+from kf_calib.sources.text.stamps import stamp_ns
+from kf_calib.support.units import WORDS
 
 _MARK = "\ufeff"  # some write it before the first line
-_ACCEL = {f"accel_{unit}": factor for unit, factor in ACCEL_UNITS.items()}
+_TIME_DECIMALS = {"time_ns": 0, "time_us": 3, "time_ms": 6, "time_s": 9}
+"""Names of the stamp, and how many decimals its unit has in nanoseconds."""
+_ACCEL = {f"accel_{unit}": WORDS["m/s^2"][unit] for unit in ("mps2", "g", "mg")}
 _BARE = ("accel", "accel_counts", "accel_raw")
 """Readings whose name tells no unit: options state it."""
 _ANGLES = {"angles_rad": 1.0, "angles_deg": math.pi / 180.0}
@@ -158,7 +27,7 @@ _ATTITUDE = "attitude_xyzw"
 POSE_KEYS = (*_ANGLES, _ATTITUDE)
 """Under which a line of JSON has an orientation."""
 _TEMPERATURE = "temperature_c"
-_KNOWN = frozenset([*TIME_DECIMALS, *_ACCEL, *_BARE, *_ANGLES, _ATTITUDE, _TEMPERATURE])
+_KNOWN = frozenset([*_TIME_DECIMALS, *_ACCEL, *_BARE, *_ANGLES, _ATTITUDE, _TEMPERATURE])
 
 
 _value_at = json.JSONDecoder().raw_decode
@@ -226,7 +95,7 @@ class JsonLines(LineReader):
     def _takes_bench(self, entry: dict[str, Any]) -> bool:
         """Whether the line describes the bench: the first one is kept, and no other may contradict it."""
         is_first, self._is_first = self._is_first, False
-        if "bench" not in entry or not (is_first or TIME_DECIMALS.keys().isdisjoint(entry)):
+        if "bench" not in entry or not (is_first or _TIME_DECIMALS.keys().isdisjoint(entry)):
             return False
         bench = entry["bench"]
         if not isinstance(bench, dict):
@@ -243,7 +112,7 @@ class JsonLines(LineReader):
         return True
 
     def _time_ns(self, entry: dict[str, Any], line: str) -> int:
-        name = next((name for name in TIME_DECIMALS if name in entry), None)
+        name = next((name for name in _TIME_DECIMALS if name in entry), None)
         if name is None:
             raise LineError("it has no time stamp (time_ns or time_s)")
         number = entry[name]
@@ -252,7 +121,7 @@ class JsonLines(LineReader):
             number = next(value for key, value in exact.items() if self._columns.get(key, key) == name)
         if type(number) not in (int, Decimal):
             raise LineError(f"{name} is not a number")
-        return stamp_ns(number, TIME_DECIMALS[name])
+        return stamp_ns(number, _TIME_DECIMALS[name])
 
     def _readings(self, entry: dict[str, Any]) -> list[float] | None:
         name = next((name for name in (*_ACCEL, *_BARE) if entry.get(name) is not None), None)

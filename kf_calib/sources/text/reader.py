@@ -1,31 +1,35 @@
-"""What the readers of JSON and CSV lines share: units, exact stamps, rows, and an account of what was not used."""
+"""What the readers of JSON and CSV lines share: rows, and an account of what was not used."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from decimal import Decimal
 from typing import ClassVar
 
 import numpy as np
 
 from kf_calib.bench.raw_input import RawInput
 from kf_calib.bench.streams import Batch, Stream
-from kf_calib.support.text import number_from
-from kf_calib.support.units import WORDS
-
-ACCEL_UNITS = {unit: WORDS["m/s^2"][unit] for unit in ("mps2", "g", "mg")}
-TIME_DECIMALS = {"time_ns": 0, "time_us": 3, "time_ms": 6, "time_s": 9}
-"""Names of the stamp, and how many decimals its unit has in nanoseconds."""
+from kf_calib.errors import CountsError, InputError
+from kf_calib.sources.text.numbers import LineError
 
 _NAMED = 8
 _NAME_LENGTH = 40
 
 
-class LineError(ValueError):
-    """A line cannot be used; the message is the reason in a few words."""
+@contextmanager
+def named(name: str) -> Iterator[None]:
+    """Puts the name of what is read before the sentence that refuses it, where it is not there yet."""
+    try:
+        yield
+    except InputError as error:
+        if str(error).startswith(f"{name}: "):
+            raise
+        said = f"{name}: {error}"
+        raise (CountsError(said, error.keys) if isinstance(error, CountsError) else type(error)(said)) from None
 
 
 @dataclass
@@ -140,25 +144,3 @@ class LineReader(ABC):
     @abstractmethod
     def _read_line(self, line: str, accel: LineRows, pose: LineRows, temperature: LineRows) -> None:
         """Adds what one line holds, all of it or nothing; raises LineError or one of ``_faults``."""
-
-
-def number_of(text: str) -> float:
-    """The number that a text says. Raises LineError where it is too small for one, as when two have run together:
-    1.234e-01700001234567 is no zero."""
-    value = number_from(text)
-    if value == 0.0 and float(text.lower().partition("e")[0]):
-        raise LineError("a number is out of range")
-    return value
-
-
-def stamp_ns(number: int | Decimal, decimals: int) -> int:
-    """A stamp in whole nanoseconds from one in a unit of 10^decimals ns, exactly; halves go to the even one."""
-    if isinstance(number, Decimal):
-        if not number.is_finite() or abs(number.adjusted()) > 20:  # before an exponent is written out in full
-            raise LineError("the time stamp is out of range")
-        nanoseconds = round(number.scaleb(decimals))
-    else:
-        nanoseconds = number * 10**decimals
-    if not -(2**63) <= nanoseconds < 2**63:
-        raise LineError("the time stamp is out of range")
-    return nanoseconds

@@ -1,1 +1,0 @@
-"""Tables of orientations: a row a dwell, with its mean readings."""

@@ -1,0 +1,577 @@
+"""Which columns of a text are what, how its stamps and numbers are written, and in which units.
+
+Names of docs/format.md are known to the letter, and go before all others. What no name tells is told by the rows, where
+there are any: the unit of the readings by their size, that of a time by its steps, the sign before decimals. A table of
+means is read as a log of samples is; it has all rows at hand, so that what stands in them tells more.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from operator import mul
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats, lengths
+from kf_calib.bench.counts import SIGNED, parse_counts
+from kf_calib.bench.raw_input import OPTIONS, PLAIN, RawInput
+from kf_calib.errors import CountsError, InputError
+from kf_calib.sources.text.contents import is_nameless, meanings_by_numbers
+from kf_calib.sources.text.heading import TextHeading
+from kf_calib.sources.text.names import (
+    ACCEL,
+    ANGLE,
+    QUATERNION,
+    TIME,
+    Meaning,
+    face_of,
+    is_exact,
+    meaning_of,
+    meanings_of,
+    unit_of_epoch,
+)
+from kf_calib.sources.text.numbers import DECIMAL_POINT, CellError, LineError, Numbers
+from kf_calib.sources.text.stamps import Stamps, stamp_of
+from kf_calib.sources.text.units import Units, choice_of, reading_units, size_of_count, usual_norm
+from kf_calib.support.text import cut
+from kf_calib.support.units import STANDARD_GRAVITY_MPS2
+
+EXAMPLE = "time_s,ax_mps2,ay_mps2,az_mps2,outer_deg,middle_deg,inner_deg,temperature_c"
+HOW = "--column THEIRS=OURS says what a column is"
+KNOWN = "ax_g (ay_mps2, az_mg), sx_g or sd_g, outer_deg (middle_rad, inner_deg), qx, face, time_s, count, temperature_c"
+READINGS, SPREADS = ("ax", "ay", "az"), ("sx", "sy", "sz")
+_OPTIONAL = ("time", "count", "temperature", "sd", *SPREADS)
+_SEVERAL = ("angle", "time", "")
+_MARKS_OF_TABLES = ("count", "face", "sd", *SPREADS)
+_NOTHING = frozenset(("-", "–", "—", "n/a", "na", "nan", "#n/a", "null", "none", "?"))
+"""What people write where there is no temperature."""
+_TIME_ALONE = {"t": "", "sec": "", "secs": "", "millis": "ms", "micros": "us"}
+_OF_STEPS = ((0.0, 1.0, "s"), (1e3, 1e6, "us"), (1e6, 1e9, "ns"))
+"""Steps that tell the unit of stamps: between them and in another unit, rows would be no samples."""
+_MANY, _ALIKE_RAD, _MOST = 500, 0.1, 0.5
+_ALIKE = 1.3  # of the norms of readings at rest, largest to smallest
+_MOST_CELLS = 0.6  # of a column of readings are numbers: a bad one is told later
+_FEWEST_ROWS, _MOST_UNITS, _APART = 20, 8, 5.0  # rows and labels of several sensors, and sigmas between these
+
+Row = Sequence[str]
+
+
+@dataclass(frozen=True)
+class QuantityColumns:
+    """Where a quantity stands in a row, the factors that bring it to our units, and texts that stand for no value."""
+
+    at: tuple[int, ...] = ()
+    factors: tuple[float, ...] = ()
+    absent: Container[str] = ()
+
+    def values(self, row: Row, header: Sequence[str], numbers: Numbers) -> list[float] | None:
+        """The quantity, None where it is not measured. Raises CellError where it cannot be used."""
+        cells = [row[at] for at in self.at]
+        if not all(cells):
+            if any(cells):
+                raise CellError(self.at[cells.index("")], "some components of a vector are missing")
+            return None
+        try:
+            values = list(map(numbers.value, cells))
+        except ValueError:
+            values = [math.nan]
+        if not math.isfinite(sum(values)):  # which numbers beyond 1e308 together are not, either
+            if cells[0].lower() in self.absent:
+                return None
+            self._refuse_cells(cells, header, numbers)
+        return list(map(mul, values, self.factors))
+
+    def _refuse_cells(self, cells: Sequence[str], header: Sequence[str], numbers: Numbers) -> None:
+        """Raise CellError for the first cell that holds no finite number, if there is one."""
+        for at, cell in zip(self.at, cells, strict=True):
+            try:
+                is_number = math.isfinite(numbers.value(cell))
+            except LineError as error:
+                raise CellError(at, str(error)) from None
+            except ValueError:
+                is_number = False
+            if not is_number:
+                raise CellError(at, f"column {cut(header[at], 40)!r} is {cut(cell, 40)!r}, which is no number")
+
+
+@dataclass
+class Columns:
+    """The columns of a text by its header and, where the header does not tell, its rows.
+
+    names: those of the header as they are to be understood. rows: the first, of a table of means all (``is_table``).
+    said: what was taken for what, where that is not plain from the names. guessed: names of columns that were
+    recognised by what stands in them. by_size: units that the size of the numbers told. raw: what the readings are in.
+    written_mps2: the unit in which specific force takes the place of readings, m/s^2: that of their names;
+    without_unit: columns of counts whose names tell none, which then are in m/s^2. chosen: a column, and the cell in it
+    of the rows that count; None where all do.
+    """
+
+    heading: TextHeading
+    names: Sequence[str]
+    rows: Sequence[Row]
+    units: Units
+    local_mps2: float = STANDARD_GRAVITY_MPS2
+    is_table: bool = False
+    said: list[str] = field(default_factory=list[str])
+    guessed: list[str] = field(default_factory=list[str])
+    by_size: dict[int, str] = field(default_factory=dict[int, str])
+    raw: RawInput = PLAIN
+    written_mps2: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    without_unit: tuple[int, ...] = ()
+    chosen: tuple[int, str] | None = None
+    meanings: list[Meaning] = field(default_factory=list[Meaning])
+
+    @classmethod
+    def of(
+        cls, heading: TextHeading, stated: Mapping[str, str], units: Units | None = None,
+        local_mps2: float = STANDARD_GRAVITY_MPS2, *, is_table: bool = False,
+    ) -> Columns:  # fmt: skip
+        """stated: our name for each foreign one; ``-`` leaves a column out. local_mps2: gravity of the place, where a g
+        is that. Raises InputError for columns that are the same."""
+        header = heading.header
+        names = ["" if stated.get(name) == "-" else stated.get(name, name) for name in header]
+        full = [row for row in heading.rows if len(row) == len(names)]
+        columns = cls(heading, names, full, units or Units(), local_mps2, is_table)
+        if columns.units.where:
+            among = "" if is_table else " among the first"
+            columns.chosen = choice_of(columns.units.where, header, full, among)
+            columns.rows = [row for row in full if columns.is_chosen(row)]
+        columns.meanings = meanings_of(header, stated)
+        columns._refuse_same_names()
+        if is_nameless(header) and not stated:
+            columns._recognise_numbers()
+        if is_table:
+            columns._recognise_contents({k for k, name in enumerate(header) if name in stated})
+        elif not columns.has("time"):
+            for k, name in enumerate(names):
+                if (unit := _TIME_ALONE.get(name.strip().lower())) is not None:
+                    columns.meanings[k] = Meaning("time", unit)
+        return columns
+
+    @property
+    def header(self) -> Sequence[str]:
+        """The names as they stand in the text."""
+        return self.heading.header
+
+    def places(self, *wanted: str) -> list[int]:
+        """Indices of the columns of these kinds, in the order asked for."""
+        return [k for ours in wanted for k, own in enumerate(self.meanings) if own.ours == ours]
+
+    def place(self, ours: str) -> int | None:
+        """The column of a quantity that is there once; names of the format go before others. Raises InputError where
+        two are left."""
+        places = self.places(ours)
+        places = [at for at in places if is_exact(self.names[at])] or places
+        if len(places) > 1:
+            raise InputError(
+                f"columns {self.named(places)} are all taken for {ours}: say which it is, for example by "
+                f"--column {f'{self.header[places[0]]}={ours}'!r}."
+            )
+        return places[0] if places else None
+
+    def has(self, *wanted: str) -> bool:
+        """Whether there is a column of each of these kinds."""
+        return all(self.places(ours) for ours in wanted)
+
+    def named(self, places: Sequence[int]) -> str:
+        """The names of columns, quoted."""
+        return ", ".join(repr(cut(self.header[at], 40)) for at in places)
+
+    def is_chosen(self, row: Row) -> bool:
+        """Whether a row counts."""
+        return self.chosen is None or row[self.chosen[0]].strip() == self.chosen[1]
+
+    @property
+    def wanted(self) -> str:
+        """How columns have to be named."""
+        return f"a header such as {EXAMPLE} is wanted"
+
+    @property
+    def unused(self) -> list[int]:
+        """Indices of the columns that mean nothing here."""
+        return [k for k, own in enumerate(self.meanings) if not own.ours and self.header[k]]
+
+    @property
+    def _seen(self) -> str:
+        shown = ",".join(self.header[:12])
+        return repr(shown if len(shown) <= 120 else shown[:120] + "...")
+
+    @cached_property
+    def numbers(self) -> Numbers | None:
+        """How the numbers are written; None where no row tells yet."""
+        return self.numbers_in(self.rows)
+
+    def numbers_in(self, rows: Sequence[Row]) -> Numbers | None:
+        """How the numbers in rows are written; None where these do not tell."""
+        used = [at for at, own in enumerate(self.meanings) if own.ours] or range(len(self.names))
+        cells = (row[at] for row in rows if len(row) == len(self.names) for at in used)
+        return Numbers.told_by(cells, commas_count=self.heading.delimiter != ",")
+
+    def values(self, places: Sequence[int], rows: Sequence[Row] | None = None) -> Floats:
+        """The numbers (n, k) in columns of rows (None: of all), NaN where there is none."""
+        numbers = self.numbers or DECIMAL_POINT
+
+        def value(cell: str) -> float:
+            try:
+                return numbers.value(cell)
+            except ValueError:
+                return math.nan
+
+        values = [[value(row[at]) for at in places] for row in (self.rows if rows is None else rows)]
+        return np.array(values, float).reshape(-1, len(places))
+
+    # -- what kind of text it is --
+
+    @property
+    def marks_of_a_table(self) -> bool:
+        """Whether there is what only a table of dwells has: numbers of readings, deviations, faces."""
+        return any(own.ours in _MARKS_OF_TABLES for own in self.meanings)
+
+    @property
+    def step_s(self) -> float:
+        """The usual step from row to row, s; NaN where no time can be told."""
+        try:
+            time = self.time()
+            stamps, numbers = list[int](), self.numbers or DECIMAL_POINT
+            for number, row in enumerate(self.rows):
+                try:
+                    stamps.append(time.ns(row, self.header, numbers, number))
+                except LineError:
+                    continue
+        except InputError:
+            return math.nan
+        steps = np.abs(np.diff(np.array(stamps, float)))
+        return float(np.median(steps)) / 1e9 if len(steps) else math.nan
+
+    @property
+    def are_alike(self) -> bool:
+        """Whether the readings of most rows are as those before, as of a sensor that lies still between turns; a
+        row a dwell would change from one to the next."""
+        places = self.places(*READINGS)
+        if len(places) != 3 or len(self.rows) < _MANY:
+            return False
+        values = self.values(places)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            unit = values / lengths(values)[:, None]
+            return bool((lengths(np.diff(unit, axis=0)) < _ALIKE_RAD).mean() > _MOST)
+
+    @property
+    def orientation(self) -> str:
+        """How orientations are told: ``attitude``, ``angles`` or, of a table, ``face``; empty if they are not.
+
+        Angles go before an attitude where they are named as those of gimbals or in a unit."""
+        if self.is_table and self.has("face"):
+            return "face"
+        are_usual = any(own.ours == "angle" and (own.rank or own.unit) for own in self.meanings)
+        return "attitude" if self.has(*QUATERNION) and not are_usual else "angles" if self.has("angle") else ""
+
+    # -- quantities --
+
+    def time(self) -> Stamps:
+        """How the time is written. Raises InputError where no column tells it, or not in which unit."""
+        if self.units.rate_hz is not None:
+            self.said.append(f"time from the numbers of the rows, {self.units.rate_hz:g} of them a second (--rate)")
+            return Stamps((), rate_hz=self.units.rate_hz)
+        places = self.places("time")
+        if not places:
+            raise InputError(
+                "no column gives the time: name it time_s or time_ns, or give the rate of the rows, for example "
+                f"--rate 100; {self.wanted}, not {self._seen}."
+            )
+        exact = [at for at in places if is_exact(self.names[at])]
+        united = [at for at in places if self.meanings[at].unit]
+        place = self._most_even(exact or united or places)
+        unit = self.meanings[place].unit
+        values = self.values([place], [row for row in self.rows if row[place]])[:, 0]
+        if not unit and len(values) and math.isnan(values[0]):
+            return self._dates(places[:2] if place == places[0] else [place])
+        unit = unit or self._unit_of_time(place, values)
+        decimals = {"ns": 0, "us": 3, "ms": 6}.get(unit, 9)
+        if self.is_table or not exact:
+            self.said.append(f"time from {self.named([place])} in {unit}")
+        return Stamps((place,), decimals, round(TIME[unit]) if decimals == 9 else 1)
+
+    def _most_even(self, places: list[int]) -> int:
+        """Return that of several columns of stamps which goes up most evenly; the first where none has numbers."""
+
+        def unevenness(steps: Floats) -> float:
+            steps = steps[np.isfinite(steps)]
+            usual = float(np.median(steps)) if len(steps) else 0.0
+            return float(np.median(np.abs(steps - usual))) / usual if usual > 0.0 else math.inf
+
+        steps = np.diff(self.values(places), axis=0) if len(places) > 1 else np.zeros((0, 1))
+        return places[int(np.argmin([unevenness(own) for own in steps.T]))]
+
+    def _unit_of_time(self, place: int, values: Floats) -> str:
+        """Return the unit of stamps (n,) whose name tells none, by their size or their steps; of means, it is s."""
+        known = values[np.isfinite(values)]
+        size = float(np.abs(known).max(initial=0.0))
+        if unit := unit_of_epoch(size) or "s" * self.is_table:
+            return unit
+        step = float(np.median(np.abs(np.diff(known)))) if len(known) > 1 else 0.0
+        if unit := next((unit for low, high, unit in _OF_STEPS if low < step < high), ""):
+            return unit
+        name = self.header[place]
+        raise InputError(
+            f"no column gives the time with its unit: say which {name!r} has, for example --column '{name}=time_ms'; "
+            f"{self.wanted}, not {self._seen}."
+        )
+
+    def _dates(self, places: Sequence[int]) -> Stamps:
+        """How stamps of a calendar are written; of two columns the second may give the time of day."""
+        cells = [[row[at] for row in self.rows if all(row[at] for at in places)] for at in places]
+        joined = [" ".join(own) for own in zip(*cells, strict=True)]
+        for chosen, texts in ((places, joined), (places[:1], cells[0])):
+            try:
+                stamps = Stamps.of_dates(chosen, texts)
+            except ValueError:
+                continue
+            zone = " (UTC, since no time zone is named)" if self.is_table and not stamps.has_zone else ""
+            self.said.append(f"time from {self.named(chosen)}{zone}")
+            return stamps
+        raise InputError(
+            f"no column gives the time: column {self.named(places[:1])} is "
+            f"{cut(cells[0][0] if cells[0] else '', 40)!r}, write seconds, or stamps such as "
+            "2026-05-04T13:45:00.010+02:00."
+        )
+
+    def accel(self) -> QuantityColumns:
+        """The three readings as they are written; ``raw`` tells then what in.
+
+        Raises InputError where their columns or their units are not told."""
+        places = self.reading_places
+        by_name = [self.meanings[at].unit for at in places]
+        named = self.units.told_by([self.header[at] for at in places], by_name)
+        values = self.values(places)
+        norm = usual_norm(values)
+        if "" in named and not (self.units.accel or self.units.as_default(named, norm)) and math.isnan(norm):
+            raise InputError(
+                f"no columns give the three readings with their unit: name them ax_mps2, ay_mps2, az_mps2 (or ax_g, "
+                f"ax_mg ...), not {self._seen}, or state it by --accel-unit, and the size of counts by --accel-scale."
+            )
+        told = reading_units(named, values, self.units, self.local_mps2)
+        self.by_size |= {at: told.units[k] for k, at in enumerate(places) if told.by_size and not named[k]}
+        if not told.is_known:
+            signed = usual_norm(parse_counts(self.units.counts).signed(values))
+            keys = size_of_count(signed)
+            example = " ".join(f"{OPTIONS[key]} {value}" for key, value in keys.items())
+            raise CountsError(
+                f"the readings in {self.named(places)} have a size of {signed:.3g}, so they are counts: give the "
+                "size of one by --accel-scale, in m/s^2 or what --accel-unit says, which is by gravity about "
+                f"{example}.", keys
+            )  # fmt: skip
+        is_stated = self.units.accel is not None or self.units.accel_scale != 1.0
+        if self.is_table or is_stated or not all(is_exact(self.names[at]) for at in places):
+            self.said.insert(0, f"{'mean ' * self.is_table}readings from {self.named(places)} in {told.words}")
+        self.raw, scale = told.raw, self.units.accel_scale
+        is_rewritten = scale != 1.0 or named != by_name or "count" in named or self.raw.sizes != PLAIN.sizes
+        is_rewritten |= self.raw.counts != SIGNED
+        written = [ACCEL.get(unit, 1.0) for unit in by_name] if is_rewritten else self.raw.factors.tolist()
+        self.written_mps2 = (written[0], written[1], written[2])
+        bare = [at for at, unit in zip(places, by_name, strict=True) if unit in ("", "count")]
+        self.without_unit = tuple(bare) if is_rewritten else ()
+        return QuantityColumns(tuple(places), (1.0, 1.0, 1.0))
+
+    @property
+    def reading_places(self) -> list[int]:
+        """The columns of the three readings. Raises InputError where one is missing."""
+        places = [at for ours in READINGS if (at := self.place(ours)) is not None]
+        if len(places) == len(READINGS):
+            return places
+        missing = [ours for ours in READINGS if not self.has(ours)]
+        example = f"--column '{self._left_over}={missing[0]}_g'"
+        raise InputError(
+            f"no column was recognised as the {'mean ' * self.is_table}reading of accelerometer "
+            f"{' and '.join(ours[1] for ours in missing)} among {cut(self.named(range(len(self.header))), 300)}: name "
+            f"it, for example {example} (known: {KNOWN})."
+        )
+
+    @property
+    def _left_over(self) -> str:
+        """The name of a column that means nothing yet, for an example."""
+        return next((self.header[k] for k in self.unused), "THEIRS")
+
+    def gimbals(self, *, needed: bool) -> QuantityColumns:
+        """The angles by the usual names, else every column of an angle in the order of the header; none where there is
+        none. Raises InputError where their unit is not told and they are needed."""
+        places = self.angles
+        ranks = [self.meanings[at].rank for at in places]
+        if any(ranks) and len(set(ranks)) < len(ranks):
+            raise InputError(f"{self.named(places)} name a gimbal twice: leave one out by --column THEIRS=-.")
+        units = [self.meanings[at].unit for at in places]
+        if other := [at for at in places if self.units.angle and self.meanings[at].unit not in ("", self.units.angle)]:
+            raise InputError(
+                f"column {self.named(other[:1])} is in {self.meanings[other[0]].unit} by its name, and --angle-unit is "
+                f"{self.units.angle}: leave out --angle-unit, or rename the column by --column."
+            )
+        by_size = ""
+        if "" in units:
+            by_size = "" if self.units.angle else self._unit_of_angles(places)
+            unit = self.units.angle or by_size
+            if not unit and not needed:
+                return QuantityColumns()
+            if not unit:
+                raise self.without_angles()
+            self.by_size |= {at: unit for at, own in zip(places, units, strict=True) if by_size and not own}
+            units = [own or unit for own in units]
+        if units and (self.is_table or not all(is_exact(self.names[at]) for at in places)):
+            how = " by their size (--angle-unit)" if by_size else ""
+            words = " and ".join(dict.fromkeys(units))
+            self.said.append(f"gimbal angles, outer to inner, from {self.named(places)} in {words}{how}")
+        return QuantityColumns(tuple(places), tuple(ANGLE[unit] for unit in units))
+
+    @property
+    def angles(self) -> list[int]:
+        """The columns of gimbal angles, outer to inner: those whose names tell which they are, else all in the order of
+        the header."""
+        places = self.places("angle")
+        ranked = sorted((at for at in places if self.meanings[at].rank), key=lambda at: self.meanings[at].rank)
+        return ranked or places
+
+    def _unit_of_angles(self, places: Sequence[int]) -> str:
+        """Return the unit of angles whose names tell none, by their size; empty where rows to come may tell."""
+        values = self.values(places)
+        if (np.abs(values) > 2.0 * math.pi).any():
+            return "deg"
+        return ("deg" if (values == np.rint(values)).all() else "rad") if self.is_table else ""
+
+    def without_angles(self) -> InputError:
+        """That no angles are there, or none whose unit is known."""
+        if self.is_table:
+            return InputError(
+                f"no column was recognised as gimbal angles, attitude or face among "
+                f"{cut(self.named(range(len(self.header))), 300)}: name it, for example --column "
+                f"'{self._left_over}=face' with cells such as +x or -z, or =outer_deg (known: {KNOWN}), or do without "
+                "orientations (--no-angles)."
+            )
+        places = self.places("angle")
+        name = self.header[places[0]] if places else ""
+        example = f", for example by --column '{name}=outer_deg'" if places else ""
+        return InputError(
+            f"no columns give the platform's angles with their unit: name them outer_deg, inner_deg ... or "
+            f"outer_rad ..., outer gimbal first{example} (or the attitude qx, qy, qz, qw), not {self._seen}; or use "
+            "none (--no-angles)."
+        )
+
+    def quaternion(self) -> QuantityColumns:
+        """The attitude; nothing where its four columns are not there."""
+        known = tuple(at for ours in QUATERNION if (at := self.place(ours)) is not None)
+        return QuantityColumns(known, (1.0,) * 4) if len(known) == 4 else QuantityColumns()
+
+    def temperature(self) -> tuple[QuantityColumns, str]:
+        """The temperature, if there is one, and its unit: ``c``, ``k`` or ``f``."""
+        at = self.place("temperature")
+        if at is None:
+            return QuantityColumns(), "c"
+        if self.is_table or not is_exact(self.names[at]):
+            self.said.append(f"temperature from {self.named([at])} in {(self.meanings[at].unit or 'c').upper()}")
+        return QuantityColumns((at,), (1.0,), _NOTHING), self.meanings[at].unit or "c"
+
+    # -- what names do not tell --
+
+    def _refuse_same_names(self) -> None:
+        """Raise InputError for two columns of a quantity under one name."""
+        used = [name.lower() for name, own in zip(self.names, self.meanings, strict=True) if own.ours not in _SEVERAL]
+        times = Counter(used)
+        if repeated := next((name for name in used if times[name] > 1), None):
+            raise InputError(f"two columns are named {repeated!r}: rename or remove one of them.")
+
+    def _recognise_numbers(self) -> None:
+        """Find time and readings in columns without names."""
+        places = [k for k in range(len(self.header)) if self._are_numbers(k, _MOST_CELLS)]
+        for place, meaning in zip(places, meanings_by_numbers(self.values(places)) if places else (), strict=True):
+            if meaning.ours:
+                self._guess(place, meaning.ours)
+        self.said.append("columns without names are told by their numbers")
+
+    def _recognise_contents(self, stated: set[int]) -> None:
+        """Find faces, stamps and readings by what stands in columns of a table whose names say nothing; columns that a
+        template has and nobody filled are as if they were not there."""
+        for k in set(range(len(self.header))) - stated:
+            kind, cells = self.meanings[k].ours, [row[k] for row in self.rows]
+            are_faces = [face_of(cell) is not None for cell in cells]
+            if (kind in _OPTIONAL and not any(cells)) or (kind == "face" and not any(are_faces)):
+                self.meanings[k] = Meaning("", "")
+            kind = self.meanings[k].ours
+            if kind in ("", "angle") and not self.has("face") and all(are_faces):
+                self._guess(k, "face")
+            elif kind == "" and not self.has("time") and self._are_stamps(cells):
+                self._guess(k, "time")
+        if self.places(*READINGS):
+            return
+        left = [k for k, own in enumerate(self.meanings) if not own.ours and not own.other and k not in stated]
+        if len(numeric := [k for k in left if self._are_numbers(k, _MOST_CELLS)]) == 3:
+            norms = lengths(self.values(numeric))
+            norms = norms[np.isfinite(norms)]
+            if norms.size and 0 < norms.max() < _ALIKE * norms.min():
+                for k, ours in zip(numeric, READINGS, strict=True):
+                    self._guess(k, ours)
+
+    def _guess(self, place: int, ours: str) -> None:
+        self.meanings[place] = Meaning(ours, self.meanings[place].unit)
+        self.guessed.append(self.header[place])
+
+    def _are_stamps(self, cells: Sequence[str]) -> bool:
+        try:
+            return bool(cells) and all(stamp_of(cell, month_first=False) for cell in cells)
+        except ValueError:
+            return False
+
+    def _are_numbers(self, place: int, share: float) -> bool:
+        """Whether at least this share of the cells of a column are numbers."""
+        return float(np.mean(np.isfinite(self.values([place])))) >= share if self.rows else False
+
+    # -- what is not to be used --
+
+    def unknown(self, used: Container[int]) -> list[str]:
+        """The names of columns that nothing here knows: not those of a gyroscope, say, which are of no use here."""
+        return [name for at, (name, own) in enumerate(zip(self.names, self.meanings, strict=True))
+                if name and at not in used and not own.other]  # fmt: skip
+
+    def refuse_several_units(self, used: Container[int]) -> None:
+        """Raise CountsError where a column that means nothing to us tells several sensors apart, whose rows take turns.
+
+        used: columns that have a meaning. Labels are few, each has a tenth of the rows, they change in three of ten
+        rows, and readings under different ones differ by more than their scatter lets them.
+        """
+        places = self.places(*READINGS)
+        if len(places) != 3 or len(self.rows) < _FEWEST_ROWS:
+            return
+        for at, name in enumerate(self.names):
+            is_told = at in used or not name or (self.chosen is not None and at == self.chosen[0])
+            labels = [] if is_told else [row[at].strip() for row in self.rows]
+            shares = Counter(labels)
+            turns = [k for k in range(len(labels) - 1) if labels[k] != labels[k + 1]]
+            if not 2 <= len(shares) <= _MOST_UNITS or min(shares.values()) < 0.1 * len(labels):
+                continue
+            if len(turns) < 0.3 * len(labels) or not all(label and len(label) <= 16 for label in shares):
+                continue
+            values, first = self.values(places), min(shares)
+            signs = np.array([1.0 if labels[k] == first else -1.0 for k in turns])
+            steps = (values[np.array(turns) + 1] - values[turns]) * signs[:, None]
+            middle = np.nanmedian(steps, axis=0)  # between poses the readings leap
+            spread = 1.86 * np.nanmedian(np.abs(steps - middle), axis=0) / math.sqrt(len(turns))
+            if not (np.abs(middle) > _APART * np.maximum(spread, 1e-300)).any():
+                continue
+            shown = ", ".join(sorted(shares)[:4])
+            example = f"{cut(name, 40)}={first}"
+            raise CountsError(
+                f"the rows are of several sensors, told apart by the column {cut(self.header[at], 40)!r} ({shown}): "
+                f"choose one, for example by --where {example!r}, or leave the column out if it means something else "
+                f"(--column {cut(self.header[at], 40) + '=-'!r}).",
+                {"where": example},
+            )
+
+
+def refuse_unknown_names(stated: Mapping[str, str], header: Sequence[str]) -> None:
+    """Raise InputError where a column is stated that is not there, or as something that nobody knows."""
+    for theirs, ours in stated.items():
+        if theirs not in header:
+            shown = cut(", ".join(map(repr, header)), 300)
+            raise InputError(f"has no column {cut(theirs, 60)!r} (--column), it has {shown}.")
+        if ours != "-" and not meaning_of(ours).ours:
+            raise InputError(f"--column {theirs}={ours}: {cut(ours, 60)!r} is not known: use {KNOWN}, or - for none.")

@@ -1,0 +1,197 @@
+"""A table as text, from a CSV file, a sheet of Excel, a structured array or a DataFrame."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from kf_calib.errors import InputError
+from kf_calib.sources.containers.opening import kind_of_container
+from kf_calib.sources.containers.spreadsheet import sheets_of
+from kf_calib.sources.text.encoding import text_of, too_large
+from kf_calib.sources.text.heading import TextHeading, delimiter_in, header_in, is_comment
+from kf_calib.sources.text.labels import Labels
+from kf_calib.sources.text.names import face_of
+from kf_calib.sources.text.numbers import DECIMAL_POINT, Numbers
+from kf_calib.support.text import cut
+
+ZIP = b"PK\x03\x04"
+TEXT_SUFFIXES = (".csv", ".tsv", ".txt")
+EXCEL_SUFFIXES = (".xlsx", ".xlsm")
+OLD_SUFFIXES = (".xls", ".ods")
+_LARGEST = (50_000_000, 50_000_000)  # bytes, of text and of a spreadsheet, which may hold pictures
+_SHOWN = 6  # rows in a message
+_LONGEST_CELL = 300  # characters; a longer one is a remark, of which the middle is left out
+_MOST_COLUMNS, _MOST_CELLS = 1000, 2_000_000
+_FEWEST = 3  # columns
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A table: name for messages, heading with all rows, and the number that each row has in the file.
+
+    remarks: how the file was read, where that was a choice. path: the file, if it is from one.
+    """
+
+    name: str
+    heading: TextHeading
+    numbers: tuple[int, ...]
+    remarks: tuple[str, ...] = ()
+    path: Path | None = None
+
+
+def grid_of(table: Any, dataset: str = "") -> Grid:
+    """The cells of a file, a structured array, a DataFrame or a mapping of columns; dataset: of a container."""
+    if not isinstance(table, str | PathLike):
+        return _of_columns(table)
+    path = Path(table)
+    try:
+        with path.open("rb") as file:
+            start = file.read(8)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
+    if path.suffix.lower() in OLD_SUFFIXES:
+        raise InputError(f"{path}: files of the kind {path.suffix} are not read: save it as .xlsx or .csv.")
+    is_excel = start.startswith(ZIP) and not kind_of_container(path)
+    if path.stat().st_size > _LARGEST[is_excel] and not kind_of_container(path):
+        raise too_large(path)
+    return replace(_of_excel(path) if is_excel else _of_text(path, dataset), path=path)
+
+
+def _of_text(path: Path, dataset: str) -> Grid:
+    """Return the cells of a CSV file: any usual encoding and delimiter, with or without lines above the header."""
+    lines = text_of(path, _LARGEST[0], dataset).splitlines()
+    if labels := Labels.of(lines):
+        return _headed(str(path), _labelled(lines, labels), ",", labels)
+    delimiter, skipped = delimiter_in(lines)
+    try:
+        reader = csv.reader(lines[skipped:], delimiter=delimiter, skipinitialspace=True)
+        rows = [(reader.line_num + skipped, list(map(_text, row))) for row in reader]
+    except csv.Error as error:
+        raise InputError(f"{path}: is no CSV file ({error}): save the table as CSV or .xlsx.") from None
+    return _headed(str(path), rows, delimiter)
+
+
+def _of_excel(path: Path) -> Grid:
+    """Return the cells of the first visible sheet of an Excel file that holds any."""
+    sheets = sheets_of(path)
+    seen = [sheet for sheet in sheets if not sheet.hidden]
+    if not seen:
+        hidden = f" that can be seen ({sheets[0].name!r} is hidden)" if sheets else ""
+        raise InputError(f"{path}: all sheets{hidden} are empty: write a header and a row for each orientation.")
+    others = ", ".join(repr(sheet.name) for sheet in seen[1:])
+    hidden = ", ".join(repr(sheet.name) for sheet in sheets if sheet.hidden)
+    remarks = [f"sheet {seen[0].name!r} was read, not {others}; put the table on the first sheet"] if others else []
+    remarks += [f"{hidden} was not read, as it is hidden"] if hidden else []
+    if rows := seen[0].left_out:
+        numbers = ", ".join(map(str, rows[:_SHOWN])) + " ..." * (len(rows) > _SHOWN)
+        one = len(rows) == 1
+        remarks.append(
+            f"row{'s' * (not one)} {numbers} {'was' if one else 'were'} not read, as hidden rows are no data"
+        )
+    texts, delimiter = _texts([row for _, row in seen[0].lines])
+    lines = [(number, row) for (number, _), row in zip(seen[0].lines, texts, strict=True)]
+    return replace(_headed(str(path), lines, delimiter), remarks=tuple(remarks))
+
+
+def _of_columns(table: Any) -> Grid:
+    """Return the cells of a structured array, a DataFrame of pandas or polars, or a mapping of columns."""
+    names = getattr(getattr(table, "dtype", None), "names", None)
+    if names is None:
+        names = list(table) if isinstance(table, Mapping) else getattr(table, "columns", None)
+    if names is None or isinstance(table, str):
+        raise InputError(
+            f"a table of type {type(table).__name__} has no names of columns: give a path, a structured array, a "
+            "DataFrame or a dict of columns."
+        )
+    names = list(names)
+    columns = [list(_values(table[name])) for name in names]
+    lengths = {len(column) for column in columns}
+    if len(lengths) > 1:
+        raise InputError(f"the columns of the table have different lengths ({sorted(lengths)}): give one row a dwell.")
+    rows, delimiter = _texts(list(zip(*columns, strict=True)))
+    _refuse_without_rows("the table", rows)
+    heading = TextHeading(tuple(map(str, names)), delimiter, 0, rows)
+    return Grid("the table", heading, tuple(range(1, len(rows) + 1)))
+
+
+def _values(column: Any) -> Iterable[Any]:
+    """Return the values of a column as Python's own types, where it can give them."""
+    as_list = getattr(column, "tolist", None) or getattr(column, "to_list", None)
+    return as_list() if as_list else column
+
+
+def _texts(rows: Sequence[Sequence[Any]]) -> tuple[list[list[str]], str]:
+    """Return cells of a spreadsheet or an array as texts, and what could be between them; numbers have the sign before
+    decimals that texts beside them have."""
+    texts = (cell for row in rows for cell in row if isinstance(cell, str))
+    decimal = (Numbers.told_by(texts, commas_count=False) or DECIMAL_POINT).decimal
+    return [[_cell(cell, decimal) for cell in row] for row in rows], ";" if decimal == "," else ","
+
+
+def _cell(value: Any, decimal: str) -> str:
+    """Return the text of a cell: number, stamp or text; none where there is nothing."""
+    if isinstance(value, str):
+        return _text(value)
+    if value is None or value != value:  # NaN and NaT
+        return ""
+    if isinstance(value, datetime):
+        return str(value).removesuffix(" 00:00:00")
+    if isinstance(value, bytes):
+        return _text(value.decode(errors="replace"))
+    try:
+        number = None if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = None
+    return _text(str(value)) if number is None else repr(number).removesuffix(".0").replace(".", decimal)
+
+
+def _text(cell: str) -> str:
+    """Return the text of a cell, of bounded length, as it is looked at in many ways."""
+    text = cell.strip()
+    return text if len(text) <= _LONGEST_CELL else cut(text, _LONGEST_CELL)
+
+
+def _headed(name: str, lines: Sequence[tuple[int, list[str]]], delimiter: str, labels: Labels | None = None) -> Grid:
+    """Return the grid of lines, with the number that each has in the file."""
+    filled = [(number, cells) for number, cells in lines if any(cells)]
+    header, begin, named = header_in([cells for _, cells in filled]) if filled else ([], 0, ())
+    if len(header) < _FEWEST:
+        raise InputError(f"{name}: has no table: write a header and a row for each orientation (docs/tables.md).")
+    width, head = len(header), tuple(filled[k][0] - 1 for k in named if filled[k][0])
+    rows = [line for line in filled[begin:] if not is_comment(line[1])]
+    if width > _MOST_COLUMNS or width * len(rows) > _MOST_CELLS:
+        raise InputError(f"{name}: has {width} columns and {len(rows)} rows, more than any table of orientations: "
+                         "leave out what is not part of it.")  # fmt: skip
+    for number, cells in rows:
+        if beyond := [cell for cell in cells[width:] if cell]:
+            raise InputError(
+                f"{name}: row {number} has {width + len(beyond)} cells where the header has {width}, the last is "
+                f"{cut(beyond[-1], 60)!r}: write one cell for each column, and quote a cell that holds a delimiter."
+            )
+    _refuse_without_rows(name, rows)
+    full = [[*cells[:width], *[""] * (width - len(cells))] for _, cells in rows]
+    return Grid(name, TextHeading(header, delimiter, 0, full, head, labels), tuple(number for number, _ in rows))
+
+
+def _labelled(lines: Sequence[str], labels: Labels) -> list[tuple[int, list[str]]]:
+    """Return labelled lines as rows under a header, with the face that a line before them names where all have one."""
+    rows, face = list[tuple[int, list[str]]](), ""
+    for number, line in enumerate(lines, start=1):
+        if values := labels.values(line):
+            rows.append((number, [face, *values]))
+        elif face_of(line.strip().rstrip(": ")):
+            face = line.strip().rstrip(": ")
+    if not all(cells[0] for _, cells in rows):
+        return [(0, labels.header), *((number, cells[1:]) for number, cells in rows)]
+    return [(0, ["face", *labels.header]), *rows]
+
+
+def _refuse_without_rows(name: str, rows: Sequence[object]) -> None:
+    if not rows:
+        raise InputError(f"{name}: has a header and no rows: write a row for each orientation.")

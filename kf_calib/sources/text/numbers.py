@@ -1,0 +1,124 @@
+"""Numbers in the cells of a text, as programs and spreadsheets of different countries write them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from decimal import Decimal
+
+from kf_calib.support.text import number_from
+
+_NUMBER = re.compile(r"[+\-−]?[\d.,'’ \u00a0\u202f]*\d[\d.,]*(?:[eE][+\-]?\d+)?")
+_SPACES = str.maketrans("", "", "'’ \u00a0\u202f")
+
+
+class LineError(ValueError):
+    """A line cannot be used; the message is the reason in a few words."""
+
+
+class CellError(LineError):
+    """It is for the sake of a cell, in column ``at``."""
+
+    def __init__(self, at: int, reason: str) -> None:
+        super().__init__(reason)
+        self.at = at
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """How the numbers of a text are written: the sign before decimals, and the one between thousands."""
+
+    decimal: str = "."
+    thousands: str = ","
+
+    @classmethod
+    def told_by(cls, cells: Iterable[str], *, commas_count: bool) -> Numbers | None:
+        """How numbers are written by the first cell that shows it; None where none does.
+
+        commas_count: whether a comma in a cell that could be either is one before decimals, since it separates no
+        cells.
+        """
+        could_be = False
+        for cell in cells:
+            if ("," in cell or "." in cell) and _NUMBER.fullmatch(cell):
+                if decimal := _decimal_of(cell):
+                    return _DECIMAL_COMMA if decimal == "," else DECIMAL_POINT
+                could_be |= commas_count and "," in cell
+        return _DECIMAL_COMMA if could_be else None
+
+    def with_point(self, cell: str) -> str:
+        """A number with a point before its decimals; raises ValueError where it has separators of thousands."""
+        if self.decimal == ".":
+            return cell
+        if "." in cell:
+            raise ValueError
+        return cell.replace(",", ".")
+
+    def exact(self, cell: str) -> Decimal:
+        """The number in a cell with all its digits; raises ValueError or ArithmeticError where there is none."""
+        try:
+            return Decimal(self.with_point(cell))
+        except (ValueError, ArithmeticError):
+            return Decimal(self._plain(cell))
+
+    def value(self, cell: str) -> float:
+        """The number in a cell, which need not be finite. Raises ValueError where there is none, LineError for one that
+        is too small."""
+        try:
+            return number_of(cell if self.decimal == "." else self.with_point(cell))
+        except LineError:
+            raise
+        except ValueError:
+            return number_of(self._plain(cell))
+
+    def _plain(self, cell: str) -> str:
+        """Return a number without separators of thousands and blanks, and with a point before its decimals."""
+        whole, point, rest = cell.translate(_SPACES).replace("−", "-").partition(self.decimal)
+        if self.thousands in whole:
+            if not re.fullmatch(rf"[+-]?\d{{1,3}}(?:\{self.thousands}\d{{3}})+", whole):
+                raise ValueError
+            whole = whole.replace(self.thousands, "")
+        if self.thousands in rest:
+            raise ValueError
+        return whole + "." * bool(point) + rest
+
+    @property
+    def example(self) -> str:
+        """A number as it would be read."""
+        return f"9{self.decimal}80665"
+
+
+DECIMAL_POINT = Numbers()
+_DECIMAL_COMMA = Numbers(",", ".")
+
+
+def _decimal_of(cell: str) -> str:
+    """Return the decimal sign that a number shows, or nothing where it could be either or has none."""
+    points, commas = cell.count("."), cell.count(",")
+    if points and commas:
+        return "," if cell.rfind(",") > cell.rfind(".") else "."
+    sign = "," if commas else "."
+    if points + commas > 1:  # of a date there are groups of other lengths
+        groups = re.split(r"[.,]", cell.translate(_SPACES).lstrip("+-−"))
+        is_thousands = 1 <= len(groups[0]) <= 3 and all(len(group) == 3 for group in groups[1:])
+        return ("." if commas else ",") if is_thousands else ""
+    if not points + commas:
+        return ""
+    whole, _, rest = cell.translate(_SPACES).lstrip("+-−").partition(sign)
+    may_be_thousands = len(rest) == 3 and 1 <= len(whole) <= 3 and not whole.startswith("0")
+    return "" if may_be_thousands else sign
+
+
+def number_of(text: str) -> float:
+    """The number that a text says. Raises LineError where it is too small for one, as when two have run together:
+    1.234e-01700001234567 is no zero."""
+    value = number_from(text)
+    if value == 0.0 and float(text.lower().partition("e")[0]):
+        raise LineError("a number is out of range")
+    return value
+
+
+def written(value: float) -> float:
+    """A reading as it is written as text: digits below 1e-12 are those of rounding, and differ between processors."""
+    return round(value, 12)
