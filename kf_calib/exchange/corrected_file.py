@@ -32,7 +32,7 @@ from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.text.encoding import encoding_of, unpacked
 from kf_calib.sources.text.grid import Grid, grid_of
 from kf_calib.sources.text.heading import with_texts
-from kf_calib.sources.text.means import Means
+from kf_calib.sources.text.means import TableOfMeans
 from kf_calib.sources.text.numbers import written
 from kf_calib.sources.text.reader import named
 from kf_calib.sources.text.units import Units
@@ -192,7 +192,7 @@ def apply_to_table(
         raise InputError(f"{path}: a corrected copy has every row, of one sensor: put its rows in a file (--where).")
     grid = grid_of(path, units.dataset)
     with named(grid.name):
-        opening = Means(grid, columns, overrides, units, angles=False)
+        opening = TableOfMeans(grid, columns, overrides, units, angles=False)
         table = opening.table()
     means = table.orientations.mean_mps2
     warmth = table.orientations.temperature_c

@@ -170,7 +170,8 @@ def test_counts_get_a_size_to_try(run, tmp_path: Path) -> None:
                     "+z,15,25,16390\n-z,25,20,-16360\n")  # fmt: skip
     _, out, _ = run("info", path, "--gravity", "9.81", "--json")
     found = json.loads(out)
-    assert [said.partition(":")[0] for said in found["missing"]] == ["the size of one count of the readings"]
+    (missing,) = found["missing"]
+    assert "so they are counts: give the size of one by --accel-scale" in missing
     code, out, err = run(*found["command"].split()[1:], "--json")
     assert (code, err) == (0, "")
     (value,) = [each["value"] for each in json.loads(out)["parameters"] if each["symbol"] == "K1"]

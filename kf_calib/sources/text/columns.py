@@ -57,7 +57,7 @@ _ALIKE = 1.3  # of the norms of readings at rest, largest to smallest
 _MOST_CELLS = 0.6  # of a column of readings are numbers: a bad one is told later
 _FEWEST_ROWS, _MOST_UNITS, _APART = 20, 8, 5.0  # rows and labels of several sensors, and sigmas between these
 
-Row = Sequence[str]
+CsvRow = Sequence[str]
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class QuantityColumns:
     factors: tuple[float, ...] = ()
     absent: Container[str] = ()
 
-    def values(self, row: Row, header: Sequence[str], numbers: Numbers) -> list[float] | None:
+    def values(self, row: CsvRow, header: Sequence[str], numbers: Numbers) -> list[float] | None:
         """The quantity, None where it is not measured. Raises CellError where it cannot be used."""
         cells = [row[at] for at in self.at]
         if not all(cells):
@@ -112,7 +112,7 @@ class Columns:
 
     heading: TextHeading
     names: Sequence[str]
-    rows: Sequence[Row]
+    rows: Sequence[CsvRow]
     units: Units
     local_mps2: float = STANDARD_GRAVITY_MPS2
     is_table: bool = False
@@ -181,7 +181,7 @@ class Columns:
         """The names of columns, quoted."""
         return ", ".join(repr(cut(self.header[at], 40)) for at in places)
 
-    def is_chosen(self, row: Row) -> bool:
+    def is_chosen(self, row: CsvRow) -> bool:
         """Whether a row counts."""
         return self.chosen is None or row[self.chosen[0]].strip() == self.chosen[1]
 
@@ -205,13 +205,13 @@ class Columns:
         """How the numbers are written; None where no row tells yet."""
         return self.numbers_in(self.rows)
 
-    def numbers_in(self, rows: Sequence[Row]) -> Numbers | None:
+    def numbers_in(self, rows: Sequence[CsvRow]) -> Numbers | None:
         """How the numbers in rows are written; None where these do not tell."""
         used = [at for at, own in enumerate(self.meanings) if own.ours] or range(len(self.names))
         cells = (row[at] for row in rows if len(row) == len(self.names) for at in used)
         return Numbers.told_by(cells, commas_count=self.heading.delimiter != ",")
 
-    def values(self, places: Sequence[int], rows: Sequence[Row] | None = None) -> Floats:
+    def values(self, places: Sequence[int], rows: Sequence[CsvRow] | None = None) -> Floats:
         """The numbers (n, k) in columns of rows (None: of all), NaN where there is none."""
         numbers = self.numbers or DECIMAL_POINT
 

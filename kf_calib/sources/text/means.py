@@ -73,10 +73,10 @@ def open_table(
     with named(grid.name):
         order = merged_metadata({}, keys, "", input).get("channels")
         units = replace(Units.of(keys, angle_unit, g_unit, input), where=where)
-        return Means(grid, columns, keys if order is None else keys | {"channels": order}, units, angles).table()
+        return TableOfMeans(grid, columns, keys if order is None else keys | {"channels": order}, units, angles).table()
 
 
-class Means:
+class TableOfMeans:
     """One opening of a table; ``said`` collects what was taken for what. angles: whether orientations count; None: they
     do where a column tells them."""
 

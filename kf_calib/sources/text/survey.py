@@ -13,7 +13,7 @@ from kf_calib.bench.streams import Table
 from kf_calib.errors import CountsError, InputError
 from kf_calib.sources.text.columns import Columns
 from kf_calib.sources.text.grid import grid_of
-from kf_calib.sources.text.means import Means
+from kf_calib.sources.text.means import TableOfMeans
 from kf_calib.sources.text.reader import named
 from kf_calib.sources.text.units import Units
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
@@ -92,21 +92,22 @@ def survey(
     grid = grid_of(path, units.dataset)
     table, trouble = None, ""
     with named(grid.name):
-        means = Means(grid, columns, _with_gravity(overrides), units, angles=None if angles else False)
+        means = TableOfMeans(grid, columns, _with_gravity(overrides), units, angles=None if angles else False)
         means.refuse_samples()
-        means.are_lacking, found = False, means.columns  # who asks is told by ``is_by_hand``
-        if found.angles and not overrides.get("axes"):
-            means.overrides["axes"] = " ".join("yzx"[k % 3] for k in range(len(found.angles)))
+        means.are_lacking, understood = False, means.columns  # who asks is told by ``is_by_hand``
+        if understood.angles and not overrides.get("axes"):
+            means.overrides["axes"] = " ".join("yzx"[k % 3] for k in range(len(understood.angles)))
         try:
             table = means.table()
         except CountsError:
             raise
         except InputError as error:
             trouble = f"{grid.name}: {error}"
-    kind = found.orientation if means.angles else ""
+    kind = understood.orientation if means.angles else ""
+    rows = _rows(table, means) if table else []
     return Survey(
-        path, _columns(found, set(columns)), len(found.rows), kind, _rows(table, means) if table else [], table,
-        trouble, list(means.warnings), len(found.angles), not found.orientation,
+        path, _columns(understood, set(columns)), len(understood.rows), kind, rows, table, trouble, means.warnings,
+        len(understood.angles), not understood.orientation,
     )  # fmt: skip
 
 
@@ -130,7 +131,7 @@ def _columns(columns: Columns, stated: set[str]) -> list[ColumnFound]:
     return described
 
 
-def _rows(table: Table, means: Means) -> list[RowFound]:
+def _rows(table: Table, means: TableOfMeans) -> list[RowFound]:
     place = means.columns.place("face") if means.angles else None
     rows = list[RowFound]()
     for k, orientation in enumerate(table.orientations):
