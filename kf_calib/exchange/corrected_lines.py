@@ -22,7 +22,7 @@ from kf_calib.bench.raw_input import CHANNELS, PLAIN, RESTATING, RawInput, wrong
 from kf_calib.bench.streams import Stream
 from kf_calib.errors import InputError
 from kf_calib.estimation.correction import Correction
-from kf_calib.sources.text.encoding import LONGEST_LINE_BYTES, line_end_of
+from kf_calib.sources.text.encoding import Cutter
 from kf_calib.sources.text.lines import is_json, reader_for, stated_of
 from kf_calib.sources.text.reader import Account, LineReader
 from kf_calib.sources.text.units import Units
@@ -155,7 +155,7 @@ class CorrectedLines:
         self._units = units or Units.of(overrides, input=correction.input)
         self._needs_temperature = bool(correction.needs_temperature)
         self._account, self._temperature_c = Account(), np.nan
-        self._cutter = _Cutter(self._account)
+        self._cutter = Cutter(self._account.refuse, keeps_ends=True)
         self._waiting = list[RawLine]()  # while it is not known what the lines are
         self._reader: LineReader | None = None
         self._input: RawInput | None = None
@@ -164,11 +164,11 @@ class CorrectedLines:
 
     def push(self, block: bytes) -> bytes:
         """The lines that end in ``block``, corrected."""
-        return self._corrected(self._cutter.push(block), ended=False)
+        return self._corrected(self._numbered(self._cutter.push(block)), ended=False)
 
     def rest(self) -> bytes:
         """The line without an end, if there is one. Raises InputError where no readings have come at all."""
-        last = self._corrected(self._cutter.rest(), ended=True)
+        last = self._corrected(self._numbered(self._cutter.rest()), ended=True)
         if not self.readings:
             advice = f": {self._reader.advice}" if self._reader else ": check that the logger wrote any"
             found = "".join(f"; {sentence.rstrip('.')}" for sentence in self.warnings)
@@ -187,6 +187,13 @@ class CorrectedLines:
     def input(self) -> RawInput:
         """What the lines hold, as far as that is known."""
         return self._input or PLAIN
+
+    def _numbered(self, lines: Sequence[str]) -> list[RawLine]:
+        """Return the next lines with their numbers."""
+        texts, first = [line.rstrip("\r\n") for line in lines], self._account.lines + 1
+        self._account.lines += len(lines)
+        numbered = enumerate(zip(lines, texts, strict=True), first)
+        return [(number, text, line[len(text) :]) for number, (line, text) in numbered]
 
     def _corrected(self, lines: list[RawLine], ended: bool) -> bytes:
         """Return lines, corrected; the readings of all of them at once."""
@@ -207,7 +214,6 @@ class CorrectedLines:
 
     def _started(self, lines: list[RawLine], ended: bool) -> list[RawLine]:
         """Add lines to those that wait, and return what of them is a heading, once it is known what they are."""
-        self._account.lines = self._cutter.number
         self._waiting += lines
         if self._reader is not None:
             return []
@@ -267,53 +273,6 @@ class CorrectedLines:
         assert self._norm is not None
         if said := self._norm.misfit(self.input, final):
             raise InputError(f"{self._name}: {said}.")
-
-
-class _Cutter:
-    """Bytes as they come, cut into lines that keep their ends; one that is too long is left out and counted."""
-
-    def __init__(self, account: Account) -> None:
-        self._account, self._tail, self._is_cut, self._end = account, bytearray(), False, b""
-        self.number = 0
-        """Lines that have ended."""
-
-    def push(self, block: bytes) -> list[RawLine]:
-        """The lines that end in ``block``."""
-        self._end = self._end or line_end_of(block)
-        end = self._end or b"\n"
-        first, *others = block.split(end)
-        if not others:
-            self._keep(first)
-            return []
-        *whole, last = others
-        lines = [self._line(bytes(self._tail) + first, end), *(self._line(line, end) for line in whole)]
-        self._tail.clear()
-        self._keep(last)
-        return [line for line in lines if line is not None]
-
-    def rest(self) -> list[RawLine]:
-        """The line without an end, if there is one."""
-        last = self._line(bytes(self._tail), b"") if self._tail or self._is_cut else None
-        self._tail.clear()
-        return [] if last is None else [last]
-
-    def _keep(self, piece: bytes) -> None:
-        """What comes of a line that is too long already is not kept."""
-        self._is_cut |= len(self._tail) + len(piece) > LONGEST_LINE_BYTES
-        if self._is_cut:
-            self._tail.clear()
-        else:
-            self._tail += piece
-
-    def _line(self, content: bytes, end: bytes) -> RawLine | None:
-        self.number += 1
-        if self._is_cut or len(content) > LONGEST_LINE_BYTES:
-            self._is_cut = False
-            self._account.refuse(self.number, "it is longer than 1 MiB")
-            return None
-        if content.endswith(b"\r"):
-            content, end = content[:-1], b"\r" + end
-        return self.number, content.decode("utf-8", errors="surrogateescape"), end.decode()
 
 
 def _bytes(lines: Mapping[int, str]) -> bytes:

@@ -166,10 +166,15 @@ def line_end_of(block: bytes) -> bytes:
 
 
 class Cutter:
-    """Bytes as they come, cut into lines; a line that is too long is left empty, and refused with its number."""
+    """Bytes as they come, cut into lines; a line that is too long is left empty, and refused with its number.
 
-    def __init__(self, refuse: Callable[[int, str], None]) -> None:
-        self._refuse, self._tail, self._cut, self._end = refuse, bytearray(), 0, b""
+    keeps_ends: whether lines are given with what ends them, and with bytes that are no UTF-8 (as surrogates), so that
+    they can be written again.
+    """
+
+    def __init__(self, refuse: Callable[[int, str], None], *, keeps_ends: bool = False) -> None:
+        self._refuse, self._keeps_ends = refuse, keeps_ends
+        self._tail, self._cut, self._end = bytearray(), 0, b""
 
     @property
     def is_amid(self) -> bool:
@@ -182,10 +187,10 @@ class Cutter:
             block = bytes(self._tail) + block
             self._tail.clear()
         self._end = self._end or line_end_of(block)
-        block = block.replace(b"\r", b"\n") if self._end == b"\r" else block
-        end, lines = block.rfind(b"\n") + 1, list[str]()
+        mark = self._end or b"\n"
+        end, lines = block.rfind(mark) + 1, list[str]()
         if end:
-            lines = self._decode(bytes(self._tail) + block[: end - 1])
+            lines = self._decode(bytes(self._tail) + block[: end - 1], mark, mark.decode())
             self._tail.clear()
         if len(self._tail) <= LONGEST_LINE_BYTES:  # else what comes up to the next end of line is not kept
             self._tail += block[end:]
@@ -195,14 +200,22 @@ class Cutter:
         """The line without an end, if there is one."""
         block = bytes(self._tail)
         self._tail.clear()
-        return self._decode(block) if block else []
+        return self._decode(block, self._end or b"\n", "") if block else []
 
-    def _decode(self, block: bytes) -> list[str]:
-        lines = block.replace(b"\r\n", b"\n").removesuffix(b"\r").split(b"\n")
+    def _decode(self, block: bytes, mark: bytes, last: str) -> list[str]:
+        """Return the lines of a block, between which a mark is; last: the end of the last one."""
+        if not self._keeps_ends and mark == b"\n":
+            block = block.replace(b"\r\n", b"\n").removesuffix(b"\r")
+        lines, too_long = block.split(mark), list[int]()
         if len(block) > LONGEST_LINE_BYTES:
-            for i, line in enumerate(lines):
-                if len(line) > LONGEST_LINE_BYTES:
-                    self._refuse(self._cut + i + 1, "it is longer than 1 MiB")
-                    lines[i] = b""
+            too_long = [i for i, line in enumerate(lines) if len(line) > LONGEST_LINE_BYTES]
+            for i in too_long:
+                self._refuse(self._cut + i + 1, "it is longer than 1 MiB")
+                lines[i] = b""
+            block = mark.join(lines)
         self._cut += len(lines)
-        return b"\n".join(lines).decode("utf-8", errors="replace").split("\n")
+        texts = block.decode("utf-8", errors="surrogateescape" if self._keeps_ends else "replace").split(mark.decode())
+        if self._keeps_ends:
+            ends = [*[mark.decode()] * (len(texts) - 1), last]
+            texts = ["" if i in too_long else text + end for i, (text, end) in enumerate(zip(texts, ends, strict=True))]
+        return texts
