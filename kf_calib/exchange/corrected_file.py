@@ -211,23 +211,22 @@ def apply_to_table(
 
 
 def _heads(grid: Grid) -> Iterator[tuple[int, Sequence[str]]]:
-    """Return the number of the row of the header, and of that of units where there is one, with what a copy has there
-    for the three readings."""
-    numbers = (line + 1 for line in grid.heading.lines_of_names)
-    return zip(numbers, (_NAMES, ["m/s^2"] * 3), strict=False)
+    """Return the lines of the header and, where there is one, of units, with what a copy has there for the three
+    readings."""
+    return zip(grid.heading.lines_of_names, (_NAMES, ["m/s^2"] * 3), strict=False)
 
 
 def _to_excel(path: Path, copy: Path, grid: Grid, places: Sequence[int], force: Floats) -> None:
     """Write a copy of a workbook."""
     book = workbook_of(path)
     sheet = book[next(each.name for each in sheets_of(path) if not each.hidden)]
-    for number, texts in _heads(grid):
+    for line, texts in _heads(grid):
         for place, text in zip(places, texts, strict=True):
-            if sheet.cell(number, place + 1).value is not None:
-                sheet.cell(number, place + 1).value = text
-    for number, own in zip(grid.numbers, force.tolist(), strict=True):
+            if sheet.cell(line + 1, place + 1).value is not None:
+                sheet.cell(line + 1, place + 1).value = text
+    for line, own in zip(grid.heading.numbers, force.tolist(), strict=True):
         for place, value in zip(places, own, strict=True):
-            cell = sheet.cell(number, place + 1)
+            cell = sheet.cell(line + 1, place + 1)
             if type(cell).__name__ == "MergedCell":
                 raise InputError(f"{path}: cell {cell.coordinate} is merged with others, so no reading can be written "
                                  "there: part the cells.")  # fmt: skip
@@ -243,19 +242,21 @@ def _to_text(path: Path, copy: Path, grid: Grid, places: Sequence[int], force: F
     encoding, plain_codec = encoding_of(content), "utf-8-sig" if content.startswith(BOM_UTF8) else "utf-8"
     codec, errors = (encoding, "strict") if encoding.startswith("utf-16") else (plain_codec, "surrogateescape")
     lines = content.decode(codec, errors).splitlines(keepends=True)
-    are_commas = heading.delimiter != "," and not any("." in lines[number - 1] for number in grid.numbers)
+    are_commas = heading.delimiter != "," and not any("." in lines[number] for number in heading.numbers)
     texts = [[repr(written(value)).replace(".", "," if are_commas else ".") for value in own]
              for own in force.tolist()]  # fmt: skip
-    for number, new in (*zip(grid.numbers, texts, strict=True), *_heads(grid)):
-        line, is_units = lines[number - 1], number - 1 in heading.lines_of_names[1:]
+    for number, new in (*zip(heading.numbers, texts, strict=True), *_heads(grid)):
+        line, is_units = lines[number], number in heading.lines_of_names[1:]
         spans = heading.spans(line.rstrip("\r\n"))
         cells = [line[start:end] for start, end in spans]
         if _is_part(cells) or not (is_units or len(spans) > max(places)):
-            raise InputError(f"{path}: the row that ends in line {number} goes over several lines: write it in one, "
-                             "without line breaks in its cells.")  # fmt: skip
+            raise InputError(
+                f"{path}: the row that ends in line {number + 1} goes over several lines: write it in one, without "
+                "line breaks in its cells."
+            )
         filled = {place: text for place, text in zip(places, new, strict=True)
                   if not is_units or (place < len(cells) and cells[place].strip('" '))}  # fmt: skip
-        lines[number - 1] = with_texts(line, spans, filled)
+        lines[number] = with_texts(line, spans, filled)
     write_whole(copy, "".join(lines).encode(codec, errors))
 
 

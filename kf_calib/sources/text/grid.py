@@ -14,9 +14,7 @@ from kf_calib.errors import InputError
 from kf_calib.sources.containers.opening import kind_of_container
 from kf_calib.sources.containers.spreadsheet import sheets_of
 from kf_calib.sources.text.encoding import text_of, too_large
-from kf_calib.sources.text.heading import TextHeading, delimiter_in, header_in, is_comment
-from kf_calib.sources.text.labels import Labels
-from kf_calib.sources.text.names import face_of
+from kf_calib.sources.text.heading import TextHeading
 from kf_calib.sources.text.numbers import DECIMAL_POINT, Numbers
 from kf_calib.support.text import cut
 
@@ -33,14 +31,13 @@ _FEWEST = 3  # columns
 
 @dataclass(frozen=True)
 class Grid:
-    """A table: name for messages, heading with all rows, and the number that each row has in the file.
+    """A table: name for messages, and heading with all rows.
 
     remarks: how the file was read, where that was a choice. path: the file, if it is from one.
     """
 
     name: str
     heading: TextHeading
-    numbers: tuple[int, ...]
     remarks: tuple[str, ...] = ()
     path: Path | None = None
 
@@ -65,16 +62,11 @@ def grid_of(table: Any, dataset: str = "") -> Grid:
 
 def _of_text(path: Path, dataset: str) -> Grid:
     """Return the cells of a CSV file: any usual encoding and delimiter, with or without lines above the header."""
-    lines = text_of(path, _LARGEST[0], dataset).splitlines()
-    if labels := Labels.of(lines):
-        return _headed(str(path), _labelled(lines, labels), ",", labels)
-    delimiter, skipped = delimiter_in(lines)
     try:
-        reader = csv.reader(lines[skipped:], delimiter=delimiter, skipinitialspace=True)
-        rows = [(reader.line_num + skipped, list(map(_text, row))) for row in reader]
+        heading = TextHeading.of(text_of(path, _LARGEST[0], dataset).splitlines(), is_whole=True)
     except csv.Error as error:
         raise InputError(f"{path}: is no CSV file ({error}): save the table as CSV or .xlsx.") from None
-    return _headed(str(path), rows, delimiter)
+    return _padded(str(path), heading)
 
 
 def _of_excel(path: Path) -> Grid:
@@ -95,8 +87,8 @@ def _of_excel(path: Path) -> Grid:
             f"row{'s' * (not one)} {numbers} {'was' if one else 'were'} not read, as hidden rows are no data"
         )
     texts, delimiter = _texts([row for _, row in seen[0].lines])
-    lines = [(number, row) for (number, _), row in zip(seen[0].lines, texts, strict=True)]
-    return replace(_headed(str(path), lines, delimiter), remarks=tuple(remarks))
+    lines = [(number - 1, row) for (number, _), row in zip(seen[0].lines, texts, strict=True)]
+    return replace(_padded(str(path), TextHeading.of_cells(lines, delimiter)), remarks=tuple(remarks))
 
 
 def _of_columns(table: Any) -> Grid:
@@ -115,9 +107,7 @@ def _of_columns(table: Any) -> Grid:
     if len(lengths) > 1:
         raise InputError(f"the columns of the table have different lengths ({sorted(lengths)}): give one row a dwell.")
     rows, delimiter = _texts(list(zip(*columns, strict=True)))
-    _refuse_without_rows("the table", rows)
-    heading = TextHeading(tuple(map(str, names)), delimiter, 0, rows)
-    return Grid("the table", heading, tuple(range(1, len(rows) + 1)))
+    return _padded("the table", TextHeading(list(map(str, names)), delimiter, 0, rows, numbers=range(len(rows))))
 
 
 def _values(column: Any) -> Iterable[Any]:
@@ -136,62 +126,35 @@ def _texts(rows: Sequence[Sequence[Any]]) -> tuple[list[list[str]], str]:
 
 def _cell(value: Any, decimal: str) -> str:
     """Return the text of a cell: number, stamp or text; none where there is nothing."""
-    if isinstance(value, str):
-        return _text(value)
     if value is None or value != value:  # NaN and NaT
         return ""
     if isinstance(value, datetime):
         return str(value).removesuffix(" 00:00:00")
     if isinstance(value, bytes):
-        return _text(value.decode(errors="replace"))
+        return value.decode(errors="replace").strip()
     try:
-        number = None if isinstance(value, bool) else float(value)
+        number = None if isinstance(value, bool | str) else float(value)
     except (TypeError, ValueError, OverflowError):
         number = None
-    return _text(str(value)) if number is None else repr(number).removesuffix(".0").replace(".", decimal)
+    return str(value).strip() if number is None else repr(number).removesuffix(".0").replace(".", decimal)
 
 
-def _text(cell: str) -> str:
-    """Return the text of a cell, of bounded length, as it is looked at in many ways."""
-    text = cell.strip()
-    return text if len(text) <= _LONGEST_CELL else cut(text, _LONGEST_CELL)
-
-
-def _headed(name: str, lines: Sequence[tuple[int, list[str]]], delimiter: str, labels: Labels | None = None) -> Grid:
-    """Return the grid of lines, with the number that each has in the file."""
-    filled = [(number, cells) for number, cells in lines if any(cells)]
-    header, begin, named = header_in([cells for _, cells in filled]) if filled else ([], 0, ())
-    if len(header) < _FEWEST:
+def _padded(name: str, heading: TextHeading) -> Grid:
+    """Return the grid of a heading with all rows, which have as many cells as the header then; cells are cut to a
+    bounded length, as they are looked at in many ways."""
+    width, rows = len(heading.header), heading.rows
+    if width < _FEWEST:
         raise InputError(f"{name}: has no table: write a header and a row for each orientation (docs/tables.md).")
-    width, head = len(header), tuple(filled[k][0] - 1 for k in named if filled[k][0])
-    rows = [line for line in filled[begin:] if not is_comment(line[1])]
     if width > _MOST_COLUMNS or width * len(rows) > _MOST_CELLS:
         raise InputError(f"{name}: has {width} columns and {len(rows)} rows, more than any table of orientations: "
                          "leave out what is not part of it.")  # fmt: skip
-    for number, cells in rows:
+    for line, cells in zip(heading.numbers, rows, strict=True):
         if beyond := [cell for cell in cells[width:] if cell]:
             raise InputError(
-                f"{name}: row {number} has {width + len(beyond)} cells where the header has {width}, the last is "
+                f"{name}: row {line + 1} has {width + len(beyond)} cells where the header has {width}, the last is "
                 f"{cut(beyond[-1], 60)!r}: write one cell for each column, and quote a cell that holds a delimiter."
             )
-    _refuse_without_rows(name, rows)
-    full = [[*cells[:width], *[""] * (width - len(cells))] for _, cells in rows]
-    return Grid(name, TextHeading(header, delimiter, 0, full, head, labels), tuple(number for number, _ in rows))
-
-
-def _labelled(lines: Sequence[str], labels: Labels) -> list[tuple[int, list[str]]]:
-    """Return labelled lines as rows under a header, with the face that a line before them names where all have one."""
-    rows, face = list[tuple[int, list[str]]](), ""
-    for number, line in enumerate(lines, start=1):
-        if values := labels.values(line):
-            rows.append((number, [face, *values]))
-        elif face_of(line.strip().rstrip(": ")):
-            face = line.strip().rstrip(": ")
-    if not all(cells[0] for _, cells in rows):
-        return [(0, labels.header), *((number, cells[1:]) for number, cells in rows)]
-    return [(0, ["face", *labels.header]), *rows]
-
-
-def _refuse_without_rows(name: str, rows: Sequence[object]) -> None:
     if not rows:
         raise InputError(f"{name}: has a header and no rows: write a row for each orientation.")
+    full = [[*(cut(cell, _LONGEST_CELL) for cell in cells), *[""] * (width - len(cells))] for cells in rows]
+    return Grid(name, heading._replace(rows=full))

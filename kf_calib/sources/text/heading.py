@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from kf_calib.sources.text.labels import Labels
-from kf_calib.sources.text.names import is_unit
+from kf_calib.sources.text.names import face_of, is_unit
 
 _DELIMITERS = ";\t,|"
 BLANK = " "
@@ -28,7 +28,7 @@ class TextHeading(NamedTuple):
     """The names of the columns, what is between cells, how many lines go before the first row, and the first rows.
 
     lines_of_names: numbers, from 0, of the line with the names and, where there is one, of that with units. labels:
-    where each value has its name before it.
+    where each value has its name before it. numbers: of the lines of the rows, from 0.
     """
 
     header: Sequence[str]
@@ -37,18 +37,50 @@ class TextHeading(NamedTuple):
     rows: Sequence[Sequence[str]]
     lines_of_names: tuple[int, ...] = ()
     labels: Labels | None = None
+    numbers: Sequence[int] = ()
 
     @classmethod
-    def of(cls, lines: Sequence[str]) -> TextHeading:
-        """The heading of lines from the beginning of a file or a stream, of which there is at least one."""
-        if labels := Labels.of(lines[:_ROWS]):
-            values = [(k, own) for k, line in enumerate(lines[: 2 * _ROWS]) if (own := labels.values(line))]
-            return cls(labels.header, ",", values[0][0], [own for _, own in values], labels=labels)
+    def of(cls, lines: Sequence[str], *, is_whole: bool = False) -> TextHeading:
+        """The heading of lines from the beginning of a file or a stream, of which there is at least one.
+
+        is_whole: whether these are all; rows are then all as well, and a cell may go over several lines. Raises
+        csv.Error for such a cell without an end.
+        """
+        if labels := Labels.of(lines):
+            return cls._of_labelled(lines if is_whole else lines[: 2 * _ROWS], labels, is_whole)
         delimiter, start = delimiter_in(lines[:_ROWS])
-        cells = [cells_of(line.lstrip("\ufeff"), delimiter) for line in lines[start : start + 2 * _ROWS]]
-        header, begin, named = header_in(cells)
-        rows = [without_empty_end(row, len(header)) for row in cells[begin : begin + _ROWS]]
-        return cls(header, delimiter, start + begin, rows, tuple(start + k for k in named))
+        if is_whole:
+            reader = csv.reader(lines[start:], delimiter=delimiter, skipinitialspace=True)
+            cells = [(start + reader.line_num - 1, [cell.strip() for cell in row]) for row in reader]
+            return cls.of_cells(cells, delimiter)
+        first = enumerate(lines[start : start + 2 * _ROWS], start)
+        heading = cls.of_cells([(k, cells_of(line.lstrip("\ufeff"), delimiter)) for k, line in first], delimiter)
+        return heading._replace(rows=heading.rows[:_ROWS])
+
+    @classmethod
+    def of_cells(cls, cells: Sequence[tuple[int, list[str]]], delimiter: str) -> TextHeading:
+        """The heading of cells with the number of the line of each."""
+        filled = [own for own in cells if any(own[1])]
+        header, begin, named = header_in([own for _, own in filled]) if filled else ([], 0, ())
+        rows = [(k, without_empty_end(own, len(header))) for k, own in filled[begin:] if not is_comment(own)]
+        behind = filled[begin][0] if begin < len(filled) else cells[-1][0] + 1 if cells else 0
+        names = tuple(filled[k][0] for k in named)
+        return cls(header, delimiter, behind, [own for _, own in rows], names, numbers=[k for k, _ in rows])
+
+    @classmethod
+    def _of_labelled(cls, lines: Sequence[str], labels: Labels, is_whole: bool) -> TextHeading:
+        """Return the heading of lines with labels; of all lines, with the face that a line before them names where all
+        have one."""
+        rows, face = list[tuple[int, list[str]]](), ""
+        for number, line in enumerate(lines):
+            if values := labels.values(line):
+                rows.append((number, [face, *values]))
+            elif face_of(line.strip().rstrip(": ")):
+                face = line.strip().rstrip(": ")
+        has_faces = is_whole and all(cells[0] for _, cells in rows)
+        header = ["face"] * has_faces + labels.header
+        cells = [own[not has_faces :] for _, own in rows]
+        return cls(header, ",", rows[0][0], cells, labels=labels, numbers=[number for number, _ in rows])
 
     def spans(self, line: str) -> list[tuple[int, int]]:
         """Where the cells of a line stand, those of columns that it does not have at its beginning."""
@@ -71,15 +103,11 @@ def _delimiter_of(lines: Sequence[str]) -> str:
     """Return the delimiter with which the most of some lines have the same number of cells, two or more."""
 
     def fitness(delimiter: str) -> int:
-        rows = csv.reader(lines[:_TELLING], delimiter=delimiter, skipinitialspace=delimiter == BLANK)
-        widths = [len(row) for row in rows if len(row) > 1]
-        return max(map(widths.count, set(widths)), default=0)
+        widths = [len(cells_of(line, delimiter)) for line in lines[:_TELLING]]
+        return max((widths.count(width) for width in set(widths) - {0, 1}), default=0)
 
-    try:
-        best = max(_DELIMITERS, key=fitness)
-        return best if fitness(best) or fitness(BLANK) < 2 else BLANK
-    except csv.Error:
-        return ","
+    best = max(_DELIMITERS, key=fitness)
+    return best if fitness(best) or fitness(BLANK) < 2 else BLANK
 
 
 def header_in(rows: Sequence[Sequence[str]]) -> tuple[list[str], int, tuple[int, ...]]:
@@ -152,13 +180,13 @@ def without_empty_end(row: list[str], count: int) -> list[str]:
 
 def cells_of(line: str, delimiter: str) -> list[str]:
     """The cells of one line without blanks and quotes around them; a quote left open ends with the line."""
-    if delimiter == BLANK and '"' not in line:
-        return line.split()
-    try:
-        cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=delimiter == BLANK), [])
-    except csv.Error:  # a cell beyond csv's own limit
-        cells = line.split(delimiter)
-    return [cell.strip() for cell in cells]
+    if '"' not in line:
+        return line.split() if delimiter == BLANK else [cell.strip() for cell in line.split(delimiter)]
+    return [_unquoted(line[start:end]) for start, end in cell_spans(line, delimiter)]
+
+
+def _unquoted(cell: str) -> str:
+    return cell[1:].removesuffix('"').replace('""', '"').strip() if cell.startswith('"') else cell
 
 
 def cell_spans(line: str, delimiter: str) -> list[tuple[int, int]]:

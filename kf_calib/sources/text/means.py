@@ -88,8 +88,8 @@ class TableOfMeans:
         if units.g == "local":
             local_mps2 = bench_without_angles("", overrides)[0].gravity_mps2
         self.columns = Columns.of(grid.heading, stated, units, local_mps2, is_table=True)
-        pairs = zip(grid.numbers, grid.heading.rows, strict=True)
-        self.numbers = [number for number, row in pairs if self.columns.is_chosen(row)]
+        pairs = zip(grid.heading.numbers, grid.heading.rows, strict=True)
+        self.numbers = [line + 1 for line, row in pairs if self.columns.is_chosen(row)]
         self.grid, self.overrides, self.units, self.said = grid, dict(overrides), units, self.columns.said
         self.are_lacking = angles is None and not self.columns.orientation
         self.angles = angles is not False and not self.are_lacking
