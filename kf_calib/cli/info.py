@@ -264,11 +264,11 @@ def _of_table(ctx: click.Context, path: Path, reading: ReadingOptions, told: Sta
     missing = {"counts": reason} if reason else {}
     words = _given(ctx, _not_of(ctx, not_of_text(path) + OF_DWELLS))
     words += _options(told)
-    if table.is_by_hand and not reading.no_angles:
+    if not table.means.columns.orientation and not reading.no_angles:
         words.append(_BY_HAND[0])
         missing["angles"] = _BY_HAND[1].format(or_else=", attitude or face")
     missing |= {key: _NAMED[key][1] for key in lacking}
-    axes = _AXES.get(table.angles, _NAMED["axes"][0])
+    axes = _AXES.get(len(table.means.columns.angles), _NAMED["axes"][0])
     words += [axes if key == "axes" else _NAMED[key][0] for key in lacking]
     taken = table.table.bench.input if table.table else None
     wrong = taken and _wrong_unit([row.norm_mps2 for row in table.rows], taken, are_named=True)

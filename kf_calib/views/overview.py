@@ -189,11 +189,12 @@ def table_object(overview: TableOverview) -> dict[str, Any]:
     return clean(
         {
             "recording": str(survey.path), "format": "table", "files": [str(survey.path)],
-            "bytes": survey.path.stat().st_size, "topics": [], "columns": [vars(column) for column in survey.columns],
+            "bytes": survey.path.stat().st_size, "topics": [],
+            "columns": [column._asdict() for column in survey.columns],
             "orientation": survey.orientation or None, "bench": overview.bench,
-            "dwells": [vars(row) | {"pose": list(row.pose), "up": list(row.up)} for row in survey.rows],
+            "dwells": [row._asdict() | {"pose": list(row.pose), "up": list(row.up)} for row in survey.rows],
             "missing": overview.missing,
-            "command": overview.command, "examples": list(overview.examples), "warnings": survey.warnings,
+            "command": overview.command, "examples": list(overview.examples), "warnings": survey.means.warnings,
         }
     )  # fmt: skip
 
@@ -202,7 +203,7 @@ def table_report(overview: TableOverview) -> RenderableType:
     """What ``info`` prints of a table."""
     survey = overview.survey
     parts: list[RenderableType] = [
-        Text(f"{survey.path}: a table of orientations, {counted(survey.count, 'row')}"),
+        Text(f"{survey.path}: a table of orientations, {counted(len(survey.means.numbers), 'row')}"),
         _column_table(survey.columns),
     ]
     bench = ", ".join(f"{key} = {value}" for key, value in overview.bench.items())
@@ -211,7 +212,7 @@ def table_report(overview: TableOverview) -> RenderableType:
         parts += [Text(f"{counted(len(survey.rows), 'orientation')}:"), _row_table(survey)]
         if len(survey.rows) > _SHOWN_ROWS:
             parts.append(Text(f"and {len(survey.rows) - _SHOWN_ROWS} more, all of them by --json"))
-    parts += [note(said) for said in survey.warnings]
+    parts += [note(said) for said in survey.means.warnings]
     if survey.rows and survey.rows[0].readings is None:
         parts.append(
             note(
