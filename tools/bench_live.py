@@ -39,7 +39,7 @@ from kf_calib.sources.live import LiveSource, frames, open_live
 from kf_calib.sources.live.feed import Link
 from kf_calib.sources.live.streamed import StreamedFeed
 from kf_calib.sources.simulation.options import options_from_query, simulation
-from kf_calib.views.live import line
+from kf_calib.views.live.objects import line
 
 HERE = Path(__file__).resolve().parent
 KEYS = {"axes": "y z x", "gravity_mps2": "9.81"}

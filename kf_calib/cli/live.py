@@ -17,6 +17,7 @@ from kf_calib.cli.command import INPUT, NOT_NEGATIVE, POSITIVE, argument, comman
 from kf_calib.cli.echo import complain, json_line, rendered
 from kf_calib.cli.failures import answered
 from kf_calib.cli.files import RerunFile, claimed, delivery, output_option, write_view
+from kf_calib.cli.live_page import RUNNING, PageOptions, page_server, page_state
 from kf_calib.cli.live_run import LiveRun, by_hand, on_bench, pressed_keys
 from kf_calib.cli.options import (
     BenchOptions,
@@ -42,9 +43,9 @@ if TYPE_CHECKING:
     from kf_calib.online.session import HandJudgement, HandStanding
     from kf_calib.online.status import Judgement, Standing
     from kf_calib.sources.live import Status
+    from kf_calib.views.live.server import PageServer
     from kf_calib.views.rerun.growing import GrowingView
 
-RUNNING = "While it runs"
 _REFRESH_S = 0.25
 
 
@@ -82,12 +83,12 @@ class LiveOptions:
     "live /dev/ttyUSB0 --bench bench.toml --record run.mcap --target theta=1arcsec --target K=2ppm --rerun",
     'live "sim://?speed=10&hide=second-order=4e-6" --target K=0.1ppm',
     "live /dev/ttyACM0 --no-angles --record hand.mcap --target K=500ppm",
-    seldom=("rerun_port", "rerun_bind", "header", "give_up_s", "idle_s", "accel_unit", "model_file", "left_out",
-            "save_model"),
+    seldom=("rerun_port", "rerun_bind", "page_port", "header", "give_up_s", "idle_s", "accel_unit", "model_file",
+            "left_out", "save_model"),
 )  # fmt: skip
 @click.pass_context
 def live(
-    ctx: click.Context, source: Annotated[str, argument(metavar="SOURCE")], options: LiveOptions,
+    ctx: click.Context, source: Annotated[str, argument(metavar="SOURCE")], options: LiveOptions, page: PageOptions,
     device: DeviceOptions, bench: BenchOptions, evaluation: EvaluationOptions, overwrite: Overwrite, rrd: RerunFile,
     save: Save, save_model: SaveModel, strict: Strict, units: ShownUnits, as_json: Json,
 ) -> None:  # fmt: skip
@@ -107,14 +108,14 @@ def live(
         source, bench.keys | device.keys, record, overwrite, columns=renamed(options.columns), header=options.header,
         give_up_s=options.give_up_s, idle_s=options.idle_s, angles=not options.no_angles,
     )  # fmt: skip
-    with opening as opened:
+    with page_server(page) as server, opening as opened:
         begin = by_hand(settings, wanted) if options.no_angles else on_bench(settings, wanted, options.auto)
         run = LiveRun(opened, begin, record, not sys.stdout.isatty() or as_json)
         view = _view(rrd, options.rerun_port if options.with_viewer else None, options.rerun_bind)
         if view is not None:
             run.listeners.append(partial(_offer, view))
         with answered(run.handle_signal):  # until all is written: who closes a terminal sends several
-            follow(run, source, record, as_json)
+            follow(run, source, record, as_json, server)
             if view is not None:
                 view.close()
             opened.close()
@@ -140,12 +141,14 @@ def _offer(view: GrowingView, judgement: Judgement | HandJudgement) -> None:
         view.offer(judgement.result, judgement if isinstance(judgement, Judgement) else None)
 
 
-def follow(run: LiveRun, name: str, record: Path | None, as_json: bool) -> None:
-    """The run to its end, with a screen, lines or objects."""
+def follow(run: LiveRun, name: str, record: Path | None, as_json: bool, page: PageServer | None) -> None:
+    """The run to its end, with a screen, lines or objects, and a page where there is one."""
+    if page is not None:
+        page.state = partial(page_state, run, name, record)
     run.start()
     if not as_json and sys.stdout.isatty():
         try:
-            _on_screen(run, name, record)
+            _on_screen(run, name, record, "" if page is None else f"   page: {page.url}")
         except OSError as error:  # the terminal is gone: the run is not
             run.print.fail(error)
     told = dict[str, str]()
@@ -159,6 +162,8 @@ def follow(run: LiveRun, name: str, record: Path | None, as_json: bool) -> None:
             if said and said != told.get(about) and not as_json:
                 _echo(run, sentence(said))
         told = now
+    if page is not None:
+        page.end()
 
 
 def _urgent_messages(run: LiveRun) -> dict[str, str]:
@@ -181,14 +186,14 @@ def _print(run: LiveRun, judgement: Judgement | HandJudgement, as_json: bool) ->
         _echo(run, json_line(_object(judgement, run.session.standing, run.source.status) | dict(run.further_keys())))
     elif not judgement.final:
         from kf_calib.online.status import Judgement
-        from kf_calib.views.live import hand_line, line
+        from kf_calib.views.live.objects import hand_line, line
 
         _echo(run, sentence(line(judgement) if isinstance(judgement, Judgement) else hand_line(judgement)))
 
 
 def _object(judgement: Judgement | HandJudgement, standing: Standing | HandStanding, status: Status) -> dict[str, Any]:
     from kf_calib.online.status import Judgement, Standing
-    from kf_calib.views.live import hand_object, live_object
+    from kf_calib.views.live.objects import hand_object, live_object
 
     if isinstance(judgement, Judgement):
         assert isinstance(standing, Standing)
@@ -208,12 +213,13 @@ def _echo(run: LiveRun, text: str) -> None:
             complain("nobody reads this output any more; the recording goes on.")
 
 
-def _on_screen(run: LiveRun, name: str, record: Path | None) -> None:
+def _on_screen(run: LiveRun, name: str, record: Path | None, where: str) -> None:
     from rich.live import Live
 
     from kf_calib.online.session import HandStanding
     from kf_calib.online.status import Standing
-    from kf_calib.views.live import hand_screen, screen
+    from kf_calib.views.live.content import content_of
+    from kf_calib.views.live.screen import screen
     from kf_calib.views.terminal import PlainConsole
 
     display = Live(console=PlainConsole(), auto_refresh=False, transient=True, redirect_stderr=sys.stderr.isatty())
@@ -224,16 +230,13 @@ def _on_screen(run: LiveRun, name: str, record: Path | None) -> None:
                 run.judgements.get_nowait()
             run.warn()
             standing = run.session.standing if run.session else Standing()
-            if isinstance(standing, HandStanding):
-                hint = "ending ..." if run.stopped else "q: end the run"
-                shown = hand_screen(standing, run.source.status, name, str(record or ""), hint)
-            else:
-                hint = "ending ..." if run.stopped else "a: accept what is missing   q: end the run"
-                shown = screen(standing, run.source.status, name, str(record or ""), hint, run.doing())
+            keys = "" if isinstance(standing, HandStanding) else "a: accept what is missing   "
+            hint = "ending ..." if run.stopped else f"{keys}q: end the run{where}"
+            content = content_of(standing, run.source.status, name, str(record or ""), run.doing())
             if display.console.size != size:  # what was drawn for another width would stay in pieces
                 size = display.console.size
                 display.console.clear()
-            display.update(shown, refresh=True)
+            display.update(screen(content, hint), refresh=True)
             key = pressed(_REFRESH_S)
             if key == "a":
                 run.accept()

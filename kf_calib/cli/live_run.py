@@ -14,7 +14,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextvars import copy_context
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -48,11 +48,12 @@ class LiveRun:
     """A session in a thread of its own: the main thread has the screen, the keys and the signals.
 
     judgements: those not shown yet. stopped: by a key or a signal. print: to standard output. further_keys: of every
-    JSON object. doing: what the bench is doing, for the screen.
+    JSON object. doing: what the bench is doing, for the screen; heading: where it goes by itself, deg, else empty.
     """
 
     further_keys: Callable[[], Mapping[str, object]] = staticmethod(dict)
     doing: Callable[[], str] = staticmethod(str)
+    heading: Callable[[], Sequence[float]] = staticmethod(tuple)
 
     def __init__(
         self,

@@ -11,7 +11,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from contextvars import copy_context
 from dataclasses import dataclass, replace
@@ -26,6 +26,7 @@ from kf_calib.cli.echo import complain, print_result, rendered
 from kf_calib.cli.failures import answered
 from kf_calib.cli.files import claimed, delivery, output_option
 from kf_calib.cli.live import follow, outcome
+from kf_calib.cli.live_page import PageOptions, page_server
 from kf_calib.cli.live_run import LiveRun, on_bench
 from kf_calib.cli.options import (
     BenchOptions,
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
     from kf_calib.positioning.drive import Decision, Drive, Outcome
     from kf_calib.positioning.opening import Opened
     from kf_calib.sources.live import LiveSource
+    from kf_calib.views.live.server import PageServer
 
 _WORDS = {signal.SIGINT: "Ctrl-C was pressed", signal.SIGTERM: "the program was told to end (SIGTERM)"}
 _BEGIN_S = 0.02
@@ -69,7 +71,7 @@ class DrivenRun(LiveRun):
         self.signalled: signal.Signals | None = None
         self._make_drive = make_drive
         self._driver = threading.Thread(target=copy_context().run, args=(self._drive,), name="drive", daemon=True)
-        self.further_keys, self.doing = self._keys, self._doing
+        self.further_keys, self.doing, self.heading = self._keys, self._doing, self._heading
 
     def start(self) -> None:
         super().start()
@@ -147,6 +149,12 @@ class DrivenRun(LiveRun):
 
         return "" if self.drive is None else doing_in_words(self.drive)
 
+    def _heading(self) -> Sequence[float]:
+        from kf_calib.positioning.loop import Phase
+
+        drive = self.drive
+        return drive.state.target if drive is not None and drive.state.phase is Phase.MOVING else ()
+
 
 def halt_in_words(outcome: Outcome) -> str:
     """Why the table was stopped, where it stands, and what to do, in one sentence each."""
@@ -198,7 +206,7 @@ class DriveOptions:
     "--target K=2ppm --target angles=1arcsec --budget-s 3600",
     "run --positioner hand --source /dev/ttyUSB0 --axes 'y z x' --gravity 9.81 --target K=2ppm",
     "run --positioner acutrol3000 --bench bench.toml --dry-run",
-    seldom=("accel_unit", "model_file", "left_out", "save_model", "stay_s", "most"),
+    seldom=("accel_unit", "model_file", "left_out", "save_model", "stay_s", "most", "page_port"),
 )
 @click.pass_context
 def run(
@@ -207,7 +215,7 @@ def run(
         "--positioner", required=True, metavar="P", help="sim://... (emulated, with its readings), hand, the name of a "
         "shipped profile (acutrol3000, lines, command), or the path of a profile in TOML.",
     )],
-    options: DriveOptions, device: DeviceOptions, bench: BenchOptions, evaluation: EvaluationOptions,
+    options: DriveOptions, page: PageOptions, device: DeviceOptions, bench: BenchOptions, evaluation: EvaluationOptions,
     overwrite: Overwrite, save: Save, save_model: SaveModel, strict: Strict, units: ShownUnits, as_json: Json,
 ) -> None:  # fmt: skip
     """Let the bench run by itself: it chooses orientations, moves, records and judges until every target is reached.
@@ -229,6 +237,7 @@ def run(
         _ask_for_programs(positioner)
     outputs = claimed(files_of(source) if source else [], overwrite=overwrite)
     with ExitStack() as stack:
+        server = stack.enter_context(page_server(page))
         live, emulated = _source(positioner, source, keys, record, overwrite)
         opened = stack.enter_context(live)
         driven = emulated or stack.enter_context(open_positioner(positioner, opened.bench, complain))
@@ -236,7 +245,7 @@ def run(
         begin = on_bench(settings, wanted, options.improve)
         running = DrivenRun(opened, begin, record, not sys.stdout.isatty() or as_json, make)
         with answered(running.handle_signal):
-            _follow(running, positioner, driven, record, as_json)
+            _follow(running, positioner, driven, record, as_json, server)
             opened.close()
             code = _code(running)
             final = None if running.drive_error else outcome(running, as_json)
@@ -332,7 +341,8 @@ def _trouble(running: DrivenRun) -> str:
     return ""
 
 
-def _follow(running: DrivenRun, name: str, device: Opened, record: Path | None, as_json: bool) -> None:
+def _follow(running: DrivenRun, name: str, device: Opened, record: Path | None, as_json: bool,
+            page: PageServer | None) -> None:  # fmt: skip
     """The run to its end; with a person as the positioner, Enter says that the gimbals stand."""
     from kf_calib.positioning.positioner import HandPositioner
 
@@ -344,7 +354,7 @@ def _follow(running: DrivenRun, name: str, device: Opened, record: Path | None, 
                 hand.done()
 
         threading.Thread(target=listen, name="enter", daemon=True).start()
-    follow(running, name, record, as_json)
+    follow(running, name, record, as_json, page)
 
 
 def _code(running: DrivenRun) -> int:

@@ -13,9 +13,9 @@ from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
 from kf_calib.online.session import Session
 from kf_calib.views import console
-from kf_calib.views import live as live_view
 from kf_calib.views.diagnosis import diagnosis_report
 from kf_calib.views.json import replay_object
+from kf_calib.views.live import objects
 from kf_calib.views.rerun.series import VisitHistory, ends
 
 pytestmark = pytest.mark.filterwarnings("error")
@@ -69,6 +69,6 @@ def test_the_table_of_a_diagnosis_names_dwells_by_these_numbers() -> None:
 @pytest.mark.slow
 def test_a_live_run_numbers_its_dwells_from_one() -> None:
     session, lines = Session(run(), Settings()), list[str]()
-    session.listeners.append(lambda judgement: lines.append(live_view.line(judgement)))
+    session.listeners.append(lambda judgement: lines.append(objects.line(judgement)))
     session.run()
     assert [int(line.split()[1]) for line in lines] == [*USED, USED[-1]]

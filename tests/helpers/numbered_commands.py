@@ -31,7 +31,7 @@ from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.opening import opened
 from kf_calib.views.exchange import verification_object
 from kf_calib.views.json import replay_object
-from kf_calib.views.live import live_object
+from kf_calib.views.live.objects import live_object
 
 Made = Callable[[Path], Mapping[str, Any]]
 """Numbers of a case, made with a folder to write to."""

@@ -29,9 +29,11 @@ from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.live import open_live
 from kf_calib.sources.simulation.options import simulation
 from kf_calib.sources.simulation.settings import SimulationOptions
-from kf_calib.views import live as views
 from kf_calib.views.console import plain
 from kf_calib.views.json import replay_object
+from kf_calib.views.live.content import content_of
+from kf_calib.views.live.objects import hand_line, hand_object
+from kf_calib.views.live.screen import screen
 
 sys.path.insert(0, str(ROOT / "tools"))
 from bench_emulator import Emulator, Pty
@@ -138,7 +140,7 @@ def test_a_poor_set_of_sides_is_told_and_not_fitted() -> None:
         session.run()
     assert [each.result for each in told] == [None] * 4 and told[-1].sides.missing == ("K1", "K3", "b1", "b3")
     assert told[-1].sides.repeats == 1 and told[-1].sides.count == 3
-    line = views.hand_line(told[-1])
+    line = hand_line(told[-1])
     assert "the side of pose 1 again" in line and "3 sides seen" in line and "not determined yet" in line
 
 
@@ -170,12 +172,12 @@ def test_a_verdict_waits_for_poses_that_test_each_other() -> None:
 def test_screen_and_object_show_nine_parameters_with_their_targets() -> None:
     told = twelve()
     standing = replace(told.session.standing, judgement=told.judged[9], rest_s=3.2)
-    screen = plain(views.hand_screen(standing, None, "/dev/ttyACM0", hint="q: end the run"), width=80)
-    assert "still for 3 s of 5 s" in screen and "sides seen" in screen and "q: end the run" in screen
-    assert "θ1" not in screen and "φ3" in screen and screen.count("ppm") == 3 and len(screen.splitlines()) <= 24
-    made = views.hand_object(told.judged[1], standing, None)
+    shown = plain(screen(content_of(standing, None, "/dev/ttyACM0"), "q: end the run"), width=80)
+    assert "still for 3 s of 5 s" in shown and "sides seen" in shown and "q: end the run" in shown
+    assert "θ1" not in shown and "φ3" in shown and shown.count("ppm") == 3 and len(shown.splitlines()) <= 24
+    made = hand_object(told.judged[1], standing, None)
     assert made["pose"] == {"number": 2, "up": "+y", "repeats": 1} and made["next_side"]["turn"] == "-y points up"
-    made = views.hand_object(told.judged[-1], standing, None)
+    made = hand_object(told.judged[-1], standing, None)
     assert made["final"] and made["targets_reached"] and made["targets"] == {"K1": 1e-3, "nu1": 1e-3}
 
 

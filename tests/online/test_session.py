@@ -46,16 +46,18 @@ from kf_calib.estimation.settings import Settings
 from kf_calib.online import status
 from kf_calib.online.evaluation import targets
 from kf_calib.online.session import Session
-from kf_calib.online.status import Judgement, current, judge_so_far
+from kf_calib.online.status import Judgement, Standing, current, judge_so_far
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.live import Status
 from kf_calib.sources.simulation.detectability import sized
 from kf_calib.sources.simulation.injected import parse
 from kf_calib.sources.simulation.sensors import GRADES, TrueNoise
 from kf_calib.sources.simulation.simulator import Simulation
-from kf_calib.views import live as views
 from kf_calib.views.console import plain
 from kf_calib.views.json import replay_object
+from kf_calib.views.live import objects
+from kf_calib.views.live.content import content_of
+from kf_calib.views.live.screen import screen
 from kf_calib.views.rerun.growing import GrowingView
 
 
@@ -346,11 +348,18 @@ def test_pieces_that_are_merged_do_not_depend_on_how_readings_come() -> None:
     assert len(folded[0]) <= MOST_PIECES and folded[0] == folded[1]
 
 
+def seen(
+    standing: Standing, status: Status | None = None, recording: str = "", hint: str = "", doing: str = "",
+    width: int = 80,
+) -> str:  # fmt: skip
+    return plain(screen(content_of(standing, status, "sim://", recording, doing), hint), width=width)
+
+
 def test_screen_lines_and_objects_of_a_standing(monkeypatch: pytest.MonkeyPatch) -> None:
     diagnosed_once(monkeypatch)
     session = Session(bench("second-order=60sigma", orientations=6), wanted={"theta1": 1e-6, "K1": 1e-9})
     found = judgements(session)
-    shown = plain(views.screen(session.standing, None, "sim://", hint="q: end"), width=80)
+    shown = seen(session.standing, hint="q: end")
     for part in (
         "12 parameters",
         "reached",
@@ -362,16 +371,16 @@ def test_screen_lines_and_objects_of_a_standing(monkeypatch: pytest.MonkeyPatch)
         assert part in shown
     assert len(shown.splitlines()) <= 24
     lost = Status(link="lost", trouble="nothing has come for 12 s, it is opened again.", gaps=1)
-    small = plain(views.screen(replace(session.standing, notice="taken"), lost, "sim://", "run.mcap"), width=60)
+    small = seen(replace(session.standing, notice="taken"), lost, "run.mcap", width=60)
     assert "disagrees: accelerometer" in "\n".join(small.splitlines()[:16]) and "1 gap " in small
     last = session.standing.judgement
     done = replace(session.standing, judgement=replace(last, wanted=np.full(12, 1.0)))
-    assert "STOP: EVERY TARGET IS REACHED" in plain(views.screen(done, None, "sim://"), width=80)
-    driven = plain(views.screen(done, None, "sim://", doing="the bench, stay 7: resting"), width=80)
+    assert "STOP: EVERY TARGET IS REACHED" in seen(done)
+    driven = seen(done, doing="the bench, stay 7: resting")
     assert "STOP" not in driven and "the bench ends the run by itself" in driven and "stay 7: resting" in driven
-    told = views.line(found[-1])
+    told = objects.line(found[-1])
     assert told.startswith("dwell 6 to") and "worst sigma K1" in told and "\n" not in told
-    empty = plain(views.screen(Session(bench()).standing, None, "sim://"), width=80)
+    empty = seen(Session(bench()).standing)
     assert "0 readings" in empty and len(empty.splitlines()) <= 24
 
 
@@ -383,7 +392,7 @@ def test_a_target_is_reached_when_its_sigma_says_so_and_not_when_the_predicted_t
     wanted[0] = 1.1 * last.result.estimate.sigma[0]
     late = replace(session.standing, judgement=replace(last, wanted=wanted), current=None, elapsed_s=1e6)
     assert (late.left_s == 0.0).all()
-    rows = [line for line in plain(views.screen(late, None, "sim://"), width=80).splitlines() if line[:1] in "θφKbν"]
+    rows = [line for line in seen(late).splitlines() if line[:1] in "θφKbν"]
     assert ["reached" in row for row in rows] == [True] + [False] * 11
     assert ["soon" in row for row in rows] == [False] + [True] * 11
 
@@ -554,8 +563,8 @@ def test_a_recording_that_stops_is_told_at_once_and_by_the_exit_code(tmp_path: P
 
 
 def test_a_recording_that_stops_is_loud_on_the_screen() -> None:
-    shown = views.screen(Session(bench()).standing, Status(recording_trouble="no room left."), "sim://", "run.mcap")
-    assert "RECORDING HAS STOPPED: no room left." in plain(shown, width=80)
+    shown = seen(Session(bench()).standing, Status(recording_trouble="no room left."), "run.mcap")
+    assert "RECORDING HAS STOPPED: no room left." in shown
 
 
 def test_nohup_keeps_a_run_alive(tmp_path: Path) -> None:

@@ -30,8 +30,10 @@ from kf_calib.estimation.settings import Settings
 from kf_calib.online.session import Session
 from kf_calib.reproduction.grebenkin2019 import repeat
 from kf_calib.sources.files.recording import Recording
-from kf_calib.views import catalogue, console, diagnosis, improvement, live, paper
+from kf_calib.views import catalogue, console, diagnosis, improvement, paper
 from kf_calib.views import plan as plans
+from kf_calib.views.live.content import content_of
+from kf_calib.views.live.screen import screen
 from kf_calib.views.terminal import Bar, ConsoleTable
 
 HIDDEN = ROOT / "recordings" / "hidden.mcap"
@@ -46,7 +48,7 @@ def result() -> Calibration:
 def _live(result: Calibration) -> RenderableType:
     session = Session(Run(dwells=5, count=60), wanted={"K1": 1e-9})
     session.run()
-    return live.screen(session.standing, None, "run")
+    return screen(content_of(session.standing, None, "run"))
 
 
 def _compared(result: Calibration) -> RenderableType:

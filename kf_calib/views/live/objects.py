@@ -1,0 +1,122 @@
+"""A live run as one JSON object, and as one line of text, for each dwell, or for each pose of a calibration by hand."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from kf_calib.bench import paper_parameters
+from kf_calib.design.sides import turn_in_words
+from kf_calib.online.session import HandJudgement, HandStanding
+from kf_calib.online.status import Judgement, Standing
+from kf_calib.support.units import shown, span
+from kf_calib.views.diagnosis import found_object, orientation_object
+from kf_calib.views.json import clean, replay_object
+from kf_calib.views.live.content import angles_in_words
+
+if TYPE_CHECKING:
+    from kf_calib.sources.live import Status
+
+
+def live_object(judgement: Judgement, standing: Standing, status: Status | None) -> dict[str, Any]:
+    """The JSON object of ``live`` after a dwell: the keys of ``replay`` and ``diagnose``, and those of a live run.
+
+    judgement: of the run after the dwell. standing: what is known now. status: of the source (None: it has none).
+    """
+    left = dict(zip(paper_parameters.SYMBOLS, judgement.left_s, strict=True))
+    wanted = dict(zip(paper_parameters.SYMBOLS, judgement.wanted, strict=True))
+    of_live = {
+        "consistent": judgement.consistent,
+        "p_value": judgement.p_value,
+        "final": judgement.final,
+        "diagnosed_dwells": len(judgement.look.result.visits),
+        "next_orientation": _going(judgement),
+        "standing": judgement.verdict,
+        "alarm": judgement.alarm,
+        "looks": judgement.watch.looks if judgement.watch else 0,
+        "elapsed_s": judgement.result.fit.dwells[-1].end_s,
+        "targets": {name: value for name, value in wanted.items() if math.isfinite(value)},
+        "time_left_s": left,
+        "notice": standing.notice,
+        "source": source_object(status),
+    }
+    return found_object(judgement.diagnosis) | replay_object(judgement.result) | clean(of_live)
+
+
+def _going(judgement: Judgement) -> dict[str, Any] | None:
+    """Return the next orientation as a JSON object: as the diagnosis advises, or without an alarm, for the sigmas."""
+    if judgement.advice is not None:
+        return orientation_object(*judgement.advice)
+    going = None if judgement.final else judgement.next_orientation
+    return None if going is None else {"gimbal_deg": list(going[0]), "stay_s": None, "why": going[1]}
+
+
+def source_object(status: Status | None) -> dict[str, Any] | None:
+    """The state of a live source as a JSON object, or None."""
+    return None if status is None else clean(asdict(status))
+
+
+def line(judgement: Judgement) -> str:
+    """The state of a run after a dwell in one line of text."""
+    result = judgement.result
+    dwell, sigma = result.fit.dwells[-1], result.estimate.sigma
+    seen = "sigmas not determined yet"
+    if np.isfinite(sigma).any():
+        k = int(np.nanargmax(sigma / np.where(np.isfinite(judgement.worst), judgement.worst, np.inf)))
+        left = f", {span(judgement.left_s[k])} to its target" if np.isfinite(judgement.wanted[k]) else ""
+        seen = f"worst sigma {paper_parameters.SYMBOLS[k]} {shown(paper_parameters.UNITS[k]).text(sigma[k])}{left}"
+    going = judgement.next_orientation
+    following = f"; next {angles_in_words(going[0])} deg ({going[1]})" if going else ""
+    per_dof = result.consistency.nis_per_dof
+    nis = "" if per_dof is None else f"; misfit {math.sqrt(per_dof):.2g} × noise"
+    return (
+        f"dwell {dwell.number} to {dwell.end_s:.0f} s: {result.tally.read} readings; {seen}{nis}; "
+        f"{judgement.verdict}{following}"
+    )
+
+
+def hand_object(judgement: HandJudgement, standing: HandStanding, status: Status | None) -> dict[str, Any]:
+    """The JSON object of ``live --no-angles`` after a pose: the keys of ``replay`` once there is a result, and its own.
+
+    judgement: of the run after the pose. standing: what is known now. status: of the source (None: it has none).
+    """
+    sides, result, last = judgement.sides, judgement.result, judgement.dwells[-1]
+    known = {"samples": standing.samples, "dwells": len(judgement.dwells)} if result is None else replay_object(result)
+    wanted = dict(zip(paper_parameters.SYMBOLS, judgement.wanted, strict=True))
+    of_hand = {
+        "consistent": judgement.consistent,
+        "p_value": None if result is None else result.consistency.p_value,
+        "final": judgement.final,
+        "standing": judgement.verdict,
+        "undetermined": sides.missing,
+        "sides": sides.count,
+        "pose": {"number": last.number, "up": sides.last, "repeats": sides.repeats},
+        "next_side": {"up": sides.following, "turn": turn_in_words(sides.following)},
+        "targets": {name: value for name, value in wanted.items() if math.isfinite(value)},
+        "targets_reached": judgement.reached,
+        "elapsed_s": last.end_s,
+        "notice": standing.notice,
+        "source": source_object(status),
+    }
+    return known | clean(of_hand)
+
+
+def hand_line(judgement: HandJudgement) -> str:
+    """The state of a run after a pose in one line of text."""
+    last, sides = judgement.dwells[-1], judgement.sides
+    side = f"{sides.last} up" if sides.repeats is None else f"the side of pose {sides.repeats} again"
+    seen, sigma = "", judgement.sigma
+    if np.isfinite(sigma).any():
+        scale = np.where(np.isfinite(judgement.wanted), judgement.wanted, np.inf)
+        if not np.isfinite(scale).any():
+            scale = np.array([9.8 if unit == "m/s^2" else 1.0 for unit in paper_parameters.UNITS])
+        k = int(np.nanargmax(sigma / scale))
+        seen = f"worst sigma {paper_parameters.SYMBOLS[k]} {shown(paper_parameters.UNITS[k]).text(sigma[k])}; "
+    seconds = last.end_s - last.start_s
+    return (
+        f"pose {last.number} ({side}), {seconds:.1f} s used; {sides.count} side{'s' * (sides.count != 1)} seen; "
+        f"{seen}{judgement.verdict}"
+    )
