@@ -21,6 +21,7 @@ from pathlib import Path
 
 import conventions_picture
 import fleet_picture
+import live_page_picture
 import numpy as np
 import right_pictures
 import run_picture
@@ -92,6 +93,7 @@ PICTURES: dict[str, Callable[[], Image.Image]] = {
 OF_SCRIPTS: dict[str, Callable[[], Image.Image]] = {
     "conventions": conventions_picture.drawn,
     "fleet": fleet_picture.drawn,
+    "live_page": live_page_picture.drawn,
     "run": _figure(run_picture.drawn),
     **{name: _figure(partial(right_pictures.drawn, name)) for name in right_pictures.FIGURES},
 }

@@ -104,11 +104,11 @@ def live(
     outputs, record = claimed(files_of(source), overwrite=overwrite), options.record
     settings, wanted = evaluation.settings(), targets_of(options.targets)
     _refuse(settings, options.auto and options.no_angles)
-    opening = open_live(
-        source, bench.keys | device.keys, record, overwrite, columns=renamed(options.columns), header=options.header,
-        give_up_s=options.give_up_s, idle_s=options.idle_s, angles=not options.no_angles,
+    opening = partial(
+        open_live, source, bench.keys | device.keys, record, overwrite, columns=renamed(options.columns),
+        header=options.header, give_up_s=options.give_up_s, idle_s=options.idle_s, angles=not options.no_angles,
     )  # fmt: skip
-    with page_server(page) as server, opening as opened:
+    with page_server(page) as server, opening() as opened:
         begin = by_hand(settings, wanted) if options.no_angles else on_bench(settings, wanted, options.auto)
         run = LiveRun(opened, begin, record, not sys.stdout.isatty() or as_json)
         view = _view(rrd, options.rerun_port if options.with_viewer else None, options.rerun_bind)
@@ -170,9 +170,9 @@ def _urgent_messages(run: LiveRun) -> dict[str, str]:
     """What a user must know at once, about what: said again where it changes."""
     from kf_calib.online.session import HandStanding
 
-    standing, status = run.session.standing if run.session else None, run.source.status
+    standing, status, doing = run.session.standing if run.session else None, run.source.status, run.doing()
     return {
-        "bench": run.doing(),
+        "bench": doing.line if doing else "",
         "task": standing.task if isinstance(standing, HandStanding) else "",
         "evaluation": (standing.problem or standing.notice) if standing else "",
         "link": "the link is lost, and tried again" if status.link == "lost" else "",

@@ -56,12 +56,12 @@ def page_state(run: LiveRun, name: str, record: Path | None) -> Mapping[str, Any
     from kf_calib.views.live.content import content_of, ended
     from kf_calib.views.live.page import directions_of, gimbals_of, page_object
 
-    session, heading = run.session, run.heading()
+    session, doing = run.session, run.doing()
     standing = session.standing if session else Standing()
-    content = content_of(standing, run.source.status, name, str(record or ""), run.doing())
+    content = content_of(standing, run.source.status, name, str(record or ""), doing)
     if run.final is not None or run.error is not None:
         content = ended(content, run.final, run.error)
     if session is None:  # the bench is not known yet, and asking for it would wait
         return page_object(content, [], [])
-    bench = session.source.bench
+    bench, heading = session.source.bench, doing.heading_deg if doing else ()
     return page_object(content, directions_of(standing, bench, heading), gimbals_of(standing, bench, heading))

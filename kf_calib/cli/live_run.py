@@ -14,7 +14,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextvars import copy_context
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from kf_calib.online.session import HandJudgement, HandSession, Session
     from kf_calib.online.status import Judgement
     from kf_calib.sources.live import LiveSource
+    from kf_calib.views.live.content import Doing
 
 
 def on_bench(settings: Settings, wanted: Mapping[str, float], auto: bool) -> Callable[..., Session]:
@@ -48,12 +49,11 @@ class LiveRun:
     """A session in a thread of its own: the main thread has the screen, the keys and the signals.
 
     judgements: those not shown yet. stopped: by a key or a signal. print: to standard output. further_keys: of every
-    JSON object. doing: what the bench is doing, for the screen; heading: where it goes by itself, deg, else empty.
+    JSON object. doing: what a bench that drives itself does; None for another.
     """
 
     further_keys: Callable[[], Mapping[str, object]] = staticmethod(dict)
-    doing: Callable[[], str] = staticmethod(str)
-    heading: Callable[[], Sequence[float]] = staticmethod(tuple)
+    doing: Callable[[], Doing | None] = staticmethod(lambda: None)
 
     def __init__(
         self,

@@ -11,7 +11,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from contextvars import copy_context
 from dataclasses import dataclass, replace
@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from kf_calib.positioning.drive import Decision, Drive, Outcome
     from kf_calib.positioning.opening import Opened
     from kf_calib.sources.live import LiveSource
+    from kf_calib.views.live.content import Doing
     from kf_calib.views.live.server import PageServer
 
 _WORDS = {signal.SIGINT: "Ctrl-C was pressed", signal.SIGTERM: "the program was told to end (SIGTERM)"}
@@ -71,7 +72,7 @@ class DrivenRun(LiveRun):
         self.signalled: signal.Signals | None = None
         self._make_drive = make_drive
         self._driver = threading.Thread(target=copy_context().run, args=(self._drive,), name="drive", daemon=True)
-        self.further_keys, self.doing, self.heading = self._keys, self._doing, self._heading
+        self.further_keys, self.doing = self._keys, self._doing
 
     def start(self) -> None:
         super().start()
@@ -144,16 +145,10 @@ class DrivenRun(LiveRun):
 
         return {} if self.drive is None else {"run": run_object(self.drive)}
 
-    def _doing(self) -> str:
-        from kf_calib.views.run import doing_in_words
+    def _doing(self) -> Doing | None:
+        from kf_calib.views.run import doing_of
 
-        return "" if self.drive is None else doing_in_words(self.drive)
-
-    def _heading(self) -> Sequence[float]:
-        from kf_calib.positioning.loop import Phase
-
-        drive = self.drive
-        return drive.state.target if drive is not None and drive.state.phase is Phase.MOVING else ()
+        return None if self.drive is None else doing_of(self.drive)
 
 
 def halt_in_words(outcome: Outcome) -> str:

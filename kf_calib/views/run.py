@@ -10,9 +10,12 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.positioning.loop import Phase
+from kf_calib.positioning.positioner import HandPositioner
 from kf_calib.sources.files.record_files import angles_of, number_of
 from kf_calib.support.units import span
 from kf_calib.views.json import clean
+from kf_calib.views.live.content import Doing
 from kf_calib.views.terminal import ConsoleTable
 
 if TYPE_CHECKING:
@@ -43,11 +46,23 @@ def _decision_object(decision: Decision) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def doing_in_words(drive: Drive) -> str:
+def doing_of(drive: Drive) -> Doing | None:
+    """What the bench is doing, by itself or by hand; None where it has ended."""
+    state = drive.state
+    if state.phase is Phase.ENDED:
+        return None
+    if state.phase is not Phase.MOVING:
+        what = "THE BENCH STANDS AND MEASURES" if state.target else "THE BENCH BEGINS"
+        return Doing(what, _doing_in_words(drive))
+    where = angles_in_words(state.target)
+    by_hand = isinstance(drive.positioner, HandPositioner)
+    what = f"TURN TO {where}, THEN PRESS ENTER" if by_hand else f"THE BENCH TURNS TO {where}"
+    return Doing(what, _doing_in_words(drive), state.target)
+
+
+def _doing_in_words(drive: Drive) -> str:
     """What the bench is doing, and why, in a line."""
     state = drive.state
-    if state.phase.value == "ended":
-        return ""
     if state.suggestion is None:
         where = f" at {angles_in_words(state.target)}" if state.target else ""
         return f"the bench: {state.phase.value}{where}"

@@ -56,7 +56,7 @@ from kf_calib.sources.simulation.simulator import Simulation
 from kf_calib.views.console import plain
 from kf_calib.views.json import replay_object
 from kf_calib.views.live import objects
-from kf_calib.views.live.content import content_of
+from kf_calib.views.live.content import Doing, content_of
 from kf_calib.views.live.screen import screen
 from kf_calib.views.rerun.growing import GrowingView
 
@@ -349,8 +349,8 @@ def test_pieces_that_are_merged_do_not_depend_on_how_readings_come() -> None:
 
 
 def seen(
-    standing: Standing, status: Status | None = None, recording: str = "", hint: str = "", doing: str = "",
-    width: int = 80,
+    standing: Standing, status: Status | None = None, recording: str = "", hint: str = "",
+    doing: Doing | None = None, width: int = 80,
 ) -> str:  # fmt: skip
     return plain(screen(content_of(standing, status, "sim://", recording, doing), hint), width=width)
 
@@ -376,7 +376,7 @@ def test_screen_lines_and_objects_of_a_standing(monkeypatch: pytest.MonkeyPatch)
     last = session.standing.judgement
     done = replace(session.standing, judgement=replace(last, wanted=np.full(12, 1.0)))
     assert "STOP: EVERY TARGET IS REACHED" in seen(done)
-    driven = seen(done, doing="the bench, stay 7: resting")
+    driven = seen(done, doing=Doing("THE BENCH STANDS AND MEASURES", "the bench, stay 7: resting"))
     assert "STOP" not in driven and "the bench ends the run by itself" in driven and "stay 7: resting" in driven
     told = objects.line(found[-1])
     assert told.startswith("dwell 6 to") and "worst sigma K1" in told and "\n" not in told

@@ -48,6 +48,16 @@ class Task:
 
 
 @dataclass(frozen=True)
+class Doing:
+    """What a bench that drives itself does: in capitals, in a line with the reason, and where it turns to, deg (empty
+    while it stands)."""
+
+    what: str
+    line: str
+    heading_deg: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
 class SigmaBar:
     """A sigma in decades above its target as a part of a full bar, 0 to 1; without a target, above a small sigma."""
 
@@ -86,19 +96,26 @@ class Content:
     model: Sequence[Line]
 
 
+_LAST = Task("THE READINGS HAVE ENDED", "the whole run is evaluated", "green")
+
+
 def content_of(
-    standing: Standing | HandStanding, status: Status | None, name: str, recording: str = "", doing: str = ""
-) -> Content:
+    standing: Standing | HandStanding, status: Status | None, name: str, recording: str = "",
+    doing: Doing | None = None,
+) -> Content:  # fmt: skip
     """What is shown of a run.
 
     standing: what is known. status: of the source (None: it has none). name: of the source. recording: path of the file
-    that is written. doing: what a bench that drives itself does.
+    that is written. doing: what a bench that drives itself does; None for another.
     """
     source = source_lines(standing, status, name, recording)
     remarks = [sentence(text) for text in (standing.problem, standing.notice) if text]
     if isinstance(standing, HandStanding):
-        return _of_hand(standing, source, remarks)
-    return _of_bench(standing, source, remarks, doing)
+        content = _of_hand(standing, source, remarks)
+    else:
+        content = _of_bench(standing, source, remarks, doing)
+    is_over = status is not None and status.link == "ended"
+    return replace(content, task=_LAST) if is_over else content
 
 
 def ended(content: Content, final: Judgement | HandJudgement | None, error: BaseException | None) -> Content:
@@ -114,11 +131,12 @@ def ended(content: Content, final: Judgement | HandJudgement | None, error: Base
     return replace(content, task=Task("THE RUN HAS ENDED", count, "green"), verdict=verdict)
 
 
-def _of_bench(standing: Standing, source: Sequence[Line], remarks: Sequence[str], doing: str) -> Content:
-    judgement = standing.judgement
-    task, (headings, rows) = _bench_task(standing, by_itself=bool(doing)), _bench_rows(standing)
+def _of_bench(standing: Standing, source: Sequence[Line], remarks: Sequence[str], doing: Doing | None
+              ) -> Content:  # fmt: skip
+    judgement, line = standing.judgement, doing.line if doing else ""
+    task, (headings, rows) = _bench_task(standing, doing), _bench_rows(standing)
     if judgement is None:
-        return Content(task, None, remarks, doing, source, headings, rows, ())
+        return Content(task, None, remarks, line, source, headings, rows, ())
     verdict = judgement.verdict, {True: "bold green", False: "bold yellow", None: "bold"}[judgement.consistent]
     model = [((_fit(judgement), ""),)]
     if judgement.risen is not None:
@@ -126,7 +144,7 @@ def _of_bench(standing: Standing, source: Sequence[Line], remarks: Sequence[str]
         said = (f"σ of {symbol(risen)} rose {factor:.1f} times with the last orientation: the orientations scatter "
                 "more than was known before, or the model has more to determine.")  # fmt: skip
         model.append(((said, "yellow"),))
-    return Content(task, verdict, remarks, doing, source, headings, rows, model)
+    return Content(task, verdict, remarks, line, source, headings, rows, model)
 
 
 def source_lines(standing: Progress, status: Status | None, name: str, recording: str) -> list[Line]:
@@ -152,22 +170,26 @@ def source_lines(standing: Progress, status: Status | None, name: str, recording
     return lines
 
 
-def _bench_task(standing: Standing, *, by_itself: bool) -> Task:
-    """Return what to do now in capitals, and where the platform stands and where it goes next; by_itself: whether the
-    bench does it."""
+def _bench_task(standing: Standing, doing: Doing | None) -> Task:
+    """Return what to do now, or what the bench does by itself, in capitals, and where the platform stands and where it
+    is to go next."""
     judgement, here = standing.judgement, standing.current
     going = None if judgement is None else judgement.next_orientation
     there = "the next orientation of your plan" if going is None else f"{angles_in_words(going[0])} deg"
     then = "" if going is None else f": {going[1]}"
     if judgement is not None and judgement.reached(standing.sigma):
-        if by_itself:
+        if doing:
             return Task("EVERY TARGET IS REACHED", "the bench ends the run by itself", "green")
         return Task("STOP: EVERY TARGET IS REACHED", f"going on to {there} {then.lstrip(': ')}".strip(), "green")
     if here is None:
         moved = f"{standing.dwells} orientations in {span(standing.elapsed_s)}; the platform moves or settles"
+        if doing:
+            return Task(doing.what, moved, "cyan")
         return Task(f"TURN TO {there.upper() if going is None else there}, THEN HOLD STILL", f"{moved}{then}", "cyan")
     angles = f"{angles_in_words(np.degrees(here.pose))} deg" if len(here.pose) < 4 else "this attitude"
     at = f"orientation {here.number} at {angles}: {span(here.seconds)}, {here.readings} readings"
+    if doing:
+        return Task(doing.what, at, "cyan" if doing.heading_deg else "yellow")
     if here.enough:
         return Task(f"GO ON: TURN TO {there.upper() if going is None else there}", f"{at}; enough here{then}", "green")
     return Task("STAY: HOLD STILL", f"{at}; then to {there}{then}", "yellow")

@@ -28,6 +28,7 @@ async function ask() {
     if (run && state.run !== run) location.reload();  // another run, perhaps of another version
     heard = new Date(); run = state.run; over = state.over;
     of("silence").hidden = true;
+    document.body.className = "";
     if (state.task) show(state);
   } catch {
     if (!over) silence();
@@ -39,6 +40,7 @@ function silence() {
   write("silence", "No answer from kf-calib since " + heard.toLocaleTimeString("en-GB") + ": it was ended or killed, or " +
         "the tunnel to it is closed. What stands below is the last that was known.");
   of("silence").hidden = false;
+  document.body.className = "stale";
 }
 
 function show(state) {

@@ -95,6 +95,8 @@ def _by_hand(standing: HandStanding) -> list[Direction]:
         return []
     open_number = here.number if here is not None and standing.rest_s > 0.0 else None
     states: list[DirectionState] = ["here" if number == open_number else "done" for number in sides.numbers]
+    if standing.judgement is not None and standing.judgement.final:
+        return _directions(states, sides.numbers, sides.up)
     return _directions([*states, "next"], [*sides.numbers, None], np.vstack([sides.up, DIRECTIONS[sides.following]]))
 
 
