@@ -17,7 +17,7 @@ from kf_calib.cli.command import INPUT, NOT_NEGATIVE, POSITIVE, argument, comman
 from kf_calib.cli.echo import complain, json_line, rendered
 from kf_calib.cli.failures import answered
 from kf_calib.cli.files import RerunFile, claimed, delivery, output_option, write_view
-from kf_calib.cli.live_page import RUNNING, PageOptions, page_server, page_state
+from kf_calib.cli.live_page import PageOptions, page_server, page_state
 from kf_calib.cli.live_run import LiveRun, by_hand, on_bench, pressed_keys
 from kf_calib.cli.options import (
     BenchOptions,
@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from kf_calib.views.live.server import PageServer
     from kf_calib.views.rerun.growing import GrowingView
 
+RUNNING = "While it runs"
 _REFRESH_S = 0.25
 
 

@@ -11,15 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import rich_click as click
 
-from kf_calib.cli.command import option
+from kf_calib.cli.command import OUTPUT, option
 from kf_calib.cli.echo import complain
 from kf_calib.cli.live_run import LiveRun
 
 if TYPE_CHECKING:
     from kf_calib.views.live.server import PageServer
 
-RUNNING = "While it runs"
-_running = partial(option, panel=RUNNING)
+_of_output = partial(option, panel=OUTPUT)
 
 
 @dataclass(frozen=True)
@@ -27,9 +26,9 @@ class PageOptions:
     """Whether there is a page, and where."""
 
     # fmt: off
-    with_page: Annotated[bool, _running(
+    with_page: Annotated[bool, _of_output(
         "--page", help="Show the run as a page in a browser on this machine, too.")] = False
-    page_port: Annotated[int, _running(
+    page_port: Annotated[int, _of_output(
         "--page-port", type=click.IntRange(0, 65535), metavar="PORT", help="Its port; 0: any that is free.")] = 8642
     # fmt: on
 
