@@ -187,8 +187,7 @@ class DriveOptions:
                                          show_default="60; 24 without a target", help="Orientations at most.")] = None
     stay_s: Annotated[float, _driving(
         "--stay-s", type=POSITIVE, help="Seconds of readings in each orientation, where no target is set.")] = 30.0
-    improve: Annotated[bool, _driving("--improve", help="Add a missing effect when it is named beyond doubt, and go "
-                                      "on to the targets.")] = False
+    improve: Annotated[bool, _driving("--improve", help="Add an effect that is named beyond doubt, and go on.")] = False
     dry_run: Annotated[bool, _driving("--dry-run", help="Print path and duration; nothing is moved.")] = False
     trust_profile: Annotated[bool, _driving("--trust-profile", help="Run the programs that a profile names "
                                             "unasked.")] = False

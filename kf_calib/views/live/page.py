@@ -13,7 +13,6 @@ from kf_calib.bench.bench import Bench, axis_names
 from kf_calib.estimation.free_attitude import DIRECTIONS
 from kf_calib.online.session import HandStanding
 from kf_calib.online.status import Standing
-from kf_calib.support.text import printable
 from kf_calib.views.live.content import Content, angles_in_words
 
 DirectionState = Literal["done", "disagrees", "here", "next"]
@@ -33,16 +32,7 @@ def page_object(
     content: Content, directions: Sequence[Direction], gimbals: Sequence[tuple[str, str]]
 ) -> dict[str, Any]:
     """The state of the page as a JSON object; gimbals: as of ``gimbals_of``."""
-    return _made_printable({**asdict(content), "directions": list(map(asdict, directions)), "gimbals": gimbals})
-
-
-def _made_printable(part: Any) -> Any:
-    """Return a part of an object whose texts have no control characters: they may come from a stranger's bench."""
-    if isinstance(part, dict):
-        return {key: _made_printable(each) for key, each in part.items()}
-    if isinstance(part, list | tuple):
-        return [_made_printable(each) for each in part]
-    return printable(part) if isinstance(part, str) else part
+    return {**asdict(content), "directions": list(map(asdict, directions)), "gimbals": gimbals}
 
 
 def gimbals_of(standing: Standing | HandStanding, bench: Bench, heading: Sequence[float] = ()) -> list[tuple[str, str]]:

@@ -18,7 +18,6 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextvars import copy_context
-from functools import cache
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
@@ -77,8 +76,7 @@ class PageServer:
                 "--page-port, or 0 for any that is free."
             ) from None
         self._server.state = self._state
-        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.1,), name="page", daemon=True)
-        self._thread.start()
+        threading.Thread(target=self._server.serve_forever, args=(0.1,), name="page", daemon=True).start()
 
     @property
     def url(self) -> str:
@@ -151,7 +149,8 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(HTTPStatus.OK, "application/json", self.server.state())
         elif self.path in _FILES:
             name, kind = _FILES[self.path]
-            self._send(HTTPStatus.OK, f"{kind}; charset=utf-8", _content(name))
+            content = files("kf_calib.views.live").joinpath(name).read_bytes()
+            self._send(HTTPStatus.OK, f"{kind}; charset=utf-8", content)
         else:
             self._send(HTTPStatus.NOT_FOUND, "text/plain", b"There is nothing here but the page at /.\n")
 
@@ -164,9 +163,3 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: Any) -> None:
         """Write no log: standard error is for the run."""
-
-
-@cache
-def _content(name: str) -> bytes:
-    """The content of a file of the page."""
-    return files("kf_calib.views.live").joinpath(name).read_bytes()
