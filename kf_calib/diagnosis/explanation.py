@@ -17,11 +17,12 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.residual_drivers import Driver, is_function_of, misfit_beyond_noise, unexplained_mps2, walk_path
 from kf_calib.effects import Effect, FrameEffect, Stimulus
-from kf_calib.effects.inputs import axis_of, is_formula, turned_about
+from kf_calib.effects.inputs import axis_of, is_formula, turned_gimbal
 from kf_calib.effects.stimulus import smooth_between
 from kf_calib.estimation.residual_table import mean_sigmas, means_over_dwells
 from kf_calib.estimation.results import Calibration
 
+ACCELEROMETERS = "accelerometer 1", "accelerometer 2", "accelerometer 3"
 _LEAST_LEVER = 0.05  # of gravity: a dwell that shows a turn with 20 times the sigma of others is left out
 
 
@@ -36,8 +37,11 @@ class EffectShape:
       which is NaN in dwells that do not show it.
     - residuals: what the model without the effect leaves. left: what the model with it leaves.
     - component: what the fitted effect adds. component_sigma: of the component; of readings, less its mean over the
-      dwells, as the biases take up any mean. sigma: of a dwell, as the misfit is judged.
+      dwells, as the biases take up any mean.
+    - sigma: of a dwell, as the misfit is judged. noise_sigma: of noise alone, that was seen within dwells or stated;
+      estimated_sigma: with what the fit with the effect estimates of scatter and setting error.
     - is_curve: whether the component is nearly a function of the quantity.
+    - gimbal: number, from 1, of the one about which the platform turns; 0 for readings of accelerometers.
     """
 
     effect: str
@@ -51,7 +55,10 @@ class EffectShape:
     component: Floats
     component_sigma: Floats
     sigma: Floats
+    noise_sigma: Floats
+    estimated_sigma: Floats
     is_curve: bool
+    gimbal: int = 0
 
     @property
     def readings(self) -> Floats:
@@ -61,7 +68,7 @@ class EffectShape:
     @property
     def channels(self) -> tuple[str, ...]:
         """What each of the C columns is of."""
-        return tuple(f"accelerometer {i}" for i in (1, 2, 3)) if self.component.shape[1] == 3 else ("platform",)
+        return (f"turn about gimbal {self.gimbal}",) if self.gimbal else ACCELEROMETERS
 
     def curve(self, column: int, count: int = 200) -> tuple[Floats, Floats, Floats]:
         """Values (n,) of the quantity that rise, and the component and its sigma there, smooth between the dwells."""
@@ -89,11 +96,12 @@ def shape_over(before: Calibration, after: Calibration, driver: Driver, name: st
     """The shape of all that a calibration has beyond another, over a quantity of the bench."""
     added = [effect for effect in after.model.effects if str(effect) not in before.model.parts]
     component, component_sigma = _component(after, added)
+    sigma, noise_sigma, estimated_sigma = _sigmas(before, after)
     return EffectShape(
         effect=name, words=driver.words, symbol=driver.symbol, unit=driver.unit, values=driver.values,
         quantity="m/s^2", residuals=before.residuals_mps2, left=unexplained_mps2(after), component=component,
-        component_sigma=component_sigma, sigma=mean_sigmas(before),
-        is_curve=is_function_of(component, driver.values, driver.unit),
+        component_sigma=component_sigma, is_curve=is_function_of(component, driver.values, driver.unit),
+        sigma=sigma, noise_sigma=noise_sigma, estimated_sigma=estimated_sigma,
     )  # fmt: skip
 
 
@@ -105,9 +113,9 @@ def _drawn_together(effect: Effect) -> tuple[str, int | None]:
 
 def _shape(before: Calibration, after: Calibration, effects: Sequence[Effect]) -> EffectShape:
     (component, component_sigma), left = _component(after, effects), unexplained_mps2(after)
-    residuals, sigma, quantity = before.residuals_mps2, mean_sigmas(before), "m/s^2"
-    axis, about = axis_of(effects, before.bench), turned_about(effects)
-    if axis is not None and not (_framed(effects) and about is None):
+    residuals, sigmas, quantity = before.residuals_mps2, _sigmas(before, after), "m/s^2"
+    axis, gimbal = axis_of(effects, before.bench), turned_gimbal(effects)
+    if axis is not None and not (_framed(effects) and gimbal is None):
         (values,) = means_over_dwells(after, [axis.of])
         words, symbol, unit = axis.words, axis.symbol, axis.unit
     elif _framed(effects):  # reading i changes by |s_i| g times the turn of gravity towards its input axis
@@ -116,17 +124,26 @@ def _shape(before: Calibration, after: Calibration, effects: Sequence[Effect]) -
                               * before.bench.gravity_mps2)  # fmt: skip
     else:
         words, symbol, unit, values = f"what the fitted {_name(effects)} adds", "", "m/s^2", component
-    if about is not None and axis is not None:
-        lever, quantity, values = _lever(after, about), "rad", values[:, :1]
-        component, residuals, left = (_turn(each, lever, sigma) for each in (component, residuals, left))
+    turning = effects[0] if axis is not None and gimbal is not None else None
+    if isinstance(turning, FrameEffect):
+        lever, quantity, values = _lever(after, turning.about), "rad", values[:, :1]
+        component, residuals, left = (_turn(each, lever, sigmas[0]) for each in (component, residuals, left))
         lengths = np.linalg.norm(lever, axis=1, keepdims=True)
         component_sigma = np.linalg.norm(component_sigma, axis=1, keepdims=True) / lengths
-        sigma = np.sum((lever / sigma) ** 2, axis=1, keepdims=True) ** -0.5
+        sigmas = [np.sum((lever / sigma) ** 2, axis=1, keepdims=True) ** -0.5 for sigma in sigmas]
+    sigma, noise_sigma, estimated_sigma = sigmas
     return EffectShape(
         effect=_name(effects), words=words, symbol=symbol, unit=unit, values=values, quantity=quantity,
-        residuals=residuals, left=left, component=component, component_sigma=component_sigma, sigma=sigma,
+        residuals=residuals, left=left, component=component, component_sigma=component_sigma,
         is_curve=is_function_of(component, values, unit) or _walks(effects),
+        sigma=sigma, noise_sigma=noise_sigma, estimated_sigma=estimated_sigma,
+        gimbal=1 + gimbal if turning is not None and gimbal is not None else 0,
     )  # fmt: skip
+
+
+def _sigmas(before: Calibration, after: Calibration) -> list[Floats]:
+    """Return sigmas (D, 3) of the means of dwells: as the misfit is judged, of noise alone, with what is estimated."""
+    return [mean_sigmas(before), mean_sigmas(after, after.noise.without_estimates()), mean_sigmas(after, after.noise)]
 
 
 def _framed(effects: Sequence[Effect]) -> bool:

@@ -42,6 +42,7 @@ from kf_calib.diagnosis.slew_effects import of_slews
 from kf_calib.diagnosis.verdict import disturbance_in_words, format_probability, second_pass_in_words, verdict_in_words
 from kf_calib.dwells import window_average
 from kf_calib.effects import effect_named
+from kf_calib.estimation.filter_history import readings_of
 from kf_calib.estimation.outlying_dwell import outlying_in_words
 from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.support.tail_probabilities import LEVEL, chi_squared_tail, log_odds_of
@@ -64,8 +65,16 @@ def diagnose(
     """
     before, refits = calibration_of(run, refits)
     with one_blas_thread():
-        diagnosis = refits.once(before, lambda: _diagnosed(refits, before))
+        diagnosis = refits.once(before, lambda: _with_readings(refits, _diagnosed(refits, before)))
         return replace(diagnosis, replication=_replication(refits, diagnosis)) if replicate else diagnosis
+
+
+def _with_readings(refits: Refits, diagnosis: Diagnosis) -> Diagnosis:
+    """Return a diagnosis with the readings of the dwell that it calls disturbed, which are read again."""
+    number, before = diagnosis.disturbed_dwell, diagnosis.before
+    if not number or refits.source is None or not before.noise.within_seen:
+        return diagnosis
+    return replace(diagnosis, disturbed_readings=readings_of(refits.source, before, number, left_out=True))
 
 
 def _replication(refits: Refits, diagnosis: Diagnosis) -> Replication | None:

@@ -19,6 +19,7 @@ from kf_calib.diagnosis.replication import Replication
 from kf_calib.diagnosis.residual_drivers import Driver, drivers_of
 from kf_calib.diagnosis.unknown_effect import Description, channel_of, describe_irregular, explained_share
 from kf_calib.effects.effect import Grade
+from kf_calib.estimation.filter_history import DwellReadings
 from kf_calib.estimation.results import Calibration, Condition, Parameter
 from kf_calib.noise.noise_model import mean_covariances
 from kf_calib.support.tail_probabilities import chi_squared_tail
@@ -71,7 +72,8 @@ class Diagnosis:
 
     before_in_noise_left: ``before`` in the noise that the likeliest explanation leaves, where noise was estimated
     (None: it is that of ``before``). replication: how what is named predicts dwells that choosing it never saw (None:
-    nothing is named, or it was not asked for).
+    nothing is named, or it was not asked for). disturbed_readings: those of the dwell that the verdict calls disturbed
+    (None: there is none, or the readings are gone).
     """
 
     before: Calibration
@@ -90,6 +92,7 @@ class Diagnosis:
     as_scatter: bool = False
     before_in_noise_left: Calibration | None = None
     replication: Replication | None = None
+    disturbed_readings: DwellReadings | None = None
 
     def __repr__(self) -> str:
         return f"<Diagnosis: {self.verdict}>"
@@ -137,6 +140,16 @@ class Diagnosis:
         return Description(channel_of(residuals), first.driver, share, first.formulas)
 
     @property
+    def disturbed_dwell(self) -> int:
+        """Number of the dwell that the verdict calls wrong or disturbed; 0 where it speaks of none."""
+        first, table = self.likeliest, self.table
+        if self.before.outlying:
+            return self.before.outlying[0].number
+        if first is not None and first.dwell:
+            return first.dwell
+        return table.disturbed.number if table and table.disturbed and self.test.consistent is False else 0
+
+    @property
     def likeliest(self) -> Hypothesis | None:
         """The likeliest explanation of a misfit; None where there is none to explain."""
         if self.table is None or self.test.consistent is not False:
@@ -150,26 +163,27 @@ class Diagnosis:
 
     @cached_property
     def explanations(self) -> list[Explanation]:
-        """What could be added to the model, the best first: what is missing, or the formula that describes an unknown
-        misfit, which is fitted here; then the other suspects, of which those that fit come first."""
-        best = self._best_explanation
+        """What could be added to the model: what the verdict names, then the other suspects, of which those that fit
+        come first."""
+        best = self.explanation
         suspects = [each for each in self.suspects if (each.name,) != self.missing]
         suspects.sort(key=lambda each: not each.fits)  # stable: by significance
         others = [Explanation((each.name,), self.before, each.refit, each.fits, each.p_value) for each in suspects]
         return others if best is None else [best, *others]
 
-    @property
-    def _best_explanation(self) -> Explanation | None:
+    @cached_property
+    def explanation(self) -> Explanation | None:
+        """What the verdict names: the missing effects, or the formula of a quantity that an unknown misfit goes with,
+        which is fitted here; None where it names neither."""
         if self.missing and self.after is not None:
             alone = self.test.effects.p_values.get(self.missing[0]) if len(self.missing) == 1 else None
             return Explanation(self.missing, self.before, self.after, True, alone)
-        if self.description is None:
+        first = self.likeliest
+        if self.description is None or first is None or not first.formulas:
             return None
         formulas = self.description.formulas
         names = tuple(text.partition("=")[2].strip() or text for text in formulas)
-        first = self.likeliest
-        after = first.refit if first and first.formulas else None
-        after = after or Refits().with_effects(self.before, formulas)
+        after = first.refit or Refits().with_effects(self.before, formulas)
         return Explanation(names, self.before, after, after.consistency.consistent is not False)
 
     @cached_property

@@ -106,7 +106,7 @@ class ScaleWarmUp(WarmUp):
 
     family = "scale in time"
     name, title = "scale-warm-up", "scale factor that settles after switching on"
-    drawn_against = None
+    drawn_against = Regressor("", "force along the input axis, fading with the warm-up", "m/s^2")
     confused_with = "scale-drift, warm-up; needs early orientations of both signs"
     symbol, unit, scale = "S", "1", 1e-3
     unknown = Unknown("tauScale", "s", 5.0, 10800.0, "min", 1.0 / 60.0)
@@ -142,6 +142,7 @@ class Memory(_Decay):
     name, title, source = "memory", "slow response to a change of the input", "anelastic relaxation; IEEE Std 1293"
     confused_with = "settling, which is over with the next step; bias-walk; needs the same pose after different ones"
     symbol, unit, scale = "c", "1", 1e-3
+    drawn_against = Regressor("", "force along the input axis less what is remembered", "m/s^2")
     unknown = Unknown("tauMemory", "s", 3.0, 7200.0, "s", 1.0)
     typical = Typical((1e-6, 100e-6), (0.1e-3, 3e-3))
 
@@ -359,7 +360,7 @@ class ThermalLag(SensorEffect):
 
     family = "temperature"
     name, title, source = "thermal-lag", "bias that follows the temperature late", IEEE
-    drawn_against = _TEMPERATURE
+    drawn_against = Regressor("", "temperature through the fitted lag, less 25 °C", "K")
     confused_with = "thermal-bias and thermal-rate together"
     symbol, unit, scale = "alphaL", "m/s^2/K", 1e-3
     typical = ThermalBias.typical
@@ -378,7 +379,7 @@ class ThermalHysteresis(SensorEffect):
     family = "temperature"
     name, title = "thermal-hysteresis", "bias that depends on whether it became warmer or colder"
     source = "IEEE Std 1293, thermal hysteresis"
-    drawn_against = _TEMPERATURE
+    drawn_against = Regressor("", "temperature through the fitted play, less 25 °C", "K")
     confused_with = "thermal-bias, thermal-lag; needs the same temperature from two sides"
     symbol, unit, scale = "alphaH", "m/s^2/K", 1e-3
     typical = ThermalBias.typical

@@ -122,12 +122,11 @@ def is_formula(effect: Effect) -> bool:
     return isinstance(effect, Formula | FrameFormula)
 
 
-def turned_about(effects: Sequence[Effect]) -> Callable[[Stimulus], Floats] | None:
-    """The axis (m, 3), of unit length, about which all the effects turn the platform, whatever their coefficients;
-    None where there is no such axis."""
+def turned_gimbal(effects: Sequence[Effect]) -> int | None:
+    """The number, from 0, of the gimbal about which all the effects turn the platform, whatever their coefficients;
+    None where there is no such gimbal."""
     gimbals = {effect.gimbal if isinstance(effect, FrameEffect) else None for effect in effects}
-    first = effects[0]
-    return first.about if isinstance(first, FrameEffect) and None not in gimbals and len(gimbals) == 1 else None
+    return gimbals.pop() if len(gimbals) == 1 else None
 
 
 def _regressor(effect: Effect, bench: Bench) -> Regressor | None:

@@ -196,7 +196,9 @@ class DwellReadings:
 
     number: of the dwell, from 1. time_s (n,): since the first reading of the run. differences_mps2 (n, 3): readings
     less the model's prediction of their mean. every: one of so many readings is kept. count: of all readings.
-    mean_mps2, sigma_mps2 (3,): mean of the differences over the dwell, its residual, and the sigma of it.
+    mean_mps2, sigma_mps2 (3,): mean of the differences over the dwell, and the sigma of it. start_s: when
+    the first of them was used; what came earlier had not settled, or was rejected. left_out: whether the prediction is
+    by all other orientations, so that the dwell has not drawn it to itself.
     """
 
     number: int
@@ -206,6 +208,8 @@ class DwellReadings:
     count: int
     mean_mps2: Floats
     sigma_mps2: Floats
+    start_s: float
+    left_out: bool = False
 
 
 def worst_dwell(result: Calibration) -> int:
@@ -214,22 +218,31 @@ def worst_dwell(result: Calibration) -> int:
     return result.visits[int(ratios.argmax())].dwell.number
 
 
-def readings_of(source: Source, result: Calibration, number: int | None = None, most: int = 4000) -> DwellReadings:
+def readings_of(
+    source: Source, result: Calibration, number: int | None = None, most: int = 4000, *, left_out: bool = False
+) -> DwellReadings:
     """The readings of a dwell from a source that was calibrated, which is read once more up to the end of the dwell.
 
     number: of the dwell, as results number it; the worst where it is not given. most: greatest number of readings that
-    are kept, evenly spread over the dwell. Raises InputError where no dwell has the number.
+    are kept, evenly spread over the dwell. left_out: predict the dwell by all other orientations, where these determine
+    the model, and begin with the arrival. Raises InputError where no dwell has the number.
     """
     number = worst_dwell(result) if number is None else number
     numbers = [visit.dwell.number for visit in result.visits]
     if number not in numbers:
         raise InputError(f"there is no dwell {number}: this run has {numbers[0]} to {numbers[-1]}.")
     k = numbers.index(number)
-    dwell, residual = result.visits[k].dwell, result.visits[k].residual_mps2
+    dwell, error, sigma = result.visits[k].dwell, result.visits[k].residual_mps2, mean_sigmas(result)[k]
+    others = result.held_out if left_out and result.bench.angles else None
+    if others is not None:
+        error, sigma = others.errors_mps2[k], np.sqrt(np.diag(others.covariance[k]))
     every = max(1, -(-dwell.count // most))
-    time_s, readings = _inside(source, dwell.start_s, dwell.end_s, every)
-    predicted = dwell.means[4:] - residual
-    return DwellReadings(number, time_s, readings - predicted, every, dwell.count, residual, mean_sigmas(result)[k])
+    first_s = dwell.start_s - (float(dwell.nodes.since_arrival_s.min()) if left_out else 0.0)
+    time_s, readings = _inside(source, first_s, dwell.end_s, every)
+    differences = readings - (dwell.means[4:] - error)
+    return DwellReadings(
+        number, time_s, differences, every, dwell.count, error, sigma, dwell.start_s, others is not None
+    )
 
 
 def _inside(source: Source, start_s: float, end_s: float, every: int) -> tuple[Floats, Floats]:

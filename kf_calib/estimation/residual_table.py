@@ -48,10 +48,12 @@ class Run(Protocol):
     def residuals_mps2(self) -> Floats: ...
 
 
-def mean_sigmas(result: Run) -> Floats:
-    """Sigma (D, 3) of the mean of each dwell under the noise model, as the misfit is judged, m/s^2."""
-    means, noise = result.linearised.means, result.noise.for_goodness_of_fit.of_readings
-    return np.sqrt(np.einsum("dii->di", mean_covariances(noise, means, result.linearised.state)))
+def mean_sigmas(result: Run, noise: Noise | None = None) -> Floats:
+    """Sigma (D, 3) of the mean of each dwell in a noise, m/s^2; where none is given in that by which the misfit is
+    judged."""
+    noise = result.noise.for_goodness_of_fit if noise is None else noise
+    covariances = mean_covariances(noise.of_readings, result.linearised.means, result.linearised.state)
+    return np.sqrt(np.einsum("dii->di", covariances))
 
 
 def quantity_means(result: Run, names: list[str]) -> dict[str, Floats]:

@@ -54,7 +54,7 @@ def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
     """The same without the next orientation."""
     named = diagnosis.missing[0] if diagnosis.missing else "noise" if diagnosis.noise else None
     missing = "unknown" if diagnosis.unknown or diagnosis.unearned else named
-    shapes = diagnosis.explanations[0].shapes if diagnosis.explanations else []
+    shapes = diagnosis.explanation.shapes if diagnosis.explanation else []
     trend, disturbed = diagnosis.test.trend, diagnosis.table.disturbed if diagnosis.table else None
     return clean(
         {
@@ -199,7 +199,7 @@ def diagnosis_report(diagnosis: Diagnosis, typed: str = "", details: bool = Fals
         if more := diagnosis.table.listed[_MOST:]:
             share = format_probability(sum(row.probability for row in more))
             parts.append(Text(f"{len(more)} more have {share} together: --details."))
-    shapes = diagnosis.explanations[0].shapes if diagnosis.explanations else []
+    shapes = diagnosis.explanation.shapes if diagnosis.explanation else []
     parts += map(TextPlot, shapes[:1])
     for step in next_steps(diagnosis, typed):
         parts.append(Text(f"{step.why}:" if step.command else f"{step.why}."))

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.hidden_effects import noisy_run, run
+from helpers.altered import Altered, short_run
+from helpers.hidden_effects import noisy_run, noisy_source, run
 from helpers.known_runs import diagnosed, hidden_diagnosed, improved
 from helpers.long_runs import slow
 from helpers.synthetic import Run
@@ -15,6 +17,8 @@ from matplotlib.container import BarContainer
 from matplotlib.figure import Figure
 
 from kf_calib import plot
+from kf_calib.diagnosis.explanation import Explanation
+from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.stepwise_selection import Improvement, begin, extend, improve, undone
 from kf_calib.errors import InputError
@@ -231,6 +235,79 @@ def test_readings_of_a_dwell_have_the_mean_of_its_residual(tmp_path: Path) -> No
     assert f"Dwell {number}, reading by reading" in panels(figure)[0].get_title("left")
     with pytest.raises(InputError, match="there is no dwell 99"):
         plot.dwell(source, result, 99)
+
+
+SLIPPED, SLIP_MPS2 = 9, np.array([0.02, -0.01, 0.3])
+
+
+def slipped() -> Altered:
+    """A run in whose dwell 9 something slips halfway: the readings are others from there to the end of the dwell."""
+    made = short_run(dwell_s=12.0)
+    arrival_s, leave_s = (float(at[SLIPPED - 1]) * 1e-9 for at in (made.motion.arrive_ns, made.motion.leave_ns))
+
+    def readings(time_s: np.ndarray, values: np.ndarray) -> np.ndarray:
+        late = (time_s > 0.5 * (arrival_s + leave_s)) & (time_s < leave_s + 0.1)
+        return values + late[:, None] * SLIP_MPS2
+
+    return Altered(made, readings)
+
+
+def test_a_disturbed_dwell_is_drawn_reading_by_reading_from_its_arrival_on() -> None:
+    diagnosis = diagnose(slipped())
+    title, draw = next(iter(plot.figures(diagnosis).items()))
+    assert title == f"Dwell {SLIPPED}, reading by reading" and diagnosis.disturbed_dwell == SLIPPED
+    readings = diagnosis.disturbed_readings
+    assert readings is not None and readings.left_out
+    jump = np.diff([half.mean(axis=0) for half in np.array_split(readings.differences_mps2, 2)], axis=0)[0]
+    assert jump == pytest.approx(SLIP_MPS2, rel=0.1, abs=2e-3), "both halves are there"
+    used = readings.time_s >= readings.start_s - 1e-9
+    assert not used.all() and readings.differences_mps2[used].mean(axis=0) == pytest.approx(
+        readings.mean_mps2, abs=1e-9
+    )
+    assert_ink(draw())
+    where = plot.residuals(diagnosis)
+    marked = [text for axes in panels(where) for text in axes.texts if text.get_text() == f"dwell {SLIPPED}"]
+    assert len(marked) == 3 and panels(where)[-1].get_xlabel().startswith("time, ")
+    with pytest.raises(InputError, match="no readings of a disturbed dwell"):
+        plot.disturbed_dwell(replace(diagnosis, disturbed_readings=None))
+
+
+@pytest.mark.parametrize(("hidden", "words"), [
+    ("memory=40sigma", "force along the input axis less what is remembered"),
+    *slow(
+        ("thermal-lag=60sigma", "temperature through the fitted lag, less 25 °C"),
+        ("thermal-hysteresis=40sigma", "temperature through the fitted play, less 25 °C"),
+    ),
+])  # fmt: skip
+def test_an_effect_with_a_constant_of_its_own_is_a_line_over_what_the_fit_made_of_it(hidden: str, words: str) -> None:
+    before = run(hidden)
+    after = Refits().with_effects(before, (hidden.partition("=")[0],))
+    (shape,) = Explanation((hidden.partition("=")[0],), before, after, True).shapes
+    assert shape.words == words and shape.is_curve
+    for values, component in zip(shape.values.T, shape.component.T, strict=True):
+        line = np.polyval(np.polyfit(values, component, 1), values)
+        assert np.abs(component - line).max() < 1e-3 * np.ptp(component)
+
+
+def test_what_the_verdict_does_not_name_has_no_picture() -> None:
+    """Dwells that scatter: the likeliest effect is in the list of suspects, and not what the residuals are drawn as."""
+    diagnosis = diagnose(noisy_source(scatter_mps2=3e-5, states={"scatter_sigma_mps2": 0.0}))
+    assert diagnosis.test.consistent is False and not diagnosis.missing
+    assert diagnosis.explanation is None and diagnosis.explanations
+    titles = [axes.get_title("left") for axes in panels(plot.residuals(diagnosis))]
+    assert titles[0] == "Residuals of twelve parameters" and not any("must explain" in title for title in titles)
+
+
+def test_bars_of_noise_alone_stand_before_those_of_the_scatter_that_was_estimated() -> None:
+    diagnosis = diagnose(noisy_source("second-order=60sigma", scatter_mps2=3e-5, states={"scatter_sigma_mps2": None}))
+    shape = diagnosis.explanations[0].shapes[0]
+    assert np.median(shape.estimated_sigma / shape.noise_sigma) > 3.0
+    figure = plot.residuals(diagnosis)
+    bars = [np.ptp(np.array(each.get_segments())[:, :, 1], axis=1) for each in panels(figure)[0].collections]
+    pale, alone = bars[0] / 2.0 * MICRO_G, bars[1] / 2.0 * MICRO_G
+    assert pale == pytest.approx(shape.estimated_sigma[:, 0]) and alone == pytest.approx(shape.noise_sigma[:, 0])
+    said = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+    assert "1σ with the scatter that was estimated" in said
 
 
 def test_the_sphere_shows_every_dwell_before_and_after() -> None:

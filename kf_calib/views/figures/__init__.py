@@ -28,11 +28,11 @@ from kf_calib.views.figures.orientations import (  # noqa: E402
     plan,
     predicted_sigmas,
 )  # fmt: skip
-from kf_calib.views.figures.residuals import dwell, residuals, what_they_go_with  # noqa: E402
+from kf_calib.views.figures.residuals import disturbed_dwell, dwell, residuals, what_they_go_with  # noqa: E402
 
 __all__ = [
     "Figures", "allan_deviation", "convergence", "correlations", "detection_limits", "directions",
-    "dwell", "estimates", "figures", "history", "hypotheses", "improvement", "information", "noise",
+    "disturbed_dwell", "dwell", "estimates", "figures", "history", "hypotheses", "improvement", "information", "noise",
     "on_the_sphere", "plan", "predicted_sigmas", "residuals", "residuals_of_steps", "save", "suspects", "three_ways",
     "what_they_go_with", "whiteness",
 ]  # fmt: skip

@@ -35,7 +35,7 @@ from kf_calib.views.figures.orientations import (
     plan,
     predicted_sigmas,
 )
-from kf_calib.views.figures.residuals import residuals, what_they_go_with
+from kf_calib.views.figures.residuals import disturbed_dwell, residuals, what_they_go_with
 
 Figures = Mapping[str, Callable[[], Figure]]
 """Title of each figure, and what draws it."""
@@ -67,8 +67,14 @@ def figures(result: Any) -> Figures:
 def _(diagnosed: Diagnosis) -> Figures:
     fails = diagnosed.test.consistent is False
     likely: Figures = {PROBABILITIES: lambda: hypotheses(diagnosed)} if diagnosed.table else {}
+    disturbed = diagnosed.disturbed_readings
+    dwells: Figures = (
+        {f"Dwell {disturbed.number}, reading by reading": lambda: disturbed_dwell(diagnosed)} if disturbed else {}
+    )
     return {
+        **({} if diagnosed.explanation else dwells),
         "Where the model fails" if fails else "What the model leaves": lambda: residuals(diagnosed),
+        **(dwells if diagnosed.explanation else {}),
         "What the residuals go with": lambda: what_they_go_with(diagnosed),
         **likely,
         "Which effect is missing" if fails else "Whether an effect is missing": lambda: suspects(diagnosed),

@@ -254,7 +254,7 @@ def on_the_sphere(diagnosis: Diagnosis) -> Figure:
     colours.
     """
     with styled():
-        figure = blank(11.0, 7.5) if diagnosis.explanations else blank(11.0, 2.8)
+        figure = blank(11.0, 7.5) if diagnosis.explanation else blank(11.0, 2.8)
         draw_on_the_sphere(figure, diagnosis)
     return figure
 
@@ -264,7 +264,8 @@ def draw_on_the_sphere(figure: FigureBase, diagnosis: Diagnosis) -> None:
     force = quantity_means(diagnosis.before, ["fx", "fy", "fz"])
     directions = np.stack([force[f"f{axis}"][:, 0] for axis in "xyz"], axis=1)
     columns = {diagnosis.before.model.sum: diagnosis.before.residuals_mps2 / mean_sigmas(diagnosis.before)}
-    columns |= {f"with {each.name}": each.unexplained_ratios for each in diagnosis.explanations[:1]}
+    if diagnosis.explanation:
+        columns[f"with {diagnosis.explanation.name}"] = diagnosis.explanation.unexplained_ratios
     most = max(_LEAST, *(float(np.percentile(np.abs(ratios), 99.0)) for ratios in columns.values()))
     shape = (3, 2) if len(columns) > 1 else (1, 3)
     panels = figure.subplots(*shape, squeeze=False, subplot_kw={"projection": "mollweide"})

@@ -15,18 +15,22 @@ from matplotlib.ticker import MaxNLocator
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import Source
 from kf_calib.diagnosis.explanation import EffectShape
+from kf_calib.diagnosis.hypothesis_table import IRREGULAR
 from kf_calib.diagnosis.residual_drivers import Driver
 from kf_calib.diagnosis.results import Diagnosis
+from kf_calib.errors import InputError
 from kf_calib.estimation.filter_history import DwellReadings, readings_of
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration, format_p
-from kf_calib.support.units import Unit, shown, shown_whole
+from kf_calib.support.units import Unit, rounded, shown, shown_whole, significant
 from kf_calib.views.figures.style import (
     ACCELEROMETERS,
+    ALARM,
     BAND,
     BEST,
     GREY,
     MARKERS,
+    PALE,
     PLATFORM,
     blank,
     rounded_number,
@@ -36,8 +40,9 @@ from kf_calib.views.figures.style import (
 )
 
 _SIGNIFICANT, _SOME = 0.01, 0.005  # p-value and share above and below which a driver explains nothing
-_TITLE = 36  # letters in a line of a title
+_TITLE, _LABEL = 36, 44  # letters in a line of a title, and below an axis
 _PANELS = 4  # drivers in small panels; the explorer of the report has all
+_LARGER = 1.1  # times sigma of noise alone, from which that with what was estimated is drawn, too
 _MANY = 150  # dwells, above which markers are smaller and bars of sigma are left out
 
 
@@ -46,8 +51,9 @@ def residuals(diagnosis: Diagnosis, driver: str | None = None) -> Figure:
 
     From the left: the residuals of the model, with what the explanation predicts of them; what the effect must explain,
     which is the readings less all else, and the effect as a curve with its 1 sigma; what it leaves. All are means of
-    dwells, with 1 sigma. driver: another quantity to draw them over, by its symbol, such as ``q1`` or ``T``. Where
-    there is no explanation, residuals alone. Raises TypeError for what is no diagnosis.
+    dwells, with 1 sigma: of noise alone, and pale with what was estimated of scatter and setting error. driver: another
+    quantity to draw them over, by its symbol, such as ``q1`` or ``T``. Where the verdict names no explanation,
+    residuals alone, with the dwell that it calls wrong. Raises TypeError for what is no diagnosis.
     """
     if not isinstance(diagnosis, Diagnosis):
         raise TypeError(
@@ -63,25 +69,31 @@ def draw_residuals(
     figure: FigureBase, diagnosis: Diagnosis, drivers: Sequence[Driver], symbol: str | None = None
 ) -> None:
     """The same on a part of a figure; drivers: of the residuals."""
-    others = diagnosis.explanations
-    if others and symbol is None and others[0].shapes:
-        return draw_shape(figure, others[0].shapes[0])
-    driver = driver_to_show([each for each in drivers if symbol in (None, each.symbol)])
+    named = diagnosis.explanation
+    if named and symbol is None and named.shapes:
+        return draw_shape(figure, named.shapes[0])
+    driver = driver_to_show([each for each in drivers if symbol in (None, each.symbol)], follows(diagnosis))
     if driver is None:
         return say(figure, f"{symbol or 'Nothing that was recorded'} does not vary in this run.")
-    if others:
-        return draw_shape(figure, others[0].over(driver))
+    if named:
+        return draw_shape(figure, named.over(driver))
     _draw_alone(figure, diagnosis, driver)
 
 
 def _draw_alone(figure: FigureBase, diagnosis: Diagnosis, driver: Driver) -> None:
     """Draw the residuals of each accelerometer over a quantity."""
-    unit, sigmas, panels = driver_axis(driver), mean_sigmas(diagnosis.before), figure.subplots(3, 1, sharex=True)
+    before, unit, panels = diagnosis.before, driver_axis(driver), figure.subplots(3, 1, sharex=True)
+    residuals, noise = before.residuals_mps2, before.noise
+    alone, estimated = mean_sigmas(before, noise.without_estimates()), mean_sigmas(before, noise)
+    wrong = np.array([visit.dwell.number == diagnosis.disturbed_dwell for visit in before.visits])
     for i, axes in enumerate(panels):
-        _points(axes, driver.values[:, i] * unit.per_si, diagnosis.before.residuals_mps2[:, i], sigmas[:, i], i)
-        _rms(axes, diagnosis.before.residuals_mps2[:, i])
+        x = driver.values[:, i] * unit.per_si
+        _points(axes, x, residuals[:, i], (alone[:, i], estimated[:, i]), i)
+        _mark(axes, x[wrong], residuals[wrong, i], diagnosis.disturbed_dwell)
+        _rms(axes, residuals[:, i])
         axes.set_ylabel(f"accelerometer {i + 1}, {shown('m/s^2').label}")
-    panels[0].set_title(wrapped(f"Residuals of {diagnosis.before.model.sum}", 3 * _TITLE))
+    panels[0].set_title(wrapped(f"Residuals of {before.model.sum}", 3 * _TITLE))
+    _say_bars(figure, panels[0])
     _say_quantity(panels[-1], driver.words, unit)
 
 
@@ -92,7 +104,8 @@ def draw_shape(figure: FigureBase, shape: EffectShape) -> None:
     for i, row in enumerate(panels):
         x, colour = shape.values[:, i] * across.per_si, i if len(panels) > 1 else None
         for axes, values in zip(row, (shape.residuals, shape.readings, shape.left), strict=True):
-            _points(axes, x, values[:, i], shape.sigma[:, i], colour, shape.quantity)
+            sigmas = shape.noise_sigma[:, i], shape.estimated_sigma[:, i]
+            _points(axes, x, values[:, i], sigmas, colour, shape.quantity)
         _rms(row[0], shape.residuals[:, i], shape.quantity)
         _rms(row[2], shape.left[:, i], shape.quantity)
         row[0].plot(x, (shape.residuals - shape.left)[:, i] * shown(shape.quantity).per_si, marker="_", markersize=9,
@@ -100,12 +113,12 @@ def draw_shape(figure: FigureBase, shape: EffectShape) -> None:
         _curve(row[1], across.per_si, shape, i)
         row[0].set_ylabel(f"{shape.channels[i]}, {shown(shape.quantity).label}")
         _say_quantity(row[1], "", across)
-    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower left")
+    _say_bars(figure, panels[0, 0])
     titles = ["Residuals without it", f"What {shape.effect} must explain", "What it leaves"]
     for axes, title in zip(panels[0], titles, strict=True):
         axes.set_title(wrapped(title, _TITLE))
     for axes in panels[-1]:
-        _say_quantity(axes, wrapped(_of_quantity(shape), 44), across)
+        _say_quantity(axes, _of_quantity(shape), across)
 
 
 def _of_quantity(shape: EffectShape) -> str:
@@ -115,13 +128,19 @@ def _of_quantity(shape: EffectShape) -> str:
 
 def _say_quantity(axes: Axes, words: str, unit: Unit) -> None:
     """Write below a panel what is across, and set few round numbers there."""
-    axes.set_xlabel(f"{words}, {unit.label}" if words else "")
+    axes.set_xlabel(wrapped(f"{words}, {unit.label}", _LABEL) if words else "")
     axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
 
 
-def driver_to_show(drivers: Sequence[Driver]) -> Driver | None:
-    """The quantity that explains most; time where none explains anything, and None where nothing varies."""
-    if drivers and _explains(drivers[0]):
+def follows(diagnosis: Diagnosis) -> bool:
+    """Whether the verdict may speak of a quantity that the misfit goes with: of noise or a wrong dwell it does not."""
+    first = diagnosis.likeliest
+    return not (diagnosis.noise or diagnosis.disturbed_dwell or (first is not None and first.driver == IRREGULAR))
+
+
+def driver_to_show(drivers: Sequence[Driver], follows: bool = True) -> Driver | None:
+    """The quantity that explains most; time where the misfit follows none, and None where nothing varies."""
+    if drivers and follows and _explains(drivers[0]):
         return drivers[0]
     return next((each for each in drivers if each.symbol == "t"), drivers[0] if drivers else None)
 
@@ -136,13 +155,34 @@ def _explains(driver: Driver) -> bool:
     return driver.p_value <= _SIGNIFICANT and driver.share >= _SOME
 
 
-def _points(axes: Axes, x: Floats, values: Floats, sigmas: Floats, i: int | None, quantity: str = "m/s^2") -> None:
-    """Draw means of dwells of accelerometer i, or of the platform, with their sigma and the line at zero."""
+def _points(
+    axes: Axes, x: Floats, values: Floats, sigmas: tuple[Floats, Floats], i: int | None, quantity: str = "m/s^2"
+) -> None:
+    """Draw means of dwells of accelerometer i, or of the platform, with two sigmas and the line at zero: of noise
+    alone, and with what was estimated."""
     many, per_si = len(x) > _MANY, shown(quantity).per_si
     axes.axhline(0.0, color=GREY, linewidth=0.8)
     mark, colour = ("D", PLATFORM) if i is None else (MARKERS[i], ACCELEROMETERS[i])
-    axes.errorbar(x, values * per_si, None if many else sigmas * per_si, fmt=mark, color=colour, zorder=3,
-                  elinewidth=0.9, markersize=2.0 if many else 4.5, markeredgewidth=0.0)  # fmt: skip
+    alone, estimated = sigmas
+    if not many and np.nanmax(estimated / alone) > _LARGER:
+        axes.errorbar(x, values * per_si, estimated * per_si, fmt="none", ecolor=PALE, elinewidth=1.0,
+                      label="1σ with the scatter that was estimated")  # fmt: skip
+    axes.errorbar(x, values * per_si, None if many else alone * per_si, fmt=mark, color=colour, zorder=3,
+                  elinewidth=1.2, markersize=2.0 if many else 4.5, markeredgewidth=0.0)  # fmt: skip
+
+
+def _mark(axes: Axes, x: Floats, values_mps2: Floats, number: int) -> None:
+    """Put a ring about the mean of the dwell of this number, and its number beside it; nothing where there is none."""
+    for at, value in zip(x, values_mps2 * shown("m/s^2").per_si, strict=True):
+        axes.plot(at, value, "o", markersize=11.0, markerfacecolor="none", color=ALARM, zorder=4)
+        axes.annotate(f"dwell {number}", (at, value), (9, 0), textcoords="offset points", color=ALARM, va="center")
+
+
+def _say_bars(figure: FigureBase, axes: Axes) -> None:
+    """Write below a figure what its dashes and pale bars are; nothing where it has none."""
+    handles, labels = axes.get_legend_handles_labels()
+    if handles:
+        figure.legend(handles, labels, loc="outside lower left", ncols=len(labels))
 
 
 def _rms(axes: Axes, residuals: Floats, quantity: str = "m/s^2") -> None:
@@ -176,7 +216,7 @@ def what_they_go_with(diagnosis: Diagnosis) -> Figure:
 
 def draw_drivers(figure: FigureBase, diagnosis: Diagnosis, drivers: Sequence[Driver]) -> None:
     """The same on a part of a figure: a column a driver, those that explain most first."""
-    drawn, others = drivers[:_PANELS], diagnosis.explanations[:1]
+    drawn, others = drivers[:_PANELS], [diagnosis.explanation] if diagnosis.explanation else []
     if not drawn:
         return say(figure, "Nothing that was recorded varies in this run.")
     wide = min(4, len(drawn))
@@ -228,25 +268,41 @@ def dwell(source: Source, result: Calibration, number: int | None = None) -> Fig
     return figure
 
 
+def disturbed_dwell(diagnosis: Diagnosis) -> Figure:
+    """The same of the dwell that a diagnosis calls wrong or disturbed, less what the other orientations predict of it.
+
+    Raises InputError where there is none, or where its readings were gone when the run was diagnosed.
+    """
+    if diagnosis.disturbed_readings is None:
+        raise InputError("this diagnosis has no readings of a disturbed dwell to draw.")
+    with styled():
+        figure = blank(11.0, 7.0)
+        draw_dwell(figure, diagnosis.disturbed_readings, diagnosis.before.model.sum)
+    return figure
+
+
 def draw_dwell(figure: FigureBase, readings: DwellReadings, model: str) -> None:
     """The same on a part of a figure; model: what the prediction is of, in words."""
+    less = "less what all others predict" if readings.left_out else f"less the model: {model}"
     panels = figure.subplots(3, 2, sharex="col", sharey="col", squeeze=False, width_ratios=(2.2, 1.0))
     for i, (wide, narrow) in enumerate(panels):
         _readings(wide, readings, i)
         _mean(narrow, readings, i)
         wide.set_ylabel(f"accelerometer {i + 1}\nreading − model, {shown('m/s^2').label}")
+    early = "; grey: not used" if (readings.time_s < readings.start_s - 1e-9).any() else ""
     some = "" if readings.every == 1 else f"; one of {readings.every} readings is drawn"
-    panels[0, 0].set_title(f"Dwell {readings.number}, reading by reading, less the model: {model}{some}")
+    panels[0, 0].set_title(f"Dwell {readings.number}, reading by reading, {less}{early}{some}")
     panels[0, 1].set_title(f"Mean of its {readings.count} readings, ± 1σ and 2σ")
     panels[-1, 0].set_xlabel("time since the first reading of the run, s")
     panels[-1, 1].set_xlabel(f"mean − model, {shown('m/s^2').label}")
 
 
 def _readings(axes: Axes, readings: DwellReadings, i: int) -> None:
-    """Draw the readings of one accelerometer with zero, which is the model, and their mean."""
-    per_si = shown("m/s^2").per_si
-    axes.plot(readings.time_s, readings.differences_mps2[:, i] * per_si, ".", color=ACCELEROMETERS[i], markersize=2.0,
-              alpha=0.55)  # fmt: skip
+    """Draw the readings of one accelerometer with zero, which is the model, and their mean; grey: not used."""
+    per_si, used = shown("m/s^2").per_si, readings.time_s >= readings.start_s - 1e-9
+    for some, colour in ((~used, GREY), (used, ACCELEROMETERS[i])):
+        axes.plot(readings.time_s[some], readings.differences_mps2[some, i] * per_si, ".", color=colour, markersize=2.0,
+                  alpha=0.55)  # fmt: skip
     axes.axhline(0.0, color=GREY, linewidth=1.0)
     axes.axhline(readings.mean_mps2[i] * per_si, color=BEST, linewidth=1.4, linestyle="--")
 
@@ -259,8 +315,9 @@ def _mean(axes: Axes, readings: DwellReadings, i: int) -> None:
     axes.errorbar([mean], [0.0], xerr=[2.0 * sigma], fmt="none", color=ACCELEROMETERS[i], elinewidth=1.0, capsize=4.0)
     axes.errorbar([mean], [0.0], xerr=[sigma], fmt="o", color=ACCELEROMETERS[i], elinewidth=4.0, markersize=8.0)
     times = mean / sigma if sigma > 0.0 else np.nan
-    found = f"{mean:+.3g} ± {sigma:.2g} {unit.label}: {times:+.1f} σ"
-    axes.annotate(found, (mean, 0.0), (0, 12), textcoords="offset points", ha="center")
+    value, spread = rounded(mean, sigma)
+    said = f"{value} ± {spread} {unit.label}: {significant(times)} σ"
+    axes.text(0.5, 0.75, said, transform=axes.transAxes, ha="center", bbox={"facecolor": "white", "edgecolor": "none"})
     axes.set_ylim(-1.0, 1.0)
     axes.set_yticks([])
     axes.margins(x=0.35)
