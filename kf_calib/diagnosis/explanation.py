@@ -38,8 +38,8 @@ class EffectShape:
     - residuals: what the model without the effect leaves. left: what the model with it leaves.
     - component: what the fitted effect adds. component_sigma: of the component; of readings, less its mean over the
       dwells, as the biases take up any mean.
-    - sigma: of a dwell, as the misfit is judged. noise_sigma: of noise alone, that was seen within dwells or stated;
-      estimated_sigma: with what the fit with the effect estimates of scatter and setting error.
+    - sigma: of a dwell, as the misfit is judged. bars: two sigmas to draw, of noise alone, that was seen or stated,
+      and with the scatter and setting error that the fit with the effect estimates.
     - is_curve: whether the component is nearly a function of the quantity.
     - gimbal: number, from 1, of the one about which the platform turns; 0 for readings of accelerometers.
     """
@@ -55,8 +55,7 @@ class EffectShape:
     component: Floats
     component_sigma: Floats
     sigma: Floats
-    noise_sigma: Floats
-    estimated_sigma: Floats
+    bars: tuple[Floats, ...]
     is_curve: bool
     gimbal: int = 0
 
@@ -96,12 +95,11 @@ def shape_over(before: Calibration, after: Calibration, driver: Driver, name: st
     """The shape of all that a calibration has beyond another, over a quantity of the bench."""
     added = [effect for effect in after.model.effects if str(effect) not in before.model.parts]
     component, component_sigma = _component(after, added)
-    sigma, noise_sigma, estimated_sigma = _sigmas(before, after)
     return EffectShape(
         effect=name, words=driver.words, symbol=driver.symbol, unit=driver.unit, values=driver.values,
         quantity="m/s^2", residuals=before.residuals_mps2, left=unexplained_mps2(after), component=component,
         component_sigma=component_sigma, is_curve=is_function_of(component, driver.values, driver.unit),
-        sigma=sigma, noise_sigma=noise_sigma, estimated_sigma=estimated_sigma,
+        sigma=mean_sigmas(before), bars=bars_of(after),
     )  # fmt: skip
 
 
@@ -113,9 +111,10 @@ def _drawn_together(effect: Effect) -> tuple[str, int | None]:
 
 def _shape(before: Calibration, after: Calibration, effects: Sequence[Effect]) -> EffectShape:
     (component, component_sigma), left = _component(after, effects), unexplained_mps2(after)
-    residuals, sigmas, quantity = before.residuals_mps2, _sigmas(before, after), "m/s^2"
-    axis, gimbal = axis_of(effects, before.bench), turned_gimbal(effects)
-    if axis is not None and not (_framed(effects) and gimbal is None):
+    residuals, quantity, sigmas = before.residuals_mps2, "m/s^2", (mean_sigmas(before), *bars_of(after))
+    axis = axis_of(effects, before.bench)
+    gimbal = turned_gimbal(effects) if axis else 0
+    if axis and (gimbal or not _framed(effects)):
         (values,) = means_over_dwells(after, [axis.of])
         words, symbol, unit = axis.words, axis.symbol, axis.unit
     elif _framed(effects):  # reading i changes by |s_i| g times the turn of gravity towards its input axis
@@ -124,26 +123,23 @@ def _shape(before: Calibration, after: Calibration, effects: Sequence[Effect]) -
                               * before.bench.gravity_mps2)  # fmt: skip
     else:
         words, symbol, unit, values = f"what the fitted {_name(effects)} adds", "", "m/s^2", component
-    turning = effects[0] if axis is not None and gimbal is not None else None
-    if isinstance(turning, FrameEffect):
-        lever, quantity, values = _lever(after, turning.about), "rad", values[:, :1]
+    if gimbal and isinstance(effects[0], FrameEffect):
+        lever, quantity, values = _lever(after, effects[0].about), "rad", values[:, :1]
         component, residuals, left = (_turn(each, lever, sigmas[0]) for each in (component, residuals, left))
         lengths = np.linalg.norm(lever, axis=1, keepdims=True)
         component_sigma = np.linalg.norm(component_sigma, axis=1, keepdims=True) / lengths
-        sigmas = [np.sum((lever / sigma) ** 2, axis=1, keepdims=True) ** -0.5 for sigma in sigmas]
-    sigma, noise_sigma, estimated_sigma = sigmas
+        sigmas = tuple(np.sum((lever / sigma) ** 2, axis=1, keepdims=True) ** -0.5 for sigma in sigmas)
     return EffectShape(
         effect=_name(effects), words=words, symbol=symbol, unit=unit, values=values, quantity=quantity,
         residuals=residuals, left=left, component=component, component_sigma=component_sigma,
-        is_curve=is_function_of(component, values, unit) or _walks(effects),
-        sigma=sigma, noise_sigma=noise_sigma, estimated_sigma=estimated_sigma,
-        gimbal=1 + gimbal if turning is not None and gimbal is not None else 0,
+        is_curve=is_function_of(component, values, unit) or _walks(effects), sigma=sigmas[0], bars=sigmas[1:],
+        gimbal=gimbal,
     )  # fmt: skip
 
 
-def _sigmas(before: Calibration, after: Calibration) -> list[Floats]:
-    """Return sigmas (D, 3) of the means of dwells: as the misfit is judged, of noise alone, with what is estimated."""
-    return [mean_sigmas(before), mean_sigmas(after, after.noise.without_estimates()), mean_sigmas(after, after.noise)]
+def bars_of(result: Calibration) -> tuple[Floats, Floats]:
+    """Sigmas (D, 3) of the means of dwells: of noise alone, and with the scatter and setting error of its estimate."""
+    return mean_sigmas(result, result.noise.without_estimates()), mean_sigmas(result, result.noise)
 
 
 def _framed(effects: Sequence[Effect]) -> bool:

@@ -208,31 +208,6 @@ def _others(diagnosis: Diagnosis, but: str = "") -> str:
     return f"; or {', '.join(words)}" if words else ""
 
 
-def replication_in_words(diagnosis: Diagnosis) -> str:
-    """A sentence on how what is named predicts dwells that choosing it never saw; "" where nothing is named."""
-    tried = diagnosis.replication
-    if tried is None:
-        return ""
-    if not tried.halves:
-        return (
-            "Whether it replicates cannot be told: the dwells cannot be divided in two halves that predict each other."
-        )
-    if not tried.relevant:
-        names = " and ".join(dict.fromkeys("+".join(half.named) for half in tried.halves))
-        return f"Whether it replicates cannot be told: half of the dwells alone would name {names}."
-    fall = (
-        f"named from half of the dwells, it lowers χ² of the others by {tried.fall:.0f} ({tried.predicted:.0f} "
-        f"predicted; p {format_p(tried.p_value)})"
-    )
-    if tried.fall < 0.0:
-        fall = f"named from half of the dwells, it raises χ² of the others by {-tried.fall:.0f}"
-    if tried.answer == "yes":
-        return f"It replicates: {fall}."
-    if tried.answer == "no":
-        return f"It does not replicate: {fall}, less than its size predicts (p {format_p(tried.p_less)})."
-    return f"Whether it replicates cannot be told: {fall}."
-
-
 def explanations_in_words(diagnosis: Diagnosis) -> str:
     """The likeliest explanations with their probabilities, for a line; "" where there are none."""
     first = diagnosis.likeliest

@@ -122,11 +122,12 @@ def is_formula(effect: Effect) -> bool:
     return isinstance(effect, Formula | FrameFormula)
 
 
-def turned_gimbal(effects: Sequence[Effect]) -> int | None:
-    """The number, from 0, of the gimbal about which all the effects turn the platform, whatever their coefficients;
-    None where there is no such gimbal."""
+def turned_gimbal(effects: Sequence[Effect]) -> int:
+    """The number, from 1, of the gimbal about which all the effects turn the platform, whatever their coefficients; 0
+    where there is no such gimbal."""
     gimbals = {effect.gimbal if isinstance(effect, FrameEffect) else None for effect in effects}
-    return gimbals.pop() if len(gimbals) == 1 else None
+    number = gimbals.pop() if len(gimbals) == 1 else None
+    return 0 if number is None else 1 + number
 
 
 def _regressor(effect: Effect, bench: Bench) -> Regressor | None:

@@ -19,7 +19,7 @@ from kf_calib.diagnosis.hypothesis_table import Hypothesis, HypothesisTable
 from kf_calib.diagnosis.replication import Replication
 from kf_calib.diagnosis.results import Diagnosis, Suspect
 from kf_calib.diagnosis.unknown_effect import Description
-from kf_calib.diagnosis.verdict import format_probability, replication_in_words
+from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.estimation.remarks import MISSING_OR_NOISE
 from kf_calib.estimation.results import Calibration, Condition, format_p
 from kf_calib.support.text import printed
@@ -183,6 +183,31 @@ def verdict(diagnosis: Diagnosis) -> str:
     first = readings.biasing if diagnosis.test.consistent is False else []
     first = [*first, *([str(readings.outliers)] if readings.outliers.clustered else [])]
     return " ".join([*(sentence[0].upper() + sentence[1:] for sentence in first), diagnosis.verdict])
+
+
+def replication_in_words(diagnosis: Diagnosis) -> str:
+    """A sentence on how what is named predicts dwells that choosing it never saw; "" where nothing is named."""
+    tried = diagnosis.replication
+    if tried is None:
+        return ""
+    if not tried.halves:
+        return (
+            "Whether it replicates cannot be told: the dwells cannot be divided in two halves that predict each other."
+        )
+    if not tried.relevant:
+        names = " and ".join(dict.fromkeys("+".join(half.named) for half in tried.halves))
+        return f"Whether it replicates cannot be told: half of the dwells alone would name {names}."
+    fall = (
+        f"named from half of the dwells, it lowers χ² of the others by {tried.fall:.0f} ({tried.predicted:.0f} "
+        f"predicted; p {format_p(tried.p_value)})"
+    )
+    if tried.fall < 0.0:
+        fall = f"named from half of the dwells, it raises χ² of the others by {-tried.fall:.0f}"
+    if tried.answer == "yes":
+        return f"It replicates: {fall}."
+    if tried.answer == "no":
+        return f"It does not replicate: {fall}, less than its size predicts (p {format_p(tried.p_less)})."
+    return f"Whether it replicates cannot be told: {fall}."
 
 
 def diagnosis_report(diagnosis: Diagnosis, typed: str = "", details: bool = False) -> RenderableType:

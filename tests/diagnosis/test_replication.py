@@ -20,8 +20,8 @@ import kf_calib
 from kf_calib.bench.streams import Stream
 from kf_calib.diagnosis.candidate_tests import candidate_frame
 from kf_calib.diagnosis.replication import FEWEST, Replication, _one_sided, replication
-from kf_calib.diagnosis.verdict import replication_in_words
 from kf_calib.estimation.results import Calibration, Consistency
+from kf_calib.views.diagnosis import replication_in_words
 
 WHITE_MPS2, COUNT = 1e-4, 600
 SIGMA_MPS2 = WHITE_MPS2 / np.sqrt(COUNT)

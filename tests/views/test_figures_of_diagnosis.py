@@ -301,11 +301,11 @@ def test_what_the_verdict_does_not_name_has_no_picture() -> None:
 def test_bars_of_noise_alone_stand_before_those_of_the_scatter_that_was_estimated() -> None:
     diagnosis = diagnose(noisy_source("second-order=60sigma", scatter_mps2=3e-5, states={"scatter_sigma_mps2": None}))
     shape = diagnosis.explanations[0].shapes[0]
-    assert np.median(shape.estimated_sigma / shape.noise_sigma) > 3.0
+    assert np.median(shape.bars[1] / shape.bars[0]) > 3.0
     figure = plot.residuals(diagnosis)
     bars = [np.ptp(np.array(each.get_segments())[:, :, 1], axis=1) for each in panels(figure)[0].collections]
     pale, alone = bars[0] / 2.0 * MICRO_G, bars[1] / 2.0 * MICRO_G
-    assert pale == pytest.approx(shape.estimated_sigma[:, 0]) and alone == pytest.approx(shape.noise_sigma[:, 0])
+    assert (alone, pale) == (pytest.approx(shape.bars[0][:, 0]), pytest.approx(shape.bars[1][:, 0]))
     said = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
     assert "1σ with the scatter that was estimated" in said
 

@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import Source
-from kf_calib.diagnosis.explanation import EffectShape
+from kf_calib.diagnosis.explanation import EffectShape, bars_of
 from kf_calib.diagnosis.hypothesis_table import IRREGULAR
 from kf_calib.diagnosis.residual_drivers import Driver
 from kf_calib.diagnosis.results import Diagnosis
@@ -83,8 +83,7 @@ def draw_residuals(
 def _draw_alone(figure: FigureBase, diagnosis: Diagnosis, driver: Driver) -> None:
     """Draw the residuals of each accelerometer over a quantity."""
     before, unit, panels = diagnosis.before, driver_axis(driver), figure.subplots(3, 1, sharex=True)
-    residuals, noise = before.residuals_mps2, before.noise
-    alone, estimated = mean_sigmas(before, noise.without_estimates()), mean_sigmas(before, noise)
+    residuals, (alone, estimated) = before.residuals_mps2, bars_of(before)
     wrong = np.array([visit.dwell.number == diagnosis.disturbed_dwell for visit in before.visits])
     for i, axes in enumerate(panels):
         x = driver.values[:, i] * unit.per_si
@@ -104,8 +103,7 @@ def draw_shape(figure: FigureBase, shape: EffectShape) -> None:
     for i, row in enumerate(panels):
         x, colour = shape.values[:, i] * across.per_si, i if len(panels) > 1 else None
         for axes, values in zip(row, (shape.residuals, shape.readings, shape.left), strict=True):
-            sigmas = shape.noise_sigma[:, i], shape.estimated_sigma[:, i]
-            _points(axes, x, values[:, i], sigmas, colour, shape.quantity)
+            _points(axes, x, values[:, i], (shape.bars[0][:, i], shape.bars[1][:, i]), colour, shape.quantity)
         _rms(row[0], shape.residuals[:, i], shape.quantity)
         _rms(row[2], shape.left[:, i], shape.quantity)
         row[0].plot(x, (shape.residuals - shape.left)[:, i] * shown(shape.quantity).per_si, marker="_", markersize=9,
