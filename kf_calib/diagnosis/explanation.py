@@ -16,6 +16,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.residual_drivers import Driver, is_function_of, misfit_beyond_noise, unexplained_mps2, walk_path
+from kf_calib.diagnosis.unknown_effect import explained_share
 from kf_calib.effects import Effect, FrameEffect, Stimulus
 from kf_calib.effects.inputs import axis_of, is_formula, turned_gimbal
 from kf_calib.effects.stimulus import smooth_between
@@ -38,8 +39,7 @@ class EffectShape:
     - residuals: what the model without the effect leaves. left: what the model with it leaves.
     - component: what the fitted effect adds. component_sigma: of the component; of readings, less its mean over the
       dwells, as the biases take up any mean.
-    - sigma: of a dwell, as the misfit is judged. bars: two sigmas to draw, of noise alone, that was seen or stated,
-      and with the scatter and setting error that the fit with the effect estimates.
+    - sigma: of a dwell, as the misfit is judged. bars: of noise alone, and with the scatter that the fit estimates.
     - is_curve: whether the component is nearly a function of the quantity.
     - gimbal: number, from 1, of the one about which the platform turns; 0 for readings of accelerometers.
     """
@@ -91,18 +91,6 @@ def shapes_of(before: Calibration, after: Calibration) -> list[EffectShape]:
     return [_shape(before, after, list(group)) for _, group in itertools.groupby(added, _drawn_together)]
 
 
-def shape_over(before: Calibration, after: Calibration, driver: Driver, name: str) -> EffectShape:
-    """The shape of all that a calibration has beyond another, over a quantity of the bench."""
-    added = [effect for effect in after.model.effects if str(effect) not in before.model.parts]
-    component, component_sigma = _component(after, added)
-    return EffectShape(
-        effect=name, words=driver.words, symbol=driver.symbol, unit=driver.unit, values=driver.values,
-        quantity="m/s^2", residuals=before.residuals_mps2, left=unexplained_mps2(after), component=component,
-        component_sigma=component_sigma, is_curve=is_function_of(component, driver.values, driver.unit),
-        sigma=mean_sigmas(before), bars=bars_of(after),
-    )  # fmt: skip
-
-
 def _drawn_together(effect: Effect) -> tuple[str, int | None]:
     """Return what effects that are next to each other have in common if they are drawn as one."""
     gimbal = effect.gimbal if isinstance(effect, FrameEffect) else None
@@ -132,8 +120,8 @@ def _shape(before: Calibration, after: Calibration, effects: Sequence[Effect]) -
     return EffectShape(
         effect=_name(effects), words=words, symbol=symbol, unit=unit, values=values, quantity=quantity,
         residuals=residuals, left=left, component=component, component_sigma=component_sigma,
-        is_curve=is_function_of(component, values, unit) or _walks(effects), sigma=sigmas[0], bars=sigmas[1:],
-        gimbal=gimbal,
+        is_curve=is_function_of(component, values, unit) or any(effect.walks for effect in effects),
+        sigma=sigmas[0], bars=sigmas[1:], gimbal=gimbal,
     )  # fmt: skip
 
 
@@ -144,10 +132,6 @@ def bars_of(result: Calibration) -> tuple[Floats, Floats]:
 
 def _framed(effects: Sequence[Effect]) -> bool:
     return all(isinstance(effect, FrameEffect) for effect in effects)
-
-
-def _walks(effects: Sequence[Effect]) -> bool:
-    return any(effect.walks for effect in effects)
 
 
 def _name(effects: Sequence[Effect]) -> str:
@@ -165,7 +149,7 @@ def _component(after: Calibration, effects: Sequence[Effect]) -> tuple[Floats, F
     if not _framed(effects):
         design = design - design.mean(axis=0)
     sigma = np.sqrt(np.einsum("dip,pq,diq->di", design, covariance[np.ix_(columns, columns)], design))
-    return added + (walk_path(after) if _walks(effects) else 0.0), sigma
+    return added + (walk_path(after) if any(effect.walks for effect in effects) else 0.0), sigma
 
 
 def _lever(after: Calibration, about: Callable[[Stimulus], Floats]) -> Floats:
@@ -205,11 +189,7 @@ class Explanation:
     def share(self) -> float | None:
         """Part of the misfit beyond noise that it explains, 0 to 1: the decrease of chi-squared from refit to refit,
         less the degrees of freedom that it takes; None if the means of the dwells agree without it."""
-        excess, before, after = misfit_beyond_noise(self.before), self.before.consistency, self.after.consistency
-        if excess <= 0.0:
-            return None
-        delta_chi2, dof = before.statistic - after.statistic, before.dof - after.dof
-        return float(np.clip((delta_chi2 - dof) / excess, 0.0, 1.0))
+        return explained_share(self.before, self.after) if misfit_beyond_noise(self.before) > 0.0 else None
 
     @cached_property
     def shapes(self) -> list[EffectShape]:
@@ -218,7 +198,17 @@ class Explanation:
 
     def over(self, driver: Driver) -> EffectShape:
         """The same of all its effects together, over a quantity of the bench."""
-        return shape_over(self.before, self.after, driver, self.name)
+        before, added = (
+            self.before,
+            [each for each in self.after.model.effects if str(each) not in self.before.model.parts],
+        )
+        component, component_sigma = _component(self.after, added)
+        return EffectShape(
+            effect=self.name, words=driver.words, symbol=driver.symbol, unit=driver.unit, values=driver.values,
+            quantity="m/s^2", residuals=before.residuals_mps2, left=self.unexplained_mps2, component=component,
+            component_sigma=component_sigma, is_curve=is_function_of(component, driver.values, driver.unit),
+            sigma=mean_sigmas(before), bars=bars_of(self.after),
+        )  # fmt: skip
 
     @cached_property
     def unexplained_mps2(self) -> Floats:

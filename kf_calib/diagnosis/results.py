@@ -14,7 +14,6 @@ from kf_calib.diagnosis.candidate_tests import CandidateTests
 from kf_calib.diagnosis.coefficient_sizes import Detectable, Unseen, detectable, sensor_grade, unseen
 from kf_calib.diagnosis.explanation import Explanation
 from kf_calib.diagnosis.hypothesis_table import ALIKE, IRREGULAR, SURE, Hypothesis, HypothesisTable
-from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.replication import Replication
 from kf_calib.diagnosis.residual_drivers import Driver, drivers_of
 from kf_calib.diagnosis.unknown_effect import Description, channel_of, describe_irregular, explained_share
@@ -136,7 +135,7 @@ class Diagnosis:
         if first is None or not first.formulas or first.refit is None:
             driver = "" if first is None or first.driver in (IRREGULAR, ALIKE) else first.driver
             return describe_irregular(self.before.fit, residuals, self.test.trend, driver)
-        share = explained_share(self.before.fit, first.refit.fit)
+        share = explained_share(self.before, first.refit)
         return Description(channel_of(residuals), first.driver, share, first.formulas)
 
     @property
@@ -166,25 +165,23 @@ class Diagnosis:
         """What could be added to the model: what the verdict names, then the other suspects, of which those that fit
         come first."""
         best = self.explanation
-        suspects = [each for each in self.suspects if (each.name,) != self.missing]
-        suspects.sort(key=lambda each: not each.fits)  # stable: by significance
-        others = [Explanation((each.name,), self.before, each.refit, each.fits, each.p_value) for each in suspects]
+        suspects = sorted(self.suspects, key=lambda each: not each.fits)  # stable: by significance
+        others = [Explanation((each.name,), self.before, each.refit, each.fits, each.p_value)
+                  for each in suspects if (each.name,) != self.missing]  # fmt: skip
         return others if best is None else [best, *others]
 
     @cached_property
     def explanation(self) -> Explanation | None:
-        """What the verdict names: the missing effects, or the formula of a quantity that an unknown misfit goes with,
-        which is fitted here; None where it names neither."""
+        """What the verdict names: the missing effects, or the formula of a quantity that an unknown misfit goes with;
+        None where it names neither."""
         if self.missing and self.after is not None:
             alone = self.test.effects.p_values.get(self.missing[0]) if len(self.missing) == 1 else None
             return Explanation(self.missing, self.before, self.after, True, alone)
         first = self.likeliest
-        if self.description is None or first is None or not first.formulas:
+        if self.description is None or first is None or not first.formulas or first.refit is None:
             return None
-        formulas = self.description.formulas
-        names = tuple(text.partition("=")[2].strip() or text for text in formulas)
-        after = first.refit or Refits().with_effects(self.before, formulas)
-        return Explanation(names, self.before, after, after.consistency.consistent is not False)
+        names = tuple(text.partition("=")[2].strip() or text for text in first.formulas)
+        return Explanation(names, self.before, first.refit, first.refit.consistency.consistent is not False)
 
     @cached_property
     def detectable(self) -> list[Detectable]:
