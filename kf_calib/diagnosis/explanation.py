@@ -189,7 +189,8 @@ class Explanation:
     def share(self) -> float | None:
         """Part of the misfit beyond noise that it explains, 0 to 1: the decrease of chi-squared from refit to refit,
         less the degrees of freedom that it takes; None if the means of the dwells agree without it."""
-        return explained_share(self.before, self.after) if misfit_beyond_noise(self.before) > 0.0 else None
+        before, after = self.before.consistency, self.after.consistency
+        return explained_share(before, after) if misfit_beyond_noise(self.before) > 0.0 else None
 
     @cached_property
     def shapes(self) -> list[EffectShape]:

@@ -135,7 +135,7 @@ class Diagnosis:
         if first is None or not first.formulas or first.refit is None:
             driver = "" if first is None or first.driver in (IRREGULAR, ALIKE) else first.driver
             return describe_irregular(self.before.fit, residuals, self.test.trend, driver)
-        share = explained_share(self.before, first.refit)
+        share = explained_share(self.before.consistency, first.refit.consistency)
         return Description(channel_of(residuals), first.driver, share, first.formulas)
 
     @property

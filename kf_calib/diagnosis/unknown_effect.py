@@ -10,7 +10,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.within_dwell_trend import Trend
 from kf_calib.effects import walk_named
 from kf_calib.estimation.fit import Fit
-from kf_calib.estimation.results import Calibration, consistency
+from kf_calib.estimation.results import Consistency, consistency
 
 _WITHIN = 0.01  # significance level of trends within dwells
 
@@ -56,9 +56,8 @@ def describe_irregular(
     return Description(channel_of(residuals), driver, irregular / max(excess, irregular, 1.0), (name,))
 
 
-def explained_share(calibration: Calibration, refit: Calibration) -> float:
+def explained_share(before: Consistency, after: Consistency) -> float:
     """Share of the chi-squared beyond noise that a refit with further effects explains."""
-    before, after = calibration.consistency, refit.consistency
     excess = before.statistic - before.dof
     return (
         min(max(before.statistic - after.statistic - (before.dof - after.dof), 0.0) / excess, 1.0)

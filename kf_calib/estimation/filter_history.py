@@ -239,10 +239,8 @@ def readings_of(
     every = max(1, -(-dwell.count // most))
     first_s = dwell.start_s - (float(dwell.nodes.since_arrival_s.min()) if left_out else 0.0)
     time_s, readings = _inside(source, first_s, dwell.end_s, every)
-    differences = readings - (dwell.means[4:] - error)
-    return DwellReadings(
-        number, time_s, differences, every, dwell.count, error, sigma, dwell.start_s, others is not None
-    )
+    less, alone = readings - (dwell.means[4:] - error), others is not None
+    return DwellReadings(number, time_s, less, every, dwell.count, error, sigma, dwell.start_s, alone)
 
 
 def _inside(source: Source, start_s: float, end_s: float, every: int) -> tuple[Floats, Floats]:

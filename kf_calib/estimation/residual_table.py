@@ -49,8 +49,7 @@ class Run(Protocol):
 
 
 def mean_sigmas(result: Run, noise: Noise | None = None) -> Floats:
-    """Sigma (D, 3) of the mean of each dwell in a noise, m/s^2; where none is given in that by which the misfit is
-    judged."""
+    """Sigma (D, 3) of the mean of each dwell, m/s^2, in a noise or in that by which the misfit is judged."""
     noise = result.noise.for_goodness_of_fit if noise is None else noise
     covariances = mean_covariances(noise.of_readings, result.linearised.means, result.linearised.state)
     return np.sqrt(np.einsum("dii->di", covariances))

@@ -12,7 +12,7 @@ from kf_calib.diagnosis import results
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.unknown_effect import Description
 
-LIKELIEST = {"formulas": ("mine = T",), "driver": "temperature", "refit": SimpleNamespace(fit="refit")}
+LIKELIEST = {"formulas": ("mine = T",), "driver": "temperature", "refit": SimpleNamespace(consistency="of refit")}
 
 
 @pytest.mark.parametrize(("unknown", "outlying", "likeliest", "expected"), [
@@ -27,7 +27,7 @@ def test_an_unknown_misfit_is_described_by_the_formulas_that_were_refitted_or_lo
     monkeypatch.setattr(results, "describe_irregular", lambda *_: "looked for")
     monkeypatch.setattr(results, "explained_share", lambda *_: 0.8)
     monkeypatch.setattr(results, "channel_of", lambda _: "z")
-    before: Any = SimpleNamespace(outlying=outlying, residuals_mps2=None, fit=None)
+    before: Any = SimpleNamespace(outlying=outlying, residuals_mps2=None, fit=None, consistency=None)
     made: Any = SimpleNamespace(
         unknown=unknown, before=before, likeliest=likeliest and SimpleNamespace(**likeliest),
         test=SimpleNamespace(trend=None),

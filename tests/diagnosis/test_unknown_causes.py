@@ -204,12 +204,9 @@ def test_no_decay_since_the_arrival_is_much_longer_than_the_dwells(dwell_s: floa
 @pytest.mark.parametrize(("fall", "taken", "share"), [
     (0.0, 3, 0.0), (33.0, 3, 0.3), (103.0, 3, 1.0), (150.0, 3, 1.0), (60.0, 10, 0.5),
 ])  # fmt: skip
-def test_a_formula_explains_a_share_of_the_misfit_beyond_noise(
-    fall: float, taken: int, share: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_formula_explains_a_share_of_the_misfit_beyond_noise(fall: float, taken: int, share: float) -> None:
     """Of a misfit of 160 with 60 degrees of freedom; the formula takes some of these, and so much of the misfit."""
     before, after = Consistency(160.0, 60, 0.0, False), Consistency(160.0 - fall, 60 - taken, 0.0, False)
-    monkeypatch.setattr(unknown_effect, "consistency", lambda fit: fit)
     assert unknown_effect.explained_share(before, after) == pytest.approx(share)
     sound = Consistency(50.0, 60, 0.8, True)
     assert unknown_effect.explained_share(sound, sound) == 1.0
