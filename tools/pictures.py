@@ -83,7 +83,6 @@ PICTURES: dict[str, Callable[[], Image.Image]] = {
     "replay_figure": _figure(lambda: kf_calib.plot.convergence(found().before)),
     "tutorial_dwell": _figure(lambda: kf_calib.plot.dwell(kf_calib.open_recording(RECORDING), found().before)),
     "tutorial_suspects": _figure(lambda: kf_calib.plot.suspects(found())),
-    "tutorial_steps": _figure(lambda: kf_calib.plot.residuals_of_steps(improved())),
     "tutorial_sigmas": _figure(lambda: kf_calib.plot.convergence(improved().result)),
     "replay": _view(lambda: found().before),
     "diagnose_view": _view(found),

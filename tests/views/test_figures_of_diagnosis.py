@@ -156,45 +156,40 @@ def test_residuals_of_single_dwells_are_drawn_in_micro_g_or_si() -> None:
     assert first.get_title("right") == f"rms {rounded_number(rms, 2)} µg"
 
 
+def headings(figure: Figure) -> list[list[str]]:
+    """The lines above the columns of an improvement."""
+    return [axes.get_title("left").split("\n") for axes in panels(figure) if axes.get_title("left")]
+
+
 @pytest.mark.slow
 def test_errors_fall_in_the_figure_as_in_the_result() -> None:
     state = improved("second-order=15sigma")
     figure = plot.improvement(state)
     assert_ink(figure)
-    axes = axes_of(figure, "The error of the model")
-    lines = {line.get_label(): np.asarray(line.get_ydata(), float) for line in axes.lines}
     results = [state.start.before, *(step.result for step in state.steps)]
-    held_out = [each.held_out_rms_mps2 for each in results]
-    assert lines["rms of orientations left out of the fit"] == pytest.approx(np.array(held_out) / MICRO_G)
-    fitted = np.array([each.residual_rms_mps2 for each in results])
-    assert lines["rms of orientations in the fit"] == pytest.approx(fitted / MICRO_G)
-    assert lines["what noise alone gives"][0] == pytest.approx(state.result.held_out_floor_mps2 / MICRO_G)
-    assert axes.get_yscale() == "log" and axes.get_ylabel() == "rms error, µg"
-    assert sum(bool(label.get_text()) for label in axes.get_yticklabels()) >= 2
-    ticks = [label.get_text() for label in axes.get_xticklabels()]
-    assert ticks[0].startswith("0: start\np ") and ticks[1].startswith("1: + second-order\np = ")
+    start, added, effect = headings(figure)
+    assert (start[0], added[0], effect[0]) == ("0: start", "1: + second-order", "second-order")
+    for result, (_, error, p_value) in zip(results, (start, added), strict=True):
+        rms, floor = result.held_out_rms_mps2 or 0.0, state.floor_mps2 or 1.0
+        assert error == f"held out {rms / MICRO_G:.3g} µg = {rms / floor:.2f} × noise" and p_value.startswith("p ")
     below = axes_of(figure, "second-order")
-    middles = [container.lines[0].get_ydata()[0] for container in below.containers]  # type: ignore[union-attr]
-    own = [state.result.parameters[f"K2_{i}"] for i in (1, 2, 3)]
-    assert middles == pytest.approx([p.value * p.per_si for p in own])
+    middles = [container.lines[0].get_xdata()[0] for container in below.containers[1::2]]  # type: ignore[union-attr]
+    parameters = [state.result.parameters[f"K2_{i}"] for i in (1, 2, 3)]
+    assert middles == pytest.approx([(p.value or 0.0) * p.per_si for p in parameters])
+    left, right = below.get_xlim()
+    assert left < 0.0 < right and below.get_xlabel() == "coefficient ± 1σ and 2σ, µg/g²"
 
 
-def test_undone_steps_and_choices_left_open_are_drawn_beside_the_way() -> None:
+def test_undone_steps_and_choices_left_open_have_columns() -> None:
     refits = Refits()
     state = extend(begin(run("bias-drift=15sigma"), refits), refits, ("second-order",), "user")
     state = undone(state, refits)
     figure = plot.improvement(state)
     assert_ink(figure)
-    axes = axes_of(figure, "The error of the model")
-    ticks = [label.get_text() for label in axes.get_xticklabels()]
-    assert ticks[1].split("\n")[:2] == ["1: + second-order", "(undone)"]
-    assert [" ".join(tick.split()) for tick in ticks if tick.endswith("?")] == [
-        f"{k}: + {each.name}?" for k, each in enumerate(state.alternatives, start=2)
-    ]
-    way = next(line for line in axes.lines if line.get_label() == "rms of orientations left out of the fit")
-    assert list(np.asarray(way.get_xdata())) == [0]
-    assert sum(line.get_marker() == "x" for line in axes.lines) == 2
-    assert_ink(plot.residuals_of_steps(state))
+    words = [" ".join(lines[:2]) for lines in headings(figure)]
+    assert words[1].startswith("1: + second-order (undone)")
+    chosen = [f"{k}: + {each.name}?" for k, each in enumerate(state.alternatives, start=2)]
+    assert all(word.startswith(text) for word, text in zip(words[2:], chosen, strict=True))
 
 
 @pytest.mark.parametrize("made", [
@@ -211,7 +206,7 @@ def test_odd_improvements_are_drawn(made: object) -> None:
 
 def test_residuals_of_each_step_share_their_axes() -> None:
     state = improved("second-order=15sigma")
-    axes = panels(plot.residuals_of_steps(state))
+    axes = panels(plot.improvement(state))[:-1]
     assert len(axes) == 3 * (1 + len(state.steps))
     assert len({each.get_ylim() for each in axes}) == len({each.get_xlim() for each in axes}) == 1
     drawn = [np.asarray(each.lines[-1].get_ydata(), float) for each in axes]

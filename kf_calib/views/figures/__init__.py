@@ -18,7 +18,7 @@ from kf_calib.views.figures.collection import Figures, figures, save  # noqa: E4
 from kf_calib.views.figures.convergence import convergence, estimates, history  # noqa: E402
 from kf_calib.views.figures.engines import allan_deviation, three_ways, whiteness  # noqa: E402
 from kf_calib.views.figures.explanations import detection_limits, hypotheses, suspects  # noqa: E402
-from kf_calib.views.figures.improvement import improvement, residuals_of_steps  # noqa: E402
+from kf_calib.views.figures.improvement import improvement  # noqa: E402
 from kf_calib.views.figures.noise import noise  # noqa: E402
 from kf_calib.views.figures.orientations import (  # noqa: E402
     correlations,
@@ -33,6 +33,6 @@ from kf_calib.views.figures.residuals import disturbed_dwell, dwell, residuals, 
 __all__ = [
     "Figures", "allan_deviation", "convergence", "correlations", "detection_limits", "directions",
     "disturbed_dwell", "dwell", "estimates", "figures", "history", "hypotheses", "improvement", "information", "noise",
-    "on_the_sphere", "plan", "predicted_sigmas", "residuals", "residuals_of_steps", "save", "suspects", "three_ways",
+    "on_the_sphere", "plan", "predicted_sigmas", "residuals", "save", "suspects", "three_ways",
     "what_they_go_with", "whiteness",
 ]  # fmt: skip

@@ -25,7 +25,7 @@ from kf_calib.views.figures import style
 from kf_calib.views.figures.convergence import convergence, estimates, history
 from kf_calib.views.figures.engines import allan_deviation, three_ways, whiteness
 from kf_calib.views.figures.explanations import detection_limits, hypotheses, suspects
-from kf_calib.views.figures.improvement import improvement, residuals_of_steps
+from kf_calib.views.figures.improvement import improvement
 from kf_calib.views.figures.noise import noise
 from kf_calib.views.figures.orientations import (
     correlations,
@@ -88,7 +88,6 @@ def _(state: Improvement) -> Figures:
     fails = state.start.test.consistent is False
     return {
         FALL if state.steps else NO_FALL: lambda: improvement(state),
-        "Residuals of each step": lambda: residuals_of_steps(state),
         "Where the first model fails" if fails else "What the first model leaves": lambda: residuals(state.start),
         "What could still hide": lambda: detection_limits(state.diagnosis),
     }
