@@ -45,7 +45,6 @@ HOW = "--column THEIRS=OURS says what a column is"
 KNOWN = "ax_g (ay_mps2, az_mg), sx_g or sd_g, outer_deg (middle_rad, inner_deg), qx, face, time_s, count, temperature_c"
 READINGS, SPREADS = ("ax", "ay", "az"), ("sx", "sy", "sz")
 _OPTIONAL = ("time", "count", "temperature", "sd", *SPREADS)
-_SEVERAL = ("angle", "time", "")
 _MARKS_OF_TABLES = ("count", "face", "sd", *SPREADS)
 _NOTHING = frozenset(("-", "–", "—", "n/a", "na", "nan", "#n/a", "null", "none", "?"))
 """What people write where there is no temperature."""
@@ -141,7 +140,6 @@ class Columns:
             columns.chosen = choice_of(columns.units.where, header, full, among)
             columns.rows = [row for row in full if columns.is_chosen(row)]
         columns.meanings = meanings_of(header, stated)
-        columns._refuse_same_names()
         if is_nameless(header) and not stated:
             columns._recognise_numbers()
         if is_table:
@@ -167,6 +165,8 @@ class Columns:
         places = self.places(ours)
         places = [at for at in places if is_exact(self.names[at])] or places
         if len(places) > 1:
+            if len({self.names[at].lower() for at in places}) == 1:
+                raise InputError(f"two columns are named {self.names[places[0]]!r}: rename or remove one of them.")
             raise InputError(
                 f"columns {self.named(places)} are all taken for {ours}: say which it is, for example by "
                 f"--column {f'{self.header[places[0]]}={ours}'!r}."
@@ -196,9 +196,8 @@ class Columns:
         return [k for k, own in enumerate(self.meanings) if not own.ours and self.header[k]]
 
     @property
-    def _seen(self) -> str:
-        shown = ",".join(self.header[:12])
-        return repr(shown if len(shown) <= 120 else shown[:120] + "...")
+    def _all(self) -> str:
+        return cut(self.named(range(len(self.header))), 300)
 
     @cached_property
     def numbers(self) -> Numbers | None:
@@ -280,7 +279,7 @@ class Columns:
         if not places:
             raise InputError(
                 "no column gives the time: name it time_s or time_ns, or give the rate of the rows, for example "
-                f"--rate 100; {self.wanted}, not {self._seen}."
+                f"--rate 100; {self.wanted}, not {self._all}."
             )
         exact = [at for at in places if is_exact(self.names[at])]
         united = [at for at in places if self.meanings[at].unit]
@@ -318,7 +317,7 @@ class Columns:
         name = self.header[place]
         raise InputError(
             f"no column gives the time with its unit: say which {name!r} has, for example --column '{name}=time_ms'; "
-            f"{self.wanted}, not {self._seen}."
+            f"{self.wanted}, not {self._all}."
         )
 
     def _dates(self, places: Sequence[int]) -> Stamps:
@@ -351,7 +350,7 @@ class Columns:
         if "" in named and not (self.units.accel or self.units.as_default(named, norm)) and math.isnan(norm):
             raise InputError(
                 f"no columns give the three readings with their unit: name them ax_mps2, ay_mps2, az_mps2 (or ax_g, "
-                f"ax_mg ...), not {self._seen}, or state it by --accel-unit, and the size of counts by --accel-scale."
+                f"ax_mg ...), not {self._all}, or state it by --accel-unit, and the size of counts by --accel-scale."
             )
         told = reading_units(named, values, self.units, self.local_mps2)
         self.by_size |= {at: told.units[k] for k, at in enumerate(places) if told.by_size and not named[k]}
@@ -386,7 +385,7 @@ class Columns:
         example = f"--column '{self._left_over}={missing[0]}_g'"
         raise InputError(
             f"no column was recognised as the {'mean ' * self.is_table}reading of accelerometer "
-            f"{' and '.join(ours[1] for ours in missing)} among {cut(self.named(range(len(self.header))), 300)}: name "
+            f"{' and '.join(ours[1] for ours in missing)} among {self._all}: name "
             f"it, for example {example} (known: {KNOWN})."
         )
 
@@ -441,20 +440,12 @@ class Columns:
 
     def without_angles(self) -> InputError:
         """That no angles are there, or none whose unit is known."""
-        if self.is_table:
-            return InputError(
-                f"no column was recognised as gimbal angles, attitude or face among "
-                f"{cut(self.named(range(len(self.header))), 300)}: name it, for example --column "
-                f"'{self._left_over}=face' with cells such as +x or -z, or =outer_deg (known: {KNOWN}), or do without "
-                "orientations (--no-angles)."
-            )
-        places = self.places("angle")
-        name = self.header[places[0]] if places else ""
-        example = f", for example by --column '{name}=outer_deg'" if places else ""
+        theirs = next((self.header[at] for at in self.places("angle")), self._left_over)
+        face = ", or the face that is up, with cells such as +x or -z" * self.is_table
         return InputError(
-            f"no columns give the platform's angles with their unit: name them outer_deg, inner_deg ... or "
-            f"outer_rad ..., outer gimbal first{example} (or the attitude qx, qy, qz, qw), not {self._seen}; or use "
-            "none (--no-angles)."
+            f"no column was recognised as gimbal angles, attitude or face among {self._all} with their unit: name them "
+            f"outer_deg, inner_deg ... or outer_rad ..., outer gimbal first, for example by --column "
+            f"'{theirs}=outer_deg' (or the attitude qx, qy, qz, qw{face}), or do without orientations (--no-angles)."
         )
 
     def quaternion(self) -> QuantityColumns:
@@ -472,13 +463,6 @@ class Columns:
         return QuantityColumns((at,), (1.0,), _NOTHING), self.meanings[at].unit or "c"
 
     # -- what names do not tell --
-
-    def _refuse_same_names(self) -> None:
-        """Raise InputError for two columns of a quantity under one name."""
-        used = [name.lower() for name, own in zip(self.names, self.meanings, strict=True) if own.ours not in _SEVERAL]
-        times = Counter(used)
-        if repeated := next((name for name in used if times[name] > 1), None):
-            raise InputError(f"two columns are named {repeated!r}: rename or remove one of them.")
 
     def _recognise_numbers(self) -> None:
         """Find time and readings in columns without names."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from kf_calib.bench.streams import Batch
 from kf_calib.sources.text.columns import Columns
 from kf_calib.sources.text.heading import BLANK, cells_of, with_texts, without_empty_end
 from kf_calib.sources.text.numbers import DECIMAL_POINT, LineError, written
@@ -20,7 +21,7 @@ class CsvLines(LineReader):
     Raises InputError where the columns do not say what is needed.
     """
 
-    _faults = ((ValueError, "a cell is not a number"), (ArithmeticError, "a cell is not a number"))
+    _wrong = "a cell is not a number"
 
     def __init__(self, columns: Columns, account: Account, angles: bool = True) -> None:
         super().__init__(account)
@@ -75,9 +76,10 @@ class CsvLines(LineReader):
         self._last_ns = max(self._last_ns, time_ns)
         return time_ns
 
-    def _begin_block(self, lines: Sequence[str]) -> None:
+    def read(self, lines: Sequence[str], first_line: int) -> Batch:
         if self._numbers is None:
             self._numbers = self._columns.numbers_in([self._cells(line) for line in lines])
+        return super().read(lines, first_line)
 
     def _cells(self, line: str) -> list[str]:
         if (labels := self._columns.heading.labels) is not None:

@@ -18,6 +18,7 @@ from kf_calib.sources.containers.opening import DatasetText, dataset_of, kind_of
 
 LONGEST_LINE_BYTES = 1 << 20
 GZIP, _UTF16 = b"\x1f\x8b", (b"\xff\xfe", b"\xfe\xff")
+LARGEST_TABLE_BYTES = 50_000_000
 _HEAD_BYTES = 1 << 18
 _CYRILLIC = re.compile(rb"[\xc0-\xff]{3}")
 _BLOCK_BYTES = 1 << 20
@@ -27,11 +28,11 @@ _NOT_UNPACKED = (EOFError, zlib.error, gzip.BadGzipFile)
 class TextFile:
     """Opened to be read once. dataset: of a container, that which is read, or the one that is taken where it is empty.
 
-    trouble: a sentence if its end cannot be unpacked. said: what of a container was taken, where that was a choice.
-    Raises OSError, and InputError of a container.
+    is_raw: whether its bytes are given as they stand in it. trouble: a sentence if its end cannot be unpacked. said:
+    what of a container was taken, where that was a choice. Raises OSError, and InputError of a container.
     """
 
-    def __init__(self, path: Path, dataset: str = "") -> None:
+    def __init__(self, path: Path, dataset: str = "", *, is_raw: bool = False) -> None:
         self._size = max(path.stat().st_size, 1)
         arrays = dataset_of(path, dataset) if kind_of_container(path) else None
         self.trouble, self._has_ended, self.said = "", False, arrays.said if arrays else ()
@@ -44,7 +45,7 @@ class TextFile:
         except BaseException:
             self._raw.close()
             raise
-        encoding = encoding_of(self._head)
+        encoding = "utf-8" if is_raw else encoding_of(self._head)
         self._decoder = None if encoding == "utf-8" else codecs.getincrementaldecoder(encoding)("replace")
 
     def __enter__(self) -> Self:
@@ -100,35 +101,34 @@ def holds_any(path: Path, words: Sequence[bytes]) -> bool:
     return False
 
 
-def text_of(path: Path, largest: int, dataset: str = "") -> str:
+def text_of(path: Path, dataset: str = "") -> str:
     """The whole text of a file, without bytes of zero at its end, as a power cut leaves them; dataset: of a container.
 
-    Raises InputError where it has more bytes than ``largest`` or is no text, OSError where it cannot be read.
+    Raises as ``unpacked``, and InputError where it is no text.
     """
-    content = bytearray()
-    with TextFile(path, dataset) as file:
-        while len(content) <= largest and (block := file.read(_BLOCK_BYTES)):
-            content += block
-    if len(content) > largest:
-        raise too_large(path)
-    if file.trouble:
-        raise InputError(f"{path}: {file.trouble.partition(': ')[0]}: copy it anew.")
-    content = content.rstrip(b"\0")
-    if b"\0" in content:
+    content = unpacked(path, dataset)
+    text = content.decode(encoding_of(content[:_HEAD_BYTES]), errors="replace").rstrip("\0").removeprefix("\ufeff")
+    if "\0" in text:
         raise InputError(f"{path}: is no text (it has bytes of zero): save the table as CSV or .xlsx.")
-    return content.decode("utf-8", errors="replace").removeprefix("\ufeff")
+    return text
 
 
 def unpacked(path: Path, dataset: str = "") -> bytes:
     """The bytes of a file of text as they stand in it, or in what gzip has packed there; of a container the lines of a
-    dataset. Raises OSError, and InputError where its end cannot be unpacked."""
-    if kind_of_container(path):
-        return b"".join(dataset_of(path, dataset).lines())
-    content = path.read_bytes()
-    try:
-        return gzip.decompress(content) if content.startswith(GZIP) else content
-    except _NOT_UNPACKED as error:
-        raise InputError(f"{path}: its end cannot be unpacked ({error}): copy it anew.") from None
+    dataset.
+
+    Raises InputError where it has more bytes than a table of orientations or its end cannot be unpacked, OSError where
+    it cannot be read.
+    """
+    content = bytearray()
+    with TextFile(path, dataset, is_raw=True) as file:
+        while len(content) <= LARGEST_TABLE_BYTES and (block := file.read(_BLOCK_BYTES)):
+            content += block
+    if len(content) > LARGEST_TABLE_BYTES:
+        raise too_large(path)
+    if file.trouble:
+        raise InputError(f"{path}: {file.trouble.partition(': ')[0]}: copy it anew.")
+    return bytes(content)
 
 
 def too_large(path: Path) -> InputError:

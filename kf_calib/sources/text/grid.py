@@ -13,7 +13,7 @@ from typing import Any
 from kf_calib.errors import InputError
 from kf_calib.sources.containers.opening import kind_of_container
 from kf_calib.sources.containers.spreadsheet import sheets_of
-from kf_calib.sources.text.encoding import text_of, too_large
+from kf_calib.sources.text.encoding import LARGEST_TABLE_BYTES, text_of, too_large
 from kf_calib.sources.text.heading import TextHeading
 from kf_calib.sources.text.numbers import DECIMAL_POINT, Numbers
 from kf_calib.support.text import cut
@@ -22,7 +22,6 @@ ZIP = b"PK\x03\x04"
 TEXT_SUFFIXES = (".csv", ".tsv", ".txt")
 EXCEL_SUFFIXES = (".xlsx", ".xlsm")
 OLD_SUFFIXES = (".xls", ".ods")
-_LARGEST = (50_000_000, 50_000_000)  # bytes, of text and of a spreadsheet, which may hold pictures
 _SHOWN = 6  # rows in a message
 _LONGEST_CELL = 300  # characters; a longer one is a remark, of which the middle is left out
 _MOST_COLUMNS, _MOST_CELLS = 1000, 2_000_000
@@ -55,7 +54,7 @@ def grid_of(table: Any, dataset: str = "") -> Grid:
     if path.suffix.lower() in OLD_SUFFIXES:
         raise InputError(f"{path}: files of the kind {path.suffix} are not read: save it as .xlsx or .csv.")
     is_excel = start.startswith(ZIP) and not kind_of_container(path)
-    if path.stat().st_size > _LARGEST[is_excel] and not kind_of_container(path):
+    if is_excel and path.stat().st_size > LARGEST_TABLE_BYTES:
         raise too_large(path)
     return replace(_of_excel(path) if is_excel else _of_text(path, dataset), path=path)
 
@@ -63,7 +62,7 @@ def grid_of(table: Any, dataset: str = "") -> Grid:
 def _of_text(path: Path, dataset: str) -> Grid:
     """Return the cells of a CSV file: any usual encoding and delimiter, with or without lines above the header."""
     try:
-        heading = TextHeading.of(text_of(path, _LARGEST[0], dataset).splitlines(), is_whole=True)
+        heading = TextHeading.of(text_of(path, dataset).splitlines(), is_whole=True)
     except csv.Error as error:
         raise InputError(f"{path}: is no CSV file ({error}): save the table as CSV or .xlsx.") from None
     return _padded(str(path), heading)

@@ -44,11 +44,7 @@ class JsonLines(LineReader):
     settle the unit that all are brought to.
     """
 
-    _faults = (
-        (ValueError, "it is not JSON"),
-        (RecursionError, "it is nested too deeply"),
-        (ArithmeticError, "a number is out of range"),
-    )
+    _wrong = "it is not JSON"
 
     def __init__(self, columns: Mapping[str, str], account: Account) -> None:
         super().__init__(account)
@@ -140,22 +136,18 @@ class JsonLines(LineReader):
 
     def _pose(self, entry: dict[str, Any]) -> tuple[list[float] | None, bool]:
         """The pose, if any, and whether it is made of angles."""
-        for name, factor in _ANGLES.items():
-            if entry.get(name) is not None:
-                return self._fitting([factor * value for value in _numbers(entry[name], name)], name, True), True
-        if entry.get(_ATTITUDE) is None:
+        name = next((name for name in POSE_KEYS if entry.get(name) is not None), None)
+        if name is None:
             return None, True
-        values = _numbers(entry[_ATTITUDE], _ATTITUDE)
-        if len(values) != 4 or not any(values):
-            raise LineError(f"{_ATTITUDE} is not a quaternion")
-        return self._fitting(values, _ATTITUDE, False), False
-
-    def _fitting(self, values: list[float], name: str, has_angles: bool) -> list[float]:
+        values, has_angles = _numbers(entry[name], name), name != _ATTITUDE
+        if not has_angles and (len(values) != 4 or not any(values)):
+            raise LineError(f"{name} is not a quaternion")
         if not values:
             raise LineError(f"{name} is empty")
         if self.pose_width and (len(values), has_angles) != (self.pose_width, self.has_angles):
             raise LineError(f"{name} is not like the poses before it")
-        return values
+        factor = _ANGLES.get(name, 1.0)
+        return [factor * value for value in values], has_angles
 
 
 def _spans(line: str) -> dict[str, tuple[tuple[int, int], tuple[int, int]]]:

@@ -323,7 +323,8 @@ class _Passage:
                 raise self._unusable(what)
 
     def _open_parser(self) -> None:
-        """Reads the first lines; of CSV some rows as well, which tell what the header may not."""
+        """Chooses the parser by the first lines, of CSV by some rows as well, which tell what the header may not; it
+        reads the rest of the first block."""
         first = list[str]()
         for lines in self._blocks:
             first += lines
@@ -334,15 +335,11 @@ class _Passage:
                 break
         if not first:
             raise InputError(f"{self._name} holds no lines: check that the logger wrote any.")
-        self._start(first)
-
-    def _start(self, lines: list[str]) -> None:
-        """Chooses the parser by the first lines and has it read the rest of the first block."""
         with named(self._name):
-            self.parser, heading = self._open_reader(lines, self.account)
+            self.parser, heading = self._open_reader(first, self.account)
         self._said = self.parser.said
         self.account.lines += heading
-        self._ahead.append(self._parse(lines[heading:]))
+        self._ahead.append(self._parse(first[heading:]))
 
     def _next_batch(self) -> Batch | None:
         lines = next(self._blocks, None)
@@ -360,21 +357,17 @@ class _Passage:
     def _split(self, stream: BinaryIO | TextFile) -> Iterator[list[str]]:
         """Whole lines, block by block as they arrive."""
         cutter = Cutter(self.account.refuse)
-        for block in self._read(stream):
-            if lines := cutter.push(block):
-                self.fraction = self._file.fraction if self._file else math.nan
-                yield lines
-        if lines := cutter.rest():
-            yield lines
-        self.fraction = 1.0
-
-    def _read(self, stream: BinaryIO | TextFile) -> Iterator[bytes]:
         read = getattr(stream, "read1", stream.read)  # read1 does not wait until a whole block has come
         try:
             while block := read(_BLOCK_BYTES):
-                yield block
+                if lines := cutter.push(block):
+                    self.fraction = self._file.fraction if self._file else math.nan
+                    yield lines
         except OSError as error:
             raise InputError(f"{self._name}: cannot be read on ({error.strerror}).") from None
+        if lines := cutter.rest():
+            yield lines
+        self.fraction = 1.0
 
     def _unusable(self, what: str) -> InputError:
         found = "".join(f"; {sentence.rstrip('.')}" for sentence in self.account.sentences())

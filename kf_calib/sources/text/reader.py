@@ -95,8 +95,8 @@ class LineReader(ABC):
     not plain.
     """
 
-    _faults: ClassVar[tuple[tuple[type[Exception], str], ...]]
-    """What reading a line may raise beside LineError, and the reason to give."""
+    _wrong: ClassVar[str]
+    """The reason to give where reading a line raises a ValueError that tells none."""
 
     def __init__(self, account: Account) -> None:
         self.metadata: dict[str, str] = {}
@@ -123,9 +123,7 @@ class LineReader(ABC):
 
     def read(self, lines: Sequence[str], first_line: int) -> Batch:
         """The batch of consecutive lines, the first of them of that number."""
-        self._begin_block(lines)
         accel, pose, temperature = LineRows(), LineRows(), LineRows()
-        faults = tuple(kind for kind, _ in self._faults)
         for number, line in enumerate(lines, start=first_line):
             if not line or line.isspace():
                 continue
@@ -133,14 +131,13 @@ class LineReader(ABC):
                 self._read_line(line, accel, pose, temperature)
             except LineError as error:
                 self._account.refuse(number, str(error))
-            except faults as error:
-                reason = next(reason for kind, reason in self._faults if isinstance(error, kind))
-                self._account.refuse(number, reason)
+            except (ValueError, ArithmeticError, RecursionError) as error:
+                reasons = {ArithmeticError: "a number is out of range", RecursionError: "it is nested too deeply"}
+                known = (reason for kind, reason in reasons.items() if isinstance(error, kind))
+                self._account.refuse(number, next(known, self._wrong))
         return Batch(accel.stream(3), pose.stream(self.pose_width), temperature.stream(1))
-
-    def _begin_block(self, lines: Sequence[str]) -> None:  # noqa: B027 (not every reader has to look ahead)
-        """Called with the lines before any of them is read."""
 
     @abstractmethod
     def _read_line(self, line: str, accel: LineRows, pose: LineRows, temperature: LineRows) -> None:
-        """Adds what one line holds, all of it or nothing; raises LineError or one of ``_faults``."""
+        """Adds what one line holds, all of it or nothing. Raises ValueError, ArithmeticError or RecursionError where it
+        cannot be used, LineError with the reason."""
