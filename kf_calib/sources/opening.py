@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from datetime import datetime
 from enum import Enum
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
 
+import numpy as np
+
+from kf_calib.bench.arrays import lengths
 from kf_calib.bench.streams import Source
 from kf_calib.errors import InputError
 from kf_calib.sources.containers.opening import dataset_of, kind_of_container
@@ -19,18 +23,20 @@ from kf_calib.sources.files.mcap_records import MAGIC
 from kf_calib.sources.files.record_files import SQLITE, first_bytes
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.files.ros1_bag import ROS1_BAG
-from kf_calib.sources.text.columns import Columns
+from kf_calib.sources.text.columns import READINGS, Columns
 from kf_calib.sources.text.encoding import head_of
 from kf_calib.sources.text.grid import OLD_SUFFIXES, TEXT_SUFFIXES, ZIP
 from kf_calib.sources.text.heading import TextHeading
 from kf_calib.sources.text.lines import Lines, is_json
 from kf_calib.sources.text.means import open_table
+from kf_calib.sources.text.numbers import DECIMAL_POINT, LineError
 from kf_calib.support.text import date_of_stamp, parse_date
 
 _OF_CALIBRATION = 200  # first bytes of a calibration, which name its format
 _FEWEST_SAMPLES = 50
 _SLOWEST_S = 1.0
 """Rows that are closer are samples, not dwells."""
+_MANY, _ALIKE_RAD, _MOST = 500, 0.1, 0.5
 
 
 class FileKind(Enum):
@@ -86,15 +92,41 @@ def kind_of(
 
 
 def _are_samples(lines: list[str], stated: Mapping[str, str]) -> bool:
-    """Whether the rows under a header are a time series: many, and close in time."""
+    """Whether the rows under a header are a time series: many, and close in time or, without one, alike."""
     try:
         columns = Columns.of(TextHeading.of(lines), stated)
     except InputError:
         return False
     if columns.marks_of_a_table or len(columns.rows) <= _FEWEST_SAMPLES:
         return False
-    step_s = columns.step_s
-    return columns.are_alike if math.isnan(step_s) else step_s < _SLOWEST_S
+    step_s = _step_s(columns)
+    return _are_alike(columns) if math.isnan(step_s) else step_s < _SLOWEST_S
+
+
+def _step_s(columns: Columns) -> float:
+    """Return the usual step from row to row, s; NaN where no time can be told."""
+    try:
+        time = columns.time()
+    except InputError:
+        return math.nan
+    stamps, numbers = list[int](), columns.numbers or DECIMAL_POINT
+    for number, row in enumerate(columns.rows):
+        with suppress(LineError):
+            stamps.append(time.ns(row, columns.header, numbers, number))
+    steps = np.abs(np.diff(np.array(stamps, float)))
+    return float(np.median(steps)) / 1e9 if len(steps) else math.nan
+
+
+def _are_alike(columns: Columns) -> bool:
+    """Return whether the readings of most rows are as those before, as of a sensor that lies still between turns; a
+    row a dwell would change from one to the next."""
+    places = columns.places(*READINGS)
+    if len(places) != 3 or len(columns.rows) < _MANY:
+        return False
+    values = columns.values(places)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        unit = values / lengths(values)[:, None]
+        return bool((lengths(np.diff(unit, axis=0)) < _ALIKE_RAD).mean() > _MOST)
 
 
 def no_recording(path: str | PathLike[str]) -> InputError:

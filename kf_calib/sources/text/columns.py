@@ -8,11 +8,9 @@ means is read as a log of samples is; it has all rows at hand, so that what stan
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from operator import mul
 
 import numpy as np
 
@@ -34,8 +32,9 @@ from kf_calib.sources.text.names import (
     meanings_of,
     unit_of_epoch,
 )
-from kf_calib.sources.text.numbers import DECIMAL_POINT, CellError, LineError, Numbers
-from kf_calib.sources.text.stamps import Stamps, stamp_of
+from kf_calib.sources.text.numbers import DECIMAL_POINT, Numbers
+from kf_calib.sources.text.quantity import CsvRow, QuantityColumns
+from kf_calib.sources.text.stamps import Stamps, are_stamps
 from kf_calib.sources.text.units import Units, choice_of, reading_units, size_of_count, usual_norm
 from kf_calib.support.text import cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
@@ -51,50 +50,8 @@ _NOTHING = frozenset(("-", "–", "—", "n/a", "na", "nan", "#n/a", "null", "no
 _TIME_ALONE = {"t": "", "sec": "", "secs": "", "millis": "ms", "micros": "us"}
 _OF_STEPS = ((0.0, 1.0, "s"), (1e3, 1e6, "us"), (1e6, 1e9, "ns"))
 """Steps that tell the unit of stamps: between them and in another unit, rows would be no samples."""
-_MANY, _ALIKE_RAD, _MOST = 500, 0.1, 0.5
 _ALIKE = 1.3  # of the norms of readings at rest, largest to smallest
 _MOST_CELLS = 0.6  # of a column of readings are numbers: a bad one is told later
-_FEWEST_ROWS, _MOST_UNITS, _APART = 20, 8, 5.0  # rows and labels of several sensors, and sigmas between these
-
-CsvRow = Sequence[str]
-
-
-@dataclass(frozen=True)
-class QuantityColumns:
-    """Where a quantity stands in a row, the factors that bring it to our units, and texts that stand for no value."""
-
-    at: tuple[int, ...] = ()
-    factors: tuple[float, ...] = ()
-    absent: Container[str] = ()
-
-    def values(self, row: CsvRow, header: Sequence[str], numbers: Numbers) -> list[float] | None:
-        """The quantity, None where it is not measured. Raises CellError where it cannot be used."""
-        cells = [row[at] for at in self.at]
-        if not all(cells):
-            if any(cells):
-                raise CellError(self.at[cells.index("")], "some components of a vector are missing")
-            return None
-        try:
-            values = list(map(numbers.value, cells))
-        except ValueError:
-            values = [math.nan]
-        if not math.isfinite(sum(values)):  # which numbers beyond 1e308 together are not, either
-            if cells[0].lower() in self.absent:
-                return None
-            self._refuse_cells(cells, header, numbers)
-        return list(map(mul, values, self.factors))
-
-    def _refuse_cells(self, cells: Sequence[str], header: Sequence[str], numbers: Numbers) -> None:
-        """Raise CellError for the first cell that holds no finite number, if there is one."""
-        for at, cell in zip(self.at, cells, strict=True):
-            try:
-                is_number = math.isfinite(numbers.value(cell))
-            except LineError as error:
-                raise CellError(at, str(error)) from None
-            except ValueError:
-                is_number = False
-            if not is_number:
-                raise CellError(at, f"column {cut(header[at], 40)!r} is {cut(cell, 40)!r}, which is no number")
 
 
 @dataclass
@@ -229,34 +186,6 @@ class Columns:
     def marks_of_a_table(self) -> bool:
         """Whether there is what only a table of dwells has: numbers of readings, deviations, faces."""
         return any(own.ours in _MARKS_OF_TABLES for own in self.meanings)
-
-    @property
-    def step_s(self) -> float:
-        """The usual step from row to row, s; NaN where no time can be told."""
-        try:
-            time = self.time()
-            stamps, numbers = list[int](), self.numbers or DECIMAL_POINT
-            for number, row in enumerate(self.rows):
-                try:
-                    stamps.append(time.ns(row, self.header, numbers, number))
-                except LineError:
-                    continue
-        except InputError:
-            return math.nan
-        steps = np.abs(np.diff(np.array(stamps, float)))
-        return float(np.median(steps)) / 1e9 if len(steps) else math.nan
-
-    @property
-    def are_alike(self) -> bool:
-        """Whether the readings of most rows are as those before, as of a sensor that lies still between turns; a
-        row a dwell would change from one to the next."""
-        places = self.places(*READINGS)
-        if len(places) != 3 or len(self.rows) < _MANY:
-            return False
-        values = self.values(places)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            unit = values / lengths(values)[:, None]
-            return bool((lengths(np.diff(unit, axis=0)) < _ALIKE_RAD).mean() > _MOST)
 
     @property
     def orientation(self) -> str:
@@ -483,7 +412,7 @@ class Columns:
             kind = self.meanings[k].ours
             if kind in ("", "angle") and not self.has("face") and all(are_faces):
                 self._guess(k, "face")
-            elif kind == "" and not self.has("time") and self._are_stamps(cells):
+            elif kind == "" and not self.has("time") and are_stamps(cells):
                 self._guess(k, "time")
         if self.places(*READINGS):
             return
@@ -499,12 +428,6 @@ class Columns:
         self.meanings[place] = Meaning(ours, self.meanings[place].unit)
         self.guessed.append(self.header[place])
 
-    def _are_stamps(self, cells: Sequence[str]) -> bool:
-        try:
-            return bool(cells) and all(stamp_of(cell, month_first=False) for cell in cells)
-        except ValueError:
-            return False
-
     def _are_numbers(self, place: int, share: float) -> bool:
         """Whether at least this share of the cells of a column are numbers."""
         return float(np.mean(np.isfinite(self.values([place])))) >= share if self.rows else False
@@ -515,40 +438,6 @@ class Columns:
         """The names of columns that nothing here knows: not those of a gyroscope, say, which are of no use here."""
         return [name for at, (name, own) in enumerate(zip(self.names, self.meanings, strict=True))
                 if name and at not in used and not own.other]  # fmt: skip
-
-    def refuse_several_units(self, used: Container[int]) -> None:
-        """Raise CountsError where a column that means nothing to us tells several sensors apart, whose rows take turns.
-
-        used: columns that have a meaning. Labels are few, each has a tenth of the rows, they change in three of ten
-        rows, and readings under different ones differ by more than their scatter lets them.
-        """
-        places = self.places(*READINGS)
-        if len(places) != 3 or len(self.rows) < _FEWEST_ROWS:
-            return
-        for at, name in enumerate(self.names):
-            is_told = at in used or not name or (self.chosen is not None and at == self.chosen[0])
-            labels = [] if is_told else [row[at].strip() for row in self.rows]
-            shares = Counter(labels)
-            turns = [k for k in range(len(labels) - 1) if labels[k] != labels[k + 1]]
-            if not 2 <= len(shares) <= _MOST_UNITS or min(shares.values()) < 0.1 * len(labels):
-                continue
-            if len(turns) < 0.3 * len(labels) or not all(label and len(label) <= 16 for label in shares):
-                continue
-            values, first = self.values(places), min(shares)
-            signs = np.array([1.0 if labels[k] == first else -1.0 for k in turns])
-            steps = (values[np.array(turns) + 1] - values[turns]) * signs[:, None]
-            middle = np.nanmedian(steps, axis=0)  # between poses the readings leap
-            spread = 1.86 * np.nanmedian(np.abs(steps - middle), axis=0) / math.sqrt(len(turns))
-            if not (np.abs(middle) > _APART * np.maximum(spread, 1e-300)).any():
-                continue
-            shown = ", ".join(sorted(shares)[:4])
-            example = f"{cut(name, 40)}={first}"
-            raise CountsError(
-                f"the rows are of several sensors, told apart by the column {cut(self.header[at], 40)!r} ({shown}): "
-                f"choose one, for example by --where {example!r}, or leave the column out if it means something else "
-                f"(--column {cut(self.header[at], 40) + '=-'!r}).",
-                {"where": example},
-            )
 
 
 def refuse_unknown_names(stated: Mapping[str, str], header: Sequence[str]) -> None:

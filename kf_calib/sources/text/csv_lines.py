@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections import Counter
+from collections.abc import Container, Sequence
+
+import numpy as np
 
 from kf_calib.bench.streams import Batch
-from kf_calib.sources.text.columns import Columns
+from kf_calib.errors import CountsError
+from kf_calib.sources.text.columns import READINGS, Columns
 from kf_calib.sources.text.heading import BLANK, cells_of, with_texts, without_empty_end
 from kf_calib.sources.text.numbers import DECIMAL_POINT, LineError, written
 from kf_calib.sources.text.reader import Account, LineReader, LineRows
 from kf_calib.sources.text.units import celsius
+from kf_calib.support.text import cut
 
 _MINUTE_NS, _HOUR_NS = 60 * 10**9, 3600 * 10**9
+_FEWEST_ROWS, _MOST_UNITS, _APART = 20, 8, 5.0  # rows and labels of several sensors, and sigmas between these
 
 
 class CsvLines(LineReader):
@@ -39,7 +46,7 @@ class CsvLines(LineReader):
         self.said = columns.said
         used = {*self._time.at, *self._accel.at, *self._pose.at, *self._temperature.at}
         used |= {columns.chosen[0]} if columns.chosen else set()
-        columns.refuse_several_units(used)
+        _refuse_several_units(columns, used)
         self._account.leave_out(columns.unknown(used))
 
     @property
@@ -113,3 +120,38 @@ class CsvLines(LineReader):
         accel.add(time_ns, readings)
         pose.add(time_ns, angles)
         temperature.add(time_ns, degrees)
+
+
+def _refuse_several_units(columns: Columns, used: Container[int]) -> None:
+    """Raise CountsError where a column that means nothing to us tells several sensors apart, whose rows take turns.
+
+    used: columns that have a meaning. Labels are few, each has a tenth of the rows, they change in three of ten
+    rows, and readings under different ones differ by more than their scatter lets them.
+    """
+    places = columns.places(*READINGS)
+    if len(places) != 3 or len(columns.rows) < _FEWEST_ROWS:
+        return
+    for at, name in enumerate(columns.names):
+        is_told = at in used or not name or (columns.chosen is not None and at == columns.chosen[0])
+        labels = [] if is_told else [row[at].strip() for row in columns.rows]
+        shares = Counter(labels)
+        turns = [k for k in range(len(labels) - 1) if labels[k] != labels[k + 1]]
+        if not 2 <= len(shares) <= _MOST_UNITS or min(shares.values()) < 0.1 * len(labels):
+            continue
+        if len(turns) < 0.3 * len(labels) or not all(label and len(label) <= 16 for label in shares):
+            continue
+        values, first = columns.values(places), min(shares)
+        signs = np.array([1.0 if labels[k] == first else -1.0 for k in turns])
+        steps = (values[np.array(turns) + 1] - values[turns]) * signs[:, None]
+        middle = np.nanmedian(steps, axis=0)  # between poses the readings leap
+        spread = 1.86 * np.nanmedian(np.abs(steps - middle), axis=0) / math.sqrt(len(turns))
+        if not (np.abs(middle) > _APART * np.maximum(spread, 1e-300)).any():
+            continue
+        shown = ", ".join(sorted(shares)[:4])
+        example = f"{cut(name, 40)}={first}"
+        raise CountsError(
+            f"the rows are of several sensors, told apart by the column {cut(columns.header[at], 40)!r} ({shown}): "
+            f"choose one, for example by --where {example!r}, or leave the column out if it means something else "
+            f"(--column {cut(columns.header[at], 40) + '=-'!r}).",
+            {"where": example},
+        )

@@ -74,6 +74,15 @@ def stamp_ns(number: int | Decimal, decimals: int) -> int:
     return nanoseconds
 
 
+def are_stamps(texts: Sequence[str]) -> bool:
+    """Whether texts, of which there are any, are all stamps of a calendar."""
+    month_first = month_comes_first(texts)
+    try:
+        return bool(texts) and all(stamp_of(text, month_first) for text in texts)
+    except ValueError:
+        return False
+
+
 def month_comes_first(texts: Sequence[str]) -> bool:
     """Whether local stamps have the month before the day, by all of them."""
     parts = [found.groups() for text in texts if (found := _LOCAL.fullmatch(text))]
