@@ -24,7 +24,7 @@ from kf_calib.errors import InputError
 from kf_calib.estimation.correction import Correction
 from kf_calib.sources.text.encoding import Cutter
 from kf_calib.sources.text.lines import is_json, reader_for, stated_of
-from kf_calib.sources.text.reader import Account, LineReader
+from kf_calib.sources.text.reader import Account, LineReader, named
 from kf_calib.sources.text.units import Units
 
 _WINDOW_NS = 500_000_000
@@ -223,12 +223,10 @@ class CorrectedLines:
         told = self._waiting[blank:]
         if not (ended or len(told) >= _TELLING_LINES or is_json(told[0][1])):
             return []
-        try:
+        with named(self._name):
             self._reader, count = reader_for(
                 [text for _, text, _ in told], self._columns, self._account, angles=False, units=self._units
             )
-        except InputError as error:
-            raise InputError(f"{self._name}: {error}") from None
         texts = self._reader.heading_of_forces([text for _, text, _ in told[:count]])
         heading = [(number, text, end) for (number, _, end), text in zip(told[:count], texts, strict=True)]
         self._waiting, passed = told[count:], self._waiting[:blank]

@@ -37,7 +37,6 @@ from kf_calib.sources.text.quantity import CsvRow, QuantityColumns
 from kf_calib.sources.text.stamps import Stamps, are_stamps
 from kf_calib.sources.text.units import Units, choice_of, reading_units, size_of_count, usual_norm
 from kf_calib.support.text import cut
-from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 EXAMPLE = "time_s,ax_mps2,ay_mps2,az_mps2,outer_deg,middle_deg,inner_deg,temperature_c"
 HOW = "--column THEIRS=OURS says what a column is"
@@ -70,7 +69,6 @@ class Columns:
     names: Sequence[str]
     rows: Sequence[CsvRow]
     units: Units
-    local_mps2: float = STANDARD_GRAVITY_MPS2
     is_table: bool = False
     said: list[str] = field(default_factory=list[str])
     guessed: list[str] = field(default_factory=list[str])
@@ -83,15 +81,14 @@ class Columns:
 
     @classmethod
     def of(
-        cls, heading: TextHeading, stated: Mapping[str, str], units: Units | None = None,
-        local_mps2: float = STANDARD_GRAVITY_MPS2, *, is_table: bool = False,
-    ) -> Columns:  # fmt: skip
-        """stated: our name for each foreign one; ``-`` leaves a column out. local_mps2: gravity of the place, where a g
-        is that. Raises InputError for columns that are the same."""
+        cls, heading: TextHeading, stated: Mapping[str, str], units: Units | None = None, *, is_table: bool = False
+    ) -> Columns:
+        """stated: our name for each foreign one; ``-`` leaves a column out. Raises InputError where units choose no
+        row."""
         header = heading.header
         names = ["" if stated.get(name) == "-" else stated.get(name, name) for name in header]
         full = [row for row in heading.rows if len(row) == len(names)]
-        columns = cls(heading, names, full, units or Units(), local_mps2, is_table)
+        columns = cls(heading, names, full, units or Units(), is_table)
         if columns.units.where:
             among = "" if is_table else " among the first"
             columns.chosen = choice_of(columns.units.where, header, full, among)
@@ -281,7 +278,7 @@ class Columns:
                 f"no columns give the three readings with their unit: name them ax_mps2, ay_mps2, az_mps2 (or ax_g, "
                 f"ax_mg ...), not {self._all}, or state it by --accel-unit, and the size of counts by --accel-scale."
             )
-        told = reading_units(named, values, self.units, self.local_mps2)
+        told = reading_units(named, values, self.units)
         self.by_size |= {at: told.units[k] for k, at in enumerate(places) if told.by_size and not named[k]}
         if not told.is_known:
             signed = usual_norm(parse_counts(self.units.counts).signed(values))

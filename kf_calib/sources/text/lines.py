@@ -32,7 +32,6 @@ from kf_calib.sources.text.heading import TextHeading
 from kf_calib.sources.text.json_lines import POSE_KEYS, JsonLines
 from kf_calib.sources.text.reader import Account, LineReader, named
 from kf_calib.sources.text.units import Units
-from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 _BLOCK_BYTES = 1 << 18
 _SAMPLED, _BLOCKS_SAMPLED = 64, 1000  # readings of a block that tell how numbers are to be read, and blocks
@@ -142,10 +141,7 @@ class Lines:
     def _open_reader(self, lines: Sequence[str], account: Account) -> tuple[LineReader, int]:
         if self._stated and not is_json(lines[0]):
             refuse_unknown_names(self._stated, TextHeading.of(lines).header)
-        local_mps2 = STANDARD_GRAVITY_MPS2
-        if self._units.g == "local":
-            local_mps2 = bench_without_angles(self.name, self._overrides)[0].gravity_mps2
-        return reader_for(lines, self._columns, account, angles=self._angles, units=self._units, local_mps2=local_mps2)
+        return reader_for(lines, self._columns, account, angles=self._angles, units=self._units)
 
     def _has_orientations(self, path: Path) -> bool:
         """Whether a log may tell them: its columns may be angles or an attitude, or a key of JSON names these; also of
@@ -193,39 +189,35 @@ def stated_of(
         by_name = {"accel_scale": reader.raw.scale, "accel_unit": reader.raw.unit}
     elif default is not None and default.sizes == PLAIN.sizes and reader.unit is not None:
         default = replace(default, unit=reader.unit)  # a unit, which the names state anew
-    try:
+    with named(name):
         stated = merged_metadata(reader.metadata, overrides, "the first line", default)
         now = RawInput.from_metadata(stated)
-    except BenchError as error:
-        raise BenchError(f"{name}: {error}") from None
-    if CONVERTED in stated:
-        raise BenchError(f"{name}: lines hold what the device sends: leave out {CONVERTED} in the bench's keys.")
-    if reader.unit is not None and "accel_unit" in stated and now.unit != reader.unit and RESTATE not in overrides:
-        raise BenchError(
-            f"{name}: the readings are in {reader.unit} by their names, and stated is {now.unit_words}: rename them by "
-            "--column, or where their names are wrong, give --accel-unit and --restate-input."
-        )
-    if reader.is_bare and not {"accel_unit", "accel_scale"} & set(stated):
-        raise BenchError(
-            f"{name}: the names of the readings do not tell their unit: name them accel_mps2 (or accel_g ...), or give "
-            "it by --accel-unit, and the size of counts by --accel-scale."
-        )
+        if CONVERTED in stated:
+            raise BenchError(f"lines hold what the device sends: leave out {CONVERTED} in the bench's keys.")
+        if reader.unit is not None and "accel_unit" in stated and now.unit != reader.unit and RESTATE not in overrides:
+            raise BenchError(
+                f"the readings are in {reader.unit} by their names, and stated is {now.unit_words}: rename them by "
+                "--column, or where their names are wrong, give --accel-unit and --restate-input."
+            )
+        if reader.is_bare and not {"accel_unit", "accel_scale"} & set(stated):
+            raise BenchError(
+                "the names of the readings do not tell their unit: name them accel_mps2 (or accel_g ...), or give it "
+                "by --accel-unit, and the size of counts by --accel-scale."
+            )
     return stated | by_name if reader.raw is not None else by_name | stated
 
 
 def bench_of(name: str, reader: Described, overrides: Mapping[str, str], default: RawInput | None = None) -> Bench:
     """The bench, once a pose has been read. Raises InputError where it cannot be that one."""
     stated = stated_of(name, reader, overrides, default)
-    try:
+    with named(name):
         bench = Bench.from_metadata(stated, reader.has_angles)
-    except BenchError as error:
-        raise BenchError(f"{name}: {error}") from error
-    if bench.pose_width != reader.pose_width:
-        raise InputError(
-            f"{name}: poses have {reader.pose_width} angles and the bench has {bench.pose_width} axes: state "
-            'as many axes as there are angles, outer first, for example --axes "y z x".'
-        )
-    return bench
+        if bench.pose_width != reader.pose_width:
+            raise InputError(
+                f"poses have {reader.pose_width} angles and the bench has {bench.pose_width} axes: state as many axes "
+                'as there are angles, outer first, for example --axes "y z x".'
+            )
+        return bench
 
 
 def reader_for(
@@ -235,7 +227,6 @@ def reader_for(
     *,
     angles: bool = True,
     units: Units | None = None,
-    local_mps2: float = STANDARD_GRAVITY_MPS2,
 ) -> tuple[LineReader, int]:
     """The reader that the first lines ask for, and how many of these are its heading.
 
@@ -245,7 +236,7 @@ def reader_for(
     if is_json(lines[0]):
         return JsonLines(columns, account), 0
     heading = TextHeading.of(lines)
-    return CsvLines(Columns.of(heading, columns, units, local_mps2), account, angles), heading.lines
+    return CsvLines(Columns.of(heading, columns, units), account, angles), heading.lines
 
 
 def is_json(first: str) -> bool:

@@ -85,10 +85,7 @@ class TableOfMeans:
         self, grid: Grid, stated: Mapping[str, str], overrides: Mapping[str, str], units: Units, angles: bool | None
     ) -> None:
         refuse_unknown_names(stated, grid.heading.header)
-        local_mps2 = STANDARD_GRAVITY_MPS2
-        if units.g == "local":
-            local_mps2 = bench_without_angles("", overrides)[0].gravity_mps2
-        self.columns = Columns.of(grid.heading, stated, units, local_mps2, is_table=True)
+        self.columns = Columns.of(grid.heading, stated, units, is_table=True)
         pairs = zip(grid.heading.numbers, grid.heading.rows, strict=True)
         self.numbers = [line + 1 for line, row in pairs if self.columns.is_chosen(row)]
         self.grid, self.overrides, self.units, self.said = grid, dict(overrides), units, self.columns.said
@@ -193,7 +190,7 @@ class TableOfMeans:
         if not np.isfinite(extremes).all():
             return
         half = (extremes[:, 0] - extremes[:, 1]) / 2.0
-        told = reading_units(["", "", ""], np.diag(half), self.units, STANDARD_GRAVITY_MPS2)
+        told = reading_units(["", "", ""], np.diag(half), self.units)
         unit = half.mean() if not told.is_known else STANDARD_GRAVITY_MPS2 / told.raw.factors[0]
         scales = ", ".join(f"K{k + 1} = {size / unit:.4f}" for k, size in enumerate(half))
         biases = ", ".join(f"b{k + 1} = {middle:g}" for k, middle in enumerate(extremes.mean(axis=1)))
@@ -304,7 +301,7 @@ class TableOfMeans:
         units = [columns.meanings[place].unit for place in places]
         factors = columns.raw.factors
         if units[0] and units[0] != "count":
-            factors = mps2_per([unit or units[0] for unit in units], self.units, columns.local_mps2)
+            factors = mps2_per([unit or units[0] for unit in units], self.units)
         counts = self._values(QuantityColumns((count,), (1.0,)), "a number of readings", is_optional=True)[:, 0]
         for row in np.flatnonzero((counts < 2) | (counts != np.rint(counts)) | (counts > 1e9)):
             wanted = "write how many readings were averaged, a whole number of at least 2"

@@ -10,6 +10,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, lengths
+from kf_calib.bench.bench import Bench
 from kf_calib.bench.counts import SIGNED, parse_counts
 from kf_calib.bench.raw_input import CHANNELS, PLAIN, RESTATE, UNITS, RawInput
 from kf_calib.errors import BenchError, InputError
@@ -36,7 +37,7 @@ _IN_WORDS = {"m/s2": "m/s^2", "mm/s2": "mm/s^2", "count": "counts"}
 class Units:
     """Units where the header names none; None: guessed from the numbers.
 
-    accel_scale: size of one count, in ``accel`` (m/s^2 if that is None). g: m/s^2 that 1 g stands for, or ``local``.
+    accel_scale: size of one count, in ``accel`` (m/s^2 if that is None). g_mps2: what 1 g stands for.
     input: what the device of a calibration sends, which holds where none of this is stated. is_restated: whether
     ``accel`` goes before the names of columns. counts: how the numbers are to be read.
     rate_hz: of rows without a time. where: column and cell of the rows that count, as ``I=0``. dataset: of a container.
@@ -45,7 +46,7 @@ class Units:
     accel: str | None = None
     accel_scale: float = 1.0
     angle: str | None = None
-    g: str | float = STANDARD_GRAVITY_MPS2
+    g_mps2: float = STANDARD_GRAVITY_MPS2
     input: RawInput | None = None
     is_restated: bool = False
     counts: str = SIGNED
@@ -58,13 +59,13 @@ class Units:
         cls, keys: Mapping[str, str], angle: str | None = None, g: str | float = STANDARD_GRAVITY_MPS2,
         input: RawInput | None = None,
     ) -> Units:  # fmt: skip
-        """Units as bench keys state them; raises BenchError."""
+        """Units as bench keys state them; g: m/s^2 that 1 g stands for, or ``local``. Raises InputError."""
         stated = RawInput.from_metadata(keys)
         if len(set(stated.sizes)) > 1:
             raise BenchError("accel_scale has a size for each channel: in lines and tables, state one for all.")
         unit = stated.unit if "accel_unit" in keys else None
         default = None if {"accel_unit", "accel_scale"} & set(keys) else input
-        return cls(unit, stated.sizes[0], angle, g, default, keys.get(RESTATE) == "true",
+        return cls(unit, stated.sizes[0], angle, _g_mps2(g, keys), default, keys.get(RESTATE) == "true",
                    stated.counts)  # fmt: skip
 
     def told_by(self, names: Sequence[str], named: Sequence[str]) -> Sequence[str]:
@@ -89,17 +90,19 @@ class Units:
         level = norm * float(self.input.factors.mean()) / STANDARD_GRAVITY_MPS2
         return set(named) <= {"", "count"} or math.isnan(norm) or _NEAR[0] < level < _NEAR[1]
 
-    def g_mps2(self, local_mps2: float) -> float:
-        """What 1 g stands for at a place of this gravity. Raises InputError where that cannot be."""
-        if self.g == "local":
-            return local_mps2
-        try:
-            size = float(self.g)
-        except ValueError:
-            size = 0.0
-        if not 9.0 < size < 10.0:
-            raise InputError(f"--g-unit is {self.g!r}: give m/s^2 from 9 to 10, such as 9.80665, or local.")
-        return size
+
+def _g_mps2(g: str | float, keys: Mapping[str, str]) -> float:
+    """Return what 1 g stands for: as stated, or the gravity of the bench. Raises InputError where that cannot be."""
+    if g == "local":
+        stated = {} if "latitude_deg" in keys else {"gravity_mps2": str(STANDARD_GRAVITY_MPS2)}
+        return Bench.from_metadata({**stated, **keys}, has_angles=False).gravity_mps2
+    try:
+        size = float(g)
+    except ValueError:
+        size = 0.0
+    if not 9.0 < size < 10.0:
+        raise InputError(f"--g-unit is {g!r}: give m/s^2 from 9 to 10, such as 9.80665, or local.")
+    return size
 
 
 def choice_of(where: str, header: Sequence[str], rows: Sequence[Sequence[str]], among: str) -> tuple[int, str]:
@@ -132,7 +135,7 @@ class ReadingUnits(NamedTuple):
     is_known: bool
 
 
-def reading_units(named: Sequence[str], values: Floats, stated: Units, local_mps2: float) -> ReadingUnits:
+def reading_units(named: Sequence[str], values: Floats, stated: Units) -> ReadingUnits:
     """The units of three readings.
 
     named: units by the names of their columns, empty where these tell none. values (n, 3): readings as they are
@@ -154,9 +157,9 @@ def reading_units(named: Sequence[str], values: Floats, stated: Units, local_mps
         words = f"counts of {stated.accel_scale:g} {words}"
     words += " by their size (--accel-unit)" * is_guessed
     if any(unit.endswith("g") for unit in units):
-        words += f", 1 g = {stated.g_mps2(local_mps2):.7g} m/s^2 (--g-unit)"
+        words += f", 1 g = {stated.g_mps2:.7g} m/s^2 (--g-unit)"
     is_known = bool(stated.accel) or stated.accel_scale != 1.0 or "count" not in (*units, *named)
-    raw = _raw(units, stated, mps2_per(units, stated, local_mps2))
+    raw = _raw(units, stated, mps2_per(units, stated))
     return ReadingUnits(tuple(units), raw, words, is_guessed, is_known)
 
 
@@ -184,13 +187,10 @@ def _raw(units: Sequence[str], stated: Units, mps2: Floats) -> RawInput:
     return replace(RawInput.of_factors((stated.accel_scale * mps2).tolist()), counts=stated.counts)
 
 
-def mps2_per(units: Sequence[str], stated: Units, local_mps2: float) -> Floats:
+def mps2_per(units: Sequence[str], stated: Units) -> Floats:
     """The size of each of these units, m/s^2."""
     return np.array(
-        [
-            ACCEL[unit] * (stated.g_mps2(local_mps2) / STANDARD_GRAVITY_MPS2 if unit.endswith("g") else 1.0)
-            for unit in units
-        ]
+        [ACCEL[unit] * (stated.g_mps2 / STANDARD_GRAVITY_MPS2 if unit.endswith("g") else 1.0) for unit in units]
     )
 
 
