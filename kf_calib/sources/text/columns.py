@@ -367,11 +367,12 @@ class Columns:
     def without_angles(self) -> InputError:
         """That no angles are there, or none whose unit is known."""
         theirs = next((self.header[at] for at in self.places("angle")), self._left_over)
+        kinds = "gimbal angles, attitude or face" if self.is_table else "gimbal angles or attitude"
         face = ", or the face that is up, with cells such as +x or -z" * self.is_table
         return InputError(
-            f"no column was recognised as gimbal angles, attitude or face among {self._all} with their unit: name them "
-            f"outer_deg, inner_deg ... or outer_rad ..., outer gimbal first, for example by --column "
-            f"'{theirs}=outer_deg' (or the attitude qx, qy, qz, qw{face}), or do without orientations (--no-angles)."
+            f"no column was recognised as {kinds} among {self._all}, with their unit: name them outer_deg, inner_deg "
+            f"... or outer_rad ..., outer gimbal first, for example by --column '{theirs}=outer_deg' (or the attitude "
+            f"qx, qy, qz, qw{face}), or do without orientations (--no-angles)."
         )
 
     def quaternion(self) -> QuantityColumns:
