@@ -34,6 +34,7 @@ class CsvLines(LineReader):
         super().__init__(account)
         self._columns, self._delimiter, self._header = columns, columns.heading.delimiter, columns.header
         self._time, self._accel = columns.time(), columns.accel()
+        self._labels = columns.heading.labels
         self._row, self._added_ns, self._last_ns = -1, 0, -(2**63)
         self.raw = columns.raw
         self._numbers = columns.numbers
@@ -89,21 +90,21 @@ class CsvLines(LineReader):
         return super().read(lines, first_line)
 
     def _cells(self, line: str) -> list[str]:
-        if (labels := self._columns.heading.labels) is not None:
-            return labels.values(line)
+        if self._labels is not None:
+            return self._labels.values(line)
         if '"' not in line and " " not in line and self._delimiter != BLANK:
             return line.split(self._delimiter)
         return cells_of(line, self._delimiter)
 
     def _read_line(self, line: str, accel: LineRows, pose: LineRows, temperature: LineRows) -> None:
-        if not (cells := self._cells(line)) and self._columns.heading.labels is not None:
+        if not (cells := self._cells(line)) and self._labels is not None:
             return  # of something else than readings
         self._row += 1
         row = without_empty_end(cells, len(self._header))
         if len(row) != len(self._header):
             raise LineError(f"it has {len(row)} cells, the header has {len(self._header)}")
         numbers = self._numbers or DECIMAL_POINT
-        if not self._columns.is_chosen(row):
+        if self._columns.chosen is not None and not self._columns.is_chosen(row):
             self._row -= 1
             return
         time_ns = self._time.ns(row, self._header, numbers, self._row)

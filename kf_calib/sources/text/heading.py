@@ -182,11 +182,11 @@ def cells_of(line: str, delimiter: str) -> list[str]:
     """The cells of one line without blanks and quotes around them; a quote left open ends with the line."""
     if '"' not in line:
         return line.split() if delimiter == BLANK else [cell.strip() for cell in line.split(delimiter)]
-    return [_unquoted(line[start:end]) for start, end in cell_spans(line, delimiter)]
-
-
-def _unquoted(cell: str) -> str:
-    return cell[1:].removesuffix('"').replace('""', '"').strip() if cell.startswith('"') else cell
+    try:
+        cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=delimiter == BLANK), [])
+    except csv.Error:  # a cell beyond csv's own limit
+        cells = line.split(delimiter)
+    return [cell.strip() for cell in cells]
 
 
 def cell_spans(line: str, delimiter: str) -> list[tuple[int, int]]:

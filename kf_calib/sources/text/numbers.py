@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 
@@ -71,6 +71,14 @@ class Numbers:
             raise
         except ValueError:
             return number_of(self._plain(cell))
+
+    def values(self, cells: Sequence[str]) -> list[float]:
+        """The numbers in cells; raises as ``value``."""
+        plain = cells if self.decimal == "." else map(self.with_point, cells)
+        try:
+            return list(map(number_of, plain))
+        except ValueError:  # not as programs write them
+            return list(map(self.value, cells))
 
     def _plain(self, cell: str) -> str:
         """Return a number without separators of thousands and blanks, and with a point before its decimals."""

@@ -29,7 +29,7 @@ class QuantityColumns:
                 raise CellError(self.at[cells.index("")], "some components of a vector are missing")
             return None
         try:
-            values = list(map(numbers.value, cells))
+            values = numbers.values(cells)
         except ValueError:
             values = [math.nan]
         if not math.isfinite(sum(values)):  # which numbers beyond 1e308 together are not, either
