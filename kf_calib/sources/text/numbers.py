@@ -74,11 +74,14 @@ class Numbers:
 
     def values(self, cells: Sequence[str]) -> list[float]:
         """The numbers in cells; raises as ``value``."""
-        plain = cells if self.decimal == "." else map(self.with_point, cells)
         try:
-            return list(map(number_of, plain))
+            if self.decimal == ".":
+                return list(map(number_of, cells))
+            if "." not in "".join(cells):
+                return [number_of(cell.replace(",", ".")) for cell in cells]
         except ValueError:  # not as programs write them
-            return list(map(self.value, cells))
+            pass
+        return list(map(self.value, cells))
 
     def _plain(self, cell: str) -> str:
         """Return a number without separators of thousands and blanks, and with a point before its decimals."""
