@@ -20,6 +20,7 @@ from functools import cache, partial
 from pathlib import Path
 
 import conventions_picture
+import covariance_picture
 import fleet_picture
 import live_page_picture
 import numpy as np
@@ -98,6 +99,9 @@ OF_SCRIPTS: dict[str, Callable[[], Image.Image]] = {
 }
 """Name of each other picture, and what draws it."""
 
+MOVING = "covariance"
+"""Name of the one that moves, which covariance_picture draws."""
+
 
 @cache
 def drawn_from() -> str:
@@ -127,12 +131,12 @@ def save(name: str) -> Path:
 
 def main(names: list[str]) -> None:
     """Draw the pictures of these names, or all."""
-    known = PICTURES | OF_SCRIPTS
+    known = PICTURES | OF_SCRIPTS | {MOVING: None}
     unknown = sorted(set(names) - set(known))
     if unknown:
         sys.exit(f"tools/pictures: there is no picture {unknown[0]}: name some of {', '.join(known)}.")
     for name in names or known:
-        path = save(name)
+        path = covariance_picture.save(DOCS / f"{MOVING}.gif") if name == MOVING else save(name)
         print(f"{path.relative_to(ROOT)}: {path.stat().st_size / 1000:.0f} kB")
 
 

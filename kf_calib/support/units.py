@@ -164,7 +164,7 @@ def rounded(value: float, sigma: float) -> tuple[str, str]:
     """A value and its sigma as text, rounded to two significant digits of sigma (GUM 7.2.6)."""
     if not (math.isfinite(sigma) and sigma > 0):
         return f"{value:.6g}", f"{sigma:.2g}"
-    decimals = max(0, 1 - math.floor(math.log10(sigma)))
+    decimals = max(0, 1 - int(f"{sigma:.1e}".partition("e")[2]))  # of 0.00998 as of 0.010, which it rounds to
     return f"{value:.{decimals}f}", f"{sigma:.{decimals}f}"
 
 
