@@ -65,6 +65,8 @@ class LiveOptions:
         "--auto", help="Accept a missing effect when it can be told from all others.")] = False
     with_viewer: Annotated[bool, _running(
         "--rerun", help="Show the run in the Rerun viewer, opened if none is.")] = False
+    with_web_viewer: Annotated[bool, _running(
+        "--rerun-web", help="Show it in Rerun's viewer for a browser, while the run goes on.")] = False
     rerun_port: Annotated[int, _running(
         "--rerun-port", type=click.IntRange(1, 65535), metavar="PORT", help="The viewer's port.")] = 9876
     rerun_bind: Annotated[str, _running(
@@ -84,8 +86,8 @@ class LiveOptions:
     "live /dev/ttyUSB0 --bench bench.toml --record run.mcap --target theta=1arcsec --target K=2ppm --rerun",
     'live "sim://?speed=10&hide=second-order=4e-6" --target K=0.1ppm',
     "live /dev/ttyACM0 --no-angles --record hand.mcap --target K=500ppm",
-    seldom=("rerun_port", "rerun_bind", "page_port", "header", "give_up_s", "idle_s", "accel_unit", "model_file",
-            "left_out", "save_model"),
+    seldom=("with_web_viewer", "rerun_port", "rerun_bind", "page_port", "header", "give_up_s", "idle_s", "accel_unit",
+            "model_file", "left_out", "save_model"),
 )  # fmt: skip
 @click.pass_context
 def live(
@@ -112,7 +114,7 @@ def live(
     with page_server(page) as server, opening() as opened:
         begin = by_hand(settings, wanted) if options.no_angles else on_bench(settings, wanted, options.auto)
         run = LiveRun(opened, begin, record, not sys.stdout.isatty() or as_json)
-        view = _view(rrd, options.rerun_port if options.with_viewer else None, options.rerun_bind)
+        view = _view(rrd, options)
         if view is not None:
             run.listeners.append(partial(_offer, view))
         with answered(run.handle_signal):  # until all is written: who closes a terminal sends several
@@ -278,12 +280,16 @@ def outcome(run: LiveRun, as_json: bool) -> Judgement | HandJudgement | None:
     return final
 
 
-def _view(rrd: Path | None, port: int | None, bind: str) -> GrowingView | None:
-    if rrd is None and port is None:
+def _view(rrd: Path | None, options: LiveOptions) -> GrowingView | None:
+    is_seen, web = options.with_viewer or options.with_web_viewer, options.with_web_viewer
+    if rrd is None and not is_seen:
         return None
     from kf_calib.views.rerun.growing import GrowingView
 
-    return GrowingView(rrd, port, bind)
+    view = GrowingView(rrd, options.rerun_port if is_seen else None, options.rerun_bind, web=web)
+    if view.url:
+        complain(f"the Rerun view of this run is at {view.url}")
+    return view
 
 
 def _of_the_view(view: GrowingView | None) -> list[str]:

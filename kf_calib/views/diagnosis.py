@@ -83,7 +83,7 @@ def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
             "trend": None
             if trend is None
             else {"ratio": trend.ratio, "p_value": trend.p_value, "dwell": trend.most[0], "channel": trend.most[1]},
-            "disturbed_dwells": _disturbed_dwells(diagnosis),
+            "disturbed_dwells": disturbed_dwells(diagnosis),
             "disturbed_dwell": None if disturbed is None else vars(disturbed),
             "detectable": [
                 {"effect": each.name, "minimum": each.minimum, "unit": each.unit} for each in diagnosis.detectable
@@ -98,8 +98,8 @@ def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
     )
 
 
-def _disturbed_dwells(diagnosis: Diagnosis) -> list[int]:
-    """Return the numbers of the dwells that something disturbed, as any test has it."""
+def disturbed_dwells(diagnosis: Diagnosis) -> list[int]:
+    """The numbers of the dwells that something disturbed, as any test has it."""
     before, table, first = diagnosis.before, diagnosis.table, diagnosis.likeliest
     numbers = {each.number for each in before.outlying}
     numbers |= {*before.readings.outliers.dwells} if before.readings.outliers.clustered else set()

@@ -18,6 +18,8 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -676,6 +678,27 @@ def test_a_viewer_that_cannot_open_says_why(tmp_path: Path, monkeypatch: pytest.
     view.offer(result)
     view.close(30.0)
     assert "no display" in view.trouble
+
+
+def test_the_viewer_in_a_browser_is_served_while_the_run_goes_on_and_needs_a_port_of_its_own(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
+        with pytest.raises(InputError, match="is taken by another Rerun viewer: close it, or add --rerun-port"):
+            GrowingView(port=port, web=True)
+    view = GrowingView(port=port, web=True)
+    address = urlsplit(view.url)
+    assert address.hostname == "127.0.0.1" and address.query.endswith(f"127.0.0.1%3A{port}%2Fproxy")
+    view.offer(calibrate(Run(dwells=5, count=60)))
+
+    def answers() -> bool:
+        try:
+            return b"web viewer" in urlopen(f"http://127.0.0.1:{address.port}/", timeout=5.0).read()
+        except OSError:
+            return False
+
+    until(answers)
+    view.close(30.0)
+    assert view.trouble == "" and not answers()
 
 
 @pytest.mark.timeout(120)

@@ -110,9 +110,9 @@ def test_parameters_are_those_of_the_trace(result: Calibration, recording: Path,
     k = paper_parameters.SYMBOLS.index(symbol)
     scalars, factor = rows_of(recording), shown(paper_parameters.UNITS[k]).per_si
     trace = [(t, e.parameters[k], e.sigma[k]) for t, _, e in result.trace() if not e.unseen[k]]
-    sigma = scalars[f"/{path_of(symbol)}/log10_sigma"]
+    sigma = scalars[f"/{path_of(symbol)}/sigma"]
     np.testing.assert_allclose([row[0] for row in sigma], [t for t, _, _ in trace], atol=1e-9)
-    np.testing.assert_allclose([10.0 ** row[2][0] for row in sigma], [s * factor for _, _, s in trace], rtol=1e-9)
+    np.testing.assert_allclose([row[2][0] for row in sigma], [s * factor for _, _, s in trace], rtol=1e-9)
     nominal = paper_parameters.nominal(result.bench.nominal)[k]
     band = np.array([row[2] for row in scalars[f"/{path_of(symbol)}/band"]])
     np.testing.assert_allclose(band.mean(axis=1), [(v - nominal) * factor for _, v, _ in trace], rtol=1e-9, atol=1e-7)
@@ -120,11 +120,11 @@ def test_parameters_are_those_of_the_trace(result: Calibration, recording: Path,
 
 
 def test_one_point_an_orientation_and_none_before_it_is_determined(result: Calibration, recording: Path) -> None:
-    whole = by_orientation(rows_of(recording)["/parameters/a1/K1/log10_sigma"])
+    whole = by_orientation(rows_of(recording)["/parameters/a1/K1/sigma"])
     seen = [k for k, visit in enumerate(result.visits, 1) if not visit.estimate.unseen[2]]
     assert list(whole) == seen
     assert 1 not in seen
-    assert 10.0 ** whole[12][0] == pytest.approx(result.estimate.sigma[2] * 1e6)
+    assert whole[12][0] == pytest.approx(result.estimate.sigma[2] * 1e6)
 
 
 def test_innovations_and_nis_are_those_of_the_visits(result: Calibration, recording: Path) -> None:
@@ -184,15 +184,15 @@ def test_numbers_as_they_are_printed() -> None:
 @pytest.mark.parametrize("bench", [ATTITUDE, INERTIAL], ids=["attitude", "inertial"])
 def test_other_benches(bench: Bench, tmp_path: Path) -> None:
     path = view.save_view(calibrate(Dwells(8, bench)), tmp_path / "run.rrd")
-    assert "/parameters/a3/b3/log10_sigma" in rows_of(path)
+    assert "/parameters/a3/b3/sigma" in rows_of(path)
 
 
 def test_a_prior_is_orientation_zero_and_one_dwell_is_enough(tmp_path: Path) -> None:
     result = calibrate(Dwells(1, GIMBALS), Settings(prior=PRIORS["navigation"]))
     path = view.save_view(result, tmp_path / "run.rrd")
-    sigma = by_orientation(rows_of(path)["/parameters/a2/b2/log10_sigma"])
+    sigma = by_orientation(rows_of(path)["/parameters/a2/b2/sigma"])
     assert list(sigma) == [0, 1]
-    assert 10.0 ** sigma[0][0] == pytest.approx(2e-2 * 1e6 / 9.80665)
+    assert sigma[0][0] == pytest.approx(2e-2 * 1e6 / 9.80665)
 
 
 def test_four_orientations_leave_nothing_to_judge(tmp_path: Path) -> None:

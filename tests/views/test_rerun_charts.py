@@ -67,8 +67,8 @@ def content(path: Path, component: str, timeline: str = "") -> dict[str, dict[in
 def test_curves_of_a_run_hold_the_coefficients_of_its_effects(hidden: Calibration, tmp_path: Path) -> None:
     path = view.save_view(hidden, tmp_path / "run.rrd")
     curves = content(path, "Scalars:scalars", view.ORIENTATION)
-    sigma = curves["/parameters/effects/h2/log10_sigma"][24]
-    assert 10.0 ** sigma[0] == pytest.approx(hidden.estimate.effect_sigma[1] * 1e6 / 9.80665)
+    sigma = curves["/parameters/effects/h2/sigma"][24]
+    assert sigma[0] == pytest.approx(hidden.estimate.effect_sigma[1] * 1e6 / 9.80665)
     h2 = hidden.parameters["h2"]
     assert h2.value is not None and curves["/parameters/effects/h2/deviation"][24] == pytest.approx(
         [h2.value * h2.per_si]
@@ -146,6 +146,19 @@ def test_spheres_of_a_diagnosis_show_what_each_explanation_leaves(found: Diagnos
         np.testing.assert_allclose(left[rank], expected, rtol=1e-5)
 
 
+def test_a_disturbed_dwell_has_a_red_ring_where_it_lies_and_the_colours_have_a_key(
+    found: Diagnosis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("kf_calib.views.rerun.diagnosis.disturbed_dwells", lambda diagnosis: [7])
+    path = view.save_view(found, tmp_path / "view.rrd")
+    force = next(visit.dwell.means[1:4] for visit in found.before.visits if visit.dwell.number == 7)
+    (ring,) = content(path, "LineStrips3D:strips")["/spheres/before/1/disturbed"][None]
+    middle = np.mean(np.array(ring)[:-1], axis=0)
+    assert middle == pytest.approx(force / np.linalg.norm(force), abs=1e-3)
+    assert content(path, "LineStrips3D:labels")["/spheres/before/1/disturbed"][None] == ["dwell 7: disturbed"]
+    assert content(path, "Points3D:labels")["/spheres/key"][None] == ["−4σ", "−2σ", "0σ", "+2σ", "+4σ"]
+
+
 def test_colours_of_residuals_tell_their_sign() -> None:
     blue, grey, orange = signed(np.array([-5.0, 0.0, 5.0])).astype(int)
     assert blue[2] > 200 > blue[0] and orange[0] > 200 > orange[2] and np.ptp(grey) < 10
@@ -195,8 +208,8 @@ def test_a_live_run_shows_targets_and_where_to_go(tmp_path: Path) -> None:
     path = tmp_path / "live.rrd"
     path.write_bytes(encoded.read() or b"")
     last = len(judgement.result.visits)
-    targets = content(path, "Scalars:scalars", view.ORIENTATION)["/parameters/a1/K1/log10_target"]
-    assert targets[last] == pytest.approx([np.log10(10.0)])  # ppm
+    targets = content(path, "Scalars:scalars", view.ORIENTATION)["/parameters/a1/K1/target"]
+    assert targets[last] == pytest.approx([10.0])  # ppm
     going = judgement.next_orientation
     assert going is not None
     arrow = content(path, "Arrows3D:vectors")["/platform/next"][None][0]

@@ -5,7 +5,7 @@ draws curves and axes. Angles are in arcsec, scale factors in ppm, biases and in
 (``support.units.shown_in``). Where the orientations so far do not determine a parameter there is no point.
 
 A run has two timelines: ``orientation`` (the count of dwells from 1; 0 is a stated prior) and ``bench_time`` (since the
-first sample; points within the dwells too). Entities: ``parameters/ACCELEROMETER/SYMBOL/{log10_sigma,log10_target,
+first sample; points within the dwells too). Entities: ``parameters/ACCELEROMETER/SYMBOL/{sigma,target,
 deviation,band}``, ``parameters/effects/SYMBOL/...``, ``platform/...``, ``innovation/CHANNEL/{value,bound,in_sigma}``,
 ``nis/{value,above,band}``, ``residual/CHANNEL``, ``bench/pose/...``, ``summary``.
 
@@ -34,6 +34,7 @@ from kf_calib.support import units
 from kf_calib.support.text import printable
 from kf_calib.support.units import Unit, shown, significant
 from kf_calib.views.console import noise_origins, whole_value
+from kf_calib.views.live.content import angles_in_words
 from kf_calib.views.rerun.diagnosis import save_diagnosis_view as save_diagnosis
 from kf_calib.views.rerun.improvement import save_improvement_view as save_improvement
 from kf_calib.views.rerun.names import (
@@ -137,7 +138,7 @@ def judgement_text(judgement: Judgement) -> str:
     going = judgement.next_orientation
     lines = [f"**So far**: {judgement.verdict}"]
     if going is not None:
-        lines.append(f"**Next**: gimbals at {_angles(going[0])} deg: {going[1]}")
+        lines.append(f"**Next**: gimbals at {angles_in_words(going[0])} deg: {going[1]}")
     return "\n\n".join(lines)
 
 
@@ -148,13 +149,9 @@ def log_next(judgement: Judgement, stream: rr.RecordingStream) -> None:
     if going is not None and bench.axes:
         now_s = np.array([judgement.result.visits[-1].dwell.end_s])
         force: Floats = bench.specific_force(now_s, np.radians([going[0]]))
-        vectors, labels = 1.25 * force / np.linalg.norm(force), [f"next: {_angles(going[0])} deg"]
+        vectors, labels = 1.25 * force / np.linalg.norm(force), [f"next: {angles_in_words(going[0])} deg"]
     arrow = rr.Arrows3D(vectors=vectors, colors=[NEXT] * len(vectors), radii=[0.012] * len(vectors), labels=labels)
     stream.log("platform/next", arrow, static=True)
-
-
-def _angles(degrees: tuple[float, ...]) -> str:
-    return ", ".join(f"{round(angle, 1):g}" for angle in degrees)
 
 
 def markdown_summary(result: Calibration) -> str:
@@ -265,8 +262,8 @@ def _sigmas(history: VisitHistory) -> list[rrb.TimeSeriesView]:
     rest = [*range(12, len(history.shown))]
     kinds += [("coefficients of effects", rest)] if rest else []
     return [
-        _series([f"{history.shown[k].path}/{curve}" for k in columns for curve in ("log10_sigma", "log10_target")],
-                f"log₁₀ σ of {name}", corner)
+        _series([f"{history.shown[k].path}/{curve}" for k in columns for curve in ("sigma", "target")],
+                f"σ of {name}", corner, around=history.sigma_range(columns))
         for name, columns in kinds
     ]  # fmt: skip
 

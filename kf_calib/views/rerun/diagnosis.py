@@ -29,9 +29,9 @@ from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import format_p
 from kf_calib.support.text import printable
 from kf_calib.support.units import shown_whole
-from kf_calib.views.diagnosis import name_of, verdict
+from kf_calib.views.diagnosis import disturbed_dwells, name_of, verdict
 from kf_calib.views.rerun.names import ACCELEROMETERS, CHANNELS, GOLD, GREY, MAUVE, Colour, rrd_file, thin
-from kf_calib.views.rerun.spheres import Log, at_step, forever, log_spheres, spheres
+from kf_calib.views.rerun.spheres import Log, at_step, forever, log_key, log_spheres, spheres
 
 EXPLANATION = "explanation"
 _MOST = 5  # explanations
@@ -42,7 +42,8 @@ def save_diagnosis_view(diagnosis: Diagnosis, path: Path) -> Path:
     before, explanations = diagnosis.before, diagnosis.explanations[:_MOST]
     ratios = before.residuals_mps2 / mean_sigmas(before)
     with rrd_file(path, _layout(diagnosis)) as stream:
-        log_spheres(before, ratios, "spheres/before", 0, stream, forever(stream))
+        log_spheres(before, ratios, "spheres/before", 0, stream, forever(stream), disturbed_dwells(diagnosis))
+        log_key("spheres", ["as measured", *(["left over"] if explanations else [])], forever(stream))
         if diagnosis.drivers and not explanations:
             _log_residuals(diagnosis.drivers[0], ratios, forever(stream))
         for rank, explanation in enumerate(explanations, 1):

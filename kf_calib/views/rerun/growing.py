@@ -29,30 +29,35 @@ from kf_calib.views.rerun.names import new_stream
 
 PORT = 9876
 _HEADER = 12  # bytes before the first message of what Rerun encoded
+_LAST_S = 1.0  # in which a browser gets what was sent last
 _WAITING = 4  # results; the next one that comes through shows what those left out would have
 
 
 class GrowingView:
     """Offer it results; ``close`` it. rrd: a file to write; port: of the viewer, None: no viewer.
 
-    bind: the address a viewer that is opened listens on. dropped: results that came while ``waiting`` others waited;
-    the dwells they would have shown are shown by the next. trouble: why the viewer shows nothing any more.
+    bind: the address a viewer that is opened listens on. web: a browser is the viewer, at ``url``, while this is open.
+    Raises InputError where another viewer has the port of a browser's. dropped: results that came while ``waiting``
+    others waited, whose dwells are shown by the next. trouble: why the viewer shows nothing any more.
     """
 
     def __init__(
-        self, rrd: Path | None = None, port: int | None = PORT, bind: str = "127.0.0.1", waiting: int = _WAITING
-    ) -> None:
-        self.dropped, self.trouble = 0, ""
+        self, rrd: Path | None = None, port: int | None = PORT, bind: str = "127.0.0.1", waiting: int = _WAITING,
+        web: bool = False,
+    ) -> None:  # fmt: skip
+        self.dropped, self.trouble, self._relays = 0, "", port is not None and _listens(port)
+        if web and self._relays:
+            raise InputError(f"port {port} is taken by another Rerun viewer: close it, or add --rerun-port.")
         self._results = queue.Queue[tuple[Calibration, Judgement | None] | None](waiting)
         self._file = _GrowingFile(rrd) if rrd else None
-        self._viewer, self._relays = None, False
+        self._viewer = None
         self._stream = new_stream()
         self._encoded = self._stream.binary_stream()
         self._is_gone = False  # the viewer
         self._log = tempfile.TemporaryFile()  # noqa: SIM115  # closed with the viewer's pipe
         if port is not None:
-            self._relays = _listens(port)
-            self._viewer = _viewer(port, bind, self._log)
+            self._viewer = _viewer(port, bind, self._log, web)
+        self.url = "" if port is None or not web else _url(port)
         self._thread = threading.Thread(target=copy_context().run, args=(self._show,), name="rerun", daemon=True)
         self._thread.start()
 
@@ -75,6 +80,12 @@ class GrowingView:
         self._thread.join(patience_s)
         viewer = self._viewer
         if viewer is None:
+            return
+        if self.url:
+            with suppress(subprocess.TimeoutExpired):
+                viewer.wait(_LAST_S)  # it never ends by itself
+            viewer.terminate()
+            viewer.wait()
             return
         if self._relays and not self._thread.is_alive():  # what sends to a viewer that was there ends by itself
             with suppress(subprocess.TimeoutExpired):
@@ -203,8 +214,14 @@ def _listens(port: int) -> bool:
     return True
 
 
-def _viewer(port: int, bind: str, log: IO[bytes]) -> subprocess.Popen[bytes]:
-    command = [binary(), "--port", str(port), "--bind", bind, "--hide-welcome-screen", "-"]
+def _url(port: int) -> str:
+    """Return where a browser finds the viewer that listens on this port, and the data."""
+    return f"http://127.0.0.1:{port + 1}/?url=rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{port}%2Fproxy"
+
+
+def _viewer(port: int, bind: str, log: IO[bytes], web: bool) -> subprocess.Popen[bytes]:
+    served = ["--serve-web", "--web-viewer-port", str(port + 1)] if web else []
+    command = [binary(), "--port", str(port), "--bind", bind, "--hide-welcome-screen", *served, "-"]
     quiet = {**os.environ, "RUST_LOG": "error"}
     return subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=log, stderr=log, env=quiet, start_new_session=True

@@ -22,8 +22,9 @@ from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration, Parameter, format_p
 from kf_calib.support import units
 from kf_calib.support.text import printable
+from kf_calib.views.diagnosis import disturbed_dwells
 from kf_calib.views.rerun.names import GOLD, GREY, MAUVE, RED, WHITE, Colour, entity, rrd_file
-from kf_calib.views.rerun.spheres import at_step, log_spheres, spheres
+from kf_calib.views.rerun.spheres import at_step, forever, log_key, log_spheres, spheres
 
 STEP = "step"
 _SMALLEST = 1e-300
@@ -85,9 +86,11 @@ def save_improvement_view(improvement: Improvement, path: Path) -> Path:
         for symbol, values in view.coefficients.items():
             _log_coefficient(stream, entity("coefficients", symbol), values)
         sigmas = mean_sigmas(improvement.start.before)
+        log_key("spheres", ["in this step"], forever(stream))
         for step, result in enumerate(view.results):
             log = at_step(stream, STEP, step)
-            log_spheres(result, result.residuals_mps2 / sigmas, "spheres", 0, stream, log)
+            marked = disturbed_dwells(view.diagnoses[step])
+            log_spheres(result, result.residuals_mps2 / sigmas, "spheres", 0, stream, log, marked)
             log("summary", rr.TextDocument(printable(_summary(view, step)), media_type=rr.MediaType.MARKDOWN))
     return path
 
@@ -161,7 +164,7 @@ def _layout(view: View) -> rrb.Blueprint:
     first = rrb.Horizontal(
         rrb.Vertical(
             _series("error", f"rms error, {units.shown('m/s^2').label}", steps, (0.0, top)),
-            _series("log10_p", "log₁₀ p: noise alone would leave as much; accepted above −2", steps),
+            _series("log10_p", "log₁₀ p, accepted above −2", steps),
         ),
         spheres("spheres", 1),
         rrb.TextDocumentView(origin="summary", name="this step"),

@@ -1,7 +1,7 @@
 """What is a curve or a row of points: parameters and their sigmas, innovations, NIS, residuals, gimbal angles.
 
-Rerun draws curves over a timeline, with axes of its own. It has no logarithmic axis: sigmas, which fall over decades,
-are sent as their logarithms to base 10.
+Rerun draws curves over a timeline, with axes of its own. It has no logarithmic axis: the panels of sigmas, which fall
+over decades, end above where they are after a third of the run, and are read in the unit of the parameter.
 """
 
 from __future__ import annotations
@@ -62,6 +62,11 @@ class VisitHistory:
         margin = max(0.1 * (high - low), 1e-9 * max(abs(low), abs(high)), 1e-12)
         return low - margin, high + margin
 
+    def sigma_range(self, columns: Sequence[int]) -> tuple[float, float] | None:
+        """From 0 to above the sigmas of these columns in the run's last two thirds; None where none is determined."""
+        late = self.sigma[self.orientation >= self.orientation[-1] / 3][:, list(columns)]
+        return (0.0, 1.15 * float(np.nanmax(late))) if np.isfinite(late).any() else None
+
     def _only(self, rows: NDArray[np.bool_]) -> VisitHistory:
         """Return the same with these rows only."""
         return VisitHistory(self.shown, *(getattr(self, each.name)[rows] for each in fields(self)[1:]))
@@ -118,17 +123,16 @@ def log_parameters(history: VisitHistory, stream: rr.RecordingStream, target: Fl
     for k, shown in enumerate(history.shown):
         path, colour, label = shown.path, shown.colour, shown.label
         value, sigma = history.deviation[:, k], history.sigma[:, k]
-        _log_curve(stream, f"{path}/log10_sigma", history, np.log10(sigma))
+        _log_curve(stream, f"{path}/sigma", history, sigma)
         _log_curve(stream, f"{path}/deviation", history, value)
         _log_curve(stream, f"{path}/band", history, np.column_stack([value - sigma, value + sigma]))
         if k < len(target) and np.isfinite(target[k]):
-            wanted = np.full(len(sigma), np.log10(target[k] * shown.per_si))
-            _log_curve(stream, f"{path}/log10_target", history, wanted)
+            _log_curve(stream, f"{path}/target", history, np.full(len(sigma), target[k] * shown.per_si))
         if styled:
             continue
         named = label if k < 12 else f"{label}, {shown.unit}"
-        _style(stream, f"{path}/log10_sigma", rr.SeriesLines(names=named, colors=colour, widths=2.0))
-        _style(stream, f"{path}/log10_target", rr.SeriesLines(names=f"target {label}", colors=colour, widths=1.0))
+        _style(stream, f"{path}/sigma", rr.SeriesLines(names=named, colors=colour, widths=2.0))
+        _style(stream, f"{path}/target", rr.SeriesLines(names=f"target {label}", colors=colour, widths=1.0))
         _style(stream, f"{path}/deviation", rr.SeriesLines(names=label, colors=colour, widths=2.0))
         _style(stream, f"{path}/band", rr.SeriesLines(names=["−σ", "+σ"], colors=[GREY] * 2, widths=[1.0] * 2))
 

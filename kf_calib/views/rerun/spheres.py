@@ -9,7 +9,7 @@ sigma, across it the two angles' (s_i = K_i E_i, all without unit).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -55,14 +55,29 @@ def spheres(origin: str, columns: int) -> rrb.Spatial3DView:
     """The view of three spheres, one below the other, in each column."""
     beside = 0.5 * (columns - 1) * _PITCH
     eye = rrb.EyeControls3D(position=(beside, -0.6 * _PITCH, 8.2), look_target=(beside, -_PITCH, 0.0), eye_up=(0, 1, 0))
-    name = f"blue −4σ, orange +4σ{'; right: left over' if columns > 1 else ''}"  # longer titles are cut off
-    return rrb.Spatial3DView(origin=origin, name=name, line_grid=False, eye_controls=eye)
+    return rrb.Spatial3DView(origin=origin, name="residuals over σ", line_grid=False, eye_controls=eye)
+
+
+def log_key(path: str, titles: Sequence[str], log: Log) -> None:
+    """The key of the colours below the spheres, and what the spheres of each column show above them."""
+    ratios = np.array([-_FULL, -0.5 * _FULL, 0.0, 0.5 * _FULL, _FULL])
+    beside = 0.5 * (len(titles) - 1) * _PITCH
+    places = [(beside + 0.6 * (k - 2), -2.0 * _PITCH - 1.45, 0.0) for k in range(len(ratios))]
+    words = [f"{'+' if ratio > 0 else ''}{ratio:g}σ".replace("-", "−") for ratio in ratios]
+    log(f"{path}/key", rr.Points3D(places, colors=signed(ratios), radii=_radii(ratios), labels=words, show_labels=True))
+    tops = [(k * _PITCH, 1.4, 0.0) for k in range(len(titles))]
+    log(f"{path}/titles", rr.Points3D(tops, colors=WHITE, radii=0.0, labels=list(titles), show_labels=True))
 
 
 def log_spheres(
-    result: Calibration, ratios: Floats, path: str, column: int, stream: rr.RecordingStream, log: Log
-) -> None:
-    """Where gravity pointed in the platform, a sphere an accelerometer, coloured and sized by the signed residual."""
+    result: Calibration, ratios: Floats, path: str, column: int, stream: rr.RecordingStream, log: Log,
+    disturbed: Collection[int] = (),
+) -> None:  # fmt: skip
+    """Where gravity pointed in the platform, a sphere an accelerometer, coloured and sized by the signed residual.
+
+    disturbed: numbers of dwells that get a red ring.
+    """
+    marked = {k: visit.dwell.number for k, visit in enumerate(result.visits) if visit.dwell.number in disturbed}
     force = np.array([visit.dwell.means[1:4] for visit in result.visits])
     directions = force / np.linalg.norm(force, axis=1, keepdims=True)
     turn = np.linspace(0, 2 * np.pi, 73)
@@ -76,9 +91,24 @@ def log_spheres(
         arrow = rr.Arrows3D(origins=[middle], vectors=[1.3 * axis], colors=ACCELEROMETERS[i], radii=0.02,
                             labels=[f"E{'₁₂₃'[i]}"], show_labels=True)  # fmt: skip
         stream.log(f"{path}/{i + 1}/axis", arrow, static=True)
-        weight = np.clip(np.abs(ratios[:, i]) / _FULL, 0.0, 1.0)
-        points = rr.Points3D(directions + middle, colors=signed(ratios[:, i]), radii=0.03 + 0.09 * weight)
+        points = rr.Points3D(directions + middle, colors=signed(ratios[:, i]), radii=_radii(ratios[:, i]))
         log(f"{path}/{i + 1}/residuals", points)
+        rings = [_ring(middle, directions[k]) for k in marked]
+        names = [f"dwell {number}: disturbed" for number in marked.values()] if i == 0 else None
+        log(f"{path}/{i + 1}/disturbed", rr.LineStrips3D(rings, colors=RED, radii=0.012, labels=names))
+
+
+def _radii(ratios: Floats) -> Floats:
+    return 0.03 + 0.09 * np.clip(np.abs(ratios) / _FULL, 0.0, 1.0)
+
+
+def _ring(middle: Floats, direction: Floats) -> Floats:
+    """Return points (n, 3) of a circle on a sphere about a direction."""
+    across = np.cross(direction, np.eye(3)[int(np.argmin(np.abs(direction)))])
+    across = across / np.linalg.norm(across)
+    turn = np.linspace(0.0, 2.0 * np.pi, 33)[:, None]
+    around = np.cos(turn) * across + np.sin(turn) * np.cross(direction, across)
+    return np.asarray(middle + direction + 0.2 * around, float)
 
 
 def signed(ratios: Floats) -> NDArray[np.uint8]:
