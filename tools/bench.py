@@ -72,7 +72,7 @@ def fold(path: Path) -> int:
     return passed.tally.read
 
 
-def candidates(dwells: list[Any], bench: Any, columns: int = 70) -> list[Any]:
+def candidates(dwells: Any, bench: Any, columns: int = 70) -> list[Any]:
     """Effects of the catalogue that have a column the twelve do not explain, and formulas up to so many columns."""
     from kf_calib.effects import effect_named, names
 
@@ -85,7 +85,7 @@ def candidates(dwells: list[Any], bench: Any, columns: int = 70) -> list[Any]:
     return effects
 
 
-def scanned(dwells: list[Any], bench: Any, effects: list[Any]) -> Sequence[Any]:
+def scanned(dwells: Any, bench: Any, effects: list[Any]) -> Sequence[Any]:
     from kf_calib.estimation.iterated_fit import fit
     from kf_calib.estimation.measurement_model import Model
     from kf_calib.estimation.score_test import scan

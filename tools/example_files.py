@@ -45,7 +45,7 @@ def write_table(path: Path) -> None:
         face = f"{'+' if force[axis] > 0 else '-'}{names[axis]}"
         means = [round(float(each) * MG_PER_MPS2, 3) for each in dwell.means[4:]]
         middle = BEGUN + timedelta(seconds=round(0.5 * (dwell.start_s + dwell.end_s)))
-        warmth = round(float(dwell.nodes.temperature_c[0]), 2)
+        warmth = round(float(dwell.pieces.nodes.temperature_c[0]), 2)
         sheet.append([middle, face, *means, *(round(float(each), 3) for each in sigmas), dwell.count, warmth, None])
     book.save(path)
 

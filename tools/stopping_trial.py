@@ -87,7 +87,7 @@ def names_told(source: IndependentBench) -> set[tuple[str, ...]] | None:
     for watch in looks(source):
         if watch.alarmed is not None:
             alarmed = True
-            first = diagnose(evaluate(list(watch.dwells), source.bench, Settings())).table
+            first = diagnose(evaluate(watch.dwells, source.bench, Settings())).table
             if first is not None and first.first.effects and first.first.probability >= SURE:
                 told.add(first.first.effects)
     return told if alarmed else None

@@ -64,8 +64,8 @@ class ComputedSequence(Sequence[Computed]):
     @overload
     def __getitem__(self, index: int) -> Computed: ...
     @overload
-    def __getitem__(self, index: slice) -> list[Computed]: ...
-    def __getitem__(self, index: int | slice) -> Computed | list[Computed]:
+    def __getitem__(self, index: slice) -> Sequence[Computed]: ...
+    def __getitem__(self, index: int | slice) -> Computed | Sequence[Computed]:
         if isinstance(index, slice):
             return [self.item(k) for k in range(*index.indices(len(self)))]
         return self.item(range(len(self))[index])

@@ -7,7 +7,6 @@ error and scatter (``noise_model.mean_covariances``).
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -99,12 +98,12 @@ class Prospect:
         """The prospect after a run so far, with dwells like those of the run; the information from the run is not
         included."""
         linearised, last = fitted.linearised, fitted.dwells[-1]
-        dwell_s = float(np.median([dwell.end_s - dwell.start_s for dwell in fitted.dwells]))
-        temperature_c = float(last.pieces[-1].nodes.temperature_c[-1])
-        before = Last(last.end_s, last.pose, last.means[1:4], temperature_c, last.variances[-1])
+        dwell_s = float(np.median(np.diff(fitted.dwells.folded.ends_s)))
+        temperature_c = float(last.pieces.nodes.temperature_c[-1])
+        before = Last(last.end_s, last.pose, last.means[1:4], temperature_c, fitted.dwells.folded.variances[-1])
         readings, nothing = float(np.median(linearised.means.counts)), np.zeros((linearised.model.count,) * 2)
-        pauses_s = [after.start_s - dwell.end_s for dwell, after in itertools.pairwise(fitted.dwells)]
-        pause_s = float(np.median(pauses_s)) if pauses_s else PAUSE_S
+        ends_s = fitted.dwells.folded.ends_s
+        pause_s = float(np.median(ends_s[1:, 0] - ends_s[:-1, 1])) if len(ends_s) > 1 else PAUSE_S
         return cls(linearised.model, linearised.state, fitted.noise, readings, dwell_s, nothing, before, pause_s)
 
     @classmethod

@@ -6,7 +6,6 @@ lowers the generalised variance of the nine parameters most.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +13,7 @@ import numpy as np
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
-from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.dwells.table import DwellTable
 from kf_calib.estimation.attitude import facing_readings, force_shown
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.fit import Fit
@@ -50,17 +49,17 @@ class Sides:
     following: str
 
     @classmethod
-    def of(cls, dwells: Sequence[DwellFactor], bench: Bench, fitted: Fit | None = None) -> Sides:
+    def of(cls, dwells: DwellTable, bench: Bench, fitted: Fit | None = None) -> Sides:
         """The sides of dwells; fitted: to these or fewer dwells, None where they do not determine it."""
         model = Model(bench)
         state = model.nominal_state() if fitted is None else fitted.linearised.state
         noise = within_dwells(dwells) if fitted is None else fitted.noise
         facing = facing_readings(dwells, state, bench.gravity_mps2)
         covariance = covariance_of(LinearisedDwells(facing, model, state), noise, bench.square_rad)
-        force = force_shown(np.array([dwell.means[4:] for dwell in dwells]), state)
+        force = force_shown(dwells.means[:, 4:], state)
         up = force / np.linalg.norm(force, axis=1, keepdims=True)
         following = most_informative(covariance, state, bench.gravity_mps2)
-        numbers = tuple(dwell.number for dwell in dwells)
+        numbers = tuple(dwells.folded.numbers.tolist())
         return cls(numbers, up, _grouped(up), tuple(undetermined(covariance)), following)
 
     @property

@@ -15,7 +15,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.within_dwell_trend import Trend, trend
 from kf_calib.dwells.coherent_tone import band_hz
 from kf_calib.dwells.line_spectrum import SpectralLine, lowest_hz
-from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.dwells.table import DwellTable
 from kf_calib.effects import Coefficient, Effect, effect_named, names, oscillation_of, slew_effects, walk_named
 from kf_calib.estimation.candidate_scan import Candidate, Scan
 from kf_calib.estimation.dwell_columns import stimulus_of
@@ -246,9 +246,9 @@ def slow_hz(fitted: Fit, effect: Effect) -> Floats:
     return frequencies_hz[frequencies_hz < min(_searched_hz(fitted.dwells))]
 
 
-def _searched_hz(dwells: Sequence[DwellFactor]) -> tuple[float, float, float]:
+def _searched_hz(dwells: DwellTable) -> tuple[float, float, float]:
     """Return the band in which a steady oscillation is searched and the lowest frequency of lines; infinite: none."""
-    steady, lowest_line_hz = band_hz([dwell.trace for dwell in dwells]), lowest_hz(dwell.spectrum for dwell in dwells)
+    steady, lowest_line_hz = band_hz(dwells.folded.traces), lowest_hz(dwells.folded.spectra)
     return *steady, lowest_line_hz
 
 

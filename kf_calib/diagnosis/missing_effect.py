@@ -101,7 +101,7 @@ def _diagnosed(refits: Refits, before: Calibration) -> Diagnosis:
     if diagnosis.unknown and test.without_lines:  # the lines keep their phase through the run, but not their amplitude
         test = test.without_lines
         diagnosis = _explained(refits, before, test)
-    if test.lines.vibration and before.bench.angles and not before.fit.dwells[0].averaged:
+    if test.lines.vibration and before.bench.angles and not before.fit.dwells.folded.averaged:
         averaged = refits.averaged(before, window_average.window_s(test.lines.vibration))
         if averaged is not None:
             retest = refits.assess(averaged)

@@ -9,7 +9,6 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, one_blas_thread
 from kf_calib.diagnosis.stepwise_selection import improve
-from kf_calib.dwells.sufficient_statistics import dwells_without
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation.attitude import linearised_at
 from kf_calib.estimation.calibration import evaluate
@@ -50,9 +49,7 @@ def nested_cross_validation(
     for number in range(folds):
         held_out = sorted(k for group in groups[number::folds] for k in group)
         with one_blas_thread():
-            others = evaluate(
-                dwells_without(start.fit.dwells, held_out), start.bench, start.settings, start.linearised.slews
-            )
+            others = evaluate(start.fit.dwells.without(held_out), start.bench, start.settings, start.linearised.slews)
         result = improve(others, accept_first=True).result
         squares, variances = _prediction_errors(start, result, held_out)
         errors.append(squares)

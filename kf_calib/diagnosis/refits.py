@@ -83,14 +83,14 @@ class Refits:
         settings, dwells, slews = replace(before.settings, effects=effects), before.fit.dwells, before.linearised.slews
         model = Model.of(before.bench, effects, settings.bench_model)
         stage.say(f"refitting with {' + '.join(map(str, model.effects))}" if model.effects else "refitting the twelve")
-        averages = model.averages and not all(dwell.averaged for dwell in dwells)
+        averages = model.averages and not dwells.folded.averaged
         if self.source is not None and (averages or (model.dynamic and not slews)):
             return calibrate(self.source, settings)
         with one_blas_thread():
             beginning = before.fit.beginning
             fitted = fit(dwells, model, settings.walk_mps2_per_sqrt_s, slews, must_settle=False, beginning=beginning)
             if self.source is not None and not holds_its_oscillation(fitted):
-                return calibrate(self.source, settings, plain=None if dwells[0].averaged else fitted)
+                return calibrate(self.source, settings, plain=None if dwells.folded.averaged else fitted)
             return replace(evaluate_fit(fitted, settings), tally=before.tally, readings=before.readings)
 
 

@@ -140,8 +140,7 @@ class RunTerms:
             of_dwell = np.empty(len(dwells), np.intp)
             for k, group in enumerate(groups):
                 of_dwell[group] = k
-            pieces = [len(dwell.pieces) for dwell in dwells]
-            visits = _Visits(np.repeat(of_dwell, 3 * np.array(pieces)), len(groups))
+            visits = _Visits(np.repeat(of_dwell, 3 * dwells.folded.piece_numbers), len(groups))
             self.unknown.append(UnknownTerm("the orientation alone, alike at each visit", "", ()))
             columns.term(f"?{len(self.unknown) - 1}", [columns.block(columns.add([visits]))], 0.0)
 

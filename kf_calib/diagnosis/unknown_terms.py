@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from kf_calib.bench.bench import Bench
-from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.dwells.sufficient_statistics import Dwell
 
 RETURNING = "time (irregular, and comes back)"
 """What biases depend on that change as irregularly as a random walk, and return to their mean."""
@@ -42,7 +42,7 @@ class UnknownTerm:
         return self.weights[k] if self.weights else 1.0
 
 
-def unknown_terms(bench: Bench, dwells: Sequence[DwellFactor]) -> Iterator[UnknownTerm]:
+def unknown_terms(bench: Bench, dwells: Sequence[Dwell]) -> Iterator[UnknownTerm]:
     """All terms of unknown form that a run of these dwells may show."""
     yield from _of_force()
     yield from _of_gimbals(len(bench.axes))
@@ -114,7 +114,7 @@ def _turning(place: str, texts: Sequence[str]) -> tuple[str, ...]:
     return tuple(f":{place} = {text}" for text in texts)
 
 
-def _of_time(dwells: Sequence[DwellFactor], turns: bool) -> Iterator[UnknownTerm]:
+def _of_time(dwells: Sequence[Dwell], turns: bool) -> Iterator[UnknownTerm]:
     run_s = f"({dwells[-1].end_s:.0f}*s)"
     texts = ["t", "t*t", *(f"cos({n}*pi*t/{run_s})" for n in range(1, 9))]
     weights = (1.0, 0.5, *(1.0 / n for n in range(1, 9)))
@@ -139,7 +139,7 @@ def _of_time(dwells: Sequence[DwellFactor], turns: bool) -> Iterator[UnknownTerm
         yield _one_of("time (a periodic tilt of the base)", "base and platform", tilts)
 
 
-def _of_jumps(dwells: Sequence[DwellFactor], turns: bool) -> Iterator[UnknownTerm]:
+def _of_jumps(dwells: Sequence[Dwell], turns: bool) -> Iterator[UnknownTerm]:
     """Jumps of biases at any time; of scale factors, alignment and base between dwells, in the middle of the way."""
     within_s = [0.5 * (dwell.start_s + dwell.end_s) for dwell in dwells]
     between_s = [0.5 * (before.end_s + dwell.start_s) for before, dwell in itertools.pairwise(dwells)]
@@ -158,7 +158,7 @@ def _of_jumps(dwells: Sequence[DwellFactor], turns: bool) -> Iterator[UnknownTer
             yield _one_of(f"time ({words})", "base and platform", turned)
 
 
-def _of_arrival(gimbals: int, dwells: Sequence[DwellFactor]) -> Iterator[UnknownTerm]:
+def _of_arrival(gimbals: int, dwells: Sequence[Dwell]) -> Iterator[UnknownTerm]:
     longest_s = max(dwell.end_s - dwell.start_s for dwell in dwells)
     decays_s = [decay_s for decay_s in _DECAYS_S if decay_s <= 2.0 * longest_s] or [_DECAYS_S[0]]
     yield _one_of("time since arrival", "memory", _neighbours([f"exp(-tau/({each}*s))" for each in decays_s]))

@@ -80,7 +80,7 @@ def second_pass_in_words(diagnosis: Diagnosis) -> str:
     """A sentence on what only a second pass over the readings could judge; "" where nothing is left to it."""
     names = [suspect.name for suspect in diagnosis.suspects if not holds_its_oscillation(suspect.refit.fit)]
     before = diagnosis.before
-    if diagnosis.test.lines.vibration and before.bench.angles and not before.fit.dwells[0].averaged:
+    if diagnosis.test.lines.vibration and before.bench.angles and not before.fit.dwells.folded.averaged:
         names.append("the lines in their spectrum")
     if not names:
         return ""

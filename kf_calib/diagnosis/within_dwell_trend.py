@@ -14,7 +14,6 @@ And a test of whether an oscillation goes on alike in all dwells, as the model o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -25,7 +24,7 @@ from kf_calib.bench.paper_parameters import BIASES
 from kf_calib.dwells.pieces import basis_values, of_all_pieces
 from kf_calib.dwells.qr import orthonormal
 from kf_calib.dwells.rows import on_basis
-from kf_calib.dwells.stack import AlikeDwells, DwellStack, Folded
+from kf_calib.dwells.table import AlikeDwells, DwellTable
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.square_root_information import scale_columns
@@ -108,7 +107,7 @@ def trend_beside(linearised: LinearisedDwells, noise: Noise, state: Floats) -> T
     from scipy.special import fdtrc
 
     dwells, folded = linearised.dwells, linearised.dwells.folded
-    if folded.dwells[0].averaged or not noise.scatter.stated:
+    if folded.averaged or not noise.scatter.stated:
         return None
     sigma, lengths_s = noise.effective_sigma_mps2, folded.ends_s[:, 1] - folded.ends_s[:, 0]
     squares, determined = _squares(dwells, _residuals(linearised, state))
@@ -154,48 +153,44 @@ def _by_thermometer(linearised: LinearisedDwells, noise: Noise) -> Floats | floa
     return squares.reshape(len(squares), 3, -1, _DEGREE).sum(axis=2)
 
 
-def _residuals(linearised: LinearisedDwells, state: Floats) -> list[Floats]:
-    """Return the residuals (d, pieces, K, 3) of the dwells of each shape on the rows of their triangles."""
+def _residuals(linearised: LinearisedDwells, state: Floats) -> Floats:
+    """Return the residuals (pieces, K, 3) of all dwells on the rows of their triangles."""
     dwells, columns = linearised.dwells_at_state, of_all_pieces(linearised.columns)
+    width = dwells.folded.width
     of_model = _on_triangles(dwells, on_basis(columns @ state[: columns.shape[-1]]))
-    return [
-        triangles[:, :, : shape.width, shape.width :] - own
-        for shape, triangles, own in zip(dwells.folded.shapes, dwells.triangles, of_model, strict=True)
-    ]
+    return dwells.triangles[:, :width, width:] - of_model
 
 
-def _on_triangles(dwells: DwellStack, coefficients: Floats) -> list[Floats]:
-    """Return the rows (d, pieces, K, c) of the dwells of each shape of functions of time with these coefficients
-    (pieces, K, c) on the basis functions."""
-    return [
-        triangles[:, :, : shape.width, : shape.width] @ coefficients[shape.pieces]
-        for shape, triangles in zip(dwells.folded.shapes, dwells.triangles, strict=True)
-    ]
+def _on_triangles(dwells: DwellTable, coefficients: Floats) -> Floats:
+    """Return the rows (pieces, K, c) of functions of time with these coefficients (pieces, K, c) on the basis
+    functions."""
+    width = dwells.folded.width
+    return dwells.triangles[:, :width, :width] @ coefficients
 
 
-def _squares(dwells: DwellStack, rows: Sequence[Floats]) -> tuple[Floats, Mask]:
-    """Return the squared coefficients (D, c, degrees) of the rows of each shape of dwells, (d, pieces, K, c), on the
-    shapes of a trend, scaled to mean square 1, and a mask (D, degrees) of the degrees that the readings of each dwell
-    determine.
-    """
+def _squares(dwells: DwellTable, rows: Floats) -> tuple[Floats, Mask]:
+    """Return the squared coefficients (D, c, degrees) of rows (pieces, K, c) on the shapes of a trend, scaled to mean
+    square 1, and a mask (D, degrees) of the degrees that the readings of each dwell determine."""
     folded = dwells.folded
-    squares, determined = np.zeros((len(dwells), rows[0].shape[3], _DEGREE)), np.zeros((len(dwells), _DEGREE), bool)
-    for alike, triangles, own in zip(folded.shapes, dwells.triangles, rows, strict=True):
-        frame, shown = _trends_in(folded, alike, triangles)
-        along = np.swapaxes(own.reshape(len(own), -1, own.shape[3]), 1, 2) @ frame
+    squares, determined = np.zeros((len(dwells), rows.shape[2], _DEGREE)), np.zeros((len(dwells), _DEGREE), bool)
+    for alike in folded.shapes:
+        frame, shown = _trends_in(dwells, alike)
+        along = np.swapaxes(rows[alike.pieces].reshape(len(frame), -1, rows.shape[2]), 1, 2) @ frame
         squares[alike.dwells, :, : frame.shape[2]] = along**2 / folded.counts[alike.dwells, None, None]
         determined[alike.dwells, : frame.shape[2]] = shown
     return squares, determined
 
 
-def _trends_in(folded: Folded, alike: AlikeDwells, triangles: Floats) -> tuple[Floats, Mask]:
+def _trends_in(dwells: DwellTable, alike: AlikeDwells) -> tuple[Floats, Mask]:
     """Return orthonormal columns (d, r, k) on the triangle rows of dwells of one shape, one column for each degree
     from one up, and a mask (d, k) of the degrees that each dwell determines.
     """
+    folded = dwells.folded
     ends, counts = folded.ends_s[alike.dwells], folded.counts[alike.dwells]
     lengths, at = ends[:, 1] - ends[:, 0], folded.elapsed_s.reshape(-1, 3)[alike.pieces]
     from_start = (at - ends[:, 0, None, None]) / np.where(lengths > 0.0, lengths, 1.0)[:, None, None]
-    rows = triangles[:, :, : alike.width, :3] @ on_basis(shapes(2.0 * from_start - 1.0))
+    basis = dwells.triangles[alike.pieces, : folded.width, :3]
+    rows = basis @ on_basis(shapes(2.0 * from_start - 1.0))
     frame, upper = np.linalg.qr(rows.reshape(len(rows), -1, rows.shape[3]))
     determined = np.abs(np.einsum("dkk->dk", upper[:, :, : upper.shape[1]])) > 1e-6 * np.sqrt(counts)[:, None]
     determined &= ((counts >= _FEWEST) & (lengths > 0.0))[:, None]

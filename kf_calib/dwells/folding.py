@@ -10,38 +10,38 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from functools import cached_property
 
 import numpy as np
 
-from kf_calib.bench.arrays import ComputedSequence, Floats, Ints, Mask
+from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Orientations
 from kf_calib.dwells.coherent_tone import MOST_CELLS, Cells, Trace
 from kf_calib.dwells.line_spectrum import Spectrum
-from kf_calib.dwells.pieces import FEWEST_PIECES, MOST_PIECES, MOST_RUN_PIECES, Piece, coarsened
+from kf_calib.dwells.pieces import FEWEST_PIECES, MOST_PIECES, MOST_RUN_PIECES, Pieces, coarsened
 from kf_calib.dwells.qr import square_triangle
-from kf_calib.dwells.rows import REGRESSORS, Nodes, Rows, basis
-from kf_calib.dwells.stack import DwellStack, Folded
-from kf_calib.dwells.sufficient_statistics import Autocovariance, DwellFactor
+from kf_calib.dwells.rows import Nodes, Rows, basis
+from kf_calib.dwells.sufficient_statistics import Autocovariance, Dwell
+from kf_calib.dwells.table import DwellTable, FoldedDwells
 from kf_calib.dwells.window_average import orthonormal_parabola
 
 _CORRELATED_SAMPLES = 8192  # first readings of a dwell over which its autocovariance is accumulated, at least
 
 
-def fold(rows: Rows, carrier_hz: float = 0.0) -> tuple[Piece, ...]:
+def fold(rows: Rows, carrier_hz: float = 0.0) -> Pieces:
     """Fold one block of rows into pieces."""
     width = 9 if carrier_hz else 3
     channels = rows.innovation if rows.static else rows.readings.T
     level = rows.readings[0] - channels[:, 0]  # what was subtracted from the readings to give the innovation
-    pieces = list[Piece]()
-    for part, u, nodes in rows.pieces:
+    triangles = np.empty((len(rows.pieces), width + 3, width + 3))
+    for (part, u, _), folded in zip(rows.pieces, triangles, strict=True):
         stacked = np.empty((width + 3, len(u)))  # contiguous rows are what LAPACK needs and are faster to fill
         stacked[:width], stacked[width:] = basis(u, rows.elapsed_s[part], carrier_hz), channels[:, part]
-        folded = square_triangle(stacked.T)
+        folded[:] = square_triangle(stacked.T)
         folded[0, width:] += folded[0, 0] * level
-        pieces.append(Piece(folded, nodes, len(u), carrier_hz, len(u) * rows.readings_per_row))
-    return tuple(pieces)
+    counts = np.array([len(u) for _, u, _ in rows.pieces])
+    nodes = Nodes.joined([nodes for _, _, nodes in rows.pieces])
+    return Pieces(triangles, nodes, counts, counts * rows.readings_per_row, carrier_hz)
 
 
 def detrended(innovation: Floats, elapsed_s: Floats | None = None, carrier_hz: float = 0.0) -> Floats:
@@ -60,11 +60,11 @@ class _DwellSequence:
     whole dwell every time. In a run of very many pieces those of its closed dwells are merged, too.
     """
 
-    def __init__(self, folded: Iterable[DwellFactor] = ()) -> None:
-        self._folded, self._blocks = list(folded), list[DwellFactor]()
+    def __init__(self, folded: Iterable[Dwell] = ()) -> None:
+        self._folded, self._blocks = list(folded), list[Dwell]()
         self._closed_pieces, self._most_closed = 0, MOST_RUN_PIECES
 
-    def add(self, block: DwellFactor) -> None:
+    def add(self, block: Dwell) -> None:
         """Add a block of the last dwell or of a new one."""
         if self._last(block.number) is None:
             if self._folded and not block.moving:
@@ -86,7 +86,7 @@ class _DwellSequence:
         return last.autocovariance.count if last else 0
 
     @property
-    def folded(self) -> list[DwellFactor]:
+    def folded(self) -> list[Dwell]:
         """All dwells, each with all its blocks."""
         if self._blocks:
             self._folded[-1] = self._folded[-1].merge(self._blocks)
@@ -107,12 +107,12 @@ class _DwellSequence:
         """Number of pieces of the last dwell."""
         return len(self._folded[-1].pieces) + sum(len(block.pieces) for block in self._blocks)
 
-    def _last(self, number: int) -> DwellFactor | None:
+    def _last(self, number: int) -> Dwell | None:
         """Return the last dwell if it has this number, else None."""
         return self._folded[-1] if self._folded and self._folded[-1].number == number else None
 
 
-def _with_half_the_pieces(dwell: DwellFactor) -> DwellFactor:
+def _with_half_the_pieces(dwell: Dwell) -> Dwell:
     """The dwell with its pieces merged two by two, if it has many: only three fit into a third of its length."""
     count = len(dwell.pieces)
     return dwell if count <= FEWEST_PIECES else replace(dwell, pieces=coarsened(dwell.pieces, count // 3))
@@ -128,27 +128,27 @@ class Folder:
         self._traced = 0
 
     @property
-    def dwells(self) -> list[DwellFactor]:
+    def dwells(self) -> list[Dwell]:
         """The dwells folded so far."""
         return self._dwells.folded
 
     @dwells.setter
-    def dwells(self, dwells: Iterable[DwellFactor]) -> None:
+    def dwells(self, dwells: Iterable[Dwell]) -> None:
         self._dwells = _DwellSequence(dwells)
 
     @property
-    def slews(self) -> list[DwellFactor]:
+    def slews(self) -> list[Dwell]:
         """The slews folded so far."""
         return self._slews.folded
 
     @slews.setter
-    def slews(self, slews: Iterable[DwellFactor]) -> None:
+    def slews(self, slews: Iterable[Dwell]) -> None:
         self._slews = _DwellSequence(slews)
 
     def add(self, rows: Rows) -> None:
         """Fold one block of rows into its dwell or slew."""
         growing = self._slews if rows.moving else self._dwells
-        block = DwellFactor(
+        block = Dwell(
             rows.dwell, fold(rows, self.carrier_hz), moving=rows.moving, pose_sigma_rad=rows.pose_sigma_rad,
             turns=rows.turns,
         )  # fmt: skip
@@ -168,102 +168,32 @@ LEAST_COUNT = 8
 """A standard deviation of fewer readings counts as if there were more readings of more noise: the same sigma of the
 mean."""
 _CURVE = 3  # basis functions of a piece
-_UNKNOWN = Autocovariance(), Spectrum(), Trace()  # the same objects for all dwells, since a set takes 2 kB
 
 
-def dwells_of_table(table: Orientations, bench: Bench) -> DwellStack:
+def dwells_of_table(table: Orientations, bench: Bench) -> DwellTable:
     """The sufficient statistics of each row of a table."""
-    return DwellStack(FoldedTable(table, bench))
+    count, times = len(table.elapsed_s), _times(table)
+    pieces = Pieces(_triangles(table, times), _nodes(table, bench), times * table.counts, table.counts)
+    folded = FoldedDwells(
+        pieces, np.arange(count + 1), np.arange(1, count + 1), np.zeros(count, bool), np.zeros(count),
+        np.ones((count, 3)), [()] * count, [Autocovariance()] * count, [Spectrum()] * count, [Trace()] * count,
+    )  # fmt: skip
+    return DwellTable(folded)
 
 
 def rows_of_table(table: Orientations, bench: Bench) -> Iterator[Rows]:
     """Rows of each dwell with every reading at the mean, from which any engine makes the same estimate as from the
     readings themselves."""
-    for dwell, mean_mps2, elapsed_s in zip(
-        FoldedTable(table, bench).dwells, table.mean_mps2, table.elapsed_s.tolist(), strict=True
+    nodes, counts = _nodes(table, bench), (_times(table) * table.counts).tolist()
+    for k, (mean_mps2, elapsed_s, count) in enumerate(
+        zip(table.mean_mps2, table.elapsed_s.tolist(), counts, strict=True)
     ):
-        count, nodes = dwell.count, dwell.pieces[0].nodes
-        readings = np.tile(mean_mps2, (count, 1))
-        columns = np.tile(nodes.regressors[:1], (count, 1))
-        assert columns.shape[1] == len(REGRESSORS)
-        piece = slice(0, count), np.zeros(count), nodes
+        readings, here = np.tile(mean_mps2, (count, 1)), nodes[3 * k : 3 * k + 3]
+        piece = slice(0, count), np.zeros(count), here
         yield Rows(
-            dwell.number, np.full(count, elapsed_s), columns, readings, np.zeros((3, count)), True, (piece,)
+            k + 1, np.full(count, elapsed_s), np.tile(here.regressors[:1], (count, 1)), readings, np.zeros((3, count)),
+            True, (piece,),
         )  # fmt: skip
-
-
-class FoldedTable(Folded):
-    """The dwells of a table, of which all is in arrays from the beginning: a dwell is an object of 1.5 kB, and is made
-    only where it is asked for."""
-
-    def __init__(self, table: Orientations, bench: Bench) -> None:
-        self._table, count, times = table, len(table.elapsed_s), _times(table)
-        self.dwells = _RowsAsDwells(self)
-        self.piece_numbers, self.ends = np.ones(count, np.intp), np.arange(count + 1)
-        self.piece_counts, self.reading_counts = (times * table.counts).astype(float), table.counts.astype(float)
-        self.triangles = [_triangles(table, times)[:, None]]
-        self._nodes = _nodes(table, bench)
-
-    @cached_property
-    def widths(self) -> Ints:
-        return np.full(len(self.dwells), _CURVE)
-
-    @cached_property
-    def weights(self) -> Floats:
-        return np.ones((len(self.dwells), 3))
-
-    @cached_property
-    def moving(self) -> Mask:
-        return np.zeros(len(self.dwells), bool)
-
-    @cached_property
-    def pose_sigmas_rad(self) -> Floats:
-        return np.zeros(len(self.dwells))
-
-    @cached_property
-    def autocovariance(self) -> Autocovariance:
-        return _UNKNOWN[0]
-
-    @cached_property
-    def spreads(self) -> Floats:
-        (triangles,) = self.triangles
-        scatter = np.square(np.einsum("dii->di", triangles[:, 0, _CURVE:, _CURVE:]))
-        return (scatter / self.counts[:, None])[:, :, None] * np.eye(3)
-
-    @cached_property
-    def came_from(self) -> dict[int, DwellFactor]:
-        return {}
-
-    def of_nodes(self, name: str) -> Floats:
-        return getattr(self._nodes, name)
-
-    def rates(self, name: str) -> Floats:
-        return np.broadcast_to(0.0, self._nodes.force_mps2.shape)
-
-    def dwell(self, k: int) -> DwellFactor:
-        """The dwell at an index."""
-        part, nodes = slice(3 * k, 3 * k + 3), self._nodes
-        here = Nodes(
-            nodes.elapsed_s[part], nodes.since_arrival_s[part], nodes.force_mps2[part], nodes.pose[part],
-            nodes.temperature_c[part],
-        )  # fmt: skip
-        piece = Piece(
-            self.triangles[0][k, 0], here, int(self.piece_counts[k]), 0.0, int(self.reading_counts[k])
-        )  # fmt: skip
-        return DwellFactor(k + 1, (piece,), *_UNKNOWN)
-
-
-class _RowsAsDwells(ComputedSequence[DwellFactor]):
-    """The rows of a folded table, each made into a dwell when it is asked for."""
-
-    def __init__(self, folded: FoldedTable) -> None:
-        self._folded = folded
-
-    def __len__(self) -> int:
-        return len(self._folded.piece_numbers)
-
-    def item(self, k: int) -> DwellFactor:
-        return self._folded.dwell(k)
 
 
 def _times(table: Orientations) -> int:

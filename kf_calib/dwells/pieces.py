@@ -22,9 +22,8 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-from kf_calib.bench.arrays import ComputedSequence, Floats
+from kf_calib.bench.arrays import ComputedSequence, Floats, Indices, Ints
 from kf_calib.dwells.qr import triangle
 from kf_calib.dwells.rows import Nodes, basis, on_basis, parabola
 
@@ -35,56 +34,100 @@ MOST_RUN_PIECES = 2048
 """Pieces of all dwells of a run, beyond which those of long dwells are merged; dwells of an hour have 70 each."""
 FEWEST_PIECES = 16
 """Dwells of no more pieces are left as they are: so many have lengths that double from 1 s to hours."""
+_THREE = np.arange(3)  # nodes of a piece
 
 
-@dataclass(frozen=True)
-class Piece:
-    """One piece of a dwell.
+@dataclass(frozen=True, eq=False, repr=False)
+class Pieces:
+    """Pieces in order of time.
 
-    - triangle (K + 3, K + 3): the triangular factor of [1 u u^2 ... | z1 z2 z3].
-    - nodes: the conditions at its three nodes.
-    - count: number of readings, or of averages of them, that were folded.
+    - triangles (P, K + 3, K + 3): the triangular factors of [1 u u^2 ... | z1 z2 z3].
+    - nodes: the conditions at the 3 P nodes, three of each piece.
+    - counts (P,): numbers of readings, or of averages of them, that were folded.
+    - reading_counts (P,): numbers of readings that these stand for.
     - carrier_hz: frequency of the carrier; 0 for none.
-    - reading_count: number of readings that ``count`` stands for.
     """
 
-    triangle: Floats
+    triangles: Floats
     nodes: Nodes
-    count: int
+    counts: Ints
+    reading_counts: Ints
     carrier_hz: float = 0.0
-    reading_count: int = 0
+
+    @classmethod
+    def joined(cls, some: Sequence[Pieces]) -> Pieces:
+        """The pieces of several dwells, or blocks, one after another."""
+        return cls(
+            np.concatenate([each.triangles for each in some]), Nodes.joined([each.nodes for each in some]),
+            np.concatenate([each.counts for each in some]), np.concatenate([each.reading_counts for each in some]),
+            some[0].carrier_hz,
+        )  # fmt: skip
+
+    def __len__(self) -> int:
+        return len(self.counts)
+
+    def __getitem__(self, part: slice | Indices) -> Pieces:
+        at = np.arange(len(self))[part]
+        nodes = (3 * at[:, None] + _THREE).ravel()
+        return replace(
+            self, triangles=self.triangles[part], nodes=self.nodes[nodes], counts=self.counts[part],
+            reading_counts=self.reading_counts[part],
+        )  # fmt: skip
+
+    @property
+    def width(self) -> int:
+        """The number K of basis functions."""
+        return self.triangles.shape[1] - 3
+
+    @property
+    def spans_s(self) -> Floats:
+        """When each piece begins and ends, (P, 2)."""
+        return self.nodes.elapsed_s.reshape(-1, 3)[:, [0, 2]]
+
+    @property
+    def means(self) -> Floats:
+        """Means (P, 7) of the regressors 1, f_x, f_y, f_z and of the three readings over each piece."""
+        functions = self.triangles[:, 0] / self.triangles[:, :1, 0]  # means of the basis, then of the readings
+        means = np.ones((len(self), 7))
+        means[:, 1:4] = (functions[:, None, :3] @ parabola(self.nodes.force_mps2.reshape(-1, 3, 3)))[:, 0]
+        means[:, 4:] = functions[:, self.width :]
+        return means
+
+    def plus(self, coefficients: Floats) -> Floats:
+        """The triangles with readings plus what has these coefficients (P, K, 3) on the basis functions."""
+        width, triangles = self.width, self.triangles.copy()
+        triangles[:, :width, width:] += triangles[:, :width, :width] @ coefficients
+        return triangles
 
 
-def coarsened(pieces: Sequence[Piece], count: int = _MERGED_PIECES) -> tuple[Piece, ...]:
+def coarsened(pieces: Pieces, count: int = _MERGED_PIECES) -> Pieces:
     """Pieces in order of time, merged to at most twice ``count`` and those shortly after the arrival."""
-    begin, end = pieces[0].nodes.elapsed_s[0], pieces[-1].nodes.elapsed_s[-1]
-    return tuple(merged_piece(group) for group in _groups(pieces, float(end - begin) / count))
+    spans_s = pieces.spans_s
+    longest_s = float(spans_s[-1, 1] - spans_s[0, 0]) / count
+    return Pieces.joined([merged_piece(pieces[part]) for part in _groups(pieces, longest_s)])
 
 
-def _groups(pieces: Sequence[Piece], longest_s: float) -> Iterator[list[Piece]]:
+def _groups(pieces: Pieces, longest_s: float) -> Iterator[slice]:
     """Yield neighbours that together last no longer than ``longest_s``, nor than it is since the arrival."""
-    group = [pieces[0]]
-    for piece in pieces[1:]:
-        first = group[0].nodes
-        length_s = piece.nodes.elapsed_s[-1] - first.elapsed_s[0]
-        if length_s > min(longest_s, first.since_arrival_s[0]):
-            yield group
-            group = []
-        group.append(piece)
-    yield group
+    (begins_s, ends_s), since_s = pieces.spans_s.T.tolist(), pieces.nodes.since_arrival_s[::3].tolist()
+    first = 0
+    for k in range(1, len(pieces)):
+        if ends_s[k] - begins_s[first] > min(longest_s, since_s[first]):
+            yield slice(first, k)
+            first = k
+    yield slice(first, len(pieces))
 
 
-def merged_piece(pieces: Sequence[Piece]) -> Piece:
+def merged_piece(pieces: Pieces) -> Pieces:
     """One piece of consecutive ones."""
     if len(pieces) == 1:
-        return pieces[0]
-    begin, end = pieces[0].nodes.elapsed_s[0], pieces[-1].nodes.elapsed_s[-1]
+        return pieces
+    begin, end = pieces.nodes.elapsed_s[[0, -1]]
     middle, half = 0.5 * (begin + end), max(0.5 * float(end - begin), 1e-9)
-    width = pieces[0].triangle.shape[1] - 3
-    stacked = np.vstack([_on_longer_basis(piece, middle, half, width) for piece in pieces])
+    stacked = np.vstack([_on_longer_basis(pieces[k : k + 1], middle, half) for k in range(len(pieces))])
     return replace(
-        pieces[0], triangle=triangle(stacked), nodes=_nodes(pieces, np.array([begin, middle, end])),
-        count=sum(piece.count for piece in pieces), reading_count=sum(piece.reading_count for piece in pieces),
+        pieces, triangles=triangle(stacked)[None], nodes=_nodes(pieces, np.array([begin, middle, end])),
+        counts=pieces.counts.sum(keepdims=True), reading_counts=pieces.reading_counts.sum(keepdims=True),
     )  # fmt: skip
 
 
@@ -93,21 +136,21 @@ def _centre(nodes: Nodes) -> tuple[float, float]:
     return float(nodes.elapsed_s[1]), max(0.5 * float(nodes.elapsed_s[-1] - nodes.elapsed_s[0]), 1e-9)
 
 
-def _on_longer_basis(piece: Piece, middle: float, half: float, width: int) -> Floats:
+def _on_longer_basis(piece: Pieces, middle: float, half: float) -> Floats:
     """The triangle of a piece on the basis of a longer one: U = shift + share u, so 1, U, U^2 follow from 1, u, u^2."""
     piece_middle, piece_half = _centre(piece.nodes)
     shift, share = (piece_middle - middle) / half, piece_half / half
     change_of_basis = np.array([[1.0, shift, shift**2], [0.0, share, 2.0 * shift * share], [0.0, 0.0, share**2]])
-    lengthened = piece.triangle.copy()
-    for first in range(0, width, 3):  # on a carrier its cosine and sine have the same three
-        lengthened[:, first : first + 3] = piece.triangle[:, first : first + 3] @ change_of_basis
+    lengthened = piece.triangles[0].copy()
+    for first in range(0, piece.width, 3):  # on a carrier its cosine and sine have the same three
+        lengthened[:, first : first + 3] = lengthened[:, first : first + 3] @ change_of_basis
     return lengthened
 
 
-def _nodes(pieces: Sequence[Piece], at_s: Floats) -> Nodes:
+def _nodes(pieces: Pieces, at_s: Floats) -> Nodes:
     """The conditions at the beginning, the middle and the end of consecutive pieces."""
-    first, last = pieces[0].nodes, pieces[-1].nodes
-    amid = next(piece.nodes for piece in pieces if piece.nodes.elapsed_s[-1] >= at_s[1])
+    k, nodes = int(np.argmax(pieces.spans_s[:, 1] >= at_s[1])), pieces.nodes
+    amid = nodes[3 * k : 3 * k + 3]
     centre, half = _centre(amid)
     functions = basis(np.array([max((at_s[1] - centre) / half, -1.0)]))[:, 0]  # -1: in a gap, the piece after it
 
@@ -116,23 +159,21 @@ def _nodes(pieces: Sequence[Piece], at_s: Floats) -> Nodes:
         if values is None:
             return None
         between = functions @ parabola(values.reshape(3, -1))
-        return np.array([getattr(first, name)[0], between.reshape(values.shape[1:]), getattr(last, name)[-1]])
+        at_all = getattr(nodes, name)
+        return np.array([at_all[0], between.reshape(values.shape[1:]), at_all[-1]])
 
-    since_s = at_s - first.elapsed_s[0] + first.since_arrival_s[0]
+    since_s = at_s - nodes.elapsed_s[0] + nodes.since_arrival_s[0]
     force, pose, warmth = node_values("force_mps2"), node_values("pose"), node_values("temperature_c")
     assert force is not None and pose is not None and warmth is not None
     return Nodes(at_s, since_s, force, pose, warmth, node_values("rate_radps"), node_values("rate_change_radps2"),
                  node_values("variance_mps2_2"))  # fmt: skip
 
 
-PieceIndices = NDArray[np.intp]
-
-
 class OfPieces(ComputedSequence[Floats]):
     """Values of the pieces of all dwells, or whitened rows, in one array (pieces, ...), as a sequence of those of each
     dwell; objects a dwell would take as much memory as the numbers."""
 
-    def __init__(self, values: Floats, ends: PieceIndices) -> None:
+    def __init__(self, values: Floats, ends: Indices) -> None:
         self.values, self._ends = values, ends
 
     def __len__(self) -> int:

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats, Mask
+from kf_calib.bench.arrays import Floats, Indices, Mask
 from kf_calib.bench.bench import Bench
 from kf_calib.dwells.blocks import Block, Curve, Tally
 from kf_calib.dwells.window_average import average
@@ -44,6 +45,25 @@ class Nodes:
     rate_radps: Floats | None = None
     rate_change_radps2: Floats | None = None
     variance_mps2_2: Floats | None = None
+
+    @classmethod
+    def joined(cls, some: Sequence[Nodes]) -> Nodes:
+        """The conditions of several pieces, or dwells, one after another; rates are zero where the platform stands, and
+        variances are those of averages only if all are averages."""
+        values = {each.name: [getattr(nodes, each.name) for nodes in some] for each in fields(cls)}
+        for name in ("rate_radps", "rate_change_radps2"):
+            if any(rate is not None for rate in values[name]):
+                pairs = zip(some, values[name], strict=True)
+                values[name] = [np.zeros_like(nodes.force_mps2) if rate is None else rate for nodes, rate in pairs]
+        joined: dict[str, Any] = {
+            name: None if any(part is None for part in parts) else np.concatenate(parts)
+            for name, parts in values.items()
+        }
+        return cls(**joined)
+
+    def __getitem__(self, part: slice | Indices) -> Nodes:
+        known = {each.name: values for each in fields(self) if (values := getattr(self, each.name)) is not None}
+        return Nodes(**{name: values[part] for name, values in known.items()})
 
     @property
     def regressors(self) -> Floats:

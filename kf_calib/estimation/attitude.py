@@ -17,8 +17,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats, crossed
 from kf_calib.bench.bench import turn_by, turned
 from kf_calib.bench.paper_parameters import STATE_COUNT
-from kf_calib.dwells.stack import Attitudes, DwellStack
-from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.dwells.table import Attitudes, DwellTable
 from kf_calib.effects import Effect, FrameEffect, Stimulus
 from kf_calib.estimation.dwell_columns import LinearisedDwells, stimulus_of
 from kf_calib.estimation.measurement_model import Model
@@ -44,7 +43,7 @@ _STILL_RAD = 1e-7
 
 def at_their_modes(
     linearised: LinearisedDwells, noise: Noise, state: Floats, untold: Floats | None = None
-) -> DwellStack:
+) -> DwellTable:
     """The dwells with attitudes at their posterior modes at ``state`` (p,), to first order about where they were.
 
     Dwells stay as they are where no setting error is allowed for. Where it is only considered (``SettingError``),
@@ -73,17 +72,16 @@ def at_their_modes(
 
 
 def _facing(
-    stack: DwellStack, forces: Floats, variances: Floats, noise: Noise, state: Floats, bendings: Floats
-) -> DwellStack:
+    stack: DwellTable, forces: Floats, variances: Floats, noise: Noise, state: Floats, bendings: Floats
+) -> DwellTable:
     """Return dwells of no known attitude with forces (D, 3), of components across them with ``variances`` (D,)."""
     variances = variances + _wander_rad2(stack, noise, state, forces)
     return with_forces(stack, forces, Attitudes(np.zeros((len(stack), 3)), variances, bendings), state)
 
 
-def without_attitudes(dwells: Sequence[DwellFactor]) -> DwellStack:
+def without_attitudes(dwells: DwellTable) -> DwellTable:
     """The dwells linearised about the forces that their poses show."""
-    stack = DwellStack.of(dwells)
-    return stack if stack.attitudes is None else stack.linearised(stack.turned_rad, None)
+    return dwells if dwells.attitudes is None else dwells.linearised(dwells.turned_rad, None)
 
 
 def untold_directions(linearised: LinearisedDwells, noise: Noise) -> Floats:
@@ -101,13 +99,13 @@ def untold_directions(linearised: LinearisedDwells, noise: Noise) -> Floats:
     return directions.T[variances < (_UNTOLD * noise.setting_rad) ** 2]
 
 
-def _shown_forces(stack: DwellStack) -> Floats:
+def _shown_forces(stack: DwellTable) -> Floats:
     """Return the mean specific forces (D, 3) that the recorded poses show."""
     shown = stack.means[:, 1:4]
     return shown if stack.turned_rad is None else turned(shown, stack.turned_rad)
 
 
-def _wander_rad2(stack: DwellStack, noise: Noise, state: Floats, forces: Floats) -> Floats:
+def _wander_rad2(stack: DwellTable, noise: Noise, state: Floats, forces: Floats) -> Floats:
     """Return the mean square (D,) of the angle by which the force wanders about its mean within each dwell: what the
     readings spread across it beyond their noise. A hand creeps and trembles, and a mean of directions is shorter than
     each."""
@@ -191,17 +189,14 @@ def _limited(rotations_rad: Floats) -> Floats:
     return rotations_rad * np.minimum(1.0, _FARTHEST_RAD / np.maximum(angles_rad, 1e-300))
 
 
-def with_forces(
-    dwells: Sequence[DwellFactor], forces_mps2: Floats, attitudes: Attitudes | None, state: Floats
-) -> DwellStack:
+def with_forces(dwells: DwellTable, forces_mps2: Floats, attitudes: Attitudes | None, state: Floats) -> DwellTable:
     """The dwells with other specific forces (D, 3), each at all nodes of its dwell, and poses that have them up, of an
     arbitrary heading. The dwell before one, where that was left out, has the force that its own readings show at
     ``state``."""
-    stack, sizes_mps2 = DwellStack.of(dwells), np.linalg.norm(forces_mps2, axis=1)
-    before = {
-        k: facing_readings([dwell], state, float(sizes_mps2[k]))[0] for k, dwell in stack.folded.came_from.items()
-    }
-    return stack.facing_forces(forces_mps2, _poses(forces_mps2 / sizes_mps2[:, None]), attitudes, before)
+    sizes_mps2 = np.linalg.norm(forces_mps2, axis=1)
+    before = dwells.came_from and facing_readings(dwells.came_from, state, sizes_mps2)
+    facing = forces_mps2, _poses(forces_mps2 / sizes_mps2[:, None])
+    return replace(dwells, attitudes=attitudes, facing=facing, came_from=before)
 
 
 def _poses(units: Floats) -> Floats:
@@ -218,13 +213,12 @@ def force_shown(readings: Floats, state: Floats) -> Floats:
     return np.asarray(np.linalg.solve(affine[:, :3], (readings - affine[:, 3]).T).T, float)
 
 
-def facing_readings(dwells: Sequence[DwellFactor], state: Floats, gravity_mps2: float) -> DwellStack:
+def facing_readings(dwells: DwellTable, state: Floats, gravity_mps2: Floats | float) -> DwellTable:
     """The dwells with the specific force that their mean readings alone show at ``state``, S^-1 (z - b) with the size
-    of g: where the search for attitudes that are not known begins."""
-    stack = DwellStack.of(dwells)
-    forces = force_shown(stack.means[:, 4:], state)
-    forces *= gravity_mps2 / np.linalg.norm(forces, axis=1, keepdims=True)
-    return with_forces(stack, forces, stack.attitudes, state)
+    of g, one or (D,): where the search for attitudes that are not known begins."""
+    forces = force_shown(dwells.means[:, 4:], state)
+    forces *= (gravity_mps2 / np.linalg.norm(forces, axis=1))[:, None]
+    return with_forces(dwells, forces, dwells.attitudes, state)
 
 
 def relinearised(
@@ -245,7 +239,7 @@ def _farthest_rad(one: LinearisedDwells, other: LinearisedDwells) -> float:
 
 
 def linearised_at(
-    dwells: Sequence[DwellFactor], model: Model, state: Floats, noise: Noise, untold: Floats | None = None
+    dwells: DwellTable, model: Model, state: Floats, noise: Noise, untold: Floats | None = None
 ) -> LinearisedDwells:
     """Dwells with the columns of a model at a state, and attitudes where the readings show them there.
 
@@ -261,13 +255,13 @@ def linearised_at(
     return linearised
 
 
-def at_its_mode(dwell: DwellFactor, so_far: LinearisedDwells, noise: Noise) -> DwellFactor:
+def at_its_mode(dwell: DwellTable, so_far: LinearisedDwells, noise: Noise) -> DwellTable:
     """A dwell that follows those ``so_far``, with its attitude where its readings show it at their state: the iterated
     update of a filter by one dwell."""
     if not noise.setting_rad:
         return dwell
-    both, untold = [so_far.dwells[-1], dwell], untold_directions(so_far, noise)
-    return linearised_at(both, so_far.model, so_far.state, noise, untold).dwells[-1]
+    both, untold = so_far.dwells[-1:].beside(dwell), untold_directions(so_far, noise)
+    return linearised_at(both, so_far.model, so_far.state, noise, untold).dwells[1:]
 
 
 def left_to_settle(state: Floats, before: Floats, sigma: Floats) -> float:

@@ -23,8 +23,8 @@ from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.bench.streams import Source
 from kf_calib.dwells import window_average
 from kf_calib.dwells.blocks import Tally
-from kf_calib.dwells.stack import DwellStack
-from kf_calib.dwells.sufficient_statistics import DwellFactor, lines_of
+from kf_calib.dwells.sufficient_statistics import Dwell, lines_of
+from kf_calib.dwells.table import DwellTable
 from kf_calib.effects import of_the_users
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation import kalman_filterpy, square_root_information
@@ -102,7 +102,7 @@ def conclude(
     - plain: a fit that is known not to suffice; the pass has then not begun.
     """
     settings, bench = passed.settings, passed.source.bench
-    dwells = DwellStack.of(passed.dwells) if plain is None else plain.dwells
+    dwells = passed.dwells if plain is None else plain.dwells
     if plain is None:
         _refuse_absent(settings.left_out, passed.folded)
         refuse_unusable(dwells, passed.tally, bench)
@@ -165,14 +165,12 @@ def _with_outlying(judged: Consistency, outlying: Sequence[OutlyingDwell]) -> Co
     return replace(judged, p_value=p_value, consistent=p_value >= LEVEL)
 
 
-def _fit_again(result: Calibration, dwells: list[DwellFactor]) -> Fit:
+def _fit_again(result: Calibration, dwells: DwellTable) -> Fit:
     """Fit the same model to other dwells."""
     return fit(dwells, result.model, result.settings.walk_mps2_per_sqrt_s, result.linearised.slews)
 
 
-def evaluate(
-    dwells: Sequence[DwellFactor], bench: Bench, settings: Settings, slews: Sequence[DwellFactor] = ()
-) -> Calibration:
+def evaluate(dwells: DwellTable, bench: Bench, settings: Settings, slews: Sequence[Dwell] = ()) -> Calibration:
     """The calibration from sufficient statistics of dwells and, if effects show in them, of slews, without a pass over
     the data."""
     model = Model.of(bench, settings.effects, settings.bench_model)
@@ -241,9 +239,9 @@ def _counted(
             return
 
 
-def _refuse_absent(left_out: Sequence[int], dwells: Sequence[DwellFactor]) -> None:
+def _refuse_absent(left_out: Sequence[int], dwells: DwellTable) -> None:
     """Raise InputError if a dwell that is to be left out does not exist, since another one was probably meant."""
-    absent = sorted(set(left_out) - {dwell.number for dwell in dwells}) if left_out else []
+    absent = sorted(set(left_out) - set(dwells.folded.numbers.tolist())) if left_out else []
     if absent and dwells:
         raise InputError(
             f"there is no dwell {absent[0]} to leave out (--leave-out): the run has dwells {dwells[0].number} to "

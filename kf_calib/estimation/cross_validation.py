@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import cast
 
 import numpy as np
@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.pieces import of_all_pieces
 from kf_calib.dwells.qr import inverse_of_lower, triangle
-from kf_calib.dwells.stack import DwellStack
-from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.dwells.table import DwellTable
 from kf_calib.estimation import square_root_information
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.free_attitude import weights_of_size
@@ -33,19 +32,20 @@ _LEAST_LEFT = 1e-3  # of the information in any direction, without an orientatio
 _ROUNDING = 1.0 + 1e-9  # by which cells are larger, so that what is near is never two apart
 
 
-def orientations(dwells: Sequence[DwellFactor]) -> list[list[int]]:
+def orientations(dwells: DwellTable) -> list[list[int]]:
     """Indices of the dwells grouped by orientation, that is by direction of gravity in the platform and by pose.
 
     Angles that differ by whole turns are the same pose: their sines and cosines are compared.
     """
-    stack = DwellStack.of(dwells)
-    direction = stack.means[:, 1:4] / np.linalg.norm(stack.means[:, 1:4], axis=1, keepdims=True)
-    places = np.column_stack([direction, np.cos(stack.poses), np.sin(stack.poses)])
-    known, before = stack.folded.known.get("orientations", ([], places[:0]))
-    if not np.array_equal(places, before):
-        known = grouped(places, math.radians(SAME_POSE_DEG))
-        stack.folded.known["orientations"] = known, places
-    return known
+    direction = dwells.means[:, 1:4] / np.linalg.norm(dwells.means[:, 1:4], axis=1, keepdims=True)
+    places = np.column_stack([direction, np.cos(dwells.poses), np.sin(dwells.poses)])
+    return _grouped(places.tobytes(), len(places))
+
+
+@lru_cache(maxsize=8)  # the same for every model of a run
+def _grouped(places: bytes, count: int) -> list[list[int]]:
+    """Compute the groups of ``orientations`` from the bytes of its places (D, k), which can be cached."""
+    return grouped(np.frombuffer(places).reshape(count, -1), math.radians(SAME_POSE_DEG))
 
 
 def grouped(places: Floats, apart: float) -> list[list[int]]:

@@ -9,16 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats, crossed
+from kf_calib.bench.arrays import Floats, Indices, crossed
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.pieces import OfPieces
 from kf_calib.dwells.rows import on_basis
-from kf_calib.dwells.stack import DwellStack, Folded
-from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.dwells.sufficient_statistics import Dwell
+from kf_calib.dwells.table import DwellTable, FoldedDwells, computed_once
 from kf_calib.effects import Effect, FrameEffect, Stimulus
 from kf_calib.estimation.measurement_model import Model, effect_columns
-from kf_calib.noise.means import Means, bending_of, means_of
+from kf_calib.noise.means import Means, means_of
 from kf_calib.noise.temperature_course import temperature_course
 
 _LITTLE_RAD = 1e-4  # of a setting error of 0.01 deg it leaves 0.2 um/s^2 along the specific force
@@ -27,17 +27,16 @@ _STEP_K = 1e-3
 _VIBRATING = 15.0  # mean squared deviation of the variances in units of sigma; autocorrelation alone gives up to 10
 
 
-def stimulus_of(dwells: Sequence[DwellFactor], bench: Bench, state: Floats) -> Stimulus:
+def stimulus_of(dwells: DwellTable, bench: Bench, state: Floats) -> Stimulus:
     """The conditions at the nodes of all pieces of all dwells and slews, in order; rotations are linearised at
     ``state``. Poses are NaN where no angles are used."""
-    stack = DwellStack.of(dwells)
-    known = _known_conditions(stack.folded) | _conditions(stack) | _turned_conditions(stack)
+    known = _known_conditions(dwells.folded) | _conditions(dwells) | _turned_conditions(dwells)
     if not bench.angles:
         known = known | {key: np.full_like(known[key], np.nan) for key in ("pose", "previous_pose")}
     return Stimulus(bench=bench, sensitivity=state[:12].reshape(3, 4)[:, :3], **known)
 
 
-def _conditions(stack: DwellStack) -> dict[str, Any]:
+def _conditions(stack: DwellTable) -> dict[str, Any]:
     """Return the forces (m, 3) and poses (m, k) that the angles show at the nodes of the dwells, and before them.
 
     The last step stays that of the poses: where a pose changes nothing along an axis, its sign is not that of noise.
@@ -50,7 +49,7 @@ def _conditions(stack: DwellStack) -> dict[str, Any]:
     return {"previous_force_mps2": before, "pose": stack.pose, "previous_pose": previous_pose}
 
 
-def _turned_conditions(stack: DwellStack) -> dict[str, Any]:
+def _turned_conditions(stack: DwellTable) -> dict[str, Any]:
     """Return the specific force (m, 3) that is felt at the nodes, and by what it is turned there."""
     conditions = dict[str, Any](force_mps2=stack.felt_force_mps2)
     if stack.turned_rad is not None or stack.attitudes is not None:
@@ -62,25 +61,24 @@ def _turned_conditions(stack: DwellStack) -> dict[str, Any]:
     return conditions
 
 
-def _known_conditions(folded: Folded) -> dict[str, Any]:
+@computed_once
+def _known_conditions(folded: FoldedDwells) -> dict[str, Any]:
     """Return the conditions that do not change if dwells are turned; every fit asks for them several times."""
-    if "conditions" not in folded.known:
-        elapsed_s = folded.elapsed_s
-        folded.known["conditions"] = {
-            "elapsed_s": elapsed_s,
-            "since_arrival_s": folded.of_nodes("since_arrival_s"),
-            "temperature_c": temperature_course(folded).temperature_c,
-            "variance_mps2_2": _varying(folded).reshape(-1, 3),
-            "rate_radps": folded.rates("rate_radps"),
-            "rate_change_radps2": folded.rates("rate_change_radps2"),
-            "half_s": np.repeat(0.5 * (elapsed_s[2::3] - elapsed_s[::3]), 3),
-            "within": np.tile([-1.0, 0.0, 1.0], int(folded.ends[-1])),
-            "carrier_hz": folded.dwells[0].carrier_hz,
-        }
-    return folded.known["conditions"]
+    elapsed_s = folded.elapsed_s
+    return {
+        "elapsed_s": elapsed_s,
+        "since_arrival_s": folded.pieces.nodes.since_arrival_s,
+        "temperature_c": temperature_course(folded).temperature_c,
+        "variance_mps2_2": _varying(folded).reshape(-1, 3),
+        "rate_radps": folded.rates("rate_radps"),
+        "rate_change_radps2": folded.rates("rate_change_radps2"),
+        "half_s": np.repeat(0.5 * (elapsed_s[2::3] - elapsed_s[::3]), 3),
+        "within": np.tile([-1.0, 0.0, 1.0], len(folded.pieces)),
+        "carrier_hz": folded.carrier_hz,
+    }
 
 
-def _varying(folded: Folded) -> Floats:
+def _varying(folded: FoldedDwells) -> Floats:
     """Return the variances of the readings (pieces, nodes, 3), or their mean if they vary no more than their estimates
     scatter."""
     at_nodes, counts = folded.shaking
@@ -90,7 +88,7 @@ def _varying(folded: Folded) -> Floats:
     return np.where(excess > _VIBRATING, at_nodes, mean)
 
 
-def without_known(dwells: Sequence[DwellFactor], model: Model) -> Sequence[DwellFactor]:
+def without_known(dwells: DwellTable, model: Model) -> DwellTable:
     """The dwells with readings that no longer contain the known effects of a model.
 
     A triangle [1 u u^2 ... | z] with z less the columns times the coefficients is the triangle times a unit matrix with
@@ -100,16 +98,17 @@ def without_known(dwells: Sequence[DwellFactor], model: Model) -> Sequence[Dwell
         return dwells
     effects, sizes = [each.effect for each in model.known], np.concatenate([each.coefficients for each in model.known])
     columns = candidate_columns(dwells, effects, model.bench, model.nominal_state())
-    return DwellStack.of(dwells).plus(-on_basis(columns.values @ sizes))
+    return dwells.plus(-on_basis(columns.values @ sizes))
 
 
-def columns_of(dwells: Sequence[DwellFactor], model: Model, state: Floats) -> OfPieces:
+def columns_of(dwells: DwellTable, model: Model, state: Floats) -> OfPieces:
     """The model's columns at the nodes of each dwell, (pieces, K nodes, 3 channels, p)."""
-    return _by_dwell(dwells, lambda s: model.columns(s, state), stimulus_of(dwells, model.bench, state))
+    stimulus = stimulus_of(dwells, model.bench, state)
+    return _by_dwell(dwells.folded, lambda s: model.columns(s, state), stimulus)
 
 
 def candidate_columns(
-    dwells: Sequence[DwellFactor],
+    dwells: DwellTable,
     effects: Sequence[Effect],
     bench: Bench,
     state: Floats,
@@ -118,7 +117,7 @@ def candidate_columns(
     """The columns of effects that are not in the model, in the form of ``columns_of``; ``stimulus`` may be given if it
     is known."""
     stimulus = stimulus or stimulus_of(dwells, bench, state)
-    return _by_dwell(dwells, lambda s: effect_columns(effects, s), stimulus)
+    return _by_dwell(dwells.folded, lambda s: effect_columns(effects, s), stimulus)
 
 
 def piece_columns(effects: Sequence[Effect], stimulus: Stimulus) -> Floats:
@@ -126,10 +125,9 @@ def piece_columns(effects: Sequence[Effect], stimulus: Stimulus) -> Floats:
     return _by_piece(lambda s: effect_columns(effects, s), stimulus)
 
 
-def _by_dwell(dwells: Sequence[DwellFactor], columns: Callable[[Stimulus], Floats], stimulus: Stimulus) -> OfPieces:
+def _by_dwell(folded: FoldedDwells, columns: Callable[[Stimulus], Floats], stimulus: Stimulus) -> OfPieces:
     """Arrange the columns of a stimulus (m, 3, p) by dwell; of dwells of which only the mean is known they are those at
     the middle node."""
-    folded = DwellStack.of(dwells).folded
     if not folded.shows_means_only or stimulus.carrier_hz:
         return OfPieces(_by_piece(columns, stimulus), folded.ends)
     middle = columns(stimulus.at(slice(1, None, 3)))[:, None]
@@ -155,35 +153,35 @@ class LinearisedDwells:
     refers to dwells only.
     """
 
-    def __init__(
-        self, dwells: Sequence[DwellFactor], model: Model, state: Floats, slews: Sequence[DwellFactor] = ()
-    ) -> None:
-        self.dwells, self.slews, self.model, self.state = DwellStack.of(dwells), list(slews), model, state
+    def __init__(self, dwells: DwellTable, model: Model, state: Floats, slews: Sequence[Dwell] = ()) -> None:
+        self.dwells, self.slews, self.model, self.state = dwells, list(slews), model, state
         self.dwells_at_state = dwells_at_state(self.dwells, model, state)
-        self.slew_columns = list[Floats]()
+        self.slew_columns: Sequence[Floats] = []
         if not slews:
             self.columns: Sequence[Floats] = columns_of(self.dwells_at_state, model, state)
             return
-        every = sorted((*self.dwells_at_state, *slews), key=lambda each: (each.number, each.moving))
-        columns = columns_of(every, model, state)
-        self.columns = [own for each, own in zip(every, columns, strict=True) if not each.moving]
-        self.slew_columns = [own for each, own in zip(every, columns, strict=True) if each.moving]
+        both = self.dwells_at_state.beside(DwellTable.of(self.slews))
+        order = np.lexsort((both.folded.moving, both.folded.numbers))
+        columns, moving = columns_of(both.take(order), model, state), both.folded.moving[order]
+        self.columns = [columns[k] for k in np.flatnonzero(~moving).tolist()]
+        self.slew_columns = [columns[k] for k in np.flatnonzero(moving).tolist()]
 
-    def followed_by(self, dwell: DwellFactor, like: DwellStack | None = None) -> LinearisedDwells:
+    def followed_by(self, dwell: DwellTable, like: DwellTable | None = None) -> LinearisedDwells:
         """The same with one more dwell; the columns of the others are not computed again.
 
-        like: all of these dwells, where they are a stack already.
+        like: all of these dwells, where they are a table already.
         """
         longer = LinearisedDwells.__new__(LinearisedDwells)
         longer.dwells, longer.slews, longer.model, longer.state = (
-            DwellStack.of([*self.dwells, dwell], like),
+            self.dwells.beside(dwell).sharing(like),
             self.slews,
             self.model,
             self.state,
         )
-        longer.dwells_at_state = DwellStack.of([*self.dwells_at_state, dwell], longer.dwells)
-        last = stimulus_of(longer.dwells_at_state, self.model.bench, self.state).at(slice(-3 * len(dwell.pieces), None))
-        longer.columns = [*self.columns, *_by_dwell([dwell], lambda s: self.model.columns(s, self.state), last)]
+        longer.dwells_at_state = self.dwells_at_state.beside(dwell).sharing(longer.dwells)
+        last = stimulus_of(longer.dwells_at_state, self.model.bench, self.state)
+        last = last.at(slice(-3 * len(dwell.folded.pieces), None))
+        longer.columns = [*self.columns, *_by_dwell(dwell.folded, lambda s: self.model.columns(s, self.state), last)]
         longer.slew_columns = self.slew_columns
         return longer
 
@@ -206,7 +204,7 @@ class LinearisedDwells:
     @property
     def carrier_hz(self) -> float:
         """Frequency of the carrier on which the dwells were folded; 0 for none."""
-        return self.dwells[0].carrier_hz
+        return self.dwells.folded.carrier_hz
 
     @property
     def sizes(self) -> Floats:
@@ -228,7 +226,7 @@ def change_by_temperature(linearised: LinearisedDwells) -> Floats:
     return (model.columns(warmer, state) - model.columns(stimulus, state)) @ state / _STEP_K
 
 
-def dwells_at_state(dwells: Sequence[DwellFactor], model: Model, state: Floats) -> DwellStack:
+def dwells_at_state(dwells: DwellTable, model: Model, state: Floats) -> DwellTable:
     """The dwells about which a model is linear in the rotations of its dwells.
 
     At ``state`` the effects of the frame turn the specific force f of a dwell by the rotation vector rho, its mean over
@@ -238,20 +236,19 @@ def dwells_at_state(dwells: Sequence[DwellFactor], model: Model, state: Floats) 
     and alpha itself, about which the prior is zero, to S (alpha x g); as S g has both rotations in it already, they
     are added to the readings. An rho below ``_LITTLE_RAD`` in all dwells, or absurd, is taken for none.
     """
-    stack = DwellStack.of(dwells)
-    rotations = _rotations_of_effects(stack, model, state)
-    if rotations is None and stack.attitudes is None:
-        return stack
-    there = stack.linearised(rotations, stack.attitudes)
-    change = _turning_mps2(there, state)
+    rotations = _rotations_of_effects(dwells, model, state)
+    if rotations is None and dwells.attitudes is None:
+        return dwells
+    there = dwells.linearised(rotations, dwells.attitudes)
+    change = turning_mps2(there, there.felt_force_mps2, state, 3 * there.folded.piece_numbers)
     if not change.any():
         return there
-    nodes = np.zeros((len(change) // 3, max(shape.width for shape in stack.folded.shapes), 3))
+    nodes = np.zeros((len(change) // 3, dwells.folded.width, 3))
     nodes[:, :3] = change.reshape(-1, 3, 3)  # no part on a carrier
     return there.plus(on_basis(nodes))
 
 
-def _rotations_of_effects(stack: DwellStack, model: Model, state: Floats) -> Floats | None:
+def _rotations_of_effects(stack: DwellTable, model: Model, state: Floats) -> Floats | None:
     """Return the mean rotation vector (D, 3) of each dwell by effects of the frame; None where they are little."""
     if not model.bench.angles or not any(isinstance(effect, FrameEffect) for effect in model.effects):
         return None
@@ -260,32 +257,15 @@ def _rotations_of_effects(stack: DwellStack, model: Model, state: Floats) -> Flo
     return means if _LITTLE_RAD < np.abs(means).max() < _ABSURD_RAD else None
 
 
-def _turning_mps2(stack: DwellStack, state: Floats) -> Floats:
-    """Return by how much the rotations of turned dwells change the readings (m, 3) at all nodes to first order about
-    the forces g that are felt: S (rho x g) + (S + B) (alpha x g), with B the bending by effects."""
-    sensitivity, force_mps2 = state[:STATE_COUNT].reshape(3, 4)[:, :3], stack.felt_force_mps2
-    times, change = 3 * stack.folded.piece_numbers, np.zeros_like(force_mps2)
-    alpha = np.zeros((len(stack), 3)) if stack.attitudes is None else stack.attitudes.rotation_rad
-    if stack.turned_rad is not None:
-        rho = stack.turned_rad + crossed(alpha, stack.turned_rad)
+def turning_mps2(dwells: DwellTable, force_mps2: Floats, state: Floats, times: Indices | int) -> Floats:
+    """By how much the rotations of turned dwells change readings (m, 3) to first order about the forces g (m, 3) that
+    are felt, ``times`` of each dwell: S (rho x g) + (S + B) (alpha x g), with B the bending by effects."""
+    sensitivity, change = state[:STATE_COUNT].reshape(3, 4)[:, :3], np.zeros_like(force_mps2)
+    alpha = np.zeros((len(dwells), 3)) if dwells.attitudes is None else dwells.attitudes.rotation_rad
+    if dwells.turned_rad is not None:
+        rho = dwells.turned_rad + crossed(alpha, dwells.turned_rad)
         change += crossed(np.repeat(rho, times, axis=0), force_mps2) @ sensitivity.T
     if alpha.any():
-        bent = np.repeat(sensitivity + stack.bendings, times, axis=0)
+        bent = np.repeat(sensitivity + dwells.bendings, times, axis=0)
         change += (bent @ crossed(np.repeat(alpha, times, axis=0), force_mps2)[:, :, None])[:, :, 0]
     return change
-
-
-def has_turns(dwell: DwellFactor) -> bool:
-    """Whether a dwell is linearised about a force that its pose does not show."""
-    return dwell.turned_rad is not None or (dwell.attitude is not None and bool(dwell.attitude.rotation_rad.any()))
-
-
-def turning_mps2(dwell: DwellFactor, force_mps2: Floats, state: Floats) -> Floats:
-    """Return by how much the rotations of a turned dwell change readings (n, 3) to first order about the forces (n, 3)
-    that are felt: S (rho x g) + (S + B) (alpha x g), with B the bending by effects."""
-    sensitivity, change = state[:STATE_COUNT].reshape(3, 4)[:, :3], np.zeros_like(force_mps2)
-    alpha = np.zeros(3) if dwell.attitude is None else dwell.attitude.rotation_rad
-    if dwell.turned_rad is not None:
-        rho = dwell.turned_rad + np.cross(alpha, dwell.turned_rad)
-        change += np.cross(rho, force_mps2) @ sensitivity.T
-    return change + np.cross(alpha, force_mps2) @ (sensitivity + bending_of(dwell)).T if alpha.any() else change

@@ -7,7 +7,7 @@ oscillation.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -25,8 +25,8 @@ from kf_calib.dwells.line_spectrum import SpectralLine
 from kf_calib.dwells.rest_in_readings import segmenter_of
 from kf_calib.dwells.rows import Rows, model_rows
 from kf_calib.dwells.segmenter import Segmenter, dwell_blocks
-from kf_calib.dwells.stack import DwellStack
-from kf_calib.dwells.sufficient_statistics import DwellFactor, dwells_without, lines_of
+from kf_calib.dwells.sufficient_statistics import lines_of
+from kf_calib.dwells.table import DwellTable
 from kf_calib.errors import InputError
 from kf_calib.estimation import setup_blunders
 from kf_calib.estimation.dwell_columns import without_known
@@ -57,7 +57,7 @@ class Pass:
     tally: Tally = field(default_factory=Tally)
     folder: Folder = field(default_factory=Folder)
     watch: ReadingsMonitor = field(default_factory=ReadingsMonitor)
-    tabulated: DwellStack | None = None
+    tabulated: DwellTable | None = None
     """The dwells of a table, which are taken as they are; None for a source of readings."""
 
     @cached_property
@@ -86,7 +86,7 @@ class Pass:
         self.folder.add(rows)
         self.watch.add(rows.raw or rows)
 
-    def fold(self, on_progress: Callable[[float], None] | None = None) -> Sequence[DwellFactor]:
+    def fold(self, on_progress: Callable[[float], None] | None = None) -> DwellTable:
         """Read the whole source and return its usable dwells."""
         if isinstance(self.source, Table):
             self._take(self.source)
@@ -106,24 +106,25 @@ class Pass:
         self.tally.read, self.tally.used, self.tally.poses = read, read, len(table.orientations)
 
     @property
-    def folded(self) -> Sequence[DwellFactor]:
+    def folded(self) -> DwellTable:
         """All dwells so far, usable or not."""
-        return self.folder.dwells if self.tabulated is None else self.tabulated
+        return DwellTable.of(self.folder.dwells) if self.tabulated is None else self.tabulated
 
     @property
-    def dwells(self) -> Sequence[DwellFactor]:
+    def dwells(self) -> DwellTable:
         """The usable dwells so far: not left out by the settings and, but for those of a table, of at least 8 readings,
         since fewer do not show their own noise. Known errors of the bench are subtracted from their readings."""
         dwells, left_out = self.folded, self.settings.left_out
-        if self.tabulated is not None and not left_out:
-            return without_known(dwells, self.model)
         least = LEAST_READINGS if self.tabulated is None else 1
-        unused = {k for k, each in enumerate(dwells) if each.count < least or each.number in left_out}
-        used = [dwell for k, dwell in enumerate(dwells) if k not in unused]
-        return without_known(dwells_without(dwells, unused) if left_out else used, self.model)
+        unused = (dwells.folded.counts < least) | np.isin(dwells.folded.numbers, left_out)
+        if left_out:
+            dwells = dwells.without(np.flatnonzero(unused).tolist())
+        elif unused.any():
+            dwells = dwells.take(np.flatnonzero(~unused))
+        return without_known(dwells, self.model)
 
 
-def refuse_unusable(dwells: Sequence[DwellFactor], tally: Tally, bench: Bench) -> None:
+def refuse_unusable(dwells: DwellTable, tally: Tally, bench: Bench) -> None:
     """Raise InputError if there is nothing to calibrate from or if the readings are not in m/s^2, and BlunderError for
     a set-up that cannot be right."""
     if not tally.read:
@@ -150,11 +151,11 @@ def refuse_unusable(dwells: Sequence[DwellFactor], tally: Tally, bench: Bench) -
             + (tally.restless or "the platform must stand still; if it did, raise --still-deg or lower --settle-s")
             + f"{unit}."
         )
-    means_mps2 = DwellStack.of(dwells).means[:, 4:]
+    means_mps2 = dwells.means[:, 4:]
     if not means_mps2.any():
         raise InputError("all readings are zero: check that this is the accelerometer, and that it is on.")
-    still = not np.ptp(means_mps2, axis=0).any() and all(not dwell.squares.any() for dwell in dwells)
-    if still and sum(dwell.count for dwell in dwells) >= LEAST_READINGS * len(dwells):
+    still = not np.ptp(means_mps2, axis=0).any() and not dwells.folded.squares.any()
+    if still and dwells.folded.counts.sum() >= LEAST_READINGS * len(dwells):
         raise InputError(
             "the readings never change, not even by noise: the sensor or what logs it has stopped, or a channel is at "
             "the end of its range."
@@ -168,7 +169,7 @@ def refuse_unusable(dwells: Sequence[DwellFactor], tally: Tally, bench: Bench) -
     raise InputError(f"{wrong_unit(level, bench.input, bench.gravity_mps2).sentence}.")
 
 
-def _refuse_restless(dwells: Sequence[DwellFactor], tally: Tally) -> None:
+def _refuse_restless(dwells: DwellTable, tally: Tally) -> None:
     """Raise InputError if no dwell shows in the readings themselves."""
     if not dwells:
         raise InputError(
@@ -184,7 +185,7 @@ def _refuse_restless(dwells: Sequence[DwellFactor], tally: Tally) -> None:
 
 
 def on_carrier(
-    passed: Pass, dwells: Sequence[DwellFactor], plain: Fit | None, on_progress: Callable[[float], None] | None
+    passed: Pass, dwells: DwellTable, plain: Fit | None, on_progress: Callable[[float], None] | None
 ) -> tuple[Pass, Fit]:
     """The source folded again on a carrier near the frequency of the model's oscillation, and the fit to it.
 
@@ -196,7 +197,8 @@ def on_carrier(
     if not lines:
         plain = plain or fitted_to(passed, dwells)
         return (passed, plain) if holds_its_oscillation(plain) else _nearer(passed, plain, on_progress)
-    shortest_s = min(dwell.end_s - dwell.start_s for dwell in dwells if dwell.count > dwells[0].count // 2)
+    counts, lengths_s = dwells.folded.counts, np.diff(dwells.folded.ends_s)[:, 0]
+    shortest_s = float(lengths_s[counts > counts[0] // 2].min())
     on_carriers = [_nearer(passed, lines[0].frequency_hz, on_progress)]
     if lines[0].frequency_hz * shortest_s < _CYCLES:
         slow = plain or fitted_to(passed, dwells)
@@ -213,8 +215,8 @@ def _may_leave(slow: Fit, line: SpectralLine) -> bool:
     """
     dwells, effect = slow.dwells, slow.linearised.model.oscillation
     assert effect is not None
-    apart = abs(line.frequency_hz - effect.value) * max(dwell.end_s - dwell.start_s for dwell in dwells)
-    if apart > _APART or effect.value * (dwells[-1].end_s - dwells[0].start_s) < 0.5:
+    apart = abs(line.frequency_hz - effect.value) * float(np.diff(dwells.folded.ends_s).max())
+    if apart > _APART or effect.value * float(np.ptp(dwells.folded.ends_s)) < 0.5:
         return False
     part = slow.linearised.model.parts[str(effect)]
     amplitude = float(np.linalg.norm(slow.state[part][: len(effect.coefficients)]))
@@ -224,7 +226,7 @@ def _may_leave(slow: Fit, line: SpectralLine) -> bool:
 
 def _unlikeliness(fitted: Fit) -> float:
     """Return -2 ln of the likelihood of the noise within dwells and of the misfit, up to a constant."""
-    sigma, count = fitted.noise.effective_sigma_mps2, sum(dwell.count for dwell in fitted.dwells)
+    sigma, count = fitted.noise.effective_sigma_mps2, float(fitted.dwells.folded.counts.sum())
     return 2.0 * count * float(np.log(sigma).sum()) + consistency(fitted).statistic
 
 
@@ -235,7 +237,7 @@ def holds_its_oscillation(fitted: Fit) -> bool:
     and its remainder shows no line.
     """
     dwells = fitted.dwells
-    if not fitted.linearised.model.oscillates or dwells[0].carrier_hz:
+    if not fitted.linearised.model.oscillates or dwells.folded.carrier_hz:
         return True
     return _cycles(fitted) < _SLOW and not lines_of(dwells)
 
@@ -249,21 +251,21 @@ def _nearer(passed: Pass, carrier: float | Fit, on_progress: Callable[[float], N
         passed = Pass(passed.source, passed.settings, folder=Folder(carrier_hz))
         dwells = passed.fold(on_progress)
         fitted = fitted_to(passed, dwells)
-        longest_s = max(float(np.ptp(piece.nodes.elapsed_s)) for dwell in dwells for piece in dwell.pieces)
+        longest_s = float(np.diff(dwells.folded.pieces.spans_s).max())
         if not left or abs(_oscillation_hz(fitted) - carrier_hz) * longest_s < _NEAR:
             return passed, fitted
         carrier_hz = _oscillation_hz(fitted)
     raise AssertionError("unreachable: the last of the carriers is taken as it is")
 
 
-def fitted_to(passed: Pass, dwells: Sequence[DwellFactor]) -> Fit:
+def fitted_to(passed: Pass, dwells: DwellTable) -> Fit:
     """The fit of the settings' model to these dwells."""
     return fit(dwells, passed.model, passed.settings.walk_mps2_per_sqrt_s, passed.folder.slews)
 
 
 def _cycles(fitted: Fit) -> float:
     """Return the cycles of the model's oscillation in the longest dwell."""
-    return _oscillation_hz(fitted) * max(dwell.end_s - dwell.start_s for dwell in fitted.dwells)
+    return _oscillation_hz(fitted) * float(np.diff(fitted.dwells.folded.ends_s).max())
 
 
 def _oscillation_hz(fitted: Fit) -> float:

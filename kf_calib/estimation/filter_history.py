@@ -237,7 +237,7 @@ def readings_of(
     if others is not None:
         error, sigma = others.errors_mps2[k], np.sqrt(np.diag(others.covariance[k]))
     every = max(1, -(-dwell.count // most))
-    first_s = dwell.start_s - (float(dwell.nodes.since_arrival_s.min()) if left_out else 0.0)
+    first_s = dwell.start_s - (float(dwell.pieces.nodes.since_arrival_s.min()) if left_out else 0.0)
     time_s, readings = _inside(source, first_s, dwell.end_s, every)
     less, alone = readings - (dwell.means[4:] - error), others is not None
     return DwellReadings(number, time_s, less, every, dwell.count, error, sigma, dwell.start_s, alone)

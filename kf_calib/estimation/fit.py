@@ -13,7 +13,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.pieces import OfPieces, of_all_pieces
-from kf_calib.dwells.stack import DwellStack
+from kf_calib.dwells.table import DwellTable
 from kf_calib.estimation import free_attitude, square_root_information, whitened_rows
 from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns
 from kf_calib.noise.means import Means
@@ -38,7 +38,7 @@ class Fit:
     beginning: Fit | None = None
 
     @property
-    def dwells(self) -> DwellStack:
+    def dwells(self) -> DwellTable:
         """The dwells that were fitted."""
         return self.linearised.dwells
 
@@ -89,7 +89,9 @@ class Fit:
         linearised, noise = self.linearised, self.noise.weights.of(moving=True)
         following = [np.zeros((0, linearised.model.count + 1))] * len(self.dwells)
         if linearised.slews:
-            whitened = whitened_rows.whiten(linearised.slews, linearised.slew_columns, noise, linearised.state)
+            whitened = whitened_rows.whiten(
+                DwellTable.of(linearised.slews), linearised.slew_columns, noise, linearised.state
+            )
             numbers = [dwell.number for dwell in self.dwells]
             for slew, rows in zip(linearised.slews, whitened, strict=True):
                 before = bisect.bisect_right(numbers, slew.number) - 1

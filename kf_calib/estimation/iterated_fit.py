@@ -21,8 +21,8 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.rows import on_basis
-from kf_calib.dwells.stack import DwellStack
-from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.dwells.sufficient_statistics import Dwell
+from kf_calib.dwells.table import DwellTable
 from kf_calib.effects import Effect
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation import free_attitude, square_root_information
@@ -69,10 +69,10 @@ _STILL = 2.5e-4  # the search ends when no step of ln(value) exceeds this share 
 
 
 def fit(
-    dwells: Sequence[DwellFactor],
+    dwells: DwellTable,
     model: Model,
     walk_mps2_per_sqrt_s: float = 0.0,
-    slews: Sequence[DwellFactor] = (),
+    slews: Sequence[Dwell] = (),
     must_settle: bool = True,
     beginning: Fit | None = None,
 ) -> Fit:
@@ -234,16 +234,16 @@ def _most_passes(model: Model) -> int:
 
 
 def _begun(
-    dwells: Sequence[DwellFactor],
+    dwells: DwellTable,
     model: Model,
-    slews: Sequence[DwellFactor],
+    slews: Sequence[Dwell],
     walk_mps2_per_sqrt_s: float,
     beginning: Fit | None,
 ) -> Fit:
     """Return the fit from which estimation begins: with angles at the nominal state, without at that of the nine
     parameters alone."""
     if model.bench.angles:
-        dwells = with_own_noise(DwellStack.of(dwells))
+        dwells = with_own_noise(dwells)
         within = within_dwells(dwells, walk_mps2_per_sqrt_s).with_terms(RandomWalk(walk_mps2_per_sqrt_s))
         return Fit(LinearisedDwells(without_attitudes(dwells), model, model.nominal_state(), slews), within)
     nine = beginning or _nine_parameters(dwells, model.bench, walk_mps2_per_sqrt_s)
@@ -252,14 +252,13 @@ def _begun(
     return Fit(LinearisedDwells(nine.dwells, whole, state), nine.noise, beginning=nine)
 
 
-def _nine_parameters(dwells: Sequence[DwellFactor], bench: Bench, walk_mps2_per_sqrt_s: float) -> Fit:
+def _nine_parameters(dwells: DwellTable, bench: Bench, walk_mps2_per_sqrt_s: float) -> Fit:
     """Return the fit of the nine parameters that tell themselves without angles, or of six with square axes where the
     poses do not tell the rest.
 
     Raises UnobservableError if the poses tell too little.
     """
-    dwells, stated = DwellStack.of(dwells), bench.scatter_sigma_mps2
-    readings = dwells.means[:, 4:]
+    stated, readings = bench.scatter_sigma_mps2, dwells.means[:, 4:]
     facing_up = readings / np.linalg.norm(readings, axis=1, keepdims=True)
     dwells = with_own_noise(dwells, facing_up)
     within = within_dwells(dwells, walk_mps2_per_sqrt_s, facing_up)
@@ -325,10 +324,10 @@ def _sensible(state: Floats, model: Model) -> bool:
     return model.bench.angles or bool(np.linalg.cond(sensitivity) < _SINGULAR)
 
 
-def _setting_deg(dwells: Sequence[DwellFactor], bench: Bench) -> float | None:
+def _setting_deg(dwells: DwellTable, bench: Bench) -> float | None:
     """Return the stated setting error, deg, combined with the uncertainty of the dwells' poses from noise of the
     angles."""
-    pose_rad = float(np.sqrt(np.mean(DwellStack.of(dwells).folded.pose_sigmas_rad ** 2)))
+    pose_rad = float(np.sqrt(np.mean(dwells.folded.pose_sigmas_rad**2)))
     if bench.angle_sigma_deg is None or pose_rad < _EXACT_RAD:
         return bench.angle_sigma_deg
     return math.hypot(bench.angle_sigma_deg, math.degrees(pose_rad))
@@ -345,8 +344,7 @@ def _slew_sigma(fitted: Fit, state: Floats) -> Floats:
     squares, counts = np.zeros(3), 0
     for slew, columns in zip(linearised.slews, linearised.slew_columns, strict=True):
         model = np.moveaxis(columns @ state, 2, 1)  # (pieces, channels, nodes)
-        own = slew.triangles[:, :, slew.width :].copy()
-        own[:, : slew.width] -= slew.triangles[:, : slew.width, : slew.width] @ on_basis(np.moveaxis(model, 1, 2))
+        own = slew.pieces.plus(-on_basis(np.moveaxis(model, 1, 2)))[:, :, slew.pieces.width :]
         squares, counts = squares + (own**2).sum(axis=(0, 1)), counts + slew.count
     sizes = np.sqrt(squares / counts) + FLOOR_MPS2
     factor = square_root_information.accumulate(fitted.all_rows(), fitted.steps)[:-1]

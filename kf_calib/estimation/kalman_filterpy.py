@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.rows import Rows, basis, on_basis
-from kf_calib.estimation.dwell_columns import LinearisedDwells, has_turns, turning_mps2
+from kf_calib.dwells.table import DwellTable
+from kf_calib.estimation.dwell_columns import LinearisedDwells, turning_mps2
 from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.rotations import along_force, sensitivities_of
 
@@ -62,27 +63,28 @@ class Samples:
 
 def samples_of(rows: Iterable[Rows], linearised: LinearisedDwells, noise: Noise) -> Iterator[Samples]:
     """Yield samples from a second pass over the rows, with the columns of the first."""
-    every, columns = [*linearised.dwells_at_state, *linearised.slews], [*linearised.columns, *linearised.slew_columns]
-    known = {(dwell.number, dwell.moving): (dwell, at_nodes) for dwell, at_nodes in zip(every, columns, strict=True)}
+    every, columns = linearised.dwells_at_state, [*linearised.columns, *linearised.slew_columns]
+    if linearised.slews:
+        every = every.beside(DwellTable.of(linearised.slews))
+    keys = zip(every.folded.numbers.tolist(), every.folded.moving.tolist(), strict=True)
+    known = {key: (every[k : k + 1], columns[k]) for k, key in enumerate(keys)}
     for block in rows:
         if (block.dwell, block.moving) not in known:
             continue
         dwell, columns_of_pieces = known[block.dwell, block.moving]
-        changes = noise.columns("dwell", [dwell], linearised.state)
-        sensitivities = sensitivities_of([dwell], linearised.state)
-        along = along_force([dwell], sensitivities)[0] if noise.attitude_unknown else None
+        changes = noise.columns("dwell", dwell, linearised.state)
+        sensitivities = sensitivities_of(dwell, linearised.state)
+        along = along_force(dwell, sensitivities)[0] if noise.attitude_unknown else None
         for (part, u, _), at_nodes, by_errors in zip(block.pieces, columns_of_pieces, changes, strict=True):
             functions = basis(u, block.elapsed_s[part], linearised.carrier_hz)
             observation, nuisances = _at_samples(functions, at_nodes), _at_samples(functions, by_errors)
             regressors, readings = block.columns[part], block.readings[part]
             if not linearised.model.bench.angles:
-                regressors = np.tile(dwell.means[:4], (len(u), 1))
-            if dwell.attitude is not None or dwell.turned_rad is not None:
-                force = dwell.felt_force(regressors[:, 1:])
-                regressors = np.hstack([regressors[:, :1], force])
-                if has_turns(dwell):
-                    readings = readings + turning_mps2(dwell, force, linearised.state)
-            sigma_mps2 = noise.of(block.moving).effective_sigma_mps2 / np.sqrt(dwell.weights)
+                regressors = np.tile(dwell.means[:, :4], (len(u), 1))
+            if dwell.attitudes is not None or dwell.turned_rad is not None:
+                force = dwell.felt(regressors[:, 1:], len(u))
+                readings = readings + turning_mps2(dwell, force, linearised.state, len(u))
+            sigma_mps2 = noise.of(block.moving).effective_sigma_mps2 / np.sqrt(dwell.folded.weights[0])
             residual_mps2 = readings - observation @ linearised.state
             samples = Samples(
                 block.dwell, block.elapsed_s[part], observation, nuisances, readings, residual_mps2, sigma_mps2,

@@ -20,7 +20,7 @@ from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.keys import UP
 from kf_calib.bench.raw_input import CHANNELS
-from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.dwells.table import DwellTable
 
 _MOST_CHANGES = 2
 
@@ -169,13 +169,13 @@ class DwellMeans:
     numbers: tuple[int, ...]
 
     @classmethod
-    def of(cls, dwells: Sequence[DwellFactor]) -> DwellMeans:
+    def of(cls, dwells: DwellTable) -> DwellMeans:
         """The means of these dwells."""
         return cls(
             np.array([dwell.recorded_pose for dwell in dwells]),
-            np.array([dwell.means[4:] for dwell in dwells]),
-            np.array([0.5 * (dwell.start_s + dwell.end_s) for dwell in dwells]),
-            tuple(dwell.number for dwell in dwells),
+            dwells.means[:, 4:],
+            dwells.folded.ends_s.mean(axis=1),
+            tuple(dwells.folded.numbers.tolist()),
         )
 
     def __getitem__(self, part: Mask) -> DwellMeans:

@@ -20,7 +20,7 @@ from dataclasses import replace
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.dwells.sufficient_statistics import DwellFactor, dwells_without
+from kf_calib.dwells.table import DwellTable
 from kf_calib.estimation.attitude import without_attitudes
 from kf_calib.estimation.dwell_columns import LinearisedDwells, turning_mps2
 from kf_calib.estimation.results import Calibration, OutlyingDwell, Turn, consistency
@@ -44,9 +44,7 @@ def outlying_in_words(found: Sequence[OutlyingDwell]) -> str:
     return " Or ".join(map(str, found))
 
 
-def outlying_dwells(
-    result: Calibration, evaluate: Callable[[list[DwellFactor]], Calibration]
-) -> tuple[OutlyingDwell, ...]:
+def outlying_dwells(result: Calibration, evaluate: Callable[[DwellTable], Calibration]) -> tuple[OutlyingDwell, ...]:
     """The dwell that alone does not fit, or several if any one of them could be the cause; empty if none is.
 
     ``evaluate`` makes a calibration from some of the dwells with the same model.
@@ -60,7 +58,7 @@ def outlying_dwells(
     ratios = (statistics / statistics.max()).round(9)  # rounded, so that the first of equal dwells comes first
     order = np.argsort(-ratios, kind="stable")[:_TRIED]
     tried = [k for k in order.tolist() if ratios[k] > _NEARLY]
-    found = [_test_dwell(result, k, evaluate(dwells_without(dwells, (k,)))) for k in tried]
+    found = [_test_dwell(result, k, evaluate(dwells.without((k,)))) for k in tried]
     return tuple(each for each in found if each is not None)
 
 
@@ -77,7 +75,7 @@ def _test_dwell(result: Calibration, k: int, rest: Calibration) -> OutlyingDwell
     p_value = min(len(dwells) * f_tail(3.0, freedom, statistic / 3.0), 1.0)
     if p_value > _BEYOND_DOUBT:
         return None
-    turns = tuple(_turns(linearised.dwells_at_state[k], means, rest))
+    turns = tuple(_turns(linearised.dwells_at_state[k : k + 1], means, rest))
     if not turns and np.linalg.norm(error) < _GROSS * result.bench.gravity_mps2:
         return None
     return OutlyingDwell(dwells[k], dwells[k].number, error, p_value, turns, rest)
@@ -96,23 +94,24 @@ def _covariance(rest: Calibration, means: Means) -> Floats:
     return lift_rounding(own + design @ estimate.covariance @ design.T)[0]
 
 
-def _turns(dwell: DwellFactor, means: Means, rest: Calibration) -> Iterator[Turn]:
-    """Yield the rotations of single gimbals with which the prediction is correct to within its covariance."""
-    bench, state = rest.bench, rest.estimate.state
+def _turns(alone: DwellTable, means: Means, rest: Calibration) -> Iterator[Turn]:
+    """Yield the rotations of single gimbals with which the prediction of one dwell is correct to within its
+    covariance."""
+    bench, state, (dwell,) = rest.bench, rest.estimate.state, alone
     at_s = np.array([0.5 * (dwell.start_s + dwell.end_s)])
 
     def at(gimbal: int, turn_rad: float) -> Means:
         """Return the dwell's means with the specific force that the platform would have at this angle of the gimbal."""
         pose = dwell.pose.copy()
         pose[gimbal] += turn_rad
-        force, design = dwell.felt_force(bench.specific_force(at_s, pose[None])), means.design.copy()
+        force, design = alone.felt(bench.specific_force(at_s, pose[None])), means.design.copy()
         for i in range(3):
             design[:, i, 4 * i : 4 * i + 3] = force
         return replace(means, force_mps2=force, design=design, readings=means.readings + there(force))
 
     def there(force: Floats) -> Floats:
         """Return by how much more effects turn the readings at another specific force."""
-        return turning_mps2(dwell, force - means.force_mps2, state)
+        return turning_mps2(alone, force - means.force_mps2, state, 1)
 
     def error(gimbal: int, turn_rad: float) -> Floats:
         other = at(gimbal, turn_rad)

@@ -42,9 +42,9 @@ class Periodogram:
     def __init__(self, linearised: LinearisedDwells, noise: Noise, effect: Effect, values_hz: Floats) -> None:
         self.values_hz, self.state, self.noise = values_hz, linearised.state, noise
         dwells = linearised.dwells
-        self._middles_s = np.array([0.5 * (dwell.start_s + dwell.end_s) for dwell in dwells])
+        self._middles_s = dwells.folded.ends_s.mean(axis=1)
         self._same_hz = _SAME_RAD / (2.0 * np.pi * float(np.abs(self._middles_s).max(initial=1e-9)))
-        points_hz, self._shares = _points(values_hz, max(dwell.end_s - dwell.start_s for dwell in dwells))
+        points_hz, self._shares = _points(values_hz, float(np.diff(dwells.folded.ends_s).max()))
         kinds, self._path = [effect.at(hz) for hz in points_hz], None
         if noise.walk_mps2_per_sqrt_s:
             self._waves, self._ends, stacked = _waves_beside_walk(linearised, noise, kinds)

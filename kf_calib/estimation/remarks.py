@@ -118,11 +118,11 @@ def remarks_on(
         common := setup_blunders.common_scale(scales / expected, estimate.sigma[2::4] / np.abs(expected), model.bench)
     ):
         yield common
-    windows = window_average.inflation() if dwells[0].averaged else 1.0
+    windows = window_average.inflation() if dwells.folded.averaged else 1.0
     if noise.inflation.max() > 1.5 * windows:
         kappa = ", ".join(f"{value / windows:.3g}" for value in noise.inflation)
         usual = float(np.median(dwells.folded.counts))
-        short = not dwells[0].averaged and usual < TOO_SHORT * noise.inflation.max()
+        short = not dwells.folded.averaged and usual < TOO_SHORT * noise.inflation.max()
         slow = "; dwells are too short to tell how slow it is: stay longer in each" if short else ""
         if judged.quiet:
             slow = "; yet the dwells differ by much less than such noise lets them: what goes on within them alike may "

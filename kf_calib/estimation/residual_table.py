@@ -66,10 +66,10 @@ def means_over_dwells(result: Run, functions: Sequence[Callable[[Stimulus], Floa
     """Means (D, 3) over each dwell of functions of what the bench does, a number or values (m, 1) or (m, 3) each."""
     dwells = result.linearised.dwells
     stimulus = stimulus_of(dwells, result.bench, result.linearised.state)
-    weights = np.concatenate([np.outer(dwell.counts / dwell.count, _SIMPSON).ravel() for dwell in dwells])
-    firsts = np.cumsum([0, *(3 * len(dwell.pieces) for dwell in dwells[:-1])])
+    folded = dwells.folded
+    weights = np.outer(folded.piece_counts / np.repeat(folded.counts, folded.piece_numbers), _SIMPSON).ravel()
     values = [np.broadcast_to(function(stimulus), (len(stimulus), 3)) for function in functions]
-    return [np.add.reduceat(each * weights[:, None], firsts) for each in values]
+    return [np.add.reduceat(each * weights[:, None], 3 * folded.ends[:-1]) for each in values]
 
 
 def residual_table(result: Run) -> NDArray[np.void]:
@@ -92,7 +92,7 @@ def residual_table(result: Run) -> NDArray[np.void]:
         return np.repeat(np.asarray(values), 3)
 
     poses = np.degrees(np.array([dwell.recorded_pose for dwell in dwells]))
-    warmth = [float(np.mean(dwell.nodes.temperature_c)) for dwell in dwells]
+    warmth = [float(np.mean(dwell.pieces.nodes.temperature_c)) for dwell in dwells]
     columns: dict[str, NDArray[Any]] = {
         "dwell": for_accelerometers([dwell.number for dwell in dwells]),
         "accelerometer": np.tile([1, 2, 3], len(dwells)),

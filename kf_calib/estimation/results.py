@@ -14,7 +14,8 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats, one_blas_thread
 from kf_calib.bench.bench import Bench
 from kf_calib.dwells.blocks import Tally
-from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.dwells.sufficient_statistics import Dwell
+from kf_calib.dwells.table import DwellTable
 from kf_calib.estimation import square_root_information, whitened_rows
 from kf_calib.estimation.attitude import at_its_mode
 from kf_calib.estimation.correction import Corrected, Correction
@@ -51,7 +52,7 @@ class Visit:
     - residual_mps2 (3,): the mean reading less its prediction by the final estimate.
     """
 
-    dwell: DwellFactor
+    dwell: Dwell
     estimate: Estimate
     nis: float
     dof: int
@@ -143,7 +144,7 @@ class OutlyingDwell:
     - without: the calibration from all other dwells, which is consistent.
     """
 
-    dwell: DwellFactor
+    dwell: Dwell
     number: int
     error_mps2: Floats
     p_value: float
@@ -357,31 +358,28 @@ class Calibration:
         model, state, around = self.model, self.linearised.state, self.model.nominal_state()
         factor = square_root_information.start(self.settings.prior, model)
         extra = np.zeros((model.count, model.count))
-        for index, (dwell, columns, (pause, _)) in enumerate(
-            zip(self.linearised.dwells_at_state, self.linearised.columns, self.fit.steps, strict=True)
-        ):
+        for index, (columns, (pause, _)) in enumerate(zip(self.linearised.columns, self.fit.steps, strict=True)):
             before, extra_before = factor, extra
-            for part in dwell.prefixes():
-                columns_so_far = [columns[: len(part.pieces)]]
-                rows = whitened_rows.whiten([part], columns_so_far, self.noise.weights, state)[0]
-                walked = np.array([pause, steps([part], self.noise)[0, 1]])
+            for part in self.linearised.dwells_at_state.prefixes(index):
+                columns_so_far = [columns[: len(part.folded.pieces)]]
+                rows = whitened_rows.whiten(part, columns_so_far, self.noise.weights, state)[0]
+                walked = np.array([pause, steps(part, self.noise)[0, 1]])
                 factor, _ = square_root_information.update(before, rows, walked)
-                extra = extra_before + considered_information(self.noise, means_of([part], columns_so_far), state)[0]
-                yield part.end_s, dwell.number, estimate_of(factor, around, extra)
+                extra = extra_before + considered_information(self.noise, means_of(part, columns_so_far), state)[0]
+                yield part[0].end_s, part[0].number, estimate_of(factor, around, extra)
             if len(self.fit.following[index]):
                 factor, _ = square_root_information.update(factor, self.fit.following[index])
 
-    def during(self, dwell: DwellFactor) -> Estimate:
+    def during(self, dwell: Dwell) -> Estimate:
         """The estimate as if ``dwell``, which follows the run and is not yet complete, ended now."""
         fitted, (factor, extra) = self.fit, self.reached
-        state, last = self.linearised.state, fitted.dwells[-1]
-        dwell = at_its_mode(dwell, self.linearised, self.noise.weights)
-        both = [last, dwell]
+        state, last = self.linearised.state, fitted.dwells[-1:]
+        both = last.beside(at_its_mode(DwellTable.of([dwell]), self.linearised, self.noise.weights))
         linearised = LinearisedDwells(both, self.model, state)
-        dwell, last_columns = linearised.dwells_at_state[-1], linearised.columns[1:]
-        rows = whitened_rows.whiten([dwell], last_columns, self.noise.weights, state)[0]
+        here, last_columns = linearised.dwells_at_state[1:], linearised.columns[1:]
+        rows = whitened_rows.whiten(here, last_columns, self.noise.weights, state)[0]
         factor, _ = square_root_information.update(factor, rows, steps(both, self.noise)[-1])
-        extra = extra + considered_information(self.noise, means_of([dwell], last_columns), state)[0]
+        extra = extra + considered_information(self.noise, means_of(here, last_columns), state)[0]
         return estimate_of(factor, self.model.nominal_state(), extra)
 
     @cached_property

@@ -25,7 +25,8 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.line_spectrum import SpectralLine
 from kf_calib.dwells.qr import orthonormal
-from kf_calib.dwells.sufficient_statistics import DwellFactor, lines_of
+from kf_calib.dwells.sufficient_statistics import lines_of
+from kf_calib.dwells.table import DwellTable
 from kf_calib.effects import Effect, Stimulus
 from kf_calib.estimation import square_root_information, whitened_rows
 from kf_calib.estimation.candidate_scan import SEEN, Complement, Scan, counts_of, project, slices
@@ -239,13 +240,13 @@ def batches(sizes: Sequence[int], columns: int) -> list[list[int]]:
 
 
 def _judged(
-    dwells: Sequence[DwellFactor], columns: Sequence[Floats], noise: Noise, state: Floats, width: int
+    dwells: DwellTable, columns: Sequence[Floats], noise: Noise, state: Floats, width: int
 ) -> tuple[Sequence[Floats], int]:
     """Call ``whitened_rows.misfit_rows`` without reducing the rows to the rank of their columns."""
     return whitened_rows.misfit_rows(dwells, columns, noise, state, width, reduced=False)
 
 
-def _stacked(rows: Sequence[Floats], dwells: Sequence[DwellFactor], noise: Noise) -> Floats:
+def _stacked(rows: Sequence[Floats], dwells: DwellTable, noise: Noise) -> Floats:
     """Concatenate all rows; if the biases walk, whiten them with respect to the walk."""
     return random_walk.whiten_walk(rows, steps(dwells, noise)) if _inside(noise) else np.concatenate(rows)
 

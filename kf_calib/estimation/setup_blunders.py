@@ -24,7 +24,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.raw_input import CHANNELS
-from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.dwells.table import DwellTable
 from kf_calib.errors import BlunderError
 from kf_calib.estimation.mountings import (
     _FARTHEST,
@@ -57,7 +57,7 @@ _IN_PLANE = 0.3  # g; gravity has to turn by as much in a plane to show the axes
 _STUCK = 1e-9  # readings with a smaller relative difference are equal
 
 
-def refuse(dwells: Sequence[DwellFactor], bench: Bench) -> None:
+def refuse(dwells: DwellTable, bench: Bench) -> None:
     """Raise BlunderError, saying what is probably wrong, if these cannot be dwells of the bench as it is stated.
 
     Nothing is raised while there are too few orientations to tell.

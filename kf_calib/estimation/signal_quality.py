@@ -24,7 +24,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.dwells.rows import Rows
-from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.dwells.table import DwellTable, FoldedDwells
 from kf_calib.noise.noise_model import Noise
 from kf_calib.support.units import shown
 
@@ -198,17 +198,17 @@ class ReadingsMonitor:
             seen.rejected += rows.gated.shape[1]
             seen.gated = seen.gated + rows.gated.sum(axis=1)
 
-    def judged(self, dwells: Sequence[DwellFactor], noise: Noise) -> Readings:
+    def judged(self, dwells: DwellTable, noise: Noise) -> Readings:
         """The defects of a run with these dwells and this noise; none where no readings were seen, as of a table."""
         if not self._dwells:
             return Readings()
-        seen = [self._dwells[dwell.number] for dwell in dwells]
+        seen = [self._dwells[number] for number in dwells.folded.numbers.tolist()]
         steps = [_step(seen, channel) for channel in range(3)]
         # Of all readings alike: by weights, dwells that stay on one step would seem to be those without noise.
-        levels = np.median(1.0 / np.array([dwell.weights for dwell in dwells]), axis=0) * noise.sigma_mps2**2
+        levels = np.median(1.0 / dwells.folded.weights, axis=0) * noise.sigma_mps2**2
         grids = [_quantisation(i, q, levels[i], noise, seen) for i, q in enumerate(steps) if q is not None]
         grids = [each for each in grids if each.matters or each.step_mps2 > 8.0 * _storage(seen, each.channel - 1)]
-        flat = tuple(_saturations(seen, steps, np.array([_spread(dwell) for dwell in dwells]), noise))
+        flat = tuple(_saturations(seen, steps, _spreads(dwells.folded), noise))
         outliers = _outliers(seen)
         if flat or any(each.matters for each in grids):  # the gate also rejects readings next to a flat top or a step
             outliers = replace(outliers, clustered_p=None, dwells=())
@@ -240,10 +240,10 @@ def _reach(seen: _Seen, rows: Rows) -> None:
             seen.ends[side] = end
 
 
-def _spread(dwell: DwellFactor) -> Floats:
-    """Return the standard deviation (3,) of the readings within a dwell."""
-    spare = dwell.count - dwell.width * len(dwell.pieces)
-    return np.sqrt(dwell.squares.sum(axis=0) / max(spare, 1))
+def _spreads(folded: FoldedDwells) -> Floats:
+    """Return the standard deviations (D, 3) of the readings within dwells."""
+    spare = np.maximum(folded.counts - folded.width * folded.piece_numbers, 1.0)
+    return np.sqrt(np.add.reduceat(folded.squares, folded.ends[:-1]) / spare[:, None])
 
 
 def _storage(seen: Sequence[_Seen], channel: int) -> float:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import cast
 
 import numpy as np
@@ -18,8 +19,8 @@ from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.pieces import OfPieces, of_all_pieces
 from kf_calib.dwells.qr import inverse_of_lower, triangle
 from kf_calib.dwells.rows import on_basis
-from kf_calib.dwells.stack import AlikeDwells, DwellStack
-from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.dwells.sufficient_statistics import Dwell
+from kf_calib.dwells.table import AlikeDwells, DwellTable
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.rotations import along_force, sensitivities_of
@@ -30,7 +31,7 @@ _AT_ONCE = 1 << 17  # numbers that are processed together, so that they stay in 
 
 
 def whiten(
-    dwells: Sequence[DwellFactor],
+    dwells: Sequence[Dwell],
     columns: Sequence[Floats],
     noise: Noise,
     state: Floats,
@@ -55,7 +56,7 @@ def whiten(
     """
     inside = 3 if noise.walk_mps2_per_sqrt_s else 0
     values = of_all_pieces(columns)
-    stack = DwellStack.of(dwells)
+    stack = DwellTable.of(dwells)
     noise_about = _About.of(stack, noise, state, about)
     batches = list(_batches(stack, values.shape[-1]))
     by_means = [reduced and batch.tells_means_only(values, noise_about) for batch in batches]
@@ -94,7 +95,7 @@ class _About:
     about: Floats | None
 
     @classmethod
-    def of(cls, stack: DwellStack, noise: Noise, state: Floats, about: Floats | None = None) -> _About:
+    def of(cls, stack: DwellTable, noise: Noise, state: Floats, about: Floats | None = None) -> _About:
         """That of some dwells."""
         return cls(noise, noise.columns("dwell", stack, state), state, about)
 
@@ -114,7 +115,7 @@ class _Batch:
     """Dwells of one shape, few enough for their rows to stay in the cache: the number of the shape, and which of its
     dwells they are."""
 
-    stack: DwellStack
+    stack: DwellTable
     number: int
     part: slice
 
@@ -133,10 +134,10 @@ class _Batch:
         """Indices (d, P) of their pieces."""
         return self.shape.pieces[self.part]
 
-    @property
+    @cached_property
     def triangles(self) -> Floats:
         """Their triangles (d, P, K + 3, K + 3)."""
-        return self.stack.triangles[self.number][self.part]
+        return self.stack.triangles[self.pieces]
 
     @property
     def force_mps2(self) -> Floats:
@@ -155,7 +156,7 @@ class _Batch:
         nothing else is known, or the columns (pieces, K, 3, p) and the force are constant within every dwell."""
         if about.noise.walk_mps2_per_sqrt_s or about.noise.attitude_unknown:
             return False
-        if self.pieces.shape[1] == 1 and not self.triangles[:, 0, 1 : self.shape.width].any():
+        if self.pieces.shape[1] == 1 and not self.triangles[:, 0, 1 : self.stack.folded.width].any():
             return True
         return (
             _is_constant(columns[self.pieces])
@@ -164,10 +165,10 @@ class _Batch:
         )
 
 
-def _batches(stack: DwellStack, width: int) -> Iterator[_Batch]:
+def _batches(stack: DwellTable, width: int) -> Iterator[_Batch]:
     """Group dwells whose rows have one shape, limited so that their ``width`` columns fit into the cache."""
     for number, shape in enumerate(stack.folded.shapes):
-        most = max(_AT_ONCE // (3 * shape.pieces.shape[1] * shape.width * (width + 1)), 1)
+        most = max(_AT_ONCE // (3 * shape.pieces.shape[1] * stack.folded.width * (width + 1)), 1)
         yield from (_Batch(stack, number, slice(k, k + most)) for k in range(0, len(shape.dwells), most))
 
 
@@ -187,10 +188,10 @@ def _weighted(batch: _Batch, columns: Floats, about: _About) -> tuple[Floats, in
         along = _unit_along(batch, noise, about.state)
         parts, walks = _combined(parts, along), np.sqrt((along**2)[:, None] @ (walks**2)[:, :, None])[:, :, 0]
     if about.steps:
-        dwells = batch.stack.folded.dwells
+        paths = batch.stack.folded.walks
         for dwell_parts, k, ratios in zip(parts, batch.dwells.tolist(), walks, strict=True):
             for part, ratio in zip(dwell_parts, ratios.tolist(), strict=True):
-                part[:] = dwells[k].walk.whiten(part, ratio)
+                part[:] = paths[k].whiten(part, ratio)
     measured = parts.reshape(many, -1, parts.shape[-1])
     prior = np.broadcast_to(np.eye(count, parts.shape[-1]), (many, count, parts.shape[-1]))
     return np.concatenate([measured, prior], axis=1), count
@@ -228,7 +229,7 @@ def _channels(batch: _Batch, columns: Floats, about: _About, height: int) -> Flo
         if first:
             part[..., :first] = batch.rows_of(changes[..., i, :], height).reshape(shape)
         if about.steps:
-            steps = [batch.stack.folded.dwells[k].walk.step for k in batch.dwells.tolist()]
+            steps = [batch.stack.folded.walks[k].step for k in batch.dwells.tolist()]
             part[..., first + i : first + i + 1] = np.array(steps)[..., None]
         part[..., last:-1] = batch.rows_of(columns[..., i, :], height).reshape(shape)
         measured = readings[..., i, None]
@@ -251,7 +252,7 @@ def _combined(parts: Floats, along: Floats) -> Floats:
 
 
 def misfit_rows(
-    dwells: Sequence[DwellFactor],
+    dwells: Sequence[Dwell],
     columns: Sequence[Floats],
     noise: Noise,
     state: Floats,
@@ -264,7 +265,7 @@ def misfit_rows(
     W are columns for noise that dwells have in common, the terms of the run; scatter that is stated may be 1/f noise,
     which is one of them. Their coefficients have a prior, whose rows come first in the list.
     """
-    dwells, values = DwellStack.of(dwells), of_all_pieces(columns)
+    dwells, values = DwellTable.of(dwells), of_all_pieces(columns)
     judging = noise.with_scatter_as_flicker(len(dwells))
     shared = judging.columns("run", dwells, state)
     count = shared.shape[3]
@@ -300,18 +301,15 @@ class MisfitColumns:
     Whatever does not depend on the columns is computed once.
     """
 
-    def __init__(self, dwells: Sequence[DwellFactor], noise: Noise, state: Floats) -> None:
-        stack, judging = DwellStack.of(dwells), noise.with_scatter_as_flicker(len(dwells))
+    def __init__(self, dwells: Sequence[Dwell], noise: Noise, state: Floats) -> None:
+        stack, judging = DwellTable.of(dwells), noise.with_scatter_as_flicker(len(dwells))
         self._sigma, shared = noise.effective_sigma_mps2, judging.columns("run", stack, state).shape[3]
         about = _About.of(stack, judging, state)
-        channels, widths = 1 if noise.attitude_unknown else 3, np.empty(len(stack), np.intp)
-        for shape in stack.folded.shapes:
-            widths[shape.dwells] = shape.width
-        lengths = channels * stack.folded.piece_numbers * widths + about.errors
+        channels, width = 1 if noise.attitude_unknown else 3, stack.folded.width
+        lengths = channels * stack.folded.piece_numbers * width + about.errors
         self._groups, self.ends = list[_Alike](), shared + np.append(0, np.cumsum(lengths))
         """The first row of each dwell, and at last the number of rows."""
         for batch in _batches(stack, _USUAL):
-            width = batch.shape.width
             rows, count = _weighted(batch, np.zeros((*batch.pieces.shape, width, 3, 0)), about)
             group = _Alike(
                 batch.pieces,

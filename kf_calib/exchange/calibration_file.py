@@ -261,7 +261,7 @@ def _not_seen(result: Calibration) -> list[str]:
 def _conditions(result: Calibration, began: datetime | None) -> SavedConditions:
     """Return when and how the run was made."""
     dwells = result.fit.dwells
-    warmth = np.concatenate([dwell.nodes.temperature_c for dwell in dwells])
+    warmth = dwells.folded.pieces.nodes.temperature_c
     known = bool(np.isfinite(warmth).any())
     return SavedConditions(
         began=None if began is None else format_date(began),

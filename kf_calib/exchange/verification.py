@@ -266,7 +266,7 @@ def _warnings(saved: SavedCalibration, source: Source, new: Calibration) -> list
     path = getattr(source, "path", None)
     if path is not None and saved.provenance.sha256 == fingerprint(path):
         warnings.append("this is the recording that it was calibrated from, so it must agree: verify with another.")
-    warmth = np.concatenate([visit.dwell.nodes.temperature_c for visit in new.visits])
+    warmth = new.fit.dwells.folded.pieces.nodes.temperature_c
     if (
         conditions.temperature_min_c is not None
         and conditions.temperature_max_c is not None

@@ -121,7 +121,7 @@ def run_factor(
 ) -> RunFactor:
     """The reduced factor of a fit: its model and, where angles are known, all effects of the catalogue."""
     linearised = fitted.linearised
-    model, state = linearised.model, linearised.state
+    model, state, folded = linearised.model, linearised.state, linearised.dwells.folded
     added = candidate_effects(model) if model.bench.angles else []
     with one_blas_thread():
         rows, before = whiten_model(linearised, fitted.noise, added, state)
@@ -136,7 +136,7 @@ def run_factor(
         columns=tuple(name for k, name in enumerate([*inside, *_names(added)]) if k not in model.fixed),
         width=model.count - len(model.fixed),
         factor=triangle(upper[:, kept]) if model.fixed else upper,
-        rows=3 * sum(min(piece.count, dwell.width) for dwell in linearised.dwells for piece in dwell.pieces),
+        rows=3 * int(np.minimum(folded.pieces.counts, folded.width).sum()),
         constants={str(each): float(each.value) for each in (*model.effects, *added) if each.unknown is not None},
         nominal=Model(model.bench).nominal_state(),
         noise_estimated=_has_estimated_parts(fitted.noise),

@@ -15,7 +15,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.dwells.sufficient_statistics import Dwell
 from kf_calib.noise.noise_model import Noise
 
 _DWELLS = 5  # as many of the longest are enough
@@ -89,7 +89,7 @@ _S = TypeVar("_S", bound=Residuals)
 class LongestDwells:
     """Collects the residuals of the longest dwells of a run from its samples as these pass by."""
 
-    run: Sequence[DwellFactor]
+    run: Sequence[Dwell]
     noise: Noise
     kept: dict[int, list[Residuals]] = field(default_factory=dict[int, list[Residuals]])
 

@@ -13,8 +13,8 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.pieces import of_all_pieces
 from kf_calib.dwells.rows import on_basis
-from kf_calib.dwells.stack import DwellStack
-from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.dwells.sufficient_statistics import Dwell
+from kf_calib.dwells.table import DwellTable
 from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.rotations import along_force, sensitivities_of
 from kf_calib.noise.terms import SLOW, SlowWaves, waves_in_dwells
@@ -23,16 +23,14 @@ _GRID = np.geomspace(1e-3, 1e5, 161)  # of h, in variances of the amplitudes by 
 _CLEAR = 0.5 * 3.84  # gain in log-likelihood over none: 1/f noise that is less clear changes no sigma
 
 
-def with_waves_in_dwells(
-    noise: Noise, dwells: Sequence[DwellFactor], columns: Sequence[Floats], state: Floats
-) -> Noise:
+def with_waves_in_dwells(noise: Noise, dwells: Sequence[Dwell], columns: Sequence[Floats], state: Floats) -> Noise:
     """The noise with 1/f noise within dwells; without where the dwells do not scatter, or show no slow waves.
 
     The likeliest h of each accelerometer; one for all three where attitudes are not known. ``columns`` are those of the
     model at the nodes of each dwell, (pieces, nodes, 3, p), ``state`` (p,) its estimate.
     """
-    stack = DwellStack.of(dwells)
-    if not noise.scatter_mps2.any() or noise.walk_mps2_per_sqrt_s or stack.folded.dwells[0].carrier_hz:
+    stack = DwellTable.of(dwells)
+    if not noise.scatter_mps2.any() or noise.walk_mps2_per_sqrt_s or stack.folded.carrier_hz:
         return noise
     if stack.folded.shows_means_only:
         return noise
@@ -45,13 +43,14 @@ def with_waves_in_dwells(
     return noise.with_terms(SlowWaves(np.broadcast_to(sizes, 3))) if any(sizes) else noise
 
 
-def _amplitudes(stack: DwellStack, predicted: Floats, sigma: Floats, weights: Floats) -> tuple[Floats, Floats]:
+def _amplitudes(stack: DwellTable, predicted: Floats, sigma: Floats, weights: Floats) -> tuple[Floats, Floats]:
     """Return the amplitudes (D, k, c) of the slow waves in what a prediction (pieces, nodes, 3) leaves of each dwell
     beside its mean, and their variances (D, k, c) by the noise of the readings, in channels with ``weights`` (D, c,
     3)."""
     amplitudes, courses = np.empty((len(stack), len(SLOW), weights.shape[1])), on_basis(waves_in_dwells(stack.folded))
     variances, coefficients = np.empty_like(amplitudes), on_basis(predicted)
-    for shape, triangles in zip(stack.folded.shapes, stack.triangles, strict=True):
+    for shape in stack.folded.shapes:
+        triangles = stack.triangles[shape.pieces]
         upper, many = triangles[:, :, :3, :3], len(shape.dwells)
         ours = weights[shape.dwells]
         left = triangles[:, :, :3, 3:] - upper @ coefficients[shape.pieces]

@@ -10,10 +10,10 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.pieces import basis_values, of_all_pieces
-from kf_calib.dwells.stack import DwellStack
-from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.dwells.sufficient_statistics import Dwell
+from kf_calib.dwells.table import DwellTable
 
-_AT_ONCE = 4096  # dwells whose columns are processed together
+_AT_ONCE = 4096  # pieces whose columns are processed together
 
 
 @dataclass(frozen=True, repr=False)
@@ -24,7 +24,7 @@ class Means:
     - readings (D, 3), force_mps2 (D, 3): readings and specific force.
     - counts (D, 3): number of readings of each channel, each as many as its weight says.
     - ends_s (D, 2): when each dwell begins and ends.
-    - bending (D, 3, 3): by how much effects change the readings per unit of force (``AttitudeError``).
+    - bending (D, 3, 3): by how much effects change the readings per unit of force (``Attitudes``).
     """
 
     design: Floats
@@ -45,9 +45,9 @@ class Means:
         return state[:STATE_COUNT].reshape(3, 4)[:, :3] + self.bending
 
 
-def means_of(dwells: Sequence[DwellFactor], columns: Sequence[Floats]) -> Means:
+def means_of(dwells: Sequence[Dwell], columns: Sequence[Floats]) -> Means:
     """The means of dwells with these columns."""
-    stack, values = DwellStack.of(dwells), of_all_pieces(columns)
+    stack, values = DwellTable.of(dwells), of_all_pieces(columns)
     if stack.folded.shows_means_only and not values.strides[1]:  # the same at all nodes
         design = values[:, 0]
     else:
@@ -58,19 +58,10 @@ def means_of(dwells: Sequence[DwellFactor], columns: Sequence[Floats]) -> Means:
     )  # fmt: skip
 
 
-def _design(stack: DwellStack, values: Floats) -> Floats:
+def _design(stack: DwellTable, values: Floats) -> Floats:
     """Return the means (D, 3, p) of columns (pieces, K nodes, 3, p)."""
     folded, of_pieces = stack.folded, np.empty((len(values), values[0, 0].size))
-    for shape, triangles in zip(folded.shapes, stack.triangles, strict=True):
-        first = triangles[:, :, 0, : shape.width] / triangles[:, :, :1, 0]  # means of the basis
-        for k in range(0, len(first), _AT_ONCE):
-            pieces = shape.pieces[k : k + _AT_ONCE]
-            coefficients = basis_values(values[pieces])
-            of_pieces[pieces] = (first[k : k + _AT_ONCE, :, None] @ coefficients)[:, :, 0]
+    first = stack.triangles[:, 0, : folded.width] / stack.triangles[:, :1, 0]  # means of the basis
+    for part in (slice(k, k + _AT_ONCE) for k in range(0, len(first), _AT_ONCE)):
+        of_pieces[part] = (first[part, None] @ basis_values(values[part]))[:, 0]
     return folded.weighted(of_pieces).reshape(len(stack), *values.shape[2:])
-
-
-def bending_of(dwell: DwellFactor) -> Floats:
-    """By how much effects change the mean readings of a dwell per unit of force, (3, 3)."""
-    known = None if dwell.attitude is None else dwell.attitude.bending
-    return np.zeros((3, 3)) if known is None else known

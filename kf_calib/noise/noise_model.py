@@ -17,8 +17,8 @@ from typing import TypeVar
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.dwells.stack import DwellStack
-from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.dwells.sufficient_statistics import Dwell
+from kf_calib.dwells.table import DwellTable
 from kf_calib.noise import random_walk
 from kf_calib.noise.means import Means
 from kf_calib.noise.terms import (
@@ -173,18 +173,18 @@ class Noise:
 
     # What the list gives
 
-    def columns(self, scope: Scope, dwells: Sequence[DwellFactor], state: Floats) -> Floats:
+    def columns(self, scope: Scope, dwells: Sequence[Dwell], state: Floats) -> Floats:
         """Changes (pieces, nodes, 3, q) of the readings by 1 sigma of each error of one scope."""
-        stack = DwellStack.of(dwells)
+        stack = DwellTable.of(dwells)
         columns = [term.columns(stack, state) for term in self.terms if term.scope == scope]
         if not columns:
-            return np.zeros((stack.folded.ends[-1], stack.folded.dwells[0].width, 3, 0))
+            return np.zeros((stack.folded.ends[-1], stack.folded.width, 3, 0))
         return columns[0] if len(columns) == 1 else np.concatenate(columns, axis=3)
 
 
-def steps(dwells: Sequence[DwellFactor], noise: Noise) -> Floats:
+def steps(dwells: Sequence[Dwell], noise: Noise) -> Floats:
     """Variances (D, 2) of the steps of a bias in the pause before each dwell and over the dwell."""
-    ends = DwellStack.of(dwells).folded.ends_s
+    ends = DwellTable.of(dwells).folded.ends_s
     return random_walk.variances(ends[:, 0], ends[:, 1], noise.walk_mps2_per_sqrt_s)
 
 

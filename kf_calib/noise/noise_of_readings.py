@@ -26,8 +26,8 @@ from functools import lru_cache
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.dwells.stack import DwellStack, Folded
 from kf_calib.dwells.sufficient_statistics import Autocovariance
+from kf_calib.dwells.table import DwellTable, FoldedDwells
 from kf_calib.support.tail_probabilities import chi_squared_tail
 
 _ITERATIONS = 60
@@ -151,20 +151,20 @@ _ROUNDS = 60
 _QUIETEST = 0.1  # variance of a dwell, in the median of all
 
 
-def with_own_noise(dwells: DwellStack, along: Floats | None = None) -> DwellStack:
+def with_own_noise(dwells: DwellTable, along: Floats | None = None) -> DwellTable:
     """The dwells, each with the weights that its own noise gives the readings of its channels, 1 where all have one.
 
     along (D, 3): the weights of the channels in the size of the force, where nothing else is known in a dwell.
     """
     folded, free = dwells.folded, np.ones(3)
-    if folded.dwells[0].averaged or not folded.autocovariance.blocks:  # as of a table: no reading is known
+    if folded.averaged or not folded.autocovariance.blocks:  # as of a table: no reading is known
         return dwells
     weights = _of_channels(*_variances(folded, along, free))
     if not np.all(weights == 1.0):  # unequal if each reading told what no other says
         weights = _of_channels(*_variances(folded, along, _lost_to_correlation(folded.autocovariance)))
     if np.array_equal(weights, folded.weights):
         return dwells
-    return DwellStack.of([dwell.weighted(own) for dwell, own in zip(dwells, weights.tolist(), strict=True)])
+    return dwells.weighted(weights)
 
 
 def _of_channels(variances: Floats, freedom: Floats) -> Floats:
@@ -213,13 +213,12 @@ def _prior(variances: Floats, freedom: Floats) -> tuple[float, float]:
     return float(_SHAPES[best]), float(levels[best, 0])
 
 
-def _variances(folded: Folded, along: Floats | None, lost: Floats) -> tuple[Floats, Floats]:
+def _variances(folded: FoldedDwells, along: Floats | None, lost: Floats) -> tuple[Floats, Floats]:
     """Return the variances (D, 3) of the readings of each dwell about their course, relative to those of the run, and
     their degrees of freedom (D, 3), of which autocorrelation takes a part: ``lost`` (3,) as ``_lost_to_correlation``.
     Those along the force, where nothing else is known, are the same for all channels."""
     first = folded.ends[:-1]
-    widths = np.repeat(folded.widths, folded.piece_numbers)
-    freedom = np.add.reduceat(np.maximum(folded.piece_counts - widths, 0.0), first)
+    freedom = np.add.reduceat(np.maximum(folded.piece_counts - folded.width, 0.0), first)
     if along is not None:
         relative = folded.squares_along(along) / np.maximum(freedom, 1.0)
         return np.tile(relative[:, None], 3), np.tile(freedom[:, None] / lost.mean(), 3)

@@ -23,8 +23,8 @@ import numpy as np
 from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.dwells.pieces import OfPieces
 from kf_calib.dwells.qr import multiplied, orthonormal
-from kf_calib.dwells.stack import DwellStack
-from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.dwells.sufficient_statistics import Dwell
+from kf_calib.dwells.table import DwellTable
 from kf_calib.noise.means import Means, means_of
 from kf_calib.noise.noise_model import Noise, mean_covariances
 from kf_calib.noise.random_walk import Links, mean_links
@@ -315,10 +315,10 @@ def gain_of(part: Part, noise: Noise, means: Means, state: Floats, prior: Floats
     return max(likelihood.without().cost - point.cost, 0.0)
 
 
-def with_shared_noise(dwells: Sequence[DwellFactor], noise: Noise, means: Means, state: Floats) -> tuple[Means, Floats]:
+def with_shared_noise(dwells: Sequence[Dwell], noise: Noise, means: Means, state: Floats) -> tuple[Means, Floats]:
     """Means with additional columns for the noise that dwells have in common, the terms of the run, and the rows (q, p
     + q + 1) of the prior of their coefficients."""
-    stack = DwellStack.of(dwells)
+    stack = DwellTable.of(dwells)
     columns = noise.with_scatter_as_flicker(len(stack)).columns("run", stack, state)
     count = columns.shape[3]
     if not count:

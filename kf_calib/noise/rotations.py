@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
-from kf_calib.dwells.stack import DwellStack
-from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.dwells.sufficient_statistics import Dwell
+from kf_calib.dwells.table import DwellTable
 
 
 def tangents(force: Floats) -> Floats:
@@ -33,22 +33,22 @@ def rotation_map(force_mps2: Floats, sensitivities: Floats, axes: Floats) -> Flo
     return np.asarray(sensitivities @ np.swapaxes(turned, 1, 2), float)
 
 
-def along_force(dwells: Sequence[DwellFactor], sensitivities: Floats, some: NDArray[np.intp] | None = None) -> Floats:
+def along_force(dwells: Sequence[Dwell], sensitivities: Floats, some: NDArray[np.intp] | None = None) -> Floats:
     """The weights m (D, 3) of the three channels in the size of the force of each dwell: m = S^-T f / |f|.
 
     No rotation changes m . reading, which is |f| but for biases; sensitivities S are (D, 3, 3). some (d,): indices of
     the dwells of which alone it is wanted, and their sensitivities (d, 3, 3).
     """
-    force = DwellStack.of(dwells).felt_means_mps2
+    force = DwellTable.of(dwells).felt_means_mps2
     force = force if some is None else force[some]
     unit = force / np.linalg.norm(force, axis=1, keepdims=True)
     return np.asarray(np.linalg.solve(np.swapaxes(sensitivities, 1, 2), unit[:, :, None])[:, :, 0], float)
 
 
-def sensitivities_of(dwells: Sequence[DwellFactor], state: Floats, some: NDArray[np.intp] | None = None) -> Floats:
+def sensitivities_of(dwells: Sequence[Dwell], state: Floats, some: NDArray[np.intp] | None = None) -> Floats:
     """Change (D, 3, 3) of the readings of each dwell per unit of force at ``state`` (p,), effects included.
 
     some (d,): indices of the dwells of which alone it is wanted.
     """
-    bendings = DwellStack.of(dwells).bendings
+    bendings = DwellTable.of(dwells).bendings
     return state[:STATE_COUNT].reshape(3, 4)[:, :3] + (bendings if some is None else bendings[some])

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.pieces import OfPieces
-from kf_calib.dwells.stack import DwellStack, Folded
-from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.dwells.sufficient_statistics import Dwell
+from kf_calib.dwells.table import DwellTable, FoldedDwells, computed_once
 from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C
 
 _KNOTS, _MOST_KNOTS = 3, 200  # of a dwell, and of the run
@@ -55,15 +55,10 @@ class TemperatureCourse:
     errors_c: Floats
 
 
-def temperature_course(folded: Folded) -> TemperatureCourse:
+@computed_once
+def temperature_course(folded: FoldedDwells) -> TemperatureCourse:
     """The course of the temperature over dwells, and slews between them, in order of time."""
-    if "temperature_course" not in folded.known:
-        folded.known["temperature_course"] = _course(folded)
-    return folded.known["temperature_course"]
-
-
-def _course(folded: Folded) -> TemperatureCourse:
-    read = folded.of_nodes("temperature_c")
+    read = folded.pieces.nodes.temperature_c
     exact = TemperatureCourse(read, np.zeros((len(read), 0)))
     if (~folded.moving).sum() < 4 or not np.isfinite(read).all():
         return exact
@@ -72,7 +67,7 @@ def _course(folded: Folded) -> TemperatureCourse:
     return _smooth(folded, read) or exact
 
 
-def _only_scatters(folded: Folded, read: Floats) -> bool:
+def _only_scatters(folded: FoldedDwells, read: Floats) -> bool:
     """Tell whether temperatures at the nodes only scatter as a thermometer does in a steady room.
 
     They only scatter if the means of consecutive dwells differ as much as any two means do (von Neumann's ratio near 1)
@@ -85,12 +80,12 @@ def _only_scatters(folded: Folded, read: Floats) -> bool:
     return bool(alike and between < 2.0 * within)
 
 
-def _means(folded: Folded, read: Floats) -> Floats:
+def _means(folded: FoldedDwells, read: Floats) -> Floats:
     """Return the mean temperature (D,) of the nodes of each dwell."""
     return np.add.reduceat(read, 3 * folded.ends[:-1]) / (3 * folded.piece_numbers)
 
 
-def _smooth(folded: Folded, read: Floats) -> TemperatureCourse | None:
+def _smooth(folded: FoldedDwells, read: Floats) -> TemperatureCourse | None:
     """Return the smooth course through temperatures at the nodes (m,); None where they are taken as they were read."""
     standing, ends, levels = ~folded.moving, folded.elapsed_s.reshape(-1, 3), read.reshape(-1, 3)[:, 1]
     lengths, owners = ends[:, 2] - ends[:, 0], np.repeat(np.cumsum(standing) - 1, folded.piece_numbers)
@@ -181,7 +176,7 @@ def _largest(errors: Floats) -> Floats:
 
 
 def sensitivity_to_temperature(
-    dwells: Sequence[DwellFactor], change_mps2_per_k: Callable[[], Floats], sigma_mps2: Floats
+    dwells: Sequence[Dwell], change_mps2_per_k: Callable[[], Floats], sigma_mps2: Floats
 ) -> Floats | None:
     """Change of the readings per K (3, 8) on the regressors 1, f, T, T f; None where the error of the temperature does
     not matter.
@@ -189,7 +184,7 @@ def sensitivity_to_temperature(
     change_mps2_per_k: gives the change per K (m, 3) at the nodes of all dwells by the model at its state. sigma_mps2
     (3,): noise of white readings.
     """
-    folded = DwellStack.of(dwells).folded
+    folded = DwellTable.of(dwells).folded
     errors_c = temperature_course(folded).errors_c
     if not errors_c.shape[1]:
         return None
@@ -203,18 +198,18 @@ def sensitivity_to_temperature(
     return np.asarray(np.linalg.lstsq(_regressors(dwells), change, rcond=1e-9)[0].T, float)
 
 
-def thermometer_errors(dwells: Sequence[DwellFactor], sensitivity_mps2_per_k: Floats) -> OfPieces:
+def thermometer_errors(dwells: Sequence[Dwell], sensitivity_mps2_per_k: Floats) -> OfPieces:
     """Changes of the readings at the nodes of each dwell by each independent error of the temperature of 1 sigma,
     (pieces, nodes, 3, k)."""
-    folded = DwellStack.of(dwells).folded
+    folded = DwellTable.of(dwells).folded
     errors_c = temperature_course(folded).errors_c
     change = (_regressors(dwells) @ sensitivity_mps2_per_k.T)[:, :, None] * errors_c[:, None, :]
     return folded.at_nodes(change)
 
 
-def _regressors(dwells: Sequence[DwellFactor]) -> Floats:
+def _regressors(dwells: Sequence[Dwell]) -> Floats:
     """Return 1, f, T and T f at the nodes of all dwells, (m, 8)."""
-    stack = DwellStack.of(dwells)
+    stack = DwellTable.of(dwells)
     regressors = np.hstack([np.ones((len(stack.force_mps2), 1)), stack.force_mps2])
     warmth = temperature_course(stack.folded).temperature_c - REFERENCE_TEMPERATURE_C
     return np.hstack([regressors, warmth[:, None] * regressors])

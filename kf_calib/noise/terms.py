@@ -24,7 +24,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.dwells.stack import DwellStack, Folded
+from kf_calib.dwells.table import DwellTable, FoldedDwells, computed_once
 from kf_calib.noise import temperature_course
 from kf_calib.noise.means import Means
 from kf_calib.noise.rotations import sensitivities_of
@@ -60,7 +60,7 @@ class NoiseTerm(ABC):
         """The numbers (n,) that say how large it is; zeros where there is none."""
 
     @abstractmethod
-    def columns(self, dwells: DwellStack, state: Floats) -> Floats:
+    def columns(self, dwells: DwellTable, state: Floats) -> Floats:
         """Changes (pieces, nodes, 3, q) of the readings by 1 sigma of each of its q errors, for a model at ``state``
         (p,)."""
 
@@ -98,7 +98,7 @@ class SettingError(NoiseTerm):
     def sizes(self) -> Floats:
         return np.array([self.size_rad])
 
-    def columns(self, dwells: DwellStack, state: Floats) -> Floats:
+    def columns(self, dwells: DwellTable, state: Floats) -> Floats:
         pieces = dwells.folded.ends[-1]
         if not 0.0 < self.size_rad < np.inf:
             return np.zeros((pieces, 3, 3, 0))
@@ -131,7 +131,7 @@ class Scatter(NoiseTerm):
     def sizes(self) -> Floats:
         return self.sizes_mps2
 
-    def columns(self, dwells: DwellStack, state: Floats) -> Floats:
+    def columns(self, dwells: DwellTable, state: Floats) -> Floats:
         channels = np.flatnonzero(self.sizes_mps2 > 0)
         columns = np.zeros((dwells.folded.ends[-1], 3, 3, len(channels)))
         columns[:, :, channels, np.arange(len(channels))] = self.sizes_mps2[channels]
@@ -156,7 +156,7 @@ class SlowWaves(NoiseTerm):
     def sizes(self) -> Floats:
         return self.flicker_mps2
 
-    def columns(self, dwells: DwellStack, state: Floats) -> Floats:
+    def columns(self, dwells: DwellTable, state: Floats) -> Floats:
         waves = waves_in_dwells(dwells.folded)
         columns = np.zeros((*waves.shape[:2], 3, 3, len(SLOW)))
         sigmas = np.maximum(self.flicker_mps2, FLOOR_MPS2)[:, None] / np.sqrt(SLOW)
@@ -177,9 +177,9 @@ class WavesOverRun(NoiseTerm):
     def sizes(self) -> Floats:
         return self.flicker_mps2
 
-    def columns(self, dwells: DwellStack, state: Floats) -> Floats:
+    def columns(self, dwells: DwellTable, state: Floats) -> Floats:
         channels, folded = np.flatnonzero(self.flicker_mps2 > 0), dwells.folded
-        pieces, width = folded.ends[-1], folded.dwells[0].width
+        pieces, width = folded.ends[-1], folded.width
         if len(dwells) < self.FEWEST:
             return np.zeros((pieces, width, 3, 0))
         begin_s, orders = folded.ends_s[0, 0], np.arange(1, _WANDER + 1)
@@ -205,7 +205,7 @@ class SquareAxes(NoiseTerm):
     def sizes(self) -> Floats:
         return self.sigmas.ravel()
 
-    def columns(self, dwells: DwellStack, state: Floats) -> Floats:
+    def columns(self, dwells: DwellTable, state: Floats) -> Floats:
         places = np.argwhere(self.sigmas > 0.0)
         changes = np.zeros((len(dwells.force_mps2), 3, len(places)))
         for k, (channel, axis) in enumerate(places.tolist()):
@@ -227,7 +227,7 @@ class ThermometerError(NoiseTerm):
     def sizes(self) -> Floats:
         return self.sensitivity_mps2_per_k.ravel()
 
-    def columns(self, dwells: DwellStack, state: Floats) -> Floats:
+    def columns(self, dwells: DwellTable, state: Floats) -> Floats:
         return temperature_course.thermometer_errors(dwells, self.sensitivity_mps2_per_k).values
 
 
@@ -247,18 +247,16 @@ class RandomWalk(NoiseTerm):
     def sizes(self) -> Floats:
         return np.array([self.intensity_mps2_per_sqrt_s])
 
-    def columns(self, dwells: DwellStack, state: Floats) -> Floats:
+    def columns(self, dwells: DwellTable, state: Floats) -> Floats:
         return np.zeros((dwells.folded.ends[-1], 3, 3, 0))
 
 
-def waves_in_dwells(folded: Folded) -> Floats:
+@computed_once
+def waves_in_dwells(folded: FoldedDwells) -> Floats:
     """sqrt(2) cos(pi k t / T) over a dwell of length T at the nodes of all pieces, (pieces, nodes, k)."""
-    if "waves_in_dwells" in folded.known:
-        return folded.known["waves_in_dwells"]
     starts_s, ends_s = np.repeat(folded.ends_s, 3 * folded.piece_numbers, axis=0).T
     share = (folded.elapsed_s - starts_s) / np.maximum(ends_s - starts_s, 1e-9)
-    waves = (np.sqrt(2.0) * np.cos(np.pi * SLOW * share[:, None])).reshape(-1, 3, len(SLOW))
-    return folded.known.setdefault("waves_in_dwells", waves)
+    return (np.sqrt(2.0) * np.cos(np.pi * SLOW * share[:, None])).reshape(-1, 3, len(SLOW))
 
 
 def setting_covariances(means: Means, state: Floats) -> Floats:

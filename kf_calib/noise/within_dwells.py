@@ -12,8 +12,8 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells import window_average
 from kf_calib.dwells.pieces import lagged_walk_products
-from kf_calib.dwells.stack import DwellStack, Folded
-from kf_calib.dwells.sufficient_statistics import Autocovariance, DwellFactor
+from kf_calib.dwells.sufficient_statistics import Autocovariance, Dwell
+from kf_calib.dwells.table import DwellTable, FoldedDwells, computed_once
 from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.noise_of_readings import are_alike, expected_products, unbiased
 
@@ -27,9 +27,7 @@ _AVERAGES = 60  # least number of averages of a block from which their own corre
 _STEPS_ALONG = 30
 
 
-def within_dwells(
-    dwells: Sequence[DwellFactor], walk_mps2_per_sqrt_s: float = 0.0, along: Floats | None = None
-) -> Noise:
+def within_dwells(dwells: Sequence[Dwell], walk_mps2_per_sqrt_s: float = 0.0, along: Floats | None = None) -> Noise:
     """The noise within dwells, sigma_w and kappa of each accelerometer, pooled over all pieces.
 
     along (D, 3): the weights of the channels in the size of the force, where nothing else is known in a dwell.
@@ -38,22 +36,20 @@ def within_dwells(
     about a parabola has the expectation sigma^2 (n - 3 kappa) if n is at least 40 kappa. If there is no such piece,
     sigma_w is taken from the autocovariance.
     """
-    stack = DwellStack.of(dwells)
-    dwells, within_seen = stack.folded.dwells, bool((stack.folded.counts > 1).any())
+    stack = DwellTable.of(dwells)
+    within_seen = bool((stack.folded.counts > 1).any())
     if walk_mps2_per_sqrt_s:
         inflation, variance = _correlation(stack.folded, walk_mps2_per_sqrt_s)
     else:  # the same for all fits to the dwells
-        if "correlation" not in stack.folded.known:
-            stack.folded.known["correlation"] = _correlation(stack.folded, 0.0)
-        inflation, variance = stack.folded.known["correlation"]
+        inflation, variance = _correlation_without_walk(stack.folded)
     if along is not None:
         return Noise(_sigma_along(stack, along, inflation), inflation, within_seen=within_seen)
     counts, of_pieces = stack.folded.piece_counts, np.repeat(stack.folded.weights, stack.folded.piece_numbers, axis=0)
     squares = of_pieces * stack.folded.squares
     if walk_mps2_per_sqrt_s:
-        rest = of_pieces * np.concatenate([dwell.walk.about_parabola for dwell in dwells])[:, None]
+        rest = of_pieces * np.concatenate([walk.about_parabola for walk in stack.folded.walks])[:, None]
         squares = np.maximum(squares - walk_mps2_per_sqrt_s**2 * rest, 0.0)
-    on_carrier = dwells[0].width - 3
+    on_carrier = stack.folded.width - 3
     long = counts[:, None] >= np.where(variance > 0, 40.0 * inflation, 0.0)
     freedom = np.where(long, np.maximum(counts[:, None] - 3.0 * inflation - on_carrier, 0.0), 0.0).sum(axis=0)
     pooled = np.where(long, squares, 0.0).sum(axis=0) / np.maximum(freedom, 1.0)
@@ -61,21 +57,26 @@ def within_dwells(
     return Noise(sigma, inflation, within_seen=within_seen)
 
 
-def _correlation(folded: Folded, walk_mps2_per_sqrt_s: float) -> tuple[Floats, Floats]:
+@computed_once
+def _correlation_without_walk(folded: FoldedDwells) -> tuple[Floats, Floats]:
+    return _correlation(folded, 0.0)
+
+
+def _correlation(folded: FoldedDwells, walk_mps2_per_sqrt_s: float) -> tuple[Floats, Floats]:
     """Return kappa (3,) and the variances (3,) of readings within dwells, less those of a random walk."""
-    total, dwells = folded.autocovariance, folded.dwells
+    total = folded.autocovariance
     if walk_mps2_per_sqrt_s:
-        total = replace(total, products=total.products - walk_mps2_per_sqrt_s**2 * _walk_products(dwells))
-    known = _of_averages if dwells[0].averaged else _inflation
+        total = replace(total, products=total.products - walk_mps2_per_sqrt_s**2 * _walk_products(folded))
+    known = _of_averages if folded.averaged else _inflation
     inflation, variance = np.array([known(total, i) for i in range(3)]).T
-    if dwells[0].averaged or total.count >= _SHORT * inflation.max() * total.blocks:
+    if folded.averaged or total.count >= _SHORT * inflation.max() * total.blocks:
         return inflation, variance
     if are_alike(total):
         return _alike(total)
     return np.maximum(inflation, _too_short(inflation, total.count / total.blocks)), variance
 
 
-def _sigma_along(stack: DwellStack, along: Floats, inflation: Floats) -> Floats:
+def _sigma_along(stack: DwellTable, along: Floats, inflation: Floats) -> Floats:
     """Return sigma_w (3,) of the accelerometers from the readings along the force alone, which have the variance sum of
     (m_i sigma_i)^2 with m = ``along`` (D, 3).
 
@@ -96,15 +97,15 @@ def _sigma_along(stack: DwellStack, along: Floats, inflation: Floats) -> Floats:
     return np.sqrt(variances)
 
 
-def _walk_products(dwells: Sequence[DwellFactor]) -> Floats:
+def _walk_products(folded: FoldedDwells) -> Floats:
     """Return what a random walk of intensity q = 1 contributes to the sums of lagged products (L + 1, 3) of all
     dwells."""
-    products = 0.0 * dwells[0].autocovariance.products
-    for dwell in dwells:
-        known, period_s = dwell.autocovariance, (dwell.end_s - dwell.start_s) / max(dwell.count - 1, 1)
+    periods_s = np.diff(folded.ends_s, axis=1)[:, 0] / np.maximum(folded.counts - 1.0, 1.0)
+    products = 0.0 * folded.autocovariances[0].products
+    for known, period_s, weights in zip(folded.autocovariances, periods_s.tolist(), folded.weights, strict=True):
         if known.blocks:
             own = lagged_walk_products(period_s, max(round(known.count / known.blocks), 1), known.pairs)
-            products = products + own[:, None] * dwell.weights
+            products = products + own[:, None] * weights
     return products
 
 

@@ -25,7 +25,7 @@ from kf_calib.bench.arrays import Floats, one_blas_thread
 from kf_calib.bench.streams import Batch, Source
 from kf_calib.dwells.blocks import Tally
 from kf_calib.dwells.folding import Folder
-from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.dwells.sufficient_statistics import Dwell
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.estimation.dwell_pass import LEAST_READINGS, Pass
 from kf_calib.estimation.measurement_model import Model
@@ -119,7 +119,7 @@ class Evaluation(ABC, Generic[J, S]):
         """Return the judgement of the whole run; raises KfCalibError where there can be none."""
 
     @abstractmethod
-    def _seen(self, dwell: DwellFactor) -> Any:
+    def _seen(self, dwell: Dwell) -> Any:
         """Return what the open dwell shows so far, for ``current`` of the standing."""
 
     def _judged_next(self, judgement: J) -> None:

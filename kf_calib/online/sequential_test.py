@@ -38,8 +38,8 @@ from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.diagnosis.candidate_tests import LEVEL, REST, SHARE, candidates, critical_delta_chi2, independent_tests
 from kf_calib.diagnosis.within_dwell_trend import Trend, trend_beside
 from kf_calib.dwells.qr import triangle
-from kf_calib.dwells.stack import DwellStack
-from kf_calib.dwells.sufficient_statistics import DwellFactor, lines_of
+from kf_calib.dwells.sufficient_statistics import Dwell, lines_of
+from kf_calib.dwells.table import DwellTable
 from kf_calib.effects import Effect
 from kf_calib.estimation import square_root_information, whitened_rows
 from kf_calib.estimation.attitude import at_its_mode, linearised_at
@@ -75,7 +75,7 @@ class Running:
     @classmethod
     def over(
         cls,
-        dwells: Sequence[DwellFactor],
+        dwells: DwellTable,
         model: Model,
         noise: Noise,
         state: Floats,
@@ -98,7 +98,7 @@ class Running:
         return cls(LinearisedDwells(attitudes, every, at), inside, noise, prior or Prior(), empty)._rebuild()
 
     @property
-    def dwells(self) -> Sequence[DwellFactor]:
+    def dwells(self) -> DwellTable:
         """The dwells so far."""
         return self.linearised.dwells
 
@@ -113,16 +113,16 @@ class Running:
         known = {str(effect): effect for effect in self.linearised.model.effects}
         return Model(self.linearised.model.bench, tuple(known[name] for name in self.inside))
 
-    def after(self, dwell: DwellFactor, exact: bool = True, like: DwellStack | None = None) -> Running:
+    def after(self, dwell: Dwell | DwellTable, exact: bool = True, like: DwellTable | None = None) -> Running:
         """The filter after one more dwell.
 
         It is one update, unless the dwell changes what is known of the conditions in earlier dwells; then the factor is
-        built again. exact: False leaves earlier dwells as they were known when they closed. like: all of these dwells,
-        where they are a stack already.
+        built again. dwell: it, or a table of it alone. exact: False leaves earlier dwells as they were known when they
+        closed. like: all of these dwells, where they are a table already.
         """
-        dwell = at_its_mode(dwell, self.linearised, self.noise.weights)
+        dwell = at_its_mode(DwellTable.of(dwell), self.linearised, self.noise.weights)
         if exact:
-            linearised = LinearisedDwells([*self.dwells, dwell], self.linearised.model, self.about)
+            linearised = LinearisedDwells(self.dwells.beside(dwell), self.linearised.model, self.about)
             if not all(map(np.array_equal, self.linearised.columns, linearised.columns[:-1])):
                 return replace(self, linearised=linearised)._rebuild()
         else:
@@ -196,10 +196,7 @@ class Running:
     def _rows(self, chosen: Sequence[int] | None = None) -> Sequence[Floats]:
         """Return the whitened rows of all dwells, or of those chosen."""
         chosen = range(len(self.dwells)) if chosen is None else chosen
-        dwells, columns = (
-            [self.linearised.dwells_at_state[k] for k in chosen],
-            [self.linearised.columns[k] for k in chosen],
-        )
+        dwells, columns = self.linearised.dwells_at_state.take(chosen), [self.linearised.columns[k] for k in chosen]
         return whitened_rows.whiten(dwells, columns, self.noise.weights, self.about, self.about)
 
 
@@ -229,7 +226,7 @@ class Watch:
     @classmethod
     def over(
         cls,
-        dwells: Sequence[DwellFactor],
+        dwells: DwellTable,
         bench: Bench,
         settings: Settings | None = None,
         looks: int = 0,
@@ -246,10 +243,8 @@ class Watch:
         with one_blas_thread():
             return cls(bench, settings, *_begun(dwells, bench, settings, fitted), looks)._look()
 
-    def after(
-        self, dwell: DwellFactor, fitted: Fit | None = None, dwells: Sequence[DwellFactor] | None = None
-    ) -> Watch:
-        """The sequential test after one more dwell.
+    def after(self, dwell: Dwell | DwellTable, fitted: Fit | None = None, dwells: DwellTable | None = None) -> Watch:
+        """The sequential test after one more dwell, or a table of it alone.
 
         fitted: the model fitted to all dwells, this one included, where it is known. dwells: all of them, where pieces
         of earlier ones may have been merged since.
@@ -263,7 +258,7 @@ class Watch:
             return replace(self, running=running, fitted_at=fitted_at, tests=tests)._look()
 
     @property
-    def dwells(self) -> Sequence[DwellFactor]:
+    def dwells(self) -> DwellTable:
         """The dwells so far."""
         return self.running.dwells
 
@@ -315,12 +310,10 @@ class Watch:
         return looked
 
 
-def _begun(
-    dwells: Sequence[DwellFactor], bench: Bench, settings: Settings, fitted: Fit | None
-) -> tuple[Running, int, float]:
+def _begun(dwells: DwellTable, bench: Bench, settings: Settings, fitted: Fit | None) -> tuple[Running, int, float]:
     """Return the filter with noise and linearisation from the dwells so far, their number, and the effective tests."""
     if fitted is None or fitted.linearised.slews or len(fitted.dwells) != len(dwells):
-        fitted = fit(list(dwells), Model.of(bench, settings.effects), settings.walk_mps2_per_sqrt_s)
+        fitted = fit(dwells, Model.of(bench, settings.effects), settings.walk_mps2_per_sqrt_s)
     noise = fitted.noise.for_goodness_of_fit.without(SlowWaves)
     noise = noise.with_terms(replace(noise.setting, considered=False))  # a test of the misfit allows for all of it
     model, state = fitted.linearised.model, fitted.linearised.state

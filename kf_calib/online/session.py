@@ -27,7 +27,7 @@ A calibration by hand needs readings alone, and gives a ``HandJudgement`` after 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -39,8 +39,8 @@ from kf_calib.bench.streams import Batch, Source
 from kf_calib.design.sides import Sides, turn_in_words
 from kf_calib.diagnosis.candidate_tests import LEVEL
 from kf_calib.dwells.rest_in_readings import RestSegmenter
-from kf_calib.dwells.stack import DwellStack
-from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.dwells.sufficient_statistics import Dwell
+from kf_calib.dwells.table import DwellTable
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.calibration import conclude, evaluate_fit, with_remarks
 from kf_calib.estimation.dwell_pass import LEAST_READINGS, Pass, refuse_unusable
@@ -135,7 +135,7 @@ class Session(Evaluation[Judgement, Standing]):
     def _judged_whole(self, passed: Pass, before: Judgement | None, again: Source | None) -> Judgement:
         return judge_whole_run(passed, self.wanted, None if before is None else before.watch, again)
 
-    def _seen(self, dwell: DwellFactor) -> Current:
+    def _seen(self, dwell: Dwell) -> Current:
         return current(dwell, self.standing.judgement)
 
     def _judged_next(self, judgement: Judgement) -> None:
@@ -165,7 +165,7 @@ class HandJudgement:
     """
 
     result: Calibration | None
-    dwells: Sequence[DwellFactor]
+    dwells: DwellTable
     sides: Sides
     wanted: Floats
     looks: int = 0
@@ -264,7 +264,7 @@ def judge_poses(passed: Pass, wanted: Floats, before: HandJudgement | None = Non
 
     Raises InputError where the readings cannot be used as they are.
     """
-    dwells, model, settings = DwellStack.of(passed.dwells), passed.model, passed.settings
+    dwells, model, settings = passed.dwells, passed.model, passed.settings
     with one_blas_thread():
         refuse_unusable(dwells, passed.tally, passed.source.bench)
         try:
@@ -311,11 +311,11 @@ class HandSession(Evaluation[HandJudgement, HandStanding]):
     def _judged_next(self, judgement: HandJudgement) -> None:
         self._show_sides(judgement.sides)
 
-    def _seen(self, dwell: DwellFactor) -> Held:
+    def _seen(self, dwell: Dwell) -> Held:
         closed = [each for each in self._passed.folder.dwells[: self._closed] if each.count >= LEAST_READINGS]
         judgement = self.standing.judgement
         fitted = None if judgement is None or judgement.result is None else judgement.result.fit
-        sides = Sides.of([*closed, dwell], self.source.bench, fitted)
+        sides = Sides.of(DwellTable.of([*closed, dwell]), self.source.bench, fitted)
         self._show_sides(sides)
         return Held(dwell.number, dwell.count, sides.last)
 

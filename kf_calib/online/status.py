@@ -8,7 +8,6 @@ result may have changed. The final judgement is that of ``diagnose``.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -24,8 +23,8 @@ from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.verdict import explanations_in_words
-from kf_calib.dwells.stack import DwellStack
-from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.dwells.sufficient_statistics import Dwell
+from kf_calib.dwells.table import DwellTable
 from kf_calib.estimation.calibration import conclude, evaluate_fit, with_remarks
 from kf_calib.estimation.cross_validation import SAME_POSE_DEG
 from kf_calib.estimation.dwell_pass import Pass, fitted_to, refuse_unusable
@@ -310,7 +309,7 @@ def judge_so_far(passed: Pass, wanted: Floats, before: Judgement | None = None) 
     passed: the pass over the readings. wanted (12,): targets of the sigmas. before: the judgement after fewer dwells.
     Raises InputError where the readings cannot be used as they are.
     """
-    dwells = DwellStack.of(passed.dwells)
+    dwells = passed.dwells
     with one_blas_thread():
         refuse_unusable(dwells, passed.tally, passed.source.bench)
         result = with_remarks(evaluate_fit(fitted_to(passed, dwells), passed.settings), passed)
@@ -320,7 +319,7 @@ def judge_so_far(passed: Pass, wanted: Floats, before: Judgement | None = None) 
         return Judgement(result, look, watch, wanted, _course(result, wanted), sigma_before=sigma_before)
 
 
-def _sequential_test(dwells: Sequence[DwellFactor], result: Calibration, watch: Watch | None) -> Watch | None:
+def _sequential_test(dwells: DwellTable, result: Calibration, watch: Watch | None) -> Watch | None:
     """Return the sequential test with all dwells so far, begun again if the model has changed; None if too few."""
     bench, settings = result.bench, result.settings
     if len(dwells) < _least(result):
@@ -328,7 +327,7 @@ def _sequential_test(dwells: Sequence[DwellFactor], result: Calibration, watch: 
     if watch is None or watch.settings.effects != settings.effects:
         return Watch.over(dwells, bench, settings, 0 if watch is None else watch.looks, result.fit)
     for k in range(len(watch.dwells), len(dwells)):
-        watch = watch.after(dwells[k], result.fit, dwells[: k + 1])
+        watch = watch.after(dwells[k : k + 1], result.fit, dwells[: k + 1])
     return watch
 
 
@@ -371,7 +370,7 @@ def _sizes(result: Calibration, wanted: Floats) -> Floats:
     return np.array([result.bench.gravity_mps2 if unit == "m/s^2" else 1.0 for unit in paper_parameters.UNITS])
 
 
-def current(dwell: DwellFactor, judgement: Judgement | None) -> Current:
+def current(dwell: Dwell, judgement: Judgement | None) -> Current:
     """The state of the open dwell, as far as it is folded.
 
     dwell: the open dwell. judgement: of the dwells before it (None: there is none yet, so that sigmas are NaN).
@@ -390,7 +389,7 @@ def current(dwell: DwellFactor, judgement: Judgement | None) -> Current:
     return replace(here, sigma=sigma, stay_s=stay_s, enough=enough)
 
 
-def _quiet(dwell: DwellFactor, result: Calibration) -> bool:
+def _quiet(dwell: Dwell, result: Calibration) -> bool:
     """Tell whether the noise of the dwell's mean is well below the scatter from dwell to dwell."""
     noise, means = result.noise, result.linearised.means[[-1]]
     means = replace(means, counts=np.full((1, 3), float(dwell.count)))

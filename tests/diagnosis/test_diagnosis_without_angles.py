@@ -101,7 +101,7 @@ def test_what_cannot_be_seen_has_no_column_in_the_size_of_f() -> None:
     for name in ("second-order", "third-order", "cross-axis-square", "thermal-bias", "hysteresis", *ATTITUDE, *ALWAYS):
         effect = effect_named(name, result.bench)
         own = candidate_columns(linearised.dwells, [effect], result.bench, state)
-        means = np.array([np.tensordot(dwell.counts / dwell.count, each.mean(axis=1), 1)
+        means = np.array([np.tensordot(dwell.pieces.counts / dwell.count, each.mean(axis=1), 1)
                           for dwell, each in zip(linearised.dwells, own, strict=True)])  # fmt: skip
         columns = np.einsum("di,diq->dq", across, means)
         left = columns - model @ np.linalg.lstsq(model, columns, rcond=None)[0]

@@ -12,17 +12,17 @@ from helpers.synthetic import plan_of
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells import folding, pieces
-from kf_calib.dwells.pieces import FEWEST_PIECES, MOST_PIECES, Piece, coarsened, merged_piece
-from kf_calib.dwells.qr import triangle
+from kf_calib.dwells.pieces import FEWEST_PIECES, MOST_PIECES, Pieces, coarsened, merged_piece
+from kf_calib.dwells.qr import square_triangle
 from kf_calib.dwells.rows import Nodes, basis
-from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.dwells.sufficient_statistics import Dwell
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.results import Calibration
 from kf_calib.sources.simulation.sensors import GRADES, TrueNoise
 from kf_calib.sources.simulation.simulator import Simulation
 
 
-def piece_of(time_s: Floats, readings: Floats, arrival_s: float = 0.0, carrier_hz: float = 0.0) -> Piece:
+def piece_of(time_s: Floats, readings: Floats, arrival_s: float = 0.0, carrier_hz: float = 0.0) -> Pieces:
     """A piece folded from readings (n, 3), its temperature a parabola of time."""
     middle, half = 0.5 * (time_s[0] + time_s[-1]), 0.5 * (time_s[-1] - time_s[0])
     rows = np.vstack([basis((time_s - middle) / half, time_s, carrier_hz), readings.T]).T
@@ -30,10 +30,11 @@ def piece_of(time_s: Floats, readings: Floats, arrival_s: float = 0.0, carrier_h
     nodes = Nodes(
         at, at - arrival_s, np.tile([0.0, 9.81, 0.0], (3, 1)), np.zeros((3, 3)), 20.0 + 0.1 * at + 3e-4 * at**2
     )
-    return Piece(triangle(rows), nodes, len(time_s), carrier_hz, len(time_s))
+    counts = np.array([len(time_s)])
+    return Pieces(square_triangle(rows)[None], nodes, counts, counts, carrier_hz)
 
 
-def standing(hours: float, rate_hz: float = 0.5, block_s: float = 20.0) -> Iterator[Piece]:
+def standing(hours: float, rate_hz: float = 0.5, block_s: float = 20.0) -> Iterator[Pieces]:
     """Pieces of a dwell, block by block."""
     rng, count = np.random.default_rng(0), int(block_s * rate_hz)
     for number in range(int(hours * 3600.0 / block_s)):
@@ -48,27 +49,29 @@ def test_merged_pieces_are_those_that_the_readings_give_at_once(carrier_hz: floa
     time_s = np.concatenate([np.arange(100.0, 130.0), np.arange(130.0, 190.0), np.arange(200.0, 260.0)])
     readings = rng.normal(9.81, 1e-3, (len(time_s), 3))
     parts = [slice(0, 30), slice(30, 90), slice(90, 150)]
-    one = merged_piece([piece_of(time_s[own], readings[own], 90.0, carrier_hz) for own in parts])
+    one = merged_piece(Pieces.joined([piece_of(time_s[own], readings[own], 90.0, carrier_hz) for own in parts]))
     whole = piece_of(time_s, readings, 90.0, carrier_hz)
-    np.testing.assert_allclose(one.triangle.T @ one.triangle, whole.triangle.T @ whole.triangle, rtol=1e-10, atol=1e-9)
+    of_one, of_whole = one.triangles[0], whole.triangles[0]
+    np.testing.assert_allclose(of_one.T @ of_one, of_whole.T @ of_whole, rtol=1e-10, atol=1e-9)
     for name in ("elapsed_s", "since_arrival_s", "force_mps2", "pose", "temperature_c"):
         np.testing.assert_allclose(getattr(one.nodes, name), getattr(whole.nodes, name), rtol=1e-12, err_msg=name)
-    assert (one.count, one.reading_count, one.carrier_hz) == (150, 150, carrier_hz)
+    assert (one.counts, one.reading_counts, one.carrier_hz) == ([150], [150], carrier_hz)
 
 
 @pytest.mark.parametrize("hours", [12.0, *slow(72.0)])
 def test_a_dwell_of_days_has_a_bounded_number_of_pieces(hours: float) -> None:
     """Short after the arrival and even later, each reading in one of them."""
-    kept, total = list[Piece](), 0
+    kept, total = list[Pieces](), 0
     for piece in standing(hours=hours):
         if len(kept) == MOST_PIECES:
-            kept = list(coarsened(kept))
+            merged = coarsened(Pieces.joined(kept))
+            kept = [merged[k : k + 1] for k in range(len(merged))]
             assert len(kept) <= MOST_PIECES // 2 + 16
         kept.append(piece)
-        total += piece.count
-    lengths = np.array([piece.nodes.elapsed_s[-1] - piece.nodes.elapsed_s[0] for piece in kept])
-    begins = np.array([piece.nodes.since_arrival_s[0] for piece in kept])
-    assert sum(piece.count for piece in kept) == total and (np.diff(begins) > 0.0).all()
+        total += int(piece.counts.sum())
+    whole = Pieces.joined(kept)
+    lengths, begins = np.diff(whole.spans_s)[:, 0], whole.nodes.since_arrival_s[::3]
+    assert whole.counts.sum() == total and (np.diff(begins) > 0.0).all()
     assert lengths[0] < 20.0 and (lengths[1:] <= np.maximum(begins[1:], 20.0)).all()
     assert lengths.max() < hours * 3600.0 / 32.0
 
@@ -76,15 +79,15 @@ def test_a_dwell_of_days_has_a_bounded_number_of_pieces(hours: float) -> None:
 @pytest.mark.parametrize("arrival_s", [-7.0, 0.0, 40.0])
 def test_merged_pieces_are_as_long_as_they_may_be(arrival_s: float) -> None:
     """At most the time since the arrival when it begins, and a share of all; one piece more would make it longer."""
-    kept = [piece_of(10.0 * k + 45.0 + np.arange(5.0), np.ones((5, 3)), arrival_s) for k in range(300)]
-    longest_s = (kept[-1].nodes.elapsed_s[-1] - 45.0) / 20.0
+    kept = Pieces.joined([piece_of(10.0 * k + 45.0 + np.arange(5.0), np.ones((5, 3)), arrival_s) for k in range(300)])
+    longest_s = (kept.nodes.elapsed_s[-1] - 45.0) / 20.0
     merged = coarsened(kept, 20)
-    begins, ends = np.array([[piece.nodes.elapsed_s[0], piece.nodes.elapsed_s[-1]] for piece in merged]).T
+    begins, ends = merged.spans_s.T
     allowed = np.minimum(longest_s, begins - arrival_s)
-    several = np.array([piece.count > 5 for piece in merged])
+    several = merged.counts > 5
     assert several.any() and (ends - begins <= allowed)[several].all()
     assert (ends[:-1] + 10.0 - begins[:-1] > allowed[:-1]).all()
-    assert sum(piece.count for piece in merged) == 1500
+    assert merged.counts.sum() == 1500
 
 
 def test_a_run_of_days_has_a_bounded_number_of_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -94,11 +97,11 @@ def test_a_run_of_days_has_a_bounded_number_of_pieces(monkeypatch: pytest.Monkey
     dwells, numbers = folding._DwellSequence(), list[int]()
     for number in range(1, 61):
         for piece in long if number % 2 else short:
-            dwells.add(DwellFactor(number, (piece,)))
+            dwells.add(Dwell(number, piece))
         numbers.append(sum(len(dwell.pieces) for dwell in dwells.folded))
     counts = [len(dwell.pieces) for dwell in dwells.folded]
     assert max(counts[:48:2]) <= FEWEST_PIECES and set(counts[1::2]) == {len(short)} and max(numbers) < 30 * 29
-    assert [dwell.count for dwell in dwells.folded[:2]] == [sum(piece.count for piece in own) for own in (long, short)]
+    assert [dwell.count for dwell in dwells.folded[:2]] == [Pieces.joined(each).counts.sum() for each in (long, short)]
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.dwells.folding import Folder
 from kf_calib.dwells.rows import Rows
-from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.dwells.sufficient_statistics import Dwell
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.settings import Settings
 
@@ -67,14 +67,14 @@ def test_a_dwell_asked_for_at_every_block_is_the_same_to_the_last_bit(rows: list
 
 
 def test_no_piece_of_a_long_dwell_is_taken_up_at_every_block(rows: list[Rows], monkeypatch: pytest.MonkeyPatch) -> None:
-    handled, merged = [0], DwellFactor.merge
+    handled, merged = [0], Dwell.merge
 
-    def counted(self: DwellFactor, others: Sequence[DwellFactor]) -> DwellFactor:
+    def counted(self: Dwell, others: Sequence[Dwell]) -> Dwell:
         out = merged(self, others)
         handled[0] += len(out.pieces)
         return out
 
-    monkeypatch.setattr(DwellFactor, "merge", counted)
+    monkeypatch.setattr(Dwell, "merge", counted)
     folder = Folder()
     for block in rows:
         folder.add(block)

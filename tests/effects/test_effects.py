@@ -17,7 +17,7 @@ from scipy.stats import chi2
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.bench.streams import Stream
-from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.dwells.table import DwellTable
 from kf_calib.effects import Bearer, SensorEffect, Stimulus, effect_named, names
 from kf_calib.errors import InputError
 from kf_calib.estimation import square_root_information, whitened_rows
@@ -368,7 +368,7 @@ def estimated(fitted: Fit) -> dict[str, tuple[float, float]]:
     return {symbol: (float(value), float(sigma)) for symbol, (value, sigma) in out.items()}
 
 
-def ratios_of(name: str, seed: int, still: list[DwellFactor]) -> dict[str, float]:
+def ratios_of(name: str, seed: int, still: DwellTable) -> dict[str, float]:
     """Errors over their sigmas of what an effect has; ``still``: dwells of a run that hides nothing."""
     if name not in HIDDEN:
         return {symbol: value / sigma for symbol, (value, sigma) in estimated(fit(still, with_(name))).items()}
@@ -391,7 +391,7 @@ def with_(name: str) -> Model:
     return Model.of(BENCH, (name,))
 
 
-def still_dwells(seed: int) -> list[DwellFactor]:
+def still_dwells(seed: int) -> DwellTable:
     return Pass(run([], 5e-5, seed, CHEAP, 10.0, 150.0, 2.0, 180.0), Settings()).fold()
 
 
@@ -438,7 +438,7 @@ def test_intervals_of_an_effect_cover_over_300_runs(name: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def navigation() -> tuple[list[DwellFactor], NoiseModel, Floats]:
+def navigation() -> tuple[DwellTable, NoiseModel, Floats]:
     """Dwells at navigation grade, their noise, and the state at which rotations are linearised."""
     dwells = Pass(run(["second-order=4e-6"], 5e-5), Settings()).fold()
     return dwells, within_dwells(dwells), fit(dwells, Model.of(BENCH, ("thermal-bias",))).linearised.state[:12]

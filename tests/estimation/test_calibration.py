@@ -16,6 +16,7 @@ from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.bench.paper_parameters import BIASES
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.diagnosis.refits import Refits
+from kf_calib.dwells.table import DwellTable
 from kf_calib.errors import BlunderError, InputError, UnobservableError
 from kf_calib.estimation import square_root_information, whitened_rows
 from kf_calib.estimation.calibration import calibrate
@@ -115,7 +116,7 @@ def test_held_out_equals_refits_without_the_orientation() -> None:
     for left_out in range(8):
         from kf_calib.estimation.calibration import evaluate
 
-        kept = [visit.dwell for k, visit in enumerate(result.visits) if k != left_out]
+        kept = result.fit.dwells.take([k for k in range(8) if k != left_out])
         rest = evaluate(kept, replace(run.bench, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0), Settings())
         means = result.visits[left_out].dwell.means
         state = rest.estimate.state.reshape(3, 4)
@@ -126,7 +127,7 @@ def test_held_out_equals_refits_without_the_orientation() -> None:
 def test_repeated_poses_are_one_orientation() -> None:
     poses = np.random.default_rng(0).uniform(-3, 3, (5, 3))
     result = calibrate(Run(seed=3, poses=np.vstack([poses, poses])))
-    groups = orientations([visit.dwell for visit in result.visits])
+    groups = orientations(result.fit.dwells)
     assert groups == [[k, k + 5] for k in range(5)]
 
 
@@ -244,11 +245,15 @@ def test_a_dwell_on_one_or_two_messages_of_a_noisy_encoder_is_left_out(seed: int
     assert len(exact.visits) == 24
 
 
+def of_unequal_lengths(dwells: DwellTable) -> DwellTable:
+    """The dwells, of two in three their first piece alone."""
+    return DwellTable.of([next(dwells.prefixes(k))[0] if k % 3 else dwell for k, dwell in enumerate(dwells)])
+
+
 def test_a_dwell_whose_columns_are_constant_tells_its_mean_alone() -> None:
     """Three rows have all that its readings tell of the states, of any number of pieces, weight and scatter."""
     dwells = Pass(Run(dwells=14, count=200, setting_deg=0.01, encoder_deg=0.0), Settings()).fold()
-    dwells = [replace(next(iter(dwell.prefixes())) if k % 3 else dwell, weights=(1.0 + 0.1 * k,) * 3)
-              for k, dwell in enumerate(dwells)]  # fmt: skip
+    dwells = of_unequal_lengths(dwells).weighted(np.repeat(1.0 + 0.1 * np.arange(14.0), 3).reshape(-1, 3))
     fitted = fit(dwells, Model.of(Run(dwells=1).bench, ("second-order",)))
     columns, state = fitted.linearised.columns, fitted.linearised.state
     for noise in (fitted.noise, fitted.noise.with_terms(Scatter(np.array([0.0, 1e-6, 1e-3])), SettingError(1e-3))):
@@ -275,14 +280,14 @@ def test_a_column_that_changes_from_piece_to_piece_tells_more_than_a_mean() -> N
 def test_dwells_whitened_together_are_those_whitened_alone() -> None:
     """Of any shape, beside each other in any order; a factor is solved alike in company, undetermined or not."""
     dwells = Pass(Run(dwells=14, count=200, setting_deg=0.01), Settings()).fold()
-    dwells = [next(iter(dwell.prefixes())) if k % 3 else dwell for k, dwell in enumerate(dwells)]
+    dwells = of_unequal_lengths(dwells)
     assert len({len(dwell.pieces) for dwell in dwells}) > 1
     fitted = fit(dwells, Model.of(Run(dwells=1).bench, ("bias-drift",)))
     columns, state = fitted.linearised.columns, fitted.linearised.state
     for noise in (fitted.noise, fitted.noise.with_terms(Scatter(np.full(3, 1e-5)), RandomWalk(1e-5))):
         together = whitened_rows.whiten(dwells, columns, noise, state, reduced=False)
-        for dwell, own, rows in zip(dwells, columns, together, strict=True):
-            (alone,) = whitened_rows.whiten([dwell], [own], noise, state, reduced=False)
+        for k, (own, rows) in enumerate(zip(columns, together, strict=True)):
+            (alone,) = whitened_rows.whiten(dwells[k : k + 1], [own], noise, state, reduced=False)
             np.testing.assert_array_equal(rows, alone)
         few = whitened_rows.whiten(dwells, columns, noise, state)
         for whole, rows in zip(together, few, strict=True):

@@ -13,6 +13,7 @@ from scipy.optimize import least_squares
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.dwells.folding import Folder
+from kf_calib.dwells.table import DwellTable
 from kf_calib.estimation import kalman_filterpy
 from kf_calib.estimation.calibration import calibrate, evaluate, filterpy_estimate
 from kf_calib.estimation.dwell_pass import Pass
@@ -125,8 +126,9 @@ def test_inertial_platform_earth_rate_and_varying_columns() -> None:
     run.accel = replace(run.accel, values=run.bench.specific_force(elapsed_s, poses) @ rows.T + biases + noise)
     compared = compare(run)
     assert compared.max_difference_sigma <= 1e-6
-    ranks = [np.linalg.matrix_rank(visit.dwell.factor[:4, :4], tol=1e-9) for visit in compared.result.visits]
-    assert sum(ranks) == 3 * 6  # gravity on a cone: 1, cosine and sine in each dwell
+    # gravity on a cone: 1, cosine and sine in each dwell
+    forces = [visit.dwell.pieces.nodes.regressors for visit in compared.result.visits]
+    assert sum(np.linalg.matrix_rank(each, tol=1e-9) for each in forces) == 3 * 6
     error = (compared.result.estimate.parameters - run.truth) / compared.result.estimate.sigma
     assert np.abs(error).max() < 4
 
@@ -143,8 +145,8 @@ def test_factors_merge_and_do_not_depend_on_batches() -> None:
     by_number = {dwell.number: dwell for dwell in left.dwells}
     for dwell in right.dwells:
         known = by_number.get(dwell.number)
-        by_number[dwell.number] = dwell if known is None else known.merge(dwell)
-    merged = evaluate([by_number[k] for k in sorted(by_number)], whole.bench, Settings())
+        by_number[dwell.number] = dwell if known is None else known.merge([dwell])
+    merged = evaluate(DwellTable.of([by_number[k] for k in sorted(by_number)]), whole.bench, Settings())
     assert distance(merged.estimate, one.estimate)[0] < 1e-2  # the autocovariance sees other stretches
     np.testing.assert_allclose(merged.estimate.state, one.estimate.state, rtol=1e-12, atol=1e-14)
 

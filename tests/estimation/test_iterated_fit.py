@@ -121,11 +121,11 @@ def test_the_error_of_the_temperature_matters_to_effects_alone(monkeypatch: pyte
     (None, 0.04, None), (0.03, 0.0, 0.03), (0.03, 0.04, 0.05), (0.0, 0.04, 0.04),
 ])  # fmt: skip
 def test_a_stated_setting_error_has_that_of_noisy_angles_added(
-    stated_deg: float | None, of_poses_deg: float, expected: float | None, monkeypatch: pytest.MonkeyPatch
+    stated_deg: float | None, of_poses_deg: float, expected: float | None
 ) -> None:
     """In squares, by their mean over the dwells."""
     poses = SimpleNamespace(pose_sigmas_rad=np.radians(of_poses_deg) * np.sqrt([0.5, 1.5]))
-    monkeypatch.setattr(iterated_fit, "DwellStack", SimpleNamespace(of=lambda _: SimpleNamespace(folded=poses)))
     bench: Any = SimpleNamespace(angle_sigma_deg=stated_deg)
-    found = iterated_fit._setting_deg([], bench)
+    dwells: Any = SimpleNamespace(folded=poses)
+    found = iterated_fit._setting_deg(dwells, bench)
     assert found == (None if expected is None else pytest.approx(expected))

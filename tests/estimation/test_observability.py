@@ -38,7 +38,7 @@ def left_of(effect: Effect) -> tuple[Floats, Floats]:
     model = linearised.means.design.reshape(-1, 12)
     model = model / np.linalg.norm(model, axis=0)
     of_dwells = candidate_columns(linearised.dwells, [effect], result().bench, linearised.state)
-    means = [np.tensordot(dwell.counts / dwell.count, each.mean(axis=1), 1)
+    means = [np.tensordot(dwell.pieces.counts / dwell.count, each.mean(axis=1), 1)
              for dwell, each in zip(linearised.dwells, of_dwells, strict=True)]  # fmt: skip
     columns = np.concatenate(means)
     return columns, columns - model @ np.linalg.lstsq(model, columns, rcond=None)[0]

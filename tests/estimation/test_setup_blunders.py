@@ -21,6 +21,7 @@ from kf_calib.bench.keys import UP
 from kf_calib.bench.raw_input import RawInput, parse_channels
 from kf_calib.bench.streams import Table
 from kf_calib.dwells.blocks import Tally
+from kf_calib.dwells.table import DwellTable
 from kf_calib.errors import BlunderError, InputError
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.dwell_pass import refuse_unusable
@@ -190,7 +191,7 @@ def test_angles_look_like_degrees_from_three_turns_on() -> None:
 
     def refusal(turns: float) -> str:
         with pytest.raises(InputError) as refused:
-            refuse_unusable([], Tally(read=1000, poses=100, farthest_rad=2.0 * np.pi * turns), bench)
+            refuse_unusable(DwellTable.of([]), Tally(read=1000, poses=100, farthest_rad=2.0 * np.pi * turns), bench)
         return str(refused.value)
 
     assert begins_at(lambda turns: "degrees" in refusal(turns), 0.1, 100.0) == pytest.approx(3.0)

@@ -144,8 +144,8 @@ def test_the_size_of_f_in_poses_left_out_is_predicted_within_its_covariance() ->
     for seed in (1, 2, 3):
         result, _ = calibrated(seed)
         assert result.held_out is not None
-        dwells = [visit.dwell for visit in result.visits]
-        rest = evaluate([*dwells[:4], *dwells[5:]], result.bench, Settings())
+        dwells = result.fit.dwells
+        rest = evaluate(dwells[:4].beside(dwells[5:]), result.bench, Settings())
         affine = rest.estimate.state.reshape(3, 4)
         force = np.linalg.solve(affine[:, :3], dwells[4].means[4:] - affine[:, 3])
         assert result.held_out.errors_mps2[4, 0] == pytest.approx(np.linalg.norm(force) - G, rel=0.05, abs=1e-5)

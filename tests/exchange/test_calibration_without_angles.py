@@ -52,7 +52,7 @@ def test_it_is_saved_with_its_frame_and_read_as_it_was(path: Path) -> None:
 
 def test_it_corrects_readings_to_the_size_of_gravity(path: Path) -> None:
     correction, means = calibration_file.open_calibration(path).correction(path), result().linearised.means
-    warmth = np.array([np.mean(dwell.nodes.temperature_c) for dwell in result().fit.dwells])
+    warmth = np.array([np.mean(dwell.pieces.nodes.temperature_c) for dwell in result().fit.dwells])
     found = correction(means.readings, warmth)
     sigma = np.sqrt(np.mean(result().noise.sigma_mps2 ** 2) / means.counts.min())
     assert np.abs(np.linalg.norm(found, axis=1) - result().bench.gravity_mps2).max() < 5.0 * sigma

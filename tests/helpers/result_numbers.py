@@ -25,8 +25,8 @@ _DEEPEST = 12
 _ARBITRARY = frozenset(
     ("Fit.misfit_rows", "Fit.considered", "Estimate.undetermined", "Estimate.unseen", "Estimate.determined",
      "Estimate.sigma", "Calibration.reached", "Candidate.columns", "Candidate.basis", "Candidate.directions",
-     "Candidate.inverse", "Scan.residual", "DwellFactor.factor", "WalkPath.modes", "Visit.nis", "Diagnosis.drivers",
-     "Folded.pose_sigmas_rad")
+     "Candidate.inverse", "Scan.residual", "WalkPath.modes", "Visit.nis", "Diagnosis.drivers",
+     "FoldedDwells.pose_sigmas_rad")
 )  # fmt: skip
 """Signs and bases that may be chosen at will, and what rounding decides where nothing is determined: these differ from
 one processor to another."""

@@ -35,7 +35,7 @@ a sigma; a plan is the best that a search meets. Of these, 1e-5 is not reached o
 2e-3, 1e-3)."""
 _LOOSE_NAMES: Mapping[str, float] = {
     "log10_odds_to_next": 1e3, "minimum": 10.0, "Fit.scatter_gain": 1e3, "EffectRow.no_one": 1e3,
-    "HypothesisTable.log10_odds": 10.0, "Folded.spreads": 10.0, "EffectTests.independent_tests": 100.0,
+    "HypothesisTable.log10_odds": 10.0, "FoldedDwells.spreads": 10.0, "EffectTests.independent_tests": 100.0,
     "EffectTests.p_values": 100.0,
 }  # fmt: skip
 """The same for numbers that are small differences of large ones, or so large that nothing was determined."""

@@ -19,7 +19,7 @@ from kf_calib.bench.arrays import one_blas_thread
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.dwells.pieces import of_all_pieces
-from kf_calib.dwells.stack import DwellStack
+from kf_calib.dwells.table import DwellTable
 from kf_calib.effects import effect_named, names
 from kf_calib.estimation.calibration import calibrate, evaluate
 from kf_calib.estimation.dwell_pass import Pass
@@ -138,7 +138,7 @@ def test_slow_waves_have_the_variance_of_their_share_of_one_over_f_noise() -> No
     at = (np.arange(count) + 0.5) / count
     waves = np.sqrt(2.0) * np.cos(np.pi * SLOW[:, None] * at)
     drawn = np.array([waves @ one_over_f(rng, h, count) / count for _ in range(2000)])
-    stack = DwellStack.of(Pass(Run(dwells=4, count=60), Settings()).fold())
+    stack = DwellTable.of(Pass(Run(dwells=4, count=60), Settings()).fold())
     columns = SlowWaves(np.array([np.sqrt(h), 0.0, 3.0])).columns(stack, np.zeros(12))[0]  # (nodes, channels, waves)
     own = np.abs(columns[0]).max(axis=0).reshape(3, len(SLOW)) / np.sqrt(2.0)  # the waves begin at their height
     assert drawn.std(axis=0) == pytest.approx(own[0], rel=0.18)
@@ -151,11 +151,14 @@ def test_amplitudes_of_white_noise_have_the_variances_that_are_said() -> None:
     run = Run(seed=3, dwells=200)
     run.accel.values[:, 1] += 2e-4 * np.random.default_rng(1).normal(size=len(run.accel.values))
     result = calibrate(run, Settings(effects=()))
-    dwells = [dwell.weighted([2.0 if k % 2 else 1.0] * 3) for k, dwell in enumerate(result.fit.dwells)]
-    stack, columns = DwellStack.of(dwells), of_all_pieces(result.linearised.columns) @ result.estimate.state
+    weights = np.repeat(np.resize([1.0, 2.0], 200), 3).reshape(-1, 3)
+    dwells, columns = (
+        result.fit.dwells.weighted(weights),
+        of_all_pieces(result.linearised.columns) @ result.estimate.state,
+    )
     sigma = np.array([1e-4, np.hypot(1e-4, 2e-4), 1e-4])
     for channels in (np.eye(3), np.array([[0.5, 0.5, np.sqrt(0.5)]])):
-        amplitudes, variances = _amplitudes(stack, columns, sigma, np.tile(channels, (200, 1, 1)))
+        amplitudes, variances = _amplitudes(dwells, columns, sigma, np.tile(channels, (200, 1, 1)))
         for first, weight in ((0, 1.0), (1, 2.0)):  # whose noise is said to be less than it is
             ratios = amplitudes[first::2] ** 2 / variances[first::2]
             assert ratios.mean(axis=(0, 1)) == pytest.approx(np.full(len(channels), weight), rel=0.25)

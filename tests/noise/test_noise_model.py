@@ -12,12 +12,13 @@ from helpers.synthetic import Run, plan_of
 from scipy.optimize import minimize
 from scipy.signal import lfilter
 
+from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.dwells.folding import detrended
-from kf_calib.dwells.pieces import Piece
+from kf_calib.dwells.pieces import Pieces
 from kf_calib.dwells.rows import Nodes
-from kf_calib.dwells.stack import DwellStack
-from kf_calib.dwells.sufficient_statistics import Autocovariance, DwellFactor
+from kf_calib.dwells.sufficient_statistics import Autocovariance, Dwell
+from kf_calib.dwells.table import DwellTable
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.noise import within_dwells
 from kf_calib.noise.terms import Scatter, WavesOverRun
@@ -174,13 +175,14 @@ def test_dwells_too_short_for_their_noise_raise_no_alarm_and_are_told(runs: int)
     assert low <= runs / 20  # one in five would be were each channel's correlation taken as it is found
 
 
-def piece_of(start_s: float, lasting_s: float, count: int, residual: np.ndarray | float = 0.0, width: int = 3) -> Piece:
+def piece_of(start_s: float, span_s: float, count: int, residual: Floats | float = 0.0, width: int = 3) -> Pieces:
     """A piece of readings that leave ``residual`` (3,) about their parabola, in one row of its triangle."""
     triangle = np.eye(width + 3)
     triangle[width:, width:] = 0.0
     triangle[width, width:] = residual
-    at_s = start_s + lasting_s * np.array([0.0, 0.5, 1.0])
-    return Piece(triangle, Nodes(at_s, at_s, np.ones((3, 3)), np.zeros((3, 1)), np.full(3, np.nan)), count)
+    at_s = start_s + span_s * np.array([0.0, 0.5, 1.0])
+    nodes, counts = Nodes(at_s, at_s, np.ones((3, 3)), np.zeros((3, 1)), np.full(3, np.nan)), np.array([count])
+    return Pieces(triangle[None], nodes, counts, counts)
 
 
 def test_noise_along_the_force_has_the_likeliest_sizes_of_gamma_sums() -> None:
@@ -192,7 +194,7 @@ def test_noise_along_the_force_has_the_likeliest_sizes_of_gamma_sums() -> None:
     squares = along**2 @ truth * rng.chisquare(freedom)
     residuals = along * np.sqrt(squares / np.sum(along**2, axis=1) ** 2)[:, None]  # whose part along m has that square
     dwells = [
-        DwellFactor(k + 1, tuple(piece_of(60.0 * k, 60.0, count, own / 2.0) for count in counts[k].tolist()))
+        Dwell(k + 1, Pieces.joined([piece_of(60.0 * k, 60.0, count, own / 2.0) for count in counts[k].tolist()]))
         for k, own in enumerate(residuals)
     ]
 
@@ -201,15 +203,15 @@ def test_noise_along_the_force_has_the_likeliest_sizes_of_gamma_sums() -> None:
         return float(np.sum(freedom * np.log(expected) + squares / expected))
 
     best = minimize(cost, np.zeros(3), method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-10, "maxiter": 9999})
-    sigma = within_dwells._sigma_along(DwellStack.of(dwells), along, kappa)
+    sigma = within_dwells._sigma_along(DwellTable.of(dwells), along, kappa)
     np.testing.assert_allclose(sigma**2, np.exp(best.x), rtol=1e-3)
 
 
 def test_slow_waves_are_independent_of_each_other_and_their_sizes_fall_with_the_root_of_their_number() -> None:
     """Mean products of waves over dwells at equal distances are one or zero; h / k is the variance of wave k."""
     count = 40
-    dwells = [DwellFactor(k + 1, (piece_of(10.0 * k, 10.0, 9, width=4),)) for k in range(count)]
-    columns = WavesOverRun(np.array([2.0, 0.0, 3.0])).columns(DwellStack.of(dwells), np.zeros(12))
+    dwells = [Dwell(k + 1, piece_of(10.0 * k, 10.0, 9, width=4)) for k in range(count)]
+    columns = WavesOverRun(np.array([2.0, 0.0, 3.0])).columns(DwellTable.of(dwells), np.zeros(12))
     sigma = np.concatenate([2.0 / np.sqrt(np.arange(1, 7)), 3.0 / np.sqrt(np.arange(1, 7))])
     waves = columns / sigma  # (dwells, nodes, channels, waves)
     assert not waves[:, 3].any() and not waves[:, :, 1].any()

@@ -10,7 +10,7 @@ import pytest
 from helpers.synthetic import Run
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.dwells.stack import DwellStack
+from kf_calib.dwells.table import DwellTable
 from kf_calib.estimation import kalman_filterpy, whitened_rows
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.dwell_pass import Pass
@@ -33,7 +33,7 @@ class ScaleJitter(NoiseTerm):
     def sizes(self) -> Floats:
         return np.array([self.size])
 
-    def columns(self, dwells: DwellStack, state: Floats) -> Floats:
+    def columns(self, dwells: DwellTable, state: Floats) -> Floats:
         force_mps2 = dwells.felt_force_mps2.reshape(-1, 3, 3)
         return self.size * force_mps2[:, :, :, None] * np.eye(3)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,8 +12,8 @@ from helpers.synthetic import plan_of
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.diagnosis.within_dwell_trend import trend
-from kf_calib.dwells.stack import DwellStack
-from kf_calib.dwells.sufficient_statistics import DwellFactor
+from kf_calib.dwells.sufficient_statistics import Dwell
+from kf_calib.dwells.table import DwellTable
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.results import Calibration, consistency
 from kf_calib.estimation.settings import Settings
@@ -44,11 +45,10 @@ def noisy() -> tuple[Calibration, Ambient]:
     return calibrated(LARGE, sigma_c=0.03)
 
 
-def errors(dwells: list[DwellFactor], ambient: Ambient) -> tuple[Floats, Floats, Floats]:
+def errors(dwells: DwellTable, ambient: Ambient) -> tuple[Floats, Floats, Floats]:
     """Errors of the temperatures as they were read and of their course, and the sigma of the course."""
-    course = temperature_course(DwellStack.of(dwells).folded)
-    true = ambient(np.concatenate([dwell.nodes.elapsed_s for dwell in dwells]))
-    read = np.concatenate([dwell.nodes.temperature_c for dwell in dwells])
+    course, nodes = temperature_course(dwells.folded), dwells.folded.pieces.nodes
+    true, read = ambient(nodes.elapsed_s), nodes.temperature_c
     return read - true, course.temperature_c - true, np.linalg.norm(course.errors_c, axis=1)
 
 
@@ -99,7 +99,7 @@ def test_an_effect_too_small_for_the_error_of_the_temperature_to_matter_has_none
 
 
 def test_a_quiet_thermometer_is_taken_as_it_was_read(noisy: tuple[Calibration, Ambient]) -> None:
-    dwells = [at_temperatures(dwell, 20.0 + 1e-3 * dwell.nodes.elapsed_s) for dwell in noisy[0].fit.dwells]
+    dwells = [at_temperatures(dwell, 20.0 + 1e-3 * dwell.pieces.nodes.elapsed_s) for dwell in noisy[0].fit.dwells]
     assert_as_read(dwells)
 
 
@@ -109,21 +109,19 @@ def test_a_temperature_with_steps_from_dwell_to_dwell_is_taken_as_it_was_read(
     """As in a chamber that is set to another temperature for each orientation: no smooth curve follows it."""
     steps = np.random.default_rng(1).uniform(-10.0, 10.0, len(noisy[0].fit.dwells)).tolist()
     each = zip(noisy[0].fit.dwells, steps, strict=True)
-    assert_as_read([at_temperatures(dwell, dwell.nodes.temperature_c + step) for dwell, step in each])
+    assert_as_read([at_temperatures(dwell, dwell.pieces.nodes.temperature_c + step) for dwell, step in each])
 
 
-def at_temperatures(dwell: DwellFactor, temperature_c: Floats) -> DwellFactor:
+def at_temperatures(dwell: Dwell, temperature_c: Floats) -> Dwell:
     """A dwell at other temperatures, (3 pieces,)."""
-    pieces = [
-        replace(own, nodes=replace(own.nodes, temperature_c=part))
-        for own, part in zip(dwell.pieces, temperature_c.reshape(-1, 3), strict=True)
-    ]
-    return replace(dwell, pieces=tuple(pieces))
+    nodes = replace(dwell.pieces.nodes, temperature_c=temperature_c)
+    return replace(dwell, pieces=replace(dwell.pieces, nodes=nodes))
 
 
-def assert_as_read(dwells: list[DwellFactor]) -> None:
-    course = temperature_course(DwellStack.of(dwells).folded)
-    np.testing.assert_array_equal(course.temperature_c, np.concatenate([own.nodes.temperature_c for own in dwells]))
+def assert_as_read(dwells: Sequence[Dwell]) -> None:
+    folded = DwellTable.of(dwells).folded
+    course = temperature_course(folded)
+    np.testing.assert_array_equal(course.temperature_c, folded.pieces.nodes.temperature_c)
     assert course.errors_c.shape[1] == 0
 
 

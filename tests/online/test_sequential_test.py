@@ -65,7 +65,7 @@ def test_a_dwell_more_has_the_columns_that_the_whole_run_gives_it() -> None:
         model = model if str(effect) in model.parts else model + effect
     state = np.concatenate([result.linearised.state[:12], np.zeros(model.count - 12)])
     more, whole = (
-        LinearisedDwells(dwells[:-1], model, state).followed_by(dwells[-1]),
+        LinearisedDwells(dwells[:-1], model, state).followed_by(dwells[-1:]),
         LinearisedDwells(dwells, model, state),
     )
     lagged = model.parts["thermal-lag"]

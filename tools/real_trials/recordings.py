@@ -69,7 +69,7 @@ class RealRecording:
     @cached_property
     def _poses(self) -> Floats:
         dwells = kf_calib.calibrate(self.altered(np.zeros(3))).fit.dwells
-        arrivals = [dwell.nodes.elapsed_s[0] - dwell.nodes.since_arrival_s[0] for dwell in dwells]
+        arrivals = [nodes.elapsed_s[0] - nodes.since_arrival_s[0] for nodes in (dwell.pieces.nodes for dwell in dwells)]
         return np.array([(at, dwell.start_s, dwell.end_s) for at, dwell in zip(arrivals, dwells, strict=True)])
 
     @property

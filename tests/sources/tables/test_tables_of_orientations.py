@@ -32,7 +32,7 @@ def table_of(result: kf_calib.Calibration) -> Table:
     rows = [
         Orientation(
             dwell.means[4:], dwell.pose, 0.5 * (dwell.start_s + dwell.end_s), result.noise.effective_sigma_mps2,
-            dwell.count, float(dwell.nodes.temperature_c[0]),
+            dwell.count, float(dwell.pieces.nodes.temperature_c[0]),
         )
         for dwell in result.fit.dwells
     ]  # fmt: skip
