@@ -62,8 +62,9 @@ def how_to_write(number: str) -> str:
     return f" (write {number[: found.end()].replace(',', '.')} with a point)" if found else ""
 
 
-def need(package: str, extra: str | None, purpose: str) -> None:
-    """Raise MissingExtraError unless ``package`` can be imported; extra: of kf_calib, that brings it, if one does."""
+def need(package: str, extra: str | None, purpose: str, requirement: str = "") -> None:
+    """Raise MissingExtraError unless ``package`` can be imported; extra: of kf_calib, that brings it, if one does;
+    requirement: what pip is to be given else, where that is not the package's name."""
     if find_spec(package) is None:
-        wanted = package if extra is None else f"'kf_calib[{extra}]'"
+        wanted = (requirement or package) if extra is None else f"'kf_calib[{extra}]'"
         raise MissingExtraError(f"{purpose} needs {package}, which is not installed: pip install {wanted}.")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -294,3 +296,19 @@ def test_no_panel_complains(recording: Path) -> None:
 def test_screenshots_that_cannot_be(recording: Path, tmp_path: Path, name: str, options: dict, message: str) -> None:
     with pytest.raises(ScreenshotError, match=message):
         _drawn(recording.parent / name, tmp_path / "x.png", **options)
+
+
+def test_without_rerun_a_replay_works_and_a_view_says_what_to_install(tmp_path: Path) -> None:
+    code = (
+        "import sys; sys.modules.pop('rerun', None)\n"
+        "from importlib.machinery import PathFinder\n"
+        "real = PathFinder.find_spec\n"
+        "PathFinder.find_spec = classmethod(lambda cls, name, path=None, target=None:"
+        " None if name.partition('.')[0] in ('rerun', 'pyarrow') else real(name, path, target))\n"
+        "from kf_calib.cli import main; sys.argv[0] = 'kf-calib'; main()"
+    )
+    recording = str(ROOT / "recordings" / "hidden.mcap")
+    for words, status, said in (((), 0, ""), (("--rrd", str(tmp_path / "x.rrd")), 2, "pip install rerun-sdk")):
+        command = [sys.executable, "-c", code, "replay", recording, "--json", *words]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+        assert done.returncode == status and said in done.stderr and len(done.stderr.splitlines()) == bool(said)

@@ -14,6 +14,11 @@ A view opens with the overview first, and with parameters and innovations in tab
 
 from __future__ import annotations
 
+from kf_calib.errors import need
+
+need("rerun", None, "a Rerun view", "rerun-sdk")
+
+# ruff: noqa: E402  # after the check
 from functools import singledispatch
 from itertools import combinations
 from pathlib import Path
