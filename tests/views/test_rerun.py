@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.paths import ROOT
 from screenshot import ScreenshotError, screenshot, viewer
 
 from kf_calib.bench import paper_parameters
