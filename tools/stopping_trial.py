@@ -1,6 +1,6 @@
 #!/usr/bin/env python
-"""A bench that may stop at any dwell: how often a run in which nothing is missing is ever alarmed, and how often a wrong
-name is ever told, looked at after every dwell.
+"""A bench that may stop at any dwell: how often a run in which nothing is missing is ever alarmed, and how often a
+wrong name is ever told, looked at after every dwell.
 
 The streams are those of a bench written with scipy's rotations (tests/helpers/independent_bench.py), dwell by dwell as
 ``live`` judges them: the sequential test after each, and the diagnosis after each once it was alarmed. A stream counts
