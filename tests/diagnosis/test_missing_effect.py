@@ -84,7 +84,7 @@ def test_vibration_is_averaged_once_and_lines_that_are_left_are_vibration_too(
         monkeypatch.setattr(missing_effect, name, lambda *_: "")
     monkeypatch.setattr(missing_effect.window_average, "window_s", lambda lines: 0.5)
     averaged = Tests("averaged", Tests("averaged without lines") if lines_left else None)
-    fit = SimpleNamespace(dwells=[SimpleNamespace(averaged=averaged_before)])
+    fit = SimpleNamespace(dwells=SimpleNamespace(folded=SimpleNamespace(averaged=averaged_before)))
     run: Any = SimpleNamespace(outlying=(), bench=SimpleNamespace(angles=angles), fit=fit)
     refits: Any = SimpleNamespace(
         assess=lambda which: Tests("first") if which is run else averaged,
