@@ -17,8 +17,7 @@ _AS_LIKELY = 0.25  # share of the likeliest from which another explanation is to
 _CHANCE = 0.01  # probability from which it is told that nothing may be missing
 _TOLD = 4  # most other explanations that are told
 _UNUSUAL = 5.0  # times the greatest usual size, from which a coefficient is said to be too large for its name
-_USUAL = {"angle_sigma_deg": "a usual table: 0.0003 to 0.003 deg",
-          "scatter_sigma_mps2": "usual sensors: 1e-5 m/s^2 of quartz to 1e-3 of MEMS"}  # fmt: skip
+_USUAL = {"angle_sigma_deg": " (a usual table: 0.0003 to 0.003 deg)", "scatter_sigma_mps2": ""}
 _FAMILIES = {
     "bias in time": "The bias changes with time", "scale in time": "The scale factor changes with time",
     "temperature": "It goes with temperature", "nonlinearity": "The accelerometer is not linear",
@@ -184,10 +183,9 @@ def _noise(diagnosis: Diagnosis, first: Hypothesis) -> str:
     """Return a sentence on noise from dwell to dwell that was not stated, and on how to be sure of it."""
     noise = diagnosis.before.noise
     stated = ("angle_sigma_deg", noise.setting.stated), ("scatter_sigma_mps2", noise.scatter.stated)
-    keys = " and ".join(key for key, is_stated in stated if not is_stated)
-    usual = "; ".join(_USUAL[key] for key, is_stated in stated if not is_stated)
+    keys = " and ".join(f"{key}{_USUAL[key]}" for key, is_stated in stated if not is_stated)
     what = "more than was stated" if dwell_noise_is_stated(diagnosis.before) else "by an amount that was not stated"
-    advice = f"state {keys} ({usual}) or repeat an orientation" if keys else "repeat an orientation"
+    advice = f"state {keys} or repeat an orientation" if keys else "repeat an orientation"
     share = format_probability(first.probability)
     return f"The dwells scatter {what} ({share}){_others(diagnosis)}. To find out, {advice}.{_of_one(diagnosis)}"
 
