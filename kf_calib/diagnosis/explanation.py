@@ -199,10 +199,8 @@ class Explanation:
 
     def over(self, driver: Driver) -> EffectShape:
         """The same of all its effects together, over a quantity of the bench."""
-        before, added = (
-            self.before,
-            [each for each in self.after.model.effects if str(each) not in self.before.model.parts],
-        )
+        before = self.before
+        added = [each for each in self.after.model.effects if str(each) not in before.model.parts]
         component, component_sigma = _component(self.after, added)
         return EffectShape(
             effect=self.name, words=driver.words, symbol=driver.symbol, unit=driver.unit, values=driver.values,

@@ -321,7 +321,7 @@ class RunPosterior:
                 self._disturbed = self._disturbed or disturbed
                 self._no_oscillation |= {str(effect) for effect in refit.model.effects if effect.oscillates}
                 return row
-        folded, before = refit.fit.dwells[0], self._before.fit.dwells[0]
+        folded, before = refit.fit.dwells.folded, self._before.fit.dwells.folded
         otherwise = (folded.carrier_hz, folded.averaged) != (before.carrier_hz, before.averaged)
         if self._run.walk in row.effects or otherwise:
             return replace(row, refit=refit)

@@ -158,7 +158,7 @@ class Folder:
             autocovariance, spectrum = Autocovariance.of(residuals), Spectrum.of(residuals, rows.elapsed_s)
             block = replace(block, autocovariance=autocovariance, spectrum=spectrum)
         self._cells = self._cells or Cells.of(rows.elapsed_s)
-        if self._cells and not rows.moving and not block.averaged and self._traced < MOST_CELLS:
+        if self._cells and not rows.moving and not block.pieces.averaged and self._traced < MOST_CELLS:
             block = replace(block, trace=Trace.of(readings, rows.elapsed_s, self._cells))
             self._traced += len(block.trace)
         growing.add(block)

@@ -63,6 +63,11 @@ class Pieces:
             some[0].carrier_hz,
         )  # fmt: skip
 
+    @property
+    def averaged(self) -> bool:
+        """Whether averages of readings were folded instead of the readings themselves."""
+        return self.nodes.variance_mps2_2 is not None
+
     def __len__(self) -> int:
         return len(self.counts)
 

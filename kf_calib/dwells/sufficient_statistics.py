@@ -96,11 +96,6 @@ class Dwell:
         return self.pieces.carrier_hz
 
     @property
-    def averaged(self) -> bool:
-        """Whether averages of readings were folded instead of the readings themselves."""
-        return self.pieces.nodes.variance_mps2_2 is not None
-
-    @property
     def start_s(self) -> float:
         """Time of the first reading since the first sample, s."""
         return float(self.pieces.nodes.elapsed_s[0])

@@ -110,7 +110,7 @@ class FoldedDwells:
     @property
     def averaged(self) -> bool:
         """Whether averages of readings were folded instead of the readings themselves."""
-        return self.pieces.nodes.variance_mps2_2 is not None
+        return self.pieces.averaged
 
     @cached_property
     def piece_numbers(self) -> Indices:

@@ -51,32 +51,32 @@ def at_their_modes(
 
     untold: the ``untold_directions`` of the run, where the dwells are not all of it.
     """
-    stack = linearised.dwells
+    table = linearised.dwells
     if not noise.setting_rad:
-        return without_attitudes(stack)
+        return without_attitudes(table)
     bendings = bendings_of(linearised, state)
     if noise.setting.considered:
-        variances = np.full(len(stack), 2.0 * noise.setting_rad**2)
-        return stack.linearised(stack.turned_rad, Attitudes(np.zeros((len(stack), 3)), variances, bendings))
+        variances = np.full(len(table), 2.0 * noise.setting_rad**2)
+        return table.linearised(table.turned_rad, Attitudes(np.zeros((len(table), 3)), variances, bendings))
     moved, variances = _posterior_rotations(linearised.means, noise, state, bendings)
-    forces, before = linearised.means.force_mps2, np.zeros((len(stack), 3))
-    if stack.attitudes is not None:
-        forces, before = forces / stack.attitudes.length[:, None], stack.attitudes.rotation_rad
+    forces, before = linearised.means.force_mps2, np.zeros((len(table), 3))
+    if table.attitudes is not None:
+        forces, before = forces / table.attitudes.length[:, None], table.attitudes.rotation_rad
     if noise.attitude_unknown:
-        return _facing(stack, turned(forces, _limited(moved)), variances, noise, state, bendings)
+        return _facing(table, turned(forces, _limited(moved)), variances, noise, state, bendings)
     untold = untold_directions(linearised, noise) if untold is None else untold
     shown = _shown_forces(linearised.dwells_at_state)
     forces = turned(forces, _limited(moved - before))
     forces = forces - (forces - shown) @ untold.T @ untold
-    return stack.linearised(None, Attitudes(rotations_between(shown, forces), variances, bendings))
+    return table.linearised(None, Attitudes(rotations_between(shown, forces), variances, bendings))
 
 
 def _facing(
-    stack: DwellTable, forces: Floats, variances: Floats, noise: Noise, state: Floats, bendings: Floats
+    table: DwellTable, forces: Floats, variances: Floats, noise: Noise, state: Floats, bendings: Floats
 ) -> DwellTable:
     """Return dwells of no known attitude with forces (D, 3), of components across them with ``variances`` (D,)."""
-    variances = variances + _wander_rad2(stack, noise, state, forces)
-    return with_forces(stack, forces, Attitudes(np.zeros((len(stack), 3)), variances, bendings), state)
+    variances = variances + _wander_rad2(table, noise, state, forces)
+    return with_forces(table, forces, Attitudes(np.zeros((len(table), 3)), variances, bendings), state)
 
 
 def without_attitudes(dwells: DwellTable) -> DwellTable:
@@ -99,18 +99,18 @@ def untold_directions(linearised: LinearisedDwells, noise: Noise) -> Floats:
     return directions.T[variances < (_UNTOLD * noise.setting_rad) ** 2]
 
 
-def _shown_forces(stack: DwellTable) -> Floats:
+def _shown_forces(table: DwellTable) -> Floats:
     """Return the mean specific forces (D, 3) that the recorded poses show."""
-    shown = stack.means[:, 1:4]
-    return shown if stack.turned_rad is None else turned(shown, stack.turned_rad)
+    shown = table.means[:, 1:4]
+    return shown if table.turned_rad is None else turned(shown, table.turned_rad)
 
 
-def _wander_rad2(stack: DwellTable, noise: Noise, state: Floats, forces: Floats) -> Floats:
+def _wander_rad2(table: DwellTable, noise: Noise, state: Floats, forces: Floats) -> Floats:
     """Return the mean square (D,) of the angle by which the force wanders about its mean within each dwell: what the
     readings spread across it beyond their noise. A hand creeps and trembles, and a mean of directions is shorter than
     each."""
     inverse = np.linalg.inv(state[:STATE_COUNT].reshape(3, 4)[:, :3])
-    beyond = inverse @ (stack.folded.spreads - np.diag(noise.sigma_mps2**2)) @ inverse.T
+    beyond = inverse @ (table.folded.spreads - np.diag(noise.sigma_mps2**2)) @ inverse.T
     squares = np.sum(forces**2, axis=1)
     across = np.einsum("dii->d", beyond) - np.einsum("di,dij,dj->d", forces, beyond, forces) / squares
     return np.clip(across / squares, 0.0, _FARTHEST_RAD**2)

@@ -36,26 +36,26 @@ def stimulus_of(dwells: DwellTable, bench: Bench, state: Floats) -> Stimulus:
     return Stimulus(bench=bench, sensitivity=state[:12].reshape(3, 4)[:, :3], **known)
 
 
-def _conditions(stack: DwellTable) -> dict[str, Any]:
+def _conditions(table: DwellTable) -> dict[str, Any]:
     """Return the forces (m, 3) and poses (m, k) that the angles show at the nodes of the dwells, and before them.
 
     The last step stays that of the poses: where a pose changes nothing along an axis, its sign is not that of noise.
     """
-    (forces, poses), times = stack.before, 3 * stack.folded.piece_numbers
+    (forces, poses), times = table.before, 3 * table.folded.piece_numbers
     before = np.repeat(forces, times, axis=0)
-    if stack.turned_rad is not None or stack.attitudes is not None:
-        before += stack.felt_force_mps2 - stack.force_mps2
+    if table.turned_rad is not None or table.attitudes is not None:
+        before += table.felt_force_mps2 - table.force_mps2
     previous_pose = np.repeat(poses, times, axis=0)
-    return {"previous_force_mps2": before, "pose": stack.pose, "previous_pose": previous_pose}
+    return {"previous_force_mps2": before, "pose": table.pose, "previous_pose": previous_pose}
 
 
-def _turned_conditions(stack: DwellTable) -> dict[str, Any]:
+def _turned_conditions(table: DwellTable) -> dict[str, Any]:
     """Return the specific force (m, 3) that is felt at the nodes, and by what it is turned there."""
-    conditions = dict[str, Any](force_mps2=stack.felt_force_mps2)
-    if stack.turned_rad is not None or stack.attitudes is not None:
-        still, times = np.zeros((len(stack), 3)), 3 * stack.folded.piece_numbers
-        turned_rad = still if stack.turned_rad is None else stack.turned_rad
-        attitude_rad = still if stack.attitudes is None else stack.attitudes.rotation_rad
+    conditions = dict[str, Any](force_mps2=table.felt_force_mps2)
+    if table.turned_rad is not None or table.attitudes is not None:
+        still, times = np.zeros((len(table), 3)), 3 * table.folded.piece_numbers
+        turned_rad = still if table.turned_rad is None else table.turned_rad
+        attitude_rad = still if table.attitudes is None else table.attitudes.rotation_rad
         conditions["turned_rad"] = np.repeat(turned_rad, times, axis=0)
         conditions["attitude_rad"] = np.repeat(attitude_rad, times, axis=0)
     return conditions
@@ -248,11 +248,11 @@ def dwells_at_state(dwells: DwellTable, model: Model, state: Floats) -> DwellTab
     return there.plus(on_basis(nodes))
 
 
-def _rotations_of_effects(stack: DwellTable, model: Model, state: Floats) -> Floats | None:
+def _rotations_of_effects(table: DwellTable, model: Model, state: Floats) -> Floats | None:
     """Return the mean rotation vector (D, 3) of each dwell by effects of the frame; None where they are little."""
     if not model.bench.angles or not any(isinstance(effect, FrameEffect) for effect in model.effects):
         return None
-    rotations, ends = model.turned_rad(stimulus_of(stack, model.bench, state), state), 3 * stack.folded.ends
+    rotations, ends = model.turned_rad(stimulus_of(table, model.bench, state), state), 3 * table.folded.ends
     means = np.add.reduceat(rotations, ends[:-1], axis=0) / np.diff(ends)[:, None]
     return means if _LITTLE_RAD < np.abs(means).max() < _ABSURD_RAD else None
 

@@ -61,7 +61,9 @@ class Frame:
         )
         self.parts = slices(counts_of(effects))
         self._stimulus = stimulus_of(linearised.dwells_at_state, linearised.model.bench, linearised.state)
-        self._whitening = None if _inside(noise) else MisfitColumns(linearised.dwells_at_state, noise, linearised.state)
+        self._whitening = (
+            None if noise.walk.steps else MisfitColumns(linearised.dwells_at_state, noise, linearised.state)
+        )
         self.basis, self.coordinates = orthonormal(self.whitened(linearised, effects))
         self._periodogram: tuple[tuple[tuple[str, float], bytes], Periodogram] | None = None
         self._lines: dict[float, tuple[SpectralLine, ...]] = {}
@@ -248,7 +250,7 @@ def _judged(
 
 def _stacked(rows: Sequence[Floats], dwells: DwellTable, noise: Noise) -> Floats:
     """Concatenate all rows; if the biases walk, whiten them with respect to the walk."""
-    return random_walk.whiten_walk(rows, steps(dwells, noise)) if _inside(noise) else np.concatenate(rows)
+    return random_walk.whiten_walk(rows, steps(dwells, noise)) if noise.walk.steps else np.concatenate(rows)
 
 
 def _with_and_without_walk(
@@ -259,9 +261,4 @@ def _with_and_without_walk(
     those of the dwells alone with the walk still in them; and how many columns the first ``width`` become with W."""
     rows, count = _judged(linearised.dwells_at_state, linearised.columns, noise, state, width)
     of_dwells = np.concatenate(rows[len(rows) - len(linearised.dwells) :])
-    return _stacked(rows, linearised.dwells, noise), of_dwells[:, _inside(noise) :], count
-
-
-def _inside(noise: Noise) -> int:
-    """Number of leading columns of a dwell's rows that belong to the steps of the biases within the dwell."""
-    return 3 if noise.walk_mps2_per_sqrt_s else 0
+    return _stacked(rows, linearised.dwells, noise), of_dwells[:, noise.walk.steps :], count

@@ -54,19 +54,18 @@ def whiten(
     - reduced: reduce the rows to the rank of their columns. Without it all rows are returned, which is faster if there
       are many columns.
     """
-    inside = 3 if noise.walk_mps2_per_sqrt_s else 0
     values = of_all_pieces(columns)
-    stack = DwellTable.of(dwells)
-    noise_about = _About.of(stack, noise, state, about)
-    batches = list(_batches(stack, values.shape[-1]))
+    table = DwellTable.of(dwells)
+    noise_about = _About.of(table, noise, state, about)
+    batches = list(_batches(table, values.shape[-1]))
     by_means = [reduced and batch.tells_means_only(values, noise_about) for batch in batches]
     if all(by_means):
-        rows_of_means = np.empty((len(stack), 3, values.shape[-1] + 1))
+        rows_of_means = np.empty((len(table), 3, values.shape[-1] + 1))
         for batch in batches:
             rows_of_means[batch.dwells] = _of_means(batch, values[batch.pieces], noise_about)
-        return OfPieces(rows_of_means.reshape(-1, rows_of_means.shape[2]), 3 * np.arange(len(stack) + 1))
-    informative = np.append(np.ones(inside), _units(values)) if reduced else None
-    all_rows = list[Floats]([np.empty((0, 0))] * len(stack))
+        return OfPieces(rows_of_means.reshape(-1, rows_of_means.shape[2]), 3 * np.arange(len(table) + 1))
+    informative = np.append(np.ones(noise.walk.steps), _units(values)) if reduced else None
+    all_rows = list[Floats]([np.empty((0, 0))] * len(table))
     for batch, is_by_means in zip(batches, by_means, strict=True):
         of_batch = values[batch.pieces]
         if is_by_means:
@@ -95,14 +94,9 @@ class _About:
     about: Floats | None
 
     @classmethod
-    def of(cls, stack: DwellTable, noise: Noise, state: Floats, about: Floats | None = None) -> _About:
+    def of(cls, table: DwellTable, noise: Noise, state: Floats, about: Floats | None = None) -> _About:
         """That of some dwells."""
-        return cls(noise, noise.columns("dwell", stack, state), state, about)
-
-    @property
-    def steps(self) -> int:
-        """Number of columns of the steps of the biases, one for each accelerometer."""
-        return 3 if self.noise.walk_mps2_per_sqrt_s else 0
+        return cls(noise, noise.columns("dwell", table, state), state, about)
 
     @property
     def errors(self) -> int:
@@ -115,14 +109,14 @@ class _Batch:
     """Dwells of one shape, few enough for their rows to stay in the cache: the number of the shape, and which of its
     dwells they are."""
 
-    stack: DwellTable
+    table: DwellTable
     number: int
     part: slice
 
     @property
     def shape(self) -> AlikeDwells:
         """The shape."""
-        return self.stack.folded.shapes[self.number]
+        return self.table.folded.shapes[self.number]
 
     @property
     def dwells(self) -> NDArray[np.intp]:
@@ -137,12 +131,7 @@ class _Batch:
     @cached_property
     def triangles(self) -> Floats:
         """Their triangles (d, P, K + 3, K + 3)."""
-        return self.stack.triangles[self.pieces]
-
-    @property
-    def force_mps2(self) -> Floats:
-        """The specific force (d, P, 3, 3) that is felt at the nodes."""
-        return self.stack.felt_force_mps2.reshape(-1, 3, 3)[self.pieces]
+        return self.table.triangles[self.pieces]
 
     def rows_of(self, values: Floats, height: int) -> Floats:
         """The first ``height`` rows (d, P, height, c) of columns given at the nodes (d, P, K, c). If it is one, only
@@ -153,23 +142,19 @@ class _Batch:
 
     def tells_means_only(self, columns: Floats, about: _About) -> bool:
         """Whether only the mean of each dwell tells something of the states, so that whitened rows have full rank:
-        nothing else is known, or the columns (pieces, K, 3, p) and the force are constant within every dwell."""
+        nothing else is known, or the columns (pieces, K, 3, p) and what errors change are constant within each."""
         if about.noise.walk_mps2_per_sqrt_s or about.noise.attitude_unknown:
             return False
-        if self.pieces.shape[1] == 1 and not self.triangles[:, 0, 1 : self.stack.folded.width].any():
+        if self.pieces.shape[1] == 1 and not self.triangles[:, 0, 1 : self.table.folded.width].any():
             return True
-        return (
-            _is_constant(columns[self.pieces])
-            and _is_constant(self.force_mps2)
-            and _is_constant(about.changes[self.pieces])
-        )
+        return _is_constant(columns[self.pieces]) and _is_constant(about.changes[self.pieces])
 
 
-def _batches(stack: DwellTable, width: int) -> Iterator[_Batch]:
+def _batches(table: DwellTable, width: int) -> Iterator[_Batch]:
     """Group dwells whose rows have one shape, limited so that their ``width`` columns fit into the cache."""
-    for number, shape in enumerate(stack.folded.shapes):
-        most = max(_AT_ONCE // (3 * shape.pieces.shape[1] * stack.folded.width * (width + 1)), 1)
-        yield from (_Batch(stack, number, slice(k, k + most)) for k in range(0, len(shape.dwells), most))
+    for number, shape in enumerate(table.folded.shapes):
+        most = max(_AT_ONCE // (3 * shape.pieces.shape[1] * table.folded.width * (width + 1)), 1)
+        yield from (_Batch(table, number, slice(k, k + most)) for k in range(0, len(shape.dwells), most))
 
 
 def _weighted(batch: _Batch, columns: Floats, about: _About) -> tuple[Floats, int]:
@@ -181,14 +166,14 @@ def _weighted(batch: _Batch, columns: Floats, about: _About) -> tuple[Floats, in
     noise, many, count = about.noise, len(columns), about.errors
     parts = _channels(batch, columns, about, columns.shape[2])
     sigma = noise.effective_sigma_mps2
-    roots = np.sqrt(batch.stack.folded.weights[batch.dwells])
+    roots = np.sqrt(batch.table.folded.weights[batch.dwells])
     parts /= (sigma / roots)[:, :, None, None]
     walks = roots * (noise.walk_mps2_per_sqrt_s / sigma)
     if noise.attitude_unknown:
         along = _unit_along(batch, noise, about.state)
         parts, walks = _combined(parts, along), np.sqrt((along**2)[:, None] @ (walks**2)[:, :, None])[:, :, 0]
-    if about.steps:
-        paths = batch.stack.folded.walks
+    if noise.walk.steps:
+        paths = batch.table.folded.walks
         for dwell_parts, k, ratios in zip(parts, batch.dwells.tolist(), walks, strict=True):
             for part, ratio in zip(dwell_parts, ratios.tolist(), strict=True):
                 part[:] = paths[k].whiten(part, ratio)
@@ -206,7 +191,7 @@ def _of_means(batch: _Batch, columns: Floats, about: _About) -> Floats:
     """
     count = about.errors
     roots = batch.triangles[:, :, 0, 0]
-    sigmas = about.noise.effective_sigma_mps2 / np.sqrt(batch.stack.folded.weights[batch.dwells])
+    sigmas = about.noise.effective_sigma_mps2 / np.sqrt(batch.table.folded.weights[batch.dwells])
     along = (roots / np.linalg.norm(roots, axis=1, keepdims=True))[:, None, None, :]
     rows = (along @ _channels(batch, columns, about, 1))[:, :, 0] / sigmas[:, :, None]
     changes = rows[..., :count]
@@ -222,14 +207,14 @@ def _channels(batch: _Batch, columns: Floats, about: _About, height: int) -> Flo
     before they are divided by their sigma."""
     many, pieces, functions, _, _ = columns.shape
     shape, readings = (many, pieces * height, -1), batch.triangles[:, :, :height, functions:]
-    changes, first, last = about.changes[batch.pieces], about.errors, about.errors + about.steps
+    changes, first, last = about.changes[batch.pieces], about.errors, about.errors + about.noise.walk.steps
     parts = np.zeros((many, 3, pieces * height, last + columns.shape[-1] + 1))
     for i in range(3):
         part = parts[:, i]
         if first:
             part[..., :first] = batch.rows_of(changes[..., i, :], height).reshape(shape)
-        if about.steps:
-            steps = [batch.stack.folded.walks[k].step for k in batch.dwells.tolist()]
+        if about.noise.walk.steps:
+            steps = [batch.table.folded.walks[k].step for k in batch.dwells.tolist()]
             part[..., first + i : first + i + 1] = np.array(steps)[..., None]
         part[..., last:-1] = batch.rows_of(columns[..., i, :], height).reshape(shape)
         measured = readings[..., i, None]
@@ -241,8 +226,8 @@ def _channels(batch: _Batch, columns: Floats, about: _About, height: int) -> Flo
 
 def _unit_along(batch: _Batch, noise: Noise, state: Floats) -> Floats:
     """Return the unit vectors (d, 3) by which whitened channels are combined to the size of the force."""
-    sensitivities = sensitivities_of(batch.stack, state, batch.dwells)
-    along = along_force(batch.stack, sensitivities, batch.dwells) * noise.effective_sigma_mps2
+    sensitivities = sensitivities_of(batch.table, state, batch.dwells)
+    along = along_force(batch.table, sensitivities, batch.dwells) * noise.effective_sigma_mps2
     return along / np.linalg.norm(along, axis=1, keepdims=True)
 
 
@@ -302,14 +287,14 @@ class MisfitColumns:
     """
 
     def __init__(self, dwells: Sequence[Dwell], noise: Noise, state: Floats) -> None:
-        stack, judging = DwellTable.of(dwells), noise.with_scatter_as_flicker(len(dwells))
-        self._sigma, shared = noise.effective_sigma_mps2, judging.columns("run", stack, state).shape[3]
-        about = _About.of(stack, judging, state)
-        channels, width = 1 if noise.attitude_unknown else 3, stack.folded.width
-        lengths = channels * stack.folded.piece_numbers * width + about.errors
+        table, judging = DwellTable.of(dwells), noise.with_scatter_as_flicker(len(dwells))
+        self._sigma, shared = noise.effective_sigma_mps2, judging.columns("run", table, state).shape[3]
+        about = _About.of(table, judging, state)
+        channels, width = 1 if noise.attitude_unknown else 3, table.folded.width
+        lengths = channels * table.folded.piece_numbers * width + about.errors
         self._groups, self.ends = list[_Alike](), shared + np.append(0, np.cumsum(lengths))
         """The first row of each dwell, and at last the number of rows."""
-        for batch in _batches(stack, _USUAL):
+        for batch in _batches(table, _USUAL):
             rows, count = _weighted(batch, np.zeros((*batch.pieces.shape, width, 3, 0)), about)
             group = _Alike(
                 batch.pieces,
@@ -317,7 +302,7 @@ class MisfitColumns:
                 batch.triangles[:, :, :width, :width],
                 np.linalg.qr(rows[..., :count])[0],
                 _unit_along(batch, noise, state) if noise.attitude_unknown else None,
-                np.sqrt(stack.folded.weights[batch.dwells]),
+                np.sqrt(table.folded.weights[batch.dwells]),
             )
             self._groups.append(group)
 
@@ -345,9 +330,9 @@ def with_frame(rows: Sequence[Floats], model: Model, noise: Noise, first: int = 
     reading of that state times g. They join the rows at index ``first``."""
     if not model.fixed:
         return rows
-    fixing, inside = np.zeros((len(model.fixed), rows[first].shape[1])), 3 if noise.walk_mps2_per_sqrt_s else 0
+    fixing = np.zeros((len(model.fixed), rows[first].shape[1]))
     for k, place in enumerate(model.fixed):
-        fixing[k, inside + place] = model.bench.gravity_mps2 / noise.effective_sigma_mps2[0]
+        fixing[k, noise.walk.steps + place] = model.bench.gravity_mps2 / noise.effective_sigma_mps2[0]
     return [*rows[:first], np.vstack([fixing, rows[first]]), *rows[first + 1 :]]
 
 

@@ -29,28 +29,28 @@ def with_waves_in_dwells(noise: Noise, dwells: Sequence[Dwell], columns: Sequenc
     The likeliest h of each accelerometer; one for all three where attitudes are not known. ``columns`` are those of the
     model at the nodes of each dwell, (pieces, nodes, 3, p), ``state`` (p,) its estimate.
     """
-    stack = DwellTable.of(dwells)
-    if not noise.scatter_mps2.any() or noise.walk_mps2_per_sqrt_s or stack.folded.carrier_hz:
+    table = DwellTable.of(dwells)
+    if not noise.scatter_mps2.any() or noise.walk_mps2_per_sqrt_s or table.folded.carrier_hz:
         return noise
-    if stack.folded.shows_means_only:
+    if table.folded.shows_means_only:
         return noise
     channels = np.eye(3)[None].repeat(len(dwells), axis=0)
     if noise.attitude_unknown:
-        along = along_force(stack, sensitivities_of(stack, state))
+        along = along_force(table, sensitivities_of(table, state))
         channels = (along / np.linalg.norm(along, axis=1, keepdims=True))[:, None]
-    amplitudes, variances = _amplitudes(stack, of_all_pieces(columns) @ state, noise.effective_sigma_mps2, channels)
+    amplitudes, variances = _amplitudes(table, of_all_pieces(columns) @ state, noise.effective_sigma_mps2, channels)
     sizes = [_likeliest(amplitudes[..., i], variances[..., i]) for i in range(channels.shape[1])]
     return noise.with_terms(SlowWaves(np.broadcast_to(sizes, 3))) if any(sizes) else noise
 
 
-def _amplitudes(stack: DwellTable, predicted: Floats, sigma: Floats, weights: Floats) -> tuple[Floats, Floats]:
+def _amplitudes(table: DwellTable, predicted: Floats, sigma: Floats, weights: Floats) -> tuple[Floats, Floats]:
     """Return the amplitudes (D, k, c) of the slow waves in what a prediction (pieces, nodes, 3) leaves of each dwell
     beside its mean, and their variances (D, k, c) by the noise of the readings, in channels with ``weights`` (D, c,
     3)."""
-    amplitudes, courses = np.empty((len(stack), len(SLOW), weights.shape[1])), on_basis(waves_in_dwells(stack.folded))
+    amplitudes, courses = np.empty((len(table), len(SLOW), weights.shape[1])), on_basis(waves_in_dwells(table.folded))
     variances, coefficients = np.empty_like(amplitudes), on_basis(predicted)
-    for shape in stack.folded.shapes:
-        triangles = stack.triangles[shape.pieces]
+    for shape in table.folded.shapes:
+        triangles = table.triangles[shape.pieces]
         upper, many = triangles[:, :, :3, :3], len(shape.dwells)
         ours = weights[shape.dwells]
         left = triangles[:, :, :3, 3:] - upper @ coefficients[shape.pieces]
@@ -62,7 +62,7 @@ def _amplitudes(stack: DwellTable, predicted: Floats, sigma: Floats, weights: Fl
         waves, left = waves - unit @ (along @ waves), left - unit @ (along @ left)
         back = np.swapaxes(waves, 1, 2)
         inverse = np.linalg.pinv(back @ waves, rcond=1e-9, hermitian=True)
-        by_readings = np.einsum("dci,di->dc", ours**2, sigma**2 / stack.folded.weights[shape.dwells])
+        by_readings = np.einsum("dci,di->dc", ours**2, sigma**2 / table.folded.weights[shape.dwells])
         spreads = np.maximum(np.einsum("dkk->dk", inverse), 1e-300)[:, :, None] * by_readings[:, None]
         amplitudes[shape.dwells], variances[shape.dwells] = inverse @ (back @ left), spreads
     return amplitudes, variances

@@ -47,21 +47,21 @@ class Means:
 
 def means_of(dwells: Sequence[Dwell], columns: Sequence[Floats]) -> Means:
     """The means of dwells with these columns."""
-    stack, values = DwellTable.of(dwells), of_all_pieces(columns)
-    if stack.folded.shows_means_only and not values.strides[1]:  # the same at all nodes
+    table, values = DwellTable.of(dwells), of_all_pieces(columns)
+    if table.folded.shows_means_only and not values.strides[1]:  # the same at all nodes
         design = values[:, 0]
     else:
-        design = _design(stack, values)
+        design = _design(table, values)
     return Means(
-        design, stack.means[:, 4:], stack.felt_means_mps2, stack.folded.weights * stack.folded.counts[:, None],
-        stack.folded.ends_s, stack.bendings,
+        design, table.means[:, 4:], table.felt_means_mps2, table.folded.weights * table.folded.counts[:, None],
+        table.folded.ends_s, table.bendings,
     )  # fmt: skip
 
 
-def _design(stack: DwellTable, values: Floats) -> Floats:
+def _design(table: DwellTable, values: Floats) -> Floats:
     """Return the means (D, 3, p) of columns (pieces, K nodes, 3, p)."""
-    folded, of_pieces = stack.folded, np.empty((len(values), values[0, 0].size))
-    first = stack.triangles[:, 0, : folded.width] / stack.triangles[:, :1, 0]  # means of the basis
+    folded, of_pieces = table.folded, np.empty((len(values), values[0, 0].size))
+    first = table.triangles[:, 0, : folded.width] / table.triangles[:, :1, 0]  # means of the basis
     for part in (slice(k, k + _AT_ONCE) for k in range(0, len(first), _AT_ONCE)):
         of_pieces[part] = (first[part, None] @ basis_values(values[part]))[:, 0]
-    return folded.weighted(of_pieces).reshape(len(stack), *values.shape[2:])
+    return folded.weighted(of_pieces).reshape(len(table), *values.shape[2:])

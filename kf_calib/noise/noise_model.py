@@ -175,10 +175,10 @@ class Noise:
 
     def columns(self, scope: Scope, dwells: Sequence[Dwell], state: Floats) -> Floats:
         """Changes (pieces, nodes, 3, q) of the readings by 1 sigma of each error of one scope."""
-        stack = DwellTable.of(dwells)
-        columns = [term.columns(stack, state) for term in self.terms if term.scope == scope]
+        table = DwellTable.of(dwells)
+        columns = [term.columns(table, state) for term in self.terms if term.scope == scope]
         if not columns:
-            return np.zeros((stack.folded.ends[-1], stack.folded.width, 3, 0))
+            return np.zeros((table.folded.ends[-1], table.folded.width, 3, 0))
         return columns[0] if len(columns) == 1 else np.concatenate(columns, axis=3)
 
 
@@ -195,12 +195,11 @@ def mean_covariances(noise: Noise, means: Means, state: Floats, misfit_mps2: flo
     An attitude that is not known counts as a setting error so large that it leaves the size of f alone, also where the
     noise is not known yet and is to be estimated from a misfit of this rms size.
     """
-    white = noise.effective_sigma_mps2**2 / means.counts
-    largest_mps2 = max(float(np.sqrt((white + noise.scatter_mps2**2).max())), misfit_mps2)
-    covariances = white[:, :, None] * np.eye(3)
-    for term in noise.terms:
-        covariances = covariances + term.covariances(means, state, largest_mps2)
-    return covariances
+    covariances = (noise.effective_sigma_mps2**2 / means.counts)[:, :, None] * np.eye(3)
+    for term in noise.without(SettingError).terms:
+        covariances = covariances + term.covariances(means, state)
+    largest_mps2 = max(float(np.sqrt(np.einsum("dii->di", covariances).max())), misfit_mps2)
+    return covariances + noise.setting.covariances(means, state, largest_mps2)
 
 
 def lift_rounding(covariances: Floats) -> Floats:

@@ -318,12 +318,12 @@ def gain_of(part: Part, noise: Noise, means: Means, state: Floats, prior: Floats
 def with_shared_noise(dwells: Sequence[Dwell], noise: Noise, means: Means, state: Floats) -> tuple[Means, Floats]:
     """Means with additional columns for the noise that dwells have in common, the terms of the run, and the rows (q, p
     + q + 1) of the prior of their coefficients."""
-    stack = DwellTable.of(dwells)
-    columns = noise.with_scatter_as_flicker(len(stack)).columns("run", stack, state)
+    table = DwellTable.of(dwells)
+    columns = noise.with_scatter_as_flicker(len(table)).columns("run", table, state)
     count = columns.shape[3]
     if not count:
         return means, np.zeros((0, means.design.shape[2] + 1))
-    added = means_of(stack, OfPieces(columns, stack.folded.ends)).design
+    added = means_of(table, OfPieces(columns, table.folded.ends)).design
     prior = np.zeros((count, means.design.shape[2] + count + 1))
     prior[:, means.design.shape[2] : -1] = np.eye(count)
     return replace(means, design=np.concatenate([means.design, added], axis=2)), prior

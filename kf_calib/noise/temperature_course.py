@@ -209,7 +209,7 @@ def thermometer_errors(dwells: Sequence[Dwell], sensitivity_mps2_per_k: Floats) 
 
 def _regressors(dwells: Sequence[Dwell]) -> Floats:
     """Return 1, f, T and T f at the nodes of all dwells, (m, 8)."""
-    stack = DwellTable.of(dwells)
-    regressors = np.hstack([np.ones((len(stack.force_mps2), 1)), stack.force_mps2])
-    warmth = temperature_course(stack.folded).temperature_c - REFERENCE_TEMPERATURE_C
+    table = DwellTable.of(dwells)
+    regressors = np.hstack([np.ones((len(table.force_mps2), 1)), table.force_mps2])
+    warmth = temperature_course(table.folded).temperature_c - REFERENCE_TEMPERATURE_C
     return np.hstack([regressors, warmth[:, None] * regressors])

@@ -64,10 +64,9 @@ class NoiseTerm(ABC):
         """Changes (pieces, nodes, 3, q) of the readings by 1 sigma of each of its q errors, for a model at ``state``
         (p,)."""
 
-    def covariances(self, means: Means, state: Floats, largest_mps2: float) -> Floats | float:
-        """Covariances (D, 3, 3) of the dwells' mean readings by errors that are drawn for each dwell; ``largest_mps2``
-        is the largest sigma that they have by other noise."""
-        del means, state, largest_mps2
+    def covariances(self, means: Means, state: Floats) -> Floats | float:
+        """Covariances (D, 3, 3) of the dwells' mean readings by errors that are drawn for each dwell."""
+        del means, state
         return 0.0
 
 
@@ -110,9 +109,9 @@ class SettingError(NoiseTerm):
         changes = force_mps2 @ np.repeat(turning, dwells.folded.piece_numbers, axis=0)
         return np.asarray(changes.reshape(pieces, 3, 3, 3), float)
 
-    def covariances(self, means: Means, state: Floats, largest_mps2: float) -> Floats | float:
-        """sigma_alpha^2 S (|f|^2 I - f f^T) S^T; an attitude that is not known counts as a sigma_alpha so large that it
-        leaves the size of f alone."""
+    def covariances(self, means: Means, state: Floats, largest_mps2: float = 0.0) -> Floats | float:
+        """sigma_alpha^2 S (|f|^2 I - f f^T) S^T; an attitude that is not known counts as a sigma_alpha so large, beside
+        the largest sigma of a mean by other noise, that it leaves the size of f alone."""
         size_rad = self.size_rad
         if self.is_unknown:
             size_rad = _TURNED * largest_mps2 / np.linalg.norm(means.force_mps2, axis=1).max()
@@ -137,7 +136,7 @@ class Scatter(NoiseTerm):
         columns[:, :, channels, np.arange(len(channels))] = self.sizes_mps2[channels]
         return columns
 
-    def covariances(self, means: Means, state: Floats, largest_mps2: float) -> Floats | float:
+    def covariances(self, means: Means, state: Floats) -> Floats | float:
         return np.diag(self.sizes_mps2**2)
 
     def flicker_mps2(self, dwells: int) -> Floats:
@@ -246,6 +245,12 @@ class RandomWalk(NoiseTerm):
     @property
     def sizes(self) -> Floats:
         return np.array([self.intensity_mps2_per_sqrt_s])
+
+    @property
+    def steps(self) -> int:
+        """Number of columns of the steps that the biases take within a dwell: one for each accelerometer, none where
+        they do not walk."""
+        return 3 if self.intensity_mps2_per_sqrt_s else 0
 
     def columns(self, dwells: DwellTable, state: Floats) -> Floats:
         return np.zeros((dwells.folded.ends[-1], 3, 3, 0))

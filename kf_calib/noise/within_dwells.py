@@ -36,20 +36,20 @@ def within_dwells(dwells: Sequence[Dwell], walk_mps2_per_sqrt_s: float = 0.0, al
     about a parabola has the expectation sigma^2 (n - 3 kappa) if n is at least 40 kappa. If there is no such piece,
     sigma_w is taken from the autocovariance.
     """
-    stack = DwellTable.of(dwells)
-    within_seen = bool((stack.folded.counts > 1).any())
+    table = DwellTable.of(dwells)
+    within_seen = bool((table.folded.counts > 1).any())
     if walk_mps2_per_sqrt_s:
-        inflation, variance = _correlation(stack.folded, walk_mps2_per_sqrt_s)
+        inflation, variance = _correlation(table.folded, walk_mps2_per_sqrt_s)
     else:  # the same for all fits to the dwells
-        inflation, variance = _correlation_without_walk(stack.folded)
+        inflation, variance = _correlation_without_walk(table.folded)
     if along is not None:
-        return Noise(_sigma_along(stack, along, inflation), inflation, within_seen=within_seen)
-    counts, of_pieces = stack.folded.piece_counts, np.repeat(stack.folded.weights, stack.folded.piece_numbers, axis=0)
-    squares = of_pieces * stack.folded.squares
+        return Noise(_sigma_along(table, along, inflation), inflation, within_seen=within_seen)
+    counts, of_pieces = table.folded.piece_counts, np.repeat(table.folded.weights, table.folded.piece_numbers, axis=0)
+    squares = of_pieces * table.folded.squares
     if walk_mps2_per_sqrt_s:
-        rest = of_pieces * np.concatenate([walk.about_parabola for walk in stack.folded.walks])[:, None]
+        rest = of_pieces * np.concatenate([walk.about_parabola for walk in table.folded.walks])[:, None]
         squares = np.maximum(squares - walk_mps2_per_sqrt_s**2 * rest, 0.0)
-    on_carrier = stack.folded.width - 3
+    on_carrier = table.folded.width - 3
     long = counts[:, None] >= np.where(variance > 0, 40.0 * inflation, 0.0)
     freedom = np.where(long, np.maximum(counts[:, None] - 3.0 * inflation - on_carrier, 0.0), 0.0).sum(axis=0)
     pooled = np.where(long, squares, 0.0).sum(axis=0) / np.maximum(freedom, 1.0)
@@ -76,14 +76,14 @@ def _correlation(folded: FoldedDwells, walk_mps2_per_sqrt_s: float) -> tuple[Flo
     return np.maximum(inflation, _too_short(inflation, total.count / total.blocks)), variance
 
 
-def _sigma_along(stack: DwellTable, along: Floats, inflation: Floats) -> Floats:
+def _sigma_along(table: DwellTable, along: Floats, inflation: Floats) -> Floats:
     """Return sigma_w (3,) of the accelerometers from the readings along the force alone, which have the variance sum of
     (m_i sigma_i)^2 with m = ``along`` (D, 3).
 
     The likeliest variances of such gamma distributed sums, by steps that keep them positive. The readings of a dwell
     then have one weight in all channels.
     """
-    weights, folded = along**2, stack.folded
+    weights, folded = along**2, table.folded
     squares = folded.weights[:, 0] * folded.squares_along(along)
     freedom = np.add.reduceat(np.maximum(folded.piece_counts - 3.0 * inflation.mean(), 0.0), folded.ends[:-1])
     if not freedom.any():

@@ -261,7 +261,7 @@ def details_of(diagnosis: Diagnosis) -> list[RenderableType]:
         parts.append(Text(description_sentence(unknown, unknown.formulas)))
     if diagnosis.test.lines.vibration:
         seen = ", ".join(f"{line.frequency_hz:.4g}" for line in diagnosis.test.lines.vibration)
-        averaged = diagnosis.before.fit.dwells[0].averaged
+        averaged = diagnosis.before.fit.dwells.folded.averaged
         treated = "the tests use averages that suppress it" if averaged else "it counts as noise"
         parts.append(Text(f"Vibration at {seen} Hz changes its amplitude during the run, so {treated}."))
     if going is not None:

@@ -37,7 +37,7 @@ class ScaleJitter(NoiseTerm):
         force_mps2 = dwells.felt_force_mps2.reshape(-1, 3, 3)
         return self.size * force_mps2[:, :, :, None] * np.eye(3)
 
-    def covariances(self, means: Means, state: Floats, largest_mps2: float) -> Floats:
+    def covariances(self, means: Means, state: Floats) -> Floats:
         return (self.size * means.force_mps2)[:, :, None] ** 2 * np.eye(3)
 
 
