@@ -223,8 +223,9 @@ class RunPosterior:
         return 2.0 * self._before.fit.walk_gain, 1
 
     def _one_dwell(self) -> Hypothesis:
-        """Return the row of one dwell that alone is off, by any amount."""
-        of_dwells = np.array([log_bayes_of_any_size(*rows.of_dwells()) for rows in self._rows]).T
+        """Return the row of one dwell that alone is off, by any amount, and whose readings may change in any way."""
+        of_courses = np.logaddexp(0.0, self._run.likelihood.courses.log_bayes()) - math.log(2.0)
+        of_dwells = np.array([log_bayes_of_any_size(*rows.of_dwells()) + of_courses for rows in self._rows]).T
         logs = np.logaddexp.reduce(self._sizes.evidence(self._base + of_dwells), axis=1)
         number = self._before.fit.dwells[int(np.argmax(logs))].number
         log = _log_sum(logs.tolist()) - math.log(len(logs)) + math.log(PRIOR["dwell"])

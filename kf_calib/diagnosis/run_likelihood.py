@@ -24,6 +24,7 @@ from kf_calib.bench.arrays import Floats, Indices, Mask
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.pieces import OfPieces, of_all_pieces
 from kf_calib.dwells.qr import triangle
+from kf_calib.dwells.table import DwellTable
 from kf_calib.effects import Effect
 from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns
 from kf_calib.estimation.whitened_rows import whiten
@@ -37,6 +38,7 @@ _SEEN = 1e-7  # share of a column that the model must leave for it to be seen
 _CHANGES = 1e-3  # share of a column's largest value by which it changes within a dwell
 _FINE = 8  # parts of a step over which the likelihood is integrated
 _LEAST = 0.1  # sigma of a mean: noise that is smaller shows nothing
+_ANY_SIZE = np.geomspace(_LEAST, 1e5, 61)  # of what disturbs a dwell, in units of the noise
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,30 @@ class Projected:
         turned = np.swapaxes(self.root, 1, 2)
         gram = turned @ (np.eye(3) - off @ np.swapaxes(off, 1, 2)) @ self.root
         return gram, (turned @ self.readings[: 3 * count].reshape(count, 3, 1))[..., 0]
+
+
+@dataclass(frozen=True)
+class Courses:
+    """What the model leaves of the courses of the readings within dwells: squares (D,) in units of the noise, and their
+    degrees of freedom (D,)."""
+
+    squares: Floats
+    freedom: Floats
+
+    @classmethod
+    def of(cls, rows: Sequence[Floats], dwells: DwellTable, channels: int) -> Courses:
+        """From whitened rows of each dwell in which nothing is left of the means of its channels."""
+        squares = np.array([float(of_dwell[:, -1] @ of_dwell[:, -1]) for of_dwell in rows])
+        return cls(squares, channels * (dwells.folded.width * dwells.folded.piece_numbers - 1.0))
+
+    def log_bayes(self) -> Floats:
+        """Log Bayes factors (D,) of whatever changes the course of one dwell, of any size s in units of the noise: with
+        n degrees of freedom (1 + s^2)^(-n/2) exp(chi^2 s^2 / (2 (1 + s^2))), averaged over s."""
+        squares = _ANY_SIZE**2
+        logs = -0.5 * self.freedom[:, None] * np.log1p(squares) + 0.5 * self.squares[:, None] * squares / (
+            1.0 + squares
+        )
+        return np.logaddexp.reduce(logs, axis=1) - math.log(len(squares))
 
 
 class RunLikelihood:
@@ -125,6 +151,7 @@ class RunLikelihood:
         linearised, noise = self.linearised, self.noise
         dwells, model = linearised.dwells_at_state, linearised.model
         values, width = of_all_pieces(linearised.columns), model.count - known + added.shape[3]
+        self.courses = Courses(np.zeros(len(dwells)), np.zeros(len(dwells)))
         if not noise.within_seen:
             return np.zeros((0, known + shared)), np.zeros((0, width)), np.zeros(0)
         judging = noise.with_scatter_as_flicker(len(dwells)).without(RandomWalk)
@@ -138,7 +165,9 @@ class RunLikelihood:
         about = np.zeros(int(moving.sum()))
         about[: model.count] = linearised.state
         moving_columns = OfPieces(both[..., moving], dwells.folded.ends)
-        rows = np.concatenate(whiten(dwells, moving_columns, without_means, linearised.state, about, reduced=False))
+        of_dwells = whiten(dwells, moving_columns, without_means, linearised.state, about, reduced=False)
+        self.courses = Courses.of(of_dwells, dwells, 1 if noise.attitude_unknown else 3)
+        rows = np.concatenate(of_dwells)
         if len(rows) > rows.shape[1]:
             rows = triangle(rows)
         full = np.zeros((len(rows), both.shape[3]))

@@ -210,11 +210,12 @@ class DisturbedDwell:
 
 
 def disturbed_dwell(fitted: Fit) -> DisturbedDwell:
-    """The dwell whose oscillation differs most from that of the model, in amplitude or phase.
+    """The dwell that has an oscillation of its own, if the one of the model does not go on alike in all of them.
 
     The sine and cosine of the oscillation, and their derivative by its frequency, are added in one dwell alone, beside
     a constant of that dwell, so that only the course of its readings counts. The decrease of chi-squared is chi-squared
-    distributed if the oscillation goes on alike in all dwells. What one dwell alone has is creep, or a disturbance.
+    distributed if the oscillation goes on alike in all dwells. What one dwell alone has is creep, or a disturbance: it
+    is the dwell in which they explain most of what a model without the oscillation leaves.
 
     fitted: a fit whose model has an oscillation. Its random walk of the biases, if it has one, is left out here.
     """
@@ -222,23 +223,34 @@ def disturbed_dwell(fitted: Fit) -> DisturbedDwell:
     model, dwells = linearised.model, linearised.dwells_at_state
     effect = model.oscillation
     assert effect is not None
-    places = [*BIASES, *np.arange(model.count)[model.parts[str(effect)]].tolist()]
+    of_effect = np.arange(model.count)[model.parts[str(effect)]]
+    places = [*BIASES, *of_effect.tolist()]
     rows, width = misfit_rows(dwells, linearised.columns, noise, linearised.state, model.count, reduced=False)
     stacked = np.concatenate(rows)
-    basis = orthonormal(scale_columns(stacked[:, : width + 1])[0][:, :width])[0]
-    left = stacked[:, -1] - basis @ (basis.T @ stacked[:, -1])
-    first, p_values = len(stacked) - sum(map(len, rows[-len(dwells) :])), list[float]()
+    columns, residuals, others = stacked[:, :width], stacked[:, -1], np.ones(width, bool)
+    others[of_effect] = False
+    without = residuals + columns[:, of_effect] @ linearised.state[of_effect]
+    bases = [_orthonormal(columns), _orthonormal(columns[:, others])]
+    left = [z - basis @ (basis.T @ z) for basis, z in zip(bases, (residuals, without), strict=True)]
+    first, p_values, falls = len(stacked) - sum(map(len, rows[-len(dwells) :])), list[float](), list[float]()
     for of_dwell in rows[-len(dwells) :]:
         part = slice(first, first := first + len(of_dwell))
-        p_values.append(_p_of_columns(of_dwell[:, places], basis[part], left[part]))
-    most = int(np.argmin(p_values))
-    return DisturbedDwell(dwells[most].number, effect.value, sidak(p_values[most], len(p_values)))
+        freedom, fall = _fall_by_columns(of_dwell[:, places], bases[0][part], left[0][part])
+        p_values.append(chi_squared_tail(max(freedom, 1), fall))
+        falls.append(_fall_by_columns(of_dwell[:, places], bases[1][part], left[1][part])[1])
+    number = dwells[int(np.argmax(falls))].number
+    return DisturbedDwell(number, effect.value, sidak(min(p_values), len(p_values)))
 
 
-def _p_of_columns(columns: Floats, basis: Floats, left: Floats) -> float:
-    """Return the p-value of the decrease of chi-squared if the columns of one dwell (r, 3 + q), the first three of them
-    constants, are added to a model; basis (r, p): the dwell's rows of an orthonormal basis of this model; left (r,):
-    what the model leaves of the dwell's readings."""
+def _orthonormal(columns: Floats) -> Floats:
+    """Return an orthonormal basis (r, k) of columns (r, c)."""
+    return orthonormal(scale_columns(np.column_stack([columns, np.zeros(len(columns))]))[0][:, :-1])[0]
+
+
+def _fall_by_columns(columns: Floats, basis: Floats, left: Floats) -> tuple[int, float]:
+    """Return the degrees of freedom and the decrease of chi-squared if the columns of one dwell (r, 3 + q), the first
+    three of them constants, are added to a model; basis (r, p): the dwell's rows of an orthonormal basis of this model;
+    left (r,): what the model leaves of the dwell's readings."""
     sizes = np.linalg.norm(columns, axis=0)
     columns = columns / np.where(sizes > 0.0, sizes, 1.0)
     inside, along = basis.T @ columns, columns.T @ left
@@ -247,4 +259,4 @@ def _p_of_columns(columns: Floats, basis: Floats, left: Floats) -> float:
     values, vectors = np.linalg.eigh(gram[3:, 3:] - constants @ gram[:3, 3:])
     seen = values > _SEEN
     delta_chi2 = np.sum((vectors[:, seen].T @ (along[3:] - constants @ along[:3])) ** 2 / values[seen])
-    return chi_squared_tail(int(seen.sum()), float(delta_chi2)) if seen.any() else 1.0
+    return int(seen.sum()), float(delta_chi2)

@@ -8,7 +8,7 @@ the noise level, which is the product of an autoregressive spectrum (the slope o
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, reduce
 
@@ -99,6 +99,24 @@ def lines(spectra: Iterable[Spectrum], level: float = 0.01) -> tuple[SpectralLin
     if not varying.any():
         return ()
     return _Search(segments, length, varying).lines(level)
+
+
+def lines_of_several(spectra: Sequence[Spectrum], level: float) -> tuple[SpectralLine, ...]:
+    """The lines that are there even without the dwell that has most of the strongest: what swings in one dwell alone
+    is a disturbance of that dwell. p-values are the larger of both."""
+    significant = lines(spectra, level)
+    if len(spectra) < 2 or not significant:
+        return significant
+    length, total = _best_covered(spectra)
+    assert total is not None
+    bin_hz = total.segments / total.duration_s
+    k = round(significant[0].frequency_hz / bin_hz)
+    powers = [float(each.sums[length].power[k].sum()) if length in each.sums else 0.0 for each in spectra]
+    loudest = int(np.argmax(powers))
+    others = lines([*spectra[:loudest], *spectra[loudest + 1 :]], level)
+    there = [(line, [each.p_value for each in others if abs(each.frequency_hz - line.frequency_hz) < 1.5 * bin_hz])
+             for line in significant]  # fmt: skip
+    return tuple(replace(line, p_value=max(line.p_value, *p_values)) for line, p_values in there if p_values)
 
 
 def lowest_hz(spectra: Iterable[Spectrum]) -> float:

@@ -22,7 +22,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.coherent_tone import Trace, tone
-from kf_calib.dwells.line_spectrum import SpectralLine, Spectrum, lines
+from kf_calib.dwells.line_spectrum import SpectralLine, Spectrum, lines_of_several
 from kf_calib.dwells.pieces import Pieces
 
 _LAGS = 64
@@ -50,9 +50,9 @@ class Autocovariance:
             self.blocks + other.blocks,
         )
 
-    def times(self, weights: tuple[float, ...]) -> Autocovariance:
-        """The sums with the products of each channel times its weight."""
-        return self if set(weights) == {1.0} else replace(self, products=weights * self.products)
+    def times(self, weights: Floats) -> Autocovariance:
+        """The sums with the products of each channel times its weight (3,)."""
+        return self if (weights == 1.0).all() else replace(self, products=weights * self.products)
 
     @classmethod
     def of(cls, residuals: Floats) -> Autocovariance:
@@ -152,7 +152,7 @@ def lines_of(dwells: Sequence[Dwell], level: float = 0.01) -> tuple[SpectralLine
     there but keeps its phase from dwell to dwell. The p-values account for both tests. In the averaged spectrum dwells
     count by their weights: the power of one that is louder than the others would have few degrees of freedom.
     """
-    spectral_lines = lines((dwell.spectrum.times(dwell.weights) for dwell in dwells), 0.5 * level)
+    spectral_lines = lines_of_several([dwell.spectrum.times(dwell.weights) for dwell in dwells], 0.5 * level)
     steady = None if spectral_lines else tone([dwell.trace for dwell in dwells], 0.5 * level)
     oscillations = spectral_lines or ((steady,) if steady else ())
     return tuple(replace(line, p_value=min(1.0, 2.0 * line.p_value)) for line in oscillations)

@@ -118,15 +118,6 @@ class FoldedDwells:
         return np.diff(self.ends)
 
     @cached_property
-    def autocovariance(self) -> Autocovariance:
-        """The sums of lagged products of all dwells, by the weights of their readings."""
-        first, *others = zip(self.autocovariances, self.weights.tolist(), strict=True)
-        total = first[0].times(first[1])
-        for autocovariance, weights in others:
-            total = total + autocovariance.times(weights) if autocovariance.count else total
-        return total
-
-    @cached_property
     def shapes(self) -> list[AlikeDwells]:
         """The dwells grouped by their number of pieces."""
         kinds = dict[int, list[int]]()

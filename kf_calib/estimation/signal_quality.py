@@ -22,7 +22,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats, Mask
+from kf_calib.bench.arrays import Floats, Ints, Mask
 from kf_calib.dwells.rows import Rows
 from kf_calib.dwells.table import DwellTable, FoldedDwells
 from kf_calib.noise.noise_model import Noise
@@ -33,6 +33,8 @@ _VALUES = 32  # largest number of distinct values of a dwell that are kept
 _ROUNDING = (2.0**-22, 2.0**-49)  # relative to the largest value: rounding of stored float32 and of computed float64
 _CROWDED = 20.0  # readings missing above a flat top; noise alone would omit them with probability e^-20
 _CLUSTERED = 1e-3  # p-value of the run below which outliers count as clustered
+_LOUD, _FEW = 10.0, 0.25  # times the noise of the run, and share of the dwells: of what disturbed single dwells
+_SHOWN = 6  # numbers of dwells in a sentence
 _COUNTABLE = 512  # if there are more dwells, neighbours are pooled
 
 
@@ -115,12 +117,43 @@ class Outliers:
 
 
 @dataclass(frozen=True)
+class LoudDwells:
+    """Dwells in which something disturbed the readings: ``numbers``, and by how many ``times`` the noise of the run, at
+    most. They are few, and count by their own noise."""
+
+    numbers: tuple[int, ...]
+    times: float
+
+    @classmethod
+    def of(cls, numbers: Ints, weights: Floats) -> LoudDwells | None:
+        """Those among dwells of these numbers (D,) and weights (D, 3); None where there are none, or many."""
+        times = weights.min(axis=1) ** -0.5
+        loud = times > _LOUD
+        if not 0 < loud.sum() <= _FEW * len(loud):
+            return None
+        return cls(tuple(numbers[loud].tolist()), float(times.max()))
+
+    def __str__(self) -> str:
+        left_out, told = " ".join(f"--leave-out {number}" for number in self.numbers[:_SHOWN]), _dwells(self.numbers)
+        if len(self.numbers) == 1:
+            return (
+                f"in {told} the readings vary by {self.times:.2g} times the noise of the run: something disturbed it; "
+                f"it counts by its own noise, or leave it out ({left_out})."
+            )
+        return (
+            f"in {told} the readings vary by up to {self.times:.2g} times the noise of the run: something disturbed "
+            f"them; they count by their own noise, or leave them out ({left_out})."
+        )
+
+
+@dataclass(frozen=True)
 class Readings:
     """The defects that were found in a run."""
 
     quantisation: tuple[Quantisation, ...] = ()
     saturation: tuple[Saturation, ...] = ()
     outliers: Outliers = field(default_factory=Outliers)
+    loud: LoudDwells | None = None
 
     @property
     def biasing(self) -> list[str]:
@@ -135,7 +168,19 @@ class Readings:
     @property
     def warnings(self) -> list[str]:
         """One sentence on each defect that a user must know."""
-        return self.biasing + [str(self.outliers)] * self.outliers.clustered
+        return self.biasing + self.disturbances
+
+    @property
+    def disturbances(self) -> list[str]:
+        """One sentence on each kind of dwells that something disturbed."""
+        return [str(self.outliers)] * self.outliers.clustered + ([str(self.loud)] if self.loud else [])
+
+    @property
+    def disturbed(self) -> set[int]:
+        """The numbers of these dwells."""
+        return ({*self.outliers.dwells} if self.outliers.clustered else set()) | (
+            {*self.loud.numbers} if self.loud else set()
+        )
 
     @property
     def findings(self) -> list[str]:
@@ -212,7 +257,7 @@ class ReadingsMonitor:
         outliers = _outliers(seen)
         if flat or any(each.matters for each in grids):  # the gate also rejects readings next to a flat top or a step
             outliers = replace(outliers, clustered_p=None, dwells=())
-        return Readings(tuple(grids), flat, outliers)
+        return Readings(tuple(grids), flat, outliers, LoudDwells.of(dwells.folded.numbers, dwells.folded.weights))
 
 
 def _first_seen(number: int, readings: Floats) -> _Seen:
@@ -384,4 +429,4 @@ def _dwells(numbers: Sequence[int]) -> str:
     """Write ``dwell 2`` or ``3 dwells (2, 5, 9)``, with at most six numbers."""
     if len(numbers) == 1:
         return f"dwell {numbers[0]}"
-    return f"{len(numbers)} dwells ({', '.join(map(str, numbers[:6]))}{' ...' * (len(numbers) > 6)})"
+    return f"{len(numbers)} dwells ({', '.join(map(str, numbers[:_SHOWN]))}{' ...' * (len(numbers) > _SHOWN)})"

@@ -27,7 +27,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.sufficient_statistics import Autocovariance
-from kf_calib.dwells.table import DwellTable, FoldedDwells
+from kf_calib.dwells.table import DwellTable, FoldedDwells, computed_once
 from kf_calib.support.tail_probabilities import chi_squared_tail
 
 _ITERATIONS = 60
@@ -157,14 +157,50 @@ def with_own_noise(dwells: DwellTable, along: Floats | None = None) -> DwellTabl
     along (D, 3): the weights of the channels in the size of the force, where nothing else is known in a dwell.
     """
     folded, free = dwells.folded, np.ones(3)
-    if folded.averaged or not folded.autocovariance.blocks:  # as of a table: no reading is known
+    if folded.averaged or not any(each.blocks for each in folded.autocovariances):  # as of a table: no reading is known
         return dwells
     weights = _of_channels(*_variances(folded, along, free))
     if not np.all(weights == 1.0):  # unequal if each reading told what no other says
-        weights = _of_channels(*_variances(folded, along, _lost_to_correlation(folded.autocovariance)))
+        weights = _of_channels(*_variances(folded, along, _lost_to_correlation(pooled_autocovariance(folded))))
+    if along is None:
+        weights = np.minimum(weights, _weights_by_course(folded))
     if np.array_equal(weights, folded.weights):
         return dwells
     return dwells.weighted(weights)
+
+
+def pooled_autocovariance(folded: FoldedDwells) -> Autocovariance:
+    """The sums of lagged products of all dwells, each by its share."""
+    pairs = zip(folded.autocovariances, shares_in_correlation(folded), strict=True)
+    return sum((each.times(share) for each, share in pairs if each.blocks), Autocovariance())
+
+
+def shares_in_correlation(folded: FoldedDwells) -> Floats:
+    """What the lagged products of each dwell count by, (D, 3), where the correlation is estimated.
+
+    A dwell whose readings vary more about its parabola than those of the others, as after a knock or in a slip, has a
+    correlation of its own, which says nothing of the others: its products count by the square of the weight that this
+    variance gives it. Where all vary alike about their parabolas, dwells count by the weights of their readings.
+    """
+    weights = _weights_by_course(folded)
+    return np.where((weights == 1.0).all(axis=0), folded.weights, weights**2)
+
+
+@computed_once
+def _weights_by_course(folded: FoldedDwells) -> Floats:
+    """Return the weights (D, 3) that dwells have by how much their readings vary about their parabolas."""
+    several = np.array([each.blocks > 0 for each in folded.autocovariances])
+    weights, known = np.ones((len(several), 3)), [each for each in folded.autocovariances if each.blocks]
+    if known:
+        counts, variances = (
+            np.array([[each.count] for each in known]),
+            [each.products[0] / each.pairs[0] for each in known],
+        )
+        alike = [each.times(1.0 / np.where(own > 0.0, own, 1.0)) for each, own in zip(known, variances, strict=True)]
+        lost = _lost_to_correlation(sum(alike, Autocovariance()))
+        parabolas = 3.0 * np.array([[each.blocks] for each in known])
+        weights[several] = _of_channels(np.array(variances), np.maximum(counts / lost - parabolas, 0.0))
+    return weights
 
 
 def _of_channels(variances: Floats, freedom: Floats) -> Floats:
@@ -229,10 +265,11 @@ def _variances(folded: FoldedDwells, along: Floats | None, lost: Floats) -> tupl
 
 
 def _lost_to_correlation(total: Autocovariance) -> Floats:
-    """Return by how much autocorrelation r_l enlarges the variance of a variance, 1 + 2 sum of r_l^2, (3,)."""
+    """Return by how much autocorrelation r_l enlarges the variance of a variance, 1 + 2 sum of r_l^2, (3,), over lags of
+    up to half a block."""
     if not total.blocks:
         return np.ones(3)
     level = np.where(total.products[0] > 0.0, total.products[0] / total.pairs[0], 1.0)
-    correlation = total.products[1:] / np.maximum(total.pairs[1:, None], 1.0) / level
-    chance = 1.0 / np.maximum(total.pairs[1:, None], 1.0)
-    return np.maximum(1.0 + 2.0 * np.sum(correlation**2 - chance, axis=0), 1.0)
+    pairs = total.pairs[1:][total.pairs[1:] > 0.5 * total.pairs[0], None]
+    correlation = total.products[1 : 1 + len(pairs)] / pairs / level
+    return np.maximum(1.0 + 2.0 * np.sum(correlation**2 - 1.0 / pairs, axis=0), 1.0)

@@ -15,7 +15,13 @@ from kf_calib.dwells.pieces import lagged_walk_products
 from kf_calib.dwells.sufficient_statistics import Autocovariance, Dwell
 from kf_calib.dwells.table import DwellTable, FoldedDwells, computed_once
 from kf_calib.noise.noise_model import Noise
-from kf_calib.noise.noise_of_readings import are_alike, expected_products, unbiased
+from kf_calib.noise.noise_of_readings import (
+    are_alike,
+    expected_products,
+    pooled_autocovariance,
+    shares_in_correlation,
+    unbiased,
+)
 
 _MAX_ORDER = 20
 _LONGEST = 2.0  # kappa is at most the readings in a block divided by this
@@ -64,7 +70,7 @@ def _correlation_without_walk(folded: FoldedDwells) -> tuple[Floats, Floats]:
 
 def _correlation(folded: FoldedDwells, walk_mps2_per_sqrt_s: float) -> tuple[Floats, Floats]:
     """Return kappa (3,) and the variances (3,) of readings within dwells, less those of a random walk."""
-    total = folded.autocovariance
+    total = pooled_autocovariance(folded)
     if walk_mps2_per_sqrt_s:
         total = replace(total, products=total.products - walk_mps2_per_sqrt_s**2 * _walk_products(folded))
     known = _of_averages if folded.averaged else _inflation
@@ -102,10 +108,12 @@ def _walk_products(folded: FoldedDwells) -> Floats:
     dwells."""
     periods_s = np.diff(folded.ends_s, axis=1)[:, 0] / np.maximum(folded.counts - 1.0, 1.0)
     products = 0.0 * folded.autocovariances[0].products
-    for known, period_s, weights in zip(folded.autocovariances, periods_s.tolist(), folded.weights, strict=True):
+    for known, period_s, share in zip(
+        folded.autocovariances, periods_s.tolist(), shares_in_correlation(folded), strict=True
+    ):
         if known.blocks:
             own = lagged_walk_products(period_s, max(round(known.count / known.blocks), 1), known.pairs)
-            products = products + own[:, None] * weights
+            products = products + own[:, None] * share
     return products
 
 

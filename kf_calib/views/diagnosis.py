@@ -101,8 +101,7 @@ def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
 def disturbed_dwells(diagnosis: Diagnosis) -> list[int]:
     """The numbers of the dwells that something disturbed, as any test has it."""
     before, table, first = diagnosis.before, diagnosis.table, diagnosis.likeliest
-    numbers = {each.number for each in before.outlying}
-    numbers |= {*before.readings.outliers.dwells} if before.readings.outliers.clustered else set()
+    numbers = {each.number for each in before.outlying} | before.readings.disturbed
     numbers |= {table.disturbed.number} if table and table.disturbed else set()
     return sorted(numbers | ({first.dwell} if first is not None and first.dwell else set()))
 
@@ -181,8 +180,8 @@ def verdict(diagnosis: Diagnosis) -> str:
     the readings that bias it."""
     readings = diagnosis.before.readings
     first = readings.biasing if diagnosis.test.consistent is False else []
-    first = [*first, *([str(readings.outliers)] if readings.outliers.clustered else [])]
-    return " ".join([*(sentence[0].upper() + sentence[1:] for sentence in first), diagnosis.verdict])
+    told = [*first, *readings.disturbances]
+    return " ".join([*(sentence[0].upper() + sentence[1:] for sentence in told), diagnosis.verdict])
 
 
 def replication_in_words(diagnosis: Diagnosis) -> str:
