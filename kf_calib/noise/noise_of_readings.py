@@ -265,8 +265,8 @@ def _variances(folded: FoldedDwells, along: Floats | None, lost: Floats) -> tupl
 
 
 def _lost_to_correlation(total: Autocovariance) -> Floats:
-    """Return by how much autocorrelation r_l enlarges the variance of a variance, 1 + 2 sum of r_l^2, (3,), over lags of
-    up to half a block."""
+    """Return by how much autocorrelation r_l enlarges the variance of a variance, 1 + 2 sum of r_l^2, (3,), over lags
+    of up to half a block."""
     if not total.blocks:
         return np.ones(3)
     level = np.where(total.products[0] > 0.0, total.products[0] / total.pairs[0], 1.0)
