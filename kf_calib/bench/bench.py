@@ -180,12 +180,12 @@ class Bench:
         return len(self.axes) or 4
 
     @classmethod
-    def from_metadata(cls, metadata: Mapping[str, str], has_angles: bool = True) -> Bench:
-        """The bench described by the strings of a metadata record (docs/format.md) or by options of the same names;
+    def from_metadata(cls, metadata: Mapping[str, Any], has_angles: bool = True) -> Bench:
+        """The bench described by the strings of a metadata record (docs/format.md) or by typed values of the same keys;
         raises BenchError."""
         from kf_calib.bench.keys import NOTES, NUMBERS, checked_keys
 
-        values = checked_keys(metadata)
+        values = dict[str, Any](checked_keys(metadata))
         numbers = {key: values[key] for key in NUMBERS if key in values}
         if has_angles and not values.get("axes", "").strip():
             raise BenchError(

@@ -1,5 +1,6 @@
-"""The keys that describe a bench, and the check of their values in recordings, streams, TOML files, options and
-Python.
+"""The keys that describe a bench, with their types, and the check of their values.
+
+In recordings and streams values are text; in TOML files, options and Python they have their types.
 
 Ranges of gimbal angles in text: limits that must not be left, and zones that must not be entered.
 
@@ -17,11 +18,12 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from numbers import Real
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, TypedDict, cast
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.raw_input import CONVERTED, RESTATE, UNITS, text_of
 from kf_calib.errors import BenchError, how_to_write
+from kf_calib.support.options import Option
 from kf_calib.support.text import COMMANDS, LONGEST, cut, number_from, parse_date
 
 FORMAT_VERSION = "1"
@@ -40,6 +42,78 @@ NUMBERS = (
 )
 FREE_TEXT = ("block_serial", "bench", "operator", "note")
 NOTES = (*FREE_TEXT, "date")
+
+
+# fmt: off
+class StatedBench(TypedDict, total=False):
+    """What is stated of a bench beside its recording: it goes before what the recording has."""
+
+    axes: Annotated[str, Option("--axes", 'Gimbal axes, outer to inner, for example "y z x".', "AXES")]
+    joints: Annotated[str, Option(
+        "--joints", 'Names of the gimbals among the joints of a bag, outer to inner, as "outer middle inner".',
+        "NAMES")]
+    up: Annotated[str, Option(
+        "--up", "Axis that points up when all angles are zero: y (the default; accelerometer 2 reads +g), z as in ROS, "
+        "x, -x, -y or -z.", "AXIS")]
+    channels: Annotated[str, Option(
+        "--channels", "Which channel accelerometer 1, 2, 3 is, with a minus where its sign is reversed: 1,-2,3; a "
+        "calibration remembers it.", "N,N,N")]
+    gravity_mps2: Annotated[float, Option("--gravity", "Local gravity, m/s^2.", "M/S^2")]
+    latitude_deg: Annotated[float, Option(
+        "--latitude", "Latitude, deg; gives normal gravity where --gravity is not stated.", "DEG")]
+    height_m: Annotated[float, Option("--height", "Height, m, for normal gravity; 0 where it is not stated.", "M")]
+    angle_sigma_deg: Annotated[float, Option(
+        "--angle-sigma", "How well an orientation repeats, 1 sigma, deg (0: exactly); estimated where it is not "
+        "stated.", "DEG", least=0)]
+    scatter_sigma_mps2: Annotated[float, Option(
+        "--scatter-sigma", "Scatter of each sensor from dwell to dwell, 1 sigma, m/s^2; estimated where it is not "
+        "stated.", "M/S^2", least=0)]
+    square_sigma_deg: Annotated[float, Option(
+        "--square-sigma", "How square the axes of the accelerometers are, 1 sigma, deg, where --no-angles cannot tell; "
+        "1 if not stated.", "DEG", least=0, is_open=True)]
+    reference: Annotated[str, Option(
+        "--reference", "base: angles are relative to the bench (usual); inertial: stabilised platform.", "WORD")]
+    azimuth_deg: Annotated[float, Option(
+        "--azimuth", "Azimuth of the bench's x axis from North toward East, deg.", "DEG")]
+    date: Annotated[str, Option(
+        "--date", "When the run began, ISO 8601 (UTC), where its stamps are no dates or wrong ones.", "DATE")]
+    nominal: Annotated[str | Mapping[str, float], Option(
+        "--nominal", "Nominal parameters that differ, for example '{\"theta1\": 0}'.", "JSON")]
+
+
+class StatedInput(TypedDict, total=False):
+    """What is stated of the numbers that a device sends."""
+
+    accel_unit: Annotated[Literal["m/s2", "g", "mg", "ug"], Option(
+        "--accel-unit", "Unit of the readings; a calibration remembers it.",
+        default="m/s2; in text, as the header or the numbers tell")]
+    accel_scale: Annotated[float | str, Option(
+        "--accel-scale", "Size of one count, in the unit of the readings; a calibration remembers it.",
+        default="1", least=0, is_open=True)]
+    counts: Annotated[str, Option(
+        "--counts", "How raw numbers are to be read: unsigned16 (or so many bits), wrap=4.096 (what negative ones are "
+        "too large by), offset=512 (the number at no force); a calibration remembers it.", "HOW", "signed")]
+    restate_input: Annotated[bool, Option(
+        "--restate-input", "What is stated of channels, unit and count was wrong: the options go before it.")]
+
+
+class BenchKeys(StatedBench, StatedInput, total=False):
+    """All that can be stated of a bench."""
+
+    format_version: str
+    converted: str
+    limits_deg: str
+    forbidden_deg: str
+    rate_degps: float
+    acceleration_degps2: float
+    block_serial: str
+    bench: str
+    operator: str
+    note: str
+
+
+# fmt: on
+UNSTATED: BenchKeys = {}
 
 _COMMAND = re.compile(f"[{COMMANDS}]")
 _OF_SYMBOL = {
@@ -82,6 +156,11 @@ def _one_of(choices: tuple[str, ...], value: Any) -> str:
     return value
 
 
+def _true(value: Any) -> bool:
+    """Return True, for which text may stand."""
+    return _one_of(("true", "True"), str(value)) != ""
+
+
 def _nominal(value: Any) -> dict[str, float]:
     """Return the values of the paper's parameters by symbol."""
     if not isinstance(value, dict):
@@ -121,7 +200,7 @@ KEYS: Mapping[str, Key] = {
     "counts": Key(partial(text_of, "counts"), "how the raw numbers are to be read, such as unsigned16 or offset=512"),
     CONVERTED: Key(partial(_one_of, ("true",)), "true, or left out: the samples are readings of the accelerometers "
                    "already, and no raw input"),
-    RESTATE: Key(partial(_one_of, ("true",)), "true, or left out: a raw input that is stated goes before the file's"),
+    RESTATE: Key(_true, "true, or left out: a raw input that is stated goes before the file's"),
     "up": Key(
         partial(_one_of, UP),
         f"the axis that points up when all angles are zero, one of {', '.join(UP)}: z for sensors and angles as ROS "
@@ -154,12 +233,13 @@ KEYS: Mapping[str, Key] = {
 }  # fmt: skip
 
 
-def checked_keys(metadata: Mapping[str, Any]) -> dict[str, Any]:
+def checked_keys(metadata: Mapping[str, Any]) -> BenchKeys:
     """The checked values of a bench's keys, without numbers that were left empty; raises BenchError, naming the key."""
     for key in metadata:
         if key not in KEYS:
             raise BenchError(f"bench key {cut(key, 60)!r} is not known: use one of {', '.join(sorted(KEYS))}.")
-    return {key: checked(key, value) for key, value in metadata.items() if not (key in NUMBERS and value == "")}
+    values = {key: checked(key, value) for key, value in metadata.items() if not (key in NUMBERS and value == "")}
+    return cast(BenchKeys, values)
 
 
 def checked(key: str, value: Any) -> Any:

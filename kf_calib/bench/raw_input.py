@@ -266,7 +266,7 @@ def merged_metadata(
     stated = dict(recorded)
     if default is not None and not default.is_plain and not set(OPTIONS) & set(recorded):
         stated, what = stated | default.to_metadata() | {"channels": default.order}, "the calibration"
-    shared = () if overrides.get(RESTATE) == "true" else set(OPTIONS) & set(stated) & set(overrides)
+    shared = () if overrides.get(RESTATE) else set(OPTIONS) & set(stated) & set(overrides)
     for key in sorted(shared):
         try:
             in_file, in_options = text_of(key, stated[key]), text_of(key, overrides[key])

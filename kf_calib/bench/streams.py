@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,14 +104,14 @@ _NO_ORIENTATIONS = (
 
 
 def bench_without_angles(
-    name: str, metadata: Mapping[str, str], *, are_lacking: bool = False
+    name: str, metadata: Mapping[str, Any], *, are_lacking: bool = False
 ) -> tuple[Bench, list[str]]:
     """The bench by the keys that are stated, and what to know of it; gravity is the standard one where none is stated.
 
     name: of the source. are_lacking: whether it has no angles, though nobody said that it need not. Raises BenchError
     for a key that cannot be.
     """
-    gravity = {} if "latitude_deg" in metadata else {"gravity_mps2": str(STANDARD_GRAVITY_MPS2)}
+    gravity = {} if "latitude_deg" in metadata else {"gravity_mps2": STANDARD_GRAVITY_MPS2}
     try:
         bench = Bench.from_metadata({**gravity, **metadata}, has_angles=False)
     except BenchError as error:

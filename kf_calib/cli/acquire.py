@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import rich_click as click
 from click import get_current_context  # rich_click declares that there may be none
 
+from kf_calib.bench.keys import BenchKeys
 from kf_calib.cli.command import OUTPUT, POSITIVE, argument, command, option
 from kf_calib.cli.echo import complain, echo, print_json, progress, show
 from kf_calib.cli.failures import Interrupter, answered
 from kf_calib.cli.files import OutputFile, claimed, delivery, write_view
 from kf_calib.cli.options import (
     BenchOptions,
-    DeviceOptions,
+    Device,
     ForeignColumns,
     Json,
     NoAngles,
@@ -224,7 +225,7 @@ def _size(count: int) -> str:
 )
 def record(
     output: Output, lines: Annotated[Path, argument(type=click.Path(path_type=Path, allow_dash=True), default="-")],
-    no_angles: NoAngles, columns: ForeignColumns, device: DeviceOptions, bench: BenchOptions, overwrite: Overwrite,
+    no_angles: NoAngles, columns: ForeignColumns, device: Device, bench: BenchOptions, overwrite: Overwrite,
     as_json: Json,
 ) -> None:  # fmt: skip
     """Record CSV or JSON LINES (a file, or - for standard input) to the MCAP file OUT."""
@@ -233,8 +234,8 @@ def record(
     if lines.suffix == ".mcap" and output.suffix != ".mcap":
         raise InputError(f"the recording goes before the lines: kf-calib record {lines} {output}.")
     claimed(overwrite=overwrite)
-    name, keys = renamed(columns), bench.keys | device.keys
-    source = Lines(sys.stdin.buffer if str(lines) == "-" else lines, keys, name, angles=not no_angles)
+    keys: BenchKeys = {**bench.keys, **device}
+    source = Lines(sys.stdin.buffer if str(lines) == "-" else lines, keys, renamed(columns), angles=not no_angles)
     with progress(f"recording {output.name}", as_json or str(lines) == "-") as tick, _told_if_table(lines):
         recorded = _record(source, output, overwrite, tick)
     warnings = [*source.warnings, *recorded.notes]

@@ -17,8 +17,8 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from functools import partial, wraps
 from pathlib import Path
-from types import NoneType
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from types import UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints, is_typeddict
 
 import rich_click as click
 
@@ -94,7 +94,7 @@ def command(
 
         @wraps(function)
         def callback(*args: Any, **values: Any) -> None:
-            groups = {name: grouped(kind, values) for name, kind in kinds.items() if is_dataclass(kind)}
+            groups = {name: grouped(kind, values) for name, kind in kinds.items() if _is_group(kind)}
             function(*args, **{name: value for name, value in values.items() if name in kinds}, **groups)
 
         for declare in reversed([*_declarations(function, {})]):
@@ -114,14 +114,26 @@ def _declarations(owner: Any, options: Mapping[str, Any]) -> Iterator[Callable[.
         kind, declare = get_args(hint) if get_origin(hint) is Annotated else (hint, options.get(name))
         if is_dataclass(kind):
             yield from _declarations(kind, declare or options)
+        elif is_typeddict(kind):
+            yield from _of_library(kind, str(declare))
         elif declare is not None:
             implied = _implied(kind, defaults.get(name), is_option=declare.func is click.option)
             yield declare(name, **implied | declare.keywords)
 
 
+def _of_library(kind: Any, panel: str) -> Iterator[Callable[..., Any]]:
+    """Decorators that declare the options of a mapping of the library's; panel: their group in ``--help``."""
+    for name, hint in get_type_hints(kind, include_extras=True).items():
+        of_key, own = get_args(hint)
+        said: dict[str, Any] = {"help": own.help, "metavar": own.metavar, "panel": panel}
+        said |= {} if own.default is None else {"show_default": own.default}
+        said |= {} if own.least is None else {"type": NumberInRange(min=own.least, min_open=own.is_open)}
+        yield option(own.name)(name, **_implied(of_key, None, is_option=True) | said)
+
+
 def _implied(kind: Any, default: object, is_option: bool) -> dict[str, Any]:
-    """What type and default of a parameter say of its option; an optional one has the type beside None."""
-    if NoneType in get_args(kind):
+    """What type and default of a parameter say of its option; of several types, the first is that of the shell."""
+    if get_origin(kind) in (Union, UnionType):
         kind = get_args(kind)[0]
     implied = dict[str, Any]()
     if get_origin(kind) is tuple:
@@ -138,19 +150,27 @@ def _implied(kind: Any, default: object, is_option: bool) -> dict[str, Any]:
     return implied | {"default": default, "show_default": True}
 
 
+def _is_group(kind: Any) -> bool:
+    return is_dataclass(kind) or is_typeddict(kind)
+
+
 def grouped(kind: Any, values: Mapping[str, Any]) -> Any:
-    """A dataclass of options, and those in it, with the values that click has of them by their names."""
+    """A dataclass or mapping of options, and those in it, with the values that click has of them by their names.
+
+    A mapping has those that are given.
+    """
     hints = get_type_hints(kind)
-    groups = {name: grouped(hint, values) for name, hint in hints.items() if is_dataclass(hint)}
+    if is_typeddict(kind):
+        return {name: value for name in hints if (value := values[name]) is not None and value is not False}
+    groups = {name: grouped(hint, values) for name, hint in hints.items() if _is_group(hint)}
     return kind(**{name: values[name] for name in hints if name in values}, **groups)
 
 
 def values_of(*groups: Any) -> Iterator[tuple[str, Any]]:
     """Names and values of all options of dataclasses."""
     for group in groups:
-        for field in fields(group):
-            value = getattr(group, field.name)
-            yield from values_of(value) if is_dataclass(value) else [(field.name, value)]
+        for name, value in group.items() if isinstance(group, dict) else vars(group).items():
+            yield from values_of(value) if is_dataclass(value) or isinstance(value, dict) else [(name, value)]
 
 
 class Number(click.ParamType[float]):

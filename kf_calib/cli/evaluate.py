@@ -133,7 +133,7 @@ def list_effects(
     if recording is not None:
         _list_visible(recording, names, as_json, reading, evaluation)
         return
-    bench = Bench.from_metadata({"axes": "y z x", "latitude_deg": "50"} | reading.keys)
+    bench = Bench.from_metadata({"axes": "y z x", "latitude_deg": 50.0, **reading.keys})
     chosen = [effect_named(name, bench) for name in names or known(bench)]
     if as_json:
         print_json(catalogue.effects_object(chosen))

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, BinaryIO, Literal
 
 import rich_click as click
 
+from kf_calib.bench.keys import BenchKeys, StatedBench
 from kf_calib.cli.command import INPUT, OUTPUT, argument, command, option
 from kf_calib.cli.echo import complain, print_json, print_result, progress, show
 from kf_calib.cli.files import FigureFiles, claimed, delivery, output_option
 from kf_calib.cli.options import (
     OF_MESSAGES,
-    BenchOptions,
     DwellOptions,
     Json,
     Overwrite,
@@ -90,8 +90,8 @@ def apply(
         )
     outputs = claimed(overwrite=overwrite)
     saved, correction = _correction(calibration, programs)
-    bench = replace(reading.bench, gravity_mps2=reading.bench.gravity_mps2 or saved.bench.gravity_mps2)
-    reading = replace(reading, bench=bench)
+    stated: StatedBench = {"gravity_mps2": saved.bench.gravity_mps2, **reading.bench.stated}
+    reading = replace(reading, bench=replace(reading.bench, stated=stated))
     done: list[tuple[Applied, list[str]]] = []
     with progress(f"correcting {recording.name}", as_json) as tick:
         outputs.write(output, lambda path: done.append(_applied(correction, recording, path, reading, unchecked, tick)))
@@ -101,7 +101,7 @@ def apply(
     )
 
 
-_BENCH_KEYS = {each.name for each in fields(BenchOptions)} - {"bench_file", "channels"}
+_BENCH_KEYS = StatedBench.__annotations__.keys() - {"channels"}
 _OF_FILES = (*OF_MESSAGES, *_BENCH_KEYS, "angle_unit", "no_angles")
 """Options on which lines of standard input have nothing to act."""
 
@@ -133,7 +133,7 @@ def _applied(
             return applied, source.warnings
 
 
-def _table_keys(keys: dict[str, str], path: Path, input: RawInput) -> dict[str, str]:
+def _table_keys(keys: BenchKeys, path: Path, input: RawInput) -> BenchKeys:
     """Bench keys of a table of what the device of a calibration sends."""
     from kf_calib.bench.raw_input import merged_metadata
 
@@ -141,7 +141,7 @@ def _table_keys(keys: dict[str, str], path: Path, input: RawInput) -> dict[str, 
         order = merged_metadata({}, keys, "", input).get("channels")
     except BenchError as error:
         raise BenchError(f"{path}: {error}") from None
-    return keys if order is None else keys | {"channels": order}
+    return keys if order is None else {**keys, "channels": order}
 
 
 def _bytes_of(path: Path, dataset: str) -> BinaryIO | TextFile:

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import rich_click as click
 
+from kf_calib.bench.keys import StatedBench
 from kf_calib.cli.command import argument, command, option, values_of
 from kf_calib.cli.echo import print_json, progress, show
 from kf_calib.cli.files import Pictures, ReportFile, claimed, delivery, measured_of, output_option, save_report
 from kf_calib.cli.options import (
-    BenchOptions,
     EvaluationOptions,
     Json,
     Overwrite,
@@ -118,7 +118,7 @@ def improve(
     exit_if(strict and state.diagnosis.test.consistent is False)
 
 
-_BY_CONTENT = ("model_file", *(field.name for field in fields(BenchOptions)))
+_BY_CONTENT = ("model_file", "bench_file", *StatedBench.__annotations__)
 _LEAVE = tuple(field.name for field in fields(ProgramOptions))
 """Options by which a user allows Python files to be run: a journal cannot give them."""
 
@@ -148,7 +148,7 @@ def _for_journal(
         files += model.allowed(programs.effects_from, programs.trust).files
     others = (*_BY_CONTENT, *_LEAVE)
     kept = {key: value for key, value in values_of(reading, evaluation) if value is not None and key not in others}
-    options = kept | reading.keys | {"effects": list(effects)}
+    options = kept | {**reading.keys} | {"effects": list(effects)}
     return Origin(recording.name, fingerprint(recording), options, tuple(loaded(files)))
 
 

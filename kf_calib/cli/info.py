@@ -19,10 +19,12 @@ from kf_calib.errors import BenchError, BlunderError, CountsError, KfCalibError
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 if TYPE_CHECKING:
+    from kf_calib.bench.keys import BenchKeys
     from kf_calib.bench.raw_input import RawInput, WrongUnit
     from kf_calib.bench.streams import Source
     from kf_calib.dwells.rest_in_readings import DwellSummary
     from kf_calib.sources.files.inventory import Inventory
+    from kf_calib.sources.text.units import Units
     from kf_calib.views.overview import Overview, TableOverview
 
 Tick = Callable[[float], None]
@@ -98,9 +100,21 @@ def _options(told: Stated) -> list[str]:
     return [f"{OPTIONS.get(key, f'--{key}')} {_quoted(value)}" for key, value in told.items()]
 
 
-def _bench_keys(told: Stated) -> dict[str, str]:
+def _bench_keys(told: Stated) -> BenchKeys:
     """What of it is of the bench: not which rows count."""
-    return {key: value for key, value in told.items() if key != "where"}
+    from kf_calib.bench.keys import checked_keys
+
+    return checked_keys({key: value for key, value in told.items() if key != "where"})
+
+
+def _units(reading: ReadingOptions, told: Stated) -> Units:
+    return reading.units(told=_bench_keys(told), where=told.get("where", ""))
+
+
+def _in_words(keys: BenchKeys) -> dict[str, str]:
+    from kf_calib.bench.bench import metadata_of
+
+    return metadata_of(keys)
 
 
 def _of_messages(ctx: click.Context, path: Path, reading: ReadingOptions, tick: Tick) -> Overview:
@@ -108,7 +122,7 @@ def _of_messages(ctx: click.Context, path: Path, reading: ReadingOptions, tick: 
     from kf_calib.sources.files.inventory import inventory_of
 
     inventory = inventory_of(path, reading.fields)
-    bench = {**inventory.bench, **reading.keys}
+    bench = inventory.bench | _in_words(reading.keys)
     fields = _fields(inventory)
     by_hand = inventory.has_readings and inventory.has_angles is None and not fields
     is_attitude = inventory.has_angles is False or any(" attitude=" in field for field in fields)
@@ -137,14 +151,16 @@ def _of_lines(
 
     told: bench keys that nobody states and the readings tell, with the ``reason``.
     """
+    from kf_calib.bench.keys import checked_keys
     from kf_calib.sources.files.inventory import inventory_of_lines
     from kf_calib.sources.text.lines import Lines
 
     missing, words = {"accel_scale": reason} if reason else {}, _given(ctx, _not_of(ctx, not_of_text(path)))
     words += _options(told)
-    units = reading.units(told=told)
+    units = _units(reading, told)
     inventory = inventory_of_lines(path, reading.renamed, units)
-    bench, angles = {**inventory.bench, **reading.keys, **_bench_keys(told)}, not reading.no_angles
+    bench = inventory.bench | _in_words({**reading.keys, **_bench_keys(told)})
+    angles = not reading.no_angles
     if angles and inventory.has_angles is None:
         angles, missing["angles"] = False, _BY_HAND[1].format(or_else=" or attitude")
         words.append(_BY_HAND[0])
@@ -161,7 +177,7 @@ def _of_lines(
         provisional["accel_unit"] = "m/s2"
     dwells, warnings, wrong, source = None, list(inventory.warnings), None, None
     try:
-        source = Lines(path, {**provisional, **bench}, reading.renamed, units=units, angles=angles)
+        source = Lines(path, checked_keys(provisional | bench), reading.renamed, units=units, angles=angles)
         dwells = _dwells(source, tick)
         warnings = list(dict.fromkeys([*warnings, *source.warnings]))
         wrong = _wrong_unit([dwell.norm_mps2 for dwell in dwells], source.bench.input, are_named=not is_bare)
@@ -258,8 +274,9 @@ def _of_table(ctx: click.Context, path: Path, reading: ReadingOptions, told: Sta
     from kf_calib.sources.text.survey import survey
     from kf_calib.views.overview import TableOverview
 
-    bench = {**reading.keys, **_bench_keys(told)}
-    table = survey(path, bench, reading.renamed, reading.units(told=told), angles=not reading.no_angles)
+    stated: BenchKeys = {**reading.keys, **_bench_keys(told)}
+    bench = _in_words(stated)
+    table = survey(path, stated, reading.renamed, _units(reading, told), angles=not reading.no_angles)
     lacking = _lacks(bench, table.orientation == "angles")
     missing = {"counts": reason} if reason else {}
     words = _given(ctx, _not_of(ctx, not_of_text(path) + OF_DWELLS))
@@ -277,7 +294,7 @@ def _of_table(ctx: click.Context, path: Path, reading: ReadingOptions, told: Sta
         missing, words = {"": table.trouble, **missing}, None
     elif wrong is None:
         examples = {"axes": shlex.split(axes)[1], "gravity_mps2": str(STANDARD_GRAVITY_MPS2)}
-        keys = {key: examples[key] for key in lacking} | _bench_keys(told)
+        keys = _bench_keys({**{key: examples[key] for key in lacking}, **told})
         missing, words = _tried(reading.table(path, keys, bool(table.orientation)), missing, words)
     command = _replay(path, words)
     return TableOverview(table, bench, list(missing.values()), command, _examples(command, lacking))

@@ -21,7 +21,7 @@ from kf_calib.cli.live_page import PageOptions, page_server, page_state
 from kf_calib.cli.live_run import LiveRun, by_hand, on_bench, pressed_keys
 from kf_calib.cli.options import (
     BenchOptions,
-    DeviceOptions,
+    Device,
     EvaluationOptions,
     ForeignColumns,
     Json,
@@ -92,7 +92,7 @@ class LiveOptions:
 @click.pass_context
 def live(
     ctx: click.Context, source: Annotated[str, argument(metavar="SOURCE")], options: LiveOptions, page: PageOptions,
-    device: DeviceOptions, bench: BenchOptions, evaluation: EvaluationOptions, overwrite: Overwrite, rrd: RerunFile,
+    device: Device, bench: BenchOptions, evaluation: EvaluationOptions, overwrite: Overwrite, rrd: RerunFile,
     save: Save, save_model: SaveModel, strict: Strict, units: ShownUnits, as_json: Json,
 ) -> None:  # fmt: skip
     """Evaluate a bench while it runs: sigmas, verdict and the next orientation as they stand; record it.
@@ -108,7 +108,7 @@ def live(
     settings, wanted = evaluation.settings(), targets_of(options.targets)
     _refuse(settings, options.auto and options.no_angles)
     opening = partial(
-        open_live, source, bench.keys | device.keys, record, overwrite, columns=renamed(options.columns),
+        open_live, source, {**bench.keys, **device}, record, overwrite, columns=renamed(options.columns),
         header=options.header, give_up_s=options.give_up_s, idle_s=options.idle_s, angles=not options.no_angles,
     )  # fmt: skip
     with page_server(page) as server, opening() as opened:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+from kf_calib.bench.keys import BenchKeys
 from kf_calib.cli.command import INPUT, MODEL, NOT_NEGATIVE, POSITIVE, argument, command, option
 from kf_calib.cli.echo import print_result, progress
 from kf_calib.cli.files import FigureFiles, claimed, delivery, output_option
@@ -82,7 +83,7 @@ def _gyroscopes(path: Path, reading: ReadingOptions, gyro: str, size: float) -> 
     from kf_calib.sources.text.lines import Lines
     from kf_calib.sources.text.units import Units
 
-    keys = {"accel_scale": repr(size), "accel_unit": "m/s2", "restate_input": "true"}
+    keys: BenchKeys = {"accel_scale": size, "accel_unit": "m/s2", "restate_input": True}
     if reading.kind(path) is FileKind.RECORDING:
         if ":" not in gyro:
             raise InputError(f"--gyro {gyro!r} names no topic: write --gyro TOPIC:X,Y,Z with the paths of the rates.")

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import rich_click as click
 from click import get_current_context  # rich_click declares that there may be none
 from click.core import ParameterSource
 
-from kf_calib.cli.command import INPUT, MODEL, NOT_NEGATIVE, OUTPUT, POSITIVE, NumberInRange, option, values_of
+from kf_calib.bench.keys import UNSTATED, BenchKeys, StatedBench, StatedInput
+from kf_calib.cli.command import INPUT, MODEL, NOT_NEGATIVE, OUTPUT, POSITIVE, NumberInRange, option
 from kf_calib.cli.echo import complain
 from kf_calib.cli.files import output_option
 from kf_calib.errors import BenchError, InputError
@@ -35,6 +35,7 @@ NoAngles = Annotated[bool, _of_input(
     "--no-angles", help="Use no platform angles, only the size of gravity: nine parameters.")]
 ForeignColumns = Annotated[tuple[str, ...], _of_input(
     "--column", metavar="THEIRS=OURS", help='Name of a foreign column: --column "acc x [g]=ax_g"; repeatable.')]
+Device = Annotated[StatedInput, INPUT]
 BenchModelFile = Annotated[Path | None, _of_model(
     "--bench-model", metavar="FILE.toml",
     help="Errors of the bench that many runs have shown: they are subtracted, and their sigma is considered.")]
@@ -71,76 +72,15 @@ class BenchOptions:
 
     bench_file: Annotated[Path | None, _of_input(
         "--bench", metavar="FILE.toml", help="Bench keys from this file; the options below go before them.")] = None
-    axes: Annotated[str | None, _of_input(
-        "--axes", metavar="AXES", help='Gimbal axes, outer to inner, for example "y z x".')] = None
-    joints: Annotated[str | None, _of_input(
-        "--joints", metavar="NAMES",
-        help='Names of the gimbals among the joints of a bag, outer to inner, as "outer middle inner".')] = None
-    up: Annotated[str | None, _of_input(
-        "--up", metavar="AXIS", help="Axis that points up when all angles are zero: y (the default; accelerometer 2 "
-        "reads +g), z as in ROS, x, -x, -y or -z.")] = None
-    channels: Annotated[str | None, _of_input(
-        "--channels", metavar="N,N,N", help="Which channel accelerometer 1, 2, 3 is, with a minus where its sign is "
-        "reversed: 1,-2,3; a calibration remembers it.")] = None
-    gravity_mps2: Annotated[float | None, _of_input("--gravity", metavar="M/S^2", help="Local gravity, m/s^2.")] = None
-    latitude_deg: Annotated[float | None, _of_input(
-        "--latitude", metavar="DEG",
-        help="Latitude, deg; gives normal gravity where --gravity is not stated.")] = None
-    height_m: Annotated[float | None, _of_input(
-        "--height", metavar="M", help="Height, m, for normal gravity; 0 where it is not stated.")] = None
-    angle_sigma_deg: Annotated[float | None, _of_input(
-        "--angle-sigma", type=NOT_NEGATIVE, metavar="DEG",
-        help="How well an orientation repeats, 1 sigma, deg (0: exactly); estimated where it is not stated.")] = None
-    scatter_sigma_mps2: Annotated[float | None, _of_input(
-        "--scatter-sigma", type=NOT_NEGATIVE, metavar="M/S^2", help="Scatter of each sensor from dwell to dwell, "
-        "1 sigma, m/s^2; estimated where it is not stated.")] = None
-    square_sigma_deg: Annotated[float | None, _of_input(
-        "--square-sigma", type=POSITIVE, metavar="DEG", help="How square the axes of the accelerometers are, 1 sigma, "
-        "deg, where --no-angles cannot tell; 1 if not stated.")] = None
-    reference: Annotated[str | None, _of_input(
-        "--reference", metavar="WORD",
-        help="base: angles are relative to the bench (usual); inertial: stabilised platform.")] = None
-    azimuth_deg: Annotated[float | None, _of_input(
-        "--azimuth", metavar="DEG", help="Azimuth of the bench's x axis from North toward East, deg.")] = None
-    date: Annotated[str | None, _of_input("--date", metavar="DATE", help="When the run began, ISO 8601 (UTC), where "
-        "its stamps are no dates or wrong ones.")] = None
-    nominal: Annotated[str | None, _of_input(
-        "--nominal", metavar="JSON", help="Nominal parameters that differ, for example '{\"theta1\": 0}'.")] = None
+    stated: Annotated[StatedBench, INPUT] = field(default_factory=StatedBench)
 
-    # fmt: on
     @property
-    def keys(self) -> dict[str, str]:
+    def keys(self) -> BenchKeys:
         """Bench keys from the TOML file and, over them, from options."""
-        stated = {name: str(value) for name, value in values_of(self) if value is not None and name != "bench_file"}
-        return (_bench_from_toml(self.bench_file) if self.bench_file else {}) | stated
+        from kf_calib.bench.keys import checked_keys
 
-
-# fmt: off
-@dataclass(frozen=True)
-class DeviceOptions:
-    """What the device sends: the unit of its readings, the size of a count; ``--channels`` is of the bench's keys."""
-
-    accel_unit: Annotated[Literal["m/s2", "g", "mg", "ug"] | None, _of_input(
-        "--accel-unit", show_default="m/s2; in text, as the header or the numbers tell",
-        help="Unit of the readings; a calibration remembers it.")] = None
-    accel_scale: Annotated[float | None, _of_input(
-        "--accel-scale", type=POSITIVE, show_default="1",
-        help="Size of one count, in the unit of the readings; a calibration remembers it.")] = None
-    counts: Annotated[str | None, _of_input(
-        "--counts", metavar="HOW", show_default="signed",
-        help="How raw numbers are to be read: unsigned16 (or so many bits), wrap=4.096 (what negative ones are too "
-        "large by), offset=512 (the number at no force); a calibration remembers it.")] = None
-    restate_input: Annotated[bool, _of_input(
-        "--restate-input",
-        help="What is stated of channels, unit and count was wrong: the options go before it.")] = False
-
-    # fmt: on
-    @property
-    def keys(self) -> dict[str, str]:
-        """The same as bench keys."""
-        stated = {"accel_unit": self.accel_unit, "accel_scale": self.accel_scale, "counts": self.counts}
-        keys = {key: str(value) for key, value in stated.items() if value is not None}
-        return keys | ({"restate_input": "true"} if self.restate_input else {})
+        keys = checked_keys(self.stated)
+        return {**_bench_from_toml(self.bench_file), **keys} if self.bench_file else keys
 
 
 # fmt: off
@@ -149,7 +89,7 @@ class ReadingOptions:
     """How to read a recording: the bench, unit of the readings, and topics."""
 
     bench: BenchOptions = BenchOptions()
-    device: DeviceOptions = DeviceOptions()
+    device: Device = field(default_factory=StatedInput)
     angle_unit: Annotated[Literal["rad", "deg"] | None, _of_input(
         "--angle-unit", show_default="rad; in text, as the header or the numbers tell",
         help="Unit of the gimbal angles.")] = None
@@ -180,9 +120,9 @@ class ReadingOptions:
 
     # fmt: on
     @property
-    def keys(self) -> dict[str, str]:
+    def keys(self) -> BenchKeys:
         """Keys of the bench, with what its device sends."""
-        return self.bench.keys | self.device.keys
+        return {**self.bench.keys, **self.device}
 
     @property
     def renamed(self) -> dict[str, str]:
@@ -203,12 +143,12 @@ class ReadingOptions:
         dataset = self.accel_topic or ""
         return kind_of(path, self.renamed, has_rate=self.rate_hz is not None, dataset=dataset)
 
-    def units(self, input: RawInput | None = None, told: Mapping[str, str] = MappingProxyType({})) -> Units:
-        """Units of a table or a log; told: bench keys beside those of the options."""
+    def units(self, input: RawInput | None = None, told: BenchKeys = UNSTATED, where: str = "") -> Units:
+        """Units of a table or a log; told, where: bench keys, and rows that count, beside those of the options."""
         from kf_calib.sources.text.units import Units
 
         return replace(Units.of({**self.keys, **told}, self.angle_unit, self.g_unit, input),
-                       rate_hz=self.rate_hz, where=told.get("where", self.where or ""),
+                       rate_hz=self.rate_hz, where=where or self.where or "",
                        dataset=self.accel_topic or "")  # fmt: skip
 
     def messages(self, path: Path, angles: bool | None, input: RawInput | None = None) -> Recording:
@@ -228,7 +168,7 @@ class ReadingOptions:
             angles=angles,
         )
 
-    def table(self, path: Path, told: Mapping[str, str], angles: bool | None, input: RawInput | None = None) -> Table:
+    def table(self, path: Path, told: BenchKeys, angles: bool | None, input: RawInput | None = None) -> Table:
         """The table at a path; told: bench keys beside those of the options. angles: whether orientations count."""
         from kf_calib.sources.text.means import open_table
 
@@ -381,7 +321,7 @@ def renamed(columns: Sequence[str]) -> dict[str, str]:
     return pairs
 
 
-def _bench_from_toml(path: Path) -> dict[str, str]:
+def _bench_from_toml(path: Path) -> BenchKeys:
     from kf_calib.bench.bench import metadata_of
     from kf_calib.bench.keys import checked_keys
     from kf_calib.support.toml_files import toml_table
@@ -389,13 +329,11 @@ def _bench_from_toml(path: Path) -> dict[str, str]:
     content = toml_table(path, "gravity_mps2 = 9.81, numbers with a point")
     table = content.get("bench", content) if isinstance(content.get("bench"), dict) else content
     try:
-        keys = metadata_of(table)
-        checked_keys(keys)
+        return checked_keys(metadata_of(table))
     except BenchError as error:
         raise BenchError(f"{path}: {error}") from None
     except (ValueError, RecursionError):
         raise BenchError(f"{path}: has a value that is too large for any key: write numbers and text.") from None
-    return keys
 
 
 _OF_TEXT = ("columns", "g_unit", "rate_hz", "where")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import rich_click as click
 
+from kf_calib.bench.keys import BenchKeys
 from kf_calib.cli.command import POSITIVE, NumberInRange, command, option
 from kf_calib.cli.echo import print_result, progress
 from kf_calib.cli.files import FigureFiles, claimed, delivery, output_option
@@ -169,7 +170,7 @@ def _plan_by_hand(options: PlanOptions, reading: ReadingOptions, evaluation: Eva
                            noise.scatter_mps2.mean())  # fmt: skip
         made = HandPlan.of(options.count or 1, before.linearised.model, sigma, before)
     else:
-        keys = {"gravity_mps2": "9.80665", **reading.keys}
+        keys: BenchKeys = {"gravity_mps2": 9.80665, **reading.keys}
         bench = replace(Bench.from_metadata(keys, has_angles=False), angles=False, nominal={"theta1": 0, "theta3": 0})
         readings = options.readings or max((options.dwell_s or _USUAL_DWELL_S) * options.sample_hz, 1.0)
         made = HandPlan.of(options.count or 12, Model(bench), options.white_mps2 / math.sqrt(readings))
@@ -182,9 +183,9 @@ def _prospect(options: PlanOptions, reading: ReadingOptions, evaluation: Evaluat
 
     if options.recording is not None:
         return _after(options.recording, options, reading, evaluation, quiet)
-    keys = {"axes": "y z x", **reading.keys}
+    keys: BenchKeys = {"axes": "y z x", **reading.keys}
     if "latitude_deg" not in keys:
-        keys.setdefault("gravity_mps2", "9.81")
+        keys.setdefault("gravity_mps2", 9.81)
     dwell_s = options.dwell_s or _USUAL_DWELL_S
     made = Prospect.of_bench(Bench.from_metadata(keys), options.white_mps2, 1.0, dwell_s)
     return replace(made, readings=options.readings or max(made.still_s * options.sample_hz, 1.0))

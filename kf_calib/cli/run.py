@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import rich_click as click
 
+from kf_calib.bench.keys import BenchKeys
 from kf_calib.cli.command import POSITIVE, command, option
 from kf_calib.cli.echo import complain, print_result, rendered
 from kf_calib.cli.failures import answered
@@ -30,7 +31,7 @@ from kf_calib.cli.live_page import PageOptions, page_server
 from kf_calib.cli.live_run import LiveRun, on_bench
 from kf_calib.cli.options import (
     BenchOptions,
-    DeviceOptions,
+    Device,
     EvaluationOptions,
     Json,
     Overwrite,
@@ -209,7 +210,7 @@ def run(
         "--positioner", required=True, metavar="P", help="sim://... (emulated, with its readings), hand, the name of a "
         "shipped profile (acutrol3000, lines, command), or the path of a profile in TOML.",
     )],
-    options: DriveOptions, page: PageOptions, device: DeviceOptions, bench: BenchOptions, evaluation: EvaluationOptions,
+    options: DriveOptions, page: PageOptions, device: Device, bench: BenchOptions, evaluation: EvaluationOptions,
     overwrite: Overwrite, save: Save, save_model: SaveModel, strict: Strict, units: ShownUnits, as_json: Json,
 ) -> None:  # fmt: skip
     """Let the bench run by itself: it chooses orientations, moves, records and judges until every target is reached.
@@ -222,7 +223,8 @@ def run(
     from kf_calib.positioning.opening import open_positioner
     from kf_calib.sources.live import files_of
 
-    settings, wanted, keys = evaluation.settings(), targets_of(options.targets), bench.keys | device.keys
+    settings, wanted = evaluation.settings(), targets_of(options.targets)
+    keys: BenchKeys = {**bench.keys, **device}
     source, record = options.source, options.record
     if options.dry_run:
         _show_dry_run(positioner, keys, options, as_json)
@@ -270,7 +272,7 @@ def _ask_for_programs(positioner: str) -> None:
         raise InputError(f"{positioner}: its programs were not run.")
 
 
-def _source(positioner: str, source: str | None, keys: Mapping[str, str], record: Path | None, overwrite: bool
+def _source(positioner: str, source: str | None, keys: BenchKeys, record: Path | None, overwrite: bool
             ) -> tuple[LiveSource, Opened | None]:  # fmt: skip
     """The source of readings that is named, or that of the emulated bench, and then that bench."""
     from kf_calib.positioning.opening import open_simulation
@@ -372,7 +374,7 @@ def _tell_end(running: DrivenRun, as_json: bool) -> None:
         running.print(rendered(ended_in_words(running.outcome)), end=False)
 
 
-def _show_dry_run(name: str, keys: Mapping[str, str], options: DriveOptions, as_json: bool) -> None:
+def _show_dry_run(name: str, keys: BenchKeys, options: DriveOptions, as_json: bool) -> None:
     """Print the opening with its ways and times; the orientations after it are decided in the run."""
     import numpy as np
 
@@ -380,8 +382,8 @@ def _show_dry_run(name: str, keys: Mapping[str, str], options: DriveOptions, as_
     from kf_calib.design.gimbal_limits import route
     from kf_calib.views import run as views
 
-    stated = {"axes": "y z x", "gravity_mps2": "9.81", **keys} if name.startswith("sim:") else dict(keys)
-    bench = Bench.from_metadata(stated)
+    usual: BenchKeys = {"axes": "y z x", "gravity_mps2": 9.81} if name.startswith("sim:") else {}
+    bench = Bench.from_metadata({**usual, **keys})
     itinerary = _itinerary(bench, 60, options)
     poses, here = itinerary.opening_poses, np.zeros(len(bench.axes))
     ways, slews_s = list[list[Any]](), list[float]()

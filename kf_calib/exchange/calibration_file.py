@@ -28,6 +28,7 @@ from kf_calib import effects
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
+from kf_calib.bench.keys import checked_keys
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.bench.raw_input import RESTATE
 from kf_calib.bench.streams import Source
@@ -246,7 +247,7 @@ def save_calibration(
     Raises InputError if the file cannot be written.
     """
     if source is not None:
-        source = opened(source, result.bench.to_metadata() | {RESTATE: "true"}, angles=False)
+        source = opened(source, checked_keys(result.bench.to_metadata() | {RESTATE: "true"}), angles=False)
     write_calibration(Path(path), saved(result) if source is None else of_source(result, source))
 
 

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.bench.keys import BenchKeys
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C
 from kf_calib.errors import InputError
@@ -181,7 +182,7 @@ def apply_to_table(
     correction: Correction,
     path: Path,
     copy: Path,
-    overrides: Mapping[str, str],
+    overrides: BenchKeys,
     columns: Mapping[str, str],
     units: Units,
     *,

@@ -18,6 +18,7 @@ from types import MappingProxyType
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.bench.keys import UNSTATED, BenchKeys
 from kf_calib.bench.raw_input import CHANNELS, PLAIN, RESTATING, RawInput, wrong_unit
 from kf_calib.bench.streams import Stream
 from kf_calib.errors import InputError
@@ -145,7 +146,7 @@ class CorrectedLines:
         self,
         correction: Correction,
         columns: Mapping[str, str] = MappingProxyType({}),
-        overrides: Mapping[str, str] = MappingProxyType({}),
+        overrides: BenchKeys = UNSTATED,
         *,
         name: str = "standard input",
         units: Units | None = None,

@@ -12,7 +12,7 @@ import queue
 import stat
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -20,6 +20,7 @@ from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
 from kf_calib.bench.bench import Bench
+from kf_calib.bench.keys import BenchKeys
 from kf_calib.bench.streams import Batch
 from kf_calib.errors import InputError
 from kf_calib.positioning.drive import Time, WallTime
@@ -124,7 +125,7 @@ class SimulatedTime:
         self.wait(self._readings, _EVALUATION_S)
 
 
-def open_simulated(url: str, keys: Mapping[str, str]) -> tuple[DrivenBench, float]:
+def open_simulated(url: str, keys: BenchKeys) -> tuple[DrivenBench, float]:
     """The bench of a URL ``sim://?KEY=VALUE&...``, and its speed; keys: of the bench.
 
     Beside the settings of the simulator it takes those of ``Servo``, and ``speed``. Raises InputError.
@@ -137,9 +138,8 @@ def open_simulated(url: str, keys: Mapping[str, str]) -> tuple[DrivenBench, floa
     if speeds and not speeds[-1] > 0.0:
         raise InputError(f"speed={speeds[-1]:g} is not positive: write for example speed=20.")
     rest = [pair for pair in pairs if pair[0] not in _OF_SERVO and pair[0] != "speed"]
-    for name in ("rate_degps", "acceleration_degps2"):
-        if name in keys:
-            servo.setdefault(name, float(keys[name]))
+    stated = {"rate_degps": keys.get("rate_degps"), "acceleration_degps2": keys.get("acceleration_degps2")}
+    servo = {name: value for name, value in stated.items() if value is not None} | servo
     run = simulation(options_from_query(urlencode(rest)), keys)
     start_deg = [0.0] * len(run.bench.axes)
     return DrivenBench(run, Servo(**servo), start_deg), speeds[-1] if speeds else math.inf
@@ -162,7 +162,7 @@ class Opened:
     feed: DrivenFeed | None = None
 
 
-def open_simulation(name: str, keys: Mapping[str, str]) -> Opened:
+def open_simulation(name: str, keys: BenchKeys) -> Opened:
     """The emulated bench of a URL, positioner and source in one; raises InputError."""
     bench, speed = open_simulated(name, keys)
     feed = DrivenFeed(bench.run.bench)

@@ -14,6 +14,7 @@ from types import MappingProxyType
 import numpy as np
 
 from kf_calib.bench.arrays import lengths
+from kf_calib.bench.keys import UNSTATED, BenchKeys
 from kf_calib.bench.streams import Source
 from kf_calib.errors import InputError
 from kf_calib.sources.containers.opening import dataset_of, kind_of_container
@@ -137,9 +138,7 @@ def no_recording(path: str | PathLike[str]) -> InputError:
     )
 
 
-def opened(
-    source: Source | str | PathLike[str], overrides: Mapping[str, str] = MappingProxyType({}), *, angles: bool = True
-) -> Source:
+def opened(source: Source | str | PathLike[str], overrides: BenchKeys = UNSTATED, *, angles: bool = True) -> Source:
     """The source itself, or that of the file at a path; overrides, angles: as of a ``Recording``."""
     if not isinstance(source, str | PathLike):
         return source

@@ -199,6 +199,20 @@ def test_limits_of_keys_are_those_of_the_page(key: str, inside: tuple[str, ...],
 
 
 @pytest.mark.parametrize(
+    ("typed", "text"),
+    [
+        ({"gravity_mps2": 9.8123}, {"gravity_mps2": "9.8123"}),
+        ({"latitude_deg": 50.0, "height_m": 120}, {"latitude_deg": "50", "height_m": "120"}),
+        ({"gravity_mps2": 9.81, "nominal": {"theta1": 0.0}}, {"gravity_mps2": "9.81", "nominal": '{"theta1": 0}'}),
+        ({"gravity_mps2": 9.81, "accel_scale": 3.9e-6}, {"gravity_mps2": "9.81", "accel_scale": "3.9e-6"}),
+        ({"gravity_mps2": 9.81, "restate_input": True}, {"gravity_mps2": "9.81", "restate_input": "true"}),
+    ],
+)
+def test_keys_in_their_types_state_the_same_bench_as_text(typed: dict[str, object], text: dict[str, str]) -> None:
+    assert Bench.from_metadata({"axes": "y z x", **typed}) == Bench.from_metadata({"axes": "y z x", **text})
+
+
+@pytest.mark.parametrize(
     "metadata, says",
     [
         ({"gravity_mps2": "9.81"}, "axes"),

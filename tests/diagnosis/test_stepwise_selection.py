@@ -326,7 +326,7 @@ def test_a_journal_has_what_numbers_depend_on(recording: Path, tmp_path: Path) -
     words = ["--bench", bench, "--still-deg", "0.04", "--with", "bias-drift", "--no-gate"]
     call("improve", recording, "--json", "--journal", kept, *words)
     table = tomllib.loads(kept.read_text())
-    assert table["options"]["gravity_mps2"] == "9.82" and table["options"]["effects"] == ["bias-drift"]
+    assert table["options"]["gravity_mps2"] == 9.82 and table["options"]["effects"] == ["bias-drift"]
     assert table["options"]["still_deg"] == 0.04 and table["options"]["gate"] is False
     assert "bias-drift" in table["model"]
 

@@ -13,13 +13,14 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from os import PathLike
 from pathlib import Path
-from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Metadata
 
 from kf_calib.bench.bench import Bench
+from kf_calib.bench.keys import UNSTATED, BenchKeys, checked_keys
 from kf_calib.bench.raw_input import Conversion, RawInput, conversion, merged_metadata
 from kf_calib.bench.streams import Batch, Stream, bench_without_angles
 from kf_calib.errors import BenchError, InputError
@@ -83,7 +84,7 @@ class Recording:
     def __init__(
         self,
         path: str | PathLike[str],
-        overrides: Mapping[str, str] = MappingProxyType({}),
+        overrides: BenchKeys = UNSTATED,
         accel_scale: float | tuple[float, float, float] | None = None,
         *,
         input: RawInput | None = None,
@@ -122,7 +123,7 @@ class Recording:
             self._pose = self._require(POSES, advice)
         self._parts.choose(TEMPERATURES, self._wanted[TEMPERATURES])  # optional, but not to be guessed
         if accel_scale is not None:
-            overrides = {**overrides, **RawInput.of_factors(accel_scale).scale_metadata()}
+            overrides = checked_keys({**overrides, **RawInput.of_factors(accel_scale).scale_metadata()})
         self.bench, self._convert = self._describe_bench(overrides, input)
         self._opening_warnings = len(self.warnings)
 
@@ -253,7 +254,7 @@ class Recording:
         self._parts.having(topic).refuse_unreadable(role, topic)
         return topic
 
-    def _describe_bench(self, overrides: Mapping[str, str], default: RawInput | None) -> tuple[Bench, Conversion]:
+    def _describe_bench(self, overrides: BenchKeys, default: RawInput | None) -> tuple[Bench, Conversion]:
         """The bench, and how the numbers of the file become readings."""
         recorded, is_damaged = self._parts.bench
         damage = f"{self.path}: the description of the bench in it is damaged"
@@ -276,8 +277,8 @@ class Recording:
             raise BenchError(f"{where}: {error}") from error
 
     def _keys_of_bench(
-        self, recorded: Mapping[str, str], overrides: Mapping[str, str], default: RawInput | None
-    ) -> dict[str, str]:
+        self, recorded: Mapping[str, str], overrides: BenchKeys, default: RawInput | None
+    ) -> dict[str, Any]:
         """The keys of the bench: those of the file, and of options over them."""
         try:
             return merged_metadata(recorded, overrides, "the recording", default)

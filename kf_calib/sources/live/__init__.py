@@ -19,6 +19,7 @@ from typing import Any
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
 from kf_calib.bench.bench import Bench
+from kf_calib.bench.keys import UNSTATED, BenchKeys
 from kf_calib.bench.streams import Batch, bench_without_angles, without_poses
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.files.fields import as_columns
@@ -44,7 +45,7 @@ _PORT_SETTINGS: dict[str, tuple[str, Callable[[str], Any]]] = {
 
 def open_live(
     url: str,
-    overrides: Mapping[str, str] | None = None,
+    overrides: BenchKeys | None = None,
     record: Path | None = None,
     overwrite: bool = False,
     *,
@@ -66,19 +67,20 @@ def open_live(
     Raises InputError where it cannot be opened.
     """
     Outputs({"--record": record}, files_of(url), overwrite)
+    overrides = overrides or UNSTATED
     address, query = _split(url)
     give_up_s, idle_s = query.pop("give_up", give_up_s), query.pop("idle", idle_s)
     silent_s = query.pop("silent", silent_s)
     scheme = url.partition("://")[0] if "://" in url else ""
     if scheme == "sim":
-        feed = _simulated_feed(url.partition("://")[2], overrides or {}, angles)
+        feed = _simulated_feed(url.partition("://")[2], overrides, angles)
     elif (path := _bag(address)) is not None:
-        feed = BagFeed(path, lambda path: Recording(path, overrides or {}, angles=angles), idle_s)
+        feed = BagFeed(path, lambda path: Recording(path, overrides, angles=angles), idle_s)
     else:
         link = _link(address)
         name = "standard input" if address == "-" else address.removeprefix("tail:")
-        columns = {**as_columns((overrides or {}).get("joints", "")), **columns}
-        feed = StreamedFeed(name, link, overrides or {}, columns, header, give_up_s, idle_s, silent_s, angles=angles)
+        columns = {**as_columns(overrides.get("joints", "")), **columns}
+        feed = StreamedFeed(name, link, overrides, columns, header, give_up_s, idle_s, silent_s, angles=angles)
     return LiveSource(feed, record, overwrite, queued)
 
 
@@ -163,7 +165,7 @@ def _tcp(address: str) -> Tcp:
     return Tcp(host, port)
 
 
-def _simulated_feed(rest: str, overrides: Mapping[str, str], angles: bool) -> Feed:
+def _simulated_feed(rest: str, overrides: BenchKeys, angles: bool) -> Feed:
     from kf_calib.sources.simulation.options import options_from_query, simulation
 
     pairs = parse_qsl(rest.partition("?")[2], keep_blank_values=True)

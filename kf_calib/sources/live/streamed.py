@@ -11,6 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from kf_calib.bench.bench import Bench
+from kf_calib.bench.keys import BenchKeys
 from kf_calib.bench.raw_input import PLAIN
 from kf_calib.bench.streams import Batch, Stream, bench_without_angles, with_accel, without_poses
 from kf_calib.errors import BenchError, InputError
@@ -59,7 +60,7 @@ class StreamedFeed(Feed):
         self,
         name: str,
         link: Link,
-        overrides: Mapping[str, str],
+        overrides: BenchKeys,
         columns: Mapping[str, str],
         header: str,
         give_up_s: float,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
@@ -10,6 +10,7 @@ from typing import Any
 from urllib.parse import parse_qsl
 
 from kf_calib.bench.bench import Bench, Vector, parse_axes
+from kf_calib.bench.keys import BenchKeys
 from kf_calib.errors import InputError
 from kf_calib.sources.simulation.detectability import sized
 from kf_calib.sources.simulation.injected import parse
@@ -48,7 +49,7 @@ def options_from_query(query: str) -> SimulationOptions:
 
 def simulation(
     options: SimulationOptions,
-    bench_keys: Mapping[str, str],
+    bench_keys: BenchKeys,
     batch_samples: int = 65536,
     angles: bool = True,
     begin: Callable[[Simulation], None] = lambda run: None,
@@ -60,16 +61,16 @@ def simulation(
     """
     if options.seed < 0:
         raise InputError(f"seed is {options.seed}: give zero or a positive number.")
-    keys = {"axes": "y z x", **bench_keys}
+    keys: BenchKeys = {"axes": "y z x", **bench_keys}
     if "latitude_deg" not in keys:
-        keys.setdefault("gravity_mps2", "9.81")
+        keys.setdefault("gravity_mps2", 9.81)
     grade = GRADES[options.grade]
     noise = options.noise.over(grade.noise)
-    axes = parse_axes(keys["axes"])
+    axes = parse_axes(keys.get("axes", ""))
     visits = _visits(options, axes, keys.get("up", "y"))
     if not options.unstated:
-        keys.setdefault("angle_sigma_deg", repr(noise.setting_sigma_deg))
-        keys.setdefault("scatter_sigma_mps2", repr(noise.dwell_sigma_mps2(len(visits))))
+        keys.setdefault("angle_sigma_deg", noise.setting_sigma_deg)
+        keys.setdefault("scatter_sigma_mps2", noise.dwell_sigma_mps2(len(visits)))
     run = Simulation(
         Bench.from_metadata(keys), grade.sensors(options.seed), noise, visits,
         sample_hz=options.sample_hz, angle_hz=options.angle_hz, slew_rate_degps=options.slew_degps,

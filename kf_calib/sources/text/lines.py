@@ -14,13 +14,14 @@ from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
-from typing import BinaryIO, Protocol
+from typing import Any, BinaryIO, Protocol
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.counts import refuse_unread
+from kf_calib.bench.keys import UNSTATED, BenchKeys
 from kf_calib.bench.raw_input import CONVERTED, PLAIN, RESTATE, RawInput, merged_metadata
 from kf_calib.bench.streams import Batch, bench_without_angles, with_accel, without_poses
 from kf_calib.errors import BenchError, InputError
@@ -53,7 +54,7 @@ class Lines:
     def __init__(
         self,
         source: str | PathLike[str] | BinaryIO,
-        overrides: Mapping[str, str] = MappingProxyType({}),
+        overrides: BenchKeys = UNSTATED,
         columns: Mapping[str, str] = MappingProxyType({}),
         name: str = "standard input",
         *,
@@ -176,9 +177,7 @@ class Described(Protocol):
     is_bare: bool
 
 
-def stated_of(
-    name: str, reader: Described, overrides: Mapping[str, str], default: RawInput | None = None
-) -> dict[str, str]:
+def stated_of(name: str, reader: Described, overrides: BenchKeys, default: RawInput | None = None) -> dict[str, Any]:
     """The bench keys that what came, options and the names of the readings state; default: the raw input where neither
     what came nor options state one.
 
@@ -207,7 +206,7 @@ def stated_of(
     return stated | by_name if reader.raw is not None else by_name | stated
 
 
-def bench_of(name: str, reader: Described, overrides: Mapping[str, str], default: RawInput | None = None) -> Bench:
+def bench_of(name: str, reader: Described, overrides: BenchKeys, default: RawInput | None = None) -> Bench:
     """The bench, once a pose has been read. Raises InputError where it cannot be that one."""
     stated = stated_of(name, reader, overrides, default)
     with named(name):

@@ -15,6 +15,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats, lengths
 from kf_calib.bench.bench import Bench, parse_axes
 from kf_calib.bench.counts import refuse_unread
+from kf_calib.bench.keys import UNSTATED, BenchKeys, checked_keys
 from kf_calib.bench.raw_input import RawInput, merged_metadata
 from kf_calib.bench.streams import Orientations, Table, bench_without_angles
 from kf_calib.errors import InputError
@@ -40,7 +41,7 @@ _UP_DOWN = re.compile(r"([+\-−])\s*1\s*g", re.IGNORECASE)
 
 def open_table(
     table: Any,
-    overrides: Mapping[str, str] = MappingProxyType({}),
+    overrides: BenchKeys = UNSTATED,
     *,
     columns: Mapping[str, str] = MappingProxyType({}),
     accel_unit: str | None = None,
@@ -70,11 +71,13 @@ def open_table(
     """
     grid = grid_of(table, dataset)
     given = {"accel_unit": accel_unit, "accel_scale": accel_scale}
-    keys = {**overrides, **{key: str(value) for key, value in given.items() if value is not None}}
     with named(grid.name):
+        keys = checked_keys({**overrides, **{key: value for key, value in given.items() if value is not None}})
         order = merged_metadata({}, keys, "", input).get("channels")
         units = replace(Units.of(keys, angle_unit, g_unit, input), where=where)
-        return TableOfMeans(grid, columns, keys if order is None else keys | {"channels": order}, units, angles).table()
+        return TableOfMeans(
+            grid, columns, keys if order is None else {**keys, "channels": order}, units, angles
+        ).table()
 
 
 class TableOfMeans:
@@ -82,13 +85,13 @@ class TableOfMeans:
     do where a column tells them."""
 
     def __init__(
-        self, grid: Grid, stated: Mapping[str, str], overrides: Mapping[str, str], units: Units, angles: bool | None
+        self, grid: Grid, stated: Mapping[str, str], overrides: BenchKeys, units: Units, angles: bool | None
     ) -> None:
         refuse_unknown_names(stated, grid.heading.header)
         self.columns = Columns.of(grid.heading, stated, units, is_table=True)
         pairs = zip(grid.heading.numbers, grid.heading.rows, strict=True)
         self.numbers = [line + 1 for line, row in pairs if self.columns.is_chosen(row)]
-        self.grid, self.overrides, self.units, self.said = grid, dict(overrides), units, self.columns.said
+        self.grid, self.overrides, self.units, self.said = grid, overrides.copy(), units, self.columns.said
         self.are_lacking = angles is None and not self.columns.orientation
         self.angles = angles is not False and not self.are_lacking
         self.warnings = [f"{grid.name}: {remark}." for remark in grid.remarks]

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kf_calib.bench.keys import UNSTATED, BenchKeys
 from kf_calib.bench.streams import Table
 from kf_calib.errors import CountsError, InputError
 from kf_calib.sources.text.grid import grid_of
@@ -104,7 +105,7 @@ class Survey:
 
 def survey(
     path: Path,
-    overrides: Mapping[str, str] = MappingProxyType({}),
+    overrides: BenchKeys = UNSTATED,
     columns: Mapping[str, str] = MappingProxyType({}),
     units: Units | None = None,
     *,
@@ -117,8 +118,9 @@ def survey(
     """
     units = units or Units()
     grid = grid_of(path, units.dataset)
-    gravity = {} if {"gravity_mps2", "latitude_deg"} & overrides.keys() else {"gravity_mps2": STANDARD_GRAVITY_MPS2}
-    keys = {**overrides, **{key: str(value) for key, value in gravity.items()}}
+    keys = overrides.copy()
+    if not {"gravity_mps2", "latitude_deg"} & keys.keys():
+        keys["gravity_mps2"] = STANDARD_GRAVITY_MPS2
     with named(grid.name):
         means = TableOfMeans(grid, columns, keys, units, angles=None if angles else False)
         means.refuse_samples()

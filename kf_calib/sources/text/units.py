@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeVar
 
@@ -12,7 +12,8 @@ import numpy as np
 from kf_calib.bench.arrays import Floats, lengths
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.counts import SIGNED, parse_counts
-from kf_calib.bench.raw_input import CHANNELS, PLAIN, RESTATE, UNITS, RawInput
+from kf_calib.bench.keys import BenchKeys
+from kf_calib.bench.raw_input import CHANNELS, PLAIN, UNITS, RawInput
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.text.names import ACCEL
 from kf_calib.support.text import cut
@@ -56,7 +57,7 @@ class Units:
 
     @classmethod
     def of(
-        cls, keys: Mapping[str, str], angle: str | None = None, g: str | float = STANDARD_GRAVITY_MPS2,
+        cls, keys: BenchKeys, angle: str | None = None, g: str | float = STANDARD_GRAVITY_MPS2,
         input: RawInput | None = None,
     ) -> Units:  # fmt: skip
         """Units as bench keys state them; g: m/s^2 that 1 g stands for, or ``local``. Raises InputError."""
@@ -65,7 +66,7 @@ class Units:
             raise BenchError("accel_scale has a size for each channel: in lines and tables, state one for all.")
         unit = stated.unit if "accel_unit" in keys else None
         default = None if {"accel_unit", "accel_scale"} & set(keys) else input
-        return cls(unit, stated.sizes[0], angle, _g_mps2(g, keys), default, keys.get(RESTATE) == "true",
+        return cls(unit, stated.sizes[0], angle, _g_mps2(g, keys), default, bool(keys.get("restate_input")),
                    stated.counts)  # fmt: skip
 
     def told_by(self, names: Sequence[str], named: Sequence[str]) -> Sequence[str]:
@@ -91,10 +92,10 @@ class Units:
         return set(named) <= {"", "count"} or math.isnan(norm) or _NEAR[0] < level < _NEAR[1]
 
 
-def _g_mps2(g: str | float, keys: Mapping[str, str]) -> float:
+def _g_mps2(g: str | float, keys: BenchKeys) -> float:
     """Return what 1 g stands for: as stated, or the gravity of the bench. Raises InputError where that cannot be."""
     if g == "local":
-        stated = {} if "latitude_deg" in keys else {"gravity_mps2": str(STANDARD_GRAVITY_MPS2)}
+        stated = {} if "latitude_deg" in keys else {"gravity_mps2": STANDARD_GRAVITY_MPS2}
         return Bench.from_metadata({**stated, **keys}, has_angles=False).gravity_mps2
     try:
         size = float(g)
