@@ -13,6 +13,7 @@ from typing import Any
 from urllib.parse import unquote, urlsplit
 
 import pytest
+import reference_pages
 from helpers.browser import chromium
 from helpers.long_runs import slow
 
@@ -75,12 +76,20 @@ def test_a_page_loads_nothing_from_elsewhere(pages: dict[Path, Page]) -> None:
 
 def test_commands_effects_and_public_names_are_all_there(pages: dict[Path, Page]) -> None:
     anchors = {path.name: page.anchors for path, page in pages.items()}
-    assert {f"kf_calib.{name}" for name in kf_calib.__all__} <= anchors["api.html"]
+    assert {name.lower().replace("_", "-") for name in kf_calib.__all__} <= {
+        each.replace("_", "-") for each in anchors["api.html"]
+    }
     listed = json.loads(_printed("effects", "--json"))["effects"]
     assert {each["effect"].partition(":")[0] for each in listed} <= anchors["effects.html"]
     commands = {"demo", "simulate", "record", "live", "replay", "compare", "diagnose", "improve", "report", "plan",
                 "paper", "info"}  # fmt: skip
-    assert {f"kf-calib-{name}" for name in commands} <= anchors["command_line.html"]
+    assert commands <= anchors["command_line.html"]
+
+
+def test_pages_of_reference_are_as_the_program_says() -> None:
+    """tools/reference_pages.py writes them anew after a change of help, docstrings or effects."""
+    for path, text in reference_pages.pages().items():
+        assert path.read_text() == text, f"{path.name}: python tools/reference_pages.py"
 
 
 def test_equations_are_mathml_without_a_command_of_tex_left_over(site: Path) -> None:

@@ -84,7 +84,8 @@ class Courses:
     def of(cls, rows: Sequence[Floats], dwells: DwellTable, channels: int) -> Courses:
         """From whitened rows of each dwell in which nothing is left of the means of its channels."""
         squares = np.array([float(of_dwell[:, -1] @ of_dwell[:, -1]) for of_dwell in rows])
-        return cls(squares, channels * (dwells.folded.width * dwells.folded.piece_numbers - 1.0))
+        freedom = channels * (dwells.folded.width * dwells.folded.piece_numbers - 1.0)
+        return cls(squares, np.asarray(freedom, float))
 
     def log_bayes(self) -> Floats:
         """Log Bayes factors (D,) of whatever changes the course of one dwell, of any size s in units of the noise: with

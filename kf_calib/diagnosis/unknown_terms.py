@@ -87,7 +87,10 @@ def _of_gimbals(count: int) -> Iterator[UnknownTerm]:
         yield _term(f"angle of gimbal {k}", "", [*waves.values()], weights)
         products = [_times(waves[n], force) for n in (1, 2) for force in ("a", "p", "o")]
         yield _term(f"angle of gimbal {k} and specific force", "", products)
-        yield _term(f"angle of gimbal {k} and temperature", "", [_times(waves[1], "T")])
+        for words, slow in (("temperature", "T"), ("time", "t")):
+            yield _term(
+                f"angle of gimbal {k} and {words}", "", [_times(waves[n], slow) for n in (1, 2, 3, 4)], weights[:4]
+            )
         before = (f"sin(q{k}_before)", f"cos(q{k}_before)")
         yield _term(f"previous orientation (angle of gimbal {k})", "memory", [before])
         turning = [(f"q{k}",), *waves.values()]
@@ -177,6 +180,7 @@ def _of_surroundings(gimbals: int, turns: bool) -> Iterator[UnknownTerm]:
     products = [f"{power}*{force}" for power in ("T", "T*T") for force in ("a", "p", "o")]
     products += [f"{power}*{force}" for power in ("T", "T*T") for force in ("a*a", "p*p", "a*p", "a*o", "p*o")]
     yield _term("temperature and specific force", "temperature", products)
+    yield _term("temperature and time", "", ["t*T", "t*t*T", "t*T*T"])
     yield _term("rate of temperature", "temperature", ["dT", "a*dT"])
     if turns:
         for place, words in (("base", "a tilt of the base"), ("platform", "a rotation of the platform")):
@@ -185,6 +189,8 @@ def _of_surroundings(gimbals: int, turns: bool) -> Iterator[UnknownTerm]:
     yield _term("previous orientation", "memory", [*texts, "a-da", "(a-da)**2"])
     steps = [f"{step}*{force}" for step in ("da", "abs(da)") for force in ("a", "p", "o")]
     yield _term("previous orientation and specific force", "memory", steps)
+    for words, slow in (("temperature", "T"), ("time", "t")):
+        yield _term(f"previous orientation and {words}", "memory", [f"{slow}*da", f"{slow}*abs(da)"])
 
 
 def name_of_formula(number: int) -> str:

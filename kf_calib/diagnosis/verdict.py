@@ -247,7 +247,8 @@ def format_probability(probability: float) -> str:
 
 def _size(diagnosis: Diagnosis) -> str:
     """Return, as text, the most significant coefficient of the missing effects and the constant of its effect, with
-    sigmas."""
+    sigmas; a constant that the run does not tell, as the time of a decay that is far longer than its dwells, is named
+    so."""
     assert diagnosis.after is not None
     parameters = diagnosis.after.parameters
     missing = [each for each in diagnosis.after.model.effects if str(each) in diagnosis.missing]
@@ -257,8 +258,9 @@ def _size(diagnosis: Diagnosis) -> str:
     parameters_named = [largest, *([parameters[constant.symbol]] if constant else [])]
     return "".join(
         f", {p.symbol} = {shown(p).number(p.value)} ± {shown(p).text(p.sigma, 2)}"
-        for p in parameters_named
         if p.value is not None and p.sigma
+        else f", {p.symbol} not determined"
+        for p in parameters_named
     )
 
 

@@ -36,6 +36,11 @@ def diagnosed(name: str, sigmas: float = 12.0, seed: int = 2) -> Diagnosis:
         ("last step x force", {"previous orientation and specific force"}),
         ("temperature x two forces", {"temperature and specific force"}),
         ("play", {"previous orientation"}),
+        ("third harmonic of an angle x temperature", {"angle of gimbal 2 and temperature"}),
+        ("angle x time", {"angle of gimbal 3 and time"}),
+        ("last step x temperature", {"previous orientation and temperature"}),
+        ("last step x time", {"previous orientation and time"}),
+        ("temperature x time", {"temperature and time"}),
     ],
 )
 def test_what_depends_on_two_drivers_or_on_the_past_is_unknown_and_goes_with_them(name: str, drivers: set[str]) -> None:

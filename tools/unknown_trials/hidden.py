@@ -68,6 +68,13 @@ HIDDEN: dict[str, Callable[[Visits], Floats]] = {
     "play": lambda at: _over(at, _play(at.force_mps2[:, None] / G_MPS2)),
     "play on the way": lambda at: _over(at, _play(at.path_mps2 / G_MPS2)),
     "angle x temperature": lambda at: np.sin(at.angles_rad[:, None, 2:] + 0.3) * _warm(at) * np.ones(3),
+    "third harmonic of an angle x temperature": lambda at: (
+        np.sin(3.0 * at.angles_rad[:, None, 1:2]) * _warm(at) * np.ones(3)
+    ),
+    "angle x time": lambda at: np.cos(at.angles_rad[:, None, 2:]) * _gone(at) * np.ones(3),
+    "last step x temperature": lambda at: at.step_mps2[:, None] * _warm(at),
+    "last step x time": lambda at: at.step_mps2[:, None] * _gone(at),
+    "temperature x time": lambda at: _warm(at) * _gone(at) * np.ones(3),
     "a rough map of the force": lambda at: _over(at, _map(at)),
     "a thirteenth harmonic of an angle": lambda at: _over(at, np.sin(13.0 * at.angles_rad[:, 2:]) * np.ones(3)),
 }

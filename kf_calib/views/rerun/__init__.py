@@ -45,8 +45,10 @@ from kf_calib.views.rerun.improvement import save_improvement_view as save_impro
 from kf_calib.views.rerun.names import (
     BENCH_TIME,
     CHANNELS,
+    DARK,
     GROUPS,
     LABELS,
+    ON_DARK,
     ORIENTATION,
     Colour,
     quantities,
@@ -318,6 +320,7 @@ def _series(
         plot_legend=rrb.PlotLegend(legend, visible=legend is not None),
         axis_x=WHOLE_RUN,
         axis_y=None if around is None else rrb.ScalarAxis(range=around),
+        background=ON_DARK,
     )
 
 
@@ -346,4 +349,5 @@ def _platform(result: Calibration) -> rrb.Spatial3DView:
         overrides={"platform/visited": rrb.VisibleTimeRanges(so_far)},
         eye_controls=eye(result.bench, (1.8, 1.2, 2.2), (0.05, 0.18, 0.0)),
         line_grid=False,
+        background=DARK,
     )

@@ -30,7 +30,7 @@ from kf_calib.estimation.results import format_p
 from kf_calib.support.text import printable
 from kf_calib.support.units import shown_whole
 from kf_calib.views.diagnosis import disturbed_dwells, name_of, verdict
-from kf_calib.views.rerun.names import ACCELEROMETERS, CHANNELS, GOLD, GREY, MAUVE, Colour, rrd_file, thin
+from kf_calib.views.rerun.names import ACCELEROMETERS, CHANNELS, DARK, GOLD, GREY, MAUVE, Colour, rrd_file, thin
 from kf_calib.views.rerun.spheres import Log, at_step, forever, log_key, log_spheres, spheres
 
 EXPLANATION = "explanation"
@@ -109,15 +109,15 @@ def _summary(diagnosis: Diagnosis) -> str:
         blocks.append(f"**Next orientation**: gimbals at {angles} deg: {why}.")
     if explanations := diagnosis.explanations[:_MOST]:
         rows = [
-            f"| {rank} | {each.name} | {'yes' if each.fits else 'no'} | "
+            f"| {rank} {each.name} | {'yes' if each.fits else 'no'} | "
             f"{format_p(each.after.consistency.p_value).removeprefix('= ')} |"
             for rank, each in enumerate(explanations, 1)
         ]
-        blocks.append("\n".join(["| explanation | adds | fits | p of the model with it |", "|:--|:--|:--|:--|", *rows]))
+        blocks.append("\n".join(["| explanation | fits | p with it |", "|:--|:--|:--|", *rows]))
         blocks.append("Move the cursor of the timeline *explanation* to see what each leaves.")
     if diagnosis.drivers:
-        rows = [f"| {each.words} | {_share(each)} | p {format_p(each.p_value)} |" for each in diagnosis.drivers]
-        blocks.append("\n".join(["| quantity | goes with | |", "|:--|:--|:--|", *rows]))
+        rows = [f"| {each.words} | {_share(each)} |" for each in diagnosis.drivers]
+        blocks.append("\n".join(["| quantity | goes with |", "|:--|:--|", *rows]))
     return "\n\n".join(blocks) + "\n"
 
 
@@ -125,7 +125,7 @@ def _share(driver: Driver) -> str:
     """How much of the misfit goes with a driver, in a few words."""
     if driver.p_value > 0.01 or driver.share < 0.005:
         return "no more than noise"
-    return f"{100 * driver.share:.0f} % of the misfit"
+    return f"{100 * driver.share:.0f} % of the misfit (p {format_p(driver.p_value)})"
 
 
 def _probabilities(table: HypothesisTable) -> str:
@@ -239,7 +239,7 @@ def heading(text: str) -> rr.Points2D:
 def charts_view(name: str) -> rrb.Spatial2DView:
     """The view that holds the three charts."""
     bounds = rrb.VisualBounds2D(x_range=[-_LEFT, _WIDTH + 20.0], y_range=[-3.0 * _ABOVE, 3.0 * _PITCH - _ABOVE])
-    return rrb.Spatial2DView(origin="driver", name=name, visual_bounds=bounds)
+    return rrb.Spatial2DView(origin="driver", name=name, visual_bounds=bounds, background=DARK)
 
 
 def round_numbers(low: float, high: float, at_most: int) -> Floats:

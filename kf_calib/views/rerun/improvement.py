@@ -23,7 +23,7 @@ from kf_calib.estimation.results import Calibration, Parameter, format_p
 from kf_calib.support import units
 from kf_calib.support.text import printable
 from kf_calib.views.diagnosis import disturbed_dwells
-from kf_calib.views.rerun.names import GOLD, GREY, MAUVE, RED, WHITE, Colour, entity, rrd_file
+from kf_calib.views.rerun.names import GOLD, GREY, MAUVE, ON_DARK, RED, WHITE, Colour, entity, rrd_file
 from kf_calib.views.rerun.spheres import at_step, forever, log_key, log_spheres, spheres
 
 STEP = "step"
@@ -192,4 +192,5 @@ def _series(path: str, name: str, steps: int, reach: tuple[float, float] | None 
         name=name,
         axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=first, end=last)),
         axis_y=None if reach is None else rrb.ScalarAxis(range=reach),
+        background=ON_DARK,
     )

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import rerun as rr
 import rerun.blueprint as rrb
+from rerun.blueprint.archetypes import PlotBackground
 
 from kf_calib.bench import paper_parameters
 from kf_calib.estimation.measurement_model import Model
@@ -36,6 +37,9 @@ WHITE: Colour = (235, 235, 235)
 GIMBALS: tuple[Colour, ...] = ((205, 160, 255), (255, 160, 205), (225, 215, 130), (200, 200, 205))
 GOLD: Colour = (250, 210, 70)
 RED: Colour = (240, 50, 70)
+DARK: Colour = (13, 16, 17)
+"""What everything is drawn on, whatever the viewer prefers: marks are light."""
+ON_DARK = PlotBackground(color=DARK)
 
 CHANNELS = ("a1", "a2", "a3")
 LABELS = {

@@ -22,7 +22,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.estimation.estimate import Estimate
 from kf_calib.estimation.results import Calibration
 from kf_calib.support.units import shown
-from kf_calib.views.rerun.names import ACCELEROMETERS, GOLD, GREY, RED, WHITE, number, thin
+from kf_calib.views.rerun.names import ACCELEROMETERS, DARK, GOLD, GREY, RED, WHITE, number, thin
 from kf_calib.views.rerun.series import above, crowd, ends, nis_band, times
 
 NEGATIVE, POSITIVE, NONE = np.array([70, 140, 255]), np.array([255, 110, 50]), np.array([150, 150, 155])
@@ -55,7 +55,7 @@ def spheres(origin: str, columns: int) -> rrb.Spatial3DView:
     """The view of three spheres, one below the other, in each column."""
     beside = 0.5 * (columns - 1) * _PITCH
     eye = rrb.EyeControls3D(position=(beside, -0.6 * _PITCH, 8.2), look_target=(beside, -_PITCH, 0.0), eye_up=(0, 1, 0))
-    return rrb.Spatial3DView(origin=origin, name="residuals over σ", line_grid=False, eye_controls=eye)
+    return rrb.Spatial3DView(origin=origin, name="residuals over σ", line_grid=False, eye_controls=eye, background=DARK)
 
 
 def log_key(path: str, titles: Sequence[str], log: Log) -> None:
