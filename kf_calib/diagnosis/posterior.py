@@ -374,7 +374,7 @@ class RunPosterior:
         """Return a row of an unknown function with the formulas that describe it, and their fit."""
         number = next((k for k, term in enumerate(self._run.unknown) if term.driver == row.driver), None)
         if number is None or not self._run.unknown[number].summands:
-            return row
+            return replace(row, refit=self._refits.with_effects(self._before, row.effects)) if row.effects else row
         texts, taken = self._formulas(number, row.effects), {effect.name for effect in self._before.model.effects}
         first = next(k for k in itertools.count() if not {name_of_formula(k + n) for n in range(len(texts))} & taken)
         formulas = tuple(text_named(text, first + n) for n, text in enumerate(texts))

@@ -120,7 +120,7 @@ def _named(diagnosis: Diagnosis, first: Hypothesis) -> str:
 
 def _beside(diagnosis: Diagnosis, first: Hypothesis) -> str:
     """Return in words what goes on beside the effects that are named, and no known effect explains; "" for nothing."""
-    if not first.formulas:
+    if not first.driver:
         return ""
     assert diagnosis.table is not None
     known = [row for row in diagnosis.table.listed if set(first.effects) < set(row.effects)]
@@ -135,7 +135,7 @@ def _share(diagnosis: Diagnosis) -> str:
     others."""
     assert diagnosis.table is not None
     first = diagnosis.table.first
-    if first.formulas:
+    if first.driver:
         return format_probability(diagnosis.table.probability(first.effects))
     alone = format_probability(first.probability)
     with_others = format_probability(diagnosis.table.probability(first.effects))

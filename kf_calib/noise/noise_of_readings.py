@@ -182,7 +182,7 @@ def shares_in_correlation(folded: FoldedDwells) -> Floats:
     correlation of its own, which says nothing of the others: its products count by the square of the weight that this
     variance gives it. Where all vary alike about their parabolas, dwells count by the weights of their readings.
     """
-    weights = _weights_by_course(folded)
+    weights = np.ones((len(folded.weights), 3)) if folded.averaged else _weights_by_course(folded)
     return np.where((weights == 1.0).all(axis=0), folded.weights, weights**2)
 
 
