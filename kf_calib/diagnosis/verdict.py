@@ -257,7 +257,7 @@ def _size(diagnosis: Diagnosis) -> str:
     constant = its_own.unknown
     parameters_named = [largest, *([parameters[constant.symbol]] if constant else [])]
     return "".join(
-        f", {p.symbol} = {shown(p).number(p.value)} ± {shown(p).text(p.sigma, 2)}"
+        f", {p.symbol} = {shown(p).with_sigma(p.value, p.sigma)}"
         if p.value is not None and p.sigma
         else f", {p.symbol} not determined"
         for p in parameters_named

@@ -43,6 +43,11 @@ class Unit(NamedTuple):
         """The same with the label behind it."""
         return f"{self.number(value, digits)} {self.label}"
 
+    def with_sigma(self, value: float, sigma: float) -> str:
+        """An SI value and its sigma in this unit, both with a power of ten where the value has one."""
+        number, spread = self.number(value), self.number(sigma, 2)
+        return f"{number} ± {f'{sigma * self.per_si:.1e}' if 'e+' in number else spread} {self.label}"
+
     def rounded(self, value: float, sigma: float) -> tuple[str, str]:
         """An SI value and its sigma in this unit, rounded to two significant digits of sigma."""
         return rounded(value * self.per_si, sigma * self.per_si)

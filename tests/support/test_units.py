@@ -116,3 +116,9 @@ def test_what_a_user_writes(text: str, unit: str, value: float) -> None:
 def test_what_is_no_quantity_of_that_kind_is_refused(text: str, unit: str, why: str) -> None:
     with pytest.raises(InputError, match=why):
         quantity(text, unit)
+
+
+def test_a_value_and_its_sigma_have_one_form() -> None:
+    unit = Unit("µg/g²", 1.0)
+    assert unit.with_sigma(-2.49123e9, 1.6e8) == "-2.49e+09 ± 1.6e+08 µg/g²"
+    assert unit.with_sigma(-1234.5, 66.0) == "-1230 ± 66 µg/g²"
