@@ -13,7 +13,6 @@ from functools import cached_property
 
 import numpy as np
 
-from kf_calib.diagnosis.within_dwell_trend import DisturbedDwell
 from kf_calib.estimation.results import Calibration
 from kf_calib.support.tail_probabilities import weights
 
@@ -79,14 +78,12 @@ class Hypothesis:
 class HypothesisTable:
     """All rows, the likeliest first; their probabilities sum to one.
 
-    disturbed: the dwell in which an oscillation would be the likeliest of all, if other dwells had it, too. certain:
-    the row of effects that are missing for sure, where the likeliest row has further ones that nothing shows.
+    certain: the row of effects that are missing for sure, where the likeliest row has further ones that nothing shows.
     scattering: the number of the accelerometer that alone scatters from dwell to dwell, if something does; 0 where
     others do, too. same: effects that explain in this run just what the one of the likeliest row does.
     """
 
     rows: tuple[Hypothesis, ...]
-    disturbed: DisturbedDwell | None = None
     certain: Hypothesis | None = None
     scattering: int = 0
     same: tuple[str, ...] = ()

@@ -39,7 +39,7 @@ from kf_calib.diagnosis.refits import (
 from kf_calib.diagnosis.replication import Replication, replication
 from kf_calib.diagnosis.results import Diagnosis, Suspect
 from kf_calib.diagnosis.slew_effects import of_slews
-from kf_calib.diagnosis.verdict import disturbance_in_words, format_probability, second_pass_in_words, verdict_in_words
+from kf_calib.diagnosis.verdict import format_probability, second_pass_in_words, verdict_in_words
 from kf_calib.dwells import window_average
 from kf_calib.effects import effect_named
 from kf_calib.estimation.filter_history import readings_of
@@ -122,7 +122,7 @@ def _oscillating(refits: Refits, before: Calibration) -> Diagnosis | None:
 
 def _in_words(diagnosis: Diagnosis) -> Diagnosis:
     """Return a diagnosis with its verdict."""
-    words = verdict_in_words(diagnosis) + second_pass_in_words(diagnosis) + disturbance_in_words(diagnosis)
+    words = verdict_in_words(diagnosis) + second_pass_in_words(diagnosis)
     return replace(diagnosis, verdict=words)
 
 

@@ -34,7 +34,7 @@ from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.run_likelihood import Projected, RunLikelihood, log_bayes_together
 from kf_calib.diagnosis.run_terms import RunTerms, log_bayes_of_any_size, sizes_of
 from kf_calib.diagnosis.unknown_terms import name_of_formula, text_named
-from kf_calib.diagnosis.within_dwell_trend import DisturbedDwell, disturbed_dwell, trend
+from kf_calib.diagnosis.within_dwell_trend import p_of_steady_oscillation, trend
 from kf_calib.dwells.qr import orthonormal
 from kf_calib.effects import effect_named
 from kf_calib.errors import InputError, UnobservableError
@@ -73,9 +73,8 @@ class RunPosterior:
         self._least_mps2 = (_ROUNDING if before.noise.within_seen else _UNSEEN) * misfit_mps2
         self._run = RunTerms(before, self._noise, self._least_mps2, test)
         measured = (1 if self._noise.attitude_unknown else 3) * len(before.fit.dwells)
-        self._sizes = NoiseSizes(self._run.likelihood, self._noise, measured - model.count + len(model.fixed))
-        self._disturbed: DisturbedDwell | None = None
         self._no_oscillation = set[str]()
+        self._sizes = NoiseSizes(self._run.likelihood, self._noise, measured - model.count + len(model.fixed))
 
     def table(self, refitted: bool = True) -> HypothesisTable:
         """All rows with their probabilities; the likeliest are fitted if ``refitted``."""
@@ -85,7 +84,7 @@ class RunPosterior:
             rows = self._fitted([*rows, *self._pairs()])
             rows = [self._with_changes_beside_walk(row, rows) if row.driver == IRREGULAR else row for row in rows]
         rows = [row for row in rows if math.isfinite(row.log_evidence)]
-        table = replace(table_of(rows), disturbed=self._disturbed, scattering=self._scattering)
+        table = replace(table_of(rows), scattering=self._scattering)
         return replace(table, same=self._same_as(table.first)) if refitted else table
 
     def _same_as(self, first: Hypothesis) -> tuple[str, ...]:
@@ -300,13 +299,13 @@ class RunPosterior:
         effects = sorted((row for row in rows if row.effects and not row.driver), key=lambda row: -row.log_evidence)
         single = [row for row in effects if len(row.effects) == 1][:_ALWAYS]  # large effects are far from linear
         likeliest = {id(row) for row in [*single, *(row for row in effects[:_REFITTED] if row.log_evidence > least)]}
-        fitted = self._rid_of_disturbed([self._refitted(row) if id(row) in likeliest else row for row in rows])
+        fitted = self._steady([self._refitted(row) if id(row) in likeliest else row for row in rows])
         while not (first := max(fitted, key=lambda row: row.log_evidence)).driver and first.effects and not first.refit:
-            fitted = self._rid_of_disturbed([self._refitted(row) if row is first else row for row in fitted])
+            fitted = self._steady([self._refitted(row) if row is first else row for row in fitted])
         least = first.log_evidence - _DESCRIBED
         return [self._described(row) if row.driver and row.log_evidence > least else row for row in fitted]
 
-    def _rid_of_disturbed(self, rows: Sequence[Hypothesis]) -> list[Hypothesis]:
+    def _steady(self, rows: Sequence[Hypothesis]) -> list[Hypothesis]:
         """Return the rows without an oscillation that does not go on alike in all dwells."""
         return [row for row in rows if not self._no_oscillation & {*row.effects}]
 
@@ -316,12 +315,9 @@ class RunPosterior:
             refit = self._refits.with_effects(self._before, row.effects)
         except UnobservableError:  # the run does not tell its coefficients: nothing speaks for it
             return replace(row, log_evidence=-math.inf)
-        if refit.model.oscillates and not self._before.model.oscillates:
-            disturbed = disturbed_dwell(refit.fit)
-            if disturbed.p_value < _APART:
-                self._disturbed = self._disturbed or disturbed
-                self._no_oscillation |= {str(effect) for effect in refit.model.effects if effect.oscillates}
-                return row
+        if refit.model.oscillates and not self._before.model.oscillates and p_of_steady_oscillation(refit.fit) < _APART:
+            self._no_oscillation |= {str(effect) for effect in refit.model.effects if effect.oscillates}
+            return row
         folded, before = refit.fit.dwells.folded, self._before.fit.dwells.folded
         otherwise = (folded.carrier_hz, folded.averaged) != (before.carrier_hz, before.averaged)
         if self._run.walk in row.effects or otherwise:

@@ -141,12 +141,12 @@ class Diagnosis:
     @property
     def disturbed_dwell(self) -> int:
         """Number of the dwell that the verdict calls wrong or disturbed; 0 where it speaks of none."""
-        first, table = self.likeliest, self.table
+        first, loud = self.likeliest, self.before.readings.loud
         if self.before.outlying:
             return self.before.outlying[0].number
         if first is not None and first.dwell:
             return first.dwell
-        return table.disturbed.number if table and table.disturbed and self.test.consistent is False else 0
+        return loud.numbers[0] if loud else 0
 
     @property
     def likeliest(self) -> Hypothesis | None:

@@ -11,7 +11,7 @@ from kf_calib.diagnosis.refits import dwell_noise_is_stated
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.estimation.dwell_pass import holds_its_oscillation
 from kf_calib.estimation.results import Parameter, format_p
-from kf_calib.support.units import shown, significant
+from kf_calib.support.units import shown
 
 _AS_LIKELY = 0.25  # share of the likeliest from which another explanation is told together with it
 _CHANCE = 0.01  # probability from which it is told that nothing may be missing
@@ -84,18 +84,6 @@ def second_pass_in_words(diagnosis: Diagnosis) -> str:
     if not names:
         return ""
     return f" A second pass over the readings is needed to judge {' and '.join(names)}: diagnose the recording itself."
-
-
-def disturbance_in_words(diagnosis: Diagnosis) -> str:
-    """A sentence on a dwell in which the readings change as in no other; "" where there is none."""
-    disturbed = diagnosis.table.disturbed if diagnosis.table else None
-    if disturbed is None or diagnosis.test.consistent is not False:
-        return ""
-    return (
-        f" In dwell {disturbed.number} the readings swing with a period of "
-        f"{significant(1.0 / disturbed.frequency_hz, 2)} s, as in no other dwell: look at what disturbed it, or leave "
-        f"it out (--leave-out {disturbed.number})."
-    )
 
 
 def _named(diagnosis: Diagnosis, first: Hypothesis) -> str:

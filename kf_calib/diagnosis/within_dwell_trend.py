@@ -36,8 +36,8 @@ from kf_calib.support.tail_probabilities import chi_squared_tail, sidak
 _DEGREE = 3
 _GRID = 600
 _FEWEST = 8  # readings that a dwell must have to be tested
-_PLACES = 9  # of the intensity of a walk, over which a density is averaged
 _SEEN = 1e-4  # of the square of a column: less that the model leaves is not told
+_PLACES = 9  # of the intensity of a walk, over which a density is averaged
 
 
 def shapes(u: Floats) -> Floats:
@@ -197,25 +197,12 @@ def _trends_in(dwells: DwellTable, alike: AlikeDwells) -> tuple[Floats, Mask]:
     return frame[:, :, 1:], determined[:, 1:]
 
 
-@dataclass(frozen=True)
-class DisturbedDwell:
-    """The dwell in which the readings differ most from an oscillation that goes on in all dwells.
-
-    number: of the dwell. frequency_hz: of the oscillation. p_value: that noise alone lets any dwell differ as much.
-    """
-
-    number: int
-    frequency_hz: float
-    p_value: float
-
-
-def disturbed_dwell(fitted: Fit) -> DisturbedDwell:
-    """The dwell that has an oscillation of its own, if the one of the model does not go on alike in all of them.
+def p_of_steady_oscillation(fitted: Fit) -> float:
+    """The p-value of an oscillation that goes on alike in all dwells, against one of another amplitude or phase in any.
 
     The sine and cosine of the oscillation, and their derivative by its frequency, are added in one dwell alone, beside
     a constant of that dwell, so that only the course of its readings counts. The decrease of chi-squared is chi-squared
-    distributed if the oscillation goes on alike in all dwells. What one dwell alone has is creep, or a disturbance: it
-    is the dwell in which they explain most of what a model without the oscillation leaves.
+    distributed if the oscillation goes on alike in all dwells. What does not is creep, a chirp, or a disturbance.
 
     fitted: a fit whose model has an oscillation. Its random walk of the biases, if it has one, is left out here.
     """
@@ -223,34 +210,22 @@ def disturbed_dwell(fitted: Fit) -> DisturbedDwell:
     model, dwells = linearised.model, linearised.dwells_at_state
     effect = model.oscillation
     assert effect is not None
-    of_effect = np.arange(model.count)[model.parts[str(effect)]]
-    places = [*BIASES, *of_effect.tolist()]
+    places = [*BIASES, *np.arange(model.count)[model.parts[str(effect)]].tolist()]
     rows, width = misfit_rows(dwells, linearised.columns, noise, linearised.state, model.count, reduced=False)
     stacked = np.concatenate(rows)
-    columns, residuals, others = stacked[:, :width], stacked[:, -1], np.ones(width, bool)
-    others[of_effect] = False
-    without = residuals + columns[:, of_effect] @ linearised.state[of_effect]
-    bases = [_orthonormal(columns), _orthonormal(columns[:, others])]
-    left = [z - basis @ (basis.T @ z) for basis, z in zip(bases, (residuals, without), strict=True)]
-    first, p_values, falls = len(stacked) - sum(map(len, rows[-len(dwells) :])), list[float](), list[float]()
+    basis = orthonormal(scale_columns(stacked[:, : width + 1])[0][:, :width])[0]
+    left = stacked[:, -1] - basis @ (basis.T @ stacked[:, -1])
+    first, p_values = len(stacked) - sum(map(len, rows[-len(dwells) :])), list[float]()
     for of_dwell in rows[-len(dwells) :]:
         part = slice(first, first := first + len(of_dwell))
-        freedom, fall = _fall_by_columns(of_dwell[:, places], bases[0][part], left[0][part])
-        p_values.append(chi_squared_tail(max(freedom, 1), fall))
-        falls.append(_fall_by_columns(of_dwell[:, places], bases[1][part], left[1][part])[1])
-    number = dwells[int(np.argmax(falls))].number
-    return DisturbedDwell(number, effect.value, sidak(min(p_values), len(p_values)))
+        p_values.append(_p_of_columns(of_dwell[:, places], basis[part], left[part]))
+    return sidak(min(p_values), len(p_values))
 
 
-def _orthonormal(columns: Floats) -> Floats:
-    """Return an orthonormal basis (r, k) of columns (r, c)."""
-    return orthonormal(scale_columns(np.column_stack([columns, np.zeros(len(columns))]))[0][:, :-1])[0]
-
-
-def _fall_by_columns(columns: Floats, basis: Floats, left: Floats) -> tuple[int, float]:
-    """Return the degrees of freedom and the decrease of chi-squared if the columns of one dwell (r, 3 + q), the first
-    three of them constants, are added to a model; basis (r, p): the dwell's rows of an orthonormal basis of this model;
-    left (r,): what the model leaves of the dwell's readings."""
+def _p_of_columns(columns: Floats, basis: Floats, left: Floats) -> float:
+    """Return the p-value of the decrease of chi-squared if the columns of one dwell (r, 3 + q), the first three of them
+    constants, are added to a model; basis (r, p): the dwell's rows of an orthonormal basis of this model; left (r,):
+    what the model leaves of the dwell's readings."""
     sizes = np.linalg.norm(columns, axis=0)
     columns = columns / np.where(sizes > 0.0, sizes, 1.0)
     inside, along = basis.T @ columns, columns.T @ left
@@ -259,4 +234,4 @@ def _fall_by_columns(columns: Floats, basis: Floats, left: Floats) -> tuple[int,
     values, vectors = np.linalg.eigh(gram[3:, 3:] - constants @ gram[:3, 3:])
     seen = values > _SEEN
     delta_chi2 = np.sum((vectors[:, seen].T @ (along[3:] - constants @ along[:3])) ** 2 / values[seen])
-    return int(seen.sum()), float(delta_chi2)
+    return chi_squared_tail(int(seen.sum()), float(delta_chi2)) if seen.any() else 1.0

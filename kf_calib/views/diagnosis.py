@@ -55,7 +55,7 @@ def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
     named = diagnosis.missing[0] if diagnosis.missing else "noise" if diagnosis.noise else None
     missing = "unknown" if diagnosis.unknown or diagnosis.unearned else named
     shapes = diagnosis.explanation.shapes if diagnosis.explanation else []
-    trend, disturbed = diagnosis.test.trend, diagnosis.table.disturbed if diagnosis.table else None
+    trend = diagnosis.test.trend
     return clean(
         {
             "consistent": diagnosis.consistent,
@@ -84,7 +84,6 @@ def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
             if trend is None
             else {"ratio": trend.ratio, "p_value": trend.p_value, "dwell": trend.most[0], "channel": trend.most[1]},
             "disturbed_dwells": disturbed_dwells(diagnosis),
-            "disturbed_dwell": None if disturbed is None else vars(disturbed),
             "detectable": [
                 {"effect": each.name, "minimum": each.minimum, "unit": each.unit} for each in diagnosis.detectable
             ],
@@ -100,9 +99,8 @@ def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
 
 def disturbed_dwells(diagnosis: Diagnosis) -> list[int]:
     """The numbers of the dwells that something disturbed, as any test has it."""
-    before, table, first = diagnosis.before, diagnosis.table, diagnosis.likeliest
+    before, first = diagnosis.before, diagnosis.likeliest
     numbers = {each.number for each in before.outlying} | before.readings.disturbed
-    numbers |= {table.disturbed.number} if table and table.disturbed else set()
     return sorted(numbers | ({first.dwell} if first is not None and first.dwell else set()))
 
 
