@@ -10,6 +10,8 @@ import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from kf_calib.bench.bench import Bench
 from kf_calib.dwells.sufficient_statistics import Dwell
 
@@ -18,6 +20,7 @@ RETURNING = "time (irregular, and comes back)"
 
 _DECAYS_S = (1, 3, 10, 30, 100, 300, 1000, 3000)
 _CREEPS_S = (3, 10, 30)  # of a platform after its arrival
+_STEADY_K = 0.1  # a temperature that changes by less drives nothing
 _MOST_MOMENTS = 100  # at which a jump is tried
 _TURNS = (0.5, 1, 1.5, 2, 3, 4, 6, 8)  # of what is periodic, in a run
 
@@ -45,11 +48,13 @@ class UnknownTerm:
 def unknown_terms(bench: Bench, dwells: Sequence[Dwell]) -> Iterator[UnknownTerm]:
     """All terms of unknown form that a run of these dwells may show."""
     yield from _of_force()
-    yield from _of_gimbals(len(bench.axes))
+    slow = [("time", "t"), *([("temperature", "T")] if _varies(dwells) else [])]
+    yield from _of_gimbals(len(bench.axes), slow)
     yield from _of_time(dwells, bench.angles)
     yield from _of_jumps(dwells, bench.angles)
     yield from _of_arrival(len(bench.axes), dwells)
     yield from _of_surroundings(len(bench.axes), bench.angles)
+    yield from _of_slow_changes(slow)
 
 
 def _term(
@@ -80,17 +85,23 @@ def _of_force() -> Iterator[UnknownTerm]:
     yield _term("direction of the specific force", "cross-axis", texts, weights)
 
 
-def _of_gimbals(count: int) -> Iterator[UnknownTerm]:
+def _varies(dwells: Sequence[Dwell]) -> bool:
+    """Tell whether the temperature varies: times one that stays, all is as it is alone."""
+    levels = np.array([np.mean(dwell.pieces.nodes.temperature_c) for dwell in dwells])
+    return bool(np.ptp(levels) > _STEADY_K)  # False of NaN, where it was not measured
+
+
+def _of_gimbals(count: int, slow: Sequence[tuple[str, str]]) -> Iterator[UnknownTerm]:
+    """slow: what changes slowly, in words and as formulas have it."""
     for k in range(1, count + 1):
         waves = {n: (f"sin({n}*q{k})", f"cos({n}*q{k})") for n in (1, 2, 3, 4, 6)}
         weights = [n**-0.5 for n in waves]
         yield _term(f"angle of gimbal {k}", "", [*waves.values()], weights)
         products = [_times(waves[n], force) for n in (1, 2) for force in ("a", "p", "o")]
         yield _term(f"angle of gimbal {k} and specific force", "", products)
-        for words, slow in (("temperature", "T"), ("time", "t")):
-            yield _term(
-                f"angle of gimbal {k} and {words}", "", [_times(waves[n], slow) for n in (1, 2, 3, 4)], weights[:4]
-            )
+        for words, symbol in slow:
+            products = [_times(waves[n], symbol) for n in (1, 2, 3, 4)]
+            yield _term(f"angle of gimbal {k} and {words}", "", products, weights[:4])
         before = (f"sin(q{k}_before)", f"cos(q{k}_before)")
         yield _term(f"previous orientation (angle of gimbal {k})", "memory", [before])
         turning = [(f"q{k}",), *waves.values()]
@@ -180,7 +191,6 @@ def _of_surroundings(gimbals: int, turns: bool) -> Iterator[UnknownTerm]:
     products = [f"{power}*{force}" for power in ("T", "T*T") for force in ("a", "p", "o")]
     products += [f"{power}*{force}" for power in ("T", "T*T") for force in ("a*a", "p*p", "a*p", "a*o", "p*o")]
     yield _term("temperature and specific force", "temperature", products)
-    yield _term("temperature and time", "", ["t*T", "t*t*T", "t*T*T"])
     yield _term("rate of temperature", "temperature", ["dT", "a*dT"])
     if turns:
         for place, words in (("base", "a tilt of the base"), ("platform", "a rotation of the platform")):
@@ -189,8 +199,14 @@ def _of_surroundings(gimbals: int, turns: bool) -> Iterator[UnknownTerm]:
     yield _term("previous orientation", "memory", [*texts, "a-da", "(a-da)**2"])
     steps = [f"{step}*{force}" for step in ("da", "abs(da)") for force in ("a", "p", "o")]
     yield _term("previous orientation and specific force", "memory", steps)
-    for words, slow in (("temperature", "T"), ("time", "t")):
-        yield _term(f"previous orientation and {words}", "memory", [f"{slow}*da", f"{slow}*abs(da)"])
+
+
+def _of_slow_changes(slow: Sequence[tuple[str, str]]) -> Iterator[UnknownTerm]:
+    """Products of what changes slowly with the last step, and with each other."""
+    for words, symbol in slow:
+        yield _term(f"previous orientation and {words}", "memory", [f"{symbol}*da", f"{symbol}*abs(da)"])
+    if len(slow) > 1:
+        yield _term("temperature and time", "", ["t*T", "t*t*T", "t*T*T"])
 
 
 def name_of_formula(number: int) -> str:

@@ -44,9 +44,8 @@ class Unit(NamedTuple):
         return f"{self.number(value, digits)} {self.label}"
 
     def with_sigma(self, value: float, sigma: float) -> str:
-        """An SI value and its sigma in this unit, both with a power of ten where the value has one."""
-        number, spread = self.number(value), self.number(sigma, 2)
-        return f"{number} ± {f'{sigma * self.per_si:.1e}' if 'e+' in number else spread} {self.label}"
+        """An SI value and its sigma in this unit, as ``rounded`` writes them."""
+        return f"{' ± '.join(self.rounded(value, sigma))} {self.label}"
 
     def rounded(self, value: float, sigma: float) -> tuple[str, str]:
         """An SI value and its sigma in this unit, rounded to two significant digits of sigma."""
@@ -166,11 +165,21 @@ def span(seconds: float) -> str:
 
 
 def rounded(value: float, sigma: float) -> tuple[str, str]:
-    """A value and its sigma as text, rounded to two significant digits of sigma (GUM 7.2.6)."""
+    """A value and its sigma as text, rounded to two significant digits of sigma (GUM 7.2.6), with one power of ten
+    where there would be many zeros."""
     if not (math.isfinite(sigma) and sigma > 0):
         return f"{value:.6g}", f"{sigma:.2g}"
-    decimals = max(0, 1 - int(f"{sigma:.1e}".partition("e")[2]))  # of 0.00998 as of 0.010, which it rounds to
-    return f"{value:.{decimals}f}", f"{sigma:.{decimals}f}"
+    place = int(f"{sigma:.1e}".partition("e")[2])  # of 0.00998 as of 0.010, which it rounds to
+    if _PLAIN[0] <= place <= _PLAIN[1]:
+        decimals = max(0, 1 - place)
+        return f"{value:.{decimals}f}", f"{sigma:.{decimals}f}"
+    power = max(place, int(f"{abs(value):.1e}".partition("e")[2])) if value else place
+    decimals, scale = power - place + 1, 10.0**-power
+    return f"{value * scale:.{decimals}f}e{power:+03d}", f"{sigma * scale:.{decimals}f}e{power:+03d}"
+
+
+_PLAIN = (-9, 7)
+"""Places of the first digit of a sigma that is written without a power of ten."""
 
 
 WORDS: dict[str, dict[str, float]] = {

@@ -120,5 +120,8 @@ def test_what_is_no_quantity_of_that_kind_is_refused(text: str, unit: str, why: 
 
 def test_a_value_and_its_sigma_have_one_form() -> None:
     unit = Unit("µg/g²", 1.0)
-    assert unit.with_sigma(-2.49123e9, 1.6e8) == "-2.49e+09 ± 1.6e+08 µg/g²"
-    assert unit.with_sigma(-1234.5, 66.0) == "-1230 ± 66 µg/g²"
+    assert unit.with_sigma(-2.49123e9, 1.6e8) == "-2.49e+09 ± 0.16e+09 µg/g²"
+    assert unit.with_sigma(2.99e-10, 1.2e-11) == "2.99e-10 ± 0.12e-10 µg/g²"
+    assert unit.with_sigma(0.0, 1.2e-11) == "0.0e-11 ± 1.2e-11 µg/g²"
+    assert unit.with_sigma(-1234.5, 66.0) == "-1234 ± 66 µg/g²"
+    assert unit.with_sigma(2.8, 0.038) == "2.800 ± 0.038 µg/g²"
