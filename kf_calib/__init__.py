@@ -91,7 +91,7 @@ _HOMES = {
     "Watch": ("online.sequential_test", "Watch"),
 }
 
-shown_by(lambda: import_module("kf_calib.views.report.page"))
+shown_by(lambda: import_module("kf_calib.views.html"))
 
 __all__ = [
     "Bench", "Calibration", "Corrected", "Correction", "Diagnosis", "Fleet", "Improvement", "InputError",

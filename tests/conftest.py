@@ -99,10 +99,10 @@ def ferraris() -> Path:
 
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Figures of a page are blank: to draw them takes most of the time, and tests/views/test_report.py does."""
+    """Figures of a page are blank: to draw them takes most of the time, and tests/report/test_report.py does."""
     from matplotlib.figure import Figure
 
-    from kf_calib.views.report import contents
+    from kf_calib.report import contents
 
     def blank(result: object) -> dict[str, Callable[[], Figure]]:
         return dict.fromkeys(drawn(result), lambda: Figure((1.0, 1.0)))

@@ -20,9 +20,9 @@ INTRODUCTION = """\
 the licence that its own metadata state. `tools/licences` writes this page from the locked versions.
 
 One library comes within `kf_calib`, and is in every page that `report` makes: uPlot {uplot}, under the MIT licence
-([uPlot.LICENSE](../kf_calib/views/report/uPlot.LICENSE)).
+([uPlot.LICENSE](../kf_calib/report/uPlot.LICENSE)).
 """
-UPLOT = ROOT / "kf_calib" / "views" / "report" / "uPlot.iife.min.js"
+UPLOT = ROOT / "kf_calib" / "report" / "uPlot.iife.min.js"
 TABLES = {"What a user installs": "requirements.lock", "Besides, for development": "requirements-dev.lock"}
 
 

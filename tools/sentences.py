@@ -16,7 +16,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "tests" / "golden" / "sentences.md"
 _WORDS = 4
-_OF_RUNS = ("design", "diagnosis", "estimation", "fleet", "noise", "online", "dwells", "views")
+_OF_RUNS = ("design", "diagnosis", "estimation", "fleet", "noise", "online", "dwells", "views", "report")
+_LEAVES, _SAYING = ("certificate", "exports", "positioning", "reproduction"), ("text.py", "figures.py", "section.py")
 _HEAD = """# All that the program can say of a run
 
 Made by `tools/sentences.py` from the source; `tests/test_sentences.py` compares. Read it once in a while: each sentence
@@ -27,9 +28,10 @@ has to be understood the first time. What a value is put in for stands in braces
 def page() -> str:
     """The page as it follows from the source."""
     parts = [_HEAD]
-    for path in (path for room in _OF_RUNS for path in sorted((ROOT / "kf_calib" / room).rglob("*.py"))):
+    rooms = [*((room, "*.py") for room in _OF_RUNS), *((room, name) for room in _LEAVES for name in _SAYING)]
+    for path in (path for room, name in rooms for path in sorted((ROOT / "kf_calib" / room).rglob(name))):
         name = path.relative_to(ROOT / "kf_calib").as_posix()
-        if said := list(dict.fromkeys(sentences(path.read_text()))):
+        if path.name != "command.py" and (said := list(dict.fromkeys(sentences(path.read_text())))):
             parts.append(f"## {name}\n\n" + "\n".join(f"- {each}" for each in said) + "\n")
     return "\n".join(parts)
 

@@ -16,17 +16,19 @@ from kf_calib.cli.echo import fall_silent, open_streams
 from kf_calib.cli.failures import tell
 
 SECTIONS = {
-    "Evaluate a recording": {"replay": "evaluate.replay", "diagnose": "evaluate.diagnose",
-                             "improve": "improve.improve", "compare": "evaluate.compare",
-                             "report": "evaluate.report", "noise": "noise.noise"},
-    "Evaluate many": {"fleet": "fleet.fleet"},
-    "Use a calibration": {"apply": "exchange.apply", "verify": "exchange.verify", "history": "exchange.history",
-                          "export": "exchange.export", "certificate": "exchange.certificate"},
-    "Run a bench": {"plan": "plan.plan", "record": "acquire.record", "live": "live.live", "run": "run.run"},
-    "Try it without a bench": {"demo": "acquire.demo", "simulate": "acquire.simulate"},
-    "Look up": {"info": "info.info", "effects": "evaluate.list_effects", "paper": "paper.paper"},
+    "Evaluate a recording": {"replay": "cli.evaluate.replay", "diagnose": "cli.evaluate.diagnose",
+                             "improve": "cli.improve.improve", "compare": "cli.evaluate.compare",
+                             "report": "report.command.report", "noise": "cli.noise.noise"},
+    "Evaluate many": {"fleet": "fleet.command.fleet"},
+    "Use a calibration": {"apply": "cli.exchange.apply", "verify": "cli.exchange.verify",
+                          "history": "cli.exchange.history", "export": "exports.command.export",
+                          "certificate": "certificate.command.certificate"},
+    "Run a bench": {"plan": "cli.plan.plan", "record": "cli.acquire.record", "live": "cli.live.live",
+                    "run": "positioning.command.run"},
+    "Try it without a bench": {"demo": "cli.acquire.demo", "simulate": "cli.acquire.simulate"},
+    "Look up": {"info": "cli.info.info", "effects": "cli.evaluate.list_effects", "paper": "reproduction.command.paper"},
 }  # fmt: skip
-"""The commands, as ``--help`` has them, and where in this package each is."""
+"""The commands, as ``--help`` has them, and where each is; a leaf is a folder with a command of its own."""
 
 _HOMES = {name: home for own in SECTIONS.values() for name, home in own.items()}
 
@@ -36,8 +38,8 @@ class _Commands(rich_click.RichGroup):
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         for name in [cmd_name] if cmd_name in _HOMES else _HOMES:  # a mistyped one is compared with all
-            module, function = _HOMES[name].split(".")
-            self.add_command(getattr(import_module(f"kf_calib.cli.{module}"), function))
+            module, _, function = _HOMES[name].rpartition(".")
+            self.add_command(getattr(import_module(f"kf_calib.{module}"), function))
         return super().get_command(ctx, cmd_name)
 
     def list_commands(self, ctx: click.Context) -> list[str]:

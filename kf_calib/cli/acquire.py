@@ -18,16 +18,7 @@ from kf_calib.cli.command import OUTPUT, POSITIVE, argument, command, option
 from kf_calib.cli.echo import complain, echo, print_json, progress, show
 from kf_calib.cli.failures import Interrupter, answered
 from kf_calib.cli.files import OutputFile, claimed, delivery, write_view
-from kf_calib.cli.options import (
-    BenchOptions,
-    Device,
-    ForeignColumns,
-    Json,
-    NoAngles,
-    Overwrite,
-    ShownUnits,
-    renamed,
-)
+from kf_calib.cli.options import BenchOptions, Device, ForeignColumns, Json, NoAngles, Overwrite, ShownUnits, renamed
 from kf_calib.errors import InputError
 from kf_calib.sources.simulation.settings import Ambient, SimulationOptions
 from kf_calib.support.output_files import Outputs, write_whole

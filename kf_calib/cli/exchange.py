@@ -1,4 +1,4 @@
-"""Commands that use calibrations: apply, verify, history, export, certificate."""
+"""Commands that use calibrations: apply, verify, history."""
 
 from __future__ import annotations
 
@@ -6,45 +6,39 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, BinaryIO, Literal
+from typing import TYPE_CHECKING, Annotated, BinaryIO
 
 import rich_click as click
 
 from kf_calib.bench.keys import BenchKeys, StatedBench
-from kf_calib.cli.command import INPUT, OUTPUT, argument, command, option
-from kf_calib.cli.echo import complain, print_json, print_result, progress, show
+from kf_calib.cli.command import INPUT, argument, command, option
+from kf_calib.cli.echo import complain, print_result, progress
 from kf_calib.cli.files import FigureFiles, claimed, delivery, output_option
 from kf_calib.cli.options import (
     OF_MESSAGES,
+    CalibrationFile,
     DwellOptions,
     Json,
     Overwrite,
     ProgramOptions,
     ReadingOptions,
     ShownUnits,
-    StatementFile,
     Strict,
     exit_if,
     refuse_given,
 )
-from kf_calib.errors import BenchError, InputError, KfCalibError, need
+from kf_calib.errors import BenchError, InputError, KfCalibError
 from kf_calib.support.output_files import whole
 
 if TYPE_CHECKING:
     from kf_calib.bench.raw_input import RawInput
     from kf_calib.estimation.correction import Correction
-    from kf_calib.estimation.measurement_model import Model
     from kf_calib.exchange.calibration_file import SavedCalibration
-    from kf_calib.exchange.certificate.budget import Certificate
-    from kf_calib.exchange.certificate.statement import Statement
     from kf_calib.exchange.corrected_file import Applied
     from kf_calib.exchange.corrected_lines import CorrectedLines
-    from kf_calib.exchange.exports.noise_keys import NoiseExport
     from kf_calib.sources.text.encoding import TextFile
-    from kf_calib.support.output_files import Outputs
 
 _BLOCK_BYTES = 1 << 16
-CalibrationFile = Annotated[Path, argument(metavar="CAL")]
 
 
 @command(
@@ -250,159 +244,3 @@ def history(
     print_result(as_json, views.history_object, views.history_report, drifts)
     with delivery(outputs, as_json) as deliver:
         figures.save(deliver, drifts)
-
-
-ExportKind = Literal[
-    "px4", "ardupilot", "imucal", "imu_calib", "kalibr", "openvins", "imu_tk", "vectornav", "csv", "c",
-    "robot_localization",
-]  # fmt: skip
-
-
-@command(
-    "export cal.json --to c -o kf_calib_correct.h", "export cal.json --to ardupilot --lossy -o accelerometer.param",
-    "export cal.json --noise noise.json --to kalibr --lossy -o imu.yaml", "export noise.json --to px4 -o noise.params",
-)  # fmt: skip
-def export(
-    calibration: CalibrationFile,
-    to: Annotated[ExportKind, option("--to", required=True, help="The program that is to take it.", panel=OUTPUT)],
-    output: Annotated[Path, output_option(
-        "-o", "--out", required=True, metavar="FILE", help="The file for that program.")],
-    lossy: Annotated[bool, option(
-        "--lossy", panel=OUTPUT,
-        help="Export though the program cannot hold all; what is lost, and the error left, are told.",
-    )],
-    noise: Annotated[Path | None, option(
-        "--noise", metavar="NOISE.json", panel=INPUT, help="The noise, too, as kf-calib noise --save has written it: "
-        "for Kalibr, OpenVINS and PX4.")],
-    programs: ProgramOptions, overwrite: Overwrite, units: ShownUnits, as_json: Json,
-) -> None:  # fmt: skip
-    """Write a calibration as the file of an autopilot, of another calibration tool, or as a function in C.
-
-    Where the program cannot hold the alignment or an effect, the numbers are those with the least rms error, over all
-    directions of gravity and the temperatures of the run; how large it is is said, and --lossy is needed. CAL may be
-    what kf-calib noise --save has written: then the file has the noise alone.
-    """
-    from kf_calib.exchange import calibration_file
-    from kf_calib.exchange.exports import exported
-    from kf_calib.support.output_files import write_whole
-    from kf_calib.views import exchange as views
-
-    outputs = claimed(overwrite=overwrite)
-    if _is_noise_alone(calibration, to, noise):
-        _export_noise(outputs, calibration if noise is None else noise, to, output, as_json)
-        return
-    saved = calibration_file.open_calibration(calibration)
-    target = exported(saved, saved.correction(calibration, programs.effects_from, programs.trust), to, lossy)
-    if noise is not None:
-        target.noise = _noise_for(noise, to)
-    content = target.text().encode()
-    outputs.write(output, lambda path: write_whole(path, content))
-    if as_json:
-        print_json(views.exported_object(target, to, output))
-    else:
-        show(views.exported_report(target, output))
-
-
-def _is_noise_alone(path: Path, to: str, noise: Path | None) -> bool:
-    """Whether noise is exported and no calibration. Raises UsageError where robot_localization lacks one."""
-    from kf_calib.exchange.noise_file import is_noise_file
-
-    if is_noise_file(path):
-        if noise is not None:
-            raise click.UsageError(f"{path} is noise already: leave out --noise, or give a calibration before it.")
-        return True
-    if to == "robot_localization" and noise is None:
-        raise click.UsageError("robot_localization takes the noise, no calibration: name it with --noise NOISE.json.")
-    return to == "robot_localization"
-
-
-def _noise_for(path: Path, to: str) -> NoiseExport:
-    """The noise of a file for a program. Raises InputError where that has no keys for it."""
-    from kf_calib.exchange.exports.noise_keys import NoiseExport
-    from kf_calib.exchange.noise_file import open_noise
-
-    for program in NoiseExport.titles:
-        if program == to:
-            return NoiseExport(open_noise(path), program)
-    raise InputError(f"{to} takes no noise: leave out --noise, or export to {', '.join(NoiseExport.titles)}.")
-
-
-def _export_noise(outputs: Outputs, path: Path, to: str, output: Path, as_json: bool) -> None:
-    """Write noise alone in the keys of a program."""
-    from kf_calib.support.output_files import write_whole
-    from kf_calib.views import noise as views
-
-    export = _noise_for(path, to)
-    content = export.text().encode()
-    outputs.write(output, lambda path: write_whole(path, content))
-    print_result(as_json, views.noise_export_object, views.noise_export_report, export, output)
-
-
-@command("certificate cal.json --statement lab.toml -o certificate.pdf")
-def certificate(
-    calibration: CalibrationFile,
-    output: Annotated[Path, output_option("-o", "--out", required=True, metavar="OUT.pdf",
-                                          help="The certificate: PDF/A-3b with the XML attached.")],
-    xml: Annotated[Path | None, output_option(
-        "--xml", metavar="OUT.xml", help="Save the XML as a file of its own, too.")],
-    statement: StatementFile,
-    schema: Annotated[Path | None, option("--schema", metavar="DCC.xsd", panel=INPUT,
-                                          help="Validate the XML against this copy of the DCC's schema.")],
-    draws: Annotated[int | None, option(
-        "--monte-carlo", metavar="DRAWS", type=click.IntRange(min=10_000, max=10_000_000), panel=OUTPUT,
-        help="Check the expanded uncertainties by so many draws, 1000000 for example (JCGM 101).")],
-    programs: ProgramOptions, overwrite: Overwrite, as_json: Json,
-) -> None:  # fmt: skip
-    """A calibration certificate as ISO/IEC 17025 asks: results, expanded uncertainties, budget, traceability.
-
-    What is neither in the calibration nor in the statement is left blank. It never claims accreditation.
-    """
-    from kf_calib.exchange import calibration_file
-    from kf_calib.exchange.certificate import statement as statements
-    from kf_calib.exchange.certificate.monte_carlo import monte_carlo
-    from kf_calib.views import exchange as views
-
-    stated = statements.read_statement(statement)
-    outputs = claimed([] if stated.before is None else [stated.before], overwrite=overwrite)
-    calibrations = []
-    for path in (calibration, stated.before):
-        if path is not None:
-            saved = calibration_file.open_calibration(path)
-            calibrations.append((saved, saved.model(path, programs.effects_from, programs.trust)))
-    written, standing = write_certificate(outputs, output, stated, *calibrations, xml=xml, schema=schema)
-    check = None if draws is None else monte_carlo(written.budget, draws)
-    print_result(as_json, views.certificate_object, views.certificate_report, written, standing, check, output, xml)
-
-
-def stated_in(certificate: Path | None, statement: Path | None) -> Statement | None:
-    """What a certificate states, checked before the work; None where there is to be none."""
-    if certificate is None:
-        if statement is not None:
-            raise click.UsageError("--statement is for a certificate: name one with --certificate OUT.pdf.")
-        return None
-    from kf_calib.exchange.certificate import statement as statements
-
-    need("typst", "report", "a certificate")
-    return statements.read_statement(statement)
-
-
-def write_certificate(
-    outputs: Outputs, pdf: Path, stated: Statement, calibrated: tuple[SavedCalibration, Model],
-    before: tuple[SavedCalibration, Model] | None = None, xml: Path | None = None, schema: Path | None = None,
-) -> tuple[Certificate, str]:  # fmt: skip
-    """Write the certificate of a calibration with its model as ``out``; what it says, and what the check of its XML
-    found. before: the same from before an adjustment.
-
-    Raises InputError for a calibration, statement or schema that cannot be used, MissingExtraError without typst.
-    """
-    from kf_calib.exchange.certificate import budget, dcc, document
-    from kf_calib.support.output_files import write_whole
-
-    certificate_ = budget.certificate(*calibrated, stated, before)
-    encoded = dcc.xml(certificate_)
-    standing = dcc.check_dcc(encoded, schema)
-    printed = document.pdf(certificate_, encoded, standing)
-    outputs.write(pdf, lambda path: write_whole(path, printed))
-    if xml is not None:
-        outputs.write(xml, lambda path: write_whole(path, encoded))
-    return certificate_, standing

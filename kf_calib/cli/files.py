@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from kf_calib.diagnosis.results import Diagnosis
     from kf_calib.diagnosis.stepwise_selection import Improvement
     from kf_calib.estimation.results import Calibration
-    from kf_calib.views.report.contents import Measured
 
 
 class OutputFile(click.Path):
@@ -168,31 +167,6 @@ def write_view(result: Calibration | Diagnosis | Improvement, path: Path) -> Non
 ReportFile = Annotated[Path | None, output_option(
     "--report", metavar="FILE.html", help="Save a page with figures and tables here; it needs no network.",
 )]  # fmt: skip
-
-
-def save_report(
-    deliver: Delivery, path: Path | None, result: object, measured: Measured | None, remarks: Sequence[str] = ()
-) -> None:
-    """Save the page of a command's result, if ``--report`` asks for one."""
-    if path is not None and measured is not None:
-        from kf_calib.views.report.contents import page_of
-        from kf_calib.views.report.page import save
-
-        commands = commands_of(get_current_context())
-        deliver.file(path, lambda path: save(page_of(result, [measured], commands, remarks), path))
-
-
-def measured_of(recording: Path, source: Source) -> Measured:
-    """What a page says of a recording's file, which ``source`` reads; raises MissingExtraError where no page can be
-    made."""
-    import kf_calib.views.figures  # noqa: F401  # which a page needs
-    from kf_calib.sources.files.record_files import END_RECORD, decision_records, fingerprint
-    from kf_calib.sources.opening import run_date
-    from kf_calib.views.report.contents import Measured
-
-    is_driven = recording.suffix == ".mcap" and recording.is_file()
-    decided, ends = (decision_records(recording), decision_records(recording, END_RECORD)) if is_driven else ((), ())
-    return Measured(recording.name, fingerprint(recording), run_date(source), decided, ends)
 
 
 _HOW_IT_ENDS = ("overwrite", "strict", "as_json")

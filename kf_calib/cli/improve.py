@@ -13,7 +13,7 @@ import rich_click as click
 from kf_calib.bench.keys import StatedBench
 from kf_calib.cli.command import argument, command, option, values_of
 from kf_calib.cli.echo import print_json, progress, show
-from kf_calib.cli.files import Pictures, ReportFile, claimed, delivery, measured_of, output_option, save_report
+from kf_calib.cli.files import Pictures, ReportFile, claimed, delivery, output_option
 from kf_calib.cli.options import (
     EvaluationOptions,
     Json,
@@ -26,6 +26,7 @@ from kf_calib.cli.options import (
     exit_if,
 )
 from kf_calib.errors import InputError
+from kf_calib.support.leaves import leaf
 from kf_calib.support.text import sentence
 
 if TYPE_CHECKING:
@@ -87,7 +88,8 @@ def improve(
     _refuse_engine(evaluation)
     settings = evaluation.settings()
     origin = _for_journal(recording, reading, evaluation, settings.effects)
-    measured = measured_of(recording, reading.opened(recording)) if report else None
+    reports = leaf("report.command", "--report") if report else None
+    measured = reports.measured_of(recording, reading.opened(recording)) if reports else None
 
     with delivery(outputs, as_json) as deliver:
 
@@ -114,7 +116,9 @@ def improve(
         deliver.model(save_model, state.result)
         deliver.file(journal_file, lambda path: selection_journal.write_journal(path, state, origin))
         pictures.save(deliver, state)
-        save_report(deliver, report, state, measured, [views.honest_sentence(checked)] if checked else [])
+        if reports is not None:
+            remarks = [views.honest_sentence(checked)] if checked else []
+            reports.save_report(deliver, report, state, measured, remarks)
     exit_if(strict and state.diagnosis.test.consistent is False)
 
 

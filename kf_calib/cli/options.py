@@ -13,7 +13,7 @@ from click import get_current_context  # rich_click declares that there may be n
 from click.core import ParameterSource
 
 from kf_calib.bench.keys import UNSTATED, BenchKeys, StatedBench, StatedInput
-from kf_calib.cli.command import INPUT, MODEL, NOT_NEGATIVE, OUTPUT, POSITIVE, NumberInRange, option
+from kf_calib.cli.command import INPUT, MODEL, NOT_NEGATIVE, OUTPUT, POSITIVE, NumberInRange, argument, option
 from kf_calib.cli.echo import complain
 from kf_calib.cli.files import output_option
 from kf_calib.errors import BenchError, InputError
@@ -39,6 +39,7 @@ Device = Annotated[StatedInput, INPUT]
 BenchModelFile = Annotated[Path | None, _of_model(
     "--bench-model", metavar="FILE.toml",
     help="Errors of the bench that many runs have shown: they are subtracted, and their sigma is considered.")]
+CalibrationFile = Annotated[Path, argument(metavar="CAL")]
 StatementFile = Annotated[Path | None, _of_input(
     "--statement", metavar="LAB.toml", help="What the laboratory states: docs/certificate.md has the keys.")]
 Save = Annotated[Path | None, output_option(

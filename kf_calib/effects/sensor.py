@@ -5,16 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, sign
-from kf_calib.effects.effect import (
-    MICRO_G,
-    MICRO_PER_G,
-    MILLI_PER_G,
-    Bearer,
-    Regressor,
-    SensorEffect,
-    Typical,
-    Unknown,
-)
+from kf_calib.effects.effect import MICRO_G, MICRO_PER_G, MILLI_PER_G, Bearer, Regressor, SensorEffect, Typical, Unknown
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 

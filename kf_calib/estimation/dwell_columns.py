@@ -108,11 +108,7 @@ def columns_of(dwells: DwellTable, model: Model, state: Floats) -> OfPieces:
 
 
 def candidate_columns(
-    dwells: DwellTable,
-    effects: Sequence[Effect],
-    bench: Bench,
-    state: Floats,
-    stimulus: Stimulus | None = None,
+    dwells: DwellTable, effects: Sequence[Effect], bench: Bench, state: Floats, stimulus: Stimulus | None = None
 ) -> OfPieces:
     """The columns of effects that are not in the model, in the form of ``columns_of``; ``stimulus`` may be given if it
     is known."""

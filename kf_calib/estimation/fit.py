@@ -169,12 +169,7 @@ class Fit:
         linearised, count = self.linearised, self.linearised.model.count
         both = np.concatenate([of_all_pieces(linearised.columns), of_all_pieces(changes)], axis=3)
         columns = OfPieces(both, self.dwells.folded.ends)
-        rows = whitened_rows.whiten(
-            linearised.dwells_at_state,
-            columns,
-            self.noise.weights,
-            linearised.state,
-        )
+        rows = whitened_rows.whiten(linearised.dwells_at_state, columns, self.noise.weights, linearised.state)
         upper = square_root_information.accumulate(rows, self.steps)
         gains = upper[:count, :count].T @ upper[:count, count:-1]
         return gains @ gains.T

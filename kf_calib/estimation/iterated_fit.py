@@ -234,11 +234,7 @@ def _most_passes(model: Model) -> int:
 
 
 def _begun(
-    dwells: DwellTable,
-    model: Model,
-    slews: Sequence[Dwell],
-    walk_mps2_per_sqrt_s: float,
-    beginning: Fit | None,
+    dwells: DwellTable, model: Model, slews: Sequence[Dwell], walk_mps2_per_sqrt_s: float, beginning: Fit | None
 ) -> Fit:
     """Return the fit from which estimation begins: with angles at the nominal state, without at that of the nine
     parameters alone."""

@@ -123,12 +123,7 @@ class Frame:
             np.hstack([beside[:, :width], np.zeros((len(beside), count)), beside[:, width:]]),
         ])  # fmt: skip
         effects = [*(self.effects[k] for k in chosen), *more]
-        return project(
-            square_root_information.accumulate([small]),
-            width,
-            effects,
-            counts_of(effects),
-        )
+        return project(square_root_information.accumulate([small]), width, effects, counts_of(effects))
 
     def _model(self, linearised: LinearisedDwells) -> tuple[Floats, Floats, int]:
         """Return the columns [H | W | z] of a model, inside the frame and outside it, and the number of columns before

@@ -237,12 +237,7 @@ def _combined(parts: Floats, along: Floats) -> Floats:
 
 
 def misfit_rows(
-    dwells: Sequence[Dwell],
-    columns: Sequence[Floats],
-    noise: Noise,
-    state: Floats,
-    width: int,
-    reduced: bool = True,
+    dwells: Sequence[Dwell], columns: Sequence[Floats], noise: Noise, state: Floats, width: int, reduced: bool = True
 ) -> tuple[Sequence[Floats], int]:
     """Rows [H | W | G | z] by which the misfit is judged, and the number of columns before G; H is the first ``width``
     columns.

@@ -25,7 +25,6 @@ from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C
 from kf_calib.errors import InputError
 from kf_calib.estimation.correction import Correction
 from kf_calib.exchange.corrected_lines import NormAtRest
-from kf_calib.sources.containers.spreadsheet import sheets_of, workbook_of
 from kf_calib.sources.files import cdr
 from kf_calib.sources.files.contents import CALIBRATED_TOPIC
 from kf_calib.sources.files.mcap_append import TopicAppender, source_file
@@ -36,6 +35,7 @@ from kf_calib.sources.text.heading import with_texts
 from kf_calib.sources.text.means import TableOfMeans
 from kf_calib.sources.text.numbers import written
 from kf_calib.sources.text.reader import named
+from kf_calib.sources.text.spreadsheet import sheets_of, workbook_of
 from kf_calib.sources.text.units import Units
 from kf_calib.support.output_files import whole, write_whole
 

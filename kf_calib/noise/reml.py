@@ -29,14 +29,7 @@ from kf_calib.noise.means import Means, means_of
 from kf_calib.noise.noise_model import Noise, mean_covariances
 from kf_calib.noise.random_walk import Links, mean_links
 from kf_calib.noise.restricted_likelihood import Point, Restricted
-from kf_calib.noise.terms import (
-    FLOOR_MPS2,
-    NoiseTerm,
-    RandomWalk,
-    Scatter,
-    SettingError,
-    setting_covariances,
-)
+from kf_calib.noise.terms import FLOOR_MPS2, NoiseTerm, RandomWalk, Scatter, SettingError, setting_covariances
 from kf_calib.support.tail_probabilities import chi_squared_tail
 
 FEWEST = 6

@@ -21,9 +21,8 @@ from kf_calib.sources.containers.opening import dataset_of, kind_of_container
 from kf_calib.sources.files.contents import CALIBRATION_FORMAT
 from kf_calib.sources.files.mcap_file import HEAD_BYTES, is_lines
 from kf_calib.sources.files.mcap_records import MAGIC
-from kf_calib.sources.files.record_files import SQLITE, first_bytes
+from kf_calib.sources.files.record_files import ROS1_BAG, SQLITE, first_bytes
 from kf_calib.sources.files.recording import Recording
-from kf_calib.sources.files.ros1_bag import ROS1_BAG
 from kf_calib.sources.text.columns import READINGS, Columns
 from kf_calib.sources.text.encoding import head_of
 from kf_calib.sources.text.grid import OLD_SUFFIXES, TEXT_SUFFIXES, ZIP

@@ -15,7 +15,6 @@ from kf_calib.estimation.estimate import Parameter
 from kf_calib.estimation.results import format_p
 from kf_calib.exchange.calibration_file import SavedCalibration
 from kf_calib.exchange.corrected_file import Applied
-from kf_calib.exchange.exports.target import Target
 from kf_calib.exchange.history import History, ParameterTrack
 from kf_calib.exchange.verification import Verification
 from kf_calib.sources.files.contents import CALIBRATED_TOPIC
@@ -25,8 +24,7 @@ from kf_calib.views.json import clean
 from kf_calib.views.terminal import ConsoleTable, note
 
 if TYPE_CHECKING:
-    from kf_calib.exchange.certificate.budget import Certificate, CertifiedResult, Contribution
-    from kf_calib.exchange.certificate.monte_carlo import MonteCarloCheck
+    pass
 
 _SHOWN = 12
 
@@ -205,41 +203,6 @@ def _track_row(track: ParameterTrack) -> list[str]:
     ]  # fmt: skip
 
 
-def exported_object(target: Target, to: str, path: Path) -> dict[str, Any]:
-    """The JSON object of ``export``."""
-    left = target.error_left
-    return clean(
-        {
-            "out": str(path),
-            "format": to,
-            "lost": list(target.lost),
-            "left_out": target.correction.left_out,
-            "takes": str(target.input),
-            "to_be_done_before": target.to_be_done_before or None,
-            "error_left_rms_mps2": None if left is None else left.rms_mps2,
-            "error_left_worst_mps2": None if left is None else left.worst_mps2,
-            "warnings": [*target.remarks, *(target.noise.remarks if target.noise else ())],
-        }
-    )
-
-
-def exported_report(target: Target, path: Path) -> RenderableType:
-    """The report of ``export``."""
-    lines = [Text(f"{path} is the calibration for {target.title}.", style="bold")]
-    if not target.correction.input.is_plain:
-        lines.append(Text(f"It takes {target.input}."))
-    if target.to_be_done_before:
-        lines.append(note(f"to be made before of what the device sends: {target.to_be_done_before}"))
-    if target.error_left is None:
-        lines.append(Text("It holds all of it."))
-    else:
-        unit, (rms, worst) = shown("m/s^2"), target.error_left
-        lines.append(note(f"it does not hold {', '.join(target.lost)}: corrected readings are wrong by "
-                          f"{unit.text(rms)} rms, {unit.text(worst)} at worst"))  # fmt: skip
-    lines += [note(f"{name} is not corrected: {why}") for name, why in target.correction.left_out.items()]
-    return Group(*lines, *map(note, [*target.remarks, *(target.noise.remarks if target.noise else ())]))
-
-
 def calibration_object(saved: SavedCalibration, path: Path) -> dict[str, Any]:
     """The JSON object of ``info`` of a calibration: what the file holds, and what it takes."""
     return clean({"file": str(path), "kind": "calibration", "input": str(saved.bench.input), **saved.model_dump()})
@@ -269,107 +232,3 @@ def _agreement(saved: SavedCalibration) -> str:
         f"Model and measurements {agree} (p {format_p(consistency.p_value)}, NIS/dof {consistency.nis_per_dof:.3g}, "
         f"{consistency.dof} degrees of freedom)."
     )
-
-
-def certificate_object(
-    certificate: Certificate, standing: str, check: MonteCarloCheck | None, path: Path, xml: Path | None
-) -> dict[str, Any]:
-    """The JSON object of ``certificate``."""
-    return clean(
-        {
-            "out": str(path),
-            "xml": None if xml is None else str(xml),
-            "xml_check": standing,
-            "number": certificate.statement.number,
-            "not_stated": list(certificate.missing),
-            "decision_rule": certificate.statement.decision_rule,
-            "parameters": [_result_object(each) for each in certificate.results],
-            "budget": [_line_object(line) for line in certificate.budget.contributions],
-            "left_out": list(certificate.budget.left_out),
-            "covariance": None if certificate.twelve is None else certificate.twelve[1].tolist(),
-            "intrinsic": [_intrinsic_object(each) for each in certificate.intrinsic],
-            "monte_carlo": None
-            if check is None
-            else {"draws": check.draws, "expanded": check.expanded.tolist(), "agrees": list(check.agrees)},
-        }
-    )
-
-
-def _intrinsic_object(result: CertifiedResult) -> dict[str, Any]:
-    return {key: value for key, value in _result_object(result).items()
-            if key not in ("before", "limit", "conformity")}  # fmt: skip
-
-
-def _result_object(result: CertifiedResult) -> dict[str, Any]:
-    return {
-        "symbol": result.symbol, "value": result.value, "unit": result.unit, "nominal": result.nominal,
-        "standard": result.standard, "expanded": result.expanded, "k": result.k, "dof": result.dof,
-        "before": None if result.before is None else list(result.before),
-        "limit": result.limit, "conformity": result.conformity,
-    }  # fmt: skip
-
-
-def _line_object(line: Contribution) -> dict[str, Any]:
-    return {
-        "symbol": line.name, "title": line.title, "kind": line.kind, "standard": line.standard, "unit": line.unit,
-        "distribution": line.distribution, "dof": line.dof, "source": line.source,
-        "sensitivity": None if line.sensitivity is None else line.sensitivity.tolist(),
-        "contribution": line.parts.tolist(),
-    }  # fmt: skip
-
-
-def certificate_report(
-    certificate: Certificate, standing: str, check: MonteCarloCheck | None, pdf: Path, xml: Path | None
-) -> RenderableType:
-    """The report of ``certificate``."""
-    from kf_calib.exchange.certificate.budget import OUTCOMES  # loaded already by what makes certificates
-
-    with_conformity = any(result.conformity for result in certificate.results)
-    table = ConsoleTable(title="Uncertainty (type A and type B: standard; U = k u)", title_justify="left")
-    drawn = ["U by Monte Carlo"] if check else []
-    judged = ["conformity"] if with_conformity else []
-    for heading in ("parameter", "type A", "type B", "U", *drawn, "k", "unit", *judged):
-        table.add_column(heading, justify="left" if heading in ("parameter", "unit", "conformity") else "right")
-    first, combined = certificate.budget.contributions[0].parts, certificate.budget.combined
-    for i, result in enumerate(certificate.results):
-        unit = shown(result.unit)
-        other = max(combined[i] ** 2 - first[i] ** 2, 0.0) ** 0.5
-        by_draws = [] if check is None else [unit.number(float(check.expanded[i]), 2)]
-        row = [symbol(result.symbol), *(unit.number(u, 2) for u in (first[i], other)),
-               "" if result.expanded is None else unit.number(result.expanded, 2),
-               *by_draws, f"{result.k:.2f}", unit.label]  # fmt: skip
-        table.add_row(
-            *row, *([OUTCOMES[result.conformity] if result.conformity else "not judged"] if with_conformity else [])
-        )
-    lines = [note(f"not stated, and left blank: {', '.join(certificate.missing)}")] if certificate.missing else []
-    saved = [Text(f"saved {path}") for path in (pdf, xml) if path is not None]
-    parts: list[RenderableType] = [table]
-    if certificate.intrinsic:
-        parts.append(_intrinsic_table(certificate.intrinsic))
-    return Group(*parts, *_drawn(certificate, check), Text(f"XML: {standing}."), *lines, *saved)
-
-
-def _intrinsic_table(results: Sequence[CertifiedResult]) -> ConsoleTable:
-    """Return the table of the nine that no choice of a frame changes."""
-    title = "Intrinsic: sensitivities, angles between the input axes, offsets"
-    table = ConsoleTable(title=title, title_justify="left")
-    for heading in ("parameter", "less nominal", "U", "k", "unit"):
-        table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
-    for k, result in enumerate(results):
-        unit = shown(result.unit)
-        assert result.value is not None and result.expanded is not None
-        value, _ = unit.rounded(result.value - result.nominal, result.expanded)
-        table.add_row(symbol(result.symbol), value, unit.number(result.expanded, 2), f"{result.k:.2f}", unit.label,
-                      end_section=k % 3 == 2)  # fmt: skip
-    return table
-
-
-def _drawn(certificate: Certificate, check: MonteCarloCheck | None) -> list[RenderableType]:
-    """Return what a Monte Carlo check says of the budget, in a sentence."""
-    if check is None:
-        return []
-    apart = [symbol(each.symbol) for each, agrees in zip(certificate.results, check.agrees, strict=True) if not agrees]
-    how = f"to half of the second digit of u, by {check.draws} draws (JCGM 101)"
-    if not apart:
-        return [Text(f"U of all parameters is confirmed {how}.")]
-    return [note(f"U of {', '.join(apart)} is not confirmed {how}: quote U by Monte Carlo for these")]

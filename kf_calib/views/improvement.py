@@ -25,9 +25,7 @@ _EIGHTHS = " ▏▎▍▌▋▊▉"
 
 
 def improvement_object(
-    state: Improvement,
-    honest: NestedCrossValidation | None,
-    files: Mapping[str, Path | None],
+    state: Improvement, honest: NestedCrossValidation | None, files: Mapping[str, Path | None]
 ) -> dict[str, Any]:
     """The JSON object of ``improve``.
 

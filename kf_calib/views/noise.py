@@ -1,15 +1,13 @@
-"""The noise of sensors at rest as a report and as a JSON object, and its export in the keys of another program."""
+"""The noise of sensors at rest as a report and as a JSON object."""
 
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from kf_calib.exchange.exports.noise_keys import NoiseExport
 from kf_calib.noise.power_laws import TERMS
 from kf_calib.noise.rest_noise import ChannelNoise, RestNoise
 from kf_calib.noise.term_fit import Size
@@ -170,21 +168,3 @@ def _remarks_of(channel: ChannelNoise) -> list[str]:
         sentences.append(f"something besides the terms that are seen is there, likeliest {names}, which this recording "
                          "cannot tell from its neighbours: a longer rest can.")  # fmt: skip
     return sentences
-
-
-def noise_export_object(export: NoiseExport, path: Path) -> dict[str, Any]:
-    """The JSON object of ``export`` of noise alone."""
-    return clean(
-        {
-            "out": str(path),
-            "format": export.to,
-            "keys": {key.name: key.value for key in export.keys},
-            "limits": [key.name for key in export.keys if key.is_limit],
-            "warnings": list(export.remarks),
-        }
-    )
-
-
-def noise_export_report(export: NoiseExport, path: Path) -> RenderableType:
-    """The report of ``export`` of noise alone."""
-    return Group(Text(f"{path} is the noise for {export.title}.", style="bold"), *map(note, export.remarks))

@@ -14,7 +14,7 @@ from helpers.paths import ROOT
 
 import kf_calib
 from kf_calib import errors
-from kf_calib.views.report import page
+from kf_calib.views import html
 
 FACES = ROOT / "recordings" / "mems_faces.mcap"
 
@@ -73,7 +73,7 @@ def test_notebooks_show_results_as_tables(
     for result, says in ((run, "Parameters (1σ)"), (improved.start, "Missing: hysteresis"), (improved, "Rms error")):
         shown = result._repr_html_()
         assert shown.count("<table>") >= 1 and says in shown and "<script" not in shown
-    monkeypatch.setattr(page, "find_spec", lambda name: None)
+    monkeypatch.setattr(html, "find_spec", lambda name: None)
     assert run._repr_html_() is None  # a notebook then shows the text
 
 

@@ -20,11 +20,11 @@ from helpers.calibrations import simulated
 from helpers.long_runs import slow
 
 import kf_calib
+from kf_calib.certificate.budget import certificate
+from kf_calib.certificate.statement import Statement
 from kf_calib.errors import KfCalibError
 from kf_calib.exchange import calibration_file
-from kf_calib.exchange.certificate.budget import certificate
-from kf_calib.exchange.certificate.statement import Statement
-from kf_calib.exchange.exports import TARGETS, exported
+from kf_calib.exports import TARGETS, exported
 
 VALUES = [None, True, -1, 0, 1, 2**70, -0.0, 1e-300, 1e300, 0.5, "", "x", "\n#", "=1", "fx*T", "second-order", [], {},
           [0.0]]  # fmt: skip

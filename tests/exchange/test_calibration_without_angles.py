@@ -15,13 +15,13 @@ from scipy import stats
 
 import kf_calib
 from kf_calib.bench.bench import Bench, axes_of
+from kf_calib.certificate import budget, statement
 from kf_calib.errors import InputError
 from kf_calib.estimation.settings import Settings
 from kf_calib.exchange import calibration_file
-from kf_calib.exchange.certificate import budget, statement
-from kf_calib.exchange.exports import TARGETS, exported
 from kf_calib.exchange.history import history
 from kf_calib.exchange.verification import verify
+from kf_calib.exports import TARGETS, exported
 from kf_calib.sources.simulation.sensors import Sensors, TrueNoise
 from kf_calib.sources.simulation.simulator import ByHand, Simulation
 from kf_calib.sources.simulation.visit_plans import PlannedVisit

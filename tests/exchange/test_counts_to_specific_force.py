@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from exchange.test_c_header import compiled, compiled_only
 from exchange.test_raw_input import forces_in_csv
+from exports.test_c_header import compiled, compiled_only
 from helpers.long_runs import slow
 
 from kf_calib.cli import cli

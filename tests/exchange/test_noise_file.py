@@ -12,8 +12,8 @@ import yaml
 from helpers.resting import Resting, level, noisy
 
 from kf_calib.errors import InputError
-from kf_calib.exchange.exports.noise_keys import NoiseExport
 from kf_calib.exchange.noise_file import SavedRestNoise, is_noise_file, open_noise, saved_noise, write_noise
+from kf_calib.exports.noise_keys import NoiseExport
 from kf_calib.noise.rest_noise import RestNoise, noise_at_rest
 
 WHITE = (1e-3, 2e-3, 1.5e-3)

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import openpyxl
 import pytest
-from exchange.test_c_header import compiled_only, compiled_together
-from exchange.test_exports import READERS, ROUNDING
+from exports.test_c_header import compiled_only, compiled_together
+from exports.test_exports import READERS, ROUNDING
 from helpers.altered import short_run
 from helpers.long_runs import slow
 from helpers.stated_sensors import correction, samples, saved
@@ -30,7 +30,7 @@ from kf_calib.bench.bench import Bench
 from kf_calib.bench.raw_input import UNITS, RawInput, merged_metadata
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import BenchError
-from kf_calib.exchange.exports import exported
+from kf_calib.exports import exported
 from kf_calib.sources.files.recorder import Recorder
 
 ORDERS = [

@@ -23,10 +23,10 @@ from fleet_generator import Campaign, record
 from helpers.fleet_workers import evaluation, threads, used
 
 import kf_calib
-from kf_calib.cli.fleet import SingleCommands
 from kf_calib.errors import InputError
 from kf_calib.fleet import batch
 from kf_calib.fleet.batch import RunEvaluation, evaluate_all
+from kf_calib.fleet.command import SingleCommands
 from kf_calib.fleet.run_list import ListedRun, runs_of
 from kf_calib.fleet.store import Store
 

@@ -24,9 +24,9 @@ from helpers.fleet_workers import evaluation, threads, used
 from helpers.long_runs import slow
 
 import kf_calib
-from kf_calib.cli.fleet import SingleCommands
 from kf_calib.fleet import batch
 from kf_calib.fleet.batch import OverTime, RunEvaluation, evaluate_all, in_time
+from kf_calib.fleet.command import SingleCommands
 from kf_calib.fleet.run_list import SCHEMA, ListedRun, runs_of
 from kf_calib.fleet.store import Store
 

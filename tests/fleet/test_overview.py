@@ -17,10 +17,10 @@ from helpers.run_factors import run_factor_of
 import kf_calib
 from kf_calib.estimation import bench_model
 from kf_calib.fleet.overview import overview_of
+from kf_calib.fleet.page import fleet_page
 from kf_calib.fleet.pooled_diagnosis import pooled_diagnosis
+from kf_calib.fleet.text import short_name
 from kf_calib.views.figures import figures
-from kf_calib.views.fleet import short_name
-from kf_calib.views.report.fleet import fleet_page
 
 pytestmark = pytest.mark.xdist_group("fleet")
 

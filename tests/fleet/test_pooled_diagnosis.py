@@ -21,7 +21,7 @@ from kf_calib.fleet.pooled_diagnosis import PooledDiagnosis, _near, pooled_diagn
 from kf_calib.fleet.pooled_terms import Attribution
 from kf_calib.fleet.results import bench_model
 from kf_calib.fleet.run_factor import ReferenceUnit
-from kf_calib.views.fleet import pooled_report, sentences
+from kf_calib.fleet.text import pooled_report, sentences
 
 BENT = np.array([2.5, -2.0, 2.0])
 REPAIRED = 13

@@ -12,13 +12,12 @@ import pytest
 from distributed import Client, LocalCluster
 
 from kf_calib.bench.streams import Source
-from kf_calib.cli import fleet
-from kf_calib.cli.fleet import SingleCommands
 from kf_calib.cli.options import EvaluationOptions, ReadingOptions, opened
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.estimation.results import Calibration
-from kf_calib.fleet import batch
+from kf_calib.fleet import batch, command
 from kf_calib.fleet.batch import RunEvaluation
+from kf_calib.fleet.command import SingleCommands
 
 _calibrations = dict[tuple[str, str], Calibration]()
 _diagnoses = dict[int, Diagnosis]()
@@ -60,7 +59,7 @@ def used(client: Client) -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(batch, "cluster", running)
-        patch.setattr(fleet, "SingleCommands", RememberingCommands)
+        patch.setattr(command, "SingleCommands", RememberingCommands)
         yield
 
 

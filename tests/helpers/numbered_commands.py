@@ -22,8 +22,8 @@ from kf_calib import calibrate
 from kf_calib.bench.streams import Batch
 from kf_calib.cli import cli
 from kf_calib.exchange import calibration_file
-from kf_calib.exchange.exports import TARGETS
 from kf_calib.exchange.verification import verify
+from kf_calib.exports import TARGETS
 from kf_calib.fleet.pooled_diagnosis import pooled_diagnosis
 from kf_calib.online.session import Session
 from kf_calib.online.status import Judgement, Standing

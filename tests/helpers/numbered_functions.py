@@ -21,10 +21,10 @@ from kf_calib.dwells.segmenter import Segmenter
 from kf_calib.estimation import signal_quality
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.fleet.pooled_diagnosis import pooled_diagnosis
+from kf_calib.fleet.text import pooled_objects
 from kf_calib.noise import allan, banded, noise_of_readings, random_walk
 from kf_calib.online.suggestion import Suggestion
 from kf_calib.positioning import loop
-from kf_calib.views.fleet import pooled_objects
 
 Numbers = Mapping[str, Any]
 SIZES = np.geomspace(1e-3, 1e3, 40)

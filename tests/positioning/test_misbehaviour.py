@@ -19,11 +19,11 @@ from hypothesis import strategies as st
 from positioner_emulator import MISBEHAVIOURS, Server
 
 from kf_calib.bench.bench import Bench, axes_of
-from kf_calib.cli.run import halt_in_words
 from kf_calib.design.gimbal_limits import Reach
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.online.session import Session
 from kf_calib.online.suggestion import Itinerary
+from kf_calib.positioning.command import halt_in_words
 from kf_calib.positioning.drive import Drive
 from kf_calib.positioning.link import device_of, refuse_address
 from kf_calib.positioning.loop import Rules

@@ -16,8 +16,8 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.bench import Bench
 from kf_calib.estimation.settings import PRIORS
 from kf_calib.reproduction import grebenkin2019, grebenkin2019_conditions
+from kf_calib.reproduction import text as views
 from kf_calib.reproduction.grebenkin2019 import NONOPTIMAL_PRINTED, OPTIMAL_PRINTED, Conditions
-from kf_calib.views import paper as views
 
 ANGLES = np.array([0.01, 0.3, 1.1, 0.0, 0.2, 0.3, 0.9, 0.0, 0.02, -1.4, 1.05, 0.0])
 """Away from the nominal, where several misprints happen to vanish."""

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from kf_calib.report.page import own_text
 from kf_calib.views.figures import style
-from kf_calib.views.report.page import own_text
 
 SEEN = {
     "all cones": np.eye(3),
@@ -47,27 +47,27 @@ def _rgb(colours: Sequence[str]) -> np.ndarray:
 
 
 def _in_figure(module: str, name: str) -> Any:
-    return getattr(import_module(f"kf_calib.views.figures.{module}"), name)
+    return getattr(import_module(f"kf_calib.{module}"), name)
 
 
-FAMILIES, KNOWN = _in_figure("explanations", "_FAMILIES"), _in_figure("fleet", "_KNOWN")
+FAMILIES, KNOWN = _in_figure("views.figures.explanations", "_FAMILIES"), _in_figure("fleet.figures", "_KNOWN")
 PALETTES: dict[str, Sequence[str]] = {
     "accelerometers": style.ACCELEROMETERS,
     "accelerometers in the dark": _on_dark(style.ACCELEROMETERS),
     "explorer": _of_page(0),
     "explorer in the dark": _of_page(1),
-    "explanations": [style.BEST, style.RUNNER_UP, _in_figure("explanations", "_FITTING")],
+    "explanations": [style.BEST, style.RUNNER_UP, _in_figure("views.figures.explanations", "_FITTING")],
     "families": FAMILIES,
     "families in the dark": _on_dark(FAMILIES),
     "verdicts of a fleet": [
-        *_in_figure("fleet", "_COLOURS"),
+        *_in_figure("fleet.figures", "_COLOURS"),
         *(KNOWN[name] for name in ("consistent", "failed", "inconsistent")),
     ],
-    "detection limits": [_in_figure("explanations", name) for name in ("_SEEN", "_HIDDEN")],
+    "detection limits": [_in_figure("views.figures.explanations", name) for name in ("_SEEN", "_HIDDEN")],
     "NIS": ["#222222", style.ALARM],
-    "gimbals": _in_figure("orientations", "_GIMBALS"),
-    "engines": list(_in_figure("engines", "_COLOURS").values()),
-    "sets of orientations": [colour for colour, _ in _in_figure("experiment", "_SETS").values()],
+    "gimbals": _in_figure("views.figures.orientations", "_GIMBALS"),
+    "engines": list(_in_figure("views.figures.engines", "_COLOURS").values()),
+    "sets of orientations": [colour for colour, _ in _in_figure("reproduction.figures", "_SETS").values()],
 }
 
 

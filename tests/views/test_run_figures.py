@@ -30,8 +30,8 @@ from kf_calib.estimation.engine_comparison import Comparison, compare
 from kf_calib.estimation.filter_history import history_of, innovation_tests
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import PRIORS, Settings
+from kf_calib.reproduction import figures as paper
 from kf_calib.reproduction.grebenkin2019 import OPTIMAL_PRINTED, Experiment, printed_column, repeat
-from kf_calib.views.figures import experiment as paper
 from kf_calib.views.figures.style import content_of, label, ticks, written
 
 HIDDEN = ROOT / "recordings" / "hidden.mcap"

@@ -28,9 +28,10 @@ from kf_calib.estimation.observability import visibility_of
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.settings import Settings
 from kf_calib.online.session import Session
+from kf_calib.reproduction import text as paper
 from kf_calib.reproduction.grebenkin2019 import repeat
 from kf_calib.sources.files.recording import Recording
-from kf_calib.views import catalogue, console, diagnosis, improvement, paper
+from kf_calib.views import catalogue, console, diagnosis, improvement
 from kf_calib.views import plan as plans
 from kf_calib.views.live.content import content_of
 from kf_calib.views.live.screen import screen

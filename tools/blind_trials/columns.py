@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.bench.keys import BenchKeys
 from kf_calib.diagnosis.candidate_tests import slow_hz
 from kf_calib.effects import Effect, effect_named, names
 from kf_calib.estimation.calibration import calibrate
@@ -32,7 +33,8 @@ def scan_columns(
     at which the program looks for slow ones, not at those of a grid. exact_poses: take the poses as they are stated, as
     what is equal in these differs by the setting errors of a run otherwise.
     """
-    result = calibrate(Recording(path, {"angle_sigma_deg": "0"} if exact_poses else {}))
+    keys: BenchKeys = {"angle_sigma_deg": 0.0} if exact_poses else {}
+    result = calibrate(Recording(path, keys))
     noise = result.noise.for_goodness_of_fit
     if white_mps2 is not None:
         noise = dataclasses.replace(noise, sigma_mps2=np.full(3, white_mps2), inflation=np.ones(3))

@@ -1,1 +1,1 @@
-"""Files that hold arrays in place of letters: MATLAB, HDF5, NumPy and flight logs, each dataset given out as lines."""
+"""Files that hold arrays in place of letters: which they are, and each of their datasets, given out as lines."""

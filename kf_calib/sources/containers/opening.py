@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from enum import Enum
 from functools import lru_cache
 from pathlib import Path
 
-from kf_calib.errors import InputError, KfCalibError, need
-from kf_calib.sources.containers.arrays import hdf5_arrays, matlab_arrays, numpy_arrays
+from kf_calib.errors import InputError, KfCalibError
 from kf_calib.sources.containers.dataset import Dataset, chosen
-from kf_calib.sources.containers.flight_logs import DATAFLASH, dataflash_datasets, ulog_datasets
-from kf_calib.sources.containers.groups import ArrayGroup, datasets_of
+from kf_calib.support.leaves import leaf
 
-_HDF5 = b"\x89HDF\r\n\x1a\n"
+_HDF5, _DATAFLASH = b"\x89HDF\r\n\x1a\n", b"\xa3\x95"
 _AFTER_A_BLOCK = 512  # bytes for the user, which MATLAB fills
 _LARGEST_BYTES = 1 << 30
 
@@ -44,7 +42,7 @@ def kind_of_container(path: Path) -> ContainerKind | None:
         return ContainerKind.NUMPY
     if start.startswith(b"ULog\x01\x12\x35"):
         return ContainerKind.ULOG
-    return ContainerKind.DATAFLASH if start.startswith((DATAFLASH, b"FMT, 128,")) else None
+    return ContainerKind.DATAFLASH if start.startswith((_DATAFLASH, b"FMT, 128,")) else None
 
 
 def datasets_in(path: Path) -> tuple[Dataset, ...]:
@@ -58,30 +56,19 @@ def datasets_in(path: Path) -> tuple[Dataset, ...]:
     return _read(path, kind, status.st_mtime_ns, status.st_size)
 
 
-_READERS: dict[ContainerKind, tuple[str, Callable[[Path], list[Dataset] | ArrayGroup]]] = {
-    ContainerKind.MATLAB: ("scipy", matlab_arrays),
-    ContainerKind.HDF5: ("h5py", hdf5_arrays),
-    ContainerKind.NUMPY: ("numpy", numpy_arrays),
-    ContainerKind.ULOG: ("pyulog", ulog_datasets),
-    ContainerKind.DATAFLASH: ("pymavlink", dataflash_datasets),
-}
-
-
 @lru_cache(maxsize=2)
 def _read(path: Path, kind: ContainerKind, *state: int) -> tuple[Dataset, ...]:
     """Return the datasets of a file in this state."""
-    package, read = _READERS[kind]
-    need(package, "logs", f"{path}, a file of {kind.value},")
+    logs = leaf("logs.reading", f"{path}, a file of {kind.value},")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of libraries, on files that are odd and can be read
-            content = read(path)
+            return tuple(logs.read_datasets(path, kind))
     except KfCalibError:
         raise
     except Exception as error:  # libraries raise what they like on a damaged file
         said = " ".join(str(error).split())[:100] or type(error).__name__
         raise InputError(f"{path}: cannot be read as a file of {kind.value} ({said}): copy it anew.") from None
-    return tuple(datasets_of(content) if isinstance(content, ArrayGroup) else content)
 
 
 def dataset_of(path: Path, name: str = "") -> Dataset:

@@ -18,9 +18,14 @@ from kf_calib.sources.files.field_messages import CDR, ENCODINGS, LOG_TIME_BEFOR
 from kf_calib.sources.files.fields import FieldError, paths_of
 from kf_calib.sources.files.mcap_file import McapFile, Warn
 from kf_calib.sources.files.mcap_records import MAX_CHUNK_MB, MessageFinder
-from kf_calib.sources.files.record_files import RecordFile, files_of, first_bytes, open_record_file
-from kf_calib.sources.files.ros1_bag import ROS1_BAG
-from kf_calib.sources.files.sqlite_bag import SqliteBag
+from kf_calib.sources.files.record_files import (
+    ROS1_BAG,
+    ListsMessages,
+    RecordFile,
+    files_of,
+    first_bytes,
+    open_record_file,
+)
 from kf_calib.sources.text.lines import Lines
 from kf_calib.sources.text.units import Units
 
@@ -140,7 +145,7 @@ def inventory_of(path: Path, fields: Sequence[str] = ()) -> Inventory:
 
 
 def _kind(part: RecordFile) -> str:
-    if isinstance(part, SqliteBag):
+    if isinstance(part, ListsMessages):
         return "db3"
     return "bag" if first_bytes(part.path).startswith(ROS1_BAG) else "mcap"
 
@@ -189,7 +194,7 @@ def _count(file: RecordFile, contents: Contents, topics: dict[str, Topic], warn:
         contents.channels = {channel.id: channel for channel in file.summary.channels}
     for channel in contents.channels.values():
         _topic(channel, contents, topics)
-        if isinstance(file, SqliteBag):
+        if isinstance(file, ListsMessages):
             _look_into(file.first(channel.id), channel.id, contents, topics)
     stray = 0
     for number, times in _receipts(file, contents, topics, warn):
@@ -212,7 +217,7 @@ def _receipts(
     file: RecordFile, contents: Contents, topics: dict[str, Topic], warn: Warn
 ) -> Iterable[tuple[int, TopicTimes]]:
     """Channel and times of receipt of messages of it, some thousands at a time."""
-    if isinstance(file, SqliteBag):
+    if isinstance(file, ListsMessages):
         return file.receipts(warn)
     assert isinstance(file, McapFile)
     return _from_blocks(file, contents, topics, warn)

@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from itertools import takewhile
 from pathlib import Path
-from typing import IO, Protocol
+from typing import IO, Protocol, runtime_checkable
 
 import zstandard
 from mcap.opcode import Opcode
@@ -28,18 +28,18 @@ from kf_calib.errors import InputError, KfCalibError
 from kf_calib.sources.files.mcap_file import McapFile, Warn
 from kf_calib.sources.files.mcap_records import (
     DamagedError,
+    Integers,
     MessageFinder,
     RecordBlock,
     Summary,
     allowed_sizes,
     parse_record,
 )
-from kf_calib.sources.files.ros1_bag import ROS1_BAG, mcap_of_bag
-from kf_calib.sources.files.sqlite_bag import SqliteBag
+from kf_calib.support.leaves import leaf
 from kf_calib.support.text import cut, number_from
 
 _USUAL_RATIO = 20  # sizes of a recording unpacked and packed, at most
-SQLITE, _ZSTD = b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
+SQLITE, ROS1_BAG, _ZSTD = b"SQLite format 3\0", b"#ROSBAG V2.0", b"\x28\xb5\x2f\xfd"
 
 
 class RecordFile(Protocol):
@@ -57,6 +57,15 @@ class RecordFile(Protocol):
     def record_at(self, position: int, opcode: int) -> bytes: ...
 
 
+@runtime_checkable
+class ListsMessages(Protocol):
+    """A file of which messages need not be unpacked to be counted."""
+
+    def receipts(self, warn: Warn) -> Iterator[tuple[int, Integers]]: ...
+
+    def first(self, channel: int) -> bytes: ...
+
+
 def open_record_file(path: Path, max_chunk: int, usable: frozenset[str]) -> RecordFile:
     """The MCAP or .db3 file at ``path``, or a bag of ROS 1. usable: types of messages wanted, and topics.
 
@@ -66,11 +75,12 @@ def open_record_file(path: Path, max_chunk: int, usable: frozenset[str]) -> Reco
     if first_bytes(path).startswith(_ZSTD):
         place = _unpacked(path, max_chunk)
     elif first_bytes(path).startswith(ROS1_BAG):
-        place, said = mcap_of_bag(path)
+        place, said = leaf("bags.ros1_bag", f"{path}, a bag of ROS 1,").mcap_of_bag(path)
     file: RecordFile
     try:
         if first_bytes(place).startswith(SQLITE):
-            file = SqliteBag(path, place, usable, max_chunk)
+            bags = leaf("bags.sqlite_bag", f"{path}, a bag in SQLite,")
+            file = bags.SqliteBag(path, place, usable, max_chunk)
         else:
             file = McapFile(path, max_chunk, place)
     except BaseException:

@@ -12,10 +12,10 @@ from typing import Any
 
 from kf_calib.errors import InputError
 from kf_calib.sources.containers.opening import kind_of_container
-from kf_calib.sources.containers.spreadsheet import sheets_of
 from kf_calib.sources.text.encoding import LARGEST_TABLE_BYTES, text_of, too_large
 from kf_calib.sources.text.heading import TextHeading
 from kf_calib.sources.text.numbers import DECIMAL_POINT, Numbers
+from kf_calib.sources.text.spreadsheet import sheets_of
 from kf_calib.support.text import cut
 
 ZIP = b"PK\x03\x04"

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Mapping
 from functools import singledispatch
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -40,12 +41,6 @@ from kf_calib.views.figures.residuals import disturbed_dwell, residuals, what_th
 Figures = Mapping[str, Callable[[], Figure]]
 """Title of each figure, and what draws it."""
 
-_OF_LEAVES = {
-    "kf_calib.fleet": "kf_calib.views.figures.fleet",
-    "kf_calib.reproduction": "kf_calib.views.figures.experiment",
-}
-"""Packages that nothing else knows, and what registers the figures of their results, when one is to be drawn."""
-
 PROBABILITIES = "What it may be, and with what probability"
 FALL, NO_FALL = "The error falls", "The error of the model"
 ON_THEIR_WAY, DIRECTIONS = "Estimates on their way", "Directions of gravity in the platform"
@@ -55,8 +50,8 @@ ON_THEIR_WAY, DIRECTIONS = "Estimates on their way", "Directions of gravity in t
 @singledispatch
 def figures(result: Any) -> Figures:
     """The figures of a result by title, the one that tells most first; nothing is drawn before it is called for."""
-    leaf = _OF_LEAVES.get(".".join(type(result).__module__.split(".")[:2]))
-    if leaf is not None and leaf not in sys.modules:
+    leaf = f"{'.'.join(type(result).__module__.split('.')[:2])}.figures"
+    if leaf not in sys.modules and leaf.startswith("kf_calib.") and find_spec(leaf):  # a folder with figures of its own
         import_module(leaf)
         return figures(result)
     raise TypeError(f"there is no figure of {type(result).__name__}: give the result of calibrate, diagnose, improve, "

@@ -196,22 +196,9 @@ def draw_allan(figure: FigureBase, allan: AllanDeviation) -> None:
 def _lines(axes: Axes, allan: AllanDeviation, i: int) -> None:
     """Draw what the parts of the noise model give."""
     per_si = shown("m/s^2").per_si
-    axes.plot(
-        allan.tau_s,
-        allan.white_mps2[:, i] * per_si,
-        color="#222222",
-        linewidth=1.2,
-        label="white, σ √(κ/m)",
-    )
+    axes.plot(allan.tau_s, allan.white_mps2[:, i] * per_si, color="#222222", linewidth=1.2, label="white, σ √(κ/m)")
     if allan.flicker_mps2[i]:
         axes.plot(allan.tau_s, np.full(len(allan.tau_s), allan.flicker_mps2[i] * per_si), "--", color="#222222",
                   linewidth=1.2, label="1/f, were it the scatter of dwells")  # fmt: skip
     if allan.walk_mps2.any():
-        axes.plot(
-            allan.tau_s,
-            allan.walk_mps2 * per_si,
-            ":",
-            color="#222222",
-            linewidth=1.4,
-            label="walk, q √(τ/3)",
-        )
+        axes.plot(allan.tau_s, allan.walk_mps2 * per_si, ":", color="#222222", linewidth=1.4, label="walk, q √(τ/3)")

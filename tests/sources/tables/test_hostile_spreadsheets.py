@@ -21,9 +21,9 @@ from helpers.paths import ROOT
 import kf_calib
 from kf_calib.bench.streams import Table
 from kf_calib.errors import InputError, KfCalibError
-from kf_calib.sources.containers.spreadsheet import PlainRows, sheets_of
 from kf_calib.sources.opening import FileKind, kind_of
 from kf_calib.sources.text.names import meaning_of
+from kf_calib.sources.text.spreadsheet import PlainRows, sheets_of
 
 HEADER = ["time [s]", "outer [deg]", "inner [deg]", "ax [g]", "ay [g]", "az [g]"]
 ROWS = [[0, 0, 0, 0.003, 1.001, -0.002], [60, 90, 0, 1.002, 0.002, 0.001], [120, 180, 0, -0.001, -0.999, 0.004],

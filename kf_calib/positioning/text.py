@@ -1,0 +1,109 @@
+"""A bench that drives itself: what it is doing, its decisions as JSON and in words, and a dry run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import Group, RenderableType
+from rich.text import Text
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.positioning.loop import Phase
+from kf_calib.positioning.positioner import HandPositioner
+from kf_calib.support.units import span
+from kf_calib.views.json import clean
+from kf_calib.views.live.content import Doing
+from kf_calib.views.terminal import ConsoleTable
+
+if TYPE_CHECKING:
+    from kf_calib.positioning.drive import Decision, Drive, Outcome
+
+
+def run_object(drive: Drive) -> dict[str, Any]:
+    """The key ``run`` of the JSON objects: what the bench is doing, and all decisions so far."""
+    outcome = drive.outcome
+    return clean(
+        {
+            "phase": drive.state.phase.value,
+            "orientations": drive.state.number,
+            "decisions": [_decision_object(decision) for decision in drive.decisions],
+            "ended": None if outcome is None else outcome.ended,
+            "why": None if outcome is None else outcome.why,
+            "stands_at_deg": None if outcome is None else list(outcome.stands_at),
+            "stopped": None if outcome is None else outcome.stopped,
+            "lasted_s": None if outcome is None else outcome.lasted_s,
+        }
+    )
+
+
+def _decision_object(decision: Decision) -> dict[str, Any]:
+    return {
+        "number": decision.number, "at_s": decision.at_s, "purpose": decision.purpose,
+        "gimbal_deg": list(decision.gimbal_deg), "stay_s": decision.stay_s, "why": decision.why,
+    }  # fmt: skip
+
+
+def doing_of(drive: Drive) -> Doing | None:
+    """What the bench is doing, by itself or by hand; None where it has ended."""
+    state = drive.state
+    if state.phase is Phase.ENDED:
+        return None
+    if state.phase is not Phase.MOVING:
+        what = "THE BENCH STANDS AND MEASURES" if state.target else "THE BENCH BEGINS"
+        return Doing(what, _doing_in_words(drive))
+    where = angles_in_words(state.target)
+    by_hand = isinstance(drive.positioner, HandPositioner)
+    what = f"TURN TO {where}, THEN PRESS ENTER" if by_hand else f"THE BENCH TURNS TO {where}"
+    return Doing(what, _doing_in_words(drive), state.target)
+
+
+def _doing_in_words(drive: Drive) -> str:
+    """What the bench is doing, and why, in a line."""
+    state = drive.state
+    if state.suggestion is None:
+        where = f" at {angles_in_words(state.target)}" if state.target else ""
+        return f"the bench: {state.phase.value}{where}"
+    stay = f", to stay {span(state.suggestion.stay_s)}" if state.phase.value == "moving" else ""
+    where = angles_in_words(state.target)
+    return f"the bench, stay {state.number}: {state.phase.value} {where}{stay}; {state.suggestion.why}"
+
+
+def ended_in_words(outcome: Outcome) -> RenderableType:
+    """The lines after a run: why it ended, where the table stands, and how it went."""
+    stays = sum(1 for decision in outcome.decisions if decision.gimbal_deg) + 1
+    where = f"; the table stands at {angles_in_words(outcome.stands_at)}" if outcome.stands_at else ""
+    return Text(f"The run ended after {span(outcome.lasted_s)} and {stays} orientations: {outcome.why}{where}.")
+
+
+def angles_in_words(gimbal_deg: Sequence[float]) -> str:
+    """Gimbal angles as text."""
+    return f"{', '.join(f'{round(angle, 2) + 0.0:g}' for angle in gimbal_deg)} deg"
+
+
+def dry_run(poses: Floats, ways: Sequence[Sequence[Floats]], slews_s: Sequence[float], stay_s: float, overhead_s: float
+            ) -> RenderableType:  # fmt: skip
+    """The path of the opening and its duration. poses (n, k), rad; ways: stations to each; slews_s: time to each."""
+    table = ConsoleTable("", "gimbals, deg", "by way of", "slew", "there until")
+    passed_s = 0.0
+    for number, (pose, way, slew_s) in enumerate(zip(poses, ways, slews_s, strict=True), start=1):
+        passed_s += slew_s + overhead_s + stay_s
+        stations = "; ".join(_deg(station) for station in way[:-1])
+        table.add_row(str(number), _deg(pose), stations, span(slew_s), span(passed_s))
+    return Group(table, Text(f"{len(poses)} orientations to begin with, {span(passed_s)}; what follows is decided as "
+                             "the run goes on. Nothing was moved."))  # fmt: skip
+
+
+def dry_run_object(
+    poses: Floats, ways: Sequence[Sequence[Floats]], slews_s: Sequence[float], stay_s: float, overhead_s: float
+) -> dict[str, Any]:
+    """The same as JSON."""
+    total_s = float(np.sum(slews_s)) + len(poses) * (stay_s + overhead_s)
+    stations = [[np.degrees(station).round(6).tolist() for station in way] for way in ways]
+    return clean({"gimbal_deg": np.degrees(poses).round(6).tolist(), "stations_deg": stations,
+                  "slew_s": list(slews_s), "stay_s": stay_s, "duration_s": total_s})  # fmt: skip
+
+
+def _deg(pose: Floats) -> str:
+    return ", ".join(f"{angle:g}" for angle in np.degrees(pose).round(2) + 0.0)
