@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from importlib import import_module
-from importlib.util import find_spec
+from pathlib import Path
 from types import ModuleType
 
 from kf_calib.errors import InputError
+
+_PACKAGE = Path(__file__).parents[1]
 
 
 def leaf(module: str, subject: str) -> ModuleType:
     """A module of a leaf; subject: what needs it. Raises InputError where its folder is not there."""
     folder = module.partition(".")[0]
-    if find_spec(f"kf_calib.{folder}") is None:
+    if not (_PACKAGE / folder / "__init__.py").is_file():
         raise InputError(
             f"{subject} needs kf_calib/{folder}, without which this program was installed: install all of it."
         )
