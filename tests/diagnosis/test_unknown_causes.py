@@ -197,11 +197,25 @@ def _texts_of(driver: str, dwells: Any) -> list[str]:
     return [text for texts in term.summands for text in texts]
 
 
+def stays(start_s: float, end_s: float, temperature_c: float = np.nan) -> Any:
+    """A dwell of which only times and temperature are known."""
+    nodes = SimpleNamespace(temperature_c=np.full(3, temperature_c))
+    return SimpleNamespace(start_s=start_s, end_s=end_s, pieces=SimpleNamespace(nodes=nodes))
+
+
+@pytest.mark.parametrize(("swing_k", "looked_for"), [(np.nan, False), (0.01, False), (0.5, True)])
+def test_products_with_a_temperature_that_stays_are_not_looked_for(swing_k: float, looked_for: bool) -> None:
+    """Times one that stays, all is as it is alone."""
+    dwells = [stays(100.0 * k, 100.0 * k + 60.0, 25.3 + swing_k * (-1.0) ** k) for k in range(12)]
+    drivers = [term.driver for term in unknown_terms(Bench(axes_of("yzx"), 9.81), dwells)]
+    assert ("temperature and time" in drivers) is looked_for and "angle of gimbal 1 and time" in drivers
+
+
 @pytest.mark.parametrize(
     ("dwell_s", "decays"), [(7.0, {1, 3, 10}), (20.0, {1, 3, 10, 30}), (200.0, {1, 3, 10, 30, 100, 300})]
 )
 def test_no_decay_since_the_arrival_is_much_longer_than_the_dwells(dwell_s: float, decays: set[int]) -> None:
-    dwells = [SimpleNamespace(start_s=300.0 * k, end_s=300.0 * k + dwell_s) for k in range(12)]
+    dwells = [stays(300.0 * k, 300.0 * k + dwell_s) for k in range(12)]
     texts = _texts_of("time since arrival", dwells)
     assert {int(found) for text in texts for found in re.findall(r"tau/\((\d+)", text)} == decays
 
@@ -219,7 +233,7 @@ def test_a_formula_explains_a_share_of_the_misfit_beyond_noise(fall: float, take
 
 def test_waves_over_time_have_half_a_cycle_to_eight() -> None:
     """Powers of two, and from one on those half as fast again, so that what is between is explained by one of them."""
-    dwells: list[Any] = [SimpleNamespace(start_s=100.0 * k, end_s=100.0 * k + 60.0) for k in range(24)]
+    dwells = [stays(100.0 * k, 100.0 * k + 60.0) for k in range(24)]
     end_s = dwells[-1].end_s
     waves = _texts_of("time (periodic)", dwells)
     phases = [eval(text.partition("(")[2][:-1], {"t": end_s, "s": 1.0, "pi": np.pi}) for text in waves]
