@@ -183,19 +183,6 @@ if {refused}:
     assert "second-order" in done.stdout.replace("kf-calib effects", "")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("leaf", LEAVES)
-def test_the_tests_of_the_core_pass_without_a_leaf(leaf: str, tmp_path: Path) -> None:
-    folder = without_leaf(leaf, tmp_path)
-    rooms = CORE - {"effects", "diagnosis"} | ({"sources"} if leaf in WITH_A_COMMAND else set())
-    own = [str(folder / "tests" / name) for name in sorted(rooms)]  # tests of sources read files of every kind
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-x", "-n", "2", "-m", "not slow", "-p", "no:cacheprovider", *own],
-        cwd=folder, env={**os.environ, "PYTHONPATH": str(folder)}, capture_output=True, text=True,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
-
-
 def test_nothing_lies_beside_the_packages() -> None:
     flat = sorted(path.name for path in PACKAGE.iterdir() if path.is_file() and path.suffix == ".py")
     assert set(flat) <= {"__init__.py", "__main__.py", "errors.py"}
@@ -211,10 +198,10 @@ CEILINGS = {
     "effects": 3120,
     "sources": 12455,
     "dwells": 3790,
-    "noise": 3405,
+    "noise": 3410,
     "estimation": 7715,
     "design": 1875,
-    "diagnosis": 5030,
+    "diagnosis": 5027,
     "online": 1650,
     "exchange": 1994,
     "views": 7393,

@@ -169,9 +169,11 @@ def with_own_noise(dwells: DwellTable, along: Floats | None = None) -> DwellTabl
     return dwells.weighted(weights)
 
 
-def pooled_autocovariance(folded: FoldedDwells) -> Autocovariance:
-    """The sums of lagged products of all dwells, each by its share."""
-    pairs = zip(folded.autocovariances, shares_in_correlation(folded), strict=True)
+def pooled_autocovariance(folded: FoldedDwells, alike: bool = False) -> Autocovariance:
+    """The sums of lagged products of all dwells, each by its share; alike: by the weights of its readings, as where all
+    tremble in the hand."""
+    shares = folded.weights if alike else shares_in_correlation(folded)
+    pairs = zip(folded.autocovariances, shares, strict=True)
     return sum((each.times(share) for each, share in pairs if each.blocks), Autocovariance())
 
 

@@ -44,7 +44,9 @@ def within_dwells(dwells: Sequence[Dwell], walk_mps2_per_sqrt_s: float = 0.0, al
     """
     table = DwellTable.of(dwells)
     within_seen = bool((table.folded.counts > 1).any())
-    if walk_mps2_per_sqrt_s:
+    if along is not None:
+        inflation, variance = _correlation(table.folded, walk_mps2_per_sqrt_s, alike=True)
+    elif walk_mps2_per_sqrt_s:
         inflation, variance = _correlation(table.folded, walk_mps2_per_sqrt_s)
     else:  # the same for all fits to the dwells
         inflation, variance = _correlation_without_walk(table.folded)
@@ -68,11 +70,11 @@ def _correlation_without_walk(folded: FoldedDwells) -> tuple[Floats, Floats]:
     return _correlation(folded, 0.0)
 
 
-def _correlation(folded: FoldedDwells, walk_mps2_per_sqrt_s: float) -> tuple[Floats, Floats]:
+def _correlation(folded: FoldedDwells, walk_mps2_per_sqrt_s: float, alike: bool = False) -> tuple[Floats, Floats]:
     """Return kappa (3,) and the variances (3,) of readings within dwells, less those of a random walk."""
-    total = pooled_autocovariance(folded)
+    total = pooled_autocovariance(folded, alike)
     if walk_mps2_per_sqrt_s:
-        total = replace(total, products=total.products - walk_mps2_per_sqrt_s**2 * _walk_products(folded))
+        total = replace(total, products=total.products - walk_mps2_per_sqrt_s**2 * _walk_products(folded, alike))
     known = _of_averages if folded.averaged else _inflation
     inflation, variance = np.array([known(total, i) for i in range(3)]).T
     if folded.averaged or total.count >= _SHORT * inflation.max() * total.blocks:
@@ -103,14 +105,13 @@ def _sigma_along(table: DwellTable, along: Floats, inflation: Floats) -> Floats:
     return np.sqrt(variances)
 
 
-def _walk_products(folded: FoldedDwells) -> Floats:
+def _walk_products(folded: FoldedDwells, alike: bool) -> Floats:
     """Return what a random walk of intensity q = 1 contributes to the sums of lagged products (L + 1, 3) of all
     dwells."""
     periods_s = np.diff(folded.ends_s, axis=1)[:, 0] / np.maximum(folded.counts - 1.0, 1.0)
     products = 0.0 * folded.autocovariances[0].products
-    for known, period_s, share in zip(
-        folded.autocovariances, periods_s.tolist(), shares_in_correlation(folded), strict=True
-    ):
+    shares = folded.weights if alike else shares_in_correlation(folded)
+    for known, period_s, share in zip(folded.autocovariances, periods_s.tolist(), shares, strict=True):
         if known.blocks:
             own = lagged_walk_products(period_s, max(round(known.count / known.blocks), 1), known.pairs)
             products = products + own[:, None] * share
