@@ -138,18 +138,13 @@ def test_a_leaf_is_known_to_the_table_of_commands_alone(leaf: str) -> None:
 
 
 def without_leaf(leaf: str, folder: Path) -> Path:
-    """A copy of the package and its tests without a leaf, its tests and its line in the table of commands."""
-    gone = shutil.ignore_patterns("__pycache__")
-    shutil.copytree(PACKAGE, folder / "kf_calib", ignore=gone)
-    shutil.copytree(ROOT / "tests", folder / "tests", ignore=shutil.ignore_patterns("__pycache__", leaf))
+    """A copy of the package without a leaf and its line in the table of commands."""
+    shutil.copytree(PACKAGE, folder / "kf_calib", ignore=shutil.ignore_patterns("__pycache__"))
     shutil.rmtree(folder / "kf_calib" / leaf)
     table = folder / "kf_calib" / "cli" / "__init__.py"
     text, count = re.subn(rf'"[a-z]+": "{leaf}\.command\.[a-z]+"(,\s*)?', "", table.read_text())
     assert count == (leaf in WITH_A_COMMAND)
     table.write_text(text)
-    shutil.copy(ROOT / "pyproject.toml", folder)
-    for name in ("recordings", "tools"):
-        (folder / name).symlink_to(ROOT / name)
     return folder
 
 

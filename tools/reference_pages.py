@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import inspect
 import json
-import os
 import re
 import textwrap
 from collections.abc import Iterator
@@ -207,10 +206,13 @@ def _parameter(parameter: inspect.Parameter) -> str:
 
 
 def _docstring(value: Any) -> list[str]:
-    text = inspect.getdoc(value) or ""
+    return _as_markdown(inspect.getdoc(value) or "").splitlines()
+
+
+def _as_markdown(text: str) -> str:
+    """The text of a docstring, in which only ``code`` is markup."""
     parts = _LITERAL.split(text)
-    plain = "".join(part[1:-1] if k % 2 else _MARKUP.sub(r"\\\g<0>", part) for k, part in enumerate(parts))
-    return plain.splitlines()
+    return "".join(part[1:-1] if k % 2 else _MARKUP.sub(r"\\\g<0>", part) for k, part in enumerate(parts))
 
 
 def _members(kind: type) -> Iterator[str]:
@@ -223,9 +225,8 @@ def _members(kind: type) -> Iterator[str]:
         call = "()" if inspect.isfunction(function) else ""
         first = " ".join((inspect.getdoc(member) or "").partition("\n\n")[0].split())
         if first:
-            told = "".join(part[1:-1] if k % 2 else _MARKUP.sub(r"\\\g<0>", part)
-                           for k, part in enumerate(_LITERAL.split(first)))  # fmt: skip
-            rows += textwrap.wrap(f"- `{name}{call}`: {told}", 118, subsequent_indent="  ", break_on_hyphens=False)
+            told = f"- `{name}{call}`: {_as_markdown(first)}"
+            rows += textwrap.wrap(told, 118, subsequent_indent="  ", break_on_hyphens=False)
     yield from (["", *rows] if rows else [])
 
 
@@ -237,11 +238,10 @@ def _is_told(member: Any) -> bool:
 @click.option("--check", is_flag=True, help="Write nothing; end with 1 where a page is not as it would be.")
 def main(check: bool) -> None:
     """Write the pages of reference."""
-    os.environ.pop("COLUMNS", None)
-    stale = [path for path, text in pages().items() if path.read_text() != text]
-    for path in stale:
+    stale = {path: text for path, text in pages().items() if path.read_text() != text}
+    for path, text in stale.items():
         if not check:
-            path.write_text(pages()[path])
+            path.write_text(text)
         click.echo(f"{path.name} {'is not' if check else 'was not'} as the program says")
     raise SystemExit(1 if check and stale else 0)
 

@@ -73,8 +73,8 @@ class RunPosterior:
         self._least_mps2 = (_ROUNDING if before.noise.within_seen else _UNSEEN) * misfit_mps2
         self._run = RunTerms(before, self._noise, self._least_mps2, test)
         measured = (1 if self._noise.attitude_unknown else 3) * len(before.fit.dwells)
-        self._no_oscillation = set[str]()
         self._sizes = NoiseSizes(self._run.likelihood, self._noise, measured - model.count + len(model.fixed))
+        self._no_oscillation = set[str]()
 
     def table(self, refitted: bool = True) -> HypothesisTable:
         """All rows with their probabilities; the likeliest are fitted if ``refitted``."""
@@ -369,9 +369,10 @@ class RunPosterior:
     def _described(self, row: Hypothesis) -> Hypothesis:
         """Return a row of an unknown function with the formulas that describe it, and their fit."""
         number = next((k for k, term in enumerate(self._run.unknown) if term.driver == row.driver), None)
-        if number is None or not self._run.unknown[number].summands:
-            return replace(row, refit=self._refits.with_effects(self._before, row.effects)) if row.effects else row
-        texts, taken = self._formulas(number, row.effects), {effect.name for effect in self._before.model.effects}
+        texts = self._formulas(number, row.effects) if number is not None and self._run.unknown[number].summands else []
+        if not (texts or row.effects):
+            return row
+        taken = {effect.name for effect in self._before.model.effects}
         first = next(k for k in itertools.count() if not {name_of_formula(k + n) for n in range(len(texts))} & taken)
         formulas = tuple(text_named(text, first + n) for n, text in enumerate(texts))
         try:
