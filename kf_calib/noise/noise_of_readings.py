@@ -161,7 +161,11 @@ def with_own_noise(dwells: DwellTable, along: Floats | None = None) -> DwellTabl
         return dwells
     weights = _of_channels(*_variances(folded, along, free))
     if not np.all(weights == 1.0):  # unequal if each reading told what no other says
-        weights = _of_channels(*_variances(folded, along, _lost_to_correlation(pooled_autocovariance(folded))))
+        weights = _of_channels(
+            *_variances(
+                folded, along, _lost_to_correlation(pooled_autocovariance(folded, shares_in_correlation(folded)))
+            )
+        )
     if along is None:
         weights = np.minimum(weights, _weights_by_course(folded))
     if np.array_equal(weights, folded.weights):
@@ -169,10 +173,8 @@ def with_own_noise(dwells: DwellTable, along: Floats | None = None) -> DwellTabl
     return dwells.weighted(weights)
 
 
-def pooled_autocovariance(folded: FoldedDwells, alike: bool = False) -> Autocovariance:
-    """The sums of lagged products of all dwells, each by its share; alike: by the weights of its readings, as where all
-    tremble in the hand."""
-    shares = folded.weights if alike else shares_in_correlation(folded)
+def pooled_autocovariance(folded: FoldedDwells, shares: Floats) -> Autocovariance:
+    """The sums of lagged products of all dwells, each by its share (D, 3)."""
     pairs = zip(folded.autocovariances, shares, strict=True)
     return sum((each.times(share) for each, share in pairs if each.blocks), Autocovariance())
 

@@ -44,12 +44,11 @@ def within_dwells(dwells: Sequence[Dwell], walk_mps2_per_sqrt_s: float = 0.0, al
     """
     table = DwellTable.of(dwells)
     within_seen = bool((table.folded.counts > 1).any())
-    if along is not None:
-        inflation, variance = _correlation(table.folded, walk_mps2_per_sqrt_s, alike=True)
-    elif walk_mps2_per_sqrt_s:
-        inflation, variance = _correlation(table.folded, walk_mps2_per_sqrt_s)
+    if walk_mps2_per_sqrt_s:
+        shares = shares_in_correlation(table.folded) if along is None else table.folded.weights
+        inflation, variance = _correlation(table.folded, shares, walk_mps2_per_sqrt_s)
     else:  # the same for all fits to the dwells
-        inflation, variance = _correlation_without_walk(table.folded)
+        inflation, variance = (_without_walk if along is None else _in_the_hand)(table.folded)
     if along is not None:
         return Noise(_sigma_along(table, along, inflation), inflation, within_seen=within_seen)
     counts, of_pieces = table.folded.piece_counts, np.repeat(table.folded.weights, table.folded.piece_numbers, axis=0)
@@ -66,15 +65,21 @@ def within_dwells(dwells: Sequence[Dwell], walk_mps2_per_sqrt_s: float = 0.0, al
 
 
 @computed_once
-def _correlation_without_walk(folded: FoldedDwells) -> tuple[Floats, Floats]:
-    return _correlation(folded, 0.0)
+def _without_walk(folded: FoldedDwells) -> tuple[Floats, Floats]:
+    return _correlation(folded, shares_in_correlation(folded))
 
 
-def _correlation(folded: FoldedDwells, walk_mps2_per_sqrt_s: float, alike: bool = False) -> tuple[Floats, Floats]:
-    """Return kappa (3,) and the variances (3,) of readings within dwells, less those of a random walk."""
-    total = pooled_autocovariance(folded, alike)
+@computed_once
+def _in_the_hand(folded: FoldedDwells) -> tuple[Floats, Floats]:
+    """As all tremble, each dwell counts by the weights of its readings."""
+    return _correlation(folded, folded.weights)
+
+
+def _correlation(folded: FoldedDwells, shares: Floats, walk_mps2_per_sqrt_s: float = 0.0) -> tuple[Floats, Floats]:
+    """Return kappa (3,) and the variances (3,) of readings within dwells of these shares, less those of a walk."""
+    total = pooled_autocovariance(folded, shares)
     if walk_mps2_per_sqrt_s:
-        total = replace(total, products=total.products - walk_mps2_per_sqrt_s**2 * _walk_products(folded, alike))
+        total = replace(total, products=total.products - walk_mps2_per_sqrt_s**2 * _walk_products(folded, shares))
     known = _of_averages if folded.averaged else _inflation
     inflation, variance = np.array([known(total, i) for i in range(3)]).T
     if folded.averaged or total.count >= _SHORT * inflation.max() * total.blocks:
@@ -105,12 +110,11 @@ def _sigma_along(table: DwellTable, along: Floats, inflation: Floats) -> Floats:
     return np.sqrt(variances)
 
 
-def _walk_products(folded: FoldedDwells, alike: bool) -> Floats:
+def _walk_products(folded: FoldedDwells, shares: Floats) -> Floats:
     """Return what a random walk of intensity q = 1 contributes to the sums of lagged products (L + 1, 3) of all
     dwells."""
     periods_s = np.diff(folded.ends_s, axis=1)[:, 0] / np.maximum(folded.counts - 1.0, 1.0)
     products = 0.0 * folded.autocovariances[0].products
-    shares = folded.weights if alike else shares_in_correlation(folded)
     for known, period_s, share in zip(folded.autocovariances, periods_s.tolist(), shares, strict=True):
         if known.blocks:
             own = lagged_walk_products(period_s, max(round(known.count / known.blocks), 1), known.pairs)
