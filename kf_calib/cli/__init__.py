@@ -12,6 +12,7 @@ from importlib import import_module
 import click
 import rich_click
 
+from kf_calib.cli.command import HELP_NAMES
 from kf_calib.cli.echo import fall_silent, open_streams
 from kf_calib.cli.failures import tell
 
@@ -57,7 +58,7 @@ _HELP = {
 }
 
 
-@rich_click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"], "rich_help_config": _HELP})
+@rich_click.group(cls=_Commands, context_settings={**HELP_NAMES, "rich_help_config": _HELP})
 @rich_click.version_option(package_name="kf_calib")
 def cli() -> None:
     """Calibrate accelerometers on a stationary gimballed bench with a Kalman filter."""

@@ -25,6 +25,9 @@ import rich_click as click
 from kf_calib.errors import how_to_write
 from kf_calib.support.text import number_from
 
+HELP_NAMES = {"help_option_names": ["-h", "--help"]}
+"""Of every command by itself: click keeps the names with which its help was asked for first."""
+
 INPUT = "Input and bench"
 MODEL = "Model and evaluation"
 OUTPUT = "Output"
@@ -99,7 +102,7 @@ def command(
 
         for declare in reversed([*_declarations(function, {})]):
             declare(callback)
-        return click.command(name, cls=_Command, seldom=seldom, epilog=epilog)(callback)
+        return click.command(name, cls=_Command, seldom=seldom, epilog=epilog, context_settings=HELP_NAMES)(callback)
 
     return made
 

@@ -13,6 +13,7 @@ from typing import get_type_hints
 import click
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.cli import cli, main
@@ -283,6 +284,14 @@ def test_help_fits_two_screens_and_help_all_has_every_option(run, monkeypatch: p
     code, everything, _ = run(name, "--help-all")
     assert code == 0 and not {option for option in options if option not in everything}
     assert ("--help-all" in out) == any(option not in out for option in options)
+
+
+def test_help_is_asked_for_alike_where_a_command_is_called_by_itself() -> None:
+    """click keeps the names with which help was asked for first."""
+    command = cli.get_command(click.Context(cli), "paper")
+    assert command is not None
+    for asked in ("-h", "--help"):
+        assert CliRunner().invoke(command, [asked]).exit_code == 0
 
 
 def test_a_plan_from_a_file_is_visited(run, tmp_path: Path) -> None:
