@@ -30,18 +30,17 @@ _CORRELATED_SAMPLES = 8192  # first readings of a dwell over which its autocovar
 
 def fold(rows: Rows, carrier_hz: float = 0.0) -> Pieces:
     """Fold one block of rows into pieces."""
-    width = 9 if carrier_hz else 3
+    width, counts = 9 if carrier_hz else 3, np.diff(rows.cuts)
     channels = rows.innovation if rows.static else rows.readings.T
     level = rows.readings[0] - channels[:, 0]  # what was subtracted from the readings to give the innovation
-    triangles = np.empty((len(rows.pieces), width + 3, width + 3))
-    for (part, u, _), folded in zip(rows.pieces, triangles, strict=True):
-        stacked = np.empty((width + 3, len(u)))  # contiguous rows are what LAPACK needs and are faster to fill
-        stacked[:width], stacked[width:] = basis(u, rows.elapsed_s[part], carrier_hz), channels[:, part]
-        folded[:] = square_triangle(stacked.T)
-        folded[0, width:] += folded[0, 0] * level
-    counts = np.array([len(u) for _, u, _ in rows.pieces])
-    nodes = Nodes.joined([nodes for _, _, nodes in rows.pieces])
-    return Pieces(triangles, nodes, counts, counts * rows.readings_per_row, carrier_hz)
+    stacked = np.concatenate([basis(rows.u, rows.elapsed_s, carrier_hz), channels])
+    triangles = np.empty((len(counts), width + 3, width + 3))
+    for count in np.unique(counts).tolist():  # pieces of as many readings are decomposed together
+        alike = np.flatnonzero(counts == count)
+        places = rows.cuts[alike, None] + np.arange(count)
+        triangles[alike] = square_triangle(np.moveaxis(stacked[:, places], 0, 2))
+    triangles[:, 0, width:] += triangles[:, :1, 0] * level
+    return Pieces(triangles, rows.nodes, counts, counts * rows.readings_per_row, carrier_hz)
 
 
 def detrended(innovation: Floats, elapsed_s: Floats | None = None, carrier_hz: float = 0.0) -> Floats:
@@ -189,10 +188,9 @@ def rows_of_table(table: Orientations, bench: Bench) -> Iterator[Rows]:
         zip(table.mean_mps2, table.elapsed_s.tolist(), counts, strict=True)
     ):
         readings, here = np.tile(mean_mps2, (count, 1)), nodes[3 * k : 3 * k + 3]
-        piece = slice(0, count), np.zeros(count), here
         yield Rows(
             k + 1, np.full(count, elapsed_s), np.tile(here.regressors[:1], (count, 1)), readings, np.zeros((3, count)),
-            True, (piece,),
+            True, np.zeros(count), here, np.array([0, count]),
         )  # fmt: skip
 
 

@@ -30,10 +30,11 @@ def triangle(rows: NDArray[np.floating[Any]]) -> Floats:
 
 
 def square_triangle(stacked: Floats) -> Floats:
-    """The square triangular factor of rows (n, c), padded with zeros if there are fewer rows than columns."""
-    width = stacked.shape[1]
-    if len(stacked) < width:
-        stacked = np.vstack([stacked, np.zeros((width - len(stacked), width))])
+    """The square triangular factors of rows (..., n, c), padded with zeros if there are fewer rows than columns."""
+    missing = stacked.shape[-1] - stacked.shape[-2]
+    if missing > 0:
+        zeros = np.zeros((*stacked.shape[:-2], missing, stacked.shape[-1]))
+        stacked = np.concatenate([stacked, zeros], axis=-2)
     return triangle(stacked)
 
 

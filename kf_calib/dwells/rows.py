@@ -9,7 +9,6 @@ because reductions along contiguous memory are several times faster.
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -99,7 +98,8 @@ class Rows:
     - readings (n, 3): the readings, m/s^2.
     - innovation (3, n): the readings less their least-squares fit within the block.
     - static: the regressors are the same in every row, so that the innovation is the reading less the mean.
-    - pieces: for each piece its slice of the rows, u (n',) from -1 to 1, and its nodes.
+    - u (n,), nodes (3 P): from -1 to 1 within each piece, and the conditions at the nodes of all pieces.
+    - cuts (P + 1,): where the pieces begin, and the number of rows.
     - moving: the block belongs to the slew after the dwell.
     - gated (3, m): for each rejected reading, the channels in which it is an outlier; None if none was rejected.
     - raw: the rows before averaging, if the readings were averaged.
@@ -116,7 +116,9 @@ class Rows:
     readings: Floats
     innovation: Floats
     static: bool
-    pieces: tuple[tuple[slice, Floats, Nodes], ...]
+    u: Floats
+    nodes: Nodes
+    cuts: Indices
     moving: bool = False
     gated: Mask | None = None
     raw: Rows | None = None
@@ -124,6 +126,11 @@ class Rows:
     pose_sigma_rad: float = 0.0
     turns: tuple[int, ...] = ()
     along: Floats | None = None
+
+    @property
+    def pieces(self) -> list[slice]:
+        """The rows of each piece."""
+        return [slice(first, last) for first, last in itertools.pairwise(self.cuts.tolist())]
 
     @property
     def without_rotations(self) -> tuple[Floats, Floats]:
@@ -188,14 +195,21 @@ def _rows(block: Block, bench: Bench, force: Floats | None) -> Rows:
     since_s = block.elapsed_s - block.arrival_s
     edges = _EDGES_S[: int(np.searchsorted(_EDGES_S, since_s[-1]))]
     cuts = np.unique(np.concatenate([[0], np.searchsorted(since_s, edges), [len(since_s)]]))
-    pieces = tuple(_piece(block, slice(a, b), bench, force) for a, b in itertools.pairwise(cuts.tolist()))
+    u, node_s = _node_times(block.elapsed_s, cuts)
+    standing = len(block.pose) == 1
+    pose = np.repeat(block.pose, len(node_s), axis=0) if standing else _values_at_nodes(u, block.pose, cuts)
+    at_nodes = bench.specific_force(node_s, pose) if force is None else np.repeat(force, len(node_s), axis=0)
+    variance = None if block.variance_mps2_2 is None else _values_at_nodes(u, block.variance_mps2_2, cuts)
+    since_s = node_s - (block.arrival_s if block.arrival_felt_s is None else block.arrival_felt_s)
+    temperature_c = _temperatures(u, block.temperature_c, cuts)
+    nodes = Nodes(node_s, since_s, at_nodes, pose, temperature_c, variance_mps2_2=variance)
     if force is not None:
-        columns = np.broadcast_to(np.append(1.0, force), (len(since_s), len(REGRESSORS)))
+        columns = np.broadcast_to(np.append(1.0, force), (len(u), len(REGRESSORS)))
     else:
-        columns = np.concatenate([basis(u).T @ parabola(nodes.regressors) for _, u, nodes in pieces])
+        columns = _between_nodes(u, nodes.regressors, cuts)
     innovation = innovations(columns, block.accel_mps2, force is not None)
     return Rows(
-        block.dwell, block.elapsed_s, columns, block.accel_mps2, innovation, force is not None, pieces,
+        block.dwell, block.elapsed_s, columns, block.accel_mps2, innovation, force is not None, u, nodes, cuts,
         pose_sigma_rad=block.pose_sigma_rad, turns=block.turns,
         along=None if bench.angles else _direction(block.accel_mps2.mean(axis=0)),
     )  # fmt: skip
@@ -207,27 +221,30 @@ def _direction(vector: Floats) -> Floats:
 
 
 def _slew_rows(block: Block, bench: Bench, curve: Curve) -> Rows:
-    """Return the rows of a slew, in pieces of 2 deg. What holds at the nodes is computed for all pieces at once."""
-    parts = [slice(a, b) for a, b in itertools.pairwise(curve.cuts(block.elapsed_s))]
-    times = [_node_times(block.elapsed_s[part]) for part in parts]
-    node_s = np.concatenate([of_piece for _, of_piece in times])
+    """Return the rows of a slew, in pieces of 2 deg."""
+    cuts = np.array(curve.cuts(block.elapsed_s))
+    u, node_s = _node_times(block.elapsed_s, cuts)
     pose = curve.angles(node_s)
-    force, rate, change = bench.specific_force(node_s, pose), curve.rate(node_s), curve.rate_change(node_s)
-    pieces = list[tuple[slice, Floats, Nodes]]()
-    for k, (part, (u, _)) in enumerate(zip(parts, times, strict=True)):
-        own, temperatures_c = slice(3 * k, 3 * k + 3), _temperatures(u, block.temperature_c[part])
-        pieces.append((part, u, Nodes(node_s[own], node_s[own] - block.arrival_s, force[own], pose[own],
-                                      temperatures_c, rate[own], change[own])))  # fmt: skip
-    columns = np.concatenate([basis(u).T @ parabola(nodes.regressors) for _, u, nodes in pieces])
-    return Rows(
-        block.dwell, block.elapsed_s, columns, block.accel_mps2, block.accel_mps2.T, False, tuple(pieces), moving=True
-    )
+    nodes = Nodes(
+        node_s, node_s - block.arrival_s, bench.specific_force(node_s, pose), pose,
+        _temperatures(u, block.temperature_c, cuts), curve.rate(node_s), curve.rate_change(node_s),
+    )  # fmt: skip
+    columns, readings = _between_nodes(u, nodes.regressors, cuts), block.accel_mps2
+    return Rows(block.dwell, block.elapsed_s, columns, readings, readings.T, False, u, nodes, cuts, moving=True)
 
 
-def _node_times(elapsed_s: Floats) -> tuple[Floats, Floats]:
-    """Return u (n,) from -1 to 1 over the readings, and the times of the nodes (3,)."""
-    middle, half = 0.5 * (elapsed_s[0] + elapsed_s[-1]), max(0.5 * (elapsed_s[-1] - elapsed_s[0]), 1e-9)
-    return (elapsed_s - middle) / half, np.array([elapsed_s[0], middle, elapsed_s[-1]])
+def _node_times(elapsed_s: Floats, cuts: Indices) -> tuple[Floats, Floats]:
+    """Return u (n,) from -1 to 1 over the readings of each piece, and the times of the nodes (3 P,)."""
+    begins_s, ends_s, counts = elapsed_s[cuts[:-1]], elapsed_s[cuts[1:] - 1], np.diff(cuts)
+    middles_s, halves_s = 0.5 * (begins_s + ends_s), np.maximum(0.5 * (ends_s - begins_s), 1e-9)
+    u = (elapsed_s - np.repeat(middles_s, counts)) / np.repeat(halves_s, counts)
+    return u, np.column_stack([begins_s, middles_s, ends_s]).ravel()
+
+
+def _between_nodes(u: Floats, values: Floats, cuts: Indices) -> Floats:
+    """Return values (n, c) at all readings from those at the nodes (3 P, c)."""
+    coefficients = parabola(values.reshape(-1, 3, values.shape[1]))
+    return np.einsum("kn,nkc->nc", basis(u), np.repeat(coefficients, np.diff(cuts), axis=0))
 
 
 _GATED = 32  # least number of averages of a block among which outliers can be recognised
@@ -235,29 +252,16 @@ _EDGES_S = np.concatenate([2.0 ** np.arange(6), 60.0 * np.arange(1, 20_000)])
 """Dwells are cut into pieces 1, 2, 4 ... 32 s after the arrival and then at every full minute."""
 
 
-def _piece(block: Block, part: slice, bench: Bench, force: Floats | None) -> tuple[slice, Floats, Nodes]:
-    """Return the slice, u and the nodes of one piece of a dwell."""
-    elapsed_s, temperature_c = block.elapsed_s[part], block.temperature_c[part]
-    u, node_s = _node_times(elapsed_s)
-    pose = np.repeat(block.pose, 3, axis=0) if len(block.pose) == 1 else _values_at_nodes(u, block.pose[part])
-    if force is None:
-        force = bench.specific_force(node_s, pose)
-    variance = None if block.variance_mps2_2 is None else _values_at_nodes(u, block.variance_mps2_2[part])
-    since_s = node_s - (block.arrival_s if block.arrival_felt_s is None else block.arrival_felt_s)
-    nodes = Nodes(
-        node_s, since_s, np.broadcast_to(force, (3, 3)), pose, _temperatures(u, temperature_c), variance_mps2_2=variance
-    )
-    return part, u, nodes
-
-
-def _temperatures(u: Floats, measured: Floats) -> Floats:
-    """Return the temperature (3,) at u = -1, 0, 1 from a straight-line fit; NaN if any measurement is missing."""
-    level = measured.mean()
-    if not math.isfinite(level) or measured[0] == measured[-1] == level:
-        return np.full(3, level)
-    centred = u - u.mean()
-    slope = (centred @ measured) / max(centred @ centred, 1e-300)
-    return level + slope * (np.array([-1.0, 0.0, 1.0]) - u.mean())
+def _temperatures(u: Floats, measured: Floats, cuts: Indices) -> Floats:
+    """Return the temperature (3 P,) at u = -1, 0, 1 of each piece from a straight-line fit; NaN where any measurement
+    is missing."""
+    first, counts = cuts[:-1], np.diff(cuts)
+    level, middle = (np.add.reduceat(values, first) / counts for values in (measured, u))
+    centred = u - np.repeat(middle, counts)
+    slope = np.add.reduceat(centred * (measured - np.repeat(measured[first], counts)), first)
+    slope /= np.maximum(np.add.reduceat(centred**2, first), 1e-300)
+    level = np.where((measured[first] == measured[cuts[1:] - 1]) & (slope == 0.0), measured[first], level)
+    return (level[:, None] + slope[:, None] * (np.array([-1.0, 0.0, 1.0]) - middle[:, None])).ravel()
 
 
 def basis(u: Floats, elapsed_s: Floats | None = None, carrier_hz: float = 0.0) -> Floats:
@@ -272,10 +276,12 @@ def basis(u: Floats, elapsed_s: Floats | None = None, carrier_hz: float = 0.0) -
     return functions
 
 
-def _values_at_nodes(u: Floats, values: Floats) -> Floats:
-    """Return the values (3, k) at u = -1, 0, 1 of the least-squares parabola through samples (n, k)."""
-    fitted = np.linalg.lstsq(basis(u).T, values, rcond=1e-9)[0]
-    return basis(np.array([-1.0, 0.0, 1.0])).T @ fitted
+def _values_at_nodes(u: Floats, values: Floats, cuts: Indices) -> Floats:
+    """Return the values (3 P, k) at u = -1, 0, 1 of the least-squares parabola through the samples (n, k) of each
+    piece."""
+    functions, at_nodes = basis(u).T, basis(np.array([-1.0, 0.0, 1.0])).T
+    parts = [slice(a, b) for a, b in itertools.pairwise(cuts.tolist())]
+    return np.concatenate([at_nodes @ np.linalg.lstsq(functions[p], values[p], rcond=1e-9)[0] for p in parts])
 
 
 _GAUSSIAN_MAD = 1.4826  # median absolute deviation -> sigma, for Gaussian noise

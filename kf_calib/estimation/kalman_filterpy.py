@@ -75,7 +75,8 @@ def samples_of(rows: Iterable[Rows], linearised: LinearisedDwells, noise: Noise)
         changes = noise.columns("dwell", dwell, linearised.state)
         sensitivities = sensitivities_of(dwell, linearised.state)
         along = along_force(dwell, sensitivities)[0] if noise.attitude_unknown else None
-        for (part, u, _), at_nodes, by_errors in zip(block.pieces, columns_of_pieces, changes, strict=True):
+        for part, at_nodes, by_errors in zip(block.pieces, columns_of_pieces, changes, strict=True):
+            u = block.u[part]
             functions = basis(u, block.elapsed_s[part], linearised.carrier_hz)
             observation, nuisances = _at_samples(functions, at_nodes), _at_samples(functions, by_errors)
             regressors, readings = block.columns[part], block.readings[part]
