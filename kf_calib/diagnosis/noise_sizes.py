@@ -49,7 +49,7 @@ class NoiseSizes:
     @cached_property
     def families(self) -> list[NoiseFamily]:
         """The families, that with no free part first."""
-        families = [NoiseFamily((), np.zeros((0, 3, 3)), self._log_prior(()))]
+        families = [NoiseFamily((), np.zeros((self._likelihood.rows // 3, 3, 3)), self._log_prior(()))]
         if self._spare <= 0:
             return families
         common = self._likelihood.shapes_of("common")
@@ -73,15 +73,19 @@ class NoiseSizes:
         evidence = list[tuple[NoiseFamily, float]]()
         for part in OF_ONE:
             shapes = self._likelihood.shapes_of(part)
-            logs = np.array([[self._likelihood.bare(size**2 * shapes) for size in self._sizes.tolist()]])
+            logs = self._likelihood.in_noises(shapes, self.squares).logs[None]
             evidence.append((NoiseFamily((part,), shapes, prior), float(self._over_sizes(logs)[0]) + prior))
         return evidence
+
+    @property
+    def squares(self) -> Floats:
+        """The squares (k,) of all sizes of noise."""
+        return np.asarray(self._sizes**2, float)
 
     @cached_property
     def covariances(self) -> list[Floats | None]:
         """Covariances (D, 3, 3) of all noises; None for none beyond what was stated."""
-        squares = (self._sizes**2).tolist()
-        return [None, *(square * family.shapes for family in self.families[1:] for square in squares)]
+        return [None, *(square * family.shapes for family in self.families[1:] for square in self.squares.tolist())]
 
     def likely(self, logs: Floats, most: Floats) -> list[list[int]]:
         """Numbers of the noises of each family that are not much larger than the likeliest by log likelihoods

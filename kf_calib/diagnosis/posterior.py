@@ -29,10 +29,11 @@ from kf_calib.diagnosis.hypothesis_table import (
     HypothesisTable,
     table_of,
 )
+from kf_calib.diagnosis.in_noises import InNoises
 from kf_calib.diagnosis.noise_sizes import NoiseFamily, NoiseSizes
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.run_likelihood import Projected, RunLikelihood, log_bayes_together
-from kf_calib.diagnosis.run_terms import RunTerms, log_bayes_of_any_size, sizes_of
+from kf_calib.diagnosis.run_terms import RunTerms, log_bayes_of_any_size, log_bayes_of_columns, sizes_of
 from kf_calib.diagnosis.unknown_terms import name_of_formula, text_named
 from kf_calib.diagnosis.within_dwell_trend import p_of_steady_oscillation, trend
 from kf_calib.dwells.qr import orthonormal
@@ -94,11 +95,11 @@ class RunPosterior:
             return ()
         (name,) = first.effects
         number = self._best[name]
-        rows = self._rows[int(np.argmax(self._base + self._log_bayes[number]))]
+        noise = self._sizes.covariances[int(np.argmax(self._base + self._log_bayes[number]))]
         others = [
             other for other in self._run.names if other != name and other != self._run.walk and other in self._best
         ]
-        bases, readings = self._run.bases([number, *(self._best[other] for other in others)], rows)
+        bases, readings = self._run.bases([number, *(self._best[other] for other in others)], noise)
         explained = bases[0].T @ (bases[0] @ readings)
         whole = float(explained @ explained)
         left = whole - np.sum((bases[1:] @ explained) ** 2, axis=1)
@@ -109,24 +110,26 @@ class RunPosterior:
     # The noise in which rows are weighed
 
     @cached_property
-    def _rows(self) -> list[Projected]:
-        """The rows of the run in all noises."""
-        return [self._run.likelihood.projected(covariance) for covariance in self._sizes.covariances]
+    def _noises(self) -> list[InNoises]:
+        """The products of all columns in the noises of each family."""
+        none, *others = self._sizes.families
+        products = [self._run.in_noises(none.shapes, np.zeros(1))]
+        return products + [self._run.in_noises(family.shapes, self._sizes.squares) for family in others]
 
     @cached_property
-    def _grams(self) -> list[list[tuple[Floats, Floats]]]:
-        """The products of the columns of all terms in all noises."""
-        return [self._run.grams(rows) for rows in self._rows]
+    def _at(self) -> list[tuple[int, int]]:
+        """The number of the family of each noise, and that of its size."""
+        return [(family, size) for family, noises in enumerate(self._noises) for size in range(len(noises.logs))]
 
     @cached_property
     def _base(self) -> Floats:
         """Log likelihoods (noises,) without any term."""
-        return np.array([rows.log for rows in self._rows])
+        return np.concatenate([noises.logs for noises in self._noises])
 
     @cached_property
     def _log_bayes(self) -> Floats:
         """Log Bayes factors (terms, noises) of all terms."""
-        return np.array([self._run.log_bayes(grams) for grams in self._grams]).T
+        return np.array([self._run.log_bayes(self._noises[family], size) for family, size in self._at]).T
 
     @cached_property
     def _log_evidence(self) -> Floats:
@@ -224,7 +227,8 @@ class RunPosterior:
     def _one_dwell(self) -> Hypothesis:
         """Return the row of one dwell that alone is off, by any amount, and whose readings may change in any way."""
         of_courses = np.logaddexp(0.0, self._run.likelihood.courses.log_bayes()) - math.log(2.0)
-        of_dwells = np.array([log_bayes_of_any_size(*rows.of_dwells()) + of_courses for rows in self._rows]).T
+        dwells = [self._noises[family].dwells(size) for family, size in self._at]
+        of_dwells = np.array([log_bayes_of_any_size(*of_noise) + of_courses for of_noise in dwells]).T
         logs = np.logaddexp.reduce(self._sizes.evidence(self._base + of_dwells), axis=1)
         number = self._before.fit.dwells[int(np.argmax(logs))].number
         log = _log_sum(logs.tolist()) - math.log(len(logs)) + math.log(PRIOR["dwell"])
@@ -232,16 +236,18 @@ class RunPosterior:
 
     def _pairs(self) -> list[Hypothesis]:
         """Return the rows of the likeliest effects, each with any other term beside it."""
-        pairs = dict[tuple[str, str], float]()
-        for name in self._heads():
+        pairs, heads = dict[tuple[str, str], float](), self._heads()
+        alone = [self._base + self._log_bayes[self._best[name]] + self._log_share_of_best(name) for name in heads]
+        # beside one more term less noise is likely, not more
+        likely = [self._sizes.likely(logs, self._log_bayes.max(axis=0)) for logs in alone]
+        explained = self._explained(heads, likely)
+        for h, name in enumerate(heads):
             stage.say(f"weighing all beside {name}")
-            alone = self._base + self._log_bayes[self._best[name]] + self._log_share_of_best(name)
-            # beside one more term less noise is likely, not more
-            numbers = self._sizes.likely(alone, self._log_bayes.max(axis=0))
-            beside = np.zeros((len(self._run.terms), len(alone)))
-            for k in itertools.chain(*numbers):
-                beside[:, k] = self._run.log_bayes_beside(self._best[name], self._rows[k], self._grams[k])
-            logs = np.logaddexp.reduce(self._sizes.evidence(alone + beside, numbers), axis=1)
+            logs = np.repeat(alone[h][None], len(self._run.terms), axis=0)
+            for k in itertools.chain(*likely[h]):
+                family, size = self._at[k]
+                logs[:, k] += self._run.log_bayes(self._noises[family], size, explained[h, k])
+            logs = np.logaddexp.reduce(self._sizes.evidence(logs, likely[h]), axis=1)
             for other, log in self._by_row(logs).items():
                 key = (other, name) if (other, name) in pairs else (name, other)
                 if other != name:
@@ -250,6 +256,16 @@ class RunPosterior:
             self._row((name,), other, log) if other.startswith("?") else self._row((name, other), "", log)
             for (name, other), log in pairs.items()
         ]
+
+    def _explained(self, heads: Sequence[str], likely: Sequence[list[list[int]]]) -> dict[tuple[int, int], Floats]:
+        """Return what each effect alone explains of all columns, in each noise that is likely beside it."""
+        groups = [self._run.terms[self._best[name]].columns for name in heads]
+        explained = dict[tuple[int, int], Floats]()
+        for family, noises in enumerate(self._noises):
+            numbers = sorted({k for of_head in likely for k in of_head[family]})
+            of_heads = noises.explained_by(groups, [self._at[k][1] for k in numbers])
+            explained |= {(h, k): own[n] for h, own in enumerate(of_heads) for n, k in enumerate(numbers)}
+        return explained
 
     def _heads(self) -> list[str]:
         """Return the effects that are likeliest: in noise that is averaged over and, since beside another effect the
@@ -263,7 +279,7 @@ class RunPosterior:
     def _ahead_of_pairs(self, names: Sequence[str], heads: Sequence[str]) -> list[str]:
         """Return the likelier effect of each pair that, in the noise that was stated, lets chi-squared fall nearly as
         much as a head with any other effect, without being such a pair: alone neither of the two need stand out."""
-        bases, readings = self._run.bases([self._best[name] for name in names], self._rows[0])
+        bases, readings = self._run.bases([self._best[name] for name in names], None)
         along, products = bases @ readings, np.einsum("iqr,jpr->ijqp", bases, bases)
         left = along - np.einsum("ijqp,iq->ijp", products, along)
         beside = np.eye(along.shape[1]) * (1.0 + _SAME) - np.einsum("ijqp,ijqs->ijps", products, products)
@@ -346,21 +362,22 @@ class RunPosterior:
         likelihood = RunLikelihood(refit.linearised, noise, self._least_mps2, known=known)
         places = [model.parts[str(effect)].start - known + np.arange(len(effect.coefficients)) for effect in effects]
         matrices = ([*effect.relations] or [np.eye(len(effect.coefficients))] for effect in effects)
-        related, whole = [*itertools.product(*matrices)], likelihood.whole()
+        related = [*itertools.product(*matrices)]
         usual = [usual_sizes(effect, self._run.grade) for effect in effects]
         sizes = [
-            [sizes_of(best_sigma(whole[:, place] @ matrix), prior, _NODES_OF_PAIR)
+            [sizes_of(best_sigma(likelihood.columns(place) @ matrix), prior, _NODES_OF_PAIR)
              for place, matrix, prior in zip(places, relation, usual, strict=True)]
             for relation in related
         ]  # fmt: skip
         logs = np.empty((len(related), len(self._sizes.covariances)))
         for k, covariance in enumerate(self._sizes.covariances):
-            rows = likelihood.projected(covariance, whole=True)
+            rows = likelihood.projected(covariance, np.concatenate(places))
             for j, relation in enumerate(related):
-                columns = [rows.columns[:, place] @ matrix for place, matrix in zip(places, relation, strict=True)]
+                columns = [rows.of(place) @ matrix for place, matrix in zip(places, relation, strict=True)]
                 logs[j, k] = rows.log + log_bayes_together(columns, rows.readings, sizes[j])
-        rows = likelihood.projected(self._sizes.covariances[int(np.argmax(logs.max(axis=0)))], whole=True)
-        explained = orthonormal(rows.columns[:, np.concatenate(places)])[0].T @ rows.readings
+        likeliest = self._sizes.covariances[int(np.argmax(logs.max(axis=0)))]
+        rows = likelihood.projected(likeliest, np.concatenate(places))
+        explained = orthonormal(rows.columns)[0].T @ rows.readings
         log = float(np.logaddexp.reduce(self._sizes.evidence(logs), axis=None)) - math.log(len(related))
         return log, float(explained @ explained)
 
@@ -384,11 +401,13 @@ class RunPosterior:
     def _formulas(self, number: int, beside: Sequence[str]) -> list[str]:
         """Return the formulas of an unknown function that the readings ask for, those that explain most first."""
         run, unknown = self._run, self._run.unknown[number]
-        flat = np.concatenate([np.zeros(0, np.intp), *(run.terms[self._best[name]].columns for name in beside)])
+        flat = [place for name in beside for place in run.terms[self._best[name]].columns.tolist()]
         terms = [term for term in run.terms if term.row == f"?{number}"]
-        noises = [run.likelihood.projected(covariance, flat) for covariance in self._sizes.covariances]
+        places = np.unique(np.concatenate([np.append(term.columns, term.spanned) for term in terms]))
+        noises = [run.likelihood.projected(covariance, places, flat) for covariance in self._sizes.covariances]
         scores = np.array([
-            [rows.log + run.log_bayes_of(term.columns, rows) + term.log_share for term in terms] for rows in noises
+            [rows.log + log_bayes_of_columns(rows.of(term.columns), rows.readings) + term.log_share for term in terms]
+            for rows in noises
         ])  # fmt: skip
         at, likeliest = np.unravel_index(int(np.argmax(scores)), scores.shape)
         term = terms[int(likeliest)]
@@ -401,7 +420,8 @@ class RunPosterior:
         chosen, log = list[int](), -math.inf
         while len(chosen) < min(_SUMMANDS, len(parts)):
             rest = [k for k in range(len(parts)) if k not in chosen]
-            logs = [self._run.log_bayes_of(np.concatenate([parts[j] for j in (*chosen, k)]), rows) for k in rest]
+            both = [rows.of(np.concatenate([parts[j] for j in (*chosen, k)])) for k in rest]
+            logs = [log_bayes_of_columns(columns, rows.readings) for columns in both]
             if max(logs) < log + _MORE:
                 break
             chosen.append(rest[int(np.argmax(logs))])

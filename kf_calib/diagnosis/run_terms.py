@@ -14,7 +14,8 @@ import numpy as np
 from kf_calib.bench.arrays import Floats, Indices
 from kf_calib.diagnosis.candidate_tests import CandidateTests
 from kf_calib.diagnosis.coefficient_sizes import SizePrior, best_sigma, sensor_grade, usual_sizes
-from kf_calib.diagnosis.run_likelihood import Projected, RunLikelihood, Sizes, log_bayes
+from kf_calib.diagnosis.in_noises import InNoises
+from kf_calib.diagnosis.run_likelihood import Combination, RunLikelihood, Sizes, log_bayes
 from kf_calib.diagnosis.unknown_terms import RETURNING, UnknownTerm, text_named, unknown_terms
 from kf_calib.dwells.qr import orthonormal
 from kf_calib.effects import Coefficient, Effect, Stimulus, effect_named, walk_named
@@ -64,14 +65,12 @@ class RunTerm:
 
 @dataclass(frozen=True)
 class _Alike:
-    """Terms of q columns: their numbers (n,), columns (n, q) and factors of these; G^T G (n, q, q) and G^T z (n, q) of
-    the rows within dwells; squares (n, m) of their sizes, logs (n, m) of their probabilities, and centres (n,)."""
+    """Terms of q columns: their numbers (n,), columns (n, q) and factors of these; squares (n, m) of their sizes, logs
+    (n, m) of their probabilities, and centres (n,)."""
 
     numbers: Indices
     places: Indices
     scales: Floats
-    gram: Floats
-    along: Floats
     squares: Floats
     log_weights: Floats
     centres: Floats
@@ -95,11 +94,13 @@ class RunTerms:
         self._add_orientations(columns)
         if self.walk:
             self._add_walk(columns)
-        self.likelihood = RunLikelihood(self._linearised, noise, least_mps2, columns.effects)
-        self.likelihood.recombine(columns.blocks)
-        rms = self.likelihood.column_lengths() / math.sqrt(self.likelihood.rows)
+        spare = _LEADING * sum(len(term.summands) > 1 for term in columns.terms)
+        self.likelihood = RunLikelihood(
+            self._linearised, noise, least_mps2, columns.effects, blocks=columns.blocks, spare=spare
+        )
+        rms = self.likelihood.lengths[: -spare or None] / math.sqrt(self.likelihood.rows)
         unknown = np.where(rms > 0.0, columns.weights / np.where(rms > 0.0, rms, 1.0), 0.0)
-        self.likelihood.rescale(np.where(columns.weights > 0.0, unknown, 1.0))
+        self.likelihood.rescale(np.append(np.where(columns.weights > 0.0, unknown, 1.0), np.ones(spare)))
         self.terms = self._seen(columns.terms)
         self.names = tuple(dict.fromkeys(term.row for term in self.terms if term.is_known))
 
@@ -163,16 +164,16 @@ class RunTerms:
 
     def _seen(self, drafts: Sequence[RunTerm]) -> list[RunTerm]:
         """Return the terms of which something is seen, with their sizes; a summand that is a known effect is none."""
-        whole, raw = self.likelihood.whole(), self.likelihood.column_lengths()
+        raw, spare = self.likelihood.lengths, _LEADING * sum(len(draft.summands) > 1 for draft in drafts)
         known, terms, matrices = dict[tuple[int, ...], list[Floats]](), list[RunTerm](), list[tuple[Indices, Floats]]()
         for draft in drafts:
-            columns = whole[:, draft.columns]
+            columns = self.likelihood.columns(draft.columns)
             if not (np.linalg.norm(columns, axis=0) > _SEEN * raw[draft.columns]).any():
                 continue
             if len(draft.summands) > 1:
                 spanned, matrix = draft.columns, _leading(columns)
                 matrices.append((spanned, matrix))
-                place = self.likelihood.count + _LEADING * (len(matrices) - 1) + np.arange(_LEADING)
+                place = self.likelihood.count - spare + _LEADING * (len(matrices) - 1) + np.arange(_LEADING)
                 sizes = sizes_of(best_sigma(columns @ matrix), None)
                 terms.append(replace(draft, columns=place, spanned=spanned, sizes=sizes))
                 continue
@@ -194,69 +195,50 @@ class RunTerms:
     @cached_property
     def _alike(self) -> list[_Alike]:
         """The terms of equal numbers of columns."""
-        more, readings = self.likelihood.more
-        transposed, widths = np.ascontiguousarray(more.T), np.array([len(term.columns) for term in self.terms])
-        alike = list[_Alike]()
+        widths, alike = np.array([len(term.columns) for term in self.terms]), list[_Alike]()
         for width in np.unique(widths).tolist():
             numbers = np.flatnonzero(widths == width)
             terms = [self.terms[k] for k in numbers.tolist()]
-            places, sizes = np.array([term.columns for term in terms]), [term.sizes for term in terms]
-            scales = np.array([np.ones(width) if term.scales is None else term.scales for term in terms])
-            within = transposed[places] * scales[:, :, None]
+            sizes, unit = [term.sizes for term in terms], np.ones(width)
             alike.append(
                 _Alike(
-                    numbers, places, scales, within @ np.swapaxes(within, 1, 2), within @ readings,
+                    numbers, np.array([term.columns for term in terms]),
+                    np.array([unit if term.scales is None else term.scales for term in terms]),
                     np.stack([each.values for each in sizes]) ** 2, np.stack([each.logs for each in sizes]),
                     np.array([each.centre for each in sizes]),
                 )
             )  # fmt: skip
         return alike
 
-    def grams(self, rows: Projected) -> list[tuple[Floats, Floats]]:
-        """G^T G (n, q, q) and G^T z (n, q) of all terms in one noise, those of equal numbers of columns together."""
-        grams, columns = list[tuple[Floats, Floats]](), np.ascontiguousarray(rows.columns.T)
-        for alike in self._alike:
-            parts = columns[alike.places] * alike.scales[:, :, None]
-            gram, along = parts @ np.swapaxes(parts, 1, 2), parts @ rows.readings
-            grams.append((gram + alike.gram, along + alike.along) if rows.means_only else (gram, along))
-        return grams
+    def in_noises(self, shapes: Floats, squares: Floats) -> InNoises:
+        """The products of the columns of all terms in noise of some sizes."""
+        return self.likelihood.in_noises(shapes, squares, [alike.places for alike in self._alike])
 
-    def log_bayes(self, grams: Sequence[tuple[Floats, Floats]]) -> Floats:
-        """Log Bayes factors (terms,) of all terms in the noise of ``grams``."""
+    def log_bayes(self, noises: InNoises, k: int, explained: Floats | None = None) -> Floats:
+        """Log Bayes factors (terms,) of all terms in noise of one size.
+
+        explained (f, C + 1): what columns beside them, of any size, explain of all columns and of the readings.
+        """
         logs = np.zeros(len(self.terms))
-        for alike, (gram, along) in zip(self._alike, grams, strict=True):
+        for alike, grams in zip(self._alike, noises.grams, strict=True):
+            gram, along = grams[k], noises.along[k, alike.places]
+            if explained is not None:
+                parts = np.moveaxis(explained[:, alike.places], 0, 2)  # (n, q, f)
+                gram = gram - parts @ np.swapaxes(parts, 1, 2)
+                along = along - parts @ explained[:, -1]
+            gram, along = gram * alike.scales[:, :, None] * alike.scales[:, None], along * alike.scales
             logs[alike.numbers] = log_bayes(gram, along, alike.squares, alike.log_weights, alike.centres)
         return logs
 
-    def log_bayes_beside(self, number: int, rows: Projected, grams: Sequence[tuple[Floats, Floats]]) -> Floats:
-        """Log Bayes factors (terms,) of all terms beside one whose columns may have any size."""
-        explained, of_readings = self.likelihood.explained_by(self.terms[number].columns, rows)
-        left = list[tuple[Floats, Floats]]()
-        for alike, (gram, along) in zip(self._alike, grams, strict=True):
-            parts = np.moveaxis(explained[:, alike.places] * alike.scales, 0, 2)  # (n, q, f)
-            left.append((gram - parts @ np.swapaxes(parts, 1, 2), along - parts @ of_readings))
-        return self.log_bayes(left)
-
-    def bases(self, numbers: Sequence[int], rows: Projected) -> tuple[Floats, Floats]:
+    def bases(self, numbers: Sequence[int], covariance: Floats | None) -> tuple[Floats, Floats]:
         """Orthonormal bases (n, q, r) of some terms in one noise, filled up with zeros, and the readings (r,)."""
-        more, readings = self.likelihood.more
-        columns, z = rows.columns, rows.readings
-        if rows.means_only:
-            columns, z = np.vstack([columns, more]), np.concatenate([z, readings])
         places = [self.terms[k].columns for k in numbers]
-        bases = np.zeros((len(places), max(map(len, places)), len(z)))
+        rows = self.likelihood.projected(covariance, np.concatenate(places))
+        bases = np.zeros((len(places), max(map(len, places)), len(rows.readings)))
         for basis, place in zip(bases, places, strict=True):
-            left, sizes, _ = np.linalg.svd(columns[:, place], full_matrices=False)
+            left, sizes, _ = np.linalg.svd(rows.of(place), full_matrices=False)
             basis[: len(place)] = np.where(sizes > _LEAST * sizes[0], left, 0.0).T
-        return bases, z
-
-    def log_bayes_of(self, places: Indices, rows: Projected) -> float:
-        """Log Bayes factor of some columns of any size in one noise."""
-        columns, (more, readings) = rows.columns[:, places], self.likelihood.more
-        gram, along = columns.T @ columns, columns.T @ rows.readings
-        if rows.means_only:
-            gram, along = gram + more[:, places].T @ more[:, places], along + more[:, places].T @ readings
-        return float(log_bayes_of_any_size(gram[None], along[None])[0])
+        return bases, rows.readings
 
 
 class _Columns:
@@ -264,7 +246,7 @@ class _Columns:
     the weights of the blocks' columns (0: as they are), and terms of blocks."""
 
     def __init__(self) -> None:
-        self.effects, self.blocks, self.terms = list[Effect](), list[tuple[slice, Floats | None]](), list[RunTerm]()
+        self.effects, self.blocks, self.terms = list[Effect](), list[Combination](), list[RunTerm]()
         self._weights, self._places = list[Floats](), list[Indices]()
         self._made = self._count = 0
 
@@ -373,6 +355,11 @@ def sizes_of(least: float, usual: SizePrior | None, nodes: int = _NODES) -> Size
     shares = np.diff(usual.below(edges))
     shares[-1] += 1.0 - float(usual.below(edges[-1:])[0])
     return Sizes(np.sqrt(edges[1:] * edges[:-1]), np.log(np.maximum(shares, 1e-300)))
+
+
+def log_bayes_of_columns(columns: Floats, readings: Floats) -> float:
+    """Log Bayes factor of columns (r, q) of any size, projected as the readings (r,)."""
+    return float(log_bayes_of_any_size((columns.T @ columns)[None], (columns.T @ readings)[None])[0])
 
 
 def log_bayes_of_any_size(gram: Floats, along: Floats) -> Floats:

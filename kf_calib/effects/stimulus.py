@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Concatenate, ParamSpec
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -15,6 +17,8 @@ from kf_calib.bench.bench import Bench, turn
 
 REFERENCE_TEMPERATURE_C = 25.0
 """T of the catalogue is the temperature less this."""
+
+_P = ParamSpec("_P")
 
 _POINTS, _WEIGHTS = legendre.leggauss(10)
 _INTEGRALS = legendre.legvander(_POINTS, 2).T * _WEIGHTS  # (3, n): of Legendre's polynomials times a function
@@ -78,6 +82,22 @@ def through_play(values: Floats, half_width: float, start: float) -> list[float]
     return list(followed)[1:]
 
 
+def _of_the_whole(compute: Callable[Concatenate[Stimulus, _P], Floats]) -> Callable[Concatenate[Stimulus, _P], Floats]:
+    """What depends on the course of the whole run: computed once for all of its parts, each of which has its instants
+    of it."""
+
+    @functools.wraps(compute)
+    def of_part(stimulus: Stimulus, /, *args: _P.args, **kwargs: _P.kwargs) -> Floats:
+        if stimulus.whole is None:
+            return compute(stimulus, *args, **kwargs)
+        known, key = stimulus.whole.known, (compute.__name__, *args, *kwargs.values())
+        if key not in known:
+            known[key] = of_part(stimulus.whole, *args, **kwargs)
+        return known[key][stimulus.places]
+
+    return of_part
+
+
 @dataclass(frozen=True)
 class Stimulus:
     """The state of the bench at m instants of dwells.
@@ -125,6 +145,11 @@ class Stimulus:
 
     def __len__(self) -> int:
         return len(self.elapsed_s)
+
+    @cached_property
+    def known(self) -> dict[tuple[object, ...], Floats]:
+        """What its parts have asked for of its whole course, by name and constants."""
+        return {}
 
     @property
     def span_s(self) -> float:
@@ -184,11 +209,10 @@ class Stimulus:
         """Delta a_i (m, 3): the last change of a_i from dwell to dwell; zero in the first."""
         return (self.force_mps2 - self.previous_force_mps2) @ self.axes.T
 
+    @_of_the_whole
     def played(self, half_width_mps2: float) -> Floats:
         """a_i (m, 3) through a play of this half-width, m/s^2, from the orientation before: it follows only where it is
         pushed."""
-        if self.whole is not None:
-            return self.whole.played(half_width_mps2)[self.places]
         before = (self.along - self.step)[0]
         columns = [through_play(self.along[:, i], half_width_mps2, float(before[i])) for i in range(3)]
         return np.stack(columns, axis=1)
@@ -199,14 +223,13 @@ class Stimulus:
         moves = self.pose[:, gimbal] - self.previous_pose[:, gimbal]
         return np.where(np.abs(moves) > max(_LEAST_MOVE_RAD, self.unsure_rad), moves, 0.0)
 
+    @_of_the_whole
     def side(self, gimbal: int) -> Floats:
         """The sense (m,) of the last move of a gimbal, 1 or -1, which it keeps while it stands still; 0 until it moves.
 
         Poses that are proposed all come after the same dwell, and none after another: one that leaves the gimbal where
         it is has 0, since the side that it was on is not known.
         """
-        if self.whole is not None:
-            return self.whole.side(gimbal)[self.places]
         senses = np.sign(self.move(gimbal))
         begins = senses != 0.0
         if not self.half_s.any():  # instants of no piece, which are not measured
@@ -287,19 +310,17 @@ class Stimulus:
         cos, sin = np.cos(azimuth), np.sin(azimuth)
         return np.array([[cos, 0.0, -sin], [sin, 0.0, cos]])
 
+    @_of_the_whole
     def lagged_warmth(self, tau_s: float) -> Floats:
         """L (m,), K: tau dL/dt = T - L, in balance at first; T passes smoothly through the middles of the pieces."""
-        if self.whole is not None:
-            return self.whole.lagged_warmth(tau_s)[self.places]
         times, values = self._smooth_warmth
         span = max(times[-1] - times[0], 1e-9)
         grid = np.linspace(times[0], times[-1], int(np.clip(20.0 * span / tau_s, 1000, 20_000)))
         return np.interp(self.elapsed_s, grid, lagged(grid, smooth_between(times, values, grid), tau_s))
 
+    @_of_the_whole
     def remembered(self, tau_s: float) -> Floats:
         """x (m, 3), m/s^2: tau dx/dt = a_i - x, in balance at first; a_i in straight lines from instant to instant."""
-        if self.whole is not None:
-            return self.whole.remembered(tau_s)[self.places]
         at_s, along, places = self._way
         return np.stack([lagged(at_s, along[:, i], tau_s)[places] for i in range(3)], axis=1)
 
@@ -330,10 +351,9 @@ class Stimulus:
         places[order] = rank[: len(order)]
         return all_s[in_time], np.concatenate([along, *on_way])[in_time], places
 
+    @_of_the_whole
     def played_warmth(self, half_width_k: float) -> Floats:
         """T (m,), K, through a play of this half-width, from the first T on."""
-        if self.whole is not None:
-            return self.whole.played_warmth(half_width_k)[self.places]
         order = np.argsort(self.elapsed_s, kind="stable")
         warm = self.warmth[order]
         through = np.empty(len(warm))

@@ -1,0 +1,156 @@
+"""All columns of a run in noise of one kind and of all its sizes at once.
+
+Noise of size s beyond what was stated has the covariance I + s^2 S in a dwell, S = U diag(l) U^T. With the rows of the
+dwell turned by U^T, each has the weight w = 1 / (1 + s^2 l), so that the products of two columns g and h in K sizes are
+(g h) W, with the products (r,) of their rows and the weights W (r, K). What the model explains is subtracted,
+
+  G^T W G - G^T W Q (Q^T W Q)^-1 Q^T W G
+
+with Q, what the model spans. Columns and readings have nothing of it in the noise that was stated, so that what is
+subtracted in any other is little, and rounding does not count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats, Indices
+
+_AT_ONCE = 1 << 20  # products that are computed together, so that they stay in the cache
+_ROUNDING = 1e-12  # share of a product that the model must leave
+
+
+@dataclass(frozen=True)
+class Spanned:
+    """Rows of all dwells, whitened by what was stated: basis (D, 3, k) of what the model spans, columns (D, 3, C) and
+    readings (D, 3) off it; the same of rows that are the same in all noise, (r, k), (r, C) and (r,). log: of the
+    density, with the model integrated out, but for chi-squared."""
+
+    basis: Floats
+    columns: Floats
+    readings: Floats
+    more_basis: Floats
+    more_columns: Floats
+    more_readings: Floats
+    log: float
+
+    def __len__(self) -> int:
+        return len(self.basis)
+
+    def turned(self, dwells: slice, turns: Floats) -> Floats:
+        """Rows [Q G z] (r, k + C + 1) of some dwells, turned by U^T, U (D, 3, 3)."""
+        parts = [self.basis[dwells], self.columns[dwells], self.readings[dwells, :, None]]
+        rows = np.swapaxes(turns[dwells], 1, 2) @ np.concatenate(parts, axis=2)
+        return rows.reshape(-1, rows.shape[2])
+
+    @property
+    def more(self) -> Floats:
+        """Rows [Q G z] (r, k + C + 1) that are the same in all noise."""
+        return np.column_stack([self.more_basis, self.more_columns, self.more_readings])
+
+
+class InNoises:
+    """The products of columns in noise of one kind and K sizes.
+
+    rows: of the run. shapes (D, 3, 3): covariances of unit size, in units of what was stated. squares (K,): of sizes.
+    groups: columns (n, q) of the terms of each group.
+
+    - logs (K,): log of the restricted likelihood without any term.
+    - grams: of each group, G^T W G (K, n, q, q). along (K, C): G^T W z. Both are projected off the model.
+    """
+
+    def __init__(self, rows: Spanned, shapes: Floats, squares: Floats, groups: Sequence[Indices] = ()) -> None:
+        values, self._turns = np.linalg.eigh(shapes)
+        self._rows, self._weights = rows, 1.0 / (1.0 + squares[:, None, None] * np.maximum(values, 0.0))
+        self._spanned = rows.basis.shape[2]
+        left = [*range(self._spanned), -1]
+        sums = [np.zeros((len(squares), len(group), group.shape[1] * (group.shape[1] + 1) // 2)) for group in groups]
+        count, width = len(squares), self._spanned + rows.columns.shape[2] + 1
+        products = np.zeros((count, self._spanned + 1, width))
+        for part in self._parts():
+            turned, weights = rows.turned(part, self._turns), self._of_rows(part)
+            weighted = (weights[:, None] * turned[:, left].T).reshape(-1, len(turned))
+            products += (weighted @ turned).reshape(products.shape)
+            columns = np.ascontiguousarray(turned[:, self._spanned : -1].T)
+            for group, summed in zip(groups, sums, strict=True):
+                _add_products(columns, group, weights, summed)
+        more = rows.more
+        products += more[:, left].T @ more
+        self._inverse = np.linalg.inv(np.linalg.cholesky(products[:, :-1, : self._spanned]))
+        self._off = self._inverse @ products[:, :-1, self._spanned :]  # (K, k, C + 1)
+        rest = products[:, -1, self._spanned :] - np.einsum("kpc,kp->kc", self._off, self._off[:, :, -1])
+        self.along, chi2 = rest[:, :-1], rest[:, -1]
+        log_model = np.log(np.einsum("kpp->kp", self._inverse)).sum(axis=1)
+        self.logs = rows.log + 0.5 * np.log(self._weights).sum(axis=(1, 2)) + log_model - 0.5 * chi2
+        self.grams = [self._gram(group, summed) for group, summed in zip(groups, sums, strict=True)]
+
+    def _gram(self, group: Indices, sums: Floats) -> Floats:
+        """Return G^T W G (K, n, q, q) of a group from the sums (K, n, pairs) of its products, projected."""
+        count, width = group.shape
+        first, second = np.triu_indices(width)
+        more = np.swapaxes(self._rows.more_columns.T[group], 1, 2)
+        gram = np.empty((len(sums), count, width, width))
+        gram[..., first, second] = gram[..., second, first] = sums
+        off = np.moveaxis(self._off[:, :, group], 1, 2)  # (K, n, k, q)
+        return gram + np.swapaxes(more, 1, 2) @ more - np.swapaxes(off, 2, 3) @ off
+
+    def dwells(self, k: int) -> tuple[Floats, Floats]:
+        """G^T W G (D, 3, 3) and G^T W z (D, 3) of offsets of the three accelerometers in one dwell alone."""
+        weights = self._turns @ (self._weights[k][:, :, None] * np.swapaxes(self._turns, 1, 2))
+        off = self._inverse[k] @ np.swapaxes(self._rows.basis, 1, 2) @ weights
+        left = self._rows.readings - self._rows.basis @ (self._inverse[k].T @ self._off[k, :, -1])
+        return weights - np.swapaxes(off, 1, 2) @ off, (weights @ left[..., None])[..., 0]
+
+    def explained_by(self, groups: Sequence[Indices], sizes: Sequence[int]) -> list[list[Floats]]:
+        """What the columns (q,) of each group explain of all columns and of the readings, (f, C + 1) in some of the
+        sizes: products with an orthonormal basis of f vectors, of those columns that the model leaves."""
+        places, chosen = np.concatenate(groups), np.array(sizes, np.intp)
+        columns = self._spanned + places
+        products = np.zeros((len(chosen), len(places), self._rows.columns.shape[2] + 1))
+        for part in self._parts():
+            turned, weights = self._rows.turned(part, self._turns), self._of_rows(part)[chosen]
+            weighted = (weights[:, None] * turned[:, columns].T).reshape(-1, len(turned))
+            products += (weighted @ turned[:, self._spanned :]).reshape(products.shape)
+        more = self._rows.more
+        products += more[:, columns].T @ more[:, self._spanned :]
+        own = np.diagonal(products[:, :, places], axis1=1, axis2=2).copy()
+        products -= np.swapaxes(self._off[chosen][:, :, places], 1, 2) @ self._off[chosen]
+        ends = np.cumsum([0, *map(len, groups)])
+        return [
+            [_explained(products[k, a:b], group, own[k, a:b]) for k in range(len(chosen))]
+            for group, a, b in zip(groups, ends[:-1].tolist(), ends[1:].tolist(), strict=True)
+        ]
+
+    def _parts(self) -> list[slice]:
+        """Return few dwells at a time."""
+        most = max(_AT_ONCE // (3 * (self._rows.columns.shape[2] + 1)), 1)
+        return [slice(k, k + most) for k in range(0, len(self._rows), most)]
+
+    def _of_rows(self, part: slice) -> Floats:
+        """Return the weights (K, r) of the rows of some dwells."""
+        return self._weights[:, part].reshape(len(self._weights), -1)
+
+
+def _add_products(columns: Floats, group: Indices, weights: Floats, sums: Floats) -> None:
+    """Add to sums (K, n, pairs) the products of columns (C, r) of a group in all weights (K, r)."""
+    first, second = np.triu_indices(group.shape[1])
+    most = max(_AT_ONCE // (len(first) * columns.shape[1]), 1)
+    for k in range(0, len(group), most):
+        few = columns[group[k : k + most]]
+        products = few[:, first] * few[:, second]
+        summed = products.reshape(-1, columns.shape[1]) @ weights.T
+        sums[:, k : k + most] += np.moveaxis(summed.reshape(*products.shape[:2], -1), 2, 0)
+
+
+def _explained(products: Floats, group: Indices, own: Floats) -> Floats:
+    """Return what columns explain, (f, C + 1), from their products (q, C + 1) with all, and their own before the
+    model's part was subtracted."""
+    gram = products[:, group]
+    squares = np.diagonal(gram)
+    scales = np.where(squares > _ROUNDING * own, 1.0 / np.sqrt(np.maximum(squares, 1e-300)), 0.0)
+    values, vectors = np.linalg.eigh(scales[:, None] * gram * scales)
+    seen = values > 1e-10
+    return (vectors[:, seen] / np.sqrt(values[seen])).T @ (scales[:, None] * products)

@@ -1,0 +1,121 @@
+"""The rows of the readings within dwells, of which noise from dwell to dwell takes nothing: the same in every noise."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats, Indices, Mask
+from kf_calib.bench.paper_parameters import STATE_COUNT
+from kf_calib.dwells.pieces import OfPieces
+from kf_calib.dwells.qr import triangle
+from kf_calib.dwells.table import DwellTable
+from kf_calib.estimation.dwell_columns import LinearisedDwells
+from kf_calib.estimation.whitened_rows import whiten
+from kf_calib.noise.noise_model import Noise
+from kf_calib.noise.terms import RandomWalk, Scatter, SettingError
+
+_IMMENSE_MPS2 = 1e3  # scatter so large that nothing is left of a dwell's mean
+_CHANGES = 1e-3  # share of a column's largest value by which it changes within a dwell
+_ANY_SIZE = np.geomspace(0.1, 1e5, 61)  # of what disturbs a dwell, in units of the noise
+
+
+@dataclass(frozen=True)
+class Courses:
+    """What the model leaves of the courses of the readings within dwells: squares (D,) in units of the noise, and their
+    degrees of freedom (D,)."""
+
+    squares: Floats
+    freedom: Floats
+
+    def log_bayes(self) -> Floats:
+        """Log Bayes factors (D,) of whatever changes the course of one dwell, of any size s in units of the noise: with
+        n degrees of freedom (1 + s^2)^(-n/2) exp(chi^2 s^2 / (2 (1 + s^2))), averaged over s."""
+        squares = _ANY_SIZE**2
+        logs = -0.5 * self.freedom[:, None] * np.log1p(squares) + 0.5 * self.squares[:, None] * squares / (
+            1.0 + squares
+        )
+        return np.logaddexp.reduce(logs, axis=1) - math.log(len(squares))
+
+
+class WithinRows:
+    """The rows within dwells, gathered a few dwells at a time.
+
+    noise: what was stated. linearised: the dwells with the columns of the model, of which the first ``known`` have a
+    flat prior. made: number of columns of effects.
+    """
+
+    def __init__(self, noise: Noise, linearised: LinearisedDwells, known: int, made: int) -> None:
+        self._model, self._state, self._known, self._made = linearised.model, linearised.state, known, made
+        judging = noise.with_scatter_as_flicker(len(linearised.dwells)).without(RandomWalk)
+        self._shared = judging.columns("run", linearised.dwells_at_state, linearised.state)
+        without_means = judging if noise.attitude_unknown else judging.without(SettingError)
+        self._noise = without_means.with_terms(Scatter(np.full(3, _IMMENSE_MPS2)))
+        self._channels = 1 if noise.attitude_unknown else 3
+        self._largest = np.zeros(self._model.count + made + self._shared.shape[3])
+        self._gathered = list[tuple[Floats, Indices]]()
+        self._squares, self._freedom = list[Floats](), list[Floats]()
+
+    @property
+    def courses(self) -> Courses:
+        """What the model leaves of the course of each dwell."""
+        return Courses(np.concatenate(self._squares), np.concatenate(self._freedom))
+
+    def add(self, dwells: DwellTable, of_model: Floats, of_effects: Floats, pieces: slice) -> None:
+        """Add a few dwells with their columns (P, K, 3, p) of the model and (P, K, 3, made) of effects; pieces: which
+        of the run they have. Columns that do not change within dwells have no rows."""
+        if not self._noise.within_seen:
+            self._squares.append(np.zeros(len(dwells)))
+            self._freedom.append(np.zeros(len(dwells)))
+            return
+        parts = [of_model, of_effects, self._shared[pieces]]
+        nodes = min(part.shape[1] for part in parts)
+        both = np.concatenate([np.broadcast_to(p[:, :nodes], (len(p), nodes, *p.shape[2:])) for p in parts], axis=3)
+        self._largest = np.maximum(self._largest, np.abs(both).max(axis=(0, 1, 2)))
+        moving = _changing(both, dwells.folded.ends, self._largest)
+        moving[: self._model.count] = True
+        about = np.zeros(int(moving.sum()))
+        about[: self._model.count] = self._state
+        columns = OfPieces(both[..., moving], dwells.folded.ends)
+        of_dwells = whiten(dwells, columns, self._noise, self._state, about, reduced=False)
+        self._squares.append(np.array([float(rows[:, -1] @ rows[:, -1]) for rows in of_dwells]))
+        freedom = self._channels * (dwells.folded.width * dwells.folded.piece_numbers - 1.0)
+        self._freedom.append(np.asarray(freedom, float))
+        self._gathered.append((_reduced(np.concatenate(of_dwells)), np.append(np.flatnonzero(moving), len(moving))))
+
+    def rows(self) -> tuple[Floats, Floats, Floats]:
+        """Rows of the model (r, known and shared), of the terms (r, the other states and made) and readings (r,)."""
+        count, last = self._model.count, self._model.count + self._made
+        width = self._known + self._shared.shape[3]
+        if not self._gathered:
+            return np.zeros((0, width)), np.zeros((0, count - self._known + self._made)), np.zeros(0)
+        moving = np.unique(np.concatenate([columns for _, columns in self._gathered]))
+        stacked = np.zeros((sum(len(rows) for rows, _ in self._gathered), len(moving)))
+        first = 0
+        for rows, columns in self._gathered:
+            stacked[first : first + len(rows), np.searchsorted(moving, columns)] = rows
+            first += len(rows)
+        stacked = stacked if len(self._gathered) == 1 else _reduced(stacked)
+        full = np.zeros((len(stacked), last + self._shared.shape[3] + 1))
+        full[:, moving] = stacked
+        of_model = np.zeros((len(full), width))
+        # the twelve have none, but for noise of the angles
+        of_model[:, STATE_COUNT : self._known] = full[:, STATE_COUNT : self._known]
+        of_model[:, self._known :] = full[:, last:-1]
+        readings = full[:, -1] + full[:, self._known : count] @ self._state[self._known :]
+        return of_model, full[:, self._known : last], readings
+
+
+def _reduced(rows: Floats) -> Floats:
+    """Return rows (m, n), or no more of them than there are columns, with the same products."""
+    return triangle(rows) if len(rows) > rows.shape[1] else rows
+
+
+def _changing(values: Floats, ends: Indices, largest: Floats) -> Mask:
+    """Tell of each column (P, K, 3, C) whether it changes within dwells by more than noise of the angles makes."""
+    starts = ends[:-1]
+    highest = np.maximum.reduceat(values.max(axis=1), starts, axis=0)
+    lowest = np.minimum.reduceat(values.min(axis=1), starts, axis=0)
+    return np.asarray((highest - lowest).max(axis=(0, 1)) > _CHANGES * np.maximum(largest, 1e-300), bool)
