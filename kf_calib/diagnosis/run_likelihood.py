@@ -31,7 +31,7 @@ from kf_calib.noise.noise_model import Noise, lift_rounding, mean_covariances
 from kf_calib.noise.reml import FREE, Part, with_shared_noise
 
 _SEEN = 1e-7  # share of a column that the model must leave for it to be seen
-_AT_ONCE = 1 << 24  # numbers of columns at the nodes of pieces that are made together
+_AT_ONCE = 1 << 22  # numbers of columns at the nodes of pieces that are made together
 _FINE = 8  # parts of a step over which the likelihood is integrated
 _LEAST = 0.1  # sigma of a mean: noise that is smaller shows nothing
 
@@ -134,7 +134,8 @@ class RunLikelihood:
             some, pieces = dwells[few], slice(int(ends[few.start]), int(ends[few.stop]))
             nodes = stimulus if len(some) == len(dwells) else stimulus.at(slice(3 * pieces.start, 3 * pieces.stop))
             added = candidate_columns(some, effects, model.bench, state, nodes)
-            of_terms = OfPieces(values[pieces, ..., known : model.count], some.folded.ends).beside(added)
+            of_states = OfPieces(values[pieces, ..., known : model.count], some.folded.ends)
+            of_terms = of_states.beside(added) if known < model.count else added
             _combine(means_of(some, of_terms).design, blocks, columns[few])
             within.add(some, values[pieces], added.values, pieces)
         return np.matmul(self._root, columns, out=columns), within

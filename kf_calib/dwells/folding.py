@@ -18,7 +18,7 @@ from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Orientations
 from kf_calib.dwells.coherent_tone import MOST_CELLS, Cells, Trace
 from kf_calib.dwells.line_spectrum import Spectrum
-from kf_calib.dwells.pieces import FEWEST_PIECES, MOST_PIECES, MOST_RUN_PIECES, Pieces, coarsened
+from kf_calib.dwells.pieces import FEWEST_PIECES, MOST_PIECES, MOST_RUN_PIECES, MOST_SLEW_PIECES, Pieces, coarsened
 from kf_calib.dwells.qr import square_triangle
 from kf_calib.dwells.rows import Nodes, Rows, basis
 from kf_calib.dwells.sufficient_statistics import Autocovariance, Dwell
@@ -118,13 +118,17 @@ def _with_half_the_pieces(dwell: Dwell) -> Dwell:
 
 
 class Folder:
-    """Folds rows into sequences of dwells and of slews, on a carrier if its frequency is not 0."""
+    """Folds rows into sequences of dwells and of slews, on a carrier if its frequency is not 0.
+
+    In a run of very many slews every second one is kept, or every fourth, and so on, so that memory is bounded.
+    """
 
     def __init__(self, carrier_hz: float = 0.0) -> None:
         self._dwells, self._slews = _DwellSequence(), _DwellSequence()
         self.carrier_hz = carrier_hz
         self._cells: Cells | None = None
-        self._traced = 0
+        self._traced = self._slew_pieces = 0
+        self._every = 1  # of so many slews one is kept
 
     @property
     def dwells(self) -> list[Dwell]:
@@ -143,9 +147,12 @@ class Folder:
     @slews.setter
     def slews(self, slews: Iterable[Dwell]) -> None:
         self._slews = _DwellSequence(slews)
+        self._slew_pieces = sum(len(slew.pieces) for slew in self.slews)
 
     def add(self, rows: Rows) -> None:
         """Fold one block of rows into its dwell or slew."""
+        if rows.moving and (rows.dwell - 1) % self._every:
+            return
         growing = self._slews if rows.moving else self._dwells
         block = Dwell(
             rows.dwell, fold(rows, self.carrier_hz), moving=rows.moving, pose_sigma_rad=rows.pose_sigma_rad,
@@ -161,6 +168,11 @@ class Folder:
             block = replace(block, trace=Trace.of(readings, rows.elapsed_s, self._cells))
             self._traced += len(block.trace)
         growing.add(block)
+        if rows.moving:
+            self._slew_pieces += len(block.pieces)
+            while self._slew_pieces > MOST_SLEW_PIECES and len(self.slews) > 1:
+                self._every *= 2
+                self.slews = [slew for slew in self.slews if (slew.number - 1) % self._every == 0]
 
 
 LEAST_COUNT = 8

@@ -32,6 +32,8 @@ MOST_PIECES = 256
 _MERGED_PIECES = MOST_PIECES // 4  # pieces after merging; at most twice as many
 MOST_RUN_PIECES = 2048
 """Pieces of all dwells of a run, beyond which those of long dwells are merged; dwells of an hour have 70 each."""
+MOST_SLEW_PIECES = 1 << 15
+"""Pieces of all slews of a run, beyond which every second slew is left out: 300 slews of 20 s have as many."""
 FEWEST_PIECES = 16
 """Dwells of no more pieces are left as they are: so many have lengths that double from 1 s to hours."""
 _THREE = np.arange(3)  # nodes of a piece

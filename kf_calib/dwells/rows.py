@@ -90,6 +90,16 @@ def on_basis(values: Floats) -> Floats:
     return np.concatenate([parabola(part) for part in np.split(values, values.shape[-2] // 3, axis=-2)], axis=-2)
 
 
+def on_nodes(functions: Floats) -> Floats:
+    """Weights (..., K) of the values at the nodes from those (..., K) of the basis functions, K = 3, or 9 on a
+    carrier: ``on_basis`` the other way round."""
+    weights = np.empty(functions.shape)
+    one, u, square = functions[..., ::3], functions[..., 1::3], functions[..., 2::3]
+    weights[..., ::3], weights[..., 2::3] = 0.5 * (square - u), 0.5 * (square + u)
+    weights[..., 1::3] = one - square
+    return weights
+
+
 @dataclass(frozen=True, slots=True)
 class Rows:
     """Regressors and readings of one block.

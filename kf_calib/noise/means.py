@@ -9,11 +9,10 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
-from kf_calib.dwells.pieces import basis_values, of_all_pieces
+from kf_calib.dwells.pieces import of_all_pieces
+from kf_calib.dwells.rows import on_nodes
 from kf_calib.dwells.sufficient_statistics import Dwell
 from kf_calib.dwells.table import DwellTable
-
-_AT_ONCE = 4096  # pieces whose columns are processed together
 
 
 @dataclass(frozen=True, repr=False)
@@ -60,8 +59,8 @@ def means_of(dwells: Sequence[Dwell], columns: Sequence[Floats]) -> Means:
 
 def _design(table: DwellTable, values: Floats) -> Floats:
     """Return the means (D, 3, p) of columns (pieces, K nodes, 3, p)."""
-    folded, of_pieces = table.folded, np.empty((len(values), values[0, 0].size))
-    first = table.triangles[:, 0, : folded.width] / table.triangles[:, :1, 0]  # means of the basis
-    for part in (slice(k, k + _AT_ONCE) for k in range(0, len(first), _AT_ONCE)):
-        of_pieces[part] = (first[part, None] @ basis_values(values[part]))[:, 0]
-    return folded.weighted(of_pieces).reshape(len(table), *values.shape[2:])
+    folded = table.folded
+    functions = table.triangles[:, 0, : folded.width] / table.triangles[:, :1, 0]  # means of the basis
+    of_nodes = on_nodes(functions[:, : values.shape[1]])  # (pieces, K)
+    of_pieces = of_nodes[:, None] @ values.reshape(*values.shape[:2], -1)
+    return folded.weighted(of_pieces[:, 0]).reshape(len(table), *values.shape[2:])
