@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.within_dwell_trend import Trend, trend
 from kf_calib.dwells.coherent_tone import band_hz
 from kf_calib.dwells.line_spectrum import SpectralLine, lowest_hz
 from kf_calib.dwells.table import DwellTable
@@ -24,14 +23,9 @@ from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.observability import is_seen, smallest_size
 from kf_calib.estimation.results import Consistency, consistency
 from kf_calib.estimation.score_test import Frame
+from kf_calib.estimation.within_dwell_trend import Trend, trend
 from kf_calib.support import stage
-from kf_calib.support.tail_probabilities import LEVEL, f_tail, sidak
-
-SHARE = 0.4
-"""Share of the false-alarm probability that is given to the test of the misfit, and as much to the scan."""
-
-REST = 0.5 * (1.0 - 2.0 * SHARE)
-"""Share that is given to the test of spectral lines, and as much to that of trends within dwells."""
+from kf_calib.support.tail_probabilities import LEVEL, REST, SHARE, f_tail, sidak
 
 _TIE = 1e-6  # of chi-squared: of values of a constant that explain as much, the first is taken, whatever rounding does
 _DRAWS = 4000

@@ -116,11 +116,11 @@ class InNoises:
             products += (weighted @ turned[:, self._spanned :]).reshape(products.shape)
         more = self._rows.more
         products += more[:, columns].T @ more[:, self._spanned :]
-        own = np.diagonal(products[:, :, places], axis1=1, axis2=2).copy()
+        lengths = np.diagonal(products[:, :, places], axis1=1, axis2=2).copy()
         products -= np.swapaxes(self._off[chosen][:, :, places], 1, 2) @ self._off[chosen]
         ends = np.cumsum([0, *map(len, groups)])
         return [
-            [_explained(products[k, a:b], group, own[k, a:b]) for k in range(len(chosen))]
+            [_explained(products[k, a:b], group, lengths[k, a:b]) for k in range(len(chosen))]
             for group, a, b in zip(groups, ends[:-1].tolist(), ends[1:].tolist(), strict=True)
         ]
 
@@ -145,12 +145,12 @@ def _add_products(columns: Floats, group: Indices, weights: Floats, sums: Floats
         sums[:, k : k + most] += np.moveaxis(summed.reshape(*products.shape[:2], -1), 2, 0)
 
 
-def _explained(products: Floats, group: Indices, own: Floats) -> Floats:
-    """Return what columns explain, (f, C + 1), from their products (q, C + 1) with all, and their own before the
-    model's part was subtracted."""
+def _explained(products: Floats, group: Indices, lengths: Floats) -> Floats:
+    """Return what columns explain, (f, C + 1), from their products (q, C + 1) with all, and with
+    themselves (q,) before the model's part was subtracted."""
     gram = products[:, group]
     squares = np.diagonal(gram)
-    scales = np.where(squares > _ROUNDING * own, 1.0 / np.sqrt(np.maximum(squares, 1e-300)), 0.0)
+    scales = np.where(squares > _ROUNDING * lengths, 1.0 / np.sqrt(np.maximum(squares, 1e-300)), 0.0)
     values, vectors = np.linalg.eigh(scales[:, None] * gram * scales)
     seen = values > 1e-10
     return (vectors[:, seen] / np.sqrt(values[seen])).T @ (scales[:, None] * products)

@@ -35,11 +35,11 @@ from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.run_likelihood import Projected, RunLikelihood, log_bayes_together
 from kf_calib.diagnosis.run_terms import RunTerms, log_bayes_of_any_size, log_bayes_of_columns, sizes_of
 from kf_calib.diagnosis.unknown_terms import name_of_formula, text_named
-from kf_calib.diagnosis.within_dwell_trend import p_of_steady_oscillation, trend
 from kf_calib.dwells.qr import orthonormal
 from kf_calib.effects import effect_named
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.results import Calibration
+from kf_calib.estimation.within_dwell_trend import p_of_steady_oscillation, trend
 from kf_calib.noise.terms import RandomWalk, ThermometerError
 from kf_calib.support import stage
 from kf_calib.support.tail_probabilities import log_odds_of

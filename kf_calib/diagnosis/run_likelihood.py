@@ -237,14 +237,14 @@ def _width(block: Combination) -> int:
     return part.stop - part.start if matrix is None else int(matrix.shape[1])
 
 
-def _combine(columns: Floats, blocks: Sequence[Combination], out: Floats) -> None:
+def _combine(columns: Floats, blocks: Sequence[Combination], combined: Floats) -> None:
     """Write combinations of columns (..., C) one behind the other; without any, the columns themselves."""
     if not blocks:
-        out[..., : columns.shape[-1]] = columns
+        combined[..., : columns.shape[-1]] = columns
     first = 0
     for part, matrix in blocks:
         some = columns[..., part] if matrix is None else columns[..., part] @ matrix
-        out[..., first : first + some.shape[-1]] = some
+        combined[..., first : first + some.shape[-1]] = some
         first += some.shape[-1]
 
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.within_dwell_trend import Trend
 from kf_calib.effects import walk_named
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.results import Consistency, consistency
+from kf_calib.estimation.within_dwell_trend import Trend
 
 _WITHIN = 0.01  # significance level of trends within dwells
 

@@ -39,7 +39,7 @@ from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.observability import visibility_of
 from kf_calib.estimation.outlying_dwell import outlying_dwells, outlying_in_words
 from kf_calib.estimation.remarks import is_gross, misfit_remark, remarks_on
-from kf_calib.estimation.results import Calibration, Consistency, OutlyingDwell, Visit, consistency
+from kf_calib.estimation.results import Calibration, Consistency, OutlyingDwell, Visit, judged_with_trend
 from kf_calib.estimation.settings import Settings
 from kf_calib.noise.noise_model import considered_information, mean_covariances
 from kf_calib.noise.random_walk import predict, to_mean
@@ -182,7 +182,7 @@ def evaluate_fit(fitted: Fit, settings: Settings) -> Calibration:
     final = estimate_of(factor, model.nominal_state(), extra.sum(axis=0) + fitted.considered)
     residuals = linearised.means.readings - linearised.means.design @ final.state
     visits = Visits(fitted, settings, residuals)
-    judged = consistency(fitted)
+    judged = judged_with_trend(fitted)
     return Calibration(
         model.bench, settings, fitted, visits, final, judged, float(np.sqrt(np.mean(residuals**2))),
         Tally(), tuple(remarks_on(linearised, noise, final, judged, residuals)),

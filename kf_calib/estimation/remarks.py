@@ -16,7 +16,7 @@ from kf_calib.effects.effect import Unknown
 from kf_calib.estimation import free_attitude, setup_blunders
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.estimate import Estimate
-from kf_calib.estimation.results import Consistency
+from kf_calib.estimation.results import Consistency, format_p
 from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.reml import ENOUGH_DIRECTIONS, FEWEST, degrees_of_freedom, directions
 from kf_calib.noise.temperature_course import temperature_course
@@ -32,6 +32,13 @@ MISSING_OR_NOISE = "the dwells scatter about the model by more than the noise: a
 
 def misfit_remark(judged: Consistency, residuals: Floats, bench: Bench, noise: Noise) -> str:
     """A sentence on what may be wrong if the dwells do not fit the model, from residuals (D, 3); '' if they fit."""
+    if judged.trend is not None:
+        dwell, channel = judged.trend.most
+        return (
+            f"the readings change within dwells by {judged.trend.ratio:.2f} times the power of noise (p "
+            f"{format_p(judged.trend.p_value)}), most in dwell {dwell}, accelerometer {channel}: something disturbed "
+            "it, or an effect that shows within dwells is missing; diagnose tells which."
+        )
     rms = float(np.sqrt(np.mean(residuals**2)))
     if not bench.angles and judged.consistent is False:
         return (

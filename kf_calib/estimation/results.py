@@ -14,7 +14,7 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats, one_blas_thread
 from kf_calib.bench.bench import Bench
 from kf_calib.dwells.blocks import Tally
-from kf_calib.dwells.sufficient_statistics import Dwell
+from kf_calib.dwells.sufficient_statistics import Dwell, lines_of
 from kf_calib.dwells.table import DwellTable
 from kf_calib.estimation import square_root_information, whitened_rows
 from kf_calib.estimation.attitude import at_its_mode
@@ -28,10 +28,11 @@ from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.residual_table import residual_table, table_as
 from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.signal_quality import Readings
+from kf_calib.estimation.within_dwell_trend import Trend, trend
 from kf_calib.noise.means import means_of
 from kf_calib.noise.noise_model import Noise, considered_information, steps
 from kf_calib.noise.terms import ATTITUDE_UNKNOWN_RAD, SettingError
-from kf_calib.support.tail_probabilities import LEVEL, f_tail
+from kf_calib.support.tail_probabilities import LEVEL, REST, f_tail
 from kf_calib.support.text import as_html, printed
 from kf_calib.support.units import field_unit, shown
 
@@ -86,7 +87,8 @@ class Consistency:
     freedom; its quotient by ``dof`` is tested against an F distribution, because the noise itself was estimated from
     finitely many readings. Scatter that was estimated from the same misfit is left out. ``p_value`` and ``consistent``
     are None if there are no degrees of freedom, or if all of the noise was estimated from the misfit. condition: what
-    was estimated from the misfit, without which they would not agree; None where nothing was.
+    was estimated from the misfit, without which they would not agree; None where nothing was. trend: of the readings
+    within dwells, where it is this that does not agree and ``p_value`` is that of it, by its share; else None.
     """
 
     statistic: float
@@ -94,6 +96,7 @@ class Consistency:
     p_value: float | None
     consistent: bool | None
     condition: Condition | None = None
+    trend: Trend | None = None
 
     @property
     def unconditional(self) -> bool | None:
@@ -415,6 +418,17 @@ def consistency(fitted: Fit) -> Consistency:
     if estimated and p_value >= LEVEL and consistency(known).consistent is False:
         condition = Condition("angle_sigma_deg", math.degrees(noise.setting_rad), "deg")
     return Consistency(statistic, dof, p_value, p_value >= LEVEL, condition)
+
+
+def judged_with_trend(fitted: Fit) -> Consistency:
+    """The same, with the test of trends within dwells: of what a line of the spectrum makes, they tell nothing."""
+    judged = consistency(fitted)
+    if judged.p_value is None:
+        return judged
+    going = trend(fitted)
+    if going is None or going.run_p >= min(LEVEL, judged.p_value) or lines_of(fitted.dwells, LEVEL * REST):
+        return judged
+    return replace(judged, p_value=going.run_p, consistent=False, trend=going)
 
 
 def _dof_along_force(fitted: Fit) -> int:

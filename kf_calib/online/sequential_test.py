@@ -35,8 +35,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats, one_blas_thread
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.paper_parameters import STATE_COUNT
-from kf_calib.diagnosis.candidate_tests import LEVEL, REST, SHARE, candidates, critical_delta_chi2, independent_tests
-from kf_calib.diagnosis.within_dwell_trend import Trend, trend_beside
+from kf_calib.diagnosis.candidate_tests import candidates, critical_delta_chi2, independent_tests
 from kf_calib.dwells.qr import triangle
 from kf_calib.dwells.sufficient_statistics import Dwell, lines_of
 from kf_calib.dwells.table import DwellTable
@@ -49,9 +48,10 @@ from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.iterated_fit import fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Prior, Settings
+from kf_calib.estimation.within_dwell_trend import Trend, trend_beside
 from kf_calib.noise.noise_model import Noise, steps
 from kf_calib.noise.terms import SlowWaves
-from kf_calib.support.tail_probabilities import sidak
+from kf_calib.support.tail_probabilities import LEVEL, REST, SHARE, sidak
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,10 @@ from numpy.typing import NDArray
 
 LEVEL = 0.01
 """Probability of a false alarm in one run."""
+SHARE = 0.4
+"""Share of the false-alarm probability that is given to the test of the misfit, and as much to the scan of effects."""
+REST = 0.5 * (1.0 - 2.0 * SHARE)
+"""Share that is given to the test of spectral lines, and as much to that of trends within dwells."""
 
 _PRECISION = 4e-16
 _INFINITE = 1e18  # degrees of freedom of noise that is as good as known

@@ -189,8 +189,9 @@ def verdict(result: Calibration, diagnosed: bool = False) -> str:
     else:
         word = "agree" if judged.consistent else "DISAGREE"
         word += f" if {judged.condition} (estimated from their misfit)" if judged.condition else ""
+        what = "readings that change so much within dwells" if judged.trend else "a misfit this large"
         text = (
-            f"Model and measurements {word}: noise alone gives a misfit this large with probability "
+            f"Model and measurements {word}: noise alone gives {what} with probability "
             f"p {format_p(judged.p_value)} (NIS/dof = {judged.nis_per_dof:.3g})."
         )
     if result.held_out_rms_mps2 is not None and result.held_out_floor_mps2 is not None:

@@ -57,6 +57,16 @@ def test_the_noise_of_the_others_is_as_without_it(course: str) -> None:
     np.testing.assert_allclose(noise.sigma_mps2, WHITE_MPS2, rtol=0.1)
 
 
+def test_a_run_has_one_p_where_its_readings_change_within_a_dwell() -> None:
+    """The means agree with p = 0.01 by their misfit: replay said so beside a diagnosis of p < 1e-300."""
+    run = calibrate(disturbed("swing of 11 s", 3e-4, 3))
+    assert run.consistency.consistent is False
+    assert run.consistency.p_value == diagnose(run).test.p_value
+    assert any(f"most in dwell {DISTURBED}, accelerometer 1" in remark for remark in run.warnings)
+    quiet = calibrate(replace(disturbed("swing of 11 s", 3e-4, 3), hidden_mps2=np.zeros((DWELLS, READINGS, 3))))
+    assert quiet.consistency.consistent and quiet.consistency.trend is None
+
+
 def test_the_parameters_are_as_without_it() -> None:
     run = disturbed("swing of 1.4 s", 3e-3, 5)
     quiet = calibrate(replace(run, hidden_mps2=np.zeros_like(run.hidden_mps2)))

@@ -64,6 +64,10 @@ def test_an_integral_over_sizes_is_that_of_quadrature() -> None:
     assert found == pytest.approx(np.log(expected), abs=0.01)
 
 
+PLACES = np.array([[0, 1, 2], [9, 10, 11], [30, 31, 32]])
+"""Columns of three terms."""
+
+
 @pytest.fixture(scope="module")
 def posterior() -> RunPosterior:
     run = Run(seed=4, dwells=12, count=60, white_mps2=1e-4, scatter_mps2=3e-5)
@@ -75,17 +79,33 @@ def test_noise_beside_the_model_has_its_restricted_likelihood(posterior: RunPost
     """Differences over the sizes of scatter: the coefficients integrated out with scipy, on what the model leaves."""
     likelihood = posterior._run.likelihood
     noises: NoiseSizes = posterior._sizes
-    design, readings = likelihood._model.reshape(36, -1), likelihood._readings.ravel()
-    rest = np.linalg.svd(design / np.linalg.norm(design, axis=0))[0][:, design.shape[1] :]
+    spanned = likelihood.spanned
+    assert not spanned.more_basis.any()
+    rest = np.linalg.svd(spanned.basis.reshape(36, -1))[0][:, spanned.basis.shape[2] :]
     found, expected = [], []
     for covariance in noises.covariances[1:12]:
         assert covariance is not None
         dense = np.eye(36)
         for k in range(12):
             dense[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += covariance[k]
-        expected.append(multivariate_normal(cov=rest.T @ dense @ rest).logpdf(rest.T @ readings))
-        found.append(likelihood.projected(covariance).log)
+        readings = rest.T @ spanned.readings.ravel()
+        expected.append(multivariate_normal(cov=rest.T @ dense @ rest).logpdf(readings))
+        found.append(likelihood.projected(covariance, np.arange(3)).log)
     np.testing.assert_allclose(np.diff(found), np.diff(expected), atol=1e-6)
+    np.testing.assert_allclose(posterior._base[1:12], found, atol=1e-8)
+
+
+def test_products_in_all_noises_are_those_of_rows_in_each(posterior: RunPosterior) -> None:
+    """Whitened and projected by numpy's QR in each noise alone, of a few columns."""
+    likelihood, terms = posterior._run.likelihood, posterior._run.terms
+    noises = likelihood.in_noises(posterior._sizes.families[2].shapes, posterior._sizes.squares, [PLACES])
+    for k in (0, 5, len(posterior._sizes.squares) - 1):
+        rows = likelihood.projected(posterior._sizes.squares[k] * posterior._sizes.families[2].shapes, PLACES.ravel())
+        for gram, place in zip(noises.grams[0][k], PLACES, strict=True):
+            columns = rows.of(place)
+            np.testing.assert_allclose(gram, columns.T @ columns, rtol=1e-6, atol=1e-9 * np.abs(gram).max())
+            np.testing.assert_allclose(noises.along[k, place], columns.T @ rows.readings, rtol=1e-6, atol=1e-6)
+    assert max(term.columns.max() for term in terms) < likelihood.count
 
 
 def test_probabilities_are_those_of_the_evidence_and_families_add_up(posterior: RunPosterior) -> None:

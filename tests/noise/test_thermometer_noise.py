@@ -11,12 +11,12 @@ from helpers.synthetic import plan_of
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, axes_of
-from kf_calib.diagnosis.within_dwell_trend import trend
 from kf_calib.dwells.sufficient_statistics import Dwell
 from kf_calib.dwells.table import DwellTable
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.results import Calibration, consistency
 from kf_calib.estimation.settings import Settings
+from kf_calib.estimation.within_dwell_trend import trend
 from kf_calib.noise.temperature_course import temperature_course
 from kf_calib.noise.terms import ThermometerError
 from kf_calib.sources.simulation.injected import parse

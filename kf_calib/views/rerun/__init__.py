@@ -202,7 +202,9 @@ def _verdict(result: Calibration) -> str:
     else:
         yes = "agree with the model" if judged.consistent else "**disagree with the model**"
         per_dof = significant(judged.statistic / judged.dof)
-        words = f"the dwells {yes} by the size of their misfit: p {format_p(judged.p_value)}, "
+        what = "readings within dwells" if judged.trend else "dwells"
+        by = "how they change" if judged.trend else "the size of their misfit"
+        words = f"the {what} {yes} by {by}: p {format_p(judged.p_value)}, "
         words += f"NIS/dof = {per_dof}, dof = {judged.dof}"
     held, unit = "", shown("m/s^2")
     if result.held_out_rms_mps2 is not None and result.held_out_floor_mps2 is not None:

@@ -19,7 +19,7 @@ from functools import cache
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats, Mask
+from kf_calib.bench.arrays import Floats, Ints, Mask
 from kf_calib.bench.paper_parameters import BIASES
 from kf_calib.dwells.pieces import basis_values, of_all_pieces
 from kf_calib.dwells.qr import orthonormal
@@ -31,7 +31,7 @@ from kf_calib.estimation.square_root_information import scale_columns
 from kf_calib.estimation.whitened_rows import misfit_rows
 from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.terms import RandomWalk, ThermometerError
-from kf_calib.support.tail_probabilities import chi_squared_tail, sidak
+from kf_calib.support.tail_probabilities import REST, chi_squared_tail, f_tail, sidak
 
 _DEGREE = 3
 _GRID = 600
@@ -73,20 +73,26 @@ class Trend:
     """The test of all trends within dwells.
 
     ratio: mean square of all coefficients over what noise gives. p_value: its p-value. sums (D, 3): sum of these ratios
-    for each dwell and channel. log_density: logarithm of the density of the coefficients in this noise, but for a
-    constant that is that of the dwells.
+    for each dwell and channel. numbers (D,): of the dwells. log_density: logarithm of the density of the coefficients
+    in this noise, but for a constant that is that of the dwells.
     """
 
     ratio: float
     p_value: float
     sums: Floats
+    numbers: Ints
     log_density: float = 0.0
 
     @property
+    def run_p(self) -> float:
+        """The p-value that it gives a run by its share of the false alarms."""
+        return min(self.p_value / REST, 1.0)
+
+    @property
     def most(self) -> tuple[int, int]:
-        """The dwell and the channel with the largest sum, both counted from 1."""
+        """The number of the dwell with the largest sum and the channel, counted from 1."""
         dwell, channel = np.unravel_index(int(self.sums.argmax()), self.sums.shape)
-        return int(dwell) + 1, int(channel) + 1
+        return int(self.numbers[dwell]), int(channel) + 1
 
 
 def trend(fitted: Fit) -> Trend | None:
@@ -104,8 +110,6 @@ def trend_beside(linearised: LinearisedDwells, noise: Noise, state: Floats) -> T
     it is judged. Returns None where the dwells are averages, where scatter was not stated, or where no dwell has enough
     readings.
     """
-    from scipy.special import fdtrc
-
     dwells, folded = linearised.dwells, linearised.dwells.folded
     if folded.averaged or not noise.scatter.stated:
         return None
@@ -130,7 +134,7 @@ def trend_beside(linearised: LinearisedDwells, noise: Noise, state: Floats) -> T
         np.broadcast_to(by_walk, squares.shape)[shown],
         noise.walk.spread or 0.0,
     )
-    return Trend(ratio, float(fdtrc(count, 2.0 / unsure, ratio)), ratios.sum(axis=2), log_density)
+    return Trend(ratio, f_tail(count, 2.0 / unsure, ratio), ratios.sum(axis=2), folded.numbers, log_density)
 
 
 def _log_density(squares: Floats, by_noise: Floats, by_walk: Floats, spread: float) -> float:

@@ -17,9 +17,9 @@ from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.unknown_effect import WITHIN_DWELLS
 from kf_calib.diagnosis.unknown_terms import RETURNING
-from kf_calib.diagnosis.within_dwell_trend import Trend, p_of_steady_oscillation, shapes, trend, variances
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.results import Calibration
+from kf_calib.estimation.within_dwell_trend import Trend, p_of_steady_oscillation, shapes, trend, variances
 from kf_calib.online.sequential_test import Watch
 from kf_calib.sources.simulation.sensors import GRADES
 from kf_calib.sources.simulation.simulator import Simulation
