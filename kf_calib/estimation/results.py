@@ -396,7 +396,7 @@ class Calibration:
 
 def consistency(fitted: Fit) -> Consistency:
     """Test whether the dwells agree with the fitted model within the noise by which the misfit is judged."""
-    noise, dwells, rows = fitted.noise, fitted.dwells, fitted.misfit_rows
+    noise, rows = fitted.noise, fitted.misfit_rows
     upper = square_root_information.accumulate(rows, fitted.steps)
     statistic = float(upper[-1, -1] ** 2)
     dof = square_root_information.row_ranks(rows) - square_root_information.rank(upper[:-1])
@@ -407,17 +407,25 @@ def consistency(fitted: Fit) -> Consistency:
     if not noise.within_seen and not noise.scatter.stated:  # the noise was taken from this misfit
         scatter_mps2 = float(np.sqrt(np.mean(noise.scatter_mps2**2)))
         return Consistency(statistic, dof, None, None, Condition("scatter_sigma_mps2", scatter_mps2, "m/s^2"))
-    noise_dof = float(np.maximum(dwells.folded.counts - 4, 1).sum() / noise.correlation_length.mean())
     left, tested = statistic, dof
     if estimated and (along := _dof_along_force(fitted)):
         # What lies across the force has the size of the setting error that was estimated from it: it is as large as
         # its degrees of freedom whatever the model is, and the misfit along the force alone is left to be tested.
         left, tested = max(statistic - (dof - along), 0.0), along
-    p_value = f_tail(tested, max(noise_dof, 1.0), left / tested)
+    p_value = f_tail(tested, max(_freedom_of_noise(fitted), 1.0), left / tested)
     condition, known = None, replace(fitted, noise=noise.without_estimates())
     if estimated and p_value >= LEVEL and consistency(known).consistent is False:
         condition = Condition("angle_sigma_deg", math.degrees(noise.setting_rad), "deg")
     return Consistency(statistic, dof, p_value, p_value >= LEVEL, condition)
+
+
+def _freedom_of_noise(fitted: Fit) -> float:
+    """Return the degrees of freedom of the noise beside which the misfit is judged: n readings tell the variance of
+    their mean to a relative variance of (4 kappa - 2) / n, as those of n / (2 kappa - 1) white ones do. Channels in
+    which dwells have unequal noise know it of each dwell from its own readings alone. The reciprocals are averaged."""
+    folded, lost = fitted.dwells.folded, 2.0 * fitted.noise.correlation_length - 1.0
+    counts, own = np.maximum(folded.counts - 4, 1), (folded.weights != 1.0).any(axis=0)
+    return float(1.0 / np.mean(lost * np.where(own, np.mean(1.0 / counts), 1.0 / counts.sum())))
 
 
 def judged_with_trend(fitted: Fit) -> Consistency:
