@@ -104,7 +104,7 @@ class RunLikelihood:
         more_z, of_model = np.append(np.zeros(len(prior)), more_z), np.concatenate([of_prior, of_model])
         self.spanned = _off(self._root @ design, columns, z, of_model, combined, more_z)
         log_root = float(np.log(np.abs(np.einsum("dii->di", self._root))).sum())
-        self.spanned = replace(self.spanned, log=self.spanned.log + log_root)
+        self.spanned = replace(self.spanned, log=self.spanned.log + log_root + within.log)
 
     @property
     def count(self) -> int:
@@ -258,14 +258,15 @@ def _off(
     whole = whole / np.where(sizes > 0.0, sizes, 1.0)
     _, singular, right = np.linalg.svd(whole, full_matrices=False)
     kept = singular > 1e-9 * singular.max(initial=1e-300)
-    basis, upper = np.linalg.qr(whole @ (right[kept] / singular[kept, None]).T)
+    basis = np.linalg.qr(whole @ (right[kept] / singular[kept, None]).T)[0]
     of_means, more = basis[: z.size].reshape(*z.shape, -1), basis[z.size :]
     onto = np.tensordot(of_means, columns, axes=((0, 1), (0, 1))) + more.T @ more_columns
     for k in range(len(columns)):
         columns[k] -= of_means[k] @ onto
     more_columns -= more @ onto
     along = basis.T @ np.append(z.ravel(), more_z)
-    log = -float(np.log(np.abs(np.diag(upper))).sum())
+    # columns with a prior of their own, as those of a thermometer's error, are integrated out: their number is no gain
+    log = -float(np.log(singular[kept]).sum() + np.log(sizes[sizes > 0.0]).sum())
     return Spanned(of_means, columns, z - of_means @ along, more, more_columns, more_z - more @ along, log)
 
 

@@ -13,7 +13,7 @@ from kf_calib.dwells.pieces import OfPieces
 from kf_calib.dwells.qr import triangle
 from kf_calib.dwells.table import DwellTable
 from kf_calib.estimation.dwell_columns import LinearisedDwells
-from kf_calib.estimation.whitened_rows import whiten
+from kf_calib.estimation.whitened_rows import log_of_errors, whiten
 from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.terms import RandomWalk, Scatter, SettingError
 
@@ -57,6 +57,8 @@ class WithinRows:
         self._largest = np.zeros(self._model.count + made + self._shared.shape[3])
         self._gathered = list[tuple[Floats, Indices]]()
         self._squares, self._freedom = list[Floats](), list[Floats]()
+        self.log = 0.0
+        """Log of the density of the readings within dwells, but for chi-squared."""
 
     @property
     def courses(self) -> Courses:
@@ -79,6 +81,7 @@ class WithinRows:
         about = np.zeros(int(moving.sum()))
         about[: self._model.count] = self._state
         columns = OfPieces(both[..., moving], dwells.folded.ends)
+        self.log += log_of_errors(dwells, self._noise, self._state)
         of_dwells = whiten(dwells, columns, self._noise, self._state, about, reduced=False)
         self._squares.append(np.array([float(rows[:, -1] @ rows[:, -1]) for rows in of_dwells]))
         freedom = self._channels * (dwells.folded.width * dwells.folded.piece_numbers - 1.0)

@@ -83,6 +83,17 @@ def whiten(
     return all_rows
 
 
+def log_of_errors(dwells: DwellTable, noise: Noise, state: Floats) -> float:
+    """Log of the density of readings that were whitened, but for chi-squared: -1/2 log det(1 + E^T E) of all dwells,
+    with E the changes of the readings by 1 sigma of each error that is drawn for a dwell."""
+    about, log, width = _About.of(dwells, noise, state), 0.0, dwells.folded.width
+    for batch in _batches(dwells, about.errors):
+        rows, count = _weighted(batch, np.zeros((*batch.pieces.shape, width, 3, 0)), about)
+        upper = np.linalg.qr(rows[..., :count], mode="r")
+        log -= float(np.log(np.abs(np.einsum("dkk->dk", upper))).sum())
+    return log
+
+
 @dataclass(frozen=True)
 class _About:
     """The noise by which rows are divided, the changes (pieces, nodes, 3, q) of the readings by 1 sigma of each error

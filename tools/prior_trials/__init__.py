@@ -1,0 +1,1 @@
+"""The parts of ``tools/prior_trial.py``."""

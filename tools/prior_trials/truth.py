@@ -1,0 +1,159 @@
+"""A truth drawn from the priors of the program: an explanation, its sizes, and noise from dwell to dwell.
+
+What is drawn are the very weights that ``RunPosterior`` has before it sees a reading, so that a probability of 70 % has
+to be right in 70 of 100 runs. What a size leaves below the noise of one mean has no row, and counts as nothing missing.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats, Indices
+from kf_calib.diagnosis.hypothesis_table import PRIOR
+from kf_calib.diagnosis.noise_sizes import NoiseSizes
+from kf_calib.diagnosis.run_likelihood import RunLikelihood
+from kf_calib.diagnosis.run_terms import _DECADES, RunTerm, RunTerms, _Walk
+from kf_calib.dwells.rows import on_basis
+from kf_calib.dwells.table import DwellTable
+from kf_calib.effects import Effect, effect_named
+from kf_calib.estimation.dwell_columns import candidate_columns
+
+NOTHING, NOISE, UNKNOWN, DWELL = "nothing", "noise", "unknown", "one dwell"
+_NOISE_RANGE = (0.1, 1000.0)  # of noise from dwell to dwell, in that which was stated
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is true of a run: the explanation as a row of the table has it, and what it adds to the readings at the
+    nodes of all pieces (P, 3, 3); coefficients: of effects alone, by their names, at values of their constants."""
+
+    label: str
+    added_mps2: Floats
+    coefficients: dict[str, list[float]]
+
+
+class Prior:
+    """The prior of one run without anything missing.
+
+    terms, noises: of its posterior. dwells: of it, about which all is linear.
+    """
+
+    def __init__(self, terms: RunTerms, noises: NoiseSizes, dwells: DwellTable) -> None:
+        self._terms, self._noises, self._dwells = terms, noises, dwells
+        self._state = terms.likelihood.linearised.state
+
+    def drawn(self, rng: np.random.Generator) -> Truth:
+        """A truth: one explanation, and noise that does not depend on it."""
+        label, added, coefficients = self._explanation(rng)
+        noisy, noise = self._noise(rng)
+        if label == NOTHING and noisy:
+            label = NOISE
+        return Truth(label, added + noise, coefficients)
+
+    def _explanation(self, rng: np.random.Generator) -> tuple[str, Floats, dict[str, list[float]]]:
+        """Return one explanation: its label, what it adds, and its coefficients."""
+        kind = _one_of(rng, [*PRIOR], [*PRIOR.values()])
+        names, nothing = self._terms.names, np.zeros((len(self._dwells.folded.pieces), 3, 3))
+        weights = [effect_named(name, self._terms.bench).prior for name in names]
+        chosen: list[str] = []
+        if kind in {"effect", "beside"}:
+            chosen = [_one_of(rng, names, weights)]
+        elif kind == "pair":
+            pairs = [*itertools.combinations(range(len(names)), 2)]
+            pair = _one_of(rng, pairs, [weights[i] * weights[j] for i, j in pairs])
+            chosen = sorted(names[k] for k in pair)
+        parts = [self._of_row(rng, name) for name in chosen]
+        unknown = kind in {"unknown", "beside"}
+        if unknown:
+            parts.append(self._of_row(rng, f"?{rng.integers(len(self._terms.unknown))}"))
+        if kind == "dwell":
+            return DWELL, self._one_dwell(rng), {}
+        seen = [(name, part) for name, part in zip([*chosen, UNKNOWN], parts, strict=False) if part is not None]
+        label = " + ".join(name for name, _ in seen) or NOTHING
+        known = {name: coefficients for name, (_, coefficients) in seen if coefficients}
+        return label, sum((added for _, (added, _) in seen), nothing), {} if unknown else known
+
+    def _of_row(self, rng: np.random.Generator, row: str) -> tuple[Floats, list[float]] | None:
+        """Return what a term of a row adds, and its coefficients; None where its size is one that nothing shows."""
+        terms = [term for term in self._terms.terms if term.row == row]
+        if not terms:
+            return None
+        term = _one_of(rng, terms, np.exp([term.log_share for term in terms]).tolist())
+        shares = np.exp(term.sizes.logs)
+        index = int(np.searchsorted(np.cumsum(shares), rng.random()))
+        if index == len(shares):
+            return None
+        drawn = term.sizes.centre + term.sizes.values[index] * rng.standard_normal(len(self._spanned(term)))
+        effects, coefficients = self._effects(rng, term, drawn)
+        return self._columns(effects) @ coefficients, coefficients.tolist() if term.effect is not None else []
+
+    def _spanned(self, term: RunTerm) -> Indices:
+        """Return the columns whose coefficients have the prior: those of all formulas, of which the term has fewer."""
+        return term.spanned if len(term.spanned) else term.columns
+
+    def _effects(self, rng: np.random.Generator, term: RunTerm, drawn: Floats) -> tuple[list[Effect], Floats]:
+        """Return the effects of a term with the coefficients in SI that it has by those drawn."""
+        if term.effect is not None:
+            relations = [*term.effect.relations]
+            if not relations:
+                return [term.effect], drawn
+            matrix = relations[int(rng.integers(len(relations)))]
+            return [term.effect], matrix @ drawn[: matrix.shape[1]]
+        if not term.summands:  # a walk, or biases that come back
+            waves = _Walk(self._dwells[-1].end_s, len(drawn) // 3)
+            return [waves], drawn * (1.0 if term.scales is None else term.scales)
+        unknown = self._terms.unknown[int(term.row[1:])]
+        texts = [(text, unknown.weight(k)) for k in term.summands for text in unknown.summands[k]]
+        effects = [self._terms.formula_of(text) for text, _ in texts]
+        weights = np.repeat([weight for _, weight in texts], [len(effect.coefficients) for effect in effects])
+        rms = self._rms(effects)
+        return effects, np.where(rms > 0.0, weights / np.where(rms > 0.0, rms, 1.0), 0.0) * drawn
+
+    def _rms(self, effects: Sequence[Effect]) -> Floats:
+        """Return the rms (C,) of the columns of effects, in units of the noise, as the terms are scaled."""
+        likelihood = self._terms.likelihood
+        own = RunLikelihood(likelihood.linearised, likelihood.noise, 1e-12, effects)
+        return own.lengths / math.sqrt(own.rows)
+
+    def _columns(self, effects: Sequence[Effect]) -> Floats:
+        """Return the columns (P, 3, 3, C) of effects at the nodes."""
+        return candidate_columns(self._dwells, effects, self._terms.bench, self._state).values
+
+    def _one_dwell(self, rng: np.random.Generator) -> Floats:
+        """Return offsets of one dwell alone, of any size."""
+        size = 10.0 ** rng.uniform(0.0, _DECADES)
+        return self._at_dwells(size * rng.standard_normal((1, 3)), [int(rng.integers(len(self._dwells)))])
+
+    def _noise(self, rng: np.random.Generator) -> tuple[bool, Floats]:
+        """Return whether there is noise from dwell to dwell beyond what was stated, and what it adds."""
+        families = self._noises.families
+        family = _one_of(rng, families, np.exp([family.log_prior for family in families]).tolist())
+        if not family.parts:
+            return False, np.zeros((len(self._dwells.folded.pieces), 3, 3))
+        size = float(np.exp(rng.uniform(*np.log(_NOISE_RANGE))))
+        values, turns = np.linalg.eigh(family.shapes)
+        errors = size * np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(values.shape)
+        return True, self._at_dwells((turns @ errors[..., None])[..., 0], range(len(self._dwells)))
+
+    def _at_dwells(self, errors: Floats, dwells: Sequence[int]) -> Floats:
+        """Return offsets (d, 3), in units of the noise of the mean of some dwells, at the nodes of all pieces."""
+        ends, added = self._dwells.folded.ends, np.zeros((len(self._dwells.folded.pieces), 3, 3))
+        for k, error in zip(dwells, errors, strict=True):
+            added[ends[k] : ends[k + 1]] = np.linalg.solve(self._terms.likelihood._root[k], error)
+        return added
+
+
+def with_truth(dwells: DwellTable, truth: Truth) -> DwellTable:
+    """The dwells with what is true added to their readings."""
+    return dwells.plus(on_basis(truth.added_mps2))
+
+
+def _one_of(rng: np.random.Generator, things: Sequence, weights: Sequence[float]):
+    """Return one of some things, by their weights."""
+    shares = np.cumsum(weights)
+    return things[int(np.searchsorted(shares, rng.random() * shares[-1]))]
