@@ -403,7 +403,7 @@ class RunPosterior:
         run, unknown = self._run, self._run.unknown[number]
         flat = [place for name in beside for place in run.terms[self._best[name]].columns.tolist()]
         terms = [term for term in run.terms if term.row == f"?{number}"]
-        places = np.unique(np.concatenate([np.append(term.columns, term.spanned) for term in terms]))
+        places = np.unique(np.concatenate([term.columns for term in terms]))
         noises = [run.likelihood.projected(covariance, places, flat) for covariance in self._sizes.covariances]
         scores = np.array([
             [rows.log + log_bayes_of_columns(rows.of(term.columns), rows.readings) + term.log_share for term in terms]
@@ -412,7 +412,7 @@ class RunPosterior:
         at, likeliest = np.unravel_index(int(np.argmax(scores)), scores.shape)
         term = terms[int(likeliest)]
         widths = [sum(len(run.formula_of(text).coefficients) for text in unknown.summands[k]) for k in term.summands]
-        parts = np.split(term.spanned, np.cumsum(widths)[:-1])
+        parts = np.split(term.columns, np.cumsum(widths)[:-1])
         return [text for k in self._summands(parts, noises[int(at)]) for text in unknown.summands[term.summands[k]]]
 
     def _summands(self, parts: Sequence[Indices], rows: Projected) -> list[int]:

@@ -69,7 +69,7 @@ class RunLikelihood:
     linearised: the dwells with the columns of the model. noise: what was stated. least_mps2: scatter that there is in
     any case, by which rounding does not decide. effects: terms that may be missing, of which the columns are made.
     known: number of states of the model that have a flat prior; further ones are terms, whose columns come first.
-    blocks: combinations of the columns, one after another, that take their place; spare: columns that ``append`` fills.
+    blocks: combinations of the columns, one after another, that take their place.
 
     The rows are whitened by what was stated. Of the model an orthonormal basis of what it spans is kept, and all else
     is projected off it.
@@ -83,7 +83,6 @@ class RunLikelihood:
         effects: Sequence[Effect] = (),
         known: int | None = None,
         blocks: Sequence[Combination] = (),
-        spare: int = 0,
     ) -> None:
         self.linearised, self.noise = linearised, noise
         model = linearised.model
@@ -96,7 +95,7 @@ class RunLikelihood:
         of_prior = np.concatenate([prior[:, :known], prior[:, model.count : -1]], axis=1)
         self._states = design.shape[2]
         z = (self._root @ readings[..., None])[..., 0]
-        columns, within = self._made(effects, known, blocks, spare)
+        columns, within = self._made(effects, known, blocks)
         self.courses, (of_model, more, more_z) = within.courses, within.rows()
         combined = np.zeros((len(prior) + len(more), columns.shape[2]))
         _combine(more, blocks, combined[len(prior) :])
@@ -116,20 +115,16 @@ class RunLikelihood:
         """Number of rows of means."""
         return self.spanned.readings.size
 
-    def _made(
-        self, effects: Sequence[Effect], known: int, blocks: Sequence[Combination], spare: int
-    ) -> tuple[Floats, WithinRows]:
+    def _made(self, effects: Sequence[Effect], known: int, blocks: Sequence[Combination]) -> tuple[Floats, WithinRows]:
         """Return the columns (D, 3, C) of all terms in the means, and rows within dwells, made for a few dwells at a
         time: their values at all nodes take ten times the memory."""
         linearised, dwells = self.linearised, self.linearised.dwells_at_state
         model, state, ends = linearised.model, linearised.state, dwells.folded.ends
         stimulus, values = stimulus_of(dwells, model.bench, state), of_all_pieces(linearised.columns)
         made = sum(len(effect.coefficients) for effect in effects)
-        self._filled = sum(_width(block) for block in blocks) if blocks else model.count - known + made
-        columns, within = (
-            np.zeros((len(dwells), 3, self._filled + spare)),
-            WithinRows(self.noise, linearised, known, made),
-        )
+        count = sum(map(_width, blocks)) if blocks else model.count - known + made
+        columns = np.empty((len(dwells), 3, count))
+        within = WithinRows(self.noise, linearised, known, made)
         for few in _parts(ends, made):
             some, pieces = dwells[few], slice(int(ends[few.start]), int(ends[few.stop]))
             nodes = stimulus if len(some) == len(dwells) else stimulus.at(slice(3 * pieces.start, 3 * pieces.stop))
@@ -139,14 +134,6 @@ class RunLikelihood:
             _combine(means_of(some, of_terms).design, blocks, columns[few])
             within.add(some, values[pieces], added.values, pieces)
         return np.matmul(self._root, columns, out=columns), within
-
-    def append(self, combinations: Sequence[tuple[Indices, Floats]]) -> None:
-        """Fill the spare columns with combinations of others, one behind the other."""
-        for columns in (self.spanned.columns, self.spanned.more_columns):
-            first = self._filled
-            for places, matrix in combinations:
-                columns[..., first : first + matrix.shape[1]] = columns[..., places] @ matrix
-                first += matrix.shape[1]
 
     def rescale(self, scales: Floats) -> None:
         """Multiply the columns of the terms by these (C,)."""
@@ -240,7 +227,7 @@ def _width(block: Combination) -> int:
 def _combine(columns: Floats, blocks: Sequence[Combination], combined: Floats) -> None:
     """Write combinations of columns (..., C) one behind the other; without any, the columns themselves."""
     if not blocks:
-        combined[..., : columns.shape[-1]] = columns
+        combined[:] = columns
     first = 0
     for part, matrix in blocks:
         some = columns[..., part] if matrix is None else columns[..., part] @ matrix

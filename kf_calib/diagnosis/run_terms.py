@@ -32,7 +32,7 @@ _SPARSE = 0.5  # share of one summand alone in the unknown functions of a driver
 _SAME = 0.99  # cosine above which a summand is a known effect
 _END = 0.99  # of the range of a constant
 _SEEN = 1e-7  # share of a column that the model must leave for it to be seen
-_LEADING, _LEAST = 24, 1e-3  # combinations of the columns of an unknown function, and the least size of one
+_LEAST = 1e-3  # share of the largest part of a term that a part of it has at least
 _WAVES = 40  # of a random walk
 _RETURNS, _PER_DWELL = (4, 8, 16, 32, 64), 0.75  # parts of a run within which a bias may come back, and most of them
 _MOST_ORIENTATIONS = 100  # that are told apart by what comes back with each
@@ -44,8 +44,7 @@ class RunTerm:
 
     row: the name of an effect, or ``?`` and the number of an unknown function. log_share: log of its share in the prior
     of its row. effect: with the constant at which it has these columns. summands: of the unknown function, those that
-    it has. sizes: of its coefficients. spanned: the columns of its formulas, of which its own are combinations. scales:
-    factors (q,) of its columns.
+    it has. sizes: of its coefficients. scales: factors (q,) of its columns.
     """
 
     row: str
@@ -54,7 +53,6 @@ class RunTerm:
     effect: Effect | None = None
     summands: tuple[int, ...] = ()
     sizes: Sizes = field(default_factory=lambda: Sizes(np.zeros(0), np.zeros(0)))
-    spanned: Indices = field(default_factory=lambda: np.zeros(0, np.intp))
     scales: Floats | None = None
 
     @property
@@ -94,13 +92,10 @@ class RunTerms:
         self._add_orientations(columns)
         if self.walk:
             self._add_walk(columns)
-        spare = _LEADING * sum(len(term.summands) > 1 for term in columns.terms)
-        self.likelihood = RunLikelihood(
-            self._linearised, noise, least_mps2, columns.effects, blocks=columns.blocks, spare=spare
-        )
-        rms = self.likelihood.lengths[: -spare or None] / math.sqrt(self.likelihood.rows)
+        self.likelihood = RunLikelihood(self._linearised, noise, least_mps2, columns.effects, blocks=columns.blocks)
+        rms = self.likelihood.lengths / math.sqrt(self.likelihood.rows)
         unknown = np.where(rms > 0.0, columns.weights / np.where(rms > 0.0, rms, 1.0), 0.0)
-        self.likelihood.rescale(np.append(np.where(columns.weights > 0.0, unknown, 1.0), np.ones(spare)))
+        self.likelihood.rescale(np.where(columns.weights > 0.0, unknown, 1.0))
         self.terms = self._seen(columns.terms)
         self.names = tuple(dict.fromkeys(term.row for term in self.terms if term.is_known))
 
@@ -164,22 +159,15 @@ class RunTerms:
 
     def _seen(self, drafts: Sequence[RunTerm]) -> list[RunTerm]:
         """Return the terms of which something is seen, with their sizes; a summand that is a known effect is none."""
-        raw, spare = self.likelihood.lengths, _LEADING * sum(len(draft.summands) > 1 for draft in drafts)
-        known, terms, matrices = dict[tuple[int, ...], list[Floats]](), list[RunTerm](), list[tuple[Indices, Floats]]()
+        raw, known, terms = self.likelihood.lengths, dict[tuple[int, ...], list[Floats]](), list[RunTerm]()
         for draft in drafts:
             columns = self.likelihood.columns(draft.columns)
             if not (np.linalg.norm(columns, axis=0) > _SEEN * raw[draft.columns]).any():
                 continue
-            if len(draft.summands) > 1:
-                spanned, matrix = draft.columns, _leading(columns)
-                matrices.append((spanned, matrix))
-                place = self.likelihood.count - spare + _LEADING * (len(matrices) - 1) + np.arange(_LEADING)
-                sizes = sizes_of(best_sigma(columns @ matrix), None)
-                terms.append(replace(draft, columns=place, spanned=spanned, sizes=sizes))
-                continue
-            if not (draft.is_known or draft.summands):
+            if not (draft.is_known or len(draft.summands) == 1):
                 scaled = columns if draft.scales is None else columns * draft.scales
-                terms.append(replace(draft, spanned=draft.columns, sizes=sizes_of(best_sigma(scaled), None)))
+                best = float(np.linalg.norm(scaled, 2)) if draft.summands else 1.0 / best_sigma(scaled)
+                terms.append(replace(draft, sizes=sizes_of(1.0 / best, None)))
                 continue
             basis = orthonormal(columns / np.linalg.norm(columns, axis=0).max())[0]
             alike = known.setdefault(basis.shape, [])
@@ -188,8 +176,7 @@ class RunTerms:
             elif not draft.is_known and alike and _largest_cosine(alike, basis) > _SAME:
                 continue
             usual = None if draft.effect is None else usual_sizes(draft.effect, self.grade)
-            terms.append(replace(draft, spanned=draft.columns, sizes=sizes_of(best_sigma(columns), usual)))
-        self.likelihood.append(matrices)
+            terms.append(replace(draft, sizes=sizes_of(best_sigma(columns), usual)))
         return terms
 
     @cached_property
@@ -316,14 +303,6 @@ class _Walk(Effect):
         columns = np.zeros((len(s), 3, 3, self.count))
         columns[:, range(3), range(3)] = waves[:, None]
         return columns.reshape(len(s), 3, -1)
-
-
-def _leading(columns: Floats) -> Floats:
-    """Return the combinations (q, ``_LEADING``) of columns (r, q) of an unknown function that show most, orthonormal in
-    its coefficients, so that these keep their prior; zeros where there are fewer."""
-    _, singular, right = np.linalg.svd(columns, full_matrices=False)
-    kept = right[: int((singular > _LEAST * singular[0]).sum())][:_LEADING]
-    return np.hstack([kept.T, np.zeros((columns.shape[1], _LEADING - len(kept)))])
 
 
 def _is_limit(effect: Effect | None) -> bool:

@@ -10,10 +10,11 @@ from typing import Any
 import click
 import pyarrow as pa
 import pyarrow.parquet as pq
-from distributed import Client, LocalCluster, as_completed
+from distributed import Client, as_completed
 from rich.console import Console
 from rich.progress import track
 
+from kf_calib.fleet.batch import cluster
 from prior_trials.play import play
 from prior_trials.report import Report
 
@@ -62,8 +63,7 @@ def main(folder: Path, runs: int, first: int, jobs: int, scheduler: str | None) 
     known = {*played(folder)["seed"].to_pylist()}
     seeds = [seed for seed in range(first, first + runs) if seed not in known]
     if seeds:
-        cluster = None if scheduler else LocalCluster(n_workers=jobs, threads_per_worker=1, dashboard_address=None)
-        with Client(scheduler or cluster) as client:
+        with cluster(jobs, scheduler) as client:
             rows = track(_rows(client, seeds), "playing", total=len(seeds), console=Console(stderr=True))
             for some in _batched(iter(rows)):
                 _write(folder, some)

@@ -1,7 +1,7 @@
 """A truth drawn from the priors of the program: an explanation, its sizes, and noise from dwell to dwell.
 
 What is drawn are the very weights that ``RunPosterior`` has before it sees a reading, so that a probability of 70 % has
-to be right in 70 of 100 runs. What a size leaves below the noise of one mean has no row, and counts as nothing missing.
+to be right in 70 of 100 runs. A size that is below the noise of one mean has no row, and counts as nothing missing.
 """
 
 from __future__ import annotations
@@ -13,18 +13,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats, Indices
+from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.hypothesis_table import PRIOR
 from kf_calib.diagnosis.noise_sizes import NoiseSizes
 from kf_calib.diagnosis.run_likelihood import RunLikelihood
 from kf_calib.diagnosis.run_terms import _DECADES, RunTerm, RunTerms, _Walk
+from kf_calib.dwells.pieces import OfPieces
 from kf_calib.dwells.rows import on_basis
 from kf_calib.dwells.table import DwellTable
 from kf_calib.effects import Effect, effect_named
 from kf_calib.estimation.dwell_columns import candidate_columns
+from kf_calib.noise.means import means_of
 
 NOTHING, NOISE, UNKNOWN, DWELL = "nothing", "noise", "unknown", "one dwell"
-_NOISE_RANGE = (0.1, 1000.0)  # of noise from dwell to dwell, in that which was stated
+_NOISE_RANGE = (0.1, 100.0)  # of noise from dwell to dwell, in that which was stated
+_LARGEST = 3000.0  # root of chi-squared of an explanation: a larger one is drawn again, since it is far from linear
 
 
 @dataclass(frozen=True)
@@ -50,10 +53,17 @@ class Prior:
     def drawn(self, rng: np.random.Generator) -> Truth:
         """A truth: one explanation, and noise that does not depend on it."""
         label, added, coefficients = self._explanation(rng)
+        while self._size(added) > _LARGEST:
+            label, added, coefficients = self._explanation(rng)
         noisy, noise = self._noise(rng)
         if label == NOTHING and noisy:
             label = NOISE
         return Truth(label, added + noise, coefficients)
+
+    def _size(self, added_mps2: Floats) -> float:
+        """Return the root of chi-squared of what is added to the means of dwells, in the noise that was stated."""
+        values = OfPieces(added_mps2[..., None], self._dwells.folded.ends)
+        return float(np.linalg.norm(self._terms.likelihood._root @ means_of(self._dwells, values).design))
 
     def _explanation(self, rng: np.random.Generator) -> tuple[str, Floats, dict[str, list[float]]]:
         """Return one explanation: its label, what it adds, and its coefficients."""
@@ -88,13 +98,9 @@ class Prior:
         index = int(np.searchsorted(np.cumsum(shares), rng.random()))
         if index == len(shares):
             return None
-        drawn = term.sizes.centre + term.sizes.values[index] * rng.standard_normal(len(self._spanned(term)))
+        drawn = term.sizes.centre + term.sizes.values[index] * rng.standard_normal(len(term.columns))
         effects, coefficients = self._effects(rng, term, drawn)
         return self._columns(effects) @ coefficients, coefficients.tolist() if term.effect is not None else []
-
-    def _spanned(self, term: RunTerm) -> Indices:
-        """Return the columns whose coefficients have the prior: those of all formulas, of which the term has fewer."""
-        return term.spanned if len(term.spanned) else term.columns
 
     def _effects(self, rng: np.random.Generator, term: RunTerm, drawn: Floats) -> tuple[list[Effect], Floats]:
         """Return the effects of a term with the coefficients in SI that it has by those drawn."""
