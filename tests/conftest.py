@@ -6,6 +6,7 @@ import functools
 import gc
 import math
 import os
+import signal
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -39,6 +40,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     sys.dont_write_bytecode = False
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, lambda *_: None)  # under nohup: unlike "ignored", children do not inherit it
     if commit := config.getoption("slow_share"):
         share = Share.of_commit(config.rootpath, commit)
         config.pluginmanager.register(SlowShare(share, config.getoption("slow_minutes")))
