@@ -6,8 +6,10 @@ inconsistent and ``--strict`` asked; 2: anything else, with one sentence on stde
 
 from __future__ import annotations
 
+import re
 import sys
 from importlib import import_module
+from pathlib import Path
 
 import click
 import rich_click
@@ -35,16 +37,33 @@ _HOMES = {name: home for own in SECTIONS.values() for name, home in own.items()}
 
 
 class _Commands(rich_click.RichGroup):
-    """Commands that are imported when one of them runs, or all are listed."""
+    """Commands that are imported when one of them runs."""
+
+    listed = False
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        for name in [cmd_name] if cmd_name in _HOMES else _HOMES:  # a mistyped one is compared with all
-            module, _, function = _HOMES[name].rpartition(".")
-            self.add_command(getattr(import_module(f"kf_calib.{module}"), function))
+        if cmd_name in _HOMES and not self.listed:
+            module, _, function = _HOMES[cmd_name].rpartition(".")
+            return getattr(import_module(f"kf_calib.{module}"), function)
+        for name in _HOMES:  # a mistyped one is compared with all
+            self.add_command(rich_click.RichCommand(name, help=_summary(_HOMES[name])))
         return super().get_command(ctx, cmd_name)
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return sorted(_HOMES)
+
+    def format_help(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        self.listed = True
+        super().format_help(ctx, formatter)
+        self.listed = False
+
+
+def _summary(home: str) -> str:
+    """Return the first paragraph of a command's docstring as it stands in its file: to import all takes 0.3 s."""
+    module, _, function = home.rpartition(".")
+    text = Path(__file__).parents[1].joinpath(*module.split(".")).with_suffix(".py").read_text("utf-8")
+    found = re.search(rf'^def {function}\(.*?"""(.*?)(?:\n\n|""")', text, re.DOTALL | re.MULTILINE)
+    return " ".join(found[1].split()) if found else ""
 
 
 _HELP = {
