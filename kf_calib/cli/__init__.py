@@ -46,13 +46,13 @@ class _Commands(rich_click.RichGroup):
             module, _, function = _HOMES[cmd_name].rpartition(".")
             return getattr(import_module(f"kf_calib.{module}"), function)
         for name in _HOMES:  # a mistyped one is compared with all
-            self.add_command(rich_click.RichCommand(name, help=_summary(_HOMES[name])))
+            self.add_command(rich_click.RichCommand(name=name, help=_summary(_HOMES[name])))
         return super().get_command(ctx, cmd_name)
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return sorted(_HOMES)
 
-    def format_help(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+    def format_help(self, ctx: rich_click.RichContext, formatter: rich_click.RichHelpFormatter) -> None:
         self.listed = True
         super().format_help(ctx, formatter)
         self.listed = False
