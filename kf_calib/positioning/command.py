@@ -43,6 +43,7 @@ from kf_calib.cli.options import (
     target_option,
 )
 from kf_calib.errors import InputError
+from kf_calib.support.text import angles_in_words, printable
 
 if TYPE_CHECKING:
     from kf_calib.bench.bench import Bench
@@ -154,7 +155,6 @@ class DrivenRun(LiveRun):
 
 def halt_in_words(outcome: Outcome) -> str:
     """Why the table was stopped, where it stands, and what to do, in one sentence each."""
-    from kf_calib.positioning.text import angles_in_words
 
     if not outcome.stopped:
         last = f"; it was last seen at {angles_in_words(outcome.stands_at)}" if outcome.stands_at else ""
@@ -259,7 +259,6 @@ def _ask_for_programs(positioner: str) -> None:
     """Ask on a terminal whether the programs that a profile names may run. Raises InputError where nobody is there to
     ask, or the answer is no."""
     from kf_calib.positioning.opening import programs_of
-    from kf_calib.support.text import printable
 
     programs = programs_of(positioner)
     if not programs:
@@ -390,7 +389,7 @@ def _show_dry_run(name: str, keys: BenchKeys, options: DriveOptions, as_json: bo
     for pose in poses:
         way = route(itinerary.reach, here, pose)
         if way is None:
-            begin, end = (views.angles_in_words(np.degrees(angles).tolist()) for angles in (here, pose))
+            begin, end = (angles_in_words(np.degrees(angles).tolist()) for angles in (here, pose))
             raise InputError(
                 f"no way from {begin} to {end} keeps out of the forbidden zones: widen what the bench file allows."
             )

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from rich.console import Group
 from rich.text import Text
 
-from kf_calib.positioning.text import angles_in_words
 from kf_calib.report.contents import Measured, in_text
 from kf_calib.report.page import Section
 from kf_calib.sources.files.record_files import angles_of, number_of
+from kf_calib.support.text import angles_in_words
 from kf_calib.support.units import span
 from kf_calib.views.terminal import ConsoleTable
 

@@ -12,6 +12,7 @@ from rich.text import Text
 from kf_calib.bench.arrays import Floats
 from kf_calib.positioning.loop import Phase
 from kf_calib.positioning.positioner import HandPositioner
+from kf_calib.support.text import angles_in_words
 from kf_calib.support.units import span
 from kf_calib.views.json import clean
 from kf_calib.views.live.content import Doing
@@ -75,11 +76,6 @@ def ended_in_words(outcome: Outcome) -> RenderableType:
     stays = sum(1 for decision in outcome.decisions if decision.gimbal_deg) + 1
     where = f"; the table stands at {angles_in_words(outcome.stands_at)}" if outcome.stands_at else ""
     return Text(f"The run ended after {span(outcome.lasted_s)} and {stays} orientations: {outcome.why}{where}.")
-
-
-def angles_in_words(gimbal_deg: Sequence[float]) -> str:
-    """Gimbal angles as text."""
-    return f"{', '.join(f'{round(angle, 2) + 0.0:g}' for angle in gimbal_deg)} deg"
 
 
 def dry_run(poses: Floats, ways: Sequence[Sequence[Floats]], slews_s: Sequence[float], stay_s: float, overhead_s: float

@@ -13,7 +13,7 @@ Dates: of stamps, and as text by ISO 8601. Where a text names no time zone, it i
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
 from functools import singledispatch
 
@@ -58,6 +58,11 @@ def cut(text: str, longest: int) -> str:
 
 
 _loaders = list[Callable[[], object]]()
+
+
+def angles_in_words(degrees: Iterable[float]) -> str:
+    """Gimbal angles in deg, outer first, to a hundredth of a degree."""
+    return f"{', '.join(f'{round(float(angle), 2) + 0.0:g}' for angle in degrees)} deg"
 
 
 def counted(count: int, what: str) -> str:

@@ -22,7 +22,7 @@ from kf_calib.diagnosis.unknown_effect import Description
 from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.estimation.remarks import MISSING_OR_NOISE
 from kf_calib.estimation.results import Calibration, Condition, format_p
-from kf_calib.support.text import printed
+from kf_calib.support.text import angles_in_words, printed
 from kf_calib.support.units import shown
 from kf_calib.views.console import plain, symbol
 from kf_calib.views.json import clean, condition_object, outlying_object, readings_object
@@ -262,7 +262,7 @@ def details_of(diagnosis: Diagnosis) -> list[RenderableType]:
         treated = "the tests use averages that suppress it" if averaged else "it counts as noise"
         parts.append(Text(f"Vibration at {seen} Hz changes its amplitude during the run, so {treated}."))
     if going is not None:
-        parts.append(Text(f"Next orientation: gimbals at {angles_in_words(diagnosis)}: {going[1]}."))
+        parts.append(Text(f"Next orientation: gimbals at {angles_in_words(going[0].gimbal_deg)}: {going[1]}."))
     if diagnosis.test.invisible:
         parts.append(Text(f"Effects that this run cannot show: {', '.join(diagnosis.test.invisible)}."))
     parts.append(_detectable_table(diagnosis.detectable))
@@ -440,15 +440,9 @@ def _unsure(diagnosis: Diagnosis, typed: str) -> Iterator[NextStep]:
     if going is not None and going[0].told and going[0].after < _TELLS:
         yield NextStep("No single orientation tells them apart here: measure at more, or for longer")
     elif going is not None:
-        yield NextStep(f"Measure with the gimbals at {angles_in_words(diagnosis)}: it {going[1]}")
+        yield NextStep(f"Measure with the gimbals at {angles_in_words(going[0].gimbal_deg)}: it {going[1]}")
     if diagnosis.description is not None:
         texts = " ".join(f"--with {shlex.quote(text)}" for text in diagnosis.description.formulas)
         yield NextStep("Try what describes it", f"kf-calib diagnose {typed} {texts}")
     elif diagnosis.missing:
         yield NextStep("Or take the likeliest", f"kf-calib improve {typed} --accept-first")
-
-
-def angles_in_words(diagnosis: Diagnosis) -> str:
-    """The angles of the next orientation, outer gimbal first."""
-    assert diagnosis.next_orientation is not None
-    return f"{', '.join(f'{angle:g}' for angle in diagnosis.next_orientation[0].gimbal_deg)} deg"

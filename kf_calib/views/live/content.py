@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
@@ -13,7 +13,7 @@ from kf_calib.bench import paper_parameters
 from kf_calib.online.evaluation import Progress
 from kf_calib.online.session import HandJudgement, HandStanding
 from kf_calib.online.status import Judgement, Standing
-from kf_calib.support.text import sentence
+from kf_calib.support.text import angles_in_words, sentence
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2, shown, span
 from kf_calib.views import diagnosis
 from kf_calib.views.console import symbol
@@ -175,7 +175,7 @@ def _bench_task(standing: Standing, doing: Doing | None) -> Task:
     is to go next."""
     judgement, here = standing.judgement, standing.current
     going = None if judgement is None else judgement.next_orientation
-    there = "the next orientation of your plan" if going is None else f"{angles_in_words(going[0])} deg"
+    there = "the next orientation of your plan" if going is None else f"{angles_in_words(going[0])}"
     then = "" if going is None else f": {going[1]}"
     if judgement is not None and judgement.reached(standing.sigma):
         if doing:
@@ -186,7 +186,7 @@ def _bench_task(standing: Standing, doing: Doing | None) -> Task:
         if doing:
             return Task(doing.what, moved, "cyan")
         return Task(f"TURN TO {there.upper() if going is None else there}, THEN HOLD STILL", f"{moved}{then}", "cyan")
-    angles = f"{angles_in_words(np.degrees(here.pose))} deg" if len(here.pose) < 4 else "this attitude"
+    angles = f"{angles_in_words(np.degrees(here.pose))}" if len(here.pose) < 4 else "this attitude"
     at = f"orientation {here.number} at {angles}: {span(here.seconds)}, {here.readings} readings"
     if doing:
         return Task(doing.what, at, "cyan" if doing.heading_deg else "yellow")
@@ -238,11 +238,6 @@ def _fit(judgement: Judgement) -> str:
         rms, floor, unit = result.held_out_rms_mps2, result.held_out_floor_mps2, shown("m/s^2")
         text += f"; orientations left out: {unit.text(rms, 2)} off, noise alone {unit.number(floor, 2)}"
     return text
-
-
-def angles_in_words(degrees: Iterable[float]) -> str:
-    """Angles in deg as text, to a tenth of a degree."""
-    return ", ".join(f"{round(float(angle), 1):g}" for angle in degrees)
 
 
 def _of_hand(standing: HandStanding, source: Sequence[Line], remarks: Sequence[str]) -> Content:

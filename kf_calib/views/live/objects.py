@@ -12,10 +12,10 @@ from kf_calib.bench import paper_parameters
 from kf_calib.design.sides import turn_in_words
 from kf_calib.online.session import HandJudgement, HandStanding
 from kf_calib.online.status import Judgement, Standing
+from kf_calib.support.text import angles_in_words
 from kf_calib.support.units import shown, span
 from kf_calib.views.diagnosis import found_object, orientation_object
 from kf_calib.views.json import clean, replay_object
-from kf_calib.views.live.content import angles_in_words
 
 if TYPE_CHECKING:
     from kf_calib.sources.live import Status
@@ -69,7 +69,7 @@ def line(judgement: Judgement) -> str:
         left = f", {span(judgement.left_s[k])} to its target" if np.isfinite(judgement.wanted[k]) else ""
         seen = f"worst sigma {paper_parameters.SYMBOLS[k]} {shown(paper_parameters.UNITS[k]).text(sigma[k])}{left}"
     going = judgement.next_orientation
-    following = f"; next {angles_in_words(going[0])} deg ({going[1]})" if going else ""
+    following = f"; next {angles_in_words(going[0])} ({going[1]})" if going else ""
     per_dof = result.consistency.nis_per_dof
     nis = "" if per_dof is None else f"; misfit {math.sqrt(per_dof):.2g} × noise"
     return (

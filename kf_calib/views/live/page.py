@@ -13,7 +13,8 @@ from kf_calib.bench.bench import Bench, axis_names
 from kf_calib.estimation.free_attitude import DIRECTIONS
 from kf_calib.online.session import HandStanding
 from kf_calib.online.status import Standing
-from kf_calib.views.live.content import Content, angles_in_words
+from kf_calib.support.text import angles_in_words
+from kf_calib.views.live.content import Content
 
 DirectionState = Literal["done", "disagrees", "here", "next"]
 
@@ -42,7 +43,7 @@ def gimbals_of(standing: Standing | HandStanding, bench: Bench, heading: Sequenc
     """
     angles = heading or _next_angles(standing)
     return [
-        (f"gimbal {k} ({axis})", angles_in_words([angle]))
+        (f"gimbal {k} ({axis})", angles_in_words([angle]).removesuffix(" deg"))
         for k, (axis, angle) in enumerate(zip(axis_names(bench.axes), angles, strict=False), start=1)
     ]
 

@@ -36,10 +36,9 @@ from kf_calib.estimation.estimate import correlation
 from kf_calib.estimation.results import Calibration, Parameter, format_p
 from kf_calib.online.status import Judgement
 from kf_calib.support import units
-from kf_calib.support.text import printable
+from kf_calib.support.text import angles_in_words, printable
 from kf_calib.support.units import Unit, shown, significant
 from kf_calib.views.console import noise_origins, whole_value
-from kf_calib.views.live.content import angles_in_words
 from kf_calib.views.rerun.diagnosis import save_diagnosis_view as save_diagnosis
 from kf_calib.views.rerun.improvement import save_improvement_view as save_improvement
 from kf_calib.views.rerun.names import (
@@ -145,7 +144,7 @@ def judgement_text(judgement: Judgement) -> str:
     going = judgement.next_orientation
     lines = [f"**So far**: {judgement.verdict}"]
     if going is not None:
-        lines.append(f"**Next**: gimbals at {angles_in_words(going[0])} deg: {going[1]}")
+        lines.append(f"**Next**: gimbals at {angles_in_words(going[0])}: {going[1]}")
     return "\n\n".join(lines)
 
 
@@ -156,7 +155,7 @@ def log_next(judgement: Judgement, stream: rr.RecordingStream) -> None:
     if going is not None and bench.axes:
         now_s = np.array([judgement.result.visits[-1].dwell.end_s])
         force: Floats = bench.specific_force(now_s, np.radians([going[0]]))
-        vectors, labels = 1.25 * force / np.linalg.norm(force), [f"next: {angles_in_words(going[0])} deg"]
+        vectors, labels = 1.25 * force / np.linalg.norm(force), [f"next: {angles_in_words(going[0])}"]
     arrow = rr.Arrows3D(vectors=vectors, colors=[NEXT] * len(vectors), radii=[0.012] * len(vectors), labels=labels)
     stream.log("platform/next", arrow, static=True)
 
