@@ -132,8 +132,9 @@ class RunLikelihood:
             of_states = OfPieces(values[pieces, ..., known : model.count], some.folded.ends)
             of_terms = of_states.beside(added) if known < model.count else added
             _combine(means_of(some, of_terms).design, blocks, columns[few])
+            columns[few] = self._root[few] @ columns[few]
             within.add(some, values[pieces], added.values, pieces)
-        return np.matmul(self._root, columns, out=columns), within
+        return columns, within
 
     def rescale(self, scales: Floats) -> None:
         """Multiply the columns of the terms by these (C,)."""

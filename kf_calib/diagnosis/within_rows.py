@@ -18,6 +18,7 @@ from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.terms import RandomWalk, Scatter, SettingError
 
 _IMMENSE_MPS2 = 1e3  # scatter so large that nothing is left of a dwell's mean
+_TALL = 4  # times as many rows as columns are kept before they are reduced
 _CHANGES = 1e-3  # share of a column's largest value by which it changes within a dwell
 _ANY_SIZE = np.geomspace(0.1, 1e5, 61)  # of what disturbs a dwell, in units of the noise
 
@@ -87,6 +88,8 @@ class WithinRows:
         freedom = self._channels * (dwells.folded.width * dwells.folded.piece_numbers - 1.0)
         self._freedom.append(np.asarray(freedom, float))
         self._gathered.append((_reduced(np.concatenate(of_dwells)), np.append(np.flatnonzero(moving), len(moving))))
+        if sum(len(rows) for rows, _ in self._gathered) > _TALL * len(moving):
+            self._gathered = [self._merged()]
 
     def rows(self) -> tuple[Floats, Floats, Floats]:
         """Rows of the model (r, known and shared), of the terms (r, the other states and made) and readings (r,)."""
@@ -94,13 +97,7 @@ class WithinRows:
         width = self._known + self._shared.shape[3]
         if not self._gathered:
             return np.zeros((0, width)), np.zeros((0, count - self._known + self._made)), np.zeros(0)
-        moving = np.unique(np.concatenate([columns for _, columns in self._gathered]))
-        stacked = np.zeros((sum(len(rows) for rows, _ in self._gathered), len(moving)))
-        first = 0
-        for rows, columns in self._gathered:
-            stacked[first : first + len(rows), np.searchsorted(moving, columns)] = rows
-            first += len(rows)
-        stacked = stacked if len(self._gathered) == 1 else _reduced(stacked)
+        stacked, moving = self._merged()
         full = np.zeros((len(stacked), last + self._shared.shape[3] + 1))
         full[:, moving] = stacked
         of_model = np.zeros((len(full), width))
@@ -109,6 +106,17 @@ class WithinRows:
         of_model[:, self._known :] = full[:, last:-1]
         readings = full[:, -1] + full[:, self._known : count] @ self._state[self._known :]
         return of_model, full[:, self._known : last], readings
+
+    def _merged(self) -> tuple[Floats, Indices]:
+        """Return the rows gathered so far with the columns of all of them."""
+        if len(self._gathered) == 1:
+            return self._gathered[0]
+        moving = np.unique(np.concatenate([columns for _, columns in self._gathered]))
+        stacked, first = np.zeros((sum(len(rows) for rows, _ in self._gathered), len(moving))), 0
+        for rows, columns in self._gathered:
+            stacked[first : first + len(rows), np.searchsorted(moving, columns)] = rows
+            first += len(rows)
+        return _reduced(stacked), moving
 
 
 def _reduced(rows: Floats) -> Floats:
