@@ -196,7 +196,7 @@ CEILINGS = {
     "noise": 3412,
     "estimation": 7993,
     "design": 1875,
-    "diagnosis": 4980,
+    "diagnosis": 4989,
     "online": 1649,
     "exchange": 1994,
     "views": 7383,

@@ -12,8 +12,10 @@ from kf_calib.diagnosis.candidate_tests import assess_candidates
 from kf_calib.diagnosis.noise_sizes import NoiseSizes
 from kf_calib.diagnosis.posterior import RunPosterior
 from kf_calib.diagnosis.refits import Refits
-from kf_calib.diagnosis.run_likelihood import Sizes, integrated, log_bayes, log_bayes_together
+from kf_calib.diagnosis.run_likelihood import RunLikelihood, Sizes, integrated, log_bayes, log_bayes_together
 from kf_calib.estimation.calibration import calibrate
+from kf_calib.noise.reml import with_shared_noise
+from kf_calib.noise.terms import WavesOverRun
 
 
 def sizes(*values: float) -> Sizes:
@@ -93,6 +95,25 @@ def test_noise_beside_the_model_has_its_restricted_likelihood(posterior: RunPost
         found.append(likelihood.projected(covariance, np.arange(3)).log)
     np.testing.assert_allclose(np.diff(found), np.diff(expected), atol=1e-6)
     np.testing.assert_allclose(posterior._base[1:12], found, atol=1e-8)
+
+
+@pytest.mark.parametrize("size_mps2", [1e-7, 1e-5, 1e-3])
+def test_noise_that_dwells_share_is_integrated_out_with_its_volume(posterior: RunPosterior, size_mps2: float) -> None:
+    """Waves over the run, against scipy's density of what the model leaves, in covariances with and without them."""
+    linearised, noise = posterior._run.likelihood.linearised, posterior._noise
+    wavy = noise.with_terms(WavesOverRun(np.full(3, size_mps2)))
+    effect = posterior._run.terms[0].effect
+    assert effect is not None
+    found = [
+        RunLikelihood(linearised, each, 1e-12, [effect]).projected(None, np.arange(1)).log for each in (noise, wavy)
+    ]
+    likelihood = RunLikelihood(linearised, noise, 1e-12, [effect])
+    means, _ = with_shared_noise(linearised.dwells, wavy, linearised.means, linearised.state)
+    waves = (likelihood._root @ means.design[..., linearised.model.count :]).reshape(36, -1)
+    rest = np.linalg.svd(likelihood.spanned.basis.reshape(36, -1))[0][:, likelihood.spanned.basis.shape[2] :]
+    readings, waves = rest.T @ likelihood.spanned.readings.ravel(), rest.T @ waves
+    expected = [multivariate_normal(cov=np.eye(len(rest.T)) + k * waves @ waves.T).logpdf(readings) for k in (0, 1)]
+    assert found[1] - found[0] == pytest.approx(expected[1] - expected[0], abs=1e-5)
 
 
 def test_products_in_all_noises_are_those_of_rows_in_each(posterior: RunPosterior) -> None:

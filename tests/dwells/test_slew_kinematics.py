@@ -115,6 +115,20 @@ def test_slews_do_not_depend_on_batches() -> None:
             np.testing.assert_array_equal(a.pieces.triangles, b.pieces.triangles)
 
 
+def test_of_very_many_slews_some_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every second, or fourth ..., from the first on, and what they tell is told."""
+    source, settings = run(["latency=1ms"], dwells=9), Settings(effects=("latency",))
+    whole = calibrate(source, settings)
+    most = sum(len(slew.pieces) for slew in whole.linearised.slews) // 3
+    monkeypatch.setattr("kf_calib.dwells.folding.MOST_SLEW_PIECES", most)
+    few = calibrate(source, settings)
+    assert [slew.number for slew in whole.linearised.slews] == [*range(1, 9)]
+    assert [slew.number for slew in few.linearised.slews] == [1, 5]
+    one, other = whole.parameters["tau_d"], few.parameters["tau_d"]
+    assert one.sigma and other.sigma and one.sigma < other.sigma
+    assert abs(other.value - 1e-3) < 4.0 * other.sigma
+
+
 def test_without_such_an_effect_slews_change_nothing() -> None:
     """Dwells are the same to the last bit, whether slews are folded beside them or not."""
     source = run([], dwells=6)
