@@ -160,6 +160,11 @@ class RunTerms:
     def _seen(self, drafts: Sequence[RunTerm]) -> list[RunTerm]:
         """Return the terms of which something is seen, with their sizes; a summand that is a known effect is none."""
         raw, known, terms = self.likelihood.lengths, dict[tuple[int, ...], list[Floats]](), list[RunTerm]()
+        ends = dict[tuple[str, tuple[int, ...]], list[Floats]]()
+        for draft in drafts:
+            if _at_its_end(draft.effect):
+                basis = self._basis(draft)
+                ends.setdefault((draft.row, basis.shape), []).append(basis)
         for draft in drafts:
             columns = self.likelihood.columns(draft.columns)
             if not (np.linalg.norm(columns, axis=0) > _SEEN * raw[draft.columns]).any():
@@ -169,15 +174,20 @@ class RunTerms:
                 best = float(np.linalg.norm(scaled, 2)) if draft.summands else 1.0 / best_sigma(scaled)
                 terms.append(replace(draft, sizes=sizes_of(1.0 / best, None)))
                 continue
-            basis = orthonormal(columns / np.linalg.norm(columns, axis=0).max())[0]
-            alike = known.setdefault(basis.shape, [])
-            if draft.is_known and not _is_limit(draft.effect):
+            basis = self._basis(draft)
+            alike, limits = known.setdefault(basis.shape, []), ends.get((draft.row, basis.shape), [])
+            if draft.is_known and not (limits and _largest_cosine(limits, basis) > _SAME):
                 alike.append(basis)
             elif not draft.is_known and alike and _largest_cosine(alike, basis) > _SAME:
                 continue
             usual = None if draft.effect is None else usual_sizes(draft.effect, self.grade)
             terms.append(replace(draft, sizes=sizes_of(best_sigma(columns), usual)))
         return terms
+
+    def _basis(self, draft: RunTerm) -> Floats:
+        """Return an orthonormal basis (r, q) of the columns of a term."""
+        columns = self.likelihood.columns(draft.columns)
+        return orthonormal(columns / max(float(np.linalg.norm(columns, axis=0).max()), 1e-300))[0]
 
     @cached_property
     def _alike(self) -> list[_Alike]:
@@ -305,9 +315,9 @@ class _Walk(Effect):
         return columns.reshape(len(s), 3, -1)
 
 
-def _is_limit(effect: Effect | None) -> bool:
-    """Tell whether an effect is at the end of the range of its constant, where it is the limit of another one, which
-    may be an unknown function."""
+def _at_its_end(effect: Effect | None) -> bool:
+    """Tell whether an effect is at the end of the range of its constant. There, and where it has the same columns, it
+    is the limit of another one, which may be an unknown function."""
     return effect is not None and effect.unknown is not None and effect.value >= _END * effect.unknown.high
 
 

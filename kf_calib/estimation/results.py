@@ -88,7 +88,8 @@ class Consistency:
     finitely many readings. Scatter that was estimated from the same misfit is left out. ``p_value`` and ``consistent``
     are None if there are no degrees of freedom, or if all of the noise was estimated from the misfit. condition: what
     was estimated from the misfit, without which they would not agree; None where nothing was. trend: of the readings
-    within dwells, where it is this that does not agree and ``p_value`` is that of it, by its share; else None.
+    within dwells, where it is this that does not agree and ``p_value`` is that of it, by its share; else None. quiet:
+    whether the dwells differ by so much less than the noise that it cannot be as large.
     """
 
     statistic: float
@@ -97,16 +98,12 @@ class Consistency:
     consistent: bool | None
     condition: Condition | None = None
     trend: Trend | None = None
+    quiet: bool = False
 
     @property
     def unconditional(self) -> bool | None:
         """Whether they agree; None where that rests on what was not stated, too."""
         return None if self.consistent and self.condition else self.consistent
-
-    @property
-    def quiet(self) -> bool:
-        """Whether the dwells differ by so much less than the noise that it cannot be as large."""
-        return self.p_value is not None and 1.0 - self.p_value < _QUIET
 
     @property
     def nis_per_dof(self) -> float | None:
@@ -416,7 +413,7 @@ def consistency(fitted: Fit) -> Consistency:
     condition, known = None, replace(fitted, noise=noise.without_estimates())
     if estimated and p_value >= LEVEL and consistency(known).consistent is False:
         condition = Condition("angle_sigma_deg", math.degrees(noise.setting_rad), "deg")
-    return Consistency(statistic, dof, p_value, p_value >= LEVEL, condition)
+    return Consistency(statistic, dof, p_value, p_value >= LEVEL, condition, quiet=1.0 - p_value < _QUIET)
 
 
 def _freedom_of_noise(fitted: Fit) -> float:
