@@ -72,8 +72,7 @@ class InNoises:
         products = np.zeros((count, self._spanned + 1, width))
         for part in self._parts():
             turned, weights = rows.turned(part, self._turns), self._of_rows(part)
-            weighted = (weights[:, None] * turned[:, left].T).reshape(-1, len(turned))
-            products += (weighted @ turned).reshape(products.shape)
+            products += _products(turned[:, left], turned, weights)
             columns = np.ascontiguousarray(turned[:, self._spanned : -1].T)
             for group, summed in zip(groups, sums, strict=True):
                 _add_products(columns, group, weights, summed)
@@ -112,8 +111,7 @@ class InNoises:
         products = np.zeros((len(chosen), len(places), self._rows.columns.shape[2] + 1))
         for part in self._parts():
             turned, weights = self._rows.turned(part, self._turns), self._of_rows(part)[chosen]
-            weighted = (weights[:, None] * turned[:, columns].T).reshape(-1, len(turned))
-            products += (weighted @ turned[:, self._spanned :]).reshape(products.shape)
+            products += _products(turned[:, columns], turned[:, self._spanned :], weights)
         more = self._rows.more
         products += more[:, columns].T @ more[:, self._spanned :]
         lengths = np.diagonal(products[:, :, places], axis1=1, axis2=2).copy()
@@ -132,6 +130,12 @@ class InNoises:
     def _of_rows(self, part: slice) -> Floats:
         """Return the weights (K, r) of the rows of some dwells."""
         return self._weights[:, part].reshape(len(self._weights), -1)
+
+
+def _products(some: Floats, others: Floats, weights: Floats) -> Floats:
+    """Return the products (K, m, n) of columns (r, m) with others (r, n) in all weights (K, r)."""
+    weighted = (weights[:, None] * some.T).reshape(-1, len(some))
+    return (weighted @ others).reshape(len(weights), some.shape[1], -1)
 
 
 def _add_products(columns: Floats, group: Indices, weights: Floats, sums: Floats) -> None:

@@ -106,11 +106,6 @@ class RunLikelihood:
         self.spanned = replace(self.spanned, log=self.spanned.log + log_root + within.log)
 
     @property
-    def count(self) -> int:
-        """Number of columns of terms."""
-        return self.spanned.columns.shape[2]
-
-    @property
     def rows(self) -> int:
         """Number of rows of means."""
         return self.spanned.readings.size

@@ -163,7 +163,7 @@ class RunTerms:
         ends = dict[tuple[str, tuple[int, ...]], list[Floats]]()
         for draft in drafts:
             if _at_its_end(draft.effect):
-                basis = self._basis(draft)
+                basis = _basis(self.likelihood.columns(draft.columns))
                 ends.setdefault((draft.row, basis.shape), []).append(basis)
         for draft in drafts:
             columns = self.likelihood.columns(draft.columns)
@@ -174,7 +174,7 @@ class RunTerms:
                 best = float(np.linalg.norm(scaled, 2)) if draft.summands else 1.0 / best_sigma(scaled)
                 terms.append(replace(draft, sizes=sizes_of(1.0 / best, None)))
                 continue
-            basis = self._basis(draft)
+            basis = _basis(columns)
             alike, limits = known.setdefault(basis.shape, []), ends.get((draft.row, basis.shape), [])
             if draft.is_known and not (limits and _largest_cosine(limits, basis) > _SAME):
                 alike.append(basis)
@@ -183,11 +183,6 @@ class RunTerms:
             usual = None if draft.effect is None else usual_sizes(draft.effect, self.grade)
             terms.append(replace(draft, sizes=sizes_of(best_sigma(columns), usual)))
         return terms
-
-    def _basis(self, draft: RunTerm) -> Floats:
-        """Return an orthonormal basis (r, q) of the columns of a term."""
-        columns = self.likelihood.columns(draft.columns)
-        return orthonormal(columns / max(float(np.linalg.norm(columns, axis=0).max()), 1e-300))[0]
 
     @cached_property
     def _alike(self) -> list[_Alike]:
@@ -319,6 +314,11 @@ def _at_its_end(effect: Effect | None) -> bool:
     """Tell whether an effect is at the end of the range of its constant. There, and where it has the same columns, it
     is the limit of another one, which may be an unknown function."""
     return effect is not None and effect.unknown is not None and effect.value >= _END * effect.unknown.high
+
+
+def _basis(columns: Floats) -> Floats:
+    """Return an orthonormal basis (r, q) of columns."""
+    return orthonormal(columns / max(float(np.linalg.norm(columns, axis=0).max()), 1e-300))[0]
 
 
 def _largest_cosine(bases: Sequence[Floats], basis: Floats) -> float:

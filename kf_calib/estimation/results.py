@@ -14,7 +14,7 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats, one_blas_thread
 from kf_calib.bench.bench import Bench
 from kf_calib.dwells.blocks import Tally
-from kf_calib.dwells.sufficient_statistics import Dwell, lines_of
+from kf_calib.dwells.sufficient_statistics import Dwell
 from kf_calib.dwells.table import DwellTable
 from kf_calib.estimation import square_root_information, whitened_rows
 from kf_calib.estimation.attitude import at_its_mode
@@ -28,11 +28,11 @@ from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.residual_table import residual_table, table_as
 from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.signal_quality import Readings
-from kf_calib.estimation.within_dwell_trend import Trend, trend
+from kf_calib.estimation.within_dwell_trend import Trend, trend, unless_lines_make_it
 from kf_calib.noise.means import means_of
 from kf_calib.noise.noise_model import Noise, considered_information, steps
 from kf_calib.noise.terms import ATTITUDE_UNKNOWN_RAD, SettingError
-from kf_calib.support.tail_probabilities import LEVEL, REST, f_tail
+from kf_calib.support.tail_probabilities import LEVEL, f_tail
 from kf_calib.support.text import as_html, printed
 from kf_calib.support.units import field_unit, shown
 
@@ -426,12 +426,12 @@ def _freedom_of_noise(fitted: Fit) -> float:
 
 
 def judged_with_trend(fitted: Fit) -> Consistency:
-    """The same, with the test of trends within dwells: of what a line of the spectrum makes, they tell nothing."""
+    """The same, with the test of trends within dwells."""
     judged = consistency(fitted)
     if judged.p_value is None:
         return judged
-    going = trend(fitted)
-    if going is None or going.run_p >= min(LEVEL, judged.p_value) or lines_of(fitted.dwells, LEVEL * REST):
+    going = unless_lines_make_it(trend(fitted), fitted.dwells)
+    if going is None or going.run_p >= min(LEVEL, judged.p_value):
         return judged
     return replace(judged, p_value=going.run_p, consistent=False, trend=going)
 

@@ -24,6 +24,7 @@ from kf_calib.bench.paper_parameters import BIASES
 from kf_calib.dwells.pieces import basis_values, of_all_pieces
 from kf_calib.dwells.qr import orthonormal
 from kf_calib.dwells.rows import on_basis
+from kf_calib.dwells.sufficient_statistics import lines_of
 from kf_calib.dwells.table import AlikeDwells, DwellTable
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.fit import Fit
@@ -31,7 +32,7 @@ from kf_calib.estimation.square_root_information import scale_columns
 from kf_calib.estimation.whitened_rows import misfit_rows
 from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.terms import RandomWalk, ThermometerError
-from kf_calib.support.tail_probabilities import REST, chi_squared_tail, f_tail, sidak
+from kf_calib.support.tail_probabilities import LEVEL, REST, chi_squared_tail, f_tail, sidak
 
 _DEGREE = 3
 _GRID = 600
@@ -98,6 +99,12 @@ class Trend:
 def trend(fitted: Fit) -> Trend | None:
     """The test of trends within dwells in the residuals of a fit; None where it cannot be made."""
     return trend_beside(fitted.linearised, fitted.noise.for_goodness_of_fit, fitted.state)
+
+
+def unless_lines_make_it(going: Trend | None, dwells: DwellTable) -> Trend | None:
+    """A trend; None where it is significant and the spectrum has lines, which would make one as well."""
+    shown = going is not None and going.p_value < LEVEL
+    return None if shown and lines_of(dwells, LEVEL * REST) else going
 
 
 def trend_beside(linearised: LinearisedDwells, noise: Noise, state: Floats) -> Trend | None:

@@ -37,7 +37,7 @@ from kf_calib.bench.bench import Bench
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.diagnosis.candidate_tests import candidates, critical_delta_chi2, independent_tests
 from kf_calib.dwells.qr import triangle
-from kf_calib.dwells.sufficient_statistics import Dwell, lines_of
+from kf_calib.dwells.sufficient_statistics import Dwell
 from kf_calib.dwells.table import DwellTable
 from kf_calib.effects import Effect
 from kf_calib.estimation import square_root_information, whitened_rows
@@ -48,7 +48,7 @@ from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.iterated_fit import fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Prior, Settings
-from kf_calib.estimation.within_dwell_trend import Trend, trend_beside
+from kf_calib.estimation.within_dwell_trend import Trend, trend_beside, unless_lines_make_it
 from kf_calib.noise.noise_model import Noise, steps
 from kf_calib.noise.terms import SlowWaves
 from kf_calib.support.tail_probabilities import LEVEL, REST, SHARE, sidak
@@ -283,9 +283,8 @@ class Watch:
     @cached_property
     def trend(self) -> Trend | None:
         """The test of trends within dwells; None where spectral lines would give trends as well."""
-        found = trend_beside(self.running.linearised, self.running.noise, self.running.state)
-        shown = found is not None and found.p_value < LEVEL
-        return None if shown and lines_of(self.dwells, LEVEL * REST) else found
+        going = trend_beside(self.running.linearised, self.running.noise, self.running.state)
+        return unless_lines_make_it(going, self.dwells)
 
     @property
     def suspects(self) -> list[str]:

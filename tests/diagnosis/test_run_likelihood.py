@@ -126,7 +126,7 @@ def test_products_in_all_noises_are_those_of_rows_in_each(posterior: RunPosterio
             columns = rows.of(place)
             np.testing.assert_allclose(gram, columns.T @ columns, rtol=1e-6, atol=1e-9 * np.abs(gram).max())
             np.testing.assert_allclose(noises.along[k, place], columns.T @ rows.readings, rtol=1e-6, atol=1e-6)
-    assert max(term.columns.max() for term in terms) < likelihood.count
+    assert max(term.columns.max() for term in terms) < likelihood.spanned.columns.shape[2]
 
 
 def test_probabilities_are_those_of_the_evidence_and_families_add_up(posterior: RunPosterior) -> None:
