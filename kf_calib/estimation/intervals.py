@@ -1,22 +1,29 @@
 """Intervals of parameters where noise from dwell to dwell was not stated, and few dwells tell how large it is.
 
-With the noise that is known alone, the misfit is r times as large as expected, with nu degrees of freedom. The whole
-noise has R times the variance of the known one; nu r / R is chi-squared with nu degrees of freedom. Before the run,
-R > 1 is three times as likely as R = 1 (none more), and any logarithm of it is as likely up to 10^2. A sigma that was
-computed with R_0 stands for an interval of 95 % of +- k sigma, where k is that with which the mean of
-P(|z| < k sqrt(R_0 / R)) over all R is 0.95, and no less than 1.96. Where no noise is known, this is Student's t with nu
-degrees of freedom.
+Scatter of size s and setting errors of size a are each in the run with a probability of 3 in 4 where they were not
+stated, and any logarithm of a size is as likely as any other. By the restricted likelihood of the dwells' means, every
+pair (s, a) has a posterior probability, an estimate x(s, a) and sigmas. The interval of 95 % about the estimate x_fit
+is +- h, where
+
+  sum over (s, a) of P(s, a | run) P(|x - x_fit| < h | s, a) = 0.95,
+
+and no less than 1.96 sigma. Where there is scatter alone and no other noise is known, this is Student's t.
 """
 
 from __future__ import annotations
 
 import math
-from functools import lru_cache
+from collections.abc import Sequence
 
 import numpy as np
 
+from kf_calib.bench import paper_parameters
+from kf_calib.bench.arrays import Floats
+from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.estimation.fit import Fit
 from kf_calib.noise.noise_model import mean_covariances
+from kf_calib.noise.reml import FREE, Part, with_shared_noise
+from kf_calib.noise.terms import FLOOR_MPS2
 
 LEVEL = 0.95
 """Probability with which an interval holds a parameter."""
@@ -24,48 +31,147 @@ LEVEL = 0.95
 NORMAL = 1.959963984540054
 """Half the length of the interval in sigmas where all noise is known."""
 
-_MORE = 0.75  # prior probability that there is more noise than is known
-_LARGEST = 1e2  # of R
-_NODES = 400
+_PARTS: tuple[Part, ...] = ("common", "setting")
+_MANY = 240  # degrees of freedom from which on the size of noise is known so well that 1.96 becomes no more than 1.98
+_RANGE = math.log(1e2)  # width of the flat prior of the logarithm of a size
+_LEAST, _MOST = 0.03, 30.0  # sizes that are tried, in units of one that would explain the misfit
+_COARSE, _FINE = 14, 14  # of them, first over that range, then where they are likely
+_HOPELESS = 12.0  # in log likelihood
+_FREE = 0.75  # prior probability of a part of the noise that was not stated
+_ROUNDING = 1e-12  # share of a covariance that is added to it
 
 
-def sigmas_of_interval(fitted: Fit, misfit: float, dof: int) -> float:
-    """Half the length of the interval of 95 % of a parameter, in units of its sigma.
+def sigmas_of_intervals(fitted: Fit) -> Floats:
+    """Half the lengths (p,) of the intervals of 95 %, in units of sigma, of the twelve parameters and the coefficients
+    of effects."""
+    noise, count = fitted.noise, fitted.linearised.model.count
+    stated = noise.scatter.stated, noise.setting.stated or noise.attitude_unknown
+    free: list[Part] = [part for part, is_stated in zip(_PARTS, stated, strict=True) if not is_stated]
+    means = _Means(fitted, free) if free and 3 * len(fitted.dwells) < _MANY else None
+    if means is None or means.freedom <= 0:
+        return np.full(count, NORMAL)
+    with np.errstate(invalid="ignore"):
+        return np.fmax(means.sigmas_of_intervals(), NORMAL)
 
-    misfit, dof: chi-squared of the fit by the noise that was stated or seen, and its degrees of freedom.
+
+class _Means:
+    """The dwells' means in blocks that are independent of each other: one a dwell, or one of all where biases walk.
+
+    free: the parts of the noise that were not stated.
     """
-    noise = fitted.noise
-    if dof <= 0 or (noise.setting.stated and noise.scatter.stated):
-        return NORMAL
-    if not noise.within_seen and not noise.scatter.stated:
-        return _student(dof)
-    linearised = fitted.linearised
-    traces = [np.einsum("dii->d", mean_covariances(each.of_readings, linearised.means, linearised.state))
-              for each in (noise, noise.without_estimates())]  # fmt: skip
-    return max(NORMAL, _averaged(dof, misfit / dof, float(np.mean(traces[0] / np.maximum(traces[1], 1e-300)))))
+
+    def __init__(self, fitted: Fit, free: Sequence[Part]) -> None:
+        noise, state = fitted.noise, fitted.linearised.state
+        known = noise.without_estimates()
+        means, prior = with_shared_noise(fitted.dwells, known, fitted.linearised.means, state)
+        basis, turn = _spanned(means.design.reshape(-1, means.design.shape[2]))
+        along = basis.T @ means.readings.ravel()
+        readings = means.readings.ravel() - basis @ along
+        measured = len(means.readings) if noise.attitude_unknown else means.readings.size
+        self.freedom = measured + len(prior) - basis.shape[1]
+        of_prior = prior[:, :-1] @ turn
+        self._prior = np.column_stack([of_prior, -of_prior @ along])
+        self._to_parameters = _jacobian(state) @ turn[: len(state)]
+        size = math.sqrt(float(readings @ readings) / max(self.freedom, 1)) + FLOOR_MPS2
+        shapes = [FREE[part].shapes(means, state).sum(axis=0) for part in free]
+        shapes = [np.broadcast_to(shape, (len(means.counts), 3, 3)) for shape in shapes]
+        self._units = np.array([size**2 / np.einsum("dii->di", shape).max(axis=1).mean() for shape in shapes])
+        self._used = mean_covariances(noise, means, state)
+        self._known, self._shapes = mean_covariances(known, means, state), np.array(shapes)
+        width = 3
+        if noise.walk_mps2_per_sqrt_s:
+            width = readings.size
+            path = _path(means.ends_s) * noise.walk_mps2_per_sqrt_s**2
+            self._used, self._known = (_whole(each) + path for each in (self._used, self._known))
+            self._shapes = np.array([_whole(shape) for shape in self._shapes])
+        self._basis, self._readings = basis.reshape(-1, width, basis.shape[1]), readings.reshape(-1, width)
+
+    def sigmas_of_intervals(self) -> Floats:
+        """Half the lengths (p,) in units of the sigma with the noise that was taken."""
+        _, about, taken = self._solved(self._used[None])
+        coarse = np.geomspace(_LEAST, _MOST, _COARSE)
+        axes = [coarse] * len(self._units)
+        logs, *_ = self._at(axes)
+        logs = logs.reshape([_COARSE + 1] * len(axes))
+        likely = logs > logs.max() - _HOPELESS
+        for k in range(len(axes)):
+            along = np.flatnonzero(likely.any(axis=tuple(j for j in range(len(axes)) if j != k))[1:])
+            first, last = (max(along[0] - 1, 0), min(along[-1] + 1, _COARSE - 1)) if len(along) else (0, 0)
+            axes[k] = np.geomspace(coarse[first], coarse[last], _FINE) if last > first else coarse[:1]
+        logs, estimates, sigmas = self._at(axes)
+        weights = np.exp(logs - logs.max()) * _prior_of(axes)
+        return _half_lengths(weights / weights.sum(), (estimates - about) / taken, sigmas / taken)
+
+    def _at(self, axes: Sequence[Floats]) -> tuple[Floats, Floats, Floats]:
+        """Return log likelihoods (N,), estimates (N, p) and sigmas (N, p) at all combinations of sizes, and none."""
+        squares = [np.append(0.0, sizes**2) * unit for sizes, unit in zip(axes, self._units, strict=True)]
+        mesh = np.stack([each.ravel() for each in np.meshgrid(*squares, indexing="ij")], axis=1)
+        return self._solved(self._known + np.tensordot(mesh, self._shapes, axes=1))
+
+    def _solved(self, covariances: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return the same for covariances (N, B, b, b)."""
+        size = covariances.shape[-1]
+        covariances = covariances + _ROUNDING * np.einsum("...ii", covariances)[..., None, None] * np.eye(size)
+        lower = np.linalg.cholesky(covariances)
+        rows = np.linalg.inv(lower) @ np.concatenate([self._basis, self._readings[..., None]], axis=2)
+        rows = rows.reshape(len(rows), -1, rows.shape[-1])
+        products = np.swapaxes(rows, 1, 2) @ rows + self._prior.T @ self._prior
+        values = np.linalg.inv(np.linalg.cholesky(products[:, :-1, :-1]))
+        turned = (values @ products[:, :-1, -1:])[..., 0]
+        chi2 = products[:, -1, -1] - np.sum(turned**2, axis=1)
+        log = np.log(np.einsum("npp->np", values)).sum(axis=1) - np.log(np.einsum("nbii->nbi", lower)).sum(axis=(1, 2))
+        roots = values @ self._to_parameters.T
+        return log - 0.5 * chi2, (turned[:, None] @ roots)[:, 0], np.sqrt(np.sum(roots**2, axis=1))
 
 
-@lru_cache(maxsize=256)
-def _student(dof: int) -> float:
-    """Return the quantile of Student's t."""
-    from scipy.special import stdtrit
+def _spanned(design: Floats) -> tuple[Floats, Floats]:
+    """Return an orthonormal basis (n, r) of what columns (n, p) span, and the matrix (p, r) from its coefficients to
+    theirs."""
+    lengths = np.linalg.norm(design, axis=0)
+    lengths = np.where(lengths > 0.0, lengths, 1.0)
+    left, singular, right = np.linalg.svd(design / lengths, full_matrices=False)
+    seen = singular > 1e-9 * singular[0]
+    return left[:, seen], right[seen].T / singular[seen] / lengths[:, None]
 
-    return float(stdtrit(dof, 0.5 + 0.5 * LEVEL))
+
+def _jacobian(state: Floats) -> Floats:
+    """Return the derivatives (p, p) of the twelve parameters, and coefficients, by the states."""
+    jacobian = np.eye(len(state))
+    jacobian[:STATE_COUNT, :STATE_COUNT] = paper_parameters.jacobian(state[:STATE_COUNT])
+    return jacobian
 
 
-@lru_cache(maxsize=256)
-def _averaged(dof: int, misfit: float, taken: float) -> float:
-    """Return k for a misfit r, where the sigma was computed with R_0 = taken."""
-    from scipy.special import erf
+def _path(ends_s: Floats) -> Floats:
+    """Return the covariance (1, 3 D, 3 D) of the means of walking biases that are known at the end, per q^2."""
+    before_end_s = ends_s[-1, 1] - ends_s.mean(axis=1)
+    return np.kron(np.minimum.outer(before_end_s, before_end_s), np.eye(3))[None]
 
-    log_ratios = np.linspace(0.0, math.log(_LARGEST), _NODES)
-    logs = -0.5 * dof * (log_ratios + misfit * np.exp(-log_ratios))
-    weights = np.exp(logs - logs.max()) * _MORE / _NODES
-    weights[0] += (1.0 - _MORE) * math.exp(logs[0] - logs.max())
-    weights /= weights.sum()
-    shrink = np.sqrt(taken * np.exp(-log_ratios) / 2.0)
-    low, high = 0.0, 100.0 * NORMAL
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if weights @ erf(middle * shrink) < LEVEL else (low, middle)
+
+def _whole(blocks: Floats) -> Floats:
+    """Return blocks (D, 3, 3) as one of all (1, 3 D, 3 D)."""
+    whole = np.zeros((len(blocks), 3, len(blocks), 3))
+    whole[np.arange(len(blocks)), :, np.arange(len(blocks))] = blocks
+    return whole.reshape(1, 3 * len(blocks), -1)
+
+
+def _prior_of(axes: Sequence[Floats]) -> Floats:
+    """Return the prior probabilities (N,) of all combinations of sizes, and none, of parts of the noise."""
+    priors = np.ones(1)
+    for sizes in axes:
+        step = math.log(sizes[-1] / sizes[0]) / (len(sizes) - 1) if len(sizes) > 1 else 0.0
+        own = np.append(1.0 - _FREE, np.full(len(sizes), _FREE * step / _RANGE))
+        priors = np.multiply.outer(priors, own).ravel()
+    return priors
+
+
+def _half_lengths(weights: Floats, shifts: Floats, sigmas: Floats) -> Floats:
+    """Return the h (p,) with which a mixture of normal distributions of weights (N,), means (N, p) and sigmas (N, p)
+    has 95 % within +-h."""
+    from scipy.special import ndtr
+
+    low, high = np.zeros(shifts.shape[1]), np.full(shifts.shape[1], 100.0 * NORMAL)
+    for _ in range(50):
+        half = 0.5 * (low + high)
+        held = weights @ (ndtr((half - shifts) / sigmas) - ndtr((-half - shifts) / sigmas))
+        low, high = np.where(held < LEVEL, half, low), np.where(held < LEVEL, high, half)
     return 0.5 * (low + high)

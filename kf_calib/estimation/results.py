@@ -13,6 +13,7 @@ import numpy as np
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats, one_blas_thread
 from kf_calib.bench.bench import Bench
+from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.blocks import Tally
 from kf_calib.dwells.sufficient_statistics import Dwell
 from kf_calib.dwells.table import DwellTable
@@ -23,7 +24,7 @@ from kf_calib.estimation.cross_validation import HeldOut, held_out
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.estimate import Estimate, Parameter, Parameters, enlarged, estimate_of
 from kf_calib.estimation.fit import Fit
-from kf_calib.estimation.intervals import NORMAL, sigmas_of_interval
+from kf_calib.estimation.intervals import NORMAL, sigmas_of_intervals
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.residual_table import residual_table, table_as
 from kf_calib.estimation.settings import Settings
@@ -228,24 +229,27 @@ class Calibration:
         return self.linearised.model
 
     @cached_property
-    def interval_sigmas(self) -> float:
-        """Half the length of the interval of 95 % of a parameter, in units of its sigma: 1.96, or more where noise that
-        was not stated is known from few dwells only."""
-        noise = self.noise
-        is_stated = noise.setting.stated and noise.scatter.stated
-        judged = self.consistency if is_stated else consistency(replace(self.fit, noise=noise.without_estimates()))
-        return sigmas_of_interval(self.fit, judged.statistic, judged.dof)
+    def interval_sigmas(self) -> Floats:
+        """Half the lengths (p,) of the intervals of 95 % in units of sigma, of the twelve parameters and the
+        coefficients of effects: 1.96, or more where noise that was not stated is known from few dwells only."""
+        with one_blas_thread():
+            return sigmas_of_intervals(self.fit)
 
     def aims(self, wanted: Floats) -> Floats:
         """The sigmas (12,) whose intervals are as long as those of ``wanted`` sigmas if all noise were known."""
-        return wanted * (NORMAL / self.interval_sigmas)
+        return wanted * (NORMAL / self.interval_sigmas[:STATE_COUNT])
 
     def interval(self, parameter: Parameter) -> tuple[float, float] | tuple[None, None]:
         """The interval of 95 % of a parameter in SI units; None, None where it is not determined."""
         if parameter.value is None or parameter.sigma is None:
             return None, None
-        half = self.interval_sigmas * parameter.sigma
+        half = self._sigmas_by_symbol.get(parameter.symbol, NORMAL) * parameter.sigma
         return parameter.value - half, parameter.value + half
+
+    @cached_property
+    def _sigmas_by_symbol(self) -> dict[str, float]:
+        symbols = [*paper_parameters.SYMBOLS, *(coefficient.symbol for coefficient in self.model.coefficients)]
+        return dict(zip(symbols, self.interval_sigmas.tolist(), strict=True))
 
     @property
     def parameters(self) -> Parameters:

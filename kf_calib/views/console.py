@@ -205,10 +205,13 @@ def verdict(result: Calibration, diagnosed: bool = False) -> str:
 
 def intervals_in_words(result: Calibration) -> list[Text]:
     """A sentence on intervals that are wider than those of known noise; none where they are not."""
-    if result.interval_sigmas < _WIDER:
+    sigmas = result.interval_sigmas[: len(paper_parameters.SYMBOLS)][~result.estimate.unseen]
+    if not sigmas.size or sigmas.max() < _WIDER:
         return []
-    said = f"Intervals of 95 % are ± {result.interval_sigmas:.2f} sigma: {len(result.fit.dwells)} dwells tell roughly"
-    return [Text(f"{said} how large the noise is that was not stated.")]
+    low, high = f"{sigmas.min():.2f}", f"{sigmas.max():.2f}"
+    width, count = low if low == high else f"{low} to {high}", len(result.fit.dwells)
+    said = f"Intervals of 95 % are ± {width} sigma: {count} dwells tell roughly how large the noise is that was not"
+    return [Text(f"{said} stated.")]
 
 
 def summary(result: Calibration, diagnosed: bool = False) -> RenderableType:

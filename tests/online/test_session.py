@@ -170,7 +170,7 @@ def test_the_look_into_a_dwell_takes_nothing_from_it() -> None:
     assert (longer.sigma < here.sigma).all() and longer.readings == 2 * here.readings
     assert here.enough is False, "white noise only, and no longer than the others"
     assert current(last.repeat(400.0), before).enough is True
-    wider = before.result.interval_sigmas / NORMAL  # noise that eight dwells tell
+    wider = before.result.interval_sigmas[:12] / NORMAL  # noise that eight dwells tell
     wanted = judged_of(run.fit.dwells[:8], longer.sigma * 1.0001 * wider)
     assert (current(last, wanted).stay_s == last.end_s - last.start_s).all()
 

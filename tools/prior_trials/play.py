@@ -96,6 +96,8 @@ def _ranks(found: Calibration, refits: Refits, truth: Truth) -> list[float]:
         for coefficient, value in zip(effect.coefficients, values, strict=True):
             known = after.parameters[coefficient.symbol]
             if known.value is not None and known.sigma:
-                scaled = (value - known.value) / known.sigma * NORMAL / after.interval_sigmas
+                low, high = after.interval(known)
+                assert low is not None and high is not None
+                scaled = 2.0 * NORMAL * (value - known.value) / (high - low)
                 ranks.append(float(norm.cdf(scaled)))
     return ranks
