@@ -65,13 +65,13 @@ def diagnose(
     """
     before, refits = calibration_of(run, refits)
     with one_blas_thread():
-        diagnosis = refits.once(before, lambda: _with_readings(refits, _diagnosed(refits, before)))
+        diagnosis = refits.once(before, lambda: _with_readings(refits, before, _diagnosed(refits, before)))
         return replace(diagnosis, replication=_replication(refits, diagnosis)) if replicate else diagnosis
 
 
-def _with_readings(refits: Refits, diagnosis: Diagnosis) -> Diagnosis:
+def _with_readings(refits: Refits, before: Calibration, diagnosis: Diagnosis) -> Diagnosis:
     """Return a diagnosis with the readings of the dwell that it calls disturbed, which are read again."""
-    number, before = diagnosis.disturbed_dwell, diagnosis.before
+    number = diagnosis.disturbed_dwell
     if not number or refits.source is None or not before.noise.within_seen:
         return diagnosis
     return replace(diagnosis, disturbed_readings=readings_of(refits.source, before, number, left_out=True))
@@ -88,6 +88,18 @@ def _replication(refits: Refits, diagnosis: Diagnosis) -> Replication | None:
 
 
 def _diagnosed(refits: Refits, before: Calibration) -> Diagnosis:
+    """Diagnose a calibration: a dwell that alone is off is a term beside all others, which takes all that it says, so
+    that what else is missing is told by the other dwells."""
+    diagnosis = _of_all_dwells(refits, before)
+    number = diagnosis.likeliest.dwell if diagnosis.likeliest else 0
+    rest = refits.without_dwell(before, number) if number else None
+    beside = None if rest is None else _diagnosed(refits, rest)
+    if beside is None or beside.test.consistent is not False:
+        return diagnosis
+    return _in_words(replace(beside, apart=(number, *beside.apart)))
+
+
+def _of_all_dwells(refits: Refits, before: Calibration) -> Diagnosis:
     """Diagnose a calibration: look for an outlying dwell first, then for effects, with vibration averaged out."""
     if before.outlying:  # one wrong dwell is not an effect, but would make many effects significant
         test = replace(refits.assess(before), noise_p=min(dwell.p_value for dwell in before.outlying))

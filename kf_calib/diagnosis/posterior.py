@@ -225,10 +225,12 @@ class RunPosterior:
         return 2.0 * self._before.fit.walk_gain, 1
 
     def _one_dwell(self) -> Hypothesis:
-        """Return the row of one dwell that alone is off, by any amount, and whose readings may change in any way."""
-        of_courses = np.logaddexp(0.0, self._run.likelihood.courses.log_bayes()) - math.log(2.0)
-        dwells = [self._noises[family].dwells(size) for family, size in self._at]
-        of_dwells = np.array([log_bayes_of_any_size(*of_noise) + of_courses for of_noise in dwells]).T
+        """Return the row of one dwell that alone is off, by any amount, and whose readings may change in any way; or
+        with it others whose readings do."""
+        courses, prior = self._run.likelihood.courses, PRIOR["dwell"] / len(self._before.fit.dwells)
+        of_courses = np.logaddexp(0.0, courses.log_bayes()) - math.log(2.0)
+        means = [log_bayes_of_any_size(*self._noises[family].dwells(size)) for family, size in self._at]
+        of_dwells = np.array([own + of_courses + courses.log_bayes_of_others(own, prior) for own in means]).T
         logs = np.logaddexp.reduce(self._sizes.evidence(self._base + of_dwells), axis=1)
         number = self._before.fit.dwells[int(np.argmax(logs))].number
         log = _log_sum(logs.tolist()) - math.log(len(logs)) + math.log(PRIOR["dwell"])

@@ -64,6 +64,19 @@ class Refits:
         """The run of a calibration with further effects in the model."""
         return self.of(before, (*before.settings.effects, *added))
 
+    def without_dwell(self, before: Calibration, number: int) -> Calibration | None:
+        """The run of a calibration without a dwell; None where the others do not determine the model."""
+        dwells, settings = before.fit.dwells, before.settings
+        k = dwells.folded.numbers.tolist().index(number)
+        settings, slews = replace(settings, left_out=(*settings.left_out, number)), before.linearised.slews
+        beginning = before.fit.beginning
+        try:
+            walk_mps2_per_sqrt_s = settings.walk_mps2_per_sqrt_s
+            fitted = fit(dwells.without((k,)), before.model, walk_mps2_per_sqrt_s, slews, beginning=beginning)
+            return replace(evaluate_fit(fitted, settings), tally=before.tally, readings=before.readings)
+        except (InputError, UnobservableError):
+            return None
+
     def averaged(self, before: Calibration, window_s: float) -> Calibration | None:
         """The run of a calibration with its readings averaged over windows; None where the readings are gone."""
         return None if self.source is None else calibrate(self.source, replace(before.settings, window_s=window_s))

@@ -71,7 +71,8 @@ class Diagnosis:
 
     before_in_noise_left: ``before`` in the noise that the likeliest explanation leaves, where noise was estimated
     (None: it is that of ``before``). replication: how what is named predicts dwells that choosing it never saw (None:
-    nothing is named, or it was not asked for). disturbed_readings: those of the dwell that the verdict calls disturbed
+    nothing is named, or it was not asked for). apart: numbers of dwells that do not fit, whatever else is missing: all
+    else is said of the run without them. disturbed_readings: those of the dwell that the verdict calls disturbed
     (None: there is none, or the readings are gone).
     """
 
@@ -91,6 +92,7 @@ class Diagnosis:
     as_scatter: bool = False
     before_in_noise_left: Calibration | None = None
     replication: Replication | None = None
+    apart: tuple[int, ...] = ()
     disturbed_readings: DwellReadings | None = None
 
     def __repr__(self) -> str:
@@ -129,9 +131,9 @@ class Diagnosis:
     @cached_property
     def description(self) -> Description | None:
         """What an unknown misfit looks like; None where the misfit is known (one dwell, too), or there is none."""
-        if not self.unknown or self.before.outlying:
-            return None
         first, residuals = self.likeliest, self.before.residuals_mps2
+        if not self.unknown or self.before.outlying or (first is not None and first.dwell):
+            return None
         if first is None or not first.formulas or first.refit is None:
             driver = "" if first is None or first.driver in (IRREGULAR, ALIKE) else first.driver
             return describe_irregular(self.before.fit, residuals, self.test.trend, driver)
@@ -142,6 +144,8 @@ class Diagnosis:
     def disturbed_dwell(self) -> int:
         """Number of the dwell that the verdict calls wrong or disturbed; 0 where it speaks of none."""
         first, loud = self.likeliest, self.before.readings.loud
+        if self.apart:
+            return self.apart[0]
         if self.before.outlying:
             return self.before.outlying[0].number
         if first is not None and first.dwell:

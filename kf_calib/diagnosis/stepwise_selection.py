@@ -26,6 +26,7 @@ from kf_calib.diagnosis.hypothesis_table import SURE
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits, calibration_of
 from kf_calib.diagnosis.results import Diagnosis
+from kf_calib.diagnosis.verdict import dwells_apart
 from kf_calib.effects import as_text, effect_named, merged, refuse_unknown
 from kf_calib.errors import InputError
 from kf_calib.estimation import square_root_information
@@ -221,7 +222,10 @@ class Improvement:
         if self.because == "asked":
             return f"Ended by you. {verdict}{equals}"
         if self.because == "consistent":
-            return f"Nothing is left that noise would not leave (p {format_p(self.diagnosis.test.p_value)}).{equals}"
+            diagnoses = self.start, *(step.diagnosis for step in self.steps)
+            apart = dwells_apart([number for each in diagnoses for number in each.apart])
+            left = f"Nothing is left that noise would not leave (p {format_p(self.diagnosis.test.p_value)})"
+            return f"{apart}{left[0].lower() + left[1:] if apart else left}.{equals}"
         if self.diagnosis.missing and self.because == "ambiguous":
             return f"{verdict} No effect is sure: none was added (--accept-first takes the likeliest).{equals}"
         return f"{verdict}{equals}"

@@ -30,7 +30,27 @@ _FAMILIES = {
 
 
 def verdict_in_words(diagnosis: Diagnosis) -> str:
-    """The verdict of a diagnosis in one sentence, with what else it could be."""
+    """The verdict of a diagnosis in one sentence, with what else it could be, after the dwells that do not fit."""
+    first = diagnosis.likeliest
+    apart = () if first is not None and first.dwell else diagnosis.apart
+    return f"{dwells_apart(apart)}{_of_the_others(diagnosis)}"
+
+
+def dwells_apart(numbers: Sequence[int]) -> str:
+    """The beginning of a sentence: that dwells do not fit, whatever is missing; "" for none."""
+    if not numbers:
+        return ""
+    do, its, it = ("do", "their poses and their", "them") if len(numbers) > 1 else ("does", "its pose and its", "it")
+    return f"{_dwells(numbers)} {do} not fit, whatever is missing: look at {its} readings. Without {it}: "
+
+
+def _dwells(numbers: Sequence[int]) -> str:
+    """Return the numbers of dwells as the beginning of a sentence."""
+    return f"Dwell{'s' * (len(numbers) > 1)} {' and '.join(map(str, numbers))}"
+
+
+def _of_the_others(diagnosis: Diagnosis) -> str:
+    """Return the verdict on the other dwells."""
     test = diagnosis.test
     if test.consistent is None:
         return "The model cannot be tested: there are no more measurements than parameters. Visit more orientations."
@@ -147,6 +167,13 @@ def _unexplained(diagnosis: Diagnosis) -> str:
 
 def _unknown(diagnosis: Diagnosis, first: Hypothesis) -> str:
     """Return a sentence on a misfit that no known effect explains."""
+    if first.dwell and diagnosis.apart:
+        numbers = *diagnosis.apart, first.dwell
+        options = " ".join(f"--leave-out {number}" for number in numbers)
+        return (
+            f"{_dwells(numbers)} are wrong: they alone do not fit ({format_probability(first.probability)}"
+            f"{_others(diagnosis)}): look at their poses and their readings, or leave them out ({options})."
+        )
     if first.dwell:
         return (
             f"One dwell is wrong: dwell {first.dwell} alone does not fit ({format_probability(first.probability)}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -31,14 +32,33 @@ class Courses:
     squares: Floats
     freedom: Floats
 
-    def log_bayes(self) -> Floats:
-        """Log Bayes factors (D,) of whatever changes the course of one dwell, of any size s in units of the noise: with
-        n degrees of freedom (1 + s^2)^(-n/2) exp(chi^2 s^2 / (2 (1 + s^2))), averaged over s."""
+    @cached_property
+    def _by_size(self) -> Floats:
+        """Log Bayes factors (D, m) of whatever changes the course of a dwell by the size s, in units of the noise: with
+        n degrees of freedom (1 + s^2)^(-n/2) exp(chi^2 s^2 / (2 (1 + s^2)))."""
         squares = _ANY_SIZE**2
-        logs = -0.5 * self.freedom[:, None] * np.log1p(squares) + 0.5 * self.squares[:, None] * squares / (
-            1.0 + squares
-        )
-        return np.logaddexp.reduce(logs, axis=1) - math.log(len(squares))
+        gained = self.squares[:, None] * squares / (1.0 + squares)
+        return 0.5 * (gained - self.freedom[:, None] * np.log1p(squares))
+
+    def log_bayes(self) -> Floats:
+        """Log Bayes factors (D,) of whatever changes the course of one dwell, averaged over its size."""
+        return np.logaddexp.reduce(self._by_size, axis=1) - math.log(len(_ANY_SIZE))
+
+    def log_bayes_of_others(self, means: Floats, prior: float) -> Floats:
+        """Log Bayes factors (D,) of changes in further dwells beside each one, in any that changes less with a prior
+        probability, where this is likelier than that all change alike.
+
+        means (D,): log Bayes factors of changes of their means, of which no more counts than of their courses: what
+        is missing in the model changes all means, a disturbance shows within its dwell, too.
+        """
+        own = self.log_bayes()
+        each = np.logaddexp(0.0, math.log(prior) + own)
+        alike = float(np.logaddexp.reduce(self._by_size.sum(axis=0))) - math.log(len(_ANY_SIZE))
+        if alike > each.sum():
+            return np.zeros(len(own))
+        both = np.logaddexp(0.0, math.log(prior) + own + np.clip(means, 0.0, np.maximum(own, 0.0)))
+        less = np.cumsum(np.append(0.0, np.sort(both)))[np.argsort(np.argsort(both))]
+        return np.asarray(less, float)
 
 
 class WithinRows:

@@ -100,7 +100,7 @@ def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
 def disturbed_dwells(diagnosis: Diagnosis) -> list[int]:
     """The numbers of the dwells that something disturbed, as any test has it."""
     before, first = diagnosis.before, diagnosis.likeliest
-    numbers = {each.number for each in before.outlying} | before.readings.disturbed
+    numbers = {each.number for each in before.outlying} | before.readings.disturbed | {*diagnosis.apart}
     return sorted(numbers | ({first.dwell} if first is not None and first.dwell else set()))
 
 
@@ -396,7 +396,8 @@ def next_steps(diagnosis: Diagnosis, typed: str) -> list[NextStep]:
     typed: recording and options of the command that was given, as words of a shell; "" outside the command line, where
     no command can be told.
     """
-    steps = list(_steps(diagnosis, typed))
+    without = "".join(f" --leave-out {number}" for number in diagnosis.apart)
+    steps = list(_steps(diagnosis, f"{typed}{without}"))
     if typed:
         return steps
     return [NextStep(each.why) for each in steps if not each.command or each.why.startswith("Measure")]
@@ -414,7 +415,9 @@ def _steps(diagnosis: Diagnosis, typed: str) -> Iterator[NextStep]:
         number = before.outlying[0].number
         yield NextStep(f"Try the run without dwell {number}", f"kf-calib diagnose {typed} --leave-out {number}")
     elif diagnosis.likeliest is not None and (number := diagnosis.likeliest.dwell):
-        yield NextStep(f"Try the run without dwell {number}", f"kf-calib diagnose {typed} --leave-out {number}")
+        numbers = [*diagnosis.apart, number]
+        dwells = f"dwell{'s' * (len(numbers) > 1)} {' and '.join(map(str, numbers))}"
+        yield NextStep(f"Try the run without {dwells}", f"kf-calib diagnose {typed} --leave-out {number}")
     elif diagnosis.sure:
         yield NextStep("Add it and see the error fall", f"kf-calib improve {typed}")
     else:

@@ -7,13 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.independent_bench import G, IndependentBench, State
 from helpers.long_runs import slow
+from scipy.spatial.transform import Rotation
 from unknown_trials.small_bench import RATE_HZ, WHITE_MPS2, SmallRun, visits
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.diagnosis.missing_effect import diagnose
+from kf_calib.diagnosis.stepwise_selection import improve
 from kf_calib.estimation.calibration import calibrate
-from kf_calib.views.diagnosis import disturbed_dwells, verdict
+from kf_calib.views.diagnosis import disturbed_dwells, next_steps, verdict
 
 DWELLS, READINGS, DISTURBED = 27, 240, 10
 
@@ -81,3 +84,64 @@ def test_a_swing_of_all_dwells_is_one_of_the_run(seed: int) -> None:
     time_s = at.time_s[:, :, None]
     swing = 3e-5 * np.sin(2.0 * np.pi * 0.7 * time_s + np.array([0.0, 1.0, 2.0]))
     assert diagnose(SmallRun(at, swing, seed)).missing == ("sinusoid",)
+
+
+# A dwell that is off is a term beside all others: what else is missing is told by the other dwells
+
+
+def second_order(state: State, size_per_mps2: float) -> np.ndarray:
+    """In the second channel, by the force there: small angles of its axis change it by nothing that counts."""
+    turned = Rotation.from_euler("YZX", state.angles_rad)
+    force = turned.inv().apply([0.0, G, 0.0])
+    return size_per_mps2 * force[:, [1]] ** 2 * np.array([0.0, 1.0, 0.0])
+
+
+def burst(state: State, *dwells: int) -> np.ndarray:
+    """A door that is slammed 3 s after the arrival in some dwells, from 1."""
+    later_s = state.since_s - 3.0
+    shakes = np.isin(state.dwell + 1, dwells) & (later_s > 0.0)
+    return 4e-4 * (shakes * np.exp(-np.maximum(later_s, 0.0) / 2.0))[:, None] * np.array([1.0, -0.6, 0.3])
+
+
+@pytest.mark.parametrize("size", [8e-6, *slow(1e-6)])
+@pytest.mark.parametrize("seed", [1, *slow(2, 3)])
+def test_an_effect_is_named_beside_a_disturbed_dwell(seed: int, size: float) -> None:
+    """It was dwell 9 alone with over 99.9 %, and nothing was said of the effect."""
+    source = IndependentBench(seed, 18, bias=lambda state: second_order(state, size) + burst(state, 9))
+    diagnosis = diagnose(source)
+    assert diagnosis.missing == ("second-order",) and disturbed_dwells(diagnosis) == [9]
+    found = diagnosis.after.parameters["K2_2"] if diagnosis.after else None
+    assert found is not None and abs(found.value - size) < 4.0 * found.sigma
+    assert "Dwell 9 does not fit" in diagnosis.verdict and diagnosis.disturbed_readings is not None
+    assert next_steps(diagnosis, "run.mcap")[0].command.endswith("--leave-out 9")
+
+
+@pytest.mark.parametrize("seed", [1, *slow(3, 4)])
+def test_an_effect_is_added_beside_a_mistyped_pose(seed: int) -> None:
+    """A dwell 2 deg off, which nothing but another angle explains."""
+
+    def off(state: State) -> np.ndarray:
+        return np.radians(2.0) * (state.dwell == 6)[:, None] * np.array([0.0, 0.0, 1.0])
+
+    source = IndependentBench(seed, 18, gimbals=off, bias=lambda state: second_order(state, 8e-6))
+    improved = improve(source)
+    assert [step.name for step in improved.steps] == ["second-order"] and improved.because == "consistent"
+    assert improved.result.settings.left_out == (7,) and "Dwell 7 does not fit" in improved.reason
+
+
+@pytest.mark.parametrize("seed", [1, *slow(2, 3)])
+def test_several_disturbed_dwells_are_told(seed: int) -> None:
+    """They were irregular changes with over 99.9 %, and the advice was a random walk of the biases."""
+    diagnosis = diagnose(IndependentBench(seed, 18, bias=lambda state: burst(state, 5, 12)))
+    assert diagnosis.missing == () and disturbed_dwells(diagnosis) == [5, 12]
+    assert "Dwells" in diagnosis.verdict and "are wrong" in diagnosis.verdict
+    assert diagnose(IndependentBench(seed, 18, bias=lambda state: burst(state, 5, 12)), replicate=False).unknown
+
+
+def test_readings_that_change_in_all_dwells_are_no_disturbed_dwells() -> None:
+    def creeping(state: State) -> np.ndarray:
+        signs = np.random.default_rng(1).choice([-1.0, 1.0], 18)[np.minimum(state.dwell, 17)]
+        return 2e-4 * (signs * np.exp(-state.since_s / 3.0))[:, None] * np.array([1.0, 1.0, 0.0])
+
+    diagnosis = diagnose(IndependentBench(4, 18, bias=creeping))
+    assert diagnosis.apart == () and diagnosis.test.consistent is False

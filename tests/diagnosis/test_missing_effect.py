@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import chi2
 
 from kf_calib.diagnosis import missing_effect
-from kf_calib.diagnosis.missing_effect import _diagnosed, _without_vibration
+from kf_calib.diagnosis.missing_effect import _of_all_dwells, _without_vibration
 
 
 def refits_to(amplitudes: tuple[float, float], misfit: float = 0.0, dof: int = 0) -> Any:
@@ -90,7 +90,7 @@ def test_vibration_is_averaged_once_and_lines_that_are_left_are_vibration_too(
         assess=lambda which: Tests("first") if which is run else averaged,
         averaged=lambda which, window_s: "averaged run" if source and window_s == 0.5 else None,
     )
-    _diagnosed(refits, run)
+    _of_all_dwells(refits, run)
     last = "averaged without lines, vibration told" if lines_left else "averaged, vibration told"
     again = [("averaged run", last)] if angles and source and not averaged_before else []
     assert explained == [(run, "first"), *again]
