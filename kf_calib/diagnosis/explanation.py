@@ -37,8 +37,8 @@ class EffectShape:
     - quantity: SI unit of all that follows: m/s^2 of C = 3 accelerometers, or rad of the C = 1 turn of the platform,
       which is NaN in dwells that do not show it.
     - residuals: what the model without the effect leaves. left: what the model with it leaves.
-    - component: what the fitted effect adds. component_sigma: of the component; of readings, less its mean over the
-      dwells, as the biases take up any mean.
+    - component: what the fitted effect adds, about its mean where that is larger than all changes. component_sigma: of
+      the component; of readings, less its mean over the dwells, as the biases take up any mean.
     - sigma: of a dwell, as the misfit is judged. bars: of noise alone, and with the scatter that the fit estimates.
     - is_curve: whether the component is nearly a function of the quantity.
     - gimbal: number, from 1, of the one about which the platform turns; 0 for readings of accelerometers.
@@ -99,6 +99,7 @@ def _drawn_together(effect: Effect) -> tuple[str, int | None]:
 
 def _shape(before: Calibration, after: Calibration, effects: Sequence[Effect]) -> EffectShape:
     (component, component_sigma), left = _component(after, effects), unexplained_mps2(after)
+    component = component - _constant(component)
     residuals, quantity, sigmas = before.residuals_mps2, "m/s^2", (mean_sigmas(before), *bars_of(after))
     axis = axis_of(effects, before.bench)
     gimbal = turned_gimbal(effects) if axis else 0
@@ -137,6 +138,13 @@ def _framed(effects: Sequence[Effect]) -> bool:
 def _name(effects: Sequence[Effect]) -> str:
     """Return the effects as a sum, formulas without the names that they were given."""
     return " + ".join(effect.title if is_formula(effect) else str(effect) for effect in effects)
+
+
+def _constant(component: Floats) -> Floats:
+    """Return the mean (3,) of what an effect adds where all that it changes is less than what it always adds, as of a
+    decay far longer than the run: the biases take that up; zeros elsewhere."""
+    far = np.abs(component).min(axis=0) > np.ptp(component, axis=0)
+    return np.where(far, component.mean(axis=0), 0.0)
 
 
 def _component(after: Calibration, effects: Sequence[Effect]) -> tuple[Floats, Floats]:

@@ -304,7 +304,7 @@ def _with_alternatives(state: Improvement, refits: Refits) -> Improvement:
     earlier one."""
     diagnosis, result = state.diagnosis, state.result
     if _rivals(diagnosis) and diagnosis.table is not None:
-        rows = [row for row in (diagnosis.table.first, *diagnosis.table.rivals) if row.effects and not row.formulas]
+        rows = [row for row in (diagnosis.table.first, *diagnosis.table.rivals) if row.effects and not row.driver]
         equal = [Alternative(" + ".join(row.effects), row.refit) for row in rows if row.refit is not None]
         return replace(state, alternatives=tuple(equal))
     alternatives, effects = list[Alternative](), list(result.settings.effects)

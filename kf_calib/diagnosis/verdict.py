@@ -11,6 +11,7 @@ from kf_calib.diagnosis.refits import dwell_noise_is_stated
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.estimation.dwell_pass import holds_its_oscillation
 from kf_calib.estimation.results import Parameter, format_p
+from kf_calib.support.tail_probabilities import LEVEL
 from kf_calib.support.units import shown
 
 _AS_LIKELY = 0.25  # share of the likeliest from which another explanation is told together with it
@@ -190,8 +191,17 @@ def _unknown(diagnosis: Diagnosis, first: Hypothesis) -> str:
         )
     but = f", but {diagnosis.unearned}" if diagnosis.unearned else ""
     said = f"{what} ({format_probability(first.probability)}){but}{_others(diagnosis)}"
-    alone = _of_one(diagnosis) if first.driver == IRREGULAR else ""
+    alone = f"{_of_one(diagnosis)}{_within(diagnosis)}" if first.driver == IRREGULAR else ""
     return f"Unknown: no known effect explains it, {said}.{alone}"
+
+
+def _within(diagnosis: Diagnosis) -> str:
+    """Return a sentence on readings that change within dwells as noise does not; "" where they do not."""
+    trend = diagnosis.test.trend
+    if trend is None or trend.run_p >= LEVEL:
+        return ""
+    dwell, channel = trend.most
+    return f" The readings change within dwells, too, most in dwell {dwell}, accelerometer {channel}."
 
 
 def _noise(diagnosis: Diagnosis, first: Hypothesis) -> str:

@@ -73,8 +73,10 @@ class _Means:
         self._prior = np.column_stack([of_prior, -of_prior @ along])
         self._to_parameters = _jacobian(state) @ turn[: len(state)]
         size = math.sqrt(float(readings @ readings) / max(self.freedom, 1)) + FLOOR_MPS2
-        shapes = [FREE[part].shapes(means, state).sum(axis=0) for part in free]
-        shapes = [np.broadcast_to(shape, (len(means.counts), 3, 3)) for shape in shapes]
+        shapes = [np.broadcast_to(FREE[part].shapes(means, state).sum(axis=0), (len(means.counts), 3, 3))
+                  for part in free]  # fmt: skip
+        if free[0] == "common" and noise.scatter_mps2.any():  # as unequal in the accelerometers as it was estimated
+            shapes[0] = shapes[0] * noise.scatter_mps2**2 / np.mean(noise.scatter_mps2**2)
         self._units = np.array([size**2 / np.einsum("dii->di", shape).max(axis=1).mean() for shape in shapes])
         self._used = mean_covariances(noise, means, state)
         self._known, self._shapes = mean_covariances(known, means, state), np.array(shapes)
