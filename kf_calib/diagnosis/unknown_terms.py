@@ -22,6 +22,7 @@ _DECAYS_S = (1, 3, 10, 30, 100, 300, 1000, 3000)
 _CREEPS_S = (3, 10, 30)  # of a platform after its arrival
 _STEADY_K = 0.1  # a temperature that changes by less drives nothing
 _MOST_MOMENTS = 100  # at which a jump is tried
+_SUMS = ((1, 1), (1, -1), (2, 1), (2, -1), (1, 2), (1, -2), (2, 2), (2, -2))  # of two angles, in turns of each
 _TURNS = (0.5, 1, 1.5, 2, 3, 4, 6, 8)  # of what is periodic, in a run
 
 
@@ -94,7 +95,7 @@ def _varies(dwells: Sequence[Dwell]) -> bool:
 def _of_gimbals(count: int, slow: Sequence[tuple[str, str]]) -> Iterator[UnknownTerm]:
     """slow: what changes slowly, in words and as formulas have it."""
     for k in range(1, count + 1):
-        waves = {n: (f"sin({n}*q{k})", f"cos({n}*q{k})") for n in (1, 2, 3, 4, 6)}
+        waves = {n: _waves(_turned(n, k)) for n in (1, 2, 3, 4, 6)}
         weights = [n**-0.5 for n in waves]
         yield _term(f"angle of gimbal {k}", "", [*waves.values()], weights)
         products = [_times(waves[n], force) for n in (1, 2) for force in ("a", "p", "o")]
@@ -111,7 +112,20 @@ def _of_gimbals(count: int, slow: Sequence[tuple[str, str]]) -> Iterator[Unknown
                         [_turning(str(j), texts) for texts in turning], (1.0, *weights))  # fmt: skip
         for place, words in (("base", "a tilt of the base"), ("platform", "a rotation of the platform")):
             yield _term(f"angle of gimbal {k} ({words})", "gimbal and encoder",
-                        [_turning(place, texts) for texts in turning[:3]], (1.0, *weights[:2]))  # fmt: skip
+                        [_turning(place, texts) for texts in turning[:5]], (1.0, *weights[:4]))  # fmt: skip
+    for k, j in itertools.combinations(range(1, count + 1), 2):
+        angles = [f"{_turned(n, k)}{'-' if m < 0 else '+'}{_turned(abs(m), j)}" for n, m in _SUMS]
+        weights = [max(n, abs(m)) ** -0.5 for n, m in _SUMS]
+        yield _term(f"angles of gimbals {k} and {j}", "", [*map(_waves, angles)], weights)
+
+
+def _turned(turns: int, gimbal: int) -> str:
+    """An angle, a number of times."""
+    return f"q{gimbal}" if turns == 1 else f"{turns}*q{gimbal}"
+
+
+def _waves(angle: str) -> tuple[str, str]:
+    return f"sin({angle})", f"cos({angle})"
 
 
 def _neighbours(texts: Sequence[str]) -> list[tuple[str, ...]]:
