@@ -36,7 +36,7 @@ LISTED = 0.01
 
 PRIOR = {"nothing": 0.4, "effect": 0.38, "pair": 0.08, "unknown": 0.1, "beside": 0.02, "dwell": 0.02}
 """Prior probability of each kind of explanation; ``beside``: an effect beside an unknown function; ``dwell``: one dwell
-alone is off."""
+alone is off; of several, each has that of one."""
 
 _ALIKE = 0.05 * PRIOR["unknown"]  # of what has a known effect's look: what is in no catalogue, and 1 of 20 looks so
 
@@ -54,7 +54,7 @@ class Hypothesis:
     - statistic, dof: fall of chi-squared in the likeliest noise, and the number of coefficients; of a random walk alone
       twice its gain in likelihood; 0 of what was not fitted.
     - refit: the calibration with it; None where none was made.
-    - dwell: the number of the dwell that alone is off; 0 for none.
+    - dwells: the numbers of those that alone are off.
     """
 
     effects: tuple[str, ...] = ()
@@ -66,7 +66,7 @@ class Hypothesis:
     dof: int = 0
     refit: Calibration | None = None
     probability: float = 0.0
-    dwell: int = 0
+    dwells: tuple[int, ...] = ()
 
     @property
     def unknown(self) -> bool:

@@ -21,6 +21,7 @@ from kf_calib.bench.arrays import Floats, Indices
 
 _AT_ONCE = 1 << 20  # products that are computed together, so that they stay in the cache
 _ROUNDING = 1e-12  # share of a product that the model must leave
+_LOST = 1e-3  # share of what all dwells determine of the model, below which some of them determine nothing
 
 
 @dataclass(frozen=True)
@@ -96,11 +97,23 @@ class InNoises:
         off = np.moveaxis(self._off[:, :, group], 1, 2)  # (K, n, k, q)
         return gram + np.swapaxes(more, 1, 2) @ more - np.swapaxes(off, 2, 3) @ off
 
-    def dwells(self, k: int) -> tuple[Floats, Floats]:
-        """G^T W G (D, 3, 3) and G^T W z (D, 3) of offsets of the three accelerometers in one dwell alone."""
+    def dwells(self, k: int, without: Sequence[int] = ()) -> tuple[Floats, Floats]:
+        """G^T W G (D, 3, 3) and G^T W z (D, 3) of offsets of the three accelerometers in one dwell, as the others tell,
+        without some of them. Raises LinAlgError where these do not determine the model."""
+        rows, kept = self._rows, np.ones(len(self._rows))
+        kept[list(without)] = 0.0
         weights = self._turns @ (self._weights[k][:, :, None] * np.swapaxes(self._turns, 1, 2))
-        off = self._inverse[k] @ np.swapaxes(self._rows.basis, 1, 2) @ weights
-        left = self._rows.readings - self._rows.basis @ (self._inverse[k].T @ self._off[k, :, -1])
+        weighted = weights @ rows.basis
+        of_basis = np.tensordot(rows.basis * kept[:, None, None], weighted, axes=((0, 1), (0, 1)))
+        lower = np.linalg.cholesky(of_basis + rows.more_basis.T @ rows.more_basis)
+        if np.min(np.diag(lower) * np.diag(self._inverse[k])) < _LOST:
+            raise np.linalg.LinAlgError("the others do not determine the model")
+        inverse = np.linalg.inv(lower)
+        along = np.tensordot(weighted * kept[:, None, None], rows.readings, axes=((0, 1), (0, 1)))
+        along = inverse.T @ (inverse @ (along + rows.more_basis.T @ rows.more_readings))
+        off = inverse @ np.swapaxes(weighted, 1, 2)
+        left = (rows.readings - rows.basis @ along) * kept[:, None]
+        off *= kept[:, None, None]
         return weights - np.swapaxes(off, 1, 2) @ off, (weights @ left[..., None])[..., 0]
 
     def explained_by(self, groups: Sequence[Indices], sizes: Sequence[int]) -> list[list[Floats]]:

@@ -91,12 +91,13 @@ def _diagnosed(refits: Refits, before: Calibration) -> Diagnosis:
     """Diagnose a calibration: a dwell that alone is off is a term beside all others, which takes all that it says, so
     that what else is missing is told by the other dwells."""
     diagnosis = _of_all_dwells(refits, before)
-    number = diagnosis.likeliest.dwell if diagnosis.likeliest else 0
-    rest = refits.without_dwell(before, number) if number else None
+    numbers = tuple(dwell.number for dwell in before.outlying[:1])
+    numbers = diagnosis.likeliest.dwells if diagnosis.likeliest else numbers
+    rest = refits.without_dwells(before, numbers) if numbers else None
     beside = None if rest is None else _diagnosed(refits, rest)
     if beside is None or beside.test.consistent is not False:
         return diagnosis
-    return _in_words(replace(beside, apart=(number, *beside.apart)))
+    return _in_words(replace(beside, apart=(*numbers, *beside.apart)))
 
 
 def _of_all_dwells(refits: Refits, before: Calibration) -> Diagnosis:

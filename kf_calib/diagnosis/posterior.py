@@ -45,6 +45,7 @@ from kf_calib.support import stage
 from kf_calib.support.tail_probabilities import log_odds_of
 
 _IRREGULAR = 0.1  # share of an unknown cause in scatter that was not stated
+_MOST_APART, _MASKED = 0.25, 3  # share of the dwells that may be off; how many may hide each other
 _AGAINST_STATED = 0.5  # the same of scatter beyond what was stated
 _OF_ORIENTATION = 0.8  # share of unknown causes that depend on the orientation alone, and come back with it
 _WITHIN = 0.01  # prior probability of irregular changes that show within dwells only
@@ -56,7 +57,7 @@ _REFITTED, _ALWAYS = 8, 3  # rows of effects that are fitted at most, and single
 _BEHIND, _BENT = 10.0, 0.02  # in log evidence, and share of the gain: rows further behind are not fitted
 _DESCRIBED = 5.0  # in log evidence: rows of unknown functions further behind get no formula
 _NODES_OF_PAIR = 16  # sizes of each of two effects
-_ROUNDING, _UNSEEN = 1e-6, 1e-3  # least scatter over the misfit: where noise within dwells was seen, and where not
+_ROUNDING, _UNSEEN = 1e-5, 1e-3  # least scatter over the misfit: where noise within dwells was seen, and where not
 _SUMMANDS, _MORE = 3, 3.0  # formulas that describe an unknown function at most, and what each has to gain
 
 
@@ -80,7 +81,7 @@ class RunPosterior:
     def table(self, refitted: bool = True) -> HypothesisTable:
         """All rows with their probabilities; the likeliest are fitted if ``refitted``."""
         stage.say(f"weighing {len(self._run.terms)} explanations in {len(self._sizes.covariances)} noises")
-        rows = [*self._without_terms(), *self._singles(), self._one_dwell()]
+        rows = [*self._without_terms(), *self._singles(), self._dwells_apart()]
         if refitted:
             rows = self._fitted([*rows, *self._pairs()])
             rows = [self._with_changes_beside_walk(row, rows) if row.driver == IRREGULAR else row for row in rows]
@@ -224,17 +225,34 @@ class RunPosterior:
             return float(effects.scan.statistics[effects.best[name]]), effects.candidate(name).dof
         return 2.0 * self._before.fit.walk_gain, 1
 
-    def _one_dwell(self) -> Hypothesis:
-        """Return the row of one dwell that alone is off, by any amount, and whose readings may change in any way; or
-        with it others whose readings do."""
-        courses, prior = self._run.likelihood.courses, PRIOR["dwell"] / len(self._before.fit.dwells)
-        of_courses = np.logaddexp(0.0, courses.log_bayes()) - math.log(2.0)
-        means = [log_bayes_of_any_size(*self._noises[family].dwells(size)) for family, size in self._at]
-        of_dwells = np.array([own + of_courses + courses.log_bayes_of_others(own, prior) for own in means]).T
-        logs = np.logaddexp.reduce(self._sizes.evidence(self._base + of_dwells), axis=1)
-        number = self._before.fit.dwells[int(np.argmax(logs))].number
-        log = _log_sum(logs.tolist()) - math.log(len(logs)) + math.log(PRIOR["dwell"])
-        return Hypothesis(driver=f"dwell {number} alone", families=(NONE,), log_evidence=log, dwell=number)
+    def _dwells_apart(self) -> Hypothesis:
+        """Return the row of one dwell that alone is off, by any amount, and whose readings may change in any way; or of
+        several, of which each next one is off by what the dwells without those before it tell."""
+        dwells, chosen, before = self._before.fit.dwells, list[int](), np.zeros(len(self._at))
+        rows, log_prior = [-math.inf], math.log(PRIOR["dwell"] / len(dwells))
+        while len(chosen) < min(max(len(dwells) * _MOST_APART, 1.0), int(np.argmax(rows)) + _MASKED):
+            try:
+                of_dwells = self._log_bayes_of_dwells(chosen, math.exp(log_prior))
+            except np.linalg.LinAlgError:
+                break
+            logs = np.logaddexp.reduce(self._sizes.evidence(self._base + before + of_dwells), axis=1)
+            in_none = (before + of_dwells)[:, 0]  # in large noise any dwell is as good as any other
+            in_none[chosen] = -math.inf
+            k = int(np.argmax(in_none))
+            rows.append(float(logs[k]) + log_prior * len(rows) if chosen else _log_sum(logs.tolist()) + log_prior)
+            chosen, before = [*chosen, k], before + of_dwells[k]
+        numbers = tuple(sorted(dwells[k].number for k in chosen[: int(np.argmax(rows))]))
+        words = f"dwell{'s' * (len(numbers) > 1)} {' and '.join(map(str, numbers))} alone"
+        return Hypothesis(driver=words, families=(NONE,), log_evidence=max(rows), dwells=numbers)
+
+    def _log_bayes_of_dwells(self, without: Sequence[int], prior: float) -> Floats:
+        """Return log Bayes factors (D, noises) of changes of each dwell, as the dwells tell without some of them, each
+        of which changes with a prior probability."""
+        courses = self._run.likelihood.courses
+        changes = courses.log_bayes_of_some(prior) if without else courses.log_bayes()
+        changes = np.logaddexp(0.0, changes) - math.log(2.0)
+        means = [self._noises[family].dwells(size, without) for family, size in self._at]
+        return np.array([log_bayes_of_any_size(*of_noise) + changes for of_noise in means]).T
 
     def _pairs(self) -> list[Hypothesis]:
         """Return the rows of the likeliest effects, each with any other term beside it."""

@@ -64,15 +64,13 @@ class Refits:
         """The run of a calibration with further effects in the model."""
         return self.of(before, (*before.settings.effects, *added))
 
-    def without_dwell(self, before: Calibration, number: int) -> Calibration | None:
-        """The run of a calibration without a dwell; None where the others do not determine the model."""
-        dwells, settings = before.fit.dwells, before.settings
-        k = dwells.folded.numbers.tolist().index(number)
-        settings, slews = replace(settings, left_out=(*settings.left_out, number)), before.linearised.slews
-        beginning = before.fit.beginning
+    def without_dwells(self, before: Calibration, numbers: Sequence[int]) -> Calibration | None:
+        """The run of a calibration without some dwells; None where the others do not determine the model."""
+        dwells, slews = before.fit.dwells, before.linearised.slews
+        settings = replace(before.settings, left_out=(*before.settings.left_out, *numbers))
+        others = dwells.without(np.flatnonzero(np.isin(dwells.folded.numbers, numbers)).tolist())
         try:
-            walk_mps2_per_sqrt_s = settings.walk_mps2_per_sqrt_s
-            fitted = fit(dwells.without((k,)), before.model, walk_mps2_per_sqrt_s, slews, beginning=beginning)
+            fitted = fit(others, before.model, settings.walk_mps2_per_sqrt_s, slews, beginning=before.fit.beginning)
             return replace(evaluate_fit(fitted, settings), tally=before.tally, readings=before.readings)
         except (InputError, UnobservableError):
             return None

@@ -33,7 +33,7 @@ _FAMILIES = {
 def verdict_in_words(diagnosis: Diagnosis) -> str:
     """The verdict of a diagnosis in one sentence, with what else it could be, after the dwells that do not fit."""
     first = diagnosis.likeliest
-    apart = () if first is not None and first.dwell else diagnosis.apart
+    apart = () if first is not None and first.dwells else diagnosis.apart
     return f"{dwells_apart(apart)}{_of_the_others(diagnosis)}"
 
 
@@ -47,7 +47,8 @@ def dwells_apart(numbers: Sequence[int]) -> str:
 
 def _dwells(numbers: Sequence[int]) -> str:
     """Return the numbers of dwells as the beginning of a sentence."""
-    return f"Dwell{'s' * (len(numbers) > 1)} {' and '.join(map(str, numbers))}"
+    *many, last = map(str, sorted(numbers))
+    return f"Dwells {', '.join(many)} and {last}" if many else f"Dwell {last}"
 
 
 def _of_the_others(diagnosis: Diagnosis) -> str:
@@ -168,17 +169,15 @@ def _unexplained(diagnosis: Diagnosis) -> str:
 
 def _unknown(diagnosis: Diagnosis, first: Hypothesis) -> str:
     """Return a sentence on a misfit that no known effect explains."""
-    if first.dwell and diagnosis.apart:
-        numbers = *diagnosis.apart, first.dwell
+    if first.dwells:
+        numbers = sorted((*diagnosis.apart, *first.dwells))
         options = " ".join(f"--leave-out {number}" for number in numbers)
+        several = len(numbers) > 1
         return (
-            f"{_dwells(numbers)} are wrong: they alone do not fit ({format_probability(first.probability)}"
-            f"{_others(diagnosis)}): look at their poses and their readings, or leave them out ({options})."
-        )
-    if first.dwell:
-        return (
-            f"One dwell is wrong: dwell {first.dwell} alone does not fit ({format_probability(first.probability)}"
-            f"{_others(diagnosis)}): look at its pose and its readings, or leave it out (--leave-out {first.dwell})."
+            f"{_dwells(numbers)} {'are' if several else 'is'} wrong: {'they alone do' if several else 'it alone does'} "
+            f"not fit ({format_probability(first.probability)}{_others(diagnosis)}): look at "
+            f"{'their poses and their' if several else 'its pose and its'} readings, or leave "
+            f"{'them' if several else 'it'} out ({options})."
         )
     what = "it changes irregularly" if first.driver == IRREGULAR else f"it goes with {first.driver}"
     assert diagnosis.table is not None

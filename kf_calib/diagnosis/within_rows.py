@@ -44,21 +44,12 @@ class Courses:
         """Log Bayes factors (D,) of whatever changes the course of one dwell, averaged over its size."""
         return np.logaddexp.reduce(self._by_size, axis=1) - math.log(len(_ANY_SIZE))
 
-    def log_bayes_of_others(self, means: Floats, prior: float) -> Floats:
-        """Log Bayes factors (D,) of changes in further dwells beside each one, in any that changes less with a prior
-        probability, where this is likelier than that all change alike.
-
-        means (D,): log Bayes factors of changes of their means, of which no more counts than of their courses: what
-        is missing in the model changes all means, a disturbance shows within its dwell, too.
-        """
+    def log_bayes_of_some(self, prior: float) -> Floats:
+        """The same (D,), where some dwells alone change, each with a prior probability; zeros where it is likelier that
+        all change alike."""
         own = self.log_bayes()
-        each = np.logaddexp(0.0, math.log(prior) + own)
         alike = float(np.logaddexp.reduce(self._by_size.sum(axis=0))) - math.log(len(_ANY_SIZE))
-        if alike > each.sum():
-            return np.zeros(len(own))
-        both = np.logaddexp(0.0, math.log(prior) + own + np.clip(means, 0.0, np.maximum(own, 0.0)))
-        less = np.cumsum(np.append(0.0, np.sort(both)))[np.argsort(np.argsort(both))]
-        return np.asarray(less, float)
+        return own if np.logaddexp(0.0, math.log(prior) + own).sum() > alike else np.zeros(len(own))
 
 
 class WithinRows:

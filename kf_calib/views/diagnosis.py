@@ -101,7 +101,7 @@ def disturbed_dwells(diagnosis: Diagnosis) -> list[int]:
     """The numbers of the dwells that something disturbed, as any test has it."""
     before, first = diagnosis.before, diagnosis.likeliest
     numbers = {each.number for each in before.outlying} | before.readings.disturbed | {*diagnosis.apart}
-    return sorted(numbers | ({first.dwell} if first is not None and first.dwell else set()))
+    return sorted(numbers | {*(first.dwells if first is not None else ())})
 
 
 def _hypotheses_object(table: HypothesisTable | None) -> list[dict[str, Any]]:
@@ -414,10 +414,11 @@ def _steps(diagnosis: Diagnosis, typed: str) -> Iterator[NextStep]:
     elif before.outlying:
         number = before.outlying[0].number
         yield NextStep(f"Try the run without dwell {number}", f"kf-calib diagnose {typed} --leave-out {number}")
-    elif diagnosis.likeliest is not None and (number := diagnosis.likeliest.dwell):
-        numbers = [*diagnosis.apart, number]
+    elif diagnosis.likeliest is not None and diagnosis.likeliest.dwells:
+        options = "".join(f" --leave-out {number}" for number in diagnosis.likeliest.dwells)
+        numbers = [*diagnosis.apart, *diagnosis.likeliest.dwells]
         dwells = f"dwell{'s' * (len(numbers) > 1)} {' and '.join(map(str, numbers))}"
-        yield NextStep(f"Try the run without {dwells}", f"kf-calib diagnose {typed} --leave-out {number}")
+        yield NextStep(f"Try the run without {dwells}", f"kf-calib diagnose {typed}{options}")
     elif diagnosis.sure:
         yield NextStep("Add it and see the error fall", f"kf-calib improve {typed}")
     else:

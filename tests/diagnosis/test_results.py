@@ -13,7 +13,7 @@ from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.unknown_effect import Description
 
 LIKELIEST = {
-    "dwell": 0,
+    "dwells": (),
     "formulas": ("mine = T",),
     "driver": "temperature",
     "refit": SimpleNamespace(consistency="of refit"),
@@ -23,7 +23,7 @@ LIKELIEST = {
 @pytest.mark.parametrize(("unknown", "outlying", "likeliest", "expected"), [
     (False, (), LIKELIEST, None), (True, ("dwell 3",), LIKELIEST, None), (True, (), None, "looked for"),
     (True, (), LIKELIEST | {"formulas": ()}, "looked for"), (True, (), LIKELIEST | {"refit": None}, "looked for"),
-    (True, (), LIKELIEST | {"dwell": 3}, None),
+    (True, (), LIKELIEST | {"dwells": (3,)}, None),
     (True, (), LIKELIEST, Description("z", "temperature", 0.8, ("mine = T",))),
 ])  # fmt: skip
 def test_an_unknown_misfit_is_described_by_the_formulas_that_were_refitted_or_looked_for(

@@ -78,7 +78,7 @@ def _said(found: Calibration, truth: Truth) -> dict[str, Any]:
 def label_of(row: Hypothesis) -> str:
     """A row of the table as a truth is labelled: what is irregular is noise, what only looks like an effect unknown."""
     effects = " + ".join(sorted(row.effects))
-    if row.dwell:
+    if row.dwells:
         return DWELL
     if row.driver and row.driver != hypothesis_table.IRREGULAR:
         return f"{effects} + {UNKNOWN}" if effects else UNKNOWN
