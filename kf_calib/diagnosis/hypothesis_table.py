@@ -54,7 +54,7 @@ class Hypothesis:
     - statistic, dof: fall of chi-squared in the likeliest noise, and the number of coefficients; of a random walk alone
       twice its gain in likelihood; 0 of what was not fitted.
     - refit: the calibration with it; None where none was made.
-    - dwells: the numbers of those that alone are off.
+    - dwells: the numbers of those that alone are off, the clearest first.
     """
 
     effects: tuple[str, ...] = ()

@@ -21,6 +21,7 @@ from kf_calib.bench.arrays import Floats, Indices
 
 _AT_ONCE = 1 << 20  # products that are computed together, so that they stay in the cache
 _ROUNDING = 1e-12  # share of a product that the model must leave
+_SEEN = 1e-6  # share of the largest part of some columns that a part of them has at least
 _LOST = 1e-3  # share of what all dwells determine of the model, below which some of them determine nothing
 
 
@@ -40,6 +41,21 @@ class Spanned:
 
     def __len__(self) -> int:
         return len(self.basis)
+
+    def beside(self, places: Indices) -> Spanned:
+        """The rows with some of the columns in the model, without any others."""
+        columns, more = self.columns[..., places], self.more_columns[:, places]
+        lengths = np.sqrt(np.einsum("dic,dic->c", columns, columns) + np.sum(more**2, axis=0))
+        count = columns.shape[0] * columns.shape[1]
+        scaled = np.vstack([columns.reshape(count, len(places)), more]) / np.where(lengths > 0.0, lengths, 1.0)
+        left, singular, _ = np.linalg.svd(scaled, full_matrices=False)
+        left = left[:, singular > _SEEN * singular.max(initial=0.0)]
+        of_means, of_more = left[:count].reshape(*columns.shape[:2], left.shape[1]), left[count:]
+        along = np.tensordot(of_means, self.readings, axes=((0, 1), (0, 1))) + of_more.T @ self.more_readings
+        return Spanned(
+            np.concatenate([self.basis, of_means], axis=2), columns[..., :0], self.readings - of_means @ along,
+            np.hstack([self.more_basis, of_more]), more[:, :0], self.more_readings - of_more @ along, self.log,
+        )  # fmt: skip
 
     def turned(self, dwells: slice, turns: Floats) -> Floats:
         """Rows [Q G z] (r, k + C + 1) of some dwells, turned by U^T, U (D, 3, 3)."""
@@ -97,24 +113,29 @@ class InNoises:
         off = np.moveaxis(self._off[:, :, group], 1, 2)  # (K, n, k, q)
         return gram + np.swapaxes(more, 1, 2) @ more - np.swapaxes(off, 2, 3) @ off
 
-    def dwells(self, k: int, without: Sequence[int] = ()) -> tuple[Floats, Floats]:
+    def dwells(self, k: int, rows: Spanned, without: Sequence[int] = ()) -> tuple[Floats, Floats]:
         """G^T W G (D, 3, 3) and G^T W z (D, 3) of offsets of the three accelerometers in one dwell, as the others tell,
-        without some of them. Raises LinAlgError where these do not determine the model."""
-        rows, kept = self._rows, np.ones(len(self._rows))
+        without some of them.
+
+        rows: of the run, with or without columns that are in the model. Raises LinAlgError where the other dwells do
+        not determine it.
+        """
+        kept = np.ones((len(rows), 1, 1))
         kept[list(without)] = 0.0
         weights = self._turns @ (self._weights[k][:, :, None] * np.swapaxes(self._turns, 1, 2))
-        weighted = weights @ rows.basis
-        of_basis = np.tensordot(rows.basis * kept[:, None, None], weighted, axes=((0, 1), (0, 1)))
-        lower = np.linalg.cholesky(of_basis + rows.more_basis.T @ rows.more_basis)
-        if np.min(np.diag(lower) * np.diag(self._inverse[k])) < _LOST:
+        weighted, both = weights @ rows.basis, ((0, 1), (0, 1))
+        more = rows.more_basis.T @ rows.more_basis
+        lower = np.linalg.cholesky(np.tensordot(rows.basis * kept, weighted, axes=both) + more)
+        whole = np.linalg.cholesky(np.tensordot(rows.basis, weighted, axes=both) + more) if len(without) else lower
+        if np.min(np.diag(lower) / np.diag(whole)) < _LOST:
             raise np.linalg.LinAlgError("the others do not determine the model")
         inverse = np.linalg.inv(lower)
-        along = np.tensordot(weighted * kept[:, None, None], rows.readings, axes=((0, 1), (0, 1)))
-        along = inverse.T @ (inverse @ (along + rows.more_basis.T @ rows.more_readings))
-        off = inverse @ np.swapaxes(weighted, 1, 2)
-        left = (rows.readings - rows.basis @ along) * kept[:, None]
-        off *= kept[:, None, None]
-        return weights - np.swapaxes(off, 1, 2) @ off, (weights @ left[..., None])[..., 0]
+        along = np.tensordot(weighted * kept, rows.readings, axes=both) + rows.more_basis.T @ rows.more_readings
+        left = (rows.readings - rows.basis @ (inverse.T @ (inverse @ along))) * kept[..., 0]
+        off = inverse @ np.swapaxes(weighted * kept, 1, 2)
+        gram = weights - np.swapaxes(off, 1, 2) @ off
+        seen = np.einsum("dii->d", gram) > _SEEN * np.einsum("dii->d", weights)  # what columns in the model do not tell
+        return gram * seen[:, None, None], (weights @ left[..., None])[..., 0] * seen[:, None]
 
     def explained_by(self, groups: Sequence[Indices], sizes: Sequence[int]) -> list[list[Floats]]:
         """What the columns (q,) of each group explain of all columns and of the readings, (f, C + 1) in some of the

@@ -92,7 +92,7 @@ def _diagnosed(refits: Refits, before: Calibration) -> Diagnosis:
     that what else is missing is told by the other dwells."""
     diagnosis = _of_all_dwells(refits, before)
     numbers = tuple(dwell.number for dwell in before.outlying[:1])
-    numbers = diagnosis.likeliest.dwells if diagnosis.likeliest else numbers
+    numbers = diagnosis.likeliest.dwells[:1] if diagnosis.likeliest else numbers
     rest = refits.without_dwells(before, numbers) if numbers else None
     beside = None if rest is None else _diagnosed(refits, rest)
     if beside is None or beside.test.consistent is not False:
@@ -216,6 +216,9 @@ def _decided(refits: Refits, diagnosis: Diagnosis) -> Diagnosis:
     before, table = diagnosis.before, diagnosis.table
     assert table is not None
     first, test = table.first, diagnosis.test
+    if first.dwells:  # what else is missing is told by the others
+        scatter = table.families.get(NOISE, 0.0) > _DOUBT
+        return replace(diagnosis, unknown=True, as_scatter=scatter, suspects=_suspects(diagnosis, table))
     if not dwell_noise_is_stated(before) and first.refit is not None:
         before_in_noise_left = with_noise_as_stated(refits, before, first.refit)
         retest = refits.assess(before_in_noise_left)

@@ -19,12 +19,14 @@ import numpy as np
 from kf_calib.bench.arrays import Floats, Indices
 from kf_calib.diagnosis.candidate_tests import CandidateTests
 from kf_calib.diagnosis.coefficient_sizes import best_sigma, usual_sizes
+from kf_calib.diagnosis.dwells_apart import DwellsApart
 from kf_calib.diagnosis.hypothesis_table import (
     IRREGULAR,
     NOISE,
     NONE,
     NOTHING,
     PRIOR,
+    SURE,
     Hypothesis,
     HypothesisTable,
     table_of,
@@ -33,7 +35,7 @@ from kf_calib.diagnosis.in_noises import InNoises
 from kf_calib.diagnosis.noise_sizes import NoiseFamily, NoiseSizes
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.run_likelihood import Projected, RunLikelihood, log_bayes_together
-from kf_calib.diagnosis.run_terms import RunTerms, log_bayes_of_any_size, log_bayes_of_columns, sizes_of
+from kf_calib.diagnosis.run_terms import RunTerms, log_bayes_of_columns, sizes_of
 from kf_calib.diagnosis.unknown_terms import name_of_formula, text_named
 from kf_calib.dwells.qr import orthonormal
 from kf_calib.effects import effect_named
@@ -45,7 +47,7 @@ from kf_calib.support import stage
 from kf_calib.support.tail_probabilities import log_odds_of
 
 _IRREGULAR = 0.1  # share of an unknown cause in scatter that was not stated
-_MOST_APART, _MASKED = 0.25, 3  # share of the dwells that may be off; how many may hide each other
+_BESIDE = 2  # rows of effects, and of unknown functions, beside which dwells are tried
 _AGAINST_STATED = 0.5  # the same of scatter beyond what was stated
 _OF_ORIENTATION = 0.8  # share of unknown causes that depend on the orientation alone, and come back with it
 _WITHIN = 0.01  # prior probability of irregular changes that show within dwells only
@@ -84,7 +86,9 @@ class RunPosterior:
         rows = [*self._without_terms(), *self._singles(), self._dwells_apart()]
         if refitted:
             rows = self._fitted([*rows, *self._pairs()])
+            beside = self._dwells_beside(rows)
             rows = [self._with_changes_beside_walk(row, rows) if row.driver == IRREGULAR else row for row in rows]
+            rows = _with_sure_dwells(rows, beside)
         rows = [row for row in rows if math.isfinite(row.log_evidence)]
         table = replace(table_of(rows), scattering=self._scattering)
         return replace(table, same=self._same_as(table.first)) if refitted else table
@@ -226,33 +230,44 @@ class RunPosterior:
         return 2.0 * self._before.fit.walk_gain, 1
 
     def _dwells_apart(self) -> Hypothesis:
-        """Return the row of one dwell that alone is off, by any amount, and whose readings may change in any way; or of
-        several, of which each next one is off by what the dwells without those before it tell."""
-        dwells, chosen, before = self._before.fit.dwells, list[int](), np.zeros(len(self._at))
-        rows, log_prior = [-math.inf], math.log(PRIOR["dwell"] / len(dwells))
-        while len(chosen) < min(max(len(dwells) * _MOST_APART, 1.0), int(np.argmax(rows)) + _MASKED):
-            try:
-                of_dwells = self._log_bayes_of_dwells(chosen, math.exp(log_prior))
-            except np.linalg.LinAlgError:
-                break
-            logs = np.logaddexp.reduce(self._sizes.evidence(self._base + before + of_dwells), axis=1)
-            in_none = (before + of_dwells)[:, 0]  # in large noise any dwell is as good as any other
-            in_none[chosen] = -math.inf
-            k = int(np.argmax(in_none))
-            rows.append(float(logs[k]) + log_prior * len(rows) if chosen else _log_sum(logs.tolist()) + log_prior)
-            chosen, before = [*chosen, k], before + of_dwells[k]
-        numbers = tuple(sorted(dwells[k].number for k in chosen[: int(np.argmax(rows))]))
-        words = f"dwell{'s' * (len(numbers) > 1)} {' and '.join(map(str, numbers))} alone"
-        return Hypothesis(driver=words, families=(NONE,), log_evidence=max(rows), dwells=numbers)
+        """Return the row of dwells that are off, and nothing else is missing."""
+        run = self._run.likelihood
+        log, places = DwellsApart(run.spanned, run.courses, self._noises, self._sizes).likeliest()
+        numbers = self._numbers(places)
+        words = f"dwell{'s' * (len(numbers) > 1)} {' and '.join(map(str, sorted(numbers)))} alone"
+        return Hypothesis(driver=words, families=(NONE,), log_evidence=log, dwells=numbers)
 
-    def _log_bayes_of_dwells(self, without: Sequence[int], prior: float) -> Floats:
-        """Return log Bayes factors (D, noises) of changes of each dwell, as the dwells tell without some of them, each
-        of which changes with a prior probability."""
-        courses = self._run.likelihood.courses
-        changes = courses.log_bayes_of_some(prior) if without else courses.log_bayes()
-        changes = np.logaddexp(0.0, changes) - math.log(2.0)
-        means = [self._noises[family].dwells(size, without) for family, size in self._at]
-        return np.array([log_bayes_of_any_size(*of_noise) + changes for of_noise in means]).T
+    def _numbers(self, places: Sequence[int]) -> tuple[int, ...]:
+        """Return the numbers of some of the dwells."""
+        return tuple(self._before.fit.dwells[k].number for k in places)
+
+    def _dwells_beside(self, rows: Sequence[Hypothesis]) -> list[Hypothesis]:
+        """Return the rows of dwells that are off beside the likeliest effects, and beside the likeliest unknown
+        functions, where these leave more than noise."""
+        likeliest = sorted(rows, key=lambda row: -row.log_evidence)
+        known = [row for row in likeliest if row.effects and not row.driver and self._run.walk not in row.effects]
+        known = [row for row in known if row.refit is not None][:_BESIDE]
+        unknown = [row for row in likeliest if row.driver not in ("", IRREGULAR) and not (row.effects or row.dwells)]
+        both = [*known, *map(self._described, unknown[:_BESIDE])]
+        fitted = [(row, row.refit) for row in both if row.refit is not None]
+        return [self._with_dwells(row, refit) for row, refit in fitted if refit.consistency.consistent is False]
+
+    def _with_dwells(self, row: Hypothesis, refit: Calibration) -> Hypothesis:
+        """Return a row with dwells that are off beside what it has, where its fit is."""
+        known, run = self._before.model.count, self._run.likelihood
+        likelihood = RunLikelihood(refit.linearised, self._noise, self._least_mps2, known=known)
+        rows = likelihood.spanned.beside(np.arange(refit.model.count - known))
+        none, *others = self._sizes.families
+        noises = [InNoises(rows, none.shapes, np.zeros(1))]
+        noises += [InNoises(rows, family.shapes, self._sizes.squares) for family in others]
+        squares = np.minimum(
+            run.courses.squares, likelihood.courses.squares
+        )  # what it disturbs is for nobody to explain
+        apart = DwellsApart(rows, replace(run.courses, squares=squares), noises, self._sizes)
+        log, places = apart.likeliest()
+        without = self._sizes.evidence(np.concatenate([of_family.logs for of_family in noises])[None])[0]
+        gain = log - float(np.logaddexp.reduce(without))
+        return replace(row, dwells=self._numbers(places), log_evidence=row.log_evidence + gain)
 
     def _pairs(self) -> list[Hypothesis]:
         """Return the rows of the likeliest effects, each with any other term beside it."""
@@ -332,14 +347,20 @@ class RunPosterior:
         """Return the rows with the likeliest of them fitted, and weighed where their fit is."""
         best = max(row.log_evidence for row in rows)
         least = best - _BEHIND - _BENT * max(best - float(self._without.max()), 0.0)
-        effects = sorted((row for row in rows if row.effects and not row.driver), key=lambda row: -row.log_evidence)
+        linear = [row for row in rows if row.effects and not (row.driver or row.dwells)]
+        effects = sorted(linear, key=lambda row: -row.log_evidence)
         single = [row for row in effects if len(row.effects) == 1][:_ALWAYS]  # large effects are far from linear
         likeliest = {id(row) for row in [*single, *(row for row in effects[:_REFITTED] if row.log_evidence > least)]}
         fitted = self._steady([self._refitted(row) if id(row) in likeliest else row for row in rows])
-        while not (first := max(fitted, key=lambda row: row.log_evidence)).driver and first.effects and not first.refit:
+        while first := max(fitted, key=lambda row: row.log_evidence):
+            if first.driver or first.dwells or first.refit or not first.effects:
+                break
             fitted = self._steady([self._refitted(row) if row is first else row for row in fitted])
         least = first.log_evidence - _DESCRIBED
-        return [self._described(row) if row.driver and row.log_evidence > least else row for row in fitted]
+        return [
+            self._described(row) if row.driver and not row.dwells and row.log_evidence > least else row
+            for row in fitted
+        ]
 
     def _steady(self, rows: Sequence[Hypothesis]) -> list[Hypothesis]:
         """Return the rows without an oscillation that does not go on alike in all dwells."""
@@ -447,6 +468,15 @@ class RunPosterior:
             chosen.append(rest[int(np.argmax(logs))])
             log = max(logs)
         return chosen
+
+
+def _with_sure_dwells(rows: list[Hypothesis], beside: list[Hypothesis]) -> list[Hypothesis]:
+    """Return rows with those of dwells beside other terms where the likeliest is one of these, and its clearest dwell
+    is off for sure, whatever else is missing; else without them."""
+    table = table_of([row for row in (*rows, *beside) if math.isfinite(row.log_evidence)])
+    dwells = table.first.dwells[:1]
+    sure = sum(row.probability for row in table.rows if {*dwells} & {*row.dwells}) >= SURE
+    return [*rows, *beside] if sure and any(table.first.dwells == row.dwells for row in beside) else rows
 
 
 def _log_sum(logs: Sequence[float]) -> float:

@@ -70,6 +70,8 @@ def _of_the_others(diagnosis: Diagnosis) -> str:
     start = f"{_what_fails(diagnosis)} (p {format_p(test.p_value)})."
     if first is None:
         return start
+    if first.dwells:
+        return f"{start} {_unknown(diagnosis, first)}"
     if first.effects and diagnosis.unearned:
         return f"{start} {_not_named(diagnosis, first)}."
     if first.effects:

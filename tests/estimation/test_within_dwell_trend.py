@@ -168,5 +168,5 @@ def test_an_oscillation_that_goes_on_in_all_dwells_is_steady(count: int) -> None
 def test_what_swings_in_one_dwell_alone_is_no_oscillation_of_the_run(seed: int) -> None:
     """Creep and what goes on around a bench swing for a while; an effect of the sensor goes on."""
     found = diagnose(calibrate(swinging(1e-4, seed, only=seed)))
-    assert found.likeliest is None or found.likeliest.dwell == seed + 1
+    assert found.likeliest is None or found.likeliest.dwells == (seed + 1,)
     assert "sinusoid" not in found.missing, found.verdict

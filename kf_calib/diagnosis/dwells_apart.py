@@ -1,0 +1,74 @@
+"""Dwells that are off, each by any amount and with readings that change in any way: a pose mistyped, a door slammed.
+
+They are searched one after another, each next one by what the dwells without those before it tell: two that are off by
+as much hide each other. Each has the prior probability of one. In the noise that was stated alone, for in noise as
+large as they are off any dwell is as good as any other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from kf_calib.bench.arrays import Floats
+from kf_calib.diagnosis.hypothesis_table import PRIOR
+from kf_calib.diagnosis.in_noises import InNoises, Spanned
+from kf_calib.diagnosis.noise_sizes import NoiseSizes
+from kf_calib.diagnosis.run_terms import log_bayes_of_any_size
+from kf_calib.diagnosis.within_rows import Courses
+
+_MOST = 0.25  # share of the dwells
+_MASKED = 3  # dwells that may hide each other
+
+
+@dataclass(frozen=True)
+class DwellsApart:
+    """The search in one run.
+
+    rows: of the run, with all that is in the model. courses: what it leaves of the readings within dwells. noises: the
+    rows in the noises of each family; sizes: these.
+    """
+
+    rows: Spanned
+    courses: Courses
+    noises: Sequence[InNoises]
+    sizes: NoiseSizes
+
+    def likeliest(self) -> tuple[float, tuple[int, ...]]:
+        """The log evidence of the likeliest dwells, with their prior, and which these are, the clearest first."""
+        chosen, before = list[int](), np.concatenate([of_family.logs for of_family in self.noises])
+        rows: list[tuple[float, tuple[int, ...]]] = [(-math.inf, ())]
+        while len(chosen) < min(max(len(self.rows) * _MOST, 1.0), len(max(rows)[1]) + _MASKED):
+            try:
+                of_dwells = self._log_bayes(chosen)
+            except np.linalg.LinAlgError:
+                break
+            evidence = np.logaddexp.reduce(self.sizes.evidence(before + of_dwells), axis=1)
+            in_none = before[0] + of_dwells[:, 0]
+            in_none[chosen] = -math.inf
+            k = int(np.argmax(in_none))
+            if chosen:
+                rows.append((float(evidence[k]) + len(rows) * self._log_prior, (*chosen, k)))
+            else:  # any of them may be the one
+                log = float(np.logaddexp.reduce(evidence)) + self._log_prior
+                rows.append((log, (int(np.argmax(evidence)),)))
+            chosen, before = [*chosen, k], before + of_dwells[k]
+        return max(rows)
+
+    @property
+    def _log_prior(self) -> float:
+        """The log of the prior probability that one certain dwell is off."""
+        return math.log(PRIOR["dwell"] / len(self.rows))
+
+    def _log_bayes(self, without: Sequence[int]) -> Floats:
+        """Return log Bayes factors (D, noises) of changes of each dwell, as the dwells without some of them tell."""
+        changes = self.courses.log_bayes_of_some(math.exp(self._log_prior)) if without else self.courses.log_bayes()
+        means = [
+            log_bayes_of_any_size(*of_family.dwells(size, self.rows, without))
+            for of_family in self.noises
+            for size in range(len(of_family.logs))
+        ]
+        return np.array(means).T + np.logaddexp(0.0, changes)[:, None] - math.log(2.0)
