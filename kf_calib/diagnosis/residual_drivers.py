@@ -156,13 +156,6 @@ def unexplained_mps2(result: Calibration) -> Floats:
     return result.residuals_mps2 - walk_path(result)
 
 
-def unexplained_rms_mps2(result: Calibration) -> float:
-    """The in-sample error without the path of the biases where these walk, m/s^2."""
-    if not result.noise.walk_mps2_per_sqrt_s:
-        return result.residual_rms_mps2
-    return float(np.sqrt(np.mean(unexplained_mps2(result) ** 2)))
-
-
 def walk_path(result: Calibration) -> Floats:
     """The path of the biases (D, 3), less where it ends, m/s^2; zeros if they do not walk.
 

@@ -208,10 +208,9 @@ def intervals_in_words(result: Calibration) -> list[Text]:
     sigmas = result.interval_sigmas[: len(paper_parameters.SYMBOLS)][~result.estimate.unseen]
     if not sigmas.size or sigmas.max() < _WIDER:
         return []
-    low, high = f"{sigmas.min():.2f}", f"{sigmas.max():.2f}"
-    width, count = low if low == high else f"{low} to {high}", len(result.fit.dwells)
-    said = f"Intervals of 95 % are ± {width} sigma: {count} dwells tell roughly how large the noise is that was not"
-    return [Text(f"{said} stated.")]
+    width = " to ".join(dict.fromkeys([f"{sigmas.min():.2f}", f"{sigmas.max():.2f}"]))
+    told = f"{len(result.fit.dwells)} dwells tell roughly how large the noise is that was not stated"
+    return [Text(f"Intervals of 95 % are ± {width} sigma: {told}.")]
 
 
 def summary(result: Calibration, diagnosed: bool = False) -> RenderableType:

@@ -396,33 +396,31 @@ def next_steps(diagnosis: Diagnosis, typed: str) -> list[NextStep]:
     typed: recording and options of the command that was given, as words of a shell; "" outside the command line, where
     no command can be told.
     """
-    without = "".join(f" --leave-out {number}" for number in diagnosis.apart)
-    steps = list(_steps(diagnosis, f"{typed}{without}"))
+    steps = list(_steps(diagnosis, f"{typed}{_leaving_out(diagnosis.apart)}"))
     if typed:
         return steps
     return [NextStep(each.why) for each in steps if not each.command or each.why.startswith("Measure")]
 
 
 def _steps(diagnosis: Diagnosis, typed: str) -> Iterator[NextStep]:
-    test, before = diagnosis.test, diagnosis.before
+    test, before, first = diagnosis.test, diagnosis.before, diagnosis.likeliest
     if test.consistent is None:
         yield NextStep("Find orientations that determine the model", f"kf-calib plan {typed} --count 24")
     elif diagnosis.condition is not None:
         yield from _of_condition(diagnosis.condition, typed)
     elif test.consistent:
         yield NextStep("Keep this calibration", f"kf-calib replay {typed} --save calibration.json")
-    elif before.outlying:
-        number = before.outlying[0].number
-        yield NextStep(f"Try the run without dwell {number}", f"kf-calib diagnose {typed} --leave-out {number}")
-    elif diagnosis.likeliest is not None and diagnosis.likeliest.dwells:
-        options = "".join(f" --leave-out {number}" for number in diagnosis.likeliest.dwells)
-        numbers = [*diagnosis.apart, *diagnosis.likeliest.dwells]
-        dwells = f"dwell{'s' * (len(numbers) > 1)} {' and '.join(map(str, numbers))}"
-        yield NextStep(f"Try the run without {dwells}", f"kf-calib diagnose {typed}{options}")
+    elif numbers := [each.number for each in before.outlying[:1]] or [*(first.dwells if first else ())]:
+        said = " and ".join(map(str, sorted([*diagnosis.apart, *numbers])))
+        yield NextStep(f"Try the run without dwell {said}", f"kf-calib diagnose {typed}{_leaving_out(numbers)}")
     elif diagnosis.sure:
         yield NextStep("Add it and see the error fall", f"kf-calib improve {typed}")
     else:
         yield from _unsure(diagnosis, typed)
+
+
+def _leaving_out(numbers: Sequence[int]) -> str:
+    return "".join(f" --leave-out {number}" for number in numbers)
 
 
 def _of_condition(condition: Condition, typed: str) -> Iterator[NextStep]:
