@@ -210,8 +210,9 @@ CEILINGS = {
     "positioning": 1974,
     "reproduction": 884,
 }
-"""How many lines each room may have. A ceiling is lowered when its room has shrunk. Those of estimation, diagnosis
-and (by 4) views were raised once, for intervals that average over two sizes of noise and for dwells that are off beside other terms."""
+"""How many lines each room may have. A ceiling is lowered when its room has shrunk. Those of estimation, diagnosis and
+(by four lines) views were raised once, for intervals that average over two sizes of noise, and for dwells that are off
+beside other terms."""
 UNDER_A_CEILING = 400  # lines: where a room has more room than this, its ceiling is out of date
 
 

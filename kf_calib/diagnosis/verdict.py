@@ -172,14 +172,17 @@ def _unexplained(diagnosis: Diagnosis) -> str:
 def _unknown(diagnosis: Diagnosis, first: Hypothesis) -> str:
     """Return a sentence on a misfit that no known effect explains."""
     if first.dwells:
-        numbers = sorted((*diagnosis.apart, *first.dwells))
-        options = " ".join(f"--leave-out {number}" for number in numbers)
-        several = len(numbers) > 1
+        numbers = (*diagnosis.apart, *first.dwells)
+        options = " ".join(f"--leave-out {number}" for number in sorted(numbers))
+        share, named = f"{format_probability(first.probability)}{_others(diagnosis)}", _dwells(numbers).lower()
+        if len(numbers) == 1:
+            return (
+                f"One dwell is wrong: {named} alone does not fit ({share}): look at its pose and its readings, or "
+                f"leave it out ({options})."
+            )
         return (
-            f"{_dwells(numbers)} {'are' if several else 'is'} wrong: {'they alone do' if several else 'it alone does'} "
-            f"not fit ({format_probability(first.probability)}{_others(diagnosis)}): look at "
-            f"{'their poses and their' if several else 'its pose and its'} readings, or leave "
-            f"{'them' if several else 'it'} out ({options})."
+            f"Several dwells are wrong: {named} alone do not fit ({share}): look at their poses and their readings, or "
+            f"leave them out ({options})."
         )
     what = "it changes irregularly" if first.driver == IRREGULAR else f"it goes with {first.driver}"
     assert diagnosis.table is not None

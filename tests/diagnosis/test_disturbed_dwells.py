@@ -7,12 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.independent_bench import G, IndependentBench, State
+from helpers.independent_bench import BENCH, G, IndependentBench, State
 from helpers.long_runs import slow
 from scipy.spatial.transform import Rotation
 from unknown_trials.small_bench import RATE_HZ, WHITE_MPS2, SmallRun, visits
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.stepwise_selection import improve
 from kf_calib.estimation.calibration import calibrate
@@ -134,7 +135,7 @@ def test_several_disturbed_dwells_are_told(seed: int) -> None:
     """They were irregular changes with over 99.9 %, and the advice was a random walk of the biases."""
     diagnosis = diagnose(IndependentBench(seed, 18, bias=lambda state: burst(state, 5, 12)))
     assert diagnosis.missing == () and disturbed_dwells(diagnosis) == [5, 12]
-    assert "Dwells" in diagnosis.verdict and "are wrong" in diagnosis.verdict
+    assert "Several dwells are wrong: dwells 5 and 12 alone do not fit" in diagnosis.verdict
     assert diagnose(IndependentBench(seed, 18, bias=lambda state: burst(state, 5, 12)), replicate=False).unknown
 
 
@@ -145,3 +146,29 @@ def test_readings_that_change_in_all_dwells_are_no_disturbed_dwells() -> None:
 
     diagnosis = diagnose(IndependentBench(4, 18, bias=creeping))
     assert diagnosis.apart == () and diagnosis.test.consistent is False
+
+
+UNSTATED = replace(BENCH, angle_sigma_deg=None, scatter_sigma_mps2=None)
+
+
+@pytest.mark.parametrize(
+    ("sizes_deg", "dwells", "bench"),
+    [((2.0, 2.0, 2.0), 20, UNSTATED), ((20.0, 5.0), 12, BENCH),
+     *slow(*((sizes, dwells, bench) for sizes in ((0.02, 0.05), (0.5, 3.0), (20.0, 5.0), (2.0, 2.0, 2.0))
+             for dwells in (12, 20) for bench in (BENCH, UNSTATED)))],
+)  # fmt: skip
+def test_several_mistyped_poses_hide_neither_each_other_nor_make_an_effect(
+    sizes_deg: tuple[float, ...], dwells: int, bench: Bench
+) -> None:
+    """They were an eccentric encoder with 99.5 %, or agreed if angles were set no better than 2000 arcsec."""
+    wrong = [4, 8, 10][: len(sizes_deg)]
+
+    def off(state: State) -> np.ndarray:
+        turns = np.zeros((len(state.time_s), 3))
+        for dwell, size_deg in zip(wrong, sizes_deg, strict=True):
+            turns[state.dwell == dwell, 1 + dwell % 2] = np.radians(size_deg)
+        return turns
+
+    diagnosis = diagnose(IndependentBench(1, dwells, gimbals=off, bench=bench), replicate=False)
+    assert disturbed_dwells(diagnosis) == [dwell + 1 for dwell in wrong], diagnosis.verdict
+    assert diagnosis.missing == () and diagnosis.consistent is False
