@@ -34,7 +34,10 @@ def test_probabilities_that_hold_are_within_the_limits_and_others_are_not(said, 
 def test_a_row_is_labelled_as_a_truth_is() -> None:
     assert label_of(Hypothesis(("b", "a"))) == "a + b"
     assert label_of(Hypothesis(("b",), driver="time")) == "b + unknown"
-    assert label_of(Hypothesis(driver="time")) == "unknown" and label_of(Hypothesis(driver="x", dwells=(3,))) == "one dwell"
+    assert (
+        label_of(Hypothesis(driver="time")) == "unknown"
+        and label_of(Hypothesis(driver="x", dwells=(3,))) == "one dwell"
+    )
     assert label_of(Hypothesis(families=(NOTHING,))) == "nothing" and label_of(Hypothesis(driver=IRREGULAR)) == "noise"
 
 
