@@ -196,7 +196,7 @@ CEILINGS = {
     "noise": 3412,
     "estimation": 8109,
     "design": 1875,
-    "diagnosis": 5258,
+    "diagnosis": 5251,
     "online": 1648,
     "exchange": 1994,
     "views": 7387,

@@ -260,9 +260,8 @@ class RunPosterior:
         none, *others = self._sizes.families
         noises = [InNoises(rows, none.shapes, np.zeros(1))]
         noises += [InNoises(rows, family.shapes, self._sizes.squares) for family in others]
-        squares = np.minimum(
-            run.courses.squares, likelihood.courses.squares
-        )  # what it disturbs is for nobody to explain
+        # what a term disturbs itself is for no dwell to explain
+        squares = np.minimum(run.courses.squares, likelihood.courses.squares)
         apart = DwellsApart(rows, replace(run.courses, squares=squares), noises, self._sizes)
         log, places = apart.likeliest()
         without = self._sizes.evidence(np.concatenate([of_family.logs for of_family in noises])[None])[0]
@@ -347,20 +346,14 @@ class RunPosterior:
         """Return the rows with the likeliest of them fitted, and weighed where their fit is."""
         best = max(row.log_evidence for row in rows)
         least = best - _BEHIND - _BENT * max(best - float(self._without.max()), 0.0)
-        linear = [row for row in rows if row.effects and not (row.driver or row.dwells)]
-        effects = sorted(linear, key=lambda row: -row.log_evidence)
+        effects = sorted((row for row in rows if row.effects and not row.driver), key=lambda row: -row.log_evidence)
         single = [row for row in effects if len(row.effects) == 1][:_ALWAYS]  # large effects are far from linear
         likeliest = {id(row) for row in [*single, *(row for row in effects[:_REFITTED] if row.log_evidence > least)]}
         fitted = self._steady([self._refitted(row) if id(row) in likeliest else row for row in rows])
-        while first := max(fitted, key=lambda row: row.log_evidence):
-            if first.driver or first.dwells or first.refit or not first.effects:
-                break
+        while not (first := max(fitted, key=lambda row: row.log_evidence)).driver and first.effects and not first.refit:
             fitted = self._steady([self._refitted(row) if row is first else row for row in fitted])
         least = first.log_evidence - _DESCRIBED
-        return [
-            self._described(row) if row.driver and not row.dwells and row.log_evidence > least else row
-            for row in fitted
-        ]
+        return [self._described(row) if row.driver and row.log_evidence > least else row for row in fitted]
 
     def _steady(self, rows: Sequence[Hypothesis]) -> list[Hypothesis]:
         """Return the rows without an oscillation that does not go on alike in all dwells."""
