@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.coherent_tone import band_hz
 from kf_calib.dwells.line_spectrum import SpectralLine, lowest_hz
+from kf_calib.dwells.sufficient_statistics import lines_of
 from kf_calib.dwells.table import DwellTable
 from kf_calib.effects import Coefficient, Effect, effect_named, names, oscillation_of, slew_effects, walk_named
 from kf_calib.estimation.candidate_scan import Candidate, Scan
@@ -22,7 +23,7 @@ from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.observability import is_seen, smallest_size
 from kf_calib.estimation.results import Consistency, consistency
-from kf_calib.estimation.score_test import Frame
+from kf_calib.estimation.score_test import periodogram, scan
 from kf_calib.estimation.within_dwell_trend import Trend, trend
 from kf_calib.support import stage
 from kf_calib.support.tail_probabilities import LEVEL, REST, SHARE, f_tail, sidak
@@ -153,9 +154,7 @@ def candidates(model: Model) -> list[Effect]:
     return effects
 
 
-def assess_candidates(
-    fitted: Fit, tests: float | None = None, seed: int = 0, frame: Frame | None = None
-) -> CandidateTests:
+def assess_candidates(fitted: Fit, tests: float | None = None, seed: int = 0) -> CandidateTests:
     """Score tests of all candidates of the catalogue against a fit.
 
     The false-alarm rate is calibrated for the columns of this run, by drawing residuals that contain only noise.
@@ -164,17 +163,15 @@ def assess_candidates(
     - tests: effective number of independent tests, where it is known from nearly the same columns; None: the draws
       give it.
     - seed: of the draws.
-    - frame: the candidates' columns of another fit of the run, which are used again if noise and dwells are the same.
     """
     from scipy.special import chdtrc
 
     model, agreed = fitted.linearised.model, consistency(fitted)
-    frame = candidate_frame(fitted, frame)
-    scan = _scanned(fitted, frame)
-    statistics = scan.statistics
-    tests = tests or independent_tests(scan, seed)
+    scanned = _scanned(fitted)
+    statistics = scanned.statistics
+    tests = tests or independent_tests(scanned, seed)
     best, scores, p_values = dict[str, int](), dict[str, float](), dict[str, float]()
-    for k, candidate in enumerate(scan.candidates):
+    for k, candidate in enumerate(scanned.candidates):
         name = str(candidate.effect)
         score = float(statistics[k]) - critical_delta_chi2(candidate, tests) if candidate.dof else -np.inf
         if name not in best or score > scores.get(name, -np.inf) + _TIE:
@@ -189,8 +186,8 @@ def assess_candidates(
         delta_chi2 = max(2.0 * fitted.walk_gain - max(fitted.misfit - agreed.statistic, 0.0), 0.0)
         p_values[name] = sidak(0.5 * float(chdtrc(1, delta_chi2)), tests)
         scores[name] = delta_chi2 - threshold(1, tests)
-    effects = EffectTests(scan, best, scores, p_values, name, tests, slew_effects(model.bench))
-    return _with_lines(CandidateTests(effects, agreed.p_value), fitted, frame)
+    effects = EffectTests(scanned, best, scores, p_values, name, tests, slew_effects(model.bench))
+    return _with_lines(CandidateTests(effects, agreed.p_value), fitted)
 
 
 def _p_alone(fitted: Fit, dof: int, delta_chi2: float, agreed: Consistency) -> float:
@@ -204,33 +201,24 @@ def _p_alone(fitted: Fit, dof: int, delta_chi2: float, agreed: Consistency) -> f
     return f_tail(dof, rest, delta_chi2 / dof / (left / rest)) if rest > 0 and left > 0.0 else 1.0
 
 
-def candidate_frame(fitted: Fit, frame: Frame | None = None) -> Frame:
-    """The frame of the columns of all candidates in the noise of a fit: ``frame`` if it serves, or a new one."""
-    linearised, noise = fitted.linearised, fitted.noise.for_goodness_of_fit
-    if frame is not None and frame.serves(linearised, noise):
-        return frame
-    effects = candidates(Model(linearised.model.bench))
-    stage.say(f"scanning {len({str(effect) for effect in effects})} effects")
-    return Frame(linearised, noise, effects)
-
-
-def _scanned(fitted: Fit, frame: Frame) -> Scan:
+def _scanned(fitted: Fit) -> Scan:
     """Return the scan of all candidates and, with angles, of slow oscillations, of which the best frequency is kept.
 
     In a hand, few dwells would have an oscillation of some frequency by chance: whatever scatters them.
     """
-    linearised, effect = fitted.linearised, oscillation_of(fitted.linearised.model.bench)
-    if effect is None or linearised.model.oscillates or fitted.noise.attitude_unknown:
-        return frame.scan(linearised)
-    frequencies_hz = slow_hz(fitted, effect)
-    if not len(frequencies_hz):
-        return frame.scan(linearised)
-    best_hz = frequencies_hz[np.argmax(frame.delta_chi2(linearised, effect, frequencies_hz))]
+    linearised, noise = fitted.linearised, fitted.noise.for_goodness_of_fit
+    effects, effect = candidates(linearised.model), oscillation_of(linearised.model.bench)
+    stage.say(f"scanning {len({str(each) for each in effects})} effects")
+    looked = effect is not None and not linearised.model.oscillates and not fitted.noise.attitude_unknown
+    frequencies_hz = slow_hz(fitted, effect) if effect is not None and looked else np.zeros(0)
+    if effect is None or not len(frequencies_hz):
+        return scan(linearised, noise, effects)
+    best_hz = frequencies_hz[np.argmax(periodogram(linearised, noise, effect, frequencies_hz))]
     tones = [effect.at(hz) for hz in best_hz + 0.125 * frequencies_hz[0] * np.arange(-3, 4)]
-    scan = frame.scan(linearised, tones)
-    others, tone_candidates = scan.candidates[: -len(tones)], scan.candidates[-len(tones) :]
-    best_tone = tone_candidates[int(np.argmax(scan.statistics[-len(tones) :]))]
-    return replace(scan, candidates=(*others, replace(best_tone, tried=len(frequencies_hz))))
+    scanned = scan(linearised, noise, [*effects, *tones])
+    others, tone_candidates = scanned.candidates[: -len(tones)], scanned.candidates[-len(tones) :]
+    best_tone = tone_candidates[int(np.argmax(scanned.statistics[-len(tones) :]))]
+    return replace(scanned, candidates=(*others, replace(best_tone, tried=len(frequencies_hz))))
 
 
 def slow_hz(fitted: Fit, effect: Effect) -> Floats:
@@ -246,7 +234,7 @@ def _searched_hz(dwells: DwellTable) -> tuple[float, float, float]:
     return *steady, lowest_line_hz
 
 
-def _with_lines(test: CandidateTests, fitted: Fit, frame: Frame) -> CandidateTests:
+def _with_lines(test: CandidateTests, fitted: Fit) -> CandidateTests:
     """Return the tests with the lines of the spectrum, which count for an oscillation in place of slow frequencies."""
     from scipy.special import chdtri
 
@@ -254,7 +242,7 @@ def _with_lines(test: CandidateTests, fitted: Fit, frame: Frame) -> CandidateTes
     if effect is None or fitted.linearised.model.oscillates:
         return replace(test, trend=trend(fitted))
     if fitted.noise.attitude_unknown:  # a body in the hand trembles: its lines are vibration
-        test, lines = replace(test, lines=LineTests(untested_band=str(effect))), frame.lines(LEVEL * REST)
+        test, lines = replace(test, lines=LineTests(untested_band=str(effect))), lines_of(fitted.dwells, LEVEL * REST)
         return test.with_vibration(lines) if lines else replace(test, trend=trend(fitted))
     name, slow, (low_hz, high_hz, lowest_line_hz) = str(effect), slow_hz(fitted, effect), _searched_hz(fitted.dwells)
     highest_slow_hz = float(slow[-1]) if len(slow) else low_hz
@@ -266,7 +254,7 @@ def _with_lines(test: CandidateTests, fitted: Fit, frame: Frame) -> CandidateTes
     bands = [f"of {a:.2g} to {b:.2g} Hz" if np.isfinite(b) else f"above {a:.2g} Hz" for a, b in gaps_hz if b > 1.5 * a]
     if bands:
         test = replace(test, lines=LineTests(untested_band=f"{name} {' and '.join(bands)}"))
-    lines = frame.lines(LEVEL * REST)
+    lines = lines_of(fitted.dwells, LEVEL * REST)
     if not lines:
         return replace(test, trend=trend(fitted))
     p_value, effects = lines[0].p_value, test.effects

@@ -66,7 +66,7 @@ def diagnose(
     before, refits = calibration_of(run, refits)
     with one_blas_thread():
         diagnosis = refits.once(before, lambda: _with_readings(refits, before, _diagnosed(refits, before)))
-        return replace(diagnosis, replication=_replication(refits, diagnosis)) if replicate else diagnosis
+        return replace(diagnosis, replication=_replication(diagnosis)) if replicate else diagnosis
 
 
 def _with_readings(refits: Refits, before: Calibration, diagnosis: Diagnosis) -> Diagnosis:
@@ -77,14 +77,13 @@ def _with_readings(refits: Refits, before: Calibration, diagnosis: Diagnosis) ->
     return replace(diagnosis, disturbed_readings=readings_of(refits.source, before, number, left_out=True))
 
 
-def _replication(refits: Refits, diagnosis: Diagnosis) -> Replication | None:
+def _replication(diagnosis: Diagnosis) -> Replication | None:
     """Return the replication of what a diagnosis names; None where it names nothing."""
     if not diagnosis.missing or diagnosis.after is None or diagnosis.after.model.dynamic:
         return None
     before = diagnosis.before_in_noise_left or diagnosis.before
     count = len({*diagnosis.missing} & {*diagnosis.test.effects.best})
-    frame, left = refits.frame_of(before.fit), diagnosis.after.consistency
-    return replication(before, frame, diagnosis.ambiguity, max(count, 1), left)
+    return replication(before, diagnosis.ambiguity, max(count, 1), diagnosis.after.consistency)
 
 
 def _diagnosed(refits: Refits, before: Calibration) -> Diagnosis:

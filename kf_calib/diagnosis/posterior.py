@@ -35,7 +35,7 @@ from kf_calib.diagnosis.in_noises import InNoises
 from kf_calib.diagnosis.noise_sizes import NoiseFamily, NoiseSizes
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.run_likelihood import Projected, RunLikelihood, log_bayes_together
-from kf_calib.diagnosis.run_terms import RunTerms, log_bayes_of_columns, sizes_of
+from kf_calib.diagnosis.run_terms import RunTerm, RunTerms, log_bayes_of_columns, sizes_of
 from kf_calib.diagnosis.unknown_terms import name_of_formula, text_named
 from kf_calib.dwells.qr import orthonormal
 from kf_calib.effects import effect_named
@@ -438,16 +438,20 @@ class RunPosterior:
         flat = [place for name in beside for place in run.terms[self._best[name]].columns.tolist()]
         terms = [term for term in run.terms if term.row == f"?{number}"]
         places = np.unique(np.concatenate([term.columns for term in terms]))
-        noises = [run.likelihood.projected(covariance, places, flat) for covariance in self._sizes.covariances]
-        scores = np.array([
-            [rows.log + log_bayes_of_columns(rows.of(term.columns), rows.readings) + term.log_share for term in terms]
-            for rows in noises
-        ])  # fmt: skip
+        scores = np.array([self._scores(terms, places, flat, covariance) for covariance in self._sizes.covariances])
         at, likeliest = np.unravel_index(int(np.argmax(scores)), scores.shape)
+        rows = run.likelihood.projected(self._sizes.covariances[int(at)], places, flat)
         term = terms[int(likeliest)]
         widths = [sum(len(run.formula_of(text).coefficients) for text in unknown.summands[k]) for k in term.summands]
         parts = np.split(term.columns, np.cumsum(widths)[:-1])
-        return [text for k in self._summands(parts, noises[int(at)]) for text in unknown.summands[term.summands[k]]]
+        return [text for k in self._summands(parts, rows) for text in unknown.summands[term.summands[k]]]
+
+    def _scores(self, terms: Sequence[RunTerm], places: Indices, flat: Sequence[int],
+                covariance: Floats | None) -> list[float]:  # fmt: skip
+        """Return the log evidence of terms in one noise."""
+        rows = self._run.likelihood.projected(covariance, places, flat)
+        found = ((rows.of(term.columns), term.log_share) for term in terms)
+        return [rows.log + log_bayes_of_columns(columns, rows.readings) + share for columns, share in found]
 
     def _summands(self, parts: Sequence[Indices], rows: Projected) -> list[int]:
         """Return the summands, by their columns, that explain most together, each of which gains evidence."""

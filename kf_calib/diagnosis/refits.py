@@ -11,16 +11,14 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, one_blas_thread
 from kf_calib.bench.streams import Source, Table
-from kf_calib.diagnosis.candidate_tests import CandidateTests, assess_candidates, candidate_frame
+from kf_calib.diagnosis.candidate_tests import CandidateTests, assess_candidates
 from kf_calib.effects import oscillation_of
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.calibration import calibrate, evaluate_fit
 from kf_calib.estimation.dwell_pass import holds_its_oscillation
-from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.iterated_fit import fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.results import Calibration
-from kf_calib.estimation.score_test import Frame
 from kf_calib.noise.noise_model import Noise
 from kf_calib.sources.opening import opened
 from kf_calib.support import stage
@@ -42,7 +40,6 @@ class Refits:
     def __init__(self, source: Source | str | PathLike[str] | None = None) -> None:
         source = None if source is None else opened(source)
         self.source = None if isinstance(source, Table) else source
-        self._frame: Frame | None = None  # only the last one is kept, to save memory
         # with each value what its key is made of, since the id of an object that is gone may be used again
         self._refits = dict[tuple[int, tuple[str, ...]], tuple[Calibration, Calibration]]()
         self._diagnosed = dict[int, tuple[Calibration, Any]]()
@@ -81,12 +78,7 @@ class Refits:
 
     def assess(self, result: Calibration, tests: float | None = None) -> CandidateTests:
         """Score tests of all candidates against a calibration, see ``assess_candidates``."""
-        return assess_candidates(result.fit, tests, frame=self.frame_of(result.fit))
-
-    def frame_of(self, fitted: Fit) -> Frame:
-        """The columns of all candidates in the noise of a fit: those of the last fit if they serve."""
-        self._frame = candidate_frame(fitted, self._frame)
-        return self._frame
+        return assess_candidates(result.fit, tests)
 
     def _refit(self, before: Calibration, effects: tuple[str, ...]) -> Calibration:
         """Fit the model with these effects, and read the source again where the statistics of the dwells do not

@@ -27,14 +27,15 @@ from typing import Literal
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import Floats, Indices
+from kf_calib.diagnosis.candidate_tests import candidates
 from kf_calib.diagnosis.coefficient_sizes import size_evidence
-from kf_calib.dwells.qr import triangle
 from kf_calib.effects import Effect
-from kf_calib.estimation.candidate_scan import SEEN, Complement, Scan, scan_of, slices
+from kf_calib.estimation.candidate_scan import SEEN, Complement, Scan, counts_of, project, slices
 from kf_calib.estimation.cross_validation import orientations
+from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.results import Calibration, Consistency
-from kf_calib.estimation.score_test import Frame
+from kf_calib.estimation.score_test import triangles
 from kf_calib.support.tail_probabilities import LEVEL, f_tail
 
 FEWEST = 12
@@ -107,24 +108,23 @@ def _combined(p_values: Sequence[float]) -> float:
     return min(1.0, math.e * math.exp(float(np.mean(np.log(np.maximum(p_values, 1e-300)))))) if p_values else 1.0
 
 
-def replication(
-    before: Calibration, frame: Frame, relevant: Sequence[str], count: int, left: Consistency
-) -> Replication:
+def replication(before: Calibration, relevant: Sequence[str], count: int, left: Consistency) -> Replication:
     """The replication of a verdict.
 
-    before: the run without what is missing, in the noise that it leaves. frame: the columns of the candidates in this
-    noise. relevant: names of the effects that the verdict names or leaves open. count: how many it names. left: the
-    test of the misfit that they leave, by which noise is enlarged.
+    before: the run without what is missing, in the noise that it leaves. relevant: names of the effects that the
+    verdict names or leaves open. count: how many it names. left: the test of the misfit that they leave, by which
+    noise is enlarged.
     """
-    groups, ends = orientations(before.fit.dwells), frame.ends
-    if len(before.fit.dwells) < FEWEST or ends is None or not {str(effect) for effect in frame.effects} & {*relevant}:
+    fitted, effects = before.fit, candidates(before.model)
+    groups, walks = orientations(fitted.dwells), fitted.noise.for_goodness_of_fit.walk.steps
+    if len(fitted.dwells) < FEWEST or walks or not {str(effect) for effect in effects} & {*relevant}:
         return Replication()
     noise = max(1.0, left.statistic / left.dof) if left.dof > 0 else 1.0
-    halves = [sorted(k for group in groups[first::2] for k in group) for first in (0, 1)]
-    rows = _DividedRows(before, frame, halves, noise)
+    halves = [np.sort(np.concatenate(groups[first::2])) for first in (0, 1)]
+    rows = _DividedRows(fitted, effects, halves, noise)
     if not rows.both_determine:
         return Replication()
-    numbers = [dwell.number for dwell in before.fit.dwells]
+    numbers = [dwell.number for dwell in fitted.dwells]
     unseen = list[UnseenHalf]()
     for seen in (0, 1):
         choice = rows.choice(seen, count)
@@ -137,60 +137,50 @@ def replication(
 
 @dataclass(frozen=True)
 class _Choice:
-    """What a half chose: effects, which columns of the frame they have, and their coefficients (q,) with covariance."""
+    """What a half chose: effects, the places of their columns, and their coefficients (q,) with covariance."""
 
     effects: tuple[Effect, ...]
-    columns: Floats
+    places: Indices
     coefficients: Floats
     covariance: Floats
 
 
 class _DividedRows:
-    """The whitened rows [H | W | z] of a run, divided by dwells; rows of prior knowledge about W belong to both
-    halves."""
+    """The triangles of the whitened rows [H | W | G | z] of a run and of each half of its dwells."""
 
-    def __init__(self, before: Calibration, frame: Frame, halves: Sequence[Sequence[int]], noise: float) -> None:
-        linearised, ends = before.linearised, frame.ends
-        assert ends is not None
-        self._frame, self._in_model, self._noise = frame, linearised.model.parts, noise
-        self._rows, self._width = frame.whitened_model(linearised)
-        prior = np.arange(ends[0])
-        self._places = [np.concatenate([prior, *(np.arange(ends[k], ends[k + 1]) for k in half)]) for half in halves]
-        self._complement = Complement(self._rows, self._width)
-        self._complements = [Complement(self._rows[places], self._width) for places in self._places]
+    def __init__(self, fitted: Fit, effects: Sequence[Effect], halves: Sequence[Indices], noise: float) -> None:
+        self._effects, self._noise = effects, noise
+        found = triangles(fitted.linearised, fitted.noise.for_goodness_of_fit, effects, halves)
+        (self._whole, *self._halves), self._width = found
+        self._complement = Complement(self._whole, self._width)
+        self._complements = [Complement(half, self._width) for half in self._halves]
 
     @property
     def both_determine(self) -> bool:
         """Whether each half determines what the whole run does."""
-        ranks = [_rank(self._rows[places][:, : self._width]) for places in (slice(None), *self._places)]
+        ranks = [_rank(rows[:, : self._width]) for rows in (self._whole, *self._halves)]
         return min(ranks) == max(ranks)
 
     def choice(self, seen: int, count: int) -> _Choice:
         """The likeliest effect by the linear tests in one half alone, and those that are likeliest beside it."""
-        numbers = [k for k, effect in enumerate(self._frame.effects) if str(effect) not in self._in_model]
-        effects = [self._frame.effects[k] for k in numbers]
-        places = self._places[seen]
-        coordinates = [self._frame.coordinates[:, self._frame.parts[k]] for k in numbers]
-        columns = self._frame.basis[places] @ np.concatenate(coordinates, axis=1)
-        parts = slices([each.shape[1] for each in coordinates])
-        left = self._complements[seen].of(np.column_stack([columns, self._rows[places][:, -1]]))
-        scan = scan_of(triangle(left), np.linalg.norm(columns, axis=0), effects, [p.stop - p.start for p in parts])
-        chosen = list[int]()
+        rows, counts = self._halves[seen], counts_of(self._effects)
+        scan, parts, chosen = project(rows, self._width, self._effects, counts), slices(counts), list[int]()
         while len(chosen) < count:
             chosen.append(_likeliest(scan, chosen, self._noise))
-        joined = np.concatenate([np.arange(parts[k].start, parts[k].stop) for k in chosen])
-        sizes = np.linalg.norm(columns[:, joined], axis=0)
+        places = self._width + np.concatenate([np.arange(parts[k].start, parts[k].stop) for k in chosen])
+        sizes = np.linalg.norm(rows[:, places], axis=0)
         sizes = np.where(sizes > 0.0, sizes, 1.0)
-        basis, singular, right = np.linalg.svd(left[:, joined] / sizes, full_matrices=False)
+        left = self._complements[seen].of(rows[:, [*places, -1]])
+        basis, singular, right = np.linalg.svd(left[:, :-1] / sizes, full_matrices=False)
         determined = singular > SEEN
         inverse = (right[determined].T / singular[determined]) @ basis[:, determined].T / sizes[:, None]
-        whole = np.hstack([self._frame.basis @ coordinates[k] for k in chosen])
-        return _Choice(tuple(effects[k] for k in chosen), whole, inverse @ left[:, -1], inverse @ inverse.T)
+        return _Choice(tuple(self._effects[k] for k in chosen), places, inverse @ left[:, -1], inverse @ inverse.T)
 
     def prediction(self, seen: int, choice: _Choice, dof: int) -> tuple[float, float, float, float]:
         """Fall of chi-squared of the unseen half by a choice, the fall predicted, and the p-values of both."""
-        both = np.column_stack([choice.columns, self._rows[:, -1]])
-        of_all, of_seen = self._complement.of(both), self._complements[seen].of(both[self._places[seen]])
+        both = [*choice.places, -1]
+        of_all = self._complement.of(self._whole[:, both])
+        of_seen = self._complements[seen].of(self._halves[seen][:, both])
         gram = of_all.T @ of_all - of_seen.T @ of_seen
         matrix, coefficients = gram[:-1, :-1], choice.coefficients
         pull, score = matrix @ coefficients, float(gram[-1, :-1] @ coefficients)

@@ -14,7 +14,7 @@ restricted likelihood of the noise over its sizes.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -25,13 +25,12 @@ from kf_calib.diagnosis.in_noises import InNoises, Spanned
 from kf_calib.diagnosis.within_rows import WithinRows
 from kf_calib.dwells.pieces import OfPieces, of_all_pieces
 from kf_calib.effects import Effect
-from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns, stimulus_of
+from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns, few_at_a_time, stimulus_of
 from kf_calib.noise.means import means_of
 from kf_calib.noise.noise_model import Noise, lift_rounding, mean_covariances
 from kf_calib.noise.reml import FREE, Part, with_shared_noise
 
 _SEEN = 1e-7  # share of a column that the model must leave for it to be seen
-_AT_ONCE = 1 << 22  # numbers of columns at the nodes of pieces that are made together
 _FINE = 8  # parts of a step over which the likelihood is integrated
 _LEAST = 0.1  # sigma of a mean: noise that is smaller shows nothing
 
@@ -114,15 +113,13 @@ class RunLikelihood:
         """Return the columns (D, 3, C) of all terms in the means, and rows within dwells, made for a few dwells at a
         time: their values at all nodes take ten times the memory."""
         linearised, dwells = self.linearised, self.linearised.dwells_at_state
-        model, state, ends = linearised.model, linearised.state, dwells.folded.ends
+        model, state = linearised.model, linearised.state
         stimulus, values = stimulus_of(dwells, model.bench, state), of_all_pieces(linearised.columns)
         made = sum(len(effect.coefficients) for effect in effects)
         count = sum(map(_width, blocks)) if blocks else model.count - known + made
         columns = np.empty((len(dwells), 3, count))
         within = WithinRows(self.noise, linearised, known, made)
-        for few in _parts(ends, made):
-            some, pieces = dwells[few], slice(int(ends[few.start]), int(ends[few.stop]))
-            nodes = stimulus if len(some) == len(dwells) else stimulus.at(slice(3 * pieces.start, 3 * pieces.stop))
+        for few, some, pieces, nodes in few_at_a_time(dwells, stimulus, made):
             added = candidate_columns(some, effects, model.bench, state, nodes)
             of_states = OfPieces(values[pieces, ..., known : model.count], some.folded.ends)
             of_terms = of_states.beside(added) if known < model.count else added
@@ -203,15 +200,6 @@ def _directions(columns: Floats) -> Floats:
     lengths = np.linalg.norm(columns, axis=0)
     left, singular, _ = np.linalg.svd(columns / np.where(lengths > 0.0, lengths, 1.0), full_matrices=False)
     return np.asarray(left[:, singular > _SEEN], float)
-
-
-def _parts(ends: Indices, columns: int) -> Iterator[slice]:
-    """Yield few dwells at a time, from the ends (D + 1,) of their pieces."""
-    first, most = 0, max(_AT_ONCE // (9 * max(columns, 1)), 1)
-    while first < len(ends) - 1:
-        last = max(int(np.searchsorted(ends, ends[first] + most, "right")) - 1, first + 1)
-        yield slice(first, last)
-        first = last
 
 
 def _width(block: Combination) -> int:

@@ -99,7 +99,7 @@ class WithinRows:
         freedom = self._channels * (dwells.folded.width * dwells.folded.piece_numbers - 1.0)
         self._freedom.append(np.asarray(freedom, float))
         self._gathered.append((_reduced(np.concatenate(of_dwells)), np.append(np.flatnonzero(moving), len(moving))))
-        if sum(len(rows) for rows, _ in self._gathered) > _TALL * len(moving):
+        if sum(len(rows) for rows, _ in self._gathered) > _TALL * max(rows.shape[1] for rows, _ in self._gathered):
             self._gathered = [self._merged()]
 
     def rows(self) -> tuple[Floats, Floats, Floats]:

@@ -480,10 +480,6 @@ class DwellTable(ComputedSequence[Dwell]):
             return self
         return replace(self, folded=other.folded)
 
-    def is_same(self, other: DwellTable) -> bool:
-        """Whether the other table has the same dwells with the same changes."""
-        return all(getattr(self, each.name) is getattr(other, each.name) for each in fields(self))
-
 
 def _both(one: Floats | None, more: Floats | None, *shapes: tuple[int, ...]) -> Floats | None:
     """Return an array and then another, zeros of its shape in place of one that is None; None if both are."""

@@ -148,12 +148,7 @@ def project(upper: Floats, width: int, effects: Sequence[Effect], counts: Sequen
     - width: number of columns H of the model.
     - effects: the candidates; counts: number of columns of each in G.
     """
-    rest = Complement(upper, width).of(upper[:, width:])
-    return scan_of(rest, np.linalg.norm(upper[:, width:-1], axis=0), effects, counts)
-
-
-def scan_of(rest: Floats, sizes: Floats, effects: Sequence[Effect], counts: Sequence[int]) -> Scan:
-    """Make the scan from what a model leaves of a triangular factor [G | z], and the norms of G before."""
+    sizes, rest = np.linalg.norm(upper[:, width:-1], axis=0), Complement(upper, width).of(upper[:, width:])
     units = np.where(sizes > 0, sizes, 1.0)
     columns, residual = rest[:-1, :-1] / units, rest[:-1, -1]
     candidates = list[Candidate]()

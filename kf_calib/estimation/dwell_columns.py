@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -24,6 +24,7 @@ from kf_calib.noise.temperature_course import temperature_course
 _LITTLE_RAD = 1e-4  # of a setting error of 0.01 deg it leaves 0.2 um/s^2 along the specific force
 _ABSURD_RAD = 0.2  # what hardly determined coefficients may amount to, but no bench
 _STEP_K = 1e-3
+_AT_ONCE = 1 << 22  # numbers of columns at the nodes of pieces that are made together
 _VIBRATING = 15.0  # mean squared deviation of the variances in units of sigma; autocorrelation alone gives up to 10
 
 
@@ -138,6 +139,21 @@ def _by_piece(columns: Callable[[Stimulus], Floats], stimulus: Stimulus) -> Floa
         parts += [columns(replace(stimulus, part=part)) for part in (1, 2)]
     shaped = [part.reshape(len(part) // 3, 3, *part.shape[1:]) for part in parts]
     return np.concatenate(shaped, axis=1) if len(shaped) > 1 else shaped[0]
+
+
+def few_at_a_time(
+    dwells: DwellTable, stimulus: Stimulus, columns: int
+) -> Iterator[tuple[slice, DwellTable, slice, Stimulus]]:
+    """Yield few dwells at a time, whose columns are made together: which they are, the dwells, which pieces they have,
+    and the stimulus at their nodes."""
+    ends, first, most = dwells.folded.ends, 0, max(_AT_ONCE // (9 * max(columns, 1)), 1)
+    while first < len(dwells):
+        last = max(int(np.searchsorted(ends, ends[first] + most, "right")) - 1, first + 1)
+        pieces = slice(int(ends[first]), int(ends[last]))
+        whole = last - first == len(dwells)
+        nodes = stimulus if whole else stimulus.at(slice(3 * pieces.start, 3 * pieces.stop))
+        yield slice(first, last), dwells[first:last], pieces, nodes
+        first = last
 
 
 class LinearisedDwells:

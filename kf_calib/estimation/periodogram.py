@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -55,27 +54,17 @@ class Periodogram:
         for k, hz in enumerate(points_hz):
             self._waves[:, k] *= np.exp(-2j * np.pi * hz * middles_s)
         self._squares = self._products_of_waves()
-        self._first: _Beside | None = None
 
-    def delta_chi2(self, rows: Floats, of_dwells: Floats, first: int) -> Floats:
+    def delta_chi2(self, rows: Floats, of_dwells: Floats) -> Floats:
         """Decrease of chi-squared (N,) if the oscillation at each frequency is added to a model.
 
-        - rows (r, c): whitened rows [H | E | z]. The columns H, ``first`` of them, have to be the same for every model
-          because their products are computed only once.
+        - rows (r, c): whitened rows [H | z].
         - of_dwells (m, c): the same columns in the rows of the dwells alone, before they are whitened with respect to
           the walk.
         """
-        if self._first is None:
-            self._first = _Beside.nothing(rows[:, -1], of_dwells[:, -1]).with_columns(
-                rows[:, :first], of_dwells[:, :first]
-            )
-            self._first.known = self._along(np.column_stack([self._first.of_dwells, self._first.left_of_dwells]))
-        base = self._first
-        whole = base.with_columns(rows[:, first:-1], of_dwells[:, first:-1])
-        added = whole.of_dwells[:, base.of_dwells.shape[1] :]
-        more = self._along(added)
-        left = base.known[:, :, -1] - more @ (whole.rows[:, base.of_dwells.shape[1] :].T @ base.left)
-        return self._lowered(np.concatenate([base.known[:, :, :-1], more], axis=2), left)
+        basis, left = _basis_and_rest(rows, of_dwells)
+        along = self._along(np.column_stack([basis, left]))
+        return self._lowered(along[:, :, :-1], along[:, :, -1])
 
     def _along(self, columns: Floats) -> Floats:
         """Return the products (N, 6, c) of the cosines and then the sines of the three accelerometers with columns (m,
@@ -149,42 +138,19 @@ class Periodogram:
             yield part, np.exp(self.values_hz[first] * turns_s) * apart[: len(own_hz)]
 
 
-@dataclass
-class _Beside:
-    """The orthonormalised columns of a model and the residual of the readings.
-
-    - rows (r, p): the columns in all whitened rows; of_dwells (m, p): the same columns in the rows of the dwells alone.
-    - left (r,), left_of_dwells (m,): the residual of the readings in both sets of rows.
-    - known: products of the oscillations with ``of_dwells`` and ``left_of_dwells``.
-    """
-
-    rows: Floats
-    of_dwells: Floats
-    left: Floats
-    left_of_dwells: Floats
-    known: Floats = field(default_factory=lambda: np.zeros(0))
-
-    @classmethod
-    def nothing(cls, left: Floats, left_of_dwells: Floats) -> _Beside:
-        """A model without columns."""
-        return cls(np.zeros((len(left), 0)), np.zeros((len(left_of_dwells), 0)), left, left_of_dwells)
-
-    def with_columns(self, rows: Floats, of_dwells: Floats) -> _Beside:
-        """The model with further columns, orthogonalised against those it has; what they add nothing to is dropped."""
-        scale = np.linalg.norm(rows, axis=0)
-        scale = np.where(scale > 0, scale, 1.0)
-        rows, of_dwells = rows / scale, of_dwells / scale
-        for _ in range(2):  # projecting twice removes the rounding errors of large components
-            share = self.rows.T @ rows
-            rows, of_dwells = rows - self.rows @ share, of_dwells - self.of_dwells @ share
-        _, singular, right = np.linalg.svd(rows, full_matrices=False)
-        seen = singular > _NEW
-        turned = right[seen].T / singular[seen]
-        rows, of_dwells, left, left_of_dwells = rows @ turned, of_dwells @ turned, self.left, self.left_of_dwells
-        for _ in range(2):
-            share = rows.T @ left
-            left, left_of_dwells = left - rows @ share, left_of_dwells - of_dwells @ share
-        return _Beside(np.hstack([self.rows, rows]), np.hstack([self.of_dwells, of_dwells]), left, left_of_dwells)
+def _basis_and_rest(rows: Floats, of_dwells: Floats) -> tuple[Floats, Floats]:
+    """Return, in the rows of the dwells alone, the columns (m, p) of a model that are orthonormal in all whitened rows
+    [H | z], and the residual (m,) of the readings."""
+    scale = np.linalg.norm(rows, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    left, left_of_dwells = rows[:, -1], of_dwells[:, -1]
+    basis, singular, right = np.linalg.svd(rows[:, :-1] / scale[:-1], full_matrices=False)
+    seen = singular > _NEW
+    basis, of_basis = basis[:, seen], (of_dwells[:, :-1] / scale[:-1]) @ (right[seen].T / singular[seen])
+    for _ in range(2):  # projecting twice removes the rounding errors of large components
+        share = basis.T @ left
+        left, left_of_dwells = left - basis @ share, left_of_dwells - of_basis @ share
+    return of_basis, left_of_dwells
 
 
 class _Path:

@@ -1,17 +1,12 @@
-"""Score tests of candidate effects against a fitted model, and what the tests share: the candidates' whitened columns.
+"""Score tests of candidate effects against a fitted model, and the rows from which they are made.
 
 Let H be the whitened columns of the model, G those of a candidate effect and z the whitened readings. G and z are
 projected onto the orthogonal complement of H. The projections answer every question about the candidate: its score
 statistic, its coefficients and their sigmas, its overlap with any other candidate, and the smallest size that would be
 detected.
 
-The columns of all candidates of the catalogue are evaluated and whitened once per run and noise model and are written
-in an orthonormal basis of their own (``Frame``). To test them against another model, only that model's columns and the
-readings have to be whitened; the projection is then done on a small matrix, and any two candidates can be compared.
-
-Formulas are too many for that, and only two things are asked of a group of them: what it explains, and whether it is a
-known effect by another name (``FurtherEffects``). The model's columns and those of the known effects are made
-orthonormal once, and each group is reduced to a small triangle of its own.
+The rows of all candidates are made and reduced by QR for a few dwells at a time, so that a long run takes no more
+memory than a short one.
 """
 
 from __future__ import annotations
@@ -19,148 +14,57 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from kf_calib.bench.arrays import Floats
-from kf_calib.bench.paper_parameters import STATE_COUNT
-from kf_calib.dwells.line_spectrum import SpectralLine
-from kf_calib.dwells.qr import orthonormal
-from kf_calib.dwells.sufficient_statistics import lines_of
+from kf_calib.bench.arrays import Floats, Indices
+from kf_calib.dwells.pieces import OfPieces, of_all_pieces
 from kf_calib.dwells.table import DwellTable
-from kf_calib.effects import Effect, Stimulus
-from kf_calib.estimation import square_root_information, whitened_rows
+from kf_calib.effects import Effect
+from kf_calib.estimation import whitened_rows
 from kf_calib.estimation.candidate_scan import SEEN, Complement, Scan, counts_of, project, slices
-from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns, piece_columns, stimulus_of
+from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns, few_at_a_time, stimulus_of
 from kf_calib.estimation.periodogram import Periodogram
-from kf_calib.estimation.whitened_rows import MisfitColumns
+from kf_calib.estimation.square_root_information import accumulate
 from kf_calib.noise import random_walk
 from kf_calib.noise.noise_model import Noise, steps
-from kf_calib.noise.terms import SlowWaves
 
-_TOGETHER = 24  # least number of columns that are whitened at a time; more would take more memory
-_CELLS = 10_000  # columns times dwells that are whitened at a time, if this allows more columns
 _OF_ONE_KIND = 400  # columns whitened at a time if there are many effects of one kind
 _MANY = 100  # above this number of oscillations, a periodogram is faster
 
 
-class Frame:
-    """The whitened columns of ``effects`` over all dwells, in an orthonormal basis of their own.
-
-      columns (m, q) = basis (m, r) @ coordinates (r, q)
-
-    A frame can be used with every model of the same dwells that is judged by the same noise. Small rotations and input
-    axes remain linearised at ``state``, the state with which the frame was made.
-    """
-
-    def __init__(self, linearised: LinearisedDwells, noise: Noise, effects: Sequence[Effect]) -> None:
-        self.dwells, self.noise, self.state, self.effects = (
-            linearised.dwells_at_state,
-            noise,
-            linearised.state,
-            list(effects),
-        )
-        self.parts = slices(counts_of(effects))
-        self._stimulus = stimulus_of(linearised.dwells_at_state, linearised.model.bench, linearised.state)
-        self._whitening = (
-            None if noise.walk.steps else MisfitColumns(linearised.dwells_at_state, noise, linearised.state)
-        )
-        self.basis, self.coordinates = orthonormal(self.whitened(linearised, effects))
-        self._periodogram: tuple[tuple[tuple[str, float], bytes], Periodogram] | None = None
-        self._lines: dict[float, tuple[SpectralLine, ...]] = {}
-        self._last: tuple[LinearisedDwells, Floats, Floats, int] | None = None
-
-    @property
-    def ends(self) -> NDArray[np.intp] | None:
-        """The first row of each dwell, after those of prior knowledge, and at last the number of rows; None where a
-        walk of the biases makes the rows of all dwells one."""
-        return None if self._whitening is None else self._whitening.ends
-
-    def whitened(self, linearised: LinearisedDwells, effects: Sequence[Effect]) -> Floats:
-        """Whitened columns (m, q) of any effects, computed for a few at a time, which saves memory."""
-        sizes, whitened, first = counts_of(effects), np.zeros((0, 0)), 0
-        for part in batches(sizes, columns_at_once(linearised)) or [[]]:
-            block = self._whitened(linearised, [effects[k] for k in part])
-            whitened = whitened if len(whitened) else np.empty((len(block), sum(sizes)))
-            whitened[:, first : first + block.shape[1]], first = block, first + block.shape[1]
-        return whitened
-
-    def _whitened(self, linearised: LinearisedDwells, effects: Sequence[Effect]) -> Floats:
-        if self._whitening is not None:
-            return self._whitening.of(piece_columns(effects, self._stimulus))
-        # a walk is whitened by the columns of the biases, which are among the twelve
-        added = candidate_columns(
-            linearised.dwells_at_state, effects, linearised.model.bench, self.state, self._stimulus
-        )
-        both = [
-            np.concatenate([own[..., :STATE_COUNT], more], axis=3)
-            for own, more in zip(linearised.columns, added, strict=True)
-        ]
-        rows, width = _judged(linearised.dwells_at_state, both, self.noise, self.state, STATE_COUNT)
-        return _stacked(rows, linearised.dwells, self.noise)[:, width:-1]
-
-    def lines(self, level: float) -> tuple[SpectralLine, ...]:
-        """Oscillations found in the readings at the significance ``level`` (see ``sufficient_statistics.lines_of``);
-        they do not depend on the model."""
-        if level not in self._lines:
-            self._lines[level] = lines_of(self.dwells, level)
-        return self._lines[level]
-
-    def serves(self, linearised: LinearisedDwells, noise: Noise) -> bool:
-        """Tell whether the frame was made for exactly these dwells and this noise."""
-        return linearised.dwells_at_state.is_same(self.dwells) and noise.same_sizes(self.noise, without=SlowWaves)
-
-    def scan(self, linearised: LinearisedDwells, more: Sequence[Effect] = ()) -> Scan:
-        """Project the frame's effects, without those that the model contains, and then the effects ``more`` off the
-        model in ``linearised``."""
-        chosen = [k for k, effect in enumerate(self.effects) if str(effect) not in linearised.model.parts]
-        inside, outside, width = self._model(linearised)
-        more_inside, more_outside = self._split(self.whitened(linearised, more))
-        beside = square_root_information.accumulate([np.hstack([outside[:, :-1], more_outside, outside[:, -1:]])])
-        coordinates = [self.coordinates[:, self.parts[k]] for k in chosen]
-        count = sum(each.shape[1] for each in coordinates)
-        small = np.vstack([
-            np.hstack([inside[:, :-1], *coordinates, more_inside, inside[:, -1:]]),
-            np.hstack([beside[:, :width], np.zeros((len(beside), count)), beside[:, width:]]),
-        ])  # fmt: skip
-        effects = [*(self.effects[k] for k in chosen), *more]
-        return project(square_root_information.accumulate([small]), width, effects, counts_of(effects))
-
-    def _model(self, linearised: LinearisedDwells) -> tuple[Floats, Floats, int]:
-        """Return the columns [H | W | z] of a model, inside the frame and outside it, and the number of columns before
-        z; the result is cached for the next scan of the same model."""
-        if self._last is None or self._last[0] is not linearised:
-            rows, width = self.whitened_model(linearised)
-            self._last = linearised, *self._split(rows), width
-        return self._last[1:]
-
-    def whitened_model(self, linearised: LinearisedDwells) -> tuple[Floats, int]:
-        """Whitened rows [H | W | z] (m, c) of the model in ``linearised``, and the number of columns before z."""
-        return whiten_model(linearised, self.noise, [], self.state, self._stimulus)
-
-    def _split(self, rows: Floats) -> tuple[Floats, Floats]:
-        """Split columns (m, c) into their coordinates (r, c) in the frame and the remainder (m, c) orthogonal to it."""
-        inside = self.basis.T @ rows
-        return inside, rows - self.basis @ inside
-
-    def delta_chi2(self, linearised: LinearisedDwells, effect: Effect, values_hz: Floats) -> Floats:
-        """Decrease of chi-squared (n,) if an oscillation at each frequency, alone, is added to the model in
-        ``linearised``; the periodogram is kept for further calls with the same frequencies.
-        """
-        key = _key(effect), values_hz.tobytes()
-        if self._periodogram is None or self._periodogram[0] != key:
-            self._periodogram = key, Periodogram(linearised, self.noise, effect, values_hz)
-        return self._periodogram[1].delta_chi2(*_with_and_without_walk(linearised, self.noise, self.state, STATE_COUNT))
-
-
-def _key(effect: Effect) -> tuple[str, float]:
-    """Return what identifies an effect together with the value of its constant."""
-    return str(effect), effect.value
-
-
 def scan(linearised: LinearisedDwells, noise: Noise, effects: Sequence[Effect]) -> Scan:
-    """Project ``effects`` off the model in ``linearised`` without a frame."""
-    rows, width = whiten_model(linearised, noise, effects)
-    return project(square_root_information.accumulate([rows]), width, effects, counts_of(effects))
+    """Project ``effects`` off the model in ``linearised``."""
+    if noise.walk.steps:
+        rows, width = whiten_model(linearised, noise, effects)
+        return project(accumulate([rows]), width, effects, counts_of(effects))
+    (upper, _), width = triangles(linearised, noise, effects, [np.arange(len(linearised.dwells))])
+    return project(upper, width, effects, counts_of(effects))
+
+
+def triangles(
+    linearised: LinearisedDwells, noise: Noise, effects: Sequence[Effect], groups: Sequence[Indices]
+) -> tuple[list[Floats], int]:
+    """Triangular factors [H | W | G | z] of all rows and of those of each of some groups of dwells, which together are
+    all, and the number of columns before G; for a noise in which the biases do not walk.
+
+    W are columns for noise that dwells have in common (``whitened_rows.misfit_rows``), of which something is known
+    beforehand: these rows belong to each group.
+    """
+    dwells, state, known = linearised.dwells_at_state, linearised.state, linearised.model.count
+    judging = noise.with_scatter_as_flicker(len(dwells))
+    shared, values = judging.columns("run", dwells, state), of_all_pieces(linearised.columns)
+    width, made = known + shared.shape[3], sum(counts_of(effects))
+    stimulus = stimulus_of(dwells, linearised.model.bench, state)
+    uppers = [np.zeros((0, width + made + 1)) for _ in groups]
+    for few, some, pieces, nodes in few_at_a_time(dwells, stimulus, width + made):
+        added = candidate_columns(some, effects, linearised.model.bench, state, nodes)
+        columns = np.concatenate([values[pieces], shared[pieces], added.values], axis=3)
+        rows = whitened_rows.whiten(some, OfPieces(columns, some.folded.ends), judging, state, reduced=False)
+        for k, group in enumerate(groups):
+            own = group[(group >= few.start) & (group < few.stop)] - few.start
+            uppers[k] = accumulate([uppers[k], *(rows[n] for n in own.tolist())]) if len(own) else uppers[k]
+    prior = np.eye(width - known, width + made + 1, known)
+    of_groups = [accumulate([prior, upper]) if len(prior) else upper for upper in uppers]
+    return [accumulate([prior, *uppers]) if len(groups) > 1 else of_groups[0], *of_groups], width
 
 
 def delta_chi2(linearised: LinearisedDwells, noise: Noise, effects: Sequence[Effect]) -> Floats:
@@ -170,8 +74,7 @@ def delta_chi2(linearised: LinearisedDwells, noise: Noise, effects: Sequence[Eff
     proportional to d times n instead of d times n^2.
     """
     if effects[0].oscillates and len(effects) > _MANY:
-        many = Periodogram(linearised, noise, effects[0], np.array([effect.value for effect in effects]))
-        return many.delta_chi2(*_with_and_without_walk(linearised, noise, linearised.state, linearised.model.count))
+        return periodogram(linearised, noise, effects[0], np.array([effect.value for effect in effects]))
     deltas = list[Floats]()
     for part in batches(counts_of(effects), _OF_ONE_KIND):
         rows, width = whiten_model(linearised, noise, [effects[k] for k in part])
@@ -182,6 +85,11 @@ def delta_chi2(linearised: LinearisedDwells, noise: Noise, effects: Sequence[Eff
         inverse = np.linalg.pinv(gram, rcond=SEEN, hermitian=True)
         deltas.append(np.einsum("ni,nij,nj->n", along, inverse, along))
     return np.concatenate(deltas)
+
+
+def periodogram(linearised: LinearisedDwells, noise: Noise, effect: Effect, values_hz: Floats) -> Floats:
+    """Decrease of chi-squared (n,) if an oscillation at each frequency, alone, is added to the model."""
+    return Periodogram(linearised, noise, effect, values_hz).delta_chi2(*_with_and_without_walk(linearised, noise))
 
 
 def joint_delta_chi2(
@@ -204,29 +112,19 @@ def joint_delta_chi2(
 
 
 def whiten_model(
-    linearised: LinearisedDwells,
-    noise: Noise,
-    effects: Sequence[Effect],
-    state: Floats | None = None,
-    stimulus: Stimulus | None = None,
+    linearised: LinearisedDwells, noise: Noise, effects: Sequence[Effect], state: Floats | None = None
 ) -> tuple[Floats, int]:
     """Whitened rows [H | W | G | z] (m, c) of the model in ``linearised`` and of ``effects``, and the number of columns
     before G.
 
     - W: columns of the slow part of a stated scatter, see ``whitened_rows.misfit_rows``.
     - state: where small rotations and input axes are linearised; by default at the state in ``linearised``.
-    - stimulus: the stimulus of the dwells at that state, if it is already known.
     """
     at, dwells = linearised.state if state is None else state, linearised.dwells_at_state
-    added = candidate_columns(dwells, effects, linearised.model.bench, at, stimulus)
+    added = candidate_columns(dwells, effects, linearised.model.bench, at)
     columns = [np.concatenate([own, more], axis=3) for own, more in zip(linearised.columns, added, strict=True)]
     rows, width = _judged(dwells, columns, noise, at, linearised.model.count)
     return _stacked(rows, dwells, noise), width
-
-
-def columns_at_once(linearised: LinearisedDwells) -> int:
-    """Number of columns to whiten at a time; it is larger for few dwells, where the overhead of the calls dominates."""
-    return max(_TOGETHER, _CELLS // len(linearised.dwells))
 
 
 def batches(sizes: Sequence[int], columns: int) -> list[list[int]]:
@@ -248,12 +146,9 @@ def _stacked(rows: Sequence[Floats], dwells: DwellTable, noise: Noise) -> Floats
     return random_walk.whiten_walk(rows, steps(dwells, noise)) if noise.walk.steps else np.concatenate(rows)
 
 
-def _with_and_without_walk(
-    linearised: LinearisedDwells, noise: Noise, state: Floats, width: int
-) -> tuple[Floats, Floats, int]:
+def _with_and_without_walk(linearised: LinearisedDwells, noise: Noise) -> tuple[Floats, Floats]:
     """Rows of the model in ``linearised`` as ``Periodogram.delta_chi2`` needs them: whitened, the walk of the biases
-    taken out;
-    those of the dwells alone with the walk still in them; and how many columns the first ``width`` become with W."""
-    rows, count = _judged(linearised.dwells_at_state, linearised.columns, noise, state, width)
+    taken out; and those of the dwells alone, with the walk still in them."""
+    rows, _ = _judged(linearised.dwells_at_state, linearised.columns, noise, linearised.state, linearised.model.count)
     of_dwells = np.concatenate(rows[len(rows) - len(linearised.dwells) :])
-    return _stacked(rows, linearised.dwells, noise), of_dwells[:, noise.walk.steps :], count
+    return _stacked(rows, linearised.dwells, noise), of_dwells[:, noise.walk.steps :]

@@ -106,20 +106,6 @@ class Noise:
         """Whether nothing is known of the attitude of a dwell, so that only the size of the force is."""
         return self.setting.is_unknown
 
-    def same_sizes(self, other: Noise, without: type[NoiseTerm]) -> bool:
-        """Whether all numbers are those of another noise, whether stated or not, but for those of one class of
-        terms."""
-        one, two = (
-            {type(term): term.sizes for term in noise.terms if term.sizes.any() and not isinstance(term, without)}
-            for noise in (self, other)
-        )
-        return (
-            one.keys() == two.keys()
-            and all(np.array_equal(one[kind], two[kind]) for kind in one)
-            and np.array_equal(self.sigma_mps2, other.sigma_mps2)
-            and np.array_equal(self.inflation, other.inflation)
-        )
-
     # Lists that differ in some terms
 
     def with_terms(self, *terms: NoiseTerm) -> Noise:

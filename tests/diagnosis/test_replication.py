@@ -18,7 +18,7 @@ from scipy.stats import t
 
 import kf_calib
 from kf_calib.bench.streams import Stream
-from kf_calib.diagnosis.candidate_tests import candidate_frame
+from kf_calib.diagnosis.candidate_tests import candidates
 from kf_calib.diagnosis.replication import FEWEST, Replication, _one_sided, replication
 from kf_calib.estimation.results import Calibration, Consistency
 from kf_calib.views.diagnosis import replication_in_words
@@ -45,13 +45,12 @@ def model(force: np.ndarray) -> np.ndarray:
 
 
 def replicated(before: Calibration, relevant: list[str], left: Consistency | None = None) -> Replication:
-    return replication(before, candidate_frame(before.fit), relevant, 1, left or Consistency(50.0, 50, 0.5, True))
+    return replication(before, relevant, 1, left or Consistency(50.0, 50, 0.5, True))
 
 
 @cache
 def everything() -> list[str]:
-    frame = candidate_frame(kf_calib.calibrate(hidden(1, 0.0)[0]).fit)
-    return sorted({str(effect) for effect in frame.effects})
+    return sorted({str(effect) for effect in candidates(kf_calib.calibrate(hidden(1, 0.0)[0]).model)})
 
 
 def by_hand(values: np.ndarray, force: np.ndarray, seen: np.ndarray) -> tuple[float, float, float]:

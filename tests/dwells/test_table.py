@@ -122,11 +122,6 @@ def test_a_dwell_grows_piece_by_piece() -> None:
     np.testing.assert_array_equal(parts[0].triangles, table[1:].triangles[:1])
 
 
-def test_tables_are_the_same_if_nothing_was_changed(dwells: DwellTable) -> None:
-    assert DwellTable.of(dwells) is dwells and dwells.is_same(replace(dwells))
-    assert not dwells.is_same(dwells[:-1]) and not dwells.is_same(changed(dwells, np.random.default_rng(3)))
-
-
 def test_columns_by_piece_are_a_sequence_by_dwell() -> None:
     values = np.arange(24.0).reshape(4, 3, 1, 2)
     columns = OfPieces(values, np.array([0, 1, 4]))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kf_calib.bench.paper_parameters import BIASES
-from kf_calib.estimation.periodogram import _Beside, _Path, _points
+from kf_calib.estimation.periodogram import _basis_and_rest, _Path, _points
 
 
 @pytest.mark.parametrize(("longest_s", "count"), [(6.0, 400), (60.0, 2000)])
@@ -55,8 +55,8 @@ def test_columns_beside_others_leave_what_least_squares_leave() -> None:
     rng = np.random.default_rng(7)
     rows, readings = rng.normal(size=(30, 6)) * 10.0 ** np.arange(-3, 3), rng.normal(size=30)
     rows[:, 4] = rows[:, 0] - 2e-3 * rows[:, 3]
-    beside = _Beside.nothing(readings, readings).with_columns(rows[:, :3], rows[:, :3])
-    beside = beside.with_columns(rows[:, 3:], rows[:, 3:])
+    both = np.column_stack([rows, readings])
+    basis, rest = _basis_and_rest(both, both)
     left = readings - rows @ np.linalg.lstsq(rows, readings, rcond=1e-13)[0]
-    np.testing.assert_allclose(beside.left, left, atol=1e-9)
-    np.testing.assert_allclose(beside.rows.T @ beside.rows, np.eye(5), atol=1e-9)
+    np.testing.assert_allclose(rest, left, atol=1e-9)
+    np.testing.assert_allclose(basis.T @ basis, np.eye(5), atol=1e-9)

@@ -1,9 +1,12 @@
-"""A frame of columns serves all models of a run, and gives what a scan made for one alone gives."""
+"""Score tests of a run, made for a few dwells at a time, are those of least squares of all."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
+import scipy.linalg
 from helpers.synthetic import plan_of
 from scipy.interpolate import Akima1DInterpolator
 
@@ -12,13 +15,12 @@ from kf_calib.diagnosis.candidate_tests import candidates
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.dwells.qr import orthonormal
-from kf_calib.effects import effect_named
 from kf_calib.effects.stimulus import smooth_between
+from kf_calib.estimation import dwell_columns
 from kf_calib.estimation.calibration import calibrate
-from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.results import Calibration
-from kf_calib.estimation.score_test import Frame, scan
-from kf_calib.noise.terms import RandomWalk, SettingError
+from kf_calib.estimation.score_test import scan, triangles, whiten_model
+from kf_calib.noise.terms import Scatter, SettingError
 from kf_calib.sources.simulation.injected import parse
 from kf_calib.sources.simulation.sensors import GRADES, TrueNoise
 from kf_calib.sources.simulation.simulator import Simulation
@@ -34,40 +36,49 @@ def run(*hidden: str, seed: int = 5) -> Calibration:
     return calibrate(base.hiding(parse(hidden, BENCH.axes, seed=seed)))
 
 
-@pytest.mark.parametrize("walk_mps2", [0.0, 1e-6])
-def test_a_frame_gives_what_a_scan_of_one_model_gives(walk_mps2: float) -> None:
+@pytest.mark.parametrize("names", [(), ("second-order", "settling")])
+def test_a_scan_of_few_dwells_at_a_time_is_least_squares_of_all(names: tuple[str, ...], monkeypatch: Any) -> None:
+    before = Refits().with_effects(run("second-order=40ug/g^2"), names)
+    noise = before.noise.for_goodness_of_fit.with_terms(SettingError(2e-6, stated=True))
+    effects = candidates(before.model)
+    monkeypatch.setattr(dwell_columns, "_AT_ONCE", 4000)
+    found = scan(before.linearised, noise, effects)
+    for effect, each, lowered in list(zip(effects, found.candidates, found.statistics, strict=True))[::9]:
+        rows, width = whiten_model(before.linearised, noise, [effect])
+        without, with_it = (chi2(rows[:, :last], rows[:, -1]) for last in (width, rows.shape[1] - 1))
+        assert each.effect is effect
+        np.testing.assert_allclose(lowered, without - with_it, rtol=1e-4, atol=1e-3)
+
+
+def chi2(columns: np.ndarray, readings: np.ndarray) -> float:
+    """What is left of the readings beside these columns, by scipy."""
+    sizes = np.linalg.norm(columns, axis=0)
+    scaled = columns / np.where(sizes > 0.0, sizes, 1.0)
+    return float(np.sum((readings - scaled @ scipy.linalg.lstsq(scaled, readings, cond=1e-7)[0]) ** 2))
+
+
+def test_triangles_of_groups_are_those_of_their_dwells() -> None:
     before = run("second-order=40ug/g^2")
-    noise = before.noise.for_goodness_of_fit.with_terms(RandomWalk(walk_mps2))
-    frame = Frame(before.linearised, noise, candidates(Model(BENCH)))
-    more = [effect_named("mine = a*p*o", BENCH)]
-    refits = Refits()
-    for result in (before, *(refits.with_effects(before, (name,)) for name in ("second-order", "settling"))):
-        found = frame.scan(result.linearised, more)
-        alone = scan(result.linearised, noise, [*candidates(result.model), *more])
-        assert [str(each.effect) for each in found.candidates] == [str(each.effect) for each in alone.candidates]
-        assert [each.dof for each in found.candidates] == [each.dof for each in alone.candidates]
-        # with an effect in the model small rotations are linearised a little elsewhere
-        np.testing.assert_allclose(found.statistics, alone.statistics, rtol=1e-4, atol=1e-4)
-        np.testing.assert_allclose(
-            [each.visibility for each in found.candidates], [each.visibility for each in alone.candidates], atol=1e-4
-        )
-
-
-def test_a_frame_serves_one_noise_and_one_run() -> None:
-    one, other = run(), run(seed=3)
-    frame = Frame(one.linearised, one.noise.for_goodness_of_fit, [])
-    assert frame.serves(one.linearised, one.noise.for_goodness_of_fit)
-    assert not frame.serves(other.linearised, one.noise.for_goodness_of_fit)
-    assert not frame.serves(one.linearised, one.noise.for_goodness_of_fit.with_terms(SettingError(1e-5)))
+    noise = before.noise.for_goodness_of_fit.with_terms(Scatter(np.full(3, 1e-5), stated=True))
+    effects, groups = candidates(before.model)[:9], [np.array([0, 3, 4, 9]), np.array([1, 2, 5, 6, 7, 8, 10, 11])]
+    (whole, *parts), width = triangles(before.linearised, noise, effects, groups)
+    rows, known = whiten_model(before.linearised, noise, effects)
+    assert width == known > before.model.count  # scatter that is stated is slow in part, which all dwells share
+    sizes = np.linalg.norm(rows, axis=0)
+    unit = np.outer(sizes, sizes) + 1e-300
+    np.testing.assert_allclose(whole.T @ whole / unit, rows.T @ rows / unit, atol=1e-12)
+    own, shared = [part.T @ part for part in parts], slice(before.model.count, width)
+    prior = np.zeros_like(own[0])
+    prior[shared, shared] = np.eye(width - before.model.count)
+    np.testing.assert_allclose((own[0] + own[1] - prior) / unit, rows.T @ rows / unit, atol=1e-12)
 
 
 def test_nothing_is_fitted_twice() -> None:
     before = run("second-order=40ug/g^2")
     refits = Refits()
     assert refits.with_effects(before, ("second-order",)) is refits.with_effects(before, ("second-order",))
-    found, frame = diagnose(before, refits), refits.frame_of(before.fit)
+    found = diagnose(before, refits)
     assert found.after is not None and found.after is refits.with_effects(before, found.missing)
-    assert refits.frame_of(found.after.fit) is frame
 
 
 @pytest.mark.parametrize("count", [5, 40, 5000])

@@ -16,7 +16,7 @@ from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.dwell_columns import LinearisedDwells, stimulus_of
 from kf_calib.estimation.engine_comparison import compare
 from kf_calib.estimation.results import Calibration
-from kf_calib.estimation.score_test import Frame, delta_chi2, scan
+from kf_calib.estimation.score_test import delta_chi2, periodogram, scan
 from kf_calib.estimation.settings import Settings
 from kf_calib.noise.terms import RandomWalk, Scatter
 from kf_calib.sources.simulation.injected import parse
@@ -105,7 +105,6 @@ def test_a_periodogram_gives_what_each_frequency_alone_does(scatter_mps2: float,
     fitted = calibrate(run(0.1, 1.0, dwells=10), Settings(effects=("scale-drift",))).fit
     noise = fitted.noise.with_terms(Scatter(np.full(3, scatter_mps2), stated=True), RandomWalk(walk_mps2))
     values = np.linspace(0.01, 0.5, 400)
-    frame = Frame(fitted.linearised, noise, [])
     twelve = LinearisedDwells(
         fitted.dwells, fitted.linearised.model - fitted.linearised.model.effects[0], fitted.linearised.state[:12]
     )
@@ -113,18 +112,8 @@ def test_a_periodogram_gives_what_each_frequency_alone_does(scatter_mps2: float,
         effects = [effect_named("sinusoid", BENCH).at(value) for value in values[::7]]
         expected = scan(linearised, noise, effects).statistics
         assert expected.max() > 10.0
-        found = frame.delta_chi2(linearised, effect_named("sinusoid", BENCH), values)[::7]
+        found = periodogram(linearised, noise, effect_named("sinusoid", BENCH), values)[::7]
         np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)
-
-
-def test_a_frame_answers_for_the_frequencies_it_is_asked() -> None:
-    """As a first call with these frequencies does, whatever was asked before."""
-    fitted = calibrate(run(0.1, 1.0, dwells=10)).fit
-    effect, frames = effect_named("sinusoid", BENCH), [Frame(fitted.linearised, fitted.noise, []) for _ in range(2)]
-    values_hz = np.linspace(0.01, 0.5, 100)
-    expected = frames[0].delta_chi2(fitted.linearised, effect, values_hz[40:60])
-    frames[1].delta_chi2(fitted.linearised, effect, values_hz[:20])
-    assert np.array_equal(frames[1].delta_chi2(fitted.linearised, effect, values_hz[40:60]), expected)
 
 
 def test_columns_are_the_nearest_parabolas() -> None:

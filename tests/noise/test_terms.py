@@ -103,6 +103,3 @@ def test_noises_differ_by_which_terms_are_in_the_list() -> None:
     assert kinds(stated) == {Scatter, RandomWalk, SlowWaves}
     assert kinds(stated.with_scatter_as_flicker(24)) >= {SlowWaves, WavesOverRun}
     assert not kinds(stated.with_scatter_as_flicker(3)) & {SlowWaves, WavesOverRun}
-    assert noise.same_sizes(noise.with_terms(SlowWaves(2.0 * sigma)), without=SlowWaves)
-    assert not noise.same_sizes(noise.with_terms(RandomWalk(2e-6)), without=SlowWaves)
-    assert noise.without(Scatter).same_sizes(noise.with_terms(Scatter(np.zeros(3), stated=True)), without=SlowWaves)
