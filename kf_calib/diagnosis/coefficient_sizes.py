@@ -86,6 +86,11 @@ def usual_sizes(effect: Effect, grade: Grade) -> SizePrior | None:
     return None if usual is None else SizePrior(usual[0] or usual[1] / _SHARPER, usual[1])
 
 
+def impossible_size(effect: Effect) -> float:
+    """The size from which on none of an effect's coefficients could be."""
+    return max(each.impossible for each in effect.coefficients)
+
+
 def best_sigma(root: Floats) -> float:
     """Sigma of the coefficient that is determined best, from a root (r, q) of the information on them all."""
     return float(1.0 / max(np.linalg.norm(root, axis=0).max(initial=0.0), 1e-100))

@@ -34,7 +34,8 @@ CREDIBLE = 0.99
 LISTED = 0.01
 """Least probability of an explanation that has a line of its own where the table is shown."""
 
-PRIOR = {"nothing": 0.4, "effect": 0.38, "pair": 0.08, "unknown": 0.1, "beside": 0.02, "dwell": 0.02}
+PRIOR = {"nothing": 0.4, "effect": 0.38, "pair": 0.08, "unknown": 0.09, "two unknown": 0.01,
+         "beside": 0.02, "dwell": 0.02}  # fmt: skip
 """Prior probability of each kind of explanation; ``beside``: an effect beside an unknown function; ``dwell``: one dwell
 alone is off; of several, each has that of one."""
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, Indices
 from kf_calib.diagnosis.candidate_tests import CandidateTests
-from kf_calib.diagnosis.coefficient_sizes import best_sigma, usual_sizes
+from kf_calib.diagnosis.coefficient_sizes import best_sigma, impossible_size, usual_sizes
 from kf_calib.diagnosis.dwells_apart import DwellsApart
 from kf_calib.diagnosis.hypothesis_table import (
     IRREGULAR,
@@ -35,7 +35,7 @@ from kf_calib.diagnosis.in_noises import InNoises
 from kf_calib.diagnosis.noise_sizes import NoiseFamily, NoiseSizes
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.run_likelihood import Projected, RunLikelihood, log_bayes_together
-from kf_calib.diagnosis.run_terms import RunTerm, RunTerms, log_bayes_of_columns, sizes_of
+from kf_calib.diagnosis.run_terms import TWO_SUMMANDS, RunTerm, RunTerms, log_bayes_of_columns, sizes_of
 from kf_calib.diagnosis.unknown_terms import name_of_formula, text_named
 from kf_calib.dwells.qr import orthonormal
 from kf_calib.effects import effect_named
@@ -52,6 +52,8 @@ _AGAINST_STATED = 0.5  # the same of scatter beyond what was stated
 _OF_ORIENTATION = 0.8  # share of unknown causes that depend on the orientation alone, and come back with it
 _WITHIN = 0.01  # prior probability of irregular changes that show within dwells only
 _APART = 1e-4  # p-value of an oscillation that does not go on alike in all dwells
+_AND = ", and with "  # between the drivers of two unknown functions
+_UNKNOWN_HEADS = 1  # unknown functions, the likeliest, beside which all other terms are tried
 _HEADS = 3  # effects beside which all other terms are tried: likeliest in any noise, in that stated, and in pairs
 _NO_SIGN = 0.5  # of chi-squared: what is left of an effect beside one that is the same
 _SAME = 1e-6  # squared sine of the angle below which two effects are one
@@ -85,7 +87,7 @@ class RunPosterior:
         stage.say(f"weighing {len(self._run.terms)} explanations in {len(self._sizes.covariances)} noises")
         rows = [*self._without_terms(), *self._singles(), self._dwells_apart()]
         if refitted:
-            rows = self._fitted([*rows, *self._pairs()])
+            rows = self._fitted(_merged([*rows, *self._pairs()]))
             beside = self._dwells_beside(rows)
             rows = [self._with_changes_beside_walk(row, rows) if row.driver == IRREGULAR else row for row in rows]
             rows = _with_sure_dwells(rows, beside)
@@ -185,13 +187,7 @@ class RunPosterior:
 
     def _singles(self) -> list[Hypothesis]:
         """Return the rows of one term each."""
-        logs, rows = self._by_row(self._log_evidence), list[Hypothesis]()
-        for row, log in logs.items():
-            if row.startswith("?"):
-                rows.append(self._row((), row, log))
-            else:
-                rows.append(self._row((row,), "", log))
-        return rows
+        return [self._row_of((row,), log) for row, log in self._by_row(self._log_evidence).items()]
 
     def _by_row(self, logs: Floats) -> dict[str, float]:
         """Return the log evidence of each row from those of its terms."""
@@ -200,26 +196,29 @@ class RunPosterior:
             of_row.setdefault(term.row, []).append(log + term.log_share)
         return {row: _log_sum(values) for row, values in of_row.items()}
 
-    def _row(self, effects: tuple[str, ...], unknown: str, log: float) -> Hypothesis:
-        """Return the row of some effects and, beside them, an unknown function, with its prior."""
-        families, driver = [effect_named(name, self._before.bench).family for name in effects], ""
-        if unknown:
-            term = self._run.unknown[int(unknown[1:])]
-            families.append(term.family or NONE)
-            driver = term.driver
-        log += self._log_prior(effects, bool(unknown))
+    def _row_of(self, names: Sequence[str], log: float) -> Hypothesis:
+        """Return the row of some effects and unknown functions, with its prior."""
+        effects = tuple(name for name in names if not name.startswith("?"))
+        unknown = [self._run.unknown[int(name[1:])] for name in names if name.startswith("?")]
+        families = [effect_named(name, self._before.bench).family for name in effects]
+        families += [term.family or NONE for term in unknown]
+        log += self._log_prior(effects, len(unknown))
         tested = [self._tested(name) for name in effects]
-        statistic, dof = tested[0][0] if len(effects) == 1 and not unknown else 0.0, sum(dof for _, dof in tested)
+        statistic, dof = tested[0][0] if len(names) == len(effects) == 1 else 0.0, sum(dof for _, dof in tested)
+        driver = _AND.join(term.driver for term in unknown)
         return Hypothesis(effects, (), driver, tuple(dict.fromkeys(families)), log, statistic, dof)
 
-    def _log_prior(self, effects: Sequence[str], beside_unknown: bool = False) -> float:
-        """Return the log of the prior probability of some effects and, if so, an unknown function."""
-        names, unknown = max(len(self._run.names), 2), len(self._run.unknown)
+    def _log_prior(self, effects: Sequence[str], unknown: int) -> float:
+        """Return the log of the prior probability of some effects and a number of unknown functions."""
+        names, functions = max(len(self._run.names), 2), max(len(self._run.unknown), 2)
         prior = math.prod(effect_named(name, self._before.bench).prior for name in effects)
-        if beside_unknown:
-            kind, among = ("beside", names * unknown) if effects else ("unknown", unknown)
-        else:
-            kind, among = ("effect", names) if len(effects) == 1 else ("pair", math.comb(names, 2))
+        kind, among = {
+            (1, 0): ("effect", names),
+            (2, 0): ("pair", math.comb(names, 2)),
+            (0, 1): ("unknown", len(self._run.unknown)),
+            (1, 1): ("beside", names * functions),
+            (0, 2): ("two unknown", math.comb(functions, 2)),
+        }[len(effects), unknown]
         return math.log(PRIOR[kind] * prior / among)
 
     def _tested(self, name: str) -> tuple[float, int]:
@@ -269,8 +268,8 @@ class RunPosterior:
         return replace(row, dwells=self._numbers(places), log_evidence=row.log_evidence + gain)
 
     def _pairs(self) -> list[Hypothesis]:
-        """Return the rows of the likeliest effects, each with any other term beside it."""
-        pairs, heads = dict[tuple[str, str], float](), self._heads()
+        """Return the rows of the likeliest effects and unknown functions, each with any other term beside it."""
+        pairs, heads = dict[tuple[str, ...], float](), self._heads()
         alone = [self._base + self._log_bayes[self._best[name]] + self._log_share_of_best(name) for name in heads]
         # beside one more term less noise is likely, not more
         likely = [self._sizes.likely(logs, self._log_bayes.max(axis=0)) for logs in alone]
@@ -282,14 +281,24 @@ class RunPosterior:
                 family, size = self._at[k]
                 logs[:, k] += self._run.log_bayes(self._noises[family], size, explained[h, k])
             logs = np.logaddexp.reduce(self._sizes.evidence(logs, likely[h]), axis=1)
+            if name.startswith("?"):
+                pairs[(name,)] = self._with_another_summand(name, logs)
             for other, log in self._by_row(logs).items():
                 key = (other, name) if (other, name) in pairs else (name, other)
                 if other != name:
                     pairs[key] = max(pairs.get(key, -math.inf), log)
-        return [
-            self._row((name,), other, log) if other.startswith("?") else self._row((name, other), "", log)
-            for (name, other), log in pairs.items()
-        ]
+        return [self._row_of(both, log) for both, log in pairs.items()]
+
+    def _with_another_summand(self, name: str, logs: Floats) -> float:
+        """Return the log evidence of two summands of an unknown function, from that of all terms beside the likeliest
+        summand."""
+        best = self._best[name]
+        others = [k for k, term in enumerate(self._run.terms)
+                  if term.row == name and k != best and len(term.summands) == 1]  # fmt: skip
+        if len(others) < 2 or len(self._run.terms[best].summands) != 1:
+            return -math.inf
+        number = math.comb(len(others) + 1, 2)
+        return _log_sum(logs[others].tolist()) - self._log_share_of_best(name) + math.log(TWO_SUMMANDS / number)
 
     def _explained(self, heads: Sequence[str], likely: Sequence[list[list[int]]]) -> dict[tuple[int, int], Floats]:
         """Return what each effect alone explains of all columns, in each noise that is likely beside it."""
@@ -304,11 +313,12 @@ class RunPosterior:
     def _heads(self) -> list[str]:
         """Return the effects that are likeliest: in noise that is averaged over and, since beside another effect the
         noise is less than with one alone, in none beyond what was stated."""
+        unknown = sorted((name for name in self._best if name.startswith("?")), key=self._evidence_of_best)
         best = {name: k for name, k in self._best.items() if not name.startswith("?") and name != self._run.walk}
         in_noise = sorted(best, key=lambda name: -self._log_evidence[best[name]])[:_HEADS]
         in_none = sorted(best, key=lambda name: -self._log_bayes[best[name], 0])[:_HEADS]
         heads = list(dict.fromkeys([*in_noise, *in_none]))
-        return [*heads, *dict.fromkeys(self._ahead_of_pairs(list(best), heads))]
+        return [*heads, *dict.fromkeys(self._ahead_of_pairs(list(best), heads)), *unknown[-_UNKNOWN_HEADS:]]
 
     def _ahead_of_pairs(self, names: Sequence[str], heads: Sequence[str]) -> list[str]:
         """Return the likelier effect of each pair that, in the noise that was stated, lets chi-squared fall nearly as
@@ -335,6 +345,10 @@ class RunPosterior:
             if term.row not in best or self._log_evidence[k] > self._log_evidence[best[term.row]]:
                 best[term.row] = k
         return best
+
+    def _evidence_of_best(self, name: str) -> float:
+        """Return the log evidence of the likeliest term of a row."""
+        return float(self._log_evidence[self._best[name]])
 
     def _log_share_of_best(self, name: str) -> float:
         """Return the log of the mean likelihood over all values of an effect's constant, over that at the best."""
@@ -373,7 +387,7 @@ class RunPosterior:
         if self._run.walk in row.effects or otherwise:
             return replace(row, refit=refit)
         log, statistic = self._log_of_fit(refit)
-        log += self._log_prior(row.effects) + sum(self._log_share_of_best(name) for name in row.effects)
+        log += self._log_prior(row.effects, 0) + sum(self._log_share_of_best(name) for name in row.effects)
         return replace(row, refit=refit, log_evidence=log, statistic=row.statistic or statistic)
 
     def _with_changes_beside_walk(self, irregular: Hypothesis, rows: Sequence[Hypothesis]) -> Hypothesis:
@@ -399,8 +413,8 @@ class RunPosterior:
         related = [*itertools.product(*matrices)]
         usual = [usual_sizes(effect, self._run.grade) for effect in effects]
         sizes = [
-            [sizes_of(best_sigma(likelihood.columns(place) @ matrix), prior, _NODES_OF_PAIR)
-             for place, matrix, prior in zip(places, relation, usual, strict=True)]
+            [sizes_of(best_sigma(likelihood.columns(place) @ matrix), prior, impossible_size(effect), _NODES_OF_PAIR)
+             for place, matrix, prior, effect in zip(places, relation, usual, effects, strict=True)]
             for relation in related
         ]  # fmt: skip
         logs = np.empty((len(related), len(self._sizes.covariances)))
@@ -419,8 +433,12 @@ class RunPosterior:
 
     def _described(self, row: Hypothesis) -> Hypothesis:
         """Return a row of an unknown function with the formulas that describe it, and their fit."""
-        number = next((k for k, term in enumerate(self._run.unknown) if term.driver == row.driver), None)
-        texts = self._formulas(number, row.effects) if number is not None and self._run.unknown[number].summands else []
+        texts, beside = list[str](), [*row.effects]
+        for driver in row.driver.split(_AND):
+            number = next((k for k, term in enumerate(self._run.unknown) if term.driver == driver), None)
+            if number is not None and self._run.unknown[number].summands:
+                texts += self._formulas(number, beside)
+                beside.append(f"?{number}")
         if not (texts or row.effects):
             return row
         taken = {effect.name for effect in self._before.model.effects}
@@ -440,6 +458,8 @@ class RunPosterior:
         places = np.unique(np.concatenate([term.columns for term in terms]))
         scores = np.array([self._scores(terms, places, flat, covariance) for covariance in self._sizes.covariances])
         at, likeliest = np.unravel_index(int(np.argmax(scores)), scores.shape)
+        if not unknown.exclusive:  # of which there may be several
+            likeliest = max(range(len(terms)), key=lambda k: len(terms[k].columns))
         rows = run.likelihood.projected(self._sizes.covariances[int(at)], places, flat)
         term = terms[int(likeliest)]
         widths = [sum(len(run.formula_of(text).coefficients) for text in unknown.summands[k]) for k in term.summands]
@@ -474,6 +494,17 @@ def _with_sure_dwells(rows: list[Hypothesis], beside: list[Hypothesis]) -> list[
     dwells = table.first.dwells[:1]
     sure = sum(row.probability for row in table.rows if {*dwells} & {*row.dwells}) >= SURE
     return [*rows, *beside] if sure and any(table.first.dwells == row.dwells for row in beside) else rows
+
+
+def _merged(rows: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Return rows of which those of the same causes are one."""
+    merged = dict[tuple[tuple[str, ...], ...], Hypothesis]()
+    for row in rows:
+        key = row.effects, (row.driver,), row.families, tuple(map(str, row.dwells))
+        before = merged.get(key, row)
+        logs = [row.log_evidence] if before is row else [before.log_evidence, row.log_evidence]
+        merged[key] = replace(before, log_evidence=_log_sum(logs))
+    return [*merged.values()]
 
 
 def _log_sum(logs: Sequence[float]) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, Indices
 from kf_calib.diagnosis.candidate_tests import CandidateTests
-from kf_calib.diagnosis.coefficient_sizes import SizePrior, best_sigma, sensor_grade, usual_sizes
+from kf_calib.diagnosis.coefficient_sizes import SizePrior, best_sigma, impossible_size, sensor_grade, usual_sizes
 from kf_calib.diagnosis.in_noises import InNoises
 from kf_calib.diagnosis.run_likelihood import Combination, RunLikelihood, Sizes, log_bayes
 from kf_calib.diagnosis.unknown_terms import RETURNING, UnknownTerm, text_named, unknown_terms
@@ -29,6 +29,8 @@ from kf_calib.noise.noise_model import Noise
 _DECADES = 7.0  # above one sigma: sizes of what has no usual size
 _NODES = 40  # sizes that are tried
 _SPARSE = 0.5  # share of one summand alone in the unknown functions of a driver
+TWO_SUMMANDS = 0.25
+"""The same of two summands."""
 _SAME = 0.99  # cosine above which a summand is a known effect
 _END = 0.99  # of the range of a constant
 _SEEN = 1e-7  # share of a column that the model must leave for it to be seen
@@ -126,7 +128,9 @@ class RunTerms:
             for k, block in enumerate(blocks):
                 columns.term(f"?{number}", [block], share, summands=(k,))
             if not alone:
-                columns.term(f"?{number}", blocks, math.log(1.0 - _SPARSE), summands=(*range(len(blocks)),))
+                columns.term(
+                    f"?{number}", blocks, math.log(1.0 - _SPARSE - TWO_SUMMANDS), summands=(*range(len(blocks)),)
+                )
 
     def _add_orientations(self, columns: _Columns) -> None:
         """Add an unknown cause that is alike at each visit of an orientation, where some are visited again."""
@@ -181,7 +185,9 @@ class RunTerms:
             elif not draft.is_known and alike and _largest_cosine(alike, basis) > _SAME:
                 continue
             usual = None if draft.effect is None else usual_sizes(draft.effect, self.grade)
-            terms.append(replace(draft, sizes=sizes_of(best_sigma(columns), usual)))
+            most = math.inf if draft.effect is None else impossible_size(draft.effect)
+            if (least := best_sigma(columns)) < most:
+                terms.append(replace(draft, sizes=sizes_of(least, usual, most)))
         return terms
 
     @cached_property
@@ -328,21 +334,24 @@ def _largest_cosine(bases: Sequence[Floats], basis: Floats) -> float:
     return float(np.linalg.svd(close, compute_uv=False).min(axis=1).max(initial=0.0))
 
 
-def sizes_of(least: float, usual: SizePrior | None, nodes: int = _NODES) -> Sizes:
+def sizes_of(least: float, usual: SizePrior | None, most: float = math.inf, nodes: int = _NODES) -> Sizes:
     """Sizes from one sigma of what is determined best, each with its prior probability: smaller ones show nothing.
 
-    usual: the prior of the sizes; None: all decades above are as likely.
+    usual: the prior of the sizes; None: all decades above are as likely. most: the size from which on there are none.
     """
+    most = max(most, 2.0 * least)
     if usual is None:
-        values = least * 10.0 ** (_DECADES * (np.arange(nodes) + 0.5) / nodes)
+        decades = min(math.log10(most / least), _DECADES)
+        values = least * 10.0 ** (decades * (np.arange(nodes) + 0.5) / nodes)
         return Sizes(values, np.full(nodes, -math.log(nodes)))
     if usual.value:
         logs = np.full(nodes, -1e300)
         logs[0] = 0.0
         return Sizes(np.full(nodes, usual.low), logs, usual.value)
-    edges = np.geomspace(least, max(1e3 * usual.high, 1e4 * least), nodes + 1)
+    edges = np.geomspace(least, min(max(1e3 * usual.high, 1e4 * least), most), nodes + 1)
     shares = np.diff(usual.below(edges))
-    shares[-1] += 1.0 - float(usual.below(edges[-1:])[0])
+    shares[-1] += float(np.diff(usual.below(np.array([edges[-1], most])))[0])
+    shares /= float(usual.below(np.array([most]))[0])
     return Sizes(np.sqrt(edges[1:] * edges[:-1]), np.log(np.maximum(shares, 1e-300)))
 
 

@@ -23,7 +23,6 @@ from kf_calib.estimation.score_test import scan
 from kf_calib.support.tail_probabilities import LEVEL
 from kf_calib.support.units import shown
 
-_IMPOSSIBLE = 1e3  # times a coefficient that a user would call large: about 1 g at 1 g
 POWER = 0.9
 """Share of runs in which an effect of the smallest detectable size is found."""
 
@@ -171,4 +170,4 @@ def _found_from(candidate: Candidate, chance: float) -> Floats:
     threshold = float(chdtri(candidate.dof, chance))
     needed = float(np.sqrt(chndtrinc(threshold, candidate.dof, 1.0 - POWER)))
     found = needed / np.maximum(sizes, 1e-300)
-    return np.where(found > _IMPOSSIBLE * candidate.scales, np.inf, found)
+    return np.where(found > [each.impossible for each in candidate.effect.coefficients], np.inf, found)

@@ -129,7 +129,15 @@ def _turns(alone: DwellTable, means: Means, rest: Calibration) -> Iterator[Turn]
         here = error(gimbal, turn)
         if float(here @ _weight(rest, at(gimbal, turn)) @ here) < _MOST_LEFT:
             recorded = math.degrees(dwell.recorded_pose[gimbal])
-            yield Turn(gimbal, axis, recorded, recorded + math.degrees(turn), math.degrees(curvature**-0.5))
+            mended = _written_as(recorded, recorded + math.degrees(turn))
+            yield Turn(gimbal, axis, recorded, mended, math.degrees(curvature**-0.5))
+
+
+def _written_as(recorded_deg: float, angle_deg: float) -> float:
+    """Return an angle between the same limits as one that was recorded: -180 to 180 deg, 0 to 360, or none."""
+    if abs(recorded_deg) <= 180.0:
+        return (angle_deg + 180.0) % 360.0 - 180.0
+    return angle_deg % 360.0 if 0.0 <= recorded_deg < 360.0 else angle_deg
 
 
 def _weight(rest: Calibration, means: Means) -> Floats:

@@ -45,6 +45,7 @@ _TURNED = 1.0  # g; if gravity along it should have changed by more
 _CHANGED = 0.1  # g; a constant reading is stuck if gravity along it should have changed by more
 _UNEXPLAINED = 0.05  # g; if the residual rms is larger, the angles do not explain the mean readings
 _BETTER = 0.2  # a change explains the readings if it leaves less than this share of the residual
+_FAR = 0.75  # g; readings farther from those of a nominal block have another mounting
 _NOMINAL = 0.15  # g; largest rms deviation from nominal without a mistake, from biases, scale factors and mounting
 _INDISTINCT = 0.25  # g^2; assignments whose sums of squares differ by less explain the readings alike
 _MOST_DWELLS = 96  # so many dwells are used at most, spread over the run
@@ -64,9 +65,12 @@ def refuse(dwells: DwellTable, bench: Bench) -> None:
     """
     step = -(-len(dwells) // _MOST_DWELLS)
     means, stated = DwellMeans.of(dwells[::step]), Mounting.stated(bench)
-    _refuse_silent(means, stated)
     affine = fit_affine(means, stated)
-    if affine is None and not determines_axes(means.readings / bench.gravity_mps2):
+    is_open = affine is None and not determines_axes(means.readings / bench.gravity_mps2)
+    if is_open:
+        _refuse_far_from_nominal(means, stated)
+    _refuse_silent(means, stated)
+    if is_open:
         _refuse_reversed_in_plane(means, stated)
         return
     if affine is not None and affine.left < _UNEXPLAINED:
@@ -134,6 +138,26 @@ def _refuse_reversed_in_plane(means: DwellMeans, stated: Mounting) -> None:
         f"{_channels(numbers)} -g where +g is expected. Gravity stays in one plane, which does not tell why: the "
         f"channel is reversed (--channels {wired}), or the gimbal turns the other way (a minus in --axes)."
     )
+
+
+def _refuse_far_from_nominal(means: DwellMeans, stated: Mounting) -> None:
+    """Refuse a run in orientations too few to show the axes, whose readings no calibration near nominal gives, if some
+    other mounting gives them."""
+
+    def far(mending: Mending) -> float:
+        """Return the distance of the readings from those of a nominal block, rms of the dwells, g."""
+        expected = means.force(mending.mounting) @ nominal_sensitivity(mending.mounting.bench).T
+        readings = means.readings[:, np.abs(mending.channels) - 1] * np.sign(mending.channels)
+        return float(np.sqrt(np.mean(np.sum((readings / stated.bench.gravity_mps2 - expected) ** 2, axis=1))))
+
+    if far(Mending(stated, CHANNELS)) < _FAR:
+        return
+    tried = [Mending(mounting, channels) for mounting in mountings(stated) for channels in _WIRINGS]
+    near = [mending for mending in tried if far(mending) < _NOMINAL]
+    fewest = min((mending.changes for mending in near), default=0)
+    if fewest:
+        mendings = sorted((m for m in near if m.changes == fewest), key=lambda m: m.channels != CHANNELS)
+        raise BlunderError(f"the readings are not those of the stated mounting: {_question(stated.bench, mendings)}")
 
 
 def _refuse_wrong_gain(fitted: AffineFit, bench: Bench) -> None:
