@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.long_runs import slow
+from scipy.integrate import quad
 from unknown_trials.hidden import HIDDEN, beside, cross_coupling, second_order
 from unknown_trials.real_noise import KINDS, noisy_run
 from unknown_trials.small_bench import WHITE_MPS2, SmallRun, hidden_run, visits
@@ -17,12 +18,16 @@ from unknown_trials.small_bench import WHITE_MPS2, SmallRun, hidden_run, visits
 import kf_calib
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.diagnosis import unknown_effect
+from kf_calib.diagnosis.coefficient_sizes import SizePrior
 from kf_calib.diagnosis.hypothesis_table import IRREGULAR, NOISE
 from kf_calib.diagnosis.results import Diagnosis
+from kf_calib.diagnosis.run_terms import sizes_of
 from kf_calib.diagnosis.unknown_terms import unknown_terms
+from kf_calib.effects import effect_named
 from kf_calib.estimation.cross_validation import orientations
 from kf_calib.estimation.dwell_columns import stimulus_of
 from kf_calib.estimation.results import Consistency
+from kf_calib.sources.text.means import open_table
 
 
 def diagnosed(name: str, sigmas: float = 12.0, seed: int = 2) -> Diagnosis:
@@ -240,3 +245,49 @@ def test_waves_over_time_have_half_a_cycle_to_eight() -> None:
     cycles = np.array(sorted({round(float(phase / (2.0 * np.pi)), 6) for phase in phases}))
     assert len(waves) == 2 * len(cycles)
     assert cycles.tolist() == sorted([0.5, *(2.0**k for k in range(4)), *(1.5 * 2.0**k for k in range(3))])
+
+
+@pytest.mark.parametrize("seed", [77001, *slow(77010)])
+def test_a_saturating_hysteresis_of_300_sigma_is_two_functions_of_the_last_step_and_no_settling(seed: int) -> None:
+    """Its shape is between two of those that are tried."""
+    found = diagnosed("saturating hysteresis", 300.0, seed)
+    assert found.unknown and not found.missing and found.likeliest is not None
+    assert found.likeliest.driver == "previous orientation" and found.likeliest.probability > 0.9
+    assert len(found.likeliest.formulas) > 1
+
+
+@pytest.mark.parametrize("usual", [None, SizePrior(1e-6, 1e-4)])
+@pytest.mark.parametrize("most", [0.5, np.inf])
+def test_sizes_that_no_sensor_could_have_are_none(usual: SizePrior | None, most: float) -> None:
+    sizes = sizes_of(1e-5, usual, most)
+    assert sizes.values.max() < most and sizes.values.min() >= 1e-5
+    below = 1.0 if usual is None else 1.0 - quad(lambda x: _density(x, usual), -40.0, -5.0)[0]
+    above = 0.0 if usual is None or np.isinf(most) else quad(lambda x: _density(x, usual), np.log10(most), 40.0)[0]
+    assert np.exp(sizes.logs).sum() == pytest.approx((below - above) / (1.0 - above), rel=1e-6)
+
+
+def _density(x: float, usual: SizePrior) -> float:
+    """Density of log10 of a size: level where it is usual, and falling by a factor e for each decade beyond."""
+    low, high = np.log10(usual.low), np.log10(usual.high)
+    return float(np.exp(-max(low - x, x - high, 0.0)) / (high - low + 2.0))
+
+
+def test_an_effect_that_only_an_absurd_size_would_show_is_no_explanation() -> None:
+    """Nearly level poses: what turns the platform about the vertical shows by radians only."""
+    rng = np.random.default_rng(4)
+    poses = np.radians(rng.uniform(-1.0, 1.0, (12, 2)) * 1e-3)
+    bench = Bench(axes_of("xz"), 9.81, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
+    force = bench.specific_force(np.zeros(12), poses)
+    means = force + rng.normal(0.0, 0.01, force.shape)
+    columns = {"outer [deg]": np.degrees(poses[:, 0]), "inner [deg]": np.degrees(poses[:, 1])}
+    columns |= {f"a{axis}_mps2": means[:, k] for k, axis in enumerate("xyz")}
+    columns |= {f"s{axis}_mps2": np.full(12, 1e-3) for axis in "xyz"} | {"count": np.full(12, 1000)}
+    table = open_table(columns, {"axes": "x z", "gravity_mps2": "9.81", "angle_sigma_deg": "0",
+                                 "scatter_sigma_mps2": "0"})  # fmt: skip
+    found = kf_calib.diagnose(table, replicate=False)
+    assert found.table is not None
+    for row in found.table.rows:
+        for name in row.effects if row.refit is not None and row.probability > 0.01 else ():
+            coefficients = row.refit.estimate.state[row.refit.model.parts[name]]
+            limits = [each.impossible for each in effect_named(name, table.bench).coefficients]
+            assert (np.abs(coefficients) < limits).all()

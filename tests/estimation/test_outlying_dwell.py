@@ -10,6 +10,7 @@ from helpers.long_runs import slow
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.errors import InputError
 from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.outlying_dwell import _written_as
 from kf_calib.estimation.settings import Settings
 
 OPTIONS = [{}, {"unstated": True}, {"setting_sigma_deg": 0.01}, {"grade": "mems"}]
@@ -90,3 +91,19 @@ def test_poses_are_those_that_were_recorded() -> None:
 def test_a_dwell_to_leave_out_must_be_there() -> None:
     with pytest.raises(InputError, match=r"no dwell 9 to leave out \(--leave-out\): the run has dwells 1 to 8"):
         calibrate(short_run(count=8), Settings(left_out=(2, 9)))
+
+
+@pytest.mark.parametrize(
+    ("recorded_deg", "angle_deg", "written_deg"),
+    [
+        (55.35, 415.35, 55.35),
+        (-170.0, -190.0, 170.0),
+        (350.0, 370.0, 10.0),
+        (200.0, -15.0, 345.0),
+        (725.0, 735.0, 735.0),
+    ],
+)
+def test_an_angle_is_told_as_the_recorded_ones_are_written(
+    recorded_deg: float, angle_deg: float, written_deg: float
+) -> None:
+    assert _written_as(recorded_deg, angle_deg) == pytest.approx(written_deg)

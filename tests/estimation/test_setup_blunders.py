@@ -14,6 +14,7 @@ import pytest
 from helpers.altered import Altered, short_run
 from helpers.long_runs import slow
 from helpers.thresholds import begins_at
+from scipy.spatial.transform import Rotation
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, parse_axes
@@ -288,3 +289,25 @@ def test_readings_of_a_sensor_that_stands_still_in_itself_are_told(level: float,
     path.write_text("\n".join(["time_s,ax_mps2,ay_mps2,az_mps2", *rows]) + "\n")
     with pytest.raises(InputError, match=said):
         calibrate(opened(path, angles=False))
+
+
+def nearly_level(upside: str, seed: int = 1, poses: int = 10) -> Table:
+    """Attitudes within some degrees of level with z up, of sensors of 0.5 % and 10 mg, as a bench whose ``upside`` is
+    up."""
+    rng = np.random.default_rng(seed)
+    attitudes = Rotation.from_euler("ZXY", rng.uniform(-1.0, 1.0, (poses, 3)) * [180.0, 4.0, 4.0], degrees=True)
+    force = attitudes.inv().apply([0.0, 0.0, 9.81])
+    means = force * (1.0 + 0.005 * rng.normal(size=3)) + rng.normal(0.0, 0.1, 3) + rng.normal(0.0, 1e-3, force.shape)
+    columns = {f"a{axis}_mps2": means[:, k] for k, axis in enumerate("xyz")}
+    columns |= {f"q{axis}": attitudes.as_quat()[:, k] for k, axis in enumerate("xyzw")}
+    return open_table(columns, {"gravity_mps2": "9.81", "up": upside})
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_nearly_level_poses_under_another_axis_that_is_up_are_refused(seed: int) -> None:
+    assert len(calibrate(nearly_level("z", seed)).visits) == 10
+    with pytest.raises(BlunderError, match=r"not those of the stated mounting.*--up z") as told:
+        calibrate(nearly_level("y", seed))
+    assert told.value.options in ("--up z", "")
+    with pytest.raises(BlunderError, match="--up z"):
+        calibrate(nearly_level("-z", seed))
