@@ -34,8 +34,7 @@ CREDIBLE = 0.99
 LISTED = 0.01
 """Least probability of an explanation that has a line of its own where the table is shown."""
 
-PRIOR = {"nothing": 0.4, "effect": 0.38, "pair": 0.08, "unknown": 0.09, "two unknown": 0.01,
-         "beside": 0.02, "dwell": 0.02}  # fmt: skip
+PRIOR = {"nothing": 0.4, "effect": 0.38, "pair": 0.08, "unknown": 0.1, "beside": 0.02, "dwell": 0.02}
 """Prior probability of each kind of explanation; ``beside``: an effect beside an unknown function; ``dwell``: one dwell
 alone is off; of several, each has that of one."""
 
@@ -74,6 +73,11 @@ class Hypothesis:
         """Whether the row says that nothing is missing but what no known effect explains."""
         return bool(self.driver) and not self.effects
 
+    @property
+    def causes(self) -> frozenset[str]:
+        """The effects, and what the unknown function depends on."""
+        return frozenset({*self.effects, self.driver} - {""})
+
 
 @dataclass(frozen=True)
 class HypothesisTable:
@@ -91,7 +95,7 @@ class HypothesisTable:
 
     def __repr__(self) -> str:
         def name(row: Hypothesis) -> str:
-            beside = [f"unknown, goes with {row.driver}"] if row.effects and row.formulas else []
+            beside = [f"unknown, goes with {row.driver}"] if row.effects and row.driver else []
             return " + ".join([*(row.effects or row.families), *beside])
 
         return "\n".join(f"{row.probability:7.2%} {name(row)}" for row in self.listed)
@@ -108,6 +112,10 @@ class HypothesisTable:
     def probability(self, effects: Sequence[str]) -> float:
         """Probability that all these effects are missing, alone or with others."""
         return sum(row.probability for row in self.rows if set(effects) <= set(row.effects))
+
+    def probability_with(self, row: Hypothesis) -> float:
+        """Probability of the causes of a row, alone or with others."""
+        return sum(each.probability for each in self.rows if row.causes <= each.causes)
 
     def probability_of_class(self, effects: Sequence[str]) -> float:
         """Probability that all these effects are missing, alone or with others, or what is the same as the first."""
@@ -154,8 +162,8 @@ class HypothesisTable:
         """The explanations in place of the first that have ``CREDIBLE`` of the probability together with it and with
         those that only add to its effects; without those that look like it."""
         first, rows = self.first, [row for row in self.rows if row.families != (NOTHING,) and row.driver != ALIKE]
-        agreeing = [row for row in rows
-                    if row is first or (first.effects and set(first.effects) <= set(row.effects))]  # fmt: skip
+        told = frozenset(first.effects) or first.causes
+        agreeing = [row for row in rows if row is first or (told and told <= row.causes)]
         others = [row for row in rows if all(row is not each for each in agreeing)]
         shares = [sum(row.probability for row in agreeing), *(row.probability for row in others)]
         before = np.cumsum(shares) / sum(shares)

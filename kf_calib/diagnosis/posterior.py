@@ -52,8 +52,6 @@ _AGAINST_STATED = 0.5  # the same of scatter beyond what was stated
 _OF_ORIENTATION = 0.8  # share of unknown causes that depend on the orientation alone, and come back with it
 _WITHIN = 0.01  # prior probability of irregular changes that show within dwells only
 _APART = 1e-4  # p-value of an oscillation that does not go on alike in all dwells
-_AND = ", and with "  # between the drivers of two unknown functions
-_UNKNOWN_HEADS = 1  # unknown functions, the likeliest, beside which all other terms are tried
 _HEADS = 3  # effects beside which all other terms are tried: likeliest in any noise, in that stated, and in pairs
 _NO_SIGN = 0.5  # of chi-squared: what is left of an effect beside one that is the same
 _SAME = 1e-6  # squared sine of the angle below which two effects are one
@@ -197,28 +195,25 @@ class RunPosterior:
         return {row: _log_sum(values) for row, values in of_row.items()}
 
     def _row_of(self, names: Sequence[str], log: float) -> Hypothesis:
-        """Return the row of some effects and unknown functions, with its prior."""
+        """Return the row of some effects and, alone or beside one, an unknown function, with its prior."""
         effects = tuple(name for name in names if not name.startswith("?"))
         unknown = [self._run.unknown[int(name[1:])] for name in names if name.startswith("?")]
         families = [effect_named(name, self._before.bench).family for name in effects]
         families += [term.family or NONE for term in unknown]
-        log += self._log_prior(effects, len(unknown))
+        log += self._log_prior(effects, bool(unknown))
         tested = [self._tested(name) for name in effects]
         statistic, dof = tested[0][0] if len(names) == len(effects) == 1 else 0.0, sum(dof for _, dof in tested)
-        driver = _AND.join(term.driver for term in unknown)
+        driver = "".join(term.driver for term in unknown)
         return Hypothesis(effects, (), driver, tuple(dict.fromkeys(families)), log, statistic, dof)
 
-    def _log_prior(self, effects: Sequence[str], unknown: int) -> float:
-        """Return the log of the prior probability of some effects and a number of unknown functions."""
-        names, functions = max(len(self._run.names), 2), max(len(self._run.unknown), 2)
+    def _log_prior(self, effects: Sequence[str], beside_unknown: bool = False) -> float:
+        """Return the log of the prior probability of some effects and, if so, an unknown function."""
+        names, unknown = max(len(self._run.names), 2), len(self._run.unknown)
         prior = math.prod(effect_named(name, self._before.bench).prior for name in effects)
-        kind, among = {
-            (1, 0): ("effect", names),
-            (2, 0): ("pair", math.comb(names, 2)),
-            (0, 1): ("unknown", len(self._run.unknown)),
-            (1, 1): ("beside", names * functions),
-            (0, 2): ("two unknown", math.comb(functions, 2)),
-        }[len(effects), unknown]
+        if beside_unknown:
+            kind, among = ("beside", names * unknown) if effects else ("unknown", unknown)
+        else:
+            kind, among = ("effect", names) if len(effects) == 1 else ("pair", math.comb(names, 2))
         return math.log(PRIOR[kind] * prior / among)
 
     def _tested(self, name: str) -> tuple[float, int]:
@@ -268,41 +263,46 @@ class RunPosterior:
         return replace(row, dwells=self._numbers(places), log_evidence=row.log_evidence + gain)
 
     def _pairs(self) -> list[Hypothesis]:
-        """Return the rows of the likeliest effects and unknown functions, each with any other term beside it."""
-        pairs, heads = dict[tuple[str, ...], float](), self._heads()
-        alone = [self._base + self._log_bayes[self._best[name]] + self._log_share_of_best(name) for name in heads]
+        """Return the rows of the likeliest effects, each with any other term beside it, and of the likeliest summand of
+        an unknown function, with another one or an effect beside it."""
+        pairs, heads = dict[tuple[str, ...], float](), [*map(self._best.__getitem__, self._heads()), *self._summand()]
+        alone = [self._base + self._log_bayes[k] + self._log_share_of(k) for k in heads]
         # beside one more term less noise is likely, not more
         likely = [self._sizes.likely(logs, self._log_bayes.max(axis=0)) for logs in alone]
         explained = self._explained(heads, likely)
-        for h, name in enumerate(heads):
-            stage.say(f"weighing all beside {name}")
+        for h, head in enumerate(heads):
+            name = self._run.terms[head].row
+            stage.say(f"weighing all beside {name.replace('?', 'unknown function ')}")
             logs = np.repeat(alone[h][None], len(self._run.terms), axis=0)
             for k in itertools.chain(*likely[h]):
                 family, size = self._at[k]
                 logs[:, k] += self._run.log_bayes(self._noises[family], size, explained[h, k])
             logs = np.logaddexp.reduce(self._sizes.evidence(logs, likely[h]), axis=1)
             if name.startswith("?"):
-                pairs[(name,)] = self._with_another_summand(name, logs)
+                pairs[(name,)] = self._of_two_summands(head, logs)
             for other, log in self._by_row(logs).items():
                 key = (other, name) if (other, name) in pairs else (name, other)
-                if other != name:
+                if other != name and not (name.startswith("?") and other.startswith("?")):
                     pairs[key] = max(pairs.get(key, -math.inf), log)
         return [self._row_of(both, log) for both, log in pairs.items()]
 
-    def _with_another_summand(self, name: str, logs: Floats) -> float:
-        """Return the log evidence of two summands of an unknown function, from that of all terms beside the likeliest
-        summand."""
-        best = self._best[name]
-        others = [k for k, term in enumerate(self._run.terms)
-                  if term.row == name and k != best and len(term.summands) == 1]  # fmt: skip
-        if len(others) < 2 or len(self._run.terms[best].summands) != 1:
-            return -math.inf
-        number = math.comb(len(others) + 1, 2)
-        return _log_sum(logs[others].tolist()) - self._log_share_of_best(name) + math.log(TWO_SUMMANDS / number)
+    def _summand(self) -> list[int]:
+        """Return the number of the likeliest summand of an unknown function, if there is one."""
+        of_one = [k for k, term in enumerate(self._run.terms) if len(term.summands) == 1]
+        return [max(of_one, key=lambda k: float(self._log_evidence[k]))] if of_one else []
 
-    def _explained(self, heads: Sequence[str], likely: Sequence[list[list[int]]]) -> dict[tuple[int, int], Floats]:
-        """Return what each effect alone explains of all columns, in each noise that is likely beside it."""
-        groups = [self._run.terms[self._best[name]].columns for name in heads]
+    def _of_two_summands(self, one: int, logs: Floats) -> float:
+        """Return the log evidence of two summands of an unknown function, from that of all terms beside one."""
+        head, terms = self._run.terms[one], self._run.terms
+        others = [k for k, term in enumerate(terms) if term.row == head.row and len(term.summands) == 1 and k != one]
+        if len(others) < 2 or self._run.unknown[int(head.row[1:])].exclusive:
+            return -math.inf
+        share = math.log(TWO_SUMMANDS / math.comb(len(others) + 1, 2))
+        return _log_sum(logs[others].tolist()) - self._log_share_of(one) + share
+
+    def _explained(self, heads: Sequence[int], likely: Sequence[list[list[int]]]) -> dict[tuple[int, int], Floats]:
+        """Return what each term alone explains of all columns, in each noise that is likely beside it."""
+        groups = [self._run.terms[k].columns for k in heads]
         explained = dict[tuple[int, int], Floats]()
         for family, noises in enumerate(self._noises):
             numbers = sorted({k for of_head in likely for k in of_head[family]})
@@ -313,12 +313,11 @@ class RunPosterior:
     def _heads(self) -> list[str]:
         """Return the effects that are likeliest: in noise that is averaged over and, since beside another effect the
         noise is less than with one alone, in none beyond what was stated."""
-        unknown = sorted((name for name in self._best if name.startswith("?")), key=self._evidence_of_best)
         best = {name: k for name, k in self._best.items() if not name.startswith("?") and name != self._run.walk}
         in_noise = sorted(best, key=lambda name: -self._log_evidence[best[name]])[:_HEADS]
         in_none = sorted(best, key=lambda name: -self._log_bayes[best[name], 0])[:_HEADS]
         heads = list(dict.fromkeys([*in_noise, *in_none]))
-        return [*heads, *dict.fromkeys(self._ahead_of_pairs(list(best), heads)), *unknown[-_UNKNOWN_HEADS:]]
+        return [*heads, *dict.fromkeys(self._ahead_of_pairs(list(best), heads))]
 
     def _ahead_of_pairs(self, names: Sequence[str], heads: Sequence[str]) -> list[str]:
         """Return the likelier effect of each pair that, in the noise that was stated, lets chi-squared fall nearly as
@@ -346,9 +345,11 @@ class RunPosterior:
                 best[term.row] = k
         return best
 
-    def _evidence_of_best(self, name: str) -> float:
-        """Return the log evidence of the likeliest term of a row."""
-        return float(self._log_evidence[self._best[name]])
+    def _log_share_of(self, k: int) -> float:
+        """Return the log of the mean likelihood over all values of an effect's constant, over that of one term; of a
+        summand of an unknown function, of its share in the prior."""
+        term = self._run.terms[k]
+        return term.log_share if term.row.startswith("?") else self._log_share_of_best(term.row)
 
     def _log_share_of_best(self, name: str) -> float:
         """Return the log of the mean likelihood over all values of an effect's constant, over that at the best."""
@@ -387,7 +388,7 @@ class RunPosterior:
         if self._run.walk in row.effects or otherwise:
             return replace(row, refit=refit)
         log, statistic = self._log_of_fit(refit)
-        log += self._log_prior(row.effects, 0) + sum(self._log_share_of_best(name) for name in row.effects)
+        log += self._log_prior(row.effects) + sum(self._log_share_of_best(name) for name in row.effects)
         return replace(row, refit=refit, log_evidence=log, statistic=row.statistic or statistic)
 
     def _with_changes_beside_walk(self, irregular: Hypothesis, rows: Sequence[Hypothesis]) -> Hypothesis:
@@ -433,12 +434,8 @@ class RunPosterior:
 
     def _described(self, row: Hypothesis) -> Hypothesis:
         """Return a row of an unknown function with the formulas that describe it, and their fit."""
-        texts, beside = list[str](), [*row.effects]
-        for driver in row.driver.split(_AND):
-            number = next((k for k, term in enumerate(self._run.unknown) if term.driver == driver), None)
-            if number is not None and self._run.unknown[number].summands:
-                texts += self._formulas(number, beside)
-                beside.append(f"?{number}")
+        number = next((k for k, term in enumerate(self._run.unknown) if term.driver == row.driver), None)
+        texts = self._formulas(number, row.effects) if number is not None and self._run.unknown[number].summands else []
         if not (texts or row.effects):
             return row
         taken = {effect.name for effect in self._before.model.effects}

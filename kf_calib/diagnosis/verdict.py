@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from kf_calib.diagnosis.hypothesis_table import IRREGULAR, NOISE, NONE, NOTHING, SURE, Hypothesis
+from kf_calib.diagnosis.hypothesis_table import IRREGULAR, NOISE, NONE, NOTHING, SURE, Hypothesis, HypothesisTable
 from kf_calib.diagnosis.refits import dwell_noise_is_stated
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.estimation.dwell_pass import holds_its_oscillation
@@ -149,8 +149,12 @@ def _share(diagnosis: Diagnosis) -> str:
     first = diagnosis.table.first
     if first.driver:
         return format_probability(diagnosis.table.probability(first.effects))
-    alone = format_probability(first.probability)
-    with_others = format_probability(diagnosis.table.probability(first.effects))
+    return _share_of_row(diagnosis.table, first)
+
+
+def _share_of_row(table: HypothesisTable, row: Hypothesis) -> str:
+    """Return the probability of a row, and that of its causes, alone or with others."""
+    alone, with_others = (format_probability(share) for share in (row.probability, table.probability_with(row)))
     return alone if alone == with_others else f"{alone} alone, {with_others} alone or with others"
 
 
@@ -194,7 +198,7 @@ def _unknown(diagnosis: Diagnosis, first: Hypothesis) -> str:
             f"{_others(diagnosis, but=NOISE)}. To find out, repeat an orientation.{_of_one(diagnosis)}"
         )
     but = f", but {diagnosis.unearned}" if diagnosis.unearned else ""
-    said = f"{what} ({format_probability(first.probability)}){but}{_others(diagnosis)}"
+    said = f"{what} ({_share_of_row(diagnosis.table, first)}){but}{_others(diagnosis)}"
     alone = f"{_of_one(diagnosis)}{_within(diagnosis)}" if first.driver == IRREGULAR else ""
     return f"Unknown: no known effect explains it, {said}.{alone}"
 
@@ -253,7 +257,7 @@ def explanations_in_words(diagnosis: Diagnosis) -> str:
 def _in_words(diagnosis: Diagnosis, row: Hypothesis) -> str:
     """Return an explanation in words."""
     if row.effects:
-        return _effects_of(row) + (f" beside no known effect, which goes with {row.driver}" if row.formulas else "")
+        return _effects_of(row) + (f" beside no known effect, which goes with {row.driver}" if row.driver else "")
     if row.families == (NOTHING,):
         return "nothing missing"
     if row.driver:
