@@ -13,7 +13,6 @@ The smallest size at which an effect would be found is computed from its columns
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,7 +27,6 @@ from kf_calib.estimation.measurement_model import effect_columns
 
 _TAIL = 1.0  # decades beyond the usual sizes in which the density falls by a factor e
 _SHARPER = 100.0  # where only the greatest usual size is known, the least one is smaller by this factor
-_SIZES = np.exp(np.linspace(0.0, math.log(1e14), 120))  # prior variance of a coefficient over that of its estimate
 
 QUIET = 1e-4
 """Density of white noise below which sensors are of navigation grade, m/s^2/sqrt(Hz) (10 ug/sqrt(Hz))."""
@@ -37,23 +35,6 @@ _CONDITIONS = {
     "variance_mps2_2": "the strength of vibration does not change in this run, or is not looked at",
 }
 """Conditions, other than orientations, that effects may depend on, and what is said where they do not vary."""
-
-
-def size_evidence(dof: int, delta_chi2: Floats | float) -> Floats:
-    """Log Bayes factor of an effect whose size and direction are unknown, against no effect.
-
-    The coefficients have the prior N(0, g C) with C the covariance of their estimate, and ln g is uniform from 0 to
-    ln 1e14, which is a size of 1 to 1e7 sigma (the g-prior of A. Zellner, 1986, mixed over g; F. Liang et al., 2008):
-
-      B = mean over g of (1 + g)^(-k/2) exp(g / (1 + g) F / 2)
-
-    dof: number of coefficients k. delta_chi2: decrease F of chi-squared with them; a number or an array. Returns
-    ln B.
-    """
-    log_terms = -0.5 * dof * np.log1p(_SIZES) + 0.5 * np.asarray(delta_chi2, float)[..., None] * (
-        _SIZES / (1.0 + _SIZES)
-    )
-    return np.logaddexp.reduce(log_terms, axis=-1) - math.log(len(_SIZES))
 
 
 @dataclass(frozen=True)
@@ -84,11 +65,6 @@ def usual_sizes(effect: Effect, grade: Grade) -> SizePrior | None:
         return SizePrior(spread, spread, 0.01, value)
     usual = effect.typical.of(grade)
     return None if usual is None else SizePrior(usual[0] or usual[1] / _SHARPER, usual[1])
-
-
-def impossible_size(effect: Effect) -> float:
-    """The size from which on none of an effect's coefficients could be."""
-    return max(each.impossible for each in effect.coefficients)
 
 
 def best_sigma(root: Floats) -> float:

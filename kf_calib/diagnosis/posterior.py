@@ -18,7 +18,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, Indices
 from kf_calib.diagnosis.candidate_tests import CandidateTests
-from kf_calib.diagnosis.coefficient_sizes import best_sigma, impossible_size, usual_sizes
+from kf_calib.diagnosis.coefficient_sizes import best_sigma, usual_sizes
 from kf_calib.diagnosis.dwells_apart import DwellsApart
 from kf_calib.diagnosis.hypothesis_table import (
     IRREGULAR,
@@ -40,6 +40,7 @@ from kf_calib.diagnosis.unknown_terms import name_of_formula, text_named
 from kf_calib.dwells.qr import orthonormal
 from kf_calib.effects import effect_named
 from kf_calib.errors import InputError, UnobservableError
+from kf_calib.estimation.observability import impossible_size
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.within_dwell_trend import p_of_steady_oscillation, trend
 from kf_calib.noise.terms import RandomWalk, ThermometerError

@@ -29,7 +29,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, Indices
 from kf_calib.diagnosis.candidate_tests import candidates
-from kf_calib.diagnosis.coefficient_sizes import size_evidence
+from kf_calib.diagnosis.run_terms import log_bayes_of_any_size
 from kf_calib.effects import Effect
 from kf_calib.estimation.candidate_scan import SEEN, Complement, Scan, counts_of, project, slices
 from kf_calib.estimation.cross_validation import orientations
@@ -202,7 +202,8 @@ def _likeliest(scan: Scan, beside: Sequence[int], noise: float) -> int:
     dofs = np.array([candidate.dof for candidate in scan.candidates])
     logs = np.full(len(dofs), -np.inf)
     for dof in set(dofs[dofs > 0].tolist()):
-        logs[dofs == dof] = size_evidence(dof, statistics[dofs == dof])
+        along = np.sqrt(statistics[dofs == dof])[:, None] * np.eye(1, dof)
+        logs[dofs == dof] = log_bayes_of_any_size(np.broadcast_to(np.eye(dof), (len(along), dof, dof)), along)
     taken, values = {str(scan.candidates[k].effect) for k in beside}, dict[str, list[int]]()
     for k in np.flatnonzero(np.isfinite(logs)).tolist():
         if str(scan.candidates[k].effect) not in taken:

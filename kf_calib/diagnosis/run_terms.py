@@ -13,7 +13,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, Indices
 from kf_calib.diagnosis.candidate_tests import CandidateTests
-from kf_calib.diagnosis.coefficient_sizes import SizePrior, best_sigma, impossible_size, sensor_grade, usual_sizes
+from kf_calib.diagnosis.coefficient_sizes import SizePrior, best_sigma, sensor_grade, usual_sizes
 from kf_calib.diagnosis.in_noises import InNoises
 from kf_calib.diagnosis.run_likelihood import Combination, RunLikelihood, Sizes, log_bayes
 from kf_calib.diagnosis.unknown_terms import RETURNING, UnknownTerm, text_named, unknown_terms
@@ -23,6 +23,7 @@ from kf_calib.effects.effect import Grade
 from kf_calib.effects.formula import formula
 from kf_calib.estimation.cross_validation import orientations
 from kf_calib.estimation.dwell_columns import stimulus_of
+from kf_calib.estimation.observability import impossible_size
 from kf_calib.estimation.results import Calibration
 from kf_calib.noise.noise_model import Noise
 

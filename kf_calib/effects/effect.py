@@ -30,9 +30,6 @@ MICRO_PER_G, MILLI_PER_G = 1e-6 / STANDARD_GRAVITY_MPS2, 1e-3 / STANDARD_GRAVITY
 Grade = Literal["navigation", "mems"]
 
 
-_IMPOSSIBLE = 1e3  # times a coefficient that a user would call large
-
-
 @dataclass(frozen=True)
 class Typical:
     """Sizes of a coefficient that are usual, from ... to, in SI; from 0 where only the greatest is known.
@@ -65,11 +62,6 @@ class Coefficient:
 
     def __post_init__(self) -> None:
         _complete(self)
-
-    @property
-    def impossible(self) -> float:
-        """The size from which on there are none: it would add about 1 g to a reading."""
-        return _IMPOSSIBLE * self.scale
 
 
 @dataclass(frozen=True)

@@ -92,12 +92,6 @@ class Scan:
         """
         return np.array([np.sum((each.basis.T @ self.residual) ** 2) for each in self.candidates])
 
-    def explained(self, columns: Floats) -> tuple[float, int]:
-        """Decrease of chi-squared if all of these columns (d, q) are added together, and the rank of the columns."""
-        left, singular, _ = np.linalg.svd(columns, full_matrices=False)
-        spanned = left[:, singular > 1e-6]
-        return float(np.sum((spanned.T @ self.residual) ** 2)), spanned.shape[1]
-
     def beside(self, k: int) -> Floats:
         """Decrease of chi-squared (n,) if each candidate is added beside candidate ``k``; zero for ``k`` itself."""
         basis, deltas = self.candidates[k].basis, np.zeros(len(self.candidates))

@@ -117,11 +117,6 @@ def candidate_columns(
     return _by_dwell(dwells.folded, lambda s: effect_columns(effects, s), stimulus)
 
 
-def piece_columns(effects: Sequence[Effect], stimulus: Stimulus) -> Floats:
-    """The same of all dwells in one array, (pieces, K nodes, 3 channels, p)."""
-    return _by_piece(lambda s: effect_columns(effects, s), stimulus)
-
-
 def _by_dwell(folded: FoldedDwells, columns: Callable[[Stimulus], Floats], stimulus: Stimulus) -> OfPieces:
     """Arrange the columns of a stimulus (m, 3, p) by dwell; of dwells of which only the mean is known they are those at
     the middle node."""

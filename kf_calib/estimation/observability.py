@@ -26,6 +26,7 @@ from kf_calib.support.units import shown
 POWER = 0.9
 """Share of runs in which an effect of the smallest detectable size is found."""
 
+_IMPOSSIBLE = 1e3  # times a coefficient that a user would call large
 _CONFUSED, _TWINS, _NAMED = 0.5, 0.99, 3  # overlap worth naming, overlap of look-alikes, number of effects named
 
 
@@ -155,6 +156,11 @@ def smallest_size(candidate: Candidate, chance: float) -> tuple[Coefficient, flo
     return candidate.effect.coefficients[worst], float(sizes[worst])
 
 
+def impossible_size(effect: Effect) -> float:
+    """The size from which on none of an effect's coefficients could be: it would add about 1 g to a reading."""
+    return _IMPOSSIBLE * max(each.scale for each in effect.coefficients)
+
+
 def is_seen(candidate: Candidate, chance: float) -> bool:
     """Whether a sensor could have so much of an effect that it is found."""
     return bool(np.isfinite(_found_from(candidate, chance)).any())
@@ -170,4 +176,4 @@ def _found_from(candidate: Candidate, chance: float) -> Floats:
     threshold = float(chdtri(candidate.dof, chance))
     needed = float(np.sqrt(chndtrinc(threshold, candidate.dof, 1.0 - POWER)))
     found = needed / np.maximum(sizes, 1e-300)
-    return np.where(found > [each.impossible for each in candidate.effect.coefficients], np.inf, found)
+    return np.where(found > _IMPOSSIBLE * candidate.scales, np.inf, found)

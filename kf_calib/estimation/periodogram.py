@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import BIASES, STATE_COUNT
+from kf_calib.dwells.pieces import OfPieces, of_all_pieces
 from kf_calib.effects import Effect
 from kf_calib.estimation import whitened_rows
-from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns, piece_columns, stimulus_of
-from kf_calib.estimation.whitened_rows import MisfitColumns
+from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns, few_at_a_time, stimulus_of
 from kf_calib.noise.noise_model import Noise, steps
 
 _SEEN = 1e-6  # a column of which the model leaves less than this share counts as explained
@@ -45,11 +45,9 @@ class Periodogram:
         self._same_hz = _SAME_RAD / (2.0 * np.pi * float(np.abs(self._middles_s).max(initial=1e-9)))
         points_hz, self._shares = _points(values_hz, float(np.diff(dwells.folded.ends_s).max()))
         kinds, self._path = [effect.at(hz) for hz in points_hz], None
-        if noise.walk_mps2_per_sqrt_s:
-            self._waves, self._ends, stacked = _waves_beside_walk(linearised, noise, kinds)
-            self._path = _Path(stacked, self._ends, steps(dwells, noise))
-        else:
-            self._waves, self._ends = _waves(linearised, noise, kinds)
+        self._waves, self._ends, twelve = _waves(linearised, noise, kinds)
+        if noise.walk.steps:
+            self._path = _Path(twelve, self._ends, steps(dwells, noise))
         middles_s = np.repeat(self._middles_s, np.diff(self._ends))[:, None]
         for k, hz in enumerate(points_hz):
             self._waves[:, k] *= np.exp(-2j * np.pi * hz * middles_s)
@@ -216,34 +214,19 @@ class _Path:
         return bands.reshape(7, -1)
 
 
-def _waves(linearised: LinearisedDwells, noise: Noise, kinds: Sequence[Effect]) -> tuple[Waves, list[int]]:
-    """Return the whitened columns (m, points, 3) of oscillations, and where the rows of each dwell begin and end."""
-    whitening = MisfitColumns(linearised.dwells_at_state, noise, linearised.state)
-    stimulus = stimulus_of(linearised.dwells_at_state, linearised.model.bench, linearised.state)
-    ends = whitening.ends - whitening.ends[0]
-    waves = np.empty((int(ends[-1]), len(kinds), 3), np.complex128)
-    for k, each in enumerate(kinds):  # one at a time, which saves memory
-        parts = whitening.of(piece_columns([each], stimulus))[whitening.ends[0] :].reshape(-1, 3, 2)
-        waves[:, k] = parts[..., 1] + 1j * parts[..., 0]
-    return waves, ends.tolist()
-
-
-def _waves_beside_walk(
-    linearised: LinearisedDwells, noise: Noise, kinds: Sequence[Effect]
-) -> tuple[Waves, list[int], Floats]:
-    """Return the same where the biases walk, and the rows [S | H | ...] that have the walk in them."""
-    waves = candidate_columns(linearised.dwells_at_state, kinds, linearised.model.bench, linearised.state)
-    columns = [
-        np.concatenate([own[..., :STATE_COUNT], more], axis=3)
-        for own, more in zip(linearised.columns, waves, strict=True)
-    ]
-    rows, width = whitened_rows.misfit_rows(
-        linearised.dwells_at_state, columns, noise, linearised.state, STATE_COUNT, reduced=False
-    )
-    rows = rows[len(rows) - len(linearised.dwells) :]
+def _waves(linearised: LinearisedDwells, noise: Noise, kinds: Sequence[Effect]) -> tuple[Waves, list[int], Floats]:
+    """Return the whitened columns (m, points, 3) of oscillations, where the rows of each dwell begin and end, and the
+    rows [S | H] (m, s + 12) of the twelve, in which the biases walk if they do."""
+    dwells, state, bench = linearised.dwells_at_state, linearised.state, linearised.model.bench
+    twelve, judging = of_all_pieces(linearised.columns)[..., :STATE_COUNT], noise.with_scatter_as_flicker(len(dwells))
+    width, rows = noise.walk.steps + STATE_COUNT, list[Floats]()
+    for _, some, pieces, nodes in few_at_a_time(dwells, stimulus_of(dwells, bench, state), 6 * len(kinds)):
+        values = candidate_columns(some, kinds, bench, state, nodes).values
+        columns = OfPieces(np.concatenate([twelve[pieces], values], axis=3), some.folded.ends)
+        rows += whitened_rows.whiten(some, columns, judging, state, reduced=False)
     stacked = np.concatenate(rows)
-    parts = stacked[:, 3 + width : -1].reshape(len(stacked), len(kinds), 3, 2)
-    return parts[..., 1] + 1j * parts[..., 0], np.cumsum([0, *map(len, rows)]).tolist(), stacked
+    parts = stacked[:, width:-1].reshape(len(stacked), len(kinds), 3, 2)
+    return parts[..., 1] + 1j * parts[..., 0], np.cumsum([0, *map(len, rows)]).tolist(), stacked[:, :width]
 
 
 def _parts(ends: list[int]) -> list[slice]:

@@ -111,12 +111,6 @@ class Consistency:
         """The statistic divided by its degrees of freedom; None if there are none."""
         return self.statistic / self.dof if self.dof > 0 else None
 
-    @property
-    def overdispersion(self) -> float:
-        """NIS per degree of freedom where it is significantly more than 1, else 1."""
-        per_dof = self.nis_per_dof
-        return max(per_dof, 1.0) if self.consistent is False and per_dof is not None else 1.0
-
 
 @dataclass(frozen=True)
 class Turn:

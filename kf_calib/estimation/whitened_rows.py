@@ -25,7 +25,6 @@ from kf_calib.estimation.measurement_model import Model
 from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.rotations import along_force, sensitivities_of
 
-_USUAL = 24  # columns of candidates that are whitened together in a long run
 _LARGE = 1e3  # errors, in sigmas of a mean, whose squares may be added to its variance
 _AT_ONCE = 1 << 17  # numbers that are processed together, so that they stay in the cache
 
@@ -266,69 +265,6 @@ def misfit_rows(
     both = np.concatenate([values[..., :width], shared, values[..., width:]], axis=3)
     rows = whiten(dwells, OfPieces(both, dwells.folded.ends), judging, state, reduced=reduced)
     return [prior, *rows], width + count
-
-
-@dataclass(frozen=True)
-class _Alike:
-    """Dwells of one shape in ``MisfitColumns``.
-
-    - pieces (d, pieces), rows (d, r): which of all pieces and rows are theirs.
-    - triangles (d, pieces, K, K): of the basis functions. errors (d, r, n): orthonormal basis of what errors change.
-    - along (d, 3): by which whitened channels are combined where attitudes are not known; else None.
-    - roots (d,): of the weights of their readings.
-    """
-
-    pieces: NDArray[np.intp]
-    rows: NDArray[np.intp]
-    triangles: Floats
-    errors: Floats
-    along: Floats | None
-    roots: Floats
-
-
-class MisfitColumns:
-    """The columns G alone of ``misfit_rows``, all their rows, for a noise in which the biases do not walk.
-
-    Whatever does not depend on the columns is computed once.
-    """
-
-    def __init__(self, dwells: Sequence[Dwell], noise: Noise, state: Floats) -> None:
-        table, judging = DwellTable.of(dwells), noise.with_scatter_as_flicker(len(dwells))
-        self._sigma, shared = noise.effective_sigma_mps2, judging.columns("run", table, state).shape[3]
-        about = _About.of(table, judging, state)
-        channels, width = 1 if noise.attitude_unknown else 3, table.folded.width
-        lengths = channels * table.folded.piece_numbers * width + about.errors
-        self._groups, self.ends = list[_Alike](), shared + np.append(0, np.cumsum(lengths))
-        """The first row of each dwell, and at last the number of rows."""
-        for batch in _batches(table, _USUAL):
-            rows, count = _weighted(batch, np.zeros((*batch.pieces.shape, width, 3, 0)), about)
-            group = _Alike(
-                batch.pieces,
-                self.ends[batch.dwells, None] + np.arange(rows.shape[1]),
-                batch.triangles[:, :, :width, :width],
-                np.linalg.qr(rows[..., :count])[0],
-                _unit_along(batch, noise, state) if noise.attitude_unknown else None,
-                np.sqrt(table.folded.weights[batch.dwells]),
-            )
-            self._groups.append(group)
-
-    def of(self, columns: Floats) -> Floats:
-        """G (m, q) of columns at the nodes of all pieces (pieces, K, 3, q)."""
-        whitened = np.zeros((self.ends[-1], columns.shape[3]))
-        for group in self._groups:
-            stacked = columns[group.pieces]  # (d, pieces, K, 3, q)
-            many, pieces, width, _, count = stacked.shape
-            on_triangles = group.triangles @ on_basis(stacked.reshape(many, pieces, width, 3 * count))
-            sigma = (self._sigma / group.roots)[:, None, None, :, None]
-            parts = np.moveaxis(on_triangles.reshape(stacked.shape) / sigma, 3, 1)
-            parts = parts.reshape(many, 3, pieces * width, count)
-            if group.along is not None:
-                parts = _combined(parts, group.along)
-            size = parts.shape[1] * parts.shape[2]
-            rows = np.zeros((many, group.rows.shape[1], count))
-            rows[:, :size] = parts.reshape(many, size, count)
-            whitened[group.rows] = rows - group.errors @ (np.swapaxes(group.errors[:, :size], 1, 2) @ rows[:, :size])
-        return whitened
 
 
 def with_frame(rows: Sequence[Floats], model: Model, noise: Noise, first: int = 0) -> Sequence[Floats]:

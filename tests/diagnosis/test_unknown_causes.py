@@ -26,6 +26,7 @@ from kf_calib.diagnosis.unknown_terms import unknown_terms
 from kf_calib.effects import effect_named
 from kf_calib.estimation.cross_validation import orientations
 from kf_calib.estimation.dwell_columns import stimulus_of
+from kf_calib.estimation.observability import impossible_size
 from kf_calib.estimation.results import Consistency
 from kf_calib.sources.text.means import open_table
 
@@ -289,5 +290,4 @@ def test_an_effect_that_only_an_absurd_size_would_show_is_no_explanation() -> No
     for row in found.table.rows:
         for name in row.effects if row.refit is not None and row.probability > 0.01 else ():
             coefficients = row.refit.estimate.state[row.refit.model.parts[name]]
-            limits = [each.impossible for each in effect_named(name, table.bench).coefficients]
-            assert (np.abs(coefficients) < limits).all()
+            assert (np.abs(coefficients) < impossible_size(effect_named(name, table.bench))).all()

@@ -16,10 +16,9 @@ from blind_trials.best_possible import (
     best_possible_pairs,
     best_possible_probability,
     probability_where_two_are_possible,
+    size_evidence,
 )
 from scipy.special import ndtr
-
-from kf_calib.diagnosis.coefficient_sizes import size_evidence
 
 
 def test_the_best_chooser_is_right_as_often_as_theory_has_it() -> None:

@@ -10,6 +10,7 @@ of n sigma, it takes the likeliest pair. Rivals are explanations that have no na
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -21,7 +22,6 @@ from scipy.stats import vonmises_fisher
 
 from blind_trials.bayes_factor import log_odds
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.coefficient_sizes import size_evidence
 
 _NEAR = 12.0  # in the logarithm of the odds: a pair that lags by more is never the likeliest
 _DRAWN = 400  # directions, for the mean over them
@@ -29,6 +29,25 @@ _ONE_TO_TWO = 4.0  # odds of one effect against two, before the readings
 _SEEN = 1e-3  # singular value of a combination of columns that counts
 _TRIED = np.exp(np.linspace(0.0, np.log(1e7), 60))  # sizes of a walk, sigma
 _INTENSITIES, _PATHS = 8, 2000  # intensities of a process that are tried, and paths that give their range
+
+_SIZES = np.exp(np.linspace(0.0, math.log(1e14), 120))  # prior variance of a coefficient over that of its estimate
+
+
+def size_evidence(dof: int, delta_chi2: Floats | float) -> Floats:
+    """Log Bayes factor of an effect whose size and direction are unknown, against no effect.
+
+    The coefficients have the prior N(0, g C) with C the covariance of their estimate, and ln g is uniform from 0 to
+    ln 1e14, which is a size of 1 to 1e7 sigma (the g-prior of A. Zellner, 1986, mixed over g; F. Liang et al., 2008):
+
+      B = mean over g of (1 + g)^(-k/2) exp(g / (1 + g) F / 2)
+
+    dof: number of coefficients k. delta_chi2: decrease F of chi-squared with them; a number or an array. Returns
+    ln B.
+    """
+    log_terms = -0.5 * dof * np.log1p(_SIZES) + 0.5 * np.asarray(delta_chi2, float)[..., None] * (
+        _SIZES / (1.0 + _SIZES)
+    )
+    return np.logaddexp.reduce(log_terms, axis=-1) - math.log(len(_SIZES))
 
 
 @dataclass(frozen=True)
