@@ -67,7 +67,7 @@ class Refits:
         settings = replace(before.settings, left_out=(*before.settings.left_out, *numbers))
         others = dwells.without(np.flatnonzero(np.isin(dwells.folded.numbers, numbers)).tolist())
         try:
-            fitted = fit(others, before.model, settings.walk_mps2_per_sqrt_s, slews, beginning=before.fit.beginning)
+            fitted = fit(others, before.model, settings.walk_mps2_per_sqrt_s, slews)
             return replace(evaluate_fit(fitted, settings), tally=before.tally, readings=before.readings)
         except (InputError, UnobservableError):
             return None
