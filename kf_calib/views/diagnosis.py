@@ -199,7 +199,7 @@ def replication_in_words(diagnosis: Diagnosis) -> str:
         f"predicted; p {format_p(tried.p_value)})"
     )
     if tried.fall < 0.0:
-        fall = f"named from half of the dwells, it raises χ² of the others by {-tried.fall:.0f}"
+        fall = f"named from half of the dwells, it raises χ² of the others by {-tried.fall:.1f}"
     if tried.answer == "yes":
         return f"It replicates: {fall}."
     if tried.answer == "no":
