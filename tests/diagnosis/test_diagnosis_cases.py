@@ -404,7 +404,7 @@ SETTING = ({"setting_sigma_deg": 3e-5}, {"angle_sigma_deg": 1e-5})
 @pytest.mark.parametrize(
     "noise, seeds",
     [
-        (TWICE, range(40, 41)),
+        (TWICE, range(40, 46)),
         (SCATTER, range(40, 52)),
         (TWICE, range(40, 52)),
         (SETTING, range(40, 52)),
