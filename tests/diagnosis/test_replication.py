@@ -131,8 +131,8 @@ def test_a_prediction_is_tested_on_one_side_by_students_t(dof: float) -> None:
     (40.2, "It replicates: named from half of the dwells, it lowers χ² of the others by 40 (35 predicted; p = 1e-08)."),
     (0.6, "It does not replicate: named from half of the dwells, it lowers χ² of the others by 1 (35 predicted; "
           "p = 0.5), less than its size predicts (p = 0.001)."),
-    (-2.8, "It does not replicate: named from half of the dwells, it raises χ² of the others by 2.8, less than its size "
-           "predicts (p = 0.001)."),
+    (-2.8, "It does not replicate: named from half of the dwells, it raises χ² of the others by 2.8, less than its "
+           "size predicts (p = 0.001)."),
 ])  # fmt: skip
 def test_what_the_other_half_shows_is_told_in_words(fall: float, said: str) -> None:
     answer, p_value = ("yes", 1e-8) if fall > 9.0 else ("no", 0.5)
