@@ -207,10 +207,10 @@ def _scanned(fitted: Fit) -> Scan:
     In a hand, few dwells would have an oscillation of some frequency by chance: whatever scatters them.
     """
     linearised, noise = fitted.linearised, fitted.noise.for_goodness_of_fit
-    effects, effect = candidates(linearised.model), oscillation_of(linearised.model.bench)
-    stage.say(f"scanning {len({str(each) for each in effects})} effects")
-    looked = effect is not None and not linearised.model.oscillates and not fitted.noise.attitude_unknown
-    frequencies_hz = slow_hz(fitted, effect) if effect is not None and looked else np.zeros(0)
+    effects, untried = candidates(linearised.model), linearised.model.oscillates or fitted.noise.attitude_unknown
+    stage.say(f"scanning {len({str(effect) for effect in effects})} effects")
+    effect = None if untried else oscillation_of(linearised.model.bench)
+    frequencies_hz = np.zeros(0) if effect is None else slow_hz(fitted, effect)
     if effect is None or not len(frequencies_hz):
         return scan(linearised, noise, effects)
     best_hz = frequencies_hz[np.argmax(periodogram(linearised, noise, effect, frequencies_hz))]

@@ -117,7 +117,7 @@ def replication(before: Calibration, relevant: Sequence[str], count: int, left: 
     """
     fitted, effects = before.fit, candidates(before.model)
     groups, walks = orientations(fitted.dwells), fitted.noise.for_goodness_of_fit.walk.steps
-    if len(fitted.dwells) < FEWEST or walks or not {str(effect) for effect in effects} & {*relevant}:
+    if len(fitted.dwells) < FEWEST or len(groups) < 2 or walks or not {*map(str, effects)} & {*relevant}:
         return Replication()
     noise = max(1.0, left.statistic / left.dof) if left.dof > 0 else 1.0
     halves = [np.sort(np.concatenate(groups[first::2])) for first in (0, 1)]

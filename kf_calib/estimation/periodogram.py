@@ -39,8 +39,7 @@ class Periodogram:
     """The periodogram of an oscillating ``effect`` at frequencies ``values_hz`` (N,), for given dwells and noise."""
 
     def __init__(self, linearised: LinearisedDwells, noise: Noise, effect: Effect, values_hz: Floats) -> None:
-        self.values_hz, self.state, self.noise = values_hz, linearised.state, noise
-        dwells = linearised.dwells
+        self.values_hz, dwells = values_hz, linearised.dwells
         self._middles_s = dwells.folded.ends_s.mean(axis=1)
         self._same_hz = _SAME_RAD / (2.0 * np.pi * float(np.abs(self._middles_s).max(initial=1e-9)))
         points_hz, self._shares = _points(values_hz, float(np.diff(dwells.folded.ends_s).max()))

@@ -162,3 +162,10 @@ def test_what_no_candidate_is_has_no_replication() -> None:
     before = kf_calib.calibrate(hidden(3, 12.0)[0])
     assert replicated(before, ["second-order"]).halves
     assert replicated(before, []).halves == replicated(before, ["no such effect"]).halves == ()
+
+
+def test_one_orientation_cannot_be_divided(monkeypatch: pytest.MonkeyPatch) -> None:
+    run, _ = hidden(4, 10.0)
+    before = kf_calib.calibrate(run)
+    monkeypatch.setattr("kf_calib.diagnosis.replication.orientations", lambda dwells: [list(range(len(dwells)))])
+    assert replicated(before, ["second-order"]).halves == ()
