@@ -20,7 +20,9 @@ import numpy as np
 from kf_calib.bench.arrays import Floats, Indices
 
 _AT_ONCE = 1 << 20  # products that are computed together, so that they stay in the cache
-_ROUNDING = 1e-12  # share of a product that the model must leave
+ROUNDING = 1e-10
+"""Share of the square of a column below which what the model, or other columns, leave of it is rounding."""
+
 _SEEN = 1e-6  # share of the largest part of some columns that a part of them has at least
 _LOST = 1e-3  # share of what all dwells determine of the model, below which some of them determine nothing
 
@@ -77,6 +79,7 @@ class InNoises:
 
     - logs (K,): log of the restricted likelihood without any term.
     - grams: of each group, G^T W G (K, n, q, q). along (K, C): G^T W z. Both are projected off the model.
+    - lengths: of each group, the largest squares (K, n) of columns that were not projected.
     """
 
     def __init__(self, rows: Spanned, shapes: Floats, squares: Floats, groups: Sequence[Indices] = ()) -> None:
@@ -101,17 +104,21 @@ class InNoises:
         self.along, chi2 = rest[:, :-1], rest[:, -1]
         log_model = np.log(np.einsum("kpp->kp", self._inverse)).sum(axis=1)
         self.logs = rows.log + 0.5 * np.log(self._weights).sum(axis=(1, 2)) + log_model - 0.5 * chi2
-        self.grams = [self._gram(group, summed) for group, summed in zip(groups, sums, strict=True)]
+        both = [self._gram(group, summed) for group, summed in zip(groups, sums, strict=True)]
+        self.grams, self.lengths = [gram for gram, _ in both], [length for _, length in both]
 
-    def _gram(self, group: Indices, sums: Floats) -> Floats:
-        """Return G^T W G (K, n, q, q) of a group from the sums (K, n, pairs) of its products, projected."""
+    def _gram(self, group: Indices, sums: Floats) -> tuple[Floats, Floats]:
+        """Return G^T W G (K, n, q, q) of a group from the sums (K, n, pairs) of its products, projected, and the
+        largest squares (K, n) on its diagonal before."""
         count, width = group.shape
         first, second = np.triu_indices(width)
         more = np.swapaxes(self._rows.more_columns.T[group], 1, 2)
         gram = np.empty((len(sums), count, width, width))
         gram[..., first, second] = gram[..., second, first] = sums
+        gram += np.swapaxes(more, 1, 2) @ more
+        lengths = np.einsum("knqq->knq", gram).max(axis=2)
         off = np.moveaxis(self._off[:, :, group], 1, 2)  # (K, n, k, q)
-        return gram + np.swapaxes(more, 1, 2) @ more - np.swapaxes(off, 2, 3) @ off
+        return gram - np.swapaxes(off, 2, 3) @ off, lengths
 
     def dwells(self, k: int, rows: Spanned, without: Sequence[int] = ()) -> tuple[Floats, Floats]:
         """G^T W G (D, 3, 3) and G^T W z (D, 3) of offsets of the three accelerometers in one dwell, as the others tell,
@@ -186,9 +193,7 @@ def _add_products(columns: Floats, group: Indices, weights: Floats, sums: Floats
 def _explained(products: Floats, group: Indices, lengths: Floats) -> Floats:
     """Return what columns explain, (f, C + 1), from their products (q, C + 1) with all, and with
     themselves (q,) before the model's part was subtracted."""
-    gram = products[:, group]
-    squares = np.diagonal(gram)
-    scales = np.where(squares > _ROUNDING * lengths, 1.0 / np.sqrt(np.maximum(squares, 1e-300)), 0.0)
-    values, vectors = np.linalg.eigh(scales[:, None] * gram * scales)
-    seen = values > 1e-10
+    scales = 1.0 / np.sqrt(np.maximum(lengths, 1e-300))
+    values, vectors = np.linalg.eigh(scales[:, None] * products[:, group] * scales)
+    seen = values > ROUNDING
     return (vectors[:, seen] / np.sqrt(values[seen])).T @ (scales[:, None] * products)

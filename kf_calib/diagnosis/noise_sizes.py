@@ -18,6 +18,7 @@ from kf_calib.noise.reml import OF_ONE, Parts
 
 _STATED, _UNSTATED = 0.02, 0.5  # prior probability of noise beyond what was stated, and where nothing was stated
 _OF_ONE = 0.1  # share of one accelerometer alone in scatter
+_INDEPENDENT = 0.5  # share of the values that are independent, where dwells differ by more than was stated
 _HOPELESS = 30.0  # in log likelihood
 _FEWEST = 4  # sizes of noise over which is integrated
 _RANGE = math.log(1e4)  # width of the flat prior of the logarithm of a size of noise
@@ -105,15 +106,39 @@ class NoiseSizes:
         """
         count = len(self._sizes)
         numbers = numbers or [[0], *([*range(first, first + count)] for first in range(1, logs.shape[1], count))]
-        parts = [logs[:, 0], *(self._over_sizes(logs[:, of_family]) for of_family in numbers[1:])]
+        families = enumerate(map(list, numbers[1:]), start=1)
+        parts = [logs[:, 0], *(self._beside_causes(k, self._over_sizes(logs[:, some])) for k, some in families)]
         return np.stack(parts, axis=1) + [family.log_prior for family in self.families]
 
     def _over_sizes(self, logs: Floats) -> Floats:
         """Return the log mean (n,) of likelihoods over the sizes of a family."""
         return integrated(logs, self._likelihood.step) - math.log(_RANGE)
 
+    def _beside_causes(self, number: int, logs: Floats) -> Floats:
+        """Return log evidence (n,) beside what a family has beyond stated noise.
+
+        That is no noise, but causes that nobody knows. Orientations that are like each other share them, so that they
+        are fewer independent values than dwells, and what is gained beside them counts by this share: the likelihood
+        has a power below 1 (Miller and Dunson, Robust Bayesian inference via coarsening, 2019).
+        """
+        family = self.families[number]
+        if not any(self._stated[part] for part in family.parts):
+            return logs
+        gains = logs - self._without[number - 1]
+        return np.where(gains > 0.0, logs - (1.0 - _INDEPENDENT) * gains, logs)
+
+    @cached_property
+    def _without(self) -> list[float]:
+        """Log evidence of the families but the first without any term."""
+        noises = (self._likelihood.in_noises(family.shapes, self.squares) for family in self.families[1:])
+        return [float(self._over_sizes(of_family.logs[None])[0]) for of_family in noises]
+
+    @property
+    def _stated(self) -> dict[str, bool]:
+        """Whether the noise from dwell to dwell was stated, by its parts."""
+        return {"setting": self._noise.setting.stated, "common": self._noise.scatter.stated}
+
     def _log_prior(self, parts: Parts) -> float:
         """Return the log of the prior probability that these parts of the noise are free, and no others."""
-        stated = {"setting": self._noise.setting.stated, "common": self._noise.scatter.stated}
-        priors = {part: _STATED if is_stated else _UNSTATED for part, is_stated in stated.items()}
+        priors = {part: _STATED if is_stated else _UNSTATED for part, is_stated in self._stated.items()}
         return sum(math.log(prior if part in parts else 1.0 - prior) for part, prior in priors.items())

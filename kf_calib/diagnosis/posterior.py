@@ -363,7 +363,8 @@ class RunPosterior:
         best = max(row.log_evidence for row in rows)
         least = best - _BEHIND - _BENT * max(best - float(self._without.max()), 0.0)
         effects = sorted((row for row in rows if row.effects and not row.driver), key=lambda row: -row.log_evidence)
-        single = [row for row in effects if len(row.effects) == 1][:_ALWAYS]  # large effects are far from linear
+        single = [row for row in effects if len(row.effects) == 1]  # large effects are far from linear
+        single = sorted(single, key=lambda row: -row.statistic)[:_ALWAYS]
         likeliest = {id(row) for row in [*single, *(row for row in effects[:_REFITTED] if row.log_evidence > least)]}
         fitted = self._steady([self._refitted(row) if id(row) in likeliest else row for row in rows])
         while not (first := max(fitted, key=lambda row: row.log_evidence)).driver and first.effects and not first.refit:
@@ -488,6 +489,8 @@ class RunPosterior:
 def _with_sure_dwells(rows: list[Hypothesis], beside: list[Hypothesis]) -> list[Hypothesis]:
     """Return rows with those of dwells beside other terms where the likeliest is one of these, and its clearest dwell
     is off for sure, whatever else is missing; else without them."""
+    alone = {number for row in rows for number in row.dwells}  # with nothing beside them: these are the clearest
+    beside = [replace(row, dwells=tuple(sorted(row.dwells, key=lambda number: number not in alone))) for row in beside]
     table = table_of([row for row in (*rows, *beside) if math.isfinite(row.log_evidence)])
     dwells = table.first.dwells[:1]
     sure = sum(row.probability for row in table.rows if {*dwells} & {*row.dwells}) >= SURE

@@ -21,7 +21,7 @@ from functools import cached_property
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, Indices
-from kf_calib.diagnosis.in_noises import InNoises, Spanned
+from kf_calib.diagnosis.in_noises import ROUNDING, InNoises, Spanned
 from kf_calib.diagnosis.within_rows import WithinRows
 from kf_calib.dwells.pieces import OfPieces, of_all_pieces
 from kf_calib.effects import Effect
@@ -32,7 +32,9 @@ from kf_calib.noise.reml import FREE, Part, with_shared_noise
 
 _SEEN = 1e-7  # share of a column that the model must leave for it to be seen
 _FINE = 8  # parts of a step over which the likelihood is integrated
+_FAR = 300.0  # in log likelihood, below the largest: a polynomial through values that differ by more swings out
 _LEAST = 0.1  # sigma of a mean: noise that is smaller shows nothing
+_ALONG = 1e-8  # variance along the force by errors across it: a turn by 2e-4 rad; less is lost in sums of the squares
 
 Combination = tuple[slice, Floats | None]
 """Columns, and the matrix by which they are combined; None: as they are."""
@@ -192,7 +194,7 @@ class RunLikelihood:
         size where it equals the noise that was stated in its mean."""
         covariances = FREE[kind].shapes(self.means, self.linearised.state).sum(axis=0)
         shapes = self._root @ covariances @ np.swapaxes(self._root, 1, 2)
-        return shapes / max(float(np.einsum("dii->di", shapes).max(axis=1).mean()), 1e-300)
+        return shapes / max(float(np.einsum("dii->di", shapes).max(axis=1).mean()), 1e-300) + _ALONG * np.eye(3)
 
 
 def _directions(columns: Floats) -> Floats:
@@ -241,12 +243,17 @@ def _off(
     return Spanned(of_means, columns, z - of_means @ along, more, more_columns, more_z - more @ along, log)
 
 
-def log_bayes(gram: Floats, along: Floats, squares: Floats, log_weights: Floats, centres: Floats) -> Floats:
+def log_bayes(gram: Floats, along: Floats, squares: Floats, log_weights: Floats, centres: Floats,
+              lengths: Floats | None = None) -> Floats:  # fmt: skip
     """Log Bayes factors (n,) of n terms of q columns: gram (n, q, q), along (n, q) = G^T z, each averaged over its
-    sizes, of which the squares (n, m), the logs (n, m) of their probabilities and the centres (n,) are given."""
-    scales = np.sqrt(np.maximum(np.einsum("nqq->nq", gram).max(axis=1), 1e-300))
+    sizes, of which the squares (n, m), the logs (n, m) of their probabilities and the centres (n,) are given.
+
+    lengths: the largest squares (n,) of columns before others were subtracted from them; None: those of gram.
+    """
+    largest = np.einsum("nqq->nq", gram).max(axis=1) if lengths is None else lengths
+    scales = np.sqrt(np.maximum(largest, 1e-300))
     values, vectors = np.linalg.eigh(gram / scales[:, None, None] ** 2)
-    values = np.where(values > 1e-13, values, 0.0)
+    values = np.where(values > ROUNDING, values, 0.0)
     shifted = along - (gram @ np.ones(gram.shape[1])) * centres[:, None] if centres.any() else along
     shift = along.sum(axis=1) * centres - 0.5 * gram.sum(axis=(1, 2)) * centres**2 if centres.any() else 0.0
     turned = np.einsum("nqk,nq->nk", vectors, shifted / scales[:, None]) ** 2 * (values > 0.0)
@@ -276,6 +283,7 @@ def log_bayes_together(parts: Sequence[Floats], readings: Floats, sizes: Sequenc
 def integrated(logs: Floats, step: float) -> Floats:
     """Log of the integral (n,) of exp(logs) over the logarithm of a size, from its values (n, k) at equal steps,
     between which it is cubic (Lagrange's polynomials through four neighbours)."""
+    logs = np.maximum(logs, logs.max(axis=1, keepdims=True) - _FAR)
     count = logs.shape[1]
     at = np.arange((count - 1) * _FINE + 1) / _FINE
     first = np.clip(np.floor(at).astype(int) - 1, 0, count - 4)

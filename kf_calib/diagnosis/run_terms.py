@@ -125,9 +125,11 @@ class RunTerms:
                 for k, texts in enumerate(unknown.summands)
             ]
             alone = unknown.exclusive or len(blocks) == 1
-            share = math.log((1.0 if alone else _SPARSE) / len(blocks))
+            # the simplest come first, and are likeliest; of alternatives any is as likely
+            shares = np.ones(len(blocks)) if unknown.exclusive else np.arange(1.0, len(blocks) + 1.0) ** -2.0
+            shares *= (1.0 if alone else _SPARSE) / shares.sum()
             for k, block in enumerate(blocks):
-                columns.term(f"?{number}", [block], share, summands=(k,))
+                columns.term(f"?{number}", [block], math.log(shares[k]), summands=(k,))
             if not alone:
                 columns.term(
                     f"?{number}", blocks, math.log(1.0 - _SPARSE - TWO_SUMMANDS), summands=(*range(len(blocks)),)
@@ -219,14 +221,15 @@ class RunTerms:
         explained (f, C + 1): what columns beside them, of any size, explain of all columns and of the readings.
         """
         logs = np.zeros(len(self.terms))
-        for alike, grams in zip(self._alike, noises.grams, strict=True):
+        for alike, grams, lengths in zip(self._alike, noises.grams, noises.lengths, strict=True):
             gram, along = grams[k], noises.along[k, alike.places]
             if explained is not None:
                 parts = np.moveaxis(explained[:, alike.places], 0, 2)  # (n, q, f)
                 gram = gram - parts @ np.swapaxes(parts, 1, 2)
                 along = along - parts @ explained[:, -1]
             gram, along = gram * alike.scales[:, :, None] * alike.scales[:, None], along * alike.scales
-            logs[alike.numbers] = log_bayes(gram, along, alike.squares, alike.log_weights, alike.centres)
+            length = lengths[k] * alike.scales.max(axis=1) ** 2
+            logs[alike.numbers] = log_bayes(gram, along, alike.squares, alike.log_weights, alike.centres, length)
         return logs
 
     def bases(self, numbers: Sequence[int], covariance: Floats | None) -> tuple[Floats, Floats]:

@@ -66,6 +66,24 @@ def test_an_integral_over_sizes_is_that_of_quadrature() -> None:
     assert found == pytest.approx(np.log(expected), abs=0.01)
 
 
+@pytest.mark.parametrize("misfit", [1e2, 1e6, 1e10])
+def test_an_integral_over_sizes_holds_where_the_likelihood_is_steep(misfit: float) -> None:
+    """Of chi-squared of a misfit that only a large size explains: a polynomial through values that fall by 1e9 from one
+    size to the next swung out above all of them."""
+    step = 0.25
+    log_sizes = np.arange(-2.0, 16.0, step)
+
+    def log_likelihood(log_size: float) -> float:
+        variance = 1.0 + np.exp(2.0 * log_size)
+        return float(-12.0 * np.log(variance) - 0.5 * misfit / variance)
+
+    middle, largest = 0.5 * np.log(misfit / 24.0), log_likelihood(0.5 * np.log(misfit / 24.0))
+    ends = max(middle - 2.0, -2.0), min(middle + 3.0, 16.0 - step)
+    expected = quad(lambda x: np.exp(log_likelihood(x) - largest), *ends, points=[middle], limit=400)[0]
+    found = integrated(np.array([[log_likelihood(x) for x in log_sizes]]), step)[0]
+    assert found == pytest.approx(np.log(expected) + largest, abs=0.02)
+
+
 PLACES = np.array([[0, 1, 2], [9, 10, 11], [30, 31, 32]])
 """Columns of three terms."""
 
@@ -127,6 +145,37 @@ def test_products_in_all_noises_are_those_of_rows_in_each(posterior: RunPosterio
             np.testing.assert_allclose(gram, columns.T @ columns, rtol=1e-6, atol=1e-9 * np.abs(gram).max())
             np.testing.assert_allclose(noises.along[k, place], columns.T @ rows.readings, rtol=1e-6, atol=1e-6)
     assert max(term.columns.max() for term in terms) < likelihood.spanned.columns.shape[2]
+
+
+def test_what_is_rounding_beside_others_explains_nothing() -> None:
+    """Two columns that are nearly one, of which another has been subtracted, and readings of 1e6 sigma."""
+    rng = np.random.default_rng(3)
+    one = rng.normal(size=(40, 1))
+    columns, readings = np.hstack([one, one * (1.0 + 1e-9)]), 1e6 * rng.normal(size=40)
+    basis = one / np.linalg.norm(one)
+    gram, along = columns.T @ columns, columns.T @ readings
+    left = gram - columns.T @ basis @ basis.T @ columns
+    along_left = along - columns.T @ basis @ (basis.T @ readings)
+    squares, logs = np.geomspace(1e-4, 1e14, 40)[None], np.full((1, 40), -np.log(40.0))
+    lengths = np.array([gram.diagonal().max()])
+    found = log_bayes(left[None], along_left[None], squares, logs, np.zeros(1), lengths)
+    assert found[0] == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_beside_causes_that_nobody_knows_half_of_a_gain_counts(stated: bool, posterior: RunPosterior) -> None:
+    """Beyond stated noise; where it was not stated it is noise, and all of the gain counts."""
+    noise = calibrate(Run(seed=4, dwells=12, stated=stated)).noise
+    sizes = NoiseSizes(posterior._run.likelihood, noise.without_estimates(), 24)
+    known = {"setting"} if stated else set[str]()  # the scatter is not stated
+    shapes = [family.shapes for family in sizes.families[1:]]
+    logs = [posterior._run.likelihood.in_noises(of_family, sizes.squares).logs for of_family in shapes]
+    base = np.concatenate([posterior._base[:1], *logs])
+    without, more, less = (sizes.evidence((base + gain)[None])[0] for gain in (0.0, 8.0, -8.0))
+    expected = [4.0 if known & {*family.parts} else 8.0 for family in sizes.families]
+    assert expected.count(4.0) == 2 * stated
+    np.testing.assert_allclose(more - without, expected, atol=1e-9)
+    np.testing.assert_allclose(less - without, -8.0, atol=1e-9)
 
 
 def test_probabilities_are_those_of_the_evidence_and_families_add_up(posterior: RunPosterior) -> None:
