@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from kf_calib.sources.text.labels import Labels
-from kf_calib.sources.text.names import face_of, is_unit
+from kf_calib.sources.text.names import NAMELESS, face_of, is_unit
 
 _DELIMITERS = ";\t,|"
 BLANK = " "
@@ -20,8 +20,6 @@ _ROWS = 1000  # that are looked at
 _MARK = re.compile(r"\s*(?:#|%|//)+\s*")
 """Before a comment, or before names."""
 _NUMBER = re.compile(r"[+\-−]?[\d.,]*\d[\d.,]*(?:[eE][+\-]?\d+)?|[+\-]?nan", re.IGNORECASE)
-NAMELESS = "column {}"
-"""The name of a column of a text without a heading, counted from 1."""
 
 
 class TextHeading(NamedTuple):

@@ -9,12 +9,11 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, BinaryIO, Protocol
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -31,7 +30,7 @@ from kf_calib.sources.text.csv_lines import CsvLines
 from kf_calib.sources.text.encoding import Cutter, TextFile, head_of, holds_any
 from kf_calib.sources.text.heading import TextHeading
 from kf_calib.sources.text.json_lines import POSE_KEYS, JsonLines
-from kf_calib.sources.text.reader import Account, LineReader, named
+from kf_calib.sources.text.reader import Account, Described, LineReader, first_line, is_json, named
 from kf_calib.sources.text.units import Units
 
 _BLOCK_BYTES = 1 << 18
@@ -79,19 +78,17 @@ class Lines:
         """The bench; a stream is read for it up to the first pose, which shows how the platform is described."""
         if self._bench is None:
             passage = self._begin()
-            with passage.closed_on_failure():
-                self._bench = self._describe_bench(passage)
-            if self.path:  # it is read from its beginning again, if it is
-                passage.close()
-            else:
-                self._waiting = passage
+            try:
+                self._bench = self._describe_bench(passage.parser)
+            finally:
+                passage.close()  # a file is read from its beginning again, if it is
+            self._waiting = None if self.path else passage
         return self._bench
 
     @property
     def warnings(self) -> list[str]:
-        if self._latest is None:
-            return self._said
-        return [*self._said, *(f"{self.name}: {sentence}" for sentence in self._latest.sentences())]
+        told = self._latest.sentences() if self._latest else []
+        return [*self._said, *(f"{self.name}: {sentence}" for sentence in told)]
 
     @property
     def fraction(self) -> float:
@@ -102,7 +99,8 @@ class Lines:
         converted = (with_accel(batch, readings(batch.accel.values)) for batch in self.batches())
         yield from converted if self._angles else map(without_poses, converted)
         if self.path and self._latest:
-            refuse_unread(self._latest.sample(), self.bench.input.counts, self.name)
+            sampled = np.concatenate([np.zeros((0, 3)), *self._latest.sampled])
+            refuse_unread(sampled, self.bench.input.counts, self.name)
 
     def batches(self) -> Iterator[Batch]:
         """What the lines hold, whatever the bench may be: raw readings."""
@@ -125,18 +123,19 @@ class Lines:
         return self._latest.parser if self._latest else None
 
     def _begin(self) -> _Passage:
+        stream, self._stream = self._stream, None
         try:
-            if self.path:
-                stream: BinaryIO | TextFile = TextFile(self.path, self._units.dataset)
-            elif self._stream is not None:
-                stream, self._stream = self._stream, None
-            else:
-                raise InputError(f"{self.name} can be read only once: record it to a file to read it again.")
+            stream = TextFile(self.path, self._units.dataset) if self.path else stream
         except OSError as error:
             raise InputError(f"{self.name}: cannot be read ({error.strerror}).") from None
+        if stream is None:
+            raise InputError(f"{self.name} can be read only once: record it to a file to read it again.")
         self._latest = _Passage(self.name, stream, self._open_reader, self._angles)
-        with self._latest.closed_on_failure():
+        try:
             self._latest.survey()
+        except BaseException:
+            self._latest.close()
+            raise
         return self._latest
 
     def _open_reader(self, lines: Sequence[str], account: Account) -> tuple[LineReader, int]:
@@ -149,32 +148,19 @@ class Lines:
         one that cannot be read, which is said elsewhere."""
         try:
             lines = head_of(path, self._units.dataset).decode(errors="replace").splitlines()
-            first = next((line for line in lines if line.strip("\ufeff \t")), "{")
-            if is_json(first):
+            if is_json(next((line for line in lines if line.strip("\ufeff \t")), "{")):
                 theirs = [name for name, ours in self._columns.items() if ours in POSE_KEYS]
                 return holds_any(path, [f'"{name}"'.encode() for name in (*POSE_KEYS, *theirs)])
-            return bool(Columns.of(TextHeading.of(lines), self._columns).orientation)
+            return bool(Columns(TextHeading.of(lines), self._columns).orientation)
         except (OSError, InputError):
             return True
 
-    def _describe_bench(self, passage: _Passage) -> Bench:
-        default = self._units.input
+    def _describe_bench(self, parser: LineReader) -> Bench:
         if self._angles:
-            return bench_of(self.name, passage.parser, self._overrides, default)
-        stated = stated_of(self.name, passage.parser, self._overrides, default)
+            return bench_of(self.name, parser, self._overrides, self._units.input)
+        stated = stated_of(self.name, parser, self._overrides, self._units.input)
         bench, self._said = bench_without_angles(self.name, stated, are_lacking=self._are_lacking)
         return bench
-
-
-class Described(Protocol):
-    """What has been learnt of the bench from what it sent."""
-
-    metadata: dict[str, str]
-    has_angles: bool
-    pose_width: int
-    raw: RawInput | None
-    unit: str | None
-    is_bare: bool
 
 
 def stated_of(name: str, reader: Described, overrides: BenchKeys, default: RawInput | None = None) -> dict[str, Any]:
@@ -220,12 +206,7 @@ def bench_of(name: str, reader: Described, overrides: BenchKeys, default: RawInp
 
 
 def reader_for(
-    lines: Sequence[str],
-    columns: Mapping[str, str],
-    account: Account,
-    *,
-    angles: bool = True,
-    units: Units | None = None,
+    lines: Sequence[str], columns: Mapping[str, str], account: Account, *, angles: bool, units: Units
 ) -> tuple[LineReader, int]:
     """The reader that the first lines ask for, and how many of these are its heading.
 
@@ -235,16 +216,14 @@ def reader_for(
     if is_json(lines[0]):
         return JsonLines(columns, account), 0
     heading = TextHeading.of(lines)
-    return CsvLines(Columns.of(heading, columns, units), account, angles), heading.lines
-
-
-def is_json(first: str) -> bool:
-    """Whether the first line that is not empty begins JSON lines."""
-    return first.lstrip("\ufeff \t")[:1] in ("{", "[")
+    return CsvLines(Columns(heading, columns, units), account, angles), heading.lines
 
 
 class _Passage:
-    """One reading of the lines, from the first to the last; iterated once."""
+    """One reading of the lines, from the first to the last; iterated once.
+
+    sampled: some of the readings (n, 3) as they stand in the lines.
+    """
 
     parser: LineReader
 
@@ -253,26 +232,15 @@ class _Passage:
         self._name, self._stream, self._open_reader = name, stream, open_reader
         self._file = stream if isinstance(stream, TextFile) else None
         self.fraction = 0.0 if self._file else math.nan
-        self._blocks = self._split(stream)
-        self._ahead, self._said = list[Batch](), list[str]()
+        self._blocks, self._ahead, self._said = self._split(), list[Batch](), list[str]()
         self._has_accel = self._has_pose = False
-        self._sampled = deque[Floats](maxlen=_BLOCKS_SAMPLED)
+        self.sampled = deque[Floats](maxlen=_BLOCKS_SAMPLED)
 
     def sentences(self) -> list[str]:
         """What was taken for what, where that is not plain, and what was not used."""
-        told = f"{'; '.join(self._said)}. {HOW}." if self._said else ""
-        trouble = self._file.trouble if self._file else ""
-        chosen = [f"{said}." for said in (self._file.said if self._file else ())]
-        return chosen + [sentence for sentence in (told, trouble) if sentence] + self.account.sentences()
-
-    @contextmanager
-    def closed_on_failure(self) -> Iterator[None]:
-        """Closes a file opened here where what is done within fails."""
-        try:
-            yield
-        except BaseException:
-            self.close()
-            raise
+        chosen, trouble = (self._file.said, self._file.trouble) if self._file else ((), "")
+        told = [f"{'; '.join(self._said)}. {HOW}."] if self._said else []
+        return [*(f"{said}." for said in chosen), *told, *([trouble] if trouble else []), *self.account.sentences()]
 
     def close(self) -> None:
         """Closes a file opened here."""
@@ -280,45 +248,12 @@ class _Passage:
             self._file.close()
 
     def survey(self) -> None:
-        """Reads up to the first readings and pose, if there must be one, and keeps what it has read."""
-        self._open_parser()
-        while lacking := self._lacking:
-            batch = self._next_batch()
-            if batch is None or self.account.lines > _SURVEY_LINES:
-                raise self._unusable(lacking)
-            self._ahead.append(batch)
-
-    @property
-    def _lacking(self) -> str:
-        """What has not come yet of that by which the bench is described; nothing where all has."""
-        if self._angles and not self.parser.pose_width:
-            return "platform angles"
-        return "" if self._has_accel else "readings"
-
-    def sample(self) -> Floats:
-        """Some of the readings (n, 3) as they stand in the lines."""
-        return np.concatenate([np.zeros((0, 3)), *self._sampled])
-
-    def __iter__(self) -> Iterator[Batch]:
-        try:
-            while self._ahead:
-                yield self._ahead.pop(0)
-            while (batch := self._next_batch()) is not None:
-                yield batch
-        finally:
-            self.close()
-        met = {"readings": self._has_accel, "platform angles": self._has_pose or not self._angles}
-        for what, is_met in met.items():
-            if not is_met:
-                raise self._unusable(what)
-
-    def _open_parser(self) -> None:
-        """Chooses the parser by the first lines, of CSV by some rows as well, which tell what the header may not; it
-        reads the rest of the first block."""
+        """Chooses the parser by the first lines, of CSV by some rows as well, which tell what the header may not; reads
+        up to the first readings and pose, if there must be one, and keeps what it has read."""
         first = list[str]()
         for lines in self._blocks:
             first += lines
-            blank = next((k for k, line in enumerate(first) if line.lstrip("\ufeff").strip()), len(first))
+            blank = first_line(first)
             self.account.lines += blank
             del first[:blank]
             if len(first) > _TELLING_ROWS or (first and is_json(first[0])):
@@ -330,24 +265,38 @@ class _Passage:
         self._said = self.parser.said
         self.account.lines += heading
         self._ahead.append(self._parse(first[heading:]))
+        while not (self._has_accel and (self.parser.pose_width or not self._angles)):
+            lines = next(self._blocks, None)
+            if lines is None or self.account.lines > _SURVEY_LINES:
+                lacks_pose = self._angles and not self.parser.pose_width
+                raise self._unusable("platform angles" if lacks_pose else "readings")
+            self._ahead.append(self._parse(lines))
 
-    def _next_batch(self) -> Batch | None:
-        lines = next(self._blocks, None)
-        return None if lines is None else self._parse(lines)
+    def __iter__(self) -> Iterator[Batch]:
+        try:
+            while self._ahead:
+                yield self._ahead.pop(0)
+            yield from map(self._parse, self._blocks)
+        finally:
+            self.close()
+        if not self._has_accel:
+            raise self._unusable("readings")
+        if self._angles and not self._has_pose:
+            raise self._unusable("platform angles")
 
     def _parse(self, lines: list[str]) -> Batch:
         batch = self.parser.read(lines, self.account.lines + 1)
         self.account.lines += len(lines)
         if count := len(batch.accel):
             self._has_accel = True
-            self._sampled.append(batch.accel.values[:: count // _SAMPLED + 1].copy())
+            self.sampled.append(batch.accel.values[:: count // _SAMPLED + 1].copy())
         self._has_pose |= len(batch.pose) > 0
         return batch
 
-    def _split(self, stream: BinaryIO | TextFile) -> Iterator[list[str]]:
+    def _split(self) -> Iterator[list[str]]:
         """Whole lines, block by block as they arrive."""
         cutter = Cutter(self.account.refuse)
-        read = getattr(stream, "read1", stream.read)  # read1 does not wait until a whole block has come
+        read = getattr(self._stream, "read1", self._stream.read)  # read1 does not wait until a whole block has come
         try:
             while block := read(_BLOCK_BYTES):
                 if lines := cutter.push(block):
@@ -360,7 +309,5 @@ class _Passage:
         self.fraction = 1.0
 
     def _unusable(self, what: str) -> InputError:
-        found = "".join(f"; {sentence.rstrip('.')}" for sentence in self.account.sentences())
         without = ", or do without (--no-angles)" if what == "platform angles" else ""
-        said = f"{self._name}: no {what} in {self.account.lines} lines{found}"
-        return InputError(f"{said}: {self.parser.advice}{without}.")
+        return self.account.refusal(f"{self._name}: no {what}", self.parser.advice + without)

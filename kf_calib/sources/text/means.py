@@ -22,8 +22,7 @@ from kf_calib.errors import InputError
 from kf_calib.sources.text.columns import HOW, READINGS, SPREADS, Columns, refuse_unknown_names
 from kf_calib.sources.text.grid import Grid, grid_of
 from kf_calib.sources.text.names import QUATERNION, face_of
-from kf_calib.sources.text.numbers import DECIMAL_POINT, CellError, LineError
-from kf_calib.sources.text.quantity import QuantityColumns
+from kf_calib.sources.text.numbers import DECIMAL_POINT, CellError, LineError, QuantityColumns
 from kf_calib.sources.text.reader import named
 from kf_calib.sources.text.units import Units, celsius, mps2_per, reading_units
 from kf_calib.support.text import cut
@@ -88,7 +87,7 @@ class TableOfMeans:
         self, grid: Grid, stated: Mapping[str, str], overrides: BenchKeys, units: Units, angles: bool | None
     ) -> None:
         refuse_unknown_names(stated, grid.heading.header)
-        self.columns = Columns.of(grid.heading, stated, units, is_table=True)
+        self.columns = Columns(grid.heading, stated, units, is_table=True)
         pairs = zip(grid.heading.numbers, grid.heading.rows, strict=True)
         self.numbers = [line + 1 for line, row in pairs if self.columns.is_chosen(row)]
         self.grid, self.overrides, self.units, self.said = grid, overrides.copy(), units, self.columns.said

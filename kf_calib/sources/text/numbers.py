@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
+from operator import mul
 
-from kf_calib.support.text import number_from
+from kf_calib.support.text import cut, number_from
+
+CsvRow = Sequence[str]
 
 _NUMBER = re.compile(r"[+\-−]?[\d.,'’ \u00a0\u202f]*\d[\d.,]*(?:[eE][+\-]?\d+)?")
 _SPACES = str.maketrans("", "", "'’ \u00a0\u202f")
@@ -66,19 +70,24 @@ class Numbers:
         """The number in a cell, which need not be finite. Raises ValueError where there is none, LineError for one that
         is too small."""
         try:
-            return number_of(cell if self.decimal == "." else self.with_point(cell))
+            return number_of(self.with_point(cell))
         except LineError:
             raise
         except ValueError:
             return number_of(self._plain(cell))
 
+    def or_nan(self, cell: str) -> float:
+        """The same, NaN where there is none."""
+        try:
+            return self.value(cell)
+        except ValueError:
+            return math.nan
+
     def values(self, cells: Sequence[str]) -> list[float]:
         """The numbers in cells; raises as ``value``."""
         try:
-            if self.decimal == ".":
-                return list(map(number_of, cells))
-            if "." not in "".join(cells):
-                return [number_of(cell.replace(",", ".")) for cell in cells]
+            if self.decimal == "." or "." not in "".join(cells):
+                return [number_of(cell.replace(self.decimal, ".")) for cell in cells]
         except ValueError:  # not as programs write them
             pass
         return list(map(self.value, cells))
@@ -119,6 +128,39 @@ def _decimal_of(cell: str) -> str:
     whole, _, rest = cell.translate(_SPACES).lstrip("+-−").partition(sign)
     may_be_thousands = len(rest) == 3 and 1 <= len(whole) <= 3 and not whole.startswith("0")
     return "" if may_be_thousands else sign
+
+
+@dataclass(frozen=True)
+class QuantityColumns:
+    """Where a quantity stands in a row, the factors that bring it to our units, and texts that stand for no value."""
+
+    at: tuple[int, ...] = ()
+    factors: tuple[float, ...] = ()
+    absent: Container[str] = ()
+
+    def values(self, row: CsvRow, header: Sequence[str], numbers: Numbers) -> list[float] | None:
+        """The quantity, None where it is not measured. Raises CellError where it cannot be used."""
+        cells = [row[at] for at in self.at]
+        if not all(cells):
+            if any(cells):
+                raise CellError(self.at[cells.index("")], "some components of a vector are missing")
+            return None
+        try:
+            values = numbers.values(cells)
+        except ValueError:
+            values = [math.nan]
+        if not math.isfinite(sum(values)):  # which numbers beyond 1e308 together are not, either
+            if cells[0].lower() in self.absent:
+                return None
+            for at, cell in zip(self.at, cells, strict=True):
+                reason = f"column {cut(header[at], 40)!r} is {cut(cell, 40)!r}, which is no number"
+                try:
+                    is_number = math.isfinite(numbers.value(cell))
+                except ValueError as error:
+                    is_number, reason = False, str(error) if isinstance(error, LineError) else reason
+                if not is_number:
+                    raise CellError(at, reason)
+        return list(map(mul, values, self.factors))
 
 
 def number_of(text: str) -> float:

@@ -66,52 +66,54 @@ class Account:
             sentences.append(f"names that are not known were left out, with the values under them: {names}.")
         return sentences
 
-
-class LineRows:
-    """Stamped rows on their way to a stream."""
-
-    def __init__(self) -> None:
-        self._stamps = list[int]()
-        self._values = list[list[float]]()
-
-    def add(self, time_ns: int, values: list[float] | None) -> None:
-        """Adds a row, unless there is nothing to add."""
-        if values:
-            self._stamps.append(time_ns)
-            self._values.append(values)
-
-    def stream(self, width: int) -> Stream:
-        if not self._stamps:
-            return Stream.empty(width)
-        return Stream(np.array(self._stamps, np.int64), np.array(self._values, float))
+    def refusal(self, what: str, advice: str) -> InputError:
+        """That what was read cannot be used, and what of it was not."""
+        unused = "".join(f"; {sentence.rstrip('.')}" for sentence in self.sentences())
+        return InputError(f"{what} in {self.lines} {self.what}{unused}: {advice}.")
 
 
-class LineReader(ABC):
-    """Reads lines block by block; those that cannot be used are put down in the account.
+def first_line(lines: Sequence[str]) -> int:
+    """How many lines are blank before the first that is not."""
+    return next((k for k, line in enumerate(lines) if line.lstrip("\ufeff").strip()), len(lines))
 
-    Readings are in batches as they stand in the lines. ``raw``: what they are in, where that is settled, ``unit``: by
-    their names; None where they name none (``is_bare``), or none has come yet. ``metadata``: of the bench, as strings.
-    ``has_angles``: poses are angles; ``pose_width``: numbers of one. ``said``: what was taken for what, where that is
-    not plain.
+
+def is_json(first: str) -> bool:
+    """Whether the first line that is not blank begins JSON lines."""
+    return first.lstrip("\ufeff \t")[:1] in ("{", "[")
+
+
+class Described:
+    """What has been learnt of the bench from what it sent.
+
+    metadata: of the bench, as strings. has_angles: poses are angles; pose_width: numbers of one, 0 until it is known.
+    raw: what the readings are in, where that is settled, unit: by their names; None where they name none (is_bare), or
+    none has come yet. said: what was taken for what, where that is not plain.
     """
 
-    _wrong: ClassVar[str]
-    """The reason to give where reading a line raises a ValueError that tells none."""
+    has_angles = True
+    pose_width = 0
+    raw: RawInput | None = None
+    unit: str | None = None
+    is_bare = False
 
     def __init__(self, account: Account) -> None:
-        self.metadata: dict[str, str] = {}
-        self.has_angles = True
-        self.pose_width = 0
-        self.raw: RawInput | None = None
-        self.unit: str | None = None
-        self.is_bare = False
-        self.said = list[str]()
+        self.metadata, self.said = dict[str, str](), list[str]()
         self._account = account
 
-    @property
-    @abstractmethod
-    def advice(self) -> str:
-        """How quantities have to be named."""
+
+SampleRow = tuple[int, list[float] | None, list[float] | None, list[float] | None]
+"""The stamp of a line, ns, its readings, its pose and its temperature, degC; None or empty: not measured."""
+
+
+class LineReader(Described, ABC):
+    """Reads lines block by block; those that cannot be used are put down in the account.
+
+    Readings are in batches as they stand in the lines. advice: how quantities have to be named. wrong: the reason where
+    reading a line raises a ValueError that tells none.
+    """
+
+    wrong: ClassVar[str]
+    advice: ClassVar[str]
 
     @abstractmethod
     def with_readings(self, line: str, readings_mps2: Sequence[float]) -> str:
@@ -123,21 +125,30 @@ class LineReader(ABC):
 
     def read(self, lines: Sequence[str], first_line: int) -> Batch:
         """The batch of consecutive lines, the first of them of that number."""
-        accel, pose, temperature = LineRows(), LineRows(), LineRows()
+        rows = list[SampleRow]()
         for number, line in enumerate(lines, start=first_line):
-            if not line or line.isspace():
-                continue
             try:
-                self._read_line(line, accel, pose, temperature)
+                if line and not line.isspace() and (row := self._row(line)):
+                    rows.append(row)
             except LineError as error:
                 self._account.refuse(number, str(error))
-            except (ValueError, ArithmeticError, RecursionError) as error:
-                reasons = {ArithmeticError: "a number is out of range", RecursionError: "it is nested too deeply"}
-                known = (reason for kind, reason in reasons.items() if isinstance(error, kind))
-                self._account.refuse(number, next(known, self._wrong))
-        return Batch(accel.stream(3), pose.stream(self.pose_width), temperature.stream(1))
+            except ArithmeticError:
+                self._account.refuse(number, "a number is out of range")
+            except RecursionError:
+                self._account.refuse(number, "it is nested too deeply")
+            except ValueError:
+                self._account.refuse(number, self.wrong)
+        return Batch(_stream(rows, 1, 3), _stream(rows, 2, self.pose_width), _stream(rows, 3, 1))
 
     @abstractmethod
-    def _read_line(self, line: str, accel: LineRows, pose: LineRows, temperature: LineRows) -> None:
-        """Adds what one line holds, all of it or nothing. Raises ValueError, ArithmeticError or RecursionError where it
-        cannot be used, LineError with the reason."""
+    def _row(self, line: str) -> SampleRow | None:
+        """What one line holds; None where that is no sample. Raises ValueError, ArithmeticError or RecursionError where
+        it cannot be used, LineError with the reason."""
+
+
+def _stream(rows: Sequence[SampleRow], at: int, width: int) -> Stream:
+    """Return the stream of one quantity in rows."""
+    filled = [row for row in rows if row[at]]
+    if not filled:
+        return Stream.empty(width)
+    return Stream(np.array([row[0] for row in filled], np.int64), np.array([row[at] for row in filled], float))
