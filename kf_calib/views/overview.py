@@ -203,7 +203,7 @@ def table_report(overview: TableOverview) -> RenderableType:
     """What ``info`` prints of a table."""
     survey = overview.survey
     parts: list[RenderableType] = [
-        Text(f"{survey.path}: a table of orientations, {counted(len(survey.means.numbers), 'row')}"),
+        Text(f"{survey.path}: a table of orientations, {counted(len(survey.means.rows), 'row')}"),
         _column_table(survey.columns),
     ]
     bench = ", ".join(f"{key} = {value}" for key, value in overview.bench.items())

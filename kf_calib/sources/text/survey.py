@@ -75,13 +75,14 @@ class Survey:
         """The columns in their order."""
         columns, described = self.means.columns, list[ColumnFound]()
         for k, (header, meaning) in enumerate(zip(columns.header, columns.meanings, strict=True)):
-            told_by = "--column" if header in self.stated else "content" if header in columns.guessed else "name"
-            if k in columns.by_size and told_by != "--column":
-                told_by = {"name": "size", "content": "content and size"}[told_by]
-            number = f" {columns.angles.index(k) + 1}" if k in columns.angles else ""
             first = next((row[k] for row in columns.rows if row[k]), "")
-            unit = columns.by_size.get(k) or meaning.unit if meaning.ours else ""
-            described.append(ColumnFound(header, first, meaning.ours + number, unit, told_by if meaning.ours else ""))
+            told_by = "content" if header in columns.guessed else "name"
+            if k in columns.by_size:
+                told_by = {"name": "size", "content": "content and size"}[told_by]
+            told_by = "--column" if header in self.stated else told_by
+            number = f" {columns.angles.index(k) + 1}" if k in columns.angles else ""
+            known = meaning.ours + number, columns.by_size.get(k) or meaning.unit, told_by
+            described.append(ColumnFound(header, first, *known if meaning.ours else ("", "", "")))
         return described
 
     @cached_property
@@ -89,17 +90,14 @@ class Survey:
         """The orientations; none where the table cannot be evaluated."""
         means, rows = self.means, list[RowFound]()
         place = means.columns.place("face") if self.orientation else None
-        for k, orientation in enumerate(self.table.orientations if self.table else ()):
-            norm = float(np.linalg.norm(orientation.mean_mps2))
-            x, y, z = (orientation.mean_mps2 / max(norm, 1e-300)).tolist()
-            pose = tuple(map(float, orientation.pose)) if self.orientation else ()
-            readings = None if orientation.sigma_mps2 is None else orientation.count
-            face, at_s = None if place is None else means.columns.rows[k][place], orientation.elapsed_s
-            rows.append(
-                RowFound(
-                    k + 1, means.numbers[k], at_s, face, pose, (x, y, z), norm, readings, orientation.temperature_c
-                )
-            )
+        for k, row in enumerate(self.table.orientations if self.table else ()):
+            norm = float(np.linalg.norm(row.mean_mps2))
+            x, y, z = (row.mean_mps2 / max(norm, 1e-300)).tolist()
+            pose = tuple(map(float, row.pose)) if self.orientation else ()
+            readings = None if row.sigma_mps2 is None else row.count
+            face = None if place is None else means.columns.rows[k][place]
+            facts = row.elapsed_s, face, pose, (x, y, z), norm, readings, row.temperature_c
+            rows.append(RowFound(k + 1, means.rows[k], *facts))
         return rows
 
 
