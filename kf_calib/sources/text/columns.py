@@ -35,7 +35,7 @@ from kf_calib.sources.text.names import (
 )
 from kf_calib.sources.text.numbers import DECIMAL_POINT, CsvRow, Numbers, QuantityColumns
 from kf_calib.sources.text.stamps import Stamps, are_stamps
-from kf_calib.sources.text.units import Units, choice_of, reading_units, size_of_count, usual_norm
+from kf_calib.sources.text.units import Units, reading_units, size_of_count, usual_norm
 from kf_calib.support.text import cut
 
 WANTED = "a header such as time_s,ax_mps2,ay_mps2,az_mps2,outer_deg,middle_deg,inner_deg,temperature_c is wanted"
@@ -77,8 +77,7 @@ class Columns:
         self.chosen: tuple[int, str] | None = None
         self.rows: list[CsvRow] = [row for row in heading.rows if len(row) == len(self.names)]
         if self.units.where:
-            self.chosen = choice_of(self.units.where, self.header, self.rows, "" if is_table else " among the first")
-            self.rows = [row for row in self.rows if self.is_chosen(row)]
+            self._choose_rows(self.units.where)
         self.meanings = meanings_of(self.header, stated)
         if is_nameless(self.header) and not stated:
             self._recognise_numbers()
@@ -88,6 +87,20 @@ class Columns:
             for k, name in enumerate(self.names):
                 if (unit := _TIME_ALONE.get(name.strip().lower())) is not None:
                     self.meanings[k] = Meaning("time", unit)
+
+    def _choose_rows(self, where: str) -> None:
+        """Keep the rows with a text in a column, as ``I=0``; raises InputError where none has it."""
+        name, value = (part.strip() for part in where.rpartition("=")[::2])
+        if not (name and value):
+            raise InputError(f"--where is {where!r}: write --where COLUMN=VALUE, as --where unit=0.")
+        if name not in self.header:
+            raise InputError(f"has no column {cut(name, 60)!r} (--where), it has {self._all}.")
+        self.chosen = at, value = list(self.header).index(name), value
+        labels = {row[at].strip() for row in self.rows}
+        if value not in labels:
+            seen, among = ", ".join(sorted(labels)[:8]), "" if self.is_table else " among the first"
+            raise InputError(f"no row{among} has {value!r} in column {name!r} (--where), they have {seen}.")
+        self.rows = [row for row in self.rows if self.is_chosen(row)]
 
     def places(self, *wanted: str) -> list[int]:
         """Indices of the columns of these kinds, in the order asked for."""
@@ -280,9 +293,12 @@ class Columns:
             f"it, for example {example} (known: {KNOWN})."
         )
 
-    def gimbals(self, *, needed: bool) -> QuantityColumns:
-        """The angles by the usual names, else every column of an angle in the order of the header; none where there is
-        none. Raises InputError where their unit is not told and they are needed."""
+    def pose(self, *, needed: bool) -> QuantityColumns:
+        """The attitude, or the angles by the usual names, else every column of an angle in the order of the header;
+        none where there is none. Raises InputError where they or their unit are not told and they are needed."""
+        if self.orientation == "attitude":
+            known = tuple(at for ours in QUATERNION if (at := self.place(ours)) is not None)
+            return QuantityColumns(known, (1.0,) * 4)
         places, stated, how = self.angles, self.units.angle, ""
         ranks, units = [self.meanings[at].rank for at in places], [self.meanings[at].unit for at in places]
         if any(ranks) and len(set(ranks)) < len(ranks):
@@ -293,13 +309,15 @@ class Columns:
                     f"column {self.named([at])} is in {unit} by its name, and --angle-unit is {stated}: leave out "
                     "--angle-unit, or rename the column by --column."
                 )
+        if "" in units and not stated:  # rows to come of a log may tell
+            values, how = self.values(places), " by their size (--angle-unit)"
+            of_table = ("deg" if (values == np.rint(values)).all() else "rad") if self.is_table else ""
+            stated = "deg" if (np.abs(values) > 2.0 * math.pi).any() else of_table
+            self.by_size |= {at: stated for at, unit in zip(places, units, strict=True) if not unit and stated}
+        if needed and (not places or ("" in units and not stated)):
+            raise self.without_angles()
         if "" in units and not stated:
-            how = " by their size (--angle-unit)"
-            if not (stated := self._unit_of_angles(places)):
-                if needed:
-                    raise self.without_angles()
-                return QuantityColumns()
-            self.by_size |= {at: stated for at, unit in zip(places, units, strict=True) if not unit}
+            return QuantityColumns()
         units = [unit or str(stated) for unit in units]
         if units and (self.is_table or not all(is_exact(self.names[at]) for at in places)):
             words = " and ".join(dict.fromkeys(units))
@@ -314,13 +332,6 @@ class Columns:
         ranked = sorted((at for at in places if self.meanings[at].rank), key=lambda at: self.meanings[at].rank)
         return ranked or places
 
-    def _unit_of_angles(self, places: Sequence[int]) -> str:
-        """Return the unit of angles whose names tell none, by their size; empty where rows to come may tell."""
-        values = self.values(places)
-        if (np.abs(values) > 2.0 * math.pi).any():
-            return "deg"
-        return ("deg" if (values == np.rint(values)).all() else "rad") if self.is_table else ""
-
     def without_angles(self) -> InputError:
         """That no angles are there, or none whose unit is known."""
         theirs = next((self.header[at] for at in self.places("angle")), self._left_over)
@@ -331,11 +342,6 @@ class Columns:
             f"... or outer_rad ..., outer gimbal first, for example by --column '{theirs}=outer_deg' (or the attitude "
             f"qx, qy, qz, qw{face}), or do without orientations (--no-angles)."
         )
-
-    def quaternion(self) -> QuantityColumns:
-        """The attitude; nothing where its four columns are not there."""
-        known = tuple(at for ours in QUATERNION if (at := self.place(ours)) is not None)
-        return QuantityColumns(known, (1.0,) * 4) if len(known) == 4 else QuantityColumns()
 
     def temperature(self) -> tuple[QuantityColumns, str]:
         """The temperature, if there is one, and its unit: ``c``, ``k`` or ``f``."""
@@ -363,7 +369,7 @@ class Columns:
             kind, cells = self.meanings[k].ours, [row[k] for row in self.rows]
             are_faces = [face_of(cell) is not None for cell in cells]
             if (kind in _OPTIONAL and not any(cells)) or (kind == "face" and not any(are_faces)):
-                self.meanings[k], kind = Meaning("", ""), ""
+                self.meanings[k], kind = Meaning(), ""
             if kind in ("", "angle") and not self.has("face") and all(are_faces):
                 self._guess(k, "face")
             elif kind == "" and not self.has("time") and are_stamps(cells):

@@ -39,9 +39,7 @@ class CsvLines(LineReader):
         self._count, self._added_ns, self._last_ns = 0, 0, -(2**63)
         self.raw, self.said, self._numbers = columns.raw, columns.said, columns.numbers
         self.has_angles = columns.orientation != "attitude"
-        self._pose = columns.gimbals(needed=angles) if self.has_angles else columns.quaternion()
-        if angles and not self._pose.at:
-            raise columns.without_angles()
+        self._pose = columns.pose(needed=angles)
         self.pose_width = len(self._pose.at)
         self._temperature, self._unit = columns.temperature()
         used = {*self._time.at, *self._accel.at, *self._pose.at, *self._temperature.at}

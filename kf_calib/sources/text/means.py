@@ -24,7 +24,7 @@ from kf_calib.sources.text.grid import Grid, grid_of
 from kf_calib.sources.text.names import QUATERNION, face_of
 from kf_calib.sources.text.numbers import DECIMAL_POINT, CellError, LineError, QuantityColumns
 from kf_calib.sources.text.reader import named
-from kf_calib.sources.text.units import Units, celsius, mps2_per, reading_units
+from kf_calib.sources.text.units import Units, celsius, reading_units
 from kf_calib.support.text import cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
@@ -236,7 +236,7 @@ class TableOfMeans:
         if self.units.angle and columns.orientation != "angles":
             raise InputError("has no gimbal angles, so leave out --angle-unit.")
         if columns.orientation == "angles":
-            return self._values(columns.gimbals(needed=True), "an angle")
+            return self._values(columns.pose(needed=True), "an angle")
         if (place := columns.place("face")) is not None:
             faces = [face_of(row[place]) for row in columns.rows]
             if None in faces:
@@ -245,7 +245,7 @@ class TableOfMeans:
             self.said.append(f"axis that points up from {columns.named([place])}")
             up = self.overrides.get("up", "y").strip().lower().removeprefix("+")
             return np.array([_attitude(*face, up) for face in faces if face])
-        quaternion = columns.quaternion()
+        quaternion = columns.pose(needed=True)
         pose = self._values(quaternion, "a number")
         norms = lengths(pose)
         for row in np.flatnonzero(np.abs(norms - 1.0) > 0.01):
@@ -292,7 +292,7 @@ class TableOfMeans:
             raise self._refusal(int(row), places[int(k)], "a standard deviation is not negative")
         units, factors = [columns.meanings[place].unit for place in places], columns.raw.factors
         if units[0] and units[0] != "count":
-            factors = mps2_per([unit or units[0] for unit in units], self.units)
+            factors = self.units.mps2_per([unit or units[0] for unit in units])
         counts = self._values(QuantityColumns((count,), (1.0,)), "a number of readings", is_optional=True)[:, 0]
         for row in np.flatnonzero((counts < 2) | (counts != np.rint(counts)) | (counts > 1e9)):
             wanted = "write how many readings were averaged, a whole number of at least 2"
