@@ -24,7 +24,7 @@ from kf_calib.bench.streams import Stream
 from kf_calib.errors import InputError
 from kf_calib.estimation.correction import Correction
 from kf_calib.sources.text.encoding import Cutter
-from kf_calib.sources.text.lines import reader_for, stated_of
+from kf_calib.sources.text.lines import reader_for
 from kf_calib.sources.text.reader import Account, LineReader, first_line, is_json, named
 from kf_calib.sources.text.units import Units
 
@@ -251,7 +251,7 @@ class CorrectedLines:
         """Add corrected lines."""
         assert self._reader is not None
         if self._input is None:
-            stated = stated_of(self._name, self._reader, self._overrides, self._correction.input)
+            stated = self._reader.stated(self._name, self._overrides, self._correction.input)
             self._input = RawInput.from_metadata(stated)
         readings = self._input.readings(np.array([values for _, _, values, _ in raw]))
         forces = self._correction.of_readings(readings, np.array([temperature for *_, temperature in raw]))

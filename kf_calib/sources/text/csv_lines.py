@@ -25,21 +25,23 @@ _FEWEST_ROWS, _MOST_UNITS, _APART = 20, 8, 5.0  # rows and labels of several sen
 class CsvLines(LineReader):
     """Reads the rows under one header, block by block.
 
-    Poses are gimbal angles (``has_angles``), or the quaternion qx qy qz qw; angles: whether there must be any.
+    Poses are gimbal angles (``has_angles``), or the quaternion qx qy qz qw; angles: whether there must be any; None:
+    where a column tells them.
     Raises InputError where the columns do not say what is needed.
     """
 
     wrong = "a cell is not a number"
     advice = WANTED
 
-    def __init__(self, columns: Columns, account: Account, angles: bool = True) -> None:
+    def __init__(self, columns: Columns, account: Account, angles: bool | None = True) -> None:
         super().__init__(account)
         self._columns, self._heading, self._header = columns, columns.heading, columns.header
         self._time, self._accel = columns.time(), columns.accel()
         self._count, self._added_ns, self._last_ns = 0, 0, -(2**63)
         self.raw, self.said, self._numbers = columns.raw, columns.said, columns.numbers
         self.has_angles = columns.orientation != "attitude"
-        self._pose = columns.pose(needed=angles)
+        self.wants_pose = bool(columns.orientation) if angles is None else angles
+        self._pose = columns.pose(needed=self.wants_pose)
         self.pose_width = len(self._pose.at)
         self._temperature, self._unit = columns.temperature()
         used = {*self._time.at, *self._accel.at, *self._pose.at, *self._temperature.at}

@@ -17,7 +17,7 @@ from kf_calib.errors import InputError
 from kf_calib.sources.containers.opening import DatasetText, dataset_of, kind_of_container
 
 LONGEST_LINE_BYTES = 1 << 20
-GZIP = b"\x1f\x8b"
+_GZIP = b"\x1f\x8b"
 LARGEST_TABLE_BYTES = 50_000_000
 TOO_LARGE = (
     "{}: is larger than a table of orientations can be: leave out what is not part of it; if it holds samples, save "
@@ -41,7 +41,7 @@ class TextFile:
         self._raw = path.open("rb")
         try:
             self._text = DatasetText(arrays) if arrays else None
-            packed = self._raw.peek(2).startswith(GZIP)
+            packed = self._raw.peek(2).startswith(_GZIP)
             self._file = self._text or (gzip.GzipFile(fileobj=self._raw) if packed else self._raw)
             self._head = self._unpacked(_HEAD_BYTES)
         except BaseException:

@@ -38,16 +38,17 @@ _find_tiny = re.compile(r"[0-9][eE]-[0-9]{3}").search  # a number as small as th
 class JsonLines(LineReader):
     """Reads JSON lines block by block.
 
-    columns: our names of foreign keys. ``metadata`` is the first line's ``{"bench": ...}`` as strings. The first pose
-    settles whether poses are angles and how many; the first readings settle the unit that all are brought to.
+    columns: our names of foreign keys; angles: whether poses count. ``metadata`` is the first line's ``{"bench": ...}``
+    as strings. The first pose settles whether poses are angles and how many; the first readings settle the unit that
+    all are brought to.
     """
 
     wrong = "it is not JSON"
     advice = "name the readings accel_mps2 or accel_g, and the poses angles_rad, angles_deg or attitude_xyzw"
 
-    def __init__(self, columns: Mapping[str, str], account: Account) -> None:
+    def __init__(self, columns: Mapping[str, str], account: Account, angles: bool = True) -> None:
         super().__init__(account)
-        self._columns, self._is_first = columns, True
+        self._columns, self._is_first, self.wants_pose = columns, True, angles
 
     def with_readings(self, line: str, readings_mps2: Sequence[float]) -> str:
         entry = json.loads(line.lstrip(_MARK))

@@ -9,11 +9,10 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 
@@ -21,13 +20,12 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.counts import refuse_unread
 from kf_calib.bench.keys import UNSTATED, BenchKeys
-from kf_calib.bench.raw_input import CONVERTED, PLAIN, RESTATE, RawInput, merged_metadata
 from kf_calib.bench.streams import Batch, bench_without_angles, with_accel, without_poses
-from kf_calib.errors import BenchError, InputError
+from kf_calib.errors import InputError
 from kf_calib.sources.files.fields import as_columns
 from kf_calib.sources.text.columns import HOW, Columns, refuse_unknown_names
 from kf_calib.sources.text.csv_lines import CsvLines
-from kf_calib.sources.text.encoding import Cutter, TextFile, head_of, holds_any
+from kf_calib.sources.text.encoding import Cutter, TextFile, holds_any
 from kf_calib.sources.text.heading import TextHeading
 from kf_calib.sources.text.json_lines import POSE_KEYS, JsonLines
 from kf_calib.sources.text.reader import Account, Described, LineReader, first_line, is_json, named
@@ -66,8 +64,8 @@ class Lines:
         self._said, self._overrides, self._stated = list[str](), overrides, columns
         self._columns = {**as_columns(overrides.get("joints", "")), **columns}
         self._units = units or Units.of(overrides)
-        self._are_lacking = angles is None and self.path is not None and not self._has_orientations(self.path)
-        self._angles = angles is not False and not self._are_lacking
+        self._angles = True if angles is None and not self.path else angles
+        self._wants_pose = True
         self._begin_ns: int | None = None
         self._bench: Bench | None = None
         self._waiting: _Passage | None = None  # begun to learn of the bench, not yet iterated
@@ -78,11 +76,15 @@ class Lines:
         """The bench; a stream is read for it up to the first pose, which shows how the platform is described."""
         if self._bench is None:
             passage = self._begin()
-            try:
-                self._bench = self._describe_bench(passage.parser)
-            finally:
-                passage.close()  # a file is read from its beginning again, if it is
-            self._waiting = None if self.path else passage
+            passage.close()  # a file is read from its beginning again, if it is
+            reader, default = passage.parser, self._units.input
+            if reader.wants_pose:
+                self._bench = reader.bench(self.name, self._overrides, default)
+            else:
+                stated = reader.stated(self.name, self._overrides, default)
+                lacking = self._angles is None
+                self._bench, self._said = bench_without_angles(self.name, stated, are_lacking=lacking)
+            self._wants_pose, self._waiting = reader.wants_pose, None if self.path else passage
         return self._bench
 
     @property
@@ -97,7 +99,7 @@ class Lines:
     def __iter__(self) -> Iterator[Batch]:
         readings = self.bench.input.readings  # here, so that a bench that cannot be used is told first
         converted = (with_accel(batch, readings(batch.accel.values)) for batch in self.batches())
-        yield from converted if self._angles else map(without_poses, converted)
+        yield from converted if self._wants_pose else map(without_poses, converted)
         if self.path and self._latest:
             sampled = np.concatenate([np.zeros((0, 3)), *self._latest.sampled])
             refuse_unread(sampled, self.bench.input.counts, self.name)
@@ -130,91 +132,35 @@ class Lines:
             raise InputError(f"{self.name}: cannot be read ({error.strerror}).") from None
         if stream is None:
             raise InputError(f"{self.name} can be read only once: record it to a file to read it again.")
-        self._latest = _Passage(self.name, stream, self._open_reader, self._angles)
+        self._latest = _Passage(self.name, stream)
         try:
-            self._latest.survey()
+            self._latest.survey(self._open_reader)
         except BaseException:
             self._latest.close()
             raise
         return self._latest
 
     def _open_reader(self, lines: Sequence[str], account: Account) -> tuple[LineReader, int]:
-        if self._stated and not is_json(lines[0]):
-            refuse_unknown_names(self._stated, TextHeading.of(lines).header)
-        return reader_for(lines, self._columns, account, angles=self._angles, units=self._units)
-
-    def _has_orientations(self, path: Path) -> bool:
-        """Whether a log may tell them: its columns may be angles or an attitude, or a key of JSON names these; also of
-        one that cannot be read, which is said elsewhere."""
-        try:
-            lines = head_of(path, self._units.dataset).decode(errors="replace").splitlines()
-            if is_json(next((line for line in lines if line.strip("\ufeff \t")), "{")):
+        angles = self._angles
+        if is_json(lines[0]):
+            if angles is None and self.path:
                 theirs = [name for name, ours in self._columns.items() if ours in POSE_KEYS]
-                return holds_any(path, [f'"{name}"'.encode() for name in (*POSE_KEYS, *theirs)])
-            return bool(Columns(TextHeading.of(lines), self._columns).orientation)
-        except (OSError, InputError):
-            return True
-
-    def _describe_bench(self, parser: LineReader) -> Bench:
-        if self._angles:
-            return bench_of(self.name, parser, self._overrides, self._units.input)
-        stated = stated_of(self.name, parser, self._overrides, self._units.input)
-        bench, self._said = bench_without_angles(self.name, stated, are_lacking=self._are_lacking)
-        return bench
-
-
-def stated_of(name: str, reader: Described, overrides: BenchKeys, default: RawInput | None = None) -> dict[str, Any]:
-    """The bench keys that what came, options and the names of the readings state; default: the raw input where neither
-    what came nor options state one.
-
-    Raises BenchError where they contradict each other, or no unit is stated.
-    """
-    by_name = {} if reader.unit is None else {"accel_unit": reader.unit}
-    if reader.raw is not None:
-        by_name = {"accel_scale": reader.raw.scale, "accel_unit": reader.raw.unit}
-    elif default is not None and default.sizes == PLAIN.sizes and reader.unit is not None:
-        default = replace(default, unit=reader.unit)  # a unit, which the names state anew
-    with named(name):
-        stated = merged_metadata(reader.metadata, overrides, "the first line", default)
-        now = RawInput.from_metadata(stated)
-        if CONVERTED in stated:
-            raise BenchError(f"lines hold what the device sends: leave out {CONVERTED} in the bench's keys.")
-        if reader.unit is not None and "accel_unit" in stated and now.unit != reader.unit and RESTATE not in overrides:
-            raise BenchError(
-                f"the readings are in {reader.unit} by their names, and stated is {now.unit_words}: rename them by "
-                "--column, or where their names are wrong, give --accel-unit and --restate-input."
-            )
-        if reader.is_bare and not {"accel_unit", "accel_scale"} & set(stated):
-            raise BenchError(
-                "the names of the readings do not tell their unit: name them accel_mps2 (or accel_g ...), or give it "
-                "by --accel-unit, and the size of counts by --accel-scale."
-            )
-    return stated | by_name if reader.raw is not None else by_name | stated
-
-
-def bench_of(name: str, reader: Described, overrides: BenchKeys, default: RawInput | None = None) -> Bench:
-    """The bench, once a pose has been read. Raises InputError where it cannot be that one."""
-    stated = stated_of(name, reader, overrides, default)
-    with named(name):
-        bench = Bench.from_metadata(stated, reader.has_angles)
-        if bench.pose_width != reader.pose_width:
-            raise InputError(
-                f"poses have {reader.pose_width} angles and the bench has {bench.pose_width} axes: state as many axes "
-                'as there are angles, outer first, for example --axes "y z x".'
-            )
-        return bench
+                angles = holds_any(self.path, [f'"{name}"'.encode() for name in (*POSE_KEYS, *theirs)])
+        elif self._stated:
+            refuse_unknown_names(self._stated, TextHeading.of(lines).header)
+        return reader_for(lines, self._columns, account, angles=angles, units=self._units)
 
 
 def reader_for(
-    lines: Sequence[str], columns: Mapping[str, str], account: Account, *, angles: bool, units: Units
+    lines: Sequence[str], columns: Mapping[str, str], account: Account, *, angles: bool | None, units: Units
 ) -> tuple[LineReader, int]:
     """The reader that the first lines ask for, and how many of these are its heading.
 
-    lines: the first of them is not empty. angles: whether a pose is wanted. Raises InputError for a header that does
-    not say what is needed.
+    lines: the first of them is not empty. angles: whether a pose is wanted; None: where a header has one. Raises
+    InputError for a header that does not say what is needed.
     """
     if is_json(lines[0]):
-        return JsonLines(columns, account), 0
+        return JsonLines(columns, account, angles is not False), 0
     heading = TextHeading.of(lines)
     return CsvLines(Columns(heading, columns, units), account, angles), heading.lines
 
@@ -227,9 +173,8 @@ class _Passage:
 
     parser: LineReader
 
-    def __init__(self, name: str, stream: BinaryIO | TextFile, open_reader: OpenReader, angles: bool) -> None:
-        self.account, self._angles = Account(), angles
-        self._name, self._stream, self._open_reader = name, stream, open_reader
+    def __init__(self, name: str, stream: BinaryIO | TextFile) -> None:
+        self.account, self._name, self._stream = Account(), name, stream
         self._file = stream if isinstance(stream, TextFile) else None
         self.fraction = 0.0 if self._file else math.nan
         self._blocks, self._ahead, self._said = self._split(), list[Batch](), list[str]()
@@ -247,7 +192,7 @@ class _Passage:
         if self._file:
             self._file.close()
 
-    def survey(self) -> None:
+    def survey(self, open_reader: OpenReader) -> None:
         """Chooses the parser by the first lines, of CSV by some rows as well, which tell what the header may not; reads
         up to the first readings and pose, if there must be one, and keeps what it has read."""
         first = list[str]()
@@ -261,16 +206,19 @@ class _Passage:
         if not first:
             raise InputError(f"{self._name} holds no lines: check that the logger wrote any.")
         with named(self._name):
-            self.parser, heading = self._open_reader(first, self.account)
+            self.parser, heading = open_reader(first, self.account)
         self._said = self.parser.said
         self.account.lines += heading
         self._ahead.append(self._parse(first[heading:]))
-        while not (self._has_accel and (self.parser.pose_width or not self._angles)):
+        while not self._has_accel or self._lacks_pose:
             lines = next(self._blocks, None)
             if lines is None or self.account.lines > _SURVEY_LINES:
-                lacks_pose = self._angles and not self.parser.pose_width
-                raise self._unusable("platform angles" if lacks_pose else "readings")
+                raise self._unusable("platform angles" if self._lacks_pose else "readings")
             self._ahead.append(self._parse(lines))
+
+    @property
+    def _lacks_pose(self) -> bool:
+        return self.parser.wants_pose and not self.parser.pose_width
 
     def __iter__(self) -> Iterator[Batch]:
         try:
@@ -281,7 +229,7 @@ class _Passage:
             self.close()
         if not self._has_accel:
             raise self._unusable("readings")
-        if self._angles and not self._has_pose:
+        if self.parser.wants_pose and not self._has_pose:
             raise self._unusable("platform angles")
 
     def _parse(self, lines: list[str]) -> Batch:

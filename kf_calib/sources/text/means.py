@@ -22,7 +22,7 @@ from kf_calib.errors import InputError
 from kf_calib.sources.text.columns import HOW, READINGS, SPREADS, Columns, refuse_unknown_names
 from kf_calib.sources.text.grid import Grid, grid_of
 from kf_calib.sources.text.names import QUATERNION, face_of
-from kf_calib.sources.text.numbers import DECIMAL_POINT, CellError, LineError, QuantityColumns
+from kf_calib.sources.text.numbers import DECIMAL_POINT, LineError, QuantityColumns
 from kf_calib.sources.text.reader import named
 from kf_calib.sources.text.units import Units, celsius, reading_units
 from kf_calib.support.text import cut
@@ -148,7 +148,7 @@ class TableOfMeans:
                 measured = quantity.values(row, self.columns.header, self.numbers)
                 if measured is None and quantity.absent:
                     measured = [math.nan] * len(quantity.at)
-            except CellError as error:
+            except LineError as error:
                 at = error.at
             if measured is None:
                 else_ = self._to_leave_out(at) if is_optional else "" if row[at] else "remove the row"

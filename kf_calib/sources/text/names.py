@@ -249,9 +249,8 @@ def _unit_of(name: str) -> tuple[str, str]:
     for pattern in (r"(.+)\s+in\s+(\S+)", r"(.+?)\s*,\s*(\S+)", r"(.+)[_ ](\S+)", r"(.+?)[_ ](\S+)",
                     r"(.+?)\s*/\s*(\S+)"):  # fmt: skip
         match = re.fullmatch(pattern, name)
-        if match and (unit := _OF_WORD.get(match[2])):
-            if match[2] not in TEMPERATURE or _TEMPERATURE & set(_tokens(match[1])):
-                return match[1], unit
+        if match and match[2] in _OF_WORD and (match[2] not in TEMPERATURE or _TEMPERATURE & set(_tokens(match[1]))):
+            return match[1], _OF_WORD[match[2]]
     return name, ""
 
 

@@ -18,13 +18,9 @@ _SPACES = str.maketrans("", "", "'’ \u00a0\u202f")
 
 
 class LineError(ValueError):
-    """A line cannot be used; the message is the reason in a few words."""
+    """A line cannot be used; the message is the reason in a few words. at: the column for the sake of whose cell."""
 
-
-class CellError(LineError):
-    """It is for the sake of a cell, in column ``at``."""
-
-    def __init__(self, at: int, reason: str) -> None:
+    def __init__(self, reason: str, at: int = 0) -> None:
         super().__init__(reason)
         self.at = at
 
@@ -115,19 +111,14 @@ _DECIMAL_COMMA = Numbers(",", ".")
 
 def _decimal_of(cell: str) -> str:
     """Return the decimal sign that a number shows, or nothing where it could be either or has none."""
-    points, commas = cell.count("."), cell.count(",")
-    if points and commas:
+    if "." in cell and "," in cell:
         return "," if cell.rfind(",") > cell.rfind(".") else "."
-    sign = "," if commas else "."
-    if points + commas > 1:  # of a date there are groups of other lengths
-        groups = re.split(r"[.,]", cell.translate(_SPACES).lstrip("+-−"))
-        is_thousands = 1 <= len(groups[0]) <= 3 and all(len(group) == 3 for group in groups[1:])
-        return ("." if commas else ",") if is_thousands else ""
-    if not points + commas:
-        return ""
-    whole, _, rest = cell.translate(_SPACES).lstrip("+-−").partition(sign)
-    may_be_thousands = len(rest) == 3 and 1 <= len(whole) <= 3 and not whole.startswith("0")
-    return "" if may_be_thousands else sign
+    sign, other = (",", ".") if "," in cell else (".", ",")
+    whole, *groups = cell.translate(_SPACES).lstrip("+-−").split(sign)
+    are_thousands = 1 <= len(whole) <= 3 and all(len(group) == 3 for group in groups)
+    if len(groups) > 1:  # of a date there are groups of other lengths
+        return other if are_thousands else ""
+    return "" if not groups or (are_thousands and not whole.startswith("0")) else sign
 
 
 @dataclass(frozen=True)
@@ -139,11 +130,11 @@ class QuantityColumns:
     absent: Container[str] = ()
 
     def values(self, row: CsvRow, header: Sequence[str], numbers: Numbers) -> list[float] | None:
-        """The quantity, None where it is not measured. Raises CellError where it cannot be used."""
+        """The quantity, None where it is not measured. Raises LineError where it cannot be used."""
         cells = [row[at] for at in self.at]
         if not all(cells):
             if any(cells):
-                raise CellError(self.at[cells.index("")], "some components of a vector are missing")
+                raise LineError("some components of a vector are missing", self.at[cells.index("")])
             return None
         try:
             values = numbers.values(cells)
@@ -159,7 +150,7 @@ class QuantityColumns:
                 except ValueError as error:
                     is_number, reason = False, str(error) if isinstance(error, LineError) else reason
                 if not is_number:
-                    raise CellError(at, reason)
+                    raise LineError(reason, at)
         return list(map(mul, values, self.factors))
 
 

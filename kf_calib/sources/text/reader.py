@@ -6,14 +6,16 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from typing import ClassVar
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
 
 import numpy as np
 
-from kf_calib.bench.raw_input import RawInput
+from kf_calib.bench.bench import Bench
+from kf_calib.bench.keys import BenchKeys
+from kf_calib.bench.raw_input import CONVERTED, PLAIN, RESTATE, RawInput, merged_metadata
 from kf_calib.bench.streams import Batch, Stream
-from kf_calib.errors import CountsError, InputError
+from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.text.numbers import LineError
 
 _NAMED = 8
@@ -26,10 +28,9 @@ def named(name: str) -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        if str(error).startswith(f"{name}: "):
-            raise
-        said = f"{name}: {error}"
-        raise (CountsError(said, error.keys) if isinstance(error, CountsError) else type(error)(said)) from None
+        if not str(error).startswith(f"{name}: "):
+            error.args = (f"{name}: {error}",)
+        raise
 
 
 @dataclass
@@ -100,6 +101,47 @@ class Described:
         self.metadata, self.said = dict[str, str](), list[str]()
         self._account = account
 
+    def stated(self, name: str, overrides: BenchKeys, default: RawInput | None = None) -> dict[str, Any]:
+        """The bench keys that what came, options and the names of the readings state; name: of the source, default: the
+        raw input where neither what came nor options state one.
+
+        Raises BenchError where they contradict each other, or no unit is stated.
+        """
+        by_name = {} if self.unit is None else {"accel_unit": self.unit}
+        if self.raw is not None:
+            by_name = {"accel_scale": self.raw.scale, "accel_unit": self.raw.unit}
+        elif default is not None and default.sizes == PLAIN.sizes and self.unit is not None:
+            default = replace(default, unit=self.unit)  # a unit, which the names state anew
+        with named(name):
+            stated = merged_metadata(self.metadata, overrides, "the first line", default)
+            now = RawInput.from_metadata(stated)
+            if CONVERTED in stated:
+                raise BenchError(f"lines hold what the device sends: leave out {CONVERTED} in the bench's keys.")
+            if self.unit not in (None, now.unit) and "accel_unit" in stated and RESTATE not in overrides:
+                raise BenchError(
+                    f"the readings are in {self.unit} by their names, and stated is {now.unit_words}: rename them by "
+                    "--column, or where their names are wrong, give --accel-unit and --restate-input."
+                )
+            if self.is_bare and not {"accel_unit", "accel_scale"} & set(stated):
+                raise BenchError(
+                    "the names of the readings do not tell their unit: name them accel_mps2 (or accel_g ...), or give "
+                    "it by --accel-unit, and the size of counts by --accel-scale."
+                )
+        return stated | by_name if self.raw is not None else by_name | stated
+
+    def bench(self, name: str, overrides: BenchKeys, default: RawInput | None = None) -> Bench:
+        """The bench, once a pose has been read; arguments as of ``stated``. Raises InputError where it cannot be that
+        one."""
+        stated = self.stated(name, overrides, default)
+        with named(name):
+            bench = Bench.from_metadata(stated, self.has_angles)
+            if bench.pose_width != self.pose_width:
+                raise InputError(
+                    f"poses have {self.pose_width} angles and the bench has {bench.pose_width} axes: state as many "
+                    'axes as there are angles, outer first, for example --axes "y z x".'
+                )
+            return bench
+
 
 SampleRow = tuple[int, list[float] | None, list[float] | None, list[float] | None]
 """The stamp of a line, ns, its readings, its pose and its temperature, degC; None or empty: not measured."""
@@ -109,11 +151,12 @@ class LineReader(Described, ABC):
     """Reads lines block by block; those that cannot be used are put down in the account.
 
     Readings are in batches as they stand in the lines. advice: how quantities have to be named. wrong: the reason where
-    reading a line raises a ValueError that tells none.
+    reading a line raises a ValueError that tells none. wants_pose: whether orientations count.
     """
 
     wrong: ClassVar[str]
     advice: ClassVar[str]
+    wants_pose = True
 
     @abstractmethod
     def with_readings(self, line: str, readings_mps2: Sequence[float]) -> str:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from decimal import Decimal
 
-from kf_calib.sources.text.numbers import CellError, LineError, Numbers
+from kf_calib.sources.text.numbers import LineError, Numbers
 from kf_calib.support.text import cut
 
 _LOCAL = re.compile(
@@ -58,7 +58,7 @@ class Stamps:
             raise
         except (ValueError, ArithmeticError):
             why = "which is no time"
-        raise CellError(self.at[0], f"column {cut(header[self.at[0]], 40)!r} is {cut(cell, 40)!r}, {why}") from None
+        raise LineError(f"column {cut(header[self.at[0]], 40)!r} is {cut(cell, 40)!r}, {why}", self.at[0]) from None
 
 
 def stamp_ns(number: int | Decimal, decimals: int) -> int:
