@@ -38,8 +38,8 @@ class Stamps:
     @classmethod
     def of_dates(cls, at: Sequence[int], texts: Sequence[str]) -> Stamps:
         """How the stamps of a calendar in columns ``at`` are written; raises ValueError where the first is none."""
-        month_first = month_comes_first(texts)
-        has_zone = bool(texts) and stamp_of(texts[0], month_first).tzinfo is not None
+        month_first = _month_comes_first(texts)
+        has_zone = bool(texts) and _stamp_of(texts[0], month_first).tzinfo is not None
         return cls(tuple(at), is_date=True, month_first=month_first, has_zone=has_zone)
 
     def ns(self, row: Sequence[str], header: Sequence[str], numbers: Numbers, number: int = 0) -> int:
@@ -50,7 +50,7 @@ class Stamps:
         try:
             if not self.is_date:
                 return stamp_ns(self.factor * numbers.exact(cell), self.decimals)
-            stamp, why = stamp_of(cell, self.month_first), "whose time zone other stamps do not have"
+            stamp, why = _stamp_of(cell, self.month_first), "whose time zone other stamps do not have"
             if (stamp.tzinfo is not None) is self.has_zone:
                 since = (stamp if self.has_zone else stamp.replace(tzinfo=UTC)) - _FIRST
                 return stamp_ns((since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000, 0)
@@ -76,38 +76,36 @@ def stamp_ns(number: int | Decimal, decimals: int) -> int:
 
 def are_stamps(texts: Sequence[str]) -> bool:
     """Whether texts, of which there are any, are all stamps of a calendar."""
-    month_first = month_comes_first(texts)
+    month_first = _month_comes_first(texts)
     try:
-        return bool(texts) and all(stamp_of(text, month_first) for text in texts)
+        return bool(texts) and all(_stamp_of(text, month_first) for text in texts)
     except ValueError:
         return False
 
 
-def month_comes_first(texts: Sequence[str]) -> bool:
-    """Whether local stamps have the month before the day, by all of them."""
+def _month_comes_first(texts: Sequence[str]) -> bool:
+    """Return whether local stamps have the month before the day, by all of them."""
     parts = [found.groups() for text in texts if (found := _LOCAL.fullmatch(text))]
     return any(int(part[1]) > 12 for part in parts) or (
         any(part[7] for part in parts) and not any(int(part[0]) > 12 for part in parts if len(part[0]) <= 2)
     )
 
 
-def stamp_of(text: str, month_first: bool) -> datetime:
-    """The stamp that a text says; raises ValueError where it says none."""
+def _stamp_of(text: str, month_first: bool) -> datetime:
+    """Return the stamp that a text says; raises ValueError where it says none."""
     try:
         return datetime.fromisoformat(text)
     except ValueError:
         match = _LOCAL.fullmatch(text.strip())
     if not match:
         raise ValueError
-    first, second, third, hour, minute, second_s, fraction, half, zone = match.groups()
-    year, month, day = (first, second, third) if len(first) == 4 else (third, second, first)
-    if month_first and len(first) != 4:
-        month, day = day, month
+    first, second, third, hour, minute, second_s, fraction, half, zone = match.groups("")
+    if len(first) == 4:
+        year, month, day = first, second, third
+    else:
+        year, month, day = (third, first, second) if month_first else (third, second, first)
     hours = int(hour or 0) % 12 + 12 * (half.lower() == "pm") if half else int(hour or 0)
-    offset = ""
-    if zone:
-        offset = f"+{_ZONES_H[zone]:02d}:00" if zone in _ZONES_H else f"{zone[:3]}:{zone[-2:]}"
-    years = int(year) + 2000 * (len(year) <= 2)
-    micro = f".{(fraction + '000000')[:6]}" if fraction else ""
-    clock = f"{hours:02d}:{minute or '00'}:{second_s or '00'}{micro}{offset}"
-    return datetime.fromisoformat(f"{years:04d}-{int(month):02d}-{int(day):02d}T{clock}")
+    offset = f"+{_ZONES_H[zone]:02d}:00" if zone in _ZONES_H else f"{zone[:3]}:{zone[-2:]}" if zone else ""
+    date = f"{int(year) + 2000 * (len(year) <= 2):04d}-{int(month):02d}-{int(day):02d}"
+    clock = f"{hours:02d}:{minute or '00'}:{second_s or '00'}.{(fraction + '000000')[:6]}"
+    return datetime.fromisoformat(f"{date}T{clock}{offset}")
