@@ -23,13 +23,13 @@ from kf_calib.sources.files.mcap_file import HEAD_BYTES, is_lines
 from kf_calib.sources.files.mcap_records import MAGIC
 from kf_calib.sources.files.record_files import ROS1_BAG, SQLITE, first_bytes
 from kf_calib.sources.files.recording import Recording
+from kf_calib.sources.text.cells import DECIMAL_POINT, LineError
 from kf_calib.sources.text.columns import READINGS, Columns
 from kf_calib.sources.text.encoding import head_of
 from kf_calib.sources.text.grid import OLD_SUFFIXES, TEXT_SUFFIXES, ZIP
 from kf_calib.sources.text.heading import TextHeading
 from kf_calib.sources.text.lines import Lines
 from kf_calib.sources.text.means import open_table
-from kf_calib.sources.text.numbers import DECIMAL_POINT, LineError
 from kf_calib.sources.text.reader import first_line, is_json
 from kf_calib.support.text import date_of_stamp, parse_date
 

@@ -18,6 +18,7 @@ from kf_calib.bench.arrays import Floats, lengths
 from kf_calib.bench.counts import SIGNED, parse_counts
 from kf_calib.bench.raw_input import OPTIONS, PLAIN
 from kf_calib.errors import CountsError, InputError
+from kf_calib.sources.text.cells import DECIMAL_POINT, CsvRow, Numbers, QuantityColumns, Stamps, are_stamps
 from kf_calib.sources.text.heading import TextHeading
 from kf_calib.sources.text.names import (
     ACCEL,
@@ -33,8 +34,6 @@ from kf_calib.sources.text.names import (
     meanings_of,
     unit_of_epoch,
 )
-from kf_calib.sources.text.numbers import DECIMAL_POINT, CsvRow, Numbers, QuantityColumns
-from kf_calib.sources.text.stamps import Stamps, are_stamps
 from kf_calib.sources.text.units import Units, reading_units, size_of_count, usual_norm
 from kf_calib.support.text import cut
 

@@ -12,9 +12,9 @@ from typing import Any
 
 from kf_calib.errors import InputError
 from kf_calib.sources.containers.opening import kind_of_container
+from kf_calib.sources.text.cells import DECIMAL_POINT, Numbers
 from kf_calib.sources.text.encoding import LARGEST_TABLE_BYTES, TOO_LARGE, text_of
 from kf_calib.sources.text.heading import TextHeading
-from kf_calib.sources.text.numbers import DECIMAL_POINT, Numbers
 from kf_calib.sources.text.spreadsheet import sheets_of
 from kf_calib.support.text import cut
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
 from typing import NamedTuple
 
 from kf_calib.sources.text.names import NAMELESS, face_of, is_unit, meanings_of
@@ -133,17 +132,12 @@ class TextHeading(NamedTuple):
             spans = [match.span() for match in _BLANK_CELL.finditer(line)]
             is_mark = bool(spans) and not line[slice(*spans[0])].strip("#%/")
             return spans[1:] if is_mark and _MARK.match(line) else spans
-        cells = [(match[1], *match.span(1)) for match in _cells_between(self.delimiter).finditer(line)]
+        mark = re.escape(self.delimiter)  # which a quoted cell may hold; a quote left open ends with the line
+        cell = rf'(?:^|{mark})((?:"(?:[^"]|"")*+"?)?[^{mark}]*)'
+        cells = [(match[1], *match.span(1)) for match in re.finditer(cell, line)]
         return [
             (start + len(cell) - len(cell.lstrip()), end - len(cell) + len(cell.rstrip())) for cell, start, end in cells
         ]
-
-
-@lru_cache
-def _cells_between(delimiter: str) -> re.Pattern[str]:
-    """The cells of a line, in which a quoted one may hold the delimiter; a quote left open ends with the line."""
-    mark = re.escape(delimiter)
-    return re.compile(rf'(?:^|{mark})((?:"(?:[^"]|"")*+"?)?[^{mark}]*)')
 
 
 def _delimiter_in(lines: Sequence[str]) -> tuple[str, int]:

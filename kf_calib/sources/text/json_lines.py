@@ -11,9 +11,8 @@ from typing import Any
 
 from kf_calib.bench.bench import metadata_of
 from kf_calib.bench.raw_input import UNITS, parse_unit
-from kf_calib.sources.text.numbers import LineError, number_of, written
+from kf_calib.sources.text.cells import LineError, number_of, stamp_ns, written
 from kf_calib.sources.text.reader import Account, LineReader, SampleRow
-from kf_calib.sources.text.stamps import stamp_ns
 from kf_calib.support.units import WORDS
 
 _MARK = "\ufeff"  # some write it before the first line

@@ -19,10 +19,10 @@ from kf_calib.bench.keys import UNSTATED, BenchKeys, checked_keys
 from kf_calib.bench.raw_input import RawInput, merged_metadata
 from kf_calib.bench.streams import Orientations, Table, bench_without_angles
 from kf_calib.errors import InputError
+from kf_calib.sources.text.cells import DECIMAL_POINT, LineError, QuantityColumns
 from kf_calib.sources.text.columns import HOW, READINGS, SPREADS, Columns, refuse_unknown_names
 from kf_calib.sources.text.grid import Grid, grid_of
 from kf_calib.sources.text.names import QUATERNION, face_of
-from kf_calib.sources.text.numbers import DECIMAL_POINT, LineError, QuantityColumns
 from kf_calib.sources.text.reader import named
 from kf_calib.sources.text.units import Units, celsius, reading_units
 from kf_calib.support.text import cut

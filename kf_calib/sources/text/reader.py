@@ -16,7 +16,7 @@ from kf_calib.bench.keys import BenchKeys
 from kf_calib.bench.raw_input import CONVERTED, PLAIN, RESTATE, RawInput, merged_metadata
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import BenchError, InputError
-from kf_calib.sources.text.numbers import LineError
+from kf_calib.sources.text.cells import LineError
 
 _NAMED = 8
 _NAME_LENGTH = 40
