@@ -5,15 +5,17 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from decimal import Decimal
 from operator import mul
+from typing import TypeVar
 
 from kf_calib.support.text import cut, number_from
 
 CsvRow = Sequence[str]
+AnyNumber = TypeVar("AnyNumber", float, Decimal)
 
 _NUMBER = re.compile(r"[+\-−]?[\d.,'’ \u00a0\u202f]*\d[\d.,]*(?:[eE][+\-]?\d+)?")
 _SPACES = str.maketrans("", "", "'’ \u00a0\u202f")
@@ -55,30 +57,14 @@ class Numbers:
                 could_be |= commas_count and "," in cell
         return _DECIMAL_COMMA if could_be else None
 
-    def with_point(self, cell: str) -> str:
-        """A number with a point before its decimals; raises ValueError where it has separators of thousands."""
-        if self.decimal == ".":
-            return cell
-        if "." in cell:
-            raise ValueError
-        return cell.replace(",", ".")
-
     def exact(self, cell: str) -> Decimal:
         """The number in a cell with all its digits; raises ValueError or ArithmeticError where there is none."""
-        try:
-            return Decimal(self.with_point(cell))
-        except (ValueError, ArithmeticError):
-            return Decimal(self._plain(cell))
+        return self._read(Decimal, cell)
 
     def value(self, cell: str) -> float:
         """The number in a cell, which need not be finite. Raises ValueError where there is none, LineError for one that
         is too small."""
-        try:
-            return number_of(self.with_point(cell))
-        except LineError:
-            raise
-        except ValueError:
-            return number_of(self._plain(cell))
+        return self._read(number_of, cell)
 
     def or_nan(self, cell: str) -> float:
         """The same, NaN where there is none."""
@@ -96,8 +82,15 @@ class Numbers:
             pass
         return list(map(self.value, cells))
 
-    def _plain(self, cell: str) -> str:
-        """Return a number without separators of thousands and blanks, and with a point before its decimals."""
+    def _read(self, kind: Callable[[str], AnyNumber], cell: str) -> AnyNumber:
+        """Return a number as programs write it or, where it is none, without separators of thousands and blanks."""
+        try:
+            if self.decimal == "." or "." not in cell:
+                return kind(cell.replace(self.decimal, "."))
+        except LineError:
+            raise
+        except (ValueError, ArithmeticError):
+            pass
         whole, point, rest = cell.translate(_SPACES).replace("−", "-").partition(self.decimal)
         if self.thousands in whole:
             if not re.fullmatch(rf"[+-]?\d{{1,3}}(?:\{self.thousands}\d{{3}})+", whole):
@@ -105,7 +98,7 @@ class Numbers:
             whole = whole.replace(self.thousands, "")
         if self.thousands in rest:
             raise ValueError
-        return whole + "." * bool(point) + rest
+        return kind(whole + "." * bool(point) + rest)
 
     @property
     def example(self) -> str:
