@@ -177,9 +177,9 @@ def meanings_of(names: Sequence[str], stated: Mapping[str, str]) -> list[Meaning
     _tell_families(names, meanings)
     words = [{*_tokens(_CAMEL.sub(" ", name[:_LONGEST]).lower())} for name in names]
     if any(own.other in ("rate", "field") for own in meanings):
-        for k, own in enumerate(meanings):  # the device has estimated them from these very readings
-            is_angle = own.ours == "angle" and not own.rank and bool(words[k] & (_ESTIMATED | set("xyz")))
-            if is_angle or (own.ours in QUATERNION and not is_exact(names[k])):
+        for k, meaning in enumerate(meanings):  # the device has estimated them from these very readings
+            is_angle = meaning.ours == "angle" and not meaning.rank and bool(words[k] & (_ESTIMATED | set("xyz")))
+            if is_angle or (meaning.ours in QUATERNION and not is_exact(names[k])):
                 meanings[k] = Meaning(other="attitude")
     # of several columns taken for a reading, those count whose names say most that they are the accelerometer's
     words = [own | {*_tokens(name[:_LONGEST].lower())} for own, name in zip(words, names, strict=True)]
@@ -194,8 +194,8 @@ def meanings_of(names: Sequence[str], stated: Mapping[str, str]) -> list[Meaning
     said = {k: meaning_of(stated[name]) for k, name in enumerate(names) if name in stated}
     kinds = {own.ours for own in said.values()} - {"", "angle", "time"}
     meanings = [Meaning("", own.unit) if own.ours in kinds else own for own in meanings]
-    for k, own in said.items():
-        meanings[k] = own if own.unit or not own.ours else own._replace(unit=meanings[k].unit)
+    for k, told in said.items():
+        meanings[k] = told if told.unit or not told.ours else told._replace(unit=meanings[k].unit)
     return meanings
 
 
