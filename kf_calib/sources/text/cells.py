@@ -7,7 +7,7 @@ import math
 import re
 from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from decimal import Decimal
 from operator import mul
 from typing import TypeVar
@@ -100,11 +100,6 @@ class Numbers:
             raise ValueError
         return kind(whole + "." * bool(point) + rest)
 
-    @property
-    def example(self) -> str:
-        """A number as it would be read."""
-        return f"9{self.decimal}80665"
-
 
 DECIMAL_POINT = Numbers()
 _DECIMAL_COMMA = Numbers(",", ".")
@@ -173,14 +168,12 @@ def written(value: float) -> float:
 class Stamps:
     """How a row's time is written: a number of a unit, or the stamp of a calendar, in one column or in two.
 
-    decimals: of a unit in nanoseconds; factor: how many of it one is. is_date: whether it is a stamp; month_first: how
-    it is written; has_zone: whether it names its time zone. rate_hz: of the rows, which have no time then.
+    unit_ns: nanoseconds in the unit; 0 of stamps of a calendar. month_first: how these are written; has_zone: whether
+    they name their time zone. rate_hz: of the rows, which have no time then.
     """
 
     at: tuple[int, ...]
-    decimals: int = 9
-    factor: int = 1
-    is_date: bool = False
+    unit_ns: int
     month_first: bool = False
     has_zone: bool = False
     rate_hz: float | None = None
@@ -190,7 +183,7 @@ class Stamps:
         """How the stamps of a calendar in columns ``at`` are written; raises ValueError where the first is none."""
         month_first = _month_comes_first(texts)
         has_zone = bool(texts) and _stamp_of(texts[0], month_first).tzinfo is not None
-        return cls(tuple(at), is_date=True, month_first=month_first, has_zone=has_zone)
+        return cls(tuple(at), 0, month_first, has_zone)
 
     def ns(self, row: Sequence[str], header: Sequence[str], numbers: Numbers, number: int = 0) -> int:
         """The stamp of a row in nanoseconds; number: of the row, from 0. Raises LineError where it has none."""
@@ -198,12 +191,12 @@ class Stamps:
             return round(number * 1e9 / self.rate_hz)
         cell = row[self.at[0]] if len(self.at) == 1 else " ".join(row[at] for at in self.at)
         try:
-            if not self.is_date:
-                return stamp_ns(self.factor * numbers.exact(cell), self.decimals)
+            if self.unit_ns:
+                return stamp_ns(numbers.exact(cell), self.unit_ns)
             stamp, why = _stamp_of(cell, self.month_first), "whose time zone other stamps do not have"
             if (stamp.tzinfo is not None) is self.has_zone:
                 since = (stamp if self.has_zone else stamp.replace(tzinfo=UTC)) - _FIRST
-                return stamp_ns((since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000, 0)
+                return stamp_ns(since // timedelta(microseconds=1), 1000)
         except LineError:
             raise
         except (ValueError, ArithmeticError):
@@ -211,14 +204,10 @@ class Stamps:
         raise LineError(f"column {cut(header[self.at[0]], 40)!r} is {cut(cell, 40)!r}, {why}", self.at[0]) from None
 
 
-def stamp_ns(number: int | Decimal, decimals: int) -> int:
-    """A stamp in whole nanoseconds from one in a unit of 10^decimals ns, exactly; halves go to the even one."""
-    if isinstance(number, Decimal):
-        if not number.is_finite() or abs(number.adjusted()) > 20:  # before an exponent is written out in full
-            raise LineError("the time stamp is out of range")
-        nanoseconds = round(number.scaleb(decimals))
-    else:
-        nanoseconds = number * 10**decimals
+def stamp_ns(number: int | Decimal, unit_ns: int) -> int:
+    """A stamp in whole nanoseconds from one in a unit of so many, exactly; halves go to the even one."""
+    is_sound = isinstance(number, int) or (number.is_finite() and abs(number.adjusted()) <= 20)
+    nanoseconds = round(number * unit_ns) if is_sound else 2**63  # before an exponent is written out in full
     if not -(2**63) <= nanoseconds < 2**63:
         raise LineError("the time stamp is out of range")
     return nanoseconds

@@ -8,7 +8,7 @@ means is read as a log of samples is; it has all rows at hand, so that what stan
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
 
@@ -185,7 +185,7 @@ class Columns:
         """How the time is written. Raises InputError where no column tells it, or not in which unit."""
         if self.units.rate_hz is not None:
             self.said.append(f"time from the numbers of the rows, {self.units.rate_hz:g} of them a second (--rate)")
-            return Stamps((), rate_hz=self.units.rate_hz)
+            return Stamps((), 1, rate_hz=self.units.rate_hz)
         places = self.places("time")
         if not places:
             raise InputError(
@@ -200,10 +200,9 @@ class Columns:
         if not unit and len(values) and math.isnan(values[0]):
             return self._dates(places[:2] if place == places[0] else [place])
         unit = unit or self._unit_of_time(place, values[np.isfinite(values)])
-        decimals = {"ns": 0, "us": 3, "ms": 6}.get(unit, 9)
         if self.is_table or not exact:
             self.said.append(f"time from {self.named([place])} in {unit}")
-        return Stamps((place,), decimals, round(TIME[unit]) if decimals == 9 else 1)
+        return Stamps((place,), round(TIME[unit] * 1e9))
 
     def _most_even(self, places: list[int]) -> int:
         """Return that of several columns of stamps which goes up most evenly; the first where none has numbers."""
@@ -257,7 +256,7 @@ class Columns:
             )
         told = reading_units(named, values, units)
         self.by_size |= {at: told.units[k] for k, at in enumerate(places) if told.by_size and not named[k]}
-        if not told.is_known:
+        if told.raw is None:
             signed = usual_norm(parse_counts(units.counts).signed(values))
             keys = size_of_count(signed)
             raise CountsError(
@@ -388,13 +387,6 @@ class Columns:
     def _are_numbers(self, place: int) -> bool:
         """Whether most of the cells of a column are numbers."""
         return bool(self.rows) and float(np.mean(np.isfinite(self.values([place])))) >= _MOST_CELLS
-
-    # -- what is not to be used --
-
-    def unknown(self, used: Container[int]) -> list[str]:
-        """The names of columns that nothing here knows: not those of a gyroscope, say, which are of no use here."""
-        return [name for at, (name, own) in enumerate(zip(self.names, self.meanings, strict=True))
-                if name and at not in used and not own.other]  # fmt: skip
 
 
 def refuse_unknown_names(stated: Mapping[str, str], header: Sequence[str]) -> None:

@@ -47,7 +47,9 @@ class CsvLines(LineReader):
         used = {*self._time.at, *self._accel.at, *self._pose.at, *self._temperature.at}
         used |= {columns.chosen[0]} if columns.chosen else set()
         _refuse_several_units(columns, used)
-        self._account.leave_out(columns.unknown(used))
+        columns_named = enumerate(zip(columns.names, columns.meanings, strict=True))
+        unknown = [name for at, (name, own) in columns_named if name and at not in used and not own.other]
+        self._account.leave_out(unknown)  # not those of a gyroscope, say, which are of no use here
 
     def with_readings(self, line: str, readings_mps2: Sequence[float]) -> str:
         values = zip(self._accel.at, readings_mps2, self._columns.written_mps2, strict=True)
@@ -89,7 +91,7 @@ class CsvLines(LineReader):
             return None
         numbers = self._numbers or DECIMAL_POINT
         time_ns = self._time.ns(row, self._header, numbers, number)
-        if self._time.is_date:
+        if not self._time.unit_ns:
             time_ns = self._of_even_clock(time_ns)
         readings = self._accel.values(row, self._header, numbers)
         angles = self._pose.values(row, self._header, numbers)

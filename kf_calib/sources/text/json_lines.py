@@ -16,8 +16,8 @@ from kf_calib.sources.text.reader import Account, LineReader, SampleRow
 from kf_calib.support.units import WORDS
 
 _MARK = "\ufeff"  # some write it before the first line
-_TIME_DECIMALS = {"time_ns": 0, "time_us": 3, "time_ms": 6, "time_s": 9}
-"""Names of the stamp, and how many decimals its unit has in nanoseconds."""
+_TIME_NS = {"time_ns": 1, "time_us": 10**3, "time_ms": 10**6, "time_s": 10**9}
+"""Names of the stamp, and its unit."""
 _ACCEL = {f"accel_{unit}": WORDS["m/s^2"][unit] for unit in ("mps2", "g", "mg")}
 _READINGS = (*_ACCEL, "accel", "accel_counts", "accel_raw")
 """The names of the last three tell no unit: options state it."""
@@ -26,7 +26,7 @@ _ATTITUDE = "attitude_xyzw"
 POSE_KEYS = (*_ANGLES, _ATTITUDE)
 """Under which a line of JSON has an orientation."""
 _TEMPERATURE = "temperature_c"
-_KNOWN = frozenset([*_TIME_DECIMALS, *_READINGS, *POSE_KEYS, _TEMPERATURE])
+_KNOWN = frozenset([*_TIME_NS, *_READINGS, *POSE_KEYS, _TEMPERATURE])
 
 _value_at = json.JSONDecoder().raw_decode
 _decode_exactly = json.JSONDecoder(parse_float=Decimal).decode
@@ -80,7 +80,7 @@ class JsonLines(LineReader):
     def _takes_bench(self, entry: dict[str, Any]) -> bool:
         """Whether the line describes the bench: the first one is kept, and no other may contradict it."""
         is_first, self._is_first = self._is_first, False
-        if "bench" not in entry or not (is_first or _TIME_DECIMALS.keys().isdisjoint(entry)):
+        if "bench" not in entry or not (is_first or _TIME_NS.keys().isdisjoint(entry)):
             return False
         bench = entry["bench"]
         if not isinstance(bench, dict):
@@ -97,7 +97,7 @@ class JsonLines(LineReader):
         return True
 
     def _time_ns(self, entry: dict[str, Any], line: str) -> int:
-        name = next((name for name in _TIME_DECIMALS if name in entry), None)
+        name = next((name for name in _TIME_NS if name in entry), None)
         if name is None:
             raise LineError("it has no time stamp (time_ns or time_s)")
         number = entry[name]
@@ -106,7 +106,7 @@ class JsonLines(LineReader):
             number = next(value for key, value in exact.items() if self._columns.get(key, key) == name)
         if type(number) not in (int, Decimal):
             raise LineError(f"{name} is not a number")
-        return stamp_ns(number, _TIME_DECIMALS[name])
+        return stamp_ns(number, _TIME_NS[name])
 
     def _readings(self, entry: dict[str, Any]) -> list[float] | None:
         if not (name := _first_of(entry, _READINGS)):

@@ -152,7 +152,7 @@ class TableOfMeans:
                 at = error.at
             if measured is None:
                 else_ = self._to_leave_out(at) if is_optional else "" if row[at] else "remove the row"
-                example = f"{self.numbers.example}{', or ' * bool(else_)}{else_}"
+                example = f"9{self.numbers.decimal}80665{', or ' * bool(else_)}{else_}"
                 raise self._refusal(k, at, f"write {wanted} such as {example}")
             values.append(measured)
         return np.array(values, float)
@@ -197,10 +197,10 @@ class TableOfMeans:
             return
         half = (extremes[:, 0] - extremes[:, 1]) / 2.0
         told = reading_units(["", "", ""], np.diag(half), self.units)
-        unit = half.mean() if not told.is_known else STANDARD_GRAVITY_MPS2 / told.raw.factors[0]
+        unit = STANDARD_GRAVITY_MPS2 / told.raw.factors[0] if told.raw else half.mean()
         scales = ", ".join(f"K{k + 1} = {size / unit:.4f}" for k, size in enumerate(half))
         biases = ", ".join(f"b{k + 1} = {middle:g}" for k, middle in enumerate(extremes.mean(axis=1)))
-        of_mean = "" if told.is_known else " of their mean, as no unit is known"
+        of_mean = "" if told.raw else " of their mean, as no unit is known"
         raise InputError(
             f"has of each axis only what it reads up and down: six numbers for six unknowns, {scales}"
             f"{of_mean}, and {biases} as written, with no degree of freedom to judge them or to tell angles: write all "

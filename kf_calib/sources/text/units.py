@@ -104,15 +104,14 @@ class Units:
 class ReadingUnits(NamedTuple):
     """Units of the three readings.
 
-    units: of each. raw: the sizes of the numbers. words: how the unit is said. by_size: whether the numbers told it.
-    is_known: whether anything did.
+    units: of each. raw: the sizes of the numbers; None where nothing tells these. words: how the unit is said. by_size:
+    whether the numbers told it.
     """
 
     units: tuple[str, ...]
-    raw: RawInput
+    raw: RawInput | None
     words: str
     by_size: bool
-    is_known: bool
 
 
 def reading_units(named: Sequence[str], values: Floats, stated: Units) -> ReadingUnits:
@@ -126,7 +125,7 @@ def reading_units(named: Sequence[str], values: Floats, stated: Units) -> Readin
     if stated.as_default(named, norm):
         assert stated.input is not None
         default = replace(stated.input, channels=CHANNELS)
-        return ReadingUnits((default.unit,) * 3, default, f"{default.unit_words}, as of the calibration", False, True)
+        return ReadingUnits((default.unit,) * 3, default, f"{default.unit_words}, as of the calibration", False)
     size = norm * stated.accel_scale
     are_counts = bool((values == np.rint(values)).all()) or stated.accel_scale != 1.0
     by_size = next((unit for unit, low, high in _BY_SIZE[: 3 if are_counts else 4] if low < size < high), "count")
@@ -138,15 +137,14 @@ def reading_units(named: Sequence[str], values: Floats, stated: Units) -> Readin
     words += " by their size (--accel-unit)" * is_guessed
     if any(unit.endswith("g") for unit in units):
         words += f", 1 g = {stated.g_mps2:.7g} m/s^2 (--g-unit)"
-    is_known = bool(stated.accel) or stated.accel_scale != 1.0 or "count" not in (*units, *named)
-    mps2 = stated.mps2_per(units)
-    if len(set(units)) == 1 and UNITS.get(units[0]) == mps2[0]:  # in the unit that they are written in
-        raw = RawInput(
-            sizes=(stated.accel_scale, stated.accel_scale, stated.accel_scale), unit=units[0], counts=stated.counts
-        )
+    mps2, scale = stated.mps2_per(units), stated.accel_scale
+    if not stated.accel and scale == 1.0 and "count" in (*units, *named):
+        raw = None
+    elif len(set(units)) == 1 and UNITS.get(units[0]) == mps2[0]:  # in the unit that they are written in
+        raw = RawInput(sizes=(scale, scale, scale), unit=units[0], counts=stated.counts)
     else:
-        raw = replace(RawInput.of_factors((stated.accel_scale * mps2).tolist()), counts=stated.counts)
-    return ReadingUnits(tuple(units), raw, words, is_guessed, is_known)
+        raw = replace(RawInput.of_factors((scale * mps2).tolist()), counts=stated.counts)
+    return ReadingUnits(tuple(units), raw, words, is_guessed)
 
 
 def usual_norm(values: Floats) -> float:
