@@ -242,15 +242,15 @@ def record(
 def _told_if_table(path: Path) -> Iterator[None]:
     """Where lines cannot be recorded because they are a table of orientations, say so."""
     from kf_calib.sources.opening import FileKind, kind_of
-    from kf_calib.sources.text.survey import survey
+    from kf_calib.sources.text.survey import Survey
 
     try:
         yield
     except InputError:
         table = None
         with suppress(InputError):
-            table = survey(path) if kind_of(path) is FileKind.TABLE else None
-        if table is not None and table.rows:
+            table = Survey(path) if kind_of(path) is FileKind.TABLE else None
+        if table is not None and table.described_rows:
             raise InputError(
                 f"{path} is a table of orientations, with a row a dwell, and is evaluated as it is: kf-calib replay "
                 f"{path}."

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, BinaryIO
+from typing import TYPE_CHECKING, Annotated
 
 import rich_click as click
 
@@ -138,17 +138,13 @@ def _table_keys(keys: BenchKeys, path: Path, input: RawInput) -> BenchKeys:
     return keys if order is None else {**keys, "channels": order}
 
 
-def _bytes_of(path: Path, dataset: str) -> BinaryIO | TextFile:
+def _bytes_of(path: Path, dataset: str) -> TextFile:
     """A log as it is, byte for byte; one that is packed, or written in another encoding, in UTF-8; of a container the
     lines of a dataset."""
-    from kf_calib.sources.containers.opening import kind_of_container
-    from kf_calib.sources.text.encoding import GZIP, TextFile, encoding_of
+    from kf_calib.sources.text.encoding import TextFile
 
     try:
-        with path.open("rb") as file:
-            start = file.read(_BLOCK_BYTES)
-        is_plain = not kind_of_container(path) and start[:2] != GZIP and encoding_of(start) == "utf-8"
-        return path.open("rb") if is_plain else TextFile(path, dataset)
+        return TextFile(path, dataset)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
 

@@ -271,24 +271,24 @@ def _show_table(ctx: click.Context, path: Path, reading: ReadingOptions, as_json
 
 def _of_table(ctx: click.Context, path: Path, reading: ReadingOptions, told: Stated, reason: str) -> TableOverview:
     """What is in a table of orientations; told, reason: as of ``_of_lines``."""
-    from kf_calib.sources.text.survey import survey
+    from kf_calib.sources.text.survey import Survey
     from kf_calib.views.overview import TableOverview
 
     stated: BenchKeys = {**reading.keys, **_bench_keys(told)}
     bench = _in_words(stated)
-    table = survey(path, stated, reading.renamed, _units(reading, told), angles=not reading.no_angles)
+    table = Survey(path, stated, reading.renamed, _units(reading, told), angles=not reading.no_angles)
     lacking = _lacks(bench, table.orientation == "angles")
     missing = {"counts": reason} if reason else {}
     words = _given(ctx, _not_of(ctx, not_of_text(path) + OF_DWELLS))
     words += _options(told)
-    if not table.means.columns.orientation and not reading.no_angles:
+    if not table.columns.orientation and not reading.no_angles:
         words.append(_BY_HAND[0])
         missing["angles"] = _BY_HAND[1].format(or_else=", attitude or face")
     missing |= {key: _NAMED[key][1] for key in lacking}
-    axes = _AXES.get(len(table.means.columns.angles), _NAMED["axes"][0])
+    axes = _AXES.get(len(table.columns.angles), _NAMED["axes"][0])
     words += [axes if key == "axes" else _NAMED[key][0] for key in lacking]
-    taken = table.table.bench.input if table.table else None
-    wrong = taken and _wrong_unit([row.norm_mps2 for row in table.rows], taken, are_named=True)
+    taken = table.evaluated.bench.input if table.evaluated else None
+    wrong = taken and _wrong_unit([row.norm_mps2 for row in table.described_rows], taken, are_named=True)
     missing, words = _with_unit(missing, words, wrong)
     if table.trouble:
         missing, words = {"": table.trouble, **missing}, None

@@ -29,11 +29,11 @@ from kf_calib.sources.files import cdr
 from kf_calib.sources.files.contents import CALIBRATED_TOPIC
 from kf_calib.sources.files.mcap_append import TopicAppender, source_file
 from kf_calib.sources.files.recording import Recording
+from kf_calib.sources.text.cells import written
 from kf_calib.sources.text.encoding import encoding_of, unpacked
 from kf_calib.sources.text.grid import Grid, grid_of
 from kf_calib.sources.text.heading import with_texts
 from kf_calib.sources.text.means import TableOfMeans
-from kf_calib.sources.text.numbers import written
 from kf_calib.sources.text.reader import named
 from kf_calib.sources.text.spreadsheet import sheets_of, workbook_of
 from kf_calib.sources.text.units import Units

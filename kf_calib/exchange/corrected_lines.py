@@ -24,8 +24,8 @@ from kf_calib.bench.streams import Stream
 from kf_calib.errors import InputError
 from kf_calib.estimation.correction import Correction
 from kf_calib.sources.text.encoding import Cutter
-from kf_calib.sources.text.lines import is_json, reader_for, stated_of
-from kf_calib.sources.text.reader import Account, LineReader, named
+from kf_calib.sources.text.lines import reader_for
+from kf_calib.sources.text.reader import Account, LineReader, first_line, is_json, named
 from kf_calib.sources.text.units import Units
 
 _WINDOW_NS = 500_000_000
@@ -171,9 +171,9 @@ class CorrectedLines:
         """The line without an end, if there is one. Raises InputError where no readings have come at all."""
         last = self._corrected(self._numbered(self._cutter.rest()), ended=True)
         if not self.readings:
-            advice = f": {self._reader.advice}" if self._reader else ": check that the logger wrote any"
-            found = "".join(f"; {sentence.rstrip('.')}" for sentence in self.warnings)
-            raise InputError(f"{self._name}: no readings to correct in {self._account.lines} lines{found}{advice}.")
+            self._account.unknown.clear()  # they pass
+            advice = self._reader.advice if self._reader else "check that the logger wrote any"
+            raise self._account.refusal(f"{self._name}: no readings to correct", advice)
         if self._norm is not None:
             self._checked(final=True)
         return last
@@ -218,11 +218,9 @@ class CorrectedLines:
         self._waiting += lines
         if self._reader is not None:
             return []
-        blank = next((k for k, line in enumerate(self._waiting) if line[1].lstrip("\ufeff").strip()), None)
-        if blank is None:
-            return []
+        blank = first_line([text for _, text, _ in self._waiting])
         told = self._waiting[blank:]
-        if not (ended or len(told) >= _TELLING_LINES or is_json(told[0][1])):
+        if not told or not (ended or len(told) >= _TELLING_LINES or is_json(told[0][1])):
             return []
         with named(self._name):
             self._reader, count = reader_for(
@@ -253,7 +251,7 @@ class CorrectedLines:
         """Add corrected lines."""
         assert self._reader is not None
         if self._input is None:
-            stated = stated_of(self._name, self._reader, self._overrides, self._correction.input)
+            stated = self._reader.stated(self._name, self._overrides, self._correction.input)
             self._input = RawInput.from_metadata(stated)
         readings = self._input.readings(np.array([values for _, _, values, _ in raw]))
         forces = self._correction.of_readings(readings, np.array([temperature for *_, temperature in raw]))

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kf_calib.sources.containers.dataset import ArrayColumn, Dataset
-from kf_calib.sources.text.heading import NAMELESS
+from kf_calib.sources.text.names import NAMELESS
 
 _MOST_COLUMNS = 64  # of an array whose rows are those of a log
 _OF_MATLAB = "#refs#"  # in which a file of version 7.3 keeps what its structs and cells point to

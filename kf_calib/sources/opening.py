@@ -23,13 +23,14 @@ from kf_calib.sources.files.mcap_file import HEAD_BYTES, is_lines
 from kf_calib.sources.files.mcap_records import MAGIC
 from kf_calib.sources.files.record_files import ROS1_BAG, SQLITE, first_bytes
 from kf_calib.sources.files.recording import Recording
+from kf_calib.sources.text.cells import DECIMAL_POINT, LineError
 from kf_calib.sources.text.columns import READINGS, Columns
 from kf_calib.sources.text.encoding import head_of
 from kf_calib.sources.text.grid import OLD_SUFFIXES, TEXT_SUFFIXES, ZIP
 from kf_calib.sources.text.heading import TextHeading
-from kf_calib.sources.text.lines import Lines, is_json
+from kf_calib.sources.text.lines import Lines
 from kf_calib.sources.text.means import open_table
-from kf_calib.sources.text.numbers import DECIMAL_POINT, LineError
+from kf_calib.sources.text.reader import first_line, is_json
 from kf_calib.support.text import date_of_stamp, parse_date
 
 _OF_CALIBRATION = 200  # first bytes of a calibration, which name its format
@@ -81,8 +82,8 @@ def kind_of(
     if not (is_container or suffix in TEXT_SUFFIXES or is_lines(head[:HEAD_BYTES])):
         return FileKind.RECORDING
     lines = head.decode("utf-8", errors="replace").splitlines()
-    first = next((k for k, line in enumerate(lines) if line.lstrip("\ufeff").strip()), None)
-    if first is None:
+    first = first_line(lines)
+    if first == len(lines):
         return FileKind.TABLE
     if CALIBRATION_FORMAT.encode() in head[:_OF_CALIBRATION]:
         return FileKind.CALIBRATION
@@ -94,7 +95,7 @@ def kind_of(
 def _are_samples(lines: list[str], stated: Mapping[str, str]) -> bool:
     """Whether the rows under a header are a time series: many, and close in time or, without one, alike."""
     try:
-        columns = Columns.of(TextHeading.of(lines), stated)
+        columns = Columns(TextHeading.of(lines), stated)
     except InputError:
         return False
     if columns.marks_of_a_table or len(columns.rows) <= _FEWEST_SAMPLES:

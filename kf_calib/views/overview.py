@@ -146,7 +146,7 @@ def _dwell_parts(dwells: Sequence[DwellSummary]) -> list[RenderableType]:
     return parts
 
 
-def up_text(up: tuple[float, float, float]) -> str:
+def up_text(up: tuple[float, ...]) -> str:
     """The direction that is up, in the axes of the accelerometers."""
     return " ".join(f"{part:+.2f}" for part in up)
 
@@ -190,11 +190,11 @@ def table_object(overview: TableOverview) -> dict[str, Any]:
         {
             "recording": str(survey.path), "format": "table", "files": [str(survey.path)],
             "bytes": survey.path.stat().st_size, "topics": [],
-            "columns": [column._asdict() for column in survey.columns],
+            "columns": [column._asdict() for column in survey.described_columns],
             "orientation": survey.orientation or None, "bench": overview.bench,
-            "dwells": [row._asdict() | {"pose": list(row.pose), "up": list(row.up)} for row in survey.rows],
+            "dwells": [row._asdict() | {"pose": list(row.pose), "up": list(row.up)} for row in survey.described_rows],
             "missing": overview.missing,
-            "command": overview.command, "examples": list(overview.examples), "warnings": survey.means.warnings,
+            "command": overview.command, "examples": list(overview.examples), "warnings": survey.warnings,
         }
     )  # fmt: skip
 
@@ -203,17 +203,17 @@ def table_report(overview: TableOverview) -> RenderableType:
     """What ``info`` prints of a table."""
     survey = overview.survey
     parts: list[RenderableType] = [
-        Text(f"{survey.path}: a table of orientations, {counted(len(survey.means.numbers), 'row')}"),
-        _column_table(survey.columns),
+        Text(f"{survey.path}: a table of orientations, {counted(len(survey.rows), 'row')}"),
+        _column_table(survey.described_columns),
     ]
     bench = ", ".join(f"{key} = {value}" for key, value in overview.bench.items())
     parts.append(Text(f"Bench: {bench or 'nothing is said of it'}"))
-    if survey.rows:
-        parts += [Text(f"{counted(len(survey.rows), 'orientation')}:"), _row_table(survey)]
-        if len(survey.rows) > _SHOWN_ROWS:
-            parts.append(Text(f"and {len(survey.rows) - _SHOWN_ROWS} more, all of them by --json"))
-    parts += [note(said) for said in survey.means.warnings]
-    if survey.rows and survey.rows[0].readings is None:
+    if survey.described_rows:
+        parts += [Text(f"{counted(len(survey.described_rows), 'orientation')}:"), _row_table(survey)]
+        if len(survey.described_rows) > _SHOWN_ROWS:
+            parts.append(Text(f"and {len(survey.described_rows) - _SHOWN_ROWS} more, all of them by --json"))
+    parts += [note(said) for said in survey.warnings]
+    if survey.described_rows and survey.described_rows[0].readings is None:
         parts.append(
             note(
                 "no standard deviation with a number of readings is given, so that the noise will be taken from the "
@@ -255,7 +255,7 @@ def _row_table(survey: Survey) -> ConsoleTable:
     table = ConsoleTable(box=SIMPLE_HEAD, pad_edge=False)
     for heading in ("dwell", "row", "at s", _ORIENTATIONS[survey.orientation], "norm m/s^2", "readings", "°C"):
         table.add_column(heading, justify="right")
-    for row in survey.rows[:_SHOWN_ROWS]:
+    for row in survey.described_rows[:_SHOWN_ROWS]:
         table.add_row(
             str(row.number), str(row.row), f"{row.at_s:g}", row.face or pose_text(row.pose) or up_text(row.up),
             f"{row.norm_mps2:.4f}",

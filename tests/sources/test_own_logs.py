@@ -23,7 +23,7 @@ from kf_calib.errors import InputError
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.opening import FileKind, kind_of, opened
 from kf_calib.sources.text.lines import Lines
-from kf_calib.sources.text.survey import survey
+from kf_calib.sources.text.survey import Survey
 
 pytestmark = pytest.mark.usefixtures("unmeasured")
 
@@ -431,7 +431,7 @@ def test_a_damaged_log_or_table_raises_nothing_but_input_errors(seed: int, tmp_p
                 if kind is FileKind.SAMPLES:
                     list(Lines(path, bench, angles=angles))
                 elif kind is FileKind.TABLE:
-                    survey(path, bench, angles=angles)
+                    Survey(path, bench, angles=angles)
             except InputError as error:
                 assert "\n" not in str(error) and len(str(error)) < 1200
     assert {FileKind.SAMPLES, FileKind.TABLE} <= kinds

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.errors import InputError
-from kf_calib.sources.text.contents import is_nameless, meanings_by_numbers
-from kf_calib.sources.text.names import TIME, Meaning, meanings_of, unit_of_epoch
+from kf_calib.sources.text.names import TIME, Meaning, is_nameless, meanings_by_numbers, meanings_of, unit_of_epoch
 from kf_calib.support.text import cut
 
 ArrayColumn = NDArray[Any]

@@ -23,9 +23,8 @@ from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats, Mask, Times
 from kf_calib.bench.bench import metadata_of
-from kf_calib.bench.raw_input import RawInput
 from kf_calib.bench.streams import Batch, Stream
-from kf_calib.sources.text.reader import Account
+from kf_calib.sources.text.reader import Account, Described
 
 FRAME_VERSION = 1
 BENCH, ACCEL, ANGLES, ATTITUDE, TEMPERATURE = b"BAGQT"
@@ -106,10 +105,10 @@ def _uncobs_alike(table: Bytes) -> tuple[Bytes, Mask]:
     return decoded[:, 1:], sound
 
 
-class FrameReader:
+class FrameReader(Described):
     """Reads frames block by block; those that cannot be used are put down in the account.
 
-    metadata, has_angles, pose_width: of the bench, as of a ``LineReader``. lost: readings whose numbers are missing.
+    lost: readings whose numbers are missing. The unit of readings is m/s^2, where no option states another.
     """
 
     advice = (
@@ -117,12 +116,8 @@ class FrameReader:
     )
 
     def __init__(self, account: Account) -> None:
-        self.metadata: dict[str, str] = {}
-        self.has_angles, self.pose_width, self.lost = True, 0, 0
-        self.raw: RawInput | None = None
-        self.unit: str | None = None  # m/s^2, where no option states another
-        self.is_bare = False
-        self._account = account
+        super().__init__(account)
+        self.lost = 0
         account.what = "frames"
         self._tail = b""
         self._number: int | None = None

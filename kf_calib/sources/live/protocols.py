@@ -99,7 +99,7 @@ class LineProtocol:
         return []
 
     def _csv(self, heading: list[str], account: Account, angles: bool) -> CsvLines:
-        return CsvLines(Columns.of(TextHeading.of(heading), self._columns, self._units), account, angles)
+        return CsvLines(Columns(TextHeading.of(heading), self._columns, self._units), account, angles)
 
     def _has_readings(self, heading: list[str]) -> bool:
         """Whether a header lacks nothing but angles."""
@@ -210,6 +210,5 @@ class Protocol:
 
     def unusable(self, what: str) -> InputError:
         """That the bytes cannot be used, with what was seen of them."""
-        found = "".join(f"; {said.rstrip('.')}" for said in self.account.sentences())
         advice = self.reader.advice if self.reader else "have it send its header again, or state it (--header)"
-        return InputError(f"{self._name}: {what} in {self.account.lines} {self.account.what}{found}: {advice}.")
+        return self.account.refusal(f"{self._name}: {what}", advice)

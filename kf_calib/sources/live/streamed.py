@@ -17,7 +17,6 @@ from kf_calib.bench.streams import Batch, Stream, bench_without_angles, with_acc
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.live.feed import IDLE_S, Feed, Link, Lost, Regained, nothing
 from kf_calib.sources.live.protocols import Protocol
-from kf_calib.sources.text.lines import bench_of, stated_of
 from kf_calib.sources.text.units import Units
 
 _PACE_S = 0.012  # between reads: many small ones cost more than they bring; a serial port holds 4 KB meanwhile
@@ -109,17 +108,17 @@ class StreamedFeed(Feed):
                 continue
             if not self._angles:
                 if readings:
-                    bench, self._said = bench_without_angles(self.name, stated_of(self.name, reader, self._overrides))
+                    bench, self._said = bench_without_angles(self.name, reader.stated(self.name, self._overrides))
                     return self._converting(bench)
                 continue
             if not reader.pose_width and time.monotonic() - first_s > _POSE_WAIT_S:
                 reader.pose_width = self._stated_width(reader.metadata)
             if reader.pose_width and readings:  # their names tell a unit
-                return self._converting(bench_of(self.name, reader, self._overrides))
+                return self._converting(reader.bench(self.name, self._overrides))
             if ahead > _MOST_AHEAD:
                 break
         if self._angles and (reader := self._protocol.reader) is not None and reader.pose_width:  # angles alone came
-            return self._converting(bench_of(self.name, reader, self._overrides))
+            return self._converting(reader.bench(self.name, self._overrides))
         raise self._protocol.unusable(
             "no platform angles (--no-angles does without them)" if self._angles else "no readings"
         )

@@ -8,17 +8,17 @@ means is read as a log of samples is; it has all rows at hand, so that what stan
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import cached_property
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, lengths
 from kf_calib.bench.counts import SIGNED, parse_counts
-from kf_calib.bench.raw_input import OPTIONS, PLAIN, RawInput
+from kf_calib.bench.raw_input import OPTIONS, PLAIN
 from kf_calib.errors import CountsError, InputError
-from kf_calib.sources.text.contents import is_nameless, meanings_by_numbers
+from kf_calib.sources.text.cells import DECIMAL_POINT, CsvRow, Numbers, QuantityColumns, Stamps, are_stamps
 from kf_calib.sources.text.heading import TextHeading
 from kf_calib.sources.text.names import (
     ACCEL,
@@ -28,17 +28,17 @@ from kf_calib.sources.text.names import (
     Meaning,
     face_of,
     is_exact,
+    is_nameless,
     meaning_of,
+    meanings_by_numbers,
     meanings_of,
     unit_of_epoch,
 )
-from kf_calib.sources.text.numbers import DECIMAL_POINT, Numbers
-from kf_calib.sources.text.quantity import CsvRow, QuantityColumns
-from kf_calib.sources.text.stamps import Stamps, are_stamps
-from kf_calib.sources.text.units import Units, choice_of, reading_units, size_of_count, usual_norm
+from kf_calib.sources.text.units import Units, reading_units, size_of_count, usual_norm
 from kf_calib.support.text import cut
 
-EXAMPLE = "time_s,ax_mps2,ay_mps2,az_mps2,outer_deg,middle_deg,inner_deg,temperature_c"
+WANTED = "a header such as time_s,ax_mps2,ay_mps2,az_mps2,outer_deg,middle_deg,inner_deg,temperature_c is wanted"
+"""How columns have to be named."""
 HOW = "--column THEIRS=OURS says what a column is"
 KNOWN = "ax_g (ay_mps2, az_mg), sx_g or sd_g, outer_deg (middle_rad, inner_deg), qx, face, time_s, count, temperature_c"
 READINGS, SPREADS = ("ax", "ay", "az"), ("sx", "sy", "sz")
@@ -53,61 +53,53 @@ _ALIKE = 1.3  # of the norms of readings at rest, largest to smallest
 _MOST_CELLS = 0.6  # of a column of readings are numbers: a bad one is told later
 
 
-@dataclass
 class Columns:
     """The columns of a text by its header and, where the header does not tell, its rows.
 
-    names: those of the header as they are to be understood. rows: the first, of a table of means all (``is_table``).
-    said: what was taken for what, where that is not plain from the names. guessed: names of columns that were
-    recognised by what stands in them. by_size: units that the size of the numbers told. raw: what the readings are in.
-    written_mps2: the unit in which specific force takes the place of readings, m/s^2: that of their names;
-    without_unit: columns of counts whose names tell none, which then are in m/s^2. chosen: a column, and the cell in it
-    of the rows that count; None where all do.
+    header: the names as they stand in the text; names: as they are to be understood. rows: the first, of a table of
+    means all (``is_table``). said: what was taken for what, where that is not plain from the names. guessed: names of
+    columns that were recognised by what stands in them. by_size: units that the size of the numbers told. raw: what the
+    readings are in. written_mps2: the unit in which specific force takes the place of readings, m/s^2: that of their
+    names; without_unit: columns of counts whose names tell none, which then are in m/s^2. chosen: a column, and the
+    cell in it of the rows that count; None where all do.
     """
 
-    heading: TextHeading
-    names: Sequence[str]
-    rows: Sequence[CsvRow]
-    units: Units
-    is_table: bool = False
-    said: list[str] = field(default_factory=list[str])
-    guessed: list[str] = field(default_factory=list[str])
-    by_size: dict[int, str] = field(default_factory=dict[int, str])
-    raw: RawInput = PLAIN
-    written_mps2: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    without_unit: tuple[int, ...] = ()
-    chosen: tuple[int, str] | None = None
-    meanings: list[Meaning] = field(default_factory=list[Meaning])
-
-    @classmethod
-    def of(
-        cls, heading: TextHeading, stated: Mapping[str, str], units: Units | None = None, *, is_table: bool = False
-    ) -> Columns:
+    def __init__(
+        self, heading: TextHeading, stated: Mapping[str, str], units: Units | None = None, *, is_table: bool = False
+    ) -> None:
         """stated: our name for each foreign one; ``-`` leaves a column out. Raises InputError where units choose no
         row."""
-        header = heading.header
-        names = ["" if stated.get(name) == "-" else stated.get(name, name) for name in header]
-        full = [row for row in heading.rows if len(row) == len(names)]
-        columns = cls(heading, names, full, units or Units(), is_table)
-        if columns.units.where:
-            among = "" if is_table else " among the first"
-            columns.chosen = choice_of(columns.units.where, header, full, among)
-            columns.rows = [row for row in full if columns.is_chosen(row)]
-        columns.meanings = meanings_of(header, stated)
-        if is_nameless(header) and not stated:
-            columns._recognise_numbers()
+        self.heading, self.header, self.units, self.is_table = heading, heading.header, units or Units(), is_table
+        self.names = ["" if stated.get(name) == "-" else stated.get(name, name) for name in self.header]
+        self.said, self.guessed, self.by_size = list[str](), list[str](), dict[int, str]()
+        self.raw, self.written_mps2, self.without_unit = PLAIN, (1.0, 1.0, 1.0), list[int]()
+        self.chosen: tuple[int, str] | None = None
+        self.rows: list[CsvRow] = [row for row in heading.rows if len(row) == len(self.names)]
+        if self.units.where:
+            self._choose_rows(self.units.where)
+        self.meanings = meanings_of(self.header, stated)
+        if is_nameless(self.header) and not stated:
+            self._recognise_numbers()
         if is_table:
-            columns._recognise_contents({k for k, name in enumerate(header) if name in stated})
-        elif not columns.has("time"):
-            for k, name in enumerate(names):
+            self._recognise_contents({k for k, name in enumerate(self.header) if name in stated})
+        elif not self.has("time"):
+            for k, name in enumerate(self.names):
                 if (unit := _TIME_ALONE.get(name.strip().lower())) is not None:
-                    columns.meanings[k] = Meaning("time", unit)
-        return columns
+                    self.meanings[k] = Meaning("time", unit)
 
-    @property
-    def header(self) -> Sequence[str]:
-        """The names as they stand in the text."""
-        return self.heading.header
+    def _choose_rows(self, where: str) -> None:
+        """Keep the rows with a text in a column, as ``I=0``; raises InputError where none has it."""
+        name, value = (part.strip() for part in where.rpartition("=")[::2])
+        if not (name and value):
+            raise InputError(f"--where is {where!r}: write --where COLUMN=VALUE, as --where unit=0.")
+        if name not in self.header:
+            raise InputError(f"has no column {cut(name, 60)!r} (--where), it has {self._all}.")
+        self.chosen = at, value = list(self.header).index(name), value
+        labels = {row[at].strip() for row in self.rows}
+        if value not in labels:
+            seen, among = ", ".join(sorted(labels)[:8]), "" if self.is_table else " among the first"
+            raise InputError(f"no row{among} has {value!r} in column {name!r} (--where), they have {seen}.")
+        self.rows = [row for row in self.rows if self.is_chosen(row)]
 
     def places(self, *wanted: str) -> list[int]:
         """Indices of the columns of these kinds, in the order asked for."""
@@ -140,11 +132,6 @@ class Columns:
         return self.chosen is None or row[self.chosen[0]].strip() == self.chosen[1]
 
     @property
-    def wanted(self) -> str:
-        """How columns have to be named."""
-        return f"a header such as {EXAMPLE} is wanted"
-
-    @property
     def unused(self) -> list[int]:
         """Indices of the columns that mean nothing here."""
         return [k for k, own in enumerate(self.meanings) if not own.ours and self.header[k]]
@@ -152,6 +139,11 @@ class Columns:
     @property
     def _all(self) -> str:
         return cut(self.named(range(len(self.header))), 300)
+
+    @property
+    def _left_over(self) -> str:
+        """The name of a column that means nothing yet, for an example."""
+        return next((self.header[k] for k in self.unused), "THEIRS")
 
     @cached_property
     def numbers(self) -> Numbers | None:
@@ -164,17 +156,10 @@ class Columns:
         cells = (row[at] for row in rows if len(row) == len(self.names) for at in used)
         return Numbers.told_by(cells, commas_count=self.heading.delimiter != ",")
 
-    def values(self, places: Sequence[int], rows: Sequence[CsvRow] | None = None) -> Floats:
-        """The numbers (n, k) in columns of rows (None: of all), NaN where there is none."""
+    def values(self, places: Sequence[int]) -> Floats:
+        """The numbers (n, k) in columns, NaN where there is none."""
         numbers = self.numbers or DECIMAL_POINT
-
-        def value(cell: str) -> float:
-            try:
-                return numbers.value(cell)
-            except ValueError:
-                return math.nan
-
-        values = [[value(row[at]) for at in places] for row in (self.rows if rows is None else rows)]
+        values = [[numbers.or_nan(row[at]) for at in places] for row in self.rows]
         return np.array(values, float).reshape(-1, len(places))
 
     # -- what kind of text it is --
@@ -200,105 +185,96 @@ class Columns:
         """How the time is written. Raises InputError where no column tells it, or not in which unit."""
         if self.units.rate_hz is not None:
             self.said.append(f"time from the numbers of the rows, {self.units.rate_hz:g} of them a second (--rate)")
-            return Stamps((), rate_hz=self.units.rate_hz)
+            return Stamps((), 1, rate_hz=self.units.rate_hz)
         places = self.places("time")
         if not places:
             raise InputError(
                 "no column gives the time: name it time_s or time_ns, or give the rate of the rows, for example "
-                f"--rate 100; {self.wanted}, not {self._all}."
+                f"--rate 100; {WANTED}, not {self._all}."
             )
         exact = [at for at in places if is_exact(self.names[at])]
         united = [at for at in places if self.meanings[at].unit]
         place = self._most_even(exact or united or places)
-        unit = self.meanings[place].unit
-        values = self.values([place], [row for row in self.rows if row[place]])[:, 0]
+        unit, values = self.meanings[place].unit, self.values([place])[:, 0]
+        values = values[[bool(row[place]) for row in self.rows]]
         if not unit and len(values) and math.isnan(values[0]):
             return self._dates(places[:2] if place == places[0] else [place])
-        unit = unit or self._unit_of_time(place, values)
-        decimals = {"ns": 0, "us": 3, "ms": 6}.get(unit, 9)
+        unit = unit or self._unit_of_time(place, values[np.isfinite(values)])
         if self.is_table or not exact:
             self.said.append(f"time from {self.named([place])} in {unit}")
-        return Stamps((place,), decimals, round(TIME[unit]) if decimals == 9 else 1)
+        return Stamps((place,), round(TIME[unit] * 1e9))
 
     def _most_even(self, places: list[int]) -> int:
         """Return that of several columns of stamps which goes up most evenly; the first where none has numbers."""
 
-        def unevenness(steps: Floats) -> float:
+        def unevenness(place: int) -> float:
+            steps = np.diff(self.values([place])[:, 0])
             steps = steps[np.isfinite(steps)]
             usual = float(np.median(steps)) if len(steps) else 0.0
             return float(np.median(np.abs(steps - usual))) / usual if usual > 0.0 else math.inf
 
-        steps = np.diff(self.values(places), axis=0) if len(places) > 1 else np.zeros((0, 1))
-        return places[int(np.argmin([unevenness(own) for own in steps.T]))]
+        return min(places, key=unevenness) if len(places) > 1 else places[0]
 
     def _unit_of_time(self, place: int, values: Floats) -> str:
         """Return the unit of stamps (n,) whose name tells none, by their size or their steps; of means, it is s."""
-        known = values[np.isfinite(values)]
-        size = float(np.abs(known).max(initial=0.0))
-        if unit := unit_of_epoch(size) or "s" * self.is_table:
-            return unit
-        step = float(np.median(np.abs(np.diff(known)))) if len(known) > 1 else 0.0
-        if unit := next((unit for low, high, unit in _OF_STEPS if low < step < high), ""):
+        step = float(np.median(np.abs(np.diff(values)))) if len(values) > 1 else 0.0
+        by_size = unit_of_epoch(float(np.abs(values).max(initial=0.0))) or "s" * self.is_table
+        if unit := by_size or next((unit for low, high, unit in _OF_STEPS if low < step < high), ""):
             return unit
         name = self.header[place]
         raise InputError(
             f"no column gives the time with its unit: say which {name!r} has, for example --column '{name}=time_ms'; "
-            f"{self.wanted}, not {self._all}."
+            f"{WANTED}, not {self._all}."
         )
 
     def _dates(self, places: Sequence[int]) -> Stamps:
         """How stamps of a calendar are written; of two columns the second may give the time of day."""
-        cells = [[row[at] for row in self.rows if all(row[at] for at in places)] for at in places]
-        joined = [" ".join(own) for own in zip(*cells, strict=True)]
-        for chosen, texts in ((places, joined), (places[:1], cells[0])):
-            try:
-                stamps = Stamps.of_dates(chosen, texts)
-            except ValueError:
-                continue
-            zone = " (UTC, since no time zone is named)" if self.is_table and not stamps.has_zone else ""
-            self.said.append(f"time from {self.named(chosen)}{zone}")
-            return stamps
+        rows = [[row[at] for at in places] for row in self.rows if all(row[at] for at in places)]
+        for count in (len(places), 1):
+            with suppress(ValueError):
+                stamps = Stamps.of_dates(places[:count], [" ".join(cells[:count]) for cells in rows])
+                zone = " (UTC, since no time zone is named)" if self.is_table and not stamps.has_zone else ""
+                self.said.append(f"time from {self.named(places[:count])}{zone}")
+                return stamps
         raise InputError(
-            f"no column gives the time: column {self.named(places[:1])} is "
-            f"{cut(cells[0][0] if cells[0] else '', 40)!r}, write seconds, or stamps such as "
-            "2026-05-04T13:45:00.010+02:00."
+            f"no column gives the time: column {self.named(places[:1])} is {cut(rows[0][0] if rows else '', 40)!r}, "
+            "write seconds, or stamps such as 2026-05-04T13:45:00.010+02:00."
         )
 
     def accel(self) -> QuantityColumns:
         """The three readings as they are written; ``raw`` tells then what in.
 
         Raises InputError where their columns or their units are not told."""
-        places = self.reading_places
+        places, units = self.reading_places, self.units
         by_name = [self.meanings[at].unit for at in places]
-        named = self.units.told_by([self.header[at] for at in places], by_name)
-        values = self.values(places)
+        named, values = units.told_by([self.header[at] for at in places], by_name), self.values(places)
         norm = usual_norm(values)
-        if "" in named and not (self.units.accel or self.units.as_default(named, norm)) and math.isnan(norm):
+        if "" in named and not (units.accel or units.as_default(named, norm)) and math.isnan(norm):
             raise InputError(
                 f"no columns give the three readings with their unit: name them ax_mps2, ay_mps2, az_mps2 (or ax_g, "
                 f"ax_mg ...), not {self._all}, or state it by --accel-unit, and the size of counts by --accel-scale."
             )
-        told = reading_units(named, values, self.units)
+        told = reading_units(named, values, units)
         self.by_size |= {at: told.units[k] for k, at in enumerate(places) if told.by_size and not named[k]}
-        if not told.is_known:
-            signed = usual_norm(parse_counts(self.units.counts).signed(values))
+        if told.raw is None:
+            signed = usual_norm(parse_counts(units.counts).signed(values))
             keys = size_of_count(signed)
-            example = " ".join(f"{OPTIONS[key]} {value}" for key, value in keys.items())
             raise CountsError(
                 f"the readings in {self.named(places)} have a size of {signed:.3g}, so they are counts: give the "
                 "size of one by --accel-scale, in m/s^2 or what --accel-unit says, which is by gravity about "
-                f"{example}.", keys
+                f"{' '.join(f'{OPTIONS[key]} {value}' for key, value in keys.items())}.", keys
             )  # fmt: skip
-        is_stated = self.units.accel is not None or self.units.accel_scale != 1.0
+        is_stated = units.accel is not None or units.accel_scale != 1.0
         if self.is_table or is_stated or not all(is_exact(self.names[at]) for at in places):
             self.said.insert(0, f"{'mean ' * self.is_table}readings from {self.named(places)} in {told.words}")
-        self.raw, scale = told.raw, self.units.accel_scale
-        is_rewritten = scale != 1.0 or named != by_name or "count" in named or self.raw.sizes != PLAIN.sizes
-        is_rewritten |= self.raw.counts != SIGNED
-        written = [ACCEL.get(unit, 1.0) for unit in by_name] if is_rewritten else self.raw.factors.tolist()
-        self.written_mps2 = (written[0], written[1], written[2])
-        bare = [at for at, unit in zip(places, by_name, strict=True) if unit in ("", "count")]
-        self.without_unit = tuple(bare) if is_rewritten else ()
+        self.raw = told.raw
+        is_made = units.accel_scale != 1.0 or named != by_name or "count" in named  # the names tell less than is known
+        if is_made or self.raw.sizes != PLAIN.sizes or self.raw.counts != SIGNED:
+            x, y, z = (ACCEL.get(unit, 1.0) for unit in by_name)
+            self.without_unit = [at for at, unit in zip(places, by_name, strict=True) if unit in ("", "count")]
+        else:
+            x, y, z = self.raw.factors.tolist()
+        self.written_mps2 = x, y, z
         return QuantityColumns(tuple(places), (1.0, 1.0, 1.0))
 
     @property
@@ -315,36 +291,33 @@ class Columns:
             f"it, for example {example} (known: {KNOWN})."
         )
 
-    @property
-    def _left_over(self) -> str:
-        """The name of a column that means nothing yet, for an example."""
-        return next((self.header[k] for k in self.unused), "THEIRS")
-
-    def gimbals(self, *, needed: bool) -> QuantityColumns:
-        """The angles by the usual names, else every column of an angle in the order of the header; none where there is
-        none. Raises InputError where their unit is not told and they are needed."""
-        places = self.angles
-        ranks = [self.meanings[at].rank for at in places]
+    def pose(self, *, needed: bool) -> QuantityColumns:
+        """The attitude, or the angles by the usual names, else every column of an angle in the order of the header;
+        none where there is none. Raises InputError where they or their unit are not told and they are needed."""
+        if self.orientation == "attitude":
+            known = tuple(at for ours in QUATERNION if (at := self.place(ours)) is not None)
+            return QuantityColumns(known, (1.0,) * 4)
+        places, stated, how = self.angles, self.units.angle, ""
+        ranks, units = [self.meanings[at].rank for at in places], [self.meanings[at].unit for at in places]
         if any(ranks) and len(set(ranks)) < len(ranks):
             raise InputError(f"{self.named(places)} name a gimbal twice: leave one out by --column THEIRS=-.")
-        units = [self.meanings[at].unit for at in places]
-        if other := [at for at in places if self.units.angle and self.meanings[at].unit not in ("", self.units.angle)]:
-            raise InputError(
-                f"column {self.named(other[:1])} is in {self.meanings[other[0]].unit} by its name, and --angle-unit is "
-                f"{self.units.angle}: leave out --angle-unit, or rename the column by --column."
-            )
-        by_size = ""
-        if "" in units:
-            by_size = "" if self.units.angle else self._unit_of_angles(places)
-            unit = self.units.angle or by_size
-            if not unit and not needed:
-                return QuantityColumns()
-            if not unit:
-                raise self.without_angles()
-            self.by_size |= {at: unit for at, own in zip(places, units, strict=True) if by_size and not own}
-            units = [own or unit for own in units]
+        for at, unit in zip(places, units, strict=True):
+            if stated and unit not in ("", stated):
+                raise InputError(
+                    f"column {self.named([at])} is in {unit} by its name, and --angle-unit is {stated}: leave out "
+                    "--angle-unit, or rename the column by --column."
+                )
+        if "" in units and not stated:  # rows to come of a log may tell
+            values, how = self.values(places), " by their size (--angle-unit)"
+            of_table = ("deg" if (values == np.rint(values)).all() else "rad") if self.is_table else ""
+            stated = "deg" if (np.abs(values) > 2.0 * math.pi).any() else of_table
+            self.by_size |= {at: stated for at, unit in zip(places, units, strict=True) if not unit and stated}
+        if needed and (not places or ("" in units and not stated)):
+            raise self.without_angles()
+        if "" in units and not stated:
+            return QuantityColumns()
+        units = [unit or str(stated) for unit in units]
         if units and (self.is_table or not all(is_exact(self.names[at]) for at in places)):
-            how = " by their size (--angle-unit)" if by_size else ""
             words = " and ".join(dict.fromkeys(units))
             self.said.append(f"gimbal angles, outer to inner, from {self.named(places)} in {words}{how}")
         return QuantityColumns(tuple(places), tuple(ANGLE[unit] for unit in units))
@@ -357,13 +330,6 @@ class Columns:
         ranked = sorted((at for at in places if self.meanings[at].rank), key=lambda at: self.meanings[at].rank)
         return ranked or places
 
-    def _unit_of_angles(self, places: Sequence[int]) -> str:
-        """Return the unit of angles whose names tell none, by their size; empty where rows to come may tell."""
-        values = self.values(places)
-        if (np.abs(values) > 2.0 * math.pi).any():
-            return "deg"
-        return ("deg" if (values == np.rint(values)).all() else "rad") if self.is_table else ""
-
     def without_angles(self) -> InputError:
         """That no angles are there, or none whose unit is known."""
         theirs = next((self.header[at] for at in self.places("angle")), self._left_over)
@@ -374,11 +340,6 @@ class Columns:
             f"... or outer_rad ..., outer gimbal first, for example by --column '{theirs}=outer_deg' (or the attitude "
             f"qx, qy, qz, qw{face}), or do without orientations (--no-angles)."
         )
-
-    def quaternion(self) -> QuantityColumns:
-        """The attitude; nothing where its four columns are not there."""
-        known = tuple(at for ours in QUATERNION if (at := self.place(ours)) is not None)
-        return QuantityColumns(known, (1.0,) * 4) if len(known) == 4 else QuantityColumns()
 
     def temperature(self) -> tuple[QuantityColumns, str]:
         """The temperature, if there is one, and its unit: ``c``, ``k`` or ``f``."""
@@ -393,7 +354,7 @@ class Columns:
 
     def _recognise_numbers(self) -> None:
         """Find time and readings in columns without names."""
-        places = [k for k in range(len(self.header)) if self._are_numbers(k, _MOST_CELLS)]
+        places = [k for k in range(len(self.header)) if self._are_numbers(k)]
         for place, meaning in zip(places, meanings_by_numbers(self.values(places)) if places else (), strict=True):
             if meaning.ours:
                 self._guess(place, meaning.ours)
@@ -406,36 +367,26 @@ class Columns:
             kind, cells = self.meanings[k].ours, [row[k] for row in self.rows]
             are_faces = [face_of(cell) is not None for cell in cells]
             if (kind in _OPTIONAL and not any(cells)) or (kind == "face" and not any(are_faces)):
-                self.meanings[k] = Meaning("", "")
-            kind = self.meanings[k].ours
+                self.meanings[k], kind = Meaning(), ""
             if kind in ("", "angle") and not self.has("face") and all(are_faces):
                 self._guess(k, "face")
             elif kind == "" and not self.has("time") and are_stamps(cells):
                 self._guess(k, "time")
-        if self.places(*READINGS):
-            return
         left = [k for k, own in enumerate(self.meanings) if not own.ours and not own.other and k not in stated]
-        if len(numeric := [k for k in left if self._are_numbers(k, _MOST_CELLS)]) == 3:
-            norms = lengths(self.values(numeric))
-            norms = norms[np.isfinite(norms)]
-            if norms.size and 0 < norms.max() < _ALIKE * norms.min():
-                for k, ours in zip(numeric, READINGS, strict=True):
-                    self._guess(k, ours)
+        numeric = [] if self.places(*READINGS) else [k for k in left if self._are_numbers(k)]
+        norms = lengths(self.values(numeric)) if len(numeric) == len(READINGS) else np.zeros(0)
+        norms = norms[np.isfinite(norms)]
+        if norms.size and 0 < norms.max() < _ALIKE * norms.min():
+            for k, ours in zip(numeric, READINGS, strict=True):
+                self._guess(k, ours)
 
     def _guess(self, place: int, ours: str) -> None:
         self.meanings[place] = Meaning(ours, self.meanings[place].unit)
         self.guessed.append(self.header[place])
 
-    def _are_numbers(self, place: int, share: float) -> bool:
-        """Whether at least this share of the cells of a column are numbers."""
-        return float(np.mean(np.isfinite(self.values([place])))) >= share if self.rows else False
-
-    # -- what is not to be used --
-
-    def unknown(self, used: Container[int]) -> list[str]:
-        """The names of columns that nothing here knows: not those of a gyroscope, say, which are of no use here."""
-        return [name for at, (name, own) in enumerate(zip(self.names, self.meanings, strict=True))
-                if name and at not in used and not own.other]  # fmt: skip
+    def _are_numbers(self, place: int) -> bool:
+        """Whether most of the cells of a column are numbers."""
+        return bool(self.rows) and float(np.mean(np.isfinite(self.values([place])))) >= _MOST_CELLS
 
 
 def refuse_unknown_names(stated: Mapping[str, str], header: Sequence[str]) -> None:

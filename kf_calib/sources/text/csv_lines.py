@@ -5,15 +5,16 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Container, Sequence
+from itertools import pairwise
 
 import numpy as np
 
 from kf_calib.bench.streams import Batch
 from kf_calib.errors import CountsError
-from kf_calib.sources.text.columns import READINGS, Columns
+from kf_calib.sources.text.cells import DECIMAL_POINT, LineError, written
+from kf_calib.sources.text.columns import READINGS, WANTED, Columns
 from kf_calib.sources.text.heading import BLANK, cells_of, with_texts, without_empty_end
-from kf_calib.sources.text.numbers import DECIMAL_POINT, LineError, written
-from kf_calib.sources.text.reader import Account, LineReader, LineRows
+from kf_calib.sources.text.reader import Account, LineReader, SampleRow
 from kf_calib.sources.text.units import celsius
 from kf_calib.support.text import cut
 
@@ -24,55 +25,80 @@ _FEWEST_ROWS, _MOST_UNITS, _APART = 20, 8, 5.0  # rows and labels of several sen
 class CsvLines(LineReader):
     """Reads the rows under one header, block by block.
 
-    Poses are gimbal angles (``has_angles``), or the quaternion qx qy qz qw; angles: whether there must be any.
+    Poses are gimbal angles (``has_angles``), or the quaternion qx qy qz qw; angles: whether there must be any; None:
+    where a column tells them.
     Raises InputError where the columns do not say what is needed.
     """
 
-    _wrong = "a cell is not a number"
+    wrong = "a cell is not a number"
+    advice = WANTED
 
-    def __init__(self, columns: Columns, account: Account, angles: bool = True) -> None:
+    def __init__(self, columns: Columns, account: Account, angles: bool | None = True) -> None:
         super().__init__(account)
-        self._columns, self._delimiter, self._header = columns, columns.heading.delimiter, columns.header
+        self._columns, self._heading, self._header = columns, columns.heading, columns.header
         self._time, self._accel = columns.time(), columns.accel()
-        self._labels = columns.heading.labels
-        self._row, self._added_ns, self._last_ns = -1, 0, -(2**63)
-        self.raw = columns.raw
-        self._numbers = columns.numbers
+        self._count, self._added_ns, self._last_ns = 0, 0, -(2**63)
+        self.raw, self.said, self._numbers = columns.raw, columns.said, columns.numbers
         self.has_angles = columns.orientation != "attitude"
-        self._pose = columns.gimbals(needed=angles) if self.has_angles else columns.quaternion()
-        if angles and not self._pose.at:
-            raise columns.without_angles()
+        self.wants_pose = bool(columns.orientation) if angles is None else angles
+        self._pose = columns.pose(needed=self.wants_pose)
         self.pose_width = len(self._pose.at)
         self._temperature, self._unit = columns.temperature()
-        self.said = columns.said
         used = {*self._time.at, *self._accel.at, *self._pose.at, *self._temperature.at}
         used |= {columns.chosen[0]} if columns.chosen else set()
         _refuse_several_units(columns, used)
-        self._account.leave_out(columns.unknown(used))
-
-    @property
-    def advice(self) -> str:
-        """How columns have to be named."""
-        return self._columns.wanted
+        columns_named = enumerate(zip(columns.names, columns.meanings, strict=True))
+        unknown = [name for at, (name, own) in columns_named if name and at not in used and not own.other]
+        self._account.leave_out(unknown)  # not those of a gyroscope, say, which are of no use here
 
     def with_readings(self, line: str, readings_mps2: Sequence[float]) -> str:
+        values = zip(self._accel.at, readings_mps2, self._columns.written_mps2, strict=True)
         decimal = (self._numbers or DECIMAL_POINT).decimal
-        texts = [
-            repr(written(value / unit)).replace(".", decimal)
-            for value, unit in zip(readings_mps2, self._columns.written_mps2, strict=True)
-        ]
-        return with_texts(line, self._columns.heading.spans(line), dict(zip(self._accel.at, texts, strict=True)))
+        texts = {at: repr(written(value / unit)).replace(".", decimal) for at, value, unit in values}
+        return with_texts(line, self._heading.spans(line), texts)
 
     def heading_of_forces(self, heading: Sequence[str]) -> list[str]:
         names = {at: f"a{'xyz'[self._accel.at.index(at)]}_mps2" for at in self._columns.without_unit}
-        lines, numbers = list(heading), self._columns.heading.lines_of_names
+        lines, numbers = list(heading), self._heading.lines_of_names
         for k in numbers if names else ():
-            cells = cells_of(lines[k].lstrip("\ufeff"), self._delimiter)
+            cells = cells_of(lines[k].lstrip("\ufeff"), self._heading.delimiter)
             if len(cells) >= len(self._header) and cells[self._accel.at[0]]:
-                is_first = k == numbers[0]
-                texts = names if is_first else dict.fromkeys(names, "m/s^2")
-                lines[k] = with_texts(lines[k], self._columns.heading.spans(lines[k]), texts)
+                texts = names if k == numbers[0] else dict.fromkeys(names, "m/s^2")
+                lines[k] = with_texts(lines[k], self._heading.spans(lines[k]), texts)
         return lines
+
+    def read(self, lines: Sequence[str], first_line: int) -> Batch:
+        if self._numbers is None:
+            self._numbers = self._columns.numbers_in([self._cells(line) for line in lines])
+        return super().read(lines, first_line)
+
+    def _cells(self, line: str) -> list[str]:
+        if self._heading.labels is not None:
+            return self._heading.labels.values(line)
+        delimiter = self._heading.delimiter
+        is_plain = '"' not in line and " " not in line and delimiter != BLANK
+        return line.split(delimiter) if is_plain else cells_of(line, delimiter)
+
+    def _row(self, line: str) -> SampleRow | None:
+        if not (cells := self._cells(line)) and self._heading.labels is not None:
+            return None  # of something else than readings
+        number, self._count = self._count, self._count + 1
+        row = without_empty_end(cells, len(self._header))
+        if len(row) != len(self._header):
+            raise LineError(f"it has {len(row)} cells, the header has {len(self._header)}")
+        if self._columns.chosen is not None and not self._columns.is_chosen(row):
+            self._count -= 1
+            return None
+        numbers = self._numbers or DECIMAL_POINT
+        time_ns = self._time.ns(row, self._header, numbers, number)
+        if not self._time.unit_ns:
+            time_ns = self._of_even_clock(time_ns)
+        readings = self._accel.values(row, self._header, numbers)
+        angles = self._pose.values(row, self._header, numbers)
+        degrees = self._temperature.values(row, self._header, numbers)
+        if angles and not self.has_angles and not any(angles):
+            raise LineError("the quaternion is zero")
+        return time_ns, readings, angles, degrees and [celsius(degrees[0], self._unit)]
 
     def _of_even_clock(self, time_ns: int) -> int:
         """Return a stamp of a calendar with the hour by which local clocks go back at the end of summer time."""
@@ -84,44 +110,6 @@ class CsvLines(LineReader):
         self._last_ns = max(self._last_ns, time_ns)
         return time_ns
 
-    def read(self, lines: Sequence[str], first_line: int) -> Batch:
-        if self._numbers is None:
-            self._numbers = self._columns.numbers_in([self._cells(line) for line in lines])
-        return super().read(lines, first_line)
-
-    def _cells(self, line: str) -> list[str]:
-        if self._labels is not None:
-            return self._labels.values(line)
-        if '"' not in line and " " not in line and self._delimiter != BLANK:
-            return line.split(self._delimiter)
-        return cells_of(line, self._delimiter)
-
-    def _read_line(self, line: str, accel: LineRows, pose: LineRows, temperature: LineRows) -> None:
-        if not (cells := self._cells(line)) and self._labels is not None:
-            return  # of something else than readings
-        self._row += 1
-        row = without_empty_end(cells, len(self._header))
-        if len(row) != len(self._header):
-            raise LineError(f"it has {len(row)} cells, the header has {len(self._header)}")
-        numbers = self._numbers or DECIMAL_POINT
-        if self._columns.chosen is not None and not self._columns.is_chosen(row):
-            self._row -= 1
-            return
-        time_ns = self._time.ns(row, self._header, numbers, self._row)
-        if self._time.is_date:
-            time_ns = self._of_even_clock(time_ns)
-        # everything on the line is understood before any of it is used
-        readings, angles, degrees = (
-            quantity.values(row, self._header, numbers) for quantity in (self._accel, self._pose, self._temperature)
-        )
-        if angles and not self.has_angles and not any(angles):
-            raise LineError("the quaternion is zero")
-        if degrees:
-            degrees = [celsius(degrees[0], self._unit)]
-        accel.add(time_ns, readings)
-        pose.add(time_ns, angles)
-        temperature.add(time_ns, degrees)
-
 
 def _refuse_several_units(columns: Columns, used: Container[int]) -> None:
     """Raise CountsError where a column that means nothing to us tells several sensors apart, whose rows take turns.
@@ -132,27 +120,25 @@ def _refuse_several_units(columns: Columns, used: Container[int]) -> None:
     places = columns.places(*READINGS)
     if len(places) != 3 or len(columns.rows) < _FEWEST_ROWS:
         return
+    values = columns.values(places)
     for at, name in enumerate(columns.names):
-        is_told = at in used or not name or (columns.chosen is not None and at == columns.chosen[0])
-        labels = [] if is_told else [row[at].strip() for row in columns.rows]
-        shares = Counter(labels)
-        turns = [k for k in range(len(labels) - 1) if labels[k] != labels[k + 1]]
-        if not 2 <= len(shares) <= _MOST_UNITS or min(shares.values()) < 0.1 * len(labels):
+        labels = [row[at].strip() for row in columns.rows]
+        shares, turns = Counter(labels), np.flatnonzero([one != other for one, other in pairwise(labels)])
+        if at in used or not name or not 2 <= len(shares) <= _MOST_UNITS or max(map(len, shares)) > 16:
             continue
-        if len(turns) < 0.3 * len(labels) or not all(label and len(label) <= 16 for label in shares):
+        if "" in shares or min(shares.values()) < 0.1 * len(labels) or len(turns) < 0.3 * len(labels):
             continue
-        values, first = columns.values(places), min(shares)
+        first = min(shares)
         signs = np.array([1.0 if labels[k] == first else -1.0 for k in turns])
-        steps = (values[np.array(turns) + 1] - values[turns]) * signs[:, None]
+        steps = (values[turns + 1] - values[turns]) * signs[:, None]
         middle = np.nanmedian(steps, axis=0)  # between poses the readings leap
         spread = 1.86 * np.nanmedian(np.abs(steps - middle), axis=0) / math.sqrt(len(turns))
-        if not (np.abs(middle) > _APART * np.maximum(spread, 1e-300)).any():
-            continue
-        shown = ", ".join(sorted(shares)[:4])
-        example = f"{cut(name, 40)}={first}"
-        raise CountsError(
-            f"the rows are of several sensors, told apart by the column {cut(columns.header[at], 40)!r} ({shown}): "
-            f"choose one, for example by --where {example!r}, or leave the column out if it means something else "
-            f"(--column {cut(columns.header[at], 40) + '=-'!r}).",
-            {"where": example},
-        )
+        if (np.abs(middle) > _APART * np.maximum(spread, 1e-300)).any():
+            theirs = cut(columns.header[at], 40)
+            example = f"{cut(name, 40)}={first}"
+            raise CountsError(
+                f"the rows are of several sensors, told apart by the column {theirs!r} "
+                f"({', '.join(sorted(shares)[:4])}): choose one, for example by --where {example!r}, or leave the "
+                f"column out if it means something else (--column {theirs + '=-'!r}).",
+                {"where": example},
+            )

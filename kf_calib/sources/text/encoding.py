@@ -17,12 +17,14 @@ from kf_calib.errors import InputError
 from kf_calib.sources.containers.opening import DatasetText, dataset_of, kind_of_container
 
 LONGEST_LINE_BYTES = 1 << 20
-GZIP, _UTF16 = b"\x1f\x8b", (b"\xff\xfe", b"\xfe\xff")
+_GZIP = b"\x1f\x8b"
 LARGEST_TABLE_BYTES = 50_000_000
-_HEAD_BYTES = 1 << 18
+TOO_LARGE = (
+    "{}: is larger than a table of orientations can be: leave out what is not part of it; if it holds samples, save "
+    "them as CSV with a column of time (docs/own_csv.md)."
+)
+_HEAD_BYTES, _BLOCK_BYTES = 1 << 18, 1 << 20
 _CYRILLIC = re.compile(rb"[\xc0-\xff]{3}")
-_BLOCK_BYTES = 1 << 20
-_NOT_UNPACKED = (EOFError, zlib.error, gzip.BadGzipFile)
 
 
 class TextFile:
@@ -39,11 +41,11 @@ class TextFile:
         self._raw = path.open("rb")
         try:
             self._text = DatasetText(arrays) if arrays else None
-            packed = self._raw.peek(2).startswith(GZIP)
+            packed = self._raw.peek(2).startswith(_GZIP)
             self._file = self._text or (gzip.GzipFile(fileobj=self._raw) if packed else self._raw)
             self._head = self._unpacked(_HEAD_BYTES)
         except BaseException:
-            self._raw.close()
+            self.close()
             raise
         encoding = "utf-8" if is_raw else encoding_of(self._head)
         self._decoder = None if encoding == "utf-8" else codecs.getincrementaldecoder(encoding)("replace")
@@ -77,7 +79,7 @@ class TextFile:
                 piece = self._file.read1(size - len(block))
                 block += piece
                 self._has_ended = not piece
-        except _NOT_UNPACKED as error:
+        except (EOFError, zlib.error, gzip.BadGzipFile) as error:
             self.trouble = f"its end cannot be unpacked ({error}): copy it anew, what comes before is used."
             self._has_ended = True
         return bytes(block)
@@ -94,10 +96,9 @@ def holds_any(path: Path, words: Sequence[bytes]) -> bool:
     longest, tail = max(map(len, words)), b""
     with TextFile(path) as file:
         while block := file.read(_BLOCK_BYTES):
-            tail += block
+            tail = tail[-longest:] + block
             if any(word in tail for word in words):
                 return True
-            tail = tail[-longest:]
     return False
 
 
@@ -125,18 +126,10 @@ def unpacked(path: Path, dataset: str = "") -> bytes:
         while len(content) <= LARGEST_TABLE_BYTES and (block := file.read(_BLOCK_BYTES)):
             content += block
     if len(content) > LARGEST_TABLE_BYTES:
-        raise too_large(path)
+        raise InputError(TOO_LARGE.format(path))
     if file.trouble:
         raise InputError(f"{path}: {file.trouble.partition(': ')[0]}: copy it anew.")
     return bytes(content)
-
-
-def too_large(path: Path) -> InputError:
-    """That a file has more bytes than a table of orientations."""
-    return InputError(
-        f"{path}: is larger than a table of orientations can be: leave out what is not part of it; if it holds "
-        "samples, save them as CSV with a column of time (docs/own_csv.md)."
-    )
 
 
 def encoding_of(head: bytes) -> str:
@@ -144,7 +137,7 @@ def encoding_of(head: bytes) -> str:
 
     It is Cyrillic (1251) where three letters beyond ASCII follow each other, as in no Western language, or else 1252.
     """
-    if head.startswith(_UTF16):
+    if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16"
     plain = head.rstrip(b"\0")
     for at, encoding in ((1, "utf-16-le"), (0, "utf-16-be")):
@@ -157,19 +150,12 @@ def encoding_of(head: bytes) -> str:
     return "utf-8"
 
 
-def line_end_of(block: bytes) -> bytes:
-    """What ends the lines of a text that begins so: a carriage return alone, else a line feed; empty while nothing
-    tells, as where a carriage return comes last."""
-    if b"\n" in block:
-        return b"\n"
-    return b"\r" if b"\r" in block[:-1] else b""
-
-
 class Cutter:
     """Bytes as they come, cut into lines; a line that is too long is left empty, and refused with its number.
 
-    keeps_ends: whether lines are given with what ends them, and with bytes that are no UTF-8 (as surrogates), so that
-    they can be written again.
+    Lines end with a carriage return where one comes alone before any line feed, else with a line feed. keeps_ends:
+    whether lines are given with what ends them, and with bytes that are no UTF-8 (as surrogates), so that they can be
+    written again.
     """
 
     def __init__(self, refuse: Callable[[int, str], None], *, keeps_ends: bool = False) -> None:
@@ -186,36 +172,35 @@ class Cutter:
         if self._tail.endswith(b"\r") and not self._end:  # what follows tells whether it ends a line alone
             block = bytes(self._tail) + block
             self._tail.clear()
-        self._end = self._end or line_end_of(block)
-        mark = self._end or b"\n"
-        end, lines = block.rfind(mark) + 1, list[str]()
-        if end:
-            lines = self._decode(bytes(self._tail) + block[: end - 1], mark, mark.decode())
+        if not self._end:
+            self._end = b"\n" if b"\n" in block else b"\r" if b"\r" in block[:-1] else b""
+        count, lines = block.rfind(self._end or b"\n") + 1, list[str]()
+        if count:
+            lines = self._lines(bytes(self._tail) + block[:count])
             self._tail.clear()
         if len(self._tail) <= LONGEST_LINE_BYTES:  # else what comes up to the next end of line is not kept
-            self._tail += block[end:]
+            self._tail += block[count:]
         return lines
 
     def rest(self) -> list[str]:
         """The line without an end, if there is one."""
         block = bytes(self._tail)
         self._tail.clear()
-        return self._decode(block, self._end or b"\n", "") if block else []
+        return self._lines(block) if block else []
 
-    def _decode(self, block: bytes, mark: bytes, last: str) -> list[str]:
-        """Return the lines of a block, between which a mark is; last: the end of the last one."""
+    def _lines(self, block: bytes) -> list[str]:
+        """Return the lines of a block, of which the last may have no end."""
+        mark, too_long = self._end or b"\n", set[int]()
+        if len(block) > LONGEST_LINE_BYTES:
+            too_long = {k for k, line in enumerate(block.split(mark)) if len(line) > LONGEST_LINE_BYTES}
         if not self._keeps_ends and mark == b"\n":
             block = block.replace(b"\r\n", b"\n").removesuffix(b"\r")
-        lines, too_long = block.split(mark), list[int]()
-        if len(block) > LONGEST_LINE_BYTES:
-            too_long = [i for i, line in enumerate(lines) if len(line) > LONGEST_LINE_BYTES]
-            for i in too_long:
-                self._refuse(self._cut + i + 1, "it is longer than 1 MiB")
-                lines[i] = b""
-            block = mark.join(lines)
-        self._cut += len(lines)
-        texts = block.decode("utf-8", errors="surrogateescape" if self._keeps_ends else "replace").split(mark.decode())
+        text, end = block.decode("utf-8", "surrogateescape" if self._keeps_ends else "replace"), mark.decode()
+        lines = text.removesuffix(end).split(end)
         if self._keeps_ends:
-            ends = [*[mark.decode()] * (len(texts) - 1), last]
-            texts = ["" if i in too_long else text + end for i, (text, end) in enumerate(zip(texts, ends, strict=True))]
-        return texts
+            lines = [*(line + end for line in lines[:-1]), lines[-1] + end * text.endswith(end)]
+        for k in sorted(too_long):
+            self._refuse(self._cut + k + 1, "it is longer than 1 MiB")
+            lines[k] = ""
+        self._cut += len(lines)
+        return lines

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from os import PathLike
 from pathlib import Path
@@ -12,9 +12,9 @@ from typing import Any
 
 from kf_calib.errors import InputError
 from kf_calib.sources.containers.opening import kind_of_container
-from kf_calib.sources.text.encoding import LARGEST_TABLE_BYTES, text_of, too_large
+from kf_calib.sources.text.cells import DECIMAL_POINT, Numbers
+from kf_calib.sources.text.encoding import LARGEST_TABLE_BYTES, TOO_LARGE, text_of
 from kf_calib.sources.text.heading import TextHeading
-from kf_calib.sources.text.numbers import DECIMAL_POINT, Numbers
 from kf_calib.sources.text.spreadsheet import sheets_of
 from kf_calib.support.text import cut
 
@@ -48,46 +48,41 @@ def grid_of(table: Any, dataset: str = "") -> Grid:
     path = Path(table)
     try:
         with path.open("rb") as file:
-            start = file.read(8)
+            is_excel = file.read(8).startswith(ZIP) and not kind_of_container(path)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
     if path.suffix.lower() in OLD_SUFFIXES:
         raise InputError(f"{path}: files of the kind {path.suffix} are not read: save it as .xlsx or .csv.")
-    is_excel = start.startswith(ZIP) and not kind_of_container(path)
-    if is_excel and path.stat().st_size > LARGEST_TABLE_BYTES:
-        raise too_large(path)
-    return replace(_of_excel(path) if is_excel else _of_text(path, dataset), path=path)
-
-
-def _of_text(path: Path, dataset: str) -> Grid:
-    """Return the cells of a CSV file: any usual encoding and delimiter, with or without lines above the header."""
-    try:
+    if is_excel:
+        return _of_excel(path)
+    try:  # any usual encoding and delimiter, with or without lines above the header
         heading = TextHeading.of(text_of(path, dataset).splitlines(), is_whole=True)
     except csv.Error as error:
         raise InputError(f"{path}: is no CSV file ({error}): save the table as CSV or .xlsx.") from None
-    return _padded(str(path), heading)
+    return _padded(str(path), heading, path=path)
 
 
 def _of_excel(path: Path) -> Grid:
     """Return the cells of the first visible sheet of an Excel file that holds any."""
+    if path.stat().st_size > LARGEST_TABLE_BYTES:
+        raise InputError(TOO_LARGE.format(path))
     sheets = sheets_of(path)
     seen = [sheet for sheet in sheets if not sheet.hidden]
     if not seen:
         hidden = f" that can be seen ({sheets[0].name!r} is hidden)" if sheets else ""
         raise InputError(f"{path}: all sheets{hidden} are empty: write a header and a row for each orientation.")
-    others = ", ".join(repr(sheet.name) for sheet in seen[1:])
-    hidden = ", ".join(repr(sheet.name) for sheet in sheets if sheet.hidden)
-    remarks = [f"sheet {seen[0].name!r} was read, not {others}; put the table on the first sheet"] if others else []
-    remarks += [f"{hidden} was not read, as it is hidden"] if hidden else []
-    if rows := seen[0].left_out:
+    remarks, read = list[str](), seen[0]
+    if others := ", ".join(repr(sheet.name) for sheet in seen[1:]):
+        remarks.append(f"sheet {read.name!r} was read, not {others}; put the table on the first sheet")
+    if hidden := ", ".join(repr(sheet.name) for sheet in sheets if sheet.hidden):
+        remarks.append(f"{hidden} was not read, as it is hidden")
+    if rows := read.left_out:
         numbers = ", ".join(map(str, rows[:_SHOWN])) + " ..." * (len(rows) > _SHOWN)
-        one = len(rows) == 1
-        remarks.append(
-            f"row{'s' * (not one)} {numbers} {'was' if one else 'were'} not read, as hidden rows are no data"
-        )
-    texts, delimiter = _texts([row for _, row in seen[0].lines])
-    lines = [(number - 1, row) for (number, _), row in zip(seen[0].lines, texts, strict=True)]
-    return replace(_padded(str(path), TextHeading.of_cells(lines, delimiter)), remarks=tuple(remarks))
+        were = f"row {numbers} was" if len(rows) == 1 else f"rows {numbers} were"
+        remarks.append(f"{were} not read, as hidden rows are no data")
+    texts, delimiter = _texts([row for _, row in read.lines])
+    lines = [(number - 1, row) for (number, _), row in zip(read.lines, texts, strict=True)]
+    return _padded(str(path), TextHeading.of_cells(lines, delimiter), tuple(remarks), path)
 
 
 def _of_columns(table: Any) -> Grid:
@@ -95,24 +90,20 @@ def _of_columns(table: Any) -> Grid:
     names = getattr(getattr(table, "dtype", None), "names", None)
     if names is None:
         names = list(table) if isinstance(table, Mapping) else getattr(table, "columns", None)
-    if names is None or isinstance(table, str):
+    if names is None:
         raise InputError(
             f"a table of type {type(table).__name__} has no names of columns: give a path, a structured array, a "
             "DataFrame or a dict of columns."
         )
-    names = list(names)
-    columns = [list(_values(table[name])) for name in names]
+    columns = list[list[Any]]()
+    for name in names:  # as Python's own types, where they can be given so
+        as_list = getattr(table[name], "tolist", None) or getattr(table[name], "to_list", None)
+        columns.append(list(as_list() if as_list else table[name]))
     lengths = {len(column) for column in columns}
     if len(lengths) > 1:
         raise InputError(f"the columns of the table have different lengths ({sorted(lengths)}): give one row a dwell.")
     rows, delimiter = _texts(list(zip(*columns, strict=True)))
     return _padded("the table", TextHeading(list(map(str, names)), delimiter, 0, rows, numbers=range(len(rows))))
-
-
-def _values(column: Any) -> Iterable[Any]:
-    """Return the values of a column as Python's own types, where it can give them."""
-    as_list = getattr(column, "tolist", None) or getattr(column, "to_list", None)
-    return as_list() if as_list else column
 
 
 def _texts(rows: Sequence[Sequence[Any]]) -> tuple[list[list[str]], str]:
@@ -138,7 +129,7 @@ def _cell(value: Any, decimal: str) -> str:
     return str(value).strip() if number is None else repr(number).removesuffix(".0").replace(".", decimal)
 
 
-def _padded(name: str, heading: TextHeading) -> Grid:
+def _padded(name: str, heading: TextHeading, remarks: tuple[str, ...] = (), path: Path | None = None) -> Grid:
     """Return the grid of a heading with all rows, which have as many cells as the header then; cells are cut to a
     bounded length, as they are looked at in many ways."""
     width, rows = len(heading.header), heading.rows
@@ -156,4 +147,4 @@ def _padded(name: str, heading: TextHeading) -> Grid:
     if not rows:
         raise InputError(f"{name}: has a header and no rows: write a row for each orientation.")
     full = [[*(cut(cell, _LONGEST_CELL) for cell in cells), *[""] * (width - len(cells))] for cells in rows]
-    return Grid(name, heading._replace(rows=full))
+    return Grid(name, heading._replace(rows=full), remarks, path)

@@ -1,4 +1,7 @@
-"""The heading of a text: comments and titles, what is between cells, the names of the columns, perhaps their units."""
+"""The heading of a text: comments and titles, what is between cells, the names of the columns, perhaps their units.
+
+In lines as on a serial port each value has its name before it: ``aX: -0.06, aY: 0.00, aZ: 8.44``.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +10,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from kf_calib.sources.text.labels import Labels
-from kf_calib.sources.text.names import face_of, is_unit
+from kf_calib.sources.text.names import NAMELESS, face_of, is_unit, meanings_of
 
 _DELIMITERS = ";\t,|"
 BLANK = " "
@@ -20,8 +22,46 @@ _ROWS = 1000  # that are looked at
 _MARK = re.compile(r"\s*(?:#|%|//)+\s*")
 """Before a comment, or before names."""
 _NUMBER = re.compile(r"[+\-−]?[\d.,]*\d[\d.,]*(?:[eE][+\-]?\d+)?|[+\-]?nan", re.IGNORECASE)
-NAMELESS = "column {}"
-"""The name of a column of a text without a heading, counted from 1."""
+_BLANK_CELL = re.compile(r'"[^"]*"|\S+')
+_LABELLED = re.compile(
+    r"(?<!\w)([^\W\d][^:=,;|\t\"{}]{0,40}?)\s*[:=]\s*([+\-−]?\d[\d.]*(?:[eE][+\-]?\d+)?|[+\-−]?\.\d+)"
+    r"(?:\s*((?:[^\s\d:=,;|][^\s:=,;|]*)(?=[\s,;|]|$)(?!\s*[:=])))?"
+)
+_FEWEST_LABELS, _LONGEST_LABELLED = 3, 1000
+
+
+class Labels(NamedTuple):
+    """The names in each line that has readings, and with their units those of the columns that they make."""
+
+    names: tuple[str, ...]
+    header: list[str]
+
+    @classmethod
+    def of(cls, lines: Sequence[str]) -> Labels | None:
+        """The labels of lines, of which those count that name an accelerometer; None where none do."""
+        seen = set[tuple[str, ...]]()
+        for line in lines[:_ROWS]:
+            parts = _LABELLED.findall(line) if (":" in line or "=" in line) and len(line) < _LONGEST_LABELLED else []
+            names = tuple(name for name, *_ in parts)
+            if len(parts) < _FEWEST_LABELS or names in seen:
+                continue
+            seen.add(names)
+            last = parts[-1][2] if is_unit(parts[-1][2]) else ""
+            units = [own if is_unit(own) else last for *_, own in parts]
+            header = [f"{name} [{unit}]" if unit else name for name, unit in zip(names, units, strict=True)]
+            if {own.ours for own in meanings_of(header, {})} >= {"ax", "ay", "az"}:
+                return cls(names, header)
+        return None
+
+    def spans(self, line: str) -> list[tuple[int, int]]:
+        """Where the values stand in a line; none where it has other labels."""
+        labelled = list(_LABELLED.finditer(line)) if len(line) < _LONGEST_LABELLED else []
+        names = tuple(match[1] for match in labelled)
+        return [match.span(2) for match in labelled] if names == self.names else []
+
+    def values(self, line: str) -> list[str]:
+        """The values in a line; none where it has other labels."""
+        return [line[start:end] for start, end in self.spans(line)]
 
 
 class TextHeading(NamedTuple):
@@ -48,7 +88,7 @@ class TextHeading(NamedTuple):
         """
         if labels := Labels.of(lines):
             return cls._of_labelled(lines if is_whole else lines[: 2 * _ROWS], labels, is_whole)
-        delimiter, start = delimiter_in(lines[:_ROWS])
+        delimiter, start = _delimiter_in(lines[:_ROWS])
         if is_whole:
             reader = csv.reader(lines[start:], delimiter=delimiter, skipinitialspace=True)
             cells = [(start + reader.line_num - 1, [cell.strip() for cell in row]) for row in reader]
@@ -61,8 +101,8 @@ class TextHeading(NamedTuple):
     def of_cells(cls, cells: Sequence[tuple[int, list[str]]], delimiter: str) -> TextHeading:
         """The heading of cells with the number of the line of each."""
         filled = [own for own in cells if any(own[1])]
-        header, begin, named = header_in([own for _, own in filled]) if filled else ([], 0, ())
-        rows = [(k, without_empty_end(own, len(header))) for k, own in filled[begin:] if not is_comment(own)]
+        header, begin, named = _header_in([own for _, own in filled]) if filled else ([], 0, ())
+        rows = [(k, without_empty_end(own, len(header))) for k, own in filled[begin:] if not _is_comment(own)]
         behind = filled[begin][0] if begin < len(filled) else cells[-1][0] + 1 if cells else 0
         names = tuple(filled[k][0] for k in named)
         return cls(header, delimiter, behind, [own for _, own in rows], names, numbers=[k for k, _ in rows])
@@ -83,94 +123,83 @@ class TextHeading(NamedTuple):
         return cls(header, ",", rows[0][0], cells, labels=labels, numbers=[number for number, _ in rows])
 
     def spans(self, line: str) -> list[tuple[int, int]]:
-        """Where the cells of a line stand, those of columns that it does not have at its beginning."""
-        if self.labels is None:
-            return cell_spans(line, self.delimiter)
-        lacking = len(self.header) - len(self.labels.names)  # of a face that stands in a line of its own
-        return [(0, 0)] * lacking + self.labels.spans(line)
+        """Where the cells of a line stand, with their quotes and without blanks around them, those of columns that it
+        does not have at its beginning; the mark of a comment in a cell of its own is none."""
+        if self.labels is not None:
+            lacking = len(self.header) - len(self.labels.names)  # of a face that stands in a line of its own
+            return [(0, 0)] * lacking + self.labels.spans(line)
+        if self.delimiter == BLANK:
+            spans = [match.span() for match in _BLANK_CELL.finditer(line)]
+            is_mark = bool(spans) and not line[slice(*spans[0])].strip("#%/")
+            return spans[1:] if is_mark and _MARK.match(line) else spans
+        mark = re.escape(self.delimiter)  # which a quoted cell may hold; a quote left open ends with the line
+        cell = rf'(?:^|{mark})((?:"(?:[^"]|"")*+"?)?[^{mark}]*)'
+        cells = [(match[1], *match.span(1)) for match in re.finditer(cell, line)]
+        return [
+            (start + len(cell) - len(cell.lstrip()), end - len(cell) + len(cell.rstrip())) for cell, start, end in cells
+        ]
 
 
-def delimiter_in(lines: Sequence[str]) -> tuple[str, int]:
-    """What is between the cells of lines, and how many lines state it (``sep=;``: one)."""
+def _delimiter_in(lines: Sequence[str]) -> tuple[str, int]:
+    """Return what is between the cells of lines, and how many lines state it (``sep=;``: one): the delimiter with which
+    the most of them have the same number of cells, two or more."""
     first = lines[0].lstrip("\ufeff").strip() if lines else ""
     if first.lower().startswith("sep=") and len(first) == 5:
         return first[-1], 1
-    plain = [line for line in lines if line.strip()]
-    return _delimiter_of([line for line in plain if not _MARK.match(line)] or plain), 0
-
-
-def _delimiter_of(lines: Sequence[str]) -> str:
-    """Return the delimiter with which the most of some lines have the same number of cells, two or more."""
+    filled = [line for line in lines if line.strip()]
+    told = [line for line in filled if not _MARK.match(line)] or filled
 
     def fitness(delimiter: str) -> int:
-        widths = [len(cells_of(line, delimiter)) for line in lines[:_TELLING]]
+        widths = [len(cells_of(line, delimiter)) for line in told[:_TELLING]]
         return max((widths.count(width) for width in set(widths) - {0, 1}), default=0)
 
     best = max(_DELIMITERS, key=fitness)
-    return best if fitness(best) or fitness(BLANK) < 2 else BLANK
+    return best if fitness(best) or fitness(BLANK) < 2 else BLANK, 0
 
 
-def header_in(rows: Sequence[Sequence[str]]) -> tuple[list[str], int, tuple[int, ...]]:
-    """The names of the columns, the place of the first row of values, and those of names and units.
+def _header_in(rows: Sequence[Sequence[str]]) -> tuple[list[str], int, tuple[int, ...]]:
+    """Return the names of the columns, the place of the first row of values, and those of names and units.
 
-    rows: cells of lines. Comments and titles are passed over. The names are the first line of three cells or more, or,
-    where that holds numbers, the comment before it that has as many; where there is none, columns have numbers.
+    rows: cells of lines that have any. Comments and titles are passed over. The names are the first line of three cells
+    or more, or, where that holds numbers, the comment before it that has as many; where there is none, columns have
+    numbers.
     """
-    at = next((k for k, row in enumerate(rows) if _filled(row) >= _FEWEST_CELLS and not is_comment(row)), None)
+    at = next((k for k, row in enumerate(rows) if sum(map(bool, row)) >= _FEWEST_CELLS and not _is_comment(row)), None)
     if at is None:  # whatever it is, it is told by its first line
-        at = next((k for k, row in enumerate(rows) if _filled(row)), 0)
-        return _names(rows[at]), at + 1, (at,)
+        return _names(rows[0]), 1, (0,)
     first = _names(rows[at])
-    if are_values(first):
-        above = next((k for k in range(at - 1, -1, -1) if _filled(rows[k])), None)
-        names = _uncommented(rows[above]) if above is not None and is_comment(rows[above]) else []
-        if above is None or len(names) != len(first) or are_values(names):
+    if _are_values(first):
+        above = _names(rows[at - 1]) if at and _is_comment(rows[at - 1]) else [""]
+        name = _MARK.sub("", above[0], count=1)
+        names = [name] * bool(name) + above[1:]  # the mark may stand in a cell of its own
+        if len(names) != len(first) or _are_values(names):
             return [NAMELESS.format(k + 1) for k in range(len(first))], at, ()
-        return names, at, (above,)
-    if at + 1 < len(rows) and _are_units(rows[at + 1]):
-        units = [*rows[at + 1], *[""] * len(first)]
-        named = [f"{name} [{unit}]" if unit else name for name, unit in zip(first, units, strict=False)]
-        return named, at + 2, (at, at + 1)
+        return names, at, (at - 1,)
+    units = _names(rows[at + 1]) if at + 1 < len(rows) else []
+    if any(map(str.isalpha, "".join(units))) and all(not text or is_unit(text) for text in units):
+        padded = zip(first, [*units, *[""] * len(first)], strict=False)
+        return [f"{name} [{unit}]" if unit else name for name, unit in padded], at + 2, (at, at + 1)
     return first, at + 1, (at,)
 
 
-def are_values(cells: Sequence[str]) -> bool:
-    """Whether cells are the values of a row and no names: most are numbers. Those that count from 0 or 1 on are names,
-    as libraries give them to columns without any."""
+def _are_values(cells: Sequence[str]) -> bool:
+    """Return whether cells are the values of a row and no names: most are numbers. Those that count from 0 or 1 on are
+    names, as libraries give them to columns without any."""
     filled = [cell for cell in cells if cell]
     numbers = [cell for cell in filled if _NUMBER.fullmatch(cell)]
     are_counted = any(numbers == [str(k + first) for k in range(len(numbers))] for first in (0, 1))
     return 2 * len(numbers) > len(filled) and not are_counted
 
 
-def _filled(row: Sequence[str]) -> int:
-    return sum(map(bool, row))
-
-
 def _names(row: Sequence[str]) -> list[str]:
     """Return the names in a row without the empty cells at its end, as of a delimiter at the end of the line."""
-    texts = list(row)
-    while texts and not texts[-1]:
-        texts.pop()
-    return texts
+    last = max((k for k, text in enumerate(row) if text), default=-1)
+    return list(row[: last + 1])
 
 
-def is_comment(row: Sequence[str]) -> bool:
-    """Whether the cells of a line begin with the mark of a comment."""
+def _is_comment(row: Sequence[str]) -> bool:
+    """Return whether the cells of a line begin with the mark of a comment."""
     return bool(row) and _MARK.match(row[0]) is not None
-
-
-def _uncommented(row: Sequence[str]) -> list[str]:
-    """Return the names in a comment; its mark may stand in a cell of its own."""
-    first, *others = _names(row)
-    mark = _MARK.match(first)
-    first = first[mark.end() :] if mark else first
-    return [first, *others] if first else others
-
-
-def _are_units(row: Sequence[str]) -> bool:
-    texts = _names(row)
-    return any(map(str.isalpha, "".join(texts))) and all(not text or is_unit(text) for text in texts)
 
 
 def without_empty_end(row: list[str], count: int) -> list[str]:
@@ -189,40 +218,9 @@ def cells_of(line: str, delimiter: str) -> list[str]:
     return [cell.strip() for cell in cells]
 
 
-def cell_spans(line: str, delimiter: str) -> list[tuple[int, int]]:
-    """Where the cells of a line stand, with their quotes and without blanks around them; the mark of a comment in a
-    cell of its own is none."""
-    if delimiter == BLANK:
-        spans = [match.span() for match in re.finditer(r'"[^"]*"|\S+', line)]
-        return spans[1:] if spans and _is_mark(line[slice(*spans[0])]) else spans
-    spans, at = list[tuple[int, int]](), 0
-    while True:
-        end = _quote_end(line, at) if line[at : at + 1] == '"' else at
-        end = line.find(delimiter, end)
-        end = len(line) if end < 0 else end
-        cell = line[at:end]
-        spans.append((at + len(cell) - len(cell.lstrip()), end - len(cell) + len(cell.rstrip())))
-        if end == len(line):
-            return spans
-        at = end + 1
-
-
 def with_texts(line: str, spans: Sequence[tuple[int, int]], texts: Mapping[int, str]) -> str:
     """A line with other texts in cells, by where these stand, and all else in it as it is."""
     for at in sorted(texts, reverse=True):
         start, end = spans[at]
         line = line[:start] + texts[at] + line[end:]
     return line
-
-
-def _is_mark(cell: str) -> bool:
-    return is_comment([cell]) and not cell.strip("#%/")
-
-
-def _quote_end(line: str, at: int) -> int:
-    """The place behind the quote that ends what the one at ``at`` begins; the end of the line where none does."""
-    while (at := line.find('"', at + 1)) >= 0:
-        if line[at + 1 : at + 2] != '"':
-            return at + 1
-        at += 1
-    return len(line)

@@ -11,24 +11,22 @@ from typing import Any
 
 from kf_calib.bench.bench import metadata_of
 from kf_calib.bench.raw_input import UNITS, parse_unit
-from kf_calib.sources.text.numbers import LineError, number_of, written
-from kf_calib.sources.text.reader import Account, LineReader, LineRows
-from kf_calib.sources.text.stamps import stamp_ns
+from kf_calib.sources.text.cells import LineError, number_of, stamp_ns, written
+from kf_calib.sources.text.reader import Account, LineReader, SampleRow
 from kf_calib.support.units import WORDS
 
 _MARK = "\ufeff"  # some write it before the first line
-_TIME_DECIMALS = {"time_ns": 0, "time_us": 3, "time_ms": 6, "time_s": 9}
-"""Names of the stamp, and how many decimals its unit has in nanoseconds."""
+_TIME_NS = {"time_ns": 1, "time_us": 10**3, "time_ms": 10**6, "time_s": 10**9}
+"""Names of the stamp, and its unit."""
 _ACCEL = {f"accel_{unit}": WORDS["m/s^2"][unit] for unit in ("mps2", "g", "mg")}
-_BARE = ("accel", "accel_counts", "accel_raw")
-"""Readings whose name tells no unit: options state it."""
+_READINGS = (*_ACCEL, "accel", "accel_counts", "accel_raw")
+"""The names of the last three tell no unit: options state it."""
 _ANGLES = {"angles_rad": 1.0, "angles_deg": math.pi / 180.0}
 _ATTITUDE = "attitude_xyzw"
 POSE_KEYS = (*_ANGLES, _ATTITUDE)
 """Under which a line of JSON has an orientation."""
 _TEMPERATURE = "temperature_c"
-_KNOWN = frozenset([*_TIME_DECIMALS, *_ACCEL, *_BARE, *_ANGLES, _ATTITUDE, _TEMPERATURE])
-
+_KNOWN = frozenset([*_TIME_NS, *_READINGS, *POSE_KEYS, _TEMPERATURE])
 
 _value_at = json.JSONDecoder().raw_decode
 _decode_exactly = json.JSONDecoder(parse_float=Decimal).decode
@@ -39,33 +37,28 @@ _find_tiny = re.compile(r"[0-9][eE]-[0-9]{3}").search  # a number as small as th
 class JsonLines(LineReader):
     """Reads JSON lines block by block.
 
-    ``columns`` renames foreign keys. ``metadata`` is the first line's ``{"bench": ...}`` as strings. The first pose
-    settles whether poses are angles (``has_angles``) and how many (``pose_width``, 0 until then); the first readings
-    settle the unit that all are brought to.
+    columns: our names of foreign keys; angles: whether poses count. ``metadata`` is the first line's ``{"bench": ...}``
+    as strings. The first pose settles whether poses are angles and how many; the first readings settle the unit that
+    all are brought to.
     """
 
-    _wrong = "it is not JSON"
+    wrong = "it is not JSON"
+    advice = "name the readings accel_mps2 or accel_g, and the poses angles_rad, angles_deg or attitude_xyzw"
 
-    def __init__(self, columns: Mapping[str, str], account: Account) -> None:
+    def __init__(self, columns: Mapping[str, str], account: Account, angles: bool = True) -> None:
         super().__init__(account)
-        self._columns = columns
-        self._is_first = True
-
-    @property
-    def advice(self) -> str:
-        """How readings and poses have to be named."""
-        return "name the readings accel_mps2 or accel_g, and the poses angles_rad, angles_deg or attitude_xyzw"
+        self._columns, self._is_first, self.wants_pose = columns, True, angles
 
     def with_readings(self, line: str, readings_mps2: Sequence[float]) -> str:
         entry = json.loads(line.lstrip(_MARK))
-        names = {self._columns.get(key, key): key for key in entry}
-        name = next(each for each in (*_ACCEL, *_BARE) if each in names and entry[names[each]] is not None)
+        theirs = {self._columns.get(key, key): key for key in entry}
+        name = _first_of({ours: entry[key] for ours, key in theirs.items()}, _READINGS)
         values = json.dumps([written(value / _ACCEL.get(name, 1.0)) for value in readings_mps2])
-        (key_start, key_end), (start, end) = _spans(line)[names[name]]
+        (key_start, key_end), (start, end) = _spans(line)[theirs[name]]
         key = line[key_start:key_end] if name in _ACCEL else '"accel_mps2"'
         return line[:key_start] + key + line[key_end:start] + values + line[end:]
 
-    def _read_line(self, line: str, accel: LineRows, pose: LineRows, temperature: LineRows) -> None:
+    def _row(self, line: str) -> SampleRow | None:
         line = line.lstrip(_MARK) if self._is_first else line
         if not line.lstrip().startswith("{"):  # found out at a tenth of the cost, where a link brings much of it
             raise LineError("it is not a JSON object")
@@ -74,24 +67,20 @@ class JsonLines(LineReader):
         if self._columns:
             entry = {self._columns.get(key, key): value for key, value in entry.items()}
         if self._takes_bench(entry):
-            return
-        time_ns = self._time_ns(entry, line)
-        # everything on the line is understood before any of it is used
-        readings = self._readings(entry)
-        attitude, has_angles = self._pose(entry)
-        degrees = _numbers([entry[_TEMPERATURE]], _TEMPERATURE) if entry.get(_TEMPERATURE) is not None else None
-        if attitude and not self.pose_width:
-            self.pose_width, self.has_angles = len(attitude), has_angles
-        accel.add(time_ns, readings)
-        pose.add(time_ns, attitude)
-        temperature.add(time_ns, degrees)
+            return None
+        time_ns, readings, pose = self._time_ns(entry, line), self._readings(entry), self._pose(entry)
+        is_warm = entry.get(_TEMPERATURE) is not None
+        degrees = _numbers([entry[_TEMPERATURE]], _TEMPERATURE) if is_warm else None
+        if pose and not self.pose_width:  # all on the line is understood before any of it is used
+            self.pose_width, self.has_angles = len(pose), _first_of(entry, POSE_KEYS) != _ATTITUDE
         if not entry.keys() <= _KNOWN:
             self._account.leave_out(key for key in entry if key not in _KNOWN)
+        return time_ns, readings, pose, degrees
 
     def _takes_bench(self, entry: dict[str, Any]) -> bool:
         """Whether the line describes the bench: the first one is kept, and no other may contradict it."""
         is_first, self._is_first = self._is_first, False
-        if "bench" not in entry or not (is_first or _TIME_DECIMALS.keys().isdisjoint(entry)):
+        if "bench" not in entry or not (is_first or _TIME_NS.keys().isdisjoint(entry)):
             return False
         bench = entry["bench"]
         if not isinstance(bench, dict):
@@ -108,7 +97,7 @@ class JsonLines(LineReader):
         return True
 
     def _time_ns(self, entry: dict[str, Any], line: str) -> int:
-        name = next((name for name in _TIME_DECIMALS if name in entry), None)
+        name = next((name for name in _TIME_NS if name in entry), None)
         if name is None:
             raise LineError("it has no time stamp (time_ns or time_s)")
         number = entry[name]
@@ -117,16 +106,14 @@ class JsonLines(LineReader):
             number = next(value for key, value in exact.items() if self._columns.get(key, key) == name)
         if type(number) not in (int, Decimal):
             raise LineError(f"{name} is not a number")
-        return stamp_ns(number, _TIME_DECIMALS[name])
+        return stamp_ns(number, _TIME_NS[name])
 
     def _readings(self, entry: dict[str, Any]) -> list[float] | None:
-        name = next((name for name in (*_ACCEL, *_BARE) if entry.get(name) is not None), None)
-        if name is None:
+        if not (name := _first_of(entry, _READINGS)):
             return None
-        values = _numbers(entry[name], name)
+        values, is_bare = _numbers(entry[name], name), name not in _ACCEL
         if len(values) != 3:
             raise LineError(f"{name} has {len(values)} numbers, not 3")
-        is_bare = name in _BARE
         if self.unit is None and not self.is_bare:
             self.unit, self.is_bare = (None if is_bare else parse_unit(name.removeprefix("accel_"))), is_bare
         if is_bare != self.is_bare:
@@ -134,11 +121,9 @@ class JsonLines(LineReader):
         factor = 1.0 if self.unit is None else _ACCEL[name] / UNITS[self.unit]
         return values if factor == 1.0 else [factor * value for value in values]
 
-    def _pose(self, entry: dict[str, Any]) -> tuple[list[float] | None, bool]:
-        """The pose, if any, and whether it is made of angles."""
-        name = next((name for name in POSE_KEYS if entry.get(name) is not None), None)
-        if name is None:
-            return None, True
+    def _pose(self, entry: dict[str, Any]) -> list[float] | None:
+        if not (name := _first_of(entry, POSE_KEYS)):
+            return None
         values, has_angles = _numbers(entry[name], name), name != _ATTITUDE
         if not has_angles and (len(values) != 4 or not any(values)):
             raise LineError(f"{name} is not a quaternion")
@@ -146,8 +131,12 @@ class JsonLines(LineReader):
             raise LineError(f"{name} is empty")
         if self.pose_width and (len(values), has_angles) != (self.pose_width, self.has_angles):
             raise LineError(f"{name} is not like the poses before it")
-        factor = _ANGLES.get(name, 1.0)
-        return [factor * value for value in values], has_angles
+        return [_ANGLES.get(name, 1.0) * value for value in values]
+
+
+def _first_of(entry: Mapping[str, Any], names: Sequence[str]) -> str:
+    """Return the first of these names under which there is anything; empty where there is none."""
+    return next((name for name in names if entry.get(name) is not None), "")
 
 
 def _spans(line: str) -> dict[str, tuple[tuple[int, int], tuple[int, int]]]:
@@ -173,13 +162,12 @@ def _numbers(values: Any, name: str) -> list[float]:
     """Finite numbers; true, "1", NaN and 1e999 are none."""
     if type(values) is not list:
         raise LineError(f"{name} is not a list of numbers")
-    for value in values:
-        if type(value) is not float and type(value) is not int:
-            raise LineError(f"{name} holds what is not a number")
+    if not all(type(value) is float or type(value) is int for value in values):
+        raise LineError(f"{name} holds what is not a number")
     try:
         numbers = [float(value) for value in values]
     except OverflowError:
-        raise LineError(f"{name} is out of range") from None
+        numbers = [math.inf]
     if not all(map(math.isfinite, numbers)):
         raise LineError(f"{name} is out of range")
     return numbers

@@ -9,12 +9,10 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, BinaryIO, Protocol
+from typing import BinaryIO
 
 import numpy as np
 
@@ -22,16 +20,15 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.counts import refuse_unread
 from kf_calib.bench.keys import UNSTATED, BenchKeys
-from kf_calib.bench.raw_input import CONVERTED, PLAIN, RESTATE, RawInput, merged_metadata
 from kf_calib.bench.streams import Batch, bench_without_angles, with_accel, without_poses
-from kf_calib.errors import BenchError, InputError
+from kf_calib.errors import InputError
 from kf_calib.sources.files.fields import as_columns
 from kf_calib.sources.text.columns import HOW, Columns, refuse_unknown_names
 from kf_calib.sources.text.csv_lines import CsvLines
-from kf_calib.sources.text.encoding import Cutter, TextFile, head_of, holds_any
+from kf_calib.sources.text.encoding import Cutter, TextFile, holds_any
 from kf_calib.sources.text.heading import TextHeading
 from kf_calib.sources.text.json_lines import POSE_KEYS, JsonLines
-from kf_calib.sources.text.reader import Account, LineReader, named
+from kf_calib.sources.text.reader import Account, Described, LineReader, first_line, is_json, named
 from kf_calib.sources.text.units import Units
 
 _BLOCK_BYTES = 1 << 18
@@ -67,8 +64,8 @@ class Lines:
         self._said, self._overrides, self._stated = list[str](), overrides, columns
         self._columns = {**as_columns(overrides.get("joints", "")), **columns}
         self._units = units or Units.of(overrides)
-        self._are_lacking = angles is None and self.path is not None and not self._has_orientations(self.path)
-        self._angles = angles is not False and not self._are_lacking
+        self._angles = True if angles is None and not self.path else angles
+        self._wants_pose = True
         self._begin_ns: int | None = None
         self._bench: Bench | None = None
         self._waiting: _Passage | None = None  # begun to learn of the bench, not yet iterated
@@ -79,19 +76,21 @@ class Lines:
         """The bench; a stream is read for it up to the first pose, which shows how the platform is described."""
         if self._bench is None:
             passage = self._begin()
-            with passage.closed_on_failure():
-                self._bench = self._describe_bench(passage)
-            if self.path:  # it is read from its beginning again, if it is
-                passage.close()
+            passage.close()  # a file is read from its beginning again, if it is
+            reader, default = passage.parser, self._units.input
+            if reader.wants_pose:
+                self._bench = reader.bench(self.name, self._overrides, default)
             else:
-                self._waiting = passage
+                stated = reader.stated(self.name, self._overrides, default)
+                lacking = self._angles is None
+                self._bench, self._said = bench_without_angles(self.name, stated, are_lacking=lacking)
+            self._wants_pose, self._waiting = reader.wants_pose, None if self.path else passage
         return self._bench
 
     @property
     def warnings(self) -> list[str]:
-        if self._latest is None:
-            return self._said
-        return [*self._said, *(f"{self.name}: {sentence}" for sentence in self._latest.sentences())]
+        told = self._latest.sentences() if self._latest else []
+        return [*self._said, *(f"{self.name}: {sentence}" for sentence in told)]
 
     @property
     def fraction(self) -> float:
@@ -100,9 +99,10 @@ class Lines:
     def __iter__(self) -> Iterator[Batch]:
         readings = self.bench.input.readings  # here, so that a bench that cannot be used is told first
         converted = (with_accel(batch, readings(batch.accel.values)) for batch in self.batches())
-        yield from converted if self._angles else map(without_poses, converted)
+        yield from converted if self._wants_pose else map(without_poses, converted)
         if self.path and self._latest:
-            refuse_unread(self._latest.sample(), self.bench.input.counts, self.name)
+            sampled = np.concatenate([np.zeros((0, 3)), *self._latest.sampled])
+            refuse_unread(sampled, self.bench.input.counts, self.name)
 
     def batches(self) -> Iterator[Batch]:
         """What the lines hold, whatever the bench may be: raw readings."""
@@ -125,200 +125,80 @@ class Lines:
         return self._latest.parser if self._latest else None
 
     def _begin(self) -> _Passage:
+        stream, self._stream = self._stream, None
         try:
-            if self.path:
-                stream: BinaryIO | TextFile = TextFile(self.path, self._units.dataset)
-            elif self._stream is not None:
-                stream, self._stream = self._stream, None
-            else:
-                raise InputError(f"{self.name} can be read only once: record it to a file to read it again.")
+            stream = TextFile(self.path, self._units.dataset) if self.path else stream
         except OSError as error:
             raise InputError(f"{self.name}: cannot be read ({error.strerror}).") from None
-        self._latest = _Passage(self.name, stream, self._open_reader, self._angles)
-        with self._latest.closed_on_failure():
-            self._latest.survey()
+        if stream is None:
+            raise InputError(f"{self.name} can be read only once: record it to a file to read it again.")
+        self._latest = _Passage(self.name, stream)
+        try:
+            self._latest.survey(self._open_reader)
+        except BaseException:
+            self._latest.close()
+            raise
         return self._latest
 
     def _open_reader(self, lines: Sequence[str], account: Account) -> tuple[LineReader, int]:
-        if self._stated and not is_json(lines[0]):
-            refuse_unknown_names(self._stated, TextHeading.of(lines).header)
-        return reader_for(lines, self._columns, account, angles=self._angles, units=self._units)
-
-    def _has_orientations(self, path: Path) -> bool:
-        """Whether a log may tell them: its columns may be angles or an attitude, or a key of JSON names these; also of
-        one that cannot be read, which is said elsewhere."""
-        try:
-            lines = head_of(path, self._units.dataset).decode(errors="replace").splitlines()
-            first = next((line for line in lines if line.strip("\ufeff \t")), "{")
-            if is_json(first):
+        angles = self._angles
+        if is_json(lines[0]):
+            if angles is None and self.path:
                 theirs = [name for name, ours in self._columns.items() if ours in POSE_KEYS]
-                return holds_any(path, [f'"{name}"'.encode() for name in (*POSE_KEYS, *theirs)])
-            return bool(Columns.of(TextHeading.of(lines), self._columns).orientation)
-        except (OSError, InputError):
-            return True
-
-    def _describe_bench(self, passage: _Passage) -> Bench:
-        default = self._units.input
-        if self._angles:
-            return bench_of(self.name, passage.parser, self._overrides, default)
-        stated = stated_of(self.name, passage.parser, self._overrides, default)
-        bench, self._said = bench_without_angles(self.name, stated, are_lacking=self._are_lacking)
-        return bench
-
-
-class Described(Protocol):
-    """What has been learnt of the bench from what it sent."""
-
-    metadata: dict[str, str]
-    has_angles: bool
-    pose_width: int
-    raw: RawInput | None
-    unit: str | None
-    is_bare: bool
-
-
-def stated_of(name: str, reader: Described, overrides: BenchKeys, default: RawInput | None = None) -> dict[str, Any]:
-    """The bench keys that what came, options and the names of the readings state; default: the raw input where neither
-    what came nor options state one.
-
-    Raises BenchError where they contradict each other, or no unit is stated.
-    """
-    by_name = {} if reader.unit is None else {"accel_unit": reader.unit}
-    if reader.raw is not None:
-        by_name = {"accel_scale": reader.raw.scale, "accel_unit": reader.raw.unit}
-    elif default is not None and default.sizes == PLAIN.sizes and reader.unit is not None:
-        default = replace(default, unit=reader.unit)  # a unit, which the names state anew
-    with named(name):
-        stated = merged_metadata(reader.metadata, overrides, "the first line", default)
-        now = RawInput.from_metadata(stated)
-        if CONVERTED in stated:
-            raise BenchError(f"lines hold what the device sends: leave out {CONVERTED} in the bench's keys.")
-        if reader.unit is not None and "accel_unit" in stated and now.unit != reader.unit and RESTATE not in overrides:
-            raise BenchError(
-                f"the readings are in {reader.unit} by their names, and stated is {now.unit_words}: rename them by "
-                "--column, or where their names are wrong, give --accel-unit and --restate-input."
-            )
-        if reader.is_bare and not {"accel_unit", "accel_scale"} & set(stated):
-            raise BenchError(
-                "the names of the readings do not tell their unit: name them accel_mps2 (or accel_g ...), or give it "
-                "by --accel-unit, and the size of counts by --accel-scale."
-            )
-    return stated | by_name if reader.raw is not None else by_name | stated
-
-
-def bench_of(name: str, reader: Described, overrides: BenchKeys, default: RawInput | None = None) -> Bench:
-    """The bench, once a pose has been read. Raises InputError where it cannot be that one."""
-    stated = stated_of(name, reader, overrides, default)
-    with named(name):
-        bench = Bench.from_metadata(stated, reader.has_angles)
-        if bench.pose_width != reader.pose_width:
-            raise InputError(
-                f"poses have {reader.pose_width} angles and the bench has {bench.pose_width} axes: state as many axes "
-                'as there are angles, outer first, for example --axes "y z x".'
-            )
-        return bench
+                angles = holds_any(self.path, [f'"{name}"'.encode() for name in (*POSE_KEYS, *theirs)])
+        elif self._stated:
+            refuse_unknown_names(self._stated, TextHeading.of(lines).header)
+        return reader_for(lines, self._columns, account, angles=angles, units=self._units)
 
 
 def reader_for(
-    lines: Sequence[str],
-    columns: Mapping[str, str],
-    account: Account,
-    *,
-    angles: bool = True,
-    units: Units | None = None,
+    lines: Sequence[str], columns: Mapping[str, str], account: Account, *, angles: bool | None, units: Units
 ) -> tuple[LineReader, int]:
     """The reader that the first lines ask for, and how many of these are its heading.
 
-    lines: the first of them is not empty. angles: whether a pose is wanted. Raises InputError for a header that does
-    not say what is needed.
+    lines: the first of them is not empty. angles: whether a pose is wanted; None: where a header has one. Raises
+    InputError for a header that does not say what is needed.
     """
     if is_json(lines[0]):
-        return JsonLines(columns, account), 0
+        return JsonLines(columns, account, angles is not False), 0
     heading = TextHeading.of(lines)
-    return CsvLines(Columns.of(heading, columns, units), account, angles), heading.lines
-
-
-def is_json(first: str) -> bool:
-    """Whether the first line that is not empty begins JSON lines."""
-    return first.lstrip("\ufeff \t")[:1] in ("{", "[")
+    return CsvLines(Columns(heading, columns, units), account, angles), heading.lines
 
 
 class _Passage:
-    """One reading of the lines, from the first to the last; iterated once."""
+    """One reading of the lines, from the first to the last; iterated once.
+
+    sampled: some of the readings (n, 3) as they stand in the lines.
+    """
 
     parser: LineReader
 
-    def __init__(self, name: str, stream: BinaryIO | TextFile, open_reader: OpenReader, angles: bool) -> None:
-        self.account, self._angles = Account(), angles
-        self._name, self._stream, self._open_reader = name, stream, open_reader
+    def __init__(self, name: str, stream: BinaryIO | TextFile) -> None:
+        self.account, self._name, self._stream = Account(), name, stream
         self._file = stream if isinstance(stream, TextFile) else None
         self.fraction = 0.0 if self._file else math.nan
-        self._blocks = self._split(stream)
-        self._ahead, self._said = list[Batch](), list[str]()
+        self._blocks, self._ahead, self._said = self._split(), list[Batch](), list[str]()
         self._has_accel = self._has_pose = False
-        self._sampled = deque[Floats](maxlen=_BLOCKS_SAMPLED)
+        self.sampled = deque[Floats](maxlen=_BLOCKS_SAMPLED)
 
     def sentences(self) -> list[str]:
         """What was taken for what, where that is not plain, and what was not used."""
-        told = f"{'; '.join(self._said)}. {HOW}." if self._said else ""
-        trouble = self._file.trouble if self._file else ""
-        chosen = [f"{said}." for said in (self._file.said if self._file else ())]
-        return chosen + [sentence for sentence in (told, trouble) if sentence] + self.account.sentences()
-
-    @contextmanager
-    def closed_on_failure(self) -> Iterator[None]:
-        """Closes a file opened here where what is done within fails."""
-        try:
-            yield
-        except BaseException:
-            self.close()
-            raise
+        chosen, trouble = (self._file.said, self._file.trouble) if self._file else ((), "")
+        told = [f"{'; '.join(self._said)}. {HOW}."] if self._said else []
+        return [*(f"{said}." for said in chosen), *told, *([trouble] if trouble else []), *self.account.sentences()]
 
     def close(self) -> None:
         """Closes a file opened here."""
         if self._file:
             self._file.close()
 
-    def survey(self) -> None:
-        """Reads up to the first readings and pose, if there must be one, and keeps what it has read."""
-        self._open_parser()
-        while lacking := self._lacking:
-            batch = self._next_batch()
-            if batch is None or self.account.lines > _SURVEY_LINES:
-                raise self._unusable(lacking)
-            self._ahead.append(batch)
-
-    @property
-    def _lacking(self) -> str:
-        """What has not come yet of that by which the bench is described; nothing where all has."""
-        if self._angles and not self.parser.pose_width:
-            return "platform angles"
-        return "" if self._has_accel else "readings"
-
-    def sample(self) -> Floats:
-        """Some of the readings (n, 3) as they stand in the lines."""
-        return np.concatenate([np.zeros((0, 3)), *self._sampled])
-
-    def __iter__(self) -> Iterator[Batch]:
-        try:
-            while self._ahead:
-                yield self._ahead.pop(0)
-            while (batch := self._next_batch()) is not None:
-                yield batch
-        finally:
-            self.close()
-        met = {"readings": self._has_accel, "platform angles": self._has_pose or not self._angles}
-        for what, is_met in met.items():
-            if not is_met:
-                raise self._unusable(what)
-
-    def _open_parser(self) -> None:
-        """Chooses the parser by the first lines, of CSV by some rows as well, which tell what the header may not; it
-        reads the rest of the first block."""
+    def survey(self, open_reader: OpenReader) -> None:
+        """Chooses the parser by the first lines, of CSV by some rows as well, which tell what the header may not; reads
+        up to the first readings and pose, if there must be one, and keeps what it has read."""
         first = list[str]()
         for lines in self._blocks:
             first += lines
-            blank = next((k for k, line in enumerate(first) if line.lstrip("\ufeff").strip()), len(first))
+            blank = first_line(first)
             self.account.lines += blank
             del first[:blank]
             if len(first) > _TELLING_ROWS or (first and is_json(first[0])):
@@ -326,28 +206,45 @@ class _Passage:
         if not first:
             raise InputError(f"{self._name} holds no lines: check that the logger wrote any.")
         with named(self._name):
-            self.parser, heading = self._open_reader(first, self.account)
+            self.parser, heading = open_reader(first, self.account)
         self._said = self.parser.said
         self.account.lines += heading
         self._ahead.append(self._parse(first[heading:]))
+        while not self._has_accel or self._lacks_pose:
+            lines = next(self._blocks, None)
+            if lines is None or self.account.lines > _SURVEY_LINES:
+                raise self._unusable("platform angles" if self._lacks_pose else "readings")
+            self._ahead.append(self._parse(lines))
 
-    def _next_batch(self) -> Batch | None:
-        lines = next(self._blocks, None)
-        return None if lines is None else self._parse(lines)
+    @property
+    def _lacks_pose(self) -> bool:
+        return self.parser.wants_pose and not self.parser.pose_width
+
+    def __iter__(self) -> Iterator[Batch]:
+        try:
+            while self._ahead:
+                yield self._ahead.pop(0)
+            yield from map(self._parse, self._blocks)
+        finally:
+            self.close()
+        if not self._has_accel:
+            raise self._unusable("readings")
+        if self.parser.wants_pose and not self._has_pose:
+            raise self._unusable("platform angles")
 
     def _parse(self, lines: list[str]) -> Batch:
         batch = self.parser.read(lines, self.account.lines + 1)
         self.account.lines += len(lines)
         if count := len(batch.accel):
             self._has_accel = True
-            self._sampled.append(batch.accel.values[:: count // _SAMPLED + 1].copy())
+            self.sampled.append(batch.accel.values[:: count // _SAMPLED + 1].copy())
         self._has_pose |= len(batch.pose) > 0
         return batch
 
-    def _split(self, stream: BinaryIO | TextFile) -> Iterator[list[str]]:
+    def _split(self) -> Iterator[list[str]]:
         """Whole lines, block by block as they arrive."""
         cutter = Cutter(self.account.refuse)
-        read = getattr(stream, "read1", stream.read)  # read1 does not wait until a whole block has come
+        read = getattr(self._stream, "read1", self._stream.read)  # read1 does not wait until a whole block has come
         try:
             while block := read(_BLOCK_BYTES):
                 if lines := cutter.push(block):
@@ -360,7 +257,5 @@ class _Passage:
         self.fraction = 1.0
 
     def _unusable(self, what: str) -> InputError:
-        found = "".join(f"; {sentence.rstrip('.')}" for sentence in self.account.sentences())
         without = ", or do without (--no-angles)" if what == "platform angles" else ""
-        said = f"{self._name}: no {what} in {self.account.lines} lines{found}"
-        return InputError(f"{said}: {self.parser.advice}{without}.")
+        return self.account.refusal(f"{self._name}: no {what}", self.parser.advice + without)

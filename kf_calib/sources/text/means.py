@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 from types import MappingProxyType
@@ -12,20 +12,19 @@ from typing import Any
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats, lengths
+from kf_calib.bench.arrays import Floats, Ints, lengths
 from kf_calib.bench.bench import Bench, parse_axes
 from kf_calib.bench.counts import refuse_unread
 from kf_calib.bench.keys import UNSTATED, BenchKeys, checked_keys
 from kf_calib.bench.raw_input import RawInput, merged_metadata
 from kf_calib.bench.streams import Orientations, Table, bench_without_angles
 from kf_calib.errors import InputError
+from kf_calib.sources.text.cells import DECIMAL_POINT, LineError, QuantityColumns
 from kf_calib.sources.text.columns import HOW, READINGS, SPREADS, Columns, refuse_unknown_names
 from kf_calib.sources.text.grid import Grid, grid_of
 from kf_calib.sources.text.names import QUATERNION, face_of
-from kf_calib.sources.text.numbers import DECIMAL_POINT, CellError, LineError
-from kf_calib.sources.text.quantity import QuantityColumns
 from kf_calib.sources.text.reader import named
-from kf_calib.sources.text.units import Units, celsius, mps2_per, reading_units
+from kf_calib.sources.text.units import Units, celsius, reading_units
 from kf_calib.support.text import cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
@@ -88,11 +87,12 @@ class TableOfMeans:
         self, grid: Grid, stated: Mapping[str, str], overrides: BenchKeys, units: Units, angles: bool | None
     ) -> None:
         refuse_unknown_names(stated, grid.heading.header)
-        self.columns = Columns.of(grid.heading, stated, units, is_table=True)
+        self.columns = columns = Columns(grid.heading, stated, units, is_table=True)
         pairs = zip(grid.heading.numbers, grid.heading.rows, strict=True)
-        self.numbers = [line + 1 for line, row in pairs if self.columns.is_chosen(row)]
-        self.grid, self.overrides, self.units, self.said = grid, overrides.copy(), units, self.columns.said
-        self.are_lacking = angles is None and not self.columns.orientation
+        self.rows = [line + 1 for line, row in pairs if columns.is_chosen(row)]
+        self.grid, self.overrides, self.units, self.said = grid, overrides.copy(), units, columns.said
+        self.numbers, self.count = columns.numbers or DECIMAL_POINT, len(columns.rows)
+        self.are_lacking = angles is None and not columns.orientation
         self.angles = angles is not False and not self.are_lacking
         self.warnings = [f"{grid.name}: {remark}." for remark in grid.remarks]
 
@@ -108,9 +108,9 @@ class TableOfMeans:
         if self.angles and not columns.orientation:
             raise columns.without_angles()
         if not columns.has("time"):
-            self.warnings.append(
-                f"{name}: no column gives the time: the rows are taken to follow each other by a minute, so "
-                "sizes of drifts are by row rather than by time."
+            self._warn(
+                "no column gives the time: the rows are taken to follow each other by a minute, so sizes of drifts are "
+                "by row rather than by time."
             )
         pose = self._poses()
         bench = self._bench()
@@ -119,19 +119,21 @@ class TableOfMeans:
         bench = replace(bench, input=replace(columns.raw, channels=bench.input.channels))
         means = bench.input.ordered(columns.raw.signed(means) * columns.raw.factors)
         sigmas = None if sigmas is None else np.abs(bench.input.ordered(sigmas))
-        warmth = self._temperatures()
-        rows = Orientations(means, pose, elapsed_s, sigmas, np.array(counts, np.int64), warmth)
+        rows = Orientations(means, pose, elapsed_s, sigmas, counts, self._temperatures())
         if unused := columns.unused:
             self.said.append(f"not used: {columns.named(unused)}")
         by = f" ({', '.join(map(repr, columns.guessed))} by what stands there)" if columns.guessed else ""
         told = f"{name}: {'; '.join(self.said)}{by}. {HOW}."
         return Table(name, bench, rows, [*self.warnings, told], start_ns, self.grid.path)
 
-    def refuse(self, row: int, at: int | str, wanted: str) -> InputError:
-        """The error that names a cell (row counted from 0), its value, and what would be read."""
-        column, cell = (self.columns.header[at], self.columns.rows[row][at]) if isinstance(at, int) else (at, "")
+    def _warn(self, sentence: str) -> None:
+        self.warnings.append(f"{self.grid.name}: {sentence}")
+
+    def _refusal(self, row: int, at: int, wanted: str) -> InputError:
+        """Return the error that names a cell (row counted from 0), its value, and what would be read."""
+        cell = self.columns.rows[row][at]
         said = f"is {cut(cell, 60)!r}" if cell else "is empty"
-        return InputError(f"row {self.numbers[row]}, column {column!r} {said}: {wanted}.")
+        return InputError(f"row {self.rows[row]}, column {self.columns.header[at]!r} {said}: {wanted}.")
 
     def _to_leave_out(self, at: int) -> str:
         return f"leave the column out by --column {self.columns.header[at] + '=-'!r}"
@@ -139,18 +141,19 @@ class TableOfMeans:
     def _values(self, quantity: QuantityColumns, wanted: str, *, is_optional: bool = False) -> Floats:
         """Return the numbers (n, k) of a quantity, NaN where its cells say that there are none; raises InputError for
         the first cell that holds none. is_optional: whether the table would do without the column."""
-        values, numbers = list[list[float]](), self.columns.numbers or DECIMAL_POINT
+        values = list[list[float]]()
         for k, row in enumerate(self.columns.rows):
             at, measured = quantity.at[0], None
             try:
-                measured = quantity.values(row, self.columns.header, numbers)
+                measured = quantity.values(row, self.columns.header, self.numbers)
                 if measured is None and quantity.absent:
                     measured = [math.nan] * len(quantity.at)
-            except CellError as error:
+            except LineError as error:
                 at = error.at
             if measured is None:
                 else_ = self._to_leave_out(at) if is_optional else "" if row[at] else "remove the row"
-                raise self.refuse(k, at, f"write {wanted} such as {numbers.example}{', or ' * bool(else_)}{else_}")
+                example = f"9{self.numbers.decimal}80665{', or ' * bool(else_)}{else_}"
+                raise self._refusal(k, at, f"write {wanted} such as {example}")
             values.append(measured)
         return np.array(values, float)
 
@@ -160,29 +163,29 @@ class TableOfMeans:
         are a minute apart."""
         columns, stamps = self.columns, list[int]()
         if not columns.has("time"):
-            return _USUAL_PAUSE_S * np.arange(len(columns.rows), dtype=np.float64), None
-        time, numbers = columns.time(), columns.numbers or DECIMAL_POINT
+            return _USUAL_PAUSE_S * np.arange(self.count, dtype=np.float64), None
+        time = columns.time()
+        or_else = self._to_leave_out(time.at[0])
         for k, row in enumerate(columns.rows):
-            or_else = self._to_leave_out(time.at[0])
             try:
-                stamps.append(time.ns(row, columns.header, numbers, k))
+                stamps.append(time.ns(row, columns.header, self.numbers, k))
             except LineError:
                 example = "such as 2026-05-04T13:45:00+02:00 or 04.05.2026 13:45:00, or seconds, all in one way"
-                raise self.refuse(k, time.at[0], f"write a time {example}, or {or_else}") from None
+                raise self._refusal(k, time.at[0], f"write a time {example}, or {or_else}") from None
             if k and stamps[k] <= stamps[k - 1]:
                 wanted = f"the row before is not earlier: sort the rows by time, or {or_else}"
-                raise self.refuse(k, time.at[0], wanted)
+                raise self._refusal(k, time.at[0], wanted)
         return (np.array(stamps) - stamps[0]) / 1e9, stamps[0]
 
     def refuse_samples(self) -> None:
         """Raise InputError for a time series."""
-        if self.columns.marks_of_a_table or len(self.columns.rows) <= _SAMPLES:
+        if self.columns.marks_of_a_table or self.count <= _SAMPLES:
             return
         step_s = float(np.median(np.diff(self.times[0])))
         if step_s < _FAST_S:
             raise InputError(
-                f"its {len(self.columns.rows)} rows are samples, {step_s:.3g} s apart, and no table with a row a "
-                "dwell: evaluate them as a log of samples in a CSV file (docs/own_csv.md)."
+                f"its {self.count} rows are samples, {step_s:.3g} s apart, and no table with a row a dwell: evaluate "
+                "them as a log of samples in a CSV file (docs/own_csv.md)."
             )
 
     # -- readings of each axis along gravity and against it alone --
@@ -194,10 +197,10 @@ class TableOfMeans:
             return
         half = (extremes[:, 0] - extremes[:, 1]) / 2.0
         told = reading_units(["", "", ""], np.diag(half), self.units)
-        unit = half.mean() if not told.is_known else STANDARD_GRAVITY_MPS2 / told.raw.factors[0]
+        unit = STANDARD_GRAVITY_MPS2 / told.raw.factors[0] if told.raw else half.mean()
         scales = ", ".join(f"K{k + 1} = {size / unit:.4f}" for k, size in enumerate(half))
         biases = ", ".join(f"b{k + 1} = {middle:g}" for k, middle in enumerate(extremes.mean(axis=1)))
-        of_mean = "" if told.is_known else " of their mean, as no unit is known"
+        of_mean = "" if told.raw else " of their mean, as no unit is known"
         raise InputError(
             f"has of each axis only what it reads up and down: six numbers for six unknowns, {scales}"
             f"{of_mean}, and {biases} as written, with no degree of freedom to judge them or to tell angles: write all "
@@ -207,25 +210,18 @@ class TableOfMeans:
     def _own_axes(self) -> Floats:
         """Return what each axis reads up and down (3, 2), where a table holds no more than that: a row for each face
         with the reading of its own axis alone, or a row for each axis with those at +1 g and -1 g. NaN in others."""
-        extremes, numbers = np.full((3, 2), np.nan), self.columns.numbers or DECIMAL_POINT
-        for axis, is_down, cell in self._own_cells() if len(self.columns.rows) <= _MOST_OWN else ():
-            try:
-                extremes[axis, int(is_down)] = numbers.value(cell)
-            except ValueError:
-                return np.full((3, 2), np.nan)
-        return extremes
-
-    def _own_cells(self) -> Iterator[tuple[int, bool, str]]:
-        """Yield axis, whether it is down, and the reading of it; no text where there are others beside it."""
-        header, readings = self.columns.header, self.columns.places(*READINGS)
+        header, readings, extremes = self.columns.header, self.columns.places(*READINGS), np.full((3, 2), np.nan)
         signs = {k: match[1] != "+" for k, name in enumerate(header) if (match := _UP_DOWN.fullmatch(name.strip()))}
-        for row in self.columns.rows:
-            face = next((told for cell in row if (told := face_of(cell))), None)
-            if face and len(signs) == 2:
-                yield from ((face[0], is_down, row[k]) for k, is_down in signs.items())
-            elif face and len(readings) == 3:
-                others = {row[k] for axis, k in enumerate(readings) if axis != face[0]}
-                yield face[0], face[1] < 0, row[readings[face[0]]] if others <= {"", "-", "–", "—"} else ""
+        for row in self.columns.rows if self.count <= _MOST_OWN else ():
+            axis, sign = next((told for cell in row if (told := face_of(cell))), (0, 0))
+            if sign and len(signs) == 2:
+                for k, is_down in signs.items():
+                    extremes[axis, int(is_down)] = self.numbers.or_nan(row[k])
+            elif sign and len(readings) == 3:
+                others = {row[k] for other, k in enumerate(readings) if other != axis}
+                is_alone = others <= {"", "-", "–", "—"}
+                extremes[axis, int(sign < 0)] = self.numbers.or_nan(row[readings[axis]]) if is_alone else math.nan
+        return extremes
 
     # -- orientations --
 
@@ -235,37 +231,30 @@ class TableOfMeans:
         columns = self.columns
         if not self.angles:
             if unused := columns.angles or columns.places("face", *QUATERNION):
-                self.warnings.append(f"{self.grid.name}: {columns.named(unused)}: not used, without angles.")
-            return np.tile(_UNKNOWN, (len(columns.rows), 1))
+                self._warn(f"{columns.named(unused)}: not used, without angles.")
+            return np.tile(_UNKNOWN, (self.count, 1))
         if self.units.angle and columns.orientation != "angles":
             raise InputError("has no gimbal angles, so leave out --angle-unit.")
-        if columns.orientation == "face":
-            return self._faces()
         if columns.orientation == "angles":
-            return self._values(columns.gimbals(needed=True), "an angle")
-        quaternion = columns.quaternion()
+            return self._values(columns.pose(needed=True), "an angle")
+        if (place := columns.place("face")) is not None:
+            faces = [face_of(row[place]) for row in columns.rows]
+            if None in faces:
+                wanted = "write the axis that points up, one of +x, -x, +y, -y, +z, -z"
+                raise self._refusal(faces.index(None), place, wanted)
+            self.said.append(f"axis that points up from {columns.named([place])}")
+            up = self.overrides.get("up", "y").strip().lower().removeprefix("+")
+            return np.array([_attitude(*face, up) for face in faces if face])
+        quaternion = columns.pose(needed=True)
         pose = self._values(quaternion, "a number")
         norms = lengths(pose)
         for row in np.flatnonzero(np.abs(norms - 1.0) > 0.01):
             raise InputError(
-                f"row {self.numbers[row]}, column 'qx, qy, qz, qw' is {', '.join(f'{own:g}' for own in pose[row])!r}: "
+                f"row {self.rows[row]}, column 'qx, qy, qz, qw' is {', '.join(f'{own:g}' for own in pose[row])!r}: "
                 f"its length is {norms[row]:.3g}: write a unit quaternion from platform to bench."
             )
         self.said.append(f"attitude from {columns.named(quaternion.at)}")
         return pose / norms[:, None]
-
-    def _faces(self) -> Floats:
-        place = self.columns.place("face")
-        assert place is not None
-        up = self.overrides.get("up", "y").strip().lower().removeprefix("+")
-        quaternions = list[Floats]()
-        for k, row in enumerate(self.columns.rows):
-            face = face_of(row[place])
-            if face is None:
-                raise self.refuse(k, place, "write the axis that points up, one of +x, -x, +y, -y, +z, -z")
-            quaternions.append(_attitude(*face, up))
-        self.said.append(f"axis that points up from {self.columns.named([place])}")
-        return np.array(quaternions)
 
     def _bench(self) -> Bench:
         if not self.angles:
@@ -282,52 +271,49 @@ class TableOfMeans:
 
     # -- deviations, counts and temperatures --
 
-    def _spreads(self) -> tuple[Floats | None, list[int]]:
-        """Return standard deviations (n, 3) and counts; None and ones where either is not given."""
+    def _spreads(self) -> tuple[Floats | None, Ints]:
+        """Return standard deviations (n, 3) and counts (n,); None and ones where either is not given."""
         columns, count = self.columns, self.columns.place("count")
         places = columns.places(*SPREADS)
         places = places if len(places) == 3 else columns.places("sd")[:1] * 3
         if not places or count is None:
-            lacking = "standard deviations", "numbers of readings"
             if places or count is not None:
-                self.warnings.append(
-                    f"{self.grid.name}: has no {lacking[bool(places)]}, so its {lacking[not places]} are not used: the "
-                    "noise of a mean needs both."
+                lacking = "standard deviations", "numbers of readings"
+                self._warn(
+                    f"has no {lacking[bool(places)]}, so its {lacking[not places]} are not used: the noise of a mean "
+                    "needs both."
                 )
-            return None, [1] * len(columns.rows)
+            return None, np.ones(self.count, np.int64)
         self.said.append(f"standard deviations from {columns.named(list(dict.fromkeys(places)))}, "
                          f"of as many readings as {columns.named([count])} says")  # fmt: skip
         deviations = QuantityColumns(tuple(places), (1.0, 1.0, 1.0))
         values = self._values(deviations, "a standard deviation", is_optional=True)
         for row, k in np.argwhere(values < 0.0):
-            raise self.refuse(int(row), places[int(k)], "a standard deviation is not negative")
-        units = [columns.meanings[place].unit for place in places]
-        factors = columns.raw.factors
+            raise self._refusal(int(row), places[int(k)], "a standard deviation is not negative")
+        units, factors = [columns.meanings[place].unit for place in places], columns.raw.factors
         if units[0] and units[0] != "count":
-            factors = mps2_per([unit or units[0] for unit in units], self.units)
+            factors = self.units.mps2_per([unit or units[0] for unit in units])
         counts = self._values(QuantityColumns((count,), (1.0,)), "a number of readings", is_optional=True)[:, 0]
         for row in np.flatnonzero((counts < 2) | (counts != np.rint(counts)) | (counts > 1e9)):
             wanted = "write how many readings were averaged, a whole number of at least 2"
-            raise self.refuse(int(row), count, wanted)
-        return values * factors, [int(value) for value in counts]
+            raise self._refusal(int(row), count, wanted)
+        return values * factors, counts.astype(np.int64)
 
     def _temperatures(self) -> Floats:
-        """Return the temperatures of the rows; between those where it was measured, as that of a recording is."""
+        """Return the temperatures (n,) of the rows, degC; between those where it was measured, as that of a recording
+        is."""
         quantity, unit = self.columns.temperature()
         if not quantity.at:
-            return np.full(len(self.columns.rows), np.nan)
+            return np.full(self.count, np.nan)
         values = celsius(self._values(quantity, "a temperature", is_optional=True)[:, 0], unit)
-        known = np.isfinite(values)
-        if not known.any():
+        lacking = np.isnan(values)
+        if lacking.all() or not lacking.any():
             return values
-        if not known.all():
-            empty = ", ".join(str(self.numbers[row]) for row in np.flatnonzero(~known)[:_SHOWN])
-            more = " ..." * (len(values) - int(known.sum()) > _SHOWN)
-            self.warnings.append(
-                f"{self.grid.name}: has no temperature in rows {empty}{more}: it is interpolated in time there."
-            )
+        empty = ", ".join(str(self.rows[row]) for row in np.flatnonzero(lacking)[:_SHOWN])
+        more = " ..." * (int(lacking.sum()) > _SHOWN)
+        self._warn(f"has no temperature in rows {empty}{more}: it is interpolated in time there.")
         elapsed_s, _ = self.times
-        return np.interp(elapsed_s, elapsed_s[known], values[known])
+        return np.interp(elapsed_s, elapsed_s[~lacking], values[~lacking])
 
 
 def _attitude(axis: int, sign: int, up: str) -> Floats:

@@ -11,6 +11,9 @@ import unicodedata
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+import numpy as np
+
+from kf_calib.bench.arrays import Floats, lengths
 from kf_calib.support.units import WORDS
 
 ACCEL = {"m/s2": 1.0, **{unit: WORDS["m/s^2"][unit] for unit in ("g", "mg", "ug")}, "mm/s2": 1e-3, "count": 1.0}
@@ -62,11 +65,6 @@ _APART = _words("cov covariance covariances variance variances kovarianz")
 _TRUTH = _words("true truth ref reference wahr soll expected истинное эталон")
 _QUATERNION = _words("q quat quaternion quaternions кватернион")
 _ESTIMATED = _words("roll pitch yaw heading euler attitude крен тангаж курс")
-_ANGLE = _words(
-    "outer middle inner aussen mitte mittlerer innen innere innerer aeussere ausserer angle angles winkel gimbal roll "
-    "pitch yaw heading azimuth elevation tilt achse axis q phi theta psi rotation rot table rahmen "
-    "угол рамка рамки ось наружный наружная внешний внешняя внутренний внутренняя крен тангаж курс азимут"
-)
 _TIME = _words(
     "time times zeit date datum stamp stamps timestamp timestamps uhrzeit datetime elapsed zeitstempel время дата"
 )
@@ -76,6 +74,11 @@ _AXIS = _words("achse axis ось")
 _TEMPERATURE = _words("temp tmp temperature temperatur t температура темп")
 _COUNT = _words("count counts n samples num number anzahl messungen stichprobe readings werte число количество")
 _FACE = _words("face side seite position pose orientation lage richtung direction flache положение грань")
+_ANGLE = _ESTIMATED - {"euler", "attitude"} | _words(
+    "angle angles winkel gimbal azimuth elevation tilt achse axis q phi theta psi rotation rot table rahmen угол рамка "
+    "рамки ось азимут outer middle inner aussen mitte mittlerer innen innere innerer aeussere ausserer наружный "
+    "наружная внешний внешняя внутренний внутренняя"
+)
 _PREFIXES = _SPREAD | _READING | {"grav"}
 _RANKS = (
     _words("outer aussen aeussere ausserer наружный наружная внешний внешняя"),
@@ -93,16 +96,19 @@ _FACES = re.compile(r"['’]?([+\-−–]?)\s*([xyz123])\s*([+\-−–]?|up|down
 
 
 class Meaning(NamedTuple):
-    """ours: ax ay az (readings), sx sy sz or sd (standard deviations), angle, qx qy qz qw, face, time, count,
-    temperature; empty if the name means nothing. unit: as the name states it; empty if it does not."""
+    """What a column holds.
 
-    ours: str
-    unit: str
+    ours: ax ay az (readings), sx sy sz or sd (standard deviations), angle, qx qy qz qw, face, time, count, temperature;
+    empty if the name means nothing. unit: as the name states it; empty if it does not. rank: place of a gimbal whose
+    name tells it: 1 outer, 2 middle, 3 inner; 0 for others. other: what it is that is of no use here: ``rate`` and
+    ``field`` of a gyroscope and a magnetometer, ``attitude`` that the device itself estimates, ``true`` for what
+    readings should be, or ``covariance``.
+    """
+
+    ours: str = ""
+    unit: str = ""
     rank: int = 0
-    """Place of a gimbal whose name tells it: 1 outer, 2 middle, 3 inner; 0 for others."""
     other: str = ""
-    """What it is that is of no use here: ``rate`` and ``field`` of a gyroscope and a magnetometer, ``attitude`` that
-    the device itself estimates, ``true`` for what readings should be, or ``covariance``."""
 
 
 def is_unit(text: str) -> bool:
@@ -120,14 +126,22 @@ def meaning_of(name: str) -> Meaning:
 def _meaning_of(name: str) -> Meaning:
     lowered = name.strip().lower()
     if lowered in QUATERNION or lowered == "-":
-        return Meaning(lowered.strip("-"), "")
+        return Meaning(lowered.strip("-"))
     text, unit = _unit_of(lowered)
     tokens = _tokens(text)
     channels = sorted(filter(_CHANNELS.__contains__, tokens), key=str.isdigit)  # acc2_x is the x of a second one
     channel = "".join(channels[:1]).translate(_AXES)
     words = set(tokens) - _CHANNELS
-    if other := _other(lowered, words, channel):
-        return Meaning("", "", 0, other)
+    of_accel = unit if unit in ACCEL else ""
+    if words & _APART:
+        return Meaning(other="covariance")
+    is_rate = words & _GYROSCOPE or ("w" in words and channel and not words & (_FACE | _QUATERNION))
+    if is_rate or _RATE.search(lowered):
+        return Meaning(other="rate")
+    if words & _FIELD or ("mg" in words and not words & _FORCE):
+        return Meaning(other="field")
+    if words & _FACE and (channel or "w" in words):
+        return Meaning(other="attitude")
     if words & _LENGTH:
         return Meaning("", unit)
     if (words & _TIME and (not unit or unit in TIME)) or (unit in TIME and not channel):
@@ -138,27 +152,12 @@ def _meaning_of(name: str) -> Meaning:
         rank = next((k + 1 for k, known in enumerate(_RANKS) if words & known), 0)
         return Meaning("angle", unit if unit in ANGLE else "", rank)
     if words & (_SPREAD - {"s"}) or ("s" in words and words <= _READING | {"s"}):
-        return Meaning(f"s{channel}" if channel else "sd", unit if unit in ACCEL else "")
-    if channel and (words & _READING or not words or unit in ACCEL):
-        if words & _TRUTH:
-            return Meaning("", unit, 0, "true")
-        return Meaning(f"a{channel}", unit if unit in ACCEL else "")
+        return Meaning(f"s{channel}" if channel else "sd", of_accel)
+    if channel and (words & _READING or not words or of_accel):
+        return Meaning("", unit, other="true") if words & _TRUTH else Meaning(f"a{channel}", of_accel)
     if words & _FACE:
-        return Meaning("face", "")
-    if words & _COUNT or lowered in _COUNT:
-        return Meaning("count", "")
-    return Meaning("", unit)
-
-
-def _other(lowered: str, words: set[str], channel: str) -> str:
-    """Return what of no use here a name says, see ``Meaning.other``; nothing where it does not."""
-    if words & _APART:
-        return "covariance"
-    if _RATE.search(lowered) or words & _GYROSCOPE or ("w" in words and channel and not words & (_FACE | _QUATERNION)):
-        return "rate"
-    if words & _FIELD or ("mg" in words and not words & _FORCE):
-        return "field"
-    return "attitude" if words & _FACE and (channel or "w" in words) else ""
+        return Meaning("face")
+    return Meaning("count") if words & _COUNT or lowered in _COUNT else Meaning("", unit)
 
 
 QUATERNION = ("qx", "qy", "qz", "qw")
@@ -176,15 +175,27 @@ def meanings_of(names: Sequence[str], stated: Mapping[str, str]) -> list[Meaning
     """What the names of the columns of one file say together; stated: ours of theirs, which go before all others."""
     meanings = [meaning_of(name) for name in names]
     _tell_families(names, meanings)
+    words = [{*_tokens(_CAMEL.sub(" ", name[:_LONGEST]).lower())} for name in names]
     if any(own.other in ("rate", "field") for own in meanings):
-        _leave_out_estimates(names, meanings)
+        for k, meaning in enumerate(meanings):  # the device has estimated them from these very readings
+            is_angle = meaning.ours == "angle" and not meaning.rank and bool(words[k] & (_ESTIMATED | set("xyz")))
+            if is_angle or (meaning.ours in QUATERNION and not is_exact(names[k])):
+                meanings[k] = Meaning(other="attitude")
+    # of several columns taken for a reading, those count whose names say most that they are the accelerometer's
+    words = [own | {*_tokens(name[:_LONGEST].lower())} for own, name in zip(words, names, strict=True)]
+    strengths = [
+        (is_exact(name), not own & _WITHOUT_GRAVITY, bool(own & _FORCE)) for own, name in zip(words, names, strict=True)
+    ]
     for ours in ("ax", "ay", "az"):
-        _keep_strongest(names, meanings, ours)
+        places = [k for k, own in enumerate(meanings) if own.ours == ours]
+        best = max((strengths[k] for k in places), default=None)
+        for k in places:
+            meanings[k] = meanings[k] if strengths[k] == best else Meaning("", meanings[k].unit)
     said = {k: meaning_of(stated[name]) for k, name in enumerate(names) if name in stated}
     kinds = {own.ours for own in said.values()} - {"", "angle", "time"}
     meanings = [Meaning("", own.unit) if own.ours in kinds else own for own in meanings]
-    for k, own in said.items():
-        meanings[k] = own if own.unit or not own.ours else own._replace(unit=meanings[k].unit)
+    for k, told in said.items():
+        meanings[k] = told if told.unit or not told.ours else told._replace(unit=meanings[k].unit)
     return meanings
 
 
@@ -199,37 +210,12 @@ def _tell_families(names: Sequence[str], meanings: list[Meaning]) -> None:
         parts = next((each for each in ("xyzw", "1230") if set(places) >= set(each)), "")
         if parts and set(stem) & _QUATERNION:
             for part, ours in zip(parts, QUATERNION, strict=True):
-                meanings[places[part]] = Meaning(ours, "")
+                meanings[places[part]] = Meaning(ours)
         elif set(filter(str.isdigit, places)) == {"0", "1", "2"}:
             for channel, last in zip("xyz", "012", strict=True):
                 own = meanings[places[last]]
                 told = _meaning_of(" ".join((*stem, channel)))
                 meanings[places[last]] = told._replace(unit=own.unit or told.unit) if not own.other else own
-
-
-def _leave_out_estimates(names: Sequence[str], meanings: list[Meaning]) -> None:
-    """Leave out angles and attitudes beside a gyroscope that are not named as the platform's: the device has estimated
-    them from these very readings."""
-    for k, name in enumerate(names):
-        words = set(_tokens(_CAMEL.sub(" ", name[:_LONGEST]).lower()))
-        is_angle = meanings[k].ours == "angle" and not meanings[k].rank and bool(words & (_ESTIMATED | set("xyz")))
-        if is_angle or (meanings[k].ours in QUATERNION and not is_exact(name)):
-            meanings[k] = Meaning("", "", 0, "attitude")
-
-
-def _keep_strongest(names: Sequence[str], meanings: list[Meaning], ours: str) -> None:
-    """Of several columns taken for a reading, keep those whose names say most that they are the accelerometer's."""
-
-    def strength(place: int) -> tuple[bool, bool, bool]:
-        name = names[place]
-        words = set(_tokens(_CAMEL.sub(" ", name[:_LONGEST]).lower())) | set(_tokens(name[:_LONGEST].lower()))
-        return is_exact(name), not words & _WITHOUT_GRAVITY, bool(words & _FORCE)
-
-    places = [k for k, own in enumerate(meanings) if own.ours == ours]
-    best = max(map(strength, places), default=None)
-    for place in places:
-        if strength(place) != best:
-            meanings[place] = Meaning("", meanings[place].unit)
 
 
 def unit_of_epoch(size: float) -> str:
@@ -243,15 +229,17 @@ def face_of(text: str) -> tuple[int, int] | None:
     if not match:
         return None
     before, axis, after = match.groups()
-    if (before and after in tuple("+-−–")) or (axis.isdigit() and not (before or after)):
+    marks = [mark.lower() for mark in (before, after) if mark]
+    if (before and after in tuple("+-−–")) or (axis.isdigit() and not marks):
         return None  # a number alone is one of a list
-    reversed_by = [mark in "-−–" if len(mark) == 1 else mark.lower() in ("down", "unten")
-                   for mark in (before, after) if mark]  # fmt: skip
-    return "xyz123".index(axis.lower()) % 3, -1 if sum(reversed_by) % 2 else 1
+    return "xyz123".index(axis.lower()) % 3, (-1) ** sum(mark in ("-", "−", "–", "down", "unten") for mark in marks)
 
 
 def _unit_of(name: str) -> tuple[str, str]:
-    """Return a name without its unit, and the unit: in brackets, or after a slash, a comma, ``in`` or an underscore."""
+    """Return a name without its unit, and the unit: in brackets, or after a slash, a comma, ``in`` or an underscore.
+
+    C, K and F are units of temperatures only, since channels have letters.
+    """
     match = re.fullmatch(r"(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]", name)
     if match and (unit := _OF_WORD.get("·".join(match[2].split()))):
         return match[1], unit
@@ -261,14 +249,9 @@ def _unit_of(name: str) -> tuple[str, str]:
     for pattern in (r"(.+)\s+in\s+(\S+)", r"(.+?)\s*,\s*(\S+)", r"(.+)[_ ](\S+)", r"(.+?)[_ ](\S+)",
                     r"(.+?)\s*/\s*(\S+)"):  # fmt: skip
         match = re.fullmatch(pattern, name)
-        if match and match[2] in _OF_WORD and _is_unit_of(match[2], match[1]):
+        if match and match[2] in _OF_WORD and (match[2] not in TEMPERATURE or _TEMPERATURE & set(_tokens(match[1]))):
             return match[1], _OF_WORD[match[2]]
     return name, ""
-
-
-def _is_unit_of(letter: str, name: str) -> bool:
-    """Whether the end of a name is a unit: C, K and F are units of temperatures only, since channels have letters."""
-    return letter not in TEMPERATURE or bool(_TEMPERATURE & set(_tokens(name)))
 
 
 def _tokens(text: str) -> list[str]:
@@ -279,3 +262,35 @@ def _tokens(text: str) -> list[str]:
         known = (last in "xyz" and stem in _PREFIXES) or (last in "wxyz" and stem in _QUATERNION - {"q"})
         tokens += [stem, last] if known else [word]
     return tokens
+
+
+NAMELESS = "column {}"
+"""The name of a column of a text without a heading, counted from 1."""
+_MOSTLY = 0.9  # of the steps of a time go up, and of sizes are counted
+_LIKE, _CLOSE = 2.0, 0.01
+
+
+def is_nameless(header: Sequence[str]) -> bool:
+    """Whether columns have no names but their numbers."""
+    return bool(header) and all(name == NAMELESS.format(k + 1) for k, name in enumerate(header))
+
+
+def meanings_by_numbers(values: Floats) -> list[Meaning]:
+    """What columns (n, k) are, NaN where a cell is no number: a first column that goes up is the time, the three beside
+    each other whose size changes least are the readings. No meaning where there are no such three."""
+    meanings = [Meaning()] * values.shape[1]
+    rises = len(values) > 1 and np.mean(np.diff(values[:, 0]) > 0.0) > _MOSTLY and values.shape[1] > 3
+    spreads = dict[int, float]()
+    for k in range(int(rises), values.shape[1] - 2):
+        sizes = lengths(values[:, k : k + 3])
+        sizes = sizes[np.isfinite(sizes)]
+        if len(sizes) and np.median(sizes) > 0.0:
+            spreads[k] = float(np.quantile(np.abs(sizes - np.median(sizes)), _MOSTLY) / np.median(sizes))
+    if not spreads:
+        return meanings
+    alike = _LIKE * min(spreads.values()) + _CLOSE  # in one pose, columns of nothing may stand beside those that tell
+    first = next(k for k, spread in spreads.items() if spread <= alike)
+    meanings[first : first + 3] = [Meaning(f"a{axis}") for axis in "xyz"]
+    if rises:
+        meanings[0] = Meaning("time")
+    return meanings

@@ -6,15 +6,17 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from typing import ClassVar
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
 
 import numpy as np
 
-from kf_calib.bench.raw_input import RawInput
+from kf_calib.bench.bench import Bench
+from kf_calib.bench.keys import BenchKeys
+from kf_calib.bench.raw_input import CONVERTED, PLAIN, RESTATE, RawInput, merged_metadata
 from kf_calib.bench.streams import Batch, Stream
-from kf_calib.errors import CountsError, InputError
-from kf_calib.sources.text.numbers import LineError
+from kf_calib.errors import BenchError, InputError
+from kf_calib.sources.text.cells import LineError
 
 _NAMED = 8
 _NAME_LENGTH = 40
@@ -26,10 +28,9 @@ def named(name: str) -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        if str(error).startswith(f"{name}: "):
-            raise
-        said = f"{name}: {error}"
-        raise (CountsError(said, error.keys) if isinstance(error, CountsError) else type(error)(said)) from None
+        if not str(error).startswith(f"{name}: "):
+            error.args = (f"{name}: {error}",)
+        raise
 
 
 @dataclass
@@ -66,52 +67,96 @@ class Account:
             sentences.append(f"names that are not known were left out, with the values under them: {names}.")
         return sentences
 
-
-class LineRows:
-    """Stamped rows on their way to a stream."""
-
-    def __init__(self) -> None:
-        self._stamps = list[int]()
-        self._values = list[list[float]]()
-
-    def add(self, time_ns: int, values: list[float] | None) -> None:
-        """Adds a row, unless there is nothing to add."""
-        if values:
-            self._stamps.append(time_ns)
-            self._values.append(values)
-
-    def stream(self, width: int) -> Stream:
-        if not self._stamps:
-            return Stream.empty(width)
-        return Stream(np.array(self._stamps, np.int64), np.array(self._values, float))
+    def refusal(self, what: str, advice: str) -> InputError:
+        """That what was read cannot be used, and what of it was not."""
+        unused = "".join(f"; {sentence.rstrip('.')}" for sentence in self.sentences())
+        return InputError(f"{what} in {self.lines} {self.what}{unused}: {advice}.")
 
 
-class LineReader(ABC):
-    """Reads lines block by block; those that cannot be used are put down in the account.
+def first_line(lines: Sequence[str]) -> int:
+    """How many lines are blank before the first that is not."""
+    return next((k for k, line in enumerate(lines) if line.lstrip("\ufeff").strip()), len(lines))
 
-    Readings are in batches as they stand in the lines. ``raw``: what they are in, where that is settled, ``unit``: by
-    their names; None where they name none (``is_bare``), or none has come yet. ``metadata``: of the bench, as strings.
-    ``has_angles``: poses are angles; ``pose_width``: numbers of one. ``said``: what was taken for what, where that is
-    not plain.
+
+def is_json(first: str) -> bool:
+    """Whether the first line that is not blank begins JSON lines."""
+    return first.lstrip("\ufeff \t")[:1] in ("{", "[")
+
+
+class Described:
+    """What has been learnt of the bench from what it sent.
+
+    metadata: of the bench, as strings. has_angles: poses are angles; pose_width: numbers of one, 0 until it is known.
+    raw: what the readings are in, where that is settled, unit: by their names; None where they name none (is_bare), or
+    none has come yet. said: what was taken for what, where that is not plain.
     """
 
-    _wrong: ClassVar[str]
-    """The reason to give where reading a line raises a ValueError that tells none."""
+    has_angles = True
+    pose_width = 0
+    raw: RawInput | None = None
+    unit: str | None = None
+    is_bare = False
 
     def __init__(self, account: Account) -> None:
-        self.metadata: dict[str, str] = {}
-        self.has_angles = True
-        self.pose_width = 0
-        self.raw: RawInput | None = None
-        self.unit: str | None = None
-        self.is_bare = False
-        self.said = list[str]()
+        self.metadata, self.said = dict[str, str](), list[str]()
         self._account = account
 
-    @property
-    @abstractmethod
-    def advice(self) -> str:
-        """How quantities have to be named."""
+    def stated(self, name: str, overrides: BenchKeys, default: RawInput | None = None) -> dict[str, Any]:
+        """The bench keys that what came, options and the names of the readings state; name: of the source, default: the
+        raw input where neither what came nor options state one.
+
+        Raises BenchError where they contradict each other, or no unit is stated.
+        """
+        by_name = {} if self.unit is None else {"accel_unit": self.unit}
+        if self.raw is not None:
+            by_name = {"accel_scale": self.raw.scale, "accel_unit": self.raw.unit}
+        elif default is not None and default.sizes == PLAIN.sizes and self.unit is not None:
+            default = replace(default, unit=self.unit)  # a unit, which the names state anew
+        with named(name):
+            stated = merged_metadata(self.metadata, overrides, "the first line", default)
+            now = RawInput.from_metadata(stated)
+            if CONVERTED in stated:
+                raise BenchError(f"lines hold what the device sends: leave out {CONVERTED} in the bench's keys.")
+            if self.unit not in (None, now.unit) and "accel_unit" in stated and RESTATE not in overrides:
+                raise BenchError(
+                    f"the readings are in {self.unit} by their names, and stated is {now.unit_words}: rename them by "
+                    "--column, or where their names are wrong, give --accel-unit and --restate-input."
+                )
+            if self.is_bare and not {"accel_unit", "accel_scale"} & set(stated):
+                raise BenchError(
+                    "the names of the readings do not tell their unit: name them accel_mps2 (or accel_g ...), or give "
+                    "it by --accel-unit, and the size of counts by --accel-scale."
+                )
+        return stated | by_name if self.raw is not None else by_name | stated
+
+    def bench(self, name: str, overrides: BenchKeys, default: RawInput | None = None) -> Bench:
+        """The bench, once a pose has been read; arguments as of ``stated``. Raises InputError where it cannot be that
+        one."""
+        stated = self.stated(name, overrides, default)
+        with named(name):
+            bench = Bench.from_metadata(stated, self.has_angles)
+            if bench.pose_width != self.pose_width:
+                raise InputError(
+                    f"poses have {self.pose_width} angles and the bench has {bench.pose_width} axes: state as many "
+                    'axes as there are angles, outer first, for example --axes "y z x".'
+                )
+            return bench
+
+
+SampleRow = tuple[int, list[float] | None, list[float] | None, list[float] | None]
+"""The stamp of a line, ns, its readings, its pose and its temperature, degC; None or empty: not measured."""
+
+
+class LineReader(Described, ABC):
+    """Reads lines block by block; those that cannot be used are put down in the account.
+
+    Readings are in batches as they stand in the lines. advice: how quantities have to be named. wrong: the reason where
+    reading a line raises a ValueError that tells none. wants_pose: whether orientations count.
+    """
+
+    wrong: ClassVar[str]
+    advice: ClassVar[str]
+    wants_pose = True
 
     @abstractmethod
     def with_readings(self, line: str, readings_mps2: Sequence[float]) -> str:
@@ -123,21 +168,30 @@ class LineReader(ABC):
 
     def read(self, lines: Sequence[str], first_line: int) -> Batch:
         """The batch of consecutive lines, the first of them of that number."""
-        accel, pose, temperature = LineRows(), LineRows(), LineRows()
+        rows = list[SampleRow]()
         for number, line in enumerate(lines, start=first_line):
-            if not line or line.isspace():
-                continue
             try:
-                self._read_line(line, accel, pose, temperature)
+                if line and not line.isspace() and (row := self._row(line)):
+                    rows.append(row)
             except LineError as error:
                 self._account.refuse(number, str(error))
-            except (ValueError, ArithmeticError, RecursionError) as error:
-                reasons = {ArithmeticError: "a number is out of range", RecursionError: "it is nested too deeply"}
-                known = (reason for kind, reason in reasons.items() if isinstance(error, kind))
-                self._account.refuse(number, next(known, self._wrong))
-        return Batch(accel.stream(3), pose.stream(self.pose_width), temperature.stream(1))
+            except ArithmeticError:
+                self._account.refuse(number, "a number is out of range")
+            except RecursionError:
+                self._account.refuse(number, "it is nested too deeply")
+            except ValueError:
+                self._account.refuse(number, self.wrong)
+        return Batch(_stream(rows, 1, 3), _stream(rows, 2, self.pose_width), _stream(rows, 3, 1))
 
     @abstractmethod
-    def _read_line(self, line: str, accel: LineRows, pose: LineRows, temperature: LineRows) -> None:
-        """Adds what one line holds, all of it or nothing. Raises ValueError, ArithmeticError or RecursionError where it
-        cannot be used, LineError with the reason."""
+    def _row(self, line: str) -> SampleRow | None:
+        """What one line holds; None where that is no sample. Raises ValueError, ArithmeticError or RecursionError where
+        it cannot be used, LineError with the reason."""
+
+
+def _stream(rows: Sequence[SampleRow], at: int, width: int) -> Stream:
+    """Return the stream of one quantity in rows."""
+    filled = [row for row in rows if row[at]]
+    if not filled:
+        return Stream.empty(width)
+    return Stream(np.array([row[0] for row in filled], np.int64), np.array([row[at] for row in filled], float))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -31,9 +30,9 @@ class ColumnFound(NamedTuple):
 
     header: str
     first: str
-    meaning: str
-    unit: str
-    told_by: str
+    meaning: str = ""
+    unit: str = ""
+    told_by: str = ""
 
 
 class RowFound(NamedTuple):
@@ -48,88 +47,78 @@ class RowFound(NamedTuple):
     at_s: float
     face: str | None
     pose: tuple[float, ...]
-    up: tuple[float, float, float]
+    up: tuple[float, ...]
     norm_mps2: float
     readings: int | None
     temperature_c: float
 
 
-@dataclass(frozen=True)
-class Survey:
-    """What is in a table. stated: columns that the user named. table: None where it cannot be evaluated, and
-    ``trouble`` says why."""
+class Survey(TableOfMeans):
+    """What is in a table. What is not stated of the bench does not matter here: cells are read alike with any gravity
+    and any axes. angles: whether orientations count, if there are any.
 
-    path: Path
-    means: TableOfMeans
-    stated: Mapping[str, str]
-    table: Table | None
-    trouble: str
+    evaluated: None where it cannot be, and ``trouble`` says why. Raises InputError where not even the columns can be
+    understood, or the rows are samples.
+    """
+
+    evaluated: Table | None = None
+    trouble = ""
+
+    def __init__(
+        self,
+        path: Path,
+        overrides: BenchKeys = UNSTATED,
+        columns: Mapping[str, str] = MappingProxyType({}),
+        units: Units | None = None,
+        *,
+        angles: bool = True,
+    ) -> None:
+        grid = grid_of(path, units.dataset if units else "")
+        keys, self.path, self._stated = overrides.copy(), path, columns
+        if not {"gravity_mps2", "latitude_deg"} & keys.keys():
+            keys["gravity_mps2"] = STANDARD_GRAVITY_MPS2
+        with named(grid.name):
+            super().__init__(grid, columns, keys, units or Units(), None if angles else False)
+            self.refuse_samples()
+            self.are_lacking = False  # whoever asks is told by the columns
+            if (places := self.columns.angles) and not overrides.get("axes"):
+                self.overrides["axes"] = " ".join("yzx"[k % 3] for k in range(len(places)))
+            try:
+                self.evaluated = self.table()
+            except CountsError:
+                raise
+            except InputError as error:
+                self.trouble = f"{grid.name}: {error}"
 
     @property
     def orientation(self) -> str:
         """``angles``, ``attitude`` or ``face``; empty where no column tells it, or none is used."""
-        return self.means.columns.orientation if self.means.angles else ""
+        return self.columns.orientation if self.angles else ""
 
     @cached_property
-    def columns(self) -> list[ColumnFound]:
+    def described_columns(self) -> list[ColumnFound]:
         """The columns in their order."""
-        columns, described = self.means.columns, list[ColumnFound]()
+        columns, described = self.columns, list[ColumnFound]()
         for k, (header, meaning) in enumerate(zip(columns.header, columns.meanings, strict=True)):
-            told_by = "--column" if header in self.stated else "content" if header in columns.guessed else "name"
-            if k in columns.by_size and told_by != "--column":
-                told_by = {"name": "size", "content": "content and size"}[told_by]
-            number = f" {columns.angles.index(k) + 1}" if k in columns.angles else ""
             first = next((row[k] for row in columns.rows if row[k]), "")
-            unit = columns.by_size.get(k) or meaning.unit if meaning.ours else ""
-            described.append(ColumnFound(header, first, meaning.ours + number, unit, told_by if meaning.ours else ""))
+            is_guessed, by_size = header in columns.guessed, columns.by_size.get(k)
+            told_by = " and ".join(["content"] * is_guessed + ["size"] * bool(by_size)) or "name"
+            told_by = "--column" if header in self._stated else told_by
+            number = f" {columns.angles.index(k) + 1}" if k in columns.angles else ""
+            used = meaning.ours + number, by_size or meaning.unit, told_by
+            described.append(ColumnFound(header, first, *(used if meaning.ours else ())))
         return described
 
     @cached_property
-    def rows(self) -> list[RowFound]:
+    def described_rows(self) -> list[RowFound]:
         """The orientations; none where the table cannot be evaluated."""
-        means, rows = self.means, list[RowFound]()
-        place = means.columns.place("face") if self.orientation else None
-        for k, orientation in enumerate(self.table.orientations if self.table else ()):
-            norm = float(np.linalg.norm(orientation.mean_mps2))
-            x, y, z = (orientation.mean_mps2 / max(norm, 1e-300)).tolist()
-            pose = tuple(map(float, orientation.pose)) if self.orientation else ()
-            readings = None if orientation.sigma_mps2 is None else orientation.count
-            face, at_s = None if place is None else means.columns.rows[k][place], orientation.elapsed_s
-            rows.append(
-                RowFound(
-                    k + 1, means.numbers[k], at_s, face, pose, (x, y, z), norm, readings, orientation.temperature_c
-                )
-            )
-        return rows
-
-
-def survey(
-    path: Path,
-    overrides: BenchKeys = UNSTATED,
-    columns: Mapping[str, str] = MappingProxyType({}),
-    units: Units | None = None,
-    *,
-    angles: bool = True,
-) -> Survey:
-    """What is in a table. What is not stated of the bench does not matter here: cells are read alike with any gravity
-    and any axes. angles: whether orientations count, if there are any.
-
-    Raises InputError where not even the columns can be understood, or the rows are samples.
-    """
-    units = units or Units()
-    grid = grid_of(path, units.dataset)
-    keys = overrides.copy()
-    if not {"gravity_mps2", "latitude_deg"} & keys.keys():
-        keys["gravity_mps2"] = STANDARD_GRAVITY_MPS2
-    with named(grid.name):
-        means = TableOfMeans(grid, columns, keys, units, angles=None if angles else False)
-        means.refuse_samples()
-        means.are_lacking = False  # whoever asks is told by the columns
-        if (places := means.columns.angles) and not overrides.get("axes"):
-            means.overrides["axes"] = " ".join("yzx"[k % 3] for k in range(len(places)))
-        try:
-            return Survey(path, means, columns, means.table(), "")
-        except CountsError:
-            raise
-        except InputError as error:
-            return Survey(path, means, columns, None, f"{grid.name}: {error}")
+        described, place = list[RowFound](), self.columns.place("face") if self.orientation else None
+        for k, row in enumerate(self.evaluated.orientations if self.evaluated else ()):
+            norm = float(np.linalg.norm(row.mean_mps2))
+            up = tuple((row.mean_mps2 / max(norm, 1e-300)).tolist())
+            face = None if place is None else self.columns.rows[k][place]
+            pose = tuple(map(float, row.pose)) if self.orientation else ()
+            readings = None if row.sigma_mps2 is None else row.count
+            facts = row.elapsed_s, face, pose, up, norm, readings, row.temperature_c
+            described.append(RowFound(k + 1, self.rows[k], *facts))
+        return described

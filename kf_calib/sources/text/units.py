@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeVar
@@ -16,7 +17,6 @@ from kf_calib.bench.keys import BenchKeys
 from kf_calib.bench.raw_input import CHANNELS, PLAIN, UNITS, RawInput
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.text.names import ACCEL
-from kf_calib.support.text import cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 AnyTemperature = TypeVar("AnyTemperature", float, Floats)
@@ -64,10 +64,14 @@ class Units:
         stated = RawInput.from_metadata(keys)
         if len(set(stated.sizes)) > 1:
             raise BenchError("accel_scale has a size for each channel: in lines and tables, state one for all.")
+        if g == "local":
+            standard = {} if "latitude_deg" in keys else {"gravity_mps2": STANDARD_GRAVITY_MPS2}
+            g = Bench.from_metadata({**standard, **keys}, has_angles=False).gravity_mps2
+        elif not re.fullmatch(r"\s*9(\.\d*)?\s*", str(g)) or not 9.0 < float(g) < 10.0:
+            raise InputError(f"--g-unit is {g!r}: give m/s^2 from 9 to 10, such as 9.80665, or local.")
         unit = stated.unit if "accel_unit" in keys else None
         default = None if {"accel_unit", "accel_scale"} & set(keys) else input
-        return cls(unit, stated.sizes[0], angle, _g_mps2(g, keys), default, bool(keys.get("restate_input")),
-                   stated.counts)  # fmt: skip
+        return cls(unit, stated.sizes[0], angle, float(g), default, bool(keys.get("restate_input")), stated.counts)
 
     def told_by(self, names: Sequence[str], named: Sequence[str]) -> Sequence[str]:
         """The units of readings (``named``) by the names of their columns, empty where these tell none, or an option
@@ -91,49 +95,23 @@ class Units:
         level = norm * float(self.input.factors.mean()) / STANDARD_GRAVITY_MPS2
         return set(named) <= {"", "count"} or math.isnan(norm) or _NEAR[0] < level < _NEAR[1]
 
-
-def _g_mps2(g: str | float, keys: BenchKeys) -> float:
-    """Return what 1 g stands for: as stated, or the gravity of the bench. Raises InputError where that cannot be."""
-    if g == "local":
-        stated = {} if "latitude_deg" in keys else {"gravity_mps2": STANDARD_GRAVITY_MPS2}
-        return Bench.from_metadata({**stated, **keys}, has_angles=False).gravity_mps2
-    try:
-        size = float(g)
-    except ValueError:
-        size = 0.0
-    if not 9.0 < size < 10.0:
-        raise InputError(f"--g-unit is {g!r}: give m/s^2 from 9 to 10, such as 9.80665, or local.")
-    return size
-
-
-def choice_of(where: str, header: Sequence[str], rows: Sequence[Sequence[str]], among: str) -> tuple[int, str]:
-    """The column and the text in it by which rows are chosen, as ``I=0``; raises InputError where none of the rows has
-    it. among: which rows these are."""
-    name, value = (part.strip() for part in where.rpartition("=")[::2])
-    if not (name and value):
-        raise InputError(f"--where is {where!r}: write --where COLUMN=VALUE, as --where unit=0.")
-    if name not in header:
-        raise InputError(f"has no column {cut(name, 60)!r} (--where), it has {cut(', '.join(map(repr, header)), 300)}.")
-    at = list(header).index(name)
-    labels = [row[at].strip() for row in rows]
-    if value not in labels:
-        seen = ", ".join(sorted(set(labels))[:8])
-        raise InputError(f"no row{among} has {value!r} in column {name!r} (--where), they have {seen}.")
-    return at, value
+    def mps2_per(self, units: Sequence[str]) -> Floats:
+        """The size of each of these units, m/s^2."""
+        g = self.g_mps2 / STANDARD_GRAVITY_MPS2
+        return np.array([ACCEL[unit] * (g if unit.endswith("g") else 1.0) for unit in units])
 
 
 class ReadingUnits(NamedTuple):
     """Units of the three readings.
 
-    units: of each. raw: the sizes of the numbers. words: how the unit is said. by_size: whether the numbers told it.
-    is_known: whether anything did.
+    units: of each. raw: the sizes of the numbers; None where nothing tells these. words: how the unit is said. by_size:
+    whether the numbers told it.
     """
 
     units: tuple[str, ...]
-    raw: RawInput
+    raw: RawInput | None
     words: str
     by_size: bool
-    is_known: bool
 
 
 def reading_units(named: Sequence[str], values: Floats, stated: Units) -> ReadingUnits:
@@ -147,7 +125,7 @@ def reading_units(named: Sequence[str], values: Floats, stated: Units) -> Readin
     if stated.as_default(named, norm):
         assert stated.input is not None
         default = replace(stated.input, channels=CHANNELS)
-        return ReadingUnits((default.unit,) * 3, default, f"{default.unit_words}, as of the calibration", False, True)
+        return ReadingUnits((default.unit,) * 3, default, f"{default.unit_words}, as of the calibration", False)
     size = norm * stated.accel_scale
     are_counts = bool((values == np.rint(values)).all()) or stated.accel_scale != 1.0
     by_size = next((unit for unit, low, high in _BY_SIZE[: 3 if are_counts else 4] if low < size < high), "count")
@@ -159,9 +137,14 @@ def reading_units(named: Sequence[str], values: Floats, stated: Units) -> Readin
     words += " by their size (--accel-unit)" * is_guessed
     if any(unit.endswith("g") for unit in units):
         words += f", 1 g = {stated.g_mps2:.7g} m/s^2 (--g-unit)"
-    is_known = bool(stated.accel) or stated.accel_scale != 1.0 or "count" not in (*units, *named)
-    raw = _raw(units, stated, mps2_per(units, stated))
-    return ReadingUnits(tuple(units), raw, words, is_guessed, is_known)
+    mps2, scale = stated.mps2_per(units), stated.accel_scale
+    if not stated.accel and scale == 1.0 and "count" in (*units, *named):
+        raw = None
+    elif len(set(units)) == 1 and UNITS.get(units[0]) == mps2[0]:  # in the unit that they are written in
+        raw = RawInput(sizes=(scale, scale, scale), unit=units[0], counts=stated.counts)
+    else:
+        raw = replace(RawInput.of_factors((scale * mps2).tolist()), counts=stated.counts)
+    return ReadingUnits(tuple(units), raw, words, is_guessed)
 
 
 def usual_norm(values: Floats) -> float:
@@ -178,21 +161,6 @@ def size_of_count(norm: float) -> dict[str, str]:
     if abs(norm / usual - 1.0) < _NEAR_USUAL:
         return _USUAL[usual]
     return {"accel_scale": f"{STANDARD_GRAVITY_MPS2 / norm if norm > 0.0 else math.nan:.3g}"}
-
-
-def _raw(units: Sequence[str], stated: Units, mps2: Floats) -> RawInput:
-    """Return the sizes of the numbers: in the unit that they are written in, where that is one for all."""
-    if len(set(units)) == 1 and UNITS.get(units[0]) == mps2[0]:
-        sizes = (stated.accel_scale, stated.accel_scale, stated.accel_scale)
-        return RawInput(sizes=sizes, unit=units[0], counts=stated.counts)
-    return replace(RawInput.of_factors((stated.accel_scale * mps2).tolist()), counts=stated.counts)
-
-
-def mps2_per(units: Sequence[str], stated: Units) -> Floats:
-    """The size of each of these units, m/s^2."""
-    return np.array(
-        [ACCEL[unit] * (stated.g_mps2 / STANDARD_GRAVITY_MPS2 if unit.endswith("g") else 1.0) for unit in units]
-    )
 
 
 def celsius(value: AnyTemperature, unit: str) -> AnyTemperature:
