@@ -253,15 +253,15 @@ def layout(result: Calibration, history: VisitHistory, goes_on: bool = False) ->
 
 def _overview(result: Calibration, history: VisitHistory, is_predicted: bool) -> rrb.Horizontal:
     return rrb.Horizontal(
-        rrb.Vertical(*_sigmas(history), _pose(result)),
-        rrb.Vertical(_platform(result), *_fit(is_predicted), row_shares=[2, 1, 1] if is_predicted else [1, 1]),
+        rrb.Vertical(*sigma_panels(history), _pose(result)),
+        rrb.Vertical(platform_panel(result), *_fit(is_predicted), row_shares=[2, 1, 1] if is_predicted else [1, 1]),
         rrb.TextDocumentView(origin="summary", name="result"),
         column_shares=[5, 4.4, 3.8],
         name="Overview",
     )
 
 
-def _sigmas(history: VisitHistory) -> list[rrb.TimeSeriesView]:
+def sigma_panels(history: VisitHistory) -> list[rrb.TimeSeriesView]:
     """A panel a kind of parameter, one for the coefficients of effects if there are any."""
     corner = rrb.Corner2D.RightTop
     kinds = [(f"{group.title}, {units.shown(group.unit).label}",
@@ -337,7 +337,7 @@ def eye(bench: Bench, position: Vector, target: Vector) -> rrb.EyeControls3D:
     return rrb.EyeControls3D(position=place, look_target=goal, eye_up=up)
 
 
-def _platform(result: Calibration) -> rrb.Spatial3DView:
+def platform_panel(result: Calibration) -> rrb.Spatial3DView:
     so_far = [
         rrb.VisibleTimeRange(
             name, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative(seq=0)
