@@ -63,7 +63,7 @@ from kf_calib.views.rerun.series import (
     log_residuals,
     predicted,
 )
-from kf_calib.views.rerun.spheres import log_platform, magnified
+from kf_calib.views.rerun.spheres import log_platform, magnified, with_y_up
 
 __all__ = ["BENCH_TIME", "ORIENTATION", "grow", "save_view"]
 
@@ -236,7 +236,7 @@ def _ties(result: Calibration) -> list[str]:
 
 
 def _three(unit: Unit, values: Floats) -> str:
-    return ", ".join(map(unit.number, values))
+    return ", ".join(unit.number(value, zeros=True) for value in values)
 
 
 def layout(result: Calibration, history: VisitHistory, goes_on: bool = False) -> rrb.Blueprint:
@@ -332,8 +332,7 @@ def _pose(result: Calibration) -> rrb.TimeSeriesView:
 
 def eye(bench: Bench, position: Vector, target: Vector) -> rrb.EyeControls3D:
     """A look at the platform from ``position`` to ``target``, both in a frame with y up, whatever axis is up."""
-    at_rest = np.zeros((1, len(bench.axes))) if bench.axes else np.array([[0.0, 0.0, 0.0, 1.0]])
-    place, goal, up = bench.to_platform(np.array([position, target, (0.0, 1.0, 0.0)]), at_rest)
+    place, goal, up = with_y_up(bench, position, target, (0.0, 1.0, 0.0))
     return rrb.EyeControls3D(position=place, look_target=goal, eye_up=up)
 
 
