@@ -199,7 +199,7 @@ CEILINGS = {
     "diagnosis": 5246,
     "online": 1648,
     "exchange": 1994,
-    "views": 7387,
+    "views": 7385,
     "cli": 3560,
     "report": 792,
     "bags": 403,

@@ -38,7 +38,7 @@ def frames() -> list[Image.Image]:
 def save(path: Path) -> Path:
     """Write the frames as a GIF that begins again, with a rest at the end."""
     drawn = frames()
-    palette = drawn[-1].quantize(_COLOURS, Image.Quantize.MAXCOVERAGE)  # everything is drawn in the last one
+    palette = drawn[-1].quantize(_COLOURS, Image.Quantize.MAXCOVERAGE, 1)  # everything is drawn in the last one
     pictures = [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in drawn]
     durations = [_FRAME_MS] * (len(pictures) - 1) + [_LAST_MS]
     pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=durations, loop=0, optimize=True)

@@ -125,7 +125,8 @@ def save(name: str) -> Path:
     path, content = DOCS / f"{name}.png", PngInfo()
     if name in PICTURES:
         content.add_text(KEY, drawn_from())
-    picture = (PICTURES | OF_SCRIPTS)[name]().quantize(_PALETTE, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    drawn = (PICTURES | OF_SCRIPTS)[name]()
+    picture = drawn.quantize(_PALETTE, Image.Quantize.MAXCOVERAGE, 1, dither=Image.Dither.NONE)
     picture.save(path, optimize=True, pnginfo=content)
     return path
 

@@ -36,10 +36,7 @@ class Unit(NamedTuple):
     per_si: float
 
     def number(self, value: float, digits: int = 3, zeros: bool = False) -> str:
-        """An SI value in this unit to significant ``digits``, without a power of ten where it is large.
-
-        zeros: with those at the end, 0.130, for columns that are compared.
-        """
+        """An SI value in this unit to significant ``digits``; zeros: with those at the end (0.130), for columns."""
         return significant(value * self.per_si, digits, zeros)
 
     def text(self, value: float, digits: int = 3) -> str:

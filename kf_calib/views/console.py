@@ -287,13 +287,5 @@ def plain(renderable: RenderableType, width: int = 110) -> str:
     return "\n".join(line.rstrip() for line in out.getvalue().splitlines())
 
 
-@printed.register
-def plain_summary(result: Calibration) -> str:
-    """The text of a calibration that ``print`` shows."""
-    return plain(summary(result))
-
-
-@printed.register
-def _plain_model(model: Model) -> str:
-    """Return the text of a model that ``print`` shows."""
-    return plain(model_table(model))
+printed.register(Calibration, lambda result: plain(summary(result)))
+printed.register(Model, lambda model: plain(model_table(model)))

@@ -109,7 +109,6 @@ def draw_shape(figure: FigureBase, shape: EffectShape) -> None:
                     linestyle="none", color=BEST, label=f"what the model with {shape.effect} predicts")  # fmt: skip
         _curve(row[1], across.per_si, shape, i)
         row[0].set_ylabel(f"{shape.channels[i]}, {shown(shape.quantity).label}")
-        _say_quantity(row[1], "", across)
     _say_bars(figure, panels[:, 0])
     titles = ["Residuals without it", f"What {shape.effect} must explain", "What it leaves"]
     for axes, title in zip(panels[0], titles, strict=True):

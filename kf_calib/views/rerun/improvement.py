@@ -163,8 +163,8 @@ def _layout(view: View) -> rrb.Blueprint:
     top, steps = 1.08 * float(np.nanmax(errors)), len(view.improvement.steps)
     first = rrb.Horizontal(
         rrb.Vertical(
-            _series("error", f"rms error, {units.shown('m/s^2').label}", steps, rrb.Corner2D.RightTop, (0.0, top)),
-            _series("log10_p", "log₁₀ p, accepted above −2", steps, rrb.Corner2D.RightBottom),
+            _series("error", f"rms error, {units.shown('m/s^2').label}", steps, (0.0, top)),
+            _series("log10_p", "log₁₀ p, accepted above −2", steps),
         ),
         spheres("spheres", 1),
         rrb.TextDocumentView(origin="summary", name="this step"),
@@ -184,15 +184,13 @@ def _layout(view: View) -> rrb.Blueprint:
     )
 
 
-def _series(
-    path: str, name: str, steps: int, legend: rrb.Corner2D | None = None, reach: tuple[float, float] | None = None
-) -> rrb.TimeSeriesView:
-    """The curves below a path over the steps, with room beside the first and the last."""
+def _series(path: str, name: str, steps: int, reach: tuple[float, float] | None = None) -> rrb.TimeSeriesView:
+    """The curves below a path over the steps, with room beside the first and the last; reach: of those that fall."""
     first, last = (rr.TimeRangeBoundary.absolute(seq=number) for number in (-1, steps + 1))
     return rrb.TimeSeriesView(
         contents=[f"{path}/**"],
         name=name,
-        plot_legend=legend,
+        plot_legend=rrb.Corner2D.RightTop if reach else rrb.Corner2D.RightBottom,
         axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=first, end=last)),
         axis_y=None if reach is None else rrb.ScalarAxis(range=reach),
         background=ON_DARK,

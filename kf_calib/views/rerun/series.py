@@ -63,10 +63,8 @@ class VisitHistory:
         return low - margin, high + margin
 
     def sigma_range(self, columns: Sequence[int]) -> tuple[float, float] | None:
-        """From 0 to above the sigmas of these columns in the run's last two thirds; None where none is determined.
-
-        A low axis has numbers at powers of ten alone: one is within the range.
-        """
+        """From 0 to above the sigmas of these columns in the run's last two thirds, and to a power of ten, the only
+        numbers that a low axis has; None where none is determined."""
         late = self.sigma[self.orientation >= self.orientation[-1] / 3][:, list(columns)]
         if not np.isfinite(late).any():
             return None
