@@ -151,7 +151,7 @@ def source_lines(standing: Progress, status: Status | None, name: str, recording
     """The lines about the source and the recording."""
     if status is None:
         return [((f"{name}: {standing.samples} readings", ""),)]
-    name = "standard input" if name == "-" else name
+    name = "stdin" if name == "-" else name
     parts = [(name if len(name) <= _NAME else f"{name[:_NAME]}...", "bold"), (" ", "")]
     parts.append((status.link, {"live": "green", "lost": "bold red"}.get(status.link, "yellow")))
     parts.append((f"  {status.rate_hz:.0f} Hz  {status.samples} readings", ""))
