@@ -1,7 +1,8 @@
 """The pictures of README and docs: ``tools/pictures`` draws them again, or those whose name is given.
 
 Figures are the program's own (``kf_calib.plot``), from recordings/hidden.mcap; pictures of the Rerun view are
-screenshots of it and need a graphics driver. Colours are reduced to a palette, so that a picture has some ten kB.
+screenshots of it and need a graphics driver. Colours are reduced to a palette, so that a picture has some ten kB: one
+that covers all colours, as the most frequent ones would make thin curves of one colour where they have two.
 
 Each of them carries a digest of what it was drawn from (``drawn_from``): a test compares it with the digest of today.
 Pictures of simulated runs are drawn by scripts of their own beside this one (``OF_SCRIPTS``). Only those of the blind
@@ -100,7 +101,7 @@ OF_SCRIPTS: dict[str, Callable[[], Image.Image]] = {
 """Name of each other picture, and what draws it."""
 
 MOVING = "covariance"
-"""Name of the one that moves, which covariance_picture draws."""
+"""Name of the one that moves, a film of the Rerun view, which covariance_picture draws."""
 
 
 @cache
@@ -124,7 +125,8 @@ def save(name: str) -> Path:
     path, content = DOCS / f"{name}.png", PngInfo()
     if name in PICTURES:
         content.add_text(KEY, drawn_from())
-    picture = (PICTURES | OF_SCRIPTS)[name]().quantize(_PALETTE, dither=Image.Dither.NONE)
+    drawn = (PICTURES | OF_SCRIPTS)[name]()
+    picture = drawn.quantize(_PALETTE, Image.Quantize.MAXCOVERAGE, 1, dither=Image.Dither.NONE)
     picture.save(path, optimize=True, pnginfo=content)
     return path
 

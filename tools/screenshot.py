@@ -12,7 +12,7 @@ import socket
 import subprocess
 import tempfile
 import time as clock
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -50,14 +50,23 @@ def screenshot(
     rrd, png = Path(rrd_path).resolve(), Path(png_path).resolve()
     if not rrd.is_file():
         raise ScreenshotError(f"there is no recording {rrd_path}: write one with --rrd first.")
+    screenshots(rrd, size, timeline, [time])[0].save(png)
+    return png
+
+
+def screenshots(
+    rrd: Path, size: tuple[int, int], timeline: str | None, moments: Sequence[float | None]
+) -> list[Image.Image]:
+    """Pictures of a recording with the time cursor at each of the ``moments``, drawn by one viewer (``screenshot``)."""
+    pictures = list[Image.Image]()
     with viewer(rrd, size) as client:
         client.run_command("ui.toggle_top_panel")
-        if timeline is not None:
-            _seek(client, timeline, time)
-        picture = _steady_picture(client)
-    window = Image.open(io.BytesIO(picture))
-    window.crop((0, _MENU_PX, window.width, window.height)).save(png)
-    return png
+        for moment in moments:
+            if timeline is not None:
+                _seek(client, timeline, moment)
+            window = Image.open(io.BytesIO(_steady_picture(client)))
+            pictures.append(window.crop((0, _MENU_PX, window.width, window.height)).convert("RGB"))
+    return pictures
 
 
 @contextmanager

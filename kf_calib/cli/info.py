@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 Tick = Callable[[float], None]
 
 _NAMED = {
-    "axes": ('--axes "y z x"', "the gimbal axes, outer to inner: --axes"),
+    "axes": ('--axes "y z x"', "the gimbal axes, outer to inner: --axes, and what is up: --up (y if not stated)"),
     "gravity_mps2": ("--gravity 9.81", "local gravity: --gravity in m/s^2 (best), or --latitude in degrees"),
 }
 """What a bench's description must have: how an option gives it, and what it is."""

@@ -187,7 +187,7 @@ class Plan:
         through = int(self.search.reach.crosses(self.poses[:-1], self.poses[1:]).sum())
         if through:
             sentences.append(f"{through} of the slews would lead straight through a forbidden zone: go round it.")
-        if self.correlation > self.timing.correlation + 0.005 and len(self.poses) > 1:
+        if self.correlation > self.timing.correlation + 0.005 and len(self.poses) > 1 and self.prospect.last is None:
             sentences.append(
                 f"time goes with the direction of gravity (correlation {self.correlation:.2f}), so a drift would pass "
                 "for a change of the parameters: visit more orientations, or repeat them (--repeats 2)."

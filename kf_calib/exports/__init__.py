@@ -37,9 +37,9 @@ def exported(saved: SavedCalibration, correction: Correction, to: str, lossy: bo
     target = TARGETS[to](saved, correction)
     if target.to_be_done_before and not lossy:
         raise InputError(
-            f"{target.title} takes readings in m/s^2 in the order of the accelerometers, and the device sends "
-            f"{correction.input}: make them before, {target.to_be_done_before}, and say so by --lossy, or export to c "
-            "or csv, which take what the device sends."
+            f"{target.title} takes readings in m/s^2 in the order of the accelerometers, but the device sends "
+            f"{correction.input}. If you convert them before they go in ({target.to_be_done_before}), confirm it by "
+            "--lossy; or export to c or csv, which take what the device sends."
         )
     if target.error_left is not None and not lossy:
         unit, (rms, worst) = shown("m/s^2"), target.error_left

@@ -73,8 +73,8 @@ class Target(ABC):
     @property
     def takes(self) -> str:
         """What it takes, in words."""
-        made = f"; to be made before of what the device sends: {self.to_be_done_before}" * bool(self.to_be_done_before)
-        return f"takes {self.input}{made}"
+        before = self.to_be_done_before
+        return f"takes {self.input}{f'; convert what the device sends before it goes in: {before}' * bool(before)}"
 
     def corrected(self, readings_mps2: Floats, temperature_c: Floats) -> Floats:
         """Specific force (n, 3) from readings (n, 3), m/s^2, by the formula of the program."""

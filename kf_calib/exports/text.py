@@ -42,7 +42,7 @@ def exported_report(target: Target, path: Path) -> RenderableType:
     if not target.correction.input.is_plain:
         lines.append(Text(f"It takes {target.input}."))
     if target.to_be_done_before:
-        lines.append(note(f"to be made before of what the device sends: {target.to_be_done_before}"))
+        lines.append(note(f"convert what the device sends before it goes in: {target.to_be_done_before}"))
     if target.error_left is None:
         lines.append(Text("It holds all of it."))
     else:

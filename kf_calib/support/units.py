@@ -35,9 +35,9 @@ class Unit(NamedTuple):
     label: str
     per_si: float
 
-    def number(self, value: float, digits: int = 3) -> str:
-        """An SI value in this unit to significant ``digits``, without a power of ten where it is large."""
-        return significant(value * self.per_si, digits)
+    def number(self, value: float, digits: int = 3, zeros: bool = False) -> str:
+        """An SI value in this unit to significant ``digits``; zeros: with those at the end (0.130), for columns."""
+        return significant(value * self.per_si, digits, zeros)
 
     def text(self, value: float, digits: int = 3) -> str:
         """The same with the label behind it."""
@@ -148,9 +148,9 @@ def shown_whole(unit: str, largest: float = math.inf) -> Unit:
     return next((shown_unit for bound, shown_unit in _WHOLE.get(unit, ()) if largest <= bound), Unit(unit, 1.0))
 
 
-def significant(value: float, digits: int = 3) -> str:
+def significant(value: float, digits: int = 3, zeros: bool = False) -> str:
     """A number to significant digits; 1.2e+03 is written 1200, as no one reads powers of ten beside a unit."""
-    text = f"{value:.{digits}g}"
+    text = f"{value:{'#' if zeros and value else ''}.{digits}g}".rstrip(".")
     return f"{float(text):.0f}" if "e+" in text and abs(value) < 1e9 else text
 
 
@@ -160,7 +160,7 @@ def span(seconds: float) -> str:
         return "-"
     for size, unit in ((86400.0, "d"), (3600.0, "h"), (60.0, "min")):
         if seconds >= 2.0 * size:
-            return f"{seconds / size:.2g} {unit}"
+            return f"{significant(seconds / size, 2)} {unit}"
     return f"{seconds:.0f} s"
 
 

@@ -145,7 +145,7 @@ def noise_table(result: Calibration) -> ConsoleTable:
     for heading in ("", "accelerometer 1", "accelerometer 2", "accelerometer 3", "unit"):
         table.add_column(heading, justify="left" if heading in ("", "unit") else "right")
     reading, angle = shown("m/s^2"), shown("rad")
-    within = map(reading.number, noise.sigma_mps2) if noise.within_seen else ["-"] * 3
+    within = [reading.number(each, zeros=True) for each in noise.sigma_mps2] if noise.within_seen else ["-"] * 3
     table.add_row("within a dwell" + ", not known" * (not noise.within_seen), *within, reading.label)
     table.add_row("inflation by correlation", *(f"{value:.3g}" for value in noise.inflation), "of variance")
     scatter, setting = noise_origins(result)
@@ -153,7 +153,8 @@ def noise_table(result: Calibration) -> ConsoleTable:
         ("dwell to dwell", scatter, noise.scatter_mps2, reading),
         ("setting of angles", setting, np.full(3, noise.setting_rad), angle),
     ):
-        cells = ["-"] * 3 if origin in (_NOT_ESTIMATED, _NOT_USED) else [unit.number(value) for value in values]
+        cells = [unit.number(value, zeros=origin != "stated") for value in values]
+        cells = ["-"] * 3 if origin in (_NOT_ESTIMATED, _NOT_USED) else cells
         table.add_row(f"{name}, {origin}", *cells, unit.label)
     return table
 
@@ -221,7 +222,7 @@ def summary(result: Calibration, diagnosed: bool = False) -> RenderableType:
         f"{len(orientations(dwells))} orientations ({tally.moving} readings moving, {tally.settling} settling)"
     )
     parts: list[RenderableType] = [
-        head, *([] if result.bench.input.is_plain else [Text(f"Made of {result.bench.input}.")]),
+        head, *([] if result.bench.input.is_plain else [Text(f"Input: {result.bench.input}.")]),
         parameter_table(result), *intervals_in_words(result),
         *([effect_table(result)] if result.model.effects else []), noise_table(result),
         Text(verdict(result, diagnosed), style="bold green" if result.consistency.unconditional else "bold yellow"),
@@ -286,13 +287,5 @@ def plain(renderable: RenderableType, width: int = 110) -> str:
     return "\n".join(line.rstrip() for line in out.getvalue().splitlines())
 
 
-@printed.register
-def plain_summary(result: Calibration) -> str:
-    """The text of a calibration that ``print`` shows."""
-    return plain(summary(result))
-
-
-@printed.register
-def _plain_model(model: Model) -> str:
-    """Return the text of a model that ``print`` shows."""
-    return plain(model_table(model))
+printed.register(Calibration, lambda result: plain(summary(result)))
+printed.register(Model, lambda model: plain(model_table(model)))

@@ -281,10 +281,7 @@ def of_what_p_is(diagnosis: Diagnosis) -> list[str]:
     return [f"p is the chance that pure noise would look this bad in any of our tests.{overall}"]
 
 
-@printed.register
-def plain_report(diagnosis: Diagnosis) -> str:
-    """The text of a diagnosis that ``print`` shows."""
-    return plain(diagnosis_report(diagnosis))
+printed.register(Diagnosis, lambda diagnosis: plain(diagnosis_report(diagnosis)))
 
 
 def _hypothesis_table(table: HypothesisTable, floor_mps2: float | None, most: int | None = None) -> ConsoleTable:

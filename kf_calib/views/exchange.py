@@ -56,7 +56,7 @@ def applied_report(
     names = ", ".join(["alignment, scale factor and bias", *map(str, correction.effects)])
     lines = [Text(f"{applied.readings} readings corrected for {names}: {place}.", style="bold")]
     unit = shown("m/s^2")
-    sigma = ", ".join(unit.number(each, 2) for each in correction.worst_sigma_mps2)
+    sigma = ", ".join(unit.number(each, 2, zeros=True) for each in correction.worst_sigma_mps2)
     lines.append(Text(f"Uncertainty by the calibration (1σ, at most, at 1 g): {sigma} {unit.label} along x, y, z."))
     if applied.temperature_c is not None:
         low, high = applied.temperature_c
@@ -118,7 +118,7 @@ def verification_report(verification: Verification) -> RenderableType:
 
 def _moves_table(verification: Verification) -> ConsoleTable:
     """Return the table of the parameters that were compared, the clearest changes first."""
-    table = ConsoleTable(title="Changes (1σ of both; p: that none of them has moved)", title_justify="left")
+    table = ConsoleTable(title="Changes (1σ of both; p: of one so large, of all, by noise alone)", title_justify="left")
     for heading in ("parameter", "change", "sigma", "unit", "change / sigma", "p", ""):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit", "") else "right")
     moved = set(verification.moved)

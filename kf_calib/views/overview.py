@@ -83,7 +83,7 @@ def overview_report(overview: Overview) -> RenderableType:
             more = " ..." * (len(topic.paths) > _PATHS)
             parts.append(Text(f"A message of {topic.name} has {', '.join(topic.paths[:_PATHS])}{more}"))
     bench = ", ".join(f"{key} = {value}" for key, value in overview.bench.items())
-    parts.append(Text(f"Bench: {bench or 'nothing is said of it'}"))
+    parts.append(Text(f"Bench: {bench or 'not described'}"))
     if overview.dwells is not None:
         parts += _dwell_parts(overview.dwells)
     parts += [note(said) for said in overview.warnings]
@@ -155,7 +155,7 @@ def pose_text(pose: tuple[float, ...]) -> str:
     """Gimbal angles in degrees; an attitude as it is."""
     if len(pose) == 4:
         return " ".join(f"{each:.4f}" for each in pose)
-    return " ".join(f"{math.degrees(each) + 0.0:.2f}°" for each in pose)
+    return " ".join(f"{round(math.degrees(each), 2) + 0.0:.2f}°" for each in pose)
 
 
 _SHOWN_ROWS = 40  # orientations
@@ -207,7 +207,7 @@ def table_report(overview: TableOverview) -> RenderableType:
         _column_table(survey.described_columns),
     ]
     bench = ", ".join(f"{key} = {value}" for key, value in overview.bench.items())
-    parts.append(Text(f"Bench: {bench or 'nothing is said of it'}"))
+    parts.append(Text(f"Bench: {bench or 'not described'}"))
     if survey.described_rows:
         parts += [Text(f"{counted(len(survey.described_rows), 'orientation')}:"), _row_table(survey)]
         if len(survey.described_rows) > _SHOWN_ROWS:

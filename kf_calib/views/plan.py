@@ -19,6 +19,7 @@ from kf_calib.design.orientation_plan import Plan, papers_sigma
 from kf_calib.design.sides import SYMBOLS, HandPlan
 from kf_calib.estimation.free_attitude import up_in_words
 from kf_calib.support.output_files import write_whole
+from kf_calib.support.text import counted
 from kf_calib.support.units import Unit, shown
 from kf_calib.views.console import symbol
 from kf_calib.views.json import clean
@@ -95,7 +96,7 @@ def plan_report(made: Plan, beside_paper: bool = False) -> RenderableType:
 
 def _orientations(made: Plan) -> ConsoleTable:
     """Return the table of the orientations in their order."""
-    table = ConsoleTable(title=f"{len(made.poses)} orientations, in this order", title_justify="left")
+    table = ConsoleTable(title=f"{counted(len(made.poses), 'orientation')}, in this order", title_justify="left")
     for heading in (
         "",
         "begins, s",
@@ -143,7 +144,7 @@ def _figure(value: float, percent: bool, unit: Unit) -> str:
     """Return a number as text; "not seen" where it is not finite."""
     if not math.isfinite(value):
         return "not seen"
-    return f"{value:.3g} %" if percent else unit.number(value)
+    return f"{value:.3g} %" if percent else unit.number(value, zeros=True)
 
 
 def sentences(made: Plan, beside_paper: bool = False) -> list[str]:
@@ -154,8 +155,8 @@ def sentences(made: Plan, beside_paper: bool = False) -> list[str]:
         f"{made.condition_number:.4g} (rad, 1, g; the least is √3).",
         f"D-efficiency {made.d_efficiency:.4f} of the bound; {made.d_efficiency_within_reach:.4f} of what these "
         f"gimbals can. Largest variance function {made.largest_variance:.4g} ({count} where D-optimal).",
-        f"{made.duration_s:.0f} s, {made.slews_s.sum():.0f} s of them in slews. Correlation of time with the direction "
-        f"of gravity: {made.correlation:.2f}.",
+        f"{made.duration_s:.0f} s, {made.slews_s.sum():.0f} s of them in slews."
+        + f" Correlation of time with the direction of gravity: {made.correlation:.2f}." * (made.prospect.last is None),
     ]
     if beside_paper:
         told.append(

@@ -24,8 +24,8 @@ from kf_calib.diagnosis.stepwise_selection import Improvement, begin, extend, im
 from kf_calib.errors import InputError
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.filter_history import readings_of, worst_dwell
-from kf_calib.support.units import shown_in
-from kf_calib.views.figures.style import label_axis, rounded_number, short_number, wrapped
+from kf_calib.support.units import shown_in, significant
+from kf_calib.views.figures.style import label_axis, short_number, wrapped
 
 MICRO_G = 9.80665e-6
 
@@ -153,7 +153,7 @@ def test_residuals_of_single_dwells_are_drawn_in_micro_g_or_si() -> None:
     assert first.get_ylabel() == "accelerometer 1, µg"
     assert panels(figure)[-1].get_xlabel() == "last step along the input axis, g"
     rms = np.sqrt(np.mean(diagnosis.before.residuals_mps2[:, 0] ** 2)) / MICRO_G
-    assert first.get_title("right") == f"rms {rounded_number(rms, 2)} µg"
+    assert first.get_title("right") == f"rms {rms:#.2g} µg"
 
 
 def headings(figure: Figure) -> list[list[str]]:
@@ -329,4 +329,5 @@ def test_decades_are_labelled_with_their_values() -> None:
 
 def test_words_of_effects_stay_whole() -> None:
     assert wrapped("second-order + cross-coupling-ip", 16) == "second-order +\ncross-coupling-ip"
-    assert rounded_number(11234567.0) == "11200000" and rounded_number(0.0012345, 2) == "0.0012"
+    assert significant(11234567.0) == "11200000" and significant(0.0012345, 2) == "0.0012"
+    assert significant(0.13, zeros=True) == "0.130" and significant(0.0, zeros=True) == "0"

@@ -69,7 +69,7 @@ def angles_from_csv(path: Path, width: int) -> list[list[float]]:
                 raise InputError(f"{path}, line {number}: {line!r} is not {width} angles in deg.") from None
             continue
         if row and len(row) != width:
-            raise InputError(f"{path}, line {number}: {len(row)} angles for {width} gimbal axes.")
+            raise InputError(f"{path}, line {number}: {len(row)} angles for {width} gimbals: give --axes of the plan.")
         rows += [row] if row else []
     if not rows:
         raise InputError(f"{path}: holds no orientation; write a line of {width} angles in deg for each.")

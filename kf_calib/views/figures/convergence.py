@@ -22,7 +22,7 @@ from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.estimation.filter_history import InnovationTests, ParameterHistory, history_of, innovation_tests
 from kf_calib.estimation.results import Calibration
 from kf_calib.exchange.history import History, ParameterTrack
-from kf_calib.support.units import rounded, shown
+from kf_calib.support.units import rounded, shown, significant
 from kf_calib.views.console import symbol
 from kf_calib.views.figures.style import (
     ACCELEROMETERS,
@@ -132,7 +132,8 @@ def _final(value: float, unit: str) -> str:
     """Return a sigma at the end as text."""
     if not np.isfinite(value):
         return "not determined"
-    return f"{written(float(f'{value:.3g}'))} {unit}".rstrip()
+    number = significant(value, zeros=True) if value >= 1e-4 else written(float(f"{value:.3g}"))
+    return f"{number} {unit}".rstrip()
 
 
 def corner(axes: Axes, text: str, strong: bool = False) -> None:

@@ -186,7 +186,7 @@ def _suspect_bars(axes: Axes, explained: Sequence[Explanation]) -> None:
     axes.set_xlabel("explained part of the misfit beyond noise, %")
     if all(explanation.share is None for explanation in explained):
         axes.text(50.0, 0.5 * (len(explained) - 1.0), _NO_MISFIT, color=GREY, ha="center", va="center")
-    axes.set_title("What each explains; hatched: the model with it does not fit")
+    axes.set_title("What each explains; p: that noise alone would do so\nhatched: the model with it does not fit")
 
 
 def _said(explanation: Explanation) -> str:
@@ -218,7 +218,7 @@ def _overlaps(axes: Axes, diagnosis: Diagnosis, names: Sequence[str]) -> None:
     axes.grid(visible=False)
     axes.spines[:].set_visible(False)
     axes.tick_params(length=0)
-    axes.set_title("Overlap of what they add to the readings\n(1.00: the same shape, not the same probability)")
+    axes.set_title("Overlap of what they add to readings\n(1.00: same shape, not same probability)")
 
 
 def _drivers(axes: Axes, drivers: Sequence[Driver]) -> None:
@@ -326,7 +326,7 @@ def _size_bars(axes: Axes, sizes: Sequence[Detectable], rows: int, grade: Grade,
         usual = detectable.typical.of(grade)
         smallest = shown(detectable.coefficient).text(detectable.minimum)
         if usual is None:
-            axes.text(1.4, k, "no usual size is known", va="center", color=GREY, fontsize=7.5)
+            axes.text(1.4, k, "no usual size", va="center", color=GREY, fontsize=7.5)
         else:
             _bar(axes, k, usual[0] / detectable.minimum, usual[1] / detectable.minimum)
             smallest += f"  ({size_range(usual, detectable.coefficient)})"

@@ -96,10 +96,9 @@ def _residuals(figure: FigureBase, state: Improvement, models: Sequence[_Model])
                 axes.set_ylabel(f"accelerometer {i + 1}\nresidual / σ")
         panels[-1, column].set_xlabel(f"{driver.words}, {unit}", fontsize=8.0)
         panels[-1, column].xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
-    said = "grey: within 2σ"
     left_out = len(models) - len(drawn)
-    panels[-1, 0].annotate(f"{said}; {left_out} steps are left out" if left_out else said, (0.01, 0.02), color=GREY,
-                           xycoords="axes fraction", fontsize=7.5)  # fmt: skip
+    said = "grey: within 2σ" + f"; {left_out} steps are left out" * bool(left_out)
+    panels[-1, 0].set_xlabel(f"{panels[-1, 0].get_xlabel()}\n{said}", fontsize=8.0)
 
 
 def _heading(number: int, model: _Model, state: Improvement) -> str:
@@ -107,7 +106,7 @@ def _heading(number: int, model: _Model, state: Improvement) -> str:
     rms, unit = model.result.held_out_rms_mps2, shown("m/s^2")
     said = [wrapped(f"{number}: {model.label}", _NAME)]
     if rms is not None and state.floor_mps2:
-        said.append(f"held out {unit.text(rms)} = {rms / state.floor_mps2:.2f} × noise")
+        said.append(f"held out {unit.number(rms, zeros=True)} {unit.label} = {rms / state.floor_mps2:.2f} × noise")
     return "\n".join([*said, *([] if model.p_value is None else [f"p {format_p(model.p_value)}"])])
 
 

@@ -374,6 +374,6 @@ def draw_correlations(figure: FigureBase, result: Calibration) -> bool:
         axes.text(column, row, f"{value:.2f}".replace("0.", ".").replace("-", "−"), ha="center", va="center",
                   fontsize=min(8.0, 110.0 / len(names)), color="white" if abs(value) > 0.65 else "#222222")  # fmt: skip
     lost = bool(np.isnan(np.diag(matrix)).any())
-    axes.set_title(f"Correlations; written from {NOTABLE} on{'; grey: not determined' if lost else ''}", pad=12.0)
+    axes.set_xlabel(f"Correlations; written from {NOTABLE} on{'; grey: not determined' if lost else ''}")
     figure.colorbar(image, ax=axes, label="correlation (no unit)", shrink=0.8)
     return True

@@ -5,7 +5,7 @@ One dwell reading by reading: readings less what the model says, and their mean 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -33,7 +33,6 @@ from kf_calib.views.figures.style import (
     PALE,
     PLATFORM,
     blank,
-    rounded_number,
     say,
     styled,
     wrapped,
@@ -92,7 +91,7 @@ def _draw_alone(figure: FigureBase, diagnosis: Diagnosis, driver: Driver) -> Non
         _rms(axes, residuals[:, i])
         axes.set_ylabel(f"accelerometer {i + 1}, {shown('m/s^2').label}")
     panels[0].set_title(wrapped(f"Residuals of {before.model.sum}", 3 * _TITLE))
-    _say_bars(figure, panels[0])
+    _say_bars(figure, panels)
     _say_quantity(panels[-1], driver.words, unit)
 
 
@@ -107,11 +106,10 @@ def draw_shape(figure: FigureBase, shape: EffectShape) -> None:
         _rms(row[0], shape.residuals[:, i], shape.quantity)
         _rms(row[2], shape.left[:, i], shape.quantity)
         row[0].plot(x, (shape.residuals - shape.left)[:, i] * shown(shape.quantity).per_si, marker="_", markersize=9,
-                    linestyle="none", color=BEST, label=f"what {shape.effect} predicts of it")  # fmt: skip
+                    linestyle="none", color=BEST, label=f"what the model with {shape.effect} predicts")  # fmt: skip
         _curve(row[1], across.per_si, shape, i)
         row[0].set_ylabel(f"{shape.channels[i]}, {shown(shape.quantity).label}")
-        _say_quantity(row[1], "", across)
-    _say_bars(figure, panels[0, 0])
+    _say_bars(figure, panels[:, 0])
     titles = ["Residuals without it", f"What {shape.effect} must explain", "What it leaves"]
     for axes, title in zip(panels[0], titles, strict=True):
         axes.set_title(wrapped(title, _TITLE))
@@ -176,17 +174,17 @@ def _mark(axes: Axes, x: Floats, values_mps2: Floats, number: int) -> None:
         axes.annotate(f"dwell {number}", (at, value), (9, 0), textcoords="offset points", color=ALARM, va="center")
 
 
-def _say_bars(figure: FigureBase, axes: Axes) -> None:
-    """Write below a figure what its dashes and pale bars are; nothing where it has none."""
-    handles, labels = axes.get_legend_handles_labels()
-    if handles:
-        figure.legend(handles, labels, loc="outside lower left", ncols=len(labels))
+def _say_bars(figure: FigureBase, panels: Iterable[Axes]) -> None:
+    """Write below a figure what dashes and pale bars are that one of its panels has; nothing where none has any."""
+    said = {label: mark for axes in panels for mark, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    if said:
+        figure.legend(said.values(), said.keys(), loc="outside lower left", ncols=len(said))
 
 
 def _rms(axes: Axes, residuals: Floats, quantity: str = "m/s^2") -> None:
     """Write the rms of residuals above their panel: on axes of large ones small ones cannot be read."""
     unit = shown(quantity)
-    rms = rounded_number(float(np.sqrt(np.nanmean(residuals**2))) * unit.per_si, 2)
+    rms = unit.number(float(np.sqrt(np.nanmean(residuals**2))), 2, zeros=True)
     axes.set_title(f"rms {rms} {unit.label}", loc="right", fontsize=8.0, color=GREY)
 
 

@@ -151,6 +151,7 @@ def source_lines(standing: Progress, status: Status | None, name: str, recording
     """The lines about the source and the recording."""
     if status is None:
         return [((f"{name}: {standing.samples} readings", ""),)]
+    name = "stdin" if name == "-" else name
     parts = [(name if len(name) <= _NAME else f"{name[:_NAME]}...", "bold"), (" ", "")]
     parts.append((status.link, {"live": "green", "lost": "bold red"}.get(status.link, "yellow")))
     parts.append((f"  {status.rate_hz:.0f} Hz  {status.samples} readings", ""))
@@ -176,11 +177,12 @@ def _bench_task(standing: Standing, doing: Doing | None) -> Task:
     judgement, here = standing.judgement, standing.current
     going = None if judgement is None else judgement.next_orientation
     there = "the next orientation of your plan" if going is None else f"{angles_in_words(going[0])}"
-    then = "" if going is None else f": {going[1]}"
+    why = "" if going is None else going[1]
+    then = f"; the next one {why}" * bool(why)
     if judgement is not None and judgement.reached(standing.sigma):
         if doing:
             return Task("EVERY TARGET IS REACHED", "the bench ends the run by itself", "green")
-        return Task("STOP: EVERY TARGET IS REACHED", f"going on to {there} {then.lstrip(': ')}".strip(), "green")
+        return Task("STOP: EVERY TARGET IS REACHED", f"going on to {there} {why}".strip(), "green")
     if here is None:
         moved = f"{standing.dwells} orientations in {span(standing.elapsed_s)}; the platform moves or settles"
         if doing:
@@ -192,7 +194,7 @@ def _bench_task(standing: Standing, doing: Doing | None) -> Task:
         return Task(doing.what, at, "cyan" if doing.heading_deg else "yellow")
     if here.enough:
         return Task(f"GO ON: TURN TO {there.upper() if going is None else there}", f"{at}; enough here{then}", "green")
-    return Task("STAY: HOLD STILL", f"{at}; then to {there}{then}", "yellow")
+    return Task("STAY: HOLD STILL", f"{at}; then to {there}{f', which {why}' * bool(why)}", "yellow")
 
 
 def _bench_rows(standing: Standing) -> tuple[Headings, list[SigmaRow]]:
@@ -210,8 +212,8 @@ def _bench_rows(standing: Standing) -> tuple[Headings, list[SigmaRow]]:
         aim = wanted[k] if targets else 0.5 * last[k]
         # a prediction can be too early: only sigma itself tells that a target is reached, and the bar then says so
         time = ("" if targets else "reached") if sigma <= aim else span(left) if left else "soon"
-        aimed = (unit.number(aim), unit.label, time) if math.isfinite(aim) else ("", "", "")
-        cells = unit.number(sigma), unit.label, *aimed
+        aimed = (unit.number(aim, zeros=not targets), unit.label, time) if math.isfinite(aim) else ("", "", "")
+        cells = unit.number(sigma, zeros=True), unit.label, *aimed
         rows.append(SigmaRow(symbol(name), cells, bar(float(sigma), float(wanted[k]), k)))
     of_aim = "target" if targets else "half of last"
     return (("1σ now", "right"), ("", "left"), (of_aim, "right"), ("", "left"), ("in", "right")), rows

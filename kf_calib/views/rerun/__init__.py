@@ -63,7 +63,7 @@ from kf_calib.views.rerun.series import (
     log_residuals,
     predicted,
 )
-from kf_calib.views.rerun.spheres import log_platform, magnified
+from kf_calib.views.rerun.spheres import log_platform, magnified, with_y_up
 
 __all__ = ["BENCH_TIME", "ORIENTATION", "grow", "save_view"]
 
@@ -236,7 +236,7 @@ def _ties(result: Calibration) -> list[str]:
 
 
 def _three(unit: Unit, values: Floats) -> str:
-    return ", ".join(map(unit.number, values))
+    return ", ".join(unit.number(value, zeros=True) for value in values)
 
 
 def layout(result: Calibration, history: VisitHistory, goes_on: bool = False) -> rrb.Blueprint:
@@ -253,15 +253,15 @@ def layout(result: Calibration, history: VisitHistory, goes_on: bool = False) ->
 
 def _overview(result: Calibration, history: VisitHistory, is_predicted: bool) -> rrb.Horizontal:
     return rrb.Horizontal(
-        rrb.Vertical(*_sigmas(history), _pose(result)),
-        rrb.Vertical(_platform(result), *_fit(is_predicted), row_shares=[2, 1, 1] if is_predicted else [1, 1]),
+        rrb.Vertical(*sigma_panels(history), _pose(result)),
+        rrb.Vertical(platform_panel(result), *_fit(is_predicted), row_shares=[2, 1, 1] if is_predicted else [1, 1]),
         rrb.TextDocumentView(origin="summary", name="result"),
         column_shares=[5, 4.4, 3.8],
         name="Overview",
     )
 
 
-def _sigmas(history: VisitHistory) -> list[rrb.TimeSeriesView]:
+def sigma_panels(history: VisitHistory) -> list[rrb.TimeSeriesView]:
     """A panel a kind of parameter, one for the coefficients of effects if there are any."""
     corner = rrb.Corner2D.RightTop
     kinds = [(f"{group.title}, {units.shown(group.unit).label}",
@@ -332,12 +332,11 @@ def _pose(result: Calibration) -> rrb.TimeSeriesView:
 
 def eye(bench: Bench, position: Vector, target: Vector) -> rrb.EyeControls3D:
     """A look at the platform from ``position`` to ``target``, both in a frame with y up, whatever axis is up."""
-    at_rest = np.zeros((1, len(bench.axes))) if bench.axes else np.array([[0.0, 0.0, 0.0, 1.0]])
-    place, goal, up = bench.to_platform(np.array([position, target, (0.0, 1.0, 0.0)]), at_rest)
+    place, goal, up = with_y_up(bench, position, target, (0.0, 1.0, 0.0))
     return rrb.EyeControls3D(position=place, look_target=goal, eye_up=up)
 
 
-def _platform(result: Calibration) -> rrb.Spatial3DView:
+def platform_panel(result: Calibration) -> rrb.Spatial3DView:
     so_far = [
         rrb.VisibleTimeRange(
             name, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative(seq=0)

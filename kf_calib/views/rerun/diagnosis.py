@@ -132,8 +132,8 @@ def _probabilities(table: HypothesisTable) -> str:
     """Families and explanations with their probabilities, the likeliest first, without the unlikely."""
     families = [(name, share) for name, share in table.families.items() if share >= LISTED]
     rows = [*families, ("", None), *((name_of(row), row.probability) for row in table.listed)]
-    lines = ["| | |" if share is None else f"| {name} | {format_probability(share)} |" for name, share in rows]
-    return "\n".join(["| it may be | probability |", "|:--|--:|", *lines])
+    lines = ["| | |" if share is None else f"| {format_probability(share)} | {name} |" for name, share in rows]
+    return "\n".join(["| probability | it may be |", "|--:|:--|", *lines])
 
 
 def _layout(diagnosis: Diagnosis) -> rrb.Blueprint:

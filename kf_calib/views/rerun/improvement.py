@@ -130,7 +130,7 @@ def _summary(view: View, number: int) -> str:
     diagnosis, result, steps = view.diagnoses[number], view.results[number], view.improvement.steps
     blocks = [f"**Step {number}**: {_done(steps[number - 1])}" if number else "**Step 0**: the first model"]
     blocks.append(f"Model: {result.model.sum}; p {format_p(diagnosis.test.p_value)}")
-    errors = [f"{words} {values[number]:.3g}" for words, values, _ in view.errors.values()]
+    errors = [f"{words} {units.significant(values[number], zeros=True)}" for words, values, _ in view.errors.values()]
     blocks.append(f"Error, {units.shown('m/s^2').label}: {'; '.join(errors)}")
     rows = [
         f"| {symbol} | {_value(each)} | {units.shown(each).label} |"
@@ -155,7 +155,7 @@ def _value(parameter: Parameter) -> str:
     if parameter.value is None or parameter.sigma is None:
         return "not determined"
     unit = units.shown(parameter)
-    return f"{parameter.value * unit.per_si:.3g} ± {parameter.sigma * unit.per_si:.2g}"
+    return " ± ".join(unit.rounded(parameter.value, parameter.sigma)).replace("-", "−")
 
 
 def _layout(view: View) -> rrb.Blueprint:
@@ -185,11 +185,12 @@ def _layout(view: View) -> rrb.Blueprint:
 
 
 def _series(path: str, name: str, steps: int, reach: tuple[float, float] | None = None) -> rrb.TimeSeriesView:
-    """The curves below a path over the steps, with room beside the first and the last."""
+    """The curves below a path over the steps, with room beside the first and the last; reach: of those that fall."""
     first, last = (rr.TimeRangeBoundary.absolute(seq=number) for number in (-1, steps + 1))
     return rrb.TimeSeriesView(
         contents=[f"{path}/**"],
         name=name,
+        plot_legend=rrb.Corner2D.RightTop if reach else rrb.Corner2D.RightBottom,
         axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=first, end=last)),
         axis_y=None if reach is None else rrb.ScalarAxis(range=reach),
         background=ON_DARK,

@@ -63,9 +63,14 @@ class VisitHistory:
         return low - margin, high + margin
 
     def sigma_range(self, columns: Sequence[int]) -> tuple[float, float] | None:
-        """From 0 to above the sigmas of these columns in the run's last two thirds; None where none is determined."""
+        """From 0 to above the sigmas of these columns in the run's last two thirds, and to a power of ten, the only
+        numbers that a low axis has; None where none is determined."""
         late = self.sigma[self.orientation >= self.orientation[-1] / 3][:, list(columns)]
-        return (0.0, 1.15 * float(np.nanmax(late))) if np.isfinite(late).any() else None
+        if not np.isfinite(late).any():
+            return None
+        top = 1.15 * float(np.nanmax(late))
+        power = 10.0 ** np.ceil(np.log10(top))
+        return 0.0, float(max(top, 1.05 * power if top > 0.6 * power else 0.0))
 
     def _only(self, rows: NDArray[np.bool_]) -> VisitHistory:
         """Return the same with these rows only."""

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.bench.bench import Bench, Vector
 from kf_calib.estimation.estimate import Estimate
 from kf_calib.estimation.results import Calibration
 from kf_calib.support.units import shown
@@ -177,7 +178,7 @@ def log_platform(result: Calibration, stream: rr.RecordingStream) -> None:
     numbers = ends(result.visits)[1].tolist()
     steps = [ellipsoids_of(visit.estimate) for visit in result.visits]
     tips = [_axes(visit.estimate) for visit in result.visits]
-    log_ellipsoids(stream, times(*ends(result.visits)), numbers, steps, tips)
+    _log_ellipsoids(stream, times(*ends(result.visits)), numbers, steps, tips, result.bench)
     _log_directions(result, stream)
 
 
@@ -207,9 +208,9 @@ def _log_axes(result: Calibration, stream: rr.RecordingStream) -> None:
     rr.send_columns("platform/axes", times(*ends(result.visits)), columns, recording=stream)
 
 
-def log_ellipsoids(
+def _log_ellipsoids(
     stream: rr.RecordingStream, index: list[rr.TimeColumn], numbers: Sequence[int], steps: list[list[Ellipsoid]],
-    tips: list[Floats],
+    tips: list[Floats], bench: Bench,
 ) -> None:  # fmt: skip
     """Ellipsoids at the tips (3, 3) of the axes after each step, all magnified alike, with a bar that shows the scale.
 
@@ -228,7 +229,7 @@ def log_ellipsoids(
     first = next((k for k, own in enumerate(shown) if len(own) == len(shown[-1])), len(shown) - 1)
     wires = rr.Ellipsoids3D(**fields[first], fill_mode=rr.components.FillMode.MajorWireframe, line_radii=thin(0.4))
     stream.log("platform/first", wires if first < len(shown) - 1 else rr.Clear(recursive=False), static=True)
-    _log_bar(stream, factor, f"; wires: orientation {numbers[first]}" if first < len(shown) - 1 else "")
+    _log_bar(stream, bench, factor, f"; wires: orientation {numbers[first]}" if first < len(shown) - 1 else "")
 
 
 def _fields(ellipsoids: list[Ellipsoid], tips: Floats, factor: float) -> dict[str, Any]:
@@ -241,18 +242,24 @@ def _fields(ellipsoids: list[Ellipsoid], tips: Floats, factor: float) -> dict[st
     }
 
 
-def _log_bar(stream: rr.RecordingStream, factor: float, words: str) -> None:
-    """A bar of a round angle, magnified as the ellipsoids are."""
+def _log_bar(stream: rr.RecordingStream, bench: Bench, factor: float, words: str) -> None:
+    """A bar of a round angle below the platform as it is seen, magnified as the ellipsoids are."""
     angle, ratio = shown("rad"), shown("1")
     length = rounded(BAR / factor * angle.per_si)
     half = 0.5 * factor * length / angle.per_si
-    bar = rr.LineStrips3D([[(-half, FLOOR, 0.0), (half, FLOOR, 0.0)]], colors=WHITE, radii=0.012)
+    *ends, place = with_y_up(bench, (-half, FLOOR, 0.0), (half, FLOOR, 0.0), (0.0, FLOOR - 0.04, 0.0))
+    bar = rr.LineStrips3D([ends], colors=WHITE, radii=0.012)
     stream.log("platform/scale", bar, static=True)
     same = number(float(f"{length / angle.per_si * ratio.per_si:.2g}"))
     text = f"{number(length)} {angle.label}, {same} {ratio.label if ratio.label != '1' else 'of K'}{words}"
-    place = (0.0, FLOOR - 0.04, 0.0)
     label = rr.Points3D([place], labels=[text], radii=0.0, colors=WHITE, show_labels=True)
     stream.log("platform/scale/label", label, static=True)
+
+
+def with_y_up(bench: Bench, *vectors: Vector) -> Floats:
+    """Vectors (n, 3) of a frame with y up in the platform, whatever axis of it is up where all angles are zero."""
+    at_rest = np.zeros((1, len(bench.axes))) if bench.axes else np.array([[0.0, 0.0, 0.0, 1.0]])
+    return bench.to_platform(np.array(vectors), at_rest)
 
 
 def _log_directions(result: Calibration, stream: rr.RecordingStream) -> None:
