@@ -199,7 +199,7 @@ CEILINGS = {
     "diagnosis": 5286,
     "online": 1648,
     "exchange": 1992,
-    "views": 7387,
+    "views": 7385,
     "cli": 3556,
     "report": 792,
     "bags": 403,
