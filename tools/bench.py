@@ -4,9 +4,9 @@ usage: .venv/bin/python tools/bench.py [--samples 1000000] [--scan-memory] [--la
 
 Decoding is this package's reader, with nothing done with the samples. Each figure is the median of several runs, the
 ways taken in turn; tools/bench_peers.py compares with other programs. ``--large`` adds the peak memory of a ten times
-longer recording. Start-up is a whole process, ``kf-calib replay --json`` of four minutes at 100 Hz. A growth exponent is
-of time in readings, those of one dwell: 1 is linear. The scan: decoding, folding, fitting the twelve, and projecting 70
-further columns off them, those of all visible effects of the catalogue and of formulas.
+longer recording. Start-up is a whole process, ``kf-calib replay --json`` of four minutes at 100 Hz. A growth exponent:
+of time in readings, those of one dwell; 1 is linear. The scan: decoding, folding, fitting the twelve, and projecting
+70 further columns off them, those of all visible effects of the catalogue and of formulas.
 """
 
 from __future__ import annotations
