@@ -200,7 +200,7 @@ CEILINGS = {
     "online": 1648,
     "exchange": 1994,
     "views": 7389,
-    "cli": 3591,
+    "cli": 3593,
     "report": 792,
     "bags": 403,
     "certificate": 1542,

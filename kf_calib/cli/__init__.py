@@ -6,6 +6,7 @@ inconsistent and ``--strict`` asked; 2: anything else, with one sentence on stde
 
 from __future__ import annotations
 
+import gc
 import os
 import re
 import sys
@@ -103,4 +104,5 @@ def main() -> None:
             stream.flush()
         except OSError:
             fall_silent(stream)
+    gc.freeze()  # as the process ends, Python would look for cycles in all that is left, which takes 40 ms
     sys.exit(code if isinstance(code, int) else 0)
