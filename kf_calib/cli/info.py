@@ -53,7 +53,7 @@ def info(
     FILE is an MCAP file, the folder of a ROS 2 bag, a .db3 file, lines of CSV or JSON, a table of orientations,
     or a calibration.
     """
-    from kf_calib.sources.opening import FileKind
+    from kf_calib.sources.file_kind import FileKind
 
     kind = reading.kind(recording)
     if kind is FileKind.CALIBRATION:

@@ -78,8 +78,8 @@ def noise(
 
 def _gyroscopes(path: Path, reading: ReadingOptions, gyro: str, size: float) -> Source:
     """The recording once more, with the gyroscopes in place of the readings; size: of their unit, rad/s."""
+    from kf_calib.sources.file_kind import FileKind
     from kf_calib.sources.files.recording import Recording
-    from kf_calib.sources.opening import FileKind
     from kf_calib.sources.text.lines import Lines
     from kf_calib.sources.text.units import Units
 

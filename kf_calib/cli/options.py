@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from kf_calib.bench.raw_input import RawInput
     from kf_calib.bench.streams import Table
     from kf_calib.estimation.settings import Settings
+    from kf_calib.sources.file_kind import FileKind
     from kf_calib.sources.files.recording import Recording
-    from kf_calib.sources.opening import FileKind
     from kf_calib.sources.text.lines import Lines
     from kf_calib.sources.text.units import Units
 
@@ -179,8 +179,8 @@ class ReadingOptions:
 
     def opened(self, path: Path, input: RawInput | None = None) -> Recording | Lines | Table:
         """The recording, log or table at a path; input: what the device sends, where nothing else states it."""
-        from kf_calib.sources.opening import FileKind, no_recording
-        from kf_calib.sources.text.lines import Lines
+        from kf_calib.sources.file_kind import FileKind
+        from kf_calib.sources.opening import no_recording
 
         columns, angles = self.renamed, self.angles
         match self.kind(path):
@@ -188,6 +188,8 @@ class ReadingOptions:
                 refuse_given(not_of_text(path) + OF_DWELLS + _OF_LINES, f"{path} is a table of mean readings")
                 return self.table(path, {}, angles, input)
             case FileKind.SAMPLES:
+                from kf_calib.sources.text.lines import Lines
+
                 refuse_given(not_of_text(path), f"{path} is a log in lines of text")
                 return Lines(path, self.keys, columns, units=self.units(input), angles=angles)
             case FileKind.RECORDING:

@@ -14,7 +14,6 @@ from kf_calib.bench import paper_parameters
 from kf_calib.effects import Coefficient, Effect, as_text
 from kf_calib.effects.effect import Grade
 from kf_calib.estimation.cross_validation import orientations
-from kf_calib.estimation.engine_comparison import Comparison
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.remarks import beyond_stated
 from kf_calib.estimation.results import Calibration, OutlyingDwell, Parameter, format_p
@@ -26,6 +25,7 @@ from kf_calib.views.terminal import ConsoleTable, PlainConsole, note
 
 if TYPE_CHECKING:
     from kf_calib.diagnosis.results import Difference, SideBySide
+    from kf_calib.estimation.engine_comparison import Comparison
 
 _WIDER = 2.0  # sigma; an interval of known noise is 1.96
 _NOT_ESTIMATED, _NOT_USED = "not estimated", "not used"

@@ -11,7 +11,7 @@ import copy
 import textwrap
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import rich.table
@@ -23,9 +23,11 @@ from rich.table import Column
 from rich.text import Text
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.diagnosis.explanation import EffectShape
 from kf_calib.support.text import printable, sentence
 from kf_calib.support.units import Unit, shown, shown_whole, significant
+
+if TYPE_CHECKING:
+    from kf_calib.diagnosis.explanation import EffectShape
 
 
 class PlainConsole(Console):

@@ -41,7 +41,7 @@ def test_the_sentence_names_a_report_that_holds_none_of_the_data(
     text = report.read_text(encoding="utf-8")
     assert SECRET not in text and str(tmp_path) not in text and str(Path.home()) not in text
     assert "command: replay · --with --gravity ·\n" in text and "\nKeyError\n" in text and "\nValueError\n" in text
-    assert re.search(r"kf_calib.cli.evaluate\.py:\d+ in ", text) and re.search(r"numpy \d+\.\d+", text)
+    assert re.search(r"kf_calib.cli.replay\.py:\d+ in ", text) and re.search(r"numpy \d+\.\d+", text)
 
 
 def test_where_no_report_can_be_written_the_traceback_is_asked_for(

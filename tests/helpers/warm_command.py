@@ -105,7 +105,7 @@ def serve(path: str) -> None:
 
 IMPORTED = (
     "kf_calib.cli.live", "kf_calib.positioning.command", "kf_calib.cli.plan", "kf_calib.cli.acquire",
-    "kf_calib.cli.evaluate", "kf_calib.cli.improve",
+    "kf_calib.cli.evaluate", "kf_calib.cli.improve", "kf_calib.cli.replay",
     "kf_calib.diagnosis.missing_effect", "kf_calib.online.session", "kf_calib.sources.live",
     "kf_calib.views.live.screen",
     "kf_calib.views.json", "kf_calib.views.console", "kf_calib.sources.simulation.options", "scipy.optimize",

@@ -32,7 +32,8 @@ from logs_page import COMMAND, PAGE, VERDICT, page
 from kf_calib.bench.streams import Table
 from kf_calib.errors import CountsError, InputError
 from kf_calib.estimation.calibration import calibrate
-from kf_calib.sources.opening import FileKind, kind_of, opened
+from kf_calib.sources.file_kind import FileKind
+from kf_calib.sources.opening import kind_of, opened
 from kf_calib.sources.text.means import open_table
 from kf_calib.sources.text.names import Meaning, meaning_of, meanings_of
 

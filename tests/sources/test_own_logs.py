@@ -20,8 +20,9 @@ from helpers.recordings import read
 
 import kf_calib
 from kf_calib.errors import InputError
+from kf_calib.sources.file_kind import FileKind
 from kf_calib.sources.files.recording import Recording
-from kf_calib.sources.opening import FileKind, kind_of, opened
+from kf_calib.sources.opening import kind_of, opened
 from kf_calib.sources.text.lines import Lines
 from kf_calib.sources.text.survey import Survey
 

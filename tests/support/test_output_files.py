@@ -534,7 +534,7 @@ def test_whatever_goes_wrong_is_one_sentence_and_exit_2(
     monkeypatch.setattr("kf_calib.views.console.summary", fail)
     code, out, err = run("replay", "run.mcap")
     assert code == 2 and out == "" and err.startswith("kf-calib: ") and says in err and err.count("\n") == 1
-    assert "kf_calib/cli/evaluate.py:" in err or isinstance(error, MemoryError)
+    assert "kf_calib/cli/replay.py:" in err or isinstance(error, MemoryError)
     monkeypatch.setenv("KF_CALIB_TRACEBACK", "1")
     code, _, err = run("replay", "run.mcap")
     assert code == 2 and "Traceback" in err and says in err.splitlines()[-1]

@@ -7,6 +7,7 @@ from __future__ import annotations
 import re
 import struct
 import zlib
+from bisect import bisect_right
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -125,6 +126,7 @@ MESSAGE_FIELDS = 22  # channel u16, sequence u32, log time u64, publish time u64
 MESSAGE_RECORD = struct.Struct("<BQHIQQ")  # head and fields of a message's record
 Integers = NDArray[np.int64]
 _MOST_KINDS = 16  # of record heads; beyond that, searching for them costs more than walking
+_FEW_OTHERS = 256  # among messages that are found all at once
 _MOST_OTHERS = 1 << 17  # records of a block that are no messages: every schema and channel there can be
 
 
@@ -180,11 +182,16 @@ class MessageFinder:
         self._known: list[int] = []
 
     def __call__(self, block: RecordBlock) -> Messages:
-        data = block.data
-        return self._chain(data, block.index) or self._chain(data, _candidates(data)) or self._walk(data, block.borders)
+        data, borders = block.data, block.borders
+        return (
+            self._chain(data, block.index, borders)
+            or self._chain(data, _candidates(data), borders)
+            or self._walk(data, borders)
+        )
 
-    def _chain(self, data: bytes, start: Integers) -> Messages | None:
-        """The messages, if all of them are among the records at ``start`` (ascending), and nothing else is there."""
+    def _chain(self, data: bytes, start: Integers, borders: tuple[int, ...]) -> Messages | None:
+        """The messages, if all of them are among the records at ``start`` (ascending), and between them are at most a
+        few whole records of other kinds."""
         start = start[np.searchsorted(start, 0) : np.searchsorted(start, len(data) - _LEAST_MESSAGE, side="right")]
         if not self._known or not len(start):
             return None
@@ -192,10 +199,17 @@ class MessageFinder:
         masks = [kind == known for known in self._known]
         found = np.logical_or.reduce(masks)
         first, end = start[found], start[found] + HEAD.size + (kind[found] >> _LENGTH_SHIFT)
-        if not len(first) or first[0] != 0 or end[-1] != len(data) or np.any(first[1:] != end[:-1]):
+        begins, ends = np.append(0, end), np.append(first, len(data))
+        if np.any(begins > ends):
             return None
+        others: list[tuple[int, bytes]] = []
+        for gap in np.flatnonzero(begins != ends).tolist():
+            between = _others(data, int(begins[gap]), int(ends[gap]), borders)
+            if between is None or len(others) > _FEW_OTHERS:
+                return None
+            others += between
         groups = [_group(known, start[mask]) for known, mask in zip(self._known, masks, strict=True)]
-        return Messages(groups, others=[], lost=0)
+        return Messages(groups, others, lost=0)
 
     def _walk(self, data: bytes, borders: tuple[int, ...]) -> Messages:
         starts: list[int] = []
@@ -226,6 +240,19 @@ class MessageFinder:
         return Messages([_group(known, start[kind == known]) for known in kinds], others, lost)
 
 
+def _others(data: bytes, begin: int, end: int, borders: tuple[int, ...]) -> list[tuple[int, bytes]] | None:
+    """The records from one byte to another; None where one of them is a message or no whole record of its part."""
+    others: list[tuple[int, bytes]] = []
+    while begin < end:
+        opcode, length = HEAD.unpack_from(data, begin) if begin + HEAD.size <= end else (0, 0)
+        content = begin + HEAD.size
+        begin, border = content + length, borders[bisect_right(borders, begin)]
+        if opcode in (0, _MESSAGE) or begin > min(end, border) or len(others) > _FEW_OTHERS:
+            return None
+        others.append((opcode, data[content:begin]))
+    return others
+
+
 def _candidates(data: bytes) -> Integers:
     """Bytes with a message's opcode; none where far too many have it to be worth looking at."""
     has_opcode = np.frombuffer(data, np.uint8) == _MESSAGE
@@ -235,9 +262,10 @@ def _candidates(data: bytes) -> Integers:
 
 def _kinds(data: bytes, start: Integers) -> Integers:
     """Opcode, channel and length of the records at ``start`` in one number each."""
-    heads = np.ndarray((max(len(data) - _HEADS.itemsize + 1, 0),), _HEADS, data, strides=(1,))
-    channel = heads["channel"][start].astype(np.int64) << _CHANNEL_SHIFT
-    return (heads["length"][start] << _LENGTH_SHIFT) | channel | heads["opcode"][start]
+    every = np.ndarray((max(len(data) - _HEADS.itemsize + 1, 0),), f"V{_HEADS.itemsize}", data, strides=(1,))
+    heads = every[start].view(_HEADS)
+    channel = heads["channel"].astype(np.int64) << _CHANNEL_SHIFT
+    return (heads["length"] << _LENGTH_SHIFT) | channel | heads["opcode"]
 
 
 def _group(kind: int, start: Integers) -> MessageGroup:

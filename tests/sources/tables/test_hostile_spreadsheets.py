@@ -21,7 +21,8 @@ from helpers.paths import ROOT
 import kf_calib
 from kf_calib.bench.streams import Table
 from kf_calib.errors import InputError, KfCalibError
-from kf_calib.sources.opening import FileKind, kind_of
+from kf_calib.sources.file_kind import FileKind
+from kf_calib.sources.opening import kind_of
 from kf_calib.sources.text.names import meaning_of
 from kf_calib.sources.text.spreadsheet import PlainRows, sheets_of
 
