@@ -310,8 +310,9 @@ def _held_out(diagnosis: Diagnosis) -> str:
     floor = diagnosis.floor_mps2
     if before.held_out_rms_mps2 is None or after.held_out_rms_mps2 is None or not floor:
         return ""
+    added = "them" if len(diagnosis.missing) > 1 else "it"
     return (
-        f" Adding it takes the error on orientations left out from {before.held_out_rms_mps2 / floor:.2f} to "
+        f" Adding {added} takes the error on orientations left out from {before.held_out_rms_mps2 / floor:.2f} to "
         f"{after.held_out_rms_mps2 / floor:.2f} times what noise gives."
     )
 
