@@ -5,13 +5,14 @@ scatter, setting errors, and both.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.diagnosis.in_noises import InNoises
 from kf_calib.diagnosis.run_likelihood import RunLikelihood, integrated
 from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.reml import OF_ONE, Parts
@@ -88,6 +89,11 @@ class NoiseSizes:
         """Covariances (D, 3, 3) of all noises; None for none beyond what was stated."""
         return [None, *(square * family.shapes for family in self.families[1:] for square in self.squares.tolist())]
 
+    def in_families(self, products: Callable[[Floats, Floats], InNoises]) -> list[InNoises]:
+        """Products in all noises of each family, made from the shapes of a family and the squares of its sizes."""
+        none, *others = self.families
+        return [products(none.shapes, np.zeros(1)), *(products(family.shapes, self.squares) for family in others)]
+
     def likely(self, logs: Floats, most: Floats) -> list[list[int]]:
         """Numbers of the noises of each family that are not much larger than the likeliest by log likelihoods
         (noises,), nor so small that even these with the most (noises,) that a term gains are hopeless."""
@@ -130,7 +136,7 @@ class NoiseSizes:
     @cached_property
     def _without(self) -> list[float]:
         """Log evidence of the families but the first without any term."""
-        noises = (self._likelihood.in_noises(family.shapes, self.squares) for family in self.families[1:])
+        noises = self.in_families(self._likelihood.in_noises)[1:]
         return [float(self._over_sizes(of_family.logs[None])[0]) for of_family in noises]
 
     @property

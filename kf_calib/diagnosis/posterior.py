@@ -12,9 +12,10 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from kf_calib.bench.arrays import Floats, Indices
 from kf_calib.diagnosis.candidate_tests import CandidateTests
@@ -31,13 +32,12 @@ from kf_calib.diagnosis.hypothesis_table import (
     HypothesisTable,
     table_of,
 )
-from kf_calib.diagnosis.in_noises import InNoises
+from kf_calib.diagnosis.in_noises import ROUNDING, InNoises
 from kf_calib.diagnosis.noise_sizes import NoiseFamily, NoiseSizes
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.run_likelihood import Projected, RunLikelihood, log_bayes_together
 from kf_calib.diagnosis.run_terms import TWO_SUMMANDS, RunTerm, RunTerms, log_bayes_of_columns, sizes_of
 from kf_calib.diagnosis.unknown_terms import name_of_formula, text_named
-from kf_calib.dwells.qr import orthonormal
 from kf_calib.effects import effect_named
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.observability import impossible_size
@@ -118,9 +118,7 @@ class RunPosterior:
     @cached_property
     def _noises(self) -> list[InNoises]:
         """The products of all columns in the noises of each family."""
-        none, *others = self._sizes.families
-        products = [self._run.in_noises(none.shapes, np.zeros(1))]
-        return products + [self._run.in_noises(family.shapes, self._sizes.squares) for family in others]
+        return self._sizes.in_families(self._run.in_noises)
 
     @cached_property
     def _at(self) -> list[tuple[int, int]]:
@@ -252,9 +250,7 @@ class RunPosterior:
         known, run = self._before.model.count, self._run.likelihood
         likelihood = RunLikelihood(refit.linearised, self._noise, self._least_mps2, known=known)
         rows = likelihood.spanned.beside(np.arange(refit.model.count - known))
-        none, *others = self._sizes.families
-        noises = [InNoises(rows, none.shapes, np.zeros(1))]
-        noises += [InNoises(rows, family.shapes, self._sizes.squares) for family in others]
+        noises = self._sizes.in_families(partial(InNoises, rows))
         # what a term disturbs itself is for no dwell to explain
         squares = np.minimum(run.courses.squares, likelihood.courses.squares)
         apart = DwellsApart(rows, replace(run.courses, squares=squares), noises, self._sizes)
@@ -420,17 +416,21 @@ class RunPosterior:
              for place, matrix, prior, effect in zip(places, relation, usual, effects, strict=True)]
             for relation in related
         ]  # fmt: skip
-        logs = np.empty((len(related), len(self._sizes.covariances)))
-        for k, covariance in enumerate(self._sizes.covariances):
-            rows = likelihood.projected(covariance, np.concatenate(places))
-            for j, relation in enumerate(related):
-                columns = [rows.of(place) @ matrix for place, matrix in zip(places, relation, strict=True)]
-                logs[j, k] = rows.log + log_bayes_together(columns, rows.readings, sizes[j])
-        likeliest = self._sizes.covariances[int(np.argmax(logs.max(axis=0)))]
-        rows = likelihood.projected(likeliest, np.concatenate(places))
-        explained = orthonormal(rows.columns)[0].T @ rows.readings
+        every = np.concatenate(places)
+        noises = self._sizes.in_families(partial(likelihood.in_noises, groups=[every[None]]))
+        grams = np.concatenate([of_family.grams[0][:, 0] for of_family in noises])
+        along = np.concatenate([of_family.along[:, every] for of_family in noises])
+        combined = [np.asarray(block_diag(*relation), float) for relation in related]
+        widths = [[matrix.shape[1] for matrix in relation] for relation in related]
+        together = [
+            log_bayes_together(matrix.T @ grams @ matrix, along @ matrix, width, of_terms)
+            for matrix, width, of_terms in zip(combined, widths, sizes, strict=True)
+        ]
+        logs = np.stack(together) + np.concatenate([of_family.logs for of_family in noises])
+        likeliest = int(np.argmax(logs.max(axis=0)))
+        statistic = along[likeliest] @ np.linalg.pinv(grams[likeliest], ROUNDING, hermitian=True) @ along[likeliest]
         log = float(np.logaddexp.reduce(self._sizes.evidence(logs), axis=None)) - math.log(len(related))
-        return log, float(explained @ explained)
+        return log, float(statistic)
 
     # What an unknown function looks like
 

@@ -263,21 +263,20 @@ def log_bayes(gram: Floats, along: Floats, squares: Floats, log_weights: Floats,
     return np.logaddexp.reduce(logs + log_weights, axis=1) + shift
 
 
-def log_bayes_together(parts: Sequence[Floats], readings: Floats, sizes: Sequence[Sizes]) -> float:
-    """Log Bayes factor of terms together: columns (r, q) of each, readings (r,), each averaged over its sizes."""
-    columns = np.hstack(parts)
-    groups = np.repeat(np.arange(len(parts)), [part.shape[1] for part in parts])
+def log_bayes_together(gram: Floats, along: Floats, widths: Sequence[int], sizes: Sequence[Sizes]) -> Floats:
+    """Log Bayes factors (k,) of terms together, each averaged over its sizes: gram (k, q, q) and along (k, q) = G^T z
+    of all their columns, of which each term has as many as widths say."""
+    groups = np.repeat(np.arange(len(widths)), widths)
     centre = np.array([each.centre for each in sizes])[groups]
-    shifted = readings - columns @ centre
-    gram, along = columns.T @ columns, columns.T @ shifted
+    shift = along @ centre - 0.5 * centre @ gram @ centre
     mesh = np.stack([each.ravel() for each in np.meshgrid(*(s.values for s in sizes), indexing="ij")], axis=1)
     logs = np.sum([each.ravel() for each in np.meshgrid(*(s.logs for s in sizes), indexing="ij")], axis=0)
     scaled = mesh[:, groups]
-    spread = np.eye(len(gram)) + scaled[:, :, None] * gram * scaled[:, None]
-    right = scaled * along
+    spread = np.eye(len(groups)) + scaled[:, :, None] * gram[:, None] * scaled[:, None]  # (k, m, q, q)
+    right = scaled * (along - gram @ centre)[:, None]
     solved = np.linalg.solve(spread, right[..., None])[..., 0]
-    terms = logs + 0.5 * np.sum(right * solved, axis=1) - 0.5 * np.linalg.slogdet(spread)[1]
-    return float(np.logaddexp.reduce(terms)) + 0.5 * float(readings @ readings - shifted @ shifted)
+    terms = logs + 0.5 * np.sum(right * solved, axis=2) - 0.5 * np.linalg.slogdet(spread)[1]
+    return np.logaddexp.reduce(terms, axis=1) + shift
 
 
 def integrated(logs: Floats, step: float) -> Floats:

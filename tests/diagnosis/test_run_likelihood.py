@@ -45,11 +45,20 @@ def test_a_term_multiplies_the_density_by_its_bayes_factor(centre: float) -> Non
 def test_two_terms_have_the_density_of_both_and_a_column_twice_is_one() -> None:
     rng = np.random.default_rng(2)
     one, other, readings = rng.normal(size=(10, 2)), rng.normal(size=(10, 3)), rng.normal(size=10) * 2.0
-    both = log_bayes_together([one, other], readings, [sizes(0.5, 4.0), sizes(1.5)])
+
+    def together(parts: list[np.ndarray], of_terms: list[Sizes]) -> float:
+        columns = np.hstack(parts)
+        gram, along = columns.T @ columns, columns.T @ readings
+        return log_bayes_together(gram[None], along[None], [part.shape[1] for part in parts], of_terms)[0]
+
+    both = together([one, other], [sizes(0.5, 4.0), sizes(1.5)])
     expected = np.logaddexp.reduce([density(np.hstack([s * one, 1.5 * other]), 1.0, readings) for s in (0.5, 4.0)])
     assert both == pytest.approx(expected - np.log(2.0) - density(one, 0.0, readings), abs=1e-9)
-    twice = log_bayes_together([one, one], readings, [sizes(1.0), sizes(1.0)])
-    assert twice == pytest.approx(log_bayes_together([np.sqrt(2.0) * one], readings, [sizes(1.0)]), abs=1e-9)
+    twice = together([one, one], [sizes(1.0), sizes(1.0)])
+    assert twice == pytest.approx(together([np.sqrt(2.0) * one], [sizes(1.0)]), abs=1e-9)
+    about = together([one], [Sizes(np.array([1.5]), np.zeros(1), 0.4)])
+    shifted = readings - 0.4 * one.sum(axis=1)
+    assert about == pytest.approx(density(1.5 * one, 1.0, shifted) - density(one, 0.0, readings), abs=1e-9)
 
 
 def test_an_integral_over_sizes_is_that_of_quadrature() -> None:
