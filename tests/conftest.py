@@ -54,6 +54,12 @@ def pytest_collection_finish() -> None:
     gc.set_threshold(20_000)
 
 
+@pytest.fixture(autouse=True)
+def _goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """This process is not at its end where ``main`` returns."""
+    monkeypatch.setattr(gc, "freeze", lambda: None)
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     """The graphics driver is hidden from a test that does not say that it draws: it would fail where there is none."""
