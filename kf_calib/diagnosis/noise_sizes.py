@@ -112,7 +112,7 @@ class NoiseSizes:
         """
         count = len(self._sizes)
         numbers = numbers or [[0], *([*range(first, first + count)] for first in range(1, logs.shape[1], count))]
-        families = enumerate(map(list, numbers[1:]), start=1)
+        families = enumerate(numbers[1:], start=1)
         parts = [logs[:, 0], *(self._beside_causes(k, self._over_sizes(logs[:, some])) for k, some in families)]
         return np.stack(parts, axis=1) + [family.log_prior for family in self.families]
 

@@ -132,7 +132,7 @@ class Diagnosis:
     def description(self) -> Description | None:
         """What an unknown misfit looks like; None where the misfit is known (one dwell, too), or there is none."""
         first, residuals = self.likeliest, self.before.residuals_mps2
-        if not self.unknown or (first is not None and first.dwells):
+        if not self.unknown or self.before.outlying or (first is not None and first.dwells):
             return None
         if first is None or not first.formulas or first.refit is None:
             driver = "" if first is None or first.driver in (IRREGULAR, ALIKE) else first.driver
@@ -146,6 +146,8 @@ class Diagnosis:
         first, loud = self.likeliest, self.before.readings.loud
         if self.apart:
             return self.apart[0]
+        if self.before.outlying:
+            return self.before.outlying[0].number
         if first is not None and first.dwells:
             return first.dwells[0]
         return loud.numbers[0] if loud else 0

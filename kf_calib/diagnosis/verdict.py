@@ -10,7 +10,6 @@ from kf_calib.diagnosis.hypothesis_table import IRREGULAR, NOISE, NONE, NOTHING,
 from kf_calib.diagnosis.refits import dwell_noise_is_stated
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.estimation.dwell_pass import holds_its_oscillation
-from kf_calib.estimation.outlying_dwell import outlying_in_words
 from kf_calib.estimation.results import Parameter, format_p
 from kf_calib.support.tail_probabilities import LEVEL
 from kf_calib.support.units import shown
@@ -180,9 +179,6 @@ def _unknown(diagnosis: Diagnosis, first: Hypothesis) -> str:
         numbers = (*diagnosis.apart, *first.dwells)
         options = " ".join(f"--leave-out {number}" for number in sorted(numbers))
         share, named = f"{format_probability(first.probability)}{_others(diagnosis)}", _dwells(numbers).lower()
-        outlying = diagnosis.before.outlying
-        if len(numbers) == 1 and numbers[0] in {dwell.number for dwell in outlying}:
-            return f"One dwell is wrong ({share}): {outlying_in_words(outlying)}"
         if len(numbers) == 1:
             return (
                 f"One dwell is wrong: {named} alone does not fit ({share}): look at its pose and its readings, or "
