@@ -37,8 +37,9 @@ class DwellsApart:
     noises: Sequence[InNoises]
     sizes: NoiseSizes
 
-    def likeliest(self) -> tuple[float, tuple[int, ...]]:
-        """The log evidence of the likeliest dwells, with their prior, and which these are, the clearest first."""
+    def rows_of_dwells(self) -> list[tuple[float, tuple[int, ...]]]:
+        """Log evidence, with its prior, that some dwells are off, and which, the clearest first: of each dwell alone,
+        and of several."""
         chosen, before = list[int](), np.concatenate([of_family.logs for of_family in self.noises])
         rows: list[tuple[float, tuple[int, ...]]] = [(-math.inf, ())]
         while len(chosen) < min(max(len(self.rows) * _MOST, 1.0), len(max(rows)[1]) + _MASKED):
@@ -50,13 +51,11 @@ class DwellsApart:
             in_none = before[0] + of_dwells[:, 0]
             in_none[chosen] = -math.inf
             k = int(np.argmax(in_none))
-            if chosen:
-                rows.append((float(evidence[k]) + len(rows) * self._log_prior, (*chosen, k)))
-            else:  # any of them may be the one
-                log = float(np.logaddexp.reduce(evidence)) + self._log_prior
-                rows.append((log, (int(np.argmax(evidence)),)))
+            some = [k] if chosen else range(len(self.rows))  # any of them may be the one
+            log_prior = (len(chosen) + 1) * self._log_prior
+            rows += [(float(evidence[j]) + log_prior, (*chosen, j)) for j in some]
             chosen, before = [*chosen, k], before + of_dwells[k]
-        return max(rows)
+        return rows[1:]
 
     @property
     def _log_prior(self) -> float:
@@ -65,7 +64,7 @@ class DwellsApart:
 
     def _log_bayes(self, without: Sequence[int]) -> Floats:
         """Return log Bayes factors (D, noises) of changes of each dwell, as the dwells without some of them tell."""
-        changes = self.courses.log_bayes_of_some(math.exp(self._log_prior)) if without else self.courses.log_bayes()
+        changes = self.courses.log_bayes(math.exp(self._log_prior))
         means = [
             log_bayes_of_any_size(*of_family.dwells(size, self.rows, without))
             for of_family in self.noises

@@ -113,6 +113,17 @@ class HypothesisTable:
         """Probability that all these effects are missing, alone or with others."""
         return sum(row.probability for row in self.rows if set(effects) <= set(row.effects))
 
+    def probability_of_dwell(self, number: int) -> float:
+        """Probability that a dwell is off, alone or with others."""
+        return sum(row.probability for row in self.rows if number in row.dwells)
+
+    def with_dwell_alone(self, number: int) -> HypothesisTable:
+        """The table where it turned out that all other dwells agree without one that is off."""
+        first = replace(
+            self.first, driver=f"dwell {number} alone", dwells=(number,), probability=self.probability_of_dwell(number)
+        )
+        return replace(self, rows=(first, *(row for row in self.rows if number not in row.dwells)))
+
     def probability_with(self, row: Hypothesis) -> float:
         """Probability of the causes of a row, alone or with others."""
         return sum(each.probability for each in self.rows if row.causes <= each.causes)

@@ -23,7 +23,7 @@ _AT_ONCE = 1 << 20  # products that are computed together, so that they stay in 
 ROUNDING = 1e-10
 """Share of the square of a column below which what the model, or other columns, leave of it is rounding."""
 
-_SEEN = 1e-6  # share of the largest part of some columns that a part of them has at least
+_SEEN = 1e-6  # share of some columns that a part of them has at least, off what the model spans
 _LOST = 1e-3  # share of what all dwells determine of the model, below which some of them determine nothing
 
 
@@ -44,14 +44,14 @@ class Spanned:
     def __len__(self) -> int:
         return len(self.basis)
 
-    def beside(self, places: Indices) -> Spanned:
-        """The rows with some of the columns in the model, without any others."""
-        columns, more = self.columns[..., places], self.more_columns[:, places]
-        lengths = np.sqrt(np.einsum("dic,dic->c", columns, columns) + np.sum(more**2, axis=0))
+    def beside(self, places: Indices, lengths: Floats) -> Spanned:
+        """The rows with some of the columns in the model, without any others; lengths (C,): of the columns before what
+        the model spans was subtracted from them."""
+        columns, more, lengths = self.columns[..., places], self.more_columns[:, places], lengths[places]
         count = columns.shape[0] * columns.shape[1]
         scaled = np.vstack([columns.reshape(count, len(places)), more]) / np.where(lengths > 0.0, lengths, 1.0)
         left, singular, _ = np.linalg.svd(scaled, full_matrices=False)
-        left = left[:, singular > _SEEN * singular.max(initial=0.0)]
+        left = left[:, singular > _SEEN]
         of_means, of_more = left[:count].reshape(*columns.shape[:2], left.shape[1]), left[count:]
         along = np.tensordot(of_means, self.readings, axes=((0, 1), (0, 1))) + of_more.T @ self.more_readings
         return Spanned(

@@ -43,8 +43,8 @@ from kf_calib.diagnosis.verdict import format_probability, second_pass_in_words,
 from kf_calib.dwells import window_average
 from kf_calib.effects import effect_named
 from kf_calib.estimation.filter_history import readings_of
-from kf_calib.estimation.outlying_dwell import outlying_in_words
-from kf_calib.estimation.results import Calibration, format_p
+from kf_calib.estimation.outlying_dwell import wrong_dwell
+from kf_calib.estimation.results import Calibration
 from kf_calib.support.tail_probabilities import LEVEL, chi_squared_tail, log_odds_of
 
 _SHOWN = 6  # number of suspects that are shown
@@ -88,23 +88,22 @@ def _replication(diagnosis: Diagnosis) -> Replication | None:
 
 def _diagnosed(refits: Refits, before: Calibration) -> Diagnosis:
     """Diagnose a calibration: a dwell that alone is off is a term beside all others, which takes all that it says, so
-    that what else is missing is told by the other dwells."""
+    that what else is missing is told by the other dwells, where these are fitted."""
     diagnosis = _of_all_dwells(refits, before)
-    numbers = tuple(dwell.number for dwell in before.outlying[:1])
-    numbers = diagnosis.likeliest.dwells[:1] if diagnosis.likeliest else numbers
-    rest = refits.without_dwells(before, numbers) if numbers else None
+    number = diagnosis.likeliest.dwells[0] if diagnosis.likeliest and diagnosis.likeliest.dwells else 0
+    rest = refits.without_dwells(before, (number,)) if number else None
     beside = None if rest is None else _diagnosed(refits, rest)
-    if beside is None or beside.test.consistent is not False:
+    if beside is None or diagnosis.table is None:
         return diagnosis
-    return _in_words(replace(beside, apart=(*numbers, *beside.apart)))
+    if beside.test.consistent is False:
+        return _in_words(replace(beside, apart=(number, *beside.apart)))
+    at = [dwell.number for dwell in before.fit.dwells].index(number)
+    wrong = wrong_dwell(before, at, beside.before) if before.bench.angles else None
+    return _in_words(replace(diagnosis, table=diagnosis.table.with_dwell_alone(number), wrong_dwell=wrong))
 
 
 def _of_all_dwells(refits: Refits, before: Calibration) -> Diagnosis:
-    """Diagnose a calibration: look for an outlying dwell first, then for effects, with vibration averaged out."""
-    if before.outlying:  # one wrong dwell is not an effect, but would make many effects significant
-        test = replace(refits.assess(before), noise_p=min(dwell.p_value for dwell in before.outlying))
-        verdict = f"One dwell is wrong (p {format_p(test.p_value)}): {outlying_in_words(before.outlying)}"
-        return Diagnosis(before=before, test=test, verdict=verdict, unknown=test.consistent is False)
+    """Diagnose a calibration by all of its dwells, with vibration averaged out."""
     test = _without_vibration(refits, before, refits.assess(before))
     oscillating = None if test.lines.vibration else _oscillating(refits, before)
     if oscillating is not None:

@@ -45,7 +45,7 @@ from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.within_dwell_trend import p_of_steady_oscillation, trend
 from kf_calib.noise.terms import RandomWalk, ThermometerError
 from kf_calib.support import stage
-from kf_calib.support.tail_probabilities import log_odds_of
+from kf_calib.support.tail_probabilities import LEVEL, chi_squared_tail, log_odds_of
 
 _IRREGULAR = 0.1  # share of an unknown cause in scatter that was not stated
 _BESIDE = 2  # rows of effects, and of unknown functions, beside which dwells are tried
@@ -54,7 +54,7 @@ _OF_ORIENTATION = 0.8  # share of unknown causes that depend on the orientation 
 _WITHIN = 0.01  # prior probability of irregular changes that show within dwells only
 _APART = 1e-4  # p-value of an oscillation that does not go on alike in all dwells
 _HEADS = 3  # effects beside which all other terms are tried: likeliest in any noise, in that stated, and in pairs
-_NO_SIGN = 0.5  # of chi-squared: what is left of an effect beside one that is the same
+_NO_SIGN, _ONE = 0.5, 1e-3  # what is left of an effect beside one that is the same: of chi-squared, and a share
 _SAME = 1e-6  # squared sine of the angle below which two effects are one
 _REFITTED, _ALWAYS = 8, 3  # rows of effects that are fitted at most, and single ones that always are
 _BEHIND, _BENT = 10.0, 0.02  # in log evidence, and share of the gain: rows further behind are not fitted
@@ -84,7 +84,7 @@ class RunPosterior:
     def table(self, refitted: bool = True) -> HypothesisTable:
         """All rows with their probabilities; the likeliest are fitted if ``refitted``."""
         stage.say(f"weighing {len(self._run.terms)} explanations in {len(self._sizes.covariances)} noises")
-        rows = [*self._without_terms(), *self._singles(), self._dwells_apart()]
+        rows = [*self._without_terms(), *self._singles(), *self._dwells_apart()]
         if refitted:
             rows = self._fitted(_merged([*rows, *self._pairs()]))
             beside = self._dwells_beside(rows)
@@ -95,8 +95,8 @@ class RunPosterior:
         return replace(table, same=self._same_as(table.first)) if refitted else table
 
     def _same_as(self, first: Hypothesis) -> tuple[str, ...]:
-        """Return the effects that explain just what a single effect does: of what it explains they leave nothing that
-        shows, whether they have it as their only column or as one of several."""
+        """Return the effects that explain just what a single effect does, whether they have it as their only column or
+        as one of several: what the effect explains with other columns than theirs is no more than noise."""
         if len(first.effects) != 1 or first.formulas or first.effects[0] not in self._best:
             return ()
         (name,) = first.effects
@@ -106,12 +106,15 @@ class RunPosterior:
             other for other in self._run.names if other != name and other != self._run.walk and other in self._best
         ]
         bases, readings = self._run.bases([number, *(self._best[other] for other in others)], noise)
-        explained = bases[0].T @ (bases[0] @ readings)
-        whole = float(explained @ explained)
-        left = whole - np.sum((bases[1:] @ explained) ** 2, axis=1)
+        along, rank = bases[0] @ readings, int(bases[0].any(axis=1).sum())
+        turns, cosines, _ = np.linalg.svd(bases[0] @ np.swapaxes(bases[1:], 1, 2))
+        shared = 1.0 - cosines**2 < min(_ONE, _NO_SIGN / max(float(along @ along), 1e-300))
+        apart = np.sum(np.where(shared, 0.0, along @ turns) ** 2, axis=1)
+        alone = rank - shared.sum(axis=1)
         return tuple(
-            other for other, own in zip(others, left.tolist(), strict=True) if own < min(_NO_SIGN, 1e-3 * whole)
-        )
+            other for other, dof, statistic in zip(others, alone.tolist(), apart.tolist(), strict=True)
+            if dof < rank and (not dof or chi_squared_tail(dof, statistic) > LEVEL)
+        )  # fmt: skip
 
     # The noise in which rows are weighed
 
@@ -222,13 +225,16 @@ class RunPosterior:
             return float(effects.scan.statistics[effects.best[name]]), effects.candidate(name).dof
         return 2.0 * self._before.fit.walk_gain, 1
 
-    def _dwells_apart(self) -> Hypothesis:
-        """Return the row of dwells that are off, and nothing else is missing."""
-        run = self._run.likelihood
-        log, places = DwellsApart(run.spanned, run.courses, self._noises, self._sizes).likeliest()
-        numbers = self._numbers(places)
-        words = f"dwell{'s' * (len(numbers) > 1)} {' and '.join(map(str, sorted(numbers)))} alone"
-        return Hypothesis(driver=words, families=(NONE,), log_evidence=log, dwells=numbers)
+    def _dwells_apart(self) -> list[Hypothesis]:
+        """Return the rows of dwells that are off, and nothing else is missing."""
+        run, rows = self._run.likelihood, list[Hypothesis]()
+        found = DwellsApart(run.spanned, run.courses, self._noises, self._sizes).rows_of_dwells()
+        likeliest = max((log for log, _ in found), default=0.0)
+        for log, places in ((log, places) for log, places in found if log > likeliest - _BEHIND):
+            numbers = self._numbers(places)
+            words = f"dwell{'s' * (len(numbers) > 1)} {' and '.join(map(str, sorted(numbers)))} alone"
+            rows.append(Hypothesis(driver=words, families=(NONE,), log_evidence=log, dwells=numbers))
+        return rows
 
     def _numbers(self, places: Sequence[int]) -> tuple[int, ...]:
         """Return the numbers of some of the dwells."""
@@ -236,25 +242,24 @@ class RunPosterior:
 
     def _dwells_beside(self, rows: Sequence[Hypothesis]) -> list[Hypothesis]:
         """Return the rows of dwells that are off beside the likeliest effects, and beside the likeliest unknown
-        functions, where these leave more than noise."""
+        functions."""
         likeliest = sorted(rows, key=lambda row: -row.log_evidence)
         known = [row for row in likeliest if row.effects and not row.driver and self._run.walk not in row.effects]
         known = [row for row in known if row.refit is not None][:_BESIDE]
         unknown = [row for row in likeliest if row.driver not in ("", IRREGULAR) and not (row.effects or row.dwells)]
         both = [*known, *map(self._described, unknown[:_BESIDE])]
-        fitted = [(row, row.refit) for row in both if row.refit is not None]
-        return [self._with_dwells(row, refit) for row, refit in fitted if refit.consistency.consistent is False]
+        return [self._with_dwells(row, row.refit) for row in both if row.refit is not None]
 
     def _with_dwells(self, row: Hypothesis, refit: Calibration) -> Hypothesis:
         """Return a row with dwells that are off beside what it has, where its fit is."""
         known, run = self._before.model.count, self._run.likelihood
         likelihood = RunLikelihood(refit.linearised, self._noise, self._least_mps2, known=known)
-        rows = likelihood.spanned.beside(np.arange(refit.model.count - known))
+        rows = likelihood.spanned.beside(np.arange(refit.model.count - known), likelihood.lengths)
         noises = self._sizes.in_families(partial(InNoises, rows))
         # what a term disturbs itself is for no dwell to explain
         squares = np.minimum(run.courses.squares, likelihood.courses.squares)
         apart = DwellsApart(rows, replace(run.courses, squares=squares), noises, self._sizes)
-        log, places = apart.likeliest()
+        log, places = max(apart.rows_of_dwells(), default=(-math.inf, ()))
         without = self._sizes.evidence(np.concatenate([of_family.logs for of_family in noises])[None])[0]
         gain = log - float(np.logaddexp.reduce(without))
         return replace(row, dwells=self._numbers(places), log_evidence=row.log_evidence + gain)
@@ -291,7 +296,8 @@ class RunPosterior:
     def _of_two_summands(self, one: int, logs: Floats) -> float:
         """Return the log evidence of two summands of an unknown function, from that of all terms beside one."""
         head, terms = self._run.terms[one], self._run.terms
-        others = [k for k, term in enumerate(terms) if term.row == head.row and len(term.summands) == 1 and k != one]
+        others = [k for k, term in enumerate(terms) if term.row == head.row and len(term.summands) == 1]
+        others = [k for k in others if not terms[k].alone and terms[k].summands != head.summands]
         if len(others) < 2 or self._run.unknown[int(head.row[1:])].exclusive:
             return -math.inf
         share = math.log(TWO_SUMMANDS / math.comb(len(others) + 1, 2))
@@ -408,8 +414,11 @@ class RunPosterior:
         known = model.parts[str(effects[0])].start
         likelihood = RunLikelihood(refit.linearised, noise, self._least_mps2, known=known)
         places = [model.parts[str(effect)].start - known + np.arange(len(effect.coefficients)) for effect in effects]
-        matrices = ([*effect.relations] or [np.eye(len(effect.coefficients))] for effect in effects)
-        related = [*itertools.product(*matrices)]
+        both = [*itertools.product(*(effect.relations for effect in effects))]
+        shares, related = (
+            [math.prod(share for share, _ in each) for each in both],
+            [[m for _, m in each] for each in both],
+        )
         usual = [usual_sizes(effect, self._run.grade) for effect in effects]
         sizes = [
             [sizes_of(best_sigma(likelihood.columns(place) @ matrix), prior, impossible_size(effect), _NODES_OF_PAIR)
@@ -429,7 +438,7 @@ class RunPosterior:
         logs = np.stack(together) + np.concatenate([of_family.logs for of_family in noises])
         likeliest = int(np.argmax(logs.max(axis=0)))
         statistic = along[likeliest] @ np.linalg.pinv(grams[likeliest], ROUNDING, hermitian=True) @ along[likeliest]
-        log = float(np.logaddexp.reduce(self._sizes.evidence(logs), axis=None)) - math.log(len(related))
+        log = float(np.logaddexp.reduce(self._sizes.evidence(logs) + np.log(shares)[:, None], axis=None))
         return log, float(statistic)
 
     # What an unknown function looks like
@@ -453,7 +462,7 @@ class RunPosterior:
         """Return the formulas of an unknown function that the readings ask for, those that explain most first."""
         run, unknown = self._run, self._run.unknown[number]
         flat = [place for name in beside for place in run.terms[self._best[name]].columns.tolist()]
-        terms = [term for term in run.terms if term.row == f"?{number}"]
+        terms = [term for term in run.terms if term.row == f"?{number}" and not term.alone]
         places = np.unique(np.concatenate([term.columns for term in terms]))
         scores = np.array([self._scores(terms, places, flat, covariance) for covariance in self._sizes.covariances])
         at, likeliest = np.unravel_index(int(np.argmax(scores)), scores.shape)

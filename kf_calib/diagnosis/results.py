@@ -19,7 +19,7 @@ from kf_calib.diagnosis.residual_drivers import Driver, drivers_of
 from kf_calib.diagnosis.unknown_effect import Description, channel_of, describe_irregular, explained_share
 from kf_calib.effects.effect import Grade
 from kf_calib.estimation.filter_history import DwellReadings
-from kf_calib.estimation.results import Calibration, Condition, Parameter
+from kf_calib.estimation.results import Calibration, Condition, OutlyingDwell, Parameter
 from kf_calib.noise.noise_model import mean_covariances
 from kf_calib.support.tail_probabilities import chi_squared_tail
 from kf_calib.support.text import as_html, printed
@@ -59,7 +59,7 @@ class Diagnosis:
     """What a diagnosis found.
 
     before: the calibration that was diagnosed. test: the tests of all candidates. table: all explanations with their
-    probabilities (None: nothing could be tested, or one dwell is wrong). verdict: the result in a sentence.
+    probabilities (None: nothing could be tested). verdict: the result in a sentence.
 
     missing: names of the effects of the likeliest explanation (empty: nothing is missing, or no known effect). unknown:
     whether the likeliest is none of the known effects. unearned: why the effects of the likeliest explanation are not
@@ -72,8 +72,9 @@ class Diagnosis:
     before_in_noise_left: ``before`` in the noise that the likeliest explanation leaves, where noise was estimated
     (None: it is that of ``before``). replication: how what is named predicts dwells that choosing it never saw (None:
     nothing is named, or it was not asked for). apart: numbers of dwells that do not fit, whatever else is missing: all
-    else is said of the run without them. disturbed_readings: those of the dwell that the verdict calls disturbed
-    (None: there is none, or the readings are gone).
+    else is said of the run without them. wrong_dwell: that of the likeliest explanation, where all others agree without
+    it (None: there is none, or there are no angles). disturbed_readings: those of the dwell that the verdict calls
+    disturbed (None: there is none, or the readings are gone).
     """
 
     before: Calibration
@@ -93,6 +94,7 @@ class Diagnosis:
     before_in_noise_left: Calibration | None = None
     replication: Replication | None = None
     apart: tuple[int, ...] = ()
+    wrong_dwell: OutlyingDwell | None = None
     disturbed_readings: DwellReadings | None = None
 
     def __repr__(self) -> str:
@@ -132,7 +134,7 @@ class Diagnosis:
     def description(self) -> Description | None:
         """What an unknown misfit looks like; None where the misfit is known (one dwell, too), or there is none."""
         first, residuals = self.likeliest, self.before.residuals_mps2
-        if not self.unknown or self.before.outlying or (first is not None and first.dwells):
+        if not self.unknown or (first is not None and first.dwells):
             return None
         if first is None or not first.formulas or first.refit is None:
             driver = "" if first is None or first.driver in (IRREGULAR, ALIKE) else first.driver
@@ -146,8 +148,6 @@ class Diagnosis:
         first, loud = self.likeliest, self.before.readings.loud
         if self.apart:
             return self.apart[0]
-        if self.before.outlying:
-            return self.before.outlying[0].number
         if first is not None and first.dwells:
             return first.dwells[0]
         return loud.numbers[0] if loud else 0

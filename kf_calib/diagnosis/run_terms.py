@@ -19,7 +19,7 @@ from kf_calib.diagnosis.run_likelihood import Combination, RunLikelihood, Sizes,
 from kf_calib.diagnosis.unknown_terms import RETURNING, UnknownTerm, text_named, unknown_terms
 from kf_calib.dwells.qr import orthonormal
 from kf_calib.effects import Coefficient, Effect, Stimulus, effect_named, walk_named
-from kf_calib.effects.effect import Grade
+from kf_calib.effects.effect import IN_ALL, Grade
 from kf_calib.effects.formula import formula
 from kf_calib.estimation.cross_validation import orientations
 from kf_calib.estimation.dwell_columns import stimulus_of
@@ -39,6 +39,9 @@ _LEAST = 1e-3  # share of the largest part of a term that a part of it has at le
 _WAVES = 40  # of a random walk
 _RETURNS, _PER_DWELL = (4, 8, 16, 32, 64), 0.75  # parts of a run within which a bias may come back, and most of them
 _MOST_ORIENTATIONS = 100  # that are told apart by what comes back with each
+_EVERY = slice(None)
+_OF_ACCELEROMETERS = [(IN_ALL, _EVERY), *(((1.0 - IN_ALL) / 3.0, slice(k, None, 3)) for k in range(3))]
+"""Columns of a function that all accelerometers have, or one alone, with the prior probabilities."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +50,8 @@ class RunTerm:
 
     row: the name of an effect, or ``?`` and the number of an unknown function. log_share: log of its share in the prior
     of its row. effect: with the constant at which it has these columns. summands: of the unknown function, those that
-    it has. sizes: of its coefficients. scales: factors (q,) of its columns.
+    it has. alone: whether one accelerometer alone has it. sizes: of its coefficients. scales: factors (q,) of its
+    columns.
     """
 
     row: str
@@ -55,6 +59,7 @@ class RunTerm:
     log_share: float
     effect: Effect | None = None
     summands: tuple[int, ...] = ()
+    alone: bool = False
     sizes: Sizes = field(default_factory=lambda: Sizes(np.zeros(0), np.zeros(0)))
     scales: Floats | None = None
 
@@ -113,9 +118,9 @@ class RunTerms:
             most = max(len(numbers), *(tried[k] for k in numbers))
             logs[numbers] -= float(np.logaddexp.reduce(logs[numbers])) + math.log(most / len(numbers))
         for effect, log in zip(effects, logs.tolist(), strict=True):
-            part, relations = columns.add([effect]), [*effect.relations] or [None]
-            for matrix in relations:
-                columns.term(str(effect), [columns.block(part, matrix)], log - math.log(len(relations)), effect)
+            part = columns.add([effect])
+            for share, matrix in effect.relations:
+                columns.term(str(effect), [columns.block(part, matrix)], log + math.log(share), effect)
 
     def _add_unknown(self, columns: _Columns) -> None:
         """Add the unknown functions: each summand alone, and all together."""
@@ -129,7 +134,9 @@ class RunTerms:
             shares = np.ones(len(blocks)) if unknown.exclusive else np.arange(1.0, len(blocks) + 1.0) ** -2.0
             shares *= (1.0 if alone else _SPARSE) / shares.sum()
             for k, block in enumerate(blocks):
-                columns.term(f"?{number}", [block], math.log(shares[k]), summands=(k,))
+                in_each = not unknown.summands[k][0].startswith(":")  # and no turn, which all have
+                for share, only in _OF_ACCELEROMETERS if in_each else [(1.0, _EVERY)]:
+                    columns.term(f"?{number}", [block], math.log(share * shares[k]), summands=(k,), only=only)
             if not alone:
                 columns.term(
                     f"?{number}", blocks, math.log(1.0 - _SPARSE - TWO_SUMMANDS), summands=(*range(len(blocks)),)
@@ -273,10 +280,10 @@ class _Columns:
         return len(self.blocks) - 1
 
     def term(self, row: str, blocks: Sequence[int], log_share: float, effect: Effect | None = None,
-             summands: tuple[int, ...] = (), scales: Floats | None = None) -> None:  # fmt: skip
-        """Add a term with the columns of some blocks."""
-        places = np.concatenate([self._places[block] for block in blocks])
-        self.terms.append(RunTerm(row, places, log_share, effect, summands, scales=scales))
+             summands: tuple[int, ...] = (), only: slice = _EVERY, scales: Floats | None = None) -> None:  # fmt: skip
+        """Add a term with the columns of some blocks; only: which of them."""
+        places = np.concatenate([self._places[block] for block in blocks])[only]
+        self.terms.append(RunTerm(row, places, log_share, effect, summands, only != _EVERY, scales=scales))
 
 
 class _Visits(Effect):

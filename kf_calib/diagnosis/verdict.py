@@ -9,6 +9,7 @@ import numpy as np
 from kf_calib.diagnosis.hypothesis_table import IRREGULAR, NOISE, NONE, NOTHING, SURE, Hypothesis, HypothesisTable
 from kf_calib.diagnosis.refits import dwell_noise_is_stated
 from kf_calib.diagnosis.results import Diagnosis
+from kf_calib.effects import effect_named
 from kf_calib.estimation.dwell_pass import holds_its_oscillation
 from kf_calib.estimation.results import Parameter, format_p
 from kf_calib.support.tail_probabilities import LEVEL
@@ -71,7 +72,7 @@ def _of_the_others(diagnosis: Diagnosis) -> str:
     if first is None:
         return start
     if first.dwells:
-        return f"{start} {_unknown(diagnosis, first)}"
+        return _wrong_dwells(diagnosis, first)
     if first.effects and diagnosis.unearned:
         return f"{start} {_not_named(diagnosis, first)}."
     if first.effects:
@@ -121,11 +122,12 @@ def _named(diagnosis: Diagnosis, first: Hypothesis) -> str:
     if diagnosis.table.same:
         *many, last = diagnosis.table.same
         listed = f"{', '.join(many)} and {last}" if many else last
-        named += f", which is the same as {listed} here ({format_probability(share)} together)"
+        named += f", or what is the same here: {listed} ({format_probability(share)} together)"
     if share >= SURE:
         return f"{'Part of it' if rest else 'Missing'}: {named}{others}"
     family, of_family = next(each for each in diagnosis.table.families.items() if each[0] not in (NOTHING, NOISE, NONE))
-    if of_family >= SURE and first.families == (family,):
+    of_same = {effect_named(name, diagnosis.before.bench).family for name in diagnosis.table.same}
+    if of_family >= SURE and {family, *of_same} == {*first.families}:
         return f"{_FAMILIES[family]} ({format_probability(of_family)}): {named}{others}"
     return f"Likeliest: {named}{others}"
 
@@ -175,19 +177,6 @@ def _unexplained(diagnosis: Diagnosis) -> str:
 
 def _unknown(diagnosis: Diagnosis, first: Hypothesis) -> str:
     """Return a sentence on a misfit that no known effect explains."""
-    if first.dwells:
-        numbers = (*diagnosis.apart, *first.dwells)
-        options = " ".join(f"--leave-out {number}" for number in sorted(numbers))
-        share, named = f"{format_probability(first.probability)}{_others(diagnosis)}", _dwells(numbers).lower()
-        if len(numbers) == 1:
-            return (
-                f"One dwell is wrong: {named} alone does not fit ({share}): look at its pose and its readings, or "
-                f"leave it out ({options})."
-            )
-        return (
-            f"Several dwells are wrong: {named} alone do not fit ({share}): look at their poses and their readings, or "
-            f"leave them out ({options})."
-        )
     what = "it changes irregularly" if first.driver == IRREGULAR else f"it goes with {first.driver}"
     assert diagnosis.table is not None
     share, noise = first.probability, diagnosis.table.families.get(NOISE, 0.0)
@@ -201,6 +190,25 @@ def _unknown(diagnosis: Diagnosis, first: Hypothesis) -> str:
     said = f"{what} ({_share_of_row(diagnosis.table, first)}){but}{_others(diagnosis)}"
     alone = f"{_of_one(diagnosis)}{_within(diagnosis)}" if first.driver == IRREGULAR else ""
     return f"Unknown: no known effect explains it, {said}.{alone}"
+
+
+def _wrong_dwells(diagnosis: Diagnosis, first: Hypothesis) -> str:
+    """Return a sentence on dwells that are off; what a turn of a gimbal explains is told of one alone."""
+    numbers = [*diagnosis.apart, *first.dwells]
+    options = " ".join(f"--leave-out {number}" for number in sorted(numbers))
+    p_value, share = format_p(diagnosis.test.p_value), format_probability(first.probability)
+    if len(numbers) > 1:
+        return (
+            f"Several dwells are wrong (p {p_value}): {_dwells(numbers).lower()} alone do not fit "
+            f"({share}{_others(diagnosis)}): look at their poses and their readings, or leave them out ({options})."
+        )
+    if first.probability < SURE:
+        return (
+            f"{_what_fails(diagnosis)} (p {p_value}). Likeliest one dwell is wrong: dwell {numbers[0]} ({share}"
+            f"{_others(diagnosis)}): look at its pose and its readings, or leave it out ({options})."
+        )
+    told = f"dwell {numbers[0]} alone does not fit: look at its pose and its readings, or leave it out ({options})."
+    return f"One dwell is wrong ({share}, p {p_value}): {diagnosis.wrong_dwell or told}"
 
 
 def _within(diagnosis: Diagnosis) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -32,23 +31,17 @@ class Courses:
     squares: Floats
     freedom: Floats
 
-    @cached_property
-    def _by_size(self) -> Floats:
-        """Log Bayes factors (D, m) of whatever changes the course of a dwell by the size s, in units of the noise: with
-        n degrees of freedom (1 + s^2)^(-n/2) exp(chi^2 s^2 / (2 (1 + s^2)))."""
+    def log_bayes(self, prior: float) -> Floats:
+        """Log Bayes factors (D,) of whatever changes the courses of some dwells alone, each with a prior probability
+        and averaged over its size; zeros where it is likelier that all change alike.
+
+        Of a size s, in units of the noise, with n degrees of freedom (1 + s^2)^(-n/2) exp(chi^2 s^2 / (2 (1 + s^2))).
+        """
         squares = _ANY_SIZE**2
         gained = self.squares[:, None] * squares / (1.0 + squares)
-        return 0.5 * (gained - self.freedom[:, None] * np.log1p(squares))
-
-    def log_bayes(self) -> Floats:
-        """Log Bayes factors (D,) of whatever changes the course of one dwell, averaged over its size."""
-        return np.logaddexp.reduce(self._by_size, axis=1) - math.log(len(_ANY_SIZE))
-
-    def log_bayes_of_some(self, prior: float) -> Floats:
-        """The same (D,), where some dwells alone change, each with a prior probability; zeros where it is likelier that
-        all change alike."""
-        own = self.log_bayes()
-        alike = float(np.logaddexp.reduce(self._by_size.sum(axis=0))) - math.log(len(_ANY_SIZE))
+        by_size = 0.5 * (gained - self.freedom[:, None] * np.log1p(squares))  # (D, sizes)
+        own = np.logaddexp.reduce(by_size, axis=1) - math.log(len(squares))
+        alike = float(np.logaddexp.reduce(by_size.sum(axis=0))) - math.log(len(squares))
         return own if np.logaddexp(0.0, math.log(prior) + own).sum() > alike else np.zeros(len(own))
 
 

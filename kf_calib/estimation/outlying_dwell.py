@@ -1,10 +1,10 @@
 """The search for one dwell that alone does not fit: a pose mistyped or misread, a knock, a cable that pulled.
 
 Each dwell is predicted by a fit to all others. Its error e (3,) has the covariance C, the sum of that of the prediction
-and of the dwell's own noise, and e^T C^-1 e / 3 is F distributed with 3 and nu degrees of freedom. nu is infinite if
-the noise from dwell to dwell is stated; otherwise it is the degrees of freedom that the other dwells leave to estimate
-it. Where scatter was stated, it may be 1/f noise or a walk, which neighbouring dwells share: what leaving the dwell out
-takes off the chi-squared of the run in such noise is then less than e^T C^-1 e, and counts in its place.
+and of the dwell's own noise, and e^T C^-1 e / 3 is F distributed with 3 and nu degrees of freedom, those that the other
+dwells leave: where these are few, they agree by chance whatever is missing. Where scatter was stated, it may be 1/f
+noise or a walk, which neighbouring dwells share: what leaving the dwell out takes off the chi-squared of the run in
+such noise is then less than e^T C^-1 e, and counts in its place.
 
 A dwell is outlying if three things hold: its error is significant at the level of the run, all other dwells are
 consistent without it, and either a rotation of one gimbal explains its readings or its error is larger than any known
@@ -58,26 +58,23 @@ def outlying_dwells(result: Calibration, evaluate: Callable[[DwellTable], Calibr
     ratios = (statistics / statistics.max()).round(9)  # rounded, so that the first of equal dwells comes first
     order = np.argsort(-ratios, kind="stable")[:_TRIED]
     tried = [k for k in order.tolist() if ratios[k] > _NEARLY]
-    found = [_test_dwell(result, k, evaluate(dwells.without((k,)))) for k in tried]
-    return tuple(each for each in found if each is not None)
+    found = ((k, evaluate(dwells.without((k,)))) for k in tried)
+    judged = [wrong_dwell(result, k, rest, _BEYOND_DOUBT) for k, rest in found if rest.consistency.consistent is True]
+    gross_mps2 = _GROSS * result.bench.gravity_mps2
+    return tuple(each for each in judged if each and (each.turns or np.linalg.norm(each.error_mps2) > gross_mps2))
 
 
-def _test_dwell(result: Calibration, k: int, rest: Calibration) -> OutlyingDwell | None:
-    """Judge dwell ``k`` against the calibration from all others; None if those disagree or if it is within chance."""
-    if rest.consistency.consistent is not True:
-        return None
-    dwells, estimate, noise = result.fit.dwells, rest.estimate, rest.noise
+def wrong_dwell(result: Calibration, k: int, rest: Calibration, most_p: float = 1.0) -> OutlyingDwell | None:
+    """Dwell ``k`` against the calibration from all others; None if its p-value is larger than ``most_p``."""
+    dwells, estimate = result.fit.dwells, rest.estimate
     linearised = LinearisedDwells(without_attitudes(dwells), rest.model, estimate.state)
     means = linearised.means[[k]]
     error, covariance = means.readings[0] - means.design[0] @ estimate.state, _covariance(rest, means)
-    freedom = 1e9 if noise.setting.stated and noise.scatter.stated else max(rest.consistency.dof, 1)
     statistic = min(float(error @ np.linalg.solve(covariance, error)), _fall(result, rest))
-    p_value = min(len(dwells) * f_tail(3.0, freedom, statistic / 3.0), 1.0)
-    if p_value > _BEYOND_DOUBT:
+    p_value = min(len(dwells) * f_tail(3.0, max(rest.consistency.dof, 1), statistic / 3.0), 1.0)
+    if p_value > most_p:
         return None
     turns = tuple(_turns(linearised.dwells_at_state[k : k + 1], means, rest))
-    if not turns and np.linalg.norm(error) < _GROSS * result.bench.gravity_mps2:
-        return None
     return OutlyingDwell(dwells[k], dwells[k].number, error, p_value, turns, rest)
 
 

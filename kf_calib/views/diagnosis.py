@@ -100,8 +100,7 @@ def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
 def disturbed_dwells(diagnosis: Diagnosis) -> list[int]:
     """The numbers of the dwells that something disturbed, as any test has it."""
     before, first = diagnosis.before, diagnosis.likeliest
-    numbers = {each.number for each in before.outlying} | before.readings.disturbed | {*diagnosis.apart}
-    return sorted(numbers | {*(first.dwells if first is not None else ())})
+    return sorted({*before.readings.disturbed, *diagnosis.apart, *(first.dwells if first is not None else ())})
 
 
 def _hypotheses_object(table: HypothesisTable | None) -> list[dict[str, Any]]:
@@ -400,14 +399,14 @@ def next_steps(diagnosis: Diagnosis, typed: str) -> list[NextStep]:
 
 
 def _steps(diagnosis: Diagnosis, typed: str) -> Iterator[NextStep]:
-    test, before, first = diagnosis.test, diagnosis.before, diagnosis.likeliest
+    test, first = diagnosis.test, diagnosis.likeliest
     if test.consistent is None:
         yield NextStep("Find orientations that determine the model", f"kf-calib plan {typed} --count 24")
     elif diagnosis.condition is not None:
         yield from _of_condition(diagnosis.condition, typed)
     elif test.consistent:
         yield NextStep("Keep this calibration", f"kf-calib replay {typed} --save calibration.json")
-    elif numbers := [each.number for each in before.outlying[:1]] or [*(first.dwells if first else ())]:
+    elif numbers := first.dwells if first else ():
         said = " and ".join(map(str, sorted([*diagnosis.apart, *numbers])))
         yield NextStep(f"Try the run without dwell {said}", f"kf-calib diagnose {typed}{_leaving_out(numbers)}")
     elif diagnosis.sure:
