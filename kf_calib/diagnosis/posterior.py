@@ -36,9 +36,17 @@ from kf_calib.diagnosis.in_noises import ROUNDING, InNoises
 from kf_calib.diagnosis.noise_sizes import NoiseFamily, NoiseSizes
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.run_likelihood import Projected, RunLikelihood, log_bayes_together
-from kf_calib.diagnosis.run_terms import TWO_SUMMANDS, RunTerm, RunTerms, log_bayes_of_columns, sizes_of
+from kf_calib.diagnosis.run_terms import (
+    TWO_SUMMANDS,
+    RunTerm,
+    RunTerms,
+    log_bayes_of_columns,
+    of_accelerometers,
+    sizes_of,
+)
 from kf_calib.diagnosis.unknown_terms import name_of_formula, text_named
-from kf_calib.effects import effect_named
+from kf_calib.effects import Effect, effect_named
+from kf_calib.effects.effect import SensorEffect
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.observability import impossible_size
 from kf_calib.estimation.results import Calibration
@@ -414,23 +422,20 @@ class RunPosterior:
         known = model.parts[str(effects[0])].start
         likelihood = RunLikelihood(refit.linearised, noise, self._least_mps2, known=known)
         places = [model.parts[str(effect)].start - known + np.arange(len(effect.coefficients)) for effect in effects]
-        both = [*itertools.product(*(effect.relations for effect in effects))]
-        shares, related = (
-            [math.prod(share for share, _ in each) for each in both],
-            [[m for _, m in each] for each in both],
-        )
+        related = [*itertools.product(*map(_relations, effects))]
         usual = [usual_sizes(effect, self._run.grade) for effect in effects]
         sizes = [
             [sizes_of(best_sigma(likelihood.columns(place) @ matrix), prior, impossible_size(effect), _NODES_OF_PAIR)
-             for place, matrix, prior, effect in zip(places, relation, usual, effects, strict=True)]
+             for place, (_, matrix), prior, effect in zip(places, relation, usual, effects, strict=True)]
             for relation in related
         ]  # fmt: skip
         every = np.concatenate(places)
         noises = self._sizes.in_families(partial(likelihood.in_noises, groups=[every[None]]))
         grams = np.concatenate([of_family.grams[0][:, 0] for of_family in noises])
         along = np.concatenate([of_family.along[:, every] for of_family in noises])
-        combined = [np.asarray(block_diag(*relation), float) for relation in related]
-        widths = [[matrix.shape[1] for matrix in relation] for relation in related]
+        combined = [np.asarray(block_diag(*(matrix for _, matrix in relation)), float) for relation in related]
+        widths = [[matrix.shape[1] for _, matrix in relation] for relation in related]
+        shares = np.array([[sum(log for log, _ in relation)] for relation in related])
         together = [
             log_bayes_together(matrix.T @ grams @ matrix, along @ matrix, width, of_terms)
             for matrix, width, of_terms in zip(combined, widths, sizes, strict=True)
@@ -438,7 +443,7 @@ class RunPosterior:
         logs = np.stack(together) + np.concatenate([of_family.logs for of_family in noises])
         likeliest = int(np.argmax(logs.max(axis=0)))
         statistic = along[likeliest] @ np.linalg.pinv(grams[likeliest], ROUNDING, hermitian=True) @ along[likeliest]
-        log = float(np.logaddexp.reduce(self._sizes.evidence(logs) + np.log(shares)[:, None], axis=None))
+        log = float(np.logaddexp.reduce(self._sizes.evidence(logs) + shares, axis=None))
         return log, float(statistic)
 
     # What an unknown function looks like
@@ -504,6 +509,13 @@ def _with_sure_dwells(rows: list[Hypothesis], beside: list[Hypothesis]) -> list[
     dwells = table.first.dwells[:1]
     sure = sum(row.probability for row in table.rows if {*dwells} & {*row.dwells}) >= SURE
     return [*rows, *beside] if sure and any(table.first.dwells == row.dwells for row in beside) else rows
+
+
+def _relations(effect: Effect) -> list[tuple[float, Floats]]:
+    """Return the matrices (q, k) that may combine the columns of an effect, with the logs of their shares."""
+    matrices = [*effect.relations] or [np.eye(len(effect.coefficients))]
+    some = of_accelerometers(isinstance(effect, SensorEffect))
+    return [(log - math.log(len(matrices)), matrix[:, only]) for matrix in matrices for log, only in some]
 
 
 def _merged(rows: Sequence[Hypothesis]) -> list[Hypothesis]:

@@ -252,7 +252,8 @@ def log_bayes(gram: Floats, along: Floats, squares: Floats, log_weights: Floats,
     """
     largest = np.einsum("nqq->nq", gram).max(axis=1) if lengths is None else lengths
     scales = np.sqrt(np.maximum(largest, 1e-300))
-    values, vectors = np.linalg.eigh(gram / scales[:, None, None] ** 2)
+    scaled = gram / scales[:, None, None] ** 2
+    values, vectors = np.linalg.eigh(scaled) if gram.shape[1] > 1 else (scaled[:, 0], np.ones_like(scaled))
     values = np.where(values > ROUNDING, values, 0.0)
     shifted = along - (gram @ np.ones(gram.shape[1])) * centres[:, None] if centres.any() else along
     shift = along.sum(axis=1) * centres - 0.5 * gram.sum(axis=(1, 2)) * centres**2 if centres.any() else 0.0
@@ -272,10 +273,16 @@ def log_bayes_together(gram: Floats, along: Floats, widths: Sequence[int], sizes
     mesh = np.stack([each.ravel() for each in np.meshgrid(*(s.values for s in sizes), indexing="ij")], axis=1)
     logs = np.sum([each.ravel() for each in np.meshgrid(*(s.logs for s in sizes), indexing="ij")], axis=0)
     scaled = mesh[:, groups]
-    spread = np.eye(len(groups)) + scaled[:, :, None] * gram[:, None] * scaled[:, None]  # (k, m, q, q)
     right = scaled * (along - gram @ centre)[:, None]
-    solved = np.linalg.solve(spread, right[..., None])[..., 0]
-    terms = logs + 0.5 * np.sum(right * solved, axis=2) - 0.5 * np.linalg.slogdet(spread)[1]
+    # the root of I + S G^T G S, with S G^T z below: its last row is the root of what is gained
+    count = len(groups)
+    spread = np.zeros((*right.shape[:2], count + 1, count + 1))
+    spread[..., :count, :count] = np.eye(count) + scaled[:, :, None] * gram[:, None] * scaled[:, None]
+    spread[..., count, :count] = right
+    spread[..., count, count] = 1.0 + np.sum(right**2, axis=2)
+    root = np.linalg.cholesky(spread)
+    gained = 0.5 * np.sum(root[..., count, :count] ** 2, axis=2)
+    terms = logs + gained - np.log(np.einsum("kmqq->kmq", root)[..., :count]).sum(axis=2)
     return np.logaddexp.reduce(terms, axis=1) + shift
 
 

@@ -19,7 +19,7 @@ from kf_calib.diagnosis.run_likelihood import Combination, RunLikelihood, Sizes,
 from kf_calib.diagnosis.unknown_terms import RETURNING, UnknownTerm, text_named, unknown_terms
 from kf_calib.dwells.qr import orthonormal
 from kf_calib.effects import Coefficient, Effect, Stimulus, effect_named, walk_named
-from kf_calib.effects.effect import IN_ALL, Grade
+from kf_calib.effects.effect import Grade, SensorEffect
 from kf_calib.effects.formula import formula
 from kf_calib.estimation.cross_validation import orientations
 from kf_calib.estimation.dwell_columns import stimulus_of
@@ -39,9 +39,8 @@ _LEAST = 1e-3  # share of the largest part of a term that a part of it has at le
 _WAVES = 40  # of a random walk
 _RETURNS, _PER_DWELL = (4, 8, 16, 32, 64), 0.75  # parts of a run within which a bias may come back, and most of them
 _MOST_ORIENTATIONS = 100  # that are told apart by what comes back with each
+_IN_ALL = 0.5  # share of what all accelerometers have, each with its own coefficient, and not one alone
 _EVERY = slice(None)
-_OF_ACCELEROMETERS = [(IN_ALL, _EVERY), *(((1.0 - IN_ALL) / 3.0, slice(k, None, 3)) for k in range(3))]
-"""Columns of a function that all accelerometers have, or one alone, with the prior probabilities."""
 
 
 @dataclass(frozen=True)
@@ -118,9 +117,11 @@ class RunTerms:
             most = max(len(numbers), *(tried[k] for k in numbers))
             logs[numbers] -= float(np.logaddexp.reduce(logs[numbers])) + math.log(most / len(numbers))
         for effect, log in zip(effects, logs.tolist(), strict=True):
-            part = columns.add([effect])
-            for share, matrix in effect.relations:
-                columns.term(str(effect), [columns.block(part, matrix)], log + math.log(share), effect)
+            part, relations = columns.add([effect]), [*effect.relations] or [None]
+            for matrix in relations:
+                block, share = columns.block(part, matrix), log - math.log(len(relations))
+                for log_share, only in of_accelerometers(isinstance(effect, SensorEffect)):
+                    columns.term(str(effect), [block], share + log_share, effect, only=only)
 
     def _add_unknown(self, columns: _Columns) -> None:
         """Add the unknown functions: each summand alone, and all together."""
@@ -135,8 +136,8 @@ class RunTerms:
             shares *= (1.0 if alone else _SPARSE) / shares.sum()
             for k, block in enumerate(blocks):
                 in_each = not unknown.summands[k][0].startswith(":")  # and no turn, which all have
-                for share, only in _OF_ACCELEROMETERS if in_each else [(1.0, _EVERY)]:
-                    columns.term(f"?{number}", [block], math.log(share * shares[k]), summands=(k,), only=only)
+                for log_share, only in of_accelerometers(in_each):
+                    columns.term(f"?{number}", [block], math.log(shares[k]) + log_share, summands=(k,), only=only)
             if not alone:
                 columns.term(
                     f"?{number}", blocks, math.log(1.0 - _SPARSE - TWO_SUMMANDS), summands=(*range(len(blocks)),)
@@ -176,10 +177,12 @@ class RunTerms:
         raw, known, terms = self.likelihood.lengths, dict[tuple[int, ...], list[Floats]](), list[RunTerm]()
         ends = dict[tuple[str, tuple[int, ...]], list[Floats]]()
         for draft in drafts:
-            if _at_its_end(draft.effect):
+            if _at_its_end(draft.effect) and not draft.alone:
                 basis = _basis(self.likelihood.columns(draft.columns))
                 ends.setdefault((draft.row, basis.shape), []).append(basis)
         for draft in drafts:
+            if draft.alone and (not terms or _whole(terms[-1]) != _whole(draft)):
+                continue  # of all accelerometers it is not seen, or is another term
             columns = self.likelihood.columns(draft.columns)
             if not (np.linalg.norm(columns, axis=0) > _SEEN * raw[draft.columns]).any():
                 continue
@@ -188,12 +191,13 @@ class RunTerms:
                 best = float(np.linalg.norm(scaled, 2)) if draft.summands else 1.0 / best_sigma(scaled)
                 terms.append(replace(draft, sizes=sizes_of(1.0 / best, None)))
                 continue
-            basis = _basis(columns)
-            alike, limits = known.setdefault(basis.shape, []), ends.get((draft.row, basis.shape), [])
-            if draft.is_known and not (limits and _largest_cosine(limits, basis) > _SAME):
-                alike.append(basis)
-            elif not draft.is_known and alike and _largest_cosine(alike, basis) > _SAME:
-                continue
+            if not draft.alone:
+                basis = _basis(columns)
+                alike, limits = known.setdefault(basis.shape, []), ends.get((draft.row, basis.shape), [])
+                if draft.is_known and not (limits and _largest_cosine(limits, basis) > _SAME):
+                    alike.append(basis)
+                elif not draft.is_known and alike and _largest_cosine(alike, basis) > _SAME:
+                    continue
             usual = None if draft.effect is None else usual_sizes(draft.effect, self.grade)
             most = math.inf if draft.effect is None else impossible_size(draft.effect)
             if (least := best_sigma(columns)) < most:
@@ -327,6 +331,11 @@ class _Walk(Effect):
         return columns.reshape(len(s), 3, -1)
 
 
+def _whole(term: RunTerm) -> tuple[str, tuple[int, ...], int]:
+    """What tells the columns of all accelerometers: row, summands, and the effect with its constant."""
+    return term.row, term.summands, id(term.effect)
+
+
 def _at_its_end(effect: Effect | None) -> bool:
     """Tell whether an effect is at the end of the range of its constant. There, and where it has the same columns, it
     is the limit of another one, which may be an unknown function."""
@@ -343,6 +352,15 @@ def _largest_cosine(bases: Sequence[Floats], basis: Floats) -> float:
     products = np.swapaxes(np.stack(bases), 1, 2) @ basis
     close = products[np.einsum("nij,nij->n", products, products) > _SAME**2 * basis.shape[1]]
     return float(np.linalg.svd(close, compute_uv=False).min(axis=1).max(initial=0.0))
+
+
+def of_accelerometers(in_each: bool) -> list[tuple[float, slice]]:
+    """Columns that a term may have, with the logs of their shares: those of all accelerometers or, where each has its
+    own, one of every three, of one accelerometer alone."""
+    if not in_each:
+        return [(0.0, _EVERY)]
+    alone = math.log((1.0 - _IN_ALL) / 3.0)
+    return [(math.log(_IN_ALL), _EVERY), *((alone, slice(k, None, 3)) for k in range(3))]
 
 
 def sizes_of(least: float, usual: SizePrior | None, most: float = math.inf, nodes: int = _NODES) -> Sizes:

@@ -199,8 +199,9 @@ def _wrong_dwells(diagnosis: Diagnosis, first: Hypothesis) -> str:
     p_value, share = format_p(diagnosis.test.p_value), format_probability(first.probability)
     if len(numbers) > 1:
         return (
-            f"Several dwells are wrong (p {p_value}): {_dwells(numbers).lower()} alone do not fit "
-            f"({share}{_others(diagnosis)}): look at their poses and their readings, or leave them out ({options})."
+            f"{_what_fails(diagnosis)} (p {p_value}). Several dwells are wrong: {_dwells(numbers).lower()} alone do "
+            f"not fit ({share}{_others(diagnosis)}): look at their poses and their readings, or leave them out "
+            f"({options})."
         )
     if first.probability < SURE:
         return (

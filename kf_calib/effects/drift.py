@@ -254,10 +254,10 @@ class Magnetic(Effect):
     typical = Typical((1 * 0.2 * MICRO_G, 20 * 0.2 * MICRO_G))  # 1 to 20 ug/G in a horizontal field of 0.2 G
 
     @property
-    def relations(self) -> Sequence[tuple[float, Floats]]:
+    def relations(self) -> Sequence[Floats]:
         """All sensors are in one field: (m_i B_N, m_i B_E) = m_i B (cos a, sin a), its direction a is not known."""
         directions = np.linspace(0.0, np.pi, _DIRECTIONS, endpoint=False)
-        return [(1.0 / _DIRECTIONS, np.kron(np.eye(3), [[np.cos(a)], [np.sin(a)]]).astype(float)) for a in directions]
+        return [np.kron(np.eye(3), [[np.cos(a)], [np.sin(a)]]).astype(float) for a in directions]
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:

@@ -215,9 +215,10 @@ class Effect(ABC):
         return self.unknown is not None and self.smooth and not self.held
 
     @property
-    def relations(self) -> Sequence[tuple[float, Floats]]:
-        """Matrices (q, k), each with its prior probability: the coefficients are one of them times k free numbers."""
-        return ((1.0, np.eye(len(self.coefficients))),)
+    def relations(self) -> Sequence[Floats]:
+        """Matrices (q, k), all as likely: the coefficients are one of them times k free numbers. Empty where they may
+        have any values."""
+        return ()
 
     @property
     def walks(self) -> bool:
@@ -282,10 +283,6 @@ class Effect(ABC):
         return other
 
 
-IN_ALL = 0.5
-"""Prior probability that all accelerometers have an effect, and not one alone."""
-
-
 class SensorEffect(Effect):
     """One coefficient for each accelerometer; ``terms`` (m, 3) is what each reads more per unit of its own.
 
@@ -305,12 +302,6 @@ class SensorEffect(Effect):
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
         return _one_each(self.symbol, self.unit, self.scale, self.shown or field_unit(self.unit))
-
-    @property
-    def relations(self) -> Sequence[tuple[float, Floats]]:
-        """All three accelerometers have it, or one alone."""
-        alone = (1.0 - IN_ALL) / 3.0
-        return ((IN_ALL, np.eye(3)), *((alone, np.eye(3)[:, k : k + 1]) for k in range(3)))
 
     @abstractmethod
     def terms(self, s: Stimulus) -> Floats: ...

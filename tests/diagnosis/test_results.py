@@ -20,20 +20,20 @@ LIKELIEST = {
 }
 
 
-@pytest.mark.parametrize(("unknown", "outlying", "likeliest", "expected"), [
-    (False, (), LIKELIEST, None), (True, ("dwell 3",), LIKELIEST, None), (True, (), None, "looked for"),
-    (True, (), LIKELIEST | {"formulas": ()}, "looked for"), (True, (), LIKELIEST | {"refit": None}, "looked for"),
-    (True, (), LIKELIEST | {"dwells": (3,)}, None),
-    (True, (), LIKELIEST, Description("z", "temperature", 0.8, ("mine = T",))),
+@pytest.mark.parametrize(("unknown", "likeliest", "expected"), [
+    (False, LIKELIEST, None), (True, None, "looked for"),
+    (True, LIKELIEST | {"formulas": ()}, "looked for"), (True, LIKELIEST | {"refit": None}, "looked for"),
+    (True, LIKELIEST | {"dwells": (3,)}, None),
+    (True, LIKELIEST, Description("z", "temperature", 0.8, ("mine = T",))),
 ])  # fmt: skip
 def test_an_unknown_misfit_is_described_by_the_formulas_that_were_refitted_or_looked_for(
-    unknown: bool, outlying: tuple[str, ...], likeliest: dict[str, Any] | None, expected: Description | str | None,
+    unknown: bool, likeliest: dict[str, Any] | None, expected: Description | str | None,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     monkeypatch.setattr(results, "describe_irregular", lambda *_: "looked for")
     monkeypatch.setattr(results, "explained_share", lambda *_: 0.8)
     monkeypatch.setattr(results, "channel_of", lambda _: "z")
-    before: Any = SimpleNamespace(outlying=outlying, residuals_mps2=None, fit=None, consistency=None)
+    before: Any = SimpleNamespace(residuals_mps2=None, fit=None, consistency=None)
     made: Any = SimpleNamespace(
         unknown=unknown, before=before, likeliest=likeliest and SimpleNamespace(**likeliest),
         test=SimpleNamespace(trend=None),
