@@ -433,18 +433,18 @@ class RunPosterior:
         noises = self._sizes.in_families(partial(likelihood.in_noises, groups=[every[None]]))
         grams = np.concatenate([of_family.grams[0][:, 0] for of_family in noises])
         along = np.concatenate([of_family.along[:, every] for of_family in noises])
+        base, logs = np.concatenate([of_family.logs for of_family in noises]), list[Floats]()
         combined = [np.asarray(block_diag(*(matrix for _, matrix in relation)), float) for relation in related]
-        widths = [[matrix.shape[1] for _, matrix in relation] for relation in related]
-        shares = np.array([[sum(log for log, _ in relation)] for relation in related])
-        together = [
-            log_bayes_together(matrix.T @ grams @ matrix, along @ matrix, width, of_terms)
-            for matrix, width, of_terms in zip(combined, widths, sizes, strict=True)
-        ]
-        logs = np.stack(together) + np.concatenate([of_family.logs for of_family in noises])
-        likeliest = int(np.argmax(logs.max(axis=0)))
-        statistic = along[likeliest] @ np.linalg.pinv(grams[likeliest], ROUNDING, hermitian=True) @ along[likeliest]
-        log = float(np.logaddexp.reduce(self._sizes.evidence(logs) + shares, axis=None))
-        return log, float(statistic)
+        gains = [_gains(matrix.T @ grams @ matrix, along @ matrix) for matrix in combined]
+        for k in sorted(range(len(related)), key=lambda k: -float(np.max(base + gains[k]))):
+            if logs and np.max(base + gains[k]) < np.max(logs) - _BEHIND:
+                break  # evidence is less than the likelihood at its best
+            matrix, widths = combined[k], [matrix.shape[1] for _, matrix in related[k]]
+            together = log_bayes_together(matrix.T @ grams @ matrix, along @ matrix, widths, sizes[k])
+            logs.append(base + together + sum(log for log, _ in related[k]))
+        likeliest = int(np.argmax(np.max(logs, axis=0)))
+        statistic = 2.0 * float(_gains(grams[[likeliest]], along[[likeliest]])[0])
+        return float(np.logaddexp.reduce(self._sizes.evidence(np.array(logs)), axis=None)), statistic
 
     # What an unknown function looks like
 
@@ -509,6 +509,12 @@ def _with_sure_dwells(rows: list[Hypothesis], beside: list[Hypothesis]) -> list[
     dwells = table.first.dwells[:1]
     sure = sum(row.probability for row in table.rows if {*dwells} & {*row.dwells}) >= SURE
     return [*rows, *beside] if sure and any(table.first.dwells == row.dwells for row in beside) else rows
+
+
+def _gains(gram: Floats, along: Floats) -> Floats:
+    """Return by how much (k,) columns raise the log likelihood at its best: gram (k, q, q), along (k, q)."""
+    inverse = np.linalg.pinv(gram, ROUNDING, hermitian=True)
+    return np.asarray(0.5 * np.einsum("kq,kqp,kp->k", along, inverse, along), float)
 
 
 def _relations(effect: Effect) -> list[tuple[float, Floats]]:

@@ -130,6 +130,12 @@ class RunLikelihood:
             within.add(some, values[pieces], added.values, pieces)
         return columns, within
 
+    @property
+    def lengths_left(self) -> Floats:
+        """Lengths (C,) of the columns of the terms off the model."""
+        columns, more = self.spanned.columns, self.spanned.more_columns
+        return np.sqrt(np.einsum("dic,dic->c", columns, columns) + np.sum(more**2, axis=0))
+
     def rescale(self, scales: Floats) -> None:
         """Multiply the columns of the terms by these (C,)."""
         for columns in (self.spanned.columns, self.spanned.more_columns):

@@ -5,7 +5,7 @@ functions, a random walk of the biases. Each has sizes with a prior, and a share
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -28,7 +28,8 @@ from kf_calib.estimation.results import Calibration
 from kf_calib.noise.noise_model import Noise
 
 _DECADES = 7.0  # above one sigma: sizes of what has no usual size
-_NODES = 40  # sizes that are tried
+_NODES = 40  # sizes that are tried: the likelihood of q columns is as wide as 1 / sqrt(2 q) of its logarithm
+_FEW, _NODES_OF_FEW = 2, 20  # columns of which a step twice as long sums it to 1e-3
 _SPARSE = 0.5  # share of one summand alone in the unknown functions of a driver
 TWO_SUMMANDS = 0.25
 """The same of two summands."""
@@ -49,8 +50,8 @@ class RunTerm:
 
     row: the name of an effect, or ``?`` and the number of an unknown function. log_share: log of its share in the prior
     of its row. effect: with the constant at which it has these columns. summands: of the unknown function, those that
-    it has. alone: whether one accelerometer alone has it. sizes: of its coefficients. scales: factors (q,) of its
-    columns.
+    it has. in_each: whether each accelerometer has columns of its own. alone: whether these are those of one. sizes: of
+    its coefficients. scales: factors (q,) of its columns.
     """
 
     row: str
@@ -58,6 +59,7 @@ class RunTerm:
     log_share: float
     effect: Effect | None = None
     summands: tuple[int, ...] = ()
+    in_each: bool = False
     alone: bool = False
     sizes: Sizes = field(default_factory=lambda: Sizes(np.zeros(0), np.zeros(0)))
     scales: Floats | None = None
@@ -103,7 +105,7 @@ class RunTerms:
         rms = self.likelihood.lengths / math.sqrt(self.likelihood.rows)
         unknown = np.where(rms > 0.0, columns.weights / np.where(rms > 0.0, rms, 1.0), 0.0)
         self.likelihood.rescale(np.where(columns.weights > 0.0, unknown, 1.0))
-        self.terms = self._seen(columns.terms)
+        self.terms = [*self._of_accelerometers(self._seen(columns.terms))]
         self.names = tuple(dict.fromkeys(term.row for term in self.terms if term.is_known))
 
     def _add_effects(self, columns: _Columns, test: CandidateTests) -> None:
@@ -120,8 +122,7 @@ class RunTerms:
             part, relations = columns.add([effect]), [*effect.relations] or [None]
             for matrix in relations:
                 block, share = columns.block(part, matrix), log - math.log(len(relations))
-                for log_share, only in of_accelerometers(isinstance(effect, SensorEffect)):
-                    columns.term(str(effect), [block], share + log_share, effect, only=only)
+                columns.term(str(effect), [block], share, effect, in_each=isinstance(effect, SensorEffect))
 
     def _add_unknown(self, columns: _Columns) -> None:
         """Add the unknown functions: each summand alone, and all together."""
@@ -136,8 +137,7 @@ class RunTerms:
             shares *= (1.0 if alone else _SPARSE) / shares.sum()
             for k, block in enumerate(blocks):
                 in_each = not unknown.summands[k][0].startswith(":")  # and no turn, which all have
-                for log_share, only in of_accelerometers(in_each):
-                    columns.term(f"?{number}", [block], math.log(shares[k]) + log_share, summands=(k,), only=only)
+                columns.term(f"?{number}", [block], math.log(shares[k]), summands=(k,), in_each=in_each)
             if not alone:
                 columns.term(
                     f"?{number}", blocks, math.log(1.0 - _SPARSE - TWO_SUMMANDS), summands=(*range(len(blocks)),)
@@ -177,32 +177,45 @@ class RunTerms:
         raw, known, terms = self.likelihood.lengths, dict[tuple[int, ...], list[Floats]](), list[RunTerm]()
         ends = dict[tuple[str, tuple[int, ...]], list[Floats]]()
         for draft in drafts:
-            if _at_its_end(draft.effect) and not draft.alone:
+            if _at_its_end(draft.effect):
                 basis = _basis(self.likelihood.columns(draft.columns))
                 ends.setdefault((draft.row, basis.shape), []).append(basis)
         for draft in drafts:
-            if draft.alone and (not terms or _whole(terms[-1]) != _whole(draft)):
-                continue  # of all accelerometers it is not seen, or is another term
             columns = self.likelihood.columns(draft.columns)
             if not (np.linalg.norm(columns, axis=0) > _SEEN * raw[draft.columns]).any():
                 continue
             if not (draft.is_known or len(draft.summands) == 1):
                 scaled = columns if draft.scales is None else columns * draft.scales
                 best = float(np.linalg.norm(scaled, 2)) if draft.summands else 1.0 / best_sigma(scaled)
-                terms.append(replace(draft, sizes=sizes_of(1.0 / best, None)))
+                terms.append(replace(draft, sizes=sizes_of(1.0 / best, None, nodes=_nodes(columns.shape[1]))))
                 continue
-            if not draft.alone:
-                basis = _basis(columns)
-                alike, limits = known.setdefault(basis.shape, []), ends.get((draft.row, basis.shape), [])
-                if draft.is_known and not (limits and _largest_cosine(limits, basis) > _SAME):
-                    alike.append(basis)
-                elif not draft.is_known and alike and _largest_cosine(alike, basis) > _SAME:
-                    continue
-            usual = None if draft.effect is None else usual_sizes(draft.effect, self.grade)
-            most = math.inf if draft.effect is None else impossible_size(draft.effect)
-            if (least := best_sigma(columns)) < most:
-                terms.append(replace(draft, sizes=sizes_of(least, usual, most)))
+            basis = _basis(columns)
+            alike, limits = known.setdefault(basis.shape, []), ends.get((draft.row, basis.shape), [])
+            if draft.is_known and not (limits and _largest_cosine(limits, basis) > _SAME):
+                alike.append(basis)
+            elif not draft.is_known and alike and _largest_cosine(alike, basis) > _SAME:
+                continue
+            if (least := best_sigma(columns)) < _most(draft):
+                terms.append(replace(draft, sizes=self._sizes(draft, least)))
         return terms
+
+    def _of_accelerometers(self, terms: Sequence[RunTerm]) -> Iterator[RunTerm]:
+        """Yield terms, those of which each accelerometer has its own columns also as terms of one alone."""
+        raw, lengths = self.likelihood.lengths, self.likelihood.lengths_left
+        for term in terms:
+            for log_share, only in of_accelerometers(term.in_each):
+                places, log = term.columns[only], term.log_share + log_share
+                if len(places) == len(term.columns):
+                    yield replace(term, log_share=log)
+                elif (lengths[places] > _SEEN * raw[places]).any():
+                    part, least = replace(term, columns=places, log_share=log, alone=True), 1.0 / lengths[places].max()
+                    if least < _most(part):
+                        yield replace(part, sizes=self._sizes(part, least))
+
+    def _sizes(self, term: RunTerm, least: float) -> Sizes:
+        """Return the sizes of a term from the least that is seen."""
+        usual = None if term.effect is None else usual_sizes(term.effect, self.grade)
+        return sizes_of(least, usual, _most(term), _nodes(len(term.columns)))
 
     @cached_property
     def _alike(self) -> list[_Alike]:
@@ -284,10 +297,10 @@ class _Columns:
         return len(self.blocks) - 1
 
     def term(self, row: str, blocks: Sequence[int], log_share: float, effect: Effect | None = None,
-             summands: tuple[int, ...] = (), only: slice = _EVERY, scales: Floats | None = None) -> None:  # fmt: skip
-        """Add a term with the columns of some blocks; only: which of them."""
-        places = np.concatenate([self._places[block] for block in blocks])[only]
-        self.terms.append(RunTerm(row, places, log_share, effect, summands, only != _EVERY, scales=scales))
+             summands: tuple[int, ...] = (), in_each: bool = False, scales: Floats | None = None) -> None:  # fmt: skip
+        """Add a term with the columns of some blocks."""
+        places = np.concatenate([self._places[block] for block in blocks])
+        self.terms.append(RunTerm(row, places, log_share, effect, summands, in_each, scales=scales))
 
 
 class _Visits(Effect):
@@ -331,9 +344,14 @@ class _Walk(Effect):
         return columns.reshape(len(s), 3, -1)
 
 
-def _whole(term: RunTerm) -> tuple[str, tuple[int, ...], int]:
-    """What tells the columns of all accelerometers: row, summands, and the effect with its constant."""
-    return term.row, term.summands, id(term.effect)
+def _nodes(columns: int) -> int:
+    """Return how many sizes of a term of so many columns are tried."""
+    return _NODES if columns > _FEW else _NODES_OF_FEW
+
+
+def _most(term: RunTerm) -> float:
+    """Return the size from which on there is nothing of a term."""
+    return math.inf if term.effect is None else impossible_size(term.effect)
 
 
 def _at_its_end(effect: Effect | None) -> bool:
