@@ -141,7 +141,7 @@ class InNoises:
         left = (rows.readings - rows.basis @ (inverse.T @ (inverse @ along))) * kept[..., 0]
         off = inverse @ np.swapaxes(weighted * kept, 1, 2)
         gram = weights - np.swapaxes(off, 1, 2) @ off
-        seen = np.einsum("dii->d", gram) > _SEEN * np.einsum("dii->d", weights)  # what columns in the model do not tell
+        seen = np.einsum("dii->d", gram) > ROUNDING * np.einsum("dii->d", weights)  # what the model leaves of them
         return gram * seen[:, None, None], (weights @ left[..., None])[..., 0] * seen[:, None]
 
     def explained_by(self, groups: Sequence[Indices], sizes: Sequence[int]) -> list[list[Floats]]:

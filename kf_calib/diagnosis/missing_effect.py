@@ -232,7 +232,8 @@ def _decided(refits: Refits, diagnosis: Diagnosis) -> Diagnosis:
         diagnosis = replace(diagnosis, table=table)
     credible = (first, *table.rivals) if first.effects else ()
     named = first if first.effects and not why_not else None
-    names = tuple(dict.fromkeys([*(name for row in credible for name in row.effects), *(table.same if named else ())]))
+    same = table.same if first.effects else ()
+    names = tuple(dict.fromkeys([*(name for row in credible for name in row.effects), *same]))
     pairs = [row.effects for row in credible[1:] if len(row.effects) > 1 and not set(first.effects) & set(row.effects)]
     return replace(
         diagnosis,

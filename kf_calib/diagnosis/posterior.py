@@ -32,7 +32,7 @@ from kf_calib.diagnosis.hypothesis_table import (
     HypothesisTable,
     table_of,
 )
-from kf_calib.diagnosis.in_noises import ROUNDING, InNoises
+from kf_calib.diagnosis.in_noises import ROUNDING, InNoises, Spanned
 from kf_calib.diagnosis.noise_sizes import NoiseFamily, NoiseSizes
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.run_likelihood import Projected, RunLikelihood, log_bayes_together
@@ -45,6 +45,7 @@ from kf_calib.diagnosis.run_terms import (
     sizes_of,
 )
 from kf_calib.diagnosis.unknown_terms import name_of_formula, text_named
+from kf_calib.diagnosis.within_rows import Courses
 from kf_calib.effects import Effect, effect_named
 from kf_calib.effects.effect import SensorEffect
 from kf_calib.errors import InputError, UnobservableError
@@ -253,24 +254,36 @@ class RunPosterior:
         functions."""
         likeliest = sorted(rows, key=lambda row: -row.log_evidence)
         known = [row for row in likeliest if row.effects and not row.driver and self._run.walk not in row.effects]
-        known = [row for row in known if row.refit is not None][:_BESIDE]
+        fitted = [(row, row.refit) for row in known if row.refit is not None][:_BESIDE]
         unknown = [row for row in likeliest if row.driver not in ("", IRREGULAR) and not (row.effects or row.dwells)]
-        both = [*known, *map(self._described, unknown[:_BESIDE])]
-        return [self._with_dwells(row, row.refit) for row in both if row.refit is not None]
+        beside = [self._with_dwells(row, *self._where_fitted(refit)) for row, refit in fitted]
+        run = self._run.likelihood
+        for row in unknown[:_BESIDE]:
+            columns = self._run.terms[self._best[f"?{self._number(row)}"]].columns
+            beside.append(self._with_dwells(row, run.spanned.beside(columns, run.lengths), run.courses))
+        return beside
 
-    def _with_dwells(self, row: Hypothesis, refit: Calibration) -> Hypothesis:
-        """Return a row with dwells that are off beside what it has, where its fit is."""
-        known, run = self._before.model.count, self._run.likelihood
+    def _where_fitted(self, refit: Calibration) -> tuple[Spanned, Courses]:
+        """Return the rows of a run, with the effects that a refit has in addition in the model, and the courses of the
+        readings within dwells."""
+        known, courses = self._before.model.count, self._run.likelihood.courses
         likelihood = RunLikelihood(refit.linearised, self._noise, self._least_mps2, known=known)
         rows = likelihood.spanned.beside(np.arange(refit.model.count - known), likelihood.lengths)
-        noises = self._sizes.in_families(partial(InNoises, rows))
         # what a term disturbs itself is for no dwell to explain
-        squares = np.minimum(run.courses.squares, likelihood.courses.squares)
-        apart = DwellsApart(rows, replace(run.courses, squares=squares), noises, self._sizes)
-        log, places = max(apart.rows_of_dwells(), default=(-math.inf, ()))
+        return rows, replace(courses, squares=np.minimum(courses.squares, likelihood.courses.squares))
+
+    def _with_dwells(self, row: Hypothesis, rows: Spanned, courses: Courses) -> Hypothesis:
+        """Return a row with dwells that are off beside what it has, which is in the model of ``rows``."""
+        noises = self._sizes.in_families(partial(InNoises, rows))
+        found = DwellsApart(rows, courses, noises, self._sizes).rows_of_dwells()
+        log, places = max(found, default=(-math.inf, ()))
         without = self._sizes.evidence(np.concatenate([of_family.logs for of_family in noises])[None])[0]
         gain = log - float(np.logaddexp.reduce(without))
         return replace(row, dwells=self._numbers(places), log_evidence=row.log_evidence + gain)
+
+    def _number(self, row: Hypothesis) -> int | None:
+        """Return the number of the unknown function of a row; None where it has none."""
+        return next((k for k, term in enumerate(self._run.unknown) if term.driver == row.driver), None)
 
     def _pairs(self) -> list[Hypothesis]:
         """Return the rows of the likeliest effects, each with any other term beside it, and of the likeliest summand of
@@ -450,7 +463,7 @@ class RunPosterior:
 
     def _described(self, row: Hypothesis) -> Hypothesis:
         """Return a row of an unknown function with the formulas that describe it, and their fit."""
-        number = next((k for k, term in enumerate(self._run.unknown) if term.driver == row.driver), None)
+        number = self._number(row)
         texts = self._formulas(number, row.effects) if number is not None and self._run.unknown[number].summands else []
         if not (texts or row.effects):
             return row

@@ -41,7 +41,8 @@ _WAVES = 40  # of a random walk
 _RETURNS, _PER_DWELL = (4, 8, 16, 32, 64), 0.75  # parts of a run within which a bias may come back, and most of them
 _MOST_ORIENTATIONS = 100  # that are told apart by what comes back with each
 _IN_ALL = 0.5  # share of what all accelerometers have, each with its own coefficient, and not one alone
-_EVERY = slice(None)
+EVERY = slice(None)
+"""All columns of a term."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +51,8 @@ class RunTerm:
 
     row: the name of an effect, or ``?`` and the number of an unknown function. log_share: log of its share in the prior
     of its row. effect: with the constant at which it has these columns. summands: of the unknown function, those that
-    it has. in_each: whether each accelerometer has columns of its own. alone: whether these are those of one. sizes: of
-    its coefficients. scales: factors (q,) of its columns.
+    it has. in_each: whether each accelerometer has columns of its own. only: which of the columns of all accelerometers
+    these are. sizes: of its coefficients. scales: factors (q,) of its columns.
     """
 
     row: str
@@ -60,9 +61,14 @@ class RunTerm:
     effect: Effect | None = None
     summands: tuple[int, ...] = ()
     in_each: bool = False
-    alone: bool = False
+    only: slice = field(default_factory=lambda: EVERY)
     sizes: Sizes = field(default_factory=lambda: Sizes(np.zeros(0), np.zeros(0)))
     scales: Floats | None = None
+
+    @property
+    def alone(self) -> bool:
+        """Whether it is of one accelerometer alone."""
+        return self.only != EVERY
 
     @property
     def is_known(self) -> bool:
@@ -208,7 +214,7 @@ class RunTerms:
                 if len(places) == len(term.columns):
                     yield replace(term, log_share=log)
                 elif (lengths[places] > _SEEN * raw[places]).any():
-                    part, least = replace(term, columns=places, log_share=log, alone=True), 1.0 / lengths[places].max()
+                    part, least = replace(term, columns=places, log_share=log, only=only), 1.0 / lengths[places].max()
                     if least < _most(part):
                         yield replace(part, sizes=self._sizes(part, least))
 
@@ -376,9 +382,9 @@ def of_accelerometers(in_each: bool) -> list[tuple[float, slice]]:
     """Columns that a term may have, with the logs of their shares: those of all accelerometers or, where each has its
     own, one of every three, of one accelerometer alone."""
     if not in_each:
-        return [(0.0, _EVERY)]
+        return [(0.0, EVERY)]
     alone = math.log((1.0 - _IN_ALL) / 3.0)
-    return [(math.log(_IN_ALL), _EVERY), *((alone, slice(k, None, 3)) for k in range(3))]
+    return [(math.log(_IN_ALL), EVERY), *((alone, slice(k, None, 3)) for k in range(3))]
 
 
 def sizes_of(least: float, usual: SizePrior | None, most: float = math.inf, nodes: int = _NODES) -> Sizes:

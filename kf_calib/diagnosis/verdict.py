@@ -118,11 +118,8 @@ def _named(diagnosis: Diagnosis, first: Hypothesis) -> str:
         diagnosis.table.probability_of_class(first.effects),
         _beside(diagnosis, first) or _unexplained(diagnosis),
     )
-    named, others = f"{_effects_of(first)}{_size(diagnosis)} ({_share(diagnosis)})", _others(diagnosis) + rest
-    if diagnosis.table.same:
-        *many, last = diagnosis.table.same
-        listed = f"{', '.join(many)} and {last}" if many else last
-        named += f", or what is the same here: {listed} ({format_probability(share)} together)"
+    named = f"{_effects_of(first)}{_size(diagnosis)} ({_share(diagnosis)}){_same(diagnosis.table)}"
+    others = _others(diagnosis) + rest
     if share >= SURE:
         return f"{'Part of it' if rest else 'Missing'}: {named}{others}"
     family, of_family = next(each for each in diagnosis.table.families.items() if each[0] not in (NOTHING, NOISE, NONE))
@@ -130,6 +127,16 @@ def _named(diagnosis: Diagnosis, first: Hypothesis) -> str:
     if of_family >= SURE and {family, *of_same} == {*first.families}:
         return f"{_FAMILIES[family]} ({format_probability(of_family)}): {named}{others}"
     return f"Likeliest: {named}{others}"
+
+
+def _same(table: HypothesisTable) -> str:
+    """Return in words what explains just the same as the likeliest effect; "" for nothing."""
+    if not table.same:
+        return ""
+    *many, last = table.same
+    listed = f"{', '.join(many)} and {last}" if many else last
+    together = format_probability(table.probability_of_class(table.first.effects))
+    return f", or what is the same here: {listed} ({together} together)"
 
 
 def _beside(diagnosis: Diagnosis, first: Hypothesis) -> str:
@@ -162,7 +169,9 @@ def _share_of_row(table: HypothesisTable, row: Hypothesis) -> str:
 
 def _not_named(diagnosis: Diagnosis, first: Hypothesis) -> str:
     """Return the likeliest effects, and why they have not earned their name."""
-    likeliest = f"{_effects_of(first)} ({format_probability(first.probability)}{_others(diagnosis)})"
+    assert diagnosis.table is not None
+    share, same = format_probability(first.probability), _same(diagnosis.table)
+    likeliest = f"{_effects_of(first)} ({share}{same}{_others(diagnosis)})"
     return f"No known effect is established. The likeliest is {likeliest}, but {diagnosis.unearned}"
 
 

@@ -50,20 +50,17 @@ def test_six_faces_do_not_tell_what_is_the_same_there(seed: int, stated: bool) -
     found = diagnosed(seed, 6, second=1e-3, stated=stated, faces=True)
     assert found.test.consistent is False and disturbed_dwells(found) == []
     assert found.table is not None and {"second-order", "scale-asymmetry"} <= {*found.ambiguity}
-    assert max(row.probability for row in found.table.rows) < SURE
-    assert found.table.first.effects[0] in ("second-order", "scale-asymmetry")
+    assert found.table.probability(found.table.first.effects) < SURE
 
 
 @pytest.mark.parametrize("stated", [True, False])
 @pytest.mark.parametrize(("second", "third"), [(1e-2, 0.0), (0.0, 1e-2)])
 @pytest.mark.parametrize("seed", [3, *slow(0, 1, 2)])
-def test_few_poses_have_no_dwell_that_is_wrong_for_an_effect(
-    seed: int, second: float, third: float, stated: bool
-) -> None:
+def test_no_dwell_of_six_is_wrong_for_an_effect(seed: int, second: float, third: float, stated: bool) -> None:
     """Two of six were wrong with over 99.9 %, as they explain all that is left of one accelerometer."""
     found = diagnosed(seed, 6, second, third, stated)
-    assert found.test.consistent is False and disturbed_dwells(found) == []
-    assert ("second-order" if second else "third-order") in found.ambiguity
+    assert disturbed_dwells(found) == [] and (found.consistent is not True or found.test.p_value > 1e-3)
+    assert not found.sure or {*found.missing} <= {"second-order" if second else "third-order"}, found.verdict
 
 
 @pytest.mark.parametrize(("poses", "seed"), [(12, 0), *slow((12, 1), (8, 0), (8, 1))])

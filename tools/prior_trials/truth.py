@@ -107,7 +107,7 @@ class Prior:
         if term.effect is not None:
             relations = [*term.effect.relations]
             if not relations:
-                return [term.effect], drawn
+                return [term.effect], _in_all(term, drawn, len(term.effect.coefficients))
             matrix = relations[int(rng.integers(len(relations)))]
             return [term.effect], matrix @ drawn[: matrix.shape[1]]
         if not term.summands:  # a walk, or biases that come back
@@ -118,6 +118,7 @@ class Prior:
         effects = [self._terms.formula_of(text) for text, _ in texts]
         weights = np.repeat([weight for _, weight in texts], [len(effect.coefficients) for effect in effects])
         rms = self._rms(effects)
+        drawn = _in_all(term, drawn, len(rms))
         return effects, np.where(rms > 0.0, weights / np.where(rms > 0.0, rms, 1.0), 0.0) * drawn
 
     def _rms(self, effects: Sequence[Effect]) -> Floats:
@@ -157,6 +158,13 @@ class Prior:
 def with_truth(dwells: DwellTable, truth: Truth) -> DwellTable:
     """The dwells with what is true added to their readings."""
     return dwells.plus(on_basis(truth.added_mps2))
+
+
+def _in_all(term: RunTerm, drawn: Floats, count: int) -> Floats:
+    """Return the coefficients (count,) of all accelerometers, zeros where one alone has a term."""
+    coefficients = np.zeros(count)
+    coefficients[term.only] = drawn
+    return coefficients
 
 
 def _one_of(rng: np.random.Generator, things: Sequence, weights: Sequence[float]):

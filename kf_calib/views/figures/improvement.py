@@ -88,7 +88,7 @@ def _residuals(figure: FigureBase, state: Improvement, models: Sequence[_Model])
     panels: Any = figure.subplots(3, len(drawn), sharex=True, sharey=True, squeeze=False)
     for column, number in enumerate(drawn):
         ratios = unexplained_mps2(models[number].result) / sigmas
-        panels[0, column].set_title(_heading(number, models[number], state), fontsize=8.5)
+        panels[0, column].set_title(_heading(number, models[number], state), fontsize=8.5 - (len(drawn) == _COLUMNS))
         for i, axes in enumerate(panels[:, column]):
             axes.axhspan(-2.0, 2.0, color="#eeeeee", zorder=0)
             axes.plot(driver.values[:, i] * scale, ratios[:, i], MARKERS[i], color=ACCELEROMETERS[i], markeredgewidth=0)
