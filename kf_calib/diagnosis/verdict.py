@@ -198,6 +198,9 @@ def _unknown(diagnosis: Diagnosis, first: Hypothesis) -> str:
     but = f", but {diagnosis.unearned}" if diagnosis.unearned else ""
     said = f"{what} ({_share_of_row(diagnosis.table, first)}){but}{_others(diagnosis)}"
     alone = f"{_of_one(diagnosis)}{_within(diagnosis)}" if first.driver == IRREGULAR else ""
+    known = sum(row.probability for row in diagnosis.table.rows if row.effects)
+    if known > diagnosis.table.probability_with(first):
+        return f"It cannot be told whether a known effect explains it. Likeliest none does, and {said}.{alone}"
     return f"Unknown: no known effect explains it, {said}.{alone}"
 
 
