@@ -259,8 +259,9 @@ class RunPosterior:
         beside = [self._with_dwells(row, *self._where_fitted(refit)) for row, refit in fitted]
         run = self._run.likelihood
         for row in unknown[:_BESIDE]:
-            columns = self._run.terms[self._best[f"?{self._number(row)}"]].columns
-            beside.append(self._with_dwells(row, run.spanned.beside(columns, run.lengths), run.courses))
+            columns, refit = self._run.terms[self._best[f"?{self._number(row)}"]].columns, self._described(row).refit
+            courses = self._where_fitted(refit)[1] if refit else replace(run.courses, squares=0.0 * run.courses.squares)
+            beside.append(self._with_dwells(row, run.spanned.beside(columns, run.lengths), courses))
         return beside
 
     def _where_fitted(self, refit: Calibration) -> tuple[Spanned, Courses]:
