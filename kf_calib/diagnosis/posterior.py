@@ -258,12 +258,12 @@ class RunPosterior:
         unknown = [row for row in likeliest if row.driver not in ("", IRREGULAR) and not (row.effects or row.dwells)]
         beside = [self._with_dwells(row, *self._where_fitted(refit)) for row, refit in fitted]
         run = self._run.likelihood
+        none = replace(run.courses, squares=0.0 * run.courses.squares)  # an unknown function may follow any of them
         for row, number in ((row, self._number(row)) for row in unknown[:_BESIDE]):
             if number is None or not self._run.unknown[number].summands:  # its columns have any size only together
                 continue
-            columns, refit = self._run.terms[self._best[f"?{number}"]].columns, self._described(row).refit
-            courses = self._where_fitted(refit)[1] if refit else replace(run.courses, squares=0.0 * run.courses.squares)
-            beside.append(self._with_dwells(row, run.spanned.beside(columns, run.lengths), courses))
+            columns = self._run.terms[self._best[f"?{number}"]].columns
+            beside.append(self._with_dwells(row, run.spanned.beside(columns, run.lengths), none))
         return beside
 
     def _where_fitted(self, refit: Calibration) -> tuple[Spanned, Courses]:
