@@ -254,9 +254,9 @@ class RunPosterior:
         functions."""
         likeliest = sorted(rows, key=lambda row: -row.log_evidence)
         known = [row for row in likeliest if row.effects and not row.driver and self._run.walk not in row.effects]
-        fitted = [(row, row.refit) for row in known if row.refit is not None][:_BESIDE]
+        fitted = [row if row.refit else self._refitted(row) for row in known[:_BESIDE]]
         unknown = [row for row in likeliest if row.driver not in ("", IRREGULAR) and not (row.effects or row.dwells)]
-        beside = [self._with_dwells(row, *self._where_fitted(refit)) for row, refit in fitted]
+        beside = [self._with_dwells(row, *self._where_fitted(row.refit)) for row in fitted if row.refit]
         run = self._run.likelihood
         none = replace(run.courses, squares=0.0 * run.courses.squares)  # an unknown function may follow any of them
         for row, number in ((row, self._number(row)) for row in unknown[:_BESIDE]):
