@@ -254,7 +254,7 @@ class RunPosterior:
         functions."""
         likeliest = sorted(rows, key=lambda row: -row.log_evidence)
         known = [row for row in likeliest if row.effects and not row.driver and self._run.walk not in row.effects]
-        fitted = [row if row.refit else self._refitted(row) for row in known[:_BESIDE]]
+        fitted = [row for row in known if row.refit is not None][:_ALWAYS]
         unknown = [row for row in likeliest if row.driver not in ("", IRREGULAR) and not (row.effects or row.dwells)]
         beside = [self._with_dwells(row, *self._where_fitted(row.refit)) for row in fitted if row.refit]
         run = self._run.likelihood
@@ -399,6 +399,7 @@ class RunPosterior:
         least = best - _BEHIND - _BENT * max(best - float(self._without.max()), 0.0)
         effects = sorted((row for row in rows if row.effects and not row.driver), key=lambda row: -row.log_evidence)
         single = [row for row in effects if len(row.effects) == 1]  # large effects are far from linear
+        single = [row for row in single if effect_named(row.effects[0], self._before.bench).scannable]
         single = sorted(single, key=lambda row: -row.statistic)[:_ALWAYS]
         likeliest = {id(row) for row in [*single, *(row for row in effects[:_REFITTED] if row.log_evidence > least)]}
         fitted = self._steady([self._refitted(row) if id(row) in likeliest else row for row in rows])
