@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 
@@ -300,7 +300,7 @@ class RunPosterior:
     def _pairs(self) -> list[Hypothesis]:
         """Return the rows of the likeliest effects, each with any other term beside it, and of the likeliest summand of
         an unknown function, with another one or an effect beside it."""
-        pairs, heads = dict[tuple[str, ...], float](), [*map(self._best.__getitem__, self._heads()), *self._summand()]
+        pairs, heads = dict[tuple[str, ...], float](), [*self._heads(), *self._summand()]
         alone = [self._base + self._log_bayes[k] + self._log_share_of(k) for k in heads]
         # beside one more term less noise is likely, not more
         likely = [self._sizes.likely(logs, self._log_bayes.max(axis=0)) for logs in alone]
@@ -346,14 +346,17 @@ class RunPosterior:
             explained |= {(h, k): own[n] for h, own in enumerate(of_heads) for n, k in enumerate(numbers)}
         return explained
 
-    def _heads(self) -> list[str]:
-        """Return the effects that are likeliest: in noise that is averaged over and, since beside another effect the
-        noise is less than with one alone, in none beyond what was stated."""
+    def _heads(self) -> list[int]:
+        """Return the numbers of the likeliest terms of the likeliest effects: in noise that is averaged over and, since
+        beside another effect the noise is less than with one alone, in none beyond what was stated. Nor does one alone
+        show what an effect has in the other accelerometers: beside others it is tried in all, too."""
         best = {name: k for name, k in self._best.items() if not name.startswith("?") and name != self._run.walk}
         in_noise = sorted(best, key=lambda name: -self._log_evidence[best[name]])[:_HEADS]
         in_none = sorted(best, key=lambda name: -self._log_bayes[best[name], 0])[:_HEADS]
         heads = list(dict.fromkeys([*in_noise, *in_none]))
-        return [*heads, *dict.fromkeys(self._ahead_of_pairs(list(best), heads))]
+        heads += dict.fromkeys(self._ahead_of_pairs(list(best), heads))
+        in_all = self._likeliest(k for k, term in enumerate(self._run.terms) if not term.alone)
+        return [*dict.fromkeys(of[name] for of in (best, in_all) for name in heads if name in of)]
 
     def _ahead_of_pairs(self, names: Sequence[str], heads: Sequence[str]) -> list[str]:
         """Return the likelier effect of each pair that, in the noise that was stated, lets chi-squared fall nearly as
@@ -375,21 +378,36 @@ class RunPosterior:
     @cached_property
     def _best(self) -> dict[str, int]:
         """The number of the likeliest term of each row."""
+        return self._likeliest(range(len(self._run.terms)))
+
+    def _likeliest(self, numbers: Iterable[int]) -> dict[str, int]:
+        """Return the number of the likeliest of some terms of each row."""
         best = dict[str, int]()
-        for k, term in enumerate(self._run.terms):
-            if term.row not in best or self._log_evidence[k] > self._log_evidence[best[term.row]]:
-                best[term.row] = k
+        for k in numbers:
+            row = self._run.terms[k].row
+            if row not in best or self._log_evidence[k] > self._log_evidence[best[row]]:
+                best[row] = k
         return best
 
     def _log_share_of(self, k: int) -> float:
-        """Return the log of the mean likelihood over all values of an effect's constant, over that of one term; of a
-        summand of an unknown function, of its share in the prior."""
+        """Return the log of the mean likelihood of an effect, in one accelerometer or in all as a term has it, over
+        that of the term; of a summand of an unknown function, of its share in the prior."""
         term = self._run.terms[k]
-        return term.log_share if term.row.startswith("?") else self._log_share_of_best(term.row)
+        return term.log_share if not term.is_known else self._log_mean(k, lambda other: other.alone == term.alone)
 
-    def _log_share_of_best(self, name: str) -> float:
+    def _log_share_of_constant(self, name: str) -> float:
         """Return the log of the mean likelihood over all values of an effect's constant, over that at the best."""
-        return self._by_row(self._log_evidence)[name] - float(self._log_evidence[self._best[name]])
+        term = self._run.terms[self._best[name]]
+        alike = self._log_mean(
+            self._best[name], lambda other: (other.relation, other.only) == (term.relation, term.only)
+        )
+        return alike - term.log_share_of_form
+
+    def _log_mean(self, k: int, alike: Callable[[RunTerm], bool]) -> float:
+        """Return the log of the likelihood of those terms of a row that are alike, over that of one of them."""
+        row, numbered = self._run.terms[k].row, zip(self._run.terms, self._log_evidence.tolist(), strict=True)
+        logs = [log + term.log_share for term, log in numbered if term.row == row and alike(term)]
+        return _log_sum(logs) - float(self._log_evidence[k])
 
     # Rows where their own fit is
 
@@ -426,14 +444,14 @@ class RunPosterior:
         if self._run.walk in row.effects or otherwise:
             return replace(row, refit=refit)
         log, statistic = self._log_of_fit(refit)
-        log += self._log_prior(row.effects) + sum(self._log_share_of_best(name) for name in row.effects)
+        log += self._log_prior(row.effects) + sum(map(self._log_share_of_constant, row.effects))
         return replace(row, refit=refit, log_evidence=log, statistic=row.statistic or statistic)
 
     def _with_changes_beside_walk(self, irregular: Hypothesis, rows: Sequence[Hypothesis]) -> Hypothesis:
         """Return the row of irregular changes with those beside a random walk of the biases: what this leaves within
-        dwells speaks for them, too."""
+        dwells speaks for them, too. What the formulas of an unknown function leave does not: they are a part of it."""
         logs = [irregular.log_evidence]
-        for row in (row for row in rows if self._run.walk in row.effects and row.refit is not None):
+        for row in (row for row in rows if self._run.walk in row.effects and row.refit and not row.driver):
             left = trend(row.refit.fit) if self._test.trend and row.refit else None
             logs += [row.log_evidence + log_odds_of(left.p_value) + math.log(_WITHIN)] if left else []
         return replace(irregular, log_evidence=_log_sum(logs))

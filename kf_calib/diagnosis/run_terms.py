@@ -50,15 +50,17 @@ class RunTerm:
     """Columns (q,) of one term in the likelihood.
 
     row: the name of an effect, or ``?`` and the number of an unknown function. log_share: log of its share in the prior
-    of its row. effect: with the constant at which it has these columns. summands: of the unknown function, those that
-    it has. in_each: whether each accelerometer has columns of its own. only: which of the columns of all accelerometers
-    these are. sizes: of its coefficients. scales: factors (q,) of its columns.
+    of its row. effect: with the constant at which it has these columns. relation: the number of that of its
+    coefficients. summands: of the unknown function, those that it has. in_each: whether each accelerometer has columns
+    of its own. only: which of the columns of all accelerometers these are. sizes: of its coefficients. scales: factors
+    (q,) of its columns.
     """
 
     row: str
     columns: Indices
     log_share: float
     effect: Effect | None = None
+    relation: int = 0
     summands: tuple[int, ...] = ()
     in_each: bool = False
     only: slice = field(default_factory=lambda: EVERY)
@@ -69,6 +71,13 @@ class RunTerm:
     def alone(self) -> bool:
         """Whether it is of one accelerometer alone."""
         return self.only != EVERY
+
+    @property
+    def log_share_of_form(self) -> float:
+        """The log of the share of its relation, and of the accelerometers that it is of."""
+        relations = self.effect.relations if self.effect is not None else ()
+        (log,) = [log for log, only in of_accelerometers(self.in_each) if only == self.only]
+        return log - math.log(max(len(relations), 1))
 
     @property
     def is_known(self) -> bool:
@@ -126,9 +135,9 @@ class RunTerms:
             logs[numbers] -= float(np.logaddexp.reduce(logs[numbers])) + math.log(most / len(numbers))
         for effect, log in zip(effects, logs.tolist(), strict=True):
             part, relations = columns.add([effect]), [*effect.relations] or [None]
-            for matrix in relations:
+            for number, matrix in enumerate(relations):
                 block, share = columns.block(part, matrix), log - math.log(len(relations))
-                columns.term(str(effect), [block], share, effect, in_each=isinstance(effect, SensorEffect))
+                columns.term(str(effect), [block], share, effect, number, in_each=isinstance(effect, SensorEffect))
 
     def _add_unknown(self, columns: _Columns) -> None:
         """Add the unknown functions: each summand alone, and all together."""
@@ -303,10 +312,11 @@ class _Columns:
         return len(self.blocks) - 1
 
     def term(self, row: str, blocks: Sequence[int], log_share: float, effect: Effect | None = None,
-             summands: tuple[int, ...] = (), in_each: bool = False, scales: Floats | None = None) -> None:  # fmt: skip
+             relation: int = 0, summands: tuple[int, ...] = (), in_each: bool = False,
+             scales: Floats | None = None) -> None:  # fmt: skip
         """Add a term with the columns of some blocks."""
         places = np.concatenate([self._places[block] for block in blocks])
-        self.terms.append(RunTerm(row, places, log_share, effect, summands, in_each, scales=scales))
+        self.terms.append(RunTerm(row, places, log_share, effect, relation, summands, in_each, scales=scales))
 
 
 class _Visits(Effect):

@@ -119,7 +119,7 @@ def test_a_bias_that_toggles_by_chance_has_no_name_but_its_accelerometer(seeds: 
 
 @pytest.mark.slow
 def test_a_scale_factor_that_warms_up_is_no_bias_that_does() -> None:
-    shares = 2e-6 * np.array([1.0, -0.7, 0.8])
+    shares = 4e-6 * np.array([1.0, -0.7, 0.8])
     bench = IndependentBench(6, scale=lambda s: shares * np.exp(-s.time_s / 60.0)[:, None])
     diagnosis = diagnosed(bench)
     assert diagnosis.likeliest is not None and diagnosis.likeliest.effects == ("scale-warm-up",), diagnosis.verdict
