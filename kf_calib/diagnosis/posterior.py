@@ -110,7 +110,7 @@ class RunPosterior:
             return ()
         (name,) = first.effects
         number = self._best[name]
-        noise = self._sizes.covariances[int(np.argmax(self._base + self._log_bayes[number]))]
+        noise = self._likeliest_noise(number)
         others = [
             other for other in self._run.names if other != name and other != self._run.walk and other in self._best
         ]
@@ -156,6 +156,10 @@ class RunPosterior:
     def _without(self) -> Floats:
         """Log evidence (families,) of no term."""
         return self._sizes.evidence(self._base[None])[0]
+
+    def _likeliest_noise(self, k: int) -> Floats | None:
+        """The covariances (D, 3, 3) of the noise that is likeliest beside a term, in units of that stated."""
+        return self._sizes.covariances[int(np.argmax(self._base + self._log_bayes[k]))]
 
     # Rows
 
@@ -258,12 +262,12 @@ class RunPosterior:
         unknown = [row for row in likeliest if row.driver not in ("", IRREGULAR) and not (row.effects or row.dwells)]
         beside = [self._with_dwells(row, *self._where_fitted(row.refit)) for row in fitted if row.refit]
         run = self._run.likelihood
-        none = replace(run.courses, squares=0.0 * run.courses.squares)  # an unknown function may follow any of them
         for row, number in ((row, self._number(row)) for row in unknown[:_BESIDE]):
             if number is None or not self._run.unknown[number].summands:  # its columns have any size only together
                 continue
-            columns = self._run.terms[self._best[f"?{number}"]].columns
-            beside.append(self._with_dwells(row, run.spanned.beside(columns, run.lengths), none))
+            k = self._best[f"?{number}"]
+            rest = run.spanned.beside(self._run.terms[k].columns, run.lengths)
+            beside.append(self._with_dwells(row, rest, self._run.courses_beside(k, self._likeliest_noise(k))))
         return beside
 
     def _where_fitted(self, refit: Calibration) -> tuple[Spanned, Courses]:
@@ -416,10 +420,16 @@ class RunPosterior:
         best = max(row.log_evidence for row in rows)
         least = best - _BEHIND - _BENT * max(best - float(self._without.max()), 0.0)
         effects = sorted((row for row in rows if row.effects and not row.driver), key=lambda row: -row.log_evidence)
-        single = [row for row in effects if len(row.effects) == 1]  # large effects are far from linear
+        single = [row for row in effects if len(row.effects) == 1]
+        of_one = {row.effects[0]: row.log_evidence for row in single}
+        # a pair behind one of its own has nothing to add
+        ahead = [
+            row for row in effects
+            if len(row.effects) == 1 or row.log_evidence > max(map(of_one.__getitem__, row.effects))
+        ]  # fmt: skip
         single = [row for row in single if effect_named(row.effects[0], self._before.bench).scannable]
-        single = sorted(single, key=lambda row: -row.statistic)[:_ALWAYS]
-        likeliest = {id(row) for row in [*single, *(row for row in effects[:_REFITTED] if row.log_evidence > least)]}
+        single = sorted(single, key=lambda row: -row.statistic)[:_ALWAYS]  # large effects are far from linear
+        likeliest = {id(row) for row in [*single, *(row for row in ahead[:_REFITTED] if row.log_evidence > least)]}
         fitted = self._steady([self._refitted(row) if id(row) in likeliest else row for row in rows])
         while not (first := max(fitted, key=lambda row: row.log_evidence)).driver and first.effects and not first.refit:
             fitted = self._steady([self._refitted(row) if row is first else row for row in fitted])

@@ -22,7 +22,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, Indices
 from kf_calib.diagnosis.in_noises import ROUNDING, InNoises, Spanned
-from kf_calib.diagnosis.within_rows import WithinRows
+from kf_calib.diagnosis.within_rows import Courses, WithinRows
 from kf_calib.dwells.pieces import OfPieces, of_all_pieces
 from kf_calib.effects import Effect
 from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns, few_at_a_time, stimulus_of
@@ -120,7 +120,7 @@ class RunLikelihood:
         made = sum(len(effect.coefficients) for effect in effects)
         count = sum(map(_width, blocks)) if blocks else model.count - known + made
         columns = np.empty((len(dwells), 3, count))
-        within = WithinRows(self.noise, linearised, known, made)
+        within = WithinRows(self.noise, linearised, known, np.zeros(made))
         for few, some, pieces, nodes in few_at_a_time(dwells, stimulus, made):
             added = candidate_columns(some, effects, model.bench, state, nodes)
             of_states = OfPieces(values[pieces, ..., known : model.count], some.folded.ends)
@@ -129,6 +129,17 @@ class RunLikelihood:
             columns[few] = self._root[few] @ columns[few]
             within.add(some, values[pieces], added.values, pieces)
         return columns, within
+
+    def courses_beside(self, effects: Sequence[Effect], coefficients: Floats) -> Courses:
+        """What the model leaves of the courses of the readings within dwells, with effects of some coefficients (C,)
+        that are not in it."""
+        linearised, dwells = self.linearised, self.linearised.dwells_at_state
+        bench, state, values = linearised.model.bench, linearised.state, of_all_pieces(linearised.columns)
+        within = WithinRows(self.noise, linearised, linearised.model.count, np.ones(1))
+        for _, some, pieces, nodes in few_at_a_time(dwells, stimulus_of(dwells, bench, state), len(coefficients)):
+            added = candidate_columns(some, effects, bench, state, nodes).values @ coefficients
+            within.add(some, values[pieces], added[..., None], pieces)
+        return within.courses
 
     @property
     def lengths_left(self) -> Floats:
@@ -140,7 +151,7 @@ class RunLikelihood:
         """Multiply the columns of the terms by these (C,)."""
         for columns in (self.spanned.columns, self.spanned.more_columns):
             columns *= scales
-        self.lengths = self.lengths * scales
+        self.lengths, self.scales = self.lengths * scales, scales
 
     def columns(self, places: Indices) -> Floats:
         """Some columns (r, q) of the terms in the noise that was stated, off the model, in all rows."""

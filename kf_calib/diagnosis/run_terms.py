@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.special import softmax
 
 from kf_calib.bench.arrays import Floats, Indices
 from kf_calib.diagnosis.candidate_tests import CandidateTests
@@ -17,6 +18,7 @@ from kf_calib.diagnosis.coefficient_sizes import SizePrior, best_sigma, sensor_g
 from kf_calib.diagnosis.in_noises import InNoises
 from kf_calib.diagnosis.run_likelihood import Combination, RunLikelihood, Sizes, log_bayes
 from kf_calib.diagnosis.unknown_terms import RETURNING, UnknownTerm, text_named, unknown_terms
+from kf_calib.diagnosis.within_rows import Courses
 from kf_calib.dwells.qr import orthonormal
 from kf_calib.effects import Coefficient, Effect, Stimulus, effect_named, walk_named
 from kf_calib.effects.effect import Grade, SensorEffect
@@ -182,6 +184,22 @@ class RunTerms:
         for time_s in times_s:
             scales = np.tile(1.0 / np.sqrt(1.0 + 1.0 / np.square(waves.rates * time_s)), 3)
             columns.term(f"?{len(self.unknown) - 1}", [block], -math.log(len(times_s)), scales=scales)
+
+    def courses_beside(self, k: int, covariance: Floats | None) -> Courses:
+        """What is left of the courses of the readings within dwells by an unknown function, as a term has it and as it
+        is likeliest in one noise."""
+        term, rows = self.terms[k], self.likelihood.projected(covariance, self.terms[k].columns)
+        columns, squares = rows.of(term.columns), term.sizes.values[:, None] ** 2
+        values, vectors = np.linalg.eigh(columns.T @ columns)
+        along = vectors.T @ (columns.T @ rows.readings)
+        shrunk = squares / (1.0 + squares * values)
+        logs = term.sizes.logs + 0.5 * np.sum(shrunk * along**2 - np.log1p(squares * values), axis=1)
+        likeliest = vectors @ (along * (softmax(logs) @ shrunk))
+        summands = self.unknown[int(term.row[1:])].summands
+        effects = [self.formula_of(text) for number in term.summands for text in summands[number]]
+        coefficients = np.zeros(sum(len(effect.coefficients) for effect in effects))
+        coefficients[term.only] = likeliest * self.likelihood.scales[term.columns]
+        return self.likelihood.courses_beside(effects, coefficients)
 
     def formula_of(self, text: str) -> Effect:
         """The effect of a formula without a name."""

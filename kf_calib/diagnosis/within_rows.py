@@ -49,17 +49,18 @@ class WithinRows:
     """The rows within dwells, gathered a few dwells at a time.
 
     noise: what was stated. linearised: the dwells with the columns of the model, of which the first ``known`` have a
-    flat prior. made: number of columns of effects.
+    flat prior. about (made,): coefficients of the columns of effects.
     """
 
-    def __init__(self, noise: Noise, linearised: LinearisedDwells, known: int, made: int) -> None:
-        self._model, self._state, self._known, self._made = linearised.model, linearised.state, known, made
+    def __init__(self, noise: Noise, linearised: LinearisedDwells, known: int, about: Floats) -> None:
+        self._model, self._state, self._known, self._made = linearised.model, linearised.state, known, len(about)
         judging = noise.with_scatter_as_flicker(len(linearised.dwells)).without(RandomWalk)
         self._shared = judging.columns("run", linearised.dwells_at_state, linearised.state)
         without_means = judging if noise.attitude_unknown else judging.without(SettingError)
         self._noise = without_means.with_terms(Scatter(np.full(3, _IMMENSE_MPS2)))
         self._channels = 1 if noise.attitude_unknown else 3
-        self._largest = np.zeros(self._model.count + made + self._shared.shape[3])
+        self._about = np.concatenate([self._state, about, np.zeros(self._shared.shape[3])])
+        self._largest = np.zeros(len(self._about))
         self._gathered = list[tuple[Floats, Indices]]()
         self._squares, self._freedom = list[Floats](), list[Floats]()
         self.log = 0.0
@@ -83,11 +84,9 @@ class WithinRows:
         self._largest = np.maximum(self._largest, np.abs(both).max(axis=(0, 1, 2)))
         moving = _changing(both, dwells.folded.ends, self._largest)
         moving[: self._model.count] = True
-        about = np.zeros(int(moving.sum()))
-        about[: self._model.count] = self._state
         columns = OfPieces(both[..., moving], dwells.folded.ends)
         self.log += log_of_errors(dwells, self._noise, self._state)
-        of_dwells = whiten(dwells, columns, self._noise, self._state, about, reduced=False)
+        of_dwells = whiten(dwells, columns, self._noise, self._state, self._about[moving], reduced=False)
         self._squares.append(np.array([float(rows[:, -1] @ rows[:, -1]) for rows in of_dwells]))
         freedom = self._channels * (dwells.folded.width * dwells.folded.piece_numbers - 1.0)
         self._freedom.append(np.asarray(freedom, float))

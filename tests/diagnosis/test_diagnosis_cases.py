@@ -163,9 +163,14 @@ def test_one_cycle_a_run_is_not_told_from_what_the_temperature_does() -> None:
 
 @pytest.mark.slow
 def test_pairs_that_explain_as_much_as_a_single_effect_are_said() -> None:
-    both = diagnose(source("thermal-bias=12sigma", "thermal-rate=12sigma"))
-    assert {"thermal-bias", "thermal-rate"} <= set(both.ambiguity), both.verdict
-    assert {"thermal-bias", "thermal-rate"} in map(set, both.together)
+    """A temperature that goes once to and fro in the run, and its rate, are a sine and a cosine of the time: one
+    oscillation, which is likelier than two effects. Never surely so, and in half of the runs the two are said."""
+    said, pair = 0, {"thermal-bias", "thermal-rate"}
+    for seed in range(1, 5):
+        both = diagnose(source("thermal-bias=12sigma", "thermal-rate=12sigma", seed=seed), replicate=False)
+        assert not both.sure, both.verdict
+        said += pair <= set(both.ambiguity) and pair in map(set, both.together)
+    assert said >= 2
 
 
 def test_what_the_run_has_no_sight_of_is_said() -> None:
@@ -205,10 +210,12 @@ def test_an_oscillation_and_another_effect_are_both_found() -> None:
 
 @pytest.mark.slow
 def test_an_oscillation_does_not_stand_for_what_is_left_of_three_effects() -> None:
-    """With settling it leaves 1.8 times the noise, and had 99 %: two of the three are named, and what they leave."""
+    """With settling it leaves 1.8 times the noise, and had 99 %: two of the three are told as likeliest, the lag or the
+    rate of the temperature that it is in the limit, and what they leave."""
     hidden = ("thermal-lag=30sigma", "settling=30sigma", "encoder-harmonic-1:x=30sigma")
     found = diagnose(source(*hidden, seed=7, dwells=24), replicate=False)
-    assert {*found.missing} < {"thermal-lag", "settling", "encoder-harmonic-1:x"} and found.table is not None
+    told = {"thermal-lag", "thermal-rate", "settling", "encoder-harmonic-1:x"}
+    assert len(found.missing) == 2 and {*found.missing} < told and not found.sure and found.table is not None
     assert "what it leaves is still" in found.verdict
     assert max(row.probability for row in found.table.rows if "sinusoid" in row.effects) < 0.9
 

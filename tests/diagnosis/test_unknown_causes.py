@@ -188,7 +188,6 @@ def test_a_pose_after_a_whole_turn_is_the_same_orientation() -> None:
 
 
 @pytest.mark.slow  # what goes with the last step and is unknown: above
-@pytest.mark.xfail(strict=True, reason="a settling that hardly decays is the same: docs/limits.md")
 def test_memory_in_proportion_to_the_last_step_is_not_surely_settling() -> None:
     """With time constants far beyond the dwells it is the same: the catalogue does not hold its limit."""
     diagnosis = diagnosed("in proportion to the last step", 15.0, 1)
