@@ -173,6 +173,7 @@ class RunPosterior:
             of_noise.append(log + prior + math.log(1.0 - share))
             irregular += [log + prior + math.log(share)] if share else []
         within = log_odds_of(self._test.trend.p_value) if self._test.trend else 0.0
+        within = max(within, self._run.likelihood.courses.log_bayes_alike)
         log_nothing = noises[0][1] + prior
         if self._test.consistent is False:  # chance, or a cause of which there is no term: as p has it
             odds = log_odds_of(self._test.p_value or 0.0) + math.log(PRIOR["unknown"] / PRIOR["nothing"])

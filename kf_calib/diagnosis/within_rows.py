@@ -26,23 +26,45 @@ _ANY_SIZE = np.geomspace(0.1, 1e5, 61)  # of what disturbs a dwell, in units of 
 @dataclass(frozen=True)
 class Courses:
     """What the model leaves of the courses of the readings within dwells: squares (D,) in units of the noise, and their
-    degrees of freedom (D,)."""
+    degrees of freedom (D,). along, made (D,): products of the courses that effects make with what is left, and with
+    themselves."""
 
     squares: Floats
     freedom: Floats
+    along: Floats
+    made: Floats
 
     def log_bayes(self, prior: float) -> Floats:
         """Log Bayes factors (D,) of whatever changes the courses of some dwells alone, each with a prior probability
-        and averaged over its size; zeros where it is likelier that all change alike.
+        and averaged over its size; zeros where it is likelier that all change alike: as much, or as the effects have
+        it, in each dwell by another share.
 
         Of a size s, in units of the noise, with n degrees of freedom (1 + s^2)^(-n/2) exp(chi^2 s^2 / (2 (1 + s^2))).
         """
-        squares = _ANY_SIZE**2
-        gained = self.squares[:, None] * squares / (1.0 + squares)
-        by_size = 0.5 * (gained - self.freedom[:, None] * np.log1p(squares))  # (D, sizes)
-        own = np.logaddexp.reduce(by_size, axis=1) - math.log(len(squares))
-        alike = float(np.logaddexp.reduce(by_size.sum(axis=0))) - math.log(len(squares))
-        return own if np.logaddexp(0.0, math.log(prior) + own).sum() > alike else np.zeros(len(own))
+        own = np.logaddexp.reduce(self._by_size, axis=1) - math.log(len(_ANY_SIZE))
+        likelier = np.logaddexp(0.0, math.log(prior) + own).sum() > self.log_bayes_alike
+        return own if likelier else np.zeros(len(own))
+
+    @property
+    def log_bayes_alike(self) -> float:
+        """Log Bayes factor of whatever changes the courses of all dwells, averaged over its size."""
+        alike = self._by_size
+        if self.made.any():
+            by_share = _log_bayes(self.along**2, self.made, 1.0, _ANY_SIZE**2 / self.made.max())
+            alike = np.concatenate([alike, by_share], axis=1)
+        return float(np.logaddexp.reduce(alike.sum(axis=0))) - math.log(alike.shape[1])
+
+    @property
+    def _by_size(self) -> Floats:
+        """Log Bayes factors (D, sizes) of whatever changes the course of each dwell."""
+        return _log_bayes(self.squares, np.ones(len(self.squares)), self.freedom, _ANY_SIZE**2)
+
+
+def _log_bayes(along_squared: Floats, made: Floats, freedom: Floats | float, squares: Floats) -> Floats:
+    """Return log Bayes factors (D, sizes) of coefficients with squares of their sizes."""
+    spread = squares * made[:, None]
+    gained = squares * along_squared[:, None] / (1.0 + spread)
+    return np.asarray(0.5 * (gained - np.reshape(freedom, (-1, 1)) * np.log1p(spread)), float)
 
 
 class WithinRows:
@@ -62,21 +84,20 @@ class WithinRows:
         self._about = np.concatenate([self._state, about, np.zeros(self._shared.shape[3])])
         self._largest = np.zeros(len(self._about))
         self._gathered = list[tuple[Floats, Indices]]()
-        self._squares, self._freedom = list[Floats](), list[Floats]()
+        self._courses = list[Floats]()
         self.log = 0.0
         """Log of the density of the readings within dwells, but for chi-squared."""
 
     @property
     def courses(self) -> Courses:
         """What the model leaves of the course of each dwell."""
-        return Courses(np.concatenate(self._squares), np.concatenate(self._freedom))
+        return Courses(*np.concatenate(self._courses, axis=1))
 
     def add(self, dwells: DwellTable, of_model: Floats, of_effects: Floats, pieces: slice) -> None:
         """Add a few dwells with their columns (P, K, 3, p) of the model and (P, K, 3, made) of effects; pieces: which
         of the run they have. Columns that do not change within dwells have no rows."""
         if not self._noise.within_seen:
-            self._squares.append(np.zeros(len(dwells)))
-            self._freedom.append(np.zeros(len(dwells)))
+            self._courses.append(np.zeros((4, len(dwells))))
             return
         parts = [of_model, of_effects, self._shared[pieces]]
         nodes = min(part.shape[1] for part in parts)
@@ -87,9 +108,11 @@ class WithinRows:
         columns = OfPieces(both[..., moving], dwells.folded.ends)
         self.log += log_of_errors(dwells, self._noise, self._state)
         of_dwells = whiten(dwells, columns, self._noise, self._state, self._about[moving], reduced=False)
-        self._squares.append(np.array([float(rows[:, -1] @ rows[:, -1]) for rows in of_dwells]))
         freedom = self._channels * (dwells.folded.width * dwells.folded.piece_numbers - 1.0)
-        self._freedom.append(np.asarray(freedom, float))
+        made = np.where(np.arange(len(moving)) < self._model.count, 0.0, self._about)[moving]
+        pairs = [(rows[:, -1], rows[:, -1 - len(made) : -1] @ made) for rows in of_dwells]
+        products = np.array([(left @ left, left @ course, course @ course) for left, course in pairs]).T
+        self._courses.append(np.stack([products[0], np.asarray(freedom, float), *products[1:]]))
         self._gathered.append((_reduced(np.concatenate(of_dwells)), np.append(np.flatnonzero(moving), len(moving))))
         if sum(len(rows) for rows, _ in self._gathered) > _TALL * max(rows.shape[1] for rows, _ in self._gathered):
             self._gathered = [self._merged()]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -148,6 +149,28 @@ def test_readings_that_change_in_all_dwells_are_no_disturbed_dwells() -> None:
 
     diagnosis = diagnose(IndependentBench(4, 18, bias=creeping))
     assert diagnosis.apart == () and diagnosis.test.consistent is False
+
+    def knocked(state: State) -> np.ndarray:
+        at_the_end = (state.dwell == 17) & (state.since_s > 15.0)
+        return creeping(state) + 2e-4 * at_the_end[:, None] * np.exp(-(state.since_s - 15.0)[:, None] / 3.0)
+
+    diagnosis = diagnose(IndependentBench(4, 18, bias=knocked), replicate=False)
+    assert diagnosis.unknown and not diagnosis.missing, diagnosis.verdict
+
+
+def test_a_dwell_that_does_not_follow_what_all_others_do_is_told_and_not_walked_around() -> None:
+    """A gimbal that creeps after each move, but for one: a random walk of the biases took the difference."""
+    after_moves = partial(creeping_gimbal, but=11)
+    diagnosis = diagnose(IndependentBench(5, gimbals=after_moves), replicate=False)
+    assert diagnosis.apart == (12,) and not diagnosis.missing, diagnosis.verdict
+    assert diagnosis.likeliest is not None
+    assert diagnosis.likeliest.driver == "time since arrival and last move of gimbal 2"
+
+
+def creeping_gimbal(state: State, but: int) -> np.ndarray:
+    """Errors (n, 3) of the second gimbal, which creeps the way that it came from, in all dwells but one."""
+    size_rad = -6e-5 * np.sign(state.moves_rad[:, 1]) * np.exp(-state.since_s / 3.0) * (state.dwell != but)
+    return size_rad[:, None] * np.eye(3)[1]
 
 
 UNSTATED = replace(BENCH, angle_sigma_deg=None, scatter_sigma_mps2=None)

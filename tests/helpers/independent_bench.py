@@ -79,7 +79,8 @@ class IndependentBench:
         moves_rad = np.diff(self.poses_rad, axis=0, prepend=self.poses_rad[:1])
         for k in range(1, self.dwells):  # a gimbal that stands still has moved before
             moves_rad[k] = np.where(moves_rad[k] == 0.0, moves_rad[k - 1], moves_rad[k])
-        return State(time_s, dwell, np.where(since_s < DWELL_S, since_s, 0.0), angles_rad, moves_rad[dwell])
+        stands = (since_s < DWELL_S) | (dwell == self.dwells - 1)  # at the end it stays where it is
+        return State(time_s, dwell, np.where(stands, since_s, 0.0), angles_rad, moves_rad[dwell])
 
     def _sensors(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Unit input axes (3, 3), scale factors (3,) and biases (3,), m/s^2."""
