@@ -272,22 +272,19 @@ class RunPosterior:
         return beside
 
     def _where_fitted(self, refit: Calibration) -> tuple[Spanned, Courses]:
-        """Return the rows of a run, with the effects that a refit has in addition in the model, and what it leaves of
-        the courses of the readings within dwells: nothing where the fit, as of a bad model, follows the means, and in
-        the likeliest noise would follow the courses."""
-        known, courses = self._before.model.count, self._run.likelihood.courses
+        """Return the rows of a run, with the effects that a refit has in addition in the model, and what they leave in
+        the likeliest noise of the courses of the readings within dwells: the refit of a bad model may follow the means
+        against these."""
+        known = self._before.model.count
         likelihood = RunLikelihood(refit.linearised, self._noise, self._least_mps2, known=known)
-        places, rows = np.arange(refit.model.count - known), likelihood.spanned
+        places = np.arange(refit.model.count - known)
         noises = self._sizes.in_families(partial(likelihood.in_noises, groups=[places[None]]))
         grams = np.concatenate([of_family.grams[0][:, 0] for of_family in noises])
         along = np.concatenate([of_family.along[:, places] for of_family in noises])
         k = int(np.argmax(np.concatenate([of_family.logs for of_family in noises]) + _gains(grams, along)))
         likeliest = np.linalg.pinv(grams[k], ROUNDING, hermitian=True) @ along[k]
-        both = np.stack([likeliest, refit.linearised.state[known:]], axis=1)
-        least, here = np.sum((rows.more_readings[:, None] - rows.more_columns @ both) ** 2, axis=0).tolist()
-        # what a term disturbs itself is for no dwell to explain
-        squares = np.minimum(courses.squares, likelihood.courses.squares) * (0.5 * (here - least) < _BEHIND)
-        return rows.beside(places, likelihood.lengths), replace(courses, squares=squares)
+        courses = likelihood.courses_at(np.append(refit.linearised.state[:known], likeliest))
+        return likelihood.spanned.beside(places, likelihood.lengths), courses
 
     def _with_dwells(self, row: Hypothesis, rows: Spanned, courses: Courses) -> Hypothesis:
         """Return a row with dwells that are off beside what it has, which is in the model of ``rows``."""

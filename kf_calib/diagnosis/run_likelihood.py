@@ -36,6 +36,8 @@ _FAR = 300.0  # in log likelihood, below the largest: a polynomial through value
 _LEAST = 0.1  # sigma of a mean: noise that is smaller shows nothing
 _ALONG = 1e-8  # variance along the force by errors across it: a turn by 2e-4 rad; less is lost in sums of the squares
 
+_NONE = np.zeros(0)
+
 Combination = tuple[slice, Floats | None]
 """Columns, and the matrix by which they are combined; None: as they are."""
 
@@ -87,7 +89,7 @@ class RunLikelihood:
     ) -> None:
         self.linearised, self.noise = linearised, noise
         model = linearised.model
-        known = model.count if known is None else known
+        known = self._known = model.count if known is None else known
         means, prior = with_shared_noise(linearised.dwells, noise, linearised.means, linearised.state)
         covariances = mean_covariances(noise, means, linearised.state) + least_mps2**2 * np.eye(3)
         self.means, self._root = means, np.linalg.inv(np.linalg.cholesky(lift_rounding(covariances)))
@@ -120,7 +122,7 @@ class RunLikelihood:
         made = sum(len(effect.coefficients) for effect in effects)
         count = sum(map(_width, blocks)) if blocks else model.count - known + made
         columns = np.empty((len(dwells), 3, count))
-        within = WithinRows(self.noise, linearised, known, np.zeros(made))
+        within = WithinRows(self.noise, linearised, known, np.append(state, np.zeros(made)))
         for few, some, pieces, nodes in few_at_a_time(dwells, stimulus, made):
             added = candidate_columns(some, effects, model.bench, state, nodes)
             of_states = OfPieces(values[pieces, ..., known : model.count], some.folded.ends)
@@ -130,14 +132,14 @@ class RunLikelihood:
             within.add(some, values[pieces], added.values, pieces)
         return columns, within
 
-    def courses_beside(self, effects: Sequence[Effect], coefficients: Floats) -> Courses:
-        """What the model leaves of the courses of the readings within dwells, with effects of some coefficients (C,)
-        that are not in it."""
+    def courses_at(self, state: Floats, effects: Sequence[Effect] = (), coefficients: Floats = _NONE) -> Courses:
+        """What the model leaves at some state (p,) of the courses of the readings within dwells, with effects of some
+        coefficients (C,) that are not in it."""
         linearised, dwells = self.linearised, self.linearised.dwells_at_state
-        bench, state, values = linearised.model.bench, linearised.state, of_all_pieces(linearised.columns)
-        within = WithinRows(self.noise, linearised, linearised.model.count, np.ones(1))
-        for _, some, pieces, nodes in few_at_a_time(dwells, stimulus_of(dwells, bench, state), len(coefficients)):
-            added = candidate_columns(some, effects, bench, state, nodes).values @ coefficients
+        bench, values = linearised.model.bench, of_all_pieces(linearised.columns)
+        within, at = WithinRows(self.noise, linearised, self._known, np.append(state, 1.0)), linearised.state
+        for _, some, pieces, nodes in few_at_a_time(dwells, stimulus_of(dwells, bench, at), len(coefficients)):
+            added = candidate_columns(some, effects, bench, at, nodes).values @ coefficients
             within.add(some, values[pieces], added[..., None], pieces)
         return within.courses
 

@@ -199,7 +199,7 @@ class RunTerms:
         effects = [self.formula_of(text) for number in term.summands for text in summands[number]]
         coefficients = np.zeros(sum(len(effect.coefficients) for effect in effects))
         coefficients[term.only] = likeliest * self.likelihood.scales[term.columns]
-        return self.likelihood.courses_beside(effects, coefficients)
+        return self.likelihood.courses_at(self._linearised.state, effects, coefficients)
 
     def formula_of(self, text: str) -> Effect:
         """The effect of a formula without a name."""

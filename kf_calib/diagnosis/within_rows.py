@@ -71,17 +71,18 @@ class WithinRows:
     """The rows within dwells, gathered a few dwells at a time.
 
     noise: what was stated. linearised: the dwells with the columns of the model, of which the first ``known`` have a
-    flat prior. about (made,): coefficients of the columns of effects.
+    flat prior. about (p + made,): the state of the model, and coefficients of the columns of effects.
     """
 
     def __init__(self, noise: Noise, linearised: LinearisedDwells, known: int, about: Floats) -> None:
-        self._model, self._state, self._known, self._made = linearised.model, linearised.state, known, len(about)
+        self._model, self._state, self._known = linearised.model, linearised.state, known
+        self._made = len(about) - self._model.count
         judging = noise.with_scatter_as_flicker(len(linearised.dwells)).without(RandomWalk)
         self._shared = judging.columns("run", linearised.dwells_at_state, linearised.state)
         without_means = judging if noise.attitude_unknown else judging.without(SettingError)
         self._noise = without_means.with_terms(Scatter(np.full(3, _IMMENSE_MPS2)))
         self._channels = 1 if noise.attitude_unknown else 3
-        self._about = np.concatenate([self._state, about, np.zeros(self._shared.shape[3])])
+        self._about = np.append(about, np.zeros(self._shared.shape[3]))
         self._largest = np.zeros(len(self._about))
         self._gathered = list[tuple[Floats, Indices]]()
         self._courses = list[Floats]()
@@ -109,7 +110,7 @@ class WithinRows:
         self.log += log_of_errors(dwells, self._noise, self._state)
         of_dwells = whiten(dwells, columns, self._noise, self._state, self._about[moving], reduced=False)
         freedom = self._channels * (dwells.folded.width * dwells.folded.piece_numbers - 1.0)
-        made = np.where(np.arange(len(moving)) < self._model.count, 0.0, self._about)[moving]
+        made = np.where(np.arange(len(moving)) < self._known, 0.0, self._about)[moving]
         pairs = [(rows[:, -1], rows[:, -1 - len(made) : -1] @ made) for rows in of_dwells]
         products = np.array([(left @ left, left @ course, course @ course) for left, course in pairs]).T
         self._courses.append(np.stack([products[0], np.asarray(freedom, float), *products[1:]]))
@@ -130,7 +131,7 @@ class WithinRows:
         # the twelve have none, but for noise of the angles
         of_model[:, STATE_COUNT : self._known] = full[:, STATE_COUNT : self._known]
         of_model[:, self._known :] = full[:, last:-1]
-        readings = full[:, -1] + full[:, self._known : count] @ self._state[self._known :]
+        readings = full[:, -1] + full[:, self._known : count] @ self._about[self._known : count]
         return of_model, full[:, self._known : last], readings
 
     def _merged(self) -> tuple[Floats, Indices]:
