@@ -89,6 +89,7 @@ class RunPosterior:
         measured = (1 if self._noise.attitude_unknown else 3) * len(before.fit.dwells)
         self._sizes = NoiseSizes(self._run.likelihood, self._noise, measured - model.count + len(model.fixed))
         self._no_oscillation = set[str]()
+        self._of_refits = dict[tuple[str, ...], tuple[RunLikelihood, Floats, Floats, Floats]]()
 
     def table(self, refitted: bool = True) -> HypothesisTable:
         """All rows with their probabilities; the likeliest are fitted if ``refitted``."""
@@ -275,16 +276,11 @@ class RunPosterior:
         """Return the rows of a run, with the effects that a refit has in addition in the model, and what they leave in
         the likeliest noise of the courses of the readings within dwells: the refit of a bad model may follow the means
         against these."""
-        known = self._before.model.count
-        likelihood = RunLikelihood(refit.linearised, self._noise, self._least_mps2, known=known)
-        places = np.arange(refit.model.count - known)
-        noises = self._sizes.in_families(partial(likelihood.in_noises, groups=[places[None]]))
-        grams = np.concatenate([of_family.grams[0][:, 0] for of_family in noises])
-        along = np.concatenate([of_family.along[:, places] for of_family in noises])
-        k = int(np.argmax(np.concatenate([of_family.logs for of_family in noises]) + _gains(grams, along)))
+        likelihood, logs, grams, along = self._in_noises_of(refit)
+        k = int(np.argmax(logs + _gains(grams, along)))
         likeliest = np.linalg.pinv(grams[k], ROUNDING, hermitian=True) @ along[k]
-        courses = likelihood.courses_at(np.append(refit.linearised.state[:known], likeliest))
-        return likelihood.spanned.beside(places, likelihood.lengths), courses
+        courses = likelihood.courses_at(np.append(refit.linearised.state[: -len(likeliest)], likeliest))
+        return likelihood.spanned.beside(np.arange(len(likeliest)), likelihood.lengths), courses
 
     def _with_dwells(self, row: Hypothesis, rows: Spanned, courses: Courses) -> Hypothesis:
         """Return a row with dwells that are off beside what it has, which is in the model of ``rows``."""
@@ -467,13 +463,12 @@ class RunPosterior:
     def _log_of_fit(self, refit: Calibration) -> tuple[float, float]:
         """Return the log evidence of the effects that a refit has in addition, at the values of their constants, and
         the fall of chi-squared by them in the likeliest noise."""
-        noise, model = self._noise, refit.model
-        if (thermometer := refit.noise.term(ThermometerError)) is not None:
-            noise = noise.with_terms(thermometer)
-        effects = model.effects[len(self._before.model.effects) :]
-        known = model.parts[str(effects[0])].start
-        likelihood = RunLikelihood(refit.linearised, noise, self._least_mps2, known=known)
-        places = [model.parts[str(effect)].start - known + np.arange(len(effect.coefficients)) for effect in effects]
+        likelihood, base, grams, along = self._in_noises_of(refit)
+        effects, known = refit.model.effects[len(self._before.model.effects) :], self._before.model.count
+        starts = [refit.model.parts[str(effect)].start - known for effect in effects]
+        places = [start + np.arange(len(each.coefficients)) for start, each in zip(starts, effects, strict=True)]
+        every = np.concatenate(places)  # of these columns, without those of constants
+        grams, along = grams[:, every][:, :, every], along[:, every]
         related = [*itertools.product(*map(_relations, effects))]
         usual = [usual_sizes(effect, self._run.grade) for effect in effects]
         sizes = [
@@ -481,11 +476,7 @@ class RunPosterior:
              for place, (_, matrix), prior, effect in zip(places, relation, usual, effects, strict=True)]
             for relation in related
         ]  # fmt: skip
-        every = np.concatenate(places)
-        noises = self._sizes.in_families(partial(likelihood.in_noises, groups=[every[None]]))
-        grams = np.concatenate([of_family.grams[0][:, 0] for of_family in noises])
-        along = np.concatenate([of_family.along[:, every] for of_family in noises])
-        base, logs = np.concatenate([of_family.logs for of_family in noises]), list[Floats]()
+        logs = list[Floats]()
         combined = [np.asarray(block_diag(*(matrix for _, matrix in relation)), float) for relation in related]
         gains = [_gains(matrix.T @ grams @ matrix, along @ matrix) for matrix in combined]
         for k in sorted(range(len(related)), key=lambda k: -float(np.max(base + gains[k]))):
@@ -497,6 +488,21 @@ class RunPosterior:
         likeliest = int(np.argmax(np.max(logs, axis=0)))
         statistic = 2.0 * float(_gains(grams[[likeliest]], along[[likeliest]])[0])
         return float(np.logaddexp.reduce(self._sizes.evidence(np.array(logs)), axis=None)), statistic
+
+    def _in_noises_of(self, refit: Calibration) -> tuple[RunLikelihood, Floats, Floats, Floats]:
+        """Return the likelihood where a refit is and, in all noises, its logs (k,) without the effects that the refit
+        has in addition, with G^T W G (k, q, q) and G^T W z (k, q) of their columns."""
+        key = tuple(map(str, refit.model.effects))
+        if key not in self._of_refits:
+            thermometer, known = refit.noise.term(ThermometerError), self._before.model.count
+            noise = self._noise if thermometer is None else self._noise.with_terms(thermometer)
+            likelihood = RunLikelihood(refit.linearised, noise, self._least_mps2, known=known)
+            every = np.arange(refit.model.count - known)
+            noises = self._sizes.in_families(partial(likelihood.in_noises, groups=[every[None]]))
+            parts = [(of_family.logs, of_family.grams[0][:, 0], of_family.along[:, every]) for of_family in noises]
+            logs, grams, along = (np.concatenate(part) for part in zip(*parts, strict=True))
+            self._of_refits[key] = likelihood, logs, grams, along
+        return self._of_refits[key]
 
     # What an unknown function looks like
 
