@@ -139,6 +139,10 @@ class HypothesisTable:
         """Probability that these effects are missing, and no others: that of their row."""
         return sum(row.probability for row in self.rows if set(effects) == set(row.effects) and not row.formulas)
 
+    def probability_of_just_known(self, effects: Sequence[str]) -> float:
+        """Probability that these effects are missing, and of the known ones no others."""
+        return sum(row.probability for row in self.rows if set(effects) == set(row.effects))
+
     def probability_of_families(self, families: Iterable[str]) -> float:
         """Probability that something of any of these families is missing."""
         return sum(row.probability for row in self.rows if set(row.families) & set(families))

@@ -252,7 +252,8 @@ def _decided(refits: Refits, diagnosis: Diagnosis) -> Diagnosis:
 
 def _certain_part(first: Hypothesis, table: HypothesisTable, before: Calibration) -> Hypothesis | None:
     """Return the row of some of the effects of the likeliest row that are missing with 95 % probability, alone or with
-    others, where all of them are not; None where there is none."""
+    others, where all of them are not, and where it is not sure that another known one is missing beside them; None
+    where there is none."""
     if (
         table.probability(first.effects) >= SURE
         and not first.formulas
@@ -261,6 +262,7 @@ def _certain_part(first: Hypothesis, table: HypothesisTable, before: Calibration
         return None
     parts = [row for row in table.rows if row.refit is not None and row.effects and not row.formulas]
     parts = [row for row in parts if set(row.effects) < set(first.effects) and table.probability(row.effects) >= SURE]
+    parts = [row for row in parts if table.probability_of_just_known(row.effects) > 1.0 - SURE]
     return next((row for row in parts if not _grown(before, row.effects, row.refit)), None)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -55,10 +56,10 @@ def test_a_hidden_effect_is_named(name: str) -> None:
     assert found.after.held_out_rms_mps2 <= 1.3 * found.after.held_out_floor_mps2
     assert found.before.held_out_rms_mps2 > 1.5 * found.before.held_out_floor_mps2
     told = {
-        "scale-drift": "The scale factor changes with time (99.6 %)",  # it may warm up, too
-        "settling": "It depends on the orientation before (99.6 %)",  # by as much as within a dwell, it may be
+        "scale-drift": r"The scale factor changes with time \(99.\d %\)",  # it may warm up, too
+        "settling": r"It depends on the orientation before \(99.\d %\)",  # by as much as within a dwell, it may be
     }.get(name, "Missing")
-    assert f"{told}: {name}, " in found.verdict and "the error on orientations left out from" in found.verdict
+    assert re.search(f"{told}: {name}, ", found.verdict) and "the error on orientations left out from" in found.verdict
 
 
 @pytest.mark.slow
