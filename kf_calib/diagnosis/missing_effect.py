@@ -48,6 +48,7 @@ from kf_calib.estimation.results import Calibration
 from kf_calib.support.tail_probabilities import LEVEL, chi_squared_tail, log_odds_of
 
 _SHOWN = 6  # number of suspects that are shown
+_LIKELIER_THAN_NOT = 0.5
 _DOUBT = 0.01  # probability from which noise that was not stated is named as a rival
 _NOISE = 1e-6  # p-value below which readings within dwells hold more than an oscillation and noise
 
@@ -252,8 +253,8 @@ def _decided(refits: Refits, diagnosis: Diagnosis) -> Diagnosis:
 
 def _certain_part(first: Hypothesis, table: HypothesisTable, before: Calibration) -> Hypothesis | None:
     """Return the row of some of the effects of the likeliest row that are missing with 95 % probability, alone or with
-    others, where all of them are not, and where it is not sure that another known one is missing beside them; None
-    where there is none."""
+    others, where all of them are not; None where there is none, or where all of them are likelier than not, and it is
+    sure that one more is a known one."""
     if (
         table.probability(first.effects) >= SURE
         and not first.formulas
@@ -262,7 +263,8 @@ def _certain_part(first: Hypothesis, table: HypothesisTable, before: Calibration
         return None
     parts = [row for row in table.rows if row.refit is not None and row.effects and not row.formulas]
     parts = [row for row in parts if set(row.effects) < set(first.effects) and table.probability(row.effects) >= SURE]
-    parts = [row for row in parts if table.probability_of_just_known(row.effects) > 1.0 - SURE]
+    if first.probability > _LIKELIER_THAN_NOT:
+        parts = [row for row in parts if table.probability_of_just_known(row.effects) > 1.0 - SURE]
     return next((row for row in parts if not _grown(before, row.effects, row.refit)), None)
 
 

@@ -6,7 +6,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from kf_calib.diagnosis.hypothesis_table import IRREGULAR, NOISE, NONE, NOTHING, SURE, Hypothesis, HypothesisTable
+from kf_calib.diagnosis.hypothesis_table import (
+    IRREGULAR,
+    LISTED,
+    NOISE,
+    NONE,
+    NOTHING,
+    SURE,
+    Hypothesis,
+    HypothesisTable,
+)
 from kf_calib.diagnosis.refits import dwell_noise_is_stated
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.effects import effect_named
@@ -116,7 +125,7 @@ def _named(diagnosis: Diagnosis, first: Hypothesis) -> str:
     assert diagnosis.table is not None
     share, rest = (
         diagnosis.table.probability_of_class(first.effects),
-        _beside(diagnosis, first) or _unexplained(diagnosis),
+        _beside(diagnosis, first) or _unexplained(diagnosis, first),
     )
     named = f"{_effects_of(first)}{_size(diagnosis)} ({_share(diagnosis)}){_same(diagnosis.table)}"
     others = _others(diagnosis) + rest
@@ -143,12 +152,17 @@ def _beside(diagnosis: Diagnosis, first: Hypothesis) -> str:
     """Return in words what goes on beside the effects that are named, and no known effect explains; "" for nothing."""
     if not first.driver:
         return ""
-    assert diagnosis.table is not None
-    known = [row for row in diagnosis.table.listed if set(first.effects) < set(row.effects)]
-    others = [(" and ".join(name for name in row.effects if name not in first.effects), row) for row in known[:_TOLD]]
-    words = [f", or is {names} {format_probability(row.probability)}" for names, row in others]
+    words = [f", or is {names} {share}" for names, share in _known_beside(diagnosis, first)]
     unknown = f"the rest goes with {first.driver}, as no known effect does ({format_probability(first.probability)})"
     return f"; {unknown}{''.join(words)}"
+
+
+def _known_beside(diagnosis: Diagnosis, first: Hypothesis) -> list[tuple[str, str]]:
+    """Return the known effects that may be missing beside those that are named, with their probabilities."""
+    assert diagnosis.table is not None
+    rows = [row for row in diagnosis.table.listed if set(first.effects) < set(row.effects)]
+    names = [" and ".join(name for name in row.effects if name not in first.effects) for row in rows]
+    return [(each, format_probability(row.probability)) for each, row in zip(names, rows[:_TOLD], strict=False)]
 
 
 def _share(diagnosis: Diagnosis) -> str:
@@ -156,7 +170,7 @@ def _share(diagnosis: Diagnosis) -> str:
     others."""
     assert diagnosis.table is not None
     first = diagnosis.table.first
-    if first.driver:
+    if first.driver or first.probability < LISTED:  # it is not alone
         return format_probability(diagnosis.table.probability(first.effects))
     return _share_of_row(diagnosis.table, first)
 
@@ -175,13 +189,17 @@ def _not_named(diagnosis: Diagnosis, first: Hypothesis) -> str:
     return f"No known effect is established. The likeliest is {likeliest}, but {diagnosis.unearned}"
 
 
-def _unexplained(diagnosis: Diagnosis) -> str:
-    """Return in words what does not fit with the effects that are named; "" where all does."""
+def _unexplained(diagnosis: Diagnosis, first: Hypothesis) -> str:
+    """Return in words what does not fit with the effects that are named, and what it may be; "" where all does."""
     assert diagnosis.after is not None
     consistency = diagnosis.after.consistency
     if consistency.consistent is not False:
         return ""
-    return f"; what it leaves is still {(consistency.statistic / consistency.dof) ** 0.5:.2g} times the noise"
+    known = [f"{names} {share}" for names, share in _known_beside(diagnosis, first)]
+    likeliest = f", likeliest {', '.join(known)}" if known else ""
+    return (
+        f"; what it leaves is still {(consistency.statistic / consistency.dof) ** 0.5:.2g} times the noise{likeliest}"
+    )
 
 
 def _unknown(diagnosis: Diagnosis, first: Hypothesis) -> str:
