@@ -264,13 +264,20 @@ class RunPosterior:
         unknown = [row for row in likeliest if row.driver not in ("", IRREGULAR) and not (row.effects or row.dwells)]
         beside = [self._with_dwells(row, *self._where_fitted(row.refit)) for row in fitted if row.refit]
         run = self._run.likelihood
-        for row, number in ((row, self._number(row)) for row in unknown[:_BESIDE]):
-            if number is None or not self._run.unknown[number].summands:  # its columns have any size only together
-                continue
-            k = self._best[f"?{number}"]
-            rest = run.spanned.beside(self._run.terms[k].columns, run.lengths)
-            beside.append(self._with_dwells(row, rest, self._run.courses_beside(k, self._likeliest_noise(k))))
+        for row in unknown[:_BESIDE]:
+            if (courses := self._courses_beside(row)) is not None:
+                columns = self._run.terms[self._best[f"?{self._number(row)}"]].columns
+                beside.append(self._with_dwells(row, run.spanned.beside(columns, run.lengths), courses))
         return beside
+
+    def _courses_beside(self, row: Hypothesis) -> Courses | None:
+        """Return what the unknown function of a row leaves of the courses within dwells; None where it has none, or one
+        whose columns have any size only together."""
+        number = self._number(row)
+        if number is None or not self._run.unknown[number].summands:
+            return None
+        k = self._best[f"?{number}"]
+        return self._run.courses_beside(k, self._likeliest_noise(k))
 
     def _where_fitted(self, refit: Calibration) -> tuple[Spanned, Courses]:
         """Return the rows of a run, with the effects that a refit has in addition in the model, and what they leave in
@@ -453,11 +460,15 @@ class RunPosterior:
 
     def _with_changes_beside_walk(self, irregular: Hypothesis, rows: Sequence[Hypothesis]) -> Hypothesis:
         """Return the row of irregular changes with those beside a random walk of the biases: what this leaves within
-        dwells speaks for them, too. What the formulas of an unknown function leave does not: they are a part of it."""
+        dwells speaks for them, too, as far as an unknown function beside it, which formulas only tell a part of, leaves
+        it."""
         logs = [irregular.log_evidence]
-        for row in (row for row in rows if self._run.walk in row.effects and row.refit and not row.driver):
+        for row in (row for row in rows if self._run.walk in row.effects and row.refit is not None):
             left = trend(row.refit.fit) if self._test.trend and row.refit else None
-            logs += [row.log_evidence + log_odds_of(left.p_value) + math.log(_WITHIN)] if left else []
+            within = log_odds_of(left.p_value) if left else -math.inf
+            if (courses := self._courses_beside(row)) is not None:
+                within = min(within, courses.log_bayes_alike)
+            logs.append(row.log_evidence + within + math.log(_WITHIN))
         return replace(irregular, log_evidence=_log_sum(logs))
 
     def _log_of_fit(self, refit: Calibration) -> tuple[float, float]:
