@@ -180,7 +180,8 @@ class Diagnosis:
         None where it names neither."""
         if self.missing and self.after is not None:
             alone = self.test.effects.p_values.get(self.missing[0]) if len(self.missing) == 1 else None
-            return Explanation(self.missing, self.before, self.after, True, alone)
+            fits = self.after.consistency.consistent is not False
+            return Explanation(self.missing, self.before, self.after, fits, alone)
         first = self.likeliest
         if self.description is None or first is None or not first.formulas or first.refit is None:
             return None

@@ -117,8 +117,7 @@ def _draw(axes: Axes, bars: Sequence[_Bar], title: str, odds: str = "") -> None:
         for k, colour in enumerate(bar.colours):
             top = middle - 0.5 + k * height
             axes.barh(top, 100.0 * bar.probability, height, color=colour, align="edge", linewidth=0.0)
-        axes.annotate(format_probability(bar.probability), (100.0 * bar.probability, middle), xytext=(4, 0),
-                      textcoords="offset points", va="center", fontsize=8.5)  # fmt: skip
+        _beside(axes, 100.0 * bar.probability, middle, format_probability(bar.probability), 8.5)
         axes.text(_END, middle, bar.odds, va="center", ha="right", fontsize=8.5)
     axes.text(1.0, 1.0, odds, transform=axes.transAxes, va="bottom", ha="right", fontsize=8.0, color=GREY)
     axes.axvline(100.0 * SURE, color=GREY, linestyle="--", linewidth=1.0)
@@ -130,6 +129,12 @@ def _draw(axes: Axes, bars: Sequence[_Bar], title: str, odds: str = "") -> None:
     axes.spines["bottom"].set_bounds(0.0, 100.0)
     axes.set_xticks([0.0, 20.0, 40.0, 60.0, 80.0, 100.0 * SURE], ["0", "20", "40", "60", "80", f"{100.0 * SURE:g}"])
     axes.set_title(title)
+
+
+def _beside(axes: Axes, value: float, place: float, text: str, size: float) -> None:
+    """Write a number at the end of its bar, clear of lines behind it."""
+    axes.annotate(text, (value, place), xytext=(4, 0), textcoords="offset points", va="center", fontsize=size,
+                  bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5})  # fmt: skip
 
 
 _MOST, _ALIKE = 7, 8  # explanations that are drawn, effects in the matrix of overlaps
@@ -244,8 +249,7 @@ def _separation(axes: Axes, diagnosis: Diagnosis) -> None:
     advice, why = going
     axes.barh([0, 1], [advice.before, advice.after], color=(PALE, BEST), height=0.5)
     for k, value in enumerate((advice.before, advice.after)):
-        text = f" {value:.0f}" if advice.shows else f" {value:.1f} σ"
-        axes.text(value, k, text, va="center", fontsize=9.0)
+        _beside(axes, value, k, f"{value:.0f}" if advice.shows else f"{value:.1f} σ", 9.0)
     stay = "a dwell" if advice.stay_s is None else span(advice.stay_s)
     axes.set_yticks([0, 1], ["now", f"after {stay} there"])
     axes.set_ylim(1.6, -0.6)
