@@ -111,7 +111,7 @@ def _shape(before: Calibration, after: Calibration, effects: Sequence[Effect]) -
         values = component / (np.linalg.norm(after.linearised.state[:12].reshape(3, 4)[:, :3], axis=1)
                               * before.bench.gravity_mps2)  # fmt: skip
     else:
-        words, symbol, unit, values = f"what the fitted {_name(effects)} adds", "", "m/s^2", component
+        words, symbol, unit, values = "what the fit of it adds", "", "m/s^2", component
     if gimbal and isinstance(effects[0], FrameEffect):
         lever, quantity, values = _lever(after, effects[0].about), "rad", values[:, :1]
         component, residuals, left = (_turn(each, lever, sigmas[0]) for each in (component, residuals, left))

@@ -134,7 +134,7 @@ def test_formulas_have_the_axis_that_they_name() -> None:
     together = shapes_of(before, Refits().with_effects(before, ("one = a**2", "two = a**4")))
     assert [(each.symbol, each.effect) for each in together] == [("a", "a**2 + a**4")]
     apart = shapes_of(before, Refits().with_effects(before, ("one = a**2", "two = T")))
-    assert [(each.symbol, each.words) for each in apart] == [("", "what the fitted a**2 + T adds")]
+    assert [(each.symbol, each.words) for each in apart] == [("", "what the fit of it adds")]
 
 
 def test_effects_of_one_model_have_a_shape_each() -> None:

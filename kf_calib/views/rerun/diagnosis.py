@@ -100,7 +100,7 @@ def _curve(shape: EffectShape, chart: Chart, per_si: float) -> rr.LineStrips2D:
 
 def _summary(diagnosis: Diagnosis) -> str:
     """The verdict, the next orientation, the explanations by rank, and the quantities by what they explain."""
-    blocks = [f"**{verdict(diagnosis)}**"]
+    blocks = [f"**{_literal(verdict(diagnosis))}**"]
     if diagnosis.table is not None:
         blocks.append(_probabilities(diagnosis.table))
     if diagnosis.next_orientation is not None:
@@ -109,7 +109,7 @@ def _summary(diagnosis: Diagnosis) -> str:
         blocks.append(f"**Next orientation**: gimbals at {angles} deg: {why}.")
     if explanations := diagnosis.explanations[:_MOST]:
         rows = [
-            f"| {rank} {each.name} | {'yes' if each.fits else 'no'} | "
+            f"| {rank} {_literal(each.name)} | {'yes' if each.fits else 'no'} | "
             f"{format_p(each.after.consistency.p_value).removeprefix('= ')} |"
             for rank, each in enumerate(explanations, 1)
         ]
@@ -119,6 +119,11 @@ def _summary(diagnosis: Diagnosis) -> str:
         rows = [f"| {each.words} | {_share(each)} |" for each in diagnosis.drivers]
         blocks.append("\n".join(["| quantity | goes with |", "|:--|:--|", *rows]))
     return "\n\n".join(blocks) + "\n"
+
+
+def _literal(text: str) -> str:
+    """Text whose asterisks, as of a formula, are no emphasis in Markdown."""
+    return text.replace("*", r"\*")
 
 
 def _share(driver: Driver) -> str:
@@ -131,7 +136,7 @@ def _share(driver: Driver) -> str:
 def _probabilities(table: HypothesisTable) -> str:
     """Families and explanations with their probabilities, the likeliest first, without the unlikely."""
     families = [(name, share) for name, share in table.families.items() if share >= LISTED]
-    rows = [*families, ("", None), *((name_of(row), row.probability) for row in table.listed)]
+    rows = [*families, ("", None), *((_literal(name_of(row)), row.probability) for row in table.listed)]
     lines = ["| | |" if share is None else f"| {format_probability(share)} | {name} |" for name, share in rows]
     return "\n".join(["| probability | it may be |", "|--:|:--|", *lines])
 
