@@ -215,7 +215,7 @@ class RunPosterior:
         """Return the row of some effects and, alone or beside one, an unknown function, with its prior."""
         effects = tuple(name for name in names if not name.startswith("?"))
         unknown = [self._run.unknown[int(name[1:])] for name in names if name.startswith("?")]
-        families = [effect_named(name, self._before.bench).family for name in effects]
+        families = [self._effects[name].family for name in effects]
         families += [term.family or NONE for term in unknown]
         log += self._log_prior(effects, bool(unknown))
         tested = [self._tested(name) for name in effects]
@@ -223,10 +223,15 @@ class RunPosterior:
         driver = "".join(term.driver for term in unknown)
         return Hypothesis(effects, (), driver, tuple(dict.fromkeys(families)), log, statistic, dof)
 
+    @cached_property
+    def _effects(self) -> dict[str, Effect]:
+        """The effects that the run may have, by their names."""
+        return {name: effect_named(name, self._before.bench) for name in self._run.names}
+
     def _log_prior(self, effects: Sequence[str], beside_unknown: bool = False) -> float:
         """Return the log of the prior probability of some effects and, if so, an unknown function."""
         names, unknown = max(len(self._run.names), 2), len(self._run.unknown)
-        prior = math.prod(effect_named(name, self._before.bench).prior for name in effects)
+        prior = math.prod(self._effects[name].prior for name in effects)
         if beside_unknown:
             kind, among = ("beside", names * unknown) if effects else ("unknown", unknown)
         else:
@@ -428,7 +433,7 @@ class RunPosterior:
             row for row in effects
             if len(row.effects) == 1 or row.log_evidence > max(map(of_one.__getitem__, row.effects))
         ]  # fmt: skip
-        single = [row for row in single if effect_named(row.effects[0], self._before.bench).scannable]
+        single = [row for row in single if self._effects[row.effects[0]].scannable]
         single = sorted(single, key=lambda row: -row.statistic)[:_ALWAYS]  # large effects are far from linear
         likeliest = {id(row) for row in [*single, *(row for row in ahead[:_REFITTED] if row.log_evidence > least)]}
         fitted = self._steady([self._refitted(row) if id(row) in likeliest else row for row in rows])
