@@ -175,14 +175,15 @@ class RunPosterior:
             irregular += [log + prior + math.log(share)] if share else []
         within = log_odds_of(self._test.trend.p_value) if self._test.trend else 0.0
         within = max(within, self._run.likelihood.courses.log_bayes_alike)
-        log_nothing = noises[0][1] + prior
-        if self._test.consistent is False:  # chance, or a cause of which there is no term: as p has it
+        log_nothing, log_irregular = noises[0][1] + prior, _log_sum(irregular) + within
+        if self._test.consistent is False:  # chance, or a cause of which there is no term: at least as p has it
             odds = log_odds_of(self._test.p_value or 0.0) + math.log(PRIOR["unknown"] / PRIOR["nothing"])
-            irregular.append(log_nothing - float(np.logaddexp(0.0, -odds)))
-            log_nothing -= float(np.logaddexp(0.0, odds))
+            if log_irregular - log_nothing < odds:
+                both = float(np.logaddexp(log_irregular, log_nothing))
+                log_nothing, log_irregular = (both - float(np.logaddexp(0.0, sign * odds)) for sign in (1.0, -1.0))
         rows = [
             Hypothesis(families=(NOTHING,), log_evidence=log_nothing),
-            Hypothesis(driver=IRREGULAR, families=(NONE,), log_evidence=_log_sum(irregular) + within),
+            Hypothesis(driver=IRREGULAR, families=(NONE,), log_evidence=log_irregular),
         ]
         return [*rows, Hypothesis(families=(NOISE,), log_evidence=_log_sum(of_noise))] if of_noise else rows
 

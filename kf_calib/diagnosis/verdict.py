@@ -195,6 +195,10 @@ def _unexplained(diagnosis: Diagnosis, first: Hypothesis) -> str:
     consistency = diagnosis.after.consistency
     if consistency.consistent is not False:
         return ""
+    if consistency.trend is not None:
+        dwell, channel = consistency.trend.most
+        where = f"most in dwell {dwell}, accelerometer {channel}"
+        return f"; the readings change within dwells, too, {where} (p {format_p(consistency.p_value)})"
     known = [f"{names} {share}" for names, share in _known_beside(diagnosis, first)]
     likeliest = f", likeliest {', '.join(known)}" if known else ""
     return (
