@@ -25,6 +25,7 @@ from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.effects.effect import Grade
 from kf_calib.estimation.results import format_p
+from kf_calib.support.text import counted
 from kf_calib.support.units import shown, span
 from kf_calib.views.console import GRADES, size_range
 from kf_calib.views.diagnosis import name_of
@@ -85,19 +86,15 @@ def _probability_bars(table: HypothesisTable) -> tuple[list[_Bar], list[_Bar]]:
     colours = {family: _NO_EFFECT.get(family) or next(own, PALE) for family in told}
     families = [_Bar(family, table.families[family], (colours[family],)) for family in told]
     others = [family for family in table.families if family not in told]
-    families += [_Bar(_others(len(others)), table.probability_of_families(others), (PALE,))] if others else []
+    families += [_Bar(counted(len(others), "other"), table.probability_of_families(others), (PALE,))] if others else []
     explanations = [
         _Bar(_name(row), row.probability, tuple(colours.get(each, PALE) for each in row.families),
              "" if odds is None else f"{odds:.1f}")
         for row, odds in zip(table.rows, table.log10_odds, strict=True) if row in table.listed
     ]  # fmt: skip
     rest = [row.probability for row in table.rows if row not in table.listed]
-    explanations += [_Bar(_others(len(rest)), sum(rest), (PALE,))] if rest else []
+    explanations += [_Bar(counted(len(rest), "other"), sum(rest), (PALE,))] if rest else []
     return families, explanations
-
-
-def _others(count: int) -> str:
-    return f"{count} other{'s' * (count > 1)}"
 
 
 def _name(row: Hypothesis) -> str:
@@ -181,9 +178,9 @@ def _suspect_bars(axes: Axes, explained: Sequence[Explanation]) -> None:
             axes.barh(k, share, color=colour, height=0.62)
         else:
             axes.barh(k, share, facecolor="white", edgecolor=GREY, hatch="////", height=0.62, linewidth=0.8)
-        axes.text(
-            103.0, k, _said(explanation), va="center", fontsize=8.5, color="#222222" if explanation.fits else GREY
-        )
+        said, ink = ("fits", "#222222") if explanation.fits else ("does not fit", GREY)
+        p_value = "" if explanation.p_value is None else f", p {format_p(explanation.p_value)}"
+        axes.text(103.0, k, said + p_value, va="center", fontsize=8.5, color=ink)
     axes.set_yticks(range(len(explained)), [wrapped(explanation.name, _SUSPECT_NAME) for explanation in explained])
     axes.set_ylim(len(explained) - 0.4, -0.6)
     axes.grid(visible=False, axis="y")
@@ -192,12 +189,6 @@ def _suspect_bars(axes: Axes, explained: Sequence[Explanation]) -> None:
     if all(explanation.share is None for explanation in explained):
         axes.text(50.0, 0.5 * (len(explained) - 1.0), _NO_MISFIT, color=GREY, ha="center", va="center")
     axes.set_title("What each explains; p: that noise alone would do so\nhatched: the model with it does not fit")
-
-
-def _said(explanation: Explanation) -> str:
-    """Return whether an explanation fits and its p-value, in words."""
-    fits = "fits" if explanation.fits else "does not fit"
-    return fits if explanation.p_value is None else f"{fits}, p {format_p(explanation.p_value)}"
 
 
 def _alike(diagnosis: Diagnosis) -> list[str]:

@@ -36,7 +36,7 @@ from kf_calib.estimation.estimate import correlation
 from kf_calib.estimation.results import Calibration, Parameter, format_p
 from kf_calib.online.status import Judgement
 from kf_calib.support import units
-from kf_calib.support.text import angles_in_words, printable
+from kf_calib.support.text import angles_in_words, counted, printable
 from kf_calib.support.units import Unit, shown, significant
 from kf_calib.views.console import noise_origins, whole_value
 from kf_calib.views.rerun.diagnosis import save_diagnosis_view as save_diagnosis
@@ -172,7 +172,7 @@ def _head(result: Calibration) -> str:
     serial = f"**{bench.notes['block_serial']}**: " if "block_serial" in bench.notes else ""
     axes = f"axes {bench.to_metadata()['axes']}" if bench.axes else "attitude recorded"
     held = ", inertially held" if bench.reference == "inertial" else ""
-    dwells = f"{len(result.visits)} dwell{'s' * (len(result.visits) != 1)}"
+    dwells = counted(len(result.visits), "dwell")
     return f"{serial}{dwells}, {count} samples; {axes}{held}, g = {bench.gravity_mps2:.6g} m/s²"
 
 

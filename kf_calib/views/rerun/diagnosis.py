@@ -108,11 +108,10 @@ def _summary(diagnosis: Diagnosis) -> str:
         angles = ", ".join(f"{angle:.4g}" for angle in advice.gimbal_deg)
         blocks.append(f"**Next orientation**: gimbals at {angles} deg: {why}.")
     if explanations := diagnosis.explanations[:_MOST]:
-        rows = [
-            f"| {rank} {_literal(each.name)} | {'yes' if each.fits else 'no'} | "
-            f"{format_p(each.after.consistency.p_value).removeprefix('= ')} |"
-            for rank, each in enumerate(explanations, 1)
-        ]
+        p_values = [format_p(each.after.consistency.p_value).removeprefix("= ") for each in explanations]
+        fits = ["yes" if each.fits else "no" for each in explanations]
+        columns = zip(explanations, fits, p_values, strict=True)
+        rows = [f"| {k} {_literal(each.name)} | {fit} | {p} |" for k, (each, fit, p) in enumerate(columns, 1)]
         blocks.append("\n".join(["| explanation | fits | p with it |", "|:--|:--|:--|", *rows]))
         blocks.append("Move the cursor of the timeline *explanation* to see what each leaves.")
     if diagnosis.drivers:
