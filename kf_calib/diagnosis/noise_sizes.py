@@ -19,7 +19,9 @@ from kf_calib.noise.reml import OF_ONE, Parts
 
 _STATED, _UNSTATED = 0.02, 0.5  # prior probability of noise beyond what was stated, and where nothing was stated
 _OF_ONE = 0.1  # share of one accelerometer alone in scatter
-_INDEPENDENT = 0.5  # share of the values that are independent, where dwells differ by more than was stated
+INDEPENDENT = 0.5
+"""Share of the values that are independent, where dwells differ by more than was stated, or by what no function has."""
+
 _HOPELESS = 30.0  # in log likelihood
 _FEWEST = 4  # sizes of noise over which is integrated
 _RANGE = math.log(1e4)  # width of the flat prior of the logarithm of a size of noise
@@ -131,7 +133,7 @@ class NoiseSizes:
         if not any(self._stated[part] for part in family.parts):
             return logs
         gains = logs - self._without[number - 1]
-        return np.where(gains > 0.0, logs - (1.0 - _INDEPENDENT) * gains, logs)
+        return np.where(gains > 0.0, logs - (1.0 - INDEPENDENT) * gains, logs)
 
     @cached_property
     def _without(self) -> list[float]:

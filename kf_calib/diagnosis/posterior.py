@@ -33,7 +33,7 @@ from kf_calib.diagnosis.hypothesis_table import (
     table_of,
 )
 from kf_calib.diagnosis.in_noises import ROUNDING, InNoises, Spanned
-from kf_calib.diagnosis.noise_sizes import NoiseFamily, NoiseSizes
+from kf_calib.diagnosis.noise_sizes import INDEPENDENT, NoiseFamily, NoiseSizes
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.run_likelihood import Projected, RunLikelihood, log_bayes_together
 from kf_calib.diagnosis.run_terms import (
@@ -330,7 +330,8 @@ class RunPosterior:
                 key = (other, name) if (other, name) in pairs else (name, other)
                 if other != name and not (name.startswith("?") and other.startswith("?")):
                     pairs[key] = max(pairs.get(key, -math.inf), log)
-        return [self._row_of(both, log) for both, log in pairs.items()]
+        alone_of = self._by_row(self._log_evidence) | {name: log for (name, *other), log in pairs.items() if not other}
+        return [self._row_of(both, _beside_function(both, log, alone_of)) for both, log in pairs.items()]
 
     def _summand(self) -> list[int]:
         """Return the number of the likeliest summand of an unknown function, if there is one."""
@@ -573,6 +574,14 @@ class RunPosterior:
             chosen.append(rest[int(np.argmax(logs))])
             log = max(logs)
         return chosen
+
+
+def _beside_function(names: Sequence[str], log: float, alone: dict[str, float]) -> float:
+    """Return the log evidence of a row where what an effect gains beside an unknown function that explains more counts
+    in part: no function is just one that is tried, and what it leaves is no noise of independent dwells."""
+    function = max((alone[name] for name in names if name.startswith("?")), default=math.inf)
+    least = max((alone[name] for name in names if not name.startswith("?")), default=math.inf)
+    return log if log < function or least > function else function + INDEPENDENT * (log - function)
 
 
 def _with_sure_dwells(rows: list[Hypothesis], beside: list[Hypothesis]) -> list[Hypothesis]:
