@@ -21,6 +21,7 @@ from kf_calib.diagnosis.hypothesis_table import NOTHING
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.results import Diagnosis
+from kf_calib.diagnosis.stepwise_selection import improve
 from kf_calib.diagnosis.unknown_terms import RETURNING
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.settings import Settings
@@ -86,9 +87,14 @@ def test_stated_scatter_and_flicker_name_nothing(noise: dict[str, float], runs: 
 
 @pytest.mark.slow  # two effects, one by one: test_stepwise_selection.py
 def test_two_accelerometers_with_different_effects() -> None:
-    """Of a square in one accelerometer, its asymmetry explains nearly as much: one is missing for sure, not which."""
-    found = diagnose(source("second-order=3e-7,0,0", "hysteresis=0,0,3e-5"))
-    assert found.missing == ("hysteresis",) and found.table is not None, found.verdict
+    """Of a square in one accelerometer, its asymmetry explains nearly as much: one is missing for sure, not which. The
+    hysteresis beside it is sure, and so is what ``improve`` adds first."""
+    recorded = source("second-order=3e-7,0,0", "hysteresis=0,0,3e-5")
+    found = diagnose(recorded)
+    assert found.missing == ("hysteresis", "second-order") and found.table is not None, found.verdict
+    assert not found.sure and "or hysteresis and scale-asymmetry together" in found.verdict
+    assert found.table.probability(["hysteresis"]) > 0.95 > found.table.probability(["second-order"])
+    assert improve(recorded).steps[0].added == "hysteresis"
     pair = found.table.rows[0]
     assert set(pair.effects) == {"second-order", "hysteresis"} and pair.refit is not None
     sigmas = {p.symbol: abs(p.value or 0.0) / (p.sigma or 1.0) for p in list(pair.refit.parameters.values())[12:]}
