@@ -196,7 +196,7 @@ CEILINGS = {
     "noise": 3398,
     "estimation": 7920,
     "design": 1875,
-    "diagnosis": 5593,
+    "diagnosis": 5594,
     "online": 1648,
     "exchange": 1992,
     "views": 7387,

@@ -26,7 +26,7 @@ from kf_calib.support.units import shown
 
 _AS_LIKELY = 0.25  # share of the likeliest from which another explanation is told together with it
 _CHANCE = 0.01  # probability from which it is told that nothing may be missing
-_TOLD = 4  # most other explanations that are told
+_TOLD, _WORTH_A_NAME = 4, 1e-3  # most other explanations that are told, and least probability of one
 _UNUSUAL = 5.0  # times the greatest usual size, from which a coefficient is said to be too large for its name
 _USUAL = {"angle_sigma_deg": " (a usual table: 0.0003 to 0.003 deg)", "scatter_sigma_mps2": ""}
 _FAMILIES = {
@@ -279,8 +279,9 @@ def _others(diagnosis: Diagnosis, but: str = "") -> str:
     nothing = [row for row in diagnosis.table.rows if row.families == (NOTHING,) and row.probability > least]
     rows = [row for row in (*diagnosis.table.rivals, *nothing) if row.families != (but,)]
     rows.sort(key=lambda row: -row.probability)
-    words = [f"{_in_words(diagnosis, row)} {format_probability(row.probability)}" for row in rows[:_TOLD]]
-    more = len(rows) - _TOLD
+    told = [row for row in rows[:_TOLD] if row.probability >= _WORTH_A_NAME]
+    words = [f"{_in_words(diagnosis, row)} {format_probability(row.probability)}" for row in told]
+    more = len(rows) - len(told)
     words += [f"{more} other{'s' * (more > 1)}"] if more > 0 else []
     return f"; or {', '.join(words)}" if words else ""
 
