@@ -476,7 +476,7 @@ def test_a_killed_run_leaves_no_lock(here: Path) -> None:
     with subprocess.Popen([sys.executable, "-m", "kf_calib.cli", *words], stdin=subprocess.PIPE) as child:
         child.stdin.write(Path("lines.csv").read_bytes())
         child.stdin.flush()
-        while not Path("out.mcap").exists():
+        while not (Path("out.mcap").exists() and Path("out.mcap").stat().st_size):  # it is locked before it is written
             assert child.poll() is None
         with pytest.raises(InputError, match=f"process {child.pid}"):
             Recorder("out.mcap", BENCH, overwrite=True)
