@@ -178,15 +178,18 @@ class Explanation:
     """A model with more in it than the one whose residuals are looked at.
 
     names: what it has in addition, formulas without the name that they were given. before, after: the two
-    calibrations. fits: whether it fits the run. p_value: the family-wise p-value of a single effect of the catalogue;
-    None of anything else.
+    calibrations. p_value: the family-wise p-value of a single effect of the catalogue; None of anything else.
     """
 
     names: tuple[str, ...]
     before: Calibration
     after: Calibration
-    fits: bool
     p_value: float | None = None
+
+    @property
+    def fits(self) -> bool:
+        """Whether it fits the run, as far as that can be tested."""
+        return self.after.consistency.consistent is not False
 
     @property
     def name(self) -> str:

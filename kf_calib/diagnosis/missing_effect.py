@@ -302,10 +302,9 @@ def _suspects(diagnosis: Diagnosis, table: HypothesisTable) -> tuple[Suspect, ..
             statistic, dof = float(effects.scan.statistics[effects.best[name]]), effects.candidate(name).dof
         else:
             statistic, dof = effects.scores.get(name, 0.0), 1
-        fits = row.refit.consistency.consistent is not False
         p_value = effects.p_values.get(name, 1.0)
         shares = row.probability, table.probability(row.effects)
-        suspects.append(Suspect(name, statistic, dof, p_value, fits, row.refit, symbols_before, *shares))
+        suspects.append(Suspect(name, statistic, dof, p_value, row.refit, symbols_before, *shares))
     return tuple(suspects)
 
 

@@ -409,10 +409,8 @@ class RunPosterior:
 
     def _log_share_of_constant(self, name: str) -> float:
         """Return the log of the mean likelihood over all values of an effect's constant, over that at the best."""
-        term = self._run.terms[self._best[name]]
-        alike = self._log_mean(
-            self._best[name], lambda other: (other.relation, other.only) == (term.relation, term.only)
-        )
+        k, term = self._best[name], self._run.terms[self._best[name]]
+        alike = self._log_mean(k, lambda other: (other.relation, other.only) == (term.relation, term.only))
         return alike - term.log_share_of_form
 
     def _log_mean(self, k: int, alike: Callable[[RunTerm], bool]) -> float:
@@ -431,10 +429,8 @@ class RunPosterior:
         single = [row for row in effects if len(row.effects) == 1]
         of_one = {row.effects[0]: row.log_evidence for row in single}
         # a pair behind one of its own has nothing to add
-        ahead = [
-            row for row in effects
-            if len(row.effects) == 1 or row.log_evidence > max(map(of_one.__getitem__, row.effects))
-        ]  # fmt: skip
+        alone = {id(row): max(map(of_one.__getitem__, row.effects)) for row in effects}
+        ahead = [row for row in effects if len(row.effects) == 1 or row.log_evidence > alone[id(row)]]
         single = [row for row in single if self._effects[row.effects[0]].scannable]
         single = sorted(single, key=lambda row: -row.statistic)[:_ALWAYS]  # large effects are far from linear
         likeliest = {id(row) for row in [*single, *(row for row in ahead[:_REFITTED] if row.log_evidence > least)]}
@@ -580,8 +576,8 @@ def _beside_function(names: Sequence[str], log: float, alone: dict[str, float]) 
     """Return the log evidence of a row where what an effect gains beside an unknown function that explains more counts
     in part: no function is just one that is tried, and what it leaves is no noise of independent dwells."""
     function = max((alone[name] for name in names if name.startswith("?")), default=math.inf)
-    least = max((alone[name] for name in names if not name.startswith("?")), default=math.inf)
-    return log if log < function or least > function else function + INDEPENDENT * (log - function)
+    effect = max((alone[name] for name in names if not name.startswith("?")), default=math.inf)
+    return log if log < function or effect > function else function + INDEPENDENT * (log - function)
 
 
 def _with_sure_dwells(rows: list[Hypothesis], beside: list[Hypothesis]) -> list[Hypothesis]:

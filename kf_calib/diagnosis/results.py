@@ -33,20 +33,23 @@ class Suspect:
     """An effect that explains a significant part of the misfit.
 
     name: of the effect. statistic: fall of chi-squared. dof: its degrees of freedom. p_value: family-wise p-value.
-    fits: whether the model with the effect fits the run. refit: the calibration with it. known: symbols of the effects
-    that were in the model before. probability: of this effect and no other, as in the table of explanations;
-    probability_with_others: of it alone or with others.
+    refit: the calibration with it. known: symbols of the effects that were in the model before. probability: of this
+    effect and no other, as in the table of explanations; probability_with_others: of it alone or with others.
     """
 
     name: str
     statistic: float
     dof: int
     p_value: float
-    fits: bool
     refit: Calibration
     known: tuple[str, ...]
     probability: float
     probability_with_others: float
+
+    @property
+    def fits(self) -> bool:
+        """Whether the model with the effect fits the run."""
+        return self.refit.consistency.consistent is not False
 
     @property
     def coefficients(self) -> list[Parameter]:
@@ -170,7 +173,7 @@ class Diagnosis:
         come first."""
         best = self.explanation
         suspects = sorted(self.suspects, key=lambda each: not each.fits)  # stable: by significance
-        others = [Explanation((each.name,), self.before, each.refit, each.fits, each.p_value)
+        others = [Explanation((each.name,), self.before, each.refit, each.p_value)
                   for each in suspects if (each.name,) != self.missing]  # fmt: skip
         return others if best is None else [best, *others]
 
@@ -180,13 +183,12 @@ class Diagnosis:
         None where it names neither."""
         if self.missing and self.after is not None:
             alone = self.test.effects.p_values.get(self.missing[0]) if len(self.missing) == 1 else None
-            fits = self.after.consistency.consistent is not False
-            return Explanation(self.missing, self.before, self.after, fits, alone)
+            return Explanation(self.missing, self.before, self.after, alone)
         first = self.likeliest
         if self.description is None or first is None or not first.formulas or first.refit is None:
             return None
         names = tuple(text.partition("=")[2].strip() or text for text in first.formulas)
-        return Explanation(names, self.before, first.refit, first.refit.consistency.consistent is not False)
+        return Explanation(names, self.before, first.refit)
 
     @cached_property
     def detectable(self) -> list[Detectable]:

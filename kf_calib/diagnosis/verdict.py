@@ -22,6 +22,7 @@ from kf_calib.effects import effect_named
 from kf_calib.estimation.dwell_pass import holds_its_oscillation
 from kf_calib.estimation.results import Parameter, format_p
 from kf_calib.support.tail_probabilities import LEVEL
+from kf_calib.support.text import counted
 from kf_calib.support.units import shown
 
 _AS_LIKELY = 0.25  # share of the likeliest from which another explanation is told together with it
@@ -201,9 +202,8 @@ def _unexplained(diagnosis: Diagnosis, first: Hypothesis) -> str:
         return f"; the readings change within dwells, too, {where} (p {format_p(consistency.p_value)})"
     known = [f"{names} {share}" for names, share in _known_beside(diagnosis, first)]
     likeliest = f", likeliest {', '.join(known)}" if known else ""
-    return (
-        f"; what it leaves is still {(consistency.statistic / consistency.dof) ** 0.5:.2g} times the noise{likeliest}"
-    )
+    times = (consistency.statistic / consistency.dof) ** 0.5
+    return f"; what it leaves is still {times:.2g} times the noise{likeliest}"
 
 
 def _unknown(diagnosis: Diagnosis, first: Hypothesis) -> str:
@@ -282,7 +282,7 @@ def _others(diagnosis: Diagnosis, but: str = "") -> str:
     told = [row for row in rows[:_TOLD] if row.probability >= _WORTH_A_NAME]
     words = [f"{_in_words(diagnosis, row)} {format_probability(row.probability)}" for row in told]
     more = len(rows) - len(told)
-    words += [f"{more} other{'s' * (more > 1)}"] if more > 0 else []
+    words += [counted(more, "other")] if more else []
     return f"; or {', '.join(words)}" if words else ""
 
 

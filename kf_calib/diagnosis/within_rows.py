@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -42,10 +43,9 @@ class Courses:
         Of a size s, in units of the noise, with n degrees of freedom (1 + s^2)^(-n/2) exp(chi^2 s^2 / (2 (1 + s^2))).
         """
         own = np.logaddexp.reduce(self._by_size, axis=1) - math.log(len(_ANY_SIZE))
-        likelier = np.logaddexp(0.0, math.log(prior) + own).sum() > self.log_bayes_alike
-        return own if likelier else np.zeros(len(own))
+        return own if np.logaddexp(0.0, math.log(prior) + own).sum() > self.log_bayes_alike else np.zeros(len(own))
 
-    @property
+    @cached_property
     def log_bayes_alike(self) -> float:
         """Log Bayes factor of whatever changes the courses of all dwells, averaged over its size."""
         alike = self._by_size
@@ -54,7 +54,7 @@ class Courses:
             alike = np.concatenate([alike, by_share], axis=1)
         return float(np.logaddexp.reduce(alike.sum(axis=0))) - math.log(alike.shape[1])
 
-    @property
+    @cached_property
     def _by_size(self) -> Floats:
         """Log Bayes factors (D, sizes) of whatever changes the course of each dwell."""
         return _log_bayes(self.squares, np.ones(len(self.squares)), self.freedom, _ANY_SIZE**2)

@@ -141,7 +141,7 @@ def _(diagnosed: Diagnosis, measured: Sequence[Measured], commands: Sequence[str
 @page_of.register
 def _(state: Improvement, measured: Sequence[Measured], commands: Sequence[str], remarks: Sequence[str] = ()) -> Page:
     start, last, steps = state.start.before, state.result, improvement.progress(state)
-    explanation = Explanation(state.effects, start, last, True)
+    explanation = Explanation(state.effects, start, last)
     explained = {f"{last.model.sum}": explanation.unexplained_mps2} if state.steps else {}
     fall = figures_of("The error, step by step", state, "fall", [FALL, NO_FALL])
     return Page(

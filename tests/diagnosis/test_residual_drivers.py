@@ -75,7 +75,7 @@ def test_nothing_has_a_share_where_the_model_fits(seed: int) -> None:
     assert {"a", "p", "o", "da", "t", "T", "q1", "q2", "q3"} <= {each.symbol for each in drivers}
     assert all(each.share == 0.0 and each.p_value > 1e-3 for each in drivers)
     after = Refits().with_effects(before, ("second-order",))
-    assert Explanation(("second-order",), before, after, True).share is None
+    assert Explanation(("second-order",), before, after).share is None
 
 
 def test_what_an_explanation_predicts_is_the_difference_of_the_predictions() -> None:
@@ -106,7 +106,7 @@ def test_the_band_of_an_effect_covers_as_often_as_it_says() -> None:
     for seed in range(runs):
         before = noisy_run("second-order=2ug/g^2,2ug/g^2,2ug/g^2", seed=300 + seed, plan=PLAN)
         after = Refits().with_effects(before, ("second-order",))
-        (shape,) = Explanation(("second-order",), before, after, True).shapes
+        (shape,) = Explanation(("second-order",), before, after).shapes
         size, own = shape.component - shape.component.mean(axis=0), shape.component_sigma
         force = before.linearised.means.force_mps2
         for i in range(3):

@@ -277,7 +277,7 @@ def test_a_disturbed_dwell_is_drawn_reading_by_reading_from_its_arrival_on() -> 
 def test_an_effect_with_a_constant_of_its_own_is_a_line_over_what_the_fit_made_of_it(hidden: str, words: str) -> None:
     before = run(hidden)
     after = Refits().with_effects(before, (hidden.partition("=")[0],))
-    (shape,) = Explanation((hidden.partition("=")[0],), before, after, True).shapes
+    (shape,) = Explanation((hidden.partition("=")[0],), before, after).shapes
     assert shape.words == words and shape.is_curve
     for values, component in zip(shape.values.T, shape.component.T, strict=True):
         line = np.polyval(np.polyfit(values, component, 1), values)
