@@ -19,7 +19,6 @@ RETURNING = "time (irregular, and comes back)"
 """What biases depend on that change as irregularly as a random walk, and return to their mean."""
 
 _DECAYS_S = (1, 3, 10, 30, 100, 300, 1000, 3000)
-_CREEPS_S = (3, 10, 30)  # of a platform after its arrival
 _STEADY_K = 0.1  # a temperature that changes by less drives nothing
 _MOST_MOMENTS = 100  # at which a jump is tried
 _SUMS = ((1, 1), (1, -1), (2, 1), (2, -1), (1, 2), (1, -2), (2, 2), (2, -2))  # of two angles, in turns of each
@@ -97,7 +96,7 @@ def _of_gimbals(count: int, slow: Sequence[tuple[str, str]]) -> Iterator[Unknown
     for k in range(1, count + 1):
         waves = {n: _waves(_turned(n, k)) for n in (1, 2, 3, 4, 6)}
         weights = [n**-0.5 for n in waves]
-        yield _term(f"angle of gimbal {k}", "", [*waves.values()], weights)
+        yield _term(f"angle of gimbal {k}", "", [(f"q{k}",), *waves.values()], (1.0, *weights))
         products = [_times(waves[n], force) for n in (1, 2) for force in ("a", "p", "o")]
         yield _term(f"angle of gimbal {k} and specific force", "", products)
         for words, symbol in slow:
@@ -189,15 +188,14 @@ def _of_jumps(dwells: Sequence[Dwell], turns: bool) -> Iterator[UnknownTerm]:
 def _of_arrival(gimbals: int, dwells: Sequence[Dwell]) -> Iterator[UnknownTerm]:
     longest_s = max(dwell.end_s - dwell.start_s for dwell in dwells)
     decays_s = [decay_s for decay_s in _DECAYS_S if decay_s <= 2.0 * longest_s] or [_DECAYS_S[0]]
-    yield _one_of("time since arrival", "memory", _neighbours([f"exp(-tau/({each}*s))" for each in decays_s]))
-    creeps = [tuple(f"{f}*exp(-tau/({each}*s))" for f in ("fx", "fy", "fz")) for each in decays_s]
+    pairs = _neighbours([f"exp(-tau/({each}*s))" for each in decays_s])
+    yield _one_of("time since arrival", "memory", pairs)
+    creeps = [tuple(f"{f}*{decay}" for f in ("fx", "fy", "fz") for decay in pair) for pair in pairs]
     yield _one_of("time since arrival and specific force", "memory", creeps)
     for k in range(1, gimbals + 1):
         sizes = (f"q{k}_move", f"sign(q{k}_move)")
-        texts = [(f":{k} = {size}*exp(-tau/({each}*s))",) for each in _CREEPS_S for size in sizes
-                 if each <= 2.0 * longest_s]  # fmt: skip
-        if texts:
-            yield _one_of(f"time since arrival and last move of gimbal {k}", "gimbal and encoder", texts)
+        texts = [tuple(f":{k} = {size}*{decay}" for decay in pair) for pair in pairs for size in sizes]
+        yield _one_of(f"time since arrival and last move of gimbal {k}", "gimbal and encoder", texts)
 
 
 def _of_surroundings(gimbals: int, turns: bool) -> Iterator[UnknownTerm]:
