@@ -40,14 +40,14 @@ from kf_calib.diagnosis.run_terms import (
     TWO_SUMMANDS,
     RunTerm,
     RunTerms,
+    bearers_of,
     log_bayes_of_columns,
-    of_accelerometers,
+    of_bearers,
     sizes_of,
 )
 from kf_calib.diagnosis.unknown_terms import name_of_formula, text_named
 from kf_calib.diagnosis.within_rows import Courses
 from kf_calib.effects import Effect, effect_named
-from kf_calib.effects.effect import SensorEffect
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.observability import impossible_size
 from kf_calib.estimation.results import Calibration
@@ -600,7 +600,7 @@ def _gains(gram: Floats, along: Floats) -> Floats:
 def _relations(effect: Effect) -> list[tuple[float, Floats]]:
     """Return the matrices (q, k) that may combine the columns of an effect, with the logs of their shares."""
     matrices = [*effect.relations] or [np.eye(len(effect.coefficients))]
-    some = of_accelerometers(isinstance(effect, SensorEffect))
+    some = of_bearers(bearers_of(effect))
     return [(log - math.log(len(matrices)), matrix[:, only]) for matrix in matrices for log, only in some]
 
 

@@ -42,7 +42,7 @@ _LEAST = 1e-3  # share of the largest part of a term that a part of it has at le
 _WAVES = 40  # of a random walk
 _RETURNS, _PER_DWELL = (4, 8, 16, 32, 64), 0.75  # parts of a run within which a bias may come back, and most of them
 _MOST_ORIENTATIONS = 100  # that are told apart by what comes back with each
-_IN_ALL = 0.5  # share of what all accelerometers have, each with its own coefficient, and not one alone
+_IN_ALL = 0.5  # share of what all accelerometers have, each with its own coefficient, and not one alone; so with axes
 EVERY = slice(None)
 """All columns of a term."""
 
@@ -53,8 +53,8 @@ class RunTerm:
 
     row: the name of an effect, or ``?`` and the number of an unknown function. log_share: log of its share in the prior
     of its row. effect: with the constant at which it has these columns. relation: the number of that of its
-    coefficients. summands: of the unknown function, those that it has. in_each: whether each accelerometer has columns
-    of its own. only: which of the columns of all accelerometers these are. sizes: of its coefficients. scales: factors
+    coefficients. summands: of the unknown function, those that it has. bearers: number of accelerometers, or of axes of
+    a rotation, of which each has columns of its own. only: which of the columns of all bearers these are. sizes: of its coefficients. scales: factors
     (q,) of its columns.
     """
 
@@ -64,21 +64,21 @@ class RunTerm:
     effect: Effect | None = None
     relation: int = 0
     summands: tuple[int, ...] = ()
-    in_each: bool = False
+    bearers: int = 1
     only: slice = field(default_factory=lambda: EVERY)
     sizes: Sizes = field(default_factory=lambda: Sizes(np.zeros(0), np.zeros(0)))
     scales: Floats | None = None
 
     @property
     def alone(self) -> bool:
-        """Whether it is of one accelerometer alone."""
+        """Whether it is of one accelerometer, or axis, alone."""
         return self.only != EVERY
 
     @property
     def log_share_of_form(self) -> float:
-        """The log of the share of its relation, and of the accelerometers that it is of."""
+        """The log of the share of its relation, and of the bearers that it is of."""
         relations = self.effect.relations if self.effect is not None else ()
-        (log,) = [log for log, only in of_accelerometers(self.in_each) if only == self.only]
+        (log,) = [log for log, only in of_bearers(self.bearers) if only == self.only]
         return log - math.log(max(len(relations), 1))
 
     @property
@@ -122,7 +122,7 @@ class RunTerms:
         rms = self.likelihood.lengths / math.sqrt(self.likelihood.rows)
         unknown = np.where(rms > 0.0, columns.weights / np.where(rms > 0.0, rms, 1.0), 0.0)
         self.likelihood.rescale(np.where(columns.weights > 0.0, unknown, 1.0))
-        self.terms = [*self._of_accelerometers(self._seen(columns.terms))]
+        self.terms = [*self._of_bearers(self._seen(columns.terms))]
         self.names = tuple(dict.fromkeys(term.row for term in self.terms if term.is_known))
 
     def _add_effects(self, columns: _Columns, test: CandidateTests) -> None:
@@ -139,7 +139,7 @@ class RunTerms:
             part, relations = columns.add([effect]), [*effect.relations] or [None]
             for number, matrix in enumerate(relations):
                 block, share = columns.block(part, matrix), log - math.log(len(relations))
-                columns.term(str(effect), [block], share, effect, number, in_each=isinstance(effect, SensorEffect))
+                columns.term(str(effect), [block], share, effect, number, bearers=bearers_of(effect))
 
     def _add_unknown(self, columns: _Columns) -> None:
         """Add the unknown functions: each summand alone, and all together."""
@@ -153,8 +153,8 @@ class RunTerms:
             shares = np.ones(len(blocks)) if unknown.exclusive else np.arange(1.0, len(blocks) + 1.0) ** -2.0
             shares *= (1.0 if alone else _SPARSE) / shares.sum()
             for k, block in enumerate(blocks):
-                in_each = not unknown.summands[k][0].startswith(":")  # and no turn, which all have
-                columns.term(f"?{number}", [block], math.log(shares[k]), summands=(k,), in_each=in_each)
+                bearers = len(self.formula_of(unknown.summands[k][0]).coefficients)
+                columns.term(f"?{number}", [block], math.log(shares[k]), summands=(k,), bearers=bearers)
             if not alone:
                 columns.term(
                     f"?{number}", blocks, math.log(1.0 - _SPARSE - TWO_SUMMANDS), summands=(*range(len(blocks)),)
@@ -232,11 +232,11 @@ class RunTerms:
                 terms.append(replace(draft, sizes=self._sizes(draft, least)))
         return terms
 
-    def _of_accelerometers(self, terms: Sequence[RunTerm]) -> Iterator[RunTerm]:
-        """Yield terms, those of which each accelerometer has its own columns also as terms of one alone."""
+    def _of_bearers(self, terms: Sequence[RunTerm]) -> Iterator[RunTerm]:
+        """Yield terms, those of which each bearer has its own columns also as terms of one alone."""
         raw, lengths = self.likelihood.lengths, self.likelihood.lengths_left
         for term in terms:
-            for log_share, only in of_accelerometers(term.in_each):
+            for log_share, only in of_bearers(term.bearers):
                 places, log = term.columns[only], term.log_share + log_share
                 if len(places) == len(term.columns):
                     yield replace(term, log_share=log)
@@ -330,11 +330,11 @@ class _Columns:
         return len(self.blocks) - 1
 
     def term(self, row: str, blocks: Sequence[int], log_share: float, effect: Effect | None = None,
-             relation: int = 0, summands: tuple[int, ...] = (), in_each: bool = False,
+             relation: int = 0, summands: tuple[int, ...] = (), bearers: int = 1,
              scales: Floats | None = None) -> None:  # fmt: skip
         """Add a term with the columns of some blocks."""
         places = np.concatenate([self._places[block] for block in blocks])
-        self.terms.append(RunTerm(row, places, log_share, effect, relation, summands, in_each, scales=scales))
+        self.terms.append(RunTerm(row, places, log_share, effect, relation, summands, bearers, scales=scales))
 
 
 class _Visits(Effect):
@@ -406,13 +406,18 @@ def _largest_cosine(bases: Sequence[Floats], basis: Floats) -> float:
     return float(np.linalg.svd(close, compute_uv=False).min(axis=1).max(initial=0.0))
 
 
-def of_accelerometers(in_each: bool) -> list[tuple[float, slice]]:
-    """Columns that a term may have, with the logs of their shares: those of all accelerometers or, where each has its
-    own, one of every three, of one accelerometer alone."""
-    if not in_each:
+def bearers_of(effect: Effect) -> int:
+    """Of how many accelerometers each has coefficients of an effect of its own."""
+    return 3 if isinstance(effect, SensorEffect) else 1
+
+
+def of_bearers(count: int) -> list[tuple[float, slice]]:
+    """Columns that a term may have, with the logs of their shares: those of all accelerometers, or axes of a rotation,
+    or where each has its own, one of every so many, of one alone."""
+    if count == 1:
         return [(0.0, EVERY)]
-    alone = math.log((1.0 - _IN_ALL) / 3.0)
-    return [(math.log(_IN_ALL), EVERY), *((alone, slice(k, None, 3)) for k in range(3))]
+    alone = math.log((1.0 - _IN_ALL) / count)
+    return [(math.log(_IN_ALL), EVERY), *((alone, slice(k, None, count)) for k in range(count))]
 
 
 def sizes_of(least: float, usual: SizePrior | None, most: float = math.inf, nodes: int = _NODES) -> Sizes:

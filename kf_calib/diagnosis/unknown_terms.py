@@ -102,6 +102,7 @@ def _of_gimbals(count: int, slow: Sequence[tuple[str, str]]) -> Iterator[Unknown
         for words, symbol in slow:
             products = [_times(waves[n], symbol) for n in (1, 2, 3, 4)]
             yield _term(f"angle of gimbal {k} and {words}", "", products, weights[:4])
+        yield _term(f"last move of gimbal {k}", "memory", [f"sign(q{k}_move)", f"q{k}_move"])
         before = (f"sin(q{k}_before)", f"cos(q{k}_before)")
         yield _term(f"previous orientation (angle of gimbal {k})", "memory", [before])
         turning = [(f"q{k}",), *waves.values()]
@@ -128,8 +129,8 @@ def _waves(angle: str) -> tuple[str, str]:
 
 
 def _neighbours(texts: Sequence[str]) -> list[tuple[str, ...]]:
-    """Decays of two neighbouring time constants together: all between them are sums of these, to one per cent."""
-    return [*itertools.pairwise(texts)] if len(texts) > 1 else [(text,) for text in texts]
+    """Decays of three neighbouring time constants together: all between them are sums of these, to a thousandth."""
+    return [tuple(texts[k : k + 3]) for k in range(max(len(texts) - 2, 1))]
 
 
 def _times(texts: Sequence[str], force: str) -> tuple[str, ...]:
@@ -154,8 +155,8 @@ def _of_time(dwells: Sequence[Dwell], turns: bool) -> Iterator[UnknownTerm]:
     yield _one_of("time (a decay)", "bias in time", _neighbours(decays))
     forces = [("a",), ("p", "o")]
     yield _one_of("time and specific force (a decay)", "scale in time",
-                  [tuple(f"{decay}*{f}" for f in force for decay in pair)
-                   for pair in _neighbours(decays) for force in forces])  # fmt: skip
+                  [tuple(f"{decay}*{f}" for f in force for decay in few)
+                   for few in _neighbours(decays) for force in forces])  # fmt: skip
     waves = [tuple(f"{wave}({n}*2*pi*t/{run_s})" for wave in ("sin", "cos")) for n in _TURNS]
     yield _one_of("time (periodic)", "bias in time", waves)
     if turns:
@@ -188,13 +189,13 @@ def _of_jumps(dwells: Sequence[Dwell], turns: bool) -> Iterator[UnknownTerm]:
 def _of_arrival(gimbals: int, dwells: Sequence[Dwell]) -> Iterator[UnknownTerm]:
     longest_s = max(dwell.end_s - dwell.start_s for dwell in dwells)
     decays_s = [decay_s for decay_s in _DECAYS_S if decay_s <= 2.0 * longest_s] or [_DECAYS_S[0]]
-    pairs = _neighbours([f"exp(-tau/({each}*s))" for each in decays_s])
-    yield _one_of("time since arrival", "memory", pairs)
-    creeps = [tuple(f"{f}*{decay}" for f in ("fx", "fy", "fz") for decay in pair) for pair in pairs]
+    neighbours = _neighbours([f"exp(-tau/({each}*s))" for each in decays_s])
+    yield _one_of("time since arrival", "memory", neighbours)
+    creeps = [tuple(f"{f}*{decay}" for f in ("fx", "fy", "fz") for decay in few) for few in neighbours]
     yield _one_of("time since arrival and specific force", "memory", creeps)
     for k in range(1, gimbals + 1):
         sizes = (f"q{k}_move", f"sign(q{k}_move)")
-        texts = [tuple(f":{k} = {size}*{decay}" for decay in pair) for pair in pairs for size in sizes]
+        texts = [tuple(f":{k} = {size}*{decay}" for decay in few) for few in neighbours for size in sizes]
         yield _one_of(f"time since arrival and last move of gimbal {k}", "gimbal and encoder", texts)
 
 
