@@ -98,6 +98,11 @@ class LineTests:
     vibration: tuple[SpectralLine, ...] = ()
     untested_band: str = ""
 
+    @property
+    def vibration_in_words(self) -> str:
+        """The frequencies of vibration, with their unit; "" where there is none."""
+        return ", ".join(f"{line.frequency_hz:.4g}" for line in self.vibration) + " Hz" * bool(self.vibration)
+
 
 @dataclass(frozen=True)
 class CandidateTests:

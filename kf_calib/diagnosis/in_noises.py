@@ -18,12 +18,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, Indices
+from kf_calib.estimation.candidate_scan import SEEN
 
 _AT_ONCE = 1 << 20  # products that are computed together, so that they stay in the cache
 ROUNDING = 1e-10
 """Share of the square of a column below which what the model, or other columns, leave of it is rounding."""
 
-_SEEN = 1e-6  # share of some columns that a part of them has at least, off what the model spans
 _LOST = 1e-3  # share of what all dwells determine of the model, below which some of them determine nothing
 
 
@@ -51,7 +51,7 @@ class Spanned:
         count = columns.shape[0] * columns.shape[1]
         scaled = np.vstack([columns.reshape(count, len(places)), more]) / np.where(lengths > 0.0, lengths, 1.0)
         left, singular, _ = np.linalg.svd(scaled, full_matrices=False)
-        left = left[:, singular > _SEEN]
+        left = left[:, singular > SEEN]
         of_means, of_more = left[:count].reshape(*columns.shape[:2], left.shape[1]), left[count:]
         along = np.tensordot(of_means, self.readings, axes=((0, 1), (0, 1))) + of_more.T @ self.more_readings
         return Spanned(

@@ -48,8 +48,6 @@ from kf_calib.estimation.results import Calibration
 from kf_calib.support.tail_probabilities import LEVEL, chi_squared_tail, log_odds_of
 
 _SHOWN = 6  # number of suspects that are shown
-_LIKELIER_THAN_NOT = 0.5
-_DOUBT = 0.01  # probability from which noise that was not stated is named as a rival
 _NOISE = 1e-6  # p-value below which readings within dwells hold more than an oscillation and noise
 
 
@@ -216,7 +214,7 @@ def _decided(refits: Refits, diagnosis: Diagnosis) -> Diagnosis:
     assert table is not None
     first, test = table.first, diagnosis.test
     if first.dwells:  # what else is missing is told by the others
-        scatter = table.families.get(NOISE, 0.0) > _DOUBT
+        scatter = table.families.get(NOISE, 0.0) >= LISTED
         return replace(diagnosis, unknown=True, as_scatter=scatter, suspects=_suspects(diagnosis, table))
     if not dwell_noise_is_stated(before) and first.refit is not None:
         before_in_noise_left = with_noise_as_stated(refits, before, first.refit)
@@ -245,7 +243,7 @@ def _decided(refits: Refits, diagnosis: Diagnosis) -> Diagnosis:
         ambiguity=names,
         overlaps=_overlaps(diagnosis.test, first.effects, names),
         together=tuple(pairs),
-        as_scatter=table.families.get(NOISE, 0.0) > _DOUBT,
+        as_scatter=table.families.get(NOISE, 0.0) >= LISTED,
         after=_after(refits, before, named) if named else None,
         suspects=_suspects(diagnosis, table),
     )
@@ -263,7 +261,7 @@ def _certain_part(first: Hypothesis, table: HypothesisTable, before: Calibration
         return None
     parts = [row for row in table.rows if row.refit is not None and row.effects and not row.formulas]
     parts = [row for row in parts if set(row.effects) < set(first.effects) and table.probability(row.effects) >= SURE]
-    if first.probability > _LIKELIER_THAN_NOT:
+    if first.probability > 0.5:
         parts = [row for row in parts if table.probability_of_just_known(row.effects) > 1.0 - SURE]
     return next((row for row in parts if not _grown(before, row.effects, row.refit)), None)
 

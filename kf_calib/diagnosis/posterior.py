@@ -23,6 +23,7 @@ from kf_calib.diagnosis.coefficient_sizes import best_sigma, usual_sizes
 from kf_calib.diagnosis.dwells_apart import DwellsApart
 from kf_calib.diagnosis.hypothesis_table import (
     IRREGULAR,
+    LISTED,
     NOISE,
     NONE,
     NOTHING,
@@ -67,7 +68,6 @@ _NO_SIGN, _ONE = 0.5, 1e-3  # what is left of an effect beside one that is the s
 _SAME = 1e-6  # squared sine of the angle below which two effects are one
 _REFITTED, _ALWAYS = 8, 3  # rows of effects that are fitted at most, and single ones that always are
 _BEHIND, _BENT = 10.0, 0.02  # in log evidence, and share of the gain: rows further behind are not fitted
-_DESCRIBED = 5.0  # in log evidence: rows of unknown functions further behind get no formula
 _NODES_OF_PAIR = 16  # sizes of each of two effects
 _ROUNDING, _UNSEEN = 1e-5, 1e-3  # least scatter over the misfit: where noise within dwells was seen, and where not
 _SUMMANDS, _MORE = 3, 3.0  # formulas that describe an unknown function at most, and what each has to gain
@@ -437,7 +437,7 @@ class RunPosterior:
         fitted = self._steady([self._refitted(row) if id(row) in likeliest else row for row in rows])
         while not (first := max(fitted, key=lambda row: row.log_evidence)).driver and first.effects and not first.refit:
             fitted = self._steady([self._refitted(row) if row is first else row for row in fitted])
-        least = first.log_evidence - _DESCRIBED
+        least = first.log_evidence + math.log(LISTED)  # others are not shown
         return [self._described(row) if row.driver and row.log_evidence > least else row for row in fitted]
 
     def _steady(self, rows: Sequence[Hypothesis]) -> list[Hypothesis]:

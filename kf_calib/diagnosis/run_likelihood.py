@@ -25,12 +25,12 @@ from kf_calib.diagnosis.in_noises import ROUNDING, InNoises, Spanned
 from kf_calib.diagnosis.within_rows import Courses, WithinRows
 from kf_calib.dwells.pieces import OfPieces, of_all_pieces
 from kf_calib.effects import Effect
+from kf_calib.estimation.candidate_scan import SEEN
 from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns, few_at_a_time, stimulus_of
 from kf_calib.noise.means import means_of
 from kf_calib.noise.noise_model import Noise, lift_rounding, mean_covariances
 from kf_calib.noise.reml import FREE, Part, with_shared_noise
 
-_SEEN = 1e-7  # share of a column that the model must leave for it to be seen
 _FINE = 8  # parts of a step over which the likelihood is integrated
 _FAR = 300.0  # in log likelihood, below the largest: a polynomial through values that differ by more swings out
 _LEAST = 0.1  # sigma of a mean: noise that is smaller shows nothing
@@ -220,7 +220,7 @@ def _directions(columns: Floats) -> Floats:
     """Return an orthonormal basis (r, f) of columns (r, q), without what is none but for rounding."""
     lengths = np.linalg.norm(columns, axis=0)
     left, singular, _ = np.linalg.svd(columns / np.where(lengths > 0.0, lengths, 1.0), full_matrices=False)
-    return np.asarray(left[:, singular > _SEEN], float)
+    return np.asarray(left[:, singular > SEEN], float)
 
 
 def _width(block: Combination) -> int:

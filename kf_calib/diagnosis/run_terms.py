@@ -17,12 +17,13 @@ from kf_calib.diagnosis.candidate_tests import CandidateTests
 from kf_calib.diagnosis.coefficient_sizes import SizePrior, best_sigma, sensor_grade, usual_sizes
 from kf_calib.diagnosis.in_noises import InNoises
 from kf_calib.diagnosis.run_likelihood import Combination, RunLikelihood, Sizes, log_bayes
-from kf_calib.diagnosis.unknown_terms import RETURNING, UnknownTerm, text_named, unknown_terms
+from kf_calib.diagnosis.unknown_terms import MOST_ALTERNATIVES, RETURNING, UnknownTerm, text_named, unknown_terms
 from kf_calib.diagnosis.within_rows import Courses
 from kf_calib.dwells.qr import orthonormal
 from kf_calib.effects import Coefficient, Effect, Stimulus, effect_named, walk_named
 from kf_calib.effects.effect import Grade, SensorEffect
 from kf_calib.effects.formula import formula
+from kf_calib.estimation.candidate_scan import SEEN
 from kf_calib.estimation.cross_validation import orientations
 from kf_calib.estimation.dwell_columns import stimulus_of
 from kf_calib.estimation.observability import impossible_size
@@ -37,11 +38,9 @@ TWO_SUMMANDS = 0.25
 """The same of two summands."""
 _SAME = 0.99  # cosine above which a summand is a known effect
 _END = 0.99  # of the range of a constant
-_SEEN = 1e-7  # share of a column that the model must leave for it to be seen
 _LEAST = 1e-3  # share of the largest part of a term that a part of it has at least
 _WAVES = 40  # of a random walk
 _RETURNS, _PER_DWELL = (4, 8, 16, 32, 64), 0.75  # parts of a run within which a bias may come back, and most of them
-_MOST_ORIENTATIONS = 100  # that are told apart by what comes back with each
 _IN_ALL = 0.5  # share of what all accelerometers have, each with its own coefficient, and not one alone; so with axes
 EVERY = slice(None)
 """All columns of a term."""
@@ -54,8 +53,8 @@ class RunTerm:
     row: the name of an effect, or ``?`` and the number of an unknown function. log_share: log of its share in the prior
     of its row. effect: with the constant at which it has these columns. relation: the number of that of its
     coefficients. summands: of the unknown function, those that it has. bearers: number of accelerometers, or of axes of
-    a rotation, of which each has columns of its own. only: which of the columns of all bearers these are. sizes: of its coefficients. scales: factors
-    (q,) of its columns.
+    a rotation, of which each has columns of its own. only: which of the columns of all bearers these are. sizes: of its
+    coefficients. scales: factors (q,) of its columns.
     """
 
     row: str
@@ -163,7 +162,7 @@ class RunTerms:
     def _add_orientations(self, columns: _Columns) -> None:
         """Add an unknown cause that is alike at each visit of an orientation, where some are visited again."""
         groups, dwells = orientations(self._linearised.dwells), self._linearised.dwells
-        self.repeats = self.bench.angles and len(groups) < min(len(dwells), _MOST_ORIENTATIONS)
+        self.repeats = self.bench.angles and len(groups) < min(len(dwells), MOST_ALTERNATIVES)
         if self.repeats:
             of_dwell = np.empty(len(dwells), np.intp)
             for k, group in enumerate(groups):
@@ -215,7 +214,7 @@ class RunTerms:
                 ends.setdefault((draft.row, basis.shape), []).append(basis)
         for draft in drafts:
             columns = self.likelihood.columns(draft.columns)
-            if not (np.linalg.norm(columns, axis=0) > _SEEN * raw[draft.columns]).any():
+            if not (np.linalg.norm(columns, axis=0) > SEEN * raw[draft.columns]).any():
                 continue
             if not (draft.is_known or len(draft.summands) == 1):
                 scaled = columns if draft.scales is None else columns * draft.scales
@@ -240,7 +239,7 @@ class RunTerms:
                 places, log = term.columns[only], term.log_share + log_share
                 if len(places) == len(term.columns):
                     yield replace(term, log_share=log)
-                elif (lengths[places] > _SEEN * raw[places]).any():
+                elif (lengths[places] > SEEN * raw[places]).any():
                     part, least = replace(term, columns=places, log_share=log, only=only), 1.0 / lengths[places].max()
                     if least < _most(part):
                         yield replace(part, sizes=self._sizes(part, least))

@@ -34,10 +34,10 @@ from kf_calib.estimation.calibration import evaluate_fit
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.results import Calibration, Parameter, format_p
+from kf_calib.support.tail_probabilities import LEVEL
 from kf_calib.support.text import as_html
 from kf_calib.support.units import si
 
-_NEEDED = 0.01  # an effect is needed where its removal raises chi-squared significantly at this level
 _NEAR_THRESHOLD = 8.0  # sigma; an effect near the threshold is found only if noise enlarges it: estimates are too large
 _TURNS = 0.5  # sigma of an angle, by which explanations turn the frame where that is said
 
@@ -57,7 +57,7 @@ class Removal:
     @property
     def needed(self) -> bool:
         """Whether the removal would raise chi-squared significantly."""
-        return self.p_value < _NEEDED
+        return self.p_value < LEVEL
 
 
 @dataclass(frozen=True)

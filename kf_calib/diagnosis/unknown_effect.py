@@ -11,8 +11,7 @@ from kf_calib.effects import walk_named
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.results import Consistency, consistency
 from kf_calib.estimation.within_dwell_trend import Trend
-
-_WITHIN = 0.01  # significance level of trends within dwells
+from kf_calib.support.tail_probabilities import LEVEL
 
 BETWEEN_DWELLS = "nothing that was recorded (irregular from dwell to dwell)"
 WITHIN_DWELLS = "time (irregular, within dwells too)"
@@ -51,7 +50,7 @@ def describe_irregular(
         return None
     misfit, walk, scatter = consistency(fitted), fitted.walk_gain, fitted.scatter_gain
     irregular, excess = 2.0 * max(walk, scatter), misfit.statistic - misfit.dof
-    within = trend is not None and trend.p_value < _WITHIN
+    within = trend is not None and trend.p_value < LEVEL
     driver = driver or (WITHIN_DWELLS if within else BETWEEN_DWELLS)
     return Description(channel_of(residuals), driver, irregular / max(excess, irregular, 1.0), (name,))
 

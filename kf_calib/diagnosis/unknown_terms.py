@@ -18,9 +18,11 @@ from kf_calib.dwells.sufficient_statistics import Dwell
 RETURNING = "time (irregular, and comes back)"
 """What biases depend on that change as irregularly as a random walk, and return to their mean."""
 
-_DECAYS_S = (1, 3, 10, 30, 100, 300, 1000, 3000)
+_DECAYS = (1, 3, 10, 30, 100, 300, 1000, 3000)  # time constants, over the least
 _STEADY_K = 0.1  # a temperature that changes by less drives nothing
-_MOST_MOMENTS = 100  # at which a jump is tried
+MOST_ALTERNATIVES = 100
+"""Of one cause that are tried: moments of a jump, orientations to which something comes back."""
+
 _SUMS = ((1, 1), (1, -1), (2, 1), (2, -1), (1, 2), (1, -2), (2, 2), (2, -2))  # of two angles, in turns of each
 _TURNS = (0.5, 1, 1.5, 2, 3, 4, 6, 8)  # of what is periodic, in a run
 
@@ -128,8 +130,9 @@ def _waves(angle: str) -> tuple[str, str]:
     return f"sin({angle})", f"cos({angle})"
 
 
-def _neighbours(texts: Sequence[str]) -> list[tuple[str, ...]]:
+def _decays(time: str, least_s: int, longest_s: float) -> list[tuple[str, ...]]:
     """Decays of three neighbouring time constants together: all between them are sums of these, to a thousandth."""
+    texts = [f"exp(-{time}/({least_s * k}*s))" for k in _DECAYS if k == 1 or least_s * k <= longest_s]
     return [tuple(texts[k : k + 3]) for k in range(max(len(texts) - 2, 1))]
 
 
@@ -149,14 +152,14 @@ def _of_time(dwells: Sequence[Dwell], turns: bool) -> Iterator[UnknownTerm]:
     yield _term("time", "bias in time", texts, weights)
     products = [f"{power}*{force}" for power in ("t", "t*t") for force in ("a", "p", "o")]
     products += [f"{power}*{force}" for power in ("t", "t*t") for force in ("a*a", "p*p", "a*p", "a*o", "p*o")]
+    products += [f"cos({n}*pi*t/{run_s})*a" for n in range(1, 7)]
     yield _term("time and specific force", "scale in time", products)
-    decays = [f"exp(-t/({10 * decay_s}*s))" for decay_s in _DECAYS_S if decay_s <= dwells[-1].end_s]
-    decays = decays or ["exp(-t/(30*s))"]
-    yield _one_of("time (a decay)", "bias in time", _neighbours(decays))
+    decays = _decays("t", 10, 10.0 * dwells[-1].end_s)
+    yield _one_of("time (a decay)", "bias in time", decays)
     forces = [("a",), ("p", "o")]
     yield _one_of("time and specific force (a decay)", "scale in time",
                   [tuple(f"{decay}*{f}" for f in force for decay in few)
-                   for few in _neighbours(decays) for force in forces])  # fmt: skip
+                   for few in decays for force in forces])  # fmt: skip
     waves = [tuple(f"{wave}({n}*2*pi*t/{run_s})" for wave in ("sin", "cos")) for n in _TURNS]
     yield _one_of("time (periodic)", "bias in time", waves)
     if turns:
@@ -172,7 +175,7 @@ def _of_jumps(dwells: Sequence[Dwell], turns: bool) -> Iterator[UnknownTerm]:
     within_s = [0.5 * (dwell.start_s + dwell.end_s) for dwell in dwells]
     between_s = [0.5 * (before.end_s + dwell.start_s) for before, dwell in itertools.pairwise(dwells)]
     moments_s = sorted(within_s + between_s)
-    moments_s, between_s = (each[:: len(each) // _MOST_MOMENTS + 1] for each in (moments_s, between_s))
+    moments_s, between_s = (each[:: len(each) // MOST_ALTERNATIVES + 1] for each in (moments_s, between_s))
     if not between_s:
         return
     yield _one_of("time (a jump)", "bias in time", [(f"t > {s:.6g}*s",) for s in moments_s])
@@ -188,14 +191,13 @@ def _of_jumps(dwells: Sequence[Dwell], turns: bool) -> Iterator[UnknownTerm]:
 
 def _of_arrival(gimbals: int, dwells: Sequence[Dwell]) -> Iterator[UnknownTerm]:
     longest_s = max(dwell.end_s - dwell.start_s for dwell in dwells)
-    decays_s = [decay_s for decay_s in _DECAYS_S if decay_s <= 2.0 * longest_s] or [_DECAYS_S[0]]
-    neighbours = _neighbours([f"exp(-tau/({each}*s))" for each in decays_s])
-    yield _one_of("time since arrival", "memory", neighbours)
-    creeps = [tuple(f"{f}*{decay}" for f in ("fx", "fy", "fz") for decay in few) for few in neighbours]
+    decays = _decays("tau", 1, 2.0 * longest_s)
+    yield _one_of("time since arrival", "memory", decays)
+    creeps = [tuple(f"{f}*{decay}" for f in ("fx", "fy", "fz") for decay in few) for few in decays]
     yield _one_of("time since arrival and specific force", "memory", creeps)
     for k in range(1, gimbals + 1):
-        sizes = (f"q{k}_move", f"sign(q{k}_move)")
-        texts = [tuple(f":{k} = {size}*{decay}" for decay in few) for few in neighbours for size in sizes]
+        sizes = (f"q{k}_move", f"sign(q{k}_move)", f"abs(q{k}_move)", f"abs(sign(q{k}_move))")
+        texts = [tuple(f":{k} = {size}*{decay}" for decay in few) for few in decays for size in sizes]
         yield _one_of(f"time since arrival and last move of gimbal {k}", "gimbal and encoder", texts)
 
 

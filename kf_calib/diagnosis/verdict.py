@@ -26,7 +26,6 @@ from kf_calib.support.text import counted
 from kf_calib.support.units import shown
 
 _AS_LIKELY = 0.25  # share of the likeliest from which another explanation is told together with it
-_CHANCE = 0.01  # probability from which it is told that nothing may be missing
 _TOLD, _WORTH_A_NAME = 4, 1e-3  # most other explanations that are told, and least probability of one
 _UNUSUAL = 5.0  # times the greatest usual size, from which a coefficient is said to be too large for its name
 _USUAL = {"angle_sigma_deg": " (a usual table: 0.0003 to 0.003 deg)", "scatter_sigma_mps2": ""}
@@ -75,7 +74,9 @@ def _of_the_others(diagnosis: Diagnosis) -> str:
                 f"The model agrees with the measurements if {diagnosis.condition}: this was estimated from their "
                 f"misfit (p {format_p(test.p_value)}), which no known effect explains beyond it.{blind}"
             )
-        agreed = f"The model agrees with the measurements (p {format_p(test.p_value)})"
+        lines = test.lines.vibration_in_words if diagnosis.before.fit.dwells.folded.averaged else ""
+        averaged = f" once their vibration at {lines} is averaged out" if lines else ""
+        agreed = f"The model agrees with the measurements{averaged} (p {format_p(test.p_value)})"
         return f"{agreed}: no effect is missing that this run could show.{blind}"
     first = diagnosis.likeliest
     start = f"{_what_fails(diagnosis)} (p {format_p(test.p_value)})."
@@ -275,7 +276,7 @@ def _of_one(diagnosis: Diagnosis) -> str:
 def _others(diagnosis: Diagnosis, but: str = "") -> str:
     """Return the other explanations in words, but for those of one family."""
     assert diagnosis.table is not None
-    least = 1.0 if _may_be_chance(diagnosis, diagnosis.table.first) else _CHANCE  # which has been told
+    least = 1.0 if _may_be_chance(diagnosis, diagnosis.table.first) else LISTED  # which has been told
     nothing = [row for row in diagnosis.table.rows if row.families == (NOTHING,) and row.probability > least]
     rows = [row for row in (*diagnosis.table.rivals, *nothing) if row.families != (but,)]
     rows.sort(key=lambda row: -row.probability)

@@ -256,10 +256,10 @@ def details_of(diagnosis: Diagnosis) -> list[RenderableType]:
     if unknown is not None:
         parts.append(Text(description_sentence(unknown, unknown.formulas)))
     if diagnosis.test.lines.vibration:
-        seen = ", ".join(f"{line.frequency_hz:.4g}" for line in diagnosis.test.lines.vibration)
         averaged = diagnosis.before.fit.dwells.folded.averaged
         treated = "the tests use averages that suppress it" if averaged else "it counts as noise"
-        parts.append(Text(f"Vibration at {seen} Hz changes its amplitude during the run, so {treated}."))
+        lines = diagnosis.test.lines.vibration_in_words
+        parts.append(Text(f"Vibration at {lines} changes its amplitude during the run, so {treated}."))
     if going is not None:
         parts.append(Text(f"Next orientation: gimbals at {angles_in_words(going[0].gimbal_deg)}: {going[1]}."))
     if diagnosis.test.invisible:

@@ -16,22 +16,26 @@ from scipy.stats import beta
 
 import kf_calib
 from kf_calib.bench.arrays import one_blas_thread
+from kf_calib.bench.streams import Source
+from unknown_trials.faulty_bench import FAULTS, faulty_run
 from unknown_trials.hidden import HIDDEN, beside, cross_coupling, second_order
 from unknown_trials.real_noise import KINDS, noisy_run
-from unknown_trials.small_bench import SmallRun, hidden_run
+from unknown_trials.small_bench import hidden_run
 
 _CREDIBLE = 0.99
 _SURE = 0.9
 
 
-GROUPS = {"none": HIDDEN, "beside": HIDDEN, "noise": KINDS}
+GROUPS = {"none": HIDDEN, "beside": HIDDEN, "bench": FAULTS, "noise": KINDS}
 _KNOWN = {"second-order": second_order, "cross-coupling-ip": cross_coupling}
 
 
-def _run(group: str, name: str, sigmas: float, seed: int) -> tuple[SmallRun, str]:
+def _run(group: str, name: str, sigmas: float, seed: int) -> tuple[Source, str]:
     """Return a run, and the effect of the catalogue that is hidden in it; "" for none."""
     if group == "none":
         return hidden_run(HIDDEN[name], sigmas, seed), ""
+    if group == "bench":
+        return faulty_run(name, sigmas, seed), ""
     if group == "noise":
         return noisy_run(name, sigmas, seed), "second-order" if sigmas else ""
     known = [*_KNOWN][seed % 2]
@@ -78,9 +82,12 @@ def _in_set(rows: Sequence[Any]) -> bool:
     type=click.Choice([*GROUPS]),
     default="none",
     show_default=True,
-    help="Effects of no catalogue; those beside one of the catalogue of twice the size; noise as real sensors have it.",
+    help="Effects of no catalogue; those beside one of the catalogue of twice the size; faults of a bench; noise as "
+    "real sensors have it.",
 )
-@click.option("--only", multiple=True, type=click.Choice([*HIDDEN, *KINDS]), help="Play only this one; repeatable.")
+@click.option(
+    "--only", multiple=True, type=click.Choice([*HIDDEN, *FAULTS, *KINDS]), help="Play only this one; repeatable."
+)
 @click.option("--jobs", type=click.IntRange(min=1), default=2, show_default=True, help="Number of processes.")
 @click.option("--resume", type=click.Path(path_type=Path), help="Keep outcomes in this file (JSON lines).")
 def main(
