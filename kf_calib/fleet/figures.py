@@ -16,7 +16,6 @@ from kf_calib.fleet.overview import FleetOverview, Track
 from kf_calib.fleet.pooled_diagnosis import BenchCoefficients, Finding
 from kf_calib.fleet.text import chance_words, short_name
 from kf_calib.support.units import shown
-from kf_calib.views.console import symbol
 from kf_calib.views.figures.collection import Figures, figures
 from kf_calib.views.figures.style import (
     ACCELEROMETERS,
@@ -33,6 +32,7 @@ from kf_calib.views.figures.style import (
     styled,
     wrapped,
 )
+from kf_calib.views.notation import symbol
 
 _WIDE = 4
 _OUTSIDE = 0.01  # chance below which a unit is an outlier

@@ -26,7 +26,7 @@ from kf_calib.estimation.settings import PRIORS, Settings
 from kf_calib.support.units import rounded, shown
 from kf_calib.views import rerun as view
 from kf_calib.views.rerun import markdown_summary
-from kf_calib.views.rerun.names import number, path_of
+from kf_calib.views.rerun.names import path_of
 from kf_calib.views.rerun.series import nis_band
 from kf_calib.views.rerun.spheres import FINAL_SIZE, ellipsoids_of, magnification
 
@@ -175,12 +175,10 @@ def test_summary_holds_every_parameter_and_every_warning(result: Calibration) ->
         if parameter.unit == "1":
             assert rounded(parameter.value, parameter.sigma)[0] in text
     assert all(warning in text for warning in result.warnings)
-    assert "agree with the model" in text
+    assert "Model and measurements agree" in text
 
 
-def test_numbers_as_they_are_printed() -> None:
-    values = {1.0: "1", 500.0: "500", 0.05: "0.05", 2e4: "2·10⁴", 1e5: "10⁵", 4.84e-8: "4.8·10⁻⁸"}
-    assert [number(value) for value in values] == [*values.values()]
+def test_the_middle_of_chi_squared() -> None:
     np.testing.assert_allclose(nis_band(np.array([3])), [[0.2158, 9.3484]], atol=1e-4)
 
 

@@ -23,7 +23,6 @@ from kf_calib.estimation.filter_history import InnovationTests, ParameterHistory
 from kf_calib.estimation.results import Calibration
 from kf_calib.exchange.history import History, ParameterTrack
 from kf_calib.support.units import rounded, shown, significant
-from kf_calib.views.console import symbol
 from kf_calib.views.figures.style import (
     ACCELEROMETERS,
     ALARM,
@@ -40,8 +39,8 @@ from kf_calib.views.figures.style import (
     twelve,
     whole_numbers,
     with_coefficients,
-    written,
 )
+from kf_calib.views.notation import symbol, written
 
 MANY = 60
 """Dwells, above which curves have no markers."""

@@ -26,8 +26,8 @@ from kf_calib.views.figures.style import (
     say,
     styled,
     whole_numbers,
-    written,
 )
+from kf_calib.views.notation import written
 
 _WAYS = {"block": "block engine", "filterpy": "filterpy", "batch": "batch least squares"}
 _COLOURS = {"block": "#222222", "filterpy": "#cc79a7", "batch": "#56b4e9"}

@@ -29,7 +29,7 @@ from kf_calib.support.text import counted
 from kf_calib.support.units import shown, span
 from kf_calib.views.console import GRADES, size_range
 from kf_calib.views.diagnosis import name_of
-from kf_calib.views.figures.style import BEST, GREY, PALE, RUNNER_UP, blank, label_axis, say, styled, wrapped
+from kf_calib.views.figures.style import BEST, GREY, PALE, RUNNER_UP, blank, label_ticks, say, styled, ticks, wrapped
 
 _FAMILIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # Okabe and Ito's, the likeliest first
 _NO_EFFECT = {NOTHING: PALE, NOISE: GREY, NONE: BEST}
@@ -330,7 +330,7 @@ def _size_bars(axes: Axes, sizes: Sequence[Detectable], rows: int, grade: Grade,
     axes.set_yticks(range(len(sizes)), [detectable.name for detectable in sizes], fontsize=8.0)
     axes.set_ylim(max(rows, 3) - 0.4, -0.6)
     axes.grid(visible=False, axis="y")
-    label_axis(axes.xaxis, _LOW, _HIGH)
+    label_ticks(axes.xaxis, ticks(_LOW, _HIGH))
     axes.set_xlabel("usual size / smallest size that would be found")
     if first:
         numbers = f"beside: smallest size found in 9 of 10 such runs (usual sizes, {GRADES[grade]})"

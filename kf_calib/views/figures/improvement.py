@@ -17,9 +17,9 @@ from kf_calib.diagnosis.stepwise_selection import Improvement, SelectionStep
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration, Parameter, format_p
 from kf_calib.support.units import shown
-from kf_calib.views.console import symbol
 from kf_calib.views.figures.residuals import driver_axis, driver_to_show
 from kf_calib.views.figures.style import ACCELEROMETERS, GREY, MARKERS, PLATFORM, blank, say, styled, wrapped
+from kf_calib.views.notation import symbol
 
 _COLUMNS = 5  # models whose residuals are drawn
 _PANELS = 4  # of coefficients

@@ -40,8 +40,8 @@ from kf_calib.views.figures.style import (
     whole_numbers,
     with_coefficients,
     wrapped,
-    written,
 )
+from kf_calib.views.notation import written
 from kf_calib.views.plan import gimbal_names
 
 _AXES = {"+x": (0.0, 0.0, -9.0, -9.0), "+z": (-90.0, 0.0, -9.0, -9.0), "−z": (90.0, 0.0, -9.0, -9.0),

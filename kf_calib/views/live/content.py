@@ -16,7 +16,7 @@ from kf_calib.online.status import Judgement, Standing
 from kf_calib.support.text import angles_in_words, sentence
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2, shown, span
 from kf_calib.views import diagnosis
-from kf_calib.views.console import symbol
+from kf_calib.views.notation import symbol
 
 if TYPE_CHECKING:
     from kf_calib.sources.live import Status

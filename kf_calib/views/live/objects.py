@@ -15,7 +15,7 @@ from kf_calib.online.status import Judgement, Standing
 from kf_calib.support.text import angles_in_words
 from kf_calib.support.units import shown, span
 from kf_calib.views.diagnosis import found_object, orientation_object
-from kf_calib.views.json import clean, replay_object
+from kf_calib.views.json import clean, members, replay_object
 
 if TYPE_CHECKING:
     from kf_calib.sources.live import Status
@@ -29,9 +29,7 @@ def live_object(judgement: Judgement, standing: Standing, status: Status | None)
     left = dict(zip(paper_parameters.SYMBOLS, judgement.left_s, strict=True))
     wanted = dict(zip(paper_parameters.SYMBOLS, judgement.wanted, strict=True))
     of_live = {
-        "consistent": judgement.consistent,
-        "p_value": judgement.p_value,
-        "final": judgement.final,
+        **members(judgement, "consistent", "p_value", "final"),
         "diagnosed_dwells": len(judgement.look.result.visits),
         "next_orientation": _going(judgement),
         "standing": judgement.verdict,

@@ -23,7 +23,8 @@ from kf_calib.bench.bench import Bench, Vector
 from kf_calib.estimation.estimate import Estimate
 from kf_calib.estimation.results import Calibration
 from kf_calib.support.units import shown
-from kf_calib.views.rerun.names import ACCELEROMETERS, DARK, GOLD, GREY, RED, WHITE, number, thin
+from kf_calib.views.notation import written
+from kf_calib.views.rerun.names import ACCELEROMETERS, DARK, GOLD, GREY, RED, WHITE, thin
 from kf_calib.views.rerun.series import above, crowd, ends, nis_band, times
 
 NEGATIVE, POSITIVE, NONE = np.array([70, 140, 255]), np.array([255, 110, 50]), np.array([150, 150, 155])
@@ -163,7 +164,7 @@ def ellipsoids_of(estimate: Estimate) -> list[Ellipsoid]:
 def magnified(estimate: Estimate) -> str:
     """What the title of the view says of the ellipsoids."""
     factor = magnification(ellipsoids_of(estimate))
-    return f", axes with 1σ ×{number(factor)}" if factor else ""
+    return f", axes with 1σ ×{written(factor)}" if factor else ""
 
 
 def _axes(estimate: Estimate) -> Floats:
@@ -250,8 +251,8 @@ def _log_bar(stream: rr.RecordingStream, bench: Bench, factor: float, words: str
     *ends, place = with_y_up(bench, (-half, FLOOR, 0.0), (half, FLOOR, 0.0), (0.0, FLOOR - 0.04, 0.0))
     bar = rr.LineStrips3D([ends], colors=WHITE, radii=0.012)
     stream.log("platform/scale", bar, static=True)
-    same = number(float(f"{length / angle.per_si * ratio.per_si:.2g}"))
-    text = f"{number(length)} {angle.label}, {same} {ratio.label if ratio.label != '1' else 'of K'}{words}"
+    same = written(float(f"{length / angle.per_si * ratio.per_si:.2g}"))
+    text = f"{written(length)} {angle.label}, {same} {ratio.label if ratio.label != '1' else 'of K'}{words}"
     label = rr.Points3D([place], labels=[text], radii=0.0, colors=WHITE, show_labels=True)
     stream.log("platform/scale/label", label, static=True)
 
