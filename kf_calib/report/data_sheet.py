@@ -39,21 +39,17 @@ def data_sheet_report(sheet: DataSheet) -> RenderableType:
 
 
 def _cell(row: DataSheetRow, k: int) -> str:
-    value, sigma, unit = row.values[k], row.sigmas[k], shown(row.unit)
+    value, sigma = row.values[k], row.sigmas[k]
     if value is None or sigma is None:
         return _NONE
-    text, spread = unit.rounded(value, sigma)
-    return f"{text} ± {spread}"
+    return " ± ".join(shown(row.unit).rounded(value, sigma))
 
 
 def data_sheet_object(sheet: DataSheet) -> list[dict[str, Any]]:
     """An object for each coefficient, in SI."""
     return [
-        {
-            "symbol": row.symbol,
-            "coefficient": row.words,
-            **members(row, "unit", "values", "sigmas"),
-            "estimated": row.how,
-        }
+        {"symbol": row.symbol, "coefficient": row.words}
+        | members(row, "unit", "values", "sigmas")
+        | {"estimated": row.how}
         for row in sheet.rows
     ]

@@ -12,16 +12,19 @@ from __future__ import annotations
 import io
 import itertools
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import update_wrapper
+from inspect import Signature, signature
 from textwrap import fill
-from typing import Any, Literal, NamedTuple
+from typing import Any, Concatenate, Literal, NamedTuple, ParamSpec
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import Figure, FigureBase
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter, NullLocator
 
@@ -39,6 +42,8 @@ PLATFORM = "#5b3f9e"
 """What is of the three accelerometers together."""
 GREY, PALE, BAND = "#6b6b6b", "#c9c9c9", "#00000018"
 ALARM = "#b3001b"
+
+Arguments = ParamSpec("Arguments")
 
 KINDS = ("png", "svg", "pdf")
 DPI = 150
@@ -85,6 +90,27 @@ class Picture(Figure):
 
     def _repr_png_(self) -> bytes:
         return content_of(self, "png", _DPI_OF_NOTEBOOKS)
+
+
+def drawn_on(
+    width_in: float = 11.0, height_in: float = 7.0
+) -> Callable[[Callable[Concatenate[Figure, Arguments], object]], Callable[Arguments, Figure]]:
+    """Make a function that draws on an empty figure, its first argument, one that gives the figure; of this size,
+    unless it sets another first."""
+
+    def given(draw: Callable[Concatenate[Figure, Arguments], object]) -> Callable[Arguments, Figure]:
+        def figure_of(*arguments: Arguments.args, **named: Arguments.kwargs) -> Figure:
+            with styled():
+                figure = blank(width_in, height_in)
+                draw(figure, *arguments, **named)
+            return figure
+
+        update_wrapper(figure_of, draw)
+        others = [*signature(draw).parameters.values()][1:]
+        figure_of.__signature__ = Signature(others, return_annotation="Figure")
+        return figure_of
+
+    return given
 
 
 def blank(width_in: float = 11.0, height_in: float = 7.0) -> Figure:
@@ -199,6 +225,36 @@ def with_coefficients(coefficients: Iterable[Parameter | Coefficient]) -> tuple[
     """The same, followed by coefficients of effects."""
     found = [(each.symbol, units.shown(each)) for each in coefficients]
     return (*twelve(), *(Shown(plain(label(symbol)), plain(unit.label), unit.per_si) for symbol, unit in found))
+
+
+_WIDE = 4
+
+
+def panels_of(figure: Figure, count: int, around_in: float, high_in: float) -> list[Axes]:
+    """So many panels, four a row, on a figure that is as high as its rows and what is around them."""
+    high = max(-(-count // _WIDE), 1)
+    figure.set_size_inches(13.0, around_in + high_in * high)
+    panels = [*figure.subplots(high, _WIDE, sharex=True, squeeze=False).flat]
+    for axes in panels[count:]:
+        axes.set_axis_off()
+    return panels[:count]
+
+
+def say_once(figure: Figure, panels: Sequence[Axes], place: str = "outside lower left", columns: int = 6) -> None:
+    """Say once beside the panels what is drawn in them."""
+    said = dict[str, Any]()
+    for axes in panels:
+        handles, labels = axes.get_legend_handles_labels()
+        said = dict(zip(labels, handles, strict=True)) | said
+    if said:
+        figure.legend([*said.values()], [*said], loc=place, ncols=columns)  # type: ignore[arg-type]  # "outside ..."
+
+
+def dated(axes: Axes) -> None:
+    """Let the x axis be of dates, with few short labels."""
+    locator = AutoDateLocator(minticks=3, maxticks=5)
+    axes.xaxis.set_major_locator(locator)
+    axes.xaxis.set_major_formatter(ConciseDateFormatter(locator, show_offset=False))
 
 
 def wrapped(text: str, width: int) -> str:
