@@ -34,7 +34,7 @@ from kf_calib.views.figures.style import BEST, GREY, PALE, RUNNER_UP, drawn_on, 
 _FAMILIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # Okabe and Ito's, the likeliest first
 _NO_EFFECT = {NOTHING: PALE, NOISE: GREY, NONE: BEST}
 _NAME = 44  # letters of a name in a line
-_ROW_OF_BARS_IN = 0.2
+_LINE_IN = 0.14
 _END = 130.0  # of the panel in per cent: beyond 100 there are numbers
 
 
@@ -63,7 +63,7 @@ def hypotheses(figure: Figure, diagnosis: Diagnosis) -> None:
         return say(figure, wrapped(diagnosis.verdict, 110))
     above, below = both = _probability_bars(diagnosis.table)
     lines = [sum(bar.lines + 0.5 for bar in bars) for bars in both]
-    figure.set_size_inches(11.0, 1.9 + _ROW_OF_BARS_IN * sum(lines))
+    figure.set_size_inches(11.0, 1.9 + _LINE_IN * sum(lines))
     families, explanations = figure.subplots(2, 1, sharex=True, height_ratios=lines)
     _draw(families, above, "Families of what is missing (two effects at once count in both of theirs)")
     _draw(explanations, below, "Explanations, in the colours of their families", "log₁₀ odds\nto the next")
@@ -251,7 +251,7 @@ def _words(axes: Axes, text: str) -> None:
 
 _LOW, _HIGH = 0.01, 1000.0  # smallest detectable sizes that the axis spans
 _SEEN, _HIDDEN = "#0072b2", "#e69f00"  # of Okabe and Ito's palette
-_ROW_IN, _LINE_IN = 0.23, 0.14
+_ROW_IN = 0.23
 _LINE = 150  # letters of a line below the panels
 
 
