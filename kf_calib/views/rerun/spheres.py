@@ -21,11 +21,12 @@ from scipy.spatial.transform import Rotation
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, Vector
 from kf_calib.estimation.estimate import Estimate
+from kf_calib.estimation.filter_history import nis_band
 from kf_calib.estimation.results import Calibration
 from kf_calib.support.units import shown
 from kf_calib.views.notation import written
 from kf_calib.views.rerun.names import ACCELEROMETERS, DARK, GOLD, GREY, RED, WHITE, thin
-from kf_calib.views.rerun.series import above, crowd, ends, nis_band, times
+from kf_calib.views.rerun.series import crowd, ends, times
 
 NEGATIVE, POSITIVE, NONE = np.array([70, 140, 255]), np.array([255, 110, 50]), np.array([150, 150, 155])
 _FULL = 4.0  # sigma at which the colour of a residual is full
@@ -283,5 +284,5 @@ def _verdicts(result: Calibration) -> list[tuple[int, int, int]]:
     """Grey where a dwell could not be judged, red where its NIS is above chi-squared's 95 % band, else white."""
     dof = np.array([visit.dof for visit in result.visits])
     nis = np.array([visit.nis for visit in result.visits])
-    bad = above(nis, nis_band(np.maximum(dof, 1)))
+    bad = nis > nis_band(dof)[:, 1]
     return [GREY if free <= 0 else RED if out else WHITE for free, out in zip(dof, bad, strict=True)]
