@@ -10,10 +10,11 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from kf_calib.effects import Bearer, Effect, as_text, remarks_of
+from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.observability import Visibility
 from kf_calib.support.units import shown
 from kf_calib.views.console import GRADES, effect_rows, size_range
-from kf_calib.views.json import members
+from kf_calib.views.json import clean, members
 from kf_calib.views.notation import symbol
 from kf_calib.views.terminal import BARE, LINED, table
 
@@ -81,11 +82,12 @@ def formula_of(effect: Effect) -> str:
     return " ".join(own.split("\n\n")[0].split()).rstrip(".")
 
 
-def sight_report(sights: Sequence[Visibility], about: str) -> RenderableType:
+def sight_report(sights: Sequence[Visibility], model: Model, name: str) -> RenderableType:
     """The report that ``effects --recording`` prints: how well a run shows each effect, and notes below the table.
 
-    sights: one for each effect. about: title of the table.
+    sights: one for each effect. model: of the run. name: of the recording.
     """
+    about = f"What {name} shows of {len(sights)} effects beside {model.sum}"
     headings = "effect", "visible", ">left of it", "smallest size", "confused with (overlap)"
     seen = table(about, headings, map(_sight_cells, sights), whole=("effect", "left of it"), **LINED)
     notes = [f"{sight.effect}: {words}." for sight in sights for words in (sight.why, sight.degeneracy) if words]
@@ -106,12 +108,11 @@ def _sight_cells(sight: Visibility) -> list[str]:
     return [*cells, ", ".join(f"{name} ({overlap:.2f})" for name, overlap in sight.rivals)]
 
 
-def sights_object(sights: Sequence[Visibility], model: Sequence[str]) -> dict[str, Any]:
-    """The JSON object of ``effects --recording``: each effect of the catalogue and how well the run shows it.
-
-    sights: one for each effect. model: names of the effects in the model of the run.
-    """
-    return {"model": list(model), "effects": [{**_object(each.effect), **_seen_object(each)} for each in sights]}
+def sights_object(sights: Sequence[Visibility], model: Model, name: str) -> dict[str, Any]:
+    """The JSON object of ``effects --recording``: each effect of the catalogue and how well the run shows it; arguments
+    as for ``sight_report``."""
+    effects = [{**_object(each.effect), **_seen_object(each)} for each in sights]
+    return clean({"model": list(map(str, model.effects)), "effects": effects})
 
 
 def _seen_object(sight: Visibility) -> dict[str, Any]:

@@ -102,6 +102,15 @@ def with_sigma(parameter: Parameter) -> tuple[str, str, str]:
     return value, f"± {sigma}", shown(parameter).label
 
 
+def clearest(parameters: Iterable[Parameter]) -> str:
+    """The parameter that stands out most from its sigma, in words; "" where none is known."""
+    sized = [p for p in parameters if p.value is not None and p.sigma]
+    if not sized:
+        return ""
+    largest = max(sized, key=lambda p: abs(p.value or 0.0) / (p.sigma or 1.0))
+    return f"{symbol(largest.symbol)} = {shown(largest).with_sigma(largest.value or 0.0, largest.sigma or 0.0)}"
+
+
 def model_table(model: Model) -> ConsoleTable:
     """The table of a model: the twelve parameters and every effect with its symbols, units and prior scales."""
     symbols = f"{symbol(paper_parameters.SYMBOLS[0])} ... {paper_parameters.SYMBOLS[-1]}"

@@ -24,7 +24,7 @@ from kf_calib.estimation.remarks import MISSING_OR_NOISE
 from kf_calib.estimation.results import Calibration, Condition, format_p
 from kf_calib.support.text import angles_in_words, printed
 from kf_calib.support.units import shown
-from kf_calib.views.console import plain, with_sigma
+from kf_calib.views.console import clearest, plain, with_sigma
 from kf_calib.views.json import clean, condition_object, members, outlying_object, readings_object
 from kf_calib.views.notation import symbol
 from kf_calib.views.terminal import ConsoleTable, TextPlot, note, table
@@ -290,13 +290,7 @@ def _largest_coefficient(row: Hypothesis) -> str:
     names = [*row.effects, *(text.partition("=")[0].strip() for text in row.formulas)]
     added = [each for each in row.refit.model.effects if str(each) in names] if row.refit is not None else []
     known = [row.refit.parameters[c.symbol] for each in added for c in each.parameters] if row.refit else []
-    sized = [p for p in known if p.value is not None and p.sigma]
-    if not sized:
-        return ""
-    largest = max(sized, key=lambda p: abs(p.value or 0.0) / (p.sigma or 1.0))
-    unit = shown(largest)
-    value, sigma = unit.rounded(largest.value or 0.0, largest.sigma or 0.0)
-    return f"{symbol(largest.symbol)} = {value} ± {sigma} {unit.label}"
+    return clearest(known)
 
 
 def held_out_ratio(refit: Calibration | None, floor_mps2: float | None) -> str:

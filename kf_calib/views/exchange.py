@@ -92,8 +92,8 @@ def verification_report(verification: Verification) -> RenderableType:
     unit = shown("m/s^2")
     parts.append(Text(f"It predicts the means of the dwells to {unit.text(verification.residual_rms_mps2)} rms."))
     if verification.worst_mps2 is not None and verification.worst_sigma_mps2 is not None:
-        worst, sigma = unit.rounded(verification.worst_mps2, verification.worst_sigma_mps2)
-        parts.append(Text(f"Readings corrected by it are wrong by up to {worst} ± {sigma} {unit.label} now."))
+        worst = unit.with_sigma(verification.worst_mps2, verification.worst_sigma_mps2)
+        parts.append(Text(f"Readings corrected by it are wrong by up to {worst} now."))
     if verification.moves:
         parts.append(_moves_table(verification))
     else:
@@ -169,8 +169,7 @@ def _track_row(track: ParameterTrack) -> list[str]:
     unit, year = shown(track.unit), 365.25
     drift = "not seen"
     if track.drift is not None and track.drift_sigma is not None:
-        value, sigma = unit.rounded(track.drift * year, track.drift_sigma * year)
-        drift = f"{value} ± {sigma}"
+        drift = " ± ".join(unit.rounded(track.drift * year, track.drift_sigma * year))
     change = unit.number(float(track.values[-1] - track.values[0]))
     return [
         symbol(track.symbol), change if change.startswith("-") else f"+{change}", drift,

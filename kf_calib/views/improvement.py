@@ -15,7 +15,7 @@ from kf_calib.diagnosis.stepwise_selection import Improvement, Removal, Selectio
 from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.support.units import shown
-from kf_calib.views.console import effect_table, parameter_table
+from kf_calib.views.console import clearest, effect_table, parameter_table
 from kf_calib.views.diagnosis import description_object, description_sentence, held_out_ratio, orientation_object
 from kf_calib.views.json import clean, condition_object, members, parameters_object
 from kf_calib.views.notation import symbol
@@ -175,14 +175,9 @@ def _told(step: SelectionStep, final: Calibration) -> str:
         return ", ".join(told)
     result = final if step.name in map(str, final.model.effects) else step.result
     (own,) = (effect.parameters for effect in result.model.effects if str(effect) == step.name)
-    sized = [result.parameters[each.symbol] for each in own]
-    clearest = max(sized, key=lambda each: abs(each.value or 0.0) / (each.sigma or float("inf")))
-    size = ""
-    if clearest.value is not None and clearest.sigma:
-        value, sigma = shown(clearest).rounded(clearest.value, clearest.sigma)
-        size = f", {symbol(clearest.symbol)} = {value} ± {sigma} {shown(clearest).label}"
+    size = clearest(result.parameters[each.symbol] for each in own)
     share = "" if step.probability is None else f" (probability {format_probability(step.probability)})"
-    return ", ".join([f"{step.name}{size}{share}", *told])
+    return ", ".join([f"{step.name}{', ' * bool(size)}{size}{share}", *told])
 
 
 def progress(state: Improvement) -> RenderableType:

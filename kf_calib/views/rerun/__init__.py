@@ -28,6 +28,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, Vector
 from kf_calib.diagnosis.results import Diagnosis
@@ -46,7 +47,7 @@ from kf_calib.views.rerun.names import (
     BENCH_TIME,
     CHANNELS,
     DARK,
-    GROUPS,
+    KINDS,
     ON_DARK,
     ORIENTATION,
     Colour,
@@ -209,9 +210,10 @@ def _overview(result: Calibration, history: VisitHistory, is_predicted: bool) ->
 def sigma_panels(history: VisitHistory) -> list[rrb.TimeSeriesView]:
     """A panel a kind of parameter, one for the coefficients of effects if there are any."""
     corner = rrb.Corner2D.RightTop
-    kinds = [(f"{group.title}, {units.shown(group.unit).label}",
-              [k for k, shown in enumerate(history.shown[:12]) if shown.path.rpartition("/")[2] in group.symbols])
-             for group in GROUPS]  # fmt: skip
+    kinds = [
+        (f"{kind}, {shown(unit).label}", [k for k, own in enumerate(paper_parameters.UNITS) if own == unit])
+        for unit, kind in KINDS.items()
+    ]
     rest = [*range(12, len(history.shown))]
     kinds += [("coefficients of effects", rest)] if rest else []
     return [

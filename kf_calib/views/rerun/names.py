@@ -44,23 +44,8 @@ ON_DARK = PlotBackground(color=DARK)
 CHANNELS = ("a1", "a2", "a3")
 MAUVE: Colour = (214, 150, 235)
 """Coefficients of effects."""
-UNIT_OF = dict(zip(paper_parameters.SYMBOLS, paper_parameters.UNITS, strict=True))
-"""SI unit of each parameter."""
-
-
-@dataclass(frozen=True)
-class EntityGroup:
-    """Parameters of one kind, which have the same SI ``unit``."""
-
-    title: str
-    unit: str
-
-    @property
-    def symbols(self) -> tuple[str, ...]:
-        return tuple(symbol for symbol, unit in UNIT_OF.items() if unit == self.unit)
-
-
-GROUPS = EntityGroup("angles", "rad"), EntityGroup("scale factors", "1"), EntityGroup("biases", "m/s^2")
+KINDS = {"rad": "angles", "1": "scale factors", "m/s^2": "biases"}
+"""What the parameters of an SI unit are."""
 
 
 def entity(*parts: str) -> str:
@@ -99,7 +84,7 @@ def quantities(model: Model) -> tuple[DrawnParameter, ...]:
     """The twelve parameters in the units that people are shown, then the coefficients of the effects in the model."""
     parameters = [
         DrawnParameter(label(symbol), shown(unit).label, shown(unit).per_si, colour_of(symbol), path_of(symbol))
-        for symbol, unit in UNIT_OF.items()
+        for symbol, unit in zip(paper_parameters.SYMBOLS, paper_parameters.UNITS, strict=True)
     ]
     coefficients = [
         DrawnParameter(printable(each.symbol), printable(shown(each).label), shown(each).per_si, MAUVE,
