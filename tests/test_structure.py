@@ -199,7 +199,7 @@ CEILINGS = {
     "diagnosis": 5594,
     "online": 1648,
     "exchange": 1992,
-    "views": 7098,
+    "views": 7105,
     "cli": 3561,
     "report": 792,
     "bags": 403,

@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from rich.console import Group
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
@@ -37,9 +38,9 @@ from kf_calib.estimation.estimate import correlation
 from kf_calib.estimation.results import Calibration
 from kf_calib.online.status import Judgement
 from kf_calib.support import units
-from kf_calib.support.text import angles_in_words, printable
+from kf_calib.support.text import angles_in_words, counted, printable
 from kf_calib.support.units import shown
-from kf_calib.views.console import summary
+from kf_calib.views.console import effect_table, noise_table, parameter_table, verdict, without_table
 from kf_calib.views.markdown import markdown
 from kf_calib.views.rerun.diagnosis import save_diagnosis_view as save_diagnosis
 from kf_calib.views.rerun.improvement import save_improvement_view as save_improvement
@@ -65,6 +66,7 @@ from kf_calib.views.rerun.series import (
     predicted,
 )
 from kf_calib.views.rerun.spheres import log_platform, magnified, with_y_up
+from kf_calib.views.terminal import note
 
 __all__ = ["BENCH_TIME", "ORIENTATION", "grow", "save_view"]
 
@@ -162,18 +164,23 @@ def log_next(judgement: Judgement, stream: rr.RecordingStream) -> None:
 
 
 def markdown_summary(result: Calibration) -> str:
-    """The page in Markdown: on what it was measured, what the console prints of it, and what is hard to tell apart."""
-    judged, unit = result.consistency, shown("m/s^2")
-    left = f"Residuals: {unit.text(result.residual_rms_mps2)} rms, {judged.dof} degrees of freedom."
-    return "\n\n".join([_bench(result), markdown(summary(result)), left, *_ties(result)]) + "\n"
+    """The page in Markdown: what was measured, what the console prints of it, the verdict before the tables, and what
+    is hard to tell apart."""
+    parts = [verdict(result), parameter_table(result), *map(note, result.warnings)]
+    parts += [*([effect_table(result)] if result.model.effects else []), noise_table(result)]
+    parts += [without_table(result, outlying) for outlying in result.outlying]
+    rms, dof = shown("m/s^2").text(result.residual_rms_mps2), result.consistency.dof
+    left = f"Residuals: {rms} rms, {dof} degrees of freedom."
+    return "\n\n".join([_measured(result), markdown(Group(*parts)), left, *_ties(result)]) + "\n"
 
 
-def _bench(result: Calibration) -> str:
-    bench = result.bench
+def _measured(result: Calibration) -> str:
+    bench, count = result.bench, sum(visit.dwell.count for visit in result.visits)
     serial = f"**{bench.notes['block_serial']}**: " if "block_serial" in bench.notes else ""
     axes = f"axes {bench.to_metadata()['axes']}" if bench.axes else "attitude recorded"
     held = ", inertially held" if bench.reference == "inertial" else ""
-    return f"{serial}{axes}{held}, g = {bench.gravity_mps2:.6g} m/s²"
+    dwells = counted(len(result.visits), "dwell")
+    return f"{serial}{dwells}, {count} samples; {axes}{held}, g = {bench.gravity_mps2:.6g} m/s²"
 
 
 def _ties(result: Calibration) -> list[str]:
@@ -202,7 +209,7 @@ def _overview(result: Calibration, history: VisitHistory, is_predicted: bool) ->
         rrb.Vertical(*sigma_panels(history), _pose(result)),
         rrb.Vertical(platform_panel(result), *_fit(is_predicted), row_shares=[2, 1, 1] if is_predicted else [1, 1]),
         rrb.TextDocumentView(origin="summary", name="result"),
-        column_shares=[5, 4.4, 3.8],
+        column_shares=[4.7, 4.3, 4.2],
         name="Overview",
     )
 
