@@ -209,7 +209,7 @@ def _overview(result: Calibration, history: VisitHistory, is_predicted: bool) ->
         rrb.Vertical(*sigma_panels(history), _pose(result)),
         rrb.Vertical(platform_panel(result), *_fit(is_predicted), row_shares=[2, 1, 1] if is_predicted else [1, 1]),
         rrb.TextDocumentView(origin="summary", name="result"),
-        column_shares=[4.7, 4.3, 4.2],
+        column_shares=[4.55, 4.25, 4.4],
         name="Overview",
     )
 
