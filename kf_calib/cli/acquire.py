@@ -22,7 +22,7 @@ from kf_calib.cli.options import BenchOptions, Device, ForeignColumns, Json, NoA
 from kf_calib.errors import InputError
 from kf_calib.sources.simulation.settings import Ambient, SimulationOptions
 from kf_calib.support.output_files import Outputs, write_whole
-from kf_calib.support.text import sentence
+from kf_calib.support.text import counted, sentence
 
 if TYPE_CHECKING:
     from importlib.resources.abc import Traversable
@@ -123,7 +123,7 @@ class _Recorded(NamedTuple):
     notes: list[str]
 
     def __str__(self) -> str:
-        return f"{self.readings} readings, {self.dwells} dwell{'s' * (self.dwells != 1)}, {self.duration_s:.0f} s"
+        return f"{self.readings} readings, {counted(self.dwells, 'dwell')}, {self.duration_s:.0f} s"
 
     @property
     def keys(self) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from kf_calib.exchange.corrected_file import Applied
 from kf_calib.exchange.history import History, ParameterTrack
 from kf_calib.exchange.verification import Verification
 from kf_calib.sources.files.contents import CALIBRATED_TOPIC
+from kf_calib.support.text import counted
 from kf_calib.support.units import field_unit, shown
 from kf_calib.views.console import table_of_parameters
 from kf_calib.views.json import clean, members
@@ -86,9 +87,8 @@ def verification_report(verification: Verification) -> RenderableType:
     """The report of ``verify``."""
     head = "The calibration still holds" if verification.holds else "The calibration does NOT hold any more"
     style = "bold green" if verification.holds else "bold yellow"
-    dwells = f"{verification.dwells} dwell{'s' * (verification.dwells != 1)}"
-    test = f"p {format_p(verification.p_value)}; {dwells}, χ² {verification.statistic:.1f} of {verification.dof} dof"
-    parts: list[RenderableType] = [Text(f"{head} ({test}).", style=style)]
+    dwells, test = counted(verification.dwells, "dwell"), f"χ² {verification.statistic:.1f} of {verification.dof} dof"
+    parts: list[RenderableType] = [Text(f"{head} (p {format_p(verification.p_value)}; {dwells}, {test}).", style=style)]
     unit = shown("m/s^2")
     parts.append(Text(f"It predicts the means of the dwells to {unit.text(verification.residual_rms_mps2)} rms."))
     if verification.worst_mps2 is not None and verification.worst_sigma_mps2 is not None:

@@ -13,7 +13,7 @@ from kf_calib.design.sides import turn_in_words
 from kf_calib.online.evaluation import Progress
 from kf_calib.online.session import HandJudgement
 from kf_calib.online.status import Judgement
-from kf_calib.support.text import angles_in_words
+from kf_calib.support.text import angles_in_words, counted
 from kf_calib.support.units import shown, span
 from kf_calib.views.diagnosis import found_object, orientation_object
 from kf_calib.views.json import clean, members, replay_object
@@ -113,6 +113,6 @@ def _hand_line(judgement: HandJudgement) -> str:
         seen = f"worst sigma {paper_parameters.SYMBOLS[k]} {shown(paper_parameters.UNITS[k]).text(sigma[k])}; "
     seconds = last.end_s - last.start_s
     return (
-        f"pose {last.number} ({side}), {seconds:.1f} s used; {sides.count} side{'s' * (sides.count != 1)} seen; "
+        f"pose {last.number} ({side}), {seconds:.1f} s used; {counted(sides.count, 'side')} seen; "
         f"{seen}{judgement.verdict}"
     )
