@@ -199,7 +199,7 @@ CEILINGS = {
     "diagnosis": 5594,
     "online": 1648,
     "exchange": 1992,
-    "views": 7104,
+    "views": 7092,
     "cli": 3562,
     "report": 792,
     "bags": 403,

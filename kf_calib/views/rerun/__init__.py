@@ -42,8 +42,8 @@ from kf_calib.support.text import angles_in_words, counted, printable
 from kf_calib.support.units import shown
 from kf_calib.views.console import effect_table, noise_table, parameter_table, verdict, without_table
 from kf_calib.views.markdown import markdown
-from kf_calib.views.rerun.diagnosis import save_diagnosis_view as save_diagnosis
-from kf_calib.views.rerun.improvement import save_improvement_view as save_improvement
+from kf_calib.views.rerun.diagnosis import save_diagnosis_view
+from kf_calib.views.rerun.improvement import save_improvement_view
 from kf_calib.views.rerun.names import (
     BENCH_TIME,
     CHANNELS,
@@ -98,14 +98,8 @@ def _(result: Calibration, path: str | Path) -> Path:
     return Path(path)
 
 
-@save_view.register
-def _(result: Diagnosis, path: str | Path) -> Path:
-    return save_diagnosis(result, Path(path))
-
-
-@save_view.register
-def _(result: Improvement, path: str | Path) -> Path:
-    return save_improvement(result, Path(path))
+save_view.register(Diagnosis, save_diagnosis_view)
+save_view.register(Improvement, save_improvement_view)
 
 
 def grow(

@@ -39,11 +39,11 @@ EXPLANATION = "explanation"
 _MOST = 5  # explanations
 
 
-def save_diagnosis_view(diagnosis: Diagnosis, path: Path) -> Path:
+def save_diagnosis_view(diagnosis: Diagnosis, path: str | Path) -> Path:
     """Write the view of a diagnosis to an .rrd file that opens laid out, at the best explanation."""
     before, explanations = diagnosis.before, diagnosis.explanations[:_MOST]
     ratios = before.residuals_mps2 / mean_sigmas(before)
-    with rrd_file(path, _layout(diagnosis)) as stream:
+    with rrd_file(Path(path), _layout(diagnosis)) as stream:
         log_spheres(before, ratios, "spheres/before", 0, stream, forever(stream), disturbed_dwells(diagnosis))
         log_key("spheres", ["as measured", *(["left over"] if explanations else [])], forever(stream))
         if diagnosis.drivers and not explanations:
@@ -55,7 +55,7 @@ def save_diagnosis_view(diagnosis: Diagnosis, path: Path) -> Path:
             log_spheres(before, explanation.unexplained_ratios, "spheres/left", 1, stream, log)
         text = rr.TextDocument(printable(_summary(diagnosis)), media_type=rr.MediaType.MARKDOWN)
         stream.log("summary", text, static=True)
-    return path
+    return Path(path)
 
 
 def _log_residuals(driver: Driver, ratios: Floats, log: Log) -> None:

@@ -76,10 +76,10 @@ def _shown(values_mps2: Sequence[float | None]) -> Floats:
     return units.shown("m/s^2").per_si * np.array([np.nan if each is None else each for each in values_mps2])
 
 
-def save_improvement_view(improvement: Improvement, path: Path) -> Path:
+def save_improvement_view(improvement: Improvement, path: str | Path) -> Path:
     """Write the view of an improvement to an .rrd file that opens laid out."""
     view = View(improvement)
-    with rrd_file(path, _layout(view)) as stream:
+    with rrd_file(Path(path), _layout(view)) as stream:
         for name, (words, values, colour) in view.errors.items():
             _curve(stream, f"error/{name}", values, *_lines_and_marks(words, colour))
         _curve(stream, "log10_p/model", view.log10_p, *_lines_and_marks("model", GOLD))
@@ -94,7 +94,7 @@ def save_improvement_view(improvement: Improvement, path: Path) -> Path:
             marked = disturbed_dwells(view.diagnoses[step])
             log_spheres(result, result.residuals_mps2 / sigmas, "spheres", 0, stream, log, marked)
             log("summary", rr.TextDocument(printable(_summary(view, step)), media_type=rr.MediaType.MARKDOWN))
-    return path
+    return Path(path)
 
 
 def _lines_and_marks(name: str, colour: Colour) -> tuple[rr.SeriesLines, rr.SeriesPoints]:
