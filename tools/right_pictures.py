@@ -23,9 +23,9 @@ from kf_calib.estimation.filter_history import innovation_tests
 from kf_calib.exchange.calibration_file import saved
 from kf_calib.exchange.verification import Verification, verify
 from kf_calib.support.units import shown
-from kf_calib.views.console import symbol
 from kf_calib.views.figures.convergence import draw_nis
 from kf_calib.views.figures.style import ACCELEROMETERS, ALARM, BAND, BEST, GREY, MARKERS, blank, styled, whole_numbers
+from kf_calib.views.notation import symbol
 
 RECORDINGS = Path(__file__).resolve().parents[1] / "recordings"
 _SIZE_IN = 11.0, 3.6

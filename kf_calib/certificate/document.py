@@ -22,10 +22,10 @@ from kf_calib.errors import InputError, need
 from kf_calib.estimation.results import format_p
 from kf_calib.support.text import cut
 from kf_calib.support.units import Unit, field_unit
+from kf_calib.views.notation import symbol
 
 ATTACHED = "certificate.xml"
 _UNITS = {"rad": Unit("°", math.degrees(1.0)), "1": Unit("1", 1.0), "m/s^2": Unit("m/s²", 1.0)}
-_GREEK = {"theta": "θ", "phi": "φ", "nu": "ν"}
 
 TableRow = dict[str, Any]
 
@@ -80,7 +80,7 @@ def content(certificate: Certificate, standing: str) -> TableRow:
         "conformity": _conformity(certificate.results),
         "budget_words": _budget_words(certificate),
         "inputs": [_input(line) for line in certificate.budget.contributions],
-        "names": [_name(each.symbol) for each in certificate.results],
+        "names": [symbol(each.symbol) for each in certificate.results],
         "small_units": [field_unit(each.unit).label for each in certificate.results],
         "contributions": _contributions(certificate),
         "sensitivities": [
@@ -156,7 +156,7 @@ def _results(results: Sequence[CertifiedResult]) -> list[TableRow]:
         large, small = _UNITS[result.unit], field_unit(result.unit)
         value, expanded = _pair(result.value, result.expanded, large)
         rows.append({
-            "name": _name(result.symbol), "value": value, "expanded": expanded, "unit": large.label,
+            "name": symbol(result.symbol), "value": value, "expanded": expanded, "unit": large.label,
             "small": _pair(result.value, result.expanded, small)[1], "small_unit": small.label,
             "k": f"{result.k:.2f}", "dof": _count(result.dof),
         })  # fmt: skip
@@ -170,7 +170,7 @@ def _correlations(certificate: Certificate) -> list[TableRow]:
     covariance = certificate.twelve[1]
     sigma = np.sqrt(np.diag(covariance))
     rows = (covariance / np.outer(sigma, sigma)).tolist()
-    return [{"symbol": _name(result.symbol), "values": [_minus(f"{value:.3f}") for value in row]}
+    return [{"symbol": symbol(result.symbol), "values": [_minus(f"{value:.3f}") for value in row]}
             for result, row in zip(certificate.results, rows, strict=True)]  # fmt: skip
 
 
@@ -181,7 +181,7 @@ def _adjustment(results: Sequence[CertifiedResult]) -> list[TableRow]:
             unit = _UNITS[result.unit]
             before, before_u = _pair(*result.before, unit)
             after, after_u = _pair(result.value, result.expanded, unit)
-            rows.append({"name": _name(result.symbol), "before": before, "before_u": before_u, "after": after,
+            rows.append({"name": symbol(result.symbol), "before": before, "before_u": before_u, "after": after,
                          "after_u": after_u, "unit": unit.label})  # fmt: skip
     return _aligned(rows, "before", "before_u", "after", "after_u")
 
@@ -194,7 +194,7 @@ def _conformity(results: Sequence[CertifiedResult]) -> list[TableRow]:
             deviation = None if result.value is None else result.value - result.nominal
             shown, expanded = _pair(deviation, result.expanded, unit)
             rows.append({
-                "name": _name(result.symbol), "deviation": shown, "expanded": expanded, "unit": unit.label,
+                "name": symbol(result.symbol), "deviation": shown, "expanded": expanded, "unit": unit.label,
                 "limit": f"{result.limit * unit.per_si:.6g}",
                 "outcome": "not determined" if result.conformity is None else OUTCOMES[result.conformity],
             })  # fmt: skip
@@ -221,7 +221,7 @@ def _input(line: Contribution) -> TableRow:
     unit = field_unit(line.unit)
     standard = "–" if line.standard is None else f"{line.standard * unit.per_si:.3g}"
     return {
-        "symbol": _name(line.name), "title": line.title, "kind": line.kind, "distribution": line.distribution,
+        "symbol": symbol(line.name), "title": line.title, "kind": line.kind, "distribution": line.distribution,
         "standard": standard, "unit": unit.label if line.unit else "–", "dof": _count(line.dof), "source": line.source,
     }  # fmt: skip
 
@@ -233,14 +233,14 @@ def _contributions(certificate: Certificate) -> list[TableRow]:
     budget = certificate.budget
     places = [max(0, 2 - math.floor(math.log10(u))) if u > 0 else 3 for u in (budget.combined * per_si).tolist()]
 
-    def row(symbol: str, values: Any) -> TableRow:
-        return texts(symbol, [f"{value:.{digits}f}" for value, digits in zip(values, places, strict=True)])
+    def row(name: str, values: Any) -> TableRow:
+        return texts(name, [f"{value:.{digits}f}" for value, digits in zip(values, places, strict=True)])
 
-    def texts(symbol: str, cells: list[str]) -> TableRow:
-        return {"symbol": symbol, "values": [text if ok else "–" for text, ok in zip(cells, known, strict=True)]}
+    def texts(name: str, cells: list[str]) -> TableRow:
+        return {"symbol": name, "values": [text if ok else "–" for text, ok in zip(cells, known, strict=True)]}
 
     plain = [texts("ν", [_count(v) for v in budget.dof]), texts("k", [f"{v:.2f}" for v in budget.k])]
-    lines = [row(_name(line.name), line.parts * per_si) for line in budget.contributions]
+    lines = [row(symbol(line.name), line.parts * per_si) for line in budget.contributions]
     return [*lines, row("u", budget.combined * per_si), *plain, row("U", budget.expanded * per_si)]
 
 
@@ -251,13 +251,13 @@ def _sensitivity(certificate: Certificate, line: Contribution) -> TableRow:
     values[np.abs(values) < 1e-9] = 0.0  # rounding
     largest = float(np.abs(values).max())
     form = "{:.4f}" if not largest or 0.01 <= largest < 1e4 else "{:.2e}"
-    return {"symbol": _name(line.name), "values": [_minus(form.format(value)) for value in values.tolist()]}
+    return {"symbol": symbol(line.name), "values": [_minus(form.format(value)) for value in values.tolist()]}
 
 
-def _coefficient(symbol: str, value: float | None, sigma: float | None, unit: str) -> TableRow:
+def _coefficient(name: str, value: float | None, sigma: float | None, unit: str) -> TableRow:
     shown = field_unit(unit)
     first, second = _pair(value, sigma, shown)
-    return {"name": _name(symbol), "value": first or "–", "sigma": second or "–", "unit": shown.label}
+    return {"name": symbol(name), "value": first or "–", "sigma": second or "–", "unit": shown.label}
 
 
 def _remarks(certificate: Certificate, standing: str) -> list[str]:
@@ -281,14 +281,6 @@ def _remarks(certificate: Certificate, standing: str) -> list[str]:
     made = origin.versions.get("kf_calib", "?")
     return [*remarks, f"Calculated by kf_calib {made} on {origin.created}; written by kf_calib "
                       f"{version('kf_calib')} on {certificate.created.isoformat()}."]  # fmt: skip
-
-
-def _name(symbol: str) -> str:
-    """A symbol as it is printed: theta1 is θ1."""
-    for word, letter in _GREEK.items():
-        if symbol.startswith(word) and symbol[len(word) :].isdigit():
-            return letter + symbol[len(word) :]
-    return symbol
 
 
 def _count(dof: float) -> str:

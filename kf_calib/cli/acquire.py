@@ -22,7 +22,7 @@ from kf_calib.cli.options import BenchOptions, Device, ForeignColumns, Json, NoA
 from kf_calib.errors import InputError
 from kf_calib.sources.simulation.settings import Ambient, SimulationOptions
 from kf_calib.support.output_files import Outputs, write_whole
-from kf_calib.support.text import sentence
+from kf_calib.support.text import counted, sentence
 
 if TYPE_CHECKING:
     from importlib.resources.abc import Traversable
@@ -46,26 +46,24 @@ uncertain, after what the twelve parameters absorb.
 
 def _hidden_table() -> RenderableType:
     """Every kind of hidden effect, in two lines or more."""
-    from rich.box import SIMPLE_HEAD
     from rich.console import Group
 
     from kf_calib.sources.simulation.injected import INNER, catalogue
-    from kf_calib.views.terminal import ConsoleTable
+    from kf_calib.views.terminal import LINED, table
 
     kinds = catalogue().values()
-    table = ConsoleTable(title=f"{len(kinds)} effects to hide", title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-    table.add_column("effect\nwhat it is")
-    for heading in ("in the\ncatalogue", "SI unit\ncoefficients", "constants", "navigation grade\nMEMS"):
-        table.add_column(heading, no_wrap=True)
+    rows = list[tuple[str, ...]]()
     for kind in kinds:
         names = kind.coefficients if len(kind.coefficients) < 7 else (*kind.coefficients[:2], "...")
         constants = [f"{name}={value:.4g} {INNER[name].unit}" for name, value in kind.inner.items()]
         sizes = [" to ".join(dict.fromkeys(sizes)) for sizes in (kind.navigation, kind.mems)]
-        table.add_row(
-            f"{kind.name}{':AXIS' * kind.per_axis}\n{kind.title}", "yes" if kind.known else "no",
-            f"{kind.unit}\n{' '.join(names)}", "\n".join(constants), "\n".join(sizes),
+        rows.append(
+            (f"{kind.name}{':AXIS' * kind.per_axis}\n{kind.title}", "yes" if kind.known else "no",
+             f"{kind.unit}\n{' '.join(names)}", "\n".join(constants), "\n".join(sizes))
         )  # fmt: skip
-    return Group(table, _HOW_TO_HIDE)
+    whole = "in the\ncatalogue", "SI unit\ncoefficients", "constants", "navigation grade\nMEMS"
+    hidden = table(f"{len(kinds)} effects to hide", ("effect\nwhat it is", *whole), rows, whole=whole, **LINED)
+    return Group(hidden, _HOW_TO_HIDE)
 
 
 def _list_hidden(ctx: click.Context, _: click.Parameter, texts: tuple[str, ...]) -> tuple[str, ...]:
@@ -125,7 +123,7 @@ class _Recorded(NamedTuple):
     notes: list[str]
 
     def __str__(self) -> str:
-        return f"{self.readings} readings, {self.dwells} dwell{'s' * (self.dwells != 1)}, {self.duration_s:.0f} s"
+        return f"{self.readings} readings, {counted(self.dwells, 'dwell')}, {self.duration_s:.0f} s"
 
     @property
     def keys(self) -> dict[str, Any]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import rich_click as click
 
 from kf_calib.cli.command import INPUT, OUTPUT, argument, command, option
-from kf_calib.cli.echo import print_json, progress, show
+from kf_calib.cli.echo import print_result, progress
 from kf_calib.cli.files import FigureFiles, Pictures, ReportFile, claimed, delivery, typed
 from kf_calib.cli.options import (
     BenchModelFile,
@@ -33,6 +34,8 @@ def compare(
 ) -> None:  # fmt: skip
     """Block engine, filterpy and batch least squares on the same recording: differences, time, memory."""
     from kf_calib.estimation.engine_comparison import compare as run
+    from kf_calib.views.console import comparison_table
+    from kf_calib.views.json import compare_object
 
     outputs = claimed(overwrite=overwrite)
     source, settings = opened(recording, reading, evaluation)
@@ -40,14 +43,7 @@ def compare(
     measured = reports.measured_of(recording, reading.opened(recording)) if reports else None
     with progress(f"comparing on {recording.name}", as_json) as tick:
         compared = run(source, settings, tick)
-    if as_json:
-        from kf_calib.views.json import compare_object
-
-        print_json(compare_object(compared))
-    else:
-        from kf_calib.views.console import comparison_table
-
-        show(comparison_table(compared))
+    print_result(as_json, compare_object, comparison_table, compared)
     with delivery(outputs, as_json) as deliver:
         figures.save(deliver, compared)
         if reports is not None:
@@ -80,10 +76,7 @@ def list_effects(
         return
     bench = Bench.from_metadata({"axes": "y z x", "latitude_deg": 50.0, **reading.keys})
     chosen = [effect_named(name, bench) for name in names or known(bench)]
-    if as_json:
-        print_json(catalogue.effects_object(chosen))
-    else:
-        show(catalogue.details(chosen) if names else catalogue.overview(chosen))
+    print_result(as_json, catalogue.effects_object, catalogue.details if names else catalogue.overview, chosen)
 
 
 def _list_visible(
@@ -95,18 +88,13 @@ def _list_visible(
     from kf_calib.estimation.calibration import calibrate
     from kf_calib.estimation.observability import visibility_of
     from kf_calib.views import catalogue
-    from kf_calib.views.json import clean
 
     source, settings = opened(recording, reading, evaluation)
     chosen = [effect_named(name, source.bench) for name in names or known(source.bench)]
     with progress(f"reading {recording.name}", as_json) as tick:
         result = calibrate(source, settings, tick)
     seen = visibility_of(result.fit, chosen)
-    if as_json:
-        print_json(clean(catalogue.sights_object(seen, [str(effect) for effect in result.model.effects])))
-    else:
-        title = f"What {recording.name} shows of {len(seen)} effects beside {result.model.sum}"
-        show(catalogue.sight_report(seen, title))
+    print_result(as_json, catalogue.sights_object, catalogue.sight_report, seen, result.model, recording.name)
 
 
 @command("diagnose run.mcap", "diagnose run.mcap --with hysteresis")
@@ -130,10 +118,8 @@ def diagnose(
     source, settings = opened(recording, reading, evaluation, bench_model)
     with progress(f"diagnosing {recording.name}", as_json) as tick:
         diagnosis = run(calibrate(source, settings, tick), Refits(source))
-    if as_json:
-        print_json(views.diagnosis_object(diagnosis))
-    else:
-        show(views.diagnosis_report(diagnosis, typed(ctx, _OF_DIAGNOSE_ALONE), details))
+    report = partial(views.diagnosis_report, typed=typed(ctx, _OF_DIAGNOSE_ALONE), details=details)
+    print_result(as_json, views.diagnosis_object, report, diagnosis)
     with delivery(outputs, as_json) as deliver:
         pictures.save(deliver, diagnosis)
     exit_if(strict and diagnosis.test.consistent is False)

@@ -9,7 +9,7 @@ import sys
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import rich_click as click
 
@@ -40,9 +40,8 @@ from kf_calib.support.text import sentence
 
 if TYPE_CHECKING:
     from kf_calib.estimation.settings import Settings
-    from kf_calib.online.session import HandJudgement, HandStanding
-    from kf_calib.online.status import Judgement, Standing
-    from kf_calib.sources.live import Status
+    from kf_calib.online.session import HandJudgement
+    from kf_calib.online.status import Judgement
     from kf_calib.views.live.server import PageServer
     from kf_calib.views.rerun.growing import GrowingView
 
@@ -184,25 +183,14 @@ def _urgent_messages(run: LiveRun) -> dict[str, str]:
 
 
 def _print(run: LiveRun, judgement: Judgement | HandJudgement, as_json: bool) -> None:
+    from kf_calib.views.live.objects import line, live_object
+
     assert run.session is not None
     if as_json:
-        _echo(run, json_line(_object(judgement, run.session.standing, run.source.status) | dict(run.further_keys())))
+        known = live_object(judgement, run.session.standing, run.source.status)
+        _echo(run, json_line(known | dict(run.further_keys())))
     elif not judgement.final:
-        from kf_calib.online.status import Judgement
-        from kf_calib.views.live.objects import hand_line, line
-
-        _echo(run, sentence(line(judgement) if isinstance(judgement, Judgement) else hand_line(judgement)))
-
-
-def _object(judgement: Judgement | HandJudgement, standing: Standing | HandStanding, status: Status) -> dict[str, Any]:
-    from kf_calib.online.status import Judgement, Standing
-    from kf_calib.views.live.objects import hand_object, live_object
-
-    if isinstance(judgement, Judgement):
-        assert isinstance(standing, Standing)
-        return live_object(judgement, standing, status)
-    assert not isinstance(standing, Standing)
-    return hand_object(judgement, standing, status)
+        _echo(run, sentence(line(judgement)))
 
 
 def _echo(run: LiveRun, text: str) -> None:

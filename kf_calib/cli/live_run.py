@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 
 from kf_calib.cli.echo import Printer, complain
 from kf_calib.errors import InputError, KfCalibError
+from kf_calib.support.text import counted
 
 if TYPE_CHECKING:
     from kf_calib.bench.streams import Source
@@ -103,7 +104,7 @@ class LiveRun:
     def troubles(self) -> list[str]:
         """What failed, though the run went on to its end: it is no success then."""
         trouble, lost = self.source.status.recording_trouble, self.print.lost
-        unheard = f"{lost} output{'s' * (lost != 1)} could not be written to standard output: they are lost."
+        unheard = f"{counted(lost, 'output')} could not be written to standard output: they are lost."
         return [f"the run was not recorded to its end: {trouble}"] * bool(trouble) + [unheard] * bool(lost)
 
     def accept(self) -> None:
@@ -129,7 +130,7 @@ class LiveRun:
         if self.session is None and (status.bytes or self.error is not self.source.failure):
             return ""  # what came, or what was asked for, is why it could not begin
         kinds = {"angle": status.poses, "temperature": status.temperatures, "refused line": status.refused}
-        counts = [f"{count} {what}{'s' * (count > 1)}" for what, count in kinds.items() if count]
+        counts = [counted(count, what) for what, count in kinds.items() if count]
         instead = f", but {' and '.join(counts)}" if counts else ""
         refusal = f" (the first: {status.first_refusal})" if status.first_refusal else ""
         recorded = "nothing was recorded: " if self._record else ""

@@ -19,7 +19,7 @@ from kf_calib.bench.streams import Source
 from kf_calib.dwells.sufficient_statistics import Autocovariance
 from kf_calib.errors import InputError
 from kf_calib.estimation import square_root_information
-from kf_calib.estimation.estimate import Estimate, estimate_of
+from kf_calib.estimation.estimate import Estimate
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration, Parameter
 from kf_calib.noise.noise_model import mean_covariances
@@ -37,11 +37,13 @@ class ParameterHistory:
 
     - parameters: what they are, in the order of the columns.
     - numbers (n,): of the dwells; a stated prior comes first and has the number 0.
+    - elapsed_s (n,): since the first reading.
     - values (n, p), sigmas (n, p): estimate and sigma after that dwell.
     """
 
     parameters: tuple[Parameter, ...]
     numbers: NDArray[np.int64]
+    elapsed_s: Floats
     values: Floats
     sigmas: Floats
 
@@ -67,17 +69,17 @@ class ParameterHistory:
         return np.nansum(twelve, axis=2) / np.where(known > 0, known, np.nan)
 
 
-def history_of(result: Calibration) -> ParameterHistory:
-    """The parameters along a run, as the filter estimated them after each dwell."""
-    model, prior = result.model, result.settings.prior
-    estimates, numbers = [visit.estimate for visit in result.visits], [visit.dwell.number for visit in result.visits]
-    if not prior.diffuse:
-        factor = square_root_information.start(prior, model)
-        nothing = np.zeros((model.count, model.count))
-        estimates, numbers = [estimate_of(factor, model.nominal_state(), nothing), *estimates], [0, *numbers]
+def history_of(result: Calibration, within: bool = False) -> ParameterHistory:
+    """The parameters along a run, as the filter estimated them after each dwell; within: several times in each, too."""
+    ends = [(visit.dwell.end_s, visit.dwell.number, visit.estimate) for visit in result.visits]
+    steps = [*result.trace()] if within else ends
+    if not result.settings.prior.diffuse:
+        steps.insert(0, (0.0, 0, prior_estimate(result)))
+    elapsed_s, numbers, estimates = zip(*steps, strict=True)
     values, sigmas = np.array([_shown(result, each) for each in estimates]).swapaxes(0, 1)
-    symbols = (*paper_parameters.SYMBOLS, *(each.symbol for each in model.coefficients))
-    return ParameterHistory(tuple(result.parameters[symbol] for symbol in symbols), np.array(numbers), values, sigmas)
+    symbols = (*paper_parameters.SYMBOLS, *(each.symbol for each in result.model.coefficients))
+    known = tuple(result.parameters[symbol] for symbol in symbols)
+    return ParameterHistory(known, np.array(numbers), np.array(elapsed_s), values, sigmas)
 
 
 def _shown(result: Calibration, estimate: Estimate) -> tuple[Floats, Floats]:
@@ -124,7 +126,7 @@ class InnovationTests:
     @cached_property
     def band(self) -> Floats:
         """The middle 95 % of chi-squared (D, 2) of each dwell; NaN without degrees of freedom."""
-        return _band(self.dof)
+        return nis_band(self.dof)
 
     @cached_property
     def high(self) -> Mask:
@@ -141,7 +143,7 @@ class InnovationTests:
     def per_dof_band(self) -> Floats:
         """The middle 95 % (D, 2) of that quotient."""
         dof = np.cumsum(self.dof)
-        return _band(dof) / np.maximum(dof, 1)[:, None]
+        return nis_band(dof) / np.maximum(dof, 1)[:, None]
 
     @cached_property
     def autocorrelation(self) -> Floats:
@@ -184,8 +186,8 @@ def _ratios(result: Calibration) -> Floats:
     return ratios
 
 
-def _band(dof: NDArray[np.int64]) -> Floats:
-    """Return the middle 95 % of chi-squared (n, 2); NaN without degrees of freedom."""
+def nis_band(dof: NDArray[np.int64]) -> Floats:
+    """The middle 95 % of chi-squared (n, 2); NaN without degrees of freedom. A smaller NIS is luck, a larger none."""
     known = np.where(dof > 0, dof, np.nan)
     return np.column_stack([chdtri(known, 1.0 - probability) for probability in _MIDDLE])
 

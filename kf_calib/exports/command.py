@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import rich_click as click
 
 from kf_calib.cli.command import INPUT, OUTPUT, command, option
-from kf_calib.cli.echo import print_json, print_result, show
+from kf_calib.cli.echo import print_result
 from kf_calib.cli.files import claimed, output_option
 from kf_calib.cli.options import CalibrationFile, Json, Overwrite, ProgramOptions, ShownUnits
 from kf_calib.errors import InputError
@@ -63,10 +63,7 @@ def export(
         target.noise = _noise_for(noise, to)
     content = target.text().encode()
     outputs.write(output, lambda path: write_whole(path, content))
-    if as_json:
-        print_json(views.exported_object(target, to, output))
-    else:
-        show(views.exported_report(target, output))
+    print_result(as_json, views.exported_object, views.exported_report, target, to, output)
 
 
 def _is_noise_alone(path: Path, to: str, noise: Path | None) -> bool:

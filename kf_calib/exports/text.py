@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.console import Group, RenderableType
 from rich.text import Text
@@ -13,9 +13,6 @@ from kf_calib.exports.target import Target
 from kf_calib.support.units import shown
 from kf_calib.views.json import clean
 from kf_calib.views.terminal import note
-
-if TYPE_CHECKING:
-    pass
 
 
 def exported_object(target: Target, to: str, path: Path) -> dict[str, Any]:
@@ -36,7 +33,7 @@ def exported_object(target: Target, to: str, path: Path) -> dict[str, Any]:
     )
 
 
-def exported_report(target: Target, path: Path) -> RenderableType:
+def exported_report(target: Target, to: str, path: Path) -> RenderableType:
     """The report of ``export``."""
     lines = [Text(f"{path} is the calibration for {target.title}.", style="bold")]
     if not target.correction.input.is_plain:

@@ -7,7 +7,7 @@ from datetime import datetime
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
+from matplotlib.dates import date2num
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -16,7 +16,6 @@ from kf_calib.fleet.overview import FleetOverview, Track
 from kf_calib.fleet.pooled_diagnosis import BenchCoefficients, Finding
 from kf_calib.fleet.text import chance_words, short_name
 from kf_calib.support.units import shown
-from kf_calib.views.console import symbol
 from kf_calib.views.figures.collection import Figures, figures
 from kf_calib.views.figures.style import (
     ACCELEROMETERS,
@@ -26,15 +25,17 @@ from kf_calib.views.figures.style import (
     GREY,
     MARKERS,
     PALE,
-    blank,
+    dated,
+    drawn_on,
     log_scale,
+    panels_of,
     plain,
     say,
-    styled,
+    say_once,
     wrapped,
 )
+from kf_calib.views.notation import symbol
 
-_WIDE = 4
 _OUTSIDE = 0.01  # chance below which a unit is an outlier
 _NAMED = 30  # units, above which they are numbered and not named
 _TOLD = 7  # verdicts with a colour of their own
@@ -43,22 +44,19 @@ _COLOURS = ("#0072b2", "#e69f00", "#cc79a7", "#009e73", "#56b4e9", "#d55e00", "#
 _KNOWN = {"consistent": PALE, "failed": ALARM, "not judged": "#e9e9e9", "inconsistent": GREY}
 
 
-def units(overview: FleetOverview) -> Figure:
+@drawn_on()
+def units(figure: Figure, overview: FleetOverview) -> None:
     """A panel a parameter: each run and the mean of each unit, on the band of the population; outliers are named."""
-    with styled():
-        figure, panels = _panels(overview.tracks, sharex=True)
-        for track, axes in zip(overview.tracks, panels, strict=False):
-            _population(axes, overview.units, track)
-        few = len(overview.units) <= _NAMED
-        for axes in panels:
-            axes.set_xlim(-0.7, len(overview.units) - 0.3)
-            if few:
-                names = [short_name(name) for name in overview.units]
-                axes.set_xticks(range(len(names)), names, rotation=90, fontsize=6.0)
-            else:
-                axes.set_xlabel("unit")
-        _legend(figure, panels)
-    return figure
+    panels = panels_of(figure, len(overview.tracks), 1.0, 2.3)
+    names = [short_name(name) for name in overview.units]
+    for track, axes in zip(overview.tracks, panels, strict=True):
+        _population(axes, overview.units, track)
+        axes.set_xlim(-0.7, len(names) - 0.3)
+        if len(names) <= _NAMED:
+            axes.set_xticks(range(len(names)), names, rotation=90, fontsize=6.0)
+        else:
+            axes.set_xlabel("unit")
+    say_once(figure, panels)
 
 
 def _population(axes: Axes, names: Sequence[str], track: Track) -> None:
@@ -82,18 +80,17 @@ def _population(axes: Axes, names: Sequence[str], track: Track) -> None:
     axes.set_title(f"{symbol(track.symbol)} less nominal, {unit.label}".rstrip(", "))
 
 
-def charts(overview: FleetOverview) -> Figure:
+@drawn_on()
+def charts(figure: Figure, overview: FleetOverview) -> None:
     """A Shewhart chart of individual runs for each parameter: each run less the mean of its unit in the order of dates,
     with control limits at 3 sigma of a run, pooled over the units, and warning limits at 2."""
-    with styled():
-        if all(date is None for track in overview.tracks for date in track.dates):
-            return _empty("No run has a date, so there is no control chart.")
-        figure, panels = _panels(overview.tracks, sharex=True)
-        for track, axes in zip(overview.tracks, panels, strict=False):
-            _chart(axes, track)
-            _dated(axes)
-        _legend(figure, panels)
-    return figure
+    if all(date is None for track in overview.tracks for date in track.dates):
+        return _say_alone(figure, "No run has a date, so there is no control chart.")
+    panels = panels_of(figure, len(overview.tracks), 1.0, 2.3)
+    for track, axes in zip(overview.tracks, panels, strict=True):
+        _chart(axes, track)
+        dated(axes)
+    say_once(figure, panels)
 
 
 def _chart(axes: Axes, track: Track) -> None:
@@ -123,19 +120,17 @@ def _chart(axes: Axes, track: Track) -> None:
     axes.set_title(f"{symbol(track.symbol)}, {unit.label}".rstrip(", "))
 
 
-def sigmas(overview: FleetOverview) -> Figure:
+@drawn_on(13.0, 4.5)
+def sigmas(figure: Figure, overview: FleetOverview) -> None:
     """The sigma that runs gave of each parameter: middle 50 and 90 % of the runs, and the target where there is one."""
-    with styled():
-        kinds = list(dict.fromkeys(track.unit for track in overview.tracks))
-        if not kinds:
-            return _empty("No run determined a parameter.")
-        groups = [[track for track in overview.tracks if track.unit == kind] for kind in kinds]
-        figure = blank(13.0, 4.5)
-        panels = figure.subplots(1, len(kinds), squeeze=False, width_ratios=[len(own) + 1 for own in groups])
-        for own, axes in zip(groups, panels.flat, strict=True):
-            _achieved(axes, own)
-        _legend(figure, [*panels.flat])
-    return figure
+    kinds = list(dict.fromkeys(track.unit for track in overview.tracks))
+    if not kinds:
+        return _say_alone(figure, "No run determined a parameter.")
+    groups = [[track for track in overview.tracks if track.unit == kind] for kind in kinds]
+    panels = figure.subplots(1, len(kinds), squeeze=False, width_ratios=[len(own) + 1 for own in groups])
+    for own, axes in zip(groups, panels.flat, strict=True):
+        _achieved(axes, own)
+    say_once(figure, [*panels.flat])
 
 
 def _achieved(axes: Axes, tracks: Sequence[Track]) -> None:
@@ -158,49 +153,46 @@ def _achieved(axes: Axes, tracks: Sequence[Track]) -> None:
     axes.set_title(f"σ of a run, {unit.label}".rstrip(", "))
 
 
-def verdicts(overview: FleetOverview) -> Figure:
+@drawn_on(13.0, 4.0)
+def verdicts(figure: Figure, overview: FleetOverview) -> None:
     """How many runs came to what in each week."""
     weeks = overview.weeks
-    with styled():
-        if not weeks.begins:
-            return _empty("No run has a date, so there are no weeks.")
-        figure = blank(13.0, 4.0)
-        axes = figure.subplots()
-        begins, bottom = date2num(weeks.begins), np.zeros(len(weeks.begins))
-        colours = iter(_COLOURS)
-        runs_by_label = dict[str, Floats]()
-        for name, counts in weeks.counts.items():
-            label = name if len(runs_by_label) < _TOLD or name in _KNOWN else "other"
-            runs_by_label[label] = runs_by_label.get(label, np.zeros(len(begins))) + np.array(counts)
-        for label, counts in runs_by_label.items():
-            colour = _KNOWN.get(label) or next(colours, BEST)
-            axes.bar(begins + 3.5, counts, width=6.0, bottom=bottom, color=colour, label=plain(label))
-            bottom = bottom + counts
-        axes.set_ylabel("runs a week")
-        axes.yaxis.set_major_locator(MaxNLocator(integer=True))
-        _dated(axes)
-        if weeks.undated:
-            axes.set_title(f"without a date, not shown: {weeks.undated}", color=GREY)
-        _legend(figure, [axes])
-    return figure
+    if not weeks.begins:
+        return _say_alone(figure, "No run has a date, so there are no weeks.")
+    axes = figure.subplots()
+    begins, bottom = date2num(weeks.begins), np.zeros(len(weeks.begins))
+    colours = iter(_COLOURS)
+    runs_by_label = dict[str, Floats]()
+    for name, counts in weeks.counts.items():
+        label = name if len(runs_by_label) < _TOLD or name in _KNOWN else "other"
+        runs_by_label[label] = runs_by_label.get(label, np.zeros(len(begins))) + np.array(counts)
+    for label, counts in runs_by_label.items():
+        colour = _KNOWN.get(label) or next(colours, BEST)
+        axes.bar(begins + 3.5, counts, width=6.0, bottom=bottom, color=colour, label=plain(label))
+        bottom = bottom + counts
+    axes.set_ylabel("runs a week")
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+    dated(axes)
+    if weeks.undated:
+        axes.set_title(f"without a date, not shown: {weeks.undated}", color=GREY)
+    say_once(figure, [axes])
 
 
-def bench_terms(overview: FleetOverview) -> Figure:
+@drawn_on()
+def bench_terms(figure: Figure, overview: FleetOverview) -> None:
     """Each error of a bench that was found: its coefficients in parts of the campaign, and those of all of it."""
     terms = [each for each in (overview.pooled.findings if overview.pooled else ()) if each.over_time]
-    with styled():
-        if not terms:
-            return _empty(_no_terms(overview))
-        pairs = [(term, bench) for term in terms for bench in dict.fromkeys(each.bench for each in term.over_time)]
-        wide = min(len(pairs), 2)
-        high = -(-len(pairs) // wide)
-        figure = blank(13.0, 0.8 + 3.2 * high)
-        panels = figure.subplots(high, wide, squeeze=False)
-        for (term, bench), axes in zip(pairs, panels.flat, strict=False):
-            _followed(axes, term, bench)
-        for axes in [*panels.flat][len(pairs) :]:
-            axes.set_axis_off()
-    return figure
+    if not terms:
+        return _say_alone(figure, _no_terms(overview))
+    pairs = [(term, bench) for term in terms for bench in dict.fromkeys(each.bench for each in term.over_time)]
+    wide = min(len(pairs), 2)
+    high = -(-len(pairs) // wide)
+    figure.set_size_inches(13.0, 0.8 + 3.2 * high)
+    panels = figure.subplots(high, wide, squeeze=False)
+    for (term, bench), axes in zip(pairs, panels.flat, strict=False):
+        _followed(axes, term, bench)
+    for axes in [*panels.flat][len(pairs) :]:
+        axes.set_axis_off()
 
 
 def _no_terms(overview: FleetOverview) -> str:
@@ -226,7 +218,7 @@ def _followed(axes: Axes, term: Finding, bench: str) -> None:
         axes.step([*first, places[-1]], [*constants, constants[-1]], where="post", color=colour, linewidth=1.1)
     axes.set_title(f"{plain(term.effect)}, {plain(bench or 'the bench')}, {unit.label} (2σ)")
     if all(coefficient.since for coefficient in parts):
-        _dated(axes)
+        dated(axes)
     axes.legend(loc="best", fontsize=7.5)
 
 
@@ -247,54 +239,27 @@ def _places(dates: Sequence[float], shift: float) -> list[float]:
     return [0.5 * (begin + end) + shift * width for begin, end in zip(dates, ends, strict=True)]
 
 
-def another_look(overview: FleetOverview) -> Figure:
+@drawn_on()
+def another_look(figure: Figure, overview: FleetOverview) -> None:
     """Units that need another look, those of which noise explains least first."""
     shown_here = overview.looks[:_LISTED]
-    with styled():
-        if not shown_here:
-            return _empty("No unit needs another look.")
-        figure = blank(13.0, 0.8 + 0.36 * len(shown_here))
-        axes = figure.subplots()
-        axes.set_axis_off()
-        axes.set_ylim(len(shown_here) - 0.4, -1.0)
-        axes.set_xlim(0.0, 1.0)
-        for x, words in ((0.0, ""), (0.03, "unit"), (0.2, "chance by noise"), (0.32, "why")):
-            axes.text(x, -0.7, words, color=GREY, va="center")
-        for k, look in enumerate(shown_here):
-            more = f"; {len(look.reasons) - 2} more" if len(look.reasons) > 2 else ""
-            axes.text(0.0, k, f"{k + 1}", color=GREY, va="center")
-            axes.text(0.03, k, plain(short_name(look.unit)), va="center", fontweight="bold")
-            axes.text(0.2, k, chance_words(look.chance), va="center")
-            axes.text(0.32, k, plain(wrapped("; ".join(look.reasons[:2]) + more, 120)), va="center", fontsize=8.0)
-        if len(overview.looks) > len(shown_here):
-            axes.text(0.03, len(shown_here) - 0.5, f"{len(overview.looks) - len(shown_here)} more", color=GREY)
-    return figure
-
-
-def _panels(tracks: Sequence[Track], sharex: bool) -> tuple[Figure, list[Axes]]:
-    """Return a figure with a panel for each track."""
-    high = max(-(-len(tracks) // _WIDE), 1)
-    figure = blank(13.0, 1.0 + 2.3 * high)
-    panels = [*figure.subplots(high, _WIDE, sharex=sharex, squeeze=False).flat]
-    for axes in panels[len(tracks) :]:
-        axes.set_axis_off()
-    return figure, panels[: len(tracks)]
-
-
-def _legend(figure: Figure, panels: Sequence[Axes]) -> None:
-    """Say once below the panels what is drawn in them."""
-    said = dict[str, object]()
-    for axes in panels:
-        handles, labels = axes.get_legend_handles_labels()
-        said = dict(zip(labels, handles, strict=True)) | said
-    if said:
-        figure.legend([*said.values()], [*said], loc="outside lower left", ncols=6)  # type: ignore[arg-type]
-
-
-def _dated(axes: Axes) -> None:
-    locator = AutoDateLocator(minticks=3, maxticks=5)
-    axes.xaxis.set_major_locator(locator)
-    axes.xaxis.set_major_formatter(ConciseDateFormatter(locator, show_offset=False))
+    if not shown_here:
+        return _say_alone(figure, "No unit needs another look.")
+    figure.set_size_inches(13.0, 0.8 + 0.36 * len(shown_here))
+    axes = figure.subplots()
+    axes.set_axis_off()
+    axes.set_ylim(len(shown_here) - 0.4, -1.0)
+    axes.set_xlim(0.0, 1.0)
+    for x, words in ((0.0, ""), (0.03, "unit"), (0.2, "chance by noise"), (0.32, "why")):
+        axes.text(x, -0.7, words, color=GREY, va="center")
+    for k, look in enumerate(shown_here):
+        more = f"; {len(look.reasons) - 2} more" if len(look.reasons) > 2 else ""
+        axes.text(0.0, k, f"{k + 1}", color=GREY, va="center")
+        axes.text(0.03, k, plain(short_name(look.unit)), va="center", fontweight="bold")
+        axes.text(0.2, k, chance_words(look.chance), va="center")
+        axes.text(0.32, k, plain(wrapped("; ".join(look.reasons[:2]) + more, 120)), va="center", fontsize=8.0)
+    if len(overview.looks) > len(shown_here):
+        axes.text(0.03, len(shown_here) - 0.5, f"{len(overview.looks) - len(shown_here)} more", color=GREY)
 
 
 def _own(name: str) -> tuple[str, str]:
@@ -303,10 +268,9 @@ def _own(name: str) -> tuple[str, str]:
     return MARKERS[place], ACCELEROMETERS[place]
 
 
-def _empty(text: str) -> Figure:
-    figure = blank(9.0, 2.0)
+def _say_alone(figure: Figure, text: str) -> None:
+    figure.set_size_inches(9.0, 2.0)
     say(figure, text)
-    return figure
 
 
 @figures.register

@@ -6,7 +6,7 @@ The diagnosis of many runs together, in words and tables.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +20,9 @@ from kf_calib.fleet.pooled_diagnosis import EffectRow, Finding, PooledDiagnosis,
 from kf_calib.fleet.pooled_terms import Attribution
 from kf_calib.fleet.results import Fleet, ParameterPopulation
 from kf_calib.support.units import shown
-from kf_calib.views.console import symbol
-from kf_calib.views.json import clean
-from kf_calib.views.terminal import ConsoleTable, note
+from kf_calib.views.json import clean, members
+from kf_calib.views.notation import symbol
+from kf_calib.views.terminal import ConsoleTable, note, table
 
 _OF = {
     Attribution.BENCH: "of the bench",
@@ -66,8 +66,7 @@ def _pooled_object(row: EffectRow, finding: Finding | None) -> dict[str, Any]:
         "spread_interval": people.spread_interval if people else None,
         "share": finding.share if finding else None,
         "share_interval": finding.share_interval if finding else None,
-        "units": [{"unit": each.unit, "probability": each.probability,
-                   "coefficients": [vars(one) for one in each.coefficients]}
+        "units": [members(each, "unit", "probability") | {"coefficients": [vars(one) for one in each.coefficients]}
                   for each in (finding.units if finding else ())],
         "changed": [vars(each) for each in finding.repair.gaps] if finding and finding.repair else [],
     }  # fmt: skip
@@ -127,37 +126,29 @@ def _listed(names: Sequence[str]) -> str:
 def _probabilities(rows: Sequence[EffectRow]) -> ConsoleTable:
     """Return the table of the probabilities of each attribution."""
     tried = [each for each in Attribution if any(each in (row.probabilities or {}) for row in rows)]
-    table = ConsoleTable(title="What has each effect, and with what probability", title_justify="left")
-    table.add_column("effect")
-    for attribution in tried:
-        table.add_column(_OF[attribution], justify="right")
-    table.add_column("of nothing", justify="right")
-    for row in rows:
-        shares = [(row.probabilities or {}).get(each, 0.0) for each in tried]
-        table.add_row(row.effect, *map(format_probability, (*shares, row.no_one or 0.0)))
-    return table
+    shares = [[*((row.probabilities or {}).get(each, 0.0) for each in tried), row.no_one or 0.0] for row in rows]
+    cells = [(row.effect, *map(format_probability, own)) for row, own in zip(rows, shares, strict=True)]
+    headings = "effect", *(f">{_OF[attribution]}" for attribution in tried), ">of nothing"
+    return table("What has each effect, and with what probability", headings, cells)
 
 
 def _coefficients(finding: Finding) -> ConsoleTable:
     """Return the table of the coefficients of one effect."""
-    table = ConsoleTable(title=f"{finding.effect}, {_OF[finding.attribution]} (1σ)", title_justify="left")
-    for heading in ("of", "coefficient", "value", "sigma", "unit"):
-        table.add_column(heading, justify="right" if heading in ("value", "sigma") else "left")
+    rows = list[tuple[str, ...]]()
     for bench in finding.benches:
         name = bench.bench or "the bench"
-        _add(table, f"{name}, since {_moment(bench.since)}" if bench.since else name, bench.coefficients)
+        rows += _rows(f"{name}, since {_moment(bench.since)}" if bench.since else name, bench.coefficients)
     if not finding.benches and finding.population is None:
         for unit_figures in finding.units:
             if unit_figures.probability > _HAS_IT:
-                _add(table, unit_figures.unit, unit_figures.coefficients)
+                rows += _rows(unit_figures.unit, unit_figures.coefficients)
     if finding.population is not None:
-        _add(table, "mean of the units", finding.population.mean)
-        unit = finding.population.mean[0].unit
-        low, high = (shown(unit).number(each) for each in finding.population.spread_interval)
-        table.add_row(
-            "spread", "", shown(unit).number(finding.population.spread), f"{low} to {high}", shown(unit).label
-        )
-    return table
+        rows += _rows("mean of the units", finding.population.mean)
+        unit = shown(finding.population.mean[0].unit)
+        low, high = map(unit.number, finding.population.spread_interval)
+        rows.append(("spread", "", unit.number(finding.population.spread), f"{low} to {high}", unit.label))
+    title = f"{finding.effect}, {_OF[finding.attribution]} (1σ)"
+    return table(title, ("of", "coefficient", ">value", ">sigma", "unit"), rows)
 
 
 def _moment(date: str) -> str:
@@ -165,14 +156,14 @@ def _moment(date: str) -> str:
     return date[:16].replace("T", " ")
 
 
-def _add(table: ConsoleTable, name: str, values: Sequence[PooledEstimate]) -> None:
-    """Add a row for each coefficient."""
+def _rows(name: str, values: Sequence[PooledEstimate]) -> Iterator[tuple[str, ...]]:
+    """A row for each coefficient."""
     for k, coefficient in enumerate(values):
         cells = ("not seen", "")
         if coefficient.value is not None and coefficient.sigma is not None:
             value, sigma = shown(coefficient.unit).rounded(coefficient.value, coefficient.sigma)
             cells = value, f"± {sigma}"
-        table.add_row("" if k else name, symbol(coefficient.symbol), *cells, shown(coefficient.unit).label)
+        yield "" if k else name, symbol(coefficient.symbol), *cells, shown(coefficient.unit).label
 
 
 _SHOWN = 6
@@ -193,9 +184,7 @@ def fleet_object(
             "fleet": str(fleet.path),
             "runs": len(fleet),
             "failed": len(failures),
-            "evaluated": done.evaluated,
-            "kept": done.kept,
-            "cpu_s": done.cpu_s,
+            **members(done, "evaluated", "kept", "cpu_s"),
             "units": fleet.distinct("unit"),
             "benches": fleet.distinct("bench"),
             "verdicts": fleet.verdicts(),
@@ -232,29 +221,26 @@ def fleet_report(
 
 def look_table(overview: FleetOverview) -> ConsoleTable:
     """The units that need another look first, with the reasons."""
-    table = ConsoleTable(title="Units that need another look first", title_justify="left")
-    for heading in ("unit", "chance by noise", "why"):
-        table.add_column(heading, justify="right" if heading == "chance by noise" else "left")
+    rows = list[tuple[str, ...]]()
     for each in overview.looks[:_SHOWN]:
         more = [f"{len(each.reasons) - _REASONS} more"] if len(each.reasons) > _REASONS else []
-        table.add_row(short_name(each.unit), chance_words(each.chance), "; ".join([*each.reasons[:_REASONS], *more]))
+        rows.append((short_name(each.unit), chance_words(each.chance), "; ".join([*each.reasons[:_REASONS], *more])))
     if len(overview.looks) > _SHOWN:
-        table.add_row(f"{len(overview.looks) - _SHOWN} more", "", "")
-    return table
+        rows.append((f"{len(overview.looks) - _SHOWN} more", "", ""))
+    return table("Units that need another look first", ("unit", ">chance by noise", "why"), rows)
 
 
 def _population_table(populations: Sequence[ParameterPopulation]) -> ConsoleTable:
-    table = ConsoleTable(title="Parameters over the runs (spread, sigma: 1σ)", title_justify="left")
-    for heading in ("parameter", "runs", "median less nominal", "spread", "sigma of a run", "unit"):
-        table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
+    rows = list[tuple[str, ...]]()
     for population in populations:
         unit = shown(population.unit)
         cells = (
             unit.number(value, 3)
             for value in (population.median - population.nominal, population.spread, population.sigma)
         )
-        table.add_row(symbol(population.symbol), str(population.runs), *cells, unit.label)
-    return table
+        rows.append((symbol(population.symbol), str(population.runs), *cells, unit.label))
+    headings = "parameter", ">runs", ">median less nominal", ">spread", ">sigma of a run", "unit"
+    return table("Parameters over the runs (spread, sigma: 1σ)", headings, rows)
 
 
 _LEAST = 1e-6

@@ -12,18 +12,20 @@ from kf_calib.report.page import Section
 from kf_calib.sources.files.record_files import angles_of, number_of
 from kf_calib.support.text import angles_in_words
 from kf_calib.support.units import span
-from kf_calib.views.terminal import ConsoleTable
+from kf_calib.views.terminal import table
 
 
 def section_of(measured: Measured) -> Section:
     """The decisions of a bench that drove itself; a section without parts where a person chose."""
-    table = ConsoleTable("", "after", "gimbals, deg", "stay", "why")
+    rows = list[tuple[str, ...]]()
     for record in measured.decisions:
         angles = angles_of(record.get("gimbal_deg", ""))
         where = ", ".join(f"{angle:g}" for angle in angles)
         stay = span(number_of(record, "stay_s")) if angles else ""
-        table.add_row(record.get("number", ""), span(number_of(record, "at_s")), where, stay, record.get("why", ""))
-    told = Group(table, *(Text(_end_in_words(record)) for record in measured.ends[-1:]))
+        after = span(number_of(record, "at_s"))
+        rows.append((record.get("number", ""), after, where, stay, record.get("why", "")))
+    decisions = table("", ("", "after", "gimbals, deg", "stay", "why"), rows)
+    told = Group(decisions, *(Text(_end_in_words(record)) for record in measured.ends[-1:]))
     return Section("How the bench drove itself", in_text(told) if measured.decisions else ())
 
 

@@ -14,12 +14,12 @@ from kf_calib.positioning.loop import Phase
 from kf_calib.positioning.positioner import HandPositioner
 from kf_calib.support.text import angles_in_words
 from kf_calib.support.units import span
-from kf_calib.views.json import clean
+from kf_calib.views.json import clean, members
 from kf_calib.views.live.content import Doing
-from kf_calib.views.terminal import ConsoleTable
+from kf_calib.views.terminal import table
 
 if TYPE_CHECKING:
-    from kf_calib.positioning.drive import Decision, Drive, Outcome
+    from kf_calib.positioning.drive import Drive, Outcome
 
 
 def run_object(drive: Drive) -> dict[str, Any]:
@@ -29,21 +29,17 @@ def run_object(drive: Drive) -> dict[str, Any]:
         {
             "phase": drive.state.phase.value,
             "orientations": drive.state.number,
-            "decisions": [_decision_object(decision) for decision in drive.decisions],
+            "decisions": [
+                members(decision, "number", "at_s", "purpose", "gimbal_deg", "stay_s", "why")
+                for decision in drive.decisions
+            ],
             "ended": None if outcome is None else outcome.ended,
             "why": None if outcome is None else outcome.why,
-            "stands_at_deg": None if outcome is None else list(outcome.stands_at),
+            "stands_at_deg": None if outcome is None else outcome.stands_at,
             "stopped": None if outcome is None else outcome.stopped,
             "lasted_s": None if outcome is None else outcome.lasted_s,
         }
     )
-
-
-def _decision_object(decision: Decision) -> dict[str, Any]:
-    return {
-        "number": decision.number, "at_s": decision.at_s, "purpose": decision.purpose,
-        "gimbal_deg": list(decision.gimbal_deg), "stay_s": decision.stay_s, "why": decision.why,
-    }  # fmt: skip
 
 
 def doing_of(drive: Drive) -> Doing | None:
@@ -81,13 +77,13 @@ def ended_in_words(outcome: Outcome) -> RenderableType:
 def dry_run(poses: Floats, ways: Sequence[Sequence[Floats]], slews_s: Sequence[float], stay_s: float, overhead_s: float
             ) -> RenderableType:  # fmt: skip
     """The path of the opening and its duration. poses (n, k), rad; ways: stations to each; slews_s: time to each."""
-    table = ConsoleTable("", "gimbals, deg", "by way of", "slew", "there until")
-    passed_s = 0.0
+    passed_s, rows = 0.0, list[tuple[str, ...]]()
     for number, (pose, way, slew_s) in enumerate(zip(poses, ways, slews_s, strict=True), start=1):
         passed_s += slew_s + overhead_s + stay_s
         stations = "; ".join(_deg(station) for station in way[:-1])
-        table.add_row(str(number), _deg(pose), stations, span(slew_s), span(passed_s))
-    return Group(table, Text(f"{len(poses)} orientations to begin with, {span(passed_s)}; what follows is decided as "
+        rows.append((str(number), _deg(pose), stations, span(slew_s), span(passed_s)))
+    path = table("", ("", "gimbals, deg", "by way of", "slew", "there until"), rows)
+    return Group(path, Text(f"{len(poses)} orientations to begin with, {span(passed_s)}; what follows is decided as "
                              "the run goes on. Nothing was moved."))  # fmt: skip
 
 

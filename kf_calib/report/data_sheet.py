@@ -10,8 +10,9 @@ from rich.text import Text
 
 from kf_calib.diagnosis.data_sheet import DataSheet, DataSheetRow
 from kf_calib.support.units import shown
-from kf_calib.views.console import symbol
-from kf_calib.views.terminal import ConsoleTable
+from kf_calib.views.json import members
+from kf_calib.views.notation import symbol
+from kf_calib.views.terminal import table
 
 TITLE = "Data sheet with the symbols of IEEE Std 1293"
 EQUATION = (
@@ -23,9 +24,7 @@ _NONE = "not determined"
 
 def data_sheet_report(sheet: DataSheet) -> RenderableType:
     """The model equation and the table of its coefficients, value ± sigma of each accelerometer."""
-    table = ConsoleTable(title=f"{TITLE} (1σ)", title_justify="left")
-    for heading in ("", "coefficient", "accelerometer 1", "2", "3", "unit", "estimated"):
-        table.add_column(heading, justify="right" if heading[-1:].isdigit() else "left")
+    rows = list[tuple[str, ...]]()
     for row in sheet.rows:
         unit = shown(row.unit)
         if row.symbol == "K1":  # whose deviations are of the size of the others
@@ -33,23 +32,24 @@ def data_sheet_report(sheet: DataSheet) -> RenderableType:
             row = replace(row, symbol="K1 - 1", values=values)
         cells = [_cell(row, k) for k in range(len(row.values))]
         label = unit.label if any(cell != _NONE for cell in cells) else ""
-        table.add_row(symbol(row.symbol), row.words, *cells, label, row.how)
+        rows.append((symbol(row.symbol), row.words, *cells, label, row.how))
+    headings = "", "coefficient", ">accelerometer 1", ">2", ">3", "unit", "estimated"
     told = "Found: missing by the diagnosis. Together: in one fit with the polynomial. Alone: beside what was found."
-    return Group(Text(EQUATION), table, Text(told))
+    return Group(Text(EQUATION), table(f"{TITLE} (1σ)", headings, rows), Text(told))
 
 
 def _cell(row: DataSheetRow, k: int) -> str:
-    value, sigma, unit = row.values[k], row.sigmas[k], shown(row.unit)
+    value, sigma = row.values[k], row.sigmas[k]
     if value is None or sigma is None:
         return _NONE
-    text, spread = unit.rounded(value, sigma)
-    return f"{text} ± {spread}"
+    return " ± ".join(shown(row.unit).rounded(value, sigma))
 
 
 def data_sheet_object(sheet: DataSheet) -> list[dict[str, Any]]:
     """An object for each coefficient, in SI."""
     return [
-        {"symbol": row.symbol, "coefficient": row.words, "unit": row.unit, "values": list(row.values),
-         "sigmas": list(row.sigmas), "estimated": row.how}
+        {"symbol": row.symbol, "coefficient": row.words}
+        | members(row, "unit", "values", "sigmas")
+        | {"estimated": row.how}
         for row in sheet.rows
-    ]  # fmt: skip
+    ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from matplotlib.figure import Figure, FigureBase
+from matplotlib.figure import Figure
 
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.reproduction.grebenkin2019 import (
@@ -18,21 +18,14 @@ from kf_calib.reproduction.grebenkin2019 import (
 )
 from kf_calib.views.figures.collection import Figures, figures
 from kf_calib.views.figures.convergence import parameter_panels
-from kf_calib.views.figures.style import GREY, blank, log_scale, styled, twelve, written
+from kf_calib.views.figures.style import GREY, drawn_on, log_scale, twelve, written
 
 _SETS = {"optimal": ("#0072b2", "-"), "non-optimal": ("#d55e00", "--")}
 
 
-def table2(experiment: Experiment) -> Figure:
+@drawn_on(11.0, 6.0)
+def table2(figure: Figure, experiment: Experiment) -> None:
     """Mean size of the error of each parameter, of both sets: printed, expected, by least squares and by the filter."""
-    with styled():
-        figure = blank(11.0, 6.0)
-        draw_table2(figure, experiment)
-    return figure
-
-
-def draw_table2(figure: FigureBase, experiment: Experiment) -> None:
-    """The same on a part of a figure."""
     axes, place = figure.subplots(), np.arange(STATE_COUNT)
     every = list[np.ndarray]()
     for (name, (colour, _)), (column, table) in zip(_SETS.items(), _tables(experiment), strict=True):
@@ -57,16 +50,9 @@ def draw_table2(figure: FigureBase, experiment: Experiment) -> None:
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4)
 
 
-def falling(experiment: Experiment) -> Figure:
+@drawn_on()
+def falling(figure: Figure, experiment: Experiment) -> None:
     """Sigma of every parameter as readings come, in the optimal and the non-optimal set, from the same prior."""
-    with styled():
-        figure = blank(11.0, 7.0)
-        draw_falling(figure, experiment)
-    return figure
-
-
-def draw_falling(figure: FigureBase, experiment: Experiment) -> None:
-    """The same on a part of a figure."""
     panels, _ = parameter_panels(figure, "σ")
     both = [falling_sigma(column.orientations) for column, _ in _tables(experiment)]
     for k, axes in enumerate(panels):
@@ -87,23 +73,21 @@ def draw_falling(figure: FigureBase, experiment: Experiment) -> None:
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
 
 
-def design_matrices(experiment: Experiment) -> Figure:
+@drawn_on(11.0, 5.0)
+def design_matrices(figure: Figure, experiment: Experiment) -> None:
     """The design matrices of both sets, as the paper's figure 4: a column a parameter, a row a reading."""
-    with styled():
-        figure = blank(11.0, 5.0)
-        panels = figure.subplots(1, 6, sharey=True)
-        unit = np.array([GRAVITY_MPS2, GRAVITY_MPS2, GRAVITY_MPS2, 1.0])  # of angles and scale factor, of the bias
-        every = [(name, i, column.orientations.design[i] / unit)
-                 for name, (column, _) in zip(_SETS, _tables(experiment), strict=True) for i in range(3)]  # fmt: skip
-        for axes, (name, i, matrix) in zip(panels, every, strict=True):
-            axes.imshow(matrix, cmap="RdBu_r", vmin=-1.0, vmax=1.0, aspect="auto", interpolation="nearest")
-            axes.set_xticks(range(4), [each.label for each in twelve()[4 * i : 4 * i + 4]])
-            axes.set_yticks(range(0, 4 * READINGS_PER_DWELL + 1, READINGS_PER_DWELL))
-            axes.grid(visible=False)
-            axes.set_title(f"{name} set" if i == 0 else "")
-        panels[0].set_ylabel(f"reading ({READINGS_PER_DWELL} in each orientation)")
-        figure.colorbar(panels[0].get_images()[0], ax=panels, label="element of D, g (bias: 1)")
-    return figure
+    panels = figure.subplots(1, 6, sharey=True)
+    unit = np.array([GRAVITY_MPS2, GRAVITY_MPS2, GRAVITY_MPS2, 1.0])  # of angles and scale factor, of the bias
+    every = [(name, i, column.orientations.design[i] / unit)
+             for name, (column, _) in zip(_SETS, _tables(experiment), strict=True) for i in range(3)]  # fmt: skip
+    for axes, (name, i, matrix) in zip(panels, every, strict=True):
+        axes.imshow(matrix, cmap="RdBu_r", vmin=-1.0, vmax=1.0, aspect="auto", interpolation="nearest")
+        axes.set_xticks(range(4), [each.label for each in twelve()[4 * i : 4 * i + 4]])
+        axes.set_yticks(range(0, 4 * READINGS_PER_DWELL + 1, READINGS_PER_DWELL))
+        axes.grid(visible=False)
+        axes.set_title(f"{name} set" if i == 0 else "")
+    panels[0].set_ylabel(f"reading ({READINGS_PER_DWELL} in each orientation)")
+    figure.colorbar(panels[0].get_images()[0], ax=panels, label="element of D, g (bias: 1)")
 
 
 def _tables(experiment: Experiment) -> list[tuple[Column, dict[str, float]]]:

@@ -13,9 +13,9 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.reproduction import grebenkin2019
 from kf_calib.reproduction.grebenkin2019 import NONOPTIMAL_PRINTED, OPTIMAL_PRINTED, TOGETHER, Conditions, Experiment
 from kf_calib.reproduction.grebenkin2019_conditions import AZIMUTHS_DEG, PERIODS_S, ConditionFit, ConditionSearch
-from kf_calib.views.console import symbol
-from kf_calib.views.json import clean
-from kf_calib.views.terminal import ConsoleTable
+from kf_calib.views.json import clean, members
+from kf_calib.views.notation import symbol
+from kf_calib.views.terminal import ConsoleTable, table
 
 _ABOUT = {
     "platform": "turns about the platform's axes, the third from the start",
@@ -32,8 +32,7 @@ def paper_object(experiment: Experiment, searched: ConditionSearch) -> dict[str,
     return clean(
         {
             "table2": [_row_object(experiment, symbol) for symbol in paper_parameters.SYMBOLS],
-            "repetitions": experiment.repetitions,
-            "seed": experiment.seed,
+            **members(experiment, "repetitions", "seed"),
             "scatter": grebenkin2019.scatter(experiment.repetitions),
             **{
                 name: {
@@ -41,17 +40,13 @@ def paper_object(experiment: Experiment, searched: ConditionSearch) -> dict[str,
                     "expected_log_ratio": float(
                         grebenkin2019.log_ratio(column.orientations.expected, _paper_column(name))
                     ),
-                    "condition_numbers": column.orientations.condition_numbers,
-                    "condition_numbers_in_g": column.orientations.condition_numbers_in_g,
-                    "rank": column.orientations.rank,
+                    **members(column.orientations, "condition_numbers", "condition_numbers_in_g", "rank"),
                     "kalman_difference_sigma": column.difference_sigma,
                 }
                 for name, column in sets.items()
             },
             "nonoptimal_gravity_fixed": {
-                "rank": experiment.fixed.rank,
-                "condition_numbers": experiment.fixed.condition_numbers,
-                "same_vector": experiment.fixed.same_vector,
+                **members(experiment.fixed, "rank", "condition_numbers", "same_vector"),
                 "why": rank_sentence(experiment),
             },
             "conditions": {**_conditions_object(experiment.conditions), "inferred": True},
@@ -116,20 +111,18 @@ def paper_report(experiment: Experiment, searched: ConditionSearch) -> Renderabl
 def table2(experiment: Experiment) -> ConsoleTable:
     """The table of both sets of orientations: print, expectation in closed form, least squares and filter."""
     title = f"Table 2: mean |error| over the deviation to be found, %, {experiment.repetitions} repetitions"
-    table = ConsoleTable(title=title, title_justify="left")
-    table.add_column("\nparameter")
-    for name in ("optimal set", "non-optimal set"):
-        for k, heading in enumerate(("paper", "expected", "batch", "filter")):
-            table.add_column(f"{name if k == 0 else ''}\n{heading}", justify="right")
+    columns = [f">{name}\npaper" for name in ("optimal set", "non-optimal set")]
+    headings = [heading for first in columns for heading in (first, ">\nexpected", ">\nbatch", ">\nfilter")]
     units = dict(zip(paper_parameters.SYMBOLS, paper_parameters.UNITS, strict=True))
     names = [name for unit in dict.fromkeys(units.values()) for name in units if units[name] == unit]
-    for k, name in enumerate(names):
-        at, cells = paper_parameters.SYMBOLS.index(name), list[str]()
+    rows = list[list[str]]()
+    for name in names:
+        at, cells = paper_parameters.SYMBOLS.index(name), [symbol(name)]
         for key, column in (("optimal", experiment.optimal), ("nonoptimal", experiment.nonoptimal)):
             figures = (column.orientations.expected[at], column.least_squares[at], column.kalman[at])
             cells += [f"{_paper_column(key)[at]:.4f}", *(f"{figure:#.4g}" for figure in figures)]
-        table.add_row(symbol(name), *cells, end_section=k in (5, 8))
-    return table
+        rows.append(cells)
+    return table(title, ("\nparameter", *headings), rows, (5, 8))
 
 
 def sentences(experiment: Experiment, searched: ConditionSearch) -> list[str]:

@@ -6,15 +6,17 @@ import inspect
 from collections.abc import Sequence
 from typing import Any
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Group, RenderableType
 from rich.text import Text
 
 from kf_calib.effects import Bearer, Effect, as_text, remarks_of
+from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.observability import Visibility
 from kf_calib.support.units import shown
-from kf_calib.views.console import GRADES, effect_rows, size_range, symbol
-from kf_calib.views.terminal import ConsoleTable
+from kf_calib.views.console import GRADES, effect_rows, size_range
+from kf_calib.views.json import clean, members
+from kf_calib.views.notation import symbol
+from kf_calib.views.terminal import BARE, LINED, table
 
 _BEARERS = {
     Bearer.BENCH: "the bench, never sensors",
@@ -28,16 +30,16 @@ def overview(effects: Sequence[Effect]) -> RenderableType:
 
     A line has the name of the effect, what it is, its coefficients and their unit, and the effects it is confused with.
     """
-    table = ConsoleTable(title=f"{len(effects)} effects", title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-    for heading in ("effect", "what it is", "coefficients", "unit", "confused with"):
-        table.add_column(heading, no_wrap=heading in ("effect", "coefficients", "unit"))
-    for effect in effects:
-        table.add_row(
-            str(effect), effect.title, _symbols(effect), ", ".join(dict.fromkeys(c.unit for c in effect.coefficients)),
-            effect.confused_with,
-        )  # fmt: skip
+    rows = [
+        (str(effect), effect.title, _symbols(effect), ", ".join(dict.fromkeys(c.unit for c in effect.coefficients)),
+         effect.confused_with)
+        for effect in effects
+    ]  # fmt: skip
+    headings = "effect", "what it is", "coefficients", "unit", "confused with"
+    whole = "effect", "coefficients", "unit"
     return Group(
-        table, Text("kf-calib effects NAME shows one in detail; kf-calib replay RECORDING --with NAME adds it.")
+        table(f"{len(effects)} effects", headings, rows, whole=whole, **LINED),
+        Text("kf-calib effects NAME shows one in detail; kf-calib replay RECORDING --with NAME adds it."),
     )
 
 
@@ -58,11 +60,7 @@ def details(effects: Sequence[Effect]) -> RenderableType:
 
 def _detail(effect: Effect) -> list[RenderableType]:
     """Return the report of one effect, part by part."""
-    table = ConsoleTable(box=None, pad_edge=False, header_style="")
-    for heading in ("coefficient", "unit", "prior scale"):
-        table.add_column(heading)
-    for row in effect_rows(effect):
-        table.add_row(*row)
+    coefficients = table("", ("coefficient", "unit", "prior scale"), effect_rows(effect), **BARE, header_style="")
     lines = [f"reading i is larger by: {formula_of(effect)}", f"source: {effect.source}"]
     lines.append(f"borne by: {_BEARERS[effect.borne_by]}")
     if effect.confused_with:
@@ -72,7 +70,7 @@ def _detail(effect: Effect) -> list[RenderableType]:
     lines += [f"typical size: {', '.join(sizes)}"] if sizes else []
     lines += [f"note: {remark}" for remark in remarks_of(effect)]
     head = Text(f"{effect}: {effect.title}", style="bold")
-    return [head, *map(Text, lines), *([table] if table.rows else []), Text()]
+    return [head, *map(Text, lines), *([coefficients] if coefficients.rows else []), Text()]
 
 
 def formula_of(effect: Effect) -> str:
@@ -84,21 +82,18 @@ def formula_of(effect: Effect) -> str:
     return " ".join(own.split("\n\n")[0].split()).rstrip(".")
 
 
-def sight_report(sights: Sequence[Visibility], about: str) -> RenderableType:
+def sight_report(sights: Sequence[Visibility], model: Model, name: str) -> RenderableType:
     """The report that ``effects --recording`` prints: how well a run shows each effect, and notes below the table.
 
-    sights: one for each effect. about: title of the table.
+    sights: one for each effect. model: of the run. name: of the recording.
     """
-    table = ConsoleTable(title=about, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-    for heading in ("effect", "visible", "left of it", "smallest size", "confused with (overlap)"):
-        right = heading == "left of it"
-        table.add_column(heading, justify="right" if right else "left", no_wrap=heading == "effect" or right)
-    for sight in sights:
-        table.add_row(*_sight_cells(sight))
+    about = f"What {name} shows of {len(sights)} effects beside {model.sum}"
+    headings = "effect", "visible", ">left of it", "smallest size", "confused with (overlap)"
+    seen = table(about, headings, map(_sight_cells, sights), whole=("effect", "left of it"), **LINED)
     notes = [f"{sight.effect}: {words}." for sight in sights for words in (sight.why, sight.degeneracy) if words]
     notes += [f"{sight.effect}: not determined: {' '.join(sight.unseen)}." for sight in sights if sight.unseen]
     explained = "Smallest sizes would be found in 9 of 10 such runs. Overlap 1: this run cannot tell the two apart."
-    return Group(table, Text(explained), *map(Text, notes))
+    return Group(seen, Text(explained), *map(Text, notes))
 
 
 def _sight_cells(sight: Visibility) -> list[str]:
@@ -113,12 +108,11 @@ def _sight_cells(sight: Visibility) -> list[str]:
     return [*cells, ", ".join(f"{name} ({overlap:.2f})" for name, overlap in sight.rivals)]
 
 
-def sights_object(sights: Sequence[Visibility], model: Sequence[str]) -> dict[str, Any]:
-    """The JSON object of ``effects --recording``: each effect of the catalogue and how well the run shows it.
-
-    sights: one for each effect. model: names of the effects in the model of the run.
-    """
-    return {"model": list(model), "effects": [{**_object(each.effect), **_seen_object(each)} for each in sights]}
+def sights_object(sights: Sequence[Visibility], model: Model, name: str) -> dict[str, Any]:
+    """The JSON object of ``effects --recording``: each effect of the catalogue and how well the run shows it; arguments
+    as for ``sight_report``."""
+    effects = [{**_object(each.effect), **_seen_object(each)} for each in sights]
+    return clean({"model": list(map(str, model.effects)), "effects": effects})
 
 
 def _seen_object(sight: Visibility) -> dict[str, Any]:
@@ -133,8 +127,7 @@ def _seen_object(sight: Visibility) -> dict[str, Any]:
         "not_determined": list(sight.unseen),
         "smallest": smallest,
         "overlaps": dict(sight.rivals),
-        "degeneracy": sight.degeneracy,
-        "why": sight.why,
+        **members(sight, "degeneracy", "why"),
     }
 
 
@@ -151,22 +144,13 @@ def _object(effect: Effect) -> dict[str, Any]:
         "title": effect.title,
         "formula": formula_of(effect),
         "coefficients": [
-            {
-                "symbol": c.symbol,
-                "unit": c.unit,
-                "scale": c.scale,
-                "shown_unit": c.shown_unit,
-                "per_si": float(c.per_si),
-            }
-            for c in effect.coefficients
+            members(each, "symbol", "unit", "scale", "shown_unit") | {"per_si": float(each.per_si)}
+            for each in effect.coefficients
         ],
-        "unknown": None
-        if unknown is None
-        else {"symbol": unknown.symbol, "unit": unknown.unit, "low": unknown.low, "high": unknown.high},
+        "unknown": None if unknown is None else members(unknown, "symbol", "unit", "low", "high"),
         "typical": {"navigation": _bounds(effect.typical.navigation), "mems": _bounds(effect.typical.mems)},
         "borne_by": effect.borne_by.value,
-        "confused_with": effect.confused_with,
-        "source": effect.source,
+        **members(effect, "confused_with", "source"),
         "remarks": list(remarks_of(effect)),
     }
 

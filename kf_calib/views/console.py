@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,7 +21,8 @@ from kf_calib.noise.reml import FEWEST, degrees_of_freedom
 from kf_calib.support.tail_probabilities import LEVEL
 from kf_calib.support.text import printed
 from kf_calib.support.units import rounded, shown, shown_whole
-from kf_calib.views.terminal import ConsoleTable, PlainConsole, note
+from kf_calib.views.notation import symbol
+from kf_calib.views.terminal import FOURS, ConsoleTable, PlainConsole, note, table
 
 if TYPE_CHECKING:
     from kf_calib.diagnosis.results import Difference, SideBySide
@@ -29,16 +30,8 @@ if TYPE_CHECKING:
 
 _WIDER = 2.0  # sigma; an interval of known noise is 1.96
 _NOT_ESTIMATED, _NOT_USED = "not estimated", "not used"
-_GREEK = {"theta": "θ", "phi": "φ", "nu": "ν"}
 GRADES: dict[Grade, str] = {"navigation": "navigation grade", "mems": "MEMS"}
 """Grades of sensors, and what they are called."""
-
-
-def symbol(name: str) -> str:
-    """A symbol as it is printed in the paper, with Greek letters in place of names such as ``theta``."""
-    for latin, greek in _GREEK.items():
-        name = name.replace(latin, greek)
-    return name
 
 
 def whole_value(parameter: Parameter) -> str:
@@ -64,63 +57,71 @@ def parameter_row(parameter: Parameter, fixed_by: str = "") -> tuple[str, str, s
 def parameter_table(result: Calibration) -> ConsoleTable:
     """The table of the twelve parameters: value, deviation from nominal and one sigma."""
     walking = "; the biases walk: those at the end of the run" if result.noise.walk_mps2_per_sqrt_s else ""
-    table = ConsoleTable(title=f"Parameters (1σ{walking})", title_justify="left")
-    for heading in ("parameter", "value", "less nominal", "sigma", "unit"):
-        table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
-    for k, parameter in enumerate(list(result.parameters.values())[:12]):
-        table.add_row(*parameter_row(parameter, result.fixed.get(parameter.symbol, "")), end_section=k % 4 == 3)
-    return table
+    twelve = list(result.parameters.values())[:12]
+    return table_of_parameters(f"Parameters (1σ{walking})", twelve, result.fixed)
+
+
+def table_of_parameters(title: str, parameters: Iterable[Parameter], fixed: Mapping[str, str]) -> ConsoleTable:
+    """The table of some parameters, the twelve first; fixed: what fixes those that are not estimated."""
+    rows = [parameter_row(each, fixed.get(each.symbol, "")) for each in parameters]
+    return table(title, ("parameter", ">value", ">less nominal", ">sigma", "unit"), rows, FOURS)
 
 
 def without_table(result: Calibration, outlying: OutlyingDwell) -> ConsoleTable:
     """The table of the parameters fitted without an outlying dwell, and of their differences from those with it."""
-    table = ConsoleTable(title=f"Without dwell {outlying.number} (1σ)", title_justify="left")
-    for heading in ("parameter", "value", "sigma", "unit", "less with it"):
-        table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
-    pairs = zip(result.parameters.values(), outlying.without.parameters.values(), strict=True)
-    for k, (before, parameter) in enumerate(pairs):
+    rows = list[tuple[str, ...]]()
+    for before, parameter in zip(result.parameters.values(), outlying.without.parameters.values(), strict=True):
         name, value, _, sigma, unit = parameter_row(parameter)
         known = parameter.value is not None and before.value is not None
         moved = shown(parameter).number(parameter.value - before.value) if known else ""  # type: ignore[operator]
         moved = moved if not moved or moved.startswith("-") else f"+{moved}"
-        table.add_row(name, value, sigma, unit, moved, end_section=k % 4 == 3)
-    return table
+        rows.append((name, value, sigma, unit, moved))
+    headings = "parameter", ">value", ">sigma", "unit", ">less with it"
+    return table(f"Without dwell {outlying.number} (1σ)", headings, rows, FOURS)
 
 
 def effect_table(result: Calibration) -> ConsoleTable:
     """The table of the coefficients of the effects in the model, with sigmas and ratios to them."""
-    table = ConsoleTable(title="Effects in the model (1σ)", title_justify="left")
-    for heading in ("effect", "coefficient", "value", "sigma", "unit", "value / sigma"):
-        table.add_column(heading, justify="left" if heading in ("effect", "coefficient", "unit") else "right")
+    rows = list[tuple[str, ...]]()
     for effect in result.model.effects:
         symbols = [each.symbol for each in (*effect.parameters, effect.unknown) if each is not None]
         for k, own in enumerate(symbols):
             parameter, name = result.parameters[own], as_text(effect) if k == 0 else ""
-            if parameter.value is None or parameter.sigma is None:
-                table.add_row(name, symbol(parameter.symbol), "not seen")
-                continue
-            unit, ratio = shown(parameter), f"{parameter.value / parameter.sigma:.1f}"
-            value, sigma = unit.rounded(parameter.value, parameter.sigma)
-            table.add_row(name, symbol(parameter.symbol), value, f"± {sigma}", unit.label, ratio)
-    return table
+            seen = parameter.value is not None and parameter.sigma is not None
+            ratio = f"{parameter.value / parameter.sigma:.1f}" if seen else ""  # type: ignore[operator]
+            rows.append((name, symbol(parameter.symbol), *with_sigma(parameter), ratio))
+    headings = "effect", "coefficient", ">value", ">sigma", "unit", ">value / sigma"
+    return table("Effects in the model (1σ)", headings, rows)
+
+
+def with_sigma(parameter: Parameter) -> tuple[str, str, str]:
+    """Value, sigma and unit of a parameter or coefficient in a table, or that it was not seen."""
+    if parameter.value is None or parameter.sigma is None:
+        return "not seen", "", ""
+    value, sigma = shown(parameter).rounded(parameter.value, parameter.sigma)
+    return value, f"± {sigma}", shown(parameter).label
+
+
+def clearest(parameters: Iterable[Parameter]) -> str:
+    """The parameter that stands out most from its sigma, in words; "" where none is known."""
+    sized = [p for p in parameters if p.value is not None and p.sigma]
+    if not sized:
+        return ""
+    largest = max(sized, key=lambda p: abs(p.value or 0.0) / (p.sigma or 1.0))
+    return f"{symbol(largest.symbol)} = {shown(largest).with_sigma(largest.value or 0.0, largest.sigma or 0.0)}"
 
 
 def model_table(model: Model) -> ConsoleTable:
     """The table of a model: the twelve parameters and every effect with its symbols, units and prior scales."""
-    table = ConsoleTable(title="Model", title_justify="left")
-    for heading in ("effect", "what it is", "coefficient", "unit", "prior scale"):
-        table.add_column(heading)
-    about = (
-        "misalignments, scale factors and biases",
-        f"{symbol(paper_parameters.SYMBOLS[0])} ... {paper_parameters.SYMBOLS[-1]}",
-    )
-    table.add_row("twelve parameters", *about, "rad, 1, m/s^2", "as stated", end_section=True)
+    symbols = f"{symbol(paper_parameters.SYMBOLS[0])} ... {paper_parameters.SYMBOLS[-1]}"
+    about = "misalignments, scale factors and biases", symbols, "rad, 1, m/s^2", "as stated"
+    rows: list[tuple[str, ...]] = [("twelve parameters", *about)]
+    ends = {0}
     for effect in model.effects:
-        rows = effect_rows(effect) or [("", "", "")]
-        for k, row in enumerate(rows):
-            name = (str(effect), effect.title) if k == 0 else ("", "")
-            table.add_row(*name, *row, end_section=k == len(rows) - 1)
-    return table
+        for k, row in enumerate(effect_rows(effect) or [("", "", "")]):
+            rows.append((*((str(effect), effect.title) if k == 0 else ("", "")), *row))
+        ends.add(len(rows) - 1)
+    return table("Model", ("effect", "what it is", "coefficient", "unit", "prior scale"), rows, ends)
 
 
 def effect_rows(effect: Effect) -> list[tuple[str, str, str]]:
@@ -141,13 +142,12 @@ def size_range(sizes: tuple[float, float], coefficient: Coefficient) -> str:
 
 def noise_table(result: Calibration) -> ConsoleTable:
     """The table of the noise model, with one column for each accelerometer."""
-    noise, table = result.noise, ConsoleTable(title="Noise (1σ)", title_justify="left")
-    for heading in ("", "accelerometer 1", "accelerometer 2", "accelerometer 3", "unit"):
-        table.add_column(heading, justify="left" if heading in ("", "unit") else "right")
-    reading, angle = shown("m/s^2"), shown("rad")
+    noise, reading, angle = result.noise, shown("m/s^2"), shown("rad")
     within = [reading.number(each, zeros=True) for each in noise.sigma_mps2] if noise.within_seen else ["-"] * 3
-    table.add_row("within a dwell" + ", not known" * (not noise.within_seen), *within, reading.label)
-    table.add_row("inflation by correlation", *(f"{value:.3g}" for value in noise.inflation), "of variance")
+    rows = [
+        ("within a dwell" + ", not known" * (not noise.within_seen), *within, reading.label),
+        ("inflation by correlation", *(f"{value:.3g}" for value in noise.inflation), "of variance"),
+    ]
     scatter, setting = noise_origins(result)
     for name, origin, values, unit in (
         ("dwell to dwell", scatter, noise.scatter_mps2, reading),
@@ -155,8 +155,8 @@ def noise_table(result: Calibration) -> ConsoleTable:
     ):
         cells = [unit.number(value, zeros=origin != "stated") for value in values]
         cells = ["-"] * 3 if origin in (_NOT_ESTIMATED, _NOT_USED) else cells
-        table.add_row(f"{name}, {origin}", *cells, unit.label)
-    return table
+        rows.append((f"{name}, {origin}", *cells, unit.label))
+    return table("Noise (1σ)", ("", *(f">accelerometer {i}" for i in (1, 2, 3)), "unit"), rows)
 
 
 def noise_origins(result: Calibration) -> tuple[str, str]:
@@ -234,15 +234,13 @@ def summary(result: Calibration, diagnosed: bool = False) -> RenderableType:
 
 def comparison_table(compared: Comparison) -> RenderableType:
     """The table that ``compare`` prints: time, memory and difference from the block engine of each way of computing."""
-    table = ConsoleTable(title="The same recording, three ways", title_justify="left")
-    for heading in ("way", "wall s", "peak MB", "largest difference, σ", "of diag P"):
-        table.add_column(heading, justify="left" if heading == "way" else "right")
-    for name, way in compared.ways.items():
-        table.add_row(
-            name, f"{way.wall_s:.3f}", f"{way.peak_mb:.1f}", f"{way.max_difference_sigma:.1e}",
-            f"{way.max_relative_variance:.1e}",
-        )  # fmt: skip
-    return Group(table, *map(note, compared.remarks))
+    rows = [
+        (name, f"{way.wall_s:.3f}", f"{way.peak_mb:.1f}", f"{way.max_difference_sigma:.1e}",
+         f"{way.max_relative_variance:.1e}")
+        for name, way in compared.ways.items()
+    ]  # fmt: skip
+    headings = "way", ">wall s", ">peak MB", ">largest difference, σ", ">of diag P"
+    return Group(table("The same recording, three ways", headings, rows), *map(note, compared.remarks))
 
 
 def difference_in_words(pair: SideBySide) -> str:
@@ -260,16 +258,15 @@ def difference_in_words(pair: SideBySide) -> str:
 
 def difference_table(differences: Sequence[Difference], first: str, second: str) -> ConsoleTable:
     """The table of the parameters in both, less nominal, and of their differences; first, second: what they are of."""
-    table = ConsoleTable(title="Parameters less nominal (1σ)", title_justify="left")
-    for heading in ("parameter", first, "sigma", second, "sigma", "unit", "difference", "in σ"):
-        table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
-    for k, difference in enumerate(differences):
+    rows = list[tuple[str, ...]]()
+    for difference in differences:
         both = *_cells_less_nominal(difference.first), *_cells_less_nominal(difference.second)
         moved = "", ""
         if difference.value is not None and difference.sigma is not None and difference.sigmas is not None:
             moved = shown(difference.first).rounded(difference.value, difference.sigma)[0], f"{difference.sigmas:+.1f}"
-        table.add_row(symbol(difference.symbol), *both, shown(difference.first).label, *moved, end_section=k % 4 == 3)
-    return table
+        rows.append((symbol(difference.symbol), *both, shown(difference.first).label, *moved))
+    headings = "parameter", f">{first}", ">sigma", f">{second}", ">sigma", "unit", ">difference", ">in σ"
+    return table("Parameters less nominal (1σ)", headings, rows, FOURS)
 
 
 def _cells_less_nominal(parameter: Parameter) -> tuple[str, str]:

@@ -24,9 +24,10 @@ from kf_calib.estimation.remarks import MISSING_OR_NOISE
 from kf_calib.estimation.results import Calibration, Condition, format_p
 from kf_calib.support.text import angles_in_words, printed
 from kf_calib.support.units import shown
-from kf_calib.views.console import plain, symbol
-from kf_calib.views.json import clean, condition_object, outlying_object, readings_object
-from kf_calib.views.terminal import ConsoleTable, TextPlot, note
+from kf_calib.views.console import clearest, plain, with_sigma
+from kf_calib.views.json import clean, condition_object, members, outlying_object, readings_object
+from kf_calib.views.notation import symbol
+from kf_calib.views.terminal import ConsoleTable, TextPlot, note, table
 
 _ANY = 1e-6  # probability of rows that are in the JSON object
 _MOST = 5
@@ -43,11 +44,9 @@ def diagnosis_object(diagnosis: Diagnosis) -> dict[str, Any]:
 def shape_object(shape: EffectShape) -> dict[str, Any]:
     """The shape of an effect as a JSON object: lists with an item a dwell, each a list of an item an accelerometer, or
     of one for the platform."""
-    return {
-        "effect": shape.effect, "axis": shape.words, "symbol": shape.symbol or None, "unit": shape.unit,
-        "values": shape.values, "quantity_unit": shape.quantity, "readings": shape.readings, "sigma": shape.sigma,
-        "component": shape.component, "component_sigma": shape.component_sigma,
-    }  # fmt: skip
+    named = {"effect": shape.effect, "axis": shape.words, "symbol": shape.symbol or None}
+    means = {"quantity_unit": shape.quantity, **members(shape, "readings", "sigma", "component", "component_sigma")}
+    return {**named, **members(shape, "unit", "values"), **means}
 
 
 def found_object(diagnosis: Diagnosis) -> dict[str, Any]:
@@ -112,11 +111,9 @@ def _hypotheses_object(table: HypothesisTable | None) -> list[dict[str, Any]]:
             "formula": row.formulas[0] if row.formulas else None,
             "formulas": list(row.formulas),
             "driver": row.driver or None,
-            "families": list(row.families),
-            "probability": row.probability,
+            **members(row, "families", "probability"),
             "log10_odds_to_next": odds,
-            "statistic": row.statistic,
-            "dof": row.dof,
+            **members(row, "statistic", "dof"),
         }
         for row, odds in rows
         if row.probability > _ANY
@@ -127,7 +124,7 @@ def _replication_object(tried: Replication | None) -> dict[str, Any] | None:
     """Return how what is named predicts dwells that choosing it never saw, or None."""
     if tried is None:
         return None
-    figures = {"fall": tried.fall, "predicted": tried.predicted, "p_value": tried.p_value, "p_less": tried.p_less}
+    figures = members(tried, "fall", "predicted", "p_value", "p_less")
     return {**figures, "halves": [vars(half) | {"dwells": list(half.dwells)} for half in tried.halves]}
 
 
@@ -158,15 +155,8 @@ def _suspect_object(suspect: Suspect, floor_mps2: float | None) -> dict[str, Any
     """Return one suspect as a JSON object."""
     return {
         "effect": suspect.name,
-        "statistic": suspect.statistic,
-        "dof": suspect.dof,
-        "p_value": suspect.p_value,
-        "probability": suspect.probability,
-        "probability_with_others": suspect.probability_with_others,
-        "fits": suspect.fits,
-        "coefficients": [
-            {"symbol": p.symbol, "value": p.value, "sigma": p.sigma, "unit": p.unit} for p in suspect.coefficients
-        ],
+        **members(suspect, "statistic", "dof", "p_value", "probability", "probability_with_others", "fits"),
+        "coefficients": [members(each, "symbol", "value", "sigma", "unit") for each in suspect.coefficients],
         "held_out_rms_mps2": suspect.refit.held_out_rms_mps2,
         "held_out_floor_mps2": floor_mps2,
     }
@@ -283,18 +273,16 @@ def of_what_p_is(diagnosis: Diagnosis) -> list[str]:
 printed.register(Diagnosis, lambda diagnosis: plain(diagnosis_report(diagnosis)))
 
 
-def _hypothesis_table(table: HypothesisTable, floor_mps2: float | None, most: int | None = None) -> ConsoleTable:
+def _hypothesis_table(hypotheses: HypothesisTable, floor_mps2: float | None, most: int | None = None) -> ConsoleTable:
     """Return the table of the explanations that have 1 % of the probability or more, at most ``most`` of them, with
     what their refits say."""
-    shown_ = ConsoleTable(title="What it may be", title_justify="left")
-    for heading in ("explanation", "family", "probability", "largest coefficient (1σ)", "held out / noise"):
-        left = heading in ("explanation", "family")
-        shown_.add_column(heading, justify="left" if left else "right")
-    for row in table.listed[:most]:
-        ratio = held_out_ratio(row.refit, floor_mps2)
-        cells = (format_probability(row.probability), _largest_coefficient(row), ratio)
-        shown_.add_row(name_of(row), ", ".join(row.families), *cells)
-    return shown_
+    rows = [
+        (name_of(row), ", ".join(row.families), format_probability(row.probability), _largest_coefficient(row),
+         held_out_ratio(row.refit, floor_mps2))
+        for row in hypotheses.listed[:most]
+    ]  # fmt: skip
+    headings = "explanation", "family", ">probability", ">largest coefficient (1σ)", ">held out / noise"
+    return table("What it may be", headings, rows)
 
 
 def _largest_coefficient(row: Hypothesis) -> str:
@@ -302,13 +290,7 @@ def _largest_coefficient(row: Hypothesis) -> str:
     names = [*row.effects, *(text.partition("=")[0].strip() for text in row.formulas)]
     added = [each for each in row.refit.model.effects if str(each) in names] if row.refit is not None else []
     known = [row.refit.parameters[c.symbol] for each in added for c in each.parameters] if row.refit else []
-    sized = [p for p in known if p.value is not None and p.sigma]
-    if not sized:
-        return ""
-    largest = max(sized, key=lambda p: abs(p.value or 0.0) / (p.sigma or 1.0))
-    unit = shown(largest)
-    value, sigma = unit.rounded(largest.value or 0.0, largest.sigma or 0.0)
-    return f"{symbol(largest.symbol)} = {value} ± {sigma} {unit.label}"
+    return clearest(known)
 
 
 def held_out_ratio(refit: Calibration | None, floor_mps2: float | None) -> str:
@@ -328,54 +310,43 @@ def name_of(row: Hypothesis) -> str:
 def _suspect_table(diagnosis: Diagnosis) -> ConsoleTable:
     """Return the table of the suspects with their coefficients."""
     title = "Suspects (1σ; p: noise alone lets some effect explain as much; held out: rms over noise floor)"
-    table = ConsoleTable(title=title, title_justify="left")
-    for heading in ("effect", "p", "χ² / dof", "fits", "symbol", "value", "sigma", "unit", "held out"):
-        left = heading in ("effect", "fits", "symbol", "unit")
-        table.add_column(heading, justify="left" if left else "right", no_wrap=heading == "effect")
+    rows, ends = list[tuple[str, ...]](), set[int]()
     for suspect in diagnosis.suspects:
         ratio = held_out_ratio(suspect.refit, diagnosis.floor_mps2)
         head = [suspect.name, format_p(suspect.p_value).removeprefix("= "), f"{suspect.statistic:.1f} / {suspect.dof}",
                 "yes" if suspect.fits else "no"]  # fmt: skip
         for k, p in enumerate(suspect.coefficients):
-            first_cells = head if k == 0 else [""] * 4
-            if p.value is None or p.sigma is None:
-                table.add_row(*first_cells, symbol(p.symbol), "not seen", "", "", ratio if k == 0 else "")
-                continue
-            unit = shown(p)
-            value, sigma = unit.rounded(p.value, p.sigma)
-            table.add_row(*first_cells, symbol(p.symbol), value, f"± {sigma}", unit.label, ratio if k == 0 else "")
-        table.add_section()
-    return table
+            first, last = (head, ratio) if k == 0 else ([""] * 4, "")
+            rows.append((*first, symbol(p.symbol), *with_sigma(p), last))
+        ends.add(len(rows) - 1)
+    headings = "effect", ">p", ">χ² / dof", "fits", "symbol", ">value", ">sigma", "unit", ">held out"
+    return table(title, headings, rows, ends, whole=("effect",))
 
 
 def _dwell_table(diagnosis: Diagnosis) -> ConsoleTable:
     """Return the table of the dwells that disagree most: their residuals over the sigma of their means."""
-    table = ConsoleTable(title="Where it fails: residual / σ of the dwell's mean", title_justify="left")
-    has_gimbals = bool(diagnosis.before.bench.axes)
-    for heading in ("dwell", "at s", "gimbals, deg" if has_gimbals else "up, in its axes", "1", "2", "3"):
-        table.add_column(heading, justify="right")
-    ratios = diagnosis.residual_ratios
+    has_gimbals, ratios = bool(diagnosis.before.bench.axes), diagnosis.residual_ratios
+    rows = list[tuple[str, ...]]()
     for k in np.argsort(-np.abs(ratios).max(axis=1))[:5].tolist():
         dwell = diagnosis.before.visits[k].dwell
         force = dwell.means[1:4] / np.linalg.norm(dwell.means[1:4])
         angles = ", ".join(f"{angle:.1f}" for angle in np.degrees(dwell.recorded_pose))
         orientation = angles if has_gimbals else ", ".join(f"{part:+.2f}" for part in force)
-        table.add_row(str(dwell.number), f"{dwell.start_s:.0f}", orientation, *(f"{ratio:+.1f}" for ratio in ratios[k]))
-    return table
+        rows.append((str(dwell.number), f"{dwell.start_s:.0f}", orientation, *(f"{ratio:+.1f}" for ratio in ratios[k])))
+    pose = ">gimbals, deg" if has_gimbals else ">up, in its axes"
+    title = "Where it fails: residual / σ of the dwell's mean"
+    return table(title, (">dwell", ">at s", pose, ">1", ">2", ">3"), rows)
 
 
 def _detectable_table(sizes: list[Detectable]) -> ConsoleTable:
     """Return the table of the smallest detectable sizes."""
-    table = ConsoleTable(title="Smallest coefficient that would be found in 9 of 10 such runs", title_justify="left")
-    for heading in ("effect", "size", "unit", "effect", "size", "unit"):
-        table.add_column(heading, justify="right" if heading == "size" else "left")
     half = (len(sizes) + 1) // 2
     units = [shown(each.coefficient) for each in sizes]
     cells = [(each.name, unit.number(each.minimum), unit.label) for each, unit in zip(sizes, units, strict=True)]
     cells += [("", "", "")] * (2 * half - len(cells))
-    for left, right in zip(cells[:half], cells[half:], strict=True):
-        table.add_row(*left, *right)
-    return table
+    rows = [(*left, *right) for left, right in zip(cells[:half], cells[half:], strict=True)]
+    title = "Smallest coefficient that would be found in 9 of 10 such runs"
+    return table(title, ("effect", ">size", "unit") * 2, rows)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.console import Group, RenderableType
 from rich.text import Text
@@ -18,15 +18,15 @@ from kf_calib.exchange.corrected_file import Applied
 from kf_calib.exchange.history import History, ParameterTrack
 from kf_calib.exchange.verification import Verification
 from kf_calib.sources.files.contents import CALIBRATED_TOPIC
+from kf_calib.support.text import counted
 from kf_calib.support.units import field_unit, shown
-from kf_calib.views.console import parameter_row, symbol
-from kf_calib.views.json import clean
-from kf_calib.views.terminal import ConsoleTable, note
-
-if TYPE_CHECKING:
-    pass
+from kf_calib.views.console import table_of_parameters
+from kf_calib.views.json import clean, members
+from kf_calib.views.notation import symbol
+from kf_calib.views.terminal import ConsoleTable, note, table
 
 _SHOWN = 12
+_OF_A_MOVE = "symbol", "difference", "sigma", "unit", "p_value"
 
 
 def applied_object(
@@ -37,8 +37,7 @@ def applied_object(
         {
             "out": str(path),
             "topic": CALIBRATED_TOPIC if topic else None,
-            "readings": applied.readings,
-            "not_finite": applied.not_finite,
+            **members(applied, "readings", "not_finite"),
             "corrected": [str(effect) for effect in correction.effects],
             "left_out": correction.left_out,
             "temperature_c": applied.temperature_c,
@@ -71,13 +70,9 @@ def verification_object(verification: Verification) -> dict[str, Any]:
     """The JSON object of ``verify``."""
     return clean(
         {
-            "holds": verification.holds,
-            "p_value": verification.p_value,
-            "statistic": verification.statistic,
-            "dof": verification.dof,
-            "dwells": verification.dwells,
-            "moved": [_move_object(move) for move in verification.moved],
-            "compared": [_move_object(move) for move in verification.moves],
+            **members(verification, "holds", "p_value", "statistic", "dof", "dwells"),
+            "moved": [members(move, *_OF_A_MOVE) for move in verification.moved],
+            "compared": [members(move, *_OF_A_MOVE) for move in verification.moves],
             "residual_rms_mps2": verification.residual_rms_mps2,
             "worst_error_mps2": verification.worst_mps2,
             "worst_error_sigma_mps2": verification.worst_sigma_mps2,
@@ -88,24 +83,17 @@ def verification_object(verification: Verification) -> dict[str, Any]:
     )
 
 
-def _move_object(move: Any) -> dict[str, Any]:
-    """Return the change of one parameter as a JSON object."""
-    return {"symbol": move.symbol, "difference": move.difference, "sigma": move.sigma, "unit": move.unit,
-            "p_value": move.p_value}  # fmt: skip
-
-
 def verification_report(verification: Verification) -> RenderableType:
     """The report of ``verify``."""
     head = "The calibration still holds" if verification.holds else "The calibration does NOT hold any more"
     style = "bold green" if verification.holds else "bold yellow"
-    dwells = f"{verification.dwells} dwell{'s' * (verification.dwells != 1)}"
-    test = f"p {format_p(verification.p_value)}; {dwells}, χ² {verification.statistic:.1f} of {verification.dof} dof"
-    parts: list[RenderableType] = [Text(f"{head} ({test}).", style=style)]
+    dwells, test = counted(verification.dwells, "dwell"), f"χ² {verification.statistic:.1f} of {verification.dof} dof"
+    parts: list[RenderableType] = [Text(f"{head} (p {format_p(verification.p_value)}; {dwells}, {test}).", style=style)]
     unit = shown("m/s^2")
     parts.append(Text(f"It predicts the means of the dwells to {unit.text(verification.residual_rms_mps2)} rms."))
     if verification.worst_mps2 is not None and verification.worst_sigma_mps2 is not None:
-        worst, sigma = unit.rounded(verification.worst_mps2, verification.worst_sigma_mps2)
-        parts.append(Text(f"Readings corrected by it are wrong by up to {worst} ± {sigma} {unit.label} now."))
+        worst = unit.with_sigma(verification.worst_mps2, verification.worst_sigma_mps2)
+        parts.append(Text(f"Readings corrected by it are wrong by up to {worst} now."))
     if verification.moves:
         parts.append(_moves_table(verification))
     else:
@@ -118,19 +106,17 @@ def verification_report(verification: Verification) -> RenderableType:
 
 def _moves_table(verification: Verification) -> ConsoleTable:
     """Return the table of the parameters that were compared, the clearest changes first."""
-    table = ConsoleTable(title="Changes (1σ of both; p: of one so large, of all, by noise alone)", title_justify="left")
-    for heading in ("parameter", "change", "sigma", "unit", "change / sigma", "p", ""):
-        table.add_column(heading, justify="left" if heading in ("parameter", "unit", "") else "right")
-    moved = set(verification.moved)
+    moved, rows = set(verification.moved), list[tuple[str, ...]]()
     for move in verification.moves[:_SHOWN]:
         unit = shown(move.unit)
         change, sigma = unit.rounded(move.difference, move.sigma)
         sign = "" if change.startswith("-") else "+"
-        table.add_row(
-            symbol(move.symbol), f"{sign}{change}", f"± {sigma}", unit.label, f"{move.difference / move.sigma:+.1f}",
-            format_p(move.p_value).removeprefix("= "), "moved" if move in moved else "",
+        rows.append(
+            (symbol(move.symbol), f"{sign}{change}", f"± {sigma}", unit.label, f"{move.difference / move.sigma:+.1f}",
+             format_p(move.p_value).removeprefix("= "), "moved" if move in moved else "")
         )  # fmt: skip
-    return table
+    headings = "parameter", ">change", ">sigma", "unit", ">change / sigma", ">p", ""
+    return table("Changes (1σ of both; p: of one so large, of all, by noise alone)", headings, rows)
 
 
 def history_object(history: History) -> dict[str, Any]:
@@ -139,7 +125,12 @@ def history_object(history: History) -> dict[str, Any]:
         {
             "serial": history.serial or None,
             "dates": [date.isoformat() for date in history.dates],
-            "parameters": [_track_object(track) for track in history.tracks],
+            "parameters": [
+                members(track, "symbol", "unit", "values", "sigmas", "predicted")
+                | {"predicted_sigmas": track.predicted_sigma}
+                | members(track, "level", "level_sigma", "drift", "drift_sigma", "repeatability", "walk", "constant_p")
+                for track in history.tracks
+            ],
             "tolerances": dict(history.tolerances),
             "due": None if history.due is None else history.due.isoformat(),
             "due_by": history.due_by or None,
@@ -148,29 +139,14 @@ def history_object(history: History) -> dict[str, Any]:
     )
 
 
-def _track_object(track: ParameterTrack) -> dict[str, Any]:
-    """Return one parameter over the calibrations as a JSON object."""
-    return {
-        "symbol": track.symbol, "unit": track.unit, "values": track.values, "sigmas": track.sigmas,
-        "predicted": track.predicted, "predicted_sigmas": track.predicted_sigma, "level": track.level,
-        "level_sigma": track.level_sigma, "drift": track.drift, "drift_sigma": track.drift_sigma,
-        "repeatability": track.repeatability, "walk": track.walk, "constant_p": track.constant_p,
-    }  # fmt: skip
-
-
 def history_report(history: History) -> RenderableType:
     """The report of ``history``."""
     of = f" of {history.serial}" if history.serial else ""
     first, last = history.dates[0].date(), history.dates[-1].date()
     parts: list[RenderableType] = [Text(f"{len(history.dates)} calibrations{of}, {first} to {last}.", style="bold")]
-    table = ConsoleTable(
-        title="Change over the calibrations (1σ; p: that a constant differs so much)", title_justify="left"
-    )
-    for heading in ("parameter", "last less first", "drift a year", "repeatability", "walk in a year", "unit", "p"):
-        table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
-    for track in history.tracks:
-        table.add_row(*_track_row(track))
-    parts.append(table)
+    title = "Change over the calibrations (1σ; p: that a constant differs so much)"
+    headings = "parameter", ">last less first", ">drift a year", ">repeatability", ">walk in a year", "unit", ">p"
+    parts.append(table(title, headings, map(_track_row, history.tracks)))
     if history.due is not None:
         parts.append(Text(_next_calibration(history, history.due), style="bold"))
     elif history.tolerances and all(track.drift is not None for track in history.tracks):
@@ -193,8 +169,7 @@ def _track_row(track: ParameterTrack) -> list[str]:
     unit, year = shown(track.unit), 365.25
     drift = "not seen"
     if track.drift is not None and track.drift_sigma is not None:
-        value, sigma = unit.rounded(track.drift * year, track.drift_sigma * year)
-        drift = f"{value} ± {sigma}"
+        drift = " ± ".join(unit.rounded(track.drift * year, track.drift_sigma * year))
     change = unit.number(float(track.values[-1] - track.values[0]))
     return [
         symbol(track.symbol), change if change.startswith("-") else f"+{change}", drift,
@@ -210,16 +185,13 @@ def calibration_object(saved: SavedCalibration, path: Path) -> dict[str, Any]:
 
 def calibration_report(saved: SavedCalibration, path: Path) -> RenderableType:
     """The report of ``info`` of a calibration."""
-    table = ConsoleTable(title="Parameters (1σ)", title_justify="left")
-    for heading in ("parameter", "value", "less nominal", "sigma", "unit"):
-        table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
-    for k, parameter in enumerate(saved.parameters):
-        field = field_unit(parameter.unit)
-        row = Parameter(**parameter.model_dump(), shown_unit=field.label, per_si=field.per_si)
-        table.add_row(*parameter_row(row, saved.fixed.get(parameter.symbol, "")), end_section=k in (3, 7, 11))
+    units = [field_unit(each.unit) for each in saved.parameters]
+    parameters = [Parameter(**each.model_dump(), shown_unit=unit.label, per_si=unit.per_si)
+                  for each, unit in zip(saved.parameters, units, strict=True)]  # fmt: skip
     lines = [Text(f"{path}: a calibration, {saved.summary}.", style="bold"), Text(f"It takes {saved.bench.input}.")]
     commands = Text(f"Try: kf-calib apply {path} RECORDING -o OUT, or certificate, export, verify, history.")
-    return Group(*lines, table, Text(_agreement(saved)), *map(note, saved.provenance.warnings), commands)
+    values = table_of_parameters("Parameters (1σ)", parameters, saved.fixed)
+    return Group(*lines, values, Text(_agreement(saved)), *map(note, saved.provenance.warnings), commands)
 
 
 def _agreement(saved: SavedCalibration) -> str:

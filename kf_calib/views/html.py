@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
@@ -151,23 +151,17 @@ def _json(value: Any) -> Markup:
     return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"))
 
 
-@as_html.register
-def _(result: Calibration) -> str | None:
-    return _html(console.summary(result))
-
-
-@as_html.register
-def _(found: Diagnosis) -> str | None:
-    return _html(diagnosis.diagnosis_report(found))
-
-
-@as_html.register
-def _(state: Improvement) -> str | None:
-    return _html(improvement.improvement_report(state, None))
-
-
 def _html(drawn: RenderableType) -> str | None:
     """Return what the console draws as HTML, or None where the package that fills in templates is not installed."""
     if find_spec("jinja2") is None:
         return None
     return templates("kf_calib.views").get_template("fragment.html").render(parts=parts_of(drawn))
+
+
+_SHOWN: dict[type, Callable[[Any], RenderableType]] = {
+    Calibration: console.summary,
+    Diagnosis: diagnosis.diagnosis_report,
+    Improvement: lambda state: improvement.improvement_report(state, None),
+}
+for _kind, _draw in _SHOWN.items():
+    as_html.register(_kind, lambda result, draw=_draw: _html(draw(result)))

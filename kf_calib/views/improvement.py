@@ -15,10 +15,11 @@ from kf_calib.diagnosis.stepwise_selection import Improvement, Removal, Selectio
 from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.support.units import shown
-from kf_calib.views.console import effect_table, parameter_table, symbol
+from kf_calib.views.console import clearest, effect_table, parameter_table
 from kf_calib.views.diagnosis import description_object, description_sentence, held_out_ratio, orientation_object
-from kf_calib.views.json import clean, condition_object, parameters_object
-from kf_calib.views.terminal import Bar, ConsoleTable, note
+from kf_calib.views.json import clean, condition_object, members, parameters_object
+from kf_calib.views.notation import symbol
+from kf_calib.views.terminal import BARE, FOURS, Bar, ConsoleTable, note, table
 
 _WIDTH = 30  # length of the longest bar in characters
 _EIGHTHS = " ▏▎▍▌▋▊▉"
@@ -54,8 +55,7 @@ def improvement_object(
             "alternatives": [
                 {
                     "effect": alternative.name,
-                    "residual_rms_mps2": alternative.result.residual_rms_mps2,
-                    "held_out_rms_mps2": alternative.result.held_out_rms_mps2,
+                    **members(alternative.result, "residual_rms_mps2", "held_out_rms_mps2"),
                     "held_out_floor_mps2": state.floor_mps2,
                     "parameters": _parameters(alternative.result),
                 }
@@ -64,10 +64,8 @@ def improvement_object(
             "spread": [
                 {
                     "symbol": spread.parameter.symbol,
-                    "lowest": spread.lowest,
-                    "highest": spread.highest,
-                    "sigma": spread.parameter.sigma,
-                    "unit": spread.parameter.unit,
+                    **members(spread, "lowest", "highest"),
+                    **members(spread.parameter, "sigma", "unit"),
                     "sigmas": spread.sigmas,
                 }
                 for spread in state.spreads
@@ -88,8 +86,7 @@ def _figures(diagnosis: Diagnosis, floor_mps2: float | None) -> dict[str, Any]:
         "p_value": diagnosis.test.p_value,
         "consistent": diagnosis.consistent,
         "conditional_on": condition_object(diagnosis.condition),
-        "residual_rms_mps2": result.residual_rms_mps2,
-        "held_out_rms_mps2": result.held_out_rms_mps2,
+        **members(result, "residual_rms_mps2", "held_out_rms_mps2"),
         "held_out_floor_mps2": floor_mps2,
     }
 
@@ -101,9 +98,7 @@ def _step_object(step: SelectionStep, before: Diagnosis, floor_mps2: float | Non
     that of the model after it.
     """
     return {
-        "added": step.added,
-        "by": step.by,
-        "probability": step.probability,
+        **members(step, "added", "by", "probability"),
         **_figures(step.diagnosis, floor_mps2),
         "p_value": None if step.name is None else before.test.effects.p_values.get(step.name),
         "p_value_after": step.diagnosis.test.p_value,
@@ -116,10 +111,7 @@ def _step_object(step: SelectionStep, before: Diagnosis, floor_mps2: float | Non
 
 def _removal_object(removal: Removal) -> dict[str, Any]:
     """Return the test of removing an effect as a JSON object."""
-    return {
-        "effect": removal.name, "statistic": removal.statistic, "dof": removal.dof, "p_value": removal.p_value,
-        "needed": removal.needed,
-    }  # fmt: skip
+    return {"effect": removal.name, **members(removal, "statistic", "dof", "p_value", "needed")}
 
 
 def _parameters(result: Calibration) -> list[dict[str, Any]]:
@@ -183,14 +175,9 @@ def _told(step: SelectionStep, final: Calibration) -> str:
         return ", ".join(told)
     result = final if step.name in map(str, final.model.effects) else step.result
     (own,) = (effect.parameters for effect in result.model.effects if str(effect) == step.name)
-    sized = [result.parameters[each.symbol] for each in own]
-    clearest = max(sized, key=lambda each: abs(each.value or 0.0) / (each.sigma or float("inf")))
-    size = ""
-    if clearest.value is not None and clearest.sigma:
-        value, sigma = shown(clearest).rounded(clearest.value, clearest.sigma)
-        size = f", {symbol(clearest.symbol)} = {value} ± {sigma} {shown(clearest).label}"
+    size = clearest(result.parameters[each.symbol] for each in own)
     share = "" if step.probability is None else f" (probability {format_probability(step.probability)})"
-    return ", ".join([f"{step.name}{size}{share}", *told])
+    return ", ".join([f"{step.name}{', ' * bool(size)}{size}{share}", *told])
 
 
 def progress(state: Improvement) -> RenderableType:
@@ -205,20 +192,19 @@ def progress(state: Improvement) -> RenderableType:
     longest = max(error for both in errors for error in both if error is not None)
     unit, alone = shown("m/s^2"), "without any one orientation the model is not determined"
     head = "over the noise floor" if floor else f"{unit.label} ({alone})"
-    table = ConsoleTable(title=f"Rms error, {head}", title_justify="left", box=None, pad_edge=False)
-    for heading in ("step", "p", "", "", ""):
-        table.add_column(heading, no_wrap=True)
+    bars = list[tuple[RenderableType, ...]]()
     for (label, _, probability, p_value), (held_out, fitted) in zip(rows, errors, strict=True):
         p_text = "" if p_value is None else format_p(p_value).removeprefix("= ")
         below = "" if probability is None else f"  probability {format_probability(probability)}"
         if held_out is not None:
-            table.add_row(label, p_text, "held out", f"{held_out:.2f}", Bar(bar(held_out, longest), style="cyan"))
+            bars.append((label, p_text, "held out", f"{held_out:.2f}", Bar(bar(held_out, longest), style="cyan")))
             label, p_text, below = below, "", ""
         number = f"{fitted:.2f}" if floor else unit.number(fitted, 2)
-        table.add_row(f"{label}{below}", p_text, "fitted", number, Bar(bar(fitted, longest), style="dim"))
+        bars.append((f"{label}{below}", p_text, "fitted", number, Bar(bar(fitted, longest), style="dim")))
     said = [Text(line) for step in state.steps for line in (*map(_out, step.dropped), *step.remarks)]
     tests = [Text(f"Tested: {_test(each)}.") for each in state.removals]
-    return Group(table, *said, *tests)
+    headings = "step", "p", "", "", ""
+    return Group(table(f"Rms error, {head}", headings, bars, whole=headings, **BARE), *said, *tests)
 
 
 def _errors(result: Calibration, floor: float | None) -> tuple[float | None, float]:
@@ -256,17 +242,15 @@ def _test(removal: Removal) -> str:
 def _spread_table(state: Improvement) -> ConsoleTable:
     """Return the table of the range of each parameter over the equally good explanations."""
     names = ", ".join(each.name for each in state.alternatives)
-    table = ConsoleTable(title=f"Parameters less nominal, over the explanations {names}", title_justify="left")
-    for heading in ("parameter", "lowest", "highest", "sigma", "unit", "differ by, σ"):
-        table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
-    for k, spread in enumerate(state.spreads):
+    rows = list[tuple[str, ...]]()
+    for spread in state.spreads:
         parameter, unit = spread.parameter, shown(spread.parameter)
         low, high = (
             unit.rounded(value - parameter.nominal, parameter.sigma or 0.0) for value in (spread.lowest, spread.highest)
         )
-        row = (symbol(parameter.symbol), low[0], high[0], f"± {low[1]}", unit.label, f"{spread.sigmas:.1f}")
-        table.add_row(*row, end_section=k % 4 == 3)
-    return table
+        rows.append((symbol(parameter.symbol), low[0], high[0], f"± {low[1]}", unit.label, f"{spread.sigmas:.1f}"))
+    headings = "parameter", ">lowest", ">highest", ">sigma", "unit", ">differ by, σ"
+    return table(f"Parameters less nominal, over the explanations {names}", headings, rows, FOURS)
 
 
 def _settling(state: Improvement) -> list[str]:
@@ -303,16 +287,13 @@ def _numbered(diagnosis: Diagnosis, choices: Sequence[tuple[str, ...]]) -> list[
     if not choices:
         return []
     refits = {suspect.name: suspect for suspect in diagnosis.suspects}
-    table = ConsoleTable(box=None, pad_edge=False)
-    for heading in ("", "suspect", "probability", "p", "fits", "held out"):
-        table.add_column(heading, justify="right" if heading in ("", "probability", "held out") else "left")
+    rows = list[tuple[str, ...]]()
     for number, names in enumerate(choices, start=1):
         suspect = refits.get(names[0]) if len(names) == 1 else None
         result = suspect.refit if suspect is not None else diagnosis.after
         p_value = "" if suspect is None else format_p(suspect.p_value).removeprefix("= ")
         fits = "yes" if suspect is None or suspect.fits else "no"
         share = "" if diagnosis.table is None else format_probability(diagnosis.table.probability_of_just(names))
-        table.add_row(
-            str(number), " + ".join(names), share, p_value, fits, held_out_ratio(result, diagnosis.floor_mps2)
-        )
-    return [table]
+        ratio = held_out_ratio(result, diagnosis.floor_mps2)
+        rows.append((str(number), " + ".join(names), share, p_value, fits, ratio))
+    return [table("", (">", "suspect", ">probability", "p", "fits", ">held out"), rows, **BARE)]

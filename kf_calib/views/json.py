@@ -40,13 +40,9 @@ def replay_object(result: Calibration) -> dict[str, Any]:
             "consistency": {
                 "consistent": judged.unconditional,
                 "conditional_on": condition_object(judged.condition),
-                "p_value": judged.p_value,
-                "nis_per_dof": judged.nis_per_dof,
-                "dof": judged.dof,
+                **members(judged, "p_value", "nis_per_dof", "dof"),
             },
-            "residual_rms_mps2": result.residual_rms_mps2,
-            "held_out_rms_mps2": result.held_out_rms_mps2,
-            "held_out_floor_mps2": result.held_out_floor_mps2,
+            **members(result, "residual_rms_mps2", "held_out_rms_mps2", "held_out_floor_mps2"),
             "counts": {key: value for key, value in vars(result.tally).items() if isinstance(value, int)},
             "readings": readings_object(result.readings),
             "outlying_dwells": [outlying_object(each) for each in result.outlying],
@@ -63,13 +59,10 @@ def condition_object(condition: Condition | None) -> dict[str, Any] | None:
 def parameters_object(result: Calibration) -> list[dict[str, Any]]:
     """All parameters of a calibration as JSON objects, in SI units."""
     return [
-        {
-            "symbol": p.symbol, "value": p.value, "sigma": p.sigma, "low": low, "high": high, "unit": p.unit,
-            "nominal": p.nominal,
-        }
+        members(p, "symbol", "value", "sigma") | {"low": low, "high": high} | members(p, "unit", "nominal")
         for p in result.parameters.values()
         for low, high in [result.interval(p)]
-    ]  # fmt: skip
+    ]
 
 
 def frame_object(result: Calibration) -> dict[str, Any] | None:
@@ -90,8 +83,7 @@ def outlying_object(outlying: OutlyingDwell) -> dict[str, Any]:
     return {
         "dwell": outlying.number,
         "gimbal_deg": np.degrees(outlying.dwell.recorded_pose) if outlying.without.bench.axes else None,
-        "error_mps2": outlying.error_mps2,
-        "p_value": outlying.p_value,
+        **members(outlying, "error_mps2", "p_value"),
         "turns": [vars(turn) | {"gimbal": turn.gimbal + 1} for turn in outlying.turns],
         "without": {"p_value": outlying.without.consistency.p_value, "parameters": parameters_object(outlying.without)},
     }
@@ -113,10 +105,7 @@ def compare_object(compared: Comparison) -> dict[str, Any]:
             "max_difference_sigma": compared.max_difference_sigma,
             "engines": {
                 name: {
-                    "wall_s": way.wall_s,
-                    "peak_mb": way.peak_mb,
-                    "max_difference_sigma": way.max_difference_sigma,
-                    "max_relative_variance": way.max_relative_variance,
+                    **members(way, "wall_s", "peak_mb", "max_difference_sigma", "max_relative_variance"),
                     "values": way.estimate.parameters,
                     "sigmas": way.estimate.sigma,
                 }
@@ -151,6 +140,11 @@ def side_by_side_object(pair: SideBySide) -> dict[str, Any]:
             "differences_p_value": pair.p_value,
         }
     )
+
+
+def members(of: object, *names: str) -> dict[str, Any]:
+    """What an object has by these names, which are the keys of JSON."""
+    return {name: getattr(of, name) for name in names}
 
 
 def clean(value: Any) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import Any
 
 from rich.console import Group, RenderableType
@@ -10,10 +11,9 @@ from rich.text import Text
 
 from kf_calib.noise.power_laws import TERMS
 from kf_calib.noise.rest_noise import ChannelNoise, RestNoise
-from kf_calib.noise.term_fit import Size
 from kf_calib.support.units import Unit, shown, significant, span
-from kf_calib.views.json import clean
-from kf_calib.views.terminal import ConsoleTable, note
+from kf_calib.views.json import clean, members
+from kf_calib.views.terminal import note, table
 
 TITLES = {
     "quantisation": "quantisation",
@@ -52,12 +52,7 @@ def noise_object(noise: RestNoise) -> dict[str, Any]:
     """The JSON object of ``noise``."""
     return clean(
         {
-            "readings": noise.readings,
-            "rate_hz": noise.rate_hz,
-            "rest_s": noise.rest_s,
-            "stretches": noise.stretches,
-            "longest_s": noise.longest_s,
-            "gaps": noise.gaps,
+            **members(noise, "readings", "rate_hz", "rest_s", "stretches", "longest_s", "gaps"),
             "left_out": {"moving": noise.moving, "next_to_motion": noise.settling, "unusable": noise.unusable},
             "channels": [_channel_object(channel) for channel in noise.channels],
             "warnings": [*noise.warnings, *remarks(noise)],
@@ -73,11 +68,9 @@ def _channel_object(channel: ChannelNoise) -> dict[str, Any]:
         "unit": channel.unit,
         "rate_hz": 1.0 / channel.period_s,
         **values,
-        "intervals": {term: _interval_object(size) for term, size in channel.terms.items()},
-        "by_allan": {term: _interval_object(size) for term, size in channel.by_allan.items()},
-        "unclear": list(channel.unclear),
-        "from_s": channel.from_s,
-        "p_value": channel.p_value,
+        "intervals": {term: members(size, "value", "low", "high") for term, size in channel.terms.items()},
+        "by_allan": {term: members(size, "value", "low", "high") for term, size in channel.by_allan.items()},
+        **members(channel, "unclear", "from_s", "p_value"),
         f"reading_sigma_{suffix}": channel.reading_sigma,
         f"step_{suffix}": channel.step or None,
         "taus_s": channel.tau_s,
@@ -88,32 +81,23 @@ def _channel_object(channel: ChannelNoise) -> dict[str, Any]:
     }
 
 
-def _interval_object(size: Size) -> dict[str, float | None]:
-    return {"value": size.value, "low": size.low, "high": size.high}
-
-
 def noise_report(noise: RestNoise) -> RenderableType:
     """The report that ``noise`` prints."""
-    table = ConsoleTable(title="Noise at rest, with 95 % intervals", title_justify="left")
-    for heading in ("channel", "term"):
-        table.add_column(heading)
-    for heading in ("size", "from", "to"):
-        table.add_column(heading, justify="right")
-    table.add_column("unit")
-    table.add_column("by Allan variance", justify="right")
-    for channel in noise.channels:
-        _add_rows(table, channel)
-    return Group(Text(_readings_sentence(noise)), table, *map(note, [*noise.warnings, *remarks(noise)]))
+    rows = [row for channel in noise.channels for row in _rows(channel)]
+    headings = "channel", "term", ">size", ">from", ">to", "unit", ">by Allan variance"
+    ends = range(len(TERMS) - 1, len(rows), len(TERMS))
+    sizes = table("Noise at rest, with 95 % intervals", headings, rows, ends)
+    return Group(Text(_readings_sentence(noise)), sizes, *map(note, [*noise.warnings, *remarks(noise)]))
 
 
-def _add_rows(table: ConsoleTable, channel: ChannelNoise) -> None:
+def _rows(channel: ChannelNoise) -> Iterator[tuple[str, ...]]:
     for term in reversed(TERMS) if channel.terms else ():
         unit, size, other = unit_of(channel.unit, term), channel.terms[term], channel.by_allan[term]
         ends = [unit.number(end) for end in (size.low, size.high)]
         cells = ["not seen", "0", f"< {ends[1]}"] if size.value is None else [unit.number(size.value), *ends]
         by_allan = f"< {unit.number(other.high)}" if other.value is None else unit.number(other.value)
         name = channel_title(channel) if term == TERMS[-1] else ""
-        table.add_row(name, TITLES[term], *cells, unit.label, by_allan, end_section=term == TERMS[0])
+        yield name, TITLES[term], *cells, unit.label, by_allan
 
 
 def _readings_sentence(noise: RestNoise) -> str:

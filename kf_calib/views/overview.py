@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Group, RenderableType
 from rich.text import Text
 
@@ -19,8 +18,8 @@ from kf_calib.sources.containers.opening import ContainerKind
 from kf_calib.sources.files.inventory import Inventory, Topic
 from kf_calib.sources.text.survey import ColumnFound, Survey
 from kf_calib.support.text import counted, cut
-from kf_calib.views.json import clean
-from kf_calib.views.terminal import ConsoleTable, note
+from kf_calib.views.json import clean, members
+from kf_calib.views.terminal import LINED, ConsoleTable, note, table
 
 _FORMATS = {"mcap": "MCAP", "db3": "SQLite of ROS 2", "lines": "lines of text", "mcap+db3": "MCAP and SQLite of ROS 2"}
 _FORMATS |= {"bag": "bag of ROS 1"} | {kind.name.lower(): f"a file of {kind.value}" for kind in ContainerKind}
@@ -54,19 +53,19 @@ def overview_object(overview: Overview) -> dict[str, Any]:
             "files": [str(file) for file in inventory.files], "bytes": inventory.size,
             "topics": [_topic_object(topic) for topic in inventory.topics], "bench": overview.bench,
             "dwells": None if overview.dwells is None else [vars(dwell) for dwell in overview.dwells],
-            "missing": overview.missing, "command": overview.command, "examples": list(overview.examples),
-            "warnings": overview.warnings,
+            **members(overview, "missing", "command", "examples", "warnings"),
         }
     )  # fmt: skip
 
 
 def _topic_object(topic: Topic) -> dict[str, Any]:
     return {
-        "topic": topic.name, "schema": topic.schema, "encoding": topic.encoding, "messages": topic.count,
-        "rate_hz": topic.rate_hz, "first_ns": topic.first_ns, "last_ns": topic.last_ns, "gaps": topic.gaps,
-        "longest_gap_s": topic.longest_gap_s, "longest_gap_at_s": topic.longest_gap_at_s,
-        "backward": topic.backward, "fields": list(topic.paths),
-    }  # fmt: skip
+        "topic": topic.name,
+        **members(topic, "schema", "encoding"),
+        "messages": topic.count,
+        **members(topic, "rate_hz", "first_ns", "last_ns", "gaps", "longest_gap_s", "longest_gap_at_s", "backward"),
+        "fields": topic.paths,
+    }
 
 
 def overview_report(overview: Overview) -> RenderableType:
@@ -101,16 +100,14 @@ def _proposal(overview: Overview | TableOverview) -> str:
 
 
 def _topic_table(topics: Sequence[Topic]) -> ConsoleTable:
-    table = ConsoleTable(box=SIMPLE_HEAD, pad_edge=False)
-    for heading in ("topic", "type", "messages", "Hz", "from s", "to s", "gaps"):
-        table.add_column(heading, justify="left" if heading in ("topic", "type", "gaps") else "right")
+    rows = list[tuple[str, ...]]()
     begin = min((topic.first_ns for topic in topics if topic.first_ns is not None), default=0)
     for topic in topics:
         times = ["" if each is None else f"{(each - begin) / 1e9:.2f}" for each in (topic.first_ns, topic.last_ns)]
         rate = "" if topic.rate_hz is None else f"{topic.rate_hz:.4g}"
         kind = f"{topic.schema or 'no schema'} ({topic.encoding})" if topic.encoding else ""
-        table.add_row(topic.name, kind, str(topic.count), rate, *times, _gaps(topic))
-    return table
+        rows.append((topic.name, kind, str(topic.count), rate, *times, _gaps(topic)))
+    return table("", ("topic", "type", ">messages", ">Hz", ">from s", ">to s", "gaps"), rows, **LINED)
 
 
 def _gaps(topic: Topic) -> str:
@@ -126,21 +123,16 @@ def _dwell_parts(dwells: Sequence[DwellSummary]) -> list[RenderableType]:
     if not dwells:
         return [Text("No dwell was found.")]
     lasts = [dwell.lasts_s for dwell in dwells]
-    parts: list[RenderableType] = [Text(f"{len(dwells)} dwells of {min(lasts):.3g} to {max(lasts):.3g} s:")]
-    table = ConsoleTable(box=SIMPLE_HEAD, pad_edge=False)
-    platform = "platform" if dwells[0].pose else "up by the readings"
-    for heading in ("dwell", "at s", "lasts s", "readings", platform, "norm m/s^2"):
-        table.add_column(heading, justify="right")
-    for dwell in dwells[:_SHOWN]:
-        table.add_row(
-            str(dwell.number),
-            f"{dwell.arrival_s:.2f}",
-            f"{dwell.lasts_s:.2f}",
-            str(dwell.readings),
-            pose_text(dwell.pose) or up_text(dwell.up),
-            f"{dwell.norm_mps2:.4f}",
-        )  # fmt: skip
-    parts.append(table)
+    rows = [
+        (str(dwell.number), f"{dwell.arrival_s:.2f}", f"{dwell.lasts_s:.2f}", str(dwell.readings),
+         pose_text(dwell.pose) or up_text(dwell.up), f"{dwell.norm_mps2:.4f}")
+        for dwell in dwells[:_SHOWN]
+    ]  # fmt: skip
+    platform = ">platform" if dwells[0].pose else ">up by the readings"
+    parts: list[RenderableType] = [
+        Text(f"{len(dwells)} dwells of {min(lasts):.3g} to {max(lasts):.3g} s:"),
+        table("", (">dwell", ">at s", ">lasts s", ">readings", platform, ">norm m/s^2"), rows, **LINED),
+    ]
     if len(dwells) > _SHOWN:
         parts.append(Text(f"and {len(dwells) - _SHOWN} more, all of them by --json"))
     return parts
@@ -193,8 +185,7 @@ def table_object(overview: TableOverview) -> dict[str, Any]:
             "columns": [column._asdict() for column in survey.described_columns],
             "orientation": survey.orientation or None, "bench": overview.bench,
             "dwells": [row._asdict() | {"pose": list(row.pose), "up": list(row.up)} for row in survey.described_rows],
-            "missing": overview.missing,
-            "command": overview.command, "examples": list(overview.examples), "warnings": survey.warnings,
+            **members(overview, "missing", "command", "examples"), "warnings": survey.warnings,
         }
     )  # fmt: skip
 
@@ -227,15 +218,12 @@ def table_report(overview: TableOverview) -> RenderableType:
 
 
 def _column_table(columns: Sequence[ColumnFound]) -> ConsoleTable:
-    table = ConsoleTable(box=SIMPLE_HEAD, pad_edge=False)
-    for heading in ("column", "first cell", "taken for", "unit", "told"):
-        table.add_column(heading, justify="left")
-    for survey in columns:
-        unit = _UNITS.get(survey.unit, survey.unit)
-        table.add_row(
-            cut(survey.header, 40), cut(survey.first, 24), _quantity(survey.meaning), unit, _TOLD[survey.told_by]
-        )
-    return table
+    rows = [
+        (cut(column.header, 40), cut(column.first, 24), _quantity(column.meaning),
+         _UNITS.get(column.unit, column.unit), _TOLD[column.told_by])
+        for column in columns
+    ]  # fmt: skip
+    return table("", ("column", "first cell", "taken for", "unit", "told"), rows, **LINED)
 
 
 def _quantity(meaning: str) -> str:
@@ -252,14 +240,12 @@ def _quantity(meaning: str) -> str:
 
 
 def _row_table(survey: Survey) -> ConsoleTable:
-    table = ConsoleTable(box=SIMPLE_HEAD, pad_edge=False)
-    for heading in ("dwell", "row", "at s", _ORIENTATIONS[survey.orientation], "norm m/s^2", "readings", "°C"):
-        table.add_column(heading, justify="right")
-    for row in survey.described_rows[:_SHOWN_ROWS]:
-        table.add_row(
-            str(row.number), str(row.row), f"{row.at_s:g}", row.face or pose_text(row.pose) or up_text(row.up),
-            f"{row.norm_mps2:.4f}",
-            "" if row.readings is None else str(row.readings),
-            "" if math.isnan(row.temperature_c) else f"{row.temperature_c:.2f}",
-        )  # fmt: skip
-    return table
+    rows = [
+        (str(row.number), str(row.row), f"{row.at_s:g}", row.face or pose_text(row.pose) or up_text(row.up),
+         f"{row.norm_mps2:.4f}", "" if row.readings is None else str(row.readings),
+         "" if math.isnan(row.temperature_c) else f"{row.temperature_c:.2f}")
+        for row in survey.described_rows[:_SHOWN_ROWS]
+    ]  # fmt: skip
+    orientation = f">{_ORIENTATIONS[survey.orientation]}"
+    headings = ">dwell", ">row", ">at s", orientation, ">norm m/s^2", ">readings", ">°C"
+    return table("", headings, rows, **LINED)

@@ -21,9 +21,9 @@ from kf_calib.estimation.free_attitude import up_in_words
 from kf_calib.support.output_files import write_whole
 from kf_calib.support.text import counted
 from kf_calib.support.units import Unit, shown
-from kf_calib.views.console import symbol
-from kf_calib.views.json import clean
-from kf_calib.views.terminal import ConsoleTable, note
+from kf_calib.views.json import clean, members
+from kf_calib.views.notation import symbol
+from kf_calib.views.terminal import FOURS, ConsoleTable, note, table
 
 
 def gimbal_names(made: Plan) -> list[str]:
@@ -52,10 +52,7 @@ def plan_object(plan: Plan, beside_paper: bool = False) -> dict[str, Any]:
         "sigma": dict(zip(symbols, plan.sigma[-1], strict=True)),
         "sigma_before": dict(zip(symbols, plan.sigma[0], strict=True)) if before else None,
         "sigma_balanced": _named(symbols, plan.balanced_sigma),
-        "condition_number": plan.condition_number,
-        "d_efficiency": plan.d_efficiency,
-        "d_efficiency_within_reach": plan.d_efficiency_within_reach,
-        "largest_variance": plan.largest_variance,
+        **members(plan, "condition_number", "d_efficiency", "d_efficiency_within_reach", "largest_variance"),
         "parameters": len(symbols),
         "time_correlation": plan.correlation,
         "remarks": plan.remarks,
@@ -96,32 +93,26 @@ def plan_report(made: Plan, beside_paper: bool = False) -> RenderableType:
 
 def _orientations(made: Plan) -> ConsoleTable:
     """Return the table of the orientations in their order."""
-    table = ConsoleTable(title=f"{counted(len(made.poses), 'orientation')}, in this order", title_justify="left")
-    for heading in (
-        "",
-        "begins, s",
-        *(f"{name.replace('_', ' ')}, deg" for name in gimbal_names(made)),
-        "up, in the platform",
-    ):
-        table.add_column(heading, justify="right")
     begins = made.at_s - 0.5 * made.timing.dwell_s
-    for k, (begin, angles, up) in enumerate(zip(begins, made.gimbal_deg, made.directions, strict=True), 1):
-        direction = " ".join(f"{part:+.3f}" for part in up)
-        table.add_row(str(k), f"{begin:.0f}", *(f"{angle:.2f}" for angle in angles), direction)
-    return table
+    rows = [
+        (str(k), f"{begin:.0f}", *(f"{angle:.2f}" for angle in angles), " ".join(f"{part:+.3f}" for part in up))
+        for k, (begin, angles, up) in enumerate(zip(begins, made.gimbal_deg, made.directions, strict=True), 1)
+    ]
+    gimbals = [f">{name.replace('_', ' ')}, deg" for name in gimbal_names(made)]
+    title = f"{counted(len(made.poses), 'orientation')}, in this order"
+    return table(title, (">", ">begins, s", *gimbals, ">up, in the platform"), rows)
 
 
 def _sigmas(made: Plan, beside_paper: bool) -> ConsoleTable:
     """Return the table of the predicted sigmas."""
-    table = ConsoleTable(title="Predicted sigma (1σ)", title_justify="left")
     columns = _columns(made, beside_paper)
-    for heading in ("parameter", *columns, "unit"):
-        table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
     units = [*map(shown, paper_parameters.UNITS), *map(shown, made.prospect.model.coefficients)]
-    for k, (name, unit) in enumerate(zip(made.prospect.symbols, units, strict=True)):
-        values = [_figure(values[k], percent, unit) for values, percent in columns.values()]
-        table.add_row(symbol(name), *values, unit.label, end_section=k % 4 == 3)
-    return table
+    rows = [
+        (symbol(name), *(_figure(values[k], percent, unit) for values, percent in columns.values()), unit.label)
+        for k, (name, unit) in enumerate(zip(made.prospect.symbols, units, strict=True))
+    ]
+    headings = "parameter", *(f">{name}" for name in columns), "unit"
+    return table("Predicted sigma (1σ)", headings, rows, FOURS)
 
 
 def _columns(plan: Plan, beside_paper: bool) -> dict[str, tuple[Floats, bool]]:
@@ -178,17 +169,11 @@ _UNITS = dict(zip(paper_parameters.SYMBOLS, paper_parameters.UNITS, strict=True)
 
 def hand_plan_report(made: HandPlan) -> RenderableType:
     """The poses in their order, and the sigmas to expect."""
-    poses = ConsoleTable(title=f"{len(made.up)} poses to hold still", title_justify="left")
-    for heading in ("pose", "points up", "in words"):
-        poses.add_column(heading, justify="right" if heading == "pose" else "left")
-    for k, up in enumerate(made.up, 1):
-        poses.add_row(str(k), up, up_in_words(up))
-    sigmas = ConsoleTable(title="Predicted sigma (1σ)", title_justify="left")
-    for heading in ("parameter", "sigma", "unit"):
-        sigmas.add_column(heading, justify="right" if heading == "sigma" else "left")
-    for name, sigma in zip(SYMBOLS, made.sigma[-1], strict=True):
-        unit = shown(_UNITS[name])
-        sigmas.add_row(symbol(name), f"± {unit.number(sigma, 2)}", unit.label)
+    turned = [(str(k), up, up_in_words(up)) for k, up in enumerate(made.up, 1)]
+    poses = table(f"{len(made.up)} poses to hold still", (">pose", "points up", "in words"), turned)
+    expected = [(symbol(name), shown(_UNITS[name]), sigma) for name, sigma in zip(SYMBOLS, made.sigma[-1], strict=True)]
+    rows = [(name, f"± {unit.number(sigma, 2)}", unit.label) for name, unit, sigma in expected]
+    sigmas = table("Predicted sigma (1σ)", ("parameter", ">sigma", "unit"), rows)
     near = "a pose need not be exact: within some ten degrees of it will do."
     return Group(poses, sigmas, note(near))
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -131,6 +131,33 @@ class ConsoleTable(rich.table.Table):
             if row.end_section and number < len(self.rows) - 1:
                 lines.append("")
         return "\n".join(lines)
+
+
+FOURS = range(3, 12, 4)
+"""The last rows of the four parameters of each accelerometer."""
+LINED: Mapping[str, Any] = {"box": SIMPLE_HEAD, "pad_edge": False}
+"""A table without a frame, but with a line below its headings."""
+BARE: Mapping[str, Any] = {"box": None, "pad_edge": False}
+"""A table without any line."""
+
+
+def table(
+    title: str, headings: Iterable[str], rows: Iterable[Iterable[RenderableType]], ends: Container[int] = (),
+    whole: Container[str] = (), **style: Any,
+) -> ConsoleTable:  # fmt: skip
+    """A table of these rows.
+
+    headings: of its columns; one of numbers, which are aligned to the right, begins with ``>``. ends: numbers of the
+    rows, from 0, below which there is a line. whole: headings of columns of text that is never folded. style: as
+    Rich has it.
+    """
+    drawn = ConsoleTable(title=title or None, title_justify="left", **style)
+    for heading in headings:
+        name, justify = heading.removeprefix(">"), "right" if heading.startswith(">") else "left"
+        drawn.add_column(name, justify=justify, no_wrap=name in whole)
+    for number, row in enumerate(rows):
+        drawn.add_row(*row, end_section=number in ends)
+    return drawn
 
 
 def _one_line(cell: RenderableType | None) -> str:

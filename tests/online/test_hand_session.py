@@ -32,7 +32,7 @@ from kf_calib.sources.simulation.settings import SimulationOptions
 from kf_calib.views.console import plain
 from kf_calib.views.json import replay_object
 from kf_calib.views.live.content import content_of
-from kf_calib.views.live.objects import hand_line, hand_object
+from kf_calib.views.live.objects import line, live_object
 from kf_calib.views.live.screen import screen
 
 sys.path.insert(0, str(ROOT / "tools"))
@@ -140,8 +140,8 @@ def test_a_poor_set_of_sides_is_told_and_not_fitted() -> None:
         session.run()
     assert [each.result for each in told] == [None] * 4 and told[-1].sides.missing == ("K1", "K3", "b1", "b3")
     assert told[-1].sides.repeats == 1 and told[-1].sides.count == 3
-    line = hand_line(told[-1])
-    assert "the side of pose 1 again" in line and "3 sides seen" in line and "not determined yet" in line
+    said = line(told[-1])
+    assert "the side of pose 1 again" in said and "3 sides seen" in said and "not determined yet" in said
 
 
 def judged(p_value: float | None, looks: int = 1, square: tuple[str, ...] = (), final: bool = False) -> HandJudgement:
@@ -175,9 +175,9 @@ def test_screen_and_object_show_nine_parameters_with_their_targets() -> None:
     shown = plain(screen(content_of(standing, None, "/dev/ttyACM0"), "q: end the run"), width=80)
     assert "still for 3 s of 5 s" in shown and "sides seen" in shown and "q: end the run" in shown
     assert "θ1" not in shown and "φ3" in shown and shown.count("ppm") == 3 and len(shown.splitlines()) <= 24
-    made = hand_object(told.judged[1], standing, None)
+    made = live_object(told.judged[1], standing, None)
     assert made["pose"] == {"number": 2, "up": "+y", "repeats": 1} and made["next_side"]["turn"] == "-y points up"
-    made = hand_object(told.judged[-1], standing, None)
+    made = live_object(told.judged[-1], standing, None)
     assert made["final"] and made["targets_reached"] and made["targets"] == {"K1": 1e-3, "nu1": 1e-3}
 
 

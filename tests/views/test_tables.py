@@ -64,7 +64,7 @@ def _plan(result: Calibration) -> RenderableType:
 
 def _visible(result: Calibration) -> RenderableType:
     chosen = [effect_named(name, result.bench) for name in ("magnetic", "thermal-bias", "warm-up")]
-    return catalogue.sight_report(visibility_of(result.fit, chosen), "What a recording shows")
+    return catalogue.sight_report(visibility_of(result.fit, chosen), result.model, "a recording")
 
 
 REFITS = Refits()

@@ -9,11 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from datetime import timedelta
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
+from matplotlib.dates import date2num
 from matplotlib.figure import Figure, FigureBase
 
 from kf_calib.bench import paper_parameters
@@ -23,7 +22,6 @@ from kf_calib.estimation.filter_history import InnovationTests, ParameterHistory
 from kf_calib.estimation.results import Calibration
 from kf_calib.exchange.history import History, ParameterTrack
 from kf_calib.support.units import rounded, shown, significant
-from kf_calib.views.console import symbol
 from kf_calib.views.figures.style import (
     ACCELEROMETERS,
     ALARM,
@@ -34,14 +32,16 @@ from kf_calib.views.figures.style import (
     PALE,
     UNIT_KINDS,
     Shown,
-    blank,
+    dated,
+    drawn_on,
     log_scale,
-    styled,
+    panels_of,
+    say_once,
     twelve,
     whole_numbers,
     with_coefficients,
-    written,
 )
+from kf_calib.views.notation import symbol, written
 
 MANY = 60
 """Dwells, above which curves have no markers."""
@@ -148,21 +148,18 @@ _LEGEND_ROOM = 0.32  # of a panel, for its legend above the points
 _CUT = 12.0  # final sigmas beyond which an estimate on its way is not drawn
 
 
-def convergence(result: Calibration) -> Figure:
+@drawn_on()
+def convergence(figure: Figure, result: Calibration) -> None:
     """Sigma of every parameter against the number of orientations, the largest of each kind named; NIS and innovations.
 
     NIS of each dwell has the middle 95 % of chi-squared behind it, innovations are over their sigma with lines at 2.
     """
     history = history_of(result)
-    units = {each.unit for each in with_coefficients(history.parameters[STATE_COUNT:])[STATE_COUNT:]}
-    with styled():
-        figure = blank(11.0, 7.0 + 1.3 * -(-len(units) // 3))
-        left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[2.1, 1.0])[0]
-        draw_sigmas(
-            left, history.numbers.astype(float), history.sigmas, with_coefficients(history.parameters[STATE_COUNT:])
-        )
-        draw_innovations(right, innovation_tests(result))
-    return figure
+    names = with_coefficients(history.parameters[STATE_COUNT:])
+    figure.set_size_inches(11.0, 7.0 + 1.3 * -(-len(_by_unit(names)) // 3))
+    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[2.1, 1.0])[0]
+    draw_sigmas(left, history.numbers.astype(float), history.sigmas, names)
+    draw_innovations(right, innovation_tests(result))
 
 
 def draw_innovations(figure: FigureBase, tests: InnovationTests) -> None:
@@ -222,19 +219,12 @@ def draw_ratios(axes: Axes, tests: InnovationTests) -> None:
                   va="center", color=GREY)  # fmt: skip
 
 
-def estimates(result: Calibration) -> Figure:
+@drawn_on()
+def estimates(figure: Figure, result: Calibration) -> None:
     """Each estimate on its way to the final one, in final sigmas, with its own sigma after every orientation."""
-    with styled():
-        history = history_of(result)
-        count = len(history.parameters) - STATE_COUNT
-        figure = blank(11.0, 7.0 + 1.3 * -(-count // 3))
-        draw_estimates(figure, history)
-    return figure
-
-
-def draw_estimates(figure: FigureBase, history: ParameterHistory) -> None:
-    """The same on a part of a figure."""
+    history = history_of(result)
     names = with_coefficients(history.parameters[STATE_COUNT:])
+    figure.set_size_inches(11.0, 7.0 + 1.3 * -(-(len(names) - STATE_COUNT) // 3))
     twelve, others = parameter_panels(figure, "", [[k] for k in range(STATE_COUNT, len(names))])
     around = history.sigmas / history.sigmas[-1]
     reach = np.abs(history.deviations) + around
@@ -262,31 +252,19 @@ def _ending(history: ParameterHistory, k: int, name: Shown) -> str:
     return f"{name.label} {'' if off.startswith('-') else '+'}{off} ± {sigma} {name.unit}".replace("-", "−")
 
 
-_WIDE = 4
 _AHEAD = 0.5  # of the time from the first to the last calibration, if no later date is asked for
 _SIGMAS = 2.0
 
 
-def history(calibrations: History) -> Figure:
+@drawn_on()
+def history(figure: Figure, calibrations: History) -> None:
     """A panel a parameter: what each calibration found less the last, with its 2 sigma, on the band within which those
     before it predict it; after the last, the band of the parameter in use, its tolerance, and when it may leave it.
     """
-    with styled():
-        high = -(-len(calibrations.tracks) // _WIDE)
-        figure = blank(13.0, 1.2 + 2.2 * high)
-        panels = figure.subplots(high, _WIDE, sharex=True, squeeze=False)
-        for track, axes in zip(calibrations.tracks, panels.flat, strict=False):
-            _chart(axes, calibrations, track)
-        for axes in [*panels.flat][len(calibrations.tracks) :]:
-            axes.set_axis_off()
-        for axes in panels[-1]:
-            axes.tick_params(axis="x", labelrotation=0)
-        handle_of = dict[str, Any]()
-        for axes in panels.flat:
-            handles, labels = axes.get_legend_handles_labels()
-            handle_of = dict(zip(labels, handles, strict=True)) | handle_of
-        figure.legend([*handle_of.values()], [*handle_of], loc="outside lower left", ncols=6)
-    return figure
+    panels = panels_of(figure, len(calibrations.tracks), 1.2, 2.2)
+    for track, axes in zip(calibrations.tracks, panels, strict=True):
+        _chart(axes, calibrations, track)
+    say_once(figure, panels)
 
 
 def _chart(axes: Axes, calibrations: History, track: ParameterTrack) -> None:
@@ -316,9 +294,7 @@ def _chart(axes: Axes, calibrations: History, track: ParameterTrack) -> None:
     if calibrations.due is not None and calibrations.due_by == track.symbol:
         axes.axvline(float(date2num(calibrations.due)), label="may leave it", color=ALARM, linewidth=1.2)
     axes.set_title(f"{symbol(track.symbol)}, {unit.label} from the last")
-    locator = AutoDateLocator(minticks=3, maxticks=5)
-    axes.xaxis.set_major_locator(locator)
-    axes.xaxis.set_major_formatter(ConciseDateFormatter(locator, show_offset=False))
+    dated(axes)
 
 
 def _days_ahead(calibrations: History) -> float:

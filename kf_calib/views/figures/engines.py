@@ -21,13 +21,12 @@ from kf_calib.views.figures.style import (
     GREY,
     MARKERS,
     PALE,
-    blank,
+    drawn_on,
     log_scale,
     say,
-    styled,
     whole_numbers,
-    written,
 )
+from kf_calib.views.notation import written
 
 _WAYS = {"block": "block engine", "filterpy": "filterpy", "batch": "batch least squares"}
 _COLOURS = {"block": "#222222", "filterpy": "#cc79a7", "batch": "#56b4e9"}
@@ -35,22 +34,20 @@ _LOWEST = 0.8  # of a value, that a bar of its sigma may reach down by on a loga
 _HATCHES = {"block": "", "filterpy": "///", "batch": "..."}
 
 
-def three_ways(compared: Comparison) -> Figure:
+@drawn_on()
+def three_ways(figure: Figure, compared: Comparison) -> None:
     """Differences of filterpy and batch least squares from the block engine after each orientation, in sigma; time and
     memory of the three; cumulative NIS beside chi-squared."""
-    with styled():
-        figure = blank(11.0, 7.0)
-        above, below = figure.subfigures(2, 1, squeeze=False)[:, 0]
-        left, right = above.subfigures(1, 2, squeeze=False, width_ratios=[1.6, 1.0])[0]
-        draw_differences(left.subplots(), compared)
-        draw_costs(right, compared)
-        tests = innovation_tests(compared.result)
-        first, second = below.subplots(1, 2)
-        draw_nis(first, tests)
-        draw_cumulative(second, tests)
-        for axes in (first, second):
-            whole_numbers(axes, tests.numbers[0], tests.numbers[-1])
-    return figure
+    above, below = figure.subfigures(2, 1, squeeze=False)[:, 0]
+    left, right = above.subfigures(1, 2, squeeze=False, width_ratios=[1.6, 1.0])[0]
+    draw_differences(left.subplots(), compared)
+    draw_costs(right, compared)
+    tests = innovation_tests(compared.result)
+    first, second = below.subplots(1, 2)
+    draw_nis(first, tests)
+    draw_cumulative(second, tests)
+    for axes in (first, second):
+        whole_numbers(axes, tests.numbers[0], tests.numbers[-1])
 
 
 def draw_differences(axes: Axes, compared: Comparison) -> None:
@@ -113,16 +110,9 @@ def draw_cumulative(axes: Axes, tests: InnovationTests) -> None:
     axes.legend(loc="upper right")
 
 
-def whiteness(result: Calibration) -> Figure:
+@drawn_on(11.0, 6.0)
+def whiteness(figure: Figure, result: Calibration) -> None:
     """Autocorrelation of the innovations from dwell to dwell and of the readings within dwells, with 2 sigma bounds."""
-    with styled():
-        figure = blank(11.0, 6.0)
-        draw_whiteness(figure, result)
-    return figure
-
-
-def draw_whiteness(figure: FigureBase, result: Calibration) -> None:
-    """The same on a part of a figure: a column an accelerometer, innovations above, readings below."""
     tests, inside = innovation_tests(result), reading_correlation(result)
     panels = figure.subplots(2, 3, sharey="row")
     nothing = np.zeros(len(tests.bound))
@@ -161,19 +151,13 @@ def _reach(axes: Axes, values: Floats, bound: Floats) -> None:
     axes.set_ylim(-(reach or 1.0), reach or 1.0)
 
 
-def allan_deviation(compared: Comparison) -> Figure:
-    """Allan deviation of the readings in the longest dwells, with the lines of the noise model."""
-    with styled():
-        figure = blank(11.0, 5.0)
-        if compared.allan is None:
-            say(figure, "There are no readings to take an Allan deviation of.")
-        else:
-            draw_allan(figure, compared.allan)
-    return figure
-
-
-def draw_allan(figure: FigureBase, allan: AllanDeviation) -> None:
-    """The same on a part of a figure: a panel an accelerometer."""
+@drawn_on(11.0, 5.0)
+def allan_deviation(figure: Figure, compared: Comparison) -> None:
+    """Allan deviation of the readings in the longest dwells, with the lines of the noise model: a panel an
+    accelerometer."""
+    allan = compared.allan
+    if allan is None:
+        return say(figure, "There are no readings to take an Allan deviation of.")
     panels: Sequence[Axes] = figure.subplots(1, 3, sharex=True, sharey=True)
     scaled = allan.deviation_mps2 * shown("m/s^2").per_si
     for i, axes in enumerate(panels):

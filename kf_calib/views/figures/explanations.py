@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure, FigureBase
+from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from kf_calib.design.next_orientation import ENOUGH, Advice
@@ -29,12 +29,12 @@ from kf_calib.support.text import counted
 from kf_calib.support.units import shown, span
 from kf_calib.views.console import GRADES, size_range
 from kf_calib.views.diagnosis import name_of
-from kf_calib.views.figures.style import BEST, GREY, PALE, RUNNER_UP, blank, label_axis, say, styled, wrapped
+from kf_calib.views.figures.style import BEST, GREY, PALE, RUNNER_UP, drawn_on, label_ticks, say, ticks, wrapped
 
 _FAMILIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # Okabe and Ito's, the likeliest first
 _NO_EFFECT = {NOTHING: PALE, NOISE: GREY, NONE: BEST}
 _NAME = 44  # letters of a name in a line
-_LINE_IN = 0.2
+_LINE_IN = 0.14
 _END = 130.0  # of the panel in per cent: beyond 100 there are numbers
 
 
@@ -52,28 +52,19 @@ class _Bar(NamedTuple):
         return self.name.count("\n") + 1
 
 
-def hypotheses(diagnosis: Diagnosis) -> Figure:
+@drawn_on()
+def hypotheses(figure: Figure, diagnosis: Diagnosis) -> None:
     """The probability of each family of effects, and of each explanation in the colours of its families.
 
     Those of less than 1 % are drawn together. Beside each explanation stands the logarithm of its odds to the next.
     """
-    with styled():
-        if diagnosis.table is None:
-            figure = blank(11.0, 2.0)
-            say(figure, wrapped(diagnosis.verdict, 110))
-            return figure
-        lines = sum(bar.lines + 0.5 for bars in _probability_bars(diagnosis.table) for bar in bars)
-        figure = blank(11.0, 1.9 + _LINE_IN * lines)
-        draw_hypotheses(figure, diagnosis.table)
-    return figure
-
-
-def draw_hypotheses(figure: FigureBase, table: HypothesisTable) -> None:
-    """The same on a part of a figure."""
-    above, below = both = _probability_bars(table)
-    families, explanations = figure.subplots(
-        2, 1, sharex=True, height_ratios=[sum(bar.lines + 0.5 for bar in bars) for bars in both]
-    )
+    if diagnosis.table is None:
+        figure.set_size_inches(11.0, 2.0)
+        return say(figure, wrapped(diagnosis.verdict, 110))
+    above, below = both = _probability_bars(diagnosis.table)
+    lines = [sum(bar.lines + 0.5 for bar in bars) for bars in both]
+    figure.set_size_inches(11.0, 1.9 + _LINE_IN * sum(lines))
+    families, explanations = figure.subplots(2, 1, sharex=True, height_ratios=lines)
     _draw(families, above, "Families of what is missing (two effects at once count in both of theirs)")
     _draw(explanations, below, "Explanations, in the colours of their families", "log₁₀ odds\nto the next")
     explanations.set_xlabel("probability, %; dashes: from 95 % on it is taken for sure", loc="left")
@@ -142,21 +133,14 @@ _DARK = 0.6  # overlap above which numbers are white
 _FITTING = "#56b4e9"  # of Okabe and Ito's palette
 
 
-def suspects(diagnosis: Diagnosis) -> Figure:
+@drawn_on()
+def suspects(figure: Figure, diagnosis: Diagnosis) -> None:
     """What each suspect explains of the misfit, how alike suspects are, and what the next orientation would tell.
 
     Above, from the left: the part of the misfit beyond noise that each explanation takes away, and whether the model
     with it fits; the overlaps of what they would add to the readings. Below: the quantities that the residuals go with,
     and the separation of the best explanation from its rivals, now and after one more dwell.
     """
-    with styled():
-        figure = blank(11.0, 7.0)
-        draw_suspects(figure, diagnosis, diagnosis.drivers)
-    return figure
-
-
-def draw_suspects(figure: FigureBase, diagnosis: Diagnosis, drivers: Sequence[Driver]) -> None:
-    """The same on a part of a figure; drivers: of the residuals."""
     explained = diagnosis.explanations[:_MOST]
     if not explained:
         return say(figure, wrapped(diagnosis.verdict, 90))
@@ -165,7 +149,7 @@ def draw_suspects(figure: FigureBase, diagnosis: Diagnosis, drivers: Sequence[Dr
     below = rows[1].subgridspec(1, 2, width_ratios=(1.15, 1.0))
     _suspect_bars(figure.add_subplot(above[0]), explained)
     _overlaps(figure.add_subplot(above[1]), diagnosis, names)
-    _drivers(figure.add_subplot(below[0]), drivers[:_DRIVERS])
+    _drivers(figure.add_subplot(below[0]), diagnosis.drivers[:_DRIVERS])
     _separation(figure.add_subplot(below[1]), diagnosis)
 
 
@@ -267,30 +251,23 @@ def _words(axes: Axes, text: str) -> None:
 
 _LOW, _HIGH = 0.01, 1000.0  # smallest detectable sizes that the axis spans
 _SEEN, _HIDDEN = "#0072b2", "#e69f00"  # of Okabe and Ito's palette
-_ROW_IN, _LINE_IN = 0.23, 0.14
+_ROW_IN = 0.23
 _LINE = 150  # letters of a line below the panels
 
 
-def detection_limits(diagnosis: Diagnosis) -> Figure:
+@drawn_on()
+def detection_limits(figure: Figure, diagnosis: Diagnosis) -> None:
     """Usual sizes of each effect over the smallest that this run would find; below, what it cannot see, and why.
 
     The part of a bar on the left of 1 could hide in the run: it is drawn in another colour. Usual sizes are those of
     sensors of the grade that the noise of the run is of.
     """
-    half = (len(diagnosis.detectable) + 1) // 2
-    below_in = _LINE_IN * (2 + sum(len(text.splitlines()) for text in _unseen_texts(diagnosis.unseen)))
-    height_in = max(7.0, 1.2 + _ROW_IN * half + below_in)
-    with styled():
-        figure = blank(11.0, height_in)
-        draw_detection_limits(figure, diagnosis, below_in / height_in)
-    return figure
-
-
-def draw_detection_limits(figure: FigureBase, diagnosis: Diagnosis, below: float) -> None:
-    """The same on a part of a figure; below: share of its height for what is not seen."""
     sizes, texts = _ordered(diagnosis.detectable, diagnosis.grade), _unseen_texts(diagnosis.unseen)
     half = (len(sizes) + 1) // 2
-    grid = figure.add_gridspec(2, 2, height_ratios=(1.0 - below, below))
+    below_in = _LINE_IN * (2 + sum(len(text.splitlines()) for text in texts))
+    height_in = max(7.0, 1.2 + _ROW_IN * half + below_in)
+    figure.set_size_inches(11.0, height_in)
+    grid = figure.add_gridspec(2, 2, height_ratios=(1.0 - below_in / height_in, below_in / height_in))
     for column, half_of_sizes in enumerate((sizes[:half], sizes[half:])):
         _size_bars(figure.add_subplot(grid[0, column]), half_of_sizes, half, diagnosis.grade, not column)
     words = figure.add_subplot(grid[1, :])
@@ -330,7 +307,7 @@ def _size_bars(axes: Axes, sizes: Sequence[Detectable], rows: int, grade: Grade,
     axes.set_yticks(range(len(sizes)), [detectable.name for detectable in sizes], fontsize=8.0)
     axes.set_ylim(max(rows, 3) - 0.4, -0.6)
     axes.grid(visible=False, axis="y")
-    label_axis(axes.xaxis, _LOW, _HIGH)
+    label_ticks(axes.xaxis, ticks(_LOW, _HIGH))
     axes.set_xlabel("usual size / smallest size that would be found")
     if first:
         numbers = f"beside: smallest size found in 9 of 10 such runs (usual sizes, {GRADES[grade]})"

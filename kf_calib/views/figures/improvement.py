@@ -17,9 +17,9 @@ from kf_calib.diagnosis.stepwise_selection import Improvement, SelectionStep
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration, Parameter, format_p
 from kf_calib.support.units import shown
-from kf_calib.views.console import symbol
 from kf_calib.views.figures.residuals import driver_axis, driver_to_show
-from kf_calib.views.figures.style import ACCELEROMETERS, GREY, MARKERS, PLATFORM, blank, say, styled, wrapped
+from kf_calib.views.figures.style import ACCELEROMETERS, GREY, MARKERS, PLATFORM, drawn_on, say, wrapped
+from kf_calib.views.notation import symbol
 
 _COLUMNS = 5  # models whose residuals are drawn
 _PANELS = 4  # of coefficients
@@ -35,21 +35,14 @@ class _Model:
     p_value: float | None = None
 
 
-def improvement(state: Improvement) -> Figure:
+@drawn_on(11.0, 8.0)
+def improvement(figure: Figure, state: Improvement) -> None:
     """Residuals over their sigma with the model of each step, on the same axes: a column a step.
 
     Above each stand its error on orientations left out, over what noise alone gives, and the p-value of the run. Undone
     steps are among them; effects among which the run cannot decide follow the last. Below are the coefficients that the
     last model has, with 1 and 2 sigma, against zero.
     """
-    with styled():
-        figure = blank(11.0, 8.0)
-        draw_improvement(figure, state)
-    return figure
-
-
-def draw_improvement(figure: FigureBase, state: Improvement) -> None:
-    """The same on a part of a figure."""
     models, coefficients = _models(state), _coefficients(state.result)
     if not any(each.result.consistency.dof for each in models):
         return say(figure, "The parameters take up every mean reading of this run: there is no error to be seen.")

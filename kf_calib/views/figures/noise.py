@@ -12,7 +12,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.noise.power_laws import FACTORS, POWERS, TERMS
 from kf_calib.noise.rest_noise import ChannelNoise, RestNoise
 from kf_calib.support.units import Unit
-from kf_calib.views.figures.style import ACCELEROMETERS, GREY, MARKERS, blank, log_scale, say, styled
+from kf_calib.views.figures.style import ACCELEROMETERS, GREY, MARKERS, drawn_on, log_scale, say, say_once
 from kf_calib.views.noise import TITLES, channel_title, unit_of
 
 _SLOPES = {"quantisation": "−1", "white": "−½", "bias_instability": "0", "random_walk": "+½"}
@@ -22,22 +22,18 @@ _ROOM = 3.0  # by how much a line of a term may be below the lowest deviation, t
 _ACROSS = 3
 
 
-def noise(found: RestNoise) -> Figure:
+@drawn_on()
+def noise(figure: Figure, found: RestNoise) -> None:
     """A panel a channel: Allan deviation with 95 % intervals, the terms with their slopes, and their sum."""
     rows = [found.of_unit(unit) for unit in ("m/s^2", "rad/s", "K")]
     rows = [row for row in rows if row]
-    with styled():
-        figure = blank(11.5, 0.8 + 4.0 * len(rows))
-        if not any(len(channel.deviation) for channel in found.channels):
-            say(figure, "There are too few readings at rest for an Allan deviation.")
-            return figure
-        panels: list[list[Axes]] = figure.subplots(len(rows), _ACROSS, squeeze=False).tolist()
-        for channels, axes in zip(rows, panels, strict=True):
-            _draw_row(axes, channels)
-        legends = [panel.get_legend_handles_labels() for panel in panels[0]]
-        handles = {name: handle for pair in legends for handle, name in zip(*pair, strict=True)}
-        figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=4)
-    return figure
+    figure.set_size_inches(11.5, 0.8 + 4.0 * len(rows))
+    if not any(len(channel.deviation) for channel in found.channels):
+        return say(figure, "There are too few readings at rest for an Allan deviation.")
+    panels: list[list[Axes]] = figure.subplots(len(rows), _ACROSS, squeeze=False).tolist()
+    for channels, axes in zip(rows, panels, strict=True):
+        _draw_row(axes, channels)
+    say_once(figure, panels[0], "outside lower center", 4)
 
 
 def _draw_row(panels: Sequence[Axes], channels: Sequence[ChannelNoise]) -> None:

@@ -21,7 +21,7 @@ from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.design.orientation_plan import Plan
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.estimation.estimate import correlation
-from kf_calib.estimation.filter_history import ParameterHistory, history_of
+from kf_calib.estimation.filter_history import history_of
 from kf_calib.estimation.residual_table import mean_sigmas, quantity_means, residual_table
 from kf_calib.estimation.results import Calibration
 from kf_calib.views.figures.convergence import MANY, draw_sigmas
@@ -32,16 +32,15 @@ from kf_calib.views.figures.style import (
     MARKERS,
     PALE,
     UNIT_KINDS,
-    blank,
+    drawn_on,
     log_scale,
     say,
-    styled,
     twelve,
     whole_numbers,
     with_coefficients,
     wrapped,
-    written,
 )
+from kf_calib.views.notation import written
 from kf_calib.views.plan import gimbal_names
 
 _AXES = {"+x": (0.0, 0.0, -9.0, -9.0), "+z": (-90.0, 0.0, -9.0, -9.0), "−z": (90.0, 0.0, -9.0, -9.0),
@@ -68,16 +67,9 @@ def on_map(directions: Floats) -> tuple[Floats, Floats]:
     return np.arctan2(-unit[:, 2], unit[:, 0]), np.arcsin(np.clip(unit[:, 1], -1.0, 1.0))
 
 
-def directions(result: Calibration) -> Figure:
+@drawn_on(11.0, 6.2)
+def directions(figure: Figure, result: Calibration) -> None:
     """Where specific force pointed in the platform in each dwell, coloured by the residual of each accelerometer."""
-    with styled():
-        figure = blank(11.0, 6.2)
-        draw_directions(figure, result)
-    return figure
-
-
-def draw_directions(figure: FigureBase, result: Calibration) -> None:
-    """The same on a part of a figure: triangles point up where the reading is larger than predicted."""
     table = residual_table(result)
     of = {name: table[name].reshape(-1, 3) for name in ("ratio", "force_x_mps2", "force_y_mps2", "force_z_mps2")}
     ratios, force = of.pop("ratio"), np.array([each[:, 0] for each in of.values()]).T
@@ -131,16 +123,14 @@ _GIMBALS = ("#222222", "#cc79a7", "#56b4e9", "#e69f00")
 _ARC = 33  # points of the way between two directions
 
 
-def plan(made: Plan) -> Figure:
+@drawn_on(11.0, 6.6)
+def plan(figure: Figure, made: Plan) -> None:
     """The orientations on the sphere in their order, and the predicted sigma of each parameter, with targets if any."""
-    with styled():
-        figure = blank(11.0, 6.6)
-        left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[1.25, 1.0])[0]
-        above, below = left.subfigures(2, 1, squeeze=False, height_ratios=[1.5, 1.0])[:, 0]
-        draw_tour(above, made)
-        draw_angles(below.subplots(), made)
-        draw_predicted(right, made)
-    return figure
+    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[1.25, 1.0])[0]
+    above, below = left.subfigures(2, 1, squeeze=False, height_ratios=[1.5, 1.0])[:, 0]
+    draw_tour(above, made)
+    draw_angles(below.subplots(), made)
+    draw_predicted(right, made)
 
 
 def draw_tour(figure: FigureBase, made: Plan) -> None:
@@ -233,34 +223,27 @@ def _values(axes: Axes, group: list[int], sigmas: Floats) -> None:
                           textcoords="offset points", va="center", fontsize=8.0)  # fmt: skip
 
 
-def predicted_sigmas(made: Plan) -> Figure:
+@drawn_on()
+def predicted_sigmas(figure: Figure, made: Plan) -> None:
     """Predicted sigma of every parameter against the number of orientations, with targets if any."""
     names = with_coefficients(made.prospect.model.coefficients)
-    with styled():
-        figure = blank(11.0, 7.0)
-        draw_sigmas(figure, np.arange(len(made.sigma), dtype=float), made.sigma, names, made.targets)
-    return figure
+    draw_sigmas(figure, np.arange(len(made.sigma), dtype=float), made.sigma, names, made.targets)
 
 
 _COLOURS = "PuOr_r"  # colour-blind eyes tell its ends apart
 _MANY = 150
 
 
-def on_the_sphere(diagnosis: Diagnosis) -> Figure:
+@drawn_on(11.0, 7.5)
+def on_the_sphere(figure: Figure, diagnosis: Diagnosis) -> None:
     """Residuals over their sigma by the direction of the specific force in the platform, a row an accelerometer.
 
     The sphere is unrolled with all areas true (Mollweide): the platform's z axis points up, its x axis out of the
     middle. Triangles up are positive, down negative. On the right: what the best explanation leaves, in the same
     colours.
     """
-    with styled():
-        figure = blank(11.0, 7.5) if diagnosis.explanation else blank(11.0, 2.8)
-        draw_on_the_sphere(figure, diagnosis)
-    return figure
-
-
-def draw_on_the_sphere(figure: FigureBase, diagnosis: Diagnosis) -> None:
-    """The same on a part of a figure; the accelerometers stand side by side where there is no explanation."""
+    if not diagnosis.explanation:
+        figure.set_size_inches(11.0, 2.8)
     force = quantity_means(diagnosis.before, ["fx", "fy", "fz"])
     directions = np.stack([force[f"f{axis}"][:, 0] for axis in "xyz"], axis=1)
     columns = {diagnosis.before.model.sum: diagnosis.before.residuals_mps2 / mean_sigmas(diagnosis.before)}
@@ -296,19 +279,13 @@ NOTABLE = 0.3
 """A correlation below this is not worth a place in a figure."""
 
 
-def information(result: Calibration) -> Figure:
+@drawn_on()
+def information(figure: Figure, result: Calibration) -> None:
     """The share of the final information 1/sigma^2 that came with each orientation.
 
     Above: mean over the parameters of each accelerometer; below: every parameter.
     """
-    with styled():
-        figure = blank(11.0, 7.0)
-        draw_information(figure, history_of(result))
-    return figure
-
-
-def draw_information(figure: FigureBase, history: ParameterHistory) -> None:
-    """The same on a part of a figure."""
+    history = history_of(result)
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=[1.0, 1.7])
     numbers, names = history.numbers, with_coefficients(history.parameters[STATE_COUNT:])
     count = int((numbers > 0).sum())
@@ -339,25 +316,17 @@ def draw_information(figure: FigureBase, history: ParameterHistory) -> None:
     figure.colorbar(mesh, ax=below, label="share, %", extend="max", pad=0.01)
 
 
-def correlations(result: Calibration) -> Figure:
+@drawn_on(8.0, 7.0)
+def correlations(figure: Figure, result: Calibration) -> None:
     """Correlations of the parameters and of the effects' coefficients at the end of a run, if any is notable."""
-    with styled():
-        figure = blank(8.0, 7.0)
-        if not draw_correlations(figure, result):
-            figure.set_size_inches(8.0, 1.5)
-    return figure
-
-
-def draw_correlations(figure: FigureBase, result: Calibration) -> bool:
-    """The same on a part of a figure; a sentence where no correlation is notable. Whether there is a matrix."""
     matrix, names = correlation(result.estimate), with_coefficients(result.model.coefficients)
     beside = np.where(np.eye(len(matrix), dtype=bool) | ~np.isfinite(matrix), 0.0, matrix)
     one, other = np.unravel_index(np.argmax(np.abs(beside)), beside.shape)
     if abs(beside[one, other]) < NOTABLE:
         largest = f"the largest, of {names[one].label} and {names[other].label}, is {beside[one, other]:.2g}"
         said = f"All correlations of parameters are smaller than {NOTABLE}: {largest.replace('-', '−')}."
-        say(figure, said, "#222222")
-        return False
+        figure.set_size_inches(8.0, 1.5)
+        return say(figure, said, "#222222")
     axes = figure.subplots()
     image = axes.imshow(np.ma.masked_invalid(matrix), cmap="PuOr_r", vmin=-1.0, vmax=1.0)
     axes.set_facecolor("#d9d9d9")
@@ -376,4 +345,3 @@ def draw_correlations(figure: FigureBase, result: Calibration) -> bool:
     lost = bool(np.isnan(np.diag(matrix)).any())
     axes.set_xlabel(f"Correlations; written from {NOTABLE} on{'; grey: not determined' if lost else ''}")
     figure.colorbar(image, ax=axes, label="correlation (no unit)", shrink=0.8)
-    return True

@@ -32,9 +32,8 @@ from kf_calib.views.figures.style import (
     MARKERS,
     PALE,
     PLATFORM,
-    blank,
+    drawn_on,
     say,
-    styled,
     wrapped,
 )
 
@@ -45,7 +44,8 @@ _LARGER = 1.1  # times sigma of noise alone, from which that with what was estim
 _MANY = 150  # dwells, above which markers are smaller and bars of sigma are left out
 
 
-def residuals(diagnosis: Diagnosis, driver: str | None = None) -> Figure:
+@drawn_on()
+def residuals(figure: Figure, diagnosis: Diagnosis, driver: str | None = None) -> None:
     """What the readings show of the best explanation, over the quantity that it goes with.
 
     From the left: the residuals of the model, with what the explanation predicts of them; what the effect must explain,
@@ -58,25 +58,15 @@ def residuals(diagnosis: Diagnosis, driver: str | None = None) -> Figure:
         raise TypeError(
             f"residuals are drawn of a diagnosis, not of a {type(diagnosis).__name__}: give what diagnose returns."
         )
-    with styled():
-        figure = blank(11.0, 7.0)
-        draw_residuals(figure, diagnosis, diagnosis.drivers, driver)
-    return figure
-
-
-def draw_residuals(
-    figure: FigureBase, diagnosis: Diagnosis, drivers: Sequence[Driver], symbol: str | None = None
-) -> None:
-    """The same on a part of a figure; drivers: of the residuals."""
     named = diagnosis.explanation
-    if named and symbol is None and named.shapes:
+    if named and driver is None and named.shapes:
         return draw_shape(figure, named.shapes[0])
-    driver = driver_to_show([each for each in drivers if symbol in (None, each.symbol)], follows(diagnosis))
-    if driver is None:
-        return say(figure, f"{symbol or 'Nothing that was recorded'} does not vary in this run.")
+    across = driver_to_show([each for each in diagnosis.drivers if driver in (None, each.symbol)], follows(diagnosis))
+    if across is None:
+        return say(figure, f"{driver or 'Nothing that was recorded'} does not vary in this run.")
     if named:
-        return draw_shape(figure, named.over(driver))
-    _draw_alone(figure, diagnosis, driver)
+        return draw_shape(figure, named.over(across))
+    _draw_alone(figure, diagnosis, across)
 
 
 def _draw_alone(figure: FigureBase, diagnosis: Diagnosis, driver: Driver) -> None:
@@ -202,17 +192,10 @@ def _curve(axes: Axes, scale: float, shape: EffectShape, i: int) -> None:
         axes.errorbar(x, middle, sigma, fmt="_", color=BEST, ecolor=BAND, elinewidth=6.0, markersize=9)
 
 
-def what_they_go_with(diagnosis: Diagnosis) -> Figure:
+@drawn_on()
+def what_they_go_with(figure: Figure, diagnosis: Diagnosis) -> None:
     """Residuals over their sigma against everything that varies in the run, and what the best explanation leaves."""
-    with styled():
-        figure = blank(11.0, 7.0)
-        draw_drivers(figure, diagnosis, diagnosis.drivers)
-    return figure
-
-
-def draw_drivers(figure: FigureBase, diagnosis: Diagnosis, drivers: Sequence[Driver]) -> None:
-    """The same on a part of a figure: a column a driver, those that explain most first."""
-    drawn, others = drivers[:_PANELS], [diagnosis.explanation] if diagnosis.explanation else []
+    drawn, others = diagnosis.drivers[:_PANELS], [diagnosis.explanation] if diagnosis.explanation else []
     if not drawn:
         return say(figure, "Nothing that was recorded varies in this run.")
     wide = min(4, len(drawn))
@@ -253,28 +236,24 @@ def _ratios(axes: Axes, x: Floats, ratios: Floats) -> None:
                   markeredgewidth=0.0, alpha=0.85, label=f"accelerometer {i + 1}")  # fmt: skip
 
 
-def dwell(source: Source, result: Calibration, number: int | None = None) -> Figure:
+@drawn_on()
+def dwell(figure: Figure, source: Source, result: Calibration, number: int | None = None) -> None:
     """Every reading of one dwell less the model's prediction, with their mean and its sigma: the worst dwell, or this.
 
     source: the recording that was calibrated, which is read once more. Of more than 4000 readings some are drawn.
     """
-    with styled():
-        figure = blank(11.0, 7.0)
-        draw_dwell(figure, readings_of(source, result, number), result.model.sum)
-    return figure
+    draw_dwell(figure, readings_of(source, result, number), result.model.sum)
 
 
-def disturbed_dwell(diagnosis: Diagnosis) -> Figure:
+@drawn_on()
+def disturbed_dwell(figure: Figure, diagnosis: Diagnosis) -> None:
     """The same of the dwell that a diagnosis calls wrong or disturbed, less what the other orientations predict of it.
 
     Raises InputError where there is none, or where its readings were gone when the run was diagnosed.
     """
     if diagnosis.disturbed_readings is None:
         raise InputError("this diagnosis has no readings of a disturbed dwell to draw.")
-    with styled():
-        figure = blank(11.0, 7.0)
-        draw_dwell(figure, diagnosis.disturbed_readings, diagnosis.before.model.sum)
-    return figure
+    draw_dwell(figure, diagnosis.disturbed_readings, diagnosis.before.model.sum)
 
 
 def draw_dwell(figure: FigureBase, readings: DwellReadings, model: str) -> None:

@@ -12,23 +12,27 @@ from __future__ import annotations
 import io
 import itertools
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import update_wrapper
+from inspect import Signature, signature
 from textwrap import fill
-from typing import Any, Literal, NamedTuple
+from typing import Any, Concatenate, Literal, NamedTuple, ParamSpec
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import Figure, FigureBase
-from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter, NullLocator
 
 from kf_calib.bench import paper_parameters
 from kf_calib.effects import Coefficient
 from kf_calib.estimation.results import Parameter
 from kf_calib.support import units
+from kf_calib.views.notation import label, written
 
 ACCELEROMETERS = ("#d55e00", "#009e73", "#0072b2")
 """One colour an accelerometer, from Okabe and Ito's palette; markers differ, too."""
@@ -38,6 +42,8 @@ PLATFORM = "#5b3f9e"
 """What is of the three accelerometers together."""
 GREY, PALE, BAND = "#6b6b6b", "#c9c9c9", "#00000018"
 ALARM = "#b3001b"
+
+Arguments = ParamSpec("Arguments")
 
 KINDS = ("png", "svg", "pdf")
 DPI = 150
@@ -86,6 +92,27 @@ class Picture(Figure):
         return content_of(self, "png", _DPI_OF_NOTEBOOKS)
 
 
+def drawn_on(
+    width_in: float = 11.0, height_in: float = 7.0
+) -> Callable[[Callable[Concatenate[Figure, Arguments], object]], Callable[Arguments, Figure]]:
+    """Make a function that draws on an empty figure, its first argument, one that gives the figure; of this size,
+    unless it sets another first."""
+
+    def given(draw: Callable[Concatenate[Figure, Arguments], object]) -> Callable[Arguments, Figure]:
+        def figure_of(*arguments: Arguments.args, **named: Arguments.kwargs) -> Figure:
+            with styled():
+                figure = blank(width_in, height_in)
+                draw(figure, *arguments, **named)
+            return figure
+
+        update_wrapper(figure_of, draw)
+        others = [*signature(draw).parameters.values()][1:]
+        figure_of.__signature__ = Signature(others, return_annotation="Figure")
+        return figure_of
+
+    return given
+
+
 def blank(width_in: float = 11.0, height_in: float = 7.0) -> Figure:
     """An empty figure that arranges its panels by itself."""
     figure = Picture(figsize=(width_in, height_in), layout="constrained", facecolor="white")
@@ -123,22 +150,9 @@ def say(where: FigureBase, text: str, colour: str = GREY) -> None:
     axes.text(0.5, 0.5, text, ha="center", va="center", color=colour, wrap=True, fontsize=10.0)
 
 
-_WIDE = 1.6  # decades, above which only decades are labelled
-
-_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _LEAST_RANGE = 4.0  # between the ends of an axis, so that two labels at least are on it
 _FEWEST = 3  # decades with labels; where there are fewer, 2 and 5 have labels, too
 _LABELS = 6  # at most, of decades
-
-
-def written(value: float) -> str:
-    """A number as on an axis: 0.05, 20,000, 10⁻⁸."""
-    if value == 0.0 or 1e-4 <= abs(value) < 1e6:
-        return f"{value:,.10g}"
-    exponent = math.floor(math.log10(abs(value)) + 1e-9)
-    mantissa = value / 10.0**exponent
-    power = f"10{str(exponent).translate(_RAISED)}"
-    return power if abs(mantissa - 1.0) < 1e-6 else f"{mantissa:.3g}·{power}"
 
 
 def log_scale(axes: Axes, values: Any, which: Literal["x", "y"] = "y", room: float = 0.0) -> None:
@@ -156,7 +170,12 @@ def log_scale(axes: Axes, values: Any, which: Literal["x", "y"] = "y", room: flo
     axis = axes.yaxis if which == "y" else axes.xaxis
     (axes.set_yscale if which == "y" else axes.set_xscale)("log")
     (axes.set_ylim if which == "y" else axes.set_xlim)(low, high)
-    axis.set_major_locator(FixedLocator(ticks(low, high) if flat.size else []))
+    label_ticks(axis, ticks(low, high) if flat.size else [])
+
+
+def label_ticks(axis: Axis, values: Sequence[float]) -> None:
+    """Give a logarithmic axis these ticks, with their values as labels, and no others."""
+    axis.set_major_locator(FixedLocator(values))
     axis.set_major_formatter(FuncFormatter(lambda value, _: written(value)))
     axis.set_minor_locator(NullLocator())
     axis.set_minor_formatter(NullFormatter())
@@ -180,27 +199,6 @@ def whole_numbers(axes: Axes, first: float, last: float, words: str = "orientati
     axes.set_xlabel(f"{words} (0: before)" if words and first == 0 else words)
 
 
-def label_axis(axis: Axis, low: float, high: float) -> None:
-    """Give a logarithmic axis from ``low`` to ``high`` ticks with their values: at decades, or at 1, 2, 5 in a few."""
-    decades = float(np.log10(high / low))
-    steps = (1.0,) if decades > _WIDE else (1.0, 2.0, 5.0) if decades > 0.7 else (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
-    first, last = int(np.floor(np.log10(low))), int(np.ceil(np.log10(high)))
-    every = max(1, round(decades / 8.0))
-    ticks = [step * 10.0**power for power in range(first, last + 1, every) for step in steps]
-    axis.set_major_locator(FixedLocator([tick for tick in ticks if low <= tick <= high]))
-    axis.set_minor_locator(LogLocator(subs=range(2, 10)) if every == 1 else FixedLocator([]))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: short_number(value)))
-    axis.set_minor_formatter(NullFormatter())
-
-
-def short_number(value: float) -> str:
-    """A number without an exponent where it is short so."""
-    return f"{value:.6f}".rstrip("0").rstrip(".") if 1e-4 <= value < 1e6 else f"{value:.0e}"
-
-
-_SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
-_GREEK = {"theta": "θ", "phi": "φ", "nu": "ν", "alpha": "α", "beta": "β", "kappa": "κ", "gamma": "γ", "delta": "δ",
-          "omega": "ω", "eps": "ε", "tau": "τ"}  # fmt: skip
 UNIT_KINDS = {"rad": "angle", "1": "scale factor", "m/s^2": "bias"}
 
 
@@ -210,14 +208,6 @@ class Shown(NamedTuple):
     label: str
     unit: str
     per_si: float
-
-
-def label(symbol: str) -> str:
-    """A symbol with Greek letters and subscripts, for a figure: ``theta1`` becomes θ₁; a dollar sign stays one."""
-    latin = next((each for each in _GREEK if symbol.startswith(each)), "")
-    name = _GREEK.get(latin, "") + symbol[len(latin) :]
-    stem = name.rstrip("0123456789")
-    return plain(stem.removesuffix("_") + name[len(stem) :].translate(_SUBSCRIPTS))
 
 
 def plain(text: str) -> str:
@@ -234,7 +224,37 @@ def twelve() -> tuple[Shown, ...]:
 def with_coefficients(coefficients: Iterable[Parameter | Coefficient]) -> tuple[Shown, ...]:
     """The same, followed by coefficients of effects."""
     found = [(each.symbol, units.shown(each)) for each in coefficients]
-    return (*twelve(), *(Shown(label(symbol), plain(unit.label), unit.per_si) for symbol, unit in found))
+    return (*twelve(), *(Shown(plain(label(symbol)), plain(unit.label), unit.per_si) for symbol, unit in found))
+
+
+_WIDE = 4
+
+
+def panels_of(figure: Figure, count: int, around_in: float, high_in: float) -> list[Axes]:
+    """So many panels, four a row, on a figure that is as high as its rows and what is around them."""
+    high = max(-(-count // _WIDE), 1)
+    figure.set_size_inches(13.0, around_in + high_in * high)
+    panels = [*figure.subplots(high, _WIDE, sharex=True, squeeze=False).flat]
+    for axes in panels[count:]:
+        axes.set_axis_off()
+    return panels[:count]
+
+
+def say_once(figure: Figure, panels: Sequence[Axes], place: str = "outside lower left", columns: int = 6) -> None:
+    """Say once beside the panels what is drawn in them."""
+    said = dict[str, Any]()
+    for axes in panels:
+        handles, labels = axes.get_legend_handles_labels()
+        said = dict(zip(labels, handles, strict=True)) | said
+    if said:
+        figure.legend([*said.values()], [*said], loc=place, ncols=columns)  # type: ignore[arg-type]  # "outside ..."
+
+
+def dated(axes: Axes) -> None:
+    """Let the x axis be of dates, with few short labels."""
+    locator = AutoDateLocator(minticks=3, maxticks=5)
+    axes.xaxis.set_major_locator(locator)
+    axes.xaxis.set_major_formatter(ConciseDateFormatter(locator, show_offset=False))
 
 
 def wrapped(text: str, width: int) -> str:

@@ -13,10 +13,10 @@ from kf_calib.bench import paper_parameters
 from kf_calib.online.evaluation import Progress
 from kf_calib.online.session import HandJudgement, HandStanding
 from kf_calib.online.status import Judgement, Standing
-from kf_calib.support.text import angles_in_words, sentence
+from kf_calib.support.text import angles_in_words, counted, sentence
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2, shown, span
 from kf_calib.views import diagnosis
-from kf_calib.views.console import symbol
+from kf_calib.views.notation import symbol
 
 if TYPE_CHECKING:
     from kf_calib.sources.live import Status
@@ -247,7 +247,7 @@ def _of_hand(standing: HandStanding, source: Sequence[Line], remarks: Sequence[s
     is_enough = standing.rest_s >= standing.enough_s
     resting = f"still for {standing.rest_s:.0f} s of {standing.enough_s:g} s" if standing.rest_s else "it moves"
     where = f"pose {here.number}, {here.up} up: " if here is not None and standing.rest_s else ""
-    done = f"{standing.dwells} pose{'s' * (standing.dwells != 1)} in {span(standing.elapsed_s)}"
+    done = f"{counted(standing.dwells, 'pose')} in {span(standing.elapsed_s)}"
     colour = "green" if is_enough else "yellow" if standing.rest_s else "cyan"
     share = min(standing.rest_s / standing.enough_s, 1.0)
     task = Task(sentence(standing.task), f"{done}; {where}{resting}", colour, share)
@@ -277,7 +277,6 @@ def _hand_rows(judgement: HandJudgement | None) -> list[SigmaRow]:
 
 def _sides_in_words(judgement: HandJudgement) -> str:
     """Return the line about sides and misfit."""
-    sides = judgement.sides.count
     nis = None if judgement.result is None else judgement.result.consistency.nis_per_dof
     misfit = "" if nis is None else f"NIS/dof {nis:.3g}; "
-    return f"{sides} side{'s' * (sides != 1)} seen; {misfit}{judgement.verdict}"
+    return f"{counted(judgement.sides.count, 'side')} seen; {misfit}{judgement.verdict}"

@@ -10,40 +10,64 @@ import numpy as np
 
 from kf_calib.bench import paper_parameters
 from kf_calib.design.sides import turn_in_words
-from kf_calib.online.session import HandJudgement, HandStanding
-from kf_calib.online.status import Judgement, Standing
-from kf_calib.support.text import angles_in_words
+from kf_calib.online.evaluation import Progress
+from kf_calib.online.session import HandJudgement
+from kf_calib.online.status import Judgement
+from kf_calib.support.text import angles_in_words, counted
 from kf_calib.support.units import shown, span
 from kf_calib.views.diagnosis import found_object, orientation_object
-from kf_calib.views.json import clean, replay_object
+from kf_calib.views.json import clean, members, replay_object
 
 if TYPE_CHECKING:
     from kf_calib.sources.live import Status
 
 
-def live_object(judgement: Judgement, standing: Standing, status: Status | None) -> dict[str, Any]:
-    """The JSON object of ``live`` after a dwell: the keys of ``replay`` and ``diagnose``, and those of a live run.
+def live_object(judgement: Judgement | HandJudgement, standing: Progress, status: Status | None) -> dict[str, Any]:
+    """The JSON object of ``live`` after a dwell or a pose: the keys of ``replay`` as soon as there is a result, on a
+    bench those of ``diagnose`` before them, and those of a live run.
 
     judgement: of the run after the dwell. standing: what is known now. status: of the source (None: it has none).
     """
-    left = dict(zip(paper_parameters.SYMBOLS, judgement.left_s, strict=True))
     wanted = dict(zip(paper_parameters.SYMBOLS, judgement.wanted, strict=True))
-    of_live = {
-        "consistent": judgement.consistent,
+    of_live = members(judgement, "consistent", "final") | {
+        "standing": judgement.verdict,
+        "targets": {name: value for name, value in wanted.items() if math.isfinite(value)},
+        "notice": standing.notice,
+        "source": None if status is None else asdict(status),
+    }
+    if isinstance(judgement, Judgement):
+        known, further = found_object(judgement.diagnosis) | replay_object(judgement.result), _of_bench(judgement)
+    else:
+        counts = {"samples": standing.samples, "dwells": len(judgement.dwells)}
+        known, further = replay_object(judgement.result) if judgement.result else counts, _of_hand(judgement)
+    return known | clean(of_live | further)
+
+
+def _of_bench(judgement: Judgement) -> dict[str, Any]:
+    """Return the keys of a run on a bench alone."""
+    return {
         "p_value": judgement.p_value,
-        "final": judgement.final,
         "diagnosed_dwells": len(judgement.look.result.visits),
         "next_orientation": _going(judgement),
-        "standing": judgement.verdict,
         "alarm": judgement.alarm,
         "looks": judgement.watch.looks if judgement.watch else 0,
         "elapsed_s": judgement.result.fit.dwells[-1].end_s,
-        "targets": {name: value for name, value in wanted.items() if math.isfinite(value)},
-        "time_left_s": left,
-        "notice": standing.notice,
-        "source": source_object(status),
+        "time_left_s": dict(zip(paper_parameters.SYMBOLS, judgement.left_s, strict=True)),
     }
-    return found_object(judgement.diagnosis) | replay_object(judgement.result) | clean(of_live)
+
+
+def _of_hand(judgement: HandJudgement) -> dict[str, Any]:
+    """Return the keys of a calibration by hand alone."""
+    sides, last = judgement.sides, judgement.dwells[-1]
+    return {
+        "p_value": judgement.result.consistency.p_value if judgement.result else None,
+        "undetermined": sides.missing,
+        "sides": sides.count,
+        "pose": {"number": last.number, "up": sides.last, "repeats": sides.repeats},
+        "next_side": {"up": sides.following, "turn": turn_in_words(sides.following)},
+        "targets_reached": judgement.reached,
+        "elapsed_s": last.end_s,
+    }
 
 
 def _going(judgement: Judgement) -> dict[str, Any] | None:
@@ -54,13 +78,12 @@ def _going(judgement: Judgement) -> dict[str, Any] | None:
     return None if going is None else {"gimbal_deg": list(going[0]), "stay_s": None, "why": going[1]}
 
 
-def source_object(status: Status | None) -> dict[str, Any] | None:
-    """The state of a live source as a JSON object, or None."""
-    return None if status is None else clean(asdict(status))
+def line(judgement: Judgement | HandJudgement) -> str:
+    """The state of a run after a dwell or a pose in one line of text."""
+    return _bench_line(judgement) if isinstance(judgement, Judgement) else _hand_line(judgement)
 
 
-def line(judgement: Judgement) -> str:
-    """The state of a run after a dwell in one line of text."""
+def _bench_line(judgement: Judgement) -> str:
     result = judgement.result
     dwell, sigma = result.fit.dwells[-1], result.estimate.sigma
     seen = "sigmas not determined yet"
@@ -78,34 +101,7 @@ def line(judgement: Judgement) -> str:
     )
 
 
-def hand_object(judgement: HandJudgement, standing: HandStanding, status: Status | None) -> dict[str, Any]:
-    """The JSON object of ``live --no-angles`` after a pose: the keys of ``replay`` once there is a result, and its own.
-
-    judgement: of the run after the pose. standing: what is known now. status: of the source (None: it has none).
-    """
-    sides, result, last = judgement.sides, judgement.result, judgement.dwells[-1]
-    known = {"samples": standing.samples, "dwells": len(judgement.dwells)} if result is None else replay_object(result)
-    wanted = dict(zip(paper_parameters.SYMBOLS, judgement.wanted, strict=True))
-    of_hand = {
-        "consistent": judgement.consistent,
-        "p_value": None if result is None else result.consistency.p_value,
-        "final": judgement.final,
-        "standing": judgement.verdict,
-        "undetermined": sides.missing,
-        "sides": sides.count,
-        "pose": {"number": last.number, "up": sides.last, "repeats": sides.repeats},
-        "next_side": {"up": sides.following, "turn": turn_in_words(sides.following)},
-        "targets": {name: value for name, value in wanted.items() if math.isfinite(value)},
-        "targets_reached": judgement.reached,
-        "elapsed_s": last.end_s,
-        "notice": standing.notice,
-        "source": source_object(status),
-    }
-    return known | clean(of_hand)
-
-
-def hand_line(judgement: HandJudgement) -> str:
-    """The state of a run after a pose in one line of text."""
+def _hand_line(judgement: HandJudgement) -> str:
     last, sides = judgement.dwells[-1], judgement.sides
     side = f"{sides.last} up" if sides.repeats is None else f"the side of pose {sides.repeats} again"
     seen, sigma = "", judgement.sigma
@@ -117,6 +113,6 @@ def hand_line(judgement: HandJudgement) -> str:
         seen = f"worst sigma {paper_parameters.SYMBOLS[k]} {shown(paper_parameters.UNITS[k]).text(sigma[k])}; "
     seconds = last.end_s - last.start_s
     return (
-        f"pose {last.number} ({side}), {seconds:.1f} s used; {sides.count} side{'s' * (sides.count != 1)} seen; "
+        f"pose {last.number} ({side}), {seconds:.1f} s used; {counted(sides.count, 'side')} seen; "
         f"{seen}{judgement.verdict}"
     )

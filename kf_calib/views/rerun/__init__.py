@@ -27,26 +27,28 @@ from typing import Any
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from rich.console import Group
 
+from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, Vector
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.stepwise_selection import Improvement
 from kf_calib.estimation.estimate import correlation
-from kf_calib.estimation.results import Calibration, Parameter, format_p
+from kf_calib.estimation.results import Calibration
 from kf_calib.online.status import Judgement
 from kf_calib.support import units
 from kf_calib.support.text import angles_in_words, counted, printable
-from kf_calib.support.units import Unit, shown, significant
-from kf_calib.views.console import noise_origins, whole_value
-from kf_calib.views.rerun.diagnosis import save_diagnosis_view as save_diagnosis
-from kf_calib.views.rerun.improvement import save_improvement_view as save_improvement
+from kf_calib.support.units import shown
+from kf_calib.views.console import effect_table, noise_table, parameter_table, verdict, without_table
+from kf_calib.views.markdown import markdown
+from kf_calib.views.rerun.diagnosis import save_diagnosis_view
+from kf_calib.views.rerun.improvement import save_improvement_view
 from kf_calib.views.rerun.names import (
     BENCH_TIME,
     CHANNELS,
     DARK,
-    GROUPS,
-    LABELS,
+    KINDS,
     ON_DARK,
     ORIENTATION,
     Colour,
@@ -64,6 +66,7 @@ from kf_calib.views.rerun.series import (
     predicted,
 )
 from kf_calib.views.rerun.spheres import log_platform, magnified, with_y_up
+from kf_calib.views.terminal import note
 
 __all__ = ["BENCH_TIME", "ORIENTATION", "grow", "save_view"]
 
@@ -95,14 +98,8 @@ def _(result: Calibration, path: str | Path) -> Path:
     return Path(path)
 
 
-@save_view.register
-def _(result: Diagnosis, path: str | Path) -> Path:
-    return save_diagnosis(result, Path(path))
-
-
-@save_view.register
-def _(result: Improvement, path: str | Path) -> Path:
-    return save_improvement(result, Path(path))
+save_view.register(Diagnosis, save_diagnosis_view)
+save_view.register(Improvement, save_improvement_view)
 
 
 def grow(
@@ -161,69 +158,23 @@ def log_next(judgement: Judgement, stream: rr.RecordingStream) -> None:
 
 
 def markdown_summary(result: Calibration) -> str:
-    """The page in Markdown, in the units that people are shown."""
-    warnings = ["**Warnings**\n\n" + "\n".join(f"- {text}" for text in result.warnings)] if result.warnings else []
-    blocks = [_head(result), _table(result), _verdict(result), *warnings, _noise(result), *_ties(result)]
-    return "\n\n".join(blocks) + "\n"
+    """The page in Markdown: what was measured, what the console prints of it, the verdict before the tables, and what
+    is hard to tell apart."""
+    parts = [verdict(result), parameter_table(result), *map(note, result.warnings)]
+    parts += [*([effect_table(result)] if result.model.effects else []), noise_table(result)]
+    parts += [without_table(result, outlying) for outlying in result.outlying]
+    rms, dof = shown("m/s^2").text(result.residual_rms_mps2), result.consistency.dof
+    left = f"Residuals: {rms} rms, {dof} degrees of freedom."
+    return "\n\n".join([_measured(result), markdown(Group(*parts)), left, *_ties(result)]) + "\n"
 
 
-def _head(result: Calibration) -> str:
+def _measured(result: Calibration) -> str:
     bench, count = result.bench, sum(visit.dwell.count for visit in result.visits)
     serial = f"**{bench.notes['block_serial']}**: " if "block_serial" in bench.notes else ""
     axes = f"axes {bench.to_metadata()['axes']}" if bench.axes else "attitude recorded"
     held = ", inertially held" if bench.reference == "inertial" else ""
     dwells = counted(len(result.visits), "dwell")
     return f"{serial}{dwells}, {count} samples; {axes}{held}, g = {bench.gravity_mps2:.6g} m/s²"
-
-
-def _table(result: Calibration) -> str:
-    head = "| | value | − nominal | ± 1σ | |\n|:--|--:|--:|--:|:--|\n"
-    return head + "\n".join(_row(parameter) for parameter in result.parameters.values())
-
-
-def _row(parameter: Parameter) -> str:
-    label, unit = LABELS.get(parameter.symbol, parameter.symbol), shown(parameter)
-    if parameter.value is None or parameter.sigma is None:
-        return f"| {label} | not determined | | | |"
-    deviation, sigma = map(_minus, unit.rounded(parameter.value - parameter.nominal, parameter.sigma))
-    value = _minus(whole_value(parameter)) if parameter.symbol in LABELS else ""
-    return f"| {label} | {value} | {deviation} | {sigma} | {unit.label} |"
-
-
-def _minus(text: str) -> str:
-    return text.replace("-", "−")
-
-
-def _verdict(result: Calibration) -> str:
-    judged = result.consistency
-    if judged.p_value is None:
-        words = "nothing left over to judge the model by"
-    else:
-        yes = "agree with the model" if judged.consistent else "**disagree with the model**"
-        per_dof = significant(judged.statistic / judged.dof)
-        what = "readings within dwells" if judged.trend else "dwells"
-        by = "how they change" if judged.trend else "the size of their misfit"
-        words = f"the {what} {yes} by {by}: p {format_p(judged.p_value)}, "
-        words += f"NIS/dof = {per_dof}, dof = {judged.dof}"
-    held, unit = "", shown("m/s^2")
-    if result.held_out_rms_mps2 is not None and result.held_out_floor_mps2 is not None:
-        rms, floor = map(unit.number, (result.held_out_rms_mps2, result.held_out_floor_mps2))
-        held = f"; held out {rms} (noise alone {floor})"
-    return f"**Misfit**: {words}. Residual rms {unit.number(result.residual_rms_mps2)}{held} {unit.label}"
-
-
-def _noise(result: Calibration) -> str:
-    noise, unit = result.noise, shown("m/s^2")
-    parts = [f"{_three(unit, noise.sigma_mps2)} {unit.label} a reading"]
-    if noise.inflation.max() > 1.05:
-        parts.append(f"correlated: variance of means × {_three(Unit('', 1.0), noise.inflation)}")
-    if noise.setting_rad > 0:
-        origin = noise_origins(result)[1]
-        parts.append(f"setting error {shown('rad').text(noise.setting_rad)} ({origin})")
-    if noise.scatter_mps2.max() > 0:
-        origin = noise_origins(result)[0]
-        parts.append(f"scatter {_three(unit, noise.scatter_mps2)} {unit.label} ({origin})")
-    return f"**Noise** (1σ): {'; '.join(parts)}"
 
 
 def _ties(result: Calibration) -> list[str]:
@@ -233,10 +184,6 @@ def _ties(result: Calibration) -> list[str]:
     names = [each.label for each in quantities(result.model)]
     strong = [f"{names[i]} {names[j]} {matrix[i, j]:+.2f}" for i, j in pairs[:4] if abs(matrix[i, j]) >= 0.5]
     return [f"**Correlated**: {', '.join(strong)}".replace("-", "−")] if strong else []
-
-
-def _three(unit: Unit, values: Floats) -> str:
-    return ", ".join(unit.number(value, zeros=True) for value in values)
 
 
 def layout(result: Calibration, history: VisitHistory, goes_on: bool = False) -> rrb.Blueprint:
@@ -256,7 +203,7 @@ def _overview(result: Calibration, history: VisitHistory, is_predicted: bool) ->
         rrb.Vertical(*sigma_panels(history), _pose(result)),
         rrb.Vertical(platform_panel(result), *_fit(is_predicted), row_shares=[2, 1, 1] if is_predicted else [1, 1]),
         rrb.TextDocumentView(origin="summary", name="result"),
-        column_shares=[5, 4.4, 3.8],
+        column_shares=[4.55, 4.25, 4.4],
         name="Overview",
     )
 
@@ -264,9 +211,10 @@ def _overview(result: Calibration, history: VisitHistory, is_predicted: bool) ->
 def sigma_panels(history: VisitHistory) -> list[rrb.TimeSeriesView]:
     """A panel a kind of parameter, one for the coefficients of effects if there are any."""
     corner = rrb.Corner2D.RightTop
-    kinds = [(f"{group.title}, {units.shown(group.unit).label}",
-              [k for k, shown in enumerate(history.shown[:12]) if shown.path.rpartition("/")[2] in group.symbols])
-             for group in GROUPS]  # fmt: skip
+    kinds = [
+        (f"{kind}, {shown(unit).label}", [k for k, own in enumerate(paper_parameters.UNITS) if own == unit])
+        for unit, kind in KINDS.items()
+    ]
     rest = [*range(12, len(history.shown))]
     kinds += [("coefficients of effects", rest)] if rest else []
     return [

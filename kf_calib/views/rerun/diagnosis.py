@@ -30,18 +30,20 @@ from kf_calib.estimation.results import format_p
 from kf_calib.support.text import printable
 from kf_calib.support.units import shown_whole
 from kf_calib.views.diagnosis import disturbed_dwells, name_of, verdict
+from kf_calib.views.markdown import literal, markdown
 from kf_calib.views.rerun.names import ACCELEROMETERS, CHANNELS, DARK, GOLD, GREY, MAUVE, Colour, rrd_file, thin
 from kf_calib.views.rerun.spheres import Log, at_step, forever, log_key, log_spheres, spheres
+from kf_calib.views.terminal import ConsoleTable, table
 
 EXPLANATION = "explanation"
 _MOST = 5  # explanations
 
 
-def save_diagnosis_view(diagnosis: Diagnosis, path: Path) -> Path:
+def save_diagnosis_view(diagnosis: Diagnosis, path: str | Path) -> Path:
     """Write the view of a diagnosis to an .rrd file that opens laid out, at the best explanation."""
     before, explanations = diagnosis.before, diagnosis.explanations[:_MOST]
     ratios = before.residuals_mps2 / mean_sigmas(before)
-    with rrd_file(path, _layout(diagnosis)) as stream:
+    with rrd_file(Path(path), _layout(diagnosis)) as stream:
         log_spheres(before, ratios, "spheres/before", 0, stream, forever(stream), disturbed_dwells(diagnosis))
         log_key("spheres", ["as measured", *(["left over"] if explanations else [])], forever(stream))
         if diagnosis.drivers and not explanations:
@@ -53,7 +55,7 @@ def save_diagnosis_view(diagnosis: Diagnosis, path: Path) -> Path:
             log_spheres(before, explanation.unexplained_ratios, "spheres/left", 1, stream, log)
         text = rr.TextDocument(printable(_summary(diagnosis)), media_type=rr.MediaType.MARKDOWN)
         stream.log("summary", text, static=True)
-    return path
+    return Path(path)
 
 
 def _log_residuals(driver: Driver, ratios: Floats, log: Log) -> None:
@@ -100,29 +102,25 @@ def _curve(shape: EffectShape, chart: Chart, per_si: float) -> rr.LineStrips2D:
 
 def _summary(diagnosis: Diagnosis) -> str:
     """The verdict, the next orientation, the explanations by rank, and the quantities by what they explain."""
-    blocks = [f"**{_literal(verdict(diagnosis))}**"]
+    blocks = [f"**{literal(verdict(diagnosis))}**"]
     if diagnosis.table is not None:
-        blocks.append(_probabilities(diagnosis.table))
+        blocks.append(markdown(_probabilities(diagnosis.table)))
     if diagnosis.next_orientation is not None:
         advice, why = diagnosis.next_orientation
         angles = ", ".join(f"{angle:.4g}" for angle in advice.gimbal_deg)
         blocks.append(f"**Next orientation**: gimbals at {angles} deg: {why}.")
     if explanations := diagnosis.explanations[:_MOST]:
-        p_values = [format_p(each.after.consistency.p_value).removeprefix("= ") for each in explanations]
-        fits = ["yes" if each.fits else "no" for each in explanations]
-        columns = zip(explanations, fits, p_values, strict=True)
-        rows = [f"| {k} {_literal(each.name)} | {fit} | {p} |" for k, (each, fit, p) in enumerate(columns, 1)]
-        blocks.append("\n".join(["| explanation | fits | p with it |", "|:--|:--|:--|", *rows]))
+        rows = [
+            (f"{k} {each.name}", "yes" if each.fits else "no",
+             format_p(each.after.consistency.p_value).removeprefix("= "))
+            for k, each in enumerate(explanations, 1)
+        ]  # fmt: skip
+        blocks.append(markdown(table("", ("explanation", "fits", "p with it"), rows)))
         blocks.append("Move the cursor of the timeline *explanation* to see what each leaves.")
     if diagnosis.drivers:
-        rows = [f"| {each.words} | {_share(each)} |" for each in diagnosis.drivers]
-        blocks.append("\n".join(["| quantity | goes with |", "|:--|:--|", *rows]))
+        shares = [(each.words, _share(each)) for each in diagnosis.drivers]
+        blocks.append(markdown(table("", ("quantity", "goes with"), shares)))
     return "\n\n".join(blocks) + "\n"
-
-
-def _literal(text: str) -> str:
-    """Text whose asterisks, as of a formula, are no emphasis in Markdown."""
-    return text.replace("*", r"\*")
 
 
 def _share(driver: Driver) -> str:
@@ -132,12 +130,11 @@ def _share(driver: Driver) -> str:
     return f"{100 * driver.share:.0f} % of the misfit (p {format_p(driver.p_value)})"
 
 
-def _probabilities(table: HypothesisTable) -> str:
+def _probabilities(hypotheses: HypothesisTable) -> ConsoleTable:
     """Families and explanations with their probabilities, the likeliest first, without the unlikely."""
-    families = [(name, share) for name, share in table.families.items() if share >= LISTED]
-    rows = [*families, ("", None), *((_literal(name_of(row)), row.probability) for row in table.listed)]
-    lines = ["| | |" if share is None else f"| {format_probability(share)} | {name} |" for name, share in rows]
-    return "\n".join(["| probability | it may be |", "|--:|:--|", *lines])
+    families = [(format_probability(share), name) for name, share in hypotheses.families.items() if share >= LISTED]
+    explanations = [(format_probability(row.probability), name_of(row)) for row in hypotheses.listed]
+    return table("", (">probability", "it may be"), [*families, ("", ""), *explanations])
 
 
 def _layout(diagnosis: Diagnosis) -> rrb.Blueprint:

@@ -22,7 +22,9 @@ from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration, Parameter, format_p
 from kf_calib.support import units
 from kf_calib.support.text import printable
+from kf_calib.views.console import effect_table
 from kf_calib.views.diagnosis import disturbed_dwells
+from kf_calib.views.markdown import markdown
 from kf_calib.views.rerun.names import GOLD, GREY, MAUVE, ON_DARK, RED, WHITE, Colour, entity, rrd_file
 from kf_calib.views.rerun.spheres import at_step, forever, log_key, log_spheres, spheres
 
@@ -74,10 +76,10 @@ def _shown(values_mps2: Sequence[float | None]) -> Floats:
     return units.shown("m/s^2").per_si * np.array([np.nan if each is None else each for each in values_mps2])
 
 
-def save_improvement_view(improvement: Improvement, path: Path) -> Path:
+def save_improvement_view(improvement: Improvement, path: str | Path) -> Path:
     """Write the view of an improvement to an .rrd file that opens laid out."""
     view = View(improvement)
-    with rrd_file(path, _layout(view)) as stream:
+    with rrd_file(Path(path), _layout(view)) as stream:
         for name, (words, values, colour) in view.errors.items():
             _curve(stream, f"error/{name}", values, *_lines_and_marks(words, colour))
         _curve(stream, "log10_p/model", view.log10_p, *_lines_and_marks("model", GOLD))
@@ -92,7 +94,7 @@ def save_improvement_view(improvement: Improvement, path: Path) -> Path:
             marked = disturbed_dwells(view.diagnoses[step])
             log_spheres(result, result.residuals_mps2 / sigmas, "spheres", 0, stream, log, marked)
             log("summary", rr.TextDocument(printable(_summary(view, step)), media_type=rr.MediaType.MARKDOWN))
-    return path
+    return Path(path)
 
 
 def _lines_and_marks(name: str, colour: Colour) -> tuple[rr.SeriesLines, rr.SeriesPoints]:
@@ -132,12 +134,8 @@ def _summary(view: View, number: int) -> str:
     blocks.append(f"Model: {result.model.sum}; p {format_p(diagnosis.test.p_value)}")
     errors = [f"{words} {units.significant(values[number], zeros=True)}" for words, values, _ in view.errors.values()]
     blocks.append(f"Error, {units.shown('m/s^2').label}: {'; '.join(errors)}")
-    rows = [
-        f"| {symbol} | {_value(each)} | {units.shown(each).label} |"
-        for symbol, each in list(result.parameters.items())[12:]
-    ]
-    if rows:
-        blocks.append("\n".join(["| coefficient | value ± σ | |", "|:--|--:|:--|", *rows]))
+    if result.model.effects:
+        blocks.append(markdown(effect_table(result)))
     if number == len(steps):
         blocks.append(f"**It ends here.** {view.improvement.reason}")
     else:
@@ -149,13 +147,6 @@ def _done(step: SelectionStep) -> str:
     share = "" if step.probability is None else f", which was missing with {format_probability(step.probability)}"
     added = [f"{step.added} added{share}"] if step.added else []
     return "; ".join([*added, *(f"{each.name} taken out (p {format_p(each.p_value)})" for each in step.dropped)])
-
-
-def _value(parameter: Parameter) -> str:
-    if parameter.value is None or parameter.sigma is None:
-        return "not determined"
-    unit = units.shown(parameter)
-    return " ± ".join(unit.rounded(parameter.value, parameter.sigma)).replace("-", "−")
 
 
 def _layout(view: View) -> rrb.Blueprint:

@@ -7,7 +7,6 @@ encoded is written as every other output is.
 
 from __future__ import annotations
 
-import math
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,6 +22,7 @@ from kf_calib.estimation.measurement_model import Model
 from kf_calib.support.output_files import write_whole
 from kf_calib.support.text import printable
 from kf_calib.support.units import shown
+from kf_calib.views.notation import label
 
 BENCH_TIME = "bench_time"
 ORIENTATION = "orientation"
@@ -42,45 +42,15 @@ DARK: Colour = (13, 16, 17)
 ON_DARK = PlotBackground(color=DARK)
 
 CHANNELS = ("a1", "a2", "a3")
-LABELS = {
-    "theta1": "θ₁", "phi1": "φ₁", "K1": "K₁", "b1": "b₁",
-    "nu1": "ν₁", "nu2": "ν₂", "K2": "K₂", "b2": "b₂",
-    "theta3": "θ₃", "phi3": "φ₃", "K3": "K₃", "b3": "b₃",
-}  # fmt: skip
 MAUVE: Colour = (214, 150, 235)
 """Coefficients of effects."""
-UNIT_OF = dict(zip(paper_parameters.SYMBOLS, paper_parameters.UNITS, strict=True))
-"""SI unit of each parameter."""
-
-
-@dataclass(frozen=True)
-class EntityGroup:
-    """Parameters of one kind, which have the same SI ``unit``."""
-
-    title: str
-    unit: str
-
-    @property
-    def symbols(self) -> tuple[str, ...]:
-        return tuple(symbol for symbol, unit in UNIT_OF.items() if unit == self.unit)
-
-
-GROUPS = EntityGroup("angles", "rad"), EntityGroup("scale factors", "1"), EntityGroup("biases", "m/s^2")
+KINDS = {"rad": "angles", "1": "scale factors", "m/s^2": "biases"}
+"""What the parameters of an SI unit are."""
 
 
 def entity(*parts: str) -> str:
     """The path of an entity, whatever characters are in the names of its parts."""
     return rr.new_entity_path([*parts]).lstrip("/")
-
-
-def number(value: float) -> str:
-    """A value above zero in few characters: ``0.05``, ``5·10⁴``."""
-    if 1e-3 <= value < 1e3:
-        return f"{value:g}"
-    exponent = math.floor(math.log10(value) + 1e-9)
-    power = "10" + str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
-    lead = f"{value / 10.0**exponent:.2g}"
-    return power if lead == "1" else f"{lead}·{power}"
 
 
 def thin(pixels: float) -> float:
@@ -113,8 +83,8 @@ class DrawnParameter:
 def quantities(model: Model) -> tuple[DrawnParameter, ...]:
     """The twelve parameters in the units that people are shown, then the coefficients of the effects in the model."""
     parameters = [
-        DrawnParameter(LABELS[symbol], shown(unit).label, shown(unit).per_si, colour_of(symbol), path_of(symbol))
-        for symbol, unit in UNIT_OF.items()
+        DrawnParameter(label(symbol), shown(unit).label, shown(unit).per_si, colour_of(symbol), path_of(symbol))
+        for symbol, unit in zip(paper_parameters.SYMBOLS, paper_parameters.UNITS, strict=True)
     ]
     coefficients = [
         DrawnParameter(printable(each.symbol), printable(shown(each).label), shown(each).per_si, MAUVE,

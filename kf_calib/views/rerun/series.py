@@ -12,11 +12,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
-from scipy.special import chdtri
 
-from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
-from kf_calib.estimation.filter_history import prior_estimate
+from kf_calib.estimation.filter_history import history_of, nis_band
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration, Visit
 from kf_calib.support import units
@@ -42,7 +40,7 @@ class VisitHistory:
     """What is estimated along the run, in shown units: deviation from nominal and sigma (n, 12 + q).
 
     NaN where not determined. ``shown``: what the columns are, the q coefficients of effects last. ``orientation`` (n,)
-    is the number of the dwell, the prior has 0; ``whole`` (n,) tells the rows at which a dwell is complete.
+    is the number of the dwell, a stated prior has 0; ``whole`` (n,) tells the rows at which a dwell is complete.
     """
 
     shown: tuple[DrawnParameter, ...]
@@ -80,31 +78,14 @@ class VisitHistory:
         """What came after these visits; the prior only where there were none."""
         return self._only(self.orientation > (visits[-1].dwell.number if visits else -1))
 
-    @property
-    def by_orientation(self) -> VisitHistory:
-        """The ends of the dwells only."""
-        return self._only(self.whole)
-
     @classmethod
     def of(cls, result: Calibration) -> VisitHistory:
-        steps = [(0.0, 0, prior_estimate(result)), *result.trace()]
-        orientation = np.array([number for _, number, _ in steps])
-        shown, gains = quantities(result.model), result.model.natural(result.estimate.state)[1]
-        nominal = paper_parameters.nominal(result.bench.nominal)
-        sigma = np.array([np.append(each.sigma, each.effect_sigma * gains) for _, _, each in steps])
-        effects = [result.model.natural(each.state)[0] for _, _, each in steps]
-        deviation = np.array(
-            [np.append(e.parameters - nominal, c) for (_, _, e), c in zip(steps, effects, strict=True)]
-        )
+        history, shown = history_of(result, within=True), quantities(result.model)
         per_si = np.array([each.per_si for each in shown])
-        return cls(
-            shown=shown,
-            elapsed_s=np.array([elapsed_s for elapsed_s, _, _ in steps]),
-            orientation=orientation,
-            whole=np.append(np.diff(orientation) > 0, True),
-            deviation=np.where(np.isfinite(sigma), deviation, np.nan) * per_si,
-            sigma=sigma * per_si,
-        )
+        nominal = np.array([parameter.nominal for parameter in history.parameters])
+        whole = np.append(np.diff(history.numbers) > 0, True)
+        deviation, sigma = (history.values - nominal) * per_si, history.sigmas * per_si
+        return cls(shown, history.elapsed_s, history.numbers, whole, deviation, sigma)
 
 
 def times(elapsed_s: Floats, orientation: Counts | None = None) -> list[rr.TimeColumn]:
@@ -193,7 +174,7 @@ def log_nis(visits: Sequence[Visit], stream: rr.RecordingStream, before: int = 0
     elapsed_s, number = ends(judged)
     value = np.array([visit.nis for visit in judged])
     band = nis_band(np.array([visit.dof for visit in judged]))
-    high = above(value, band)
+    high = value > band[:, 1]
     for name, place, colour in (("value", ~high, WHITE), ("above", high, RED)):
         _send(stream, f"nis/{name}", elapsed_s[place], number[place], value[place])
         _style(stream, f"nis/{name}", _points(name, colour, before + len(visits)))
@@ -216,16 +197,6 @@ def log_residuals(result: Calibration, stream: rr.RecordingStream) -> None:
         _style(stream, f"residual/{channel}", _points(channel, colour, len(ratios)))
     _send(stream, "residual/bound", elapsed_s, number, np.tile([-2.0, 2.0], (len(ratios), 1)))
     _style(stream, "residual/bound", _bounds("−2σ", "+2σ"))
-
-
-def nis_band(dof: Counts) -> Floats:
-    """2.5 and 97.5 % points (n, 2) of chi-squared with ``dof`` (n,) degrees of freedom."""
-    return np.column_stack([chdtri(dof, 0.975), chdtri(dof, 0.025)])
-
-
-def above(value: Floats, band: Floats) -> NDArray[np.bool_]:
-    """Which NIS tell of a misfit: a small one is only luck."""
-    return value > band[:, 1]
 
 
 def _points(name: str, colour: Colour, count: int) -> rr.SeriesPoints:

@@ -21,10 +21,12 @@ from scipy.spatial.transform import Rotation
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, Vector
 from kf_calib.estimation.estimate import Estimate
+from kf_calib.estimation.filter_history import nis_band
 from kf_calib.estimation.results import Calibration
 from kf_calib.support.units import shown
-from kf_calib.views.rerun.names import ACCELEROMETERS, DARK, GOLD, GREY, RED, WHITE, number, thin
-from kf_calib.views.rerun.series import above, crowd, ends, nis_band, times
+from kf_calib.views.notation import written
+from kf_calib.views.rerun.names import ACCELEROMETERS, DARK, GOLD, GREY, RED, WHITE, thin
+from kf_calib.views.rerun.series import crowd, ends, times
 
 NEGATIVE, POSITIVE, NONE = np.array([70, 140, 255]), np.array([255, 110, 50]), np.array([150, 150, 155])
 _FULL = 4.0  # sigma at which the colour of a residual is full
@@ -163,7 +165,7 @@ def ellipsoids_of(estimate: Estimate) -> list[Ellipsoid]:
 def magnified(estimate: Estimate) -> str:
     """What the title of the view says of the ellipsoids."""
     factor = magnification(ellipsoids_of(estimate))
-    return f", axes with 1σ ×{number(factor)}" if factor else ""
+    return f", axes with 1σ ×{written(factor)}" if factor else ""
 
 
 def _axes(estimate: Estimate) -> Floats:
@@ -250,8 +252,8 @@ def _log_bar(stream: rr.RecordingStream, bench: Bench, factor: float, words: str
     *ends, place = with_y_up(bench, (-half, FLOOR, 0.0), (half, FLOOR, 0.0), (0.0, FLOOR - 0.04, 0.0))
     bar = rr.LineStrips3D([ends], colors=WHITE, radii=0.012)
     stream.log("platform/scale", bar, static=True)
-    same = number(float(f"{length / angle.per_si * ratio.per_si:.2g}"))
-    text = f"{number(length)} {angle.label}, {same} {ratio.label if ratio.label != '1' else 'of K'}{words}"
+    same = written(float(f"{length / angle.per_si * ratio.per_si:.2g}"))
+    text = f"{written(length)} {angle.label}, {same} {ratio.label if ratio.label != '1' else 'of K'}{words}"
     label = rr.Points3D([place], labels=[text], radii=0.0, colors=WHITE, show_labels=True)
     stream.log("platform/scale/label", label, static=True)
 
@@ -282,5 +284,5 @@ def _verdicts(result: Calibration) -> list[tuple[int, int, int]]:
     """Grey where a dwell could not be judged, red where its NIS is above chi-squared's 95 % band, else white."""
     dof = np.array([visit.dof for visit in result.visits])
     nis = np.array([visit.nis for visit in result.visits])
-    bad = above(nis, nis_band(np.maximum(dof, 1)))
+    bad = nis > nis_band(dof)[:, 1]
     return [GREY if free <= 0 else RED if out else WHITE for free, out in zip(dof, bad, strict=True)]
