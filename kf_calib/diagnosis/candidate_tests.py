@@ -334,11 +334,6 @@ def _walk_to_test(fitted: Fit) -> str:
     return walk_named(model.bench)
 
 
-def values_of(scan: Scan, name: str) -> list[int]:
-    """Numbers of the candidates of one effect: one for each value of its constant at which it is visible."""
-    return [k for k, each in enumerate(scan.candidates) if str(each.effect) == name and each.dof]
-
-
 def overlap_matrix(test: CandidateTests, names: Sequence[str]) -> Floats:
     """The overlaps (n, n) of effects with each other: 1 with a random walk, which can take any path, and NaN with an
     effect that has no columns in the scan and is no walk."""

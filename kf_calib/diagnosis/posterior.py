@@ -262,8 +262,7 @@ class RunPosterior:
         return tuple(self._before.fit.dwells[k].number for k in places)
 
     def _dwells_beside(self, rows: Sequence[Hypothesis]) -> list[Hypothesis]:
-        """Return the rows of dwells that are off beside the likeliest effects, and beside the likeliest unknown
-        functions."""
+        """Return the rows of dwells that are off beside the likeliest effects, and unknown functions."""
         likeliest = sorted(rows, key=lambda row: -row.log_evidence)
         known = [row for row in likeliest if row.effects and not row.driver and self._run.walk not in row.effects]
         fitted = [row for row in known if row.refit is not None][:_ALWAYS]
@@ -462,9 +461,8 @@ class RunPosterior:
         return replace(row, refit=refit, log_evidence=log, statistic=row.statistic or statistic)
 
     def _with_changes_beside_walk(self, irregular: Hypothesis, rows: Sequence[Hypothesis]) -> Hypothesis:
-        """Return the row of irregular changes with those beside a random walk of the biases: what this leaves within
-        dwells speaks for them, too, as far as an unknown function beside it, which formulas only tell a part of, leaves
-        it."""
+        """Return the row of irregular changes with those beside a random walk of the biases, for which speaks what this
+        leaves within dwells, as far as an unknown function beside it leaves it."""
         logs = [irregular.log_evidence]
         for row in (row for row in rows if self._run.walk in row.effects and row.refit is not None):
             left = trend(row.refit.fit) if self._test.trend and row.refit else None
@@ -581,8 +579,7 @@ def _beside_function(names: Sequence[str], log: float, alone: dict[str, float]) 
 
 
 def _with_sure_dwells(rows: list[Hypothesis], beside: list[Hypothesis]) -> list[Hypothesis]:
-    """Return rows with those of dwells beside other terms where the likeliest is one of these, and its clearest dwell
-    is off for sure, whatever else is missing; else without them."""
+    """Return rows with those of dwells beside others if the likeliest is of these, and its clearest dwell surely off."""
     alone = {number for row in rows for number in row.dwells}  # with nothing beside them: these are the clearest
     beside = [replace(row, dwells=tuple(sorted(row.dwells, key=lambda number: number not in alone))) for row in beside]
     table = table_of([row for row in (*rows, *beside) if math.isfinite(row.log_evidence)])
