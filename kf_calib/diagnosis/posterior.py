@@ -579,7 +579,7 @@ def _beside_function(names: Sequence[str], log: float, alone: dict[str, float]) 
 
 
 def _with_sure_dwells(rows: list[Hypothesis], beside: list[Hypothesis]) -> list[Hypothesis]:
-    """Return rows with those of dwells beside others if the likeliest is of these, and its clearest dwell surely off."""
+    """Return rows with those of dwells beside others if the likeliest is of these, its clearest dwell surely off."""
     alone = {number for row in rows for number in row.dwells}  # with nothing beside them: these are the clearest
     beside = [replace(row, dwells=tuple(sorted(row.dwells, key=lambda number: number not in alone))) for row in beside]
     table = table_of([row for row in (*rows, *beside) if math.isfinite(row.log_evidence)])
