@@ -132,54 +132,63 @@ class Lines:
             raise InputError(f"{self.name}: cannot be read ({error.strerror}).") from None
         if stream is None:
             raise InputError(f"{self.name} can be read only once: record it to a file to read it again.")
-        self._latest = _Passage(self.name, stream)
-        try:
-            self._latest.survey(self._open_reader)
-        except BaseException:
-            self._latest.close()
-            raise
+        self._latest = _Passage(self.name, stream, self._reader)
         return self._latest
 
-    def _open_reader(self, lines: Sequence[str], account: Account) -> tuple[LineReader, int]:
+    def _reader(self, lines: Sequence[str], account: Account) -> tuple[LineReader, int]:
         angles = self._angles
-        if is_json(lines[0]):
-            if angles is None and self.path:
-                theirs = [name for name, ours in self._columns.items() if ours in POSE_KEYS]
-                angles = holds_any(self.path, [f'"{name}"'.encode() for name in (*POSE_KEYS, *theirs)])
-        elif self._stated:
-            refuse_unknown_names(self._stated, TextHeading.of(lines).header)
-        return reader_for(lines, self._columns, account, angles=angles, units=self._units)
+        if angles is None and self.path and is_json(lines[0]):
+            theirs = [name for name, ours in self._columns.items() if ours in POSE_KEYS]
+            angles = holds_any(self.path, [f'"{name}"'.encode() for name in (*POSE_KEYS, *theirs)])
+        return reader_for(lines, self._columns, account, angles=angles, units=self._units, stated=self._stated)
 
 
 def reader_for(
-    lines: Sequence[str], columns: Mapping[str, str], account: Account, *, angles: bool | None, units: Units
-) -> tuple[LineReader, int]:
+    lines: Sequence[str], columns: Mapping[str, str], account: Account, *, angles: bool | None, units: Units,
+    stated: Mapping[str, str] = MappingProxyType({}),
+) -> tuple[LineReader, int]:  # fmt: skip
     """The reader that the first lines ask for, and how many of these are its heading.
 
-    lines: the first of them is not empty. angles: whether a pose is wanted; None: where a header has one. Raises
-    InputError for a header that does not say what is needed.
+    lines: the first of them is not empty. angles: whether a pose is wanted; None: where a header has one. stated: of
+    the columns, those that a header must have. Raises InputError for one that does not say what is needed.
     """
     if is_json(lines[0]):
         return JsonLines(columns, account, angles is not False), 0
     heading = TextHeading.of(lines)
+    refuse_unknown_names(stated, heading.header)
     return CsvLines(Columns(heading, columns, units), account, angles), heading.lines
 
 
 class _Passage:
     """One reading of the lines, from the first to the last; iterated once.
 
-    sampled: some of the readings (n, 3) as they stand in the lines.
+    parser: chosen by the first lines, of CSV by some rows as well, which tell what the header may not. sampled: some of
+    the readings (n, 3) as they stand in the lines. What is read for the first readings and pose, if there must be one,
+    is kept till it is iterated.
     """
 
-    parser: LineReader
-
-    def __init__(self, name: str, stream: BinaryIO | TextFile) -> None:
+    def __init__(self, name: str, stream: BinaryIO | TextFile, open_reader: OpenReader) -> None:
         self.account, self._name, self._stream = Account(), name, stream
         self._file = stream if isinstance(stream, TextFile) else None
         self.fraction = 0.0 if self._file else math.nan
-        self._blocks, self._ahead, self._said = self._split(), list[Batch](), list[str]()
         self._has_accel = self._has_pose = False
         self.sampled = deque[Floats](maxlen=_BLOCKS_SAMPLED)
+        self._blocks = self._split()
+        try:
+            first = self._first_lines()
+            with named(name):
+                self.parser, heading = open_reader(first, self.account)
+            self._said = self.parser.said
+            self.account.lines += heading
+            self._ahead = [self._parse(first[heading:])]
+            while not self._has_accel or self._lacks_pose:
+                lines = next(self._blocks, None)
+                if lines is None or self.account.lines > _SURVEY_LINES:
+                    raise self._unusable("platform angles" if self._lacks_pose else "readings")
+                self._ahead.append(self._parse(lines))
+        except BaseException:
+            self.close()
+            raise
 
     def sentences(self) -> list[str]:
         """What was taken for what, where that is not plain, and what was not used."""
@@ -192,9 +201,8 @@ class _Passage:
         if self._file:
             self._file.close()
 
-    def survey(self, open_reader: OpenReader) -> None:
-        """Chooses the parser by the first lines, of CSV by some rows as well, which tell what the header may not; reads
-        up to the first readings and pose, if there must be one, and keeps what it has read."""
+    def _first_lines(self) -> list[str]:
+        """Return lines from the first on that is not blank, as many as tell what they are."""
         first = list[str]()
         for lines in self._blocks:
             first += lines
@@ -205,16 +213,7 @@ class _Passage:
                 break
         if not first:
             raise InputError(f"{self._name} holds no lines: check that the logger wrote any.")
-        with named(self._name):
-            self.parser, heading = open_reader(first, self.account)
-        self._said = self.parser.said
-        self.account.lines += heading
-        self._ahead.append(self._parse(first[heading:]))
-        while not self._has_accel or self._lacks_pose:
-            lines = next(self._blocks, None)
-            if lines is None or self.account.lines > _SURVEY_LINES:
-                raise self._unusable("platform angles" if self._lacks_pose else "readings")
-            self._ahead.append(self._parse(lines))
+        return first
 
     @property
     def _lacks_pose(self) -> bool:

@@ -141,21 +141,16 @@ class TableOfMeans:
     def _values(self, quantity: QuantityColumns, wanted: str, *, is_optional: bool = False) -> Floats:
         """Return the numbers (n, k) of a quantity, NaN where its cells say that there are none; raises InputError for
         the first cell that holds none. is_optional: whether the table would do without the column."""
-        values = list[list[float]]()
-        for k, row in enumerate(self.columns.rows):
-            at, measured = quantity.at[0], None
-            try:
-                measured = quantity.values(row, self.columns.header, self.numbers)
-                if measured is None and quantity.absent:
-                    measured = [math.nan] * len(quantity.at)
-            except LineError as error:
-                at = error.at
-            if measured is None:
-                else_ = self._to_leave_out(at) if is_optional else "" if row[at] else "remove the row"
-                example = f"9{self.numbers.decimal}80665{', or ' * bool(else_)}{else_}"
-                raise self._refusal(k, at, f"write {wanted} such as {example}")
-            values.append(measured)
-        return np.array(values, float)
+        values = self.columns.values(quantity.at)
+        for row, k in np.argwhere(~np.isfinite(values)).tolist():
+            at, cell = quantity.at[k], self.columns.rows[row][quantity.at[k]]
+            if quantity.absent and cell.lower() in ("", *quantity.absent):
+                values[row, k] = math.nan
+                continue
+            else_ = self._to_leave_out(at) if is_optional else "" if cell else "remove the row"
+            example = f"9{self.numbers.decimal}80665{', or ' * bool(else_)}{else_}"
+            raise self._refusal(row, at, f"write {wanted} such as {example}")
+        return values * quantity.factors
 
     @cached_property
     def times(self) -> tuple[Floats, int | None]:
