@@ -159,7 +159,7 @@ class Columns:
     def values(self, places: Sequence[int]) -> Floats:
         """The numbers (n, k) in columns, NaN where there is none."""
         numbers = self.numbers or DECIMAL_POINT
-        values = [[numbers.or_nan(row[at]) for at in places] for row in self.rows]
+        values = [[numbers.value(row[at]) for at in places] for row in self.rows]
         return np.array(values, float).reshape(-1, len(places))
 
     # -- what kind of text it is --

@@ -211,11 +211,11 @@ class TableOfMeans:
             axis, sign = next((told for cell in row if (told := face_of(cell))), (0, 0))
             if sign and len(signs) == 2:
                 for k, is_down in signs.items():
-                    extremes[axis, int(is_down)] = self.numbers.or_nan(row[k])
+                    extremes[axis, int(is_down)] = self.numbers.value(row[k])
             elif sign and len(readings) == 3:
                 others = {row[k] for other, k in enumerate(readings) if other != axis}
                 is_alone = others <= {"", "-", "–", "—"}
-                extremes[axis, int(sign < 0)] = self.numbers.or_nan(row[readings[axis]]) if is_alone else math.nan
+                extremes[axis, int(sign < 0)] = self.numbers.value(row[readings[axis]]) if is_alone else math.nan
         return extremes
 
     # -- orientations --
