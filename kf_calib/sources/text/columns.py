@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from functools import cached_property
 
 import numpy as np
 
@@ -78,6 +77,7 @@ class Columns:
         if self.units.where:
             self._choose_rows(self.units.where)
         self.meanings = meanings_of(self.header, stated)
+        self.numbers = self.numbers_in(self.rows)
         if is_nameless(self.header) and not stated:
             self._recognise_numbers()
         if is_table:
@@ -145,11 +145,6 @@ class Columns:
         """The name of a column that means nothing yet, for an example."""
         return next((self.header[k] for k in self.unused), "THEIRS")
 
-    @cached_property
-    def numbers(self) -> Numbers | None:
-        """How the numbers are written; None where no row tells yet."""
-        return self.numbers_in(self.rows)
-
     def numbers_in(self, rows: Sequence[CsvRow]) -> Numbers | None:
         """How the numbers in rows are written; None where these do not tell."""
         used = [at for at, own in enumerate(self.meanings) if own.ours] or range(len(self.names))
@@ -194,7 +189,7 @@ class Columns:
             )
         exact = [at for at in places if is_exact(self.names[at])]
         united = [at for at in places if self.meanings[at].unit]
-        place = self._most_even(exact or united or places)
+        place = min(exact or united or places, key=self._unevenness)
         unit, values = self.meanings[place].unit, self.values([place])[:, 0]
         values = values[[bool(row[place]) for row in self.rows]]
         if not unit and len(values) and math.isnan(values[0]):
@@ -204,16 +199,13 @@ class Columns:
             self.said.append(f"time from {self.named([place])} in {unit}")
         return Stamps((place,), round(TIME[unit] * 1e9))
 
-    def _most_even(self, places: list[int]) -> int:
-        """Return that of several columns of stamps which goes up most evenly; the first where none has numbers."""
-
-        def unevenness(place: int) -> float:
-            steps = np.diff(self.values([place])[:, 0])
-            steps = steps[np.isfinite(steps)]
-            usual = float(np.median(steps)) if len(steps) else 0.0
-            return float(np.median(np.abs(steps - usual))) / usual if usual > 0.0 else math.inf
-
-        return min(places, key=unevenness) if len(places) > 1 else places[0]
+    def _unevenness(self, place: int) -> float:
+        """Return how much the steps of a column of stamps differ from the usual one; infinite where it does not go
+        up."""
+        steps = np.diff(self.values([place])[:, 0])
+        steps = steps[np.isfinite(steps)]
+        usual = float(np.median(steps)) if len(steps) else 0.0
+        return float(np.median(np.abs(steps - usual))) / usual if usual > 0.0 else math.inf
 
     def _unit_of_time(self, place: int, values: Floats) -> str:
         """Return the unit of stamps (n,) whose name tells none, by their size or their steps; of means, it is s."""
