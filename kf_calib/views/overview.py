@@ -17,7 +17,7 @@ from rich.text import Text
 from kf_calib.dwells.rest_in_readings import DwellSummary
 from kf_calib.sources.containers.opening import ContainerKind
 from kf_calib.sources.files.inventory import Inventory, Topic
-from kf_calib.sources.text.survey import ColumnFound, Survey
+from kf_calib.sources.text.survey import Survey
 from kf_calib.support.text import counted, cut
 from kf_calib.views.json import clean
 from kf_calib.views.terminal import ConsoleTable, note
@@ -146,12 +146,12 @@ def _dwell_parts(dwells: Sequence[DwellSummary]) -> list[RenderableType]:
     return parts
 
 
-def up_text(up: tuple[float, ...]) -> str:
+def up_text(up: Sequence[float]) -> str:
     """The direction that is up, in the axes of the accelerometers."""
     return " ".join(f"{part:+.2f}" for part in up)
 
 
-def pose_text(pose: tuple[float, ...]) -> str:
+def pose_text(pose: Sequence[float]) -> str:
     """Gimbal angles in degrees; an attitude as it is."""
     if len(pose) == 4:
         return " ".join(f"{each:.4f}" for each in pose)
@@ -190,10 +190,9 @@ def table_object(overview: TableOverview) -> dict[str, Any]:
         {
             "recording": str(survey.path), "format": "table", "files": [str(survey.path)],
             "bytes": survey.path.stat().st_size, "topics": [],
-            "columns": [column._asdict() for column in survey.described_columns],
+            "columns": survey.described_columns,
             "orientation": survey.orientation or None, "bench": overview.bench,
-            "dwells": [row._asdict() | {"pose": list(row.pose), "up": list(row.up)} for row in survey.described_rows],
-            "missing": overview.missing,
+            "dwells": survey.described_rows, "missing": overview.missing,
             "command": overview.command, "examples": list(overview.examples), "warnings": survey.warnings,
         }
     )  # fmt: skip
@@ -213,7 +212,7 @@ def table_report(overview: TableOverview) -> RenderableType:
         if len(survey.described_rows) > _SHOWN_ROWS:
             parts.append(Text(f"and {len(survey.described_rows) - _SHOWN_ROWS} more, all of them by --json"))
     parts += [note(said) for said in survey.warnings]
-    if survey.described_rows and survey.described_rows[0].readings is None:
+    if survey.described_rows and survey.described_rows[0]["readings"] is None:
         parts.append(
             note(
                 "no standard deviation with a number of readings is given, so that the noise will be taken from the "
@@ -226,15 +225,13 @@ def table_report(overview: TableOverview) -> RenderableType:
     return Group(*parts)
 
 
-def _column_table(columns: Sequence[ColumnFound]) -> ConsoleTable:
+def _column_table(columns: Sequence[dict[str, str]]) -> ConsoleTable:
     table = ConsoleTable(box=SIMPLE_HEAD, pad_edge=False)
     for heading in ("column", "first cell", "taken for", "unit", "told"):
         table.add_column(heading, justify="left")
-    for survey in columns:
-        unit = _UNITS.get(survey.unit, survey.unit)
-        table.add_row(
-            cut(survey.header, 40), cut(survey.first, 24), _quantity(survey.meaning), unit, _TOLD[survey.told_by]
-        )
+    for column in columns:
+        unit, told_by = _UNITS.get(column["unit"], column["unit"]), _TOLD[column["told_by"]]
+        table.add_row(cut(column["header"], 40), cut(column["first"], 24), _quantity(column["meaning"]), unit, told_by)
     return table
 
 
@@ -257,9 +254,9 @@ def _row_table(survey: Survey) -> ConsoleTable:
         table.add_column(heading, justify="right")
     for row in survey.described_rows[:_SHOWN_ROWS]:
         table.add_row(
-            str(row.number), str(row.row), f"{row.at_s:g}", row.face or pose_text(row.pose) or up_text(row.up),
-            f"{row.norm_mps2:.4f}",
-            "" if row.readings is None else str(row.readings),
-            "" if math.isnan(row.temperature_c) else f"{row.temperature_c:.2f}",
+            str(row["number"]), str(row["row"]), f"{row['at_s']:g}",
+            row["face"] or pose_text(row["pose"]) or up_text(row["up"]), f"{row['norm_mps2']:.4f}",
+            "" if row["readings"] is None else str(row["readings"]),
+            "" if math.isnan(row["temperature_c"]) else f"{row['temperature_c']:.2f}",
         )  # fmt: skip
     return table

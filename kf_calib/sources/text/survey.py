@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -18,39 +18,6 @@ from kf_calib.sources.text.means import TableOfMeans
 from kf_calib.sources.text.reader import named
 from kf_calib.sources.text.units import Units
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
-
-
-class ColumnFound(NamedTuple):
-    """A column as it was understood.
-
-    header, first: as they stand in the table. meaning: of ``names.Meaning``, gimbal angles with their number, outer to
-    inner; empty if it is not used. unit: of its numbers. told_by: ``name``, ``content``, ``size`` (the unit, by its
-    numbers), ``content and size`` or ``--column``.
-    """
-
-    header: str
-    first: str
-    meaning: str = ""
-    unit: str = ""
-    told_by: str = ""
-
-
-class RowFound(NamedTuple):
-    """An orientation: its dwell's number, its row in the table, its middle since the first, and what was written down.
-
-    pose: gimbal angles in rad, or attitude; empty without angles. up (3,): the unit vector along the mean readings.
-    readings: how many were averaged; None where it is not known.
-    """
-
-    number: int
-    row: int
-    at_s: float
-    face: str | None
-    pose: tuple[float, ...]
-    up: tuple[float, ...]
-    norm_mps2: float
-    readings: int | None
-    temperature_c: float
 
 
 class Survey(TableOfMeans):
@@ -65,14 +32,9 @@ class Survey(TableOfMeans):
     trouble = ""
 
     def __init__(
-        self,
-        path: Path,
-        overrides: BenchKeys = UNSTATED,
-        columns: Mapping[str, str] = MappingProxyType({}),
-        units: Units | None = None,
-        *,
-        angles: bool = True,
-    ) -> None:
+        self, path: Path, overrides: BenchKeys = UNSTATED, columns: Mapping[str, str] = MappingProxyType({}),
+        units: Units | None = None, *, angles: bool = True,
+    ) -> None:  # fmt: skip
         grid = grid_of(path, units.dataset if units else "")
         keys, self.path, self._stated = overrides.copy(), path, columns
         if not {"gravity_mps2", "latitude_deg"} & keys.keys():
@@ -96,29 +58,41 @@ class Survey(TableOfMeans):
         return self.columns.orientation if self.angles else ""
 
     @cached_property
-    def described_columns(self) -> list[ColumnFound]:
-        """The columns in their order."""
-        columns, described = self.columns, list[ColumnFound]()
+    def described_columns(self) -> list[dict[str, str]]:
+        """The columns in their order.
+
+        header, first: name and first cell as they stand in the table. meaning: of ``names.Meaning``, gimbal angles with
+        their number, outer to inner; empty if it is not used. unit: of its numbers. told_by: ``name``, ``content``,
+        ``size`` (the unit, by its numbers), ``content and size`` or ``--column``.
+        """
+        columns, described = self.columns, list[dict[str, str]]()
         for k, (header, meaning) in enumerate(zip(columns.header, columns.meanings, strict=True)):
-            first = next((row[k] for row in columns.rows if row[k]), "")
-            is_guessed, by_size = header in columns.guessed, columns.by_size.get(k)
-            told_by = " and ".join(["content"] * is_guessed + ["size"] * bool(by_size)) or "name"
-            told_by = "--column" if header in self._stated else told_by
+            by_size, is_used = columns.by_size.get(k, ""), bool(meaning.ours)
+            told_by = " and ".join(["content"] * (header in columns.guessed) + ["size"] * bool(by_size)) or "name"
             number = f" {columns.angles.index(k) + 1}" if k in columns.angles else ""
-            used = meaning.ours + number, by_size or meaning.unit, told_by
-            described.append(ColumnFound(header, first, *(used if meaning.ours else ())))
+            described.append({
+                "header": header, "first": next((row[k] for row in columns.rows if row[k]), ""),
+                "meaning": meaning.ours + number, "unit": (by_size or meaning.unit) * is_used,
+                "told_by": ("--column" if header in self._stated else told_by) * is_used,
+            })  # fmt: skip
         return described
 
     @cached_property
-    def described_rows(self) -> list[RowFound]:
-        """The orientations; none where the table cannot be evaluated."""
-        described, place = list[RowFound](), self.columns.place("face") if self.orientation else None
+    def described_rows(self) -> list[dict[str, Any]]:
+        """The orientations; none where the table cannot be evaluated.
+
+        number: of the dwell; row: in the table. at_s: its middle since the first. face: as it was written down. pose:
+        gimbal angles in rad, or attitude; empty without angles. up (3,): the unit vector along the mean readings.
+        readings: how many were averaged; None where it is not known.
+        """
+        described, place = list[dict[str, Any]](), self.columns.place("face") if self.orientation else None
         for k, row in enumerate(self.evaluated.orientations if self.evaluated else ()):
             norm = float(np.linalg.norm(row.mean_mps2))
-            up = tuple((row.mean_mps2 / max(norm, 1e-300)).tolist())
-            face = None if place is None else self.columns.rows[k][place]
-            pose = tuple(map(float, row.pose)) if self.orientation else ()
-            readings = None if row.sigma_mps2 is None else row.count
-            facts = row.elapsed_s, face, pose, up, norm, readings, row.temperature_c
-            described.append(RowFound(k + 1, self.rows[k], *facts))
+            described.append({
+                "number": k + 1, "row": self.rows[k], "at_s": row.elapsed_s,
+                "face": None if place is None else self.columns.rows[k][place],
+                "pose": list(map(float, row.pose)) if self.orientation else [],
+                "up": (row.mean_mps2 / max(norm, 1e-300)).tolist(), "norm_mps2": norm,
+                "readings": None if row.sigma_mps2 is None else row.count, "temperature_c": row.temperature_c,
+            })  # fmt: skip
         return described
