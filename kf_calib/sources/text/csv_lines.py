@@ -30,7 +30,6 @@ class CsvLines(LineReader):
     Raises InputError where the columns do not say what is needed.
     """
 
-    wrong = "a cell is not a number"
     advice = WANTED
 
     def __init__(self, columns: Columns, account: Account, angles: bool | None = True) -> None:

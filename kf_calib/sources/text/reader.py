@@ -55,17 +55,12 @@ class Account:
             self.unknown[short if short in self.unknown or len(self.unknown) < _NAMED else "others"] += 1
 
     def sentences(self) -> list[str]:
-        sentences = list[str]()
-        if self.first_malformed:
-            line, reason = self.first_malformed
-            sentences.append(
-                f"{self.malformed} of {self.lines} {self.what} were malformed and skipped "
-                f"(first {self.what.removesuffix('s')} {line}: {reason})."
-            )
-        if self.unknown:
-            names = ", ".join(f"{name!r} ({count})" for name, count in dict(self.unknown).items())
-            sentences.append(f"names that are not known were left out, with the values under them: {names}.")
-        return sentences
+        line, reason = self.first_malformed or (0, "")
+        names = ", ".join(f"{name!r} ({count})" for name, count in self.unknown.items())
+        malformed = (f"{self.malformed} of {self.lines} {self.what} were malformed and skipped "
+                     f"(first {self.what.removesuffix('s')} {line}: {reason}).")  # fmt: skip
+        unknown = f"names that are not known were left out, with the values under them: {names}."
+        return [malformed] * bool(self.malformed) + [unknown] * bool(names)
 
     def refusal(self, what: str, advice: str) -> InputError:
         """That what was read cannot be used, and what of it was not."""
@@ -150,11 +145,10 @@ SampleRow = tuple[int, list[float] | None, list[float] | None, list[float] | Non
 class LineReader(Described, ABC):
     """Reads lines block by block; those that cannot be used are put down in the account.
 
-    Readings are in batches as they stand in the lines. advice: how quantities have to be named. wrong: the reason where
-    reading a line raises a ValueError that tells none. wants_pose: whether orientations count.
+    Readings are in batches as they stand in the lines. advice: how quantities have to be named. wants_pose: whether
+    orientations count.
     """
 
-    wrong: ClassVar[str]
     advice: ClassVar[str]
     wants_pose = True
 
@@ -175,18 +169,11 @@ class LineReader(Described, ABC):
                     rows.append(row)
             except LineError as error:
                 self._account.refuse(number, str(error))
-            except ArithmeticError:
-                self._account.refuse(number, "a number is out of range")
-            except RecursionError:
-                self._account.refuse(number, "it is nested too deeply")
-            except ValueError:
-                self._account.refuse(number, self.wrong)
         return Batch(_stream(rows, 1, 3), _stream(rows, 2, self.pose_width), _stream(rows, 3, 1))
 
     @abstractmethod
     def _row(self, line: str) -> SampleRow | None:
-        """What one line holds; None where that is no sample. Raises ValueError, ArithmeticError or RecursionError where
-        it cannot be used, LineError with the reason."""
+        """What one line holds; None where that is no sample. Raises LineError where it cannot be used."""
 
 
 def _stream(rows: Sequence[SampleRow], at: int, width: int) -> Stream:
