@@ -77,7 +77,7 @@ class Columns:
         if self.units.where:
             self._choose_rows(self.units.where)
         self.meanings = meanings_of(self.header, stated)
-        self.numbers = self.numbers_in(self.rows)
+        self.numbers = self.numbers_in(self.rows) or DECIMAL_POINT
         if is_nameless(self.header) and not stated:
             self._recognise_numbers()
         if is_table:
@@ -153,8 +153,7 @@ class Columns:
 
     def values(self, places: Sequence[int]) -> Floats:
         """The numbers (n, k) in columns, NaN where there is none."""
-        numbers = self.numbers or DECIMAL_POINT
-        values = [[numbers.value(row[at]) for at in places] for row in self.rows]
+        values = [[self.numbers.value(row[at]) for at in places] for row in self.rows]
         return np.array(values, float).reshape(-1, len(places))
 
     # -- what kind of text it is --

@@ -37,7 +37,7 @@ class CsvLines(LineReader):
         self._columns, self._heading, self._header = columns, columns.heading, columns.header
         self._time, self._accel = columns.time(), columns.accel()
         self._count, self._added_ns, self._last_ns = 0, 0, -(2**63)
-        self.raw, self.said, self._numbers = columns.raw, columns.said, columns.numbers
+        self.raw, self.said, self._numbers = columns.raw, columns.said, columns.numbers_in(columns.rows)
         self.has_angles = columns.orientation != "attitude"
         self.wants_pose = bool(columns.orientation) if angles is None else angles
         self._pose = columns.pose(needed=self.wants_pose)

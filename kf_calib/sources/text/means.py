@@ -19,13 +19,13 @@ from kf_calib.bench.keys import UNSTATED, BenchKeys, checked_keys
 from kf_calib.bench.raw_input import RawInput, merged_metadata
 from kf_calib.bench.streams import Orientations, Table, bench_without_angles
 from kf_calib.errors import InputError
-from kf_calib.sources.text.cells import DECIMAL_POINT, LineError, QuantityColumns
+from kf_calib.sources.text.cells import LineError, QuantityColumns
 from kf_calib.sources.text.columns import HOW, READINGS, SPREADS, Columns, refuse_unknown_names
 from kf_calib.sources.text.grid import Grid, grid_of
 from kf_calib.sources.text.names import QUATERNION, face_of
 from kf_calib.sources.text.reader import named
 from kf_calib.sources.text.units import Units, celsius, reading_units
-from kf_calib.support.text import cut
+from kf_calib.support.text import counted, cut
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 _SAMPLES, _FAST_S = 50, 1.0
@@ -33,8 +33,8 @@ _USUAL_PAUSE_S = 60.0
 _SHOWN = 6  # rows in a message
 _UNKNOWN = (0.0, 0.0, 0.0, 1.0)
 """The attitude that stands for those that are not known."""
-_UP = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _MOST_OWN = 6  # rows of a table of own axes
+_BLANK = {"", "-", "–", "—"}
 _UP_DOWN = re.compile(r"([+\-−])\s*1\s*g", re.IGNORECASE)
 
 
@@ -91,7 +91,6 @@ class TableOfMeans:
         pairs = zip(grid.heading.numbers, grid.heading.rows, strict=True)
         self.rows = [line + 1 for line, row in pairs if columns.is_chosen(row)]
         self.grid, self.overrides, self.units, self.said = grid, overrides.copy(), units, columns.said
-        self.numbers, self.count = columns.numbers or DECIMAL_POINT, len(columns.rows)
         self.are_lacking = angles is None and not columns.orientation
         self.angles = angles is not False and not self.are_lacking
         self.warnings = [f"{grid.name}: {remark}." for remark in grid.remarks]
@@ -112,8 +111,7 @@ class TableOfMeans:
                 "no column gives the time: the rows are taken to follow each other by a minute, so sizes of drifts are "
                 "by row rather than by time."
             )
-        pose = self._poses()
-        bench = self._bench()
+        pose, bench = self._poses(), self._bench()
         means = self._values(readings, "a reading")
         sigmas, counts = self._spreads()
         bench = replace(bench, input=replace(columns.raw, channels=bench.input.channels))
@@ -129,27 +127,26 @@ class TableOfMeans:
     def _warn(self, sentence: str) -> None:
         self.warnings.append(f"{self.grid.name}: {sentence}")
 
-    def _refusal(self, row: int, at: int, wanted: str) -> InputError:
-        """Return the error that names a cell (row counted from 0), its value, and what would be read."""
-        cell = self.columns.rows[row][at]
+    def _refusal(self, row: int, at: int, wanted: str, *, is_optional: bool = False) -> InputError:
+        """Return the error that names a cell (row counted from 0), its value, and what would be read. is_optional:
+        whether the table would do without the column."""
+        cell, header = self.columns.rows[row][at], self.columns.header[at]
         said = f"is {cut(cell, 60)!r}" if cell else "is empty"
-        return InputError(f"row {self.rows[row]}, column {self.columns.header[at]!r} {said}: {wanted}.")
-
-    def _to_leave_out(self, at: int) -> str:
-        return f"leave the column out by --column {self.columns.header[at] + '=-'!r}"
+        or_else = f", or leave the column out by --column {header + '=-'!r}" * is_optional
+        return InputError(f"row {self.rows[row]}, column {header!r} {said}: {wanted}{or_else}.")
 
     def _values(self, quantity: QuantityColumns, wanted: str, *, is_optional: bool = False) -> Floats:
         """Return the numbers (n, k) of a quantity, NaN where its cells say that there are none; raises InputError for
-        the first cell that holds none. is_optional: whether the table would do without the column."""
-        values = self.columns.values(quantity.at)
+        the first cell that holds none. is_optional: as of ``_refusal``."""
+        values, example = self.columns.values(quantity.at), f"9{self.columns.numbers.decimal}80665"
         for row, k in np.argwhere(~np.isfinite(values)).tolist():
-            at, cell = quantity.at[k], self.columns.rows[row][quantity.at[k]]
+            cell = self.columns.rows[row][quantity.at[k]]
             if quantity.absent and cell.lower() in ("", *quantity.absent):
                 values[row, k] = math.nan
                 continue
-            else_ = self._to_leave_out(at) if is_optional else "" if cell else "remove the row"
-            example = f"9{self.numbers.decimal}80665{', or ' * bool(else_)}{else_}"
-            raise self._refusal(row, at, f"write {wanted} such as {example}")
+            or_else = ", or remove the row" * (not cell and not is_optional)
+            wanted = f"write {wanted} such as {example}{or_else}"
+            raise self._refusal(row, quantity.at[k], wanted, is_optional=is_optional)
         return values * quantity.factors
 
     @cached_property
@@ -158,29 +155,30 @@ class TableOfMeans:
         are a minute apart."""
         columns, stamps = self.columns, list[int]()
         if not columns.has("time"):
-            return _USUAL_PAUSE_S * np.arange(self.count, dtype=np.float64), None
+            return _USUAL_PAUSE_S * np.arange(len(self.rows), dtype=np.float64), None
         time = columns.time()
-        or_else = self._to_leave_out(time.at[0])
         for k, row in enumerate(columns.rows):
             try:
-                stamps.append(time.ns(row, columns.header, self.numbers, k))
+                stamps.append(time.ns(row, columns.header, columns.numbers, k))
             except LineError:
-                example = "such as 2026-05-04T13:45:00+02:00 or 04.05.2026 13:45:00, or seconds, all in one way"
-                raise self._refusal(k, time.at[0], f"write a time {example}, or {or_else}") from None
+                wanted = (
+                    "write a time such as 2026-05-04T13:45:00+02:00 or 04.05.2026 13:45:00, or seconds, all in one way"
+                )
+                raise self._refusal(k, time.at[0], f"write a time such as {example}", is_optional=True) from None
             if k and stamps[k] <= stamps[k - 1]:
-                wanted = f"the row before is not earlier: sort the rows by time, or {or_else}"
-                raise self._refusal(k, time.at[0], wanted)
+                wanted = "the row before is not earlier: sort the rows by time"
+                raise self._refusal(k, time.at[0], wanted, is_optional=True)
         return (np.array(stamps) - stamps[0]) / 1e9, stamps[0]
 
     def refuse_samples(self) -> None:
         """Raise InputError for a time series."""
-        if self.columns.marks_of_a_table or self.count <= _SAMPLES:
+        if self.columns.marks_of_a_table or len(self.rows) <= _SAMPLES:
             return
         step_s = float(np.median(np.diff(self.times[0])))
         if step_s < _FAST_S:
             raise InputError(
-                f"its {self.count} rows are samples, {step_s:.3g} s apart, and no table with a row a dwell: evaluate "
-                "them as a log of samples in a CSV file (docs/own_csv.md)."
+                f"its {len(self.rows)} rows are samples, {step_s:.3g} s apart, and no table with a row a dwell: "
+                "evaluate them as a log of samples in a CSV file (docs/own_csv.md)."
             )
 
     # -- readings of each axis along gravity and against it alone --
@@ -205,17 +203,16 @@ class TableOfMeans:
     def _own_axes(self) -> Floats:
         """Return what each axis reads up and down (3, 2), where a table holds no more than that: a row for each face
         with the reading of its own axis alone, or a row for each axis with those at +1 g and -1 g. NaN in others."""
-        header, readings, extremes = self.columns.header, self.columns.places(*READINGS), np.full((3, 2), np.nan)
-        signs = {k: match[1] != "+" for k, name in enumerate(header) if (match := _UP_DOWN.fullmatch(name.strip()))}
-        for row in self.columns.rows if self.count <= _MOST_OWN else ():
-            axis, sign = next((told for cell in row if (told := face_of(cell))), (0, 0))
-            if sign and len(signs) == 2:
-                for k, is_down in signs.items():
-                    extremes[axis, int(is_down)] = self.numbers.value(row[k])
-            elif sign and len(readings) == 3:
-                others = {row[k] for other, k in enumerate(readings) if other != axis}
-                is_alone = others <= {"", "-", "–", "—"}
-                extremes[axis, int(sign < 0)] = self.numbers.value(row[readings[axis]]) if is_alone else math.nan
+        columns, extremes = self.columns, np.full((3, 2), np.nan)
+        signs = [(match[1] != "+", k) for k, name in enumerate(columns.header) if (match := _UP_DOWN.fullmatch(name))]
+        readings, up_down = columns.places(*READINGS), [k for _, k in sorted(signs)]
+        for row in range(len(self.rows) if len(self.rows) <= _MOST_OWN else 0):
+            cells = columns.rows[row]
+            axis, sign = next((told for cell in cells if (told := face_of(cell))), (0, 0))
+            if sign and len(up_down) == 2:
+                extremes[axis] = columns.values(up_down)[row]
+            elif sign and len(readings) == 3 and {cells[k] for k in readings if k != readings[axis]} <= _BLANK:
+                extremes[axis, int(sign < 0)] = columns.values(readings)[row, axis]
         return extremes
 
     # -- orientations --
@@ -227,7 +224,7 @@ class TableOfMeans:
         if not self.angles:
             if unused := columns.angles or columns.places("face", *QUATERNION):
                 self._warn(f"{columns.named(unused)}: not used, without angles.")
-            return np.tile(_UNKNOWN, (self.count, 1))
+            return np.tile(_UNKNOWN, (len(self.rows), 1))
         if self.units.angle and columns.orientation != "angles":
             raise InputError("has no gimbal angles, so leave out --angle-unit.")
         if columns.orientation == "angles":
@@ -238,14 +235,14 @@ class TableOfMeans:
                 wanted = "write the axis that points up, one of +x, -x, +y, -y, +z, -z"
                 raise self._refusal(faces.index(None), place, wanted)
             self.said.append(f"axis that points up from {columns.named([place])}")
-            up = self.overrides.get("up", "y").strip().lower().removeprefix("+")
+            up = self.overrides.get("up", "y").strip().lower()
             return np.array([_attitude(*face, up) for face in faces if face])
         quaternion = columns.pose(needed=True)
         pose = self._values(quaternion, "a number")
         norms = lengths(pose)
         for row in np.flatnonzero(np.abs(norms - 1.0) > 0.01):
             raise InputError(
-                f"row {self.rows[row]}, column 'qx, qy, qz, qw' is {', '.join(f'{own:g}' for own in pose[row])!r}: "
+                f"row {self.rows[row]}, column 'qx, qy, qz, qw' is {', '.join(f'{part:g}' for part in pose[row])!r}: "
                 f"its length is {norms[row]:.3g}: write a unit quaternion from platform to bench."
             )
         self.said.append(f"attitude from {columns.named(quaternion.at)}")
@@ -259,7 +256,7 @@ class TableOfMeans:
         has_angles, count = self.columns.orientation == "angles", len(self.columns.angles)
         if has_angles and (axes := self.overrides.get("axes")) and (known := len(parse_axes(axes))) != count:
             raise InputError(
-                f"has {count} column{'s' * (count != 1)} of angles ({self.columns.named(self.columns.angles)}) where "
+                f"has {counted(count, 'column')} of angles ({self.columns.named(self.columns.angles)}) where "
                 f"--axes names {known} gimbals: {HOW}."
             )
         return Bench.from_metadata(self.overrides, has_angles)
@@ -278,20 +275,20 @@ class TableOfMeans:
                     f"has no {lacking[bool(places)]}, so its {lacking[not places]} are not used: the noise of a mean "
                     "needs both."
                 )
-            return None, np.ones(self.count, np.int64)
+            return None, np.ones(len(self.rows), np.int64)
         self.said.append(f"standard deviations from {columns.named(list(dict.fromkeys(places)))}, "
                          f"of as many readings as {columns.named([count])} says")  # fmt: skip
-        deviations = QuantityColumns(tuple(places), (1.0, 1.0, 1.0))
+        deviations, numbers = QuantityColumns(tuple(places), (1.0,) * 3), QuantityColumns((count,), (1.0,))
         values = self._values(deviations, "a standard deviation", is_optional=True)
-        for row, k in np.argwhere(values < 0.0):
-            raise self._refusal(int(row), places[int(k)], "a standard deviation is not negative")
+        for row, k in np.argwhere(values < 0.0).tolist():
+            raise self._refusal(row, places[k], "a standard deviation is not negative")
         units, factors = [columns.meanings[place].unit for place in places], columns.raw.factors
         if units[0] and units[0] != "count":
             factors = self.units.mps2_per([unit or units[0] for unit in units])
-        counts = self._values(QuantityColumns((count,), (1.0,)), "a number of readings", is_optional=True)[:, 0]
-        for row in np.flatnonzero((counts < 2) | (counts != np.rint(counts)) | (counts > 1e9)):
+        counts = self._values(numbers, "a number of readings", is_optional=True)[:, 0]
+        for row in np.flatnonzero((counts < 2) | (counts != np.rint(counts)) | (counts > 1e9)).tolist():
             wanted = "write how many readings were averaged, a whole number of at least 2"
-            raise self._refusal(int(row), count, wanted)
+            raise self._refusal(row, count, wanted)
         return values * factors, counts.astype(np.int64)
 
     def _temperatures(self) -> Floats:
@@ -299,7 +296,7 @@ class TableOfMeans:
         is."""
         quantity, unit = self.columns.temperature()
         if not quantity.at:
-            return np.full(self.count, np.nan)
+            return np.full(len(self.rows), np.nan)
         values = celsius(self._values(quantity, "a temperature", is_optional=True)[:, 0], unit)
         lacking = np.isnan(values)
         if lacking.all() or not lacking.any():
@@ -316,8 +313,7 @@ def _attitude(axis: int, sign: int, up: str) -> Floats:
 
     Of all such attitudes, that which is reached by the shortest turn; a turn about the vertical changes no reading.
     """
-    upward = sign * np.eye(3)[axis]
-    target = (-1.0 if up.startswith("-") else 1.0) * np.array(_UP[up.removeprefix("-")])
+    upward, target = sign * np.eye(3)[axis], np.eye(3)["xyz".index(up[-1])] * (-1.0 if up[0] == "-" else 1.0)
     turned = np.append(np.cross(upward, target), 1.0 + float(upward @ target))
     if not turned.any():
         turned = np.append(np.roll(np.abs(upward), 1), 0.0)  # half a turn about any axis across
