@@ -271,7 +271,7 @@ def _show_table(ctx: click.Context, path: Path, reading: ReadingOptions, as_json
 
 def _of_table(ctx: click.Context, path: Path, reading: ReadingOptions, told: Stated, reason: str) -> TableOverview:
     """What is in a table of orientations; told, reason: as of ``_of_lines``."""
-    from kf_calib.sources.text.survey import Survey
+    from kf_calib.sources.text.means import Survey
     from kf_calib.views.overview import TableOverview
 
     stated: BenchKeys = {**reading.keys, **_bench_keys(told)}

@@ -17,7 +17,7 @@ from rich.text import Text
 from kf_calib.dwells.rest_in_readings import DwellSummary
 from kf_calib.sources.containers.opening import ContainerKind
 from kf_calib.sources.files.inventory import Inventory, Topic
-from kf_calib.sources.text.survey import Survey
+from kf_calib.sources.text.means import Survey
 from kf_calib.support.text import counted, cut
 from kf_calib.views.json import clean
 from kf_calib.views.terminal import ConsoleTable, note

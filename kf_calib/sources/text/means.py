@@ -1,4 +1,6 @@
-"""A table of means: a row a dwell, with its mean readings and its angles, attitude or face."""
+"""A table of means: a row a dwell, with its mean readings and its angles, attitude or face.
+
+What is in one before it is evaluated: what each column was taken for and why, and the orientations."""
 
 from __future__ import annotations
 
@@ -7,6 +9,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -18,7 +21,7 @@ from kf_calib.bench.counts import refuse_unread
 from kf_calib.bench.keys import UNSTATED, BenchKeys, checked_keys
 from kf_calib.bench.raw_input import RawInput, merged_metadata
 from kf_calib.bench.streams import Orientations, Table, bench_without_angles
-from kf_calib.errors import InputError
+from kf_calib.errors import CountsError, InputError
 from kf_calib.sources.text.cells import LineError, QuantityColumns
 from kf_calib.sources.text.columns import HOW, READINGS, SPREADS, Columns, refuse_unknown_names
 from kf_calib.sources.text.grid import Grid, grid_of
@@ -161,9 +164,7 @@ class TableOfMeans:
             try:
                 stamps.append(time.ns(row, columns.header, columns.numbers, k))
             except LineError:
-                wanted = (
-                    "write a time such as 2026-05-04T13:45:00+02:00 or 04.05.2026 13:45:00, or seconds, all in one way"
-                )
+                example = "2026-05-04T13:45:00+02:00 or 04.05.2026 13:45:00, or seconds, all in one way"
                 raise self._refusal(k, time.at[0], f"write a time such as {example}", is_optional=True) from None
             if k and stamps[k] <= stamps[k - 1]:
                 wanted = "the row before is not earlier: sort the rows by time"
@@ -306,6 +307,84 @@ class TableOfMeans:
         self._warn(f"has no temperature in rows {empty}{more}: it is interpolated in time there.")
         elapsed_s, _ = self.times
         return np.interp(elapsed_s, elapsed_s[~lacking], values[~lacking])
+
+
+class Survey(TableOfMeans):
+    """What is in a table. What is not stated of the bench does not matter here: cells are read alike with any gravity
+    and any axes. angles: whether orientations count, if there are any.
+
+    evaluated: None where it cannot be, and ``trouble`` says why. Raises InputError where not even the columns can be
+    understood, or the rows are samples.
+    """
+
+    evaluated: Table | None = None
+    trouble = ""
+
+    def __init__(
+        self, path: Path, overrides: BenchKeys = UNSTATED, columns: Mapping[str, str] = MappingProxyType({}),
+        units: Units | None = None, *, angles: bool = True,
+    ) -> None:  # fmt: skip
+        grid = grid_of(path, units.dataset if units else "")
+        keys, self.path, self._stated = overrides.copy(), path, columns
+        if not {"gravity_mps2", "latitude_deg"} & keys.keys():
+            keys["gravity_mps2"] = STANDARD_GRAVITY_MPS2
+        with named(grid.name):
+            super().__init__(grid, columns, keys, units or Units(), None if angles else False)
+            self.refuse_samples()
+            self.are_lacking = False  # whoever asks is told by the columns
+            if (places := self.columns.angles) and not overrides.get("axes"):
+                self.overrides["axes"] = " ".join("yzx"[k % 3] for k in range(len(places)))
+            try:
+                self.evaluated = self.table()
+            except CountsError:
+                raise
+            except InputError as error:
+                self.trouble = f"{grid.name}: {error}"
+
+    @property
+    def orientation(self) -> str:
+        """``angles``, ``attitude`` or ``face``; empty where no column tells it, or none is used."""
+        return self.columns.orientation if self.angles else ""
+
+    @cached_property
+    def described_columns(self) -> list[dict[str, str]]:
+        """The columns in their order.
+
+        header, first: name and first cell as they stand in the table. meaning: of ``names.Meaning``, gimbal angles with
+        their number, outer to inner; empty if it is not used. unit: of its numbers. told_by: ``name``, ``content``,
+        ``size`` (the unit, by its numbers), ``content and size`` or ``--column``.
+        """
+        columns, described = self.columns, list[dict[str, str]]()
+        for k, (header, meaning) in enumerate(zip(columns.header, columns.meanings, strict=True)):
+            by_size, is_used = columns.by_size.get(k, ""), bool(meaning.ours)
+            told_by = " and ".join(["content"] * (header in columns.guessed) + ["size"] * bool(by_size)) or "name"
+            number = f" {columns.angles.index(k) + 1}" if k in columns.angles else ""
+            described.append({
+                "header": header, "first": next((row[k] for row in columns.rows if row[k]), ""),
+                "meaning": meaning.ours + number, "unit": (by_size or meaning.unit) * is_used,
+                "told_by": ("--column" if header in self._stated else told_by) * is_used,
+            })  # fmt: skip
+        return described
+
+    @cached_property
+    def described_rows(self) -> list[dict[str, Any]]:
+        """The orientations; none where the table cannot be evaluated.
+
+        number: of the dwell; row: in the table. at_s: its middle since the first. face: as it was written down. pose:
+        gimbal angles in rad, or attitude; empty without angles. up (3,): the unit vector along the mean readings.
+        readings: how many were averaged; None where it is not known.
+        """
+        described, place = list[dict[str, Any]](), self.columns.place("face") if self.orientation else None
+        for k, row in enumerate(self.evaluated.orientations if self.evaluated else ()):
+            norm = float(np.linalg.norm(row.mean_mps2))
+            described.append({
+                "number": k + 1, "row": self.rows[k], "at_s": row.elapsed_s,
+                "face": None if place is None else self.columns.rows[k][place],
+                "pose": list(map(float, row.pose)) if self.orientation else [],
+                "up": (row.mean_mps2 / max(norm, 1e-300)).tolist(), "norm_mps2": norm,
+                "readings": None if row.sigma_mps2 is None else row.count, "temperature_c": row.temperature_c,
+            })  # fmt: skip
+        return described
 
 
 def _attitude(axis: int, sign: int, up: str) -> Floats:
