@@ -246,7 +246,7 @@ class Columns:
                 f"ax_mg ...), not {self._all}, or state it by --accel-unit, and the size of counts by --accel-scale."
             )
         told = reading_units(named, values, units)
-        self.by_size |= {at: told.units[k] for k, at in enumerate(places) if told.by_size and not named[k]}
+        self.by_size |= {at: told.by_size for at, unit in zip(places, named, strict=True) if told.by_size and not unit}
         if told.raw is None:
             signed = usual_norm(parse_counts(units.counts).signed(values))
             keys = size_of_count(signed)
