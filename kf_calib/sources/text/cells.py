@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from decimal import Decimal
@@ -113,7 +113,7 @@ class QuantityColumns:
 
     at: tuple[int, ...] = ()
     factors: tuple[float, ...] = ()
-    absent: Container[str] = ()
+    absent: frozenset[str] = frozenset()
 
     def values(self, row: CsvRow, header: Sequence[str], numbers: Numbers) -> list[float] | None:
         """The quantity, None where it is not measured. Raises LineError where it cannot be used."""
