@@ -26,11 +26,7 @@ _FIRST = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 class LineError(ValueError):
-    """A line cannot be used; the message is the reason in a few words. at: the column for the sake of whose cell."""
-
-    def __init__(self, reason: str, at: int = 0) -> None:
-        super().__init__(reason)
-        self.at = at
+    """A line cannot be used; the message is the reason in a few words."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +116,7 @@ class QuantityColumns:
         cells = [row[at] for at in self.at]
         if not all(cells):
             if any(cells):
-                raise LineError("some components of a vector are missing", self.at[cells.index("")])
+                raise LineError("some components of a vector are missing")
             return None
         values = numbers.values(cells)
         if not math.isfinite(sum(values)):  # which numbers beyond 1e308 together are not, either
@@ -128,7 +124,7 @@ class QuantityColumns:
                 return None
             for at, cell, value in zip(self.at, cells, values, strict=True):
                 if not math.isfinite(value):
-                    raise LineError(f"column {cut(header[at], 40)!r} is {cut(cell, 40)!r}, which is no number", at)
+                    raise LineError(f"column {cut(header[at], 40)!r} is {cut(cell, 40)!r}, which is no number")
         return list(map(mul, values, self.factors))
 
 
@@ -183,7 +179,7 @@ class Stamps:
             raise
         except (ValueError, ArithmeticError):
             why = "which is no time"
-        raise LineError(f"column {cut(header[self.at[0]], 40)!r} is {cut(cell, 40)!r}, {why}", self.at[0]) from None
+        raise LineError(f"column {cut(header[self.at[0]], 40)!r} is {cut(cell, 40)!r}, {why}") from None
 
 
 def stamp_ns(number: int | Decimal, unit_ns: int) -> int:

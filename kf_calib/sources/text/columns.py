@@ -245,9 +245,9 @@ class Columns:
                 f"no columns give the three readings with their unit: name them ax_mps2, ay_mps2, az_mps2 (or ax_g, "
                 f"ax_mg ...), not {self._all}, or state it by --accel-unit, and the size of counts by --accel-scale."
             )
-        told = reading_units(named, values, units)
-        self.by_size |= {at: told.by_size for at, unit in zip(places, named, strict=True) if told.by_size and not unit}
-        if told.raw is None:
+        raw, words, by_size = reading_units(named, values, units)
+        self.by_size |= {at: by_size for at, unit in zip(places, named, strict=True) if by_size and not unit}
+        if raw is None:
             signed = usual_norm(parse_counts(units.counts).signed(values))
             keys = size_of_count(signed)
             raise CountsError(
@@ -257,8 +257,8 @@ class Columns:
             )  # fmt: skip
         is_stated = units.accel is not None or units.accel_scale != 1.0
         if self.is_table or is_stated or not all(is_exact(self.names[at]) for at in places):
-            self.said.insert(0, f"{'mean ' * self.is_table}readings from {self.named(places)} in {told.words}")
-        self.raw = told.raw
+            self.said.insert(0, f"{'mean ' * self.is_table}readings from {self.named(places)} in {words}")
+        self.raw = raw
         is_made = units.accel_scale != 1.0 or named != by_name or "count" in named  # the names tell less than is known
         if is_made or self.raw.sizes != PLAIN.sizes or self.raw.counts != SIGNED:
             x, y, z = (ACCEL.get(unit, 1.0) for unit in by_name)

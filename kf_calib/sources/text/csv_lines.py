@@ -72,14 +72,14 @@ class CsvLines(LineReader):
         return super().read(lines, first_line)
 
     def _cells(self, line: str) -> list[str]:
-        if self._heading.labels is not None:
-            return self._heading.labels.values(line)
+        if self._heading.labels:
+            return [line[start:end] for start, end in self._heading.spans(line)]
         delimiter = self._heading.delimiter
         is_plain = '"' not in line and " " not in line and delimiter != BLANK
         return line.split(delimiter) if is_plain else cells_of(line, delimiter)
 
     def _row(self, line: str) -> SampleRow | None:
-        if not (cells := self._cells(line)) and self._heading.labels is not None:
+        if not (cells := self._cells(line)) and self._heading.labels:
             return None  # of something else than readings
         number, self._count = self._count, self._count + 1
         row = without_empty_end(cells, len(self._header))

@@ -190,11 +190,11 @@ class TableOfMeans:
         if not np.isfinite(extremes).all():
             return
         half = (extremes[:, 0] - extremes[:, 1]) / 2.0
-        told = reading_units(["", "", ""], np.diag(half), self.units)
-        unit = STANDARD_GRAVITY_MPS2 / told.raw.factors[0] if told.raw else half.mean()
+        raw, *_ = reading_units(["", "", ""], np.diag(half), self.units)
+        unit = STANDARD_GRAVITY_MPS2 / raw.factors[0] if raw else half.mean()
         scales = ", ".join(f"K{k + 1} = {size / unit:.4f}" for k, size in enumerate(half))
         biases = ", ".join(f"b{k + 1} = {middle:g}" for k, middle in enumerate(extremes.mean(axis=1)))
-        of_mean = "" if told.raw else " of their mean, as no unit is known"
+        of_mean = "" if raw else " of their mean, as no unit is known"
         raise InputError(
             f"has of each axis only what it reads up and down: six numbers for six unknowns, {scales}"
             f"{of_mean}, and {biases} as written, with no degree of freedom to judge them or to tell angles: write all "

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -101,17 +101,9 @@ class Units:
         return np.array([ACCEL[unit] * (g if unit.endswith("g") else 1.0) for unit in units])
 
 
-class ReadingUnits(NamedTuple):
-    """raw: the sizes of the numbers of three readings; None where nothing tells these. words: how their unit is said.
-    by_size: the unit that the numbers told; empty where something else does."""
-
-    raw: RawInput | None
-    words: str
-    by_size: str
-
-
-def reading_units(named: Sequence[str], values: Floats, stated: Units) -> ReadingUnits:
-    """The units of three readings.
+def reading_units(named: Sequence[str], values: Floats, stated: Units) -> tuple[RawInput | None, str, str]:
+    """The sizes of the numbers of three readings, None where nothing tells these; how their unit is said; and the unit
+    that the numbers told, empty where something else does.
 
     named: units by the names of their columns, empty where these tell none. values (n, 3): readings as they are
     written, whose size at rest tells a unit that neither a name nor ``stated`` tells.
@@ -121,7 +113,7 @@ def reading_units(named: Sequence[str], values: Floats, stated: Units) -> Readin
     if stated.as_default(named, norm):
         assert stated.input is not None
         default = replace(stated.input, channels=CHANNELS)
-        return ReadingUnits(default, f"{default.unit_words}, as of the calibration", "")
+        return default, f"{default.unit_words}, as of the calibration", ""
     size = norm * stated.accel_scale
     are_counts = bool((values == np.rint(values)).all()) or stated.accel_scale != 1.0
     by_size = next((unit for unit, low, high in _BY_SIZE[: 3 if are_counts else 4] if low < size < high), "count")
@@ -140,7 +132,7 @@ def reading_units(named: Sequence[str], values: Floats, stated: Units) -> Readin
         raw = RawInput(sizes=(scale, scale, scale), unit=units[0], counts=stated.counts)
     else:
         raw = replace(RawInput.of_factors((scale * mps2).tolist()), counts=stated.counts)
-    return ReadingUnits(raw, words, guessed)
+    return raw, words, guessed
 
 
 def usual_norm(values: Floats) -> float:
