@@ -9,6 +9,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
+from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -24,7 +25,7 @@ from kf_calib.bench.streams import Orientations, Table, bench_without_angles
 from kf_calib.errors import CountsError, InputError
 from kf_calib.sources.text.cells import LineError, QuantityColumns
 from kf_calib.sources.text.columns import HOW, READINGS, SPREADS, Columns, refuse_unknown_names
-from kf_calib.sources.text.grid import Grid, grid_of
+from kf_calib.sources.text.grid import grid_of
 from kf_calib.sources.text.names import QUATERNION, face_of
 from kf_calib.sources.text.reader import named
 from kf_calib.sources.text.units import Units, celsius, reading_units
@@ -71,14 +72,14 @@ def open_table(
 
     Raises InputError where a cell, or what the columns are, cannot be understood.
     """
-    grid = grid_of(table, dataset)
     given = {"accel_unit": accel_unit, "accel_scale": accel_scale}
-    with named(grid.name):
+    table = Path(table) if isinstance(table, str | PathLike) else table
+    with named(_name_of(table)):
         keys = checked_keys({**overrides, **{key: value for key, value in given.items() if value is not None}})
         order = merged_metadata({}, keys, "", input).get("channels")
-        units = replace(Units.of(keys, angle_unit, g_unit, input), where=where)
+        units = replace(Units.of(keys, angle_unit, g_unit, input), where=where, dataset=dataset)
         return TableOfMeans(
-            grid, columns, keys if order is None else {**keys, "channels": order}, units, angles
+            table, columns, keys if order is None else {**keys, "channels": order}, units, angles
         ).table()
 
 
@@ -87,20 +88,22 @@ class TableOfMeans:
     do where a column tells them."""
 
     def __init__(
-        self, grid: Grid, stated: Mapping[str, str], overrides: BenchKeys, units: Units, angles: bool | None
+        self, table: Any, stated: Mapping[str, str], overrides: BenchKeys, units: Units, angles: bool | None
     ) -> None:
-        refuse_unknown_names(stated, grid.heading.header)
-        self.columns = columns = Columns(grid.heading, stated, units, is_table=True)
-        pairs = zip(grid.heading.numbers, grid.heading.rows, strict=True)
+        heading, remarks = grid_of(table, units.dataset)
+        self.name, self.path = _name_of(table), table if isinstance(table, Path) else None
+        refuse_unknown_names(stated, heading.header)
+        self.columns = columns = Columns(heading, stated, units, is_table=True)
+        pairs = zip(heading.numbers, heading.rows, strict=True)
         self.rows = [line + 1 for line, row in pairs if columns.is_chosen(row)]
-        self.grid, self.overrides, self.units, self.said = grid, overrides.copy(), units, columns.said
+        self.overrides, self.units, self.said = overrides.copy(), units, columns.said
         self.are_lacking = angles is None and not columns.orientation
         self.angles = angles is not False and not self.are_lacking
-        self.warnings = [f"{grid.name}: {remark}." for remark in grid.remarks]
+        self.warnings = [f"{self.name}: {remark}." for remark in remarks]
 
     def table(self) -> Table:
         """The table; what is read first is what is most often missing."""
-        columns, name = self.columns, self.grid.name
+        columns, name = self.columns, self.name
         elapsed_s, start_ns = self.times
         self.refuse_samples()
         self._refuse_own_axes()
@@ -125,10 +128,10 @@ class TableOfMeans:
             self.said.append(f"not used: {columns.named(unused)}")
         by = f" ({', '.join(map(repr, columns.guessed))} by what stands there)" if columns.guessed else ""
         told = f"{name}: {'; '.join(self.said)}{by}. {HOW}."
-        return Table(name, bench, rows, [*self.warnings, told], start_ns, self.grid.path)
+        return Table(name, bench, rows, [*self.warnings, told], start_ns, self.path)
 
     def _warn(self, sentence: str) -> None:
-        self.warnings.append(f"{self.grid.name}: {sentence}")
+        self.warnings.append(f"{self.name}: {sentence}")
 
     def _refusal(self, row: int, at: int, wanted: str, *, is_optional: bool = False) -> InputError:
         """Return the error that names a cell (row counted from 0), its value, and what would be read. is_optional:
@@ -251,7 +254,7 @@ class TableOfMeans:
 
     def _bench(self) -> Bench:
         if not self.angles:
-            bench, said = bench_without_angles(self.grid.name, self.overrides, are_lacking=self.are_lacking)
+            bench, said = bench_without_angles(self.name, self.overrides, are_lacking=self.are_lacking)
             self.warnings += said
             return bench
         has_angles, count = self.columns.orientation == "angles", len(self.columns.angles)
@@ -324,12 +327,11 @@ class Survey(TableOfMeans):
         self, path: Path, overrides: BenchKeys = UNSTATED, columns: Mapping[str, str] = MappingProxyType({}),
         units: Units | None = None, *, angles: bool = True,
     ) -> None:  # fmt: skip
-        grid = grid_of(path, units.dataset if units else "")
-        keys, self.path, self._stated = overrides.copy(), path, columns
+        keys, self._stated = overrides.copy(), columns
         if not {"gravity_mps2", "latitude_deg"} & keys.keys():
             keys["gravity_mps2"] = STANDARD_GRAVITY_MPS2
-        with named(grid.name):
-            super().__init__(grid, columns, keys, units or Units(), None if angles else False)
+        with named(str(path)):
+            super().__init__(path, columns, keys, units or Units(), None if angles else False)
             self.refuse_samples()
             self.are_lacking = False  # whoever asks is told by the columns
             if (places := self.columns.angles) and not overrides.get("axes"):
@@ -339,7 +341,7 @@ class Survey(TableOfMeans):
             except CountsError:
                 raise
             except InputError as error:
-                self.trouble = f"{grid.name}: {error}"
+                self.trouble = f"{path}: {error}"
 
     @property
     def orientation(self) -> str:
@@ -385,6 +387,11 @@ class Survey(TableOfMeans):
                 "readings": None if row.sigma_mps2 is None else row.count, "temperature_c": row.temperature_c,
             })  # fmt: skip
         return described
+
+
+def _name_of(table: Any) -> str:
+    """Return what messages call a table."""
+    return str(table) if isinstance(table, Path) else "the table"
 
 
 def _attitude(axis: int, sign: int, up: str) -> Floats:
