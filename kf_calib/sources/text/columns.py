@@ -71,7 +71,7 @@ class Columns:
         self.heading, self.header, self.units, self.is_table = heading, heading.header, units or Units(), is_table
         self.names = ["" if stated.get(name) == "-" else stated.get(name, name) for name in self.header]
         self.said, self.guessed, self.by_size = list[str](), list[str](), dict[int, str]()
-        self.raw, self.written_mps2, self.without_unit = PLAIN, (1.0, 1.0, 1.0), list[int]()
+        self.raw, self.written_mps2, self.without_unit = PLAIN, [1.0] * 3, list[int]()
         self.chosen: tuple[int, str] | None = None
         self.rows: list[CsvRow] = [row for row in heading.rows if len(row) == len(self.names)]
         if self.units.where:
@@ -261,11 +261,10 @@ class Columns:
         self.raw = raw
         is_made = units.accel_scale != 1.0 or named != by_name or "count" in named  # the names tell less than is known
         if is_made or self.raw.sizes != PLAIN.sizes or self.raw.counts != SIGNED:
-            x, y, z = (ACCEL.get(unit, 1.0) for unit in by_name)
+            self.written_mps2 = [ACCEL.get(unit, 1.0) for unit in by_name]
             self.without_unit = [at for at, unit in zip(places, by_name, strict=True) if unit in ("", "count")]
         else:
-            x, y, z = self.raw.factors.tolist()
-        self.written_mps2 = x, y, z
+            self.written_mps2 = self.raw.factors.tolist()
         return QuantityColumns(tuple(places), (1.0, 1.0, 1.0))
 
     @property
@@ -303,12 +302,12 @@ class Columns:
             of_table = ("deg" if (values == np.rint(values)).all() else "rad") if self.is_table else ""
             stated = "deg" if (np.abs(values) > 2.0 * math.pi).any() else of_table
             self.by_size |= {at: stated for at, unit in zip(places, units, strict=True) if not unit and stated}
-        if needed and (not places or ("" in units and not stated)):
-            raise self.without_angles()
-        if "" in units and not stated:
+        if not places or ("" in units and not stated):
+            if needed:
+                raise self.without_angles()
             return QuantityColumns()
         units = [unit or str(stated) for unit in units]
-        if units and (self.is_table or not all(is_exact(self.names[at]) for at in places)):
+        if self.is_table or not all(is_exact(self.names[at]) for at in places):
             words = " and ".join(dict.fromkeys(units))
             self.said.append(f"gimbal angles, outer to inner, from {self.named(places)} in {words}{how}")
         return QuantityColumns(tuple(places), tuple(ANGLE[unit] for unit in units))
@@ -372,7 +371,7 @@ class Columns:
                 self._guess(k, ours)
 
     def _guess(self, place: int, ours: str) -> None:
-        self.meanings[place] = Meaning(ours, self.meanings[place].unit)
+        self.meanings[place] = self.meanings[place]._replace(ours=ours)
         self.guessed.append(self.header[place])
 
     def _are_numbers(self, place: int) -> bool:
