@@ -98,18 +98,6 @@ def holds_any(path: Path, words: Sequence[bytes]) -> bool:
         return any(word in before + block for before, block in itertools.pairwise(blocks) for word in words)
 
 
-def text_of(path: Path, dataset: str = "") -> str:
-    """The whole text of a file, without bytes of zero at its end, as a power cut leaves them; dataset: of a container.
-
-    Raises as ``unpacked``, and InputError where it is no text.
-    """
-    content = unpacked(path, dataset)
-    text = content.decode(encoding_of(content[:_HEAD_BYTES]), errors="replace").rstrip("\0").removeprefix("\ufeff")
-    if "\0" in text:
-        raise InputError(f"{path}: is no text (it has bytes of zero): save the table as CSV or .xlsx.")
-    return text
-
-
 def unpacked(path: Path, dataset: str = "") -> bytes:
     """The whole of a file, unpacked; of a container the lines of a dataset.
 
@@ -125,11 +113,12 @@ def unpacked(path: Path, dataset: str = "") -> bytes:
     return content
 
 
-def encoding_of(head: bytes) -> str:
-    """UTF-8 or UTF-16, each with or without a byte-order mark, or else a code page of Windows.
+def encoding_of(content: bytes) -> str:
+    """UTF-8 or UTF-16, each with or without a byte-order mark, or else a code page of Windows, by the beginning.
 
     It is Cyrillic (1251) where three letters beyond ASCII follow each other, as in no Western language, or else 1252.
     """
+    head = content[:_HEAD_BYTES]
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16"
     plain = head.rstrip(b"\0")

@@ -11,7 +11,7 @@ from typing import Any
 from kf_calib.errors import InputError
 from kf_calib.sources.containers.opening import kind_of_container
 from kf_calib.sources.text.cells import DECIMAL_POINT, Numbers
-from kf_calib.sources.text.encoding import LARGEST_TABLE_BYTES, TOO_LARGE, text_of
+from kf_calib.sources.text.encoding import LARGEST_TABLE_BYTES, TOO_LARGE, encoding_of, unpacked
 from kf_calib.sources.text.heading import TextHeading
 from kf_calib.sources.text.spreadsheet import sheets_of
 from kf_calib.support.text import cut
@@ -49,8 +49,12 @@ def _of_file(path: Path, dataset: str) -> Grid:
         raise InputError(f"files of the kind {path.suffix} are not read: save it as .xlsx or .csv.")
     if is_excel:
         return _of_excel(path)
-    try:  # any usual encoding and delimiter, with or without lines above the header
-        return TextHeading.of(text_of(path, dataset).splitlines(), is_whole=True), []
+    content = unpacked(path, dataset)
+    text = content.decode(encoding_of(content), errors="replace").rstrip("\0")  # which a power cut leaves at the end
+    if "\0" in text:
+        raise InputError("is no text (it has bytes of zero): save the table as CSV or .xlsx.")
+    try:  # any usual delimiter, with or without lines above the header
+        return TextHeading.of(text.removeprefix("\ufeff").splitlines(), is_whole=True), []
     except csv.Error as error:
         raise InputError(f"is no CSV file ({error}): save the table as CSV or .xlsx.") from None
 

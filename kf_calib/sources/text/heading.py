@@ -90,6 +90,12 @@ class TextHeading(NamedTuple):
             rows, header = [[face, *cells] for face, cells in zip(faces, rows, strict=True)], ["face", *header]
         return cls(header, ",", numbers[0], rows, labels=labels, numbers=numbers)
 
+    def cells(self, line: str) -> list[str]:
+        """The cells of a line below; none where it has other labels than those of readings."""
+        if self.labels:
+            return [line[start:end] for start, end in self.spans(line)]
+        return cells_of(line, self.delimiter)
+
     def spans(self, line: str) -> list[tuple[int, int]]:
         """Where the cells of a line stand, with their quotes and without blanks around them, those of columns that it
         does not have at its beginning; the mark of a comment in a cell of its own is none."""
@@ -207,7 +213,8 @@ def without_empty_end(row: list[str], count: int) -> list[str]:
 def cells_of(line: str, delimiter: str) -> list[str]:
     """The cells of one line without blanks and quotes around them; a quote left open ends with the line."""
     if '"' not in line:
-        return line.split() if delimiter == BLANK else [cell.strip() for cell in line.split(delimiter)]
+        cells = line.split(None if delimiter == BLANK else delimiter)
+        return [cell.strip() for cell in cells] if " " in line else cells
     try:
         cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=delimiter == BLANK), [])
     except csv.Error:  # a cell beyond csv's own limit
