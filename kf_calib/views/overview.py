@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
@@ -188,8 +189,8 @@ def table_object(overview: TableOverview) -> dict[str, Any]:
     survey = overview.survey
     return clean(
         {
-            "recording": str(survey.path), "format": "table", "files": [str(survey.path)],
-            "bytes": survey.path.stat().st_size, "topics": [],
+            "recording": survey.name, "format": "table", "files": [survey.name],
+            "bytes": Path(survey.name).stat().st_size, "topics": [],
             "columns": survey.described_columns,
             "orientation": survey.orientation or None, "bench": overview.bench,
             "dwells": survey.described_rows, "missing": overview.missing,
@@ -202,7 +203,7 @@ def table_report(overview: TableOverview) -> RenderableType:
     """What ``info`` prints of a table."""
     survey = overview.survey
     parts: list[RenderableType] = [
-        Text(f"{survey.path}: a table of orientations, {counted(len(survey.rows), 'row')}"),
+        Text(f"{survey.name}: a table of orientations, {counted(len(survey.rows), 'row')}"),
         _column_table(survey.described_columns),
     ]
     bench = ", ".join(f"{key} = {value}" for key, value in overview.bench.items())

@@ -10,15 +10,14 @@ from decimal import Decimal
 from typing import Any
 
 from kf_calib.bench.bench import metadata_of
-from kf_calib.bench.raw_input import UNITS, parse_unit
+from kf_calib.bench.raw_input import UNITS
 from kf_calib.sources.text.cells import LineError, stamp_ns, written
 from kf_calib.sources.text.reader import Account, LineReader, SampleRow
-from kf_calib.support.units import WORDS
 
 _MARK = "\ufeff"  # some write it before the first line
 _TIME_NS = {"time_ns": 1, "time_us": 10**3, "time_ms": 10**6, "time_s": 10**9}
 """Names of the stamp, and its unit."""
-_ACCEL = {f"accel_{unit}": WORDS["m/s^2"][unit] for unit in ("mps2", "g", "mg")}
+_ACCEL = {"accel_mps2": "m/s2", "accel_g": "g", "accel_mg": "mg"}
 _READINGS = (*_ACCEL, "accel", "accel_counts", "accel_raw")
 """The names of the last three tell no unit: options state it."""
 _ANGLES = {"angles_rad": 1.0, "angles_deg": math.pi / 180.0}
@@ -53,7 +52,7 @@ class JsonLines(LineReader):
         entry = json.loads(line.lstrip(_MARK))
         theirs = {self._columns.get(key, key): key for key in entry}
         name = _first_of({ours: entry[key] for ours, key in theirs.items()}, _READINGS)
-        values = json.dumps([written(value / _ACCEL.get(name, 1.0)) for value in readings_mps2])
+        values = json.dumps([written(value / UNITS[_ACCEL.get(name, "m/s2")]) for value in readings_mps2])
         (key_start, key_end), (start, end) = _spans(line)[theirs[name]]
         key = line[key_start:key_end] if name in _ACCEL else '"accel_mps2"'
         return line[:key_start] + key + line[key_end:start] + values + line[end:]
@@ -116,15 +115,13 @@ class JsonLines(LineReader):
     def _readings(self, entry: dict[str, Any]) -> list[float] | None:
         if not (name := _first_of(entry, _READINGS)):
             return None
-        values, is_bare = _numbers(entry[name], name), name not in _ACCEL
+        values, unit = _numbers(entry[name], name), _ACCEL.get(name, "")
         if len(values) != 3:
             raise LineError(f"{name} has {len(values)} numbers, not 3")
-        if self.unit is None and not self.is_bare:
-            self.unit, self.is_bare = (None if is_bare else parse_unit(name.removeprefix("accel_"))), is_bare
-        if is_bare != self.is_bare:
+        self.unit = unit if self.unit is None else self.unit
+        if bool(unit) != bool(self.unit):
             raise LineError(f"{name} is not like the readings before it")
-        factor = 1.0 if self.unit is None else _ACCEL[name] / UNITS[self.unit]
-        return values if factor == 1.0 else [factor * value for value in values]
+        return values if unit == self.unit else [UNITS[unit] / UNITS[self.unit] * value for value in values]
 
     def _pose(self, entry: dict[str, Any]) -> list[float] | None:
         if not (name := _first_of(entry, POSE_KEYS)):

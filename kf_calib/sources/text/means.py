@@ -85,7 +85,7 @@ def open_table(
 
 class TableOfMeans:
     """One opening of a table; ``said`` collects what was taken for what. angles: whether orientations count; None: they
-    do where a column tells them."""
+    do where a column tells them. orientation: how, as of the columns; empty where they do not count."""
 
     def __init__(
         self, table: Any, stated: Mapping[str, str], overrides: BenchKeys, units: Units, angles: bool | None
@@ -99,6 +99,7 @@ class TableOfMeans:
         self.overrides, self.units, self.said = overrides.copy(), units, columns.said
         self.are_lacking = angles is None and not columns.orientation
         self.angles = angles is not False and not self.are_lacking
+        self.orientation = columns.orientation if self.angles else ""
         self.warnings = [f"{self.name}: {remark}." for remark in remarks]
 
     def table(self) -> Table:
@@ -110,7 +111,7 @@ class TableOfMeans:
         raw = columns.values(columns.reading_places)
         refuse_unread(raw[np.isfinite(raw).all(axis=1)], self.units.counts, name)
         readings = columns.accel()
-        if self.angles and not columns.orientation:
+        if self.angles and not self.orientation:
             raise columns.without_angles()
         if not columns.has("time"):
             self._warn(
@@ -342,11 +343,6 @@ class Survey(TableOfMeans):
                 raise
             except InputError as error:
                 self.trouble = f"{path}: {error}"
-
-    @property
-    def orientation(self) -> str:
-        """``angles``, ``attitude`` or ``face``; empty where no column tells it, or none is used."""
-        return self.columns.orientation if self.angles else ""
 
     @cached_property
     def described_columns(self) -> list[dict[str, str]]:

@@ -82,7 +82,7 @@ class Described:
     """What has been learnt of the bench from what it sent.
 
     metadata: of the bench, as strings. has_angles: poses are angles; pose_width: numbers of one, 0 until it is known.
-    raw: what the readings are in, where that is settled, unit: by their names; None where they name none (is_bare), or
+    raw: what the readings are in, where that is settled, unit: by their names; empty where they name none, None where
     none has come yet. said: what was taken for what, where that is not plain.
     """
 
@@ -90,7 +90,6 @@ class Described:
     pose_width = 0
     raw: RawInput | None = None
     unit: str | None = None
-    is_bare = False
 
     def __init__(self, account: Account) -> None:
         self.metadata, self.said = dict[str, str](), list[str]()
@@ -102,22 +101,22 @@ class Described:
 
         Raises BenchError where they contradict each other, or no unit is stated.
         """
-        by_name = {} if self.unit is None else {"accel_unit": self.unit}
+        by_name = {"accel_unit": self.unit} if self.unit else {}
         if self.raw is not None:
             by_name = {"accel_scale": self.raw.scale, "accel_unit": self.raw.unit}
-        elif default is not None and default.sizes == PLAIN.sizes and self.unit is not None:
+        elif default is not None and default.sizes == PLAIN.sizes and self.unit:
             default = replace(default, unit=self.unit)  # a unit, which the names state anew
         with named(name):
             stated = merged_metadata(self.metadata, overrides, "the first line", default)
             now = RawInput.from_metadata(stated)
             if CONVERTED in stated:
                 raise BenchError(f"lines hold what the device sends: leave out {CONVERTED} in the bench's keys.")
-            if self.unit not in (None, now.unit) and "accel_unit" in stated and RESTATE not in overrides:
+            if self.unit not in (None, "", now.unit) and "accel_unit" in stated and RESTATE not in overrides:
                 raise BenchError(
                     f"the readings are in {self.unit} by their names, and stated is {now.unit_words}: rename them by "
                     "--column, or where their names are wrong, give --accel-unit and --restate-input."
                 )
-            if self.is_bare and not {"accel_unit", "accel_scale"} & set(stated):
+            if self.unit == "" and not {"accel_unit", "accel_scale"} & set(stated):
                 raise BenchError(
                     "the names of the readings do not tell their unit: name them accel_mps2 (or accel_g ...), or give "
                     "it by --accel-unit, and the size of counts by --accel-scale."
