@@ -153,7 +153,7 @@ class Columns:
 
     def values(self, places: Sequence[int]) -> Floats:
         """The numbers (n, k) in columns, NaN where there is none."""
-        values = [[self.numbers.value(row[at]) for at in places] for row in self.rows]
+        values = [self.numbers.values([row[at] for at in places]) for row in self.rows]
         return np.array(values, float).reshape(-1, len(places))
 
     # -- what kind of text it is --
@@ -187,8 +187,8 @@ class Columns:
                 f"--rate 100; {WANTED}, not {self._all}."
             )
         exact = [at for at in places if is_exact(self.names[at])]
-        united = [at for at in places if self.meanings[at].unit]
-        place = min(exact or united or places, key=self._unevenness)
+        best = exact or [at for at in places if self.meanings[at].unit] or places
+        place = min(best, key=self._unevenness) if len(best) > 1 else best[0]
         unit, values = self.meanings[place].unit, self.values([place])[:, 0]
         values = values[[bool(row[place]) for row in self.rows]]
         if not unit and len(values) and math.isnan(values[0]):
