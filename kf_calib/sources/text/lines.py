@@ -165,7 +165,8 @@ class Lines:
             if not first:
                 raise InputError(f"{self.name} holds no lines: check that the logger wrote any.")
             with named(self.name):
-                self.described, heading = reader, heading = self._reader(first)
+                reader, heading = self._reader(first)
+            self.described = reader
             account.lines += heading
             for lines in itertools.chain([first[heading:]], blocks):
                 batch = reader.read(lines, account.lines + 1)
@@ -173,8 +174,8 @@ class Lines:
                 has_accel, has_pose = has_accel or len(batch.accel) > 0, has_pose or len(batch.pose) > 0
                 yield batch
         finally:
-            if self._file:
-                self._file.close()
+            if isinstance(stream, TextFile):
+                stream.close()
         lacks_pose = reader.wants_pose and not (has_pose if has_accel else reader.pose_width)
         if lacks_pose or not has_accel:
             raise self._unusable("platform angles" if lacks_pose else "readings")
@@ -186,7 +187,7 @@ class Lines:
         try:
             while block := read(_BLOCK_BYTES):
                 if lines := cutter.push(block):
-                    self.fraction = self._file.fraction if self._file else math.nan
+                    self.fraction = stream.fraction if isinstance(stream, TextFile) else math.nan
                     yield lines
         except OSError as error:
             raise InputError(f"{self.name}: cannot be read on ({error.strerror}).") from None
