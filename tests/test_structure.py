@@ -191,7 +191,7 @@ CEILINGS = {
     "support": 1039,
     "bench": 1691,
     "effects": 3140,
-    "sources": 12162,
+    "sources": 11978,
     "dwells": 3815,
     "noise": 3398,
     "estimation": 7918,

@@ -241,7 +241,7 @@ def _told_if_table(path: Path) -> Iterator[None]:
     """Where lines cannot be recorded because they are a table of orientations, say so."""
     from kf_calib.sources.file_kind import FileKind
     from kf_calib.sources.opening import kind_of
-    from kf_calib.sources.text.survey import Survey
+    from kf_calib.sources.text.means import Survey
 
     try:
         yield

@@ -271,7 +271,7 @@ def _show_table(ctx: click.Context, path: Path, reading: ReadingOptions, as_json
 
 def _of_table(ctx: click.Context, path: Path, reading: ReadingOptions, told: Stated, reason: str) -> TableOverview:
     """What is in a table of orientations; told, reason: as of ``_of_lines``."""
-    from kf_calib.sources.text.survey import Survey
+    from kf_calib.sources.text.means import Survey
     from kf_calib.views.overview import TableOverview
 
     stated: BenchKeys = {**reading.keys, **_bench_keys(told)}
@@ -288,7 +288,7 @@ def _of_table(ctx: click.Context, path: Path, reading: ReadingOptions, told: Sta
     axes = _AXES.get(len(table.columns.angles), _NAMED["axes"][0])
     words += [axes if key == "axes" else _NAMED[key][0] for key in lacking]
     taken = table.evaluated.bench.input if table.evaluated else None
-    wrong = taken and _wrong_unit([row.norm_mps2 for row in table.described_rows], taken, are_named=True)
+    wrong = taken and _wrong_unit([row["norm_mps2"] for row in table.described_rows], taken, are_named=True)
     missing, words = _with_unit(missing, words, wrong)
     if table.trouble:
         missing, words = {"": table.trouble, **missing}, None

@@ -31,8 +31,7 @@ from kf_calib.sources.files.mcap_append import TopicAppender, source_file
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.text.cells import written
 from kf_calib.sources.text.encoding import encoding_of, unpacked
-from kf_calib.sources.text.grid import Grid, grid_of
-from kf_calib.sources.text.heading import with_texts
+from kf_calib.sources.text.heading import TextHeading, with_texts
 from kf_calib.sources.text.means import TableOfMeans
 from kf_calib.sources.text.reader import named
 from kf_calib.sources.text.spreadsheet import sheets_of, workbook_of
@@ -191,9 +190,8 @@ def apply_to_table(
     """Write the ``copy``, wholly or not at all; arguments as of ``open_table`` and ``apply_to_file``."""
     if units.where:
         raise InputError(f"{path}: a corrected copy has every row, of one sensor: put its rows in a file (--where).")
-    grid = grid_of(path, units.dataset)
-    with named(grid.name):
-        opening = TableOfMeans(grid, columns, overrides, units, angles=False)
+    with named(str(path)):
+        opening = TableOfMeans(path, columns, overrides, units, angles=False)
         table = opening.table()
     means = table.orientations.mean_mps2
     warmth = table.orientations.temperature_c
@@ -205,27 +203,27 @@ def apply_to_table(
         raise InputError(f"{path}: {said}.")
     force = correction.of_readings(means, warmth if correction.needs_temperature else None)
     write = _to_excel if path.suffix.lower() in (".xlsx", ".xlsm") else partial(_to_text, dataset=units.dataset)
-    write(path, copy, grid, opening.columns.accel().at, force)
+    write(path, copy, opening.columns.heading, opening.columns.accel().at, force)
     known = warmth[np.isfinite(warmth)]
     used = (float(known.min()), float(known.max())) if correction.needs_temperature else None
     return Applied(len(force), int(np.count_nonzero(~np.isfinite(force).all(axis=1))), used)
 
 
-def _heads(grid: Grid) -> Iterator[tuple[int, Sequence[str]]]:
+def _heads(heading: TextHeading) -> Iterator[tuple[int, Sequence[str]]]:
     """Return the lines of the header and, where there is one, of units, with what a copy has there for the three
     readings."""
-    return zip(grid.heading.lines_of_names, (_NAMES, ["m/s^2"] * 3), strict=False)
+    return zip(heading.lines_of_names, (_NAMES, ["m/s^2"] * 3), strict=False)
 
 
-def _to_excel(path: Path, copy: Path, grid: Grid, places: Sequence[int], force: Floats) -> None:
+def _to_excel(path: Path, copy: Path, heading: TextHeading, places: Sequence[int], force: Floats) -> None:
     """Write a copy of a workbook."""
     book = workbook_of(path)
     sheet = book[next(each.name for each in sheets_of(path) if not each.hidden)]
-    for line, texts in _heads(grid):
+    for line, texts in _heads(heading):
         for place, text in zip(places, texts, strict=True):
             if sheet.cell(line + 1, place + 1).value is not None:
                 sheet.cell(line + 1, place + 1).value = text
-    for line, own in zip(grid.heading.numbers, force.tolist(), strict=True):
+    for line, own in zip(heading.numbers, force.tolist(), strict=True):
         for place, value in zip(places, own, strict=True):
             cell = sheet.cell(line + 1, place + 1)
             if type(cell).__name__ == "MergedCell":
@@ -237,16 +235,16 @@ def _to_excel(path: Path, copy: Path, grid: Grid, places: Sequence[int], force: 
     write_whole(copy, content.getvalue())
 
 
-def _to_text(path: Path, copy: Path, grid: Grid, places: Sequence[int], force: Floats, dataset: str) -> None:
+def _to_text(path: Path, copy: Path, heading: TextHeading, places: Sequence[int], force: Floats, dataset: str) -> None:
     """Write a copy of a text, or of a dataset of a container, in its encoding."""
-    content, heading = unpacked(path, dataset), grid.heading
+    content = unpacked(path, dataset)
     encoding, plain_codec = encoding_of(content), "utf-8-sig" if content.startswith(BOM_UTF8) else "utf-8"
     codec, errors = (encoding, "strict") if encoding.startswith("utf-16") else (plain_codec, "surrogateescape")
     lines = content.decode(codec, errors).splitlines(keepends=True)
     are_commas = heading.delimiter != "," and not any("." in lines[number] for number in heading.numbers)
     texts = [[repr(written(value)).replace(".", "," if are_commas else ".") for value in own]
              for own in force.tolist()]  # fmt: skip
-    for number, new in (*zip(heading.numbers, texts, strict=True), *_heads(grid)):
+    for number, new in (*zip(heading.numbers, texts, strict=True), *_heads(heading)):
         line, is_units = lines[number], number in heading.lines_of_names[1:]
         spans = heading.spans(line.rstrip("\r\n"))
         cells = [line[start:end] for start, end in spans]

@@ -15,7 +15,7 @@ from kf_calib.sources.containers.opening import dataset_of, kind_of_container
 from kf_calib.sources.file_kind import FileKind
 from kf_calib.sources.files.contents import CALIBRATION_FORMAT
 from kf_calib.sources.files.mcap_file import HEAD_BYTES, is_lines
-from kf_calib.sources.text.cells import DECIMAL_POINT, LineError
+from kf_calib.sources.text.cells import LineError
 from kf_calib.sources.text.columns import READINGS, Columns
 from kf_calib.sources.text.encoding import head_of
 from kf_calib.sources.text.grid import OLD_SUFFIXES, TEXT_SUFFIXES, ZIP
@@ -72,10 +72,10 @@ def _step_s(columns: Columns) -> float:
         time = columns.time()
     except InputError:
         return math.nan
-    stamps, numbers = list[int](), columns.numbers or DECIMAL_POINT
+    stamps = list[int]()
     for number, row in enumerate(columns.rows):
         with suppress(LineError):
-            stamps.append(time.ns(row, columns.header, numbers, number))
+            stamps.append(time.ns(row, columns.header, columns.numbers, number))
     steps = np.abs(np.diff(np.array(stamps, float)))
     return float(np.median(steps)) / 1e9 if len(steps) else math.nan
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from rich.console import Group, RenderableType
@@ -16,7 +17,7 @@ from rich.text import Text
 from kf_calib.dwells.rest_in_readings import DwellSummary
 from kf_calib.sources.containers.opening import ContainerKind
 from kf_calib.sources.files.inventory import Inventory, Topic
-from kf_calib.sources.text.survey import ColumnFound, Survey
+from kf_calib.sources.text.means import Survey
 from kf_calib.support.text import counted, cut
 from kf_calib.views.json import clean, members
 from kf_calib.views.terminal import LINED, ConsoleTable, note, table
@@ -138,12 +139,12 @@ def _dwell_parts(dwells: Sequence[DwellSummary]) -> list[RenderableType]:
     return parts
 
 
-def up_text(up: tuple[float, ...]) -> str:
+def up_text(up: Sequence[float]) -> str:
     """The direction that is up, in the axes of the accelerometers."""
     return " ".join(f"{part:+.2f}" for part in up)
 
 
-def pose_text(pose: tuple[float, ...]) -> str:
+def pose_text(pose: Sequence[float]) -> str:
     """Gimbal angles in degrees; an attitude as it is."""
     if len(pose) == 4:
         return " ".join(f"{each:.4f}" for each in pose)
@@ -180,11 +181,11 @@ def table_object(overview: TableOverview) -> dict[str, Any]:
     survey = overview.survey
     return clean(
         {
-            "recording": str(survey.path), "format": "table", "files": [str(survey.path)],
-            "bytes": survey.path.stat().st_size, "topics": [],
-            "columns": [column._asdict() for column in survey.described_columns],
+            "recording": survey.name, "format": "table", "files": [survey.name],
+            "bytes": Path(survey.name).stat().st_size, "topics": [],
+            "columns": survey.described_columns,
             "orientation": survey.orientation or None, "bench": overview.bench,
-            "dwells": [row._asdict() | {"pose": list(row.pose), "up": list(row.up)} for row in survey.described_rows],
+            "dwells": survey.described_rows,
             **members(overview, "missing", "command", "examples"), "warnings": survey.warnings,
         }
     )  # fmt: skip
@@ -194,7 +195,7 @@ def table_report(overview: TableOverview) -> RenderableType:
     """What ``info`` prints of a table."""
     survey = overview.survey
     parts: list[RenderableType] = [
-        Text(f"{survey.path}: a table of orientations, {counted(len(survey.rows), 'row')}"),
+        Text(f"{survey.name}: a table of orientations, {counted(len(survey.rows), 'row')}"),
         _column_table(survey.described_columns),
     ]
     bench = ", ".join(f"{key} = {value}" for key, value in overview.bench.items())
@@ -204,7 +205,7 @@ def table_report(overview: TableOverview) -> RenderableType:
         if len(survey.described_rows) > _SHOWN_ROWS:
             parts.append(Text(f"and {len(survey.described_rows) - _SHOWN_ROWS} more, all of them by --json"))
     parts += [note(said) for said in survey.warnings]
-    if survey.described_rows and survey.described_rows[0].readings is None:
+    if survey.described_rows and survey.described_rows[0]["readings"] is None:
         parts.append(
             note(
                 "no standard deviation with a number of readings is given, so that the noise will be taken from the "
@@ -217,10 +218,10 @@ def table_report(overview: TableOverview) -> RenderableType:
     return Group(*parts)
 
 
-def _column_table(columns: Sequence[ColumnFound]) -> ConsoleTable:
+def _column_table(columns: Sequence[dict[str, str]]) -> ConsoleTable:
     rows = [
-        (cut(column.header, 40), cut(column.first, 24), _quantity(column.meaning),
-         _UNITS.get(column.unit, column.unit), _TOLD[column.told_by])
+        (cut(column["header"], 40), cut(column["first"], 24), _quantity(column["meaning"]),
+         _UNITS.get(column["unit"], column["unit"]), _TOLD[column["told_by"]])
         for column in columns
     ]  # fmt: skip
     return table("", ("column", "first cell", "taken for", "unit", "told"), rows, **LINED)
@@ -241,9 +242,10 @@ def _quantity(meaning: str) -> str:
 
 def _row_table(survey: Survey) -> ConsoleTable:
     rows = [
-        (str(row.number), str(row.row), f"{row.at_s:g}", row.face or pose_text(row.pose) or up_text(row.up),
-         f"{row.norm_mps2:.4f}", "" if row.readings is None else str(row.readings),
-         "" if math.isnan(row.temperature_c) else f"{row.temperature_c:.2f}")
+        (str(row["number"]), str(row["row"]), f"{row['at_s']:g}",
+         row["face"] or pose_text(row["pose"]) or up_text(row["up"]), f"{row['norm_mps2']:.4f}",
+         "" if row["readings"] is None else str(row["readings"]),
+         "" if math.isnan(row["temperature_c"]) else f"{row['temperature_c']:.2f}")
         for row in survey.described_rows[:_SHOWN_ROWS]
     ]  # fmt: skip
     orientation = f">{_ORIENTATIONS[survey.orientation]}"

@@ -24,7 +24,7 @@ from kf_calib.sources.file_kind import FileKind
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.opening import kind_of, opened
 from kf_calib.sources.text.lines import Lines
-from kf_calib.sources.text.survey import Survey
+from kf_calib.sources.text.means import Survey
 
 pytestmark = pytest.mark.usefixtures("unmeasured")
 

@@ -172,7 +172,7 @@ def inventory_of_lines(
     kind = kind_of_container(path)
     form, met = (kind.name.lower(), [*met, *_other_datasets(path, units)]) if kind else ("lines", met)
     return Inventory(path, form, [path], path.stat().st_size, met, said.metadata, True, has_angles, lines.warnings,
-                     said.pose_width if has_angles else None, said.is_bare)  # fmt: skip
+                     said.pose_width if has_angles else None, said.unit == "")  # fmt: skip
 
 
 def _other_datasets(path: Path, units: Units | None) -> Iterator[Topic]:

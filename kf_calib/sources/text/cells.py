@@ -5,20 +5,18 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Container, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from decimal import Decimal
 from operator import mul
-from typing import TypeVar
 
 from kf_calib.support.text import cut, number_from
 
 CsvRow = Sequence[str]
-AnyNumber = TypeVar("AnyNumber", float, Decimal)
 
 _NUMBER = re.compile(r"[+\-−]?[\d.,'’ \u00a0\u202f]*\d[\d.,]*(?:[eE][+\-]?\d+)?")
-_SPACES = str.maketrans("", "", "'’ \u00a0\u202f")
+_PLAIN = str.maketrans("−", "-", "'’ \u00a0\u202f")
 _LOCAL = re.compile(
     r"(\d{1,4})[./-](\d{1,2})[./-](\d{1,4})[,T ]*\s*(?:(\d{1,2})[:.](\d{2})(?:[:.](\d{2})(?:[.,](\d+))?)?)?"
     r"\s*([AaPp][Mm])?\s*(Z|UTC|GMT|CET|MEZ|CEST|MESZ|[+-]\d{2}:?\d{2})?"
@@ -28,11 +26,7 @@ _FIRST = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 class LineError(ValueError):
-    """A line cannot be used; the message is the reason in a few words. at: the column for the sake of whose cell."""
-
-    def __init__(self, reason: str, at: int = 0) -> None:
-        super().__init__(reason)
-        self.at = at
+    """A line cannot be used; the message is the reason in a few words."""
 
 
 @dataclass(frozen=True)
@@ -59,46 +53,38 @@ class Numbers:
 
     def exact(self, cell: str) -> Decimal:
         """The number in a cell with all its digits; raises ValueError or ArithmeticError where there is none."""
-        return self._read(Decimal, cell)
+        try:
+            return Decimal(cell.replace(self.thousands, "x").replace(self.decimal, "."))
+        except ArithmeticError:  # not as programs write it
+            return Decimal(self._plain(cell))
 
     def value(self, cell: str) -> float:
-        """The number in a cell, which need not be finite. Raises ValueError where there is none, LineError for one that
-        is too small."""
-        return self._read(number_of, cell)
-
-    def or_nan(self, cell: str) -> float:
-        """The same, NaN where there is none."""
+        """The number in a cell, which need not be finite; NaN where there is none."""
         try:
-            return self.value(cell)
+            return number_of(self._plain(cell))
         except ValueError:
             return math.nan
 
     def values(self, cells: Sequence[str]) -> list[float]:
-        """The numbers in cells; raises as ``value``."""
+        """The numbers in cells, as by ``value``; at once where all are as programs write them."""
         try:
             if self.decimal == "." or "." not in "".join(cells):
                 return [number_of(cell.replace(self.decimal, ".")) for cell in cells]
-        except ValueError:  # not as programs write them
+        except ValueError:
             pass
         return list(map(self.value, cells))
 
-    def _read(self, kind: Callable[[str], AnyNumber], cell: str) -> AnyNumber:
-        """Return a number as programs write it or, where it is none, without separators of thousands and blanks."""
-        try:
-            if self.decimal == "." or "." not in cell:
-                return kind(cell.replace(self.decimal, "."))
-        except LineError:
-            raise
-        except (ValueError, ArithmeticError):
-            pass
-        whole, point, rest = cell.translate(_SPACES).replace("−", "-").partition(self.decimal)
+    def _plain(self, cell: str) -> str:
+        """Return a number as programs write it, without separators of thousands and blanks; raises ValueError where
+        these separate other groups of digits."""
+        whole, point, rest = cell.translate(_PLAIN).partition(self.decimal)
         if self.thousands in whole:
             if not re.fullmatch(rf"[+-]?\d{{1,3}}(?:\{self.thousands}\d{{3}})+", whole):
                 raise ValueError
             whole = whole.replace(self.thousands, "")
         if self.thousands in rest:
             raise ValueError
-        return kind(whole + "." * bool(point) + rest)
+        return f"{whole}.{rest}" if point else whole
 
 
 DECIMAL_POINT = Numbers()
@@ -110,7 +96,7 @@ def _decimal_of(cell: str) -> str:
     if "." in cell and "," in cell:
         return "," if cell.rfind(",") > cell.rfind(".") else "."
     sign, other = (",", ".") if "," in cell else (".", ",")
-    whole, *groups = cell.translate(_SPACES).lstrip("+-−").split(sign)
+    whole, *groups = cell.translate(_PLAIN).lstrip("+-").split(sign)
     are_thousands = 1 <= len(whole) <= 3 and all(len(group) == 3 for group in groups)
     if len(groups) > 1:  # of a date there are groups of other lengths
         return other if are_thousands else ""
@@ -123,30 +109,22 @@ class QuantityColumns:
 
     at: tuple[int, ...] = ()
     factors: tuple[float, ...] = ()
-    absent: Container[str] = ()
+    absent: frozenset[str] = frozenset()
 
     def values(self, row: CsvRow, header: Sequence[str], numbers: Numbers) -> list[float] | None:
         """The quantity, None where it is not measured. Raises LineError where it cannot be used."""
         cells = [row[at] for at in self.at]
         if not all(cells):
             if any(cells):
-                raise LineError("some components of a vector are missing", self.at[cells.index("")])
+                raise LineError("some components of a vector are missing")
             return None
-        try:
-            values = numbers.values(cells)
-        except ValueError:
-            values = [math.nan]
+        values = numbers.values(cells)
         if not math.isfinite(sum(values)):  # which numbers beyond 1e308 together are not, either
             if cells[0].lower() in self.absent:
                 return None
-            for at, cell in zip(self.at, cells, strict=True):
-                reason = f"column {cut(header[at], 40)!r} is {cut(cell, 40)!r}, which is no number"
-                try:
-                    is_number = math.isfinite(numbers.value(cell))
-                except ValueError as error:
-                    is_number, reason = False, str(error) if isinstance(error, LineError) else reason
-                if not is_number:
-                    raise LineError(reason, at)
+            for at, cell, value in zip(self.at, cells, values, strict=True):
+                if not math.isfinite(value):
+                    raise LineError(f"column {cut(header[at], 40)!r} is {cut(cell, 40)!r}, which is no number")
         return list(map(mul, values, self.factors))
 
 
@@ -201,7 +179,7 @@ class Stamps:
             raise
         except (ValueError, ArithmeticError):
             why = "which is no time"
-        raise LineError(f"column {cut(header[self.at[0]], 40)!r} is {cut(cell, 40)!r}, {why}", self.at[0]) from None
+        raise LineError(f"column {cut(header[self.at[0]], 40)!r} is {cut(cell, 40)!r}, {why}") from None
 
 
 def stamp_ns(number: int | Decimal, unit_ns: int) -> int:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from functools import cached_property
 
 import numpy as np
 
@@ -72,12 +71,13 @@ class Columns:
         self.heading, self.header, self.units, self.is_table = heading, heading.header, units or Units(), is_table
         self.names = ["" if stated.get(name) == "-" else stated.get(name, name) for name in self.header]
         self.said, self.guessed, self.by_size = list[str](), list[str](), dict[int, str]()
-        self.raw, self.written_mps2, self.without_unit = PLAIN, (1.0, 1.0, 1.0), list[int]()
+        self.raw, self.written_mps2, self.without_unit = PLAIN, [1.0] * 3, list[int]()
         self.chosen: tuple[int, str] | None = None
         self.rows: list[CsvRow] = [row for row in heading.rows if len(row) == len(self.names)]
         if self.units.where:
             self._choose_rows(self.units.where)
         self.meanings = meanings_of(self.header, stated)
+        self.numbers = self.numbers_in(self.rows) or DECIMAL_POINT
         if is_nameless(self.header) and not stated:
             self._recognise_numbers()
         if is_table:
@@ -145,11 +145,6 @@ class Columns:
         """The name of a column that means nothing yet, for an example."""
         return next((self.header[k] for k in self.unused), "THEIRS")
 
-    @cached_property
-    def numbers(self) -> Numbers | None:
-        """How the numbers are written; None where no row tells yet."""
-        return self.numbers_in(self.rows)
-
     def numbers_in(self, rows: Sequence[CsvRow]) -> Numbers | None:
         """How the numbers in rows are written; None where these do not tell."""
         used = [at for at, own in enumerate(self.meanings) if own.ours] or range(len(self.names))
@@ -158,8 +153,7 @@ class Columns:
 
     def values(self, places: Sequence[int]) -> Floats:
         """The numbers (n, k) in columns, NaN where there is none."""
-        numbers = self.numbers or DECIMAL_POINT
-        values = [[numbers.or_nan(row[at]) for at in places] for row in self.rows]
+        values = [self.numbers.values([row[at] for at in places]) for row in self.rows]
         return np.array(values, float).reshape(-1, len(places))
 
     # -- what kind of text it is --
@@ -193,8 +187,8 @@ class Columns:
                 f"--rate 100; {WANTED}, not {self._all}."
             )
         exact = [at for at in places if is_exact(self.names[at])]
-        united = [at for at in places if self.meanings[at].unit]
-        place = self._most_even(exact or united or places)
+        best = exact or [at for at in places if self.meanings[at].unit] or places
+        place = min(best, key=self._unevenness) if len(best) > 1 else best[0]
         unit, values = self.meanings[place].unit, self.values([place])[:, 0]
         values = values[[bool(row[place]) for row in self.rows]]
         if not unit and len(values) and math.isnan(values[0]):
@@ -204,16 +198,13 @@ class Columns:
             self.said.append(f"time from {self.named([place])} in {unit}")
         return Stamps((place,), round(TIME[unit] * 1e9))
 
-    def _most_even(self, places: list[int]) -> int:
-        """Return that of several columns of stamps which goes up most evenly; the first where none has numbers."""
-
-        def unevenness(place: int) -> float:
-            steps = np.diff(self.values([place])[:, 0])
-            steps = steps[np.isfinite(steps)]
-            usual = float(np.median(steps)) if len(steps) else 0.0
-            return float(np.median(np.abs(steps - usual))) / usual if usual > 0.0 else math.inf
-
-        return min(places, key=unevenness) if len(places) > 1 else places[0]
+    def _unevenness(self, place: int) -> float:
+        """Return how much the steps of a column of stamps differ from the usual one; infinite where it does not go
+        up."""
+        steps = np.diff(self.values([place])[:, 0])
+        steps = steps[np.isfinite(steps)]
+        usual = float(np.median(steps)) if len(steps) else 0.0
+        return float(np.median(np.abs(steps - usual))) / usual if usual > 0.0 else math.inf
 
     def _unit_of_time(self, place: int, values: Floats) -> str:
         """Return the unit of stamps (n,) whose name tells none, by their size or their steps; of means, it is s."""
@@ -254,9 +245,9 @@ class Columns:
                 f"no columns give the three readings with their unit: name them ax_mps2, ay_mps2, az_mps2 (or ax_g, "
                 f"ax_mg ...), not {self._all}, or state it by --accel-unit, and the size of counts by --accel-scale."
             )
-        told = reading_units(named, values, units)
-        self.by_size |= {at: told.units[k] for k, at in enumerate(places) if told.by_size and not named[k]}
-        if told.raw is None:
+        raw, words, by_size = reading_units(named, values, units)
+        self.by_size |= {at: by_size for at, unit in zip(places, named, strict=True) if by_size and not unit}
+        if raw is None:
             signed = usual_norm(parse_counts(units.counts).signed(values))
             keys = size_of_count(signed)
             raise CountsError(
@@ -266,15 +257,14 @@ class Columns:
             )  # fmt: skip
         is_stated = units.accel is not None or units.accel_scale != 1.0
         if self.is_table or is_stated or not all(is_exact(self.names[at]) for at in places):
-            self.said.insert(0, f"{'mean ' * self.is_table}readings from {self.named(places)} in {told.words}")
-        self.raw = told.raw
+            self.said.insert(0, f"{'mean ' * self.is_table}readings from {self.named(places)} in {words}")
+        self.raw = raw
         is_made = units.accel_scale != 1.0 or named != by_name or "count" in named  # the names tell less than is known
         if is_made or self.raw.sizes != PLAIN.sizes or self.raw.counts != SIGNED:
-            x, y, z = (ACCEL.get(unit, 1.0) for unit in by_name)
+            self.written_mps2 = [ACCEL.get(unit, 1.0) for unit in by_name]
             self.without_unit = [at for at, unit in zip(places, by_name, strict=True) if unit in ("", "count")]
         else:
-            x, y, z = self.raw.factors.tolist()
-        self.written_mps2 = x, y, z
+            self.written_mps2 = self.raw.factors.tolist()
         return QuantityColumns(tuple(places), (1.0, 1.0, 1.0))
 
     @property
@@ -312,12 +302,12 @@ class Columns:
             of_table = ("deg" if (values == np.rint(values)).all() else "rad") if self.is_table else ""
             stated = "deg" if (np.abs(values) > 2.0 * math.pi).any() else of_table
             self.by_size |= {at: stated for at, unit in zip(places, units, strict=True) if not unit and stated}
-        if needed and (not places or ("" in units and not stated)):
-            raise self.without_angles()
-        if "" in units and not stated:
+        if not places or ("" in units and not stated):
+            if needed:
+                raise self.without_angles()
             return QuantityColumns()
         units = [unit or str(stated) for unit in units]
-        if units and (self.is_table or not all(is_exact(self.names[at]) for at in places)):
+        if self.is_table or not all(is_exact(self.names[at]) for at in places):
             words = " and ".join(dict.fromkeys(units))
             self.said.append(f"gimbal angles, outer to inner, from {self.named(places)} in {words}{how}")
         return QuantityColumns(tuple(places), tuple(ANGLE[unit] for unit in units))
@@ -381,7 +371,7 @@ class Columns:
                 self._guess(k, ours)
 
     def _guess(self, place: int, ours: str) -> None:
-        self.meanings[place] = Meaning(ours, self.meanings[place].unit)
+        self.meanings[place] = self.meanings[place]._replace(ours=ours)
         self.guessed.append(self.header[place])
 
     def _are_numbers(self, place: int) -> bool:

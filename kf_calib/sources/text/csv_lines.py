@@ -13,7 +13,7 @@ from kf_calib.bench.streams import Batch
 from kf_calib.errors import CountsError
 from kf_calib.sources.text.cells import DECIMAL_POINT, LineError, written
 from kf_calib.sources.text.columns import READINGS, WANTED, Columns
-from kf_calib.sources.text.heading import BLANK, cells_of, with_texts, without_empty_end
+from kf_calib.sources.text.heading import with_texts, without_empty_end
 from kf_calib.sources.text.reader import Account, LineReader, SampleRow
 from kf_calib.sources.text.units import celsius
 from kf_calib.support.text import cut
@@ -30,7 +30,6 @@ class CsvLines(LineReader):
     Raises InputError where the columns do not say what is needed.
     """
 
-    wrong = "a cell is not a number"
     advice = WANTED
 
     def __init__(self, columns: Columns, account: Account, angles: bool | None = True) -> None:
@@ -38,7 +37,7 @@ class CsvLines(LineReader):
         self._columns, self._heading, self._header = columns, columns.heading, columns.header
         self._time, self._accel = columns.time(), columns.accel()
         self._count, self._added_ns, self._last_ns = 0, 0, -(2**63)
-        self.raw, self.said, self._numbers = columns.raw, columns.said, columns.numbers
+        self.raw, self.said, self._numbers = columns.raw, columns.said, columns.numbers_in(columns.rows)
         self.has_angles = columns.orientation != "attitude"
         self.wants_pose = bool(columns.orientation) if angles is None else angles
         self._pose = columns.pose(needed=self.wants_pose)
@@ -61,7 +60,7 @@ class CsvLines(LineReader):
         names = {at: f"a{'xyz'[self._accel.at.index(at)]}_mps2" for at in self._columns.without_unit}
         lines, numbers = list(heading), self._heading.lines_of_names
         for k in numbers if names else ():
-            cells = cells_of(lines[k].lstrip("\ufeff"), self._heading.delimiter)
+            cells = self._heading.cells(lines[k].lstrip("\ufeff"))
             if len(cells) >= len(self._header) and cells[self._accel.at[0]]:
                 texts = names if k == numbers[0] else dict.fromkeys(names, "m/s^2")
                 lines[k] = with_texts(lines[k], self._heading.spans(lines[k]), texts)
@@ -69,18 +68,11 @@ class CsvLines(LineReader):
 
     def read(self, lines: Sequence[str], first_line: int) -> Batch:
         if self._numbers is None:
-            self._numbers = self._columns.numbers_in([self._cells(line) for line in lines])
+            self._numbers = self._columns.numbers_in(list(map(self._heading.cells, lines)))
         return super().read(lines, first_line)
 
-    def _cells(self, line: str) -> list[str]:
-        if self._heading.labels is not None:
-            return self._heading.labels.values(line)
-        delimiter = self._heading.delimiter
-        is_plain = '"' not in line and " " not in line and delimiter != BLANK
-        return line.split(delimiter) if is_plain else cells_of(line, delimiter)
-
     def _row(self, line: str) -> SampleRow | None:
-        if not (cells := self._cells(line)) and self._heading.labels is not None:
+        if not (cells := self._heading.cells(line)):
             return None  # of something else than readings
         number, self._count = self._count, self._count + 1
         row = without_empty_end(cells, len(self._header))
@@ -124,9 +116,8 @@ def _refuse_several_units(columns: Columns, used: Container[int]) -> None:
     for at, name in enumerate(columns.names):
         labels = [row[at].strip() for row in columns.rows]
         shares, turns = Counter(labels), np.flatnonzero([one != other for one, other in pairwise(labels)])
-        if at in used or not name or not 2 <= len(shares) <= _MOST_UNITS or max(map(len, shares)) > 16:
-            continue
-        if "" in shares or min(shares.values()) < 0.1 * len(labels) or len(turns) < 0.3 * len(labels):
+        are_few = name and at not in used and 2 <= len(shares) <= _MOST_UNITS and max(map(len, shares)) <= 16
+        if not are_few or "" in shares or min(shares.values()) < 0.1 * len(labels) or len(turns) < 0.3 * len(labels):
             continue
         first = min(shares)
         signs = np.array([1.0 if labels[k] == first else -1.0 for k in turns])

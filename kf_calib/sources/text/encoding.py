@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import codecs
 import gzip
+import itertools
 import re
 import zlib
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
-from typing import Self
 
 from kf_calib.errors import InputError
 from kf_calib.sources.containers.opening import DatasetText, dataset_of, kind_of_container
@@ -27,31 +29,28 @@ _HEAD_BYTES, _BLOCK_BYTES = 1 << 18, 1 << 20
 _CYRILLIC = re.compile(rb"[\xc0-\xff]{3}")
 
 
-class TextFile:
+class TextFile(AbstractContextManager["TextFile"]):
     """Opened to be read once. dataset: of a container, that which is read, or the one that is taken where it is empty.
 
-    is_raw: whether its bytes are given as they stand in it. trouble: a sentence if its end cannot be unpacked. said:
-    what of a container was taken, where that was a choice. Raises OSError, and InputError of a container.
+    trouble: a sentence if its end cannot be unpacked. said: what of a container was taken, where that was a choice.
+    Raises OSError, and InputError of a container.
     """
 
-    def __init__(self, path: Path, dataset: str = "", *, is_raw: bool = False) -> None:
+    def __init__(self, path: Path, dataset: str = "") -> None:
         self._size = max(path.stat().st_size, 1)
         arrays = dataset_of(path, dataset) if kind_of_container(path) else None
-        self.trouble, self._has_ended, self.said = "", False, arrays.said if arrays else ()
+        self.trouble, self._head, self._has_ended, self.said = "", b"", False, arrays.said if arrays else ()
         self._raw = path.open("rb")
         try:
             self._text = DatasetText(arrays) if arrays else None
             packed = self._raw.peek(2).startswith(_GZIP)
             self._file = self._text or (gzip.GzipFile(fileobj=self._raw) if packed else self._raw)
-            self._head = self._unpacked(_HEAD_BYTES)
+            self._head = self.unpacked(_HEAD_BYTES)
         except BaseException:
             self.close()
             raise
-        encoding = "utf-8" if is_raw else encoding_of(self._head)
+        encoding = encoding_of(self._head)
         self._decoder = None if encoding == "utf-8" else codecs.getincrementaldecoder(encoding)("replace")
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -63,17 +62,15 @@ class TextFile:
 
     def read(self, size: int) -> bytes:
         """The next bytes, about so many; none at the end."""
-        block, self._head = self._head or self._unpacked(size), b""
+        block = self.unpacked(size)
         if self._decoder is None:
             return block
         text = self._decoder.decode(block, final=not block)
         return text.encode() or (self.read(size) if block else b"")
 
-    def close(self) -> None:
-        self._raw.close()
-
-    def _unpacked(self, size: int) -> bytes:
-        block = bytearray()
+    def unpacked(self, size: int) -> bytes:
+        """The next bytes as they stand in the file, or in what gzip has packed there, so many; fewer at the end."""
+        block, self._head = bytearray(self._head), b""
         try:
             while len(block) < size and not self._has_ended:
                 piece = self._file.read1(size - len(block))
@@ -84,6 +81,9 @@ class TextFile:
             self._has_ended = True
         return bytes(block)
 
+    def close(self) -> None:
+        self._raw.close()
+
 
 def head_of(path: Path, dataset: str = "") -> bytes:
     """The beginning of a file: of one that is packed by gzip, of what is in it. dataset, raises: as of ``TextFile``."""
@@ -93,50 +93,32 @@ def head_of(path: Path, dataset: str = "") -> bytes:
 
 def holds_any(path: Path, words: Sequence[bytes]) -> bool:
     """Whether any of these words, in UTF-8, is in a text. Raises OSError."""
-    longest, tail = max(map(len, words)), b""
     with TextFile(path) as file:
-        while block := file.read(_BLOCK_BYTES):
-            tail = tail[-longest:] + block
-            if any(word in tail for word in words):
-                return True
-    return False
-
-
-def text_of(path: Path, dataset: str = "") -> str:
-    """The whole text of a file, without bytes of zero at its end, as a power cut leaves them; dataset: of a container.
-
-    Raises as ``unpacked``, and InputError where it is no text.
-    """
-    content = unpacked(path, dataset)
-    text = content.decode(encoding_of(content[:_HEAD_BYTES]), errors="replace").rstrip("\0").removeprefix("\ufeff")
-    if "\0" in text:
-        raise InputError(f"{path}: is no text (it has bytes of zero): save the table as CSV or .xlsx.")
-    return text
+        blocks = itertools.chain([b""], iter(partial(file.read, _BLOCK_BYTES), b""))
+        return any(word in before + block for before, block in itertools.pairwise(blocks) for word in words)
 
 
 def unpacked(path: Path, dataset: str = "") -> bytes:
-    """The bytes of a file of text as they stand in it, or in what gzip has packed there; of a container the lines of a
-    dataset.
+    """The whole of a file, unpacked; of a container the lines of a dataset.
 
     Raises InputError where it has more bytes than a table of orientations or its end cannot be unpacked, OSError where
     it cannot be read.
     """
-    content = bytearray()
-    with TextFile(path, dataset, is_raw=True) as file:
-        while len(content) <= LARGEST_TABLE_BYTES and (block := file.read(_BLOCK_BYTES)):
-            content += block
+    with TextFile(path, dataset) as file:
+        content = file.unpacked(LARGEST_TABLE_BYTES + 1)
     if len(content) > LARGEST_TABLE_BYTES:
         raise InputError(TOO_LARGE.format(path))
     if file.trouble:
         raise InputError(f"{path}: {file.trouble.partition(': ')[0]}: copy it anew.")
-    return bytes(content)
+    return content
 
 
-def encoding_of(head: bytes) -> str:
-    """UTF-8 or UTF-16, each with or without a byte-order mark, or else a code page of Windows.
+def encoding_of(content: bytes) -> str:
+    """UTF-8 or UTF-16, each with or without a byte-order mark, or else a code page of Windows, by the beginning.
 
     It is Cyrillic (1251) where three letters beyond ASCII follow each other, as in no Western language, or else 1252.
     """
+    head = content[:_HEAD_BYTES]
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16"
     plain = head.rstrip(b"\0")
@@ -169,17 +151,12 @@ class Cutter:
 
     def push(self, block: bytes) -> list[str]:
         """The lines that end in ``block``."""
-        if self._tail.endswith(b"\r") and not self._end:  # what follows tells whether it ends a line alone
-            block = bytes(self._tail) + block
-            self._tail.clear()
-        if not self._end:
-            self._end = b"\n" if b"\n" in block else b"\r" if b"\r" in block[:-1] else b""
-        count, lines = block.rfind(self._end or b"\n") + 1, list[str]()
-        if count:
-            lines = self._lines(bytes(self._tail) + block[:count])
-            self._tail.clear()
-        if len(self._tail) <= LONGEST_LINE_BYTES:  # else what comes up to the next end of line is not kept
-            self._tail += block[count:]
+        self._tail += block
+        if not self._end:  # of a carriage return at the end, what follows tells whether it ends a line alone
+            self._end = b"\n" if b"\n" in self._tail else b"\r" if b"\r" in self._tail[:-1] else b""
+        count = self._tail.rfind(self._end or b"\n") + 1
+        lines = self._lines(bytes(self._tail[:count])) if count else []
+        self._tail = self._tail[count:][: LONGEST_LINE_BYTES + 1]
         return lines
 
     def rest(self) -> list[str]:
@@ -190,16 +167,16 @@ class Cutter:
 
     def _lines(self, block: bytes) -> list[str]:
         """Return the lines of a block, of which the last may have no end."""
-        mark, too_long = self._end or b"\n", set[int]()
+        mark, too_long = self._end or b"\n", list[int]()
         if len(block) > LONGEST_LINE_BYTES:
-            too_long = {k for k, line in enumerate(block.split(mark)) if len(line) > LONGEST_LINE_BYTES}
+            too_long = [k for k, line in enumerate(block.split(mark)) if len(line) > LONGEST_LINE_BYTES]
         if not self._keeps_ends and mark == b"\n":
             block = block.replace(b"\r\n", b"\n").removesuffix(b"\r")
         text, end = block.decode("utf-8", "surrogateescape" if self._keeps_ends else "replace"), mark.decode()
         lines = text.removesuffix(end).split(end)
         if self._keeps_ends:
             lines = [*(line + end for line in lines[:-1]), lines[-1] + end * text.endswith(end)]
-        for k in sorted(too_long):
+        for k in too_long:
             self._refuse(self._cut + k + 1, "it is longer than 1 MiB")
             lines[k] = ""
         self._cut += len(lines)

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from datetime import datetime
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
 from kf_calib.errors import InputError
 from kf_calib.sources.containers.opening import kind_of_container
 from kf_calib.sources.text.cells import DECIMAL_POINT, Numbers
-from kf_calib.sources.text.encoding import LARGEST_TABLE_BYTES, TOO_LARGE, text_of
+from kf_calib.sources.text.encoding import LARGEST_TABLE_BYTES, TOO_LARGE, encoding_of, unpacked
 from kf_calib.sources.text.heading import TextHeading
 from kf_calib.sources.text.spreadsheet import sheets_of
 from kf_calib.support.text import cut
@@ -28,38 +26,37 @@ _MOST_COLUMNS, _MOST_CELLS = 1000, 2_000_000
 _FEWEST = 3  # columns
 
 
-@dataclass(frozen=True)
-class Grid:
-    """A table: name for messages, and heading with all rows.
-
-    remarks: how the file was read, where that was a choice. path: the file, if it is from one.
-    """
-
-    name: str
-    heading: TextHeading
-    remarks: tuple[str, ...] = ()
-    path: Path | None = None
+Grid = tuple[TextHeading, list[str]]
+"""The heading of a table with all its rows, and how its file was read, where that was a choice."""
 
 
 def grid_of(table: Any, dataset: str = "") -> Grid:
-    """The cells of a file, a structured array, a DataFrame or a mapping of columns; dataset: of a container."""
-    if not isinstance(table, str | PathLike):
-        return _of_columns(table)
-    path = Path(table)
+    """The cells of the file at a path, a structured array, a DataFrame or a mapping of columns; dataset: of a
+    container."""
+    path = table if isinstance(table, Path) else None
+    heading, remarks = (_of_columns(table), []) if path is None else _of_file(path, dataset)
+    return heading._replace(rows=_full_rows(heading)), remarks
+
+
+def _of_file(path: Path, dataset: str) -> Grid:
+    """Return the cells of a file as they stand there."""
     try:
         with path.open("rb") as file:
             is_excel = file.read(8).startswith(ZIP) and not kind_of_container(path)
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
+        raise InputError(f"cannot be read ({error.strerror}).") from None
     if path.suffix.lower() in OLD_SUFFIXES:
-        raise InputError(f"{path}: files of the kind {path.suffix} are not read: save it as .xlsx or .csv.")
+        raise InputError(f"files of the kind {path.suffix} are not read: save it as .xlsx or .csv.")
     if is_excel:
         return _of_excel(path)
-    try:  # any usual encoding and delimiter, with or without lines above the header
-        heading = TextHeading.of(text_of(path, dataset).splitlines(), is_whole=True)
+    content = unpacked(path, dataset)
+    text = content.decode(encoding_of(content), errors="replace").rstrip("\0")  # which a power cut leaves at the end
+    if "\0" in text:
+        raise InputError("is no text (it has bytes of zero): save the table as CSV or .xlsx.")
+    try:  # any usual delimiter, with or without lines above the header
+        return TextHeading.of(text.removeprefix("\ufeff").splitlines(), is_whole=True), []
     except csv.Error as error:
-        raise InputError(f"{path}: is no CSV file ({error}): save the table as CSV or .xlsx.") from None
-    return _padded(str(path), heading, path=path)
+        raise InputError(f"is no CSV file ({error}): save the table as CSV or .xlsx.") from None
 
 
 def _of_excel(path: Path) -> Grid:
@@ -70,7 +67,7 @@ def _of_excel(path: Path) -> Grid:
     seen = [sheet for sheet in sheets if not sheet.hidden]
     if not seen:
         hidden = f" that can be seen ({sheets[0].name!r} is hidden)" if sheets else ""
-        raise InputError(f"{path}: all sheets{hidden} are empty: write a header and a row for each orientation.")
+        raise InputError(f"all sheets{hidden} are empty: write a header and a row for each orientation.")
     remarks, read = list[str](), seen[0]
     if others := ", ".join(repr(sheet.name) for sheet in seen[1:]):
         remarks.append(f"sheet {read.name!r} was read, not {others}; put the table on the first sheet")
@@ -82,10 +79,10 @@ def _of_excel(path: Path) -> Grid:
         remarks.append(f"{were} not read, as hidden rows are no data")
     texts, delimiter = _texts([row for _, row in read.lines])
     lines = [(number - 1, row) for (number, _), row in zip(read.lines, texts, strict=True)]
-    return _padded(str(path), TextHeading.of_cells(lines, delimiter), tuple(remarks), path)
+    return TextHeading.of_cells(lines, delimiter), remarks
 
 
-def _of_columns(table: Any) -> Grid:
+def _of_columns(table: Any) -> TextHeading:
     """Return the cells of a structured array, a DataFrame of pandas or polars, or a mapping of columns."""
     names = getattr(getattr(table, "dtype", None), "names", None)
     if names is None:
@@ -103,7 +100,7 @@ def _of_columns(table: Any) -> Grid:
     if len(lengths) > 1:
         raise InputError(f"the columns of the table have different lengths ({sorted(lengths)}): give one row a dwell.")
     rows, delimiter = _texts(list(zip(*columns, strict=True)))
-    return _padded("the table", TextHeading(list(map(str, names)), delimiter, 0, rows, numbers=range(len(rows))))
+    return TextHeading(list(map(str, names)), delimiter, 0, rows, numbers=range(len(rows)))
 
 
 def _texts(rows: Sequence[Sequence[Any]]) -> tuple[list[list[str]], str]:
@@ -129,22 +126,21 @@ def _cell(value: Any, decimal: str) -> str:
     return str(value).strip() if number is None else repr(number).removesuffix(".0").replace(".", decimal)
 
 
-def _padded(name: str, heading: TextHeading, remarks: tuple[str, ...] = (), path: Path | None = None) -> Grid:
-    """Return the grid of a heading with all rows, which have as many cells as the header then; cells are cut to a
-    bounded length, as they are looked at in many ways."""
+def _full_rows(heading: TextHeading) -> list[list[str]]:
+    """Return the rows with as many cells as the header; cells are cut to a bounded length, as they are looked at in
+    many ways."""
     width, rows = len(heading.header), heading.rows
     if width < _FEWEST:
-        raise InputError(f"{name}: has no table: write a header and a row for each orientation (docs/tables.md).")
+        raise InputError("has no table: write a header and a row for each orientation (docs/tables.md).")
     if width > _MOST_COLUMNS or width * len(rows) > _MOST_CELLS:
-        raise InputError(f"{name}: has {width} columns and {len(rows)} rows, more than any table of orientations: "
-                         "leave out what is not part of it.")  # fmt: skip
+        raise InputError(f"has {width} columns and {len(rows)} rows, more than any table of orientations: leave out "
+                         "what is not part of it.")  # fmt: skip
     for line, cells in zip(heading.numbers, rows, strict=True):
         if beyond := [cell for cell in cells[width:] if cell]:
             raise InputError(
-                f"{name}: row {line + 1} has {width + len(beyond)} cells where the header has {width}, the last is "
+                f"row {line + 1} has {width + len(beyond)} cells where the header has {width}, the last is "
                 f"{cut(beyond[-1], 60)!r}: write one cell for each column, and quote a cell that holds a delimiter."
             )
     if not rows:
-        raise InputError(f"{name}: has a header and no rows: write a row for each orientation.")
-    full = [[*(cut(cell, _LONGEST_CELL) for cell in cells), *[""] * (width - len(cells))] for cells in rows]
-    return Grid(name, heading._replace(rows=full), remarks, path)
+        raise InputError("has a header and no rows: write a row for each orientation.")
+    return [[*(cut(cell, _LONGEST_CELL) for cell in cells), *[""] * (width - len(cells))] for cells in rows]

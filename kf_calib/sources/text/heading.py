@@ -30,45 +30,12 @@ _LABELLED = re.compile(
 _FEWEST_LABELS, _LONGEST_LABELLED = 3, 1000
 
 
-class Labels(NamedTuple):
-    """The names in each line that has readings, and with their units those of the columns that they make."""
-
-    names: tuple[str, ...]
-    header: list[str]
-
-    @classmethod
-    def of(cls, lines: Sequence[str]) -> Labels | None:
-        """The labels of lines, of which those count that name an accelerometer; None where none do."""
-        seen = set[tuple[str, ...]]()
-        for line in lines[:_ROWS]:
-            parts = _LABELLED.findall(line) if (":" in line or "=" in line) and len(line) < _LONGEST_LABELLED else []
-            names = tuple(name for name, *_ in parts)
-            if len(parts) < _FEWEST_LABELS or names in seen:
-                continue
-            seen.add(names)
-            last = parts[-1][2] if is_unit(parts[-1][2]) else ""
-            units = [own if is_unit(own) else last for *_, own in parts]
-            header = [f"{name} [{unit}]" if unit else name for name, unit in zip(names, units, strict=True)]
-            if {own.ours for own in meanings_of(header, {})} >= {"ax", "ay", "az"}:
-                return cls(names, header)
-        return None
-
-    def spans(self, line: str) -> list[tuple[int, int]]:
-        """Where the values stand in a line; none where it has other labels."""
-        labelled = list(_LABELLED.finditer(line)) if len(line) < _LONGEST_LABELLED else []
-        names = tuple(match[1] for match in labelled)
-        return [match.span(2) for match in labelled] if names == self.names else []
-
-    def values(self, line: str) -> list[str]:
-        """The values in a line; none where it has other labels."""
-        return [line[start:end] for start, end in self.spans(line)]
-
-
 class TextHeading(NamedTuple):
     """The names of the columns, what is between cells, how many lines go before the first row, and the first rows.
 
     lines_of_names: numbers, from 0, of the line with the names and, where there is one, of that with units. labels:
-    where each value has its name before it. numbers: of the lines of the rows, from 0.
+    the names in each line that has readings, where each value has its name before it. numbers: of the lines of the
+    rows, from 0.
     """
 
     header: Sequence[str]
@@ -76,7 +43,7 @@ class TextHeading(NamedTuple):
     lines: int
     rows: Sequence[Sequence[str]]
     lines_of_names: tuple[int, ...] = ()
-    labels: Labels | None = None
+    labels: Sequence[str] = ()
     numbers: Sequence[int] = ()
 
     @classmethod
@@ -86,8 +53,8 @@ class TextHeading(NamedTuple):
         is_whole: whether these are all; rows are then all as well, and a cell may go over several lines. Raises
         csv.Error for such a cell without an end.
         """
-        if labels := Labels.of(lines):
-            return cls._of_labelled(lines if is_whole else lines[: 2 * _ROWS], labels, is_whole)
+        if labelled := _first_labelled(lines[:_ROWS]):
+            return cls._of_labelled(lines if is_whole else lines[: 2 * _ROWS], *labelled, is_whole)
         delimiter, start = _delimiter_in(lines[:_ROWS])
         if is_whole:
             reader = csv.reader(lines[start:], delimiter=delimiter, skipinitialspace=True)
@@ -108,26 +75,33 @@ class TextHeading(NamedTuple):
         return cls(header, delimiter, behind, [own for _, own in rows], names, numbers=[k for k, _ in rows])
 
     @classmethod
-    def _of_labelled(cls, lines: Sequence[str], labels: Labels, is_whole: bool) -> TextHeading:
+    def _of_labelled(cls, lines: Sequence[str], labels: list[str], header: list[str], is_whole: bool) -> TextHeading:
         """Return the heading of lines with labels; of all lines, with the face that a line before them names where all
         have one."""
-        rows, face = list[tuple[int, list[str]]](), ""
+        rows, faces, numbers, face = list[list[str]](), list[str](), list[int](), ""
         for number, line in enumerate(lines):
-            if values := labels.values(line):
-                rows.append((number, [face, *values]))
+            if spans := _labelled_spans(line, labels):
+                rows.append([line[start:end] for start, end in spans])
+                faces.append(face)
+                numbers.append(number)
             elif face_of(line.strip().rstrip(": ")):
                 face = line.strip().rstrip(": ")
-        has_faces = is_whole and all(cells[0] for _, cells in rows)
-        header = ["face"] * has_faces + labels.header
-        cells = [own[not has_faces :] for _, own in rows]
-        return cls(header, ",", rows[0][0], cells, labels=labels, numbers=[number for number, _ in rows])
+        if is_whole and all(faces):
+            rows, header = [[face, *cells] for face, cells in zip(faces, rows, strict=True)], ["face", *header]
+        return cls(header, ",", numbers[0], rows, labels=labels, numbers=numbers)
+
+    def cells(self, line: str) -> list[str]:
+        """The cells of a line below; none where it has other labels than those of readings."""
+        if self.labels:
+            return [line[start:end] for start, end in self.spans(line)]
+        return cells_of(line, self.delimiter)
 
     def spans(self, line: str) -> list[tuple[int, int]]:
         """Where the cells of a line stand, with their quotes and without blanks around them, those of columns that it
         does not have at its beginning; the mark of a comment in a cell of its own is none."""
-        if self.labels is not None:
-            lacking = len(self.header) - len(self.labels.names)  # of a face that stands in a line of its own
-            return [(0, 0)] * lacking + self.labels.spans(line)
+        if self.labels:
+            lacking = len(self.header) - len(self.labels)  # of a face that stands in a line of its own
+            return [(0, 0)] * lacking + _labelled_spans(line, self.labels)
         if self.delimiter == BLANK:
             spans = [match.span() for match in _BLANK_CELL.finditer(line)]
             is_mark = bool(spans) and not line[slice(*spans[0])].strip("#%/")
@@ -138,6 +112,35 @@ class TextHeading(NamedTuple):
         return [
             (start + len(cell) - len(cell.lstrip()), end - len(cell) + len(cell.rstrip())) for cell, start, end in cells
         ]
+
+
+def _first_labelled(lines: Sequence[str]) -> tuple[list[str], list[str]] | None:
+    """Return the labels in the first of lines that name an accelerometer, and with their units the names of the columns
+    that they make; None where none do."""
+    seen = list[list[str]]()
+    for line in lines:
+        labelled = _labelled_in(line)
+        labels = [match[1] for match in labelled]
+        if len(labels) < _FEWEST_LABELS or labels in seen:
+            continue
+        seen.append(labels)
+        units = [match[3] if is_unit(match[3] or "") else "" for match in labelled]
+        header = [f"{label} [{unit}]" if (unit := own or units[-1]) else label
+                  for label, own in zip(labels, units, strict=True)]  # fmt: skip
+        if {own.ours for own in meanings_of(header, {})} >= {"ax", "ay", "az"}:
+            return labels, header
+    return None
+
+
+def _labelled_spans(line: str, labels: Sequence[str]) -> list[tuple[int, int]]:
+    """Return where the values stand in a line; none where it has other labels."""
+    labelled = _labelled_in(line)
+    return [match.span(2) for match in labelled] if [match[1] for match in labelled] == labels else []
+
+
+def _labelled_in(line: str) -> list[re.Match[str]]:
+    """Return label, value and what follows it, of all in a line."""
+    return list(_LABELLED.finditer(line)) if (":" in line or "=" in line) and len(line) < _LONGEST_LABELLED else []
 
 
 def _delimiter_in(lines: Sequence[str]) -> tuple[str, int]:
@@ -210,7 +213,8 @@ def without_empty_end(row: list[str], count: int) -> list[str]:
 def cells_of(line: str, delimiter: str) -> list[str]:
     """The cells of one line without blanks and quotes around them; a quote left open ends with the line."""
     if '"' not in line:
-        return line.split() if delimiter == BLANK else [cell.strip() for cell in line.split(delimiter)]
+        cells = line.split(None if delimiter == BLANK else delimiter)
+        return [cell.strip() for cell in cells] if " " in line else cells
     try:
         cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=delimiter == BLANK), [])
     except csv.Error:  # a cell beyond csv's own limit

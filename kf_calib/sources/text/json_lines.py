@@ -5,20 +5,19 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from decimal import Decimal
 from typing import Any
 
 from kf_calib.bench.bench import metadata_of
-from kf_calib.bench.raw_input import UNITS, parse_unit
-from kf_calib.sources.text.cells import LineError, number_of, stamp_ns, written
+from kf_calib.bench.raw_input import UNITS
+from kf_calib.sources.text.cells import LineError, stamp_ns, written
 from kf_calib.sources.text.reader import Account, LineReader, SampleRow
-from kf_calib.support.units import WORDS
 
 _MARK = "\ufeff"  # some write it before the first line
 _TIME_NS = {"time_ns": 1, "time_us": 10**3, "time_ms": 10**6, "time_s": 10**9}
 """Names of the stamp, and its unit."""
-_ACCEL = {f"accel_{unit}": WORDS["m/s^2"][unit] for unit in ("mps2", "g", "mg")}
+_ACCEL = {"accel_mps2": "m/s2", "accel_g": "g", "accel_mg": "mg"}
 _READINGS = (*_ACCEL, "accel", "accel_counts", "accel_raw")
 """The names of the last three tell no unit: options state it."""
 _ANGLES = {"angles_rad": 1.0, "angles_deg": math.pi / 180.0}
@@ -30,7 +29,8 @@ _KNOWN = frozenset([*_TIME_NS, *_READINGS, *POSE_KEYS, _TEMPERATURE])
 
 _value_at = json.JSONDecoder().raw_decode
 _decode_exactly = json.JSONDecoder(parse_float=Decimal).decode
-_decode_with_care = json.JSONDecoder(parse_float=number_of).decode
+_BETWEEN = " \t\r\n,:"
+"""What is between the names and the values of an object."""
 _find_tiny = re.compile(r"[0-9][eE]-[0-9]{3}").search  # a number as small as this is rare, and may be two
 
 
@@ -42,7 +42,6 @@ class JsonLines(LineReader):
     all are brought to.
     """
 
-    wrong = "it is not JSON"
     advice = "name the readings accel_mps2 or accel_g, and the poses angles_rad, angles_deg or attitude_xyzw"
 
     def __init__(self, columns: Mapping[str, str], account: Account, angles: bool = True) -> None:
@@ -53,7 +52,7 @@ class JsonLines(LineReader):
         entry = json.loads(line.lstrip(_MARK))
         theirs = {self._columns.get(key, key): key for key in entry}
         name = _first_of({ours: entry[key] for ours, key in theirs.items()}, _READINGS)
-        values = json.dumps([written(value / _ACCEL.get(name, 1.0)) for value in readings_mps2])
+        values = json.dumps([written(value / UNITS[_ACCEL.get(name, "m/s2")]) for value in readings_mps2])
         (key_start, key_end), (start, end) = _spans(line)[theirs[name]]
         key = line[key_start:key_end] if name in _ACCEL else '"accel_mps2"'
         return line[:key_start] + key + line[key_end:start] + values + line[end:]
@@ -62,13 +61,18 @@ class JsonLines(LineReader):
         line = line.lstrip(_MARK) if self._is_first else line
         if not line.lstrip().startswith("{"):  # found out at a tenth of the cost, where a link brings much of it
             raise LineError("it is not a JSON object")
-        is_tiny = ("e-" in line or "E-" in line) and _find_tiny(line)
-        entry = _decode_with_care(line) if is_tiny else json.loads(line)
-        if self._columns:
-            entry = {self._columns.get(key, key): value for key, value in entry.items()}
+        entry = self._entry(line, json.loads)
         if self._takes_bench(entry):
             return None
-        time_ns, readings, pose = self._time_ns(entry, line), self._readings(entry), self._pose(entry)
+        name = next((name for name in _TIME_NS if name in entry), None)
+        if name is None:
+            raise LineError("it has no time stamp (time_ns or time_s)")
+        if type(entry[name]) is float or (("e-" in line or "E-" in line) and _find_tiny(line)):
+            entry = self._entry(line, _decode_exactly)  # floats have lost digits
+        if type(entry[name]) not in (int, Decimal):
+            raise LineError(f"{name} is not a number")
+        time_ns = stamp_ns(entry[name], _TIME_NS[name])
+        readings, pose = self._readings(entry), self._pose(entry)
         is_warm = entry.get(_TEMPERATURE) is not None
         degrees = _numbers([entry[_TEMPERATURE]], _TEMPERATURE) if is_warm else None
         if pose and not self.pose_width:  # all on the line is understood before any of it is used
@@ -76,6 +80,18 @@ class JsonLines(LineReader):
         if not entry.keys() <= _KNOWN:
             self._account.leave_out(key for key in entry if key not in _KNOWN)
         return time_ns, readings, pose, degrees
+
+    def _entry(self, line: str, decode: Callable[[str], dict[str, Any]]) -> dict[str, Any]:
+        """Return what is on a line by our names. Raises LineError where it cannot be decoded."""
+        try:
+            entry = decode(line)
+        except ArithmeticError:
+            raise LineError("a number is out of range") from None
+        except RecursionError:
+            raise LineError("it is nested too deeply") from None
+        except ValueError:
+            raise LineError("it is not JSON") from None
+        return {self._columns.get(key, key): value for key, value in entry.items()} if self._columns else entry
 
     def _takes_bench(self, entry: dict[str, Any]) -> bool:
         """Whether the line describes the bench: the first one is kept, and no other may contradict it."""
@@ -96,30 +112,16 @@ class JsonLines(LineReader):
             )
         return True
 
-    def _time_ns(self, entry: dict[str, Any], line: str) -> int:
-        name = next((name for name in _TIME_NS if name in entry), None)
-        if name is None:
-            raise LineError("it has no time stamp (time_ns or time_s)")
-        number = entry[name]
-        if type(number) is float:  # has lost digits: read the line again with all of them
-            exact = _decode_exactly(line)
-            number = next(value for key, value in exact.items() if self._columns.get(key, key) == name)
-        if type(number) not in (int, Decimal):
-            raise LineError(f"{name} is not a number")
-        return stamp_ns(number, _TIME_NS[name])
-
     def _readings(self, entry: dict[str, Any]) -> list[float] | None:
         if not (name := _first_of(entry, _READINGS)):
             return None
-        values, is_bare = _numbers(entry[name], name), name not in _ACCEL
+        values, unit = _numbers(entry[name], name), _ACCEL.get(name, "")
         if len(values) != 3:
             raise LineError(f"{name} has {len(values)} numbers, not 3")
-        if self.unit is None and not self.is_bare:
-            self.unit, self.is_bare = (None if is_bare else parse_unit(name.removeprefix("accel_"))), is_bare
-        if is_bare != self.is_bare:
+        self.unit = unit if self.unit is None else self.unit
+        if bool(unit) != bool(self.unit):
             raise LineError(f"{name} is not like the readings before it")
-        factor = 1.0 if self.unit is None else _ACCEL[name] / UNITS[self.unit]
-        return values if factor == 1.0 else [factor * value for value in values]
+        return values if unit == self.unit else [UNITS[unit] / UNITS[self.unit] * value for value in values]
 
     def _pose(self, entry: dict[str, Any]) -> list[float] | None:
         if not (name := _first_of(entry, POSE_KEYS)):
@@ -142,32 +144,25 @@ def _first_of(entry: Mapping[str, Any], names: Sequence[str]) -> str:
 def _spans(line: str) -> dict[str, tuple[tuple[int, int], tuple[int, int]]]:
     """Where each key of an object stands in its line, with its quotes, and where its value does; the last of a name."""
     spans, at = dict[str, tuple[tuple[int, int], tuple[int, int]]](), line.index("{") + 1
-    while line[at := _skip(line, at, " \t\r\n,")] != "}":
+    while line[at := len(line) - len(line[at:].lstrip(_BETWEEN))] != "}":
         name, end = _value_at(line, at)
-        start = _skip(line, end, " \t\r\n:")
+        start = len(line) - len(line[end:].lstrip(_BETWEEN))
         _, behind = _value_at(line, start)
         spans[name] = (at, end), (start, behind)
         at = behind
     return spans
 
 
-def _skip(line: str, at: int, passed: str) -> int:
-    """The next place in a line of none of these characters."""
-    while line[at] in passed:
-        at += 1
-    return at
-
-
 def _numbers(values: Any, name: str) -> list[float]:
-    """Finite numbers; true, "1", NaN and 1e999 are none."""
+    """Finite numbers; true, "1", NaN, 1e999 and 1e-999 are none."""
     if type(values) is not list:
         raise LineError(f"{name} is not a list of numbers")
-    if not all(type(value) is float or type(value) is int for value in values):
+    if not all(type(value) in (float, int, Decimal) for value in values):
         raise LineError(f"{name} holds what is not a number")
     try:
         numbers = [float(value) for value in values]
     except OverflowError:
         numbers = [math.inf]
-    if not all(map(math.isfinite, numbers)):
+    if not all(map(math.isfinite, numbers)) or numbers.count(0.0) != values.count(0):
         raise LineError(f"{name} is out of range")
     return numbers

@@ -6,9 +6,10 @@ Bytes are taken as they arrive and cut into lines here; memory is that of one bl
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
@@ -28,14 +29,14 @@ from kf_calib.sources.text.csv_lines import CsvLines
 from kf_calib.sources.text.encoding import Cutter, TextFile, holds_any
 from kf_calib.sources.text.heading import TextHeading
 from kf_calib.sources.text.json_lines import POSE_KEYS, JsonLines
-from kf_calib.sources.text.reader import Account, Described, LineReader, first_line, is_json, named
+from kf_calib.sources.text.reader import Account, LineReader, first_line, is_json, named
 from kf_calib.sources.text.units import Units
 
 _BLOCK_BYTES = 1 << 18
 _SAMPLED, _BLOCKS_SAMPLED = 64, 1000  # readings of a block that tell how numbers are to be read, and blocks
 _TELLING_ROWS = 8  # of CSV, at the beginning of a stream
-OpenReader = Callable[[Sequence[str], Account], tuple[LineReader, int]]
 _SURVEY_LINES = 1_000_000  # without a pose in them, none will come
+Batches = Generator[Batch, None, None]
 
 
 class Lines:
@@ -45,8 +46,11 @@ class Lines:
     over those on the first line. columns: our name for each foreign column or key, for example
     ``{"acc_x[g]": "ax_g"}``. name: what messages call a stream. units: where the header names none, and the size of a
     count. angles: False to do without platform angles; poses that come are then left out; None to do so where a file
-    of CSV has no column of them. Raises InputError where the lines cannot be used.
+    of CSV has no column of them. described: what the lines say of the bench, as far as they were read. Raises
+    InputError where the lines cannot be used.
     """
+
+    described: LineReader | None = None
 
     def __init__(
         self,
@@ -65,49 +69,54 @@ class Lines:
         self._columns = {**as_columns(overrides.get("joints", "")), **columns}
         self._units = units or Units.of(overrides)
         self._angles = True if angles is None and not self.path else angles
-        self._wants_pose = True
+        self._account, self.fraction = Account(), 0.0
+        self._file: TextFile | None = None
         self._begin_ns: int | None = None
         self._bench: Bench | None = None
-        self._waiting: _Passage | None = None  # begun to learn of the bench, not yet iterated
-        self._latest: _Passage | None = None
+        self._ahead = deque[Batch]()  # read up to the first readings and pose
+        self._waiting: Batches | None = None  # begun to learn of the bench, not yet iterated
 
     @property
     def bench(self) -> Bench:
         """The bench; a stream is read for it up to the first pose, which shows how the platform is described."""
         if self._bench is None:
-            passage = self._begin()
-            passage.close()  # a file is read from its beginning again, if it is
-            reader, default = passage.parser, self._units.input
+            batches, default = self._begun(), self._units.input
+            if self.path:  # it is read from its beginning again, if it is
+                batches.close()
+            reader = self.described
+            assert reader
             if reader.wants_pose:
                 self._bench = reader.bench(self.name, self._overrides, default)
             else:
                 stated = reader.stated(self.name, self._overrides, default)
                 lacking = self._angles is None
                 self._bench, self._said = bench_without_angles(self.name, stated, are_lacking=lacking)
-            self._wants_pose, self._waiting = reader.wants_pose, None if self.path else passage
+            self._waiting = None if self.path else batches
         return self._bench
 
     @property
     def warnings(self) -> list[str]:
-        told = self._latest.sentences() if self._latest else []
-        return [*self._said, *(f"{self.name}: {sentence}" for sentence in told)]
-
-    @property
-    def fraction(self) -> float:
-        return self._latest.fraction if self._latest else 0.0
+        """What was taken for what, where that is not plain, and what was not used."""
+        chosen, trouble = (self._file.said, self._file.trouble) if self._file else ((), "")
+        taken = "; ".join(self.described.said) if self.described else ""
+        told = [*(f"{said}." for said in chosen), f"{taken}. {HOW}." * bool(taken), trouble, *self._account.sentences()]
+        return [*self._said, *(f"{self.name}: {sentence}" for sentence in told if sentence)]
 
     def __iter__(self) -> Iterator[Batch]:
-        readings = self.bench.input.readings  # here, so that a bench that cannot be used is told first
-        converted = (with_accel(batch, readings(batch.accel.values)) for batch in self.batches())
-        yield from converted if self._wants_pose else map(without_poses, converted)
-        if self.path and self._latest:
-            sampled = np.concatenate([np.zeros((0, 3)), *self._latest.sampled])
-            refuse_unread(sampled, self.bench.input.counts, self.name)
+        bench, sampled = self.bench, deque[Floats](maxlen=_BLOCKS_SAMPLED)
+        for batch in self.batches():
+            if count := len(batch.accel):
+                sampled.append(batch.accel.values[:: count // _SAMPLED + 1].copy())
+            converted = with_accel(batch, bench.input.readings(batch.accel.values))
+            yield converted if bench.angles else without_poses(converted)
+        if self.path:
+            refuse_unread(np.concatenate([np.zeros((0, 3)), *sampled]), bench.input.counts, self.name)
 
     def batches(self) -> Iterator[Batch]:
         """What the lines hold, whatever the bench may be: raw readings."""
-        passage, self._waiting = self._waiting or self._begin(), None
-        for batch in passage:
+        batches, self._waiting = self._waiting or self._begun(), None
+        ahead = self._ahead
+        for batch in itertools.chain((ahead.popleft() for _ in range(len(ahead))), batches):
             if self._begin_ns is None and len(batch.accel):
                 self._begin_ns = int(batch.accel.time_ns[0])
             yield batch
@@ -119,143 +128,97 @@ class Lines:
             next((batch for batch in self if len(batch.accel)), None)
         return self._begin_ns
 
-    @property
-    def described(self) -> Described | None:
-        """What the lines say of the bench, as far as they were read."""
-        return self._latest.parser if self._latest else None
-
-    def _begin(self) -> _Passage:
+    def _begun(self) -> Batches:
+        """Begin to read, up to the first readings and pose, if there must be one; return what is to come."""
         stream, self._stream = self._stream, None
         try:
-            stream = TextFile(self.path, self._units.dataset) if self.path else stream
+            self._file = TextFile(self.path, self._units.dataset) if self.path else None
         except OSError as error:
             raise InputError(f"{self.name}: cannot be read ({error.strerror}).") from None
-        if stream is None:
+        if (opened := self._file or stream) is None:
             raise InputError(f"{self.name} can be read only once: record it to a file to read it again.")
-        self._latest = _Passage(self.name, stream)
-        try:
-            self._latest.survey(self._open_reader)
-        except BaseException:
-            self._latest.close()
-            raise
-        return self._latest
-
-    def _open_reader(self, lines: Sequence[str], account: Account) -> tuple[LineReader, int]:
-        angles = self._angles
-        if is_json(lines[0]):
-            if angles is None and self.path:
-                theirs = [name for name, ours in self._columns.items() if ours in POSE_KEYS]
-                angles = holds_any(self.path, [f'"{name}"'.encode() for name in (*POSE_KEYS, *theirs)])
-        elif self._stated:
-            refuse_unknown_names(self._stated, TextHeading.of(lines).header)
-        return reader_for(lines, self._columns, account, angles=angles, units=self._units)
-
-
-def reader_for(
-    lines: Sequence[str], columns: Mapping[str, str], account: Account, *, angles: bool | None, units: Units
-) -> tuple[LineReader, int]:
-    """The reader that the first lines ask for, and how many of these are its heading.
-
-    lines: the first of them is not empty. angles: whether a pose is wanted; None: where a header has one. Raises
-    InputError for a header that does not say what is needed.
-    """
-    if is_json(lines[0]):
-        return JsonLines(columns, account, angles is not False), 0
-    heading = TextHeading.of(lines)
-    return CsvLines(Columns(heading, columns, units), account, angles), heading.lines
-
-
-class _Passage:
-    """One reading of the lines, from the first to the last; iterated once.
-
-    sampled: some of the readings (n, 3) as they stand in the lines.
-    """
-
-    parser: LineReader
-
-    def __init__(self, name: str, stream: BinaryIO | TextFile) -> None:
-        self.account, self._name, self._stream = Account(), name, stream
-        self._file = stream if isinstance(stream, TextFile) else None
-        self.fraction = 0.0 if self._file else math.nan
-        self._blocks, self._ahead, self._said = self._split(), list[Batch](), list[str]()
-        self._has_accel = self._has_pose = False
-        self.sampled = deque[Floats](maxlen=_BLOCKS_SAMPLED)
-
-    def sentences(self) -> list[str]:
-        """What was taken for what, where that is not plain, and what was not used."""
-        chosen, trouble = (self._file.said, self._file.trouble) if self._file else ((), "")
-        told = [f"{'; '.join(self._said)}. {HOW}."] if self._said else []
-        return [*(f"{said}." for said in chosen), *told, *([trouble] if trouble else []), *self.account.sentences()]
-
-    def close(self) -> None:
-        """Closes a file opened here."""
-        if self._file:
-            self._file.close()
-
-    def survey(self, open_reader: OpenReader) -> None:
-        """Chooses the parser by the first lines, of CSV by some rows as well, which tell what the header may not; reads
-        up to the first readings and pose, if there must be one, and keeps what it has read."""
-        first = list[str]()
-        for lines in self._blocks:
-            first += lines
-            blank = first_line(first)
-            self.account.lines += blank
-            del first[:blank]
-            if len(first) > _TELLING_ROWS or (first and is_json(first[0])):
+        batches, self._ahead, has_accel = self._read(opened), deque[Batch](), False
+        for batch in batches:
+            self._ahead.append(batch)
+            has_accel |= len(batch.accel) > 0
+            lacks_pose = self.described is None or (self.described.wants_pose and not self.described.pose_width)
+            if has_accel and not lacks_pose:
                 break
-        if not first:
-            raise InputError(f"{self._name} holds no lines: check that the logger wrote any.")
-        with named(self._name):
-            self.parser, heading = open_reader(first, self.account)
-        self._said = self.parser.said
-        self.account.lines += heading
-        self._ahead.append(self._parse(first[heading:]))
-        while not self._has_accel or self._lacks_pose:
-            lines = next(self._blocks, None)
-            if lines is None or self.account.lines > _SURVEY_LINES:
-                raise self._unusable("platform angles" if self._lacks_pose else "readings")
-            self._ahead.append(self._parse(lines))
+            if self._account.lines > _SURVEY_LINES:
+                raise self._unusable("platform angles" if lacks_pose else "readings")
+        return batches
 
-    @property
-    def _lacks_pose(self) -> bool:
-        return self.parser.wants_pose and not self.parser.pose_width
-
-    def __iter__(self) -> Iterator[Batch]:
+    def _read(self, stream: BinaryIO | TextFile) -> Batches:
+        """Yield what all lines hold. The first of them choose the reader, of CSV with some rows, which tell what the
+        header may not."""
+        account = self._account = Account()
+        has_accel, has_pose, first = False, False, list[str]()
         try:
-            while self._ahead:
-                yield self._ahead.pop(0)
-            yield from map(self._parse, self._blocks)
+            blocks = self._blocks(stream)
+            for lines in blocks:
+                first += lines
+                blank = first_line(first)
+                account.lines += blank
+                del first[:blank]
+                if len(first) > _TELLING_ROWS or (first and is_json(first[0])):
+                    break
+            if not first:
+                raise InputError(f"{self.name} holds no lines: check that the logger wrote any.")
+            with named(self.name):
+                reader, heading = self._reader(first)
+            self.described = reader
+            account.lines += heading
+            for lines in itertools.chain([first[heading:]], blocks):
+                batch = reader.read(lines, account.lines + 1)
+                account.lines += len(lines)
+                has_accel, has_pose = has_accel or len(batch.accel) > 0, has_pose or len(batch.pose) > 0
+                yield batch
         finally:
-            self.close()
-        if not self._has_accel:
-            raise self._unusable("readings")
-        if self.parser.wants_pose and not self._has_pose:
-            raise self._unusable("platform angles")
+            if isinstance(stream, TextFile):
+                stream.close()
+        lacks_pose = reader.wants_pose and not (has_pose if has_accel else reader.pose_width)
+        if lacks_pose or not has_accel:
+            raise self._unusable("platform angles" if lacks_pose else "readings")
 
-    def _parse(self, lines: list[str]) -> Batch:
-        batch = self.parser.read(lines, self.account.lines + 1)
-        self.account.lines += len(lines)
-        if count := len(batch.accel):
-            self._has_accel = True
-            self.sampled.append(batch.accel.values[:: count // _SAMPLED + 1].copy())
-        self._has_pose |= len(batch.pose) > 0
-        return batch
-
-    def _split(self) -> Iterator[list[str]]:
-        """Whole lines, block by block as they arrive."""
-        cutter = Cutter(self.account.refuse)
-        read = getattr(self._stream, "read1", self._stream.read)  # read1 does not wait until a whole block has come
+    def _blocks(self, stream: BinaryIO | TextFile) -> Iterator[list[str]]:
+        """Yield whole lines, block by block as they arrive."""
+        cutter = Cutter(self._account.refuse)
+        read = getattr(stream, "read1", stream.read)  # read1 does not wait until a whole block has come
         try:
             while block := read(_BLOCK_BYTES):
                 if lines := cutter.push(block):
-                    self.fraction = self._file.fraction if self._file else math.nan
+                    self.fraction = stream.fraction if isinstance(stream, TextFile) else math.nan
                     yield lines
         except OSError as error:
-            raise InputError(f"{self._name}: cannot be read on ({error.strerror}).") from None
+            raise InputError(f"{self.name}: cannot be read on ({error.strerror}).") from None
         if lines := cutter.rest():
             yield lines
         self.fraction = 1.0
 
     def _unusable(self, what: str) -> InputError:
         without = ", or do without (--no-angles)" if what == "platform angles" else ""
-        return self.account.refusal(f"{self._name}: no {what}", self.parser.advice + without)
+        advice = self.described.advice if self.described else ""
+        return self._account.refusal(f"{self.name}: no {what}", advice + without)
+
+    def _reader(self, lines: Sequence[str]) -> tuple[LineReader, int]:
+        angles = self._angles
+        if angles is None and self.path and is_json(lines[0]):
+            theirs = [name for name, ours in self._columns.items() if ours in POSE_KEYS]
+            angles = holds_any(self.path, [f'"{name}"'.encode() for name in (*POSE_KEYS, *theirs)])
+        return reader_for(lines, self._columns, self._account, angles=angles, units=self._units, stated=self._stated)
+
+
+def reader_for(
+    lines: Sequence[str], columns: Mapping[str, str], account: Account, *, angles: bool | None, units: Units,
+    stated: Mapping[str, str] = MappingProxyType({}),
+) -> tuple[LineReader, int]:  # fmt: skip
+    """The reader that the first lines ask for, and how many of these are its heading.
+
+    lines: the first of them is not empty. angles: whether a pose is wanted; None: where a header has one. stated: of
+    the columns, those that a header must have. Raises InputError for one that does not say what is needed.
+    """
+    if is_json(lines[0]):
+        return JsonLines(columns, account, angles is not False), 0
+    heading = TextHeading.of(lines)
+    refuse_unknown_names(stated, heading.header)
+    return CsvLines(Columns(heading, columns, units), account, angles), heading.lines

@@ -175,14 +175,13 @@ def meanings_of(names: Sequence[str], stated: Mapping[str, str]) -> list[Meaning
     """What the names of the columns of one file say together; stated: ours of theirs, which go before all others."""
     meanings = [meaning_of(name) for name in names]
     _tell_families(names, meanings)
-    words = [{*_tokens(_CAMEL.sub(" ", name[:_LONGEST]).lower())} for name in names]
+    words = [{*_tokens(_CAMEL.sub(" ", name[:_LONGEST]).lower()), *_tokens(name[:_LONGEST].lower())} for name in names]
     if any(own.other in ("rate", "field") for own in meanings):
         for k, meaning in enumerate(meanings):  # the device has estimated them from these very readings
             is_angle = meaning.ours == "angle" and not meaning.rank and bool(words[k] & (_ESTIMATED | set("xyz")))
             if is_angle or (meaning.ours in QUATERNION and not is_exact(names[k])):
                 meanings[k] = Meaning(other="attitude")
     # of several columns taken for a reading, those count whose names say most that they are the accelerometer's
-    words = [own | {*_tokens(name[:_LONGEST].lower())} for own, name in zip(words, names, strict=True)]
     strengths = [
         (is_exact(name), not own & _WITHOUT_GRAVITY, bool(own & _FORCE)) for own, name in zip(words, names, strict=True)
     ]

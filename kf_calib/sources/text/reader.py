@@ -55,17 +55,12 @@ class Account:
             self.unknown[short if short in self.unknown or len(self.unknown) < _NAMED else "others"] += 1
 
     def sentences(self) -> list[str]:
-        sentences = list[str]()
-        if self.first_malformed:
-            line, reason = self.first_malformed
-            sentences.append(
-                f"{self.malformed} of {self.lines} {self.what} were malformed and skipped "
-                f"(first {self.what.removesuffix('s')} {line}: {reason})."
-            )
-        if self.unknown:
-            names = ", ".join(f"{name!r} ({count})" for name, count in dict(self.unknown).items())
-            sentences.append(f"names that are not known were left out, with the values under them: {names}.")
-        return sentences
+        line, reason = self.first_malformed or (0, "")
+        names = ", ".join(f"{name!r} ({count})" for name, count in self.unknown.items())
+        malformed = (f"{self.malformed} of {self.lines} {self.what} were malformed and skipped "
+                     f"(first {self.what.removesuffix('s')} {line}: {reason}).")  # fmt: skip
+        unknown = f"names that are not known were left out, with the values under them: {names}."
+        return [malformed] * bool(self.malformed) + [unknown] * bool(names)
 
     def refusal(self, what: str, advice: str) -> InputError:
         """That what was read cannot be used, and what of it was not."""
@@ -87,7 +82,7 @@ class Described:
     """What has been learnt of the bench from what it sent.
 
     metadata: of the bench, as strings. has_angles: poses are angles; pose_width: numbers of one, 0 until it is known.
-    raw: what the readings are in, where that is settled, unit: by their names; None where they name none (is_bare), or
+    raw: what the readings are in, where that is settled, unit: by their names; empty where they name none, None where
     none has come yet. said: what was taken for what, where that is not plain.
     """
 
@@ -95,7 +90,6 @@ class Described:
     pose_width = 0
     raw: RawInput | None = None
     unit: str | None = None
-    is_bare = False
 
     def __init__(self, account: Account) -> None:
         self.metadata, self.said = dict[str, str](), list[str]()
@@ -107,22 +101,22 @@ class Described:
 
         Raises BenchError where they contradict each other, or no unit is stated.
         """
-        by_name = {} if self.unit is None else {"accel_unit": self.unit}
+        by_name = {"accel_unit": self.unit} if self.unit else {}
         if self.raw is not None:
             by_name = {"accel_scale": self.raw.scale, "accel_unit": self.raw.unit}
-        elif default is not None and default.sizes == PLAIN.sizes and self.unit is not None:
+        elif default is not None and default.sizes == PLAIN.sizes and self.unit:
             default = replace(default, unit=self.unit)  # a unit, which the names state anew
         with named(name):
             stated = merged_metadata(self.metadata, overrides, "the first line", default)
             now = RawInput.from_metadata(stated)
             if CONVERTED in stated:
                 raise BenchError(f"lines hold what the device sends: leave out {CONVERTED} in the bench's keys.")
-            if self.unit not in (None, now.unit) and "accel_unit" in stated and RESTATE not in overrides:
+            if self.unit not in (None, "", now.unit) and "accel_unit" in stated and RESTATE not in overrides:
                 raise BenchError(
                     f"the readings are in {self.unit} by their names, and stated is {now.unit_words}: rename them by "
                     "--column, or where their names are wrong, give --accel-unit and --restate-input."
                 )
-            if self.is_bare and not {"accel_unit", "accel_scale"} & set(stated):
+            if self.unit == "" and not {"accel_unit", "accel_scale"} & set(stated):
                 raise BenchError(
                     "the names of the readings do not tell their unit: name them accel_mps2 (or accel_g ...), or give "
                     "it by --accel-unit, and the size of counts by --accel-scale."
@@ -150,11 +144,10 @@ SampleRow = tuple[int, list[float] | None, list[float] | None, list[float] | Non
 class LineReader(Described, ABC):
     """Reads lines block by block; those that cannot be used are put down in the account.
 
-    Readings are in batches as they stand in the lines. advice: how quantities have to be named. wrong: the reason where
-    reading a line raises a ValueError that tells none. wants_pose: whether orientations count.
+    Readings are in batches as they stand in the lines. advice: how quantities have to be named. wants_pose: whether
+    orientations count.
     """
 
-    wrong: ClassVar[str]
     advice: ClassVar[str]
     wants_pose = True
 
@@ -175,18 +168,11 @@ class LineReader(Described, ABC):
                     rows.append(row)
             except LineError as error:
                 self._account.refuse(number, str(error))
-            except ArithmeticError:
-                self._account.refuse(number, "a number is out of range")
-            except RecursionError:
-                self._account.refuse(number, "it is nested too deeply")
-            except ValueError:
-                self._account.refuse(number, self.wrong)
         return Batch(_stream(rows, 1, 3), _stream(rows, 2, self.pose_width), _stream(rows, 3, 1))
 
     @abstractmethod
     def _row(self, line: str) -> SampleRow | None:
-        """What one line holds; None where that is no sample. Raises ValueError, ArithmeticError or RecursionError where
-        it cannot be used, LineError with the reason."""
+        """What one line holds; None where that is no sample. Raises LineError where it cannot be used."""
 
 
 def _stream(rows: Sequence[SampleRow], at: int, width: int) -> Stream:

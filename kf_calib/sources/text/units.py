@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -101,21 +101,9 @@ class Units:
         return np.array([ACCEL[unit] * (g if unit.endswith("g") else 1.0) for unit in units])
 
 
-class ReadingUnits(NamedTuple):
-    """Units of the three readings.
-
-    units: of each. raw: the sizes of the numbers; None where nothing tells these. words: how the unit is said. by_size:
-    whether the numbers told it.
-    """
-
-    units: tuple[str, ...]
-    raw: RawInput | None
-    words: str
-    by_size: bool
-
-
-def reading_units(named: Sequence[str], values: Floats, stated: Units) -> ReadingUnits:
-    """The units of three readings.
+def reading_units(named: Sequence[str], values: Floats, stated: Units) -> tuple[RawInput | None, str, str]:
+    """The sizes of the numbers of three readings, None where nothing tells these; how their unit is said; and the unit
+    that the numbers told, empty where something else does.
 
     named: units by the names of their columns, empty where these tell none. values (n, 3): readings as they are
     written, whose size at rest tells a unit that neither a name nor ``stated`` tells.
@@ -125,16 +113,16 @@ def reading_units(named: Sequence[str], values: Floats, stated: Units) -> Readin
     if stated.as_default(named, norm):
         assert stated.input is not None
         default = replace(stated.input, channels=CHANNELS)
-        return ReadingUnits((default.unit,) * 3, default, f"{default.unit_words}, as of the calibration", False)
+        return default, f"{default.unit_words}, as of the calibration", ""
     size = norm * stated.accel_scale
     are_counts = bool((values == np.rint(values)).all()) or stated.accel_scale != 1.0
     by_size = next((unit for unit, low, high in _BY_SIZE[: 3 if are_counts else 4] if low < size < high), "count")
     units = [unit if unit not in ("", "count") else stated.accel or ("m/s2" if unit else by_size) for unit in named]
-    is_guessed = "" in named and not stated.accel
+    guessed = by_size if "" in named and not stated.accel else ""
     words = " and ".join(dict.fromkeys(_IN_WORDS.get(unit, unit) for unit in units))
     if stated.accel_scale != 1.0 or "count" in named:
         words = f"counts of {stated.accel_scale:g} {words}"
-    words += " by their size (--accel-unit)" * is_guessed
+    words += " by their size (--accel-unit)" * bool(guessed)
     if any(unit.endswith("g") for unit in units):
         words += f", 1 g = {stated.g_mps2:.7g} m/s^2 (--g-unit)"
     mps2, scale = stated.mps2_per(units), stated.accel_scale
@@ -144,7 +132,7 @@ def reading_units(named: Sequence[str], values: Floats, stated: Units) -> Readin
         raw = RawInput(sizes=(scale, scale, scale), unit=units[0], counts=stated.counts)
     else:
         raw = replace(RawInput.of_factors((scale * mps2).tolist()), counts=stated.counts)
-    return ReadingUnits(tuple(units), raw, words, is_guessed)
+    return raw, words, guessed
 
 
 def usual_norm(values: Floats) -> float:
