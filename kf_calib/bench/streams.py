@@ -27,6 +27,10 @@ from kf_calib.bench.bench import Bench
 from kf_calib.errors import BenchError, InputError
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
+SECOND_NS = 1_000_000_000
+LAST_NS = int(np.iinfo(np.int64).max) // 2
+"""Later than any stamp; the sum of two such still is a stamp."""
+
 
 @dataclass(frozen=True, slots=True)
 class Stream:

@@ -19,12 +19,12 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, Mask, Times
 from kf_calib.bench.bench import Bench, turn
-from kf_calib.bench.streams import Stream
+from kf_calib.bench.streams import SECOND_NS, Stream
+from kf_calib.dwells.limits import CURVE
 from kf_calib.dwells.stationarity import Stillness
 
 PIECE_RAD = np.radians(2.0)
 PIECE_S = 0.2
-_SHORTEST = 3  # readings of a piece, as many as a parabola has coefficients
 _STEP_S = 1e-3  # step of the difference quotient for the acceleration; the spline is smooth over it
 
 
@@ -67,7 +67,7 @@ class Curve:
         passed = np.cumsum(steps * (speed / PIECE_RAD + 1.0 / PIECE_S))
         edges = [0]
         for edge in np.searchsorted(passed, np.arange(1.0, passed[-1])).tolist():
-            if edge - edges[-1] >= _SHORTEST and len(elapsed_s) - edge >= _SHORTEST:
+            if edge - edges[-1] >= CURVE and len(elapsed_s) - edge >= CURVE:
                 edges.append(edge)
         return [*edges, len(elapsed_s)]
 
@@ -75,10 +75,8 @@ class Curve:
 LARGEST_MPS2 = 1e12
 """Readings beyond this are dropped. Counts of a 32-bit converter are below it, so that the check of the unit sees
 them."""
-LARGEST_RAD = 1e6
-"""Angles beyond this are dropped: 160 000 turns, of which a double keeps the fraction to 1e-10 rad."""
-LARGEST_C = 1e6
-"""Temperatures beyond this are dropped."""
+LARGEST = 1e6
+"""Angles in rad and temperatures in degC beyond this are dropped; of 160 000 turns a double keeps 1e-10 rad."""
 _ALTERNATING = 0.2  # squares of every second step over those of every step, which noise makes equal
 _PERIODS_S = (2e-5, 0.5)  # of accelerometers
 _TURNING_DEG = 1.0  # within one block; a platform that only creeps turns by less
@@ -182,9 +180,9 @@ class Tally:
             "backward": f"readings whose stamps jumped back (first at {backward_s:.3f} s), dropped: {{}}.",
             "leaping": "readings with a stamp far ahead of their neighbours, dropped: {}.",
             "without_pose": "readings with no platform angle within 1 s of them, dropped: {}.",
-            "poses_dropped": f"angle messages not finite, beyond {LARGEST_RAD:.0e} rad, out of order of time or no "
+            "poses_dropped": f"angle messages not finite, beyond {LARGEST:.0e} rad, out of order of time or no "
             "unit quaternion, dropped: {}.",
-            "temperatures_dropped": f"temperatures not finite or beyond {LARGEST_C:.0e} degC, dropped: {{}}.",
+            "temperatures_dropped": f"temperatures not finite or beyond {LARGEST:.0e} degC, dropped: {{}}.",
             "gated": "outlying readings (innovation gate), rejected: {}; --no-gate keeps them.",
         }
         return [text.format(getattr(self, key)) for key, text in sentence_of.items() if getattr(self, key)]
@@ -219,7 +217,6 @@ def within(values: Floats, largest: float) -> Mask | None:
     return None if size.max(initial=0.0) <= largest else np.asarray((size <= largest).all(axis=1))
 
 
-SECOND_NS = 1_000_000_000
 _LEAP_NS = 10 * SECOND_NS  # a stamp this far ahead is damaged if the next one is earlier
 
 

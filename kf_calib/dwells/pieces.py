@@ -23,7 +23,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from kf_calib.bench.arrays import ComputedSequence, Floats, Indices, Ints
+from kf_calib.bench.arrays import ROUNDING, ComputedSequence, Floats, Indices, Ints
+from kf_calib.dwells.limits import CURVE
 from kf_calib.dwells.qr import triangle
 from kf_calib.dwells.rows import Nodes, basis, on_basis, parabola
 
@@ -36,7 +37,7 @@ MOST_SLEW_PIECES = 1 << 15
 """Pieces of all slews of a run, beyond which every second slew is left out: 300 slews of 20 s have as many."""
 FEWEST_PIECES = 16
 """Dwells of no more pieces are left as they are: so many have lengths that double from 1 s to hours."""
-_THREE = np.arange(3)  # nodes of a piece
+_NODES = np.arange(CURVE)  # of a piece
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -75,7 +76,7 @@ class Pieces:
 
     def __getitem__(self, part: slice | Indices) -> Pieces:
         at = np.arange(len(self))[part]
-        nodes = (3 * at[:, None] + _THREE).ravel()
+        nodes = (3 * at[:, None] + _NODES).ravel()
         return replace(
             self, triangles=self.triangles[part], nodes=self.nodes[nodes], counts=self.counts[part],
             reading_counts=self.reading_counts[part],
@@ -209,9 +210,6 @@ def basis_values(columns: Floats) -> Floats:
     return on_basis(columns.reshape(*columns.shape[:-2], -1))
 
 
-_LEAST = 1e-12  # relative to the largest variance; smaller modes are rounding
-
-
 @dataclass(frozen=True)
 class WalkPath:
     """The effect of a random walk of intensity q = 1 on the r rows of a dwell's triangles.
@@ -244,7 +242,7 @@ def walk_path_of(begins_s: Floats, ends_s: Floats, counts: Sequence[int], triang
     total = float(end @ end)
     share = onto @ end / total if total > 0 else np.zeros(len(onto))
     axes, sizes, _ = np.linalg.svd(onto - np.outer(share, end), full_matrices=False)
-    significant = sizes**2 > _LEAST * max(float(sizes[0]) ** 2, 1e-300)
+    significant = sizes**2 > ROUNDING * max(float(sizes[0]) ** 2, 1e-300)
     spans = np.maximum(ends_s - begins_s, 0.0)
     about_parabola = spans * np.array([_moments(count)[1] / max(count - 1, 1) for count in counts])
     return WalkPath(share - triangles[:, :, 0].ravel(), axes[:, significant], sizes[significant] ** 2, about_parabola)

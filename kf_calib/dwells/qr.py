@@ -8,9 +8,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from kf_calib.bench.arrays import Floats, Mask
-
-_PART = 1024  # rows that are decomposed at once, so that they and their copies stay in the cache
+from kf_calib.bench.arrays import AT_ONCE, Floats, Mask
 
 
 def triangle(rows: NDArray[np.floating[Any]]) -> Floats:
@@ -19,7 +17,7 @@ def triangle(rows: NDArray[np.floating[Any]]) -> Floats:
     Only orthogonal transformations are used, so that the condition number is that of the rows, not its square.
     """
     count, width = rows.shape[-2:]
-    part = max(_PART, 4 * width)
+    part = max(AT_ONCE, 4 * width)
     if rows.ndim == 2 and count >= 4 * part:
         whole = count // part * part
         rows = np.vstack([*(triangle(rows[k : k + part]) for k in range(0, whole, part)), rows[whole:]])
@@ -50,7 +48,7 @@ def orthonormal(rows: Floats) -> tuple[Floats, Floats]:
     To save memory, Q may overwrite the rows.
     """
     count, width = rows.shape
-    part = max(_PART, 4 * width)
+    part = max(AT_ONCE, 4 * width)
     if count < 2 * part or not width:
         return np.linalg.qr(rows)
     parts = [slice(k, min(k + part, count)) for k in range(0, count - width, part)]
@@ -68,7 +66,7 @@ def multiplied(rows: Floats, matrix: Floats) -> Floats:
     """The product (m, l) of rows (m, n) and a matrix (n, l) that is no wider; to save memory, it overwrites the
     rows."""
     product = rows[:, : matrix.shape[1]]
-    for part in (slice(k, k + _PART) for k in range(0, len(rows), _PART)):
+    for part in (slice(k, k + AT_ONCE) for k in range(0, len(rows), AT_ONCE)):
         product[part] = rows[part] @ matrix
     return product
 

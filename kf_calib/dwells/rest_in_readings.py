@@ -26,18 +26,16 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
-from kf_calib.bench.streams import Batch, Source, Stream
-from kf_calib.dwells.blocks import SECOND_NS, Block, Tally, carry_on
+from kf_calib.bench.streams import SECOND_NS, Batch, Source, Stream
+from kf_calib.dwells.blocks import Block, Tally, carry_on
+from kf_calib.dwells.limits import SAMPLE, SIGMAS
 from kf_calib.dwells.segmenter import BLOCK_SAMPLES, Segmenter, dwell_blocks
-from kf_calib.dwells.stationarity import Stillness
+from kf_calib.dwells.stationarity import FEWEST_IN_WINDOW, READING_WINDOW_NS, Stillness
+from kf_calib.support.tail_probabilities import normal_quantile
 
-_WINDOW_NS = SECOND_NS // 4
-_FEWEST = 4  # readings of a window
-_PERIODS = 32  # intervals between the first readings, whose median tells how many readings a window has
-_LEAST_WINDOWS = 4  # of a dwell
+_LEAST_WINDOWS = SECOND_NS // READING_WINDOW_NS  # of a dwell
 _REMEMBERED = 1200  # windows whose variances tell the noise: five minutes
 _VARIANCE_MARGIN = 1.5  # correlated noise has fewer degrees of freedom than readings
-_SIGMAS = 6.0
 _LEAST_G, _MOST_G = 1e-5, 0.05  # scatter that is never, and always, called a motion, in g
 _ANY_ATTITUDE = np.array([[0.0, 0.0, 0.0, 1.0]])  # stands for an attitude that is not known
 
@@ -130,10 +128,10 @@ class RestSegmenter(Segmenter):
 
     def _knows_window_size(self, final: bool) -> bool:
         """Settle how many readings a window has; tell whether that is known by now."""
-        if len(self._accel) <= _PERIODS and not (final and len(self._accel) >= 2 * _FEWEST):
+        if len(self._accel) <= SAMPLE and not (final and len(self._accel) >= 2 * FEWEST_IN_WINDOW):
             return False
-        period_ns = float(np.median(np.diff(self._accel.time_ns[: _PERIODS + 1])))
-        self._size = max(_FEWEST, round(_WINDOW_NS / max(period_ns, 1.0)))
+        period_ns = float(np.median(np.diff(self._accel.time_ns[: SAMPLE + 1])))
+        self._size = max(FEWEST_IN_WINDOW, round(READING_WINDOW_NS / max(period_ns, 1.0)))
         self._noise = _RestNoise(self.bench.gravity_mps2, 3 * (self._size - 1), self.stillness.tolerance_rad)
         return True
 
@@ -320,8 +318,8 @@ class _RestNoise:
         low, high = self.ordered[math.floor(rank)], self.ordered[math.ceil(rank)]
         quartile = low + (rank - math.floor(rank)) * (high - low)
         least, most = (_LEAST_G * self.gravity_mps2) ** 2, (_MOST_G * self.gravity_mps2) ** 2
-        noise = min(quartile / _chi_squared(-0.674, self.freedom), most) + least
-        allowed = _SIGMAS * math.sqrt(noise / count) + self.tolerance_rad * self.gravity_mps2
+        noise = min(quartile / _chi_squared(normal_quantile(0.25), self.freedom), most) + least
+        allowed = SIGMAS * math.sqrt(noise / count) + self.tolerance_rad * self.gravity_mps2
         return _VARIANCE_MARGIN * _chi_squared(5.0, self.freedom) * noise, allowed
 
 

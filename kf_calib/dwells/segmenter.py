@@ -21,12 +21,10 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, Mask, Times
 from kf_calib.bench.bench import Bench, interpolate_pose, mean_pose, pose_distance, unwrap_pose
-from kf_calib.bench.streams import Batch, Source, Stream
+from kf_calib.bench.streams import LAST_NS, SECOND_NS, Batch, Source, Stream
 from kf_calib.dwells.blocks import (
-    LARGEST_C,
+    LARGEST,
     LARGEST_MPS2,
-    LARGEST_RAD,
-    SECOND_NS,
     Block,
     Curve,
     DwellEvent,
@@ -37,19 +35,15 @@ from kf_calib.dwells.blocks import (
     within,
 )
 from kf_calib.dwells.encoder_noise import EncoderNoise, distance_sigma, encoder_sigma
+from kf_calib.dwells.limits import CURVE, FEWEST_READINGS, SIGMAS
 from kf_calib.dwells.stationarity import HISTORY, Stillness
 from kf_calib.errors import InputError
 
 BLOCK_SAMPLES = 4000
 """Largest number of samples of a block. A block then fits into the cache; the number is not a power of two because
 columns at such distances evict each other from it."""
-_LAST_NS = 1 << 62  # later than any stamp
 _HOLD_NS = SECOND_NS  # a reading up to this far outside the first or last angle still gets that angle
-_SLEW_READINGS = 8  # least number of readings of a slew that is used
-_REST_NS = 2 * SECOND_NS  # least length of a dwell that is recognised from readings alone
 _PENDING_SAMPLES = 1 << 22  # readings that may wait for an angle; 32 B each
-_TELLING = 1000  # first readings, which tell whether two sensors take turns
-_FEWEST_FOR_NOISE = 3  # fewer messages do not determine the noise of an encoder
 
 
 @dataclass
@@ -82,7 +76,7 @@ class Segmenter:
         self._temperature = Stream.empty(1)
         self._orders = (StampOrder(), StampOrder(), StampOrder())
         self._decided_ns: int | None = None  # intervals of poses before this stamp have been judged
-        self._cover_ns = -_LAST_NS  # end of the latest window that was judged as still
+        self._cover_ns = -LAST_NS  # end of the latest window that was judged as still
         self._dwell: OpenDwell | None = None
         self._encoder_rad = 0.0  # noise of an angle message, estimated in the last dwell
         self._begun = False
@@ -131,7 +125,7 @@ class Segmenter:
         self._take_poses(batch.pose, final)
         if len(batch.temperature):
             warm = batch.temperature
-            readable = within(warm.values, LARGEST_C)
+            readable = within(warm.values, LARGEST)
             if readable is not None:
                 self.tally.temperatures_dropped += int((~readable).sum())
                 warm = warm[readable]
@@ -150,8 +144,8 @@ class Segmenter:
         accel = self._orders[0](accel, self.tally, self.first_ns)
         if self.first_ns is None and len(accel):
             self.first_ns = int(accel.time_ns[0])
-        if len(self._first) < _TELLING:
-            self._first = np.concatenate([self._first, accel.values[: _TELLING - len(self._first)]])
+        if len(self._first) < BLOCK_SAMPLES:
+            self._first = np.concatenate([self._first, accel.values[: BLOCK_SAMPLES - len(self._first)]])
         self._accel += accel
 
     def _take_poses(self, pose: Stream, final: bool) -> None:
@@ -168,7 +162,7 @@ class Segmenter:
             if self.bench.axes:
                 self.tally.farthest_rad = max(self.tally.farthest_rad, float(np.abs(pose.values).max(initial=0.0)))
         self._early_poses += [pose] if len(pose) else []
-        reached_ns = _LAST_NS if final else self._orders[0].last_ns
+        reached_ns = LAST_NS if final else self._orders[0].last_ns
         if not self._early_poses or reached_ns is None or self._early_poses[0].time_ns[0] > reached_ns:
             return
         pose = Stream.joined(self._early_poses)
@@ -187,7 +181,7 @@ class Segmenter:
 
     def _usable(self, poses: Floats) -> Mask:
         """Return a mask (m,) of usable poses: finite angles of possible size, or quaternions of nearly unit length."""
-        readable = within(poses, LARGEST_RAD)
+        readable = within(poses, LARGEST)
         readable = np.ones(len(poses), bool) if readable is None else readable
         if self.bench.axes:
             return readable
@@ -269,12 +263,12 @@ class Segmenter:
                 events.append((arrived_ns, DwellEvent.ARRIVE, not first))
             elif unresolved[j]:
                 leave, arrive = self.stillness.moved_between(self._accel, begin, end, self.bench.gravity_mps2)
-                if not in_dwell and leave - begin >= _REST_NS:
+                if not in_dwell and self.stillness.is_dwell(leave - begin):
                     arrived_ns, in_dwell = begin - (0 if self._begun else _HOLD_NS), True
                     events.append((arrived_ns, DwellEvent.ARRIVE, False))
                 if in_dwell:
                     events.append((self._departed_ns(arrived_ns, leave), DwellEvent.LEAVE, False))
-                arrived_ns, in_dwell = arrive, end - arrive >= _REST_NS
+                arrived_ns, in_dwell = arrive, self.stillness.is_dwell(end - arrive)
                 if in_dwell:
                     events.append((arrive, DwellEvent.ARRIVE, True))
             elif not still[j] and in_dwell:
@@ -313,7 +307,7 @@ class Segmenter:
                 return None
             return int(self._accel.time_ns[-1]) + 1 if len(self._accel) else None
         if final:
-            return int(self._pose.time_ns[-1]) + _HOLD_NS if len(self._pose) > 1 else _LAST_NS
+            return int(self._pose.time_ns[-1]) + _HOLD_NS if len(self._pose) > 1 else LAST_NS
         return self._decided_ns - self.stillness.lead_ns - self.stillness.window_ns
 
     def _resting_ns(self) -> int:
@@ -326,7 +320,7 @@ class Segmenter:
     def _discard(self, until_ns: int) -> None:
         """Drop and count the readings before ``until_ns``, during which the platform moved or no angle was known."""
         count = int(np.searchsorted(self._accel.time_ns, until_ns))
-        first_pose = int(self._pose.time_ns[0]) if len(self._pose) and not self.dwell_count else -_LAST_NS
+        first_pose = int(self._pose.time_ns[0]) if len(self._pose) and not self.dwell_count else -LAST_NS
         early = int(np.searchsorted(self._accel.time_ns[:count], first_pose - _HOLD_NS))
         self.tally.without_pose += early
         self.tally.moving += count - early
@@ -343,7 +337,7 @@ class Segmenter:
         ``stillness`` in time and a quarter of the motion in angle.
         """
         count = int(np.searchsorted(self._accel.time_ns, arrival_ns))
-        if not self._slewing() or count < _SLEW_READINGS or self.first_ns is None:
+        if not self._slewing() or count < FEWEST_READINGS or self.first_ns is None:
             return
         accel, window_ns = self._accel[:count], self.stillness.window_ns
         begin_ns, end_ns = int(accel.time_ns[0]), int(accel.time_ns[-1])
@@ -406,7 +400,7 @@ class Segmenter:
         estimated."""
         if not len(times) or self._encoder_rad <= self.stillness.rest_rad:
             return False
-        return int(np.diff(np.searchsorted(self._pose.time_ns, (times[0], times[-1])))[0]) < _FEWEST_FOR_NOISE
+        return int(np.diff(np.searchsorted(self._pose.time_ns, (times[0], times[-1])))[0]) < CURVE
 
     def _block(self, accel: Stream) -> Block:
         """Make a block of the open dwell from these readings."""
@@ -458,7 +452,7 @@ class Segmenter:
         assert self._dwell is not None
         mean = mean_pose(inside)[None, :]
         dwell_pose = self._dwell.pose
-        allowed = 6.0 * inside.std(axis=0) / np.sqrt(len(inside)) + 1e-9
+        allowed = SIGMAS * inside.std(axis=0) / np.sqrt(len(inside)) + 1e-9
         if dwell_pose is None or (np.abs(mean - dwell_pose) > allowed).any():
             sigma = self._sigma_of_angle(inside)
             self._dwell.pose, self._dwell.pose_sigma_rad = mean, sigma / math.sqrt(len(inside))

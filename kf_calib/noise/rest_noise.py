@@ -16,8 +16,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, Ints, Times
-from kf_calib.bench.streams import Source, Table
-from kf_calib.dwells.blocks import SECOND_NS, Block, Tally
+from kf_calib.bench.streams import SECOND_NS, Source, Table
+from kf_calib.dwells.blocks import Block, Tally
 from kf_calib.dwells.rest_in_readings import RestSegmenter
 from kf_calib.dwells.stationarity import Stillness
 from kf_calib.errors import InputError

@@ -7,6 +7,8 @@ half of its digits when the denominator has 1e9 degrees of freedom.
 from __future__ import annotations
 
 import math
+from functools import cache
+from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +49,13 @@ def f_tail(freedom: float, noise_freedom: float, ratio: float) -> float:
 def chi_squared_tail(freedom: float, value: float) -> float:
     """Probability that chi-squared with these degrees of freedom exceeds ``value``: F with a known noise."""
     return f_tail(freedom, _INFINITE, value / freedom)
+
+
+@cache
+def normal_quantile(probability: float) -> float:
+    """The number below which a normal one of unit variance is with this probability: 0.6745 for 0.75, the median of its
+    size; its square at 0.975 is the 95 % point of chi-squared with one degree of freedom."""
+    return NormalDist().inv_cdf(probability)
 
 
 def sidak(p_value: float, tests: float) -> float:

@@ -1,0 +1,12 @@
+"""Numbers of readings and of sigmas from which something is told; several modules have them in common."""
+
+from __future__ import annotations
+
+CURVE = 3
+"""Coefficients of a parabola, and the readings or messages that its second difference takes."""
+FEWEST_READINGS = 8
+"""Readings, or degrees of freedom, whose scatter tells noise."""
+SAMPLE = 32
+"""Numbers whose median tells what is usual."""
+SIGMAS = 6.0
+"""What is farther off than by so many is no chance."""
