@@ -30,6 +30,8 @@ from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 SECOND_NS = 1_000_000_000
 LAST_NS = int(np.iinfo(np.int64).max) // 2
 """Later than any stamp; the sum of two such still is a stamp."""
+MOST_KEPT = 1 << 22
+"""Readings that are kept in memory, at most; 32 B each."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, Mask, Times
 from kf_calib.bench.bench import Bench, interpolate_pose, mean_pose, pose_distance, unwrap_pose
-from kf_calib.bench.streams import LAST_NS, SECOND_NS, Batch, Source, Stream
+from kf_calib.bench.streams import LAST_NS, MOST_KEPT, SECOND_NS, Batch, Source, Stream
 from kf_calib.dwells.blocks import (
     LARGEST,
     LARGEST_MPS2,
@@ -43,7 +43,6 @@ BLOCK_SAMPLES = 4000
 """Largest number of samples of a block. A block then fits into the cache; the number is not a power of two because
 columns at such distances evict each other from it."""
 _HOLD_NS = SECOND_NS  # a reading up to this far outside the first or last angle still gets that angle
-_PENDING_SAMPLES = 1 << 22  # readings that may wait for an angle; 32 B each
 
 
 @dataclass
@@ -303,7 +302,7 @@ class Segmenter:
     def _horizon(self, final: bool) -> int | None:
         """Return the stamp before which readings can be released; None if none can be yet."""
         if self._decided_ns is None:
-            if not final and len(self._accel) <= _PENDING_SAMPLES:
+            if not final and len(self._accel) <= MOST_KEPT:
                 return None
             return int(self._accel.time_ns[-1]) + 1 if len(self._accel) else None
         if final:
@@ -328,7 +327,7 @@ class Segmenter:
 
     def _slewing(self) -> bool:
         """Tell whether the waiting readings may belong to a slew that will be used."""
-        return self.slews and self.dwell_count > 0 and len(self._accel) <= _PENDING_SAMPLES
+        return self.slews and self.dwell_count > 0 and len(self._accel) <= MOST_KEPT
 
     def _slew(self, arrival_ns: int) -> Iterator[Block]:
         """Yield blocks of the readings between the last dwell and an arrival.

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import ROUNDING, Floats
 from kf_calib.dwells.pieces import OfPieces
 from kf_calib.dwells.sufficient_statistics import Dwell
 from kf_calib.dwells.table import DwellTable, FoldedDwells, computed_once
@@ -32,7 +32,6 @@ from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C
 _KNOTS, _MOST_KNOTS = 3, 200  # of a dwell, and of the run
 _ORDER = 4  # of the differences that are held small: what is left of the noise is least in the run of a climate
 _CARRIED_S = 1.5  # readings once a second are carried on to the next one, which adds to the noise of short pieces
-_ROUNDING_C = 1e-9  # of the means of temperatures that are all the same
 _QUIET = 1e-5  # noise of the mean of a dwell over the spread of the temperature
 _FEWEST = 12  # degrees of freedom within dwells
 _STEPS = 2.0  # the curve leaves at most this times the variance that parabolas within the dwells leave
@@ -91,7 +90,7 @@ def _smooth(folded: FoldedDwells, read: Floats) -> TemperatureCourse | None:
     lengths, owners = ends[:, 2] - ends[:, 0], np.repeat(np.cumsum(standing) - 1, folded.piece_numbers)
     used = (lengths > 0.0) & np.repeat(standing, folded.piece_numbers)
     ends, levels, lengths, owners = ends[used], levels[used], lengths[used], owners[used]
-    if not len(levels) or np.ptp(levels) < _ROUNDING_C:
+    if not len(levels) or np.ptp(levels) <= ROUNDING * np.abs(levels).max():
         return None  # a thermometer that always reads the same
     weights = lengths**2 / (lengths + _CARRIED_S)  # over the variance of readings of 1 K per sqrt(Hz)
     within, freedom = _within_dwells(ends[:, 1], levels, weights, owners)

@@ -20,6 +20,12 @@ SHARE = 0.4
 REST = 0.5 * (1.0 - 2.0 * SHARE)
 """Share that is given to the test of spectral lines, and as much to that of trends within dwells."""
 
+SIGMAS_95 = NormalDist().inv_cdf(0.975)
+"""Within so many sigmas lie 95 % of normal numbers: 1.96; its square, 3.84, is the 95 % point of chi-squared with one
+degree of freedom, and the 2.5 % point of the likelihood ratio of a variance against zero, half of it."""
+VARIANCE_SEEN = NormalDist().inv_cdf(1.0 - LEVEL) ** 2
+"""1 % point of the likelihood ratio of a variance against zero: 5.41."""
+
 _PRECISION = 4e-16
 _INFINITE = 1e18  # degrees of freedom of noise that is as good as known
 
@@ -53,8 +59,8 @@ def chi_squared_tail(freedom: float, value: float) -> float:
 
 @cache
 def normal_quantile(probability: float) -> float:
-    """The number below which a normal one of unit variance is with this probability: 0.6745 for 0.75, the median of its
-    size; its square at 0.975 is the 95 % point of chi-squared with one degree of freedom."""
+    """The number below which a normal one of unit variance is with this probability; for 0.75 the median of its
+    size."""
     return NormalDist().inv_cdf(probability)
 
 
