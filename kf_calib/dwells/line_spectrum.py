@@ -15,14 +15,17 @@ from functools import lru_cache, reduce
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, Mask
+from kf_calib.dwells.limits import CURVE
 from kf_calib.support.tail_probabilities import sidak
 
 _LENGTHS = np.array(sorted([4000, *(2**k for k in range(6, 12)), *(3 * 2**k for k in range(5, 11))]))
-_FIRST_BIN = 3  # in lower bins the parabola has removed the power
+_FIRST_BIN = CURVE  # in lower bins the parabola has removed the power
 _ORDER = 8
 _NEIGHBOURS, _SKIPPED = 32, 3  # bins on either side that give the level, without those that a line may fill
 _MEDIAN_EFFICIENCY = 0.45  # efficiency of the median of bins that the Hann window has correlated
-_RISE_BINS, _CUBIC = 128, 3  # up to this bin a rise that no autoregression follows (1/f) is fitted
+_RISE_BINS = 128  # up to this bin a rise that no autoregression follows (1/f) is fitted
+CUBIC = 3
+"""Degree of the polynomial in logarithms that follows noise which rises to low frequencies."""
 _MOST_LINES = 5
 _LEAK = 0.05  # bins into which a line leaks more than this share of the level are not searched for another
 
@@ -262,7 +265,7 @@ def _leverages(count: int) -> Floats:
 def _cubic(count: int) -> Floats:
     """Return an orthonormal basis (n, 4) of 1, x, x^2, x^3, where x is the logarithm of the lowest bin numbers."""
     x = np.log(np.arange(_FIRST_BIN, min(_RISE_BINS, count - 1)))
-    return np.linalg.qr(np.vander(x - x.mean(), _CUBIC + 1))[0]
+    return np.linalg.qr(np.vander(x - x.mean(), CUBIC + 1))[0]
 
 
 def _running_median(values: Floats, reach: int, skipped: int) -> Floats:

@@ -137,7 +137,7 @@ class Dwell:
             pieces=pieces[order],
             autocovariance=sum((block.autocovariance for block in blocks), self.autocovariance),
             spectrum=sum((block.spectrum for block in blocks), self.spectrum),
-            trace=sum((block.trace for block in blocks), self.trace),
+            trace=Trace.joined([self.trace, *(block.trace for block in blocks)]),
         )
 
     def repeat(self, times: float) -> Dwell:

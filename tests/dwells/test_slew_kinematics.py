@@ -11,7 +11,6 @@ from helpers.synthetic import plan_of
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, axes_of
-from kf_calib.dwells import folding
 from kf_calib.dwells.blocks import Curve
 from kf_calib.errors import InputError
 from kf_calib.estimation.calibration import calibrate
@@ -177,9 +176,10 @@ def test_slews_have_no_autocovariance_and_no_spectrum() -> None:
 def test_traces_are_of_readings_that_are_not_averaged_and_of_bounded_length(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = Pass(run([]), Settings()).fold()
     assert not any(len(dwell.trace) for dwell in Pass(run([]), Settings(window_s=1.0)).fold())
-    lengths = [len(dwell.trace) for dwell in whole]
-    monkeypatch.setattr(folding, "MOST_CELLS", lengths[0] + lengths[1] + 1)
-    assert [len(dwell.trace) for dwell in Pass(run([]), Settings()).fold()] == [*lengths[:3], *[0] * (len(whole) - 3)]
+    lengths, last = [len(dwell.trace) for dwell in whole], whole[2].trace
+    monkeypatch.setattr("kf_calib.dwells.coherent_tone.MOST_CELLS", last.first + 5)
+    bounded = [len(dwell.trace) for dwell in Pass(run([]), Settings()).fold()]
+    assert bounded == [*lengths[:2], 5, *[0] * (len(whole) - 3)] and lengths[2] > 5
 
 
 @pytest.mark.parametrize(("rate_hz", "degps", "count"), [
