@@ -17,25 +17,28 @@ from enum import Enum
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats, Mask, Times
+from kf_calib.bench.arrays import Floats, Mask, Times, crossed
 from kf_calib.bench.bench import Bench, turn
 from kf_calib.bench.streams import SECOND_NS, Stream
 from kf_calib.dwells.limits import CURVE
 from kf_calib.dwells.stationarity import Stillness
 
+BLOCK_SAMPLES = 4000
+"""Largest number of samples of a block. A block then fits into the cache; the number is not a power of two because
+columns at such distances evict each other from it."""
 PIECE_RAD = np.radians(2.0)
 PIECE_S = 0.2
-_STEP_S = 1e-3  # step of the difference quotient for the acceleration; the spline is smooth over it
 
 
 @dataclass(frozen=True)
 class Curve:
-    """The gimbal angles of one slew as functions of elapsed time, s: ``angles`` (n,) -> (n, k), rad, and ``speeds``,
-    rad/s."""
+    """The gimbal angles of one slew as functions of elapsed time, s: ``angles`` (n,) -> (n, k), rad, ``speeds``, rad/s,
+    and their ``changes``, rad/s^2."""
 
     bench: Bench
     angles: Callable[[Floats], Floats]
     speeds: Callable[[Floats], Floats]
+    changes: Callable[[Floats], Floats]
 
     @classmethod
     def through(cls, bench: Bench, elapsed_s: Floats, pose: Floats) -> Curve:
@@ -43,7 +46,7 @@ class Curve:
         from scipy.interpolate import CubicSpline
 
         spline = CubicSpline(elapsed_s, pose)
-        return cls(bench, spline, spline.derivative())
+        return cls(bench, spline, spline.derivative(), spline.derivative(2))
 
     def rate(self, elapsed_s: Floats) -> Floats:
         """Angular rate omega (n, 3), rad/s, of the platform relative to the bench, in the platform frame.
@@ -56,8 +59,17 @@ class Curve:
         return omega
 
     def rate_change(self, elapsed_s: Floats) -> Floats:
-        """Angular acceleration domega/dt (n, 3), rad/s^2, in the platform frame."""
-        return (self.rate(elapsed_s + _STEP_S) - self.rate(elapsed_s - _STEP_S)) / (2.0 * _STEP_S)
+        """Angular acceleration domega/dt (n, 3), rad/s^2, in the platform frame.
+
+        dw_k/dt = R_k^T dw_(k-1)/dt + R_k^T w_(k-1) x axis_k dq_k/dt + axis_k d^2q_k/dt^2.
+        """
+        angles, speeds, changes = self.angles(elapsed_s), self.speeds(elapsed_s), self.changes(elapsed_s)
+        omega, change = np.zeros((2, len(elapsed_s), 3))
+        for k, axis in enumerate(map(np.array, self.bench.axes)):
+            omega, change = turn(omega, axis, -angles[:, k]), turn(change, axis, -angles[:, k])
+            change = change + crossed(omega, speeds[:, k, None] * axis) + changes[:, k, None] * axis
+            omega = omega + speeds[:, k, None] * axis
+        return change
 
     def cuts(self, elapsed_s: Floats) -> list[int]:
         """Indices at which readings at times ``elapsed_s`` (n,) are cut into pieces of at most about 2 deg and 0.2 s
@@ -84,7 +96,7 @@ _TURNING_DEG = 1.0  # within one block; a platform that only creeps turns by les
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """Up to 4000 consecutive readings of one dwell, or of the slew that ended it.
+    """Up to ``BLOCK_SAMPLES`` consecutive readings of one dwell, or of the slew that ended it.
 
     - dwell: number of the dwell, counted from 1.
     - arrival_s: its arrival according to the angles.

@@ -16,6 +16,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Orientations
+from kf_calib.dwells.blocks import BLOCK_SAMPLES
 from kf_calib.dwells.coherent_tone import Cells, Trace
 from kf_calib.dwells.limits import CURVE, FEWEST_READINGS
 from kf_calib.dwells.line_spectrum import Spectrum
@@ -25,8 +26,6 @@ from kf_calib.dwells.rows import Nodes, Rows, basis
 from kf_calib.dwells.sufficient_statistics import Autocovariance, Dwell
 from kf_calib.dwells.table import DwellTable, FoldedDwells
 from kf_calib.dwells.window_average import orthonormal_parabola
-
-_CORRELATED_SAMPLES = 8192  # first readings of a dwell over which its autocovariance is accumulated, at least
 
 
 def fold(rows: Rows, carrier_hz: float = 0.0) -> Pieces:
@@ -160,7 +159,7 @@ class Folder:
             turns=rows.turns,
         )  # fmt: skip
         innovation, readings = rows.without_rotations
-        if not rows.moving and growing.autocovariance_count(rows.dwell) < _CORRELATED_SAMPLES:
+        if not rows.moving and growing.autocovariance_count(rows.dwell) <= 2 * BLOCK_SAMPLES:  # of the first blocks
             residuals = detrended(innovation, rows.elapsed_s, self.carrier_hz)
             autocovariance, spectrum = Autocovariance.of(residuals), Spectrum.of(residuals, rows.elapsed_s)
             block = replace(block, autocovariance=autocovariance, spectrum=spectrum)

@@ -27,9 +27,9 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import SECOND_NS, Batch, Source, Stream
-from kf_calib.dwells.blocks import Block, Tally, carry_on
+from kf_calib.dwells.blocks import BLOCK_SAMPLES, Block, Tally, carry_on
 from kf_calib.dwells.limits import SAMPLE, SIGMAS
-from kf_calib.dwells.segmenter import BLOCK_SAMPLES, Segmenter, dwell_blocks
+from kf_calib.dwells.segmenter import Segmenter, dwell_blocks
 from kf_calib.dwells.stationarity import FEWEST_IN_WINDOW, READING_WINDOW_NS, Stillness
 from kf_calib.support.tail_probabilities import normal_quantile
 

@@ -23,6 +23,7 @@ from kf_calib.bench.arrays import Floats, Mask, Times
 from kf_calib.bench.bench import Bench, interpolate_pose, mean_pose, pose_distance, unwrap_pose
 from kf_calib.bench.streams import LAST_NS, MOST_KEPT, SECOND_NS, Batch, Source, Stream
 from kf_calib.dwells.blocks import (
+    BLOCK_SAMPLES,
     LARGEST,
     LARGEST_MPS2,
     Block,
@@ -39,9 +40,6 @@ from kf_calib.dwells.limits import CURVE, FEWEST_READINGS, SIGMAS
 from kf_calib.dwells.stationarity import HISTORY, Stillness
 from kf_calib.errors import InputError
 
-BLOCK_SAMPLES = 4000
-"""Largest number of samples of a block. A block then fits into the cache; the number is not a power of two because
-columns at such distances evict each other from it."""
 _HOLD_NS = SECOND_NS  # a reading up to this far outside the first or last angle still gets that angle
 
 

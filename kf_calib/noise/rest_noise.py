@@ -17,10 +17,9 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, Ints, Times
 from kf_calib.bench.streams import LAST_NS, SECOND_NS, Source, Table
-from kf_calib.dwells.blocks import Block, Tally
+from kf_calib.dwells.blocks import BLOCK_SAMPLES, Block, Tally
 from kf_calib.dwells.limits import FEWEST_READINGS
 from kf_calib.dwells.rest_in_readings import RestSegmenter
-from kf_calib.dwells.segmenter import BLOCK_SAMPLES
 from kf_calib.dwells.stationarity import Stillness
 from kf_calib.dwells.sufficient_statistics import LAGS
 from kf_calib.errors import InputError
