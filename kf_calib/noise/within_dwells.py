@@ -25,10 +25,11 @@ from kf_calib.noise.noise_of_readings import (
 from kf_calib.support.searches import MOST_STEPS
 
 _MAX_ORDER = 20
-_LONGEST = 2.0  # kappa is at most the readings in a block divided by this
-_SHORT = 8.0  # if blocks are shorter than this times kappa, channels that are alike share one correlation
 TOO_SHORT = 4.0
-"""If blocks are shorter than this times kappa, they do not determine how slow their noise is."""
+"""If blocks are shorter than this times kappa, they do not determine how slow their noise is. kappa is then as large as
+in blocks half as long as they would have to be; in blocks up to twice as long, channels that are alike share one
+correlation."""
+_LONGEST, _SHORT = TOO_SHORT / 2.0, TOO_SHORT * 2.0
 
 
 def within_dwells(dwells: Sequence[Dwell], walk_mps2_per_sqrt_s: float = 0.0, along: Floats | None = None) -> Noise:
