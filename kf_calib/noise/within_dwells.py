@@ -24,7 +24,6 @@ from kf_calib.noise.noise_of_readings import (
 )
 from kf_calib.support.searches import MOST_STEPS
 
-_MAX_ORDER = 20
 TOO_SHORT = 4.0
 """If blocks are shorter than this times kappa, they do not determine how slow their noise is. kappa is then as large as
 in blocks half as long as they would have to be; in blocks up to twice as long, channels that are alike share one
@@ -131,7 +130,7 @@ def _inflation(total: Autocovariance, channel: int) -> tuple[float, float]:
     if total.count < LAGS or total.products[0, channel] <= 0:
         return 1.0, 0.0
     size = round(total.count / total.blocks)
-    lags = min(_MAX_ORDER, total.count // 16, size // 4)
+    lags = min(LAGS, total.count // 16, size // 4)
     raw = total.products[: lags + 1, channel] / np.maximum(total.pairs[: lags + 1], 1.0)
     model, variance = unbiased(raw, total.count, size)
     return min(max(model.inflation, 1.0 / size), max(size / _LONGEST, 1.0)), variance
