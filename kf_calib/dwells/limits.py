@@ -4,10 +4,10 @@ from __future__ import annotations
 
 CURVE = 3
 """Coefficients of a parabola, and the readings or messages that its second difference takes."""
+FEWEST_COMPARED = 4
+"""Dwells, windows of readings, or readings in one, of which it is told how they differ."""
 FEWEST_READINGS = 8
 """Readings, or degrees of freedom, whose scatter tells noise."""
-FEWEST_DWELLS = 4
-"""Dwells that tell how dwells differ, or what goes on over the run."""
 SAMPLE = 32
 """Numbers whose median tells what is usual."""
 SIGMAS = 6.0

@@ -28,9 +28,9 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import SECOND_NS, Batch, Source, Stream
 from kf_calib.dwells.blocks import BLOCK_SAMPLES, Block, Tally, carry_on
-from kf_calib.dwells.limits import SAMPLE, SIGMAS
+from kf_calib.dwells.limits import FEWEST_COMPARED, SAMPLE, SIGMAS
 from kf_calib.dwells.segmenter import Segmenter, dwell_blocks
-from kf_calib.dwells.stationarity import FEWEST_IN_WINDOW, READING_WINDOW_NS, Stillness
+from kf_calib.dwells.stationarity import READING_WINDOW_NS, Stillness
 from kf_calib.support.tail_probabilities import normal_quantile
 
 _LEAST_WINDOWS = SECOND_NS // READING_WINDOW_NS  # of a dwell
@@ -128,10 +128,10 @@ class RestSegmenter(Segmenter):
 
     def _knows_window_size(self, final: bool) -> bool:
         """Settle how many readings a window has; tell whether that is known by now."""
-        if len(self._accel) <= SAMPLE and not (final and len(self._accel) >= 2 * FEWEST_IN_WINDOW):
+        if len(self._accel) <= SAMPLE and not (final and len(self._accel) >= 2 * FEWEST_COMPARED):
             return False
         period_ns = float(np.median(np.diff(self._accel.time_ns[: SAMPLE + 1])))
-        self._size = max(FEWEST_IN_WINDOW, round(READING_WINDOW_NS / max(period_ns, 1.0)))
+        self._size = max(FEWEST_COMPARED, round(READING_WINDOW_NS / max(period_ns, 1.0)))
         self._noise = _RestNoise(self.bench.gravity_mps2, 3 * (self._size - 1), self.stillness.tolerance_rad)
         return True
 

@@ -16,13 +16,11 @@ from kf_calib.bench.arrays import Floats, Mask, Times
 from kf_calib.bench.bench import mean_pose, pose_distance
 from kf_calib.bench.streams import SECOND_NS, Stream
 from kf_calib.dwells.encoder_noise import distance_sigma, encoder_sigma
-from kf_calib.dwells.limits import CURVE, SIGMAS
+from kf_calib.dwells.limits import CURVE, FEWEST_COMPARED, SIGMAS
 from kf_calib.errors import InputError, check_number
 
 READING_WINDOW_NS = SECOND_NS // 4
 """Length of the windows of readings whose means show a motion."""
-FEWEST_IN_WINDOW = 4
-"""Readings of such a window, at least."""
 _CREEPING_NS = 10 * SECOND_NS  # creep that lasts longer than this is taken as permanent
 _LARGEST_DEG = 5.0  # largest tolerance; at it, a platform turning at 10 deg/s would count as still
 _PARTS = 8  # number of parts of a block whose mean poses are compared
@@ -80,7 +78,7 @@ class Stillness:
     @property
     def _compared_ns(self) -> int:
         """Time before a message over which others tell the pose that it is compared with, ns: four windows."""
-        return 4 * self.window_ns
+        return FEWEST_COMPARED * self.window_ns
 
     @property
     def history_ns(self) -> int:
@@ -229,9 +227,9 @@ class Stillness:
         """
         part = slice(*np.searchsorted(accel.time_ns, (begin_ns, end_ns)))
         times, values = accel.time_ns[part], accel.values[part]
-        size = max(FEWEST_IN_WINDOW, int(np.searchsorted(times, begin_ns + READING_WINDOW_NS)))
+        size = max(FEWEST_COMPARED, int(np.searchsorted(times, begin_ns + READING_WINDOW_NS)))
         count = len(times) // size
-        if count < 4:
+        if count < FEWEST_COMPARED:
             return begin_ns, end_ns
         shaped = values[: count * size].reshape(count, size, 3)
         means, scatter = shaped.mean(axis=1), np.median(shaped.std(axis=1), axis=0)

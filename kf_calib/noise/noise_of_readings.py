@@ -26,7 +26,7 @@ from functools import lru_cache
 import numpy as np
 
 from kf_calib.bench.arrays import ROUNDING, Floats
-from kf_calib.dwells.limits import FEWEST_DWELLS
+from kf_calib.dwells.limits import FEWEST_COMPARED
 from kf_calib.dwells.sufficient_statistics import Autocovariance
 from kf_calib.dwells.table import DwellTable, FoldedDwells, computed_once
 from kf_calib.support.searches import MOST_STEPS
@@ -214,7 +214,7 @@ def weights_of(variances: Floats, freedom: Floats) -> Floats:
     """The weights 1 / v_d (D,) of readings of dwells with variances s_d^2 (D,) of nu_d (D,) degrees of freedom, of mean
     1; all 1 where the variances are equal but for chance."""
     known, weights = freedom >= _LEAST_FREEDOM, np.ones(len(variances))
-    if known.sum() < FEWEST_DWELLS or np.median(variances[known]) <= 0.0:
+    if known.sum() < FEWEST_COMPARED or np.median(variances[known]) <= 0.0:
         return weights
     variances = np.maximum(variances, _QUIETEST * np.median(variances[known]))
     if _equal_p(variances[known], freedom[known]) > _CLEAR_P:

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import ROUNDING, Floats
-from kf_calib.dwells.limits import FEWEST_DWELLS, FEWEST_READINGS
+from kf_calib.dwells.limits import FEWEST_COMPARED, FEWEST_READINGS
 from kf_calib.dwells.pieces import OfPieces
 from kf_calib.dwells.sufficient_statistics import Dwell
 from kf_calib.dwells.table import DwellTable, FoldedDwells, computed_once
@@ -58,7 +58,7 @@ def temperature_course(folded: FoldedDwells) -> TemperatureCourse:
     """The course of the temperature over dwells, and slews between them, in order of time."""
     read = folded.pieces.nodes.temperature_c
     exact = TemperatureCourse(read, np.zeros((len(read), 0)))
-    if (~folded.moving).sum() < FEWEST_DWELLS or not np.isfinite(read).all():
+    if (~folded.moving).sum() < FEWEST_COMPARED or not np.isfinite(read).all():
         return exact
     if _only_scatters(folded, read):
         return TemperatureCourse(np.full(len(read), _means(folded, read).mean()), exact.errors_c)
