@@ -12,12 +12,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats, Mask, Times, crossed
+from kf_calib.bench.arrays import Floats, Indices, Mask, Times, crossed
 from kf_calib.bench.bench import Bench, turn
 from kf_calib.bench.streams import SECOND_NS, Stream
 from kf_calib.dwells.limits import CURVE
@@ -125,6 +125,14 @@ class Block:
     """Standard deviation of the pose due to noise of the angles."""
     turns: tuple[int, ...] = ()
     """Whole turns of each gimbal by which ``pose`` goes beyond the angles as recorded; () for quaternions."""
+
+    def __getitem__(self, rows: Indices | Mask) -> Block:
+        variance = self.variance_mps2_2
+        return replace(
+            self, elapsed_s=self.elapsed_s[rows], accel_mps2=self.accel_mps2[rows],
+            pose=self.pose if len(self.pose) == 1 else self.pose[rows], temperature_c=self.temperature_c[rows],
+            variance_mps2_2=None if variance is None else variance[rows],
+        )  # fmt: skip
 
 
 @dataclass

@@ -183,23 +183,10 @@ def model_rows(
             if keep is not None:
                 tally.gated += int((~keep).sum())
                 rejected = rows.innovation[:, ~keep]
-                block = _select(block, keep)
+                block = block[keep]
                 rows = _rows(block, bench, force)
                 rows = replace(rows, gated=channels(rejected, rows.innovation, gate_sigma))
         yield replace(rows, raw=raw, readings_per_row=block.readings_per_row) if window_s else rows
-
-
-def _select(block: Block, keep: Mask) -> Block:
-    """Return the block with only the readings in ``keep``."""
-    pose = block.pose if len(block.pose) == 1 else block.pose[keep]
-    return replace(
-        block,
-        elapsed_s=block.elapsed_s[keep],
-        accel_mps2=block.accel_mps2[keep],
-        pose=pose,
-        temperature_c=block.temperature_c[keep],
-        variance_mps2_2=None if block.variance_mps2_2 is None else block.variance_mps2_2[keep],
-    )
 
 
 def _rows(block: Block, bench: Bench, force: Floats | None) -> Rows:

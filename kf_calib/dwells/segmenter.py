@@ -16,6 +16,7 @@ import copy
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from typing import overload
 
 import numpy as np
 
@@ -97,9 +98,16 @@ class Segmenter:
     @property
     def arrival_s(self) -> float:
         """Time of arrival of the open dwell, s since the first sample; NaN if no dwell is open."""
-        if self._dwell is None or self.first_ns is None:
-            return math.nan
-        return (self._dwell.arrival_ns - self.first_ns) / SECOND_NS
+        return math.nan if self._dwell is None else self._elapsed_s(self._dwell.arrival_ns)
+
+    @overload
+    def _elapsed_s(self, stamp_ns: int) -> float: ...
+    @overload
+    def _elapsed_s(self, stamp_ns: Times) -> Floats: ...
+    def _elapsed_s(self, stamp_ns: int | Times) -> float | Floats:
+        """Return the time since the first reading, s."""
+        assert self.first_ns is not None
+        return (stamp_ns - self.first_ns) / SECOND_NS
 
     def waiting(self) -> list[Block]:
         """The readings of the open dwell that do not yet fill a block, as a block; the segmenter is not changed."""
@@ -334,7 +342,7 @@ class Segmenter:
         ``stillness`` in time and a quarter of the motion in angle.
         """
         count = int(np.searchsorted(self._accel.time_ns, arrival_ns))
-        if not self._slewing() or count < FEWEST_READINGS or self.first_ns is None:
+        if not self._slewing() or count < FEWEST_READINGS:
             return
         accel, window_ns = self._accel[:count], self.stillness.window_ns
         begin_ns, end_ns = int(accel.time_ns[0]), int(accel.time_ns[-1])
@@ -344,22 +352,19 @@ class Segmenter:
             return
         if np.abs(np.diff(poses, axis=0)).max() > np.ptp(poses, axis=0).max() / 4.0:  # too few messages
             return
-        curve = Curve.through(self.bench, (times - self.first_ns) / SECOND_NS, poses)
-        temperature_c, elapsed_s = (
-            carry_on(self._temperature, accel.time_ns),
-            (accel.time_ns - self.first_ns) / SECOND_NS,
+        curve = Curve.through(self.bench, self._elapsed_s(times), poses)
+        elapsed_s, temperature_c = self._elapsed_s(accel.time_ns), carry_on(self._temperature, accel.time_ns)
+        slew = Block(
+            self.dwell_count,
+            float(elapsed_s[0]),
+            elapsed_s,
+            accel.values,
+            curve.angles(elapsed_s),
+            temperature_c,
+            curve,
         )
         for part in np.array_split(np.arange(count), -(-count // BLOCK_SAMPLES)):
-            part_s = elapsed_s[part]
-            yield Block(
-                self.dwell_count,
-                float(elapsed_s[0]),
-                part_s,
-                accel.values[part],
-                curve.angles(part_s),
-                temperature_c[part],
-                curve,
-            )
+            yield slew[part]
         self.tally.slewing += count
         self._accel = self._accel[count:]
 
@@ -401,17 +406,14 @@ class Segmenter:
 
     def _block(self, accel: Stream) -> Block:
         """Make a block of the open dwell from these readings."""
-        assert self._dwell is not None and self.first_ns is not None
+        assert self._dwell is not None
         self.tally.used += len(accel)
-        elapsed_s = (accel.time_ns - self.first_ns) / SECOND_NS
-        arrival_s, arrival_felt_s = (
-            max((stamp - self.first_ns) / SECOND_NS, 0.0)
-            for stamp in (self._dwell.arrival_ns, self._dwell.arrival_felt_ns)
-        )
+        arrivals_ns = self._dwell.arrival_ns, self._dwell.arrival_felt_ns
+        arrival_s, arrival_felt_s = (max(self._elapsed_s(stamp_ns), 0.0) for stamp_ns in arrivals_ns)
         pose, temperature_c = self._block_pose(accel.time_ns), carry_on(self._temperature, accel.time_ns)
         return Block(
-            self._dwell.number, arrival_s, elapsed_s, accel.values, pose, temperature_c, arrival_felt_s=arrival_felt_s,
-            pose_sigma_rad=self._dwell.pose_sigma_rad, turns=self._dwell_turns(),
+            self._dwell.number, arrival_s, self._elapsed_s(accel.time_ns), accel.values, pose, temperature_c,
+            arrival_felt_s=arrival_felt_s, pose_sigma_rad=self._dwell.pose_sigma_rad, turns=self._dwell_turns(),
         )  # fmt: skip
 
     def _dwell_turns(self) -> tuple[int, ...]:
