@@ -143,12 +143,10 @@ class Stillness:
             first = max(min(first, first_judged - HISTORY), arrived)
             if last - first_judged < 1 or last - first < HISTORY:
                 return None
-            deviating = first_judged + np.flatnonzero(
-                self._deviates(pose[first:last], is_quaternion)[first_judged - first :]
-            )
-            step = max(
-                1, round(self.window_ns * (last - 1 - first) / int(pose.time_ns[last - 1] - pose.time_ns[first]))
-            )
+            away = self._deviates(pose[first:last], is_quaternion)
+            deviating = first_judged + np.flatnonzero(away[first_judged - first :])
+            lasts_ns = int(pose.time_ns[last - 1] - pose.time_ns[first])
+            step = max(1, round(self.window_ns * (last - 1 - first) / lasts_ns))
             if not deviating.size or last - 1 - deviating[-1] > step:
                 return None
             breaks = np.flatnonzero(np.diff(deviating) > step)
@@ -167,17 +165,12 @@ class Stillness:
         starts = np.minimum(np.searchsorted(times, times - self._compared_ns), np.maximum(ends - CURVE, 0))
         sums, counts = _cumulative_sums(relative), (ends - starts)[:, None]
         means = (sums[ends] - sums[starts]) / np.maximum(counts, 1)
-        curvature, curvature_count = (
-            _cumulative_sums(np.diff(relative, 2, axis=0) ** 2),
-            np.maximum(ends - starts - 2, 0)[:, None],
-        )
-        variance = (curvature[starts + curvature_count[:, 0]] - curvature[starts]) / (
-            6.0 * np.maximum(curvature_count, 1)
-        )
+        curvature, seen = _cumulative_sums(np.diff(relative, 2, axis=0) ** 2), np.maximum(ends - starts - 2, 0)
+        variance = (curvature[starts + seen] - curvature[starts]) / (6.0 * np.maximum(seen, 1))[:, None]
         sigma = distance_sigma(np.sqrt(np.maximum(variance, 0.0)), is_quaternion)
         allowed = np.maximum(self.rest_rad, 4.0 * sigma)
         distance = pose_distance(pose.values, means + pose.values[0], is_quaternion)
-        return (distance > allowed) & (curvature_count[:, 0] > 0)
+        return (distance > allowed) & (seen > 0)
 
     def rest_ns(self, pose: Stream, is_quaternion: bool, arrived_ns: int, until_ns: int) -> tuple[int, bool]:
         """Stamp, ns, at which the platform came to rest in a dwell since ``arrived_ns``, and whether this is certain by
@@ -235,10 +228,8 @@ class Stillness:
         means, scatter = shaped.mean(axis=1), np.median(shaped.std(axis=1), axis=0)
         coarse = SIGMAS * scatter + 1e-3 * gravity_mps2
         fine = 3.0 * scatter / math.sqrt(size) + self.rest_rad * gravity_mps2
-        count_before, count_after = (
-            _windows_at_first_level(means, coarse, fine),
-            _windows_at_first_level(means[::-1], coarse, fine),
-        )
+        both_ways = means, means[::-1]
+        count_before, count_after = (_windows_at_first_level(each, coarse, fine) for each in both_ways)
         leave = begin_ns if count_before < 2 else int(times[(count_before - 1) * size])
         arrive = end_ns if count_after < 2 else int(times[(count - count_after + 1) * size])
         return leave, max(arrive, leave)
