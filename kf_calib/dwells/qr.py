@@ -71,6 +71,19 @@ def multiplied(rows: Floats, matrix: Floats) -> Floats:
     return product
 
 
+def spanned(columns: Floats) -> tuple[Floats, Floats, float]:
+    """What columns (m, n) span: an orthonormal basis (m, r), the matrix (n, r) from its coefficients to theirs, and the
+    logarithm of their volume; rounding counts as nothing. To save memory, the columns are overwritten."""
+    lengths = np.sqrt(np.einsum("ij,ij->j", columns, columns))
+    lengths = np.where(lengths > 0.0, lengths, 1.0)
+    columns /= lengths
+    rows, upper = orthonormal(columns)
+    turn, singular, right = np.linalg.svd(upper, full_matrices=False)
+    seen = singular > 1e-9 * singular.max(initial=0.0)
+    log_volume = float(np.log(singular[seen]).sum() + np.log(lengths).sum())
+    return multiplied(rows, turn[:, seen]), right[seen].T / singular[seen] / lengths[:, None], log_volume
+
+
 def inverse_of_lower(lower: Floats) -> Floats:
     """The inverses (n, k, k) of many small lower triangles, by substitution: each entry has the accuracy of its terms.
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.dwells.pieces import OfPieces
-from kf_calib.dwells.qr import multiplied, orthonormal
+from kf_calib.dwells.qr import spanned
 from kf_calib.dwells.sufficient_statistics import Dwell
 from kf_calib.dwells.table import DwellTable
 from kf_calib.noise.means import Means, means_of
@@ -346,12 +346,7 @@ def _reduce(means: Means, prior: Floats | None = None) -> _Reduced:
     design = means.design.reshape(-1, means.design.shape[2])
     prior = np.zeros((0, design.shape[1] + 1)) if prior is None else prior
     known: Mask = np.array(prior[:, :-1].any(axis=0))
-    free = design[:, ~known]  # a copy, which the basis may overwrite
-    scale = np.sqrt(np.einsum("ij,ij->j", free, free))
-    free /= np.where(scale > 0, scale, 1.0)
-    basis, upper = orthonormal(free)
-    turn, singular, _ = np.linalg.svd(upper, full_matrices=False)
-    basis = multiplied(basis, turn[:, singular > 1e-9 * singular[0]])
+    basis = spanned(design[:, ~known])[0]
     rest = means.readings.ravel() - basis @ (basis.T @ means.readings.ravel())
     columns = np.hstack([basis, design[:, known]]) if known.any() else basis
     means = replace(means, design=columns.reshape(*means.readings.shape, -1), readings=rest.reshape(-1, 3))
