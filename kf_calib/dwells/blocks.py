@@ -19,7 +19,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, Indices, Mask, Times, crossed
 from kf_calib.bench.bench import Bench, turn
-from kf_calib.bench.streams import SECOND_NS, Stream
+from kf_calib.bench.streams import LEAP_NS, SECOND_NS, Stream
 from kf_calib.dwells.limits import CURVE
 from kf_calib.dwells.stationarity import Stillness
 
@@ -237,9 +237,6 @@ def within(values: Floats, largest: float) -> Mask | None:
     return None if size.max(initial=0.0) <= largest else np.asarray((size <= largest).all(axis=1))
 
 
-_LEAP_NS = 10 * SECOND_NS  # a stamp this far ahead is damaged if the next one is earlier
-
-
 class StampOrder:
     """Keeps the samples of a stream whose stamps increase, and counts the others."""
 
@@ -255,7 +252,7 @@ class StampOrder:
             return stream
         begun = 1 if self.last_ns is None else stream.time_ns[0] - self.last_ns
         steps = np.diff(stream.time_ns)
-        if min(begun, steps.min(initial=1)) > 0 and max(begun, steps.max(initial=1)) < _LEAP_NS:
+        if min(begun, steps.min(initial=1)) > 0 and max(begun, steps.max(initial=1)) < LEAP_NS:
             self.last_ns = int(stream.time_ns[-1])
             return stream
         return self._one_by_one(stream, tally or Tally(), first_ns)
@@ -273,7 +270,7 @@ class StampOrder:
                     if tally.first_backward_s is None:
                         tally.first_backward_s = (self.last_ns - (first_ns or stamps[0])) / SECOND_NS
                 continue
-            if self.last_ns is not None and stamp - self.last_ns >= _LEAP_NS:
+            if self.last_ns is not None and stamp - self.last_ns >= LEAP_NS:
                 if i + 1 == len(stamps) and not self._ended:  # the next stamp tells a gap from damage
                     self._held_back = stream[i:]
                     break

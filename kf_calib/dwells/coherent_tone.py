@@ -17,14 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import ROUNDING, Floats, Mask
-from kf_calib.dwells.line_spectrum import CUBIC, SpectralLine, independent
+from kf_calib.dwells.limits import CUBIC, CURVE
+from kf_calib.dwells.line_spectrum import SpectralLine, independent
 from kf_calib.support.tail_probabilities import sidak
 
 CELL_S = 0.125
 """Largest length of a cell, unless readings are less frequent: several periods of vibration."""
 MOST_CELLS = 1 << 20
 """Cells of a run, from its first reading on, that are kept and transformed: a day and a half, 32 MB."""
-_FEWEST_CYCLES = 1.5  # per dwell; a parabola removes more than half of a slower oscillation
+_FEWEST_CYCLES = CURVE / 2  # per dwell: a parabola, of as many coefficients as half cycles, removes a slower one
 _HIGHEST = 0.75  # highest frequency, as a share of half the rate of cells
 _BANDS, _BAND_POINTS = 40, 16  # bands of equal ratio, with at least so many frequencies; their medians give the noise
 

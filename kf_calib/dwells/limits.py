@@ -4,6 +4,8 @@ from __future__ import annotations
 
 CURVE = 3
 """Coefficients of a parabola, and the readings or messages that its second difference takes."""
+CUBIC = 3
+"""Degree of the curves that follow what changes slowly: noise over frequencies, the temperature over a run."""
 FEWEST_COMPARED = 4
 """Dwells, windows of readings, or readings in one, of which it is told how they differ."""
 FEWEST_READINGS = 8

@@ -15,7 +15,7 @@ from functools import lru_cache, reduce
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, Mask
-from kf_calib.dwells.limits import CURVE, SAMPLE
+from kf_calib.dwells.limits import CUBIC, CURVE, SAMPLE
 from kf_calib.support.tail_probabilities import sidak
 
 _LENGTHS = np.array(sorted([4000, *(2**k for k in range(6, 12)), *(3 * 2**k for k in range(5, 11))]))
@@ -24,8 +24,6 @@ _ORDER = 8
 _SKIPPED = 3  # nearest bins on either side, which a line may fill, of the ``SAMPLE`` that give the level
 _MEDIAN_EFFICIENCY = 0.45  # efficiency of the median of bins that the Hann window has correlated
 _RISE_BINS = 128  # up to this bin a rise that no autoregression follows (1/f) is fitted
-CUBIC = 3
-"""Degree of the polynomial in logarithms that follows noise which rises to low frequencies."""
 _MOST_LINES = 5  # that are told; what swings like a square wave has dozens
 _LEAK = 0.05  # bins into which a line leaks more than this share of the level are not searched for another
 

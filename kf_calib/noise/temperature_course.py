@@ -24,14 +24,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import ROUNDING, Floats
-from kf_calib.dwells.limits import FEWEST_COMPARED, FEWEST_READINGS
+from kf_calib.dwells.limits import CUBIC, FEWEST_COMPARED, FEWEST_READINGS
 from kf_calib.dwells.pieces import OfPieces
 from kf_calib.dwells.sufficient_statistics import Dwell
 from kf_calib.dwells.table import DwellTable, FoldedDwells, computed_once
 from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C
 
 _KNOTS, _MOST_KNOTS = 3, 200  # of a dwell, and of the run
-_ORDER = 4  # of the differences that are held small: what is left of the noise is least in the run of a climate
+_ORDER = CUBIC + 1  # of the differences that are held small: cubics are free, which is best for the run of a climate
 _CARRIED_S = 1.5  # readings once a second are carried on to the next one, which adds to the noise of short pieces
 _STEPS = 2.0  # the curve leaves at most this times the variance that parabolas within the dwells leave
 _KEPT = 1e-4  # share of the variance of the errors that may be left out
