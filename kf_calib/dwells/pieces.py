@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 
@@ -270,29 +269,21 @@ def _root(begins_s: Floats, ends_s: Floats, counts: Sequence[int]) -> tuple[Floa
     return coefficients, level
 
 
-_MANY = 1 << 14
-"""Readings of a piece above which the moments of a walk are those of a continuous one, to 1e-4 of them."""
-
-
-@lru_cache(maxsize=4096)
 def _moments(count: int) -> tuple[Floats, float]:
     """Return moments of a walk with unit steps over ``count`` readings that begins at zero.
 
-    They are the covariance (4, 4) of the coefficients of its parabola on 1, u, u^2 and of its last value, and the mean
-    sum of squares about the parabola.
+    They are the covariance (4, 4) of the coefficients of its least-squares parabola on 1, u, u^2 and of its last value,
+    and the sum of squares about the parabola, 3 (n^2 - 9) / 70: sums over the covariance min(i, j) of the values.
     """
-    if count > _MANY:  # of so many readings, it grows with their number, and the mean square with that of its square
-        covariance, squares = _moments(_MANY)
-        return covariance * (count / _MANY), squares * (count / _MANY) ** 2
-    u = np.linspace(-1.0, 1.0, count)
-    design = np.column_stack([np.ones(count), u, u * u]) if count > 1 else np.array([[1.0, 0.0, 0.0]])
-    last = np.zeros((count, 1))
-    last[-1] = 1.0
-    weights = np.hstack([np.linalg.pinv(design).T, last])
-    later = np.cumsum(weights[::-1], axis=0)[::-1][1:]  # each step moves all later readings
-    covariance = later.T @ later
-    inside = float(np.trace(design.T @ design @ covariance[:3, :3]))
-    return covariance, max(0.5 * count * (count - 1) - inside, 0.0)
+    n = float(count)
+    if count < CURVE:  # one reading, or the line through two
+        line = np.array([0.5, 0.5, 0.0, 1.0])
+        return (n - 1.0) * np.outer(line, line), 0.0
+    whole = 56.0 * n * (n**2 - 4.0)
+    level, bend = (25.0 * n**3 - 3.0 * n**2 - 85.0 * n + 27.0) / whole, -3.0 * (n - 1.0) * (4.0 * n**2 - 1.0) / whole
+    slope, square = 0.3 * (n**2 + 1.0) / (n * (n + 1.0)), 15.0 * (n - 1.0) ** 2 * (n**2 + 5.0) / (whole * (n + 1.0))
+    covariance = [[level, 0.25, bend, 0.5], [0.25, slope, 0.0, 0.5], [bend, 0.0, square, 0.0], [0.5, 0.5, 0.0, 1.0]]
+    return (n - 1.0) * np.array(covariance), 3.0 * (n**2 - 9.0) / 70.0
 
 
 def lagged_walk_products(period_s: float, size: int, pairs: Floats) -> Floats:
