@@ -23,8 +23,9 @@ from kf_calib.support.tail_probabilities import sidak
 
 CELL_S = 0.125
 """Largest length of a cell, unless readings are less frequent: several periods of vibration."""
-MOST_CELLS = 1 << 20
-"""Cells of a run, from its first reading on, that are kept and transformed: a day and a half, 32 MB."""
+MOST_CELLS = 1 << 17
+"""Cells with readings that are kept of a run: four and a half hours, which take 4 MB."""
+_LONGEST_RUN = 1 << 20  # cells of a run, with pauses, from its first reading on, that are transformed: a day and a half
 _FEWEST_CYCLES = CURVE / 2  # per dwell: a parabola, of as many coefficients as half cycles, removes a slower one
 _HIGHEST = 0.75  # highest frequency, as a share of half the rate of cells
 _BANDS, _BAND_POINTS = 40, 16  # bands of equal ratio, with at least so many frequencies; their medians give the noise
@@ -73,7 +74,7 @@ class Trace:
     def of(cls, readings: Floats, elapsed_s: Floats, into: Cells) -> Trace:
         """The sums of a block of readings (n, 3) at increasing times (n,)."""
         cells = into.numbers(elapsed_s)
-        kept = int(np.searchsorted(cells, MOST_CELLS))
+        kept = int(np.searchsorted(cells, _LONGEST_RUN))
         if not kept:
             return cls()
         cells, readings = cells[:kept], readings[:kept]

@@ -17,7 +17,7 @@ from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Orientations
 from kf_calib.dwells.blocks import BLOCK_SAMPLES
-from kf_calib.dwells.coherent_tone import Cells, Trace
+from kf_calib.dwells.coherent_tone import MOST_CELLS, Cells, Trace
 from kf_calib.dwells.limits import CURVE, FEWEST_READINGS
 from kf_calib.dwells.line_spectrum import Spectrum
 from kf_calib.dwells.pieces import FEWEST_PIECES, MOST_PIECES, MOST_RUN_PIECES, MOST_SLEW_PIECES, Pieces, coarsened
@@ -127,7 +127,7 @@ class Folder:
         self._dwells, self._slews = _DwellSequence(), _DwellSequence()
         self.carrier_hz = carrier_hz
         self._cells: Cells | None = None
-        self._slew_pieces = 0
+        self._traced = self._slew_pieces = 0
         self._every = 1  # of so many slews one is kept
 
     @property
@@ -164,8 +164,9 @@ class Folder:
             autocovariance, spectrum = Autocovariance.of(residuals), Spectrum.of(residuals, rows.elapsed_s)
             block = replace(block, autocovariance=autocovariance, spectrum=spectrum)
         self._cells = self._cells or Cells.of(rows.elapsed_s)
-        if self._cells and not rows.moving and not block.pieces.averaged:
+        if self._cells and not rows.moving and not block.pieces.averaged and self._traced < MOST_CELLS:
             block = replace(block, trace=Trace.of(readings, rows.elapsed_s, self._cells))
+            self._traced += len(block.trace)
         growing.add(block)
         if rows.moving:
             self._slew_pieces += len(block.pieces)

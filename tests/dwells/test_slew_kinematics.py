@@ -176,10 +176,11 @@ def test_slews_have_no_autocovariance_and_no_spectrum() -> None:
 def test_traces_are_of_readings_that_are_not_averaged_and_of_bounded_length(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = Pass(run([]), Settings()).fold()
     assert not any(len(dwell.trace) for dwell in Pass(run([]), Settings(window_s=1.0)).fold())
-    lengths, last = [len(dwell.trace) for dwell in whole], whole[2].trace
-    monkeypatch.setattr("kf_calib.dwells.coherent_tone.MOST_CELLS", last.first + 5)
-    bounded = [len(dwell.trace) for dwell in Pass(run([]), Settings()).fold()]
-    assert bounded == [*lengths[:2], 5, *[0] * (len(whole) - 3)] and lengths[2] > 5
+    lengths, last, none = [len(dwell.trace) for dwell in whole], whole[2].trace, [0] * (len(whole) - 3)
+    monkeypatch.setattr("kf_calib.dwells.folding.MOST_CELLS", lengths[0] + lengths[1] + 1)
+    assert [len(dwell.trace) for dwell in Pass(run([]), Settings()).fold()] == [*lengths[:3], *none]
+    monkeypatch.setattr("kf_calib.dwells.coherent_tone._LONGEST_RUN", last.first + 5)
+    assert [len(dwell.trace) for dwell in Pass(run([]), Settings()).fold()] == [*lengths[:2], 5, *none]
 
 
 @pytest.mark.parametrize(("rate_hz", "degps", "count"), [
