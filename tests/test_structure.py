@@ -192,7 +192,7 @@ CEILINGS = {
     "bench": 1694,
     "effects": 3140,
     "sources": 12162,
-    "dwells": 3812,
+    "dwells": 3805,
     "noise": 3381,
     "estimation": 7920,
     "design": 1875,
