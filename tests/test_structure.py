@@ -188,17 +188,17 @@ def test_nothing_lies_beside_the_packages() -> None:
 
 CEILINGS = {
     "kf_calib": 188,
-    "support": 1039,
-    "bench": 1691,
+    "support": 1064,
+    "bench": 1694,
     "effects": 3140,
-    "sources": 11978,
-    "dwells": 3815,
-    "noise": 3398,
-    "estimation": 7918,
+    "sources": 11975,
+    "dwells": 3805,
+    "noise": 3381,
+    "estimation": 7909,
     "design": 1875,
-    "diagnosis": 5594,
+    "diagnosis": 5590,
     "online": 1648,
-    "exchange": 1992,
+    "exchange": 1990,
     "views": 7092,
     "cli": 3562,
     "report": 792,
@@ -213,7 +213,8 @@ CEILINGS = {
 """How many lines each room may have. A ceiling is lowered when its room has shrunk. Those of estimation, diagnosis and
 (by four lines) views were raised once, for intervals that average over two sizes of noise, and for dwells that are off
 beside other terms; that of diagnosis three times more, for causes that nobody knows beside stated noise, for what one
-accelerometer alone has, and for the readings within dwells beside what is fitted."""
+accelerometer alone has, and for the readings within dwells beside what is fitted. Those of bench and support were
+raised for numbers that several rooms had each for itself."""
 UNDER_A_CEILING = 400  # lines: where a room has more room than this, its ceiling is out of date
 
 

@@ -21,6 +21,9 @@ Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
+ROUNDING = 1e-12  # share of the largest of numbers below which what is left of a difference of them is rounding
+AT_ONCE = 1024  # rows that are worked on together, so that they and their copies stay in the cache
+
 
 def lengths(vectors: Floats) -> Floats:
     """The length (n,) of each row (n, k) of numbers as they stand in a file; infinite where it is beyond a double."""

@@ -9,23 +9,23 @@ A table of orientations is a source, too: of its dwells only the mean readings a
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-
-if TYPE_CHECKING:
-    from kf_calib.bench.bench import Bench
-from collections.abc import Mapping
-from dataclasses import replace
-from pathlib import Path
 
 from kf_calib.bench.arrays import ComputedSequence, Floats, Ints, Times
 from kf_calib.bench.bench import Bench
 from kf_calib.errors import BenchError, InputError
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
+
+SECOND_NS = 1_000_000_000
+LEAP_NS = 10 * SECOND_NS  # a stamp this far ahead is a pause or damaged: those after it tell which
+LAST_NS = int(np.iinfo(np.int64).max) // 2  # later than any stamp; the sum of two such is one
+MOST_KEPT = 1 << 22  # readings that are kept in memory, at most; 32 B each
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,6 +18,7 @@ from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.residual_table import mean_sigmas, quantity_means
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import joint_delta_chi2
+from kf_calib.noise.random_walk import known_at_end
 from kf_calib.support.tail_probabilities import f_tail
 
 _OF_FORCE = ("{0}*{0}", "{0}**3", "{0}**4")
@@ -165,8 +166,7 @@ def walk_path(result: Calibration) -> Floats:
     intensity, means = result.noise.walk_mps2_per_sqrt_s, result.linearised.means
     if not intensity:
         return np.zeros_like(result.residuals_mps2)
-    before_end_s = means.ends_s[-1, 1] - means.ends_s.mean(axis=1)
-    covariance = intensity**2 * np.minimum.outer(before_end_s, before_end_s)
+    covariance = intensity**2 * known_at_end(means.ends_s)
     path = [covariance @ np.linalg.solve(covariance + np.diag(sigma**2), residual)
             for sigma, residual in zip(mean_sigmas(result).T, result.residuals_mps2.T, strict=True)]  # fmt: skip
     return np.array(path).T

@@ -24,6 +24,7 @@ from kf_calib.bench.arrays import Floats, Indices
 from kf_calib.diagnosis.in_noises import ROUNDING, InNoises, Spanned
 from kf_calib.diagnosis.within_rows import Courses, WithinRows
 from kf_calib.dwells.pieces import OfPieces, of_all_pieces
+from kf_calib.dwells.qr import spanned
 from kf_calib.effects import Effect
 from kf_calib.estimation.candidate_scan import SEEN
 from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns, few_at_a_time, stimulus_of
@@ -246,11 +247,7 @@ def _off(
     """Return what a model (D, 3, P) spans, with columns (D, 3, C) and readings (D, 3) off it; the columns are
     overwritten."""
     whole = np.concatenate([model.reshape(-1, model.shape[2]), more_model])
-    sizes = np.linalg.norm(whole, axis=0)
-    whole = whole / np.where(sizes > 0.0, sizes, 1.0)
-    _, singular, right = np.linalg.svd(whole, full_matrices=False)
-    kept = singular > 1e-9 * singular.max(initial=1e-300)
-    basis = np.linalg.qr(whole @ (right[kept] / singular[kept, None]).T)[0]
+    basis, _, log_volume = spanned(whole)
     of_means, more = basis[: z.size].reshape(*z.shape, -1), basis[z.size :]
     onto = np.tensordot(of_means, columns, axes=((0, 1), (0, 1))) + more.T @ more_columns
     for k in range(len(columns)):
@@ -258,8 +255,7 @@ def _off(
     more_columns -= more @ onto
     along = basis.T @ np.append(z.ravel(), more_z)
     # columns with a prior of their own, as those of a thermometer's error, are integrated out: their number is no gain
-    log = -float(np.log(singular[kept]).sum() + np.log(sizes[sizes > 0.0]).sum())
-    return Spanned(of_means, columns, z - of_means @ along, more, more_columns, more_z - more @ along, log)
+    return Spanned(of_means, columns, z - of_means @ along, more, more_columns, more_z - more @ along, -log_volume)
 
 
 def log_bayes(gram: Floats, along: Floats, squares: Floats, log_weights: Floats, centres: Floats,

@@ -12,30 +12,33 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats, Mask, Times
+from kf_calib.bench.arrays import Floats, Indices, Mask, Times, crossed
 from kf_calib.bench.bench import Bench, turn
-from kf_calib.bench.streams import Stream
+from kf_calib.bench.streams import LEAP_NS, SECOND_NS, Stream
+from kf_calib.dwells.limits import CURVE
 from kf_calib.dwells.stationarity import Stillness
 
+BLOCK_SAMPLES = 4000
+"""Largest number of samples of a block. A block then fits into the cache; the number is not a power of two because
+columns at such distances evict each other from it."""
 PIECE_RAD = np.radians(2.0)
 PIECE_S = 0.2
-_SHORTEST = 3  # readings of a piece, as many as a parabola has coefficients
-_STEP_S = 1e-3  # step of the difference quotient for the acceleration; the spline is smooth over it
 
 
 @dataclass(frozen=True)
 class Curve:
-    """The gimbal angles of one slew as functions of elapsed time, s: ``angles`` (n,) -> (n, k), rad, and ``speeds``,
-    rad/s."""
+    """The gimbal angles of one slew as functions of elapsed time, s: ``angles`` (n,) -> (n, k), rad, ``speeds``, rad/s,
+    and their ``changes``, rad/s^2."""
 
     bench: Bench
     angles: Callable[[Floats], Floats]
     speeds: Callable[[Floats], Floats]
+    changes: Callable[[Floats], Floats]
 
     @classmethod
     def through(cls, bench: Bench, elapsed_s: Floats, pose: Floats) -> Curve:
@@ -43,7 +46,7 @@ class Curve:
         from scipy.interpolate import CubicSpline
 
         spline = CubicSpline(elapsed_s, pose)
-        return cls(bench, spline, spline.derivative())
+        return cls(bench, spline, spline.derivative(), spline.derivative(2))
 
     def rate(self, elapsed_s: Floats) -> Floats:
         """Angular rate omega (n, 3), rad/s, of the platform relative to the bench, in the platform frame.
@@ -56,8 +59,17 @@ class Curve:
         return omega
 
     def rate_change(self, elapsed_s: Floats) -> Floats:
-        """Angular acceleration domega/dt (n, 3), rad/s^2, in the platform frame."""
-        return (self.rate(elapsed_s + _STEP_S) - self.rate(elapsed_s - _STEP_S)) / (2.0 * _STEP_S)
+        """Angular acceleration domega/dt (n, 3), rad/s^2, in the platform frame.
+
+        dw_k/dt = R_k^T dw_(k-1)/dt + R_k^T w_(k-1) x axis_k dq_k/dt + axis_k d^2q_k/dt^2.
+        """
+        angles, speeds, changes = self.angles(elapsed_s), self.speeds(elapsed_s), self.changes(elapsed_s)
+        omega, change = np.zeros((2, len(elapsed_s), 3))
+        for k, axis in enumerate(map(np.array, self.bench.axes)):
+            omega, change = turn(omega, axis, -angles[:, k]), turn(change, axis, -angles[:, k])
+            change = change + crossed(omega, speeds[:, k, None] * axis) + changes[:, k, None] * axis
+            omega = omega + speeds[:, k, None] * axis
+        return change
 
     def cuts(self, elapsed_s: Floats) -> list[int]:
         """Indices at which readings at times ``elapsed_s`` (n,) are cut into pieces of at most about 2 deg and 0.2 s
@@ -67,7 +79,7 @@ class Curve:
         passed = np.cumsum(steps * (speed / PIECE_RAD + 1.0 / PIECE_S))
         edges = [0]
         for edge in np.searchsorted(passed, np.arange(1.0, passed[-1])).tolist():
-            if edge - edges[-1] >= _SHORTEST and len(elapsed_s) - edge >= _SHORTEST:
+            if edge - edges[-1] >= CURVE and len(elapsed_s) - edge >= CURVE:
                 edges.append(edge)
         return [*edges, len(elapsed_s)]
 
@@ -75,10 +87,8 @@ class Curve:
 LARGEST_MPS2 = 1e12
 """Readings beyond this are dropped. Counts of a 32-bit converter are below it, so that the check of the unit sees
 them."""
-LARGEST_RAD = 1e6
-"""Angles beyond this are dropped: 160 000 turns, of which a double keeps the fraction to 1e-10 rad."""
-LARGEST_C = 1e6
-"""Temperatures beyond this are dropped."""
+LARGEST = 1e6
+"""Angles in rad and temperatures in degC beyond this are dropped; of 160 000 turns a double keeps 1e-10 rad."""
 _ALTERNATING = 0.2  # squares of every second step over those of every step, which noise makes equal
 _PERIODS_S = (2e-5, 0.5)  # of accelerometers
 _TURNING_DEG = 1.0  # within one block; a platform that only creeps turns by less
@@ -86,7 +96,7 @@ _TURNING_DEG = 1.0  # within one block; a platform that only creeps turns by les
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """Up to 4000 consecutive readings of one dwell, or of the slew that ended it.
+    """Up to ``BLOCK_SAMPLES`` consecutive readings of one dwell, or of the slew that ended it.
 
     - dwell: number of the dwell, counted from 1.
     - arrival_s: its arrival according to the angles.
@@ -115,6 +125,14 @@ class Block:
     """Standard deviation of the pose due to noise of the angles."""
     turns: tuple[int, ...] = ()
     """Whole turns of each gimbal by which ``pose`` goes beyond the angles as recorded; () for quaternions."""
+
+    def __getitem__(self, rows: Indices | Mask) -> Block:
+        variance = self.variance_mps2_2
+        return replace(
+            self, elapsed_s=self.elapsed_s[rows], accel_mps2=self.accel_mps2[rows],
+            pose=self.pose if len(self.pose) == 1 else self.pose[rows], temperature_c=self.temperature_c[rows],
+            variance_mps2_2=None if variance is None else variance[rows],
+        )  # fmt: skip
 
 
 @dataclass
@@ -182,9 +200,9 @@ class Tally:
             "backward": f"readings whose stamps jumped back (first at {backward_s:.3f} s), dropped: {{}}.",
             "leaping": "readings with a stamp far ahead of their neighbours, dropped: {}.",
             "without_pose": "readings with no platform angle within 1 s of them, dropped: {}.",
-            "poses_dropped": f"angle messages not finite, beyond {LARGEST_RAD:.0e} rad, out of order of time or no "
+            "poses_dropped": f"angle messages not finite, beyond {LARGEST:.0e} rad, out of order of time or no "
             "unit quaternion, dropped: {}.",
-            "temperatures_dropped": f"temperatures not finite or beyond {LARGEST_C:.0e} degC, dropped: {{}}.",
+            "temperatures_dropped": f"temperatures not finite or beyond {LARGEST:.0e} degC, dropped: {{}}.",
             "gated": "outlying readings (innovation gate), rejected: {}; --no-gate keeps them.",
         }
         return [text.format(getattr(self, key)) for key, text in sentence_of.items() if getattr(self, key)]
@@ -219,10 +237,6 @@ def within(values: Floats, largest: float) -> Mask | None:
     return None if size.max(initial=0.0) <= largest else np.asarray((size <= largest).all(axis=1))
 
 
-SECOND_NS = 1_000_000_000
-_LEAP_NS = 10 * SECOND_NS  # a stamp this far ahead is damaged if the next one is earlier
-
-
 class StampOrder:
     """Keeps the samples of a stream whose stamps increase, and counts the others."""
 
@@ -238,7 +252,7 @@ class StampOrder:
             return stream
         begun = 1 if self.last_ns is None else stream.time_ns[0] - self.last_ns
         steps = np.diff(stream.time_ns)
-        if min(begun, steps.min(initial=1)) > 0 and max(begun, steps.max(initial=1)) < _LEAP_NS:
+        if min(begun, steps.min(initial=1)) > 0 and max(begun, steps.max(initial=1)) < LEAP_NS:
             self.last_ns = int(stream.time_ns[-1])
             return stream
         return self._one_by_one(stream, tally or Tally(), first_ns)
@@ -256,7 +270,7 @@ class StampOrder:
                     if tally.first_backward_s is None:
                         tally.first_backward_s = (self.last_ns - (first_ns or stamps[0])) / SECOND_NS
                 continue
-            if self.last_ns is not None and stamp - self.last_ns >= _LEAP_NS:
+            if self.last_ns is not None and stamp - self.last_ns >= LEAP_NS:
                 if i + 1 == len(stamps) and not self._ended:  # the next stamp tells a gap from damage
                     self._held_back = stream[i:]
                     break

@@ -10,29 +10,25 @@ resolve.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kf_calib.bench.arrays import Floats, Mask
+from kf_calib.bench.arrays import ROUNDING, Floats, Mask
+from kf_calib.dwells.limits import CUBIC, CURVE
 from kf_calib.dwells.line_spectrum import SpectralLine, independent
 from kf_calib.support.tail_probabilities import sidak
 
-_CELL_S = 0.125  # largest length of a cell, unless readings are less frequent
-_LONGEST = 1 << 15  # cells of a dwell that are kept at most: more than an hour
+CELL_S = 0.125
+"""Largest length of a cell, unless readings are less frequent: several periods of vibration."""
 MOST_CELLS = 1 << 17
-"""Cells of a run that are kept: four and a half hours, which take 4 MB."""
-_LONGEST_RUN = 1 << 20  # cells of a run that are transformed at most: a day and a half
-_FEWEST_CYCLES = 1.5  # per dwell; a parabola removes more than half of a slower oscillation
+"""Cells with readings that are kept of a run: four and a half hours, which take 4 MB."""
+_LONGEST_RUN = 1 << 20  # cells of a run, with pauses, from its first reading on, that are transformed: a day and a half
+_FEWEST_CYCLES = CURVE / 2  # per dwell: a parabola, of as many coefficients as half cycles, removes a slower one
 _HIGHEST = 0.75  # highest frequency, as a share of half the rate of cells
 _BANDS, _BAND_POINTS = 40, 16  # bands of equal ratio, with at least so many frequencies; their medians give the noise
-_DEGREE = 3  # degree of the polynomial through the logarithms of these medians
-_ROUNDING = 1e-12  # relative to a reading
-_KNOTS = 1000
-_TALL = 32  # number of tallest peaks that are compared by their p-values
-_MEDIAN_EFFICIENCY = 0.48  # efficiency of the median of independent exponential variates
 
 
 @dataclass(frozen=True)
@@ -52,7 +48,7 @@ class Cells:
         if len(elapsed_s) < 3:
             return None
         step_s = float(np.median(np.diff(elapsed_s)))
-        return cls(step_s, max(1, int(_CELL_S / step_s)))
+        return cls(step_s, max(1, int(CELL_S / step_s)))
 
     @property
     def cell_s(self) -> float:
@@ -69,7 +65,7 @@ class Trace:
     """Sums (m, 3) and counts (m,) of a dwell's readings in consecutive cells of the run's clock, beginning with cell
     ``first``."""
 
-    cell_s: float = _CELL_S
+    cell_s: float = CELL_S
     first: int = 0
     sums: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     counts: Floats = field(default_factory=lambda: np.zeros(0))
@@ -78,10 +74,12 @@ class Trace:
     def of(cls, readings: Floats, elapsed_s: Floats, into: Cells) -> Trace:
         """The sums of a block of readings (n, 3) at increasing times (n,)."""
         cells = into.numbers(elapsed_s)
+        kept = int(np.searchsorted(cells, _LONGEST_RUN))
+        if not kept:
+            return cls()
+        cells, readings = cells[:kept], readings[:kept]
         starts = np.append(0, np.flatnonzero(cells[1:] != cells[:-1]) + 1)
         positions, length = cells[starts] - cells[0], int(cells[-1] - cells[0]) + 1
-        if length > _LONGEST:
-            return cls()
         sums, counts = np.zeros((length, 3)), np.zeros(length)
         sums[positions] = np.add.reduceat(readings, starts, axis=0)
         counts[positions] = np.diff(starts, append=len(cells))
@@ -90,18 +88,19 @@ class Trace:
     def __len__(self) -> int:
         return len(self.counts)
 
-    def __add__(self, other: Trace) -> Trace:
-        if not len(self) or not len(other):
-            return self if len(self) else other
-        first, end = min(self.first, other.first), max(self.first + len(self), other.first + len(other))
-        if end - first > _LONGEST or other.cell_s != self.cell_s:
-            return self
+    @classmethod
+    def joined(cls, some: Iterable[Trace]) -> Trace:
+        """The sums of all blocks of a dwell."""
+        traces = [trace for trace in some if len(trace)]
+        if len(traces) < 2:
+            return traces[0] if traces else cls()
+        first, end = _ends(traces)
         sums, counts = np.zeros((end - first, 3)), np.zeros(end - first)
-        for trace in (self, other):
+        for trace in traces:
             part = slice(trace.first - first, trace.first - first + len(trace))
             sums[part] += trace.sums
             counts[part] += trace.counts
-        return Trace(self.cell_s, first, sums, counts)
+        return cls(traces[0].cell_s, first, sums, counts)
 
     @property
     def residual_sums(self) -> Floats:
@@ -119,7 +118,7 @@ class Trace:
 def band_hz(traces: Sequence[Trace]) -> tuple[float, float]:
     """Lowest and highest frequency at which ``tone`` searches; infinite if it cannot."""
     recorded = [trace for trace in traces if len(trace)]
-    if not recorded or np.diff(_ends(recorded)) > _LONGEST_RUN:
+    if not recorded:
         return np.inf, np.inf
     low, high = _FEWEST_CYCLES / _median_dwell_s(recorded), _HIGHEST * 0.5 / recorded[0].cell_s
     return (low, high) if high > 2.0 * low else (np.inf, np.inf)
@@ -155,24 +154,22 @@ def tone(traces: Sequence[Trace], level: float = 0.01) -> SpectralLine | None:
     for trace in recorded:
         grid[:, trace.first - first :][:, : len(trace)] += trace.residual_sums.T
     largest = max(float(np.abs(trace.sums).max()) for trace in recorded)
-    varying = np.asarray(np.abs(grid).max(axis=1) > _ROUNDING * largest)
+    varying = np.asarray(np.abs(grid).max(axis=1) > ROUNDING * largest)
     cell_s = recorded[0].cell_s
     step_hz = 1.0 / (size * cell_s)
     band = slice(int(np.ceil(low_hz / step_hz)), int(high_hz / step_hz) + 1)
-    if not varying.any() or band.stop - band.start < _DEGREE * _BAND_POINTS:
+    if not varying.any() or band.stop - band.start < CUBIC * _BAND_POINTS:
         return None
     frequency_hz = step_hz * np.arange(band.start, band.stop, dtype=float)
     wave = np.fft.rfft(grid, size, axis=1)[:, band]
-    knots = np.geomspace(frequency_hz[0], frequency_hz[-1], _KNOTS)
-    passed_share = np.interp(frequency_hz, knots, _share_beside_parabola(np.pi * knots * _median_dwell_s(recorded)))
+    passed_share = _share_beside_parabola(np.pi * frequency_hz * _median_dwell_s(recorded))
     power = (wave.real**2 + wave.imag**2)[varying] / passed_share
     levels, variance = _levels(power, frequency_hz, size / (end - first))
     heights = power / levels
     freedom, height = 2.0 * independent(heights.T), heights.mean(axis=0)
-    tall = np.argsort(height)[-_TALL:]
-    chances = fdtrc(freedom, freedom / variance[tall], height[tall])
-    k, chance = int(tall[np.argmin(chances)]), float(chances.min())
-    p_value = sidak(chance, len(height))
+    chances = fdtrc(freedom, freedom / variance, height)
+    k = int(np.argmax(np.where(chances <= chances.min(), height, 0.0)))  # the tallest of those beyond any chance
+    p_value = sidak(float(chances[k]), len(height))
     if p_value >= level or not _steady(recorded, frequency_hz[k], levels[:, k] * passed_share[k], varying):
         return None
     gain = passed_share[k] * np.sinc(frequency_hz[k] * cell_s) * sum(float(trace.counts.sum()) for trace in recorded)
@@ -204,19 +201,21 @@ def _share_beside_parabola(half_phase: Floats) -> Floats:
     """Return the share of a sinusoid's power that remains after a parabola over a dwell is removed.
 
     If the phase advances by 2 x over the dwell, the share is 1 - sum over l = 0, 1, 2 of (2 l + 1) j_l(x)^2, where j_l
-    are the spherical Bessel functions.
+    are the spherical Bessel functions; x is beyond 1, so that nothing cancels in their closed form.
     """
-    from scipy.special import spherical_jn
-
-    orders = np.arange(3)[:, None]
-    return 1.0 - np.sum((2 * orders + 1) * spherical_jn(orders, half_phase) ** 2, axis=0)
+    x = half_phase
+    first = np.sin(x) / x
+    second = (first - np.cos(x)) / x
+    third = 3.0 * second / x - first
+    return 1.0 - first**2 - 3.0 * second**2 - 5.0 * third**2
 
 
 def _levels(power: Floats, frequency_hz: Floats, padded: float) -> tuple[Floats, Floats]:
     """Return the noise level (c, b) of |X|^2 (c, b) as a smooth curve, and the relative variance (b,) of the curve.
 
     The curve is a cubic through the logarithms of medians in bands. Medians are insensitive to lines, and a cubic
-    follows white noise as well as noise that rises to low frequencies. ``padded`` is the number of frequencies per
+    follows white noise as well as noise that rises to low frequencies. The median of independent exponential variates,
+    ln 2 times their mean, is as precise as the mean of (ln 2)^2 as many. ``padded`` is the number of frequencies per
     independent one.
     """
     x = np.log(frequency_hz)
@@ -231,8 +230,8 @@ def _levels(power: Floats, frequency_hz: Floats, padded: float) -> tuple[Floats,
     centres = np.array([x[a:b].mean() for a, b in itertools.pairwise(ends)])
     medians = np.array([np.median(power[:, a:b], axis=1) for a, b in itertools.pairwise(ends)])
     logs = np.log(np.maximum(medians / np.log(2.0), 1e-300))
-    weights = np.sqrt(_MEDIAN_EFFICIENCY * np.diff(ends) / padded)[:, None]
-    degree = min(_DEGREE, len(centres) - 1)
+    weights = np.log(2.0) * np.sqrt(np.diff(ends) / padded)[:, None]
+    degree = min(CUBIC, len(centres) - 1)
     basis, upper = np.linalg.qr(weights * np.vander(centres, degree + 1))
     curve = np.vander(x, degree + 1) @ np.linalg.inv(upper)
     return np.exp(curve @ (basis.T @ (weights * logs))).T, (curve**2).sum(axis=1)

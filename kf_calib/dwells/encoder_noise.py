@@ -13,19 +13,19 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import Stream
+from kf_calib.dwells.limits import CURVE, SAMPLE
+from kf_calib.support.tail_probabilities import normal_quantile
 
-_COUNT = 32  # messages of a block
 _BLOCKS = 5  # the median of whose noises is taken
 _WHITE = 0.6  # least ratio of white noise by third differences to that by second ones
 _LONGEST_PERIOD_NS = 100_100_000  # messages farther apart than this do not tell noise from the beginning of a motion
-_MEDIAN = 0.6745  # of the absolute value of a normal number of unit variance
 
 
 def encoder_sigma(poses: Floats) -> Floats:
     """Noise of the components of a message, one standard deviation (k,), from poses (n, k); 0 for fewer than three."""
-    return (
-        np.sqrt(np.mean(np.diff(poses, 2, axis=0) ** 2, axis=0) / 6.0) if len(poses) > 2 else np.zeros(poses.shape[1])
-    )
+    if len(poses) < CURVE:
+        return np.zeros(poses.shape[1])
+    return np.asarray(np.sqrt(np.mean(np.diff(poses, 2, axis=0) ** 2, axis=0) / 6.0), float)
 
 
 def distance_sigma(sigma: Floats, is_quaternion: bool) -> Floats:
@@ -50,12 +50,12 @@ class EncoderNoise:
 
     def waits_for_more(self, pose: Stream) -> bool:
         """Tell whether these messages, all that came so far, are too few for the noise of the first ones."""
-        return not self._noises.size and len(pose) < _COUNT and not _begins_slowly(pose)
+        return not self._noises.size and len(pose) < SAMPLE and not _begins_slowly(pose)
 
     def of_next(self, pose: Stream) -> Floats:
         """The noise (m,) of distances of these messages, which are the next ones, from their poses, rad."""
         stream = self._waiting + pose
-        complete = len(stream) // _COUNT * _COUNT
+        complete = len(stream) // SAMPLE * SAMPLE
         noises = self._of_blocks(stream[:complete])
         if not self._noises.size:
             known = len(noises) and np.isfinite(noises[0]) and not _begins_slowly(pose)
@@ -64,20 +64,21 @@ class EncoderNoise:
         noises = noises[np.maximum.accumulate(np.where(np.isfinite(noises), np.arange(len(noises)), 0))]
         usual = np.median(np.lib.stride_tricks.sliding_window_view(noises, _BLOCKS), axis=1)
         self._noises, self._waiting = noises[-_BLOCKS:], stream[complete:]
-        return np.repeat(usual, _COUNT)[len(stream) - len(pose) : len(stream)]
+        return np.repeat(usual, SAMPLE)[len(stream) - len(pose) : len(stream)]
 
     def _of_blocks(self, stream: Stream) -> Floats:
         """Return the noise (b,) of complete blocks, rad; NaN of those in which the platform moves."""
-        values = stream.values.reshape(-1, _COUNT, stream.values.shape[1])
+        values = stream.values.reshape(-1, SAMPLE, stream.values.shape[1])
+        usual = normal_quantile(0.75)  # size of a normal number of unit variance
         by_second, by_third = (
             distance_sigma(
-                np.median(np.abs(np.diff(values, order, axis=1)), axis=1) / (_MEDIAN * math.sqrt(variance)),
+                np.median(np.abs(np.diff(values, order, axis=1)), axis=1) / (usual * math.sqrt(variance)),
                 self._is_quaternion,
             )
             for order, variance in ((2, 6.0), (3, 20.0))
         )
-        stamps = stream.time_ns.reshape(-1, _COUNT)
-        slow = stamps[:, -1] - stamps[:, 0] > (_COUNT - 1) * _LONGEST_PERIOD_NS
+        stamps = stream.time_ns.reshape(-1, SAMPLE)
+        slow = stamps[:, -1] - stamps[:, 0] > (SAMPLE - 1) * _LONGEST_PERIOD_NS
         return np.where(by_third < _WHITE * by_second, np.nan, np.where(slow, 0.0, by_third))
 
 

@@ -16,7 +16,9 @@ import numpy as np
 from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Orientations
+from kf_calib.dwells.blocks import BLOCK_SAMPLES
 from kf_calib.dwells.coherent_tone import MOST_CELLS, Cells, Trace
+from kf_calib.dwells.limits import CURVE, FEWEST_READINGS
 from kf_calib.dwells.line_spectrum import Spectrum
 from kf_calib.dwells.pieces import FEWEST_PIECES, MOST_PIECES, MOST_RUN_PIECES, MOST_SLEW_PIECES, Pieces, coarsened
 from kf_calib.dwells.qr import square_triangle
@@ -24,8 +26,6 @@ from kf_calib.dwells.rows import Nodes, Rows, basis
 from kf_calib.dwells.sufficient_statistics import Autocovariance, Dwell
 from kf_calib.dwells.table import DwellTable, FoldedDwells
 from kf_calib.dwells.window_average import orthonormal_parabola
-
-_CORRELATED_SAMPLES = 8192  # first readings of a dwell over which its autocovariance is accumulated, at least
 
 
 def fold(rows: Rows, carrier_hz: float = 0.0) -> Pieces:
@@ -159,7 +159,7 @@ class Folder:
             turns=rows.turns,
         )  # fmt: skip
         innovation, readings = rows.without_rotations
-        if not rows.moving and growing.autocovariance_count(rows.dwell) < _CORRELATED_SAMPLES:
+        if not rows.moving and growing.autocovariance_count(rows.dwell) <= 2 * BLOCK_SAMPLES:  # of the first blocks
             residuals = detrended(innovation, rows.elapsed_s, self.carrier_hz)
             autocovariance, spectrum = Autocovariance.of(residuals), Spectrum.of(residuals, rows.elapsed_s)
             block = replace(block, autocovariance=autocovariance, spectrum=spectrum)
@@ -173,12 +173,6 @@ class Folder:
             while self._slew_pieces > MOST_SLEW_PIECES and len(self.slews) > 1:
                 self._every *= 2
                 self.slews = [slew for slew in self.slews if (slew.number - 1) % self._every == 0]
-
-
-LEAST_COUNT = 8
-"""A standard deviation of fewer readings counts as if there were more readings of more noise: the same sigma of the
-mean."""
-_CURVE = 3  # basis functions of a piece
 
 
 def dwells_of_table(table: Orientations, bench: Bench) -> DwellTable:
@@ -207,9 +201,10 @@ def rows_of_table(table: Orientations, bench: Bench) -> Iterator[Rows]:
 
 
 def _times(table: Orientations) -> int:
-    """Return by how much the counts have to be multiplied."""
+    """Return by how much the counts have to be multiplied: a standard deviation of few readings counts as if there were
+    more readings of more noise, the same sigma of the mean."""
     counts = table.counts[_scattering(table)]
-    return math.ceil(LEAST_COUNT / int(counts.min(initial=LEAST_COUNT))) if counts.size else 1
+    return math.ceil(FEWEST_READINGS / int(counts.min(initial=FEWEST_READINGS))) if counts.size else 1
 
 
 def _scattering(table: Orientations) -> Mask:
@@ -234,12 +229,12 @@ def _nodes(table: Orientations, bench: Bench) -> Nodes:
 def _triangles(table: Orientations, times: int) -> Floats:
     """Return the triangles (D, 6, 6) of the one piece of each dwell."""
     counts, scattering = (table.counts * times).astype(float), np.flatnonzero(_scattering(table))
-    triangles = np.zeros((len(counts), _CURVE + 3, _CURVE + 3))
+    triangles = np.zeros((len(counts), CURVE + 3, CURVE + 3))
     triangles[:, 0, 0] = np.sqrt(counts)
-    triangles[:, 0, _CURVE:] = np.sqrt(counts)[:, None] * table.mean_mps2
+    triangles[:, 0, CURVE:] = np.sqrt(counts)[:, None] * table.mean_mps2
     if table.sigma_mps2 is not None:  # about a parabola, because the noise model assumes so
-        freedom = times * (counts[scattering, None] - _CURVE)
-        triangles[scattering[:, None], _CURVE + np.arange(3), _CURVE + np.arange(3)] = table.sigma_mps2[
+        freedom = times * (counts[scattering, None] - CURVE)
+        triangles[scattering[:, None], CURVE + np.arange(3), CURVE + np.arange(3)] = table.sigma_mps2[
             scattering
         ] * np.sqrt(freedom)
     return triangles

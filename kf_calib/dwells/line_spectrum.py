@@ -15,15 +15,16 @@ from functools import lru_cache, reduce
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, Mask
+from kf_calib.dwells.limits import CUBIC, CURVE, SAMPLE
 from kf_calib.support.tail_probabilities import sidak
 
 _LENGTHS = np.array(sorted([4000, *(2**k for k in range(6, 12)), *(3 * 2**k for k in range(5, 11))]))
-_FIRST_BIN = 3  # in lower bins the parabola has removed the power
+_FIRST_BIN = CURVE  # in lower bins the parabola has removed the power
 _ORDER = 8
-_NEIGHBOURS, _SKIPPED = 32, 3  # bins on either side that give the level, without those that a line may fill
+_SKIPPED = 3  # nearest bins on either side, which a line may fill, of the ``SAMPLE`` that give the level
 _MEDIAN_EFFICIENCY = 0.45  # efficiency of the median of bins that the Hann window has correlated
-_RISE_BINS, _CUBIC = 128, 3  # up to this bin a rise that no autoregression follows (1/f) is fitted
-_MOST_LINES = 5
+_RISE_BINS = 128  # up to this bin a rise that no autoregression follows (1/f) is fitted
+_MOST_LINES = 5  # that are told; what swings like a square wave has dozens
 _LEAK = 0.05  # bins into which a line leaks more than this share of the level are not searched for another
 
 
@@ -177,7 +178,7 @@ class _Search:
         """Return the probability that noise alone makes bin ``k`` as high as it is."""
         from scipy.special import fdtrc
 
-        neighbours = max(min(2 * (_NEIGHBOURS - _SKIPPED), len(self.height) - 2 * _SKIPPED), 1)
+        neighbours = max(min(2 * (SAMPLE - _SKIPPED), len(self.height) - 2 * _SKIPPED), 1)
         relative = 1.0 / (_MEDIAN_EFFICIENCY * neighbours) + _leverages(len(self.height))[k]
         return float(fdtrc(self.freedom, self.freedom / relative, self.height[k]))
 
@@ -232,7 +233,7 @@ def _level(power: Floats, segments: int) -> Floats:
         slope = 1.0 / np.abs(np.fft.rfft(a, length)) ** 2
         bound = slope * np.median(power / slope)
     slope = slope * _rise(power / slope)
-    median = _running_median(power / slope, _NEIGHBOURS, _SKIPPED)
+    median = _running_median(power / slope, SAMPLE, _SKIPPED)
     return slope * median * segments / float(gammaincinv(segments, 0.5))
 
 
@@ -262,7 +263,7 @@ def _leverages(count: int) -> Floats:
 def _cubic(count: int) -> Floats:
     """Return an orthonormal basis (n, 4) of 1, x, x^2, x^3, where x is the logarithm of the lowest bin numbers."""
     x = np.log(np.arange(_FIRST_BIN, min(_RISE_BINS, count - 1)))
-    return np.linalg.qr(np.vander(x - x.mean(), _CUBIC + 1))[0]
+    return np.linalg.qr(np.vander(x - x.mean(), CUBIC + 1))[0]
 
 
 def _running_median(values: Floats, reach: int, skipped: int) -> Floats:

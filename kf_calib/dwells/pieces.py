@@ -19,11 +19,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 
-from kf_calib.bench.arrays import ComputedSequence, Floats, Indices, Ints
+from kf_calib.bench.arrays import ROUNDING, ComputedSequence, Floats, Indices, Ints
+from kf_calib.dwells.limits import CURVE
 from kf_calib.dwells.qr import triangle
 from kf_calib.dwells.rows import Nodes, basis, on_basis, parabola
 
@@ -36,7 +36,7 @@ MOST_SLEW_PIECES = 1 << 15
 """Pieces of all slews of a run, beyond which every second slew is left out: 300 slews of 20 s have as many."""
 FEWEST_PIECES = 16
 """Dwells of no more pieces are left as they are: so many have lengths that double from 1 s to hours."""
-_THREE = np.arange(3)  # nodes of a piece
+_NODES = np.arange(CURVE)  # of a piece
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -75,7 +75,7 @@ class Pieces:
 
     def __getitem__(self, part: slice | Indices) -> Pieces:
         at = np.arange(len(self))[part]
-        nodes = (3 * at[:, None] + _THREE).ravel()
+        nodes = (3 * at[:, None] + _NODES).ravel()
         return replace(
             self, triangles=self.triangles[part], nodes=self.nodes[nodes], counts=self.counts[part],
             reading_counts=self.reading_counts[part],
@@ -209,9 +209,6 @@ def basis_values(columns: Floats) -> Floats:
     return on_basis(columns.reshape(*columns.shape[:-2], -1))
 
 
-_LEAST = 1e-12  # relative to the largest variance; smaller modes are rounding
-
-
 @dataclass(frozen=True)
 class WalkPath:
     """The effect of a random walk of intensity q = 1 on the r rows of a dwell's triangles.
@@ -244,7 +241,7 @@ def walk_path_of(begins_s: Floats, ends_s: Floats, counts: Sequence[int], triang
     total = float(end @ end)
     share = onto @ end / total if total > 0 else np.zeros(len(onto))
     axes, sizes, _ = np.linalg.svd(onto - np.outer(share, end), full_matrices=False)
-    significant = sizes**2 > _LEAST * max(float(sizes[0]) ** 2, 1e-300)
+    significant = sizes**2 > ROUNDING * max(float(sizes[0]) ** 2, 1e-300)
     spans = np.maximum(ends_s - begins_s, 0.0)
     about_parabola = spans * np.array([_moments(count)[1] / max(count - 1, 1) for count in counts])
     return WalkPath(share - triangles[:, :, 0].ravel(), axes[:, significant], sizes[significant] ** 2, about_parabola)
@@ -272,29 +269,21 @@ def _root(begins_s: Floats, ends_s: Floats, counts: Sequence[int]) -> tuple[Floa
     return coefficients, level
 
 
-_MANY = 1 << 14
-"""Readings of a piece above which the moments of a walk are those of a continuous one, to 1e-4 of them."""
-
-
-@lru_cache(maxsize=4096)
 def _moments(count: int) -> tuple[Floats, float]:
     """Return moments of a walk with unit steps over ``count`` readings that begins at zero.
 
-    They are the covariance (4, 4) of the coefficients of its parabola on 1, u, u^2 and of its last value, and the mean
-    sum of squares about the parabola.
+    They are the covariance (4, 4) of the coefficients of its least-squares parabola on 1, u, u^2 and of its last value,
+    and the sum of squares about the parabola, 3 (n^2 - 9) / 70: sums over the covariance min(i, j) of the values.
     """
-    if count > _MANY:  # of so many readings, it grows with their number, and the mean square with that of its square
-        covariance, squares = _moments(_MANY)
-        return covariance * (count / _MANY), squares * (count / _MANY) ** 2
-    u = np.linspace(-1.0, 1.0, count)
-    design = np.column_stack([np.ones(count), u, u * u]) if count > 1 else np.array([[1.0, 0.0, 0.0]])
-    last = np.zeros((count, 1))
-    last[-1] = 1.0
-    weights = np.hstack([np.linalg.pinv(design).T, last])
-    later = np.cumsum(weights[::-1], axis=0)[::-1][1:]  # each step moves all later readings
-    covariance = later.T @ later
-    inside = float(np.trace(design.T @ design @ covariance[:3, :3]))
-    return covariance, max(0.5 * count * (count - 1) - inside, 0.0)
+    n = float(count)
+    if count < CURVE:  # one reading, or the line through two
+        line = np.array([0.5, 0.5, 0.0, 1.0])
+        return (n - 1.0) * np.outer(line, line), 0.0
+    whole = 56.0 * n * (n**2 - 4.0)
+    level, bend = (25.0 * n**3 - 3.0 * n**2 - 85.0 * n + 27.0) / whole, -3.0 * (n - 1.0) * (4.0 * n**2 - 1.0) / whole
+    slope, square = 0.3 * (n**2 + 1.0) / (n * (n + 1.0)), 15.0 * (n - 1.0) ** 2 * (n**2 + 5.0) / (whole * (n + 1.0))
+    covariance = [[level, 0.25, bend, 0.5], [0.25, slope, 0.0, 0.5], [bend, 0.0, square, 0.0], [0.5, 0.5, 0.0, 1.0]]
+    return (n - 1.0) * np.array(covariance), 3.0 * (n**2 - 9.0) / 70.0
 
 
 def lagged_walk_products(period_s: float, size: int, pairs: Floats) -> Floats:

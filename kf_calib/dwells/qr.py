@@ -8,9 +8,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from kf_calib.bench.arrays import Floats, Mask
-
-_PART = 1024  # rows that are decomposed at once, so that they and their copies stay in the cache
+from kf_calib.bench.arrays import AT_ONCE, Floats, Mask
 
 
 def triangle(rows: NDArray[np.floating[Any]]) -> Floats:
@@ -19,7 +17,7 @@ def triangle(rows: NDArray[np.floating[Any]]) -> Floats:
     Only orthogonal transformations are used, so that the condition number is that of the rows, not its square.
     """
     count, width = rows.shape[-2:]
-    part = max(_PART, 4 * width)
+    part = max(AT_ONCE, 4 * width)
     if rows.ndim == 2 and count >= 4 * part:
         whole = count // part * part
         rows = np.vstack([*(triangle(rows[k : k + part]) for k in range(0, whole, part)), rows[whole:]])
@@ -50,7 +48,7 @@ def orthonormal(rows: Floats) -> tuple[Floats, Floats]:
     To save memory, Q may overwrite the rows.
     """
     count, width = rows.shape
-    part = max(_PART, 4 * width)
+    part = max(AT_ONCE, 4 * width)
     if count < 2 * part or not width:
         return np.linalg.qr(rows)
     parts = [slice(k, min(k + part, count)) for k in range(0, count - width, part)]
@@ -68,9 +66,22 @@ def multiplied(rows: Floats, matrix: Floats) -> Floats:
     """The product (m, l) of rows (m, n) and a matrix (n, l) that is no wider; to save memory, it overwrites the
     rows."""
     product = rows[:, : matrix.shape[1]]
-    for part in (slice(k, k + _PART) for k in range(0, len(rows), _PART)):
+    for part in (slice(k, k + AT_ONCE) for k in range(0, len(rows), AT_ONCE)):
         product[part] = rows[part] @ matrix
     return product
+
+
+def spanned(columns: Floats) -> tuple[Floats, Floats, float]:
+    """What columns (m, n) span: an orthonormal basis (m, r), the matrix (n, r) from its coefficients to theirs, and the
+    logarithm of their volume; rounding counts as nothing. To save memory, the columns are overwritten."""
+    lengths = np.sqrt(np.einsum("ij,ij->j", columns, columns))
+    lengths = np.where(lengths > 0.0, lengths, 1.0)
+    columns /= lengths
+    rows, upper = orthonormal(columns)
+    turn, singular, right = np.linalg.svd(upper, full_matrices=False)
+    seen = singular > 1e-9 * singular.max(initial=0.0)
+    log_volume = float(np.log(singular[seen]).sum() + np.log(lengths).sum())
+    return multiplied(rows, turn[:, seen]), right[seen].T / singular[seen] / lengths[:, None], log_volume
 
 
 def inverse_of_lower(lower: Floats) -> Floats:

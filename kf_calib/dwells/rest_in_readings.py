@@ -26,18 +26,16 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
-from kf_calib.bench.streams import Batch, Source, Stream
-from kf_calib.dwells.blocks import SECOND_NS, Block, Tally, carry_on
-from kf_calib.dwells.segmenter import BLOCK_SAMPLES, Segmenter, dwell_blocks
-from kf_calib.dwells.stationarity import Stillness
+from kf_calib.bench.streams import SECOND_NS, Batch, Source, Stream
+from kf_calib.dwells.blocks import BLOCK_SAMPLES, Block, Tally, carry_on
+from kf_calib.dwells.limits import FEWEST_COMPARED, SAMPLE, SIGMAS
+from kf_calib.dwells.segmenter import Segmenter, dwell_blocks
+from kf_calib.dwells.stationarity import READING_WINDOW_NS, Stillness
+from kf_calib.support.tail_probabilities import normal_quantile
 
-_WINDOW_NS = SECOND_NS // 4
-_FEWEST = 4  # readings of a window
-_PERIODS = 32  # intervals between the first readings, whose median tells how many readings a window has
-_LEAST_WINDOWS = 4  # of a dwell
+_LEAST_WINDOWS = SECOND_NS // READING_WINDOW_NS  # of a dwell
 _REMEMBERED = 1200  # windows whose variances tell the noise: five minutes
 _VARIANCE_MARGIN = 1.5  # correlated noise has fewer degrees of freedom than readings
-_SIGMAS = 6.0
 _LEAST_G, _MOST_G = 1e-5, 0.05  # scatter that is never, and always, called a motion, in g
 _ANY_ATTITUDE = np.array([[0.0, 0.0, 0.0, 1.0]])  # stands for an attitude that is not known
 
@@ -100,40 +98,35 @@ class RestSegmenter(Segmenter):
         The last window of a run also takes the readings that do not fill another one; therefore a window is judged only
         when the next one is complete.
         """
-        for begin, end, mean, variance in self._windows(final):
-            window = _Window(begin, end, mean, variance)
+        for window in self._windows(final):
             assert self._noise is not None
-            self._noise.add(variance)
-            yield from self._add_window(window, *self._noise.bounds(end - begin))
+            self._noise.add(window.variance)
+            yield from self._add_window(window, *self._noise.bounds(window.end - window.begin))
         run = self._run
         if run is not None and run.number is not None:
             yield from self._whole_blocks(run)
         self._skip_to(self._window_begin if run is None else min(run.begin, self._window_begin))
         self._forget_temperatures()
 
-    def _windows(self, final: bool) -> Iterator[tuple[int, int, Floats, float]]:
-        """Yield place of the first reading, of the one after the last, mean (3,) and variance of each new window."""
+    def _windows(self, final: bool) -> Iterator[_Window]:
+        """Yield the windows that are new."""
         if not self._size and not self._knows_window_size(final):
             return
         values = self._accel.values[self._window_begin - self._dropped :]
-        size, count = self._size, len(values) // self._size - 1
-        if count > 0:
-            parts = values[: count * size].reshape(count, size, 3)
+        whole = max(len(values) // self._size - 1, 0) * self._size
+        equal, rest = values[:whole].reshape(-1, self._size, 3), values[None, whole:]
+        for parts in (equal, rest) if final and len(values) >= self._size else (equal,):
             means, variances = parts.mean(axis=1), parts.var(axis=1, ddof=1).sum(axis=1)
-            for k in range(count):
-                begin, self._window_begin = self._window_begin, self._window_begin + size
-                yield begin, self._window_begin, means[k], float(variances[k])
-        if final and count >= 0:
-            remainder, begin = values[count * size :], self._window_begin
-            self._window_begin += len(remainder)
-            yield begin, self._window_begin, remainder.mean(axis=0), float(remainder.var(axis=0, ddof=1).sum())
+            for mean, variance in zip(means, variances.tolist(), strict=True):
+                begin, self._window_begin = self._window_begin, self._window_begin + parts.shape[1]
+                yield _Window(begin, self._window_begin, mean, variance)
 
     def _knows_window_size(self, final: bool) -> bool:
         """Settle how many readings a window has; tell whether that is known by now."""
-        if len(self._accel) <= _PERIODS and not (final and len(self._accel) >= 2 * _FEWEST):
+        if len(self._accel) <= SAMPLE and not (final and len(self._accel) >= 2 * FEWEST_COMPARED):
             return False
-        period_ns = float(np.median(np.diff(self._accel.time_ns[: _PERIODS + 1])))
-        self._size = max(_FEWEST, round(_WINDOW_NS / max(period_ns, 1.0)))
+        period_ns = float(np.median(np.diff(self._accel.time_ns[: SAMPLE + 1])))
+        self._size = max(FEWEST_COMPARED, round(READING_WINDOW_NS / max(period_ns, 1.0)))
         self._noise = _RestNoise(self.bench.gravity_mps2, 3 * (self._size - 1), self.stillness.tolerance_rad)
         return True
 
@@ -203,14 +196,13 @@ class RestSegmenter(Segmenter):
 
     def _next_block(self, run: _StillRun, count: int) -> Block:
         """Make a block of the next readings of a dwell, whose attitude is not known."""
-        assert run.number is not None and self.first_ns is not None
+        assert run.number is not None
         readings = self._accel[:count]
         self._release(count)
         self.tally.used += count
-        elapsed_s = (readings.time_ns - self.first_ns) / SECOND_NS
-        temperature_c = carry_on(self._temperature, readings.time_ns)
+        times_s, temperature_c = self._elapsed_s(readings.time_ns), carry_on(self._temperature, readings.time_ns)
         return Block(
-            run.number, self._elapsed_s(run.arrival_ns), elapsed_s, readings.values, _ANY_ATTITUDE, temperature_c
+            run.number, self._elapsed_s(run.arrival_ns), times_s, readings.values, _ANY_ATTITUDE, temperature_c
         )
 
     def _skip_to(self, index: int) -> None:
@@ -231,10 +223,6 @@ class RestSegmenter(Segmenter):
     def _stamp(self, index: int) -> int:
         """Return the stamp of a reading that waits."""
         return int(self._accel.time_ns[index - self._dropped])
-
-    def _elapsed_s(self, stamp_ns: int) -> float:
-        assert self.first_ns is not None
-        return (stamp_ns - self.first_ns) / SECOND_NS
 
     def _forget_temperatures(self) -> None:
         """Drop the temperatures that no waiting reading needs."""
@@ -320,8 +308,8 @@ class _RestNoise:
         low, high = self.ordered[math.floor(rank)], self.ordered[math.ceil(rank)]
         quartile = low + (rank - math.floor(rank)) * (high - low)
         least, most = (_LEAST_G * self.gravity_mps2) ** 2, (_MOST_G * self.gravity_mps2) ** 2
-        noise = min(quartile / _chi_squared(-0.674, self.freedom), most) + least
-        allowed = _SIGMAS * math.sqrt(noise / count) + self.tolerance_rad * self.gravity_mps2
+        noise = min(quartile / _chi_squared(normal_quantile(0.25), self.freedom), most) + least
+        allowed = SIGMAS * math.sqrt(noise / count) + self.tolerance_rad * self.gravity_mps2
         return _VARIANCE_MARGIN * _chi_squared(5.0, self.freedom) * noise, allowed
 
 

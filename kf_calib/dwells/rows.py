@@ -18,7 +18,9 @@ import numpy as np
 from kf_calib.bench.arrays import Floats, Indices, Mask
 from kf_calib.bench.bench import Bench
 from kf_calib.dwells.blocks import Block, Curve, Tally
+from kf_calib.dwells.limits import FEWEST_READINGS, SAMPLE, SIGMAS
 from kf_calib.dwells.window_average import average
+from kf_calib.support.tail_probabilities import normal_quantile
 
 REGRESSORS = ("1", "f_x", "f_y", "f_z")
 
@@ -153,7 +155,7 @@ class Rows:
 
 
 def model_rows(
-    blocks: Iterable[Block], bench: Bench, tally: Tally, gate_sigma: float | None = 6.0, window_s: float = 0.0
+    blocks: Iterable[Block], bench: Bench, tally: Tally, gate_sigma: float | None = SIGMAS, window_s: float = 0.0
 ) -> Iterator[Rows]:
     """Rows of every block, without outliers; both engines and batch least squares work on the same rows.
 
@@ -176,28 +178,15 @@ def model_rows(
         if averaged is None:
             continue
         block, rows = averaged, _rows(averaged, bench, force) if window_s else raw
-        if gate_sigma is not None and (not window_s or len(rows.readings) >= _GATED):
+        if gate_sigma is not None and (not window_s or len(rows.readings) >= SAMPLE):
             keep = inliers(rows.columns, rows.readings, rows.innovation, static, gate_sigma)
             if keep is not None:
                 tally.gated += int((~keep).sum())
                 rejected = rows.innovation[:, ~keep]
-                block = _select(block, keep)
+                block = block[keep]
                 rows = _rows(block, bench, force)
                 rows = replace(rows, gated=channels(rejected, rows.innovation, gate_sigma))
         yield replace(rows, raw=raw, readings_per_row=block.readings_per_row) if window_s else rows
-
-
-def _select(block: Block, keep: Mask) -> Block:
-    """Return the block with only the readings in ``keep``."""
-    pose = block.pose if len(block.pose) == 1 else block.pose[keep]
-    return replace(
-        block,
-        elapsed_s=block.elapsed_s[keep],
-        accel_mps2=block.accel_mps2[keep],
-        pose=pose,
-        temperature_c=block.temperature_c[keep],
-        variance_mps2_2=None if block.variance_mps2_2 is None else block.variance_mps2_2[keep],
-    )
 
 
 def _rows(block: Block, bench: Bench, force: Floats | None) -> Rows:
@@ -257,7 +246,6 @@ def _between_nodes(u: Floats, values: Floats, cuts: Indices) -> Floats:
     return np.einsum("kn,nkc->nc", basis(u), np.repeat(coefficients, np.diff(cuts), axis=0))
 
 
-_GATED = 32  # least number of averages of a block among which outliers can be recognised
 _EDGES_S = np.concatenate([2.0 ** np.arange(6), 60.0 * np.arange(1, 20_000)])
 """Dwells are cut into pieces 1, 2, 4 ... 32 s after the arrival and then at every full minute."""
 
@@ -294,9 +282,6 @@ def _values_at_nodes(u: Floats, values: Floats, cuts: Indices) -> Floats:
     return np.concatenate([at_nodes @ np.linalg.lstsq(functions[p], values[p], rcond=1e-9)[0] for p in parts])
 
 
-_GAUSSIAN_MAD = 1.4826  # median absolute deviation -> sigma, for Gaussian noise
-
-
 def innovations(columns: Floats, readings: Floats, static: bool, keep: Mask | None = None) -> Floats:
     """Readings (n, 3) less their least-squares fit by the columns (n, c) within the block, as (3, n).
 
@@ -317,11 +302,11 @@ def inliers(columns: Floats, readings: Floats, innovation: Floats, static: bool,
     """Mask (n,) of the readings that pass the gate; None if all do.
 
     A reading is rejected if the innovation in any channel differs from the block's median by more than ``threshold``
-    robust standard deviations: 1.4826 times the median absolute deviation or, where that is zero because of coarse
-    quantisation, the ordinary standard deviation.
+    robust standard deviations: the median absolute deviation over that of noise of unit variance or, where that is zero
+    because of coarse quantisation, the ordinary standard deviation.
     """
     count = len(readings)
-    if count < 8:
+    if count < FEWEST_READINGS:
         return None
     if _plainly_clean(innovation, threshold):
         return None
@@ -329,7 +314,7 @@ def inliers(columns: Floats, readings: Floats, innovation: Floats, static: bool,
     kept_innovation = innovation
     for _ in range(5):
         centre = np.median(kept_innovation, axis=1, keepdims=True)
-        sigma = _GAUSSIAN_MAD * np.median(np.abs(kept_innovation - centre), axis=1, keepdims=True)
+        sigma = np.median(np.abs(kept_innovation - centre), axis=1, keepdims=True) / normal_quantile(0.75)
         sigma = np.where(sigma > 0, sigma, kept_innovation.std(axis=1, keepdims=True))
         inlying: Mask = np.all(np.abs(innovation - centre) <= threshold * np.maximum(sigma, 1e-12), axis=0)
         if (inlying == keep).all():
@@ -359,5 +344,5 @@ def _plainly_clean(innovation: Floats, threshold: float) -> bool:
     if (np.maximum(innovation.max(axis=1), -innovation.min(axis=1)) > min(4.5, threshold) * rms).any():
         return False
     sample = innovation[:, :: max(1, innovation.shape[1] // 256)]
-    bulk = _GAUSSIAN_MAD * np.median(np.abs(sample), axis=1)
+    bulk = np.median(np.abs(sample), axis=1) / normal_quantile(0.75)
     return bool((rms <= 1.5 * bulk).all())

@@ -16,17 +16,17 @@ import copy
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from typing import overload
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, Mask, Times
 from kf_calib.bench.bench import Bench, interpolate_pose, mean_pose, pose_distance, unwrap_pose
-from kf_calib.bench.streams import Batch, Source, Stream
+from kf_calib.bench.streams import LAST_NS, MOST_KEPT, SECOND_NS, Batch, Source, Stream
 from kf_calib.dwells.blocks import (
-    LARGEST_C,
+    BLOCK_SAMPLES,
+    LARGEST,
     LARGEST_MPS2,
-    LARGEST_RAD,
-    SECOND_NS,
     Block,
     Curve,
     DwellEvent,
@@ -37,19 +37,11 @@ from kf_calib.dwells.blocks import (
     within,
 )
 from kf_calib.dwells.encoder_noise import EncoderNoise, distance_sigma, encoder_sigma
+from kf_calib.dwells.limits import CURVE, FEWEST_READINGS, SIGMAS
 from kf_calib.dwells.stationarity import HISTORY, Stillness
 from kf_calib.errors import InputError
 
-BLOCK_SAMPLES = 4000
-"""Largest number of samples of a block. A block then fits into the cache; the number is not a power of two because
-columns at such distances evict each other from it."""
-_LAST_NS = 1 << 62  # later than any stamp
 _HOLD_NS = SECOND_NS  # a reading up to this far outside the first or last angle still gets that angle
-_SLEW_READINGS = 8  # least number of readings of a slew that is used
-_REST_NS = 2 * SECOND_NS  # least length of a dwell that is recognised from readings alone
-_PENDING_SAMPLES = 1 << 22  # readings that may wait for an angle; 32 B each
-_TELLING = 1000  # first readings, which tell whether two sensors take turns
-_FEWEST_FOR_NOISE = 3  # fewer messages do not determine the noise of an encoder
 
 
 @dataclass
@@ -82,7 +74,7 @@ class Segmenter:
         self._temperature = Stream.empty(1)
         self._orders = (StampOrder(), StampOrder(), StampOrder())
         self._decided_ns: int | None = None  # intervals of poses before this stamp have been judged
-        self._cover_ns = -_LAST_NS  # end of the latest window that was judged as still
+        self._cover_ns = -LAST_NS  # end of the latest window that was judged as still
         self._dwell: OpenDwell | None = None
         self._encoder_rad = 0.0  # noise of an angle message, estimated in the last dwell
         self._begun = False
@@ -106,9 +98,16 @@ class Segmenter:
     @property
     def arrival_s(self) -> float:
         """Time of arrival of the open dwell, s since the first sample; NaN if no dwell is open."""
-        if self._dwell is None or self.first_ns is None:
-            return math.nan
-        return (self._dwell.arrival_ns - self.first_ns) / SECOND_NS
+        return math.nan if self._dwell is None else self._elapsed_s(self._dwell.arrival_ns)
+
+    @overload
+    def _elapsed_s(self, stamp_ns: int) -> float: ...
+    @overload
+    def _elapsed_s(self, stamp_ns: Times) -> Floats: ...
+    def _elapsed_s(self, stamp_ns: int | Times) -> float | Floats:
+        """Return the time since the first reading, s."""
+        assert self.first_ns is not None
+        return (stamp_ns - self.first_ns) / SECOND_NS
 
     def waiting(self) -> list[Block]:
         """The readings of the open dwell that do not yet fill a block, as a block; the segmenter is not changed."""
@@ -131,7 +130,7 @@ class Segmenter:
         self._take_poses(batch.pose, final)
         if len(batch.temperature):
             warm = batch.temperature
-            readable = within(warm.values, LARGEST_C)
+            readable = within(warm.values, LARGEST)
             if readable is not None:
                 self.tally.temperatures_dropped += int((~readable).sum())
                 warm = warm[readable]
@@ -150,8 +149,8 @@ class Segmenter:
         accel = self._orders[0](accel, self.tally, self.first_ns)
         if self.first_ns is None and len(accel):
             self.first_ns = int(accel.time_ns[0])
-        if len(self._first) < _TELLING:
-            self._first = np.concatenate([self._first, accel.values[: _TELLING - len(self._first)]])
+        if len(self._first) < BLOCK_SAMPLES:
+            self._first = np.concatenate([self._first, accel.values[: BLOCK_SAMPLES - len(self._first)]])
         self._accel += accel
 
     def _take_poses(self, pose: Stream, final: bool) -> None:
@@ -168,7 +167,7 @@ class Segmenter:
             if self.bench.axes:
                 self.tally.farthest_rad = max(self.tally.farthest_rad, float(np.abs(pose.values).max(initial=0.0)))
         self._early_poses += [pose] if len(pose) else []
-        reached_ns = _LAST_NS if final else self._orders[0].last_ns
+        reached_ns = LAST_NS if final else self._orders[0].last_ns
         if not self._early_poses or reached_ns is None or self._early_poses[0].time_ns[0] > reached_ns:
             return
         pose = Stream.joined(self._early_poses)
@@ -187,7 +186,7 @@ class Segmenter:
 
     def _usable(self, poses: Floats) -> Mask:
         """Return a mask (m,) of usable poses: finite angles of possible size, or quaternions of nearly unit length."""
-        readable = within(poses, LARGEST_RAD)
+        readable = within(poses, LARGEST)
         readable = np.ones(len(poses), bool) if readable is None else readable
         if self.bench.axes:
             return readable
@@ -269,12 +268,12 @@ class Segmenter:
                 events.append((arrived_ns, DwellEvent.ARRIVE, not first))
             elif unresolved[j]:
                 leave, arrive = self.stillness.moved_between(self._accel, begin, end, self.bench.gravity_mps2)
-                if not in_dwell and leave - begin >= _REST_NS:
+                if not in_dwell and self.stillness.is_dwell(leave - begin):
                     arrived_ns, in_dwell = begin - (0 if self._begun else _HOLD_NS), True
                     events.append((arrived_ns, DwellEvent.ARRIVE, False))
                 if in_dwell:
                     events.append((self._departed_ns(arrived_ns, leave), DwellEvent.LEAVE, False))
-                arrived_ns, in_dwell = arrive, end - arrive >= _REST_NS
+                arrived_ns, in_dwell = arrive, self.stillness.is_dwell(end - arrive)
                 if in_dwell:
                     events.append((arrive, DwellEvent.ARRIVE, True))
             elif not still[j] and in_dwell:
@@ -309,11 +308,11 @@ class Segmenter:
     def _horizon(self, final: bool) -> int | None:
         """Return the stamp before which readings can be released; None if none can be yet."""
         if self._decided_ns is None:
-            if not final and len(self._accel) <= _PENDING_SAMPLES:
+            if not final and len(self._accel) <= MOST_KEPT:
                 return None
             return int(self._accel.time_ns[-1]) + 1 if len(self._accel) else None
         if final:
-            return int(self._pose.time_ns[-1]) + _HOLD_NS if len(self._pose) > 1 else _LAST_NS
+            return int(self._pose.time_ns[-1]) + _HOLD_NS if len(self._pose) > 1 else LAST_NS
         return self._decided_ns - self.stillness.lead_ns - self.stillness.window_ns
 
     def _resting_ns(self) -> int:
@@ -326,7 +325,7 @@ class Segmenter:
     def _discard(self, until_ns: int) -> None:
         """Drop and count the readings before ``until_ns``, during which the platform moved or no angle was known."""
         count = int(np.searchsorted(self._accel.time_ns, until_ns))
-        first_pose = int(self._pose.time_ns[0]) if len(self._pose) and not self.dwell_count else -_LAST_NS
+        first_pose = int(self._pose.time_ns[0]) if len(self._pose) and not self.dwell_count else -LAST_NS
         early = int(np.searchsorted(self._accel.time_ns[:count], first_pose - _HOLD_NS))
         self.tally.without_pose += early
         self.tally.moving += count - early
@@ -334,7 +333,7 @@ class Segmenter:
 
     def _slewing(self) -> bool:
         """Tell whether the waiting readings may belong to a slew that will be used."""
-        return self.slews and self.dwell_count > 0 and len(self._accel) <= _PENDING_SAMPLES
+        return self.slews and self.dwell_count > 0 and len(self._accel) <= MOST_KEPT
 
     def _slew(self, arrival_ns: int) -> Iterator[Block]:
         """Yield blocks of the readings between the last dwell and an arrival.
@@ -343,7 +342,7 @@ class Segmenter:
         ``stillness`` in time and a quarter of the motion in angle.
         """
         count = int(np.searchsorted(self._accel.time_ns, arrival_ns))
-        if not self._slewing() or count < _SLEW_READINGS or self.first_ns is None:
+        if not self._slewing() or count < FEWEST_READINGS:
             return
         accel, window_ns = self._accel[:count], self.stillness.window_ns
         begin_ns, end_ns = int(accel.time_ns[0]), int(accel.time_ns[-1])
@@ -353,22 +352,19 @@ class Segmenter:
             return
         if np.abs(np.diff(poses, axis=0)).max() > np.ptp(poses, axis=0).max() / 4.0:  # too few messages
             return
-        curve = Curve.through(self.bench, (times - self.first_ns) / SECOND_NS, poses)
-        temperature_c, elapsed_s = (
-            carry_on(self._temperature, accel.time_ns),
-            (accel.time_ns - self.first_ns) / SECOND_NS,
+        curve = Curve.through(self.bench, self._elapsed_s(times), poses)
+        elapsed_s, temperature_c = self._elapsed_s(accel.time_ns), carry_on(self._temperature, accel.time_ns)
+        slew = Block(
+            self.dwell_count,
+            float(elapsed_s[0]),
+            elapsed_s,
+            accel.values,
+            curve.angles(elapsed_s),
+            temperature_c,
+            curve,
         )
         for part in np.array_split(np.arange(count), -(-count // BLOCK_SAMPLES)):
-            part_s = elapsed_s[part]
-            yield Block(
-                self.dwell_count,
-                float(elapsed_s[0]),
-                part_s,
-                accel.values[part],
-                curve.angles(part_s),
-                temperature_c[part],
-                curve,
-            )
+            yield slew[part]
         self.tally.slewing += count
         self._accel = self._accel[count:]
 
@@ -406,21 +402,18 @@ class Segmenter:
         estimated."""
         if not len(times) or self._encoder_rad <= self.stillness.rest_rad:
             return False
-        return int(np.diff(np.searchsorted(self._pose.time_ns, (times[0], times[-1])))[0]) < _FEWEST_FOR_NOISE
+        return int(np.diff(np.searchsorted(self._pose.time_ns, (times[0], times[-1])))[0]) < CURVE
 
     def _block(self, accel: Stream) -> Block:
         """Make a block of the open dwell from these readings."""
-        assert self._dwell is not None and self.first_ns is not None
+        assert self._dwell is not None
         self.tally.used += len(accel)
-        elapsed_s = (accel.time_ns - self.first_ns) / SECOND_NS
-        arrival_s, arrival_felt_s = (
-            max((stamp - self.first_ns) / SECOND_NS, 0.0)
-            for stamp in (self._dwell.arrival_ns, self._dwell.arrival_felt_ns)
-        )
+        arrivals_ns = self._dwell.arrival_ns, self._dwell.arrival_felt_ns
+        arrival_s, arrival_felt_s = (max(self._elapsed_s(stamp_ns), 0.0) for stamp_ns in arrivals_ns)
         pose, temperature_c = self._block_pose(accel.time_ns), carry_on(self._temperature, accel.time_ns)
         return Block(
-            self._dwell.number, arrival_s, elapsed_s, accel.values, pose, temperature_c, arrival_felt_s=arrival_felt_s,
-            pose_sigma_rad=self._dwell.pose_sigma_rad, turns=self._dwell_turns(),
+            self._dwell.number, arrival_s, self._elapsed_s(accel.time_ns), accel.values, pose, temperature_c,
+            arrival_felt_s=arrival_felt_s, pose_sigma_rad=self._dwell.pose_sigma_rad, turns=self._dwell_turns(),
         )  # fmt: skip
 
     def _dwell_turns(self) -> tuple[int, ...]:
@@ -458,7 +451,7 @@ class Segmenter:
         assert self._dwell is not None
         mean = mean_pose(inside)[None, :]
         dwell_pose = self._dwell.pose
-        allowed = 6.0 * inside.std(axis=0) / np.sqrt(len(inside)) + 1e-9
+        allowed = SIGMAS * inside.std(axis=0) / np.sqrt(len(inside)) + 1e-9
         if dwell_pose is None or (np.abs(mean - dwell_pose) > allowed).any():
             sigma = self._sigma_of_angle(inside)
             self._dwell.pose, self._dwell.pose_sigma_rad = mean, sigma / math.sqrt(len(inside))

@@ -14,19 +14,18 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, Mask, Times
 from kf_calib.bench.bench import mean_pose, pose_distance
-from kf_calib.bench.streams import Stream
+from kf_calib.bench.streams import SECOND_NS, Stream
 from kf_calib.dwells.encoder_noise import distance_sigma, encoder_sigma
+from kf_calib.dwells.limits import CURVE, FEWEST_COMPARED, SIGMAS
 from kf_calib.errors import InputError, check_number
 
-_SECOND_NS = 1_000_000_000
-_FEWEST_BEFORE = 3  # least number of messages with which one is compared
-_LONGEST_PERIOD_NS = 2 * _SECOND_NS  # messages farther apart than this do not determine a departure
-_CREEPING_NS = 10 * _SECOND_NS  # creep that lasts longer than this is taken as permanent
+READING_WINDOW_NS = SECOND_NS // 4
+"""Length of the windows of readings whose means show a motion."""
+_CREEPING_NS = 10 * SECOND_NS  # creep that lasts longer than this is taken as permanent
 _LARGEST_DEG = 5.0  # largest tolerance; at it, a platform turning at 10 deg/s would count as still
-_SIGMAS = 12.0  # of an angle message: two that show the same pose differ by no more
 _PARTS = 8  # number of parts of a block whose mean poses are compared
 
-HISTORY = _FEWEST_BEFORE + 2
+HISTORY = CURVE + 2
 """Number of messages before those of ``Stillness.history_ns`` that are needed if messages are infrequent."""
 
 
@@ -64,28 +63,37 @@ class Stillness:
     @property
     def window_ns(self) -> int:
         """The window in ns."""
-        return round(self.window_s * _SECOND_NS)
+        return round(self.window_s * SECOND_NS)
 
     @property
     def settle_ns(self) -> int:
         """The margin after an arrival in ns."""
-        return round(self.settle_s * _SECOND_NS)
+        return round(self.settle_s * SECOND_NS)
 
     @property
     def lead_ns(self) -> int:
         """The margin before a departure in ns."""
-        return round(self.lead_s * _SECOND_NS)
+        return round(self.lead_s * SECOND_NS)
+
+    @property
+    def _compared_ns(self) -> int:
+        """Time before a message over which others tell the pose that it is compared with, ns: four windows."""
+        return FEWEST_COMPARED * self.window_ns
 
     @property
     def history_ns(self) -> int:
         """Time before an interval from which on messages are needed to judge it, ns."""
-        return _CREEPING_NS + 6 * self.window_ns
+        return _CREEPING_NS + self._compared_ns + 2 * self.window_ns
+
+    def is_dwell(self, length_ns: int) -> bool:
+        """Whether a rest that readings alone show is long enough for a dwell: as the messages that tell a pose."""
+        return length_ns >= self._compared_ns
 
     def allowed_rad(self, noise_rad: Floats | float) -> Floats:
         """Largest distance, rad, of two messages of a platform at rest, whose noise is ``noise_rad``: the tolerance, or
-        twelve sigma."""
+        what two may be apart of which each is as far off as chance allows."""
         largest = max(self.tolerance_rad, math.radians(_LARGEST_DEG))
-        return np.clip(_SIGMAS * np.asarray(noise_rad), self.tolerance_rad, largest)
+        return np.clip(2.0 * SIGMAS * np.asarray(noise_rad), self.tolerance_rad, largest)
 
     def intervals(
         self, times: Times, poses: Floats, is_quaternion: bool, complete: Mask, covered_ns: int, noise_rad: Floats
@@ -118,7 +126,7 @@ class Stillness:
         if leaving is None:
             return end_ns
         early_ns, standing_ns = pose.time_ns[max(leaving - 2, 0)], pose.time_ns[max(leaving - 1, 0)]
-        period_ns = min(int(standing_ns - early_ns), _LONGEST_PERIOD_NS)
+        period_ns = min(int(standing_ns - early_ns), self._compared_ns)
         return max(int(standing_ns) - max(period_ns - self.lead_ns, 0), arrived_ns)
 
     def creeping_from(self, pose: Stream, is_quaternion: bool, arrived_ns: int, until_ns: int) -> int | None:
@@ -131,16 +139,14 @@ class Stillness:
         begin = last
         for span_ns in (self.window_ns, _CREEPING_NS + self.window_ns):  # the short span suffices most of the time
             first_judged = max(int(np.searchsorted(pose.time_ns, until_ns - span_ns)), arrived)
-            first = int(np.searchsorted(pose.time_ns, until_ns - span_ns - 4 * self.window_ns))
+            first = int(np.searchsorted(pose.time_ns, until_ns - span_ns - self._compared_ns))
             first = max(min(first, first_judged - HISTORY), arrived)
             if last - first_judged < 1 or last - first < HISTORY:
                 return None
-            deviating = first_judged + np.flatnonzero(
-                self._deviates(pose[first:last], is_quaternion)[first_judged - first :]
-            )
-            step = max(
-                1, round(self.window_ns * (last - 1 - first) / int(pose.time_ns[last - 1] - pose.time_ns[first]))
-            )
+            away = self._deviates(pose[first:last], is_quaternion)
+            deviating = first_judged + np.flatnonzero(away[first_judged - first :])
+            lasts_ns = int(pose.time_ns[last - 1] - pose.time_ns[first])
+            step = max(1, round(self.window_ns * (last - 1 - first) / lasts_ns))
             if not deviating.size or last - 1 - deviating[-1] > step:
                 return None
             breaks = np.flatnonzero(np.diff(deviating) > step)
@@ -156,20 +162,15 @@ class Stillness:
         """
         times, relative = pose.time_ns, pose.values - pose.values[0]
         ends = np.minimum(np.searchsorted(times, times - self.window_ns), np.maximum(np.arange(len(times)) - 1, 0))
-        starts = np.minimum(np.searchsorted(times, times - 4 * self.window_ns), np.maximum(ends - _FEWEST_BEFORE, 0))
+        starts = np.minimum(np.searchsorted(times, times - self._compared_ns), np.maximum(ends - CURVE, 0))
         sums, counts = _cumulative_sums(relative), (ends - starts)[:, None]
         means = (sums[ends] - sums[starts]) / np.maximum(counts, 1)
-        curvature, curvature_count = (
-            _cumulative_sums(np.diff(relative, 2, axis=0) ** 2),
-            np.maximum(ends - starts - 2, 0)[:, None],
-        )
-        variance = (curvature[starts + curvature_count[:, 0]] - curvature[starts]) / (
-            6.0 * np.maximum(curvature_count, 1)
-        )
+        curvature, seen = _cumulative_sums(np.diff(relative, 2, axis=0) ** 2), np.maximum(ends - starts - 2, 0)
+        variance = (curvature[starts + seen] - curvature[starts]) / (6.0 * np.maximum(seen, 1))[:, None]
         sigma = distance_sigma(np.sqrt(np.maximum(variance, 0.0)), is_quaternion)
         allowed = np.maximum(self.rest_rad, 4.0 * sigma)
         distance = pose_distance(pose.values, means + pose.values[0], is_quaternion)
-        return (distance > allowed) & (curvature_count[:, 0] > 0)
+        return (distance > allowed) & (seen > 0)
 
     def rest_ns(self, pose: Stream, is_quaternion: bool, arrived_ns: int, until_ns: int) -> tuple[int, bool]:
         """Stamp, ns, at which the platform came to rest in a dwell since ``arrived_ns``, and whether this is certain by
@@ -184,7 +185,7 @@ class Stillness:
         for k, end_index in enumerate(np.searchsorted(times, times + span_ns, side="right").tolist()):
             if times[k] > arrived_ns + _CREEPING_NS:
                 break
-            at_ns, end = int(times[k]) if k else arrived_ns, max(end_index, k + 1 + _FEWEST_BEFORE)
+            at_ns, end = int(times[k]) if k else arrived_ns, max(end_index, k + 1 + CURVE)
             if times[k] + span_ns > until_ns or end > len(times):
                 return at_ns, False
             following = poses[k + 1 : end]
@@ -219,18 +220,16 @@ class Stillness:
         """
         part = slice(*np.searchsorted(accel.time_ns, (begin_ns, end_ns)))
         times, values = accel.time_ns[part], accel.values[part]
-        size = max(4, int(np.searchsorted(times, begin_ns + _SECOND_NS // 4)))
+        size = max(FEWEST_COMPARED, int(np.searchsorted(times, begin_ns + READING_WINDOW_NS)))
         count = len(times) // size
-        if count < 4:
+        if count < FEWEST_COMPARED:
             return begin_ns, end_ns
         shaped = values[: count * size].reshape(count, size, 3)
         means, scatter = shaped.mean(axis=1), np.median(shaped.std(axis=1), axis=0)
-        coarse = 6.0 * scatter + 1e-3 * gravity_mps2
+        coarse = SIGMAS * scatter + 1e-3 * gravity_mps2
         fine = 3.0 * scatter / math.sqrt(size) + self.rest_rad * gravity_mps2
-        count_before, count_after = (
-            _windows_at_first_level(means, coarse, fine),
-            _windows_at_first_level(means[::-1], coarse, fine),
-        )
+        both_ways = means, means[::-1]
+        count_before, count_after = (_windows_at_first_level(each, coarse, fine) for each in both_ways)
         leave = begin_ns if count_before < 2 else int(times[(count_before - 1) * size])
         arrive = end_ns if count_after < 2 else int(times[(count - count_after + 1) * size])
         return leave, max(arrive, leave)
@@ -247,7 +246,7 @@ class Stillness:
         if settled_from == end:
             return arrival_ns
         settled = accel.values[settled_from:end]
-        allowed = 6.0 * float(settled.std(axis=0).max()) + self.rest_rad * gravity_mps2
+        allowed = SIGMAS * float(settled.std(axis=0).max()) + self.rest_rad * gravity_mps2
         deviation = np.abs(accel.values[first:settled_from] - settled.mean(axis=0)).max(axis=1, initial=0.0)
         unsettled = np.flatnonzero(deviation > allowed)
         if not unsettled.size:

@@ -25,7 +25,8 @@ from kf_calib.dwells.coherent_tone import Trace, tone
 from kf_calib.dwells.line_spectrum import SpectralLine, Spectrum, lines_of_several
 from kf_calib.dwells.pieces import Pieces
 
-_LAGS = 64
+LAGS = 64
+"""Lags of the autocovariance; fewer readings tell no correlation of their own."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +38,8 @@ class Autocovariance:
     power.
     """
 
-    products: Floats = field(default_factory=lambda: np.zeros((_LAGS + 1, 3)))
-    pairs: Floats = field(default_factory=lambda: np.zeros(_LAGS + 1))
+    products: Floats = field(default_factory=lambda: np.zeros((LAGS + 1, 3)))
+    pairs: Floats = field(default_factory=lambda: np.zeros(LAGS + 1))
     count: int = 0
     blocks: int = 0
 
@@ -58,12 +59,12 @@ class Autocovariance:
     def of(cls, residuals: Floats) -> Autocovariance:
         """The sums for one block of readings (3, n) from which the parabola has been removed."""
         count = residuals.shape[1]
-        padded = 1 << (count + _LAGS).bit_length()
+        padded = 1 << (count + LAGS).bit_length()
         spectrum = np.fft.rfft(residuals, padded, axis=1)
-        products = np.zeros((_LAGS + 1, 3))
-        lags = min(_LAGS, count - 1) + 1
+        products = np.zeros((LAGS + 1, 3))
+        lags = min(LAGS, count - 1) + 1
         products[:lags] = np.fft.irfft(np.abs(spectrum) ** 2, padded, axis=1)[:, :lags].T
-        return cls(products, np.maximum(count - np.arange(_LAGS + 1), 0).astype(float), count, 1)
+        return cls(products, np.maximum(count - np.arange(LAGS + 1), 0).astype(float), count, 1)
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -136,7 +137,7 @@ class Dwell:
             pieces=pieces[order],
             autocovariance=sum((block.autocovariance for block in blocks), self.autocovariance),
             spectrum=sum((block.spectrum for block in blocks), self.spectrum),
-            trace=sum((block.trace for block in blocks), self.trace),
+            trace=Trace.joined([self.trace, *(block.trace for block in blocks)]),
         )
 
     def repeat(self, times: float) -> Dwell:

@@ -18,13 +18,11 @@ import numpy as np
 from kf_calib.bench.arrays import ComputedSequence, Floats, Indices, Ints, Mask
 from kf_calib.bench.bench import turned
 from kf_calib.dwells.coherent_tone import Trace
+from kf_calib.dwells.limits import FEWEST_READINGS
 from kf_calib.dwells.line_spectrum import Spectrum
 from kf_calib.dwells.pieces import OfPieces, Pieces, WalkPath, walk_path_of
 from kf_calib.dwells.rows import Nodes
 from kf_calib.dwells.sufficient_statistics import Autocovariance, Dwell
-
-LEAST_FREEDOM = 8
-"""Degrees of freedom of a piece, with fewer of which its variance is that of its whole dwell."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -159,13 +157,13 @@ class FoldedDwells:
 
     @cached_property
     def variances(self) -> Floats:
-        """Variance of the readings about their fit within each piece, (pieces, 3); short pieces have the value pooled
-        over the dwell."""
+        """Variance of the readings about their fit within each piece, (pieces, 3); those of few degrees of freedom have
+        the value pooled over the dwell."""
         freedom = np.maximum(self.piece_counts - self.width, 0.0)[:, None]
         squares, firsts = self.squares, self.ends[:-1]
         pooled = np.add.reduceat(squares, firsts) / np.maximum(np.add.reduceat(freedom, firsts), 1.0)
         of_pieces = squares / np.maximum(freedom, 1.0)
-        return np.where(freedom >= LEAST_FREEDOM, of_pieces, np.repeat(pooled, self.piece_numbers, axis=0))
+        return np.where(freedom >= FEWEST_READINGS, of_pieces, np.repeat(pooled, self.piece_numbers, axis=0))
 
     @property
     def shaking(self) -> tuple[Floats, Floats]:

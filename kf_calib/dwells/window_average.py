@@ -17,15 +17,15 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.blocks import Block
+from kf_calib.dwells.coherent_tone import CELL_S
+from kf_calib.dwells.limits import FEWEST_COMPARED
 from kf_calib.dwells.line_spectrum import SpectralLine
 
 WINDOW_S = 1.0
 """Default length of a window, s."""
 
 _CYCLES = 20.0  # cycles in a window: a millionth of an oscillation is left, and slow changes are still resolved
-_WINDOWS = 4  # least number of consecutive windows in a block
 _OVERLAP = 3  # number of windows in which each reading lies; the squares of Hann windows then add up to a constant
-_SHORTEST_S = 0.5  # shorter blocks are left out, since a window in them would not cover several periods of vibration
 
 
 def window_s(lines: Iterable[SpectralLine]) -> float:
@@ -61,10 +61,10 @@ def average(block: Block, length_s: float = WINDOW_S) -> Block | None:
     over the block, because a vibration has no mean within so short a window.
     """
     count, span_s = len(block.elapsed_s), float(block.elapsed_s[-1] - block.elapsed_s[0])
-    step = math.ceil(min(length_s / max(span_s, 1e-9), 1.0 / _WINDOWS) * count / _OVERLAP)
+    step = math.ceil(min(length_s / max(span_s, 1e-9), 1.0 / FEWEST_COMPARED) * count / _OVERLAP)
     length = step * _OVERLAP
-    if span_s < _SHORTEST_S or step < 2 or length > count:
-        return None
+    if span_s < FEWEST_COMPARED * CELL_S or step < 2 or length > count:
+        return None  # a window would not cover several periods of vibration
     weights = np.sin(np.pi * (np.arange(length) + 0.5) / length) ** 4
     weights /= weights.sum()
 

@@ -19,7 +19,7 @@ from kf_calib.bench.counts import refuse_unread
 from kf_calib.bench.raw_input import LEVELS, wrong_unit
 from kf_calib.bench.streams import Source, Table
 from kf_calib.dwells import window_average
-from kf_calib.dwells.blocks import LARGEST_RAD, Block, Tally
+from kf_calib.dwells.blocks import LARGEST, Block, Tally
 from kf_calib.dwells.folding import Folder, dwells_of_table, rows_of_table
 from kf_calib.dwells.line_spectrum import SpectralLine
 from kf_calib.dwells.rest_in_readings import segmenter_of
@@ -134,7 +134,7 @@ def refuse_unusable(dwells: DwellTable, tally: Tally, bench: Bench) -> None:
     elif tally.poses_dropped and not tally.poses:
         raise InputError(
             f"none of the {tally.poses_dropped} angle messages can be used: they are not finite, beyond "
-            f"{LARGEST_RAD:.0e} rad (counts of an encoder?) or no unit quaternions; record angles in rad or deg, or "
+            f"{LARGEST:.0e} rad (counts of an encoder?) or no unit quaternions; record angles in rad or deg, or "
             "unit quaternions."
         )
     elif not tally.poses:

@@ -20,8 +20,10 @@ import numpy as np
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
+from kf_calib.dwells.qr import spanned
 from kf_calib.estimation.fit import Fit
 from kf_calib.noise.noise_model import mean_covariances
+from kf_calib.noise.random_walk import known_at_end
 from kf_calib.noise.reml import FREE, Part, with_shared_noise
 from kf_calib.noise.terms import FLOOR_MPS2
 
@@ -64,7 +66,7 @@ class _Means:
         noise, state = fitted.noise, fitted.linearised.state
         known = noise.without_estimates()
         means, prior = with_shared_noise(fitted.dwells, known, fitted.linearised.means, state)
-        basis, turn = _spanned(means.design.reshape(-1, means.design.shape[2]))
+        basis, turn, _ = spanned(means.design.reshape(-1, means.design.shape[2]).copy())
         along = basis.T @ means.readings.ravel()
         readings = means.readings.ravel() - basis @ along
         measured = len(means.readings) if noise.attitude_unknown else means.readings.size
@@ -126,16 +128,6 @@ class _Means:
         return log - 0.5 * chi2, (turned[:, None] @ roots)[:, 0], np.sqrt(np.sum(roots**2, axis=1))
 
 
-def _spanned(design: Floats) -> tuple[Floats, Floats]:
-    """Return an orthonormal basis (n, r) of what columns (n, p) span, and the matrix (p, r) from its coefficients to
-    theirs."""
-    lengths = np.linalg.norm(design, axis=0)
-    lengths = np.where(lengths > 0.0, lengths, 1.0)
-    left, singular, right = np.linalg.svd(design / lengths, full_matrices=False)
-    seen = singular > 1e-9 * singular[0]
-    return left[:, seen], right[seen].T / singular[seen] / lengths[:, None]
-
-
 def _jacobian(state: Floats) -> Floats:
     """Return the derivatives (p, p) of the twelve parameters, and coefficients, by the states."""
     jacobian = np.eye(len(state))
@@ -145,8 +137,7 @@ def _jacobian(state: Floats) -> Floats:
 
 def _path(ends_s: Floats) -> Floats:
     """Return the covariance (1, 3 D, 3 D) of the means of walking biases that are known at the end, per q^2."""
-    before_end_s = ends_s[-1, 1] - ends_s.mean(axis=1)
-    return np.kron(np.minimum.outer(before_end_s, before_end_s), np.eye(3))[None]
+    return np.asarray(np.kron(known_at_end(ends_s), np.eye(3))[None], float)
 
 
 def _whole(blocks: Floats) -> Floats:

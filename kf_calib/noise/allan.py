@@ -15,13 +15,12 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.bench.streams import MOST_KEPT
 from kf_calib.dwells.sufficient_statistics import Dwell
+from kf_calib.noise.block_differences import FEWEST_CLUSTERS
 from kf_calib.noise.noise_model import Noise
 
 _DWELLS = 5  # as many of the longest are enough
-_LONG = 0.5  # of the longest dwell; shorter ones say nothing of the longest clusters
-_READINGS = 1_000_000  # in all, 24 MB; the longest dwell is used whatever its length
-_CLUSTERS = 3  # fewest in the longest dwell, for a deviation to be given
 _PER_OCTAVE = 3
 
 
@@ -64,7 +63,7 @@ def deviations(series: Sequence[Floats], sizes: Sequence[int]) -> tuple[Floats, 
 
 def cluster_sizes(longest: int) -> list[int]:
     """Sizes of clusters from one reading up to a third of the longest dwell, three an octave."""
-    most = max(longest // _CLUSTERS, 1)
+    most = max(longest // FEWEST_CLUSTERS, 1)
     octaves = np.arange(0, _PER_OCTAVE * np.log2(most) + 1e-9) / _PER_OCTAVE
     return sorted({round(2.0**octave) for octave in octaves})
 
@@ -87,7 +86,8 @@ _S = TypeVar("_S", bound=Residuals)
 
 @dataclass
 class LongestDwells:
-    """Collects the residuals of the longest dwells of a run from its samples as these pass by."""
+    """Collects the residuals of the longest dwells of a run, as many as memory holds but one at least, from its samples
+    as these pass by."""
 
     run: Sequence[Dwell]
     noise: Noise
@@ -99,7 +99,7 @@ class LongestDwells:
         self.kept |= {
             dwell.number: []
             for dwell, sum_so_far in zip(dwells, total, strict=True)
-            if dwell is dwells[0] or (dwell.count >= _LONG * dwells[0].count and sum_so_far <= _READINGS)
+            if dwell is dwells[0] or sum_so_far <= MOST_KEPT
         }
 
     def passed_by(self, samples: Iterable[_S]) -> Iterator[_S]:

@@ -10,7 +10,7 @@ Each level of a cascade halves the rate: level j has the means of blocks of 2^j 
   that clusters of a week take no more memory than those of a second and have the same expectation.
 - the Haar variance: the same where clusters do not overlap, half the mean square difference of the two halves of each
   block. Haar differences of all lengths and the means of the longest blocks are an orthogonal transform of readings.
-- the means of blocks of the least length of which there are no more than ``KEPT``.
+- the means of blocks of the least length of which there are no more than ``EVERY``.
 
 Readings come in stretches without a gap; no block and no difference reaches from one stretch into another.
 """
@@ -23,13 +23,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats, Ints
+from kf_calib.bench.arrays import AT_ONCE, Floats, Ints
 
 EVERY = 1024
-"""Clusters of up to so many readings begin at every reading; longer ones at so many places of their own length."""
-KEPT = 1024
-"""Most block means that are kept of a level."""
-_AT_ONCE = 1024  # blocks of a level that are processed together; fewer at the end of a stretch
+"""Clusters of up to so many readings begin at every reading; longer ones at so many places of their own length.
+Of a level no more block means are kept."""
+FEWEST_CLUSTERS = 3
+"""Clusters in the longest stretch from which a variance is told."""
 
 
 class Variances(NamedTuple):
@@ -45,7 +45,7 @@ class _Level:
     """Means of blocks of 2^number readings, as they come; channels (c,) go first in all arrays.
 
     tail: the latest of them, which differences of later ones still need. half: a block that waits for the next.
-    kept: their means, a list a stretch, as long as there are no more than ``KEPT``.
+    kept: their means, a list a stretch, as long as there are no more than ``EVERY``.
     """
 
     number: int
@@ -90,7 +90,7 @@ class _Level:
     def _keep(self, means: Floats) -> None:
         self.kept_count += means.shape[1]
         if self.kept is not None:
-            if self.kept_count > KEPT:
+            if self.kept_count > EVERY:
                 self.kept = None
             else:
                 self.kept[-1].append(means)
@@ -145,8 +145,8 @@ class BlockDifferences:
         origin = readings[0].copy() if self._origin is None else self._origin
         self._origin = origin  # sums of what is left are small, so that rounding is
         self.lengths[-1] += len(readings)
-        for begin in range(0, len(readings), 4 * _AT_ONCE):
-            self._pass_on(0, np.ascontiguousarray((readings[begin : begin + 4 * _AT_ONCE] - origin).T))
+        for begin in range(0, len(readings), 4 * AT_ONCE):
+            self._pass_on(0, np.ascontiguousarray((readings[begin : begin + 4 * AT_ONCE] - origin).T))
 
     def end_stretch(self) -> None:
         """What comes next does not follow on what came: there is a gap, or it is the end."""
@@ -198,7 +198,7 @@ class BlockDifferences:
         level = self._levels[number]
         level.waiting.append(means)
         level.waiting_count += means.shape[1]
-        if level.waiting_count >= _AT_ONCE:
+        if level.waiting_count >= AT_ONCE:
             self._process(number)
 
     def _process(self, number: int) -> None:

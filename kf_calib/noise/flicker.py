@@ -18,9 +18,9 @@ from kf_calib.dwells.table import DwellTable
 from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.rotations import along_force, sensitivities_of
 from kf_calib.noise.terms import SLOW, SlowWaves, waves_in_dwells
+from kf_calib.support.tail_probabilities import SIGMAS_95
 
 _GRID = np.geomspace(1e-3, 1e5, 161)  # of h, in variances of the amplitudes by the noise of the readings
-_CLEAR = 0.5 * 3.84  # gain in log-likelihood over none: 1/f noise that is less clear changes no sigma
 
 
 def with_waves_in_dwells(noise: Noise, dwells: Sequence[Dwell], columns: Sequence[Floats], state: Floats) -> Noise:
@@ -74,4 +74,5 @@ def _likeliest(amplitudes: Floats, variances: Floats) -> float:
     total = variances[..., None] + sizes / SLOW[:, None]
     log = -0.5 * (np.log(total) + amplitudes[..., None] ** 2 / total).sum(axis=(0, 1))
     best = int(log.argmax())
-    return float(np.sqrt(sizes[best])) if log[best] - log[0] > _CLEAR else 0.0
+    clear = log[best] - log[0] > 0.5 * SIGMAS_95**2  # 1/f noise that is less clear changes no sigma
+    return float(np.sqrt(sizes[best])) if clear else 0.0

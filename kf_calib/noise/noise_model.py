@@ -17,6 +17,7 @@ from typing import TypeVar
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.dwells.limits import FEWEST_COMPARED
 from kf_calib.dwells.sufficient_statistics import Dwell
 from kf_calib.dwells.table import DwellTable
 from kf_calib.noise import random_walk
@@ -153,7 +154,7 @@ class Noise:
         """The noise by which a misfit over so many dwells is judged: scatter that is stated for a bench may be 1/f
         noise, which goes on within dwells and looks like a drift of the run."""
         flicker_mps2, without = self.scatter.flicker_mps2(dwells), self.without(SlowWaves)
-        if dwells < WavesOverRun.FEWEST or not flicker_mps2.any():
+        if dwells < FEWEST_COMPARED or not flicker_mps2.any():
             return without
         return without.with_terms(SlowWaves(flicker_mps2), WavesOverRun(flicker_mps2))
 

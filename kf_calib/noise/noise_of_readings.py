@@ -25,15 +25,15 @@ from functools import lru_cache
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import ROUNDING, Floats
+from kf_calib.dwells.limits import FEWEST_COMPARED
 from kf_calib.dwells.sufficient_statistics import Autocovariance
 from kf_calib.dwells.table import DwellTable, FoldedDwells, computed_once
+from kf_calib.support.searches import MOST_STEPS
 from kf_calib.support.tail_probabilities import chi_squared_tail
 
-_ITERATIONS = 60
 _STILL = 1e-3  # relative change of kappa
 _LONG = 500  # in blocks of more readings than this, a parabola removes almost nothing of white noise
-_GONE = 1e-9  # relative to the variance
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Autoregression:
         curve[: order + 1] = known[: order + 1]
         for lag in range(order + 1, size if order else 0):
             before = curve[lag - order : lag]
-            if np.abs(before).max() < _GONE * curve[0]:
+            if np.abs(before).max() < ROUNDING * curve[0]:
                 break
             curve[lag] = self.coefficients @ before[::-1]
         return curve
@@ -119,7 +119,7 @@ def _unbiased(raw_bytes: bytes, count: int, size: int) -> tuple[Autoregression, 
         model = Autoregression()
     elif not len(model.coefficients):  # white noise, of which it removes almost nothing
         return model, float(raw[0])
-    for _ in range(_ITERATIONS):
+    for _ in range(MOST_STEPS):
         if abs(model.inflation - kappa) < _STILL * model.inflation:
             break
         kappa, whole = model.inflation, model.autocovariances(gamma, size)
@@ -144,10 +144,8 @@ def are_alike(total: Autocovariance) -> bool:
 
 
 _CLEAR_P = 1e-4  # of equal noise; with p-values above it, dwells keep one noise
-_FEWEST = 4  # dwells whose noise is known
-_LEAST_FREEDOM = 2.0  # of a dwell whose own noise counts
+_LEAST_FREEDOM = 2.0  # of a dwell whose own noise counts: with less, chi-squared is infinitely dense at zero
 _SHAPES = np.geomspace(1.0, 1e4, 61)  # nu_0
-_ROUNDS = 60
 _QUIETEST = 0.1  # variance of a dwell, in the median of all
 
 
@@ -216,7 +214,7 @@ def weights_of(variances: Floats, freedom: Floats) -> Floats:
     """The weights 1 / v_d (D,) of readings of dwells with variances s_d^2 (D,) of nu_d (D,) degrees of freedom, of mean
     1; all 1 where the variances are equal but for chance."""
     known, weights = freedom >= _LEAST_FREEDOM, np.ones(len(variances))
-    if known.sum() < _FEWEST or np.median(variances[known]) <= 0.0:
+    if known.sum() < FEWEST_COMPARED or np.median(variances[known]) <= 0.0:
         return weights
     variances = np.maximum(variances, _QUIETEST * np.median(variances[known]))
     if _equal_p(variances[known], freedom[known]) > _CLEAR_P:
@@ -240,7 +238,7 @@ def _prior(variances: Floats, freedom: Floats) -> tuple[float, float]:
     from scipy.special import betaln  # few runs need it
 
     shapes, levels = _SHAPES[:, None], np.full((len(_SHAPES), 1), np.median(variances))
-    for _ in range(_ROUNDS):
+    for _ in range(MOST_STEPS):
         precision = np.mean((shapes + freedom) / (shapes * levels + freedom * variances), axis=1, keepdims=True)
         levels = 1.0 / precision
     ratios = freedom * variances / (shapes * levels)

@@ -32,10 +32,8 @@ FACTORS = np.array([3.0, 1.0, 2.0 * math.log(2.0) / math.pi, 1.0 / 3.0])
 """Allan variance of each term of size 1 at a cluster of 1 s."""
 FLATTEST = math.sqrt(FACTORS[2])
 """Where the Allan deviation of 1/f noise stays: 0.664 B."""
-_SECOND = (1.0, -2.0, 1.0)
 _FARTHEST = 9  # octaves between clusters, beyond which estimates hardly depend on each other
-_PLACES = 16  # of a difference within the length of a cluster, in sums over all places
-_HAAR_LAGS = 16
+_PLACES = 16  # lags in sums over all places: within the length of a cluster, or of clusters that do not overlap
 
 
 def allan_variance(tau_s: Floats) -> Floats:
@@ -53,11 +51,10 @@ def _generalised(lag: Floats) -> Floats:
 
 def _second_differences(lag: Floats, ratio: float) -> Floats:
     """Covariance (4, ...) of second differences over clusters of 1 and of ``ratio``, the former a lag later."""
-    total = np.zeros((4, *lag.shape))
-    for i, a in enumerate(_SECOND):
-        for j, b in enumerate(_SECOND):
-            total += a * b * _generalised(lag + i - j * ratio)
-    return total / ratio
+    ends = np.arange(3.0)
+    apart = ends[:, None] - ratio * ends
+    of_ends = _generalised(lag[..., None, None] + apart)
+    return np.diff(np.diff(of_ends, 2, axis=-1), 2, axis=-2)[..., 0, 0] / ratio
 
 
 def cosine_transform(values: Floats) -> Floats:
@@ -87,7 +84,7 @@ def block_spectrum(count: int) -> Floats:
 @lru_cache(maxsize=1)
 def _haar_correlations() -> Floats:
     """Covariance (4, lags) of Haar differences of blocks of one length, of which the first is with itself."""
-    lags = 2.0 * np.arange(_HAAR_LAGS, dtype=float)
+    lags = 2.0 * np.arange(_PLACES, dtype=float)
     return 0.5 * _second_differences(lags, 1.0)
 
 
@@ -96,7 +93,7 @@ def haar_freedom(sizes: Floats, counts: Ints, squares: Floats) -> Floats:
     these squares (4,)."""
     scaled = (squares * sizes[:, None] ** POWERS) @ _haar_correlations()
     correlation = scaled[:, 1:] / scaled[:, :1]
-    share = np.maximum(1.0 - np.arange(1, _HAAR_LAGS) / counts[:, None], 0.0)
+    share = np.maximum(1.0 - np.arange(1, _PLACES) / counts[:, None], 0.0)
     return counts / (1.0 + 2.0 * (share * correlation**2).sum(axis=1))
 
 

@@ -41,6 +41,13 @@ def mean_links(ends_s: Floats) -> Links:
     return Links(np.ones(len(spans) - 1), alone, spans[:-1] / 6.0)
 
 
+def known_at_end(ends_s: Floats) -> Floats:
+    """Covariance (D, D) per q^2 of the means of a walk that is known at its end, over dwells that begin and end at
+    ``ends_s`` (D, 2): min(T - s, T - t) between their middles s and t."""
+    before_end_s = ends_s[-1, 1] - ends_s.mean(axis=1)
+    return np.asarray(np.minimum.outer(before_end_s, before_end_s), float)
+
+
 def variances(begins_s: Floats, ends_s: Floats, intensity: float) -> Floats:
     """Variances (D, 2) of a bias's steps in the pause before each dwell and over the dwell."""
     pauses = np.maximum(np.append(0.0, begins_s[1:] - ends_s[:-1]), 0.0)

@@ -22,7 +22,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.dwells.pieces import OfPieces
-from kf_calib.dwells.qr import multiplied, orthonormal
+from kf_calib.dwells.qr import spanned
 from kf_calib.dwells.sufficient_statistics import Dwell
 from kf_calib.dwells.table import DwellTable
 from kf_calib.noise.means import Means, means_of
@@ -30,7 +30,7 @@ from kf_calib.noise.noise_model import Noise, mean_covariances
 from kf_calib.noise.random_walk import Links, mean_links
 from kf_calib.noise.restricted_likelihood import Point, Restricted
 from kf_calib.noise.terms import FLOOR_MPS2, NoiseTerm, RandomWalk, Scatter, SettingError, setting_covariances
-from kf_calib.support.tail_probabilities import chi_squared_tail
+from kf_calib.support.tail_probabilities import SIGMAS_95, VARIANCE_SEEN, chi_squared_tail
 
 FEWEST = 6
 """With fewer degrees of freedom between dwells than this, only scatter of one size is estimated."""
@@ -38,9 +38,7 @@ FEWEST = 6
 ENOUGH_DIRECTIONS = 12
 """With this many directions of gravity, if spread, it can be checked that a setting error only turns the force."""
 
-_SIGNIFICANT = 5.41  # 1 % point of the likelihood-ratio statistic of a variance against zero, half of a chi2 with 1 dof
 _WALK = 0.5  # a walk has to gain at least this much log-likelihood
-_JUDGED = 3.84  # 2.5 % point of that statistic: a setting error that is clearer belongs to the noise that judges
 
 Part = Literal["setting", "common", "scatter", "walk", "first", "second", "third"]
 Parts = tuple[Part, ...]
@@ -257,7 +255,8 @@ def _with_estimates(stated: Noise, likelihood: Likelihood, parts: Parts, sizes: 
         rest: Parts = tuple(part for part in parts if part != "setting")
         cost = likelihood.of(rest).most_likely()[1].cost if rest else without.cost
         gain = cost - likelihood.of(parts).cost(sizes**2)
-        noise = noise.with_terms(replace(noise.setting, judged=2.0 * gain > _JUDGED))
+        clear = 2.0 * gain > SIGMAS_95**2  # one that is clearer belongs to the noise that judges
+        noise = noise.with_terms(replace(noise.setting, judged=clear))
     return noise
 
 
@@ -267,7 +266,7 @@ def _charge(parts: Parts, likelihood: Likelihood) -> float:
     A setting error is taken at its likeliest size, however small: left out below a limit, it would be missing in sigma.
     """
     charges = {"walk": _WALK, "setting": 0.0}
-    return sum(charges.get(part, 0.5 * _SIGNIFICANT * len(likelihood.units[part])) for part in parts)
+    return sum(charges.get(part, 0.5 * VARIANCE_SEEN * len(likelihood.units[part])) for part in parts)
 
 
 def _last_spread(curvature: Floats) -> float:
@@ -347,12 +346,7 @@ def _reduce(means: Means, prior: Floats | None = None) -> _Reduced:
     design = means.design.reshape(-1, means.design.shape[2])
     prior = np.zeros((0, design.shape[1] + 1)) if prior is None else prior
     known: Mask = np.array(prior[:, :-1].any(axis=0))
-    free = design[:, ~known]  # a copy, which the basis may overwrite
-    scale = np.sqrt(np.einsum("ij,ij->j", free, free))
-    free /= np.where(scale > 0, scale, 1.0)
-    basis, upper = orthonormal(free)
-    turn, singular, _ = np.linalg.svd(upper, full_matrices=False)
-    basis = multiplied(basis, turn[:, singular > 1e-9 * singular[0]])
+    basis = spanned(design[:, ~known])[0]
     rest = means.readings.ravel() - basis @ (basis.T @ means.readings.ravel())
     columns = np.hstack([basis, design[:, known]]) if known.any() else basis
     means = replace(means, design=columns.reshape(*means.readings.shape, -1), readings=rest.reshape(-1, 3))

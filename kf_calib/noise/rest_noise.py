@@ -16,12 +16,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, Ints, Times
-from kf_calib.bench.streams import Source, Table
-from kf_calib.dwells.blocks import SECOND_NS, Block, Tally
+from kf_calib.bench.streams import LAST_NS, SECOND_NS, Source, Table
+from kf_calib.dwells.blocks import BLOCK_SAMPLES, Block, Tally
+from kf_calib.dwells.limits import FEWEST_READINGS
 from kf_calib.dwells.rest_in_readings import RestSegmenter
 from kf_calib.dwells.stationarity import Stillness
+from kf_calib.dwells.sufficient_statistics import LAGS
 from kf_calib.errors import InputError
-from kf_calib.noise.block_differences import BlockDifferences
+from kf_calib.noise.block_differences import FEWEST_CLUSTERS, BlockDifferences
 from kf_calib.noise.power_laws import (
     POWERS,
     TERMS,
@@ -33,17 +35,11 @@ from kf_calib.noise.power_laws import (
     histogram,
 )
 from kf_calib.noise.term_fit import AllanFit, LikelihoodFit, Minimum, Size, minimum, sizes
-from kf_calib.support.tail_probabilities import LEVEL, chi_squared_tail
+from kf_calib.support.tail_probabilities import LEVEL, SIGMAS_95, chi_squared_tail
 
-_CLUSTERS = 3  # fewest in the longest stretch, for a variance to be used
-_FEWEST_SIZES = 4  # of clusters, as many as there are terms
-_FEWEST_READINGS = 64  # of a channel
-_INTERVALS = 8  # between stamps, which tell the period
 _GAP = 1.5  # times the usual time between stamps, of which nine in ten are no longer
-_STEP_READINGS = 20_000
 _WHOLE = 0.05  # by how much a difference of readings may be off a whole number of steps
 _COARSE = math.sqrt(3.0)  # steps of readings over their sigma, from which rounding is no longer white and small
-_NORMAL = 1.96
 
 SizesOfTerms = Mapping[str, Size]
 
@@ -146,10 +142,10 @@ class ChannelGroup:
         """Take readings (n, c) at times (n,) that follow those before, or begin a rest."""
         if not len(values):
             return
-        if not math.isfinite(self._most_s) and len(elapsed_s) > _INTERVALS:
+        if not math.isfinite(self._most_s) and len(elapsed_s) > FEWEST_READINGS:
             self._most_s = _GAP * float(np.quantile(np.diff(elapsed_s), 0.9))
-        if self._first_count < _STEP_READINGS:
-            self._first.append(values[: _STEP_READINGS - self._first_count].copy())
+        if self._first_count < BLOCK_SAMPLES:
+            self._first.append(values[: BLOCK_SAMPLES - self._first_count].copy())
             self._first_count += len(self._first[-1])
         steps_s = np.diff(elapsed_s, prepend=self._last_s if math.isfinite(self._last_s) else elapsed_s[0])
         breaks = np.flatnonzero(steps_s > self._most_s).tolist()
@@ -197,12 +193,12 @@ def channel_noise(group: ChannelGroup, channel: int) -> ChannelNoise:
     """The noise of one channel of a group."""
     period_s, allan = group.period_s, group.differences.allan()
     longest = max(group.differences.lengths, default=0)
-    usable = allan.sizes * _CLUSTERS <= longest
+    usable = allan.sizes * FEWEST_CLUSTERS <= longest
     variances, cluster_sizes = allan.variance[usable, channel], allan.sizes[usable]
     tau_s = period_s * cluster_sizes
     nothing = np.zeros(0)
     bare = ChannelNoise(group.names[channel], group.unit, period_s, nothing, nothing, nothing, nothing)
-    if group.differences.count < _FEWEST_READINGS or len(tau_s) < _FEWEST_SIZES:
+    if group.differences.count < LAGS or len(tau_s) < len(TERMS):
         return replace(bare, why_not="too few readings at rest follow each other without a gap")
     if not (variances > 0.0).all():
         return replace(bare, why_not="its readings do not change", tau_s=tau_s, deviation=np.sqrt(variances),
@@ -252,7 +248,7 @@ def _fitted(
 def _fit_allan(variances: Floats, cluster_sizes: Ints, lengths: Mapping[int, int], period_s: float) -> _AllanOutcome:
     """The fit that leaves out as few of the shortest clusters as it must to agree; where none does, the best one."""
     outcomes = list[_AllanOutcome]()
-    for first in range(len(cluster_sizes) - _FEWEST_SIZES + 1):
+    for first in range(len(cluster_sizes) - len(TERMS) + 1):
         outcomes.append(_fit_allan_from(first, variances, cluster_sizes, lengths, period_s))
         if outcomes[-1].p_value >= LEVEL:
             return outcomes[-1]
@@ -298,7 +294,7 @@ def _deviation_interval(deviation: Floats, spread: Floats) -> tuple[Floats, Floa
     """95 % interval of deviations whose variances have so large a relative sigma: chi-squared of 2 / spread^2 degrees
     of freedom, in the cube root of which it is nearly normal (Wilson and Hilferty)."""
     ninth = spread**2 / 9.0
-    ends = [np.maximum(1.0 - ninth + sign * _NORMAL * np.sqrt(ninth), 1e-2) ** 1.5 for sign in (1.0, -1.0)]
+    ends = [np.maximum(1.0 - ninth + sign * SIGMAS_95 * np.sqrt(ninth), 1e-2) ** 1.5 for sign in (1.0, -1.0)]
     return deviation / ends[0], deviation / ends[1]
 
 
@@ -373,7 +369,7 @@ def noise_at_rest(
 
 def _blocks(source: Source, segmenter: RestSegmenter, thermometer: ChannelGroup | None) -> Iterator[Block]:
     """The blocks of all rests; temperatures go to the thermometer as they pass by."""
-    first_ns, last_ns = None, -(1 << 62)
+    first_ns, last_ns = None, -LAST_NS
     for batch in source:
         stream = batch.temperature
         if thermometer is not None and len(stream):

@@ -13,17 +13,14 @@ from functools import cached_property
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import AT_ONCE, ROUNDING, Floats
 from kf_calib.dwells.qr import square_triangle, triangle
 from kf_calib.noise import banded
 from kf_calib.noise.noise_model import lift_rounding
+from kf_calib.support.searches import ENOUGH, MOST_HALVINGS, MOST_STEPS
 
 _LEAST = 1e-4  # relative to the size at which a search begins; smaller sizes count as zero
 _NEAR = 0.5  # if ln of a size changes by more, the search did not begin near its end
-_ENOUGH = 1e-9  # the search ends when less log-likelihood than this can be gained,
-_ROUNDING = 1e-12  # or less than this share of the cost, which for thousands of dwells is not computed better
-_STEPS, _HALVES = 100, 12
-_AT_ONCE = 1024  # means that are worked on together where they are not correlated
 
 
 @dataclass(frozen=True)
@@ -99,7 +96,7 @@ class Restricted:
     def _parts(self) -> list[slice]:
         """The means that are worked on together: all where they are correlated, else as many as stay in the cache."""
         count = len(self.fixed)
-        size = _AT_ONCE if self.fixed.shape[1] == 3 else count
+        size = AT_ONCE if self.fixed.shape[1] == 3 else count
         return [slice(k, min(k + size, count)) for k in range(0, count, size)]
 
     def _shapes_of(self, part: slice) -> Floats:
@@ -180,13 +177,13 @@ class Restricted:
         far above the minimum, a step then halves a size approximately; from far below it doubles it.
         """
         point = self.at(sizes**2)
-        for _ in range(_STEPS):
+        for _ in range(MOST_STEPS):
             slope = 2.0 * sizes * point.slope
             curve = 4.0 * np.outer(sizes, sizes) * point.information + np.diag(2.0 * np.abs(point.slope) + 1e-12)
             free = (sizes > _LEAST) | (slope < 0.0)
             step = np.zeros_like(sizes)
             step[free] = -np.linalg.solve(curve[np.ix_(free, free)], slope[free])
-            enough = max(_ENOUGH, _ROUNDING * abs(point.cost))
+            enough = max(ENOUGH, ROUNDING * abs(point.cost))  # for thousands of dwells the cost is no more exact
             lower = self._lower(sizes, step, point) if -0.5 * slope @ step > enough else None
             if lower is None:
                 break
@@ -195,7 +192,7 @@ class Restricted:
 
     def _lower(self, sizes: Floats, step: Floats, point: Point) -> tuple[Floats, Point] | None:
         """Return the sizes and the point after the step, halved until the cost is lower; None if it never is."""
-        for _ in range(_HALVES):
+        for _ in range(MOST_HALVINGS):
             moved = np.maximum(sizes + step, _LEAST)
             there = self._level(moved**2)
             if there.cost < point.cost:

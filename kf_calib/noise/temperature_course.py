@@ -23,18 +23,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import ROUNDING, Floats
+from kf_calib.dwells.limits import CUBIC, FEWEST_COMPARED, FEWEST_READINGS
 from kf_calib.dwells.pieces import OfPieces
 from kf_calib.dwells.sufficient_statistics import Dwell
 from kf_calib.dwells.table import DwellTable, FoldedDwells, computed_once
 from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C
 
 _KNOTS, _MOST_KNOTS = 3, 200  # of a dwell, and of the run
-_ORDER = 4  # of the differences that are held small: what is left of the noise is least in the run of a climate
+_ORDER = CUBIC + 1  # of the differences that are held small: cubics are free, which is best for the run of a climate
 _CARRIED_S = 1.5  # readings once a second are carried on to the next one, which adds to the noise of short pieces
-_ROUNDING_C = 1e-9  # of the means of temperatures that are all the same
-_QUIET = 1e-5  # noise of the mean of a dwell over the spread of the temperature
-_FEWEST = 12  # degrees of freedom within dwells
 _STEPS = 2.0  # the curve leaves at most this times the variance that parabolas within the dwells leave
 _KEPT = 1e-4  # share of the variance of the errors that may be left out
 _SIMPSON = np.array([1.0, 4.0, 1.0]) / 6.0
@@ -60,7 +58,7 @@ def temperature_course(folded: FoldedDwells) -> TemperatureCourse:
     """The course of the temperature over dwells, and slews between them, in order of time."""
     read = folded.pieces.nodes.temperature_c
     exact = TemperatureCourse(read, np.zeros((len(read), 0)))
-    if (~folded.moving).sum() < 4 or not np.isfinite(read).all():
+    if (~folded.moving).sum() < FEWEST_COMPARED or not np.isfinite(read).all():
         return exact
     if _only_scatters(folded, read):
         return TemperatureCourse(np.full(len(read), _means(folded, read).mean()), exact.errors_c)
@@ -91,18 +89,17 @@ def _smooth(folded: FoldedDwells, read: Floats) -> TemperatureCourse | None:
     lengths, owners = ends[:, 2] - ends[:, 0], np.repeat(np.cumsum(standing) - 1, folded.piece_numbers)
     used = (lengths > 0.0) & np.repeat(standing, folded.piece_numbers)
     ends, levels, lengths, owners = ends[used], levels[used], lengths[used], owners[used]
-    if not len(levels) or np.ptp(levels) < _ROUNDING_C:
+    if not len(levels) or np.ptp(levels) <= ROUNDING * np.abs(levels).max():
         return None  # a thermometer that always reads the same
     weights = lengths**2 / (lengths + _CARRIED_S)  # over the variance of readings of 1 K per sqrt(Hz)
     within, freedom = _within_dwells(ends[:, 1], levels, weights, owners)
-    if freedom < _FEWEST:
+    if freedom < FEWEST_READINGS:
         return None
     knots = min(_KNOTS * int(standing.sum()), _MOST_KNOTS)
     begin, spacing = ends[0, 0], (ends[-1, 2] - ends[0, 0]) / (knots - 3)
     over_piece = np.einsum("j,njk->nk", _SIMPSON, _bumps((ends - begin) / spacing, knots))
     spline = _Spline.through(over_piece, levels, weights)
-    usual_s = float(np.median(np.bincount(owners, lengths)))
-    if spline.variance / usual_s < (_QUIET * levels.std()) ** 2 or spline.variance > _STEPS * within:
+    if spline.variance > _STEPS * within:
         return None
     there = _bumps(np.clip((folded.elapsed_s - begin) / spacing, 0.0, knots - 3), knots)
     return TemperatureCourse(levels.mean() + there @ spline.coefficients, _largest(there @ spline.errors))

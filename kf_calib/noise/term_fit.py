@@ -27,11 +27,9 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, Mask
+from kf_calib.support.searches import ENOUGH, MOST_HALVINGS, MOST_STEPS
+from kf_calib.support.tail_probabilities import SIGMAS_95, VARIANCE_SEEN
 
-_INTERVAL, _SEEN = 3.84, 5.41
-_ROUNDS, _CONVERGED = 60, 1e-7
-_HALVINGS = 12
-_STEPS = 60  # of a search for an end of an interval
 _WIDTH = 2e-3  # relative, of an end
 
 
@@ -126,12 +124,12 @@ def minimum(objective: Objective, start: Floats, free: Mask | None = None) -> Mi
     squares = start.copy()
     places = np.flatnonzero(np.ones(len(start), bool) if free is None else free)
     value, gradient, curvature = objective(squares)
-    for _ in range(_ROUNDS):
+    for _ in range(MOST_STEPS):
         inner, scale = curvature[np.ix_(places, places)], 1.0 / np.sqrt(np.diag(curvature)[places])
         factor = np.linalg.cholesky(inner * np.outer(scale, scale) + 1e-10 * np.eye(len(places)))
         target = factor.T @ (squares[places] / scale) - np.linalg.solve(factor, gradient[places] * scale)
         step = nnls(factor.T, target)[0] * scale - squares[places]
-        for halving in range(_HALVINGS):
+        for halving in range(MOST_HALVINGS):
             trial = squares.copy()
             trial[places] = np.maximum(squares[places] + step * 0.5**halving, 0.0)
             if not trial.any():
@@ -143,7 +141,7 @@ def minimum(objective: Objective, start: Floats, free: Mask | None = None) -> Mi
             break
         fall, squares = value - new[0], trial
         value, gradient, curvature = new
-        if fall < _CONVERGED:
+        if fall < ENOUGH:
             break
     return Minimum(squares, value)
 
@@ -175,7 +173,7 @@ def sizes(objective: Objective, best: Minimum, inflation: float = 1.0) -> TermSi
     while True:
         rises = {term: needed.rise(term, 0.0) for term in np.flatnonzero(needed.free).tolist()}
         weakest = min(rises, key=lambda term: rises[term])
-        if rises[weakest] > _SEEN or len(rises) == 1:
+        if rises[weakest] > VARIANCE_SEEN or len(rises) == 1:
             break
         needed = needed.without(weakest)
     return TermSizes([_size(everything, needed, term) for term in range(count)], list(rises), needed.best.squares)
@@ -225,10 +223,10 @@ class _Profile:
         scale = square if square > 0.0 else float(self.objective.start()[term])
 
         def above(trial: float) -> float:
-            return self.rise(term, trial) - _INTERVAL
+            return self.rise(term, trial) - SIGMAS_95**2
 
         high = math.sqrt(_end(above, square, scale))
-        if self.rise(term, 0.0) <= _SEEN:
+        if self.rise(term, 0.0) <= VARIANCE_SEEN:
             return 0.0, high
         return math.sqrt(_between(above, square, 0.0)), high
 
@@ -236,7 +234,7 @@ class _Profile:
 def _end(above: Callable[[float], float], square: float, scale: float) -> float:
     """The square above the estimate where a function that rises with it becomes positive."""
     inside, factor = square, 1e-4
-    for _ in range(_STEPS):
+    for _ in range(MOST_STEPS):
         outside = square + factor * scale
         if above(outside) >= 0.0:
             return _between(above, inside, outside)
@@ -249,5 +247,5 @@ def _between(above: Callable[[float], float], inside: float, outside: float) -> 
     from scipy.optimize import brentq
 
     accuracy = _WIDTH * max(abs(outside - inside), np.finfo(float).tiny)
-    root: Any = brentq(above, inside, outside, xtol=accuracy, maxiter=_STEPS)
+    root: Any = brentq(above, inside, outside, xtol=accuracy, maxiter=MOST_STEPS)
     return float(root)

@@ -24,6 +24,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
+from kf_calib.dwells.limits import FEWEST_COMPARED
 from kf_calib.dwells.table import DwellTable, FoldedDwells, computed_once
 from kf_calib.noise import temperature_course
 from kf_calib.noise.means import Means
@@ -169,8 +170,6 @@ class WavesOverRun(NoiseTerm):
 
     flicker_mps2: Floats
     scope: ClassVar[Scope] = "run"
-    FEWEST: ClassVar[int] = 4
-    """Dwells that show the waves of a run."""
 
     @property
     def sizes(self) -> Floats:
@@ -179,7 +178,7 @@ class WavesOverRun(NoiseTerm):
     def columns(self, dwells: DwellTable, state: Floats) -> Floats:
         channels, folded = np.flatnonzero(self.flicker_mps2 > 0), dwells.folded
         pieces, width = folded.ends[-1], folded.width
-        if len(dwells) < self.FEWEST:
+        if len(dwells) < FEWEST_COMPARED:
             return np.zeros((pieces, width, 3, 0))
         begin_s, orders = folded.ends_s[0, 0], np.arange(1, _WANDER + 1)
         at = (folded.ends_s.mean(axis=1) - begin_s) / (folded.ends_s[-1, 1] - begin_s)

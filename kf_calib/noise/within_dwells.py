@@ -12,7 +12,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells import window_average
 from kf_calib.dwells.pieces import lagged_walk_products
-from kf_calib.dwells.sufficient_statistics import Autocovariance, Dwell
+from kf_calib.dwells.sufficient_statistics import LAGS, Autocovariance, Dwell
 from kf_calib.dwells.table import DwellTable, FoldedDwells, computed_once
 from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.noise_of_readings import (
@@ -22,15 +22,13 @@ from kf_calib.noise.noise_of_readings import (
     shares_in_correlation,
     unbiased,
 )
+from kf_calib.support.searches import MOST_STEPS
 
-_MAX_ORDER = 20
-_LONGEST = 2.0  # kappa is at most the readings in a block divided by this
-_SHORT = 8.0  # if blocks are shorter than this times kappa, channels that are alike share one correlation
 TOO_SHORT = 4.0
-"""If blocks are shorter than this times kappa, they do not determine how slow their noise is."""
-
-_AVERAGES = 60  # least number of averages of a block from which their own correlation is estimated
-_STEPS_ALONG = 30
+"""If blocks are shorter than this times kappa, they do not determine how slow their noise is. kappa is then as large as
+in blocks half as long as they would have to be; in blocks up to twice as long, channels that are alike share one
+correlation."""
+_LONGEST, _SHORT = TOO_SHORT / 2.0, TOO_SHORT * 2.0
 
 
 def within_dwells(dwells: Sequence[Dwell], walk_mps2_per_sqrt_s: float = 0.0, along: Floats | None = None) -> Noise:
@@ -104,7 +102,7 @@ def _sigma_along(table: DwellTable, along: Floats, inflation: Floats) -> Floats:
     if not squares.any() or not freedom.any():
         return np.zeros(3)
     variances = np.full(3, squares.sum() / (freedom @ weights).sum())
-    for _ in range(_STEPS_ALONG):
+    for _ in range(MOST_STEPS):
         expected = weights @ variances
         variances = variances * ((squares / expected**2) @ weights) / np.maximum((freedom / expected) @ weights, 1e-300)
     return np.sqrt(variances)
@@ -129,10 +127,10 @@ def _inflation(total: Autocovariance, channel: int) -> tuple[float, float]:
     kappa is limited from above to what blocks of this length can show. It is below 1 where averages fall faster than
     those of white noise, but above 1/n: that is what is left of n differences when they are added up.
     """
-    if total.count < 64 or total.products[0, channel] <= 0:
+    if total.count < LAGS or total.products[0, channel] <= 0:
         return 1.0, 0.0
     size = round(total.count / total.blocks)
-    lags = min(_MAX_ORDER, total.count // 16, size // 4)
+    lags = min(LAGS, total.count // 16, size // 4)
     raw = total.products[: lags + 1, channel] / np.maximum(total.pairs[: lags + 1], 1.0)
     model, variance = unbiased(raw, total.count, size)
     return min(max(model.inflation, 1.0 / size), max(size / _LONGEST, 1.0)), variance
@@ -167,7 +165,7 @@ def _of_averages(total: Autocovariance, channel: int) -> tuple[float, float]:
     if not total.count:
         return 1.0, 0.0
     size, kappa = round(total.count / total.blocks), window_average.inflation()
-    if size >= _AVERAGES:
+    if size >= LAGS:
         found, variance = _inflation(total, channel)
         return max(found, kappa), variance
     kept = expected_products(np.append(window_average.correlations(), np.zeros(size))[:size], 0)[0] / size

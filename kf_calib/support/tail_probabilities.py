@@ -7,6 +7,8 @@ half of its digits when the denominator has 1e9 degrees of freedom.
 from __future__ import annotations
 
 import math
+from functools import cache
+from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +19,12 @@ SHARE = 0.4
 """Share of the false-alarm probability that is given to the test of the misfit, and as much to the scan of effects."""
 REST = 0.5 * (1.0 - 2.0 * SHARE)
 """Share that is given to the test of spectral lines, and as much to that of trends within dwells."""
+
+SIGMAS_95 = NormalDist().inv_cdf(0.975)
+"""Within so many sigmas lie 95 % of normal numbers: 1.96; its square, 3.84, is the 95 % point of chi-squared with one
+degree of freedom, and the 2.5 % point of the likelihood ratio of a variance against zero, half of it."""
+VARIANCE_SEEN = NormalDist().inv_cdf(1.0 - LEVEL) ** 2
+"""1 % point of the likelihood ratio of a variance against zero: 5.41."""
 
 _PRECISION = 4e-16
 _INFINITE = 1e18  # degrees of freedom of noise that is as good as known
@@ -47,6 +55,13 @@ def f_tail(freedom: float, noise_freedom: float, ratio: float) -> float:
 def chi_squared_tail(freedom: float, value: float) -> float:
     """Probability that chi-squared with these degrees of freedom exceeds ``value``: F with a known noise."""
     return f_tail(freedom, _INFINITE, value / freedom)
+
+
+@cache
+def normal_quantile(probability: float) -> float:
+    """The number below which a normal one of unit variance is with this probability; for 0.75 the median of its
+    size."""
+    return NormalDist().inv_cdf(probability)
 
 
 def sidak(p_value: float, tests: float) -> float:

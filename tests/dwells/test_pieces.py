@@ -124,11 +124,14 @@ def test_fewer_pieces_tell_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     assert merged.consistency.p_value == pytest.approx(whole.consistency.p_value, abs=0.01)
 
 
-def test_moments_of_a_walk_over_many_readings_are_those_that_it_has(monkeypatch: pytest.MonkeyPatch) -> None:
-    count = 40_000
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 7, 40, 20_000])
+def test_moments_of_a_walk_are_sums_over_its_steps(count: int) -> None:
+    """Each step moves all later readings; two readings lie on their line."""
+    u = np.linspace(-1.0, 1.0, count) if count > 1 else np.zeros(1)
+    design = np.column_stack([np.ones(count), u, u * u][: max(count, 1)])
+    onto = np.vstack([np.linalg.pinv(design), np.zeros((3 - design.shape[1], count)), np.arange(count) == count - 1])
+    steps = np.cumsum(onto[:, ::-1], axis=1)[:, ::-1][:, 1:]
     covariance, squares = pieces._moments(count)
-    monkeypatch.setattr(pieces, "_MANY", count)
-    whole, whole_squares = pieces._moments.__wrapped__(count)
-    scale = np.sqrt(np.diag(whole))
-    assert covariance.shape == (4, 4) and np.abs((covariance - whole) / scale / scale[:, None]).max() < 2e-4
-    assert squares == pytest.approx(whole_squares, rel=2e-4)
+    np.testing.assert_allclose(covariance, steps @ steps.T, atol=1e-9 * count)
+    fitted = np.trace(design.T @ design @ covariance[: design.shape[1], : design.shape[1]])
+    assert squares == pytest.approx(0.5 * count * (count - 1) - fitted, rel=1e-6, abs=1e-9)

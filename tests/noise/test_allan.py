@@ -76,7 +76,7 @@ def test_the_spread_is_that_of_white_noise_drawn_anew() -> None:
 
 
 def test_the_longest_dwell_is_used_whatever_its_length(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("kf_calib.noise.allan._READINGS", 10)
+    monkeypatch.setattr("kf_calib.noise.allan.MOST_KEPT", 10)
     result = calibrate(Run(dwells=6, count=100))
     longest = max(result.fit.dwells, key=lambda dwell: dwell.count)
     assert list(LongestDwells(result.fit.dwells, result.noise).kept) == [longest.number]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.noise.block_differences import EVERY, KEPT, BlockDifferences
+from kf_calib.noise.block_differences import EVERY, BlockDifferences
 
 
 def of_stretches(*stretches: Floats, at_once: int = 4096) -> BlockDifferences:
@@ -86,7 +86,7 @@ def test_block_means_are_those_of_the_shortest_blocks_that_are_few_enough() -> N
     values = walks(3000)
     differences = of_stretches(values[:1000], values[1000:])
     size, stretches = differences.block_means(0)
-    assert size == 4 and [len(means) for means in stretches] == [250, 500] and 750 <= KEPT
+    assert size == 4 and [len(means) for means in stretches] == [250, 500] and 750 <= EVERY
     expected = values[1000:].reshape(-1, 4, 3).mean(axis=1) - values[0]
     assert stretches[1] == pytest.approx(expected, abs=1e-12)
     assert differences.block_means(5)[0] == 32

@@ -137,7 +137,7 @@ def test_means_that_are_worked_on_in_parts_have_the_same_likelihood(monkeypatch:
     made = Restricted(whole.rows, whole.prior, uncorrelated[0], tuple(uncorrelated[1:]))
     variances = np.array([0.3, 2.0, 0.7])
     at_once = made.at(variances)
-    monkeypatch.setattr("kf_calib.noise.restricted_likelihood._AT_ONCE", 4)
+    monkeypatch.setattr("kf_calib.noise.restricted_likelihood.AT_ONCE", 4)
     in_parts = Restricted(made.rows, made.prior, made.fixed, made.shapes).at(variances)
     assert in_parts.cost == pytest.approx(at_once.cost, rel=1e-12)
     np.testing.assert_allclose(in_parts.slope, at_once.slope, rtol=1e-9)

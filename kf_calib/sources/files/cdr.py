@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.bench.streams import Stream
+from kf_calib.bench.streams import SECOND_NS, Stream
 from kf_calib.sources.files.fields import Joints, JointsError
 
 Offsets = NDArray[np.int64]
@@ -25,7 +25,6 @@ Offsets = NDArray[np.int64]
 _LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 _FRAME = 12  # byte offset of frame_id in every message that starts with a std_msgs/Header
 _HEAD = np.dtype([("kind", "<u4"), ("sec", "<i4"), ("nanosec", "<u4"), ("frame", "<u4")])
-_NS_PER_S = 1_000_000_000
 _MAX_PADDING = 7
 _ANEW = "the messages are not of the type that the topic has, so record it anew, or choose another topic"
 
@@ -258,7 +257,7 @@ def filled(kind: MessageType, template: bytes, stream: Stream) -> NDArray[np.voi
 
 def fill(messages: NDArray[np.void], stream: Stream) -> None:
     """Put stamps and values, of their number, into messages (n,); raises CdrError where a stamp does not fit."""
-    seconds, nanoseconds = np.divmod(stream.time_ns, _NS_PER_S)
+    seconds, nanoseconds = np.divmod(stream.time_ns, SECOND_NS)
     if len(seconds) and not (0 <= seconds.min() and seconds.max() < 2**31):
         raise CdrError("stamps must be nanoseconds between the years 1970 and 2038")
     messages["sec"], messages["nanosec"], messages["values"] = seconds, nanoseconds, stream.values
@@ -303,7 +302,7 @@ class Decoder:
             if every["names"].shape[1]:
                 names = every["names"][at[rest]]
                 alike &= (names == names[0]).all(axis=1)
-            stamps = head["sec"].astype(np.int64) * _NS_PER_S + head["nanosec"]
+            stamps = head["sec"].astype(np.int64) * SECOND_NS + head["nanosec"]
             if len(rest) == len(at) and alike.all() and columns is not None:
                 return at, Stream(stamps, self._values(every["numbers"][at], layout, columns))
             part, rest = rest[alike], rest[~alike]

@@ -12,12 +12,10 @@ from itertools import pairwise
 import numpy as np
 
 from kf_calib.bench.arrays import Mask, Times
-from kf_calib.bench.streams import Batch, Stream
+from kf_calib.bench.streams import LEAP_NS, SECOND_NS, Batch, Stream
 
-_SECOND_NS = 1_000_000_000
-_BACK_NS = 5 * _SECOND_NS  # less is a late sample, or a bench that sends its last readings again after a lost link
-_LEAP_NS = 10 * _SECOND_NS  # further ahead is a pause or a damaged stamp: the readings after it tell which
-_SET_NS = 86_400 * _SECOND_NS  # no pause is as long as this: the clock was set
+_BACK_NS = 5 * SECOND_NS  # less is a late sample, or a bench that sends its last readings again after a lost link
+_SET_NS = 86_400 * SECOND_NS  # no pause is as long as this: the clock was set
 _BREAK_S = 1.0  # at least, before the new stamps: angles that came a little late are still in order
 _PERSISTS = 5  # readings that agree with each other tell a clock that was set from damaged stamps
 
@@ -37,7 +35,7 @@ class Restart:
     @property
     def reason(self) -> str:
         way = "back" if self.by_ns < 0 else "ahead"
-        return f"the bench's clock jumped {way} by {abs(self.by_ns) / _SECOND_NS:.1f} s"
+        return f"the bench's clock jumped {way} by {abs(self.by_ns) / SECOND_NS:.1f} s"
 
 
 class Clock:
@@ -68,7 +66,7 @@ class Clock:
         first_ns = int(self._first.time_ns[0])
         if self._unmoved >= _PERSISTS:
             return (
-                f"the bench's clock stands still at {(self._last_ns - first_ns) / _SECOND_NS:.3f} s after the first "
+                f"the bench's clock stands still at {(self._last_ns - first_ns) / SECOND_NS:.3f} s after the first "
                 "reading; what comes is recorded and left out of the evaluation"
             )
         if not self.restarts:
@@ -76,7 +74,7 @@ class Clock:
         last, count = self.restarts[-1], len(self.restarts)
         times = f" (it was set {count} times in all)" if count > 1 else ""
         return (
-            f"{last.reason}, {(last.after_ns - first_ns) / _SECOND_NS:.3f} s after the first reading{times}; the new "
+            f"{last.reason}, {(last.after_ns - first_ns) / SECOND_NS:.3f} s after the first reading{times}; the new "
             "stamps are counted on from the last one"
         )
 
@@ -135,7 +133,7 @@ class Clock:
     def _agreeing(self, raw: list[int]) -> tuple[int, int]:
         """How many of these stamps, from the first on, go on from each other and not from the last, and how many have
         to for a clock that was set; after a pause one more is enough."""
-        longest_ns, needed = (_SET_NS, 2) if self._is_pause(raw[0]) else (_LEAP_NS, _PERSISTS)
+        longest_ns, needed = (_SET_NS, 2) if self._is_pause(raw[0]) else (LEAP_NS, _PERSISTS)
         count = 1
         for before, stamp in pairwise(raw):
             if not -_BACK_NS < stamp - before < longest_ns or self._follows(stamp + self._shifts[-1]):
@@ -158,7 +156,7 @@ class Clock:
             self._last_ns = raw + self._shifts[-1]
             return
         step = raw + self._shifts[-1] - self._last_ns
-        begin = self._last_ns + round(max(now_s - self._came_s, _BREAK_S) * _SECOND_NS)
+        begin = self._last_ns + round(max(now_s - self._came_s, _BREAK_S) * SECOND_NS)
         self.restarts.append(Restart(self._last_ns, begin, step, begin - raw))
         self._shifts.append(begin - raw)
         self._last_ns = begin
@@ -208,7 +206,7 @@ class _Follower:
 
 def _fit(steps: Times) -> Mask:
     """Which steps from stamp to stamp are those of a clock that goes on."""
-    return (steps > -_BACK_NS) & (steps < _LEAP_NS)
+    return (steps > -_BACK_NS) & (steps < LEAP_NS)
 
 
 _ENOUGH = 16  # steps that give a period
