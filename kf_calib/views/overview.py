@@ -219,11 +219,9 @@ def table_report(overview: TableOverview) -> RenderableType:
 
 
 def _column_table(columns: Sequence[dict[str, str]]) -> ConsoleTable:
-    rows = [
-        (cut(column["header"], 40), cut(column["first"], 24), _quantity(column["meaning"]),
-         _UNITS.get(column["unit"], column["unit"]), _TOLD[column["told_by"]])
-        for column in columns
-    ]  # fmt: skip
+    cells = ((each["header"], each["first"], each["meaning"], each["unit"], each["told_by"]) for each in columns)
+    rows = [(cut(header, 40), cut(first, 24), _quantity(meaning), _UNITS.get(unit, unit), _TOLD[told_by])
+            for header, first, meaning, unit, told_by in cells]  # fmt: skip
     return table("", ("column", "first cell", "taken for", "unit", "told"), rows, **LINED)
 
 
@@ -248,6 +246,5 @@ def _row_table(survey: Survey) -> ConsoleTable:
          "" if math.isnan(row["temperature_c"]) else f"{row['temperature_c']:.2f}")
         for row in survey.described_rows[:_SHOWN_ROWS]
     ]  # fmt: skip
-    orientation = f">{_ORIENTATIONS[survey.orientation]}"
-    headings = ">dwell", ">row", ">at s", orientation, ">norm m/s^2", ">readings", ">°C"
+    headings = ">dwell", ">row", ">at s", f">{_ORIENTATIONS[survey.orientation]}", ">norm m/s^2", ">readings", ">°C"
     return table("", headings, rows, **LINED)
