@@ -189,7 +189,7 @@ def test_nothing_lies_beside_the_packages() -> None:
 CEILINGS = {
     "kf_calib": 188,
     "support": 1039,
-    "bench": 1691,
+    "bench": 1700,
     "effects": 3140,
     "sources": 12162,
     "dwells": 3815,
@@ -213,7 +213,8 @@ CEILINGS = {
 """How many lines each room may have. A ceiling is lowered when its room has shrunk. Those of estimation, diagnosis and
 (by four lines) views were raised once, for intervals that average over two sizes of noise, and for dwells that are off
 beside other terms; that of diagnosis three times more, for causes that nobody knows beside stated noise, for what one
-accelerometer alone has, and for the readings within dwells beside what is fitted."""
+accelerometer alone has, and for the readings within dwells beside what is fitted. That of bench was raised by nine for
+the numbers of rounding, differences and memory, which thirteen modules had each for itself."""
 UNDER_A_CEILING = 400  # lines: where a room has more room than this, its ceiling is out of date
 
 

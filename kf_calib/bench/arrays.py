@@ -21,6 +21,15 @@ Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
+ROUNDING = 1e-9
+"""Share of the largest of numbers below which another is what rounding leaves of zero."""
+DIFFERENCE = float(np.finfo(float).eps) ** (1.0 / 3.0)
+"""Step of central differences, of what counts from 1: rounding and curvature then leave errors alike."""
+IN_CACHE = 1 << 17
+"""Numbers that are worked on together, so that they stay in the cache of a processor."""
+IN_MEMORY = 1 << 22
+"""Numbers that are made together: 32 MB."""
+
 
 def lengths(vectors: Floats) -> Floats:
     """The length (n,) of each row (n, k) of numbers as they stand in a file; infinite where it is beyond a double."""
@@ -28,12 +37,12 @@ def lengths(vectors: Floats) -> Floats:
         return np.asarray(np.linalg.norm(vectors, axis=1))
 
 
-def sign(values: Floats, least: float = 1e-9) -> Floats:
+def sign(values: Floats, least: float = ROUNDING) -> Floats:
     """The sign of numbers in SI; 0 of those that are no larger than what rounding leaves of zero."""
     return np.sign(np.where(np.abs(values) > least, values, 0.0))
 
 
-def first_least(values: Floats, tie: float = 1e-9) -> int:
+def first_least(values: Floats, tie: float = ROUNDING) -> int:
     """Index of the least of numbers (n,); the first of those that are as small but for rounding.
 
     Processors round differently. By ``argmin`` one of several equal choices would be another on each.

@@ -21,7 +21,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import ROUNDING, Floats
 from kf_calib.bench.streams import Source, Table
 from kf_calib.dwells.qr import triangle
 from kf_calib.estimation.calibration import calibrate, filterpy_estimate
@@ -184,9 +184,6 @@ def _remarks(settings: Settings, result: Calibration) -> list[str]:
     return said
 
 
-_SEEN = 1e-9  # singular values that are smaller relative to the largest are rounding
-
-
 def least_squares(samples: Iterable[Samples], around: Floats) -> tuple[Floats, Floats]:
     """State (p,) and covariance (p, p) from all samples, with a diffuse prior and without process noise.
 
@@ -228,7 +225,7 @@ def _solution(rows: Floats, scale: Floats, around: Floats) -> tuple[Floats, Floa
     design, readings = rows[:, :-1], rows[:, -1]
     left, upper = np.linalg.qr(design / scale)
     rotated, singular, right = np.linalg.svd(upper, full_matrices=False)  # fewer rows than columns at first
-    seen = singular > _SEEN * singular[0]
+    seen = singular > ROUNDING * singular[0]
     inverse = (right[seen].T / singular[seen]) / scale[:, None]
     solution = around + inverse @ (rotated[:, seen].T @ (left.T @ (readings - design @ around)))
     return np.asarray(solution, float), np.asarray(inverse @ inverse.T, float)
