@@ -21,7 +21,6 @@ from kf_calib.estimation.measurement_model import Model, effect_columns
 from kf_calib.noise.means import Means, means_of
 from kf_calib.noise.temperature_course import temperature_course
 
-_LITTLE_RAD = 1e-4  # of a setting error of 0.01 deg it leaves 0.2 um/s^2 along the specific force
 FARTHEST_RAD = 0.3
 """By which attitudes are turned in a step; what hardly determined coefficients may amount to, but no bench."""
 _VIBRATING = 15.0  # mean squared deviation of the variances in units of sigma; autocorrelation alone gives up to 10
@@ -240,7 +239,7 @@ def dwells_at_state(dwells: DwellTable, model: Model, state: Floats) -> DwellTab
     sensitivities. What is still to be found (changes of coefficients, of S and of alpha) acts on g, which therefore
     takes the place of f. The columns of the effects there, times their coefficients, amount to S (R(alpha) rho x g),
     and alpha itself, about which the prior is zero, to S (alpha x g); as S g has both rotations in it already, they
-    are added to the readings. An rho below ``_LITTLE_RAD`` in all dwells, or absurd, is taken for none.
+    are added to the readings. An absurd rho is taken for none.
     """
     rotations = _rotations_of_effects(dwells, model, state)
     if rotations is None and dwells.attitudes is None:
@@ -255,12 +254,12 @@ def dwells_at_state(dwells: DwellTable, model: Model, state: Floats) -> DwellTab
 
 
 def _rotations_of_effects(table: DwellTable, model: Model, state: Floats) -> Floats | None:
-    """Return the mean rotation vector (D, 3) of each dwell by effects of the frame; None where they are little."""
+    """Return the mean rotation vector (D, 3) of each dwell by effects of the frame; None where there are none."""
     if not model.bench.angles or not any(isinstance(effect, FrameEffect) for effect in model.effects):
         return None
     rotations, ends = model.turned_rad(stimulus_of(table, model.bench, state), state), 3 * table.folded.ends
     means = np.add.reduceat(rotations, ends[:-1], axis=0) / np.diff(ends)[:, None]
-    return means if _LITTLE_RAD < np.abs(means).max() < FARTHEST_RAD else None
+    return means if 0.0 < np.abs(means).max() < FARTHEST_RAD else None
 
 
 def turning_mps2(dwells: DwellTable, force_mps2: Floats, state: Floats, times: Indices | int) -> Floats:

@@ -39,7 +39,6 @@ from kf_calib.support.text import as_html, printed
 from kf_calib.support.units import field_unit, shown
 
 _WEAK = 5.0  # times the size that a coefficient may well have
-_CLEAR = 3.0  # sigmas: of a coefficient that is seen, however large it is
 _QUIET = 1e-6  # probability that dwells differ as little by noise, below which the noise is taken for too large
 
 
@@ -256,7 +255,7 @@ class Calibration:
         sigmas = np.where((gains != 1.0) & (sigmas > effects), np.nan, sigmas)  # not known: sigma over value
         if not self.bench.angles:  # |f| tells of some effects little more than that they are not absurdly large
             scales = np.array([coefficient.scale for coefficient in coefficients])
-            weak = (sigmas > _WEAK * scales) & (np.abs(effects) < _CLEAR * sigmas)
+            weak = (sigmas > _WEAK * scales) & (np.abs(effects) < NORMAL * sigmas)
             sigmas = np.where((gains == 1.0) & weak, np.nan, sigmas)
         rows = [
             *zip(
