@@ -25,7 +25,7 @@ from kf_calib.bench.arrays import ROUNDING, Floats
 from kf_calib.bench.streams import Source, Table
 from kf_calib.dwells.qr import triangle
 from kf_calib.estimation.calibration import calibrate, filterpy_estimate
-from kf_calib.estimation.dwell_pass import Pass
+from kf_calib.estimation.dwell_pass import LEAST_READINGS, Pass
 from kf_calib.estimation.estimate import Estimate
 from kf_calib.estimation.free_attitude import holding_frame
 from kf_calib.estimation.kalman_filterpy import Samples, samples_of
@@ -38,8 +38,6 @@ from kf_calib.support import stage
 
 Result = TypeVar("Result")
 
-_TRACED = 300  # readings over which the memory of filterpy is measured
-
 
 @dataclass(frozen=True)
 class Way:
@@ -47,7 +45,7 @@ class Way:
 
     - wall_s: elapsed time, s.
     - peak_mb: peak memory of numpy and Python, MB. It is measured in a separate run, because this slows down many small
-      steps several times; filterpy's is measured over its first few hundred readings, since it keeps none.
+      steps several times; filterpy's is measured over its first readings, since it keeps none.
     - max_difference_sigma: largest absolute difference of a parameter from the block engine, in sigma.
     - max_relative_variance: largest relative difference of a variance.
     """
@@ -114,7 +112,9 @@ def compare(
     stage.say("memory of each")
     ways = {
         "block": Way(result.estimate, block_s, _peak_mb(lambda: calibrate(source, settings))),
-        "filterpy": Way(filterpy, filterpy_s, _peak_mb(lambda: filterpy_estimate(source, result, at_most=_TRACED))),
+        "filterpy": Way(
+            filterpy, filterpy_s, _peak_mb(lambda: filterpy_estimate(source, result, at_most=LEAST_READINGS))
+        ),
         "batch": Way(least, batch_s, _peak_mb(batch)),
     }
     ways = {name: _against(way, result.estimate) for name, way in ways.items()}
