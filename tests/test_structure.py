@@ -194,7 +194,7 @@ CEILINGS = {
     "sources": 12162,
     "dwells": 3815,
     "noise": 3398,
-    "estimation": 7920,
+    "estimation": 7885,
     "design": 1875,
     "diagnosis": 5594,
     "online": 1648,

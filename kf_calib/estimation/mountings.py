@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -70,6 +71,7 @@ class Mounting:
 
 def mountings(stated: Mounting) -> Iterator[Mounting]:
     """Yield the possible interpretations, beginning with the stated one, in order of the number of changes."""
+    # Another axis up comes first, as it begins with the bench as it is stated.
     possible = [*_of_up(stated.bench), *(_of_gimbals(stated.bench) if stated.bench.axes else _of_attitude())]
     for count in range(_MOST_CHANGES + 1):
         for chosen in itertools.combinations(possible, count):
@@ -99,24 +101,26 @@ def _of_gimbals(bench: Bench) -> Iterator[_Alternative]:
     for order in itertools.permutations(gimbals):
         if order != tuple(gimbals):
             axes, columns = " ".join(letters[k] for k in order), ", ".join(str(k + 1) for k in order)
-            yield _Alternative("axes", f"the gimbal axes are, outer to inner, {axes}", _reordered_axes(order))
-            yield _Alternative("order", f"gimbals {' '.join(letters)} have the angles {columns}", _reordered(order))
-    yield _Alternative("unit", "the angles are in degrees", _with_unit(math.radians(1.0)))
-    yield _Alternative("unit", "the angles were turned from degrees into radians twice", _with_unit(math.degrees(1.0)))
+            yield _Alternative("axes", f"the gimbal axes are, outer to inner, {axes}", _with_axes(order))
+            yield _Alternative("order", f"gimbals {' '.join(letters)} have the angles {columns}", _with(order=order))
+    yield _Alternative("unit", "the angles are in degrees", _with(angle_unit=math.radians(1.0)))
+    yield _Alternative(
+        "unit", "the angles were turned from degrees into radians twice", _with(angle_unit=math.degrees(1.0))
+    )
 
 
 def _of_up(bench: Bench) -> Iterator[_Alternative]:
     """Yield changes of the axis that points up."""
     for up in UP:
         if up != bench.up:
-            yield _Alternative("up", f"{up} is up when all angles are zero", _with_up(up))
+            yield _Alternative("up", f"{up} is up when all angles are zero", _with(bench=replace(bench, up=up)))
 
 
 def _of_attitude() -> Iterator[_Alternative]:
     """Yield changes of the sense and of the order of components of attitude quaternions."""
     inverted, first = "the attitude is that of the bench in the platform", "the quaternion has its real part first"
-    yield _Alternative("sense", inverted, lambda mounting: replace(mounting, conjugate=True))
-    yield _Alternative("order", first, lambda mounting: replace(mounting, real_first=True))
+    yield _Alternative("sense", inverted, _with(conjugate=True))
+    yield _Alternative("order", first, _with(real_first=True))
 
 
 def _reversed_gimbals(gimbals: Collection[int]) -> Callable[[Mounting], Mounting]:
@@ -132,29 +136,18 @@ def _reversed_gimbals(gimbals: Collection[int]) -> Callable[[Mounting], Mounting
     return apply
 
 
-def _reordered_axes(order: Sequence[int]) -> Callable[[Mounting], Mounting]:
+def _with_axes(order: Sequence[int]) -> Callable[[Mounting], Mounting]:
     """Return the change that puts the gimbal axes into another order."""
 
     def apply(mounting: Mounting) -> Mounting:
-        axes = tuple(mounting.bench.axes[k] for k in order)
-        return replace(mounting, bench=replace(mounting.bench, axes=axes))
+        return replace(mounting, bench=replace(mounting.bench, axes=tuple(mounting.bench.axes[k] for k in order)))
 
     return apply
 
 
-def _reordered(order: tuple[int, ...]) -> Callable[[Mounting], Mounting]:
-    """Return the change that assigns the recorded angles to the gimbals in another order."""
-    return lambda mounting: replace(mounting, order=order)
-
-
-def _with_unit(angle_unit: float) -> Callable[[Mounting], Mounting]:
-    """Return the change of the unit of the recorded angles."""
-    return lambda mounting: replace(mounting, angle_unit=angle_unit)
-
-
-def _with_up(up: str) -> Callable[[Mounting], Mounting]:
-    """Return the change of the axis that points up."""
-    return lambda mounting: replace(mounting, bench=replace(mounting.bench, up=up))
+def _with(**changes: Any) -> Callable[[Mounting], Mounting]:
+    """Return the change of some of a mounting's fields."""
+    return lambda mounting: replace(mounting, **changes)
 
 
 @dataclass(frozen=True)
