@@ -214,7 +214,8 @@ CEILINGS = {
 (by four lines) views were raised once, for intervals that average over two sizes of noise, and for dwells that are off
 beside other terms; that of diagnosis three times more, for causes that nobody knows beside stated noise, for what one
 accelerometer alone has, and for the readings within dwells beside what is fitted. That of bench was raised by nine for
-the numbers of rounding, differences and memory, which thirteen modules had each for itself, that of support by two for how many things a sentence names."""
+the numbers of rounding, differences and memory, which thirteen modules had each for itself, that of support by two for
+how many things a sentence names."""
 UNDER_A_CEILING = 400  # lines: where a room has more room than this, its ceiling is out of date
 
 
