@@ -92,7 +92,7 @@ def _refuse_mounting(means: DwellMeans, stated: Mounting, affine: AffineFit | No
     alike = [
         each for each in mendings if each.misfit < likeliest.misfit + _CHANGE and each.changes == likeliest.changes
     ]
-    alike.sort(key=lambda each: (each.mounting.changes > 0 and each.channels != CHANNELS, each.misfit))  # mixed last
+    alike.sort(key=lambda each: each.mounting.changes > 0 and each.channels != CHANNELS)  # mixed changes last
     options = "" if _words(bench, alike[0]) else " ".join(_options(bench, alike[0]))
     single = len({_advice(bench, each) for each in alike}) == 1
     raise BlunderError(f"{_what_is_wrong(means, affine, bench)}: {_question(bench, alike)}", options * single)
