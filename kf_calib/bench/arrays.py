@@ -21,8 +21,18 @@ Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
-ROUNDING = 1e-12  # share of the largest of numbers below which what is left of a difference of them is rounding
-AT_ONCE = 1024  # rows that are worked on together, so that they and their copies stay in the cache
+ROUNDING = 1e-9
+"""Share of the largest of numbers below which another is what rounding leaves of zero."""
+LAST_DIGITS = 1e-12
+"""The same of a difference of two numbers, which has lost nothing but its last digits."""
+DIFFERENCE = float(np.finfo(float).eps) ** (1.0 / 3.0)
+"""Step of central differences, of what counts from 1: rounding and curvature then leave errors alike."""
+AT_ONCE = 1024
+"""Rows that are worked on together, so that they and their copies stay in the cache of a processor."""
+IN_CACHE = 1 << 17
+"""Numbers that are worked on together for the same reason."""
+IN_MEMORY = 1 << 22
+"""Numbers that are made together: 32 MB."""
 
 
 def lengths(vectors: Floats) -> Floats:
@@ -31,12 +41,12 @@ def lengths(vectors: Floats) -> Floats:
         return np.asarray(np.linalg.norm(vectors, axis=1))
 
 
-def sign(values: Floats, least: float = 1e-9) -> Floats:
+def sign(values: Floats, least: float = ROUNDING) -> Floats:
     """The sign of numbers in SI; 0 of those that are no larger than what rounding leaves of zero."""
     return np.sign(np.where(np.abs(values) > least, values, 0.0))
 
 
-def first_least(values: Floats, tie: float = 1e-9) -> int:
+def first_least(values: Floats, tie: float = ROUNDING) -> int:
     """Index of the least of numbers (n,); the first of those that are as small but for rounding.
 
     Processors round differently. By ``argmin`` one of several equal choices would be another on each.

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from kf_calib.bench.arrays import ROUNDING, Floats, Mask
+from kf_calib.bench.arrays import LAST_DIGITS, Floats, Mask
 from kf_calib.dwells.limits import CUBIC, CURVE
 from kf_calib.dwells.line_spectrum import SpectralLine, independent
 from kf_calib.support.tail_probabilities import sidak
@@ -154,7 +154,7 @@ def tone(traces: Sequence[Trace], level: float = 0.01) -> SpectralLine | None:
     for trace in recorded:
         grid[:, trace.first - first :][:, : len(trace)] += trace.residual_sums.T
     largest = max(float(np.abs(trace.sums).max()) for trace in recorded)
-    varying = np.asarray(np.abs(grid).max(axis=1) > ROUNDING * largest)
+    varying = np.asarray(np.abs(grid).max(axis=1) > LAST_DIGITS * largest)
     cell_s = recorded[0].cell_s
     step_hz = 1.0 / (size * cell_s)
     band = slice(int(np.ceil(low_hz / step_hz)), int(high_hz / step_hz) + 1)

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kf_calib.bench.arrays import ROUNDING, ComputedSequence, Floats, Indices, Ints
+from kf_calib.bench.arrays import LAST_DIGITS, ComputedSequence, Floats, Indices, Ints
 from kf_calib.dwells.limits import CURVE
 from kf_calib.dwells.qr import triangle
 from kf_calib.dwells.rows import Nodes, basis, on_basis, parabola
@@ -241,7 +241,7 @@ def walk_path_of(begins_s: Floats, ends_s: Floats, counts: Sequence[int], triang
     total = float(end @ end)
     share = onto @ end / total if total > 0 else np.zeros(len(onto))
     axes, sizes, _ = np.linalg.svd(onto - np.outer(share, end), full_matrices=False)
-    significant = sizes**2 > ROUNDING * max(float(sizes[0]) ** 2, 1e-300)
+    significant = sizes**2 > LAST_DIGITS * max(float(sizes[0]) ** 2, 1e-300)
     spans = np.maximum(ends_s - begins_s, 0.0)
     about_parabola = spans * np.array([_moments(count)[1] / max(count - 1, 1) for count in counts])
     return WalkPath(share - triangles[:, :, 0].ravel(), axes[:, significant], sizes[significant] ** 2, about_parabola)

@@ -14,31 +14,26 @@ from dataclasses import replace
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats, crossed
+from kf_calib.bench.arrays import DIFFERENCE, ROUNDING, Floats, crossed
 from kf_calib.bench.bench import turn_by, turned
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.table import Attitudes, DwellTable
 from kf_calib.effects import Effect, FrameEffect, Stimulus
-from kf_calib.estimation.dwell_columns import LinearisedDwells, stimulus_of
+from kf_calib.estimation.dwell_columns import FARTHEST_RAD, LinearisedDwells, stimulus_of
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.rotations import rotation_map, tangents
 
-_STEP = 1e-6  # relative to g, of the differences that give the bending
-_ROUNDING = 1e-7  # of differences, and of constants that follow the force: below it an effect is linear in it
 _ABRUPT = 0.5  # a bending beyond this is a jump of an effect's column, which has no derivative
-_FARTHEST_RAD = 0.3  # of one step of an attitude
 _UNTOLD = 10.0  # setting errors: where the poses spread less, the attitudes would tell as much as they
 
-SETTLED = 1e-4
-"""In sigmas of each state: a smaller step ends the search."""
+SETTLED = 2.5e-4
+"""A smaller step ends the search: in sigmas of each state, or as a share of the largest that a constant may take."""
 UNSETTLED = 1.0
 """In sigmas: a fit whose last step was larger has not converged."""
-_HALVES = 6
-_UPHILL = 1e-6  # by which the misfit may grow, relative; more is no rounding
-_TURNS = 4  # most times that attitudes are found at a given state
-_STILL_RAD = 1e-7
+MOST_ROUNDS = 50
+"""Of a search that settles in a few."""
 
 
 def at_their_modes(
@@ -113,7 +108,7 @@ def _wander_rad2(table: DwellTable, noise: Noise, state: Floats, forces: Floats)
     beyond = inverse @ (table.folded.spreads - np.diag(noise.sigma_mps2**2)) @ inverse.T
     squares = np.sum(forces**2, axis=1)
     across = np.einsum("dii->d", beyond) - np.einsum("di,dij,dj->d", forces, beyond, forces) / squares
-    return np.clip(across / squares, 0.0, _FARTHEST_RAD**2)
+    return np.clip(across / squares, 0.0, FARTHEST_RAD**2)
 
 
 def _posterior_rotations(means: Means, noise: Noise, state: Floats, bendings: Floats) -> tuple[Floats, Floats]:
@@ -139,7 +134,7 @@ def bendings_of(linearised: LinearisedDwells, state: Floats) -> Floats:
     if not bent:
         return bendings
     stimulus, folded = stimulus_of(dwells, model.bench, state), dwells.folded
-    step_mps2, firsts = _STEP * model.bench.gravity_mps2, 3 * folded.ends[:-1]
+    step_mps2, firsts = DIFFERENCE * model.bench.gravity_mps2, 3 * folded.ends[:-1]
     counts = 3 * folded.piece_numbers[:, None]
     for axis in range(3):
         more, less = (
@@ -147,8 +142,7 @@ def bendings_of(linearised: LinearisedDwells, state: Floats) -> Floats:
             for step in (step_mps2, -step_mps2)
         )
         bendings[:, :, axis] = np.add.reduceat((more - less) / (2.0 * step_mps2), firsts, axis=0) / counts
-    sizes = np.abs(bendings)
-    return np.where((sizes > _ROUNDING) & (sizes < _ABRUPT), bendings, 0.0)
+    return np.where(np.abs(bendings) < _ABRUPT, bendings, 0.0)
 
 
 def bent_effects(model: Model, state: Floats) -> list[Effect]:
@@ -186,7 +180,7 @@ def rotations_between(one: Floats, other: Floats) -> Floats:
 def _limited(rotations_rad: Floats) -> Floats:
     """Return rotation vectors (D, 3) no longer than a step may be."""
     angles_rad = np.linalg.norm(rotations_rad, axis=1, keepdims=True)
-    return rotations_rad * np.minimum(1.0, _FARTHEST_RAD / np.maximum(angles_rad, 1e-300))
+    return rotations_rad * np.minimum(1.0, FARTHEST_RAD / np.maximum(angles_rad, 1e-300))
 
 
 def with_forces(dwells: DwellTable, forces_mps2: Floats, attitudes: Attitudes | None, state: Floats) -> DwellTable:
@@ -248,9 +242,9 @@ def linearised_at(
     if noise.attitude_unknown:
         dwells = facing_readings(dwells, state, model.bench.gravity_mps2)
     linearised = LinearisedDwells(dwells, model, state)
-    for _ in range(_TURNS if noise.setting_rad else 1):
+    for _ in range(MOST_ROUNDS if noise.setting_rad else 1):
         before, linearised = linearised, relinearised(linearised, noise, model, state, untold)
-        if _farthest_rad(before, linearised) < _STILL_RAD:
+        if _farthest_rad(before, linearised) < ROUNDING:
             break
     return linearised
 
@@ -278,11 +272,9 @@ def descended(
     sigmas.
     """
     model, begin, share = linearised.model, linearised.state, 1.0
-    highest = misfit(linearised) * (1.0 + _UPHILL)
+    highest = misfit(linearised) * (1.0 + ROUNDING)
     nearest = relinearised(linearised, noise, model, state)
-    for _ in range(_HALVES - 1):
-        if misfit(nearest) <= highest:
-            break
+    while share > SETTLED and misfit(nearest) > highest:
         share *= 0.5
         nearest = relinearised(linearised, noise, model, begin + share * (state - begin))
     return nearest

@@ -21,6 +21,7 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import TypedDict
 
+from kf_calib.bench.arrays import ROUNDING
 from kf_calib.bench.bench import Bench
 from kf_calib.effects import effect_named
 from kf_calib.effects.effect import KnownEffect
@@ -29,7 +30,6 @@ from kf_calib.support.output_files import write_whole
 from kf_calib.support.toml_files import FINITE, TEXT, Misfit, converted, toml_table
 
 _EXAMPLE = '[[terms]] with effect = "flexure", symbols, coefficients, covariance'
-_ROUNDING = 1e-9
 
 
 class _Term(TypedDict):
@@ -116,7 +116,7 @@ def _term(entry: _Term) -> BenchTerm:
     covariance = np.array(entry["covariance"])
     sizes = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     relative = covariance / np.maximum(np.outer(sizes, sizes), 1e-300)
-    if not np.allclose(covariance, covariance.T, rtol=_ROUNDING, atol=0.0) or np.linalg.eigvalsh(relative)[0] < -1e-6:
+    if not np.allclose(covariance, covariance.T, rtol=ROUNDING, atol=0.0) or np.linalg.eigvalsh(relative)[0] < -1e-6:
         raise ValueError(f"the covariance of {name} is not one: it must be symmetric, without a negative variance")
     rows = tuple(tuple(row) for row in entry["covariance"])
     return BenchTerm(name, tuple(entry["symbols"]), tuple(entry["coefficients"]), rows, entry.get("since", ""))

@@ -12,7 +12,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import IN_MEMORY, ROUNDING, Floats
 from kf_calib.dwells.pieces import of_all_pieces
 from kf_calib.dwells.qr import inverse_of_lower, triangle
 from kf_calib.dwells.table import DwellTable
@@ -27,9 +27,8 @@ from kf_calib.noise.noise_model import considered_information, lift_rounding, me
 SAME_POSE_DEG = 1.0
 """Dwells whose directions of gravity and poses differ by less than this are visits of one orientation."""
 
-_AT_ONCE = 4096  # dwells whose covariances are computed together
-_LEAST_LEFT = 1e-3  # of the information in any direction, without an orientation; with less, digits are lost
-_ROUNDING = 1.0 + 1e-9  # by which cells are larger, so that what is near is never two apart
+_DWELLS = IN_MEMORY // 1024
+"""Dwells at a time: a root of the covariance of one has up to so many numbers."""
 
 
 def orientations(dwells: DwellTable) -> list[list[int]]:
@@ -53,21 +52,21 @@ def grouped(places: Floats, apart: float) -> list[list[int]]:
     every coordinate.
 
     Groups are looked up by the cell of their first place in the four coordinates that differ most. A cell is twice as
-    wide as ``apart``, so that what is near lies in the cell itself or in the neighbours on the nearer side. One of the
-    other coordinates is compared first: it tells most of what is in one cell apart.
+    wide as ``apart``, and more by rounding, so that what is near lies in the cell itself or in the neighbours on the
+    nearer side. One of the other coordinates is compared first: it tells most of what is in one cell apart.
     """
     groups, at = list[list[int]](), dict[int, list[int]]()
     order = np.argsort(-np.ptp(places, axis=0))
     widest, other = places[:, order[:4]], places[:, order[:5][-1]].tolist()
-    scaled = (widest - widest.min(axis=0)) / (2.0 * apart * _ROUNDING) + 1.0
+    scaled = (widest - widest.min(axis=0)) / (2.0 * apart * (1.0 + ROUNDING)) + 1.0
     cells = np.floor(scaled).astype(int)
     strides = np.append(1, np.cumprod(cells.max(axis=0)[:-1] + 2))
     sides, choices = (
         np.where(scaled - cells < 0.5, -strides, strides),
         np.array([*itertools.product((0, 1), repeat=widest.shape[1])]),
     )
-    for first in range(0, len(places), _AT_ONCE):
-        part = slice(first, first + _AT_ONCE)
+    for first in range(0, len(places), _DWELLS):
+        part = slice(first, first + _DWELLS)
         around = (cells[part] @ strides)[:, None] + sides[part] @ choices.T
         for k, near in enumerate(around.tolist(), first):
             nearby = [number for cell in near if cell in at for number in at[cell]]
@@ -145,7 +144,7 @@ def _without(fitted: Fit, groups: list[list[int]]) -> tuple[Floats, Floats] | No
     states, roots = estimates
     design, extra = means.design, considered_information(noise, means, linearised.state)
     spreads = mean_covariances(noise, means, linearised.state)
-    for part in (slice(k, k + _AT_ONCE) for k in range(0, len(place), _AT_ONCE)):  # roots are large
+    for part in (slice(k, k + _DWELLS) for k in range(0, len(place), _DWELLS)):
         ours = design[part] @ roots.of(place[part])
         spreads[part] += ours @ np.swapaxes(ours, 1, 2)
     if extra.any():
@@ -174,7 +173,7 @@ class _OfGroups:
         """Groups (g,) of one size at a time, not too many, and the places (g, m) of their rows."""
         for size in np.unique(self.sizes).tolist():
             groups = np.flatnonzero(self.sizes == size)
-            for chosen in (groups[k : k + _AT_ONCE] for k in range(0, len(groups), _AT_ONCE)):
+            for chosen in (groups[k : k + _DWELLS] for k in range(0, len(groups), _DWELLS)):
                 yield chosen, self.firsts[chosen, None] + np.arange(size)
 
     def of(self, groups: NDArray[np.intp]) -> Floats:
@@ -219,7 +218,7 @@ def _by_leverage(fitted: Fit, place: NDArray[np.intp]) -> tuple[Floats, _Roots] 
         ours = of_groups.rows[places]
         shares = ours[..., :-1] @ inverse
         left = np.eye(places.shape[1]) - shares @ np.swapaxes(shares, 1, 2)
-        if places.size and np.linalg.eigvalsh(left)[:, 0].min() < _LEAST_LEFT:
+        if places.size and np.linalg.eigvalsh(left)[:, 0].min() < math.sqrt(ROUNDING):  # digits are lost
             return None
         residuals = ours[..., -1:] - ours[..., :-1] @ state[:, None]
         lower = cast("Floats", np.linalg.cholesky(left))

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats, Indices, crossed
+from kf_calib.bench.arrays import DIFFERENCE, IN_MEMORY, Floats, Indices, crossed
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.pieces import OfPieces
@@ -21,10 +21,8 @@ from kf_calib.estimation.measurement_model import Model, effect_columns
 from kf_calib.noise.means import Means, means_of
 from kf_calib.noise.temperature_course import temperature_course
 
-_LITTLE_RAD = 1e-4  # of a setting error of 0.01 deg it leaves 0.2 um/s^2 along the specific force
-_ABSURD_RAD = 0.2  # what hardly determined coefficients may amount to, but no bench
-_STEP_K = 1e-3
-_AT_ONCE = 1 << 22  # numbers of columns at the nodes of pieces that are made together
+FARTHEST_RAD = 0.3
+"""By which attitudes are turned in a step; what hardly determined coefficients may amount to, but no bench."""
 _VIBRATING = 15.0  # mean squared deviation of the variances in units of sigma; autocorrelation alone gives up to 10
 
 
@@ -141,7 +139,7 @@ def few_at_a_time(
 ) -> Iterator[tuple[slice, DwellTable, slice, Stimulus]]:
     """Yield few dwells at a time, whose columns are made together: which they are, the dwells, which pieces they have,
     and the stimulus at their nodes."""
-    ends, first, most = dwells.folded.ends, 0, max(_AT_ONCE // (9 * max(columns, 1)), 1)
+    ends, first, most = dwells.folded.ends, 0, max(IN_MEMORY // (9 * max(columns, 1)), 1)
     while first < len(dwells):
         last = max(int(np.searchsorted(ends, ends[first] + most, "right")) - 1, first + 1)
         pieces = slice(int(ends[first]), int(ends[last]))
@@ -229,8 +227,8 @@ def change_by_temperature(linearised: LinearisedDwells) -> Floats:
     """Change of the readings per K (m, 3) at the nodes of all dwells, by the model at its state."""
     model, state = linearised.model, linearised.state
     stimulus = stimulus_of(linearised.dwells_at_state, model.bench, state)
-    warmer = replace(stimulus, temperature_c=stimulus.temperature_c + _STEP_K)
-    return (model.columns(warmer, state) - model.columns(stimulus, state)) @ state / _STEP_K
+    warmer = replace(stimulus, temperature_c=stimulus.temperature_c + DIFFERENCE)
+    return (model.columns(warmer, state) - model.columns(stimulus, state)) @ state / DIFFERENCE
 
 
 def dwells_at_state(dwells: DwellTable, model: Model, state: Floats) -> DwellTable:
@@ -241,7 +239,7 @@ def dwells_at_state(dwells: DwellTable, model: Model, state: Floats) -> DwellTab
     sensitivities. What is still to be found (changes of coefficients, of S and of alpha) acts on g, which therefore
     takes the place of f. The columns of the effects there, times their coefficients, amount to S (R(alpha) rho x g),
     and alpha itself, about which the prior is zero, to S (alpha x g); as S g has both rotations in it already, they
-    are added to the readings. An rho below ``_LITTLE_RAD`` in all dwells, or absurd, is taken for none.
+    are added to the readings. An absurd rho is taken for none.
     """
     rotations = _rotations_of_effects(dwells, model, state)
     if rotations is None and dwells.attitudes is None:
@@ -256,12 +254,12 @@ def dwells_at_state(dwells: DwellTable, model: Model, state: Floats) -> DwellTab
 
 
 def _rotations_of_effects(table: DwellTable, model: Model, state: Floats) -> Floats | None:
-    """Return the mean rotation vector (D, 3) of each dwell by effects of the frame; None where they are little."""
+    """Return the mean rotation vector (D, 3) of each dwell by effects of the frame; None where there are none."""
     if not model.bench.angles or not any(isinstance(effect, FrameEffect) for effect in model.effects):
         return None
     rotations, ends = model.turned_rad(stimulus_of(table, model.bench, state), state), 3 * table.folded.ends
     means = np.add.reduceat(rotations, ends[:-1], axis=0) / np.diff(ends)[:, None]
-    return means if _LITTLE_RAD < np.abs(means).max() < _ABSURD_RAD else None
+    return means if 0.0 < np.abs(means).max() < FARTHEST_RAD else None
 
 
 def turning_mps2(dwells: DwellTable, force_mps2: Floats, state: Floats, times: Indices | int) -> Floats:

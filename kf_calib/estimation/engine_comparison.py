@@ -21,11 +21,11 @@ from typing import TypeVar
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import ROUNDING, Floats
 from kf_calib.bench.streams import Source, Table
 from kf_calib.dwells.qr import triangle
 from kf_calib.estimation.calibration import calibrate, filterpy_estimate
-from kf_calib.estimation.dwell_pass import Pass
+from kf_calib.estimation.dwell_pass import LEAST_READINGS, Pass
 from kf_calib.estimation.estimate import Estimate
 from kf_calib.estimation.free_attitude import holding_frame
 from kf_calib.estimation.kalman_filterpy import Samples, samples_of
@@ -38,8 +38,6 @@ from kf_calib.support import stage
 
 Result = TypeVar("Result")
 
-_TRACED = 300  # readings over which the memory of filterpy is measured
-
 
 @dataclass(frozen=True)
 class Way:
@@ -47,7 +45,7 @@ class Way:
 
     - wall_s: elapsed time, s.
     - peak_mb: peak memory of numpy and Python, MB. It is measured in a separate run, because this slows down many small
-      steps several times; filterpy's is measured over its first few hundred readings, since it keeps none.
+      steps several times; filterpy's is measured over its first readings, since it keeps none.
     - max_difference_sigma: largest absolute difference of a parameter from the block engine, in sigma.
     - max_relative_variance: largest relative difference of a variance.
     """
@@ -114,7 +112,9 @@ def compare(
     stage.say("memory of each")
     ways = {
         "block": Way(result.estimate, block_s, _peak_mb(lambda: calibrate(source, settings))),
-        "filterpy": Way(filterpy, filterpy_s, _peak_mb(lambda: filterpy_estimate(source, result, at_most=_TRACED))),
+        "filterpy": Way(
+            filterpy, filterpy_s, _peak_mb(lambda: filterpy_estimate(source, result, at_most=LEAST_READINGS))
+        ),
         "batch": Way(least, batch_s, _peak_mb(batch)),
     }
     ways = {name: _against(way, result.estimate) for name, way in ways.items()}
@@ -184,9 +184,6 @@ def _remarks(settings: Settings, result: Calibration) -> list[str]:
     return said
 
 
-_SEEN = 1e-9  # singular values that are smaller relative to the largest are rounding
-
-
 def least_squares(samples: Iterable[Samples], around: Floats) -> tuple[Floats, Floats]:
     """State (p,) and covariance (p, p) from all samples, with a diffuse prior and without process noise.
 
@@ -228,7 +225,7 @@ def _solution(rows: Floats, scale: Floats, around: Floats) -> tuple[Floats, Floa
     design, readings = rows[:, :-1], rows[:, -1]
     left, upper = np.linalg.qr(design / scale)
     rotated, singular, right = np.linalg.svd(upper, full_matrices=False)  # fewer rows than columns at first
-    seen = singular > _SEEN * singular[0]
+    seen = singular > ROUNDING * singular[0]
     inverse = (right[seen].T / singular[seen]) / scale[:, None]
     solution = around + inverse @ (rotated[:, seen].T @ (left.T @ (readings - design @ around)))
     return np.asarray(solution, float), np.asarray(inverse @ inverse.T, float)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench import paper_parameters
-from kf_calib.bench.arrays import Floats, Mask
+from kf_calib.bench.arrays import ROUNDING, Floats, Mask
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.errors import need
 from kf_calib.estimation import square_root_information
@@ -62,7 +62,7 @@ class Estimate:
     @cached_property
     def determined(self) -> Mask:
         """Mask (p,) of the states that the orientations determine."""
-        return np.asarray(np.linalg.norm(self._lost, axis=1) < 1e-9)
+        return np.asarray(np.linalg.norm(self._lost, axis=1) < ROUNDING)
 
     @cached_property
     def sigma(self) -> Floats:
@@ -80,7 +80,7 @@ class Estimate:
         sigma = np.sqrt(np.diag(self.covariance)[STATE_COUNT:])
         if self.undetermined.size:
             lost = np.abs(self.undetermined[STATE_COUNT:]).max(axis=1)  # in the unit of the coefficient, as sigma
-            sigma = np.where(lost > 1e-9 * sigma, np.nan, sigma)
+            sigma = np.where(lost > ROUNDING * sigma, np.nan, sigma)
         return sigma
 
 

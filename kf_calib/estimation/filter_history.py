@@ -13,21 +13,19 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from kf_calib.bench import paper_parameters
-from kf_calib.bench.arrays import Floats, Mask
+from kf_calib.bench.arrays import ROUNDING, Floats, Mask
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.bench.streams import Source
 from kf_calib.dwells.sufficient_statistics import Autocovariance
 from kf_calib.errors import InputError
 from kf_calib.estimation import square_root_information
 from kf_calib.estimation.estimate import Estimate
+from kf_calib.estimation.intervals import LEVEL, NORMAL
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration, Parameter
 from kf_calib.noise.noise_model import mean_covariances
 from kf_calib.noise.noise_of_readings import expected_products
 
-_MIDDLE = (0.025, 0.975)  # probabilities between which 95 % of all values lie
-_BOUND = 2.0  # sigmas
-_ROUNDING = 1e-9
 _MOST_LAGS = 20  # dwells
 
 
@@ -156,9 +154,9 @@ class InnovationTests:
 
     @cached_property
     def bound(self) -> Floats:
-        """2 sigma (L,) of that autocorrelation where the innovations are independent."""
+        """Half the interval (L,) of 95 % of that autocorrelation where the innovations are independent."""
         count = int(np.isfinite(self.ratios).all(axis=1).sum())
-        return _BOUND * np.sqrt(count - np.arange(1, len(self.autocorrelation) + 1)) / max(count, 1)
+        return NORMAL * np.sqrt(count - np.arange(1, len(self.autocorrelation) + 1)) / max(count, 1)
 
 
 def innovation_tests(result: Calibration) -> InnovationTests:
@@ -180,7 +178,7 @@ def _ratios(result: Calibration) -> Floats:
     for k in np.flatnonzero(np.isnan(ratios).any(axis=1) & (np.arange(len(ratios)) > 0)).tolist():
         before, rows = visits[k - 1].estimate, means.design[k]
         lost = before.undetermined / np.linalg.norm(before.undetermined, axis=0)
-        seen = np.linalg.norm(rows @ lost, axis=1) < _ROUNDING * np.linalg.norm(rows, axis=1)
+        seen = np.linalg.norm(rows @ lost, axis=1) < ROUNDING * np.linalg.norm(rows, axis=1)
         sigma = np.sqrt(np.diag(rows @ before.covariance @ rows.T) + np.diag(noise_covariances[k]))
         ratios[k] = np.where(seen, (means.readings[k] - rows @ before.state) / sigma, np.nan)
     return ratios
@@ -189,7 +187,7 @@ def _ratios(result: Calibration) -> Floats:
 def nis_band(dof: NDArray[np.int64]) -> Floats:
     """The middle 95 % of chi-squared (n, 2); NaN without degrees of freedom. A smaller NIS is luck, a larger none."""
     known = np.where(dof > 0, dof, np.nan)
-    return np.column_stack([chdtri(known, 1.0 - probability) for probability in _MIDDLE])
+    return np.column_stack([chdtri(known, 0.5 * (1.0 + side * LEVEL)) for side in (1.0, -1.0)])
 
 
 @dataclass(frozen=True)
@@ -270,7 +268,8 @@ def _inside(source: Source, start_s: float, end_s: float, every: int) -> tuple[F
 class ReadingCorrelation:
     """Autocorrelation (L, 3) of the readings within dwells about their parabolas, at lags of 1, 2, ... L readings.
 
-    white (L,): what white noise would give, of which a parabola removes a part. bound (L,): 2 sigma about it.
+    white (L,): what white noise would give, of which a parabola removes a part. bound (L,): half the interval
+    of 95 % about it.
     """
 
     values: Floats
@@ -289,4 +288,4 @@ def reading_correlation(result: Calibration) -> ReadingCorrelation:
     raw = total.products[: lags + 1] / pairs[:, None]
     white = expected_products(np.eye(1, size)[0], lags) / (size - np.arange(lags + 1))
     level = np.where(raw[0] > 0.0, raw[0], np.nan)
-    return ReadingCorrelation(raw[1:] / level, white[1:] / white[0], _BOUND / np.sqrt(pairs[1:]))
+    return ReadingCorrelation(raw[1:] / level, white[1:] / white[0], NORMAL / np.sqrt(pairs[1:]))

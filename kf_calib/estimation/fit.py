@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import ROUNDING, Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.pieces import OfPieces, of_all_pieces
 from kf_calib.dwells.table import DwellTable
@@ -20,8 +20,6 @@ from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise, steps
 from kf_calib.noise.reml import Part, gain_of, misfit, with_shared_noise
 from kf_calib.noise.terms import RandomWalk, SlowWaves, WavesOverRun
-
-_DETERMINED = 1e-9  # share of a state in combinations that are not determined
 
 
 @dataclass(frozen=True, repr=False)
@@ -63,7 +61,7 @@ class Fit:
         rounding."""
         lost = self._solution[2]
         lost = lost / np.linalg.norm(lost, axis=0)
-        return np.where(np.linalg.norm(lost, axis=1) < _DETERMINED, self.sigma, 0.0)
+        return np.where(np.linalg.norm(lost, axis=1) < ROUNDING, self.sigma, 0.0)
 
     @cached_property
     def _solution(self) -> tuple[Floats, Floats, Floats]:

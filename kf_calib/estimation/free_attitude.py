@@ -19,7 +19,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import DIFFERENCE, Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.pieces import OfPieces
 from kf_calib.errors import UnobservableError
@@ -41,7 +41,6 @@ DIRECTIONS: dict[str, Floats] = {
 
 _NINE = [k for k in range(STATE_COUNT) if k not in FRAME]
 _HOPELESS_SCALE, _HOPELESS_MPS2 = 0.2, 2.0
-_TRIAD_STEP_RAD = 1e-4
 
 
 def weights_of_size(means: Means, state: Floats) -> Floats:
@@ -132,13 +131,13 @@ def triad_changes(linearised: LinearisedDwells) -> OfPieces:
     for axis in range(3):
         ends = list[Floats]()
         for sign in (1.0, -1.0):
-            turn = matrix_of(sign * _TRIAD_STEP_RAD * np.eye(3)[axis])
+            turn = matrix_of(sign * DIFFERENCE * np.eye(3)[axis])
             turned = replace(
                 stimulus, force_mps2=stimulus.force_mps2 @ turn.T, sensitivity=sensitivity @ turn.T,
                 previous_force_mps2=stimulus.previous_force_mps2 @ turn.T,
             )  # fmt: skip
             ends.append(added_by(bent_effects(model, state), turned, model, state))
-        changes[:, :, axis] = (ends[0] - ends[1]) * (0.5 * sigma_rad / _TRIAD_STEP_RAD)
+        changes[:, :, axis] = (ends[0] - ends[1]) * (0.5 * sigma_rad / DIFFERENCE)
     return linearised.dwells.folded.at_nodes(changes)
 
 

@@ -14,11 +14,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from statistics import NormalDist
 
 import numpy as np
 
 from kf_calib.bench import paper_parameters
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import ROUNDING, Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.qr import spanned
 from kf_calib.estimation.fit import Fit
@@ -30,7 +31,7 @@ from kf_calib.noise.terms import FLOOR_MPS2
 LEVEL = 0.95
 """Probability with which an interval holds a parameter."""
 
-NORMAL = 1.959963984540054
+NORMAL = NormalDist().inv_cdf(0.5 * (1.0 + LEVEL))
 """Half the length of the interval in sigmas where all noise is known."""
 
 _PARTS: tuple[Part, ...] = ("common", "setting")
@@ -40,7 +41,6 @@ _LEAST, _MOST = 0.03, 30.0  # sizes that are tried, in units of one that would e
 _COARSE, _FINE = 14, 14  # of them, first over that range, then where they are likely
 _HOPELESS = 12.0  # in log likelihood
 _FREE = 0.75  # prior probability of a part of the noise that was not stated
-_ROUNDING = 1e-12  # share of a covariance that is added to it
 
 
 def sigmas_of_intervals(fitted: Fit) -> Floats:
@@ -115,7 +115,7 @@ class _Means:
     def _solved(self, covariances: Floats) -> tuple[Floats, Floats, Floats]:
         """Return the same for covariances (N, B, b, b)."""
         size = covariances.shape[-1]
-        covariances = covariances + _ROUNDING * np.einsum("...ii", covariances)[..., None, None] * np.eye(size)
+        covariances = covariances + ROUNDING * np.einsum("...ii", covariances)[..., None, None] * np.eye(size)
         lower = np.linalg.cholesky(covariances)
         rows = np.linalg.inv(lower) @ np.concatenate([self._basis, self._readings[..., None]], axis=2)
         rows = rows.reshape(len(rows), -1, rows.shape[-1])

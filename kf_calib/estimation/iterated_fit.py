@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import ROUNDING, Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.rows import on_basis
@@ -27,6 +27,7 @@ from kf_calib.effects import Effect
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation import free_attitude, square_root_information
 from kf_calib.estimation.attitude import (
+    MOST_ROUNDS,
     SETTLED,
     UNSETTLED,
     descended,
@@ -58,14 +59,11 @@ from kf_calib.noise.within_dwells import within_dwells
 
 _PASSES = 3
 _PASSES_WITH_UNKNOWNS = 10
-_EXACT_RAD = 1e-9
 _MANY = 8192  # dwells by which variances are known to one percent, which is enough until the fit nearly settles
-_TURNS = 50  # most times that forces and state are found in turn
 _SINGULAR = 100.0
 _PASSES_WITH_NOISE = 5  # after which the estimate of the noise does not move the fit any more
 _BACK, _ON = -0.5, 0.9  # cosine of a step with the last one
 _LEAST_SHARE, _MOST_SHARE = 0.125, 3.0
-_STILL = 2.5e-4  # the search ends when no step of ln(value) exceeds this share of its largest allowed step
 
 
 def fit(
@@ -112,7 +110,7 @@ def fit(
         fitted = replace(fitted, noise=replace(fitted.noise, slew_sigma_mps2=slew_sigma_mps2))
         within = _within_again(fitted, within)
         # a constant without a derivative holds the input axes near their linearisation, so that convergence is slow
-        still = (np.abs(constant_steps) <= _STILL * reach).all() and not model.stepped
+        still = (np.abs(constant_steps) <= SETTLED * reach).all() and not model.stepped
         turning = fitted.noise.weights.setting_rad > 0.0
         if number >= _PASSES - 1 and still and (left < SETTLED or not turning):
             return fitted
@@ -230,7 +228,7 @@ def _not_sensible(model: Model) -> str:
 
 def _most_passes(model: Model) -> int:
     """Return how often noise, linearisation and constants are estimated in turn at most."""
-    return _PASSES_WITH_UNKNOWNS if model.bench.angles or model.stepped else _TURNS
+    return _PASSES_WITH_UNKNOWNS if model.bench.angles or model.stepped else MOST_ROUNDS
 
 
 def _begun(
@@ -278,7 +276,7 @@ def _nine_parameters(dwells: DwellTable, bench: Bench, walk_mps2_per_sqrt_s: flo
 
 def _settled(fitted: Fit) -> Fit:
     """Return the fit of the nine parameters with forces and state found in turn until neither moves."""
-    for _ in range(_TURNS):
+    for _ in range(MOST_ROUNDS):
         state = fitted.state
         if not _sensible(state, fitted.linearised.model):
             break
@@ -324,7 +322,7 @@ def _setting_deg(dwells: DwellTable, bench: Bench) -> float | None:
     """Return the stated setting error, deg, combined with the uncertainty of the dwells' poses from noise of the
     angles."""
     pose_rad = float(np.sqrt(np.mean(dwells.folded.pose_sigmas_rad**2)))
-    if bench.angle_sigma_deg is None or pose_rad < _EXACT_RAD:
+    if bench.angle_sigma_deg is None or pose_rad < ROUNDING:
         return bench.angle_sigma_deg
     return math.hypot(bench.angle_sigma_deg, math.degrees(pose_rad))
 

@@ -26,8 +26,9 @@ from kf_calib.support.text import printed
 if TYPE_CHECKING:  # a replay without a bench model does not import what reads one
     from kf_calib.estimation.bench_model import BenchModel
 
-_ROUNDING_MPS2 = 1e-13
-FRAME = (1, 2, 6)
+EXACT = 1e-14
+"""Of gravity: less in a reading is rounding."""
+FRAME = tuple(4 * i + j for i, j in itertools.combinations(range(3), 2))
 """s1y, s1z, s2z: without angles the frame is that in which accelerometer 1 is x and 2 lies in the plane of x and y."""
 SQUARE = {"nu1": 4, "phi3": 8, "theta3": 9}
 """s2x, s3x, s3y, by the angle that each is: by how much the axes are not square, in that frame."""
@@ -212,11 +213,12 @@ def effect_columns(effects: Sequence[Effect], stimulus: Stimulus) -> Floats:
     """The change (m, 3, q) of each accelerometer's reading per unit of each coefficient of the effects."""
     counts = [len(each.coefficients) for each in effects]
     columns, last = np.zeros((len(stimulus), 3, sum(counts))), np.cumsum(counts).tolist()
+    rounding_mps2 = EXACT * stimulus.bench.gravity_mps2
     for effect, end, count in zip(effects, last, counts, strict=True):
         if not effect.shows_in(stimulus):
             continue
         added, scales = effect.columns(stimulus), np.array([coefficient.scale for coefficient in effect.coefficients])
         # set to zero what even a large coefficient would not raise above rounding, as for the tilt of a vertical axis,
         # and what depends on an attitude that is not known (NaN), of which nothing can be seen
-        columns[:, :, end - count : end] = np.where(np.abs(added) * scales >= _ROUNDING_MPS2, added, 0.0)
+        columns[:, :, end - count : end] = np.where(np.abs(added) * scales >= rounding_mps2, added, 0.0)
     return columns

@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -19,16 +20,20 @@ from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats, Mask
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.keys import UP
-from kf_calib.bench.raw_input import CHANNELS
 from kf_calib.dwells.table import DwellTable
+from kf_calib.support.tail_probabilities import LEVEL
 
 _MOST_CHANGES = 2
 
 Channels = tuple[int, int, int]
-_FARTHEST = math.cos(math.radians(45.0))  # largest angle of an axis from nominal
-GAIN_RANGE = (0.5, 2.0)  # range of a scale factor over nominal; outside it is another unit or no accelerometer
+FARTHEST = math.cos(math.radians(45.0))
+"""Cosine of the largest angle of an axis from nominal."""
+GAIN_RANGE = (0.5, 2.0)
+"""Range of a scale factor over nominal; outside it is another unit or no accelerometer."""
+NOISE = 0.05
+"""g; to which mean readings are assumed good: an effect or scatter of this size is a blunder."""
+_LOOSE = 0.3  # prior sigma of sensitivities and, in g, biases about nominal
 _SPREAD = 0.2  # least singular value of the directions over sqrt(D); 0.577 if they are spread evenly
-_BIAS = 0.3  # g; prior sigma of a bias, which matters if the orientations do not determine it
 
 
 @dataclass(frozen=True)
@@ -66,6 +71,7 @@ class Mounting:
 
 def mountings(stated: Mounting) -> Iterator[Mounting]:
     """Yield the possible interpretations, beginning with the stated one, in order of the number of changes."""
+    # Another axis up comes first, as it begins with the bench as it is stated.
     possible = [*_of_up(stated.bench), *(_of_gimbals(stated.bench) if stated.bench.axes else _of_attitude())]
     for count in range(_MOST_CHANGES + 1):
         for chosen in itertools.combinations(possible, count):
@@ -95,24 +101,26 @@ def _of_gimbals(bench: Bench) -> Iterator[_Alternative]:
     for order in itertools.permutations(gimbals):
         if order != tuple(gimbals):
             axes, columns = " ".join(letters[k] for k in order), ", ".join(str(k + 1) for k in order)
-            yield _Alternative("axes", f"the gimbal axes are, outer to inner, {axes}", _reordered_axes(order))
-            yield _Alternative("order", f"gimbals {' '.join(letters)} have the angles {columns}", _reordered(order))
-    yield _Alternative("unit", "the angles are in degrees", _with_unit(math.radians(1.0)))
-    yield _Alternative("unit", "the angles were turned from degrees into radians twice", _with_unit(math.degrees(1.0)))
+            yield _Alternative("axes", f"the gimbal axes are, outer to inner, {axes}", _with_axes(order))
+            yield _Alternative("order", f"gimbals {' '.join(letters)} have the angles {columns}", _with(order=order))
+    yield _Alternative("unit", "the angles are in degrees", _with(angle_unit=math.radians(1.0)))
+    yield _Alternative(
+        "unit", "the angles were turned from degrees into radians twice", _with(angle_unit=math.degrees(1.0))
+    )
 
 
 def _of_up(bench: Bench) -> Iterator[_Alternative]:
     """Yield changes of the axis that points up."""
     for up in UP:
         if up != bench.up:
-            yield _Alternative("up", f"{up} is up when all angles are zero", _with_up(up))
+            yield _Alternative("up", f"{up} is up when all angles are zero", _with(bench=replace(bench, up=up)))
 
 
 def _of_attitude() -> Iterator[_Alternative]:
     """Yield changes of the sense and of the order of components of attitude quaternions."""
     inverted, first = "the attitude is that of the bench in the platform", "the quaternion has its real part first"
-    yield _Alternative("sense", inverted, lambda mounting: replace(mounting, conjugate=True))
-    yield _Alternative("order", first, lambda mounting: replace(mounting, real_first=True))
+    yield _Alternative("sense", inverted, _with(conjugate=True))
+    yield _Alternative("order", first, _with(real_first=True))
 
 
 def _reversed_gimbals(gimbals: Collection[int]) -> Callable[[Mounting], Mounting]:
@@ -128,29 +136,18 @@ def _reversed_gimbals(gimbals: Collection[int]) -> Callable[[Mounting], Mounting
     return apply
 
 
-def _reordered_axes(order: Sequence[int]) -> Callable[[Mounting], Mounting]:
+def _with_axes(order: Sequence[int]) -> Callable[[Mounting], Mounting]:
     """Return the change that puts the gimbal axes into another order."""
 
     def apply(mounting: Mounting) -> Mounting:
-        axes = tuple(mounting.bench.axes[k] for k in order)
-        return replace(mounting, bench=replace(mounting.bench, axes=axes))
+        return replace(mounting, bench=replace(mounting.bench, axes=tuple(mounting.bench.axes[k] for k in order)))
 
     return apply
 
 
-def _reordered(order: tuple[int, ...]) -> Callable[[Mounting], Mounting]:
-    """Return the change that assigns the recorded angles to the gimbals in another order."""
-    return lambda mounting: replace(mounting, order=order)
-
-
-def _with_unit(angle_unit: float) -> Callable[[Mounting], Mounting]:
-    """Return the change of the unit of the recorded angles."""
-    return lambda mounting: replace(mounting, angle_unit=angle_unit)
-
-
-def _with_up(up: str) -> Callable[[Mounting], Mounting]:
-    """Return the change of the axis that points up."""
-    return lambda mounting: replace(mounting, bench=replace(mounting.bench, up=up))
+def _with(**changes: Any) -> Callable[[Mounting], Mounting]:
+    """Return the change of some of a mounting's fields."""
+    return lambda mounting: replace(mounting, **changes)
 
 
 @dataclass(frozen=True)
@@ -212,13 +209,63 @@ class AffineFit:
         own, nominal = (rows / np.linalg.norm(rows, axis=1)[:, None] for rows in (self.sensitivity, self.nominal))
         return own @ nominal.T
 
-    def is_near(self, channels: Channels = CHANNELS) -> bool:
-        """Tell whether all axes and scale factors are near nominal with the channels in this order and with these
-        signs."""
-        own = np.abs(channels) - 1
-        cosines = np.sign(channels) * self.cosines[own, [0, 1, 2]]
-        scales = np.linalg.norm(self.sensitivity, axis=1)[own] / np.linalg.norm(self.nominal, axis=1)
-        return bool((cosines > _FARTHEST).all() and (scales > GAIN_RANGE[0]).all() and (scales < GAIN_RANGE[1]).all())
+    def is_along(self) -> bool:
+        """Tell whether all axes are near nominal."""
+        return bool((np.diag(self.cosines) > FARTHEST).all())
+
+    def is_near(self) -> bool:
+        """Tell whether all axes and scale factors are near nominal."""
+        return self.is_along() and bool((self.scales > GAIN_RANGE[0]).all() and (self.scales < GAIN_RANGE[1]).all())
+
+
+@dataclass(frozen=True)
+class Misfits:
+    """How little a mounting explains the readings, with sensitivities and biases as near nominal as they may be.
+
+    Half of chi-squared of each channel's readings z, with either sign, as those of accelerometer j: of the residuals of
+    z - F n_j, beside the deviations from the nominal sensitivity n_j and of the bias. F are the directions of gravity.
+
+    - of_axes (3, 2, 3): of channels, signs + and -, and accelerometers.
+    - of_none (3,): of channels that feel nothing but their bias.
+    - count: number of readings.
+    """
+
+    of_axes: Floats
+    of_none: Floats
+    count: int
+
+    @classmethod
+    def of_mounting(cls, means: DwellMeans, mounting: Mounting) -> Misfits:
+        """Those of a mounting."""
+        force, readings = means.force(mounting), means.readings / mounting.bench.gravity_mps2
+        expected, signed = force @ nominal_sensitivity(mounting.bench).T, np.stack([readings, -readings], axis=2)
+        ones = np.ones((len(force), 1))
+        return cls(
+            _half_chi2(signed[..., None] - expected[:, None, None], np.hstack([force, ones])),
+            _half_chi2(readings, ones),
+            readings.size,
+        )
+
+    def of(self, wirings: Sequence[Channels]) -> Floats:
+        """The misfits (n,) with these channels; 0 stands for one that is dead."""
+        wired = np.asarray(wirings)
+        felt = self.of_axes[np.abs(wired) - 1, (wired < 0).astype(int), [0, 1, 2]]
+        return np.where(wired == 0, self.of_none, felt).sum(axis=1)
+
+    def within_noise(self, wirings: Sequence[Channels]) -> Floats:
+        """The same; infinite where readings would not leave so much by their noise."""
+        from scipy.special import chdtri
+
+        misfits = self.of(wirings)
+        return np.where(2.0 * misfits < chdtri(self.count, LEVEL), misfits, np.inf)
+
+
+def _half_chi2(left: Floats, columns: Floats) -> Floats:
+    """Return half of the least of |left - columns x|^2 / NOISE^2 + |x|^2 / LOOSE^2 for many left (D, ...)."""
+    stacked = left.reshape(len(left), -1)
+    along = columns.T @ stacked
+    inside = np.linalg.solve(columns.T @ columns + (NOISE / _LOOSE) ** 2 * np.eye(columns.shape[1]), along)
+    return ((stacked**2).sum(axis=0) - (along * inside).sum(axis=0)).reshape(left.shape[1:]) / (2.0 * NOISE**2)
 
 
 def fit_affine(means: DwellMeans, mounting: Mounting) -> AffineFit | None:
@@ -228,7 +275,7 @@ def fit_affine(means: DwellMeans, mounting: Mounting) -> AffineFit | None:
         return None
     readings = means.readings / mounting.bench.gravity_mps2
     columns = np.column_stack([force, np.ones(len(force))])
-    held = np.vstack([columns, [0.0, 0.0, 0.0, 0.05 / _BIAS]])  # readings are assumed good to 0.05 g
+    held = np.vstack([columns, [0.0, 0.0, 0.0, NOISE / _LOOSE]])
     solution = np.linalg.lstsq(held, np.vstack([readings, np.zeros((1, 3))]), rcond=None)[0]
     freedom = max(len(force) - 4, 1) / len(force)
     left = math.sqrt(np.mean((readings - columns @ solution) ** 2) / freedom)

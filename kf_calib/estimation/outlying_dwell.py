@@ -6,9 +6,8 @@ dwells leave: where these are few, they agree by chance whatever is missing. Whe
 noise or a walk, which neighbouring dwells share: what leaving the dwell out takes off the chi-squared of the run in
 such noise is then less than e^T C^-1 e, and counts in its place.
 
-A dwell is outlying if three things hold: its error is significant at the level of the run, all other dwells are
-consistent without it, and either a rotation of one gimbal explains its readings or its error is larger than any known
-effect causes.
+A dwell is outlying if its error is significant, as one of as many as there are dwells, and all others are consistent
+without it. A turn of one gimbal moves the force along a circle, so that the error is u + v cos + w sin of the angle.
 """
 
 from __future__ import annotations
@@ -26,17 +25,7 @@ from kf_calib.estimation.dwell_columns import LinearisedDwells, turning_mps2
 from kf_calib.estimation.results import Calibration, OutlyingDwell, Turn, consistency
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import lift_rounding, mean_covariances
-from kf_calib.support.tail_probabilities import f_tail
-
-_BEYOND_DOUBT = 1e-6  # significance over the whole run; a dwell must be wrong beyond doubt
-_MOST_LEFT = -2.0 * math.log(1e-4)  # limit of chi-squared after a rotation; three channels less one angle leave 2 dof
-_GROSS = 0.02  # g; larger than any known effect in one dwell
-_NEARLY = 0.3  # relative to the largest statistic; dwells above it are tried, too
-_TRIED = 4
-_GRID = 360  # rotations of a gimbal that are tried first
-_REFINED = 6  # Gauss-Newton steps
-_STEP = 1e-4  # rad, for difference quotients
-_FARTHEST = 0.02  # rad, largest Gauss-Newton step
+from kf_calib.support.tail_probabilities import LEVEL, REST, chi_squared_tail, f_tail
 
 
 def outlying_in_words(found: Sequence[OutlyingDwell]) -> str:
@@ -47,33 +36,32 @@ def outlying_in_words(found: Sequence[OutlyingDwell]) -> str:
 def outlying_dwells(result: Calibration, evaluate: Callable[[DwellTable], Calibration]) -> tuple[OutlyingDwell, ...]:
     """The dwell that alone does not fit, or several if any one of them could be the cause; empty if none is.
 
-    ``evaluate`` makes a calibration from some of the dwells with the same model.
+    They are tried in the order of what leaving them out takes off the misfit, while the others agree. ``evaluate``
+    makes a calibration from some of the dwells with the same model.
     """
-    left_out, dwells = result.held_out, result.fit.dwells
-    if left_out is None or not result.bench.angles or len(dwells) < 6 or result.noise.walk_mps2_per_sqrt_s:
+    left_out, dwells, wrong = result.held_out, result.fit.dwells, list[OutlyingDwell]()
+    if left_out is None or not result.bench.angles or result.noise.walk_mps2_per_sqrt_s:
         return ()
-    statistics = left_out.statistics
-    if statistics.max() < 30.0:  # no dwell can be significant
-        return ()
-    ratios = (statistics / statistics.max()).round(9)  # rounded, so that the first of equal dwells comes first
-    order = np.argsort(-ratios, kind="stable")[:_TRIED]
-    tried = [k for k in order.tolist() if ratios[k] > _NEARLY]
-    found = ((k, evaluate(dwells.without((k,)))) for k in tried)
-    judged = [wrong_dwell(result, k, rest, _BEYOND_DOUBT) for k, rest in found if rest.consistency.consistent is True]
-    gross_mps2 = _GROSS * result.bench.gravity_mps2
-    return tuple(each for each in judged if each and (each.turns or np.linalg.norm(each.error_mps2) > gross_mps2))
+    ratios = (left_out.statistics / left_out.statistics.max()).round(9)  # the first of equal dwells comes first
+    for k in np.argsort(-ratios, kind="stable").tolist():
+        if len(dwells) * chi_squared_tail(3.0, float(left_out.statistics[k])) > LEVEL * REST:
+            break
+        rest = evaluate(dwells.without((k,)))
+        found = wrong_dwell(result, k, rest)
+        if rest.consistency.consistent is not True or found.p_value > LEVEL * REST:
+            break
+        wrong.append(found)
+    return tuple(wrong)
 
 
-def wrong_dwell(result: Calibration, k: int, rest: Calibration, most_p: float = 1.0) -> OutlyingDwell | None:
-    """Dwell ``k`` against the calibration from all others; None if its p-value is larger than ``most_p``."""
+def wrong_dwell(result: Calibration, k: int, rest: Calibration) -> OutlyingDwell:
+    """Dwell ``k`` against the calibration from all others."""
     dwells, estimate = result.fit.dwells, rest.estimate
     linearised = LinearisedDwells(without_attitudes(dwells), rest.model, estimate.state)
     means = linearised.means[[k]]
     error, covariance = means.readings[0] - means.design[0] @ estimate.state, _covariance(rest, means)
     statistic = min(float(error @ np.linalg.solve(covariance, error)), _fall(result, rest))
     p_value = min(len(dwells) * f_tail(3.0, max(rest.consistency.dof, 1), statistic / 3.0), 1.0)
-    if p_value > most_p:
-        return None
     turns = tuple(_turns(linearised.dwells_at_state[k : k + 1], means, rest))
     return OutlyingDwell(dwells[k], dwells[k].number, error, p_value, turns, rest)
 
@@ -97,37 +85,45 @@ def _turns(alone: DwellTable, means: Means, rest: Calibration) -> Iterator[Turn]
     bench, state, (dwell,) = rest.bench, rest.estimate.state, alone
     at_s = np.array([0.5 * (dwell.start_s + dwell.end_s)])
 
-    def at(gimbal: int, turn_rad: float) -> Means:
-        """Return the dwell's means with the specific force that the platform would have at this angle of the gimbal."""
+    def at(gimbal: int, turn_rad: float) -> tuple[Floats, Floats]:
+        """Return the error (3,) with the specific force that the platform would have at this angle of the gimbal, and
+        the inverse of its covariance (3, 3)."""
         pose = dwell.pose.copy()
         pose[gimbal] += turn_rad
         force, design = alone.felt(bench.specific_force(at_s, pose[None])), means.design.copy()
         for i in range(3):
             design[:, i, 4 * i : 4 * i + 3] = force
-        return replace(means, force_mps2=force, design=design, readings=means.readings + there(force))
-
-    def there(force: Floats) -> Floats:
-        """Return by how much more effects turn the readings at another specific force."""
-        return turning_mps2(alone, force - means.force_mps2, state, 1)
-
-    def error(gimbal: int, turn_rad: float) -> Floats:
-        other = at(gimbal, turn_rad)
-        return other.readings[0] - other.design[0] @ state
+        readings = means.readings + turning_mps2(alone, force - means.force_mps2, state, 1)
+        there = replace(means, force_mps2=force, design=design, readings=readings)
+        return (readings - design @ state)[0], np.asarray(np.linalg.inv(_covariance(rest, there)), float)
 
     for gimbal, axis in enumerate(bench.to_metadata().get("axes", "").split()):
-        grid = np.linspace(-np.pi, np.pi, _GRID, endpoint=False).tolist()
-        turn = min(grid, key=lambda each, g=gimbal: float(np.sum(error(g, each) ** 2)))
-        curvature = 1e-300
-        for _ in range(_REFINED):  # Gauss-Newton, with the pose's uncertainty taken at the new angle
-            ahead, behind = (error(gimbal, turn + step) for step in (_STEP, -_STEP))
-            slope, here, weight = (ahead - behind) / (2.0 * _STEP), error(gimbal, turn), _weight(rest, at(gimbal, turn))
-            curvature = max(float(slope @ weight @ slope), 1e-300)
-            turn -= min(max(float(slope @ weight @ here) / curvature, -_FARTHEST), _FARTHEST)
-        here = error(gimbal, turn)
-        if float(here @ _weight(rest, at(gimbal, turn)) @ here) < _MOST_LEFT:
+        (here, weight), (across, _), (opposite, _) = (at(gimbal, turn) for turn in (0.0, 0.5 * np.pi, np.pi))
+        middle, cosine = 0.5 * (here + opposite), 0.5 * (here - opposite)
+        sine, turn = across - middle, 0.0
+        for _ in range(2):  # the second time by the covariance there
+            turn = _least(middle, cosine, sine, weight)
+            weight = at(gimbal, turn)[1]
+        error, slope = at(gimbal, turn)[0], sine * math.cos(turn) - cosine * math.sin(turn)
+        sigma_rad = max(float(slope @ weight @ slope), 1e-300) ** -0.5
+        left = chi_squared_tail(2.0, float(error @ weight @ error))  # three channels less one angle
+        if left > LEVEL * REST and sigma_rad < np.pi:
             recorded = math.degrees(dwell.recorded_pose[gimbal])
             mended = _written_as(recorded, recorded + math.degrees(turn))
-            yield Turn(gimbal, axis, recorded, mended, math.degrees(curvature**-0.5))
+            yield Turn(gimbal, axis, recorded, mended, math.degrees(sigma_rad))
+
+
+def _least(middle: Floats, cosine: Floats, sine: Floats, weight: Floats) -> float:
+    """Return the angle at which e = middle + cosine cos + sine sin (3,) is least by e^T weight e.
+
+    Of z = exp(i angle) the derivative is a polynomial of degree 4, whose roots on the unit circle are the extrema.
+    """
+    wave = 0.5 * (cosine - 1j * sine)  # e = middle + wave z + its conjugate
+    twice, once = 2j * (wave @ weight @ wave), 2j * (middle @ weight @ wave)
+    roots = np.roots(np.array([twice, once, 0.0, np.conj(once), np.conj(twice)]))
+    angles = np.append(np.angle(roots), 0.0)
+    errors = middle[:, None] + np.outer(cosine, np.cos(angles)) + np.outer(sine, np.sin(angles))
+    return float(angles[np.einsum("in,ij,jn->n", errors, weight, errors).argmin()])
 
 
 def _written_as(recorded_deg: float, angle_deg: float) -> float:
@@ -135,8 +131,3 @@ def _written_as(recorded_deg: float, angle_deg: float) -> float:
     if abs(recorded_deg) <= 180.0:
         return (angle_deg + 180.0) % 360.0 - 180.0
     return angle_deg % 360.0 if 0.0 <= recorded_deg < 360.0 else angle_deg
-
-
-def _weight(rest: Calibration, means: Means) -> Floats:
-    """Return the inverse covariance of the dwell's error."""
-    return np.asarray(np.linalg.inv(_covariance(rest, means)), float)

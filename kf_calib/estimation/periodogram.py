@@ -17,20 +17,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import IN_CACHE, ROUNDING, Floats
 from kf_calib.bench.paper_parameters import BIASES, STATE_COUNT
 from kf_calib.dwells.pieces import OfPieces, of_all_pieces
 from kf_calib.effects import Effect
 from kf_calib.estimation import whitened_rows
+from kf_calib.estimation.candidate_scan import SEEN
 from kf_calib.estimation.dwell_columns import LinearisedDwells, candidate_columns, few_at_a_time, stimulus_of
 from kf_calib.noise.noise_model import Noise, steps
 
-_SEEN = 1e-6  # a column of which the model leaves less than this share counts as explained
-_NEW = 1e-9  # a smaller share of a column beside those before it is rounding
 _SPARE = 18  # points beyond the phase, rad, that passes during a dwell; the error is then 1e-10 of a column
-_AT_ONCE = 64  # frequencies that are processed together
-_SAME_RAD = 1e-10  # phases that differ by less are equal
-_LEAST_PAUSE = 1e-6  # of the largest variance of a step: the variance over a pause is at least this
 
 Waves = NDArray[np.complex128]
 
@@ -41,7 +37,7 @@ class Periodogram:
     def __init__(self, linearised: LinearisedDwells, noise: Noise, effect: Effect, values_hz: Floats) -> None:
         self.values_hz, dwells = values_hz, linearised.dwells
         self._middles_s = dwells.folded.ends_s.mean(axis=1)
-        self._same_hz = _SAME_RAD / (2.0 * np.pi * float(np.abs(self._middles_s).max(initial=1e-9)))
+        self._same_hz = ROUNDING / (2.0 * np.pi * float(np.abs(self._middles_s).max(initial=1e-9)))
         points_hz, self._shares = _points(values_hz, float(np.diff(dwells.folded.ends_s).max()))
         kinds, self._path = [effect.at(hz) for hz in points_hz], None
         self._waves, self._ends, twelve = _waves(linearised, noise, kinds)
@@ -86,10 +82,10 @@ class Periodogram:
         - along_left (N, 6): products of the waves with the residual of the readings.
         """
         sizes = np.sqrt(np.maximum(np.einsum("nii->ni", self._squares), 0.0))
-        sizes[sizes <= _NEW * sizes.max(initial=0.0)] = np.inf  # a sine that is zero at all (equidistant) dwells
+        sizes[sizes <= ROUNDING * sizes.max(initial=0.0)] = np.inf  # a sine that is zero at all (equidistant) dwells
         gram = self._squares - along_model @ np.swapaxes(along_model, 1, 2)
         gram, along = gram / (sizes[:, :, None] * sizes[:, None, :]), along_left / sizes
-        inverse = np.linalg.pinv(gram, rcond=_SEEN, hermitian=True)
+        inverse = np.linalg.pinv(gram, rcond=SEEN, hermitian=True)
         return np.einsum("ni,nij,nj->n", along, inverse, along)
 
     def _products_of_waves(self) -> Floats:
@@ -127,8 +123,9 @@ class Periodogram:
     def _turning(self) -> Iterator[tuple[slice, Waves]]:
         """Yield slices of the frequencies and e^(2 pi i f t_d) (n, D) for each."""
         turns_s, apart_hz, apart = 2j * np.pi * self._middles_s, np.zeros(0), np.zeros((0, 0))
-        for first in range(0, len(self.values_hz), _AT_ONCE):
-            part = slice(first, first + _AT_ONCE)
+        numbers = len(turns_s) + 3 * self._shares.shape[1] * STATE_COUNT  # turns, and sums of the three accelerometers
+        for first in range(0, len(self.values_hz), most := -(-IN_CACHE // numbers)):
+            part = slice(first, first + most)
             own_hz = self.values_hz[part] - self.values_hz[first]
             if len(own_hz) > len(apart_hz) or np.abs(own_hz - apart_hz[: len(own_hz)]).max() > self._same_hz:
                 apart_hz, apart = own_hz, np.exp(own_hz[:, None] * turns_s)  # once, if the frequencies are equidistant
@@ -142,7 +139,7 @@ def _basis_and_rest(rows: Floats, of_dwells: Floats) -> tuple[Floats, Floats]:
     scale = np.where(scale > 0, scale, 1.0)
     left, left_of_dwells = rows[:, -1], of_dwells[:, -1]
     basis, singular, right = np.linalg.svd(rows[:, :-1] / scale[:-1], full_matrices=False)
-    seen = singular > _NEW
+    seen = singular > ROUNDING
     basis, of_basis = basis[:, seen], (of_dwells[:, :-1] / scale[:-1]) @ (right[seen].T / singular[seen])
     for _ in range(2):  # projecting twice removes the rounding errors of large components
         share = basis.T @ left
@@ -201,7 +198,7 @@ class _Path:
             own = self._columns[part].T @ self._columns[part]
             for apart in range(6):
                 bands[apart, k, : 6 - apart] = np.diag(own, -apart)
-        within, pauses = 1.0 / steps[:, 1], 1.0 / np.maximum(steps[1:, 0], _LEAST_PAUSE)
+        within, pauses = 1.0 / steps[:, 1], 1.0 / np.maximum(steps[1:, 0], SEEN)
         bands[0, :, 3:] += within[:, None]
         bands[0, 0, :3] += 1.0  # the first a is fixed at zero; 1 keeps the matrix regular
         bands[0, 1:, :3] += pauses[:, None]

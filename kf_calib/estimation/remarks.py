@@ -16,6 +16,7 @@ from kf_calib.effects.effect import Unknown
 from kf_calib.estimation import free_attitude, setup_blunders
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.estimate import Estimate
+from kf_calib.estimation.mountings import NOISE
 from kf_calib.estimation.results import Consistency, format_p
 from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.reml import ENOUGH_DIRECTIONS, FEWEST, degrees_of_freedom, directions
@@ -23,8 +24,6 @@ from kf_calib.noise.temperature_course import temperature_course
 from kf_calib.noise.terms import ThermometerError
 from kf_calib.noise.within_dwells import TOO_SHORT
 from kf_calib.support.units import shown
-
-_GROSS = 0.05  # g; scatter beyond this is a blunder
 
 MISSING_OR_NOISE = "the dwells scatter about the model by more than the noise: an effect is missing in the model, or "
 """How the sentence begins on a misfit of which no more is known."""
@@ -169,7 +168,7 @@ def remarks_on(
 
 def is_gross(noise: Noise, bench: Bench) -> bool:
     """Tell whether dwells scatter, by an amount that nobody stated, as no sensor does."""
-    return not noise.scatter.stated and float(noise.scatter_mps2.max()) > _GROSS * bench.gravity_mps2
+    return not noise.scatter.stated and float(noise.scatter_mps2.max()) > NOISE * bench.gravity_mps2
 
 
 def _scatter_in_words(noise: Noise, freedom: int) -> str:

@@ -17,6 +17,7 @@ from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.blocks import Tally
 from kf_calib.dwells.sufficient_statistics import Dwell
 from kf_calib.dwells.table import DwellTable
+from kf_calib.effects.drift import WarmUp
 from kf_calib.estimation import square_root_information, whitened_rows
 from kf_calib.estimation.attitude import at_its_mode
 from kf_calib.estimation.correction import Corrected, Correction
@@ -38,9 +39,7 @@ from kf_calib.support.text import as_html, printed
 from kf_calib.support.units import field_unit, shown
 
 _WEAK = 5.0  # times the size that a coefficient may well have
-_CLEAR = 3.0  # sigmas: of a coefficient that is seen, however large it is
 _QUIET = 1e-6  # probability that dwells differ as little by noise, below which the noise is taken for too large
-_WARMING_MPS2 = 0.1  # the most by which a bias is off after switching on: some 10 mg
 
 
 @dataclass(frozen=True)
@@ -152,9 +151,11 @@ class OutlyingDwell:
         at = f" (recorded at {', '.join(f'{angle:.4g}' for angle in np.degrees(pose))} deg)" if axes else ""
         error_mps2 = float(np.linalg.norm(self.error_mps2))
         told = f"dwell {self.number}{at} alone does not fit: it is off by {shown('m/s^2').text(error_mps2, 2)}"
-        if self.turns:
-            warming = self.number < self.without.fit.dwells[0].number and error_mps2 < _WARMING_MPS2
-            told += f", as if {' or '.join(map(str, self.turns))}{' or the block was still warming up' * warming}"
+        causes = list(map(str, self.turns))
+        if self.number < self.without.fit.dwells[0].number and error_mps2 < max(WarmUp.typical.mems or (0.0,)):
+            causes.append("the block was still warming up")
+        if causes:
+            told += f", as if {' or '.join(causes)}"
         elif axes:
             told += ", which no turn of one gimbal explains"
         p_value = self.without.consistency.p_value
@@ -254,7 +255,7 @@ class Calibration:
         sigmas = np.where((gains != 1.0) & (sigmas > effects), np.nan, sigmas)  # not known: sigma over value
         if not self.bench.angles:  # |f| tells of some effects little more than that they are not absurdly large
             scales = np.array([coefficient.scale for coefficient in coefficients])
-            weak = (sigmas > _WEAK * scales) & (np.abs(effects) < _CLEAR * sigmas)
+            weak = (sigmas > _WEAK * scales) & (np.abs(effects) < NORMAL * sigmas)
             sigmas = np.where((gains == 1.0) & weak, np.nan, sigmas)
         rows = [
             *zip(

@@ -1,61 +1,56 @@
 """Detection of mistakes in the set-up that make any estimate from the run meaningless.
 
 The model is linear in s_i = K_i E_i. Reversed or exchanged channels and a reversed gimbal can therefore be fitted
-exactly, and no p-value shows them. The estimate itself does: the axis of an accelerometer then lies more than 45 deg
-from nominal.
+exactly, and no p-value shows them; but the axes are then far from nominal.
 
-  mean reading of dwell d, channel i:  z_di = s_i . f_d + b_i        (D dwells; f_d from the angles)
-
-``refuse`` fits this to the means of the dwells and raises ``BlunderError`` if the result cannot be a calibration. The
-message says what is wrong and, if the cause is known, which options correct it. To find the cause it tries the orders
-and signs of the channels (48), the sense and order of the gimbals, the unit of the angles and the axis that is up, with
-the fewest changes first. No correction is applied automatically, and all changes that give the same readings are named.
+``refuse`` compares what may have been done: what is stated; another order or sign of the channels, or channels that are
+dead; another sense or order of the gimbals, unit of the angles or axis that is up; channels that change in the course
+of the run; one reading of the wrong sign. Each explains the mean readings to within a misfit (``Misfits``), to which
+every change adds what makes it improbable beforehand. If the least misfit is not that of what is stated,
+``BlunderError`` says what is wrong, and which options state it. No correction is applied automatically, and all changes
+that give the same readings are named.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NoReturn
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import ROUNDING, Floats
 from kf_calib.bench.bench import Bench
+from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.bench.raw_input import CHANNELS
 from kf_calib.dwells.table import DwellTable
 from kf_calib.errors import BlunderError
 from kf_calib.estimation.mountings import (
-    _FARTHEST,
+    FARTHEST,
     GAIN_RANGE,
+    NOISE,
     AffineFit,
     Channels,
     DwellMeans,
+    Misfits,
     Mounting,
     determines_axes,
     fit_affine,
     mountings,
     nominal_sensitivity,
 )
+from kf_calib.noise.reml import FEWEST
+from kf_calib.support.tail_probabilities import LEVEL
+from kf_calib.support.text import SHOWN
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
-_DEAD = 0.05  # g; a channel whose means vary by less is dead
-_TURNED = 1.0  # g; if gravity along it should have changed by more
-_CHANGED = 0.1  # g; a constant reading is stuck if gravity along it should have changed by more
-_UNEXPLAINED = 0.05  # g; if the residual rms is larger, the angles do not explain the mean readings
-_BETTER = 0.2  # a change explains the readings if it leaves less than this share of the residual
-_FAR = 0.75  # g; readings farther from those of a nominal block have another mounting
-_NOMINAL = 0.15  # g; largest rms deviation from nominal without a mistake, from biases, scale factors and mounting
-_INDISTINCT = 0.25  # g^2; assignments whose sums of squares differ by less explain the readings alike
 _MOST_DWELLS = 96  # so many dwells are used at most, spread over the run
-_MOST_CHANGES = 4  # largest number of changes of gimbals and channels together
-_MOST_NAMED = 3  # largest number of equally good changes in a message
 _ALIKE = 0.05  # three scale factors share a deviation if they differ by less than this share of it
 _LITTLE = 20e-6  # a smaller deviation of the scale factors is not reported
-_FEW_DWELLS = 8  # with more, the other dwells tell the noise, and so a dwell that does not fit
-_IN_PLANE = 0.3  # g; gravity has to turn by as much in a plane to show the axes that lie in it
-_STUCK = 1e-9  # readings with a smaller relative difference are equal
+_CHANGE = -math.log(LEVEL)
+"""What every change adds to a misfit, as it has the prior probability LEVEL."""
 
 
 def refuse(dwells: DwellTable, bench: Bench) -> None:
@@ -65,104 +60,73 @@ def refuse(dwells: DwellTable, bench: Bench) -> None:
     """
     step = -(-len(dwells) // _MOST_DWELLS)
     means, stated = DwellMeans.of(dwells[::step]), Mounting.stated(bench)
-    affine = fit_affine(means, stated)
-    is_open = affine is None and not determines_axes(means.readings / bench.gravity_mps2)
-    if is_open:
-        _refuse_far_from_nominal(means, stated)
-    _refuse_silent(means, stated)
-    if is_open:
-        _refuse_reversed_in_plane(means, stated)
-        return
-    if affine is not None and affine.left < _UNEXPLAINED:
-        if affine.is_near():
-            return
-        _refuse_wrong_gain(affine, bench)
-    wrong = _what_is_wrong(affine, bench)
-    _refuse_one_sign(means, stated)
-    _refuse_exchange(means, stated)
-    mending = _mendings(means, stated, affine)
-    if mending:
-        one = mending[0] if len({_advice(bench, each) for each in mending}) == 1 else None
-        options = "" if one is None or _words(bench, one) else " ".join(_options(bench, one))
-        raise BlunderError(f"{wrong}: {_question(bench, mending)}", options)
-    if (affine is None or not affine.is_near()) and not _one_dwell(means, stated):
+    _refuse_stuck(means, stated)
+    affine, misfit = fit_affine(means, stated), float(Misfits.of_mounting(means, stated).of([CHANNELS])[0])
+    is_near = affine is None or affine.is_near()
+    if affine is not None and affine.left < NOISE and affine.is_along():
+        _refuse_wrong_gain(means, affine, bench)
+    if misfit > _CHANGE:  # else no change could explain more than it costs
+        in_course = min(_one_dwell(means, stated), _exchange(means, stated))
+        least = min(misfit if is_near else math.inf, in_course[0])
+        _refuse_mounting(means, stated, affine, least)
+        if in_course[0] == least < math.inf:
+            if in_course[1]:
+                raise BlunderError(in_course[1])
+            return  # one dwell alone is off
+    if not is_near or (affine is None and determines_axes(means.readings / bench.gravity_mps2)):
         raise BlunderError(
-            f"{wrong}, and no order or sign of channels, gimbals or angles brings all axes near nominal: check what "
-            "the channels and the angles are, and state --nominal where the block is mounted so."
+            f"{_what_is_wrong(means, affine, bench)}, and no order or sign of channels, gimbals or angles brings all "
+            "axes near nominal: check what the channels and the angles are, and state --nominal where the block is "
+            "mounted so."
         )
 
 
-def _refuse_silent(means: DwellMeans, stated: Mounting) -> None:
-    """Refuse a channel that is constant, or nearly so, although gravity along it should change much."""
+def _refuse_mounting(means: DwellMeans, stated: Mounting, affine: AffineFit | None, limit: float) -> None:
+    """Refuse a run that another mounting or assignment explains, with a misfit below a limit."""
+    mendings, bench = list(_mendings(means, stated)), stated.bench
+    likeliest = min(mendings, key=lambda each: each.misfit, default=None)
+    if likeliest is None or likeliest.misfit >= limit:
+        return
+    if 0 in likeliest.channels:
+        _refuse_dead(means, bench, likeliest.channels.index(0))
+    alike = [
+        each for each in mendings if each.misfit < likeliest.misfit + _CHANGE and each.changes == likeliest.changes
+    ]
+    alike.sort(key=lambda each: each.mounting.changes > 0 and each.channels != CHANNELS)  # mixed changes last
+    options = "" if _words(bench, alike[0]) else " ".join(_options(bench, alike[0]))
+    single = len({_advice(bench, each) for each in alike}) == 1
+    raise BlunderError(f"{_what_is_wrong(means, affine, bench)}: {_question(bench, alike)}", options * single)
+
+
+def _refuse_dead(means: DwellMeans, bench: Bench, i: int) -> NoReturn:
+    """Refuse a channel that does not feel gravity."""
+    raise BlunderError(
+        f"channel {abs(bench.input.channels[i])} is dead: its mean stays within {np.ptp(means.readings[:, i]):.2g} "
+        f"m/s^2 in {len(means.numbers)} dwells in which gravity along it should change; check that it is connected and "
+        "on."
+    )
+
+
+def _refuse_stuck(means: DwellMeans, stated: Mounting) -> None:
+    """Refuse a channel that reads exactly the same in the last dwells, although gravity along it should change."""
     readings, count = means.readings, len(means.readings)
     expected = means.force(stated) @ nominal_sensitivity(stated.bench).T
-    same = np.abs(readings - readings[-1]) <= _STUCK * np.abs(readings[-1])
+    same = np.abs(readings - readings[-1]) <= ROUNDING * np.abs(readings[-1])
     for i, channel in enumerate(map(abs, stated.bench.input.channels)):
         first = count - int(np.argmin(np.append(same[::-1, i], False)))
-        if count - first >= 3 and np.ptp(expected[first:, i]) > _CHANGED:
+        if count - first >= 3 and np.ptp(expected[first:, i]) > 2.0 * NOISE:
             since = f"from dwell {means.numbers[first]} on (at {means.middle_s[first]:.0f} s)" if first else "all along"
             raise BlunderError(
                 f"channel {channel} is stuck: {since} it reads {readings[-1, i]:.6g} m/s^2 in every orientation; check "
                 "its cable and converter, and evaluate what was recorded before."
             )
-        spread_mps2 = float(np.ptp(readings[:, i]))
-        if spread_mps2 < _DEAD * stated.bench.gravity_mps2 and np.ptp(expected[:, i]) > _TURNED:
-            raise BlunderError(
-                f"channel {channel} is dead: its mean stays within {spread_mps2:.2g} m/s^2 in {count} dwells in which "
-                "gravity along it should change by more than g; check that it is connected and on."
-            )
 
 
-def _refuse_reversed_in_plane(means: DwellMeans, stated: Mounting) -> None:
-    """Refuse a run whose gravity stays in one plane, and in which a channel that lies near this plane follows gravity
-    with the opposite sign: the plane shows so much of its axis."""
-    force, bench = means.force(stated), stated.bench
-    readings, count = means.readings / bench.gravity_mps2, len(means.readings)
-    _, sizes, directions = np.linalg.svd(force - force.mean(axis=0), full_matrices=False)
-    plane = directions[:2]
-    if count < 4 or sizes[1] < _IN_PLANE * math.sqrt(count):
-        return
-    columns = np.column_stack([force @ plane.T, np.ones(count)])
-    solution = np.linalg.lstsq(columns, readings, rcond=None)[0]
-    left = np.sqrt(np.mean((readings - columns @ solution) ** 2, axis=0))
-    nominal = nominal_sensitivity(bench) @ plane.T
-    sizes_of = np.linalg.norm(nominal, axis=1) * np.linalg.norm(solution[:2], axis=0)
-    cosines = np.sum(nominal * solution[:2].T, axis=1) / np.where(sizes_of > 0.0, sizes_of, np.inf)
-    opposite = (np.linalg.norm(nominal, axis=1) > _FARTHEST) & (cosines < -_FARTHEST) & (left < _UNEXPLAINED)
-    if not opposite.any():
-        return
-    one, two, three = (-k if wrong else k for k, wrong in zip(CHANNELS, opposite.tolist(), strict=True))
-    numbers = [abs(channel) for channel, wrong in zip(bench.input.channels, opposite.tolist(), strict=True) if wrong]
-    wired = _wired(bench, (one, two, three)) + bench.input.restating("channels")
-    raise BlunderError(
-        f"{_channels(numbers)} -g where +g is expected. Gravity stays in one plane, which does not tell why: the "
-        f"channel is reversed (--channels {wired}), or the gimbal turns the other way (a minus in --axes)."
-    )
-
-
-def _refuse_far_from_nominal(means: DwellMeans, stated: Mounting) -> None:
-    """Refuse a run in orientations too few to show the axes, whose readings no calibration near nominal gives, if some
-    other mounting gives them."""
-
-    def far(mending: Mending) -> float:
-        """Return the distance of the readings from those of a nominal block, rms of the dwells, g."""
-        expected = means.force(mending.mounting) @ nominal_sensitivity(mending.mounting.bench).T
-        readings = means.readings[:, np.abs(mending.channels) - 1] * np.sign(mending.channels)
-        return float(np.sqrt(np.mean(np.sum((readings / stated.bench.gravity_mps2 - expected) ** 2, axis=1))))
-
-    if far(Mending(stated, CHANNELS)) < _FAR:
-        return
-    tried = [Mending(mounting, channels) for mounting in mountings(stated) for channels in _WIRINGS]
-    near = [mending for mending in tried if far(mending) < _NOMINAL]
-    fewest = min((mending.changes for mending in near), default=0)
-    if fewest:
-        mendings = sorted((m for m in near if m.changes == fewest), key=lambda m: m.channels != CHANNELS)
-        raise BlunderError(f"the readings are not those of the stated mounting: {_question(stated.bench, mendings)}")
-
-
-def _refuse_wrong_gain(fitted: AffineFit, bench: Bench) -> None:
+def _refuse_wrong_gain(means: DwellMeans, fitted: AffineFit, bench: Bench) -> None:
     """Refuse a channel that measures gravity by another factor than the others, as in another unit."""
     for i, scale in enumerate(fitted.scales.tolist()):
+        if scale < NOISE:
+            _refuse_dead(means, bench, i)
         if not GAIN_RANGE[0] < scale < GAIN_RANGE[1]:
             others = " and ".join(f"{other:.3g}" for other in np.delete(fitted.scales, i))
             raise BlunderError(
@@ -173,10 +137,11 @@ def _refuse_wrong_gain(fitted: AffineFit, bench: Bench) -> None:
 
 @dataclass(frozen=True)
 class Mending:
-    """A mounting and an assignment of the channels with which all axes are near nominal."""
+    """A mounting and an assignment of the channels that explain the readings, and the misfit that they leave."""
 
     mounting: Mounting
     channels: Channels
+    misfit: float = 0.0
 
     @property
     def changes(self) -> int:
@@ -187,12 +152,12 @@ class Mending:
 def _changes_of(channels: Channels) -> int:
     """Return the number of changes in an assignment of the channels.
 
-    A different order counts as one change and each sign as one; if all signs are reversed, they count as one, the sense
-    of the readings.
+    A different order counts as one change, as does each sign and each channel that is dead; if all signs are reversed,
+    they count as one, the sense of the readings.
     """
-    reversed_ = sum(channel < 0 for channel in channels)
-    order = tuple(map(abs, channels)) != CHANNELS
-    return order + (1 if reversed_ == 3 else reversed_)
+    reversed_, dead = sum(channel < 0 for channel in channels), channels.count(0)
+    order = any(abs(channel) not in (0, k) for k, channel in zip(CHANNELS, channels, strict=True))
+    return order + dead + (1 if reversed_ == 3 else reversed_)
 
 
 _WIRINGS: tuple[Channels, ...] = tuple(
@@ -201,40 +166,34 @@ _WIRINGS: tuple[Channels, ...] = tuple(
     for i, j, k in itertools.product((1, -1), repeat=3)
 )
 """The 48 assignments of channels, with signs, to accelerometers."""
+_WITH_DEAD: tuple[Channels, ...] = (*_WIRINGS, (0, 2, 3), (1, 0, 3), (1, 2, 0), (0, 0, 3), (0, 2, 0), (1, 0, 0))
+"""These, and one or two channels that are dead, 0."""
 
 
-def _mendings(means: DwellMeans, stated: Mounting, affine: AffineFit | None) -> list[Mending]:
-    """Return the mountings and assignments with the fewest changes that explain the readings with all axes near
-    nominal."""
-    left = _UNEXPLAINED if affine is None or affine.left < _UNEXPLAINED else max(_BETTER * affine.left, 0.01)
-    mendings, fewest = list[Mending](), _MOST_CHANGES
+def _mendings(means: DwellMeans, stated: Mounting) -> Iterator[Mending]:
+    """Yield the mountings and assignments other than those stated that explain the readings."""
     for mounting in mountings(stated):
-        if mounting.changes > fewest:
-            break
-        fitted = affine if not mounting.changes else fit_affine(means, mounting)
-        if fitted is None or fitted.left > left:
-            continue
-        for channels in _WIRINGS:
-            mending = Mending(mounting, channels)
-            if mending.changes and mending.changes <= fewest and fitted.is_near(channels):
-                fewest = mending.changes
-                mendings.append(mending)
-    equal = [each for each in mendings if each.changes == fewest]
-    return sorted(equal, key=lambda each: each.mounting.changes > 0 and each.channels != CHANNELS)  # mixed changes last
+        misfits = Misfits.of_mounting(means, mounting).within_noise(_WITH_DEAD)
+        for k in np.flatnonzero(np.isfinite(misfits)).tolist():
+            mending = Mending(mounting, _WITH_DEAD[k])
+            if mending.changes:
+                yield replace(mending, misfit=float(misfits[k]) + _CHANGE * mending.changes)
 
 
-def _what_is_wrong(affine: AffineFit | None, bench: Bench) -> str:
+def _what_is_wrong(means: DwellMeans, affine: AffineFit | None, bench: Bench) -> str:
     """Name the channels whose axes are far from nominal or, if there are none, say that the angles do not explain the
     readings."""
+    if affine is None and not determines_axes(means.readings / bench.gravity_mps2):
+        return "the readings are not those of the stated mounting"
     if affine is None:
         return "the readings show the platform in many orientations, the angles in few"
     cosines, numbers = np.diag(affine.cosines), [abs(channel) for channel in bench.input.channels]
-    opposite = [channel for channel, cosine in zip(numbers, cosines, strict=True) if cosine < -_FARTHEST]
+    opposite = [channel for channel, cosine in zip(numbers, cosines, strict=True) if cosine < -FARTHEST]
     reasons = list[str]()
     if opposite:
         reasons.append(f"{_channels(opposite)} -g where +g is expected")
     for channel, cosine in zip(numbers, cosines.tolist(), strict=True):
-        if abs(cosine) < _FARTHEST:
+        if abs(cosine) < FARTHEST:
             reasons.append(f"the axis of channel {channel} lies {math.degrees(math.acos(cosine)):.0f} deg from nominal")
     return ", ".join(reasons) or f"the angles do not explain the readings ({affine.left:.2g} g rms are left)"
 
@@ -250,8 +209,8 @@ def _question(stated: Bench, mendings: Sequence[Mending]) -> str:
     if len(said) == 1:
         reason, advice = said[0]
         return f"{reason}? Try {advice}."
-    more = f" (or one of {len(said) - _MOST_NAMED} more)" if len(said) > _MOST_NAMED else ""
-    named = ", or ".join(f"{reason} ({advice})" for reason, advice in said[:_MOST_NAMED])
+    more = f" (or one of {len(said) - SHOWN} more)" if len(said) > SHOWN else ""
+    named = ", or ".join(f"{reason} ({advice})" for reason, advice in said[:SHOWN])
     return f"{named}{more}? Each would give these readings: look at the bench to tell."
 
 
@@ -312,60 +271,56 @@ def _words(stated: Bench, mending: Mending) -> list[str]:
     return words
 
 
-def _refuse_one_sign(means: DwellMeans, stated: Mounting) -> None:
-    """Refuse a run of few dwells in which all readings are near nominal but one, which has the opposite sign. With more
-    dwells an outlying one is told from its own misfit."""
-    if not 3 <= len(means.numbers) <= _FEW_DWELLS:
-        return
-    bench = stated.bench
-    expected, readings = means.force(stated) @ nominal_sensitivity(bench).T, means.readings / bench.gravity_mps2
-    errors = np.abs(readings - expected)
-    k, i = np.unravel_index(int(np.argmax(errors)), errors.shape)
-    mended = errors.copy()
-    mended[k, i] = abs(readings[k, i] + expected[k, i])
-    if errors[k, i] < 1.0 or np.sqrt(np.mean(mended**2)) > _NOMINAL:
-        return
-    channel, sign = abs(bench.input.channels[i]), "+-"[int(expected[k, i] < 0.0)]
-    raise BlunderError(
-        f"dwell {means.numbers[k]} (at {means.middle_s[k]:.0f} s): channel {channel} reads {means.readings[k, i]:.5g} "
-        f"m/s^2, and {sign}{abs(means.readings[k, i]):.5g} would fit with all other readings: either the sign of this "
-        f"reading is wrong, or the pose; correct it, or leave the dwell out (--leave-out {means.numbers[k]})."
+def _one_dwell(means: DwellMeans, stated: Mounting) -> tuple[float, str]:
+    """Return the misfit where one dwell alone is off, which is told from its own misfit; of so few that the others do
+    not tell their noise, where the sign of one of its readings is taken for wrong, and a sentence that says so."""
+    count = len(means.numbers)
+    if 3 * (count - 1) >= STATE_COUNT + FEWEST:
+        rest = (means[np.arange(count) != k] for k in range(count))
+        least = min(float(Misfits.of_mounting(each, stated).within_noise([CHANNELS])[0]) for each in rest)
+        return least + _CHANGE + math.log(count), ""
+    places, misfits = list(np.ndindex(count, 3)), list[float]()
+    for place in places:
+        readings = means.readings.copy()
+        readings[place] *= -1.0
+        misfits.append(
+            float(Misfits.of_mounting(replace(means, readings=readings), stated).within_noise([CHANNELS])[0])
+        )
+    k, i = places[int(np.argmin(misfits))]
+    channel, reading, number = abs(stated.bench.input.channels[i]), means.readings[k, i], means.numbers[k]
+    return min(misfits) + _CHANGE + math.log(len(places)), (
+        f"dwell {number} (at {means.middle_s[k]:.0f} s): channel {channel} reads {reading:.5g} m/s^2, and "
+        f"{-reading:+.5g} would fit with all other readings: either the sign of this reading is wrong, or the pose; "
+        f"correct it, or leave the dwell out (--leave-out {number})."
     )
 
 
-def _refuse_exchange(means: DwellMeans, stated: Mounting) -> None:
-    """Refuse a run in which the channels change their order or signs between two dwells, with both parts near nominal,
-    and which no one assignment explains: a sign shows in no dwell in which gravity is across."""
-    if len(means.numbers) < 6:
-        return
-    bench = stated.bench
-    expected, readings = means.force(stated) @ nominal_sensitivity(bench).T, means.readings / bench.gravity_mps2
-    wired = np.stack([readings[:, np.abs(own) - 1] * np.sign(own) for own in _WIRINGS])  # (48, D, 3)
-    squares = ((wired - expected) ** 2).sum(axis=2)
-    before = np.cumsum(squares, axis=1)[:, :-1]  # sums over the dwells up to k, for each assignment
+def _exchange(means: DwellMeans, stated: Mounting) -> tuple[float, str]:
+    """Return the misfit and a sentence where the channels change their order or signs between two dwells, which is a
+    change itself.
+
+    The assignments of both parts are those that are nearest to nominal, but for what changes cost; a sign shows in no
+    dwell in which gravity is across.
+    """
+    bench, count, least, said = stated.bench, len(means.numbers), math.inf, ""
+    expected = means.force(stated) @ nominal_sensitivity(bench).T
+    wired = np.stack([means.readings[:, np.abs(own) - 1] * np.sign(own) for own in _WIRINGS])  # (48, D, 3)
+    squares = ((wired / bench.gravity_mps2 - expected) ** 2).sum(axis=2) / (2.0 * NOISE**2)
+    costs = _CHANGE * np.array([[_changes_of(channels)] for channels in _WIRINGS])
+    before = np.cumsum(squares, axis=1)  # sums over the dwells up to k, for each assignment
     after = squares.sum(axis=1, keepdims=True) - before
-    k = int(np.argmin(before.min(axis=0) + after.min(axis=0)))
-    explaining = [part <= part.min() + _INDISTINCT for part in (before[:, k], after[:, k])]
-    if (explaining[0] & explaining[1]).any() or not 2 <= k + 1 <= len(readings) - 2:
-        return
-    first, then = (min(np.flatnonzero(own), key=lambda i: _changes_of(_WIRINGS[i])) for own in explaining)
-    if math.sqrt((before[first, k] + after[then, k]) / expected.size) > _NOMINAL:
-        return
-    wirings = (Mending(stated, _WIRINGS[own]) for own in (first, then))
-    told = [" and ".join(_reasons(bench, each)) or "channels are as stated" for each in wirings]
-    raise BlunderError(
-        f"the channels change in the course of the run: up to dwell {means.numbers[k]} {told[0]}, from dwell "
-        f"{means.numbers[k + 1]} on (at {means.middle_s[k + 1]:.0f} s) {told[1]}; evaluate the two parts apart."
-    )
-
-
-def _one_dwell(means: DwellMeans, stated: Mounting) -> bool:
-    """Tell whether without some single dwell all axes are near nominal and the angles explain the readings."""
-    for k in range(len(means.numbers)):
-        found = fit_affine(means[np.arange(len(means.numbers)) != k], stated)
-        if found is not None and found.is_near() and found.left < _UNEXPLAINED:
-            return True
-    return False
+    for k in range(1, count - 2):
+        first, then = (int((part[:, k] + costs[:, 0]).argmin()) for part in (before, after))
+        readings = np.vstack([wired[first, : k + 1], wired[then, k + 1 :]])
+        misfit = float(Misfits.of_mounting(replace(means, readings=readings), stated).within_noise([CHANNELS])[0])
+        misfit += _CHANGE + math.log(count) + float(costs[first, 0] + costs[then, 0])
+        if misfit < least:
+            parts = (" and ".join(_reasons(bench, Mending(stated, _WIRINGS[own]))) for own in (first, then))
+            one, other = (part or "channels are as stated" for part in parts)
+            at = f"dwell {means.numbers[k + 1]} on (at {means.middle_s[k + 1]:.0f} s)"
+            said = f"up to dwell {means.numbers[k]} {one}, from {at} {other}"
+            least = misfit
+    return least, f"the channels change in the course of the run: {said}; evaluate the two parts apart."
 
 
 def common_scale(scales: Floats, sigmas: Floats, bench: Bench) -> str:

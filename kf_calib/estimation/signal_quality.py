@@ -22,19 +22,19 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats, Ints, Mask
+from kf_calib.bench.arrays import ROUNDING, Floats, Ints, Mask
 from kf_calib.dwells.rows import Rows
 from kf_calib.dwells.table import DwellTable, FoldedDwells
 from kf_calib.noise.noise_model import Noise
+from kf_calib.support.tail_probabilities import LEVEL, REST
+from kf_calib.support.text import SHOWN
 from kf_calib.support.units import shown
 
 _SAMPLE = 256  # readings of a dwell whose values are compared; a step below a twentieth of the noise is not noticed
 _VALUES = 32  # largest number of distinct values of a dwell that are kept
-_ROUNDING = (2.0**-22, 2.0**-49)  # relative to the largest value: rounding of stored float32 and of computed float64
-_CROWDED = 20.0  # readings missing above a flat top; noise alone would omit them with probability e^-20
-_CLUSTERED = 1e-3  # p-value of the run below which outliers count as clustered
+_ROUNDING = 2.0 * float(np.finfo(np.float32).eps), 8.0 * float(np.finfo(float).eps)  # of stored and computed values
+_CROWDED = -math.log(ROUNDING)  # readings missing above a flat top, which noise alone practically never omits
 _LOUD, _FEW = 10.0, 0.25  # times the noise of the run, and share of the dwells: of what disturbed single dwells
-_SHOWN = 6  # numbers of dwells in a sentence
 _COUNTABLE = 512  # if there are more dwells, neighbours are pooled
 
 
@@ -104,7 +104,7 @@ class Outliers:
     @property
     def clustered(self) -> bool:
         """Whether the outliers are significantly clustered."""
-        return self.clustered_p is not None and self.clustered_p < _CLUSTERED
+        return self.clustered_p is not None and self.clustered_p < LEVEL * REST
 
     def __str__(self) -> str:
         told = f"{self.count} outlying readings were rejected ({self.share:.2%}; accelerometers {self.by_channel})"
@@ -134,7 +134,7 @@ class LoudDwells:
         return cls(tuple(numbers[loud].tolist()), float(times.max()))
 
     def __str__(self) -> str:
-        left_out, told = " ".join(f"--leave-out {number}" for number in self.numbers[:_SHOWN]), _dwells(self.numbers)
+        left_out, told = " ".join(f"--leave-out {number}" for number in self.numbers[:SHOWN]), _dwells(self.numbers)
         if len(self.numbers) == 1:
             return (
                 f"in {told} the readings vary by {self.times:.2g} times the noise of the run: something disturbed it; "
@@ -429,4 +429,4 @@ def _dwells(numbers: Sequence[int]) -> str:
     """Write ``dwell 2`` or ``3 dwells (2, 5, 9)``, with at most six numbers."""
     if len(numbers) == 1:
         return f"dwell {numbers[0]}"
-    return f"{len(numbers)} dwells ({', '.join(map(str, numbers[:_SHOWN]))}{' ...' * (len(numbers) > _SHOWN)})"
+    return f"{len(numbers)} dwells ({', '.join(map(str, numbers[:SHOWN]))}{' ...' * (len(numbers) > SHOWN)})"

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench import paper_parameters
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import ROUNDING, Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.pieces import OfPieces, of_all_pieces
 from kf_calib.dwells.qr import triangle
@@ -153,18 +153,18 @@ def scale_columns(factor: Floats) -> tuple[Floats, Floats]:
     return factor[..., :-1] / scale[..., None, :], scale
 
 
-def rank(factor: Floats, tolerance: float = 1e-9) -> int:
+def rank(factor: Floats, tolerance: float = ROUNDING) -> int:
     """Number of combinations of states that the factor determines: the rank of R."""
     return int(ranks(factor, tolerance))
 
 
-def ranks(factors: Floats, tolerance: float = 1e-9) -> NDArray[np.intp]:
+def ranks(factors: Floats, tolerance: float = ROUNDING) -> NDArray[np.intp]:
     """Ranks (...) of many factors (..., p, p + 1), as ``rank``."""
     singular = np.linalg.svd(scale_columns(factors)[0], compute_uv=False)
     return np.asarray((singular > tolerance).sum(axis=-1))
 
 
-def solve(factor: Floats, around: Floats, tolerance: float = 1e-9) -> tuple[Floats, Floats, Floats]:
+def solve(factor: Floats, around: Floats, tolerance: float = ROUNDING) -> tuple[Floats, Floats, Floats]:
     """State (p,), covariance (p, p) and a basis (p, q) of the combinations of states that are not determined.
 
       x = R^-1 z,  P = R^-1 R^-T
@@ -175,7 +175,7 @@ def solve(factor: Floats, around: Floats, tolerance: float = 1e-9) -> tuple[Floa
     return solve_all(factor[None], around, tolerance)[0]
 
 
-def solve_all(factors: Floats, around: Floats, tolerance: float = 1e-9) -> list[tuple[Floats, Floats, Floats]]:
+def solve_all(factors: Floats, around: Floats, tolerance: float = ROUNDING) -> list[tuple[Floats, Floats, Floats]]:
     """Solve many factors (n, p, p + 1); each result is as in ``solve``."""
     upper, scale = scale_columns(factors)
     left, singular, right = np.linalg.svd(upper)

@@ -14,7 +14,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import IN_CACHE, ROUNDING, Floats
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.dwells.pieces import OfPieces, of_all_pieces
 from kf_calib.dwells.qr import inverse_of_lower, triangle
@@ -26,7 +26,6 @@ from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.rotations import along_force, sensitivities_of
 
 _LARGE = 1e3  # errors, in sigmas of a mean, whose squares may be added to its variance
-_AT_ONCE = 1 << 17  # numbers that are processed together, so that they stay in the cache
 
 
 def whiten(
@@ -163,7 +162,7 @@ class _Batch:
 def _batches(table: DwellTable, width: int) -> Iterator[_Batch]:
     """Group dwells whose rows have one shape, limited so that their ``width`` columns fit into the cache."""
     for number, shape in enumerate(table.folded.shapes):
-        most = max(_AT_ONCE // (3 * shape.pieces.shape[1] * table.folded.width * (width + 1)), 1)
+        most = max(IN_CACHE // (3 * shape.pieces.shape[1] * table.folded.width * (width + 1)), 1)
         yield from (_Batch(table, number, slice(k, k + most)) for k in range(0, len(shape.dwells), most))
 
 
@@ -298,7 +297,7 @@ def _informative(rows: Floats, units: Floats) -> list[Floats]:
     columns of rounding size are nonzero.
     """
     left, singular, _ = np.linalg.svd(rows[..., :-1] / units, full_matrices=False)
-    ranks = (singular > 1e-9 * singular[:, :1]).sum(axis=1)
+    ranks = (singular > ROUNDING * singular[:, :1]).sum(axis=1)
     most = int(ranks.max())
     turned = np.swapaxes(left[..., :most], 1, 2) @ rows
     return [own[:rank].copy() for own, rank in zip(turned, ranks, strict=True)]

@@ -26,6 +26,7 @@ from kf_calib.dwells.qr import orthonormal
 from kf_calib.dwells.rows import on_basis
 from kf_calib.dwells.sufficient_statistics import lines_of
 from kf_calib.dwells.table import AlikeDwells, DwellTable
+from kf_calib.estimation.candidate_scan import SEEN
 from kf_calib.estimation.dwell_columns import LinearisedDwells
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.square_root_information import scale_columns
@@ -36,8 +37,6 @@ from kf_calib.support.tail_probabilities import LEVEL, REST, chi_squared_tail, f
 
 _DEGREE = 3
 _GRID = 600
-_FEWEST = 8  # readings that a dwell must have to be tested
-_SEEN = 1e-4  # of the square of a column: less that the model leaves is not told
 _PLACES = 9  # of the intensity of a walk, over which a density is averaged
 
 
@@ -203,8 +202,8 @@ def _trends_in(dwells: DwellTable, alike: AlikeDwells) -> tuple[Floats, Mask]:
     basis = dwells.triangles[alike.pieces, : folded.width, :3]
     rows = basis @ on_basis(shapes(2.0 * from_start - 1.0))
     frame, upper = np.linalg.qr(rows.reshape(len(rows), -1, rows.shape[3]))
-    determined = np.abs(np.einsum("dkk->dk", upper[:, :, : upper.shape[1]])) > 1e-6 * np.sqrt(counts)[:, None]
-    determined &= ((counts >= _FEWEST) & (lengths > 0.0))[:, None]
+    determined = np.abs(np.einsum("dkk->dk", upper[:, :, : upper.shape[1]])) > SEEN * np.sqrt(counts)[:, None]
+    determined &= (lengths > 0.0)[:, None]
     return frame[:, :, 1:], determined[:, 1:]
 
 
@@ -241,8 +240,8 @@ def _p_of_columns(columns: Floats, basis: Floats, left: Floats) -> float:
     columns = columns / np.where(sizes > 0.0, sizes, 1.0)
     inside, along = basis.T @ columns, columns.T @ left
     gram = columns.T @ columns - inside.T @ inside
-    constants = gram[3:, :3] @ np.linalg.pinv(gram[:3, :3], rcond=_SEEN, hermitian=True)
+    constants = gram[3:, :3] @ np.linalg.pinv(gram[:3, :3], rcond=SEEN, hermitian=True)
     values, vectors = np.linalg.eigh(gram[3:, 3:] - constants @ gram[:3, 3:])
-    seen = values > _SEEN
+    seen = values > SEEN
     delta_chi2 = np.sum((vectors[:, seen].T @ (along[3:] - constants @ along[:3])) ** 2 / values[seen])
     return chi_squared_tail(int(seen.sum()), float(delta_chi2)) if seen.any() else 1.0

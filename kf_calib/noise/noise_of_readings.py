@@ -25,7 +25,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from kf_calib.bench.arrays import ROUNDING, Floats
+from kf_calib.bench.arrays import LAST_DIGITS, Floats
 from kf_calib.dwells.limits import FEWEST_COMPARED
 from kf_calib.dwells.sufficient_statistics import Autocovariance
 from kf_calib.dwells.table import DwellTable, FoldedDwells, computed_once
@@ -75,7 +75,7 @@ class Autoregression:
         curve[: order + 1] = known[: order + 1]
         for lag in range(order + 1, size if order else 0):
             before = curve[lag - order : lag]
-            if np.abs(before).max() < ROUNDING * curve[0]:
+            if np.abs(before).max() < LAST_DIGITS * curve[0]:
                 break
             curve[lag] = self.coefficients @ before[::-1]
         return curve

@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from kf_calib.bench.arrays import AT_ONCE, ROUNDING, Floats
+from kf_calib.bench.arrays import AT_ONCE, LAST_DIGITS, Floats
 from kf_calib.dwells.qr import square_triangle, triangle
 from kf_calib.noise import banded
 from kf_calib.noise.noise_model import lift_rounding
@@ -183,7 +183,7 @@ class Restricted:
             free = (sizes > _LEAST) | (slope < 0.0)
             step = np.zeros_like(sizes)
             step[free] = -np.linalg.solve(curve[np.ix_(free, free)], slope[free])
-            enough = max(ENOUGH, ROUNDING * abs(point.cost))  # for thousands of dwells the cost is no more exact
+            enough = max(ENOUGH, LAST_DIGITS * abs(point.cost))  # for thousands of dwells the cost is no more exact
             lower = self._lower(sizes, step, point) if -0.5 * slope @ step > enough else None
             if lower is None:
                 break

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kf_calib.bench.arrays import ROUNDING, Floats
+from kf_calib.bench.arrays import LAST_DIGITS, Floats
 from kf_calib.dwells.limits import CUBIC, FEWEST_COMPARED, FEWEST_READINGS
 from kf_calib.dwells.pieces import OfPieces
 from kf_calib.dwells.sufficient_statistics import Dwell
@@ -89,7 +89,7 @@ def _smooth(folded: FoldedDwells, read: Floats) -> TemperatureCourse | None:
     lengths, owners = ends[:, 2] - ends[:, 0], np.repeat(np.cumsum(standing) - 1, folded.piece_numbers)
     used = (lengths > 0.0) & np.repeat(standing, folded.piece_numbers)
     ends, levels, lengths, owners = ends[used], levels[used], lengths[used], owners[used]
-    if not len(levels) or np.ptp(levels) <= ROUNDING * np.abs(levels).max():
+    if not len(levels) or np.ptp(levels) <= LAST_DIGITS * np.abs(levels).max():
         return None  # a thermometer that always reads the same
     weights = lengths**2 / (lengths + _CARRIED_S)  # over the variance of readings of 1 K per sqrt(Hz)
     within, freedom = _within_dwells(ends[:, 1], levels, weights, owners)

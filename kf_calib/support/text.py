@@ -19,6 +19,8 @@ from functools import singledispatch
 
 LONGEST = 1000
 """Characters of a message, at most."""
+SHOWN = 6
+"""Things of one kind that a sentence names, at most."""
 COMMANDS = r"\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069"
 """Control characters, but for line ends and tabs, and what turns the direction of writing: for a regular expression."""
 CONTROLS = COMMANDS.replace(r"\x00-\x08\x0b-\x1f", r"\x00-\x1f")

@@ -78,7 +78,7 @@ def test_autocorrelation_finds_what_is_in_the_innovations() -> None:
     tests = InnovationTests(np.arange(3999), np.zeros(3999), np.zeros(3999, int), moved)
     assert tests.autocorrelation[0] == pytest.approx(0.4, abs=0.04)
     assert (np.abs(tests.autocorrelation[1:]) < 2.2 * tests.bound[1:, None]).all()
-    assert tests.bound == pytest.approx(2.0 / np.sqrt(3999), rel=0.01)
+    assert tests.bound == pytest.approx(1.96 / np.sqrt(3999), rel=0.01)
 
 
 def test_readings_of_white_noise_are_white_and_those_of_coloured_noise_are_not() -> None:

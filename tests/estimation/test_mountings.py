@@ -11,7 +11,7 @@ from helpers.synthetic import G
 from scipy.spatial.transform import Rotation
 
 from kf_calib.bench.bench import Bench, axes_of
-from kf_calib.estimation.mountings import AffineFit, Mounting, _reversed_gimbals
+from kf_calib.estimation.mountings import AffineFit, DwellMeans, Misfits, Mounting, _reversed_gimbals
 
 
 def test_angles_are_put_in_order_and_into_radians() -> None:
@@ -34,17 +34,28 @@ def test_quaternions_are_those_of_the_rotation_that_is_meant(conjugate: bool, re
     np.testing.assert_allclose(Rotation.from_quat(mounting.poses(recorded)).as_matrix(), meant.as_matrix(), atol=1e-12)
 
 
-def test_a_fit_is_near_nominal_with_the_channels_as_they_are_wired_alone() -> None:
-    """Axes 20 deg off and scale factors a tenth off, wired in every order and with every sign."""
+def test_the_misfit_is_least_with_the_channels_as_they_are_wired() -> None:
+    """Axes 20 deg off and scale factors a tenth off, wired in every order and with every sign; one that is dead."""
     turned = np.diag([1.1, 0.9, 1.05]) @ Rotation.from_euler("x", 20.0, degrees=True).as_matrix()
+    stated, poses = Mounting.stated(Bench(axes_of("yzx"), G)), np.random.default_rng(1).uniform(-3.0, 3.0, (12, 3))
+    means = DwellMeans(poses, np.zeros((12, 3)), np.zeros(12), tuple(range(1, 13)))
     orders = [tuple(s * k for s, k in zip(signs, order, strict=True))
               for order in permutations((1, 2, 3)) for signs in product((1, -1), repeat=3)]  # fmt: skip
+    readings = G * means.force(stated) @ turned.T
     for wired in orders:
-        sensitivity = np.empty((3, 3))
-        for channel, row in zip(wired, turned, strict=True):
-            sensitivity[abs(channel) - 1] = np.sign(channel) * row
-        fit = AffineFit(sensitivity, 0.0, np.eye(3))
-        assert [order for order in orders if fit.is_near(order)] == [wired]
+        altered = np.empty_like(readings)
+        for channel, column in zip(wired, readings.T, strict=True):
+            altered[:, abs(channel) - 1] = np.sign(channel) * column
+        misfits = Misfits.of_mounting(replace(means, readings=altered), stated)
+        assert orders[int(misfits.of(orders).argmin())] == wired
+    silent = Misfits.of_mounting(replace(means, readings=readings * [1.0, 0.0, 1.0]), stated)
+    assert silent.of([(1, 0, 3)])[0] < silent.of([(1, 2, 3)])[0]
+
+
+def test_axes_and_scale_factors_are_near_nominal() -> None:
+    turned = Rotation.from_euler("x", 44.0, degrees=True).as_matrix()
+    assert AffineFit(turned, 0.0, np.eye(3)).is_near()
+    assert not AffineFit(turned @ Rotation.from_euler("x", 2.0, degrees=True).as_matrix(), 0.0, np.eye(3)).is_near()
     assert not AffineFit(np.diag([1.0, 1.0, 30.0]), 0.0, np.eye(3)).is_near()
     assert not AffineFit(np.diag([1.0, 0.03, 1.0]), 0.0, np.eye(3)).is_near()
 

@@ -41,7 +41,7 @@ def test_a_scan_of_few_dwells_at_a_time_is_least_squares_of_all(names: tuple[str
     before = Refits().with_effects(run("second-order=40ug/g^2"), names)
     noise = before.noise.for_goodness_of_fit.with_terms(SettingError(2e-6, stated=True))
     effects = candidates(before.model)
-    monkeypatch.setattr(dwell_columns, "_AT_ONCE", 4000)
+    monkeypatch.setattr(dwell_columns, "IN_MEMORY", 4000)
     found = scan(before.linearised, noise, effects)
     for effect, each, lowered in list(zip(effects, found.candidates, found.statistics, strict=True))[::9]:
         rows, width = whiten_model(before.linearised, noise, [effect])

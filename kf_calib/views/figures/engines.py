@@ -112,7 +112,7 @@ def draw_cumulative(axes: Axes, tests: InnovationTests) -> None:
 
 @drawn_on(11.0, 6.0)
 def whiteness(figure: Figure, result: Calibration) -> None:
-    """Autocorrelation of the innovations from dwell to dwell and of the readings within dwells, with 2 sigma bounds."""
+    """Autocorrelation of the innovations from dwell to dwell and of the readings within dwells, with bounds of 95 %."""
     tests, inside = innovation_tests(result), reading_correlation(result)
     panels = figure.subplots(2, 3, sharey="row")
     nothing = np.zeros(len(tests.bound))
@@ -139,7 +139,7 @@ def _autocorrelation(axes: Axes, values: Floats, white: Floats, bound: Floats, i
         return
     lags = np.arange(1, len(values) + 1)
     axes.fill_between(lags, white - bound, white + bound, color=PALE, alpha=0.6, linewidth=0.0,
-                      label="white noise, ±2σ")  # fmt: skip
+                      label="white noise, 95 %")  # fmt: skip
     axes.vlines(lags, white, values, color=ACCELEROMETERS[i], linewidth=1.5)
     axes.plot(lags, values, MARKERS[i], color=ACCELEROMETERS[i], markersize=3.0)
     axes.plot(lags, white, color=GREY, linewidth=0.8)
