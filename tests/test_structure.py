@@ -194,7 +194,7 @@ CEILINGS = {
     "sources": 11975,
     "dwells": 3805,
     "noise": 3381,
-    "estimation": 7878,
+    "estimation": 7877,
     "design": 1875,
     "diagnosis": 5590,
     "online": 1648,

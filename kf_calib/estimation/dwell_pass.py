@@ -21,6 +21,7 @@ from kf_calib.bench.streams import Source, Table
 from kf_calib.dwells import window_average
 from kf_calib.dwells.blocks import LARGEST, Block, Tally
 from kf_calib.dwells.folding import Folder, dwells_of_table, rows_of_table
+from kf_calib.dwells.limits import FEWEST_READINGS
 from kf_calib.dwells.line_spectrum import SpectralLine
 from kf_calib.dwells.rest_in_readings import segmenter_of
 from kf_calib.dwells.rows import Rows, model_rows
@@ -37,9 +38,6 @@ from kf_calib.estimation.results import consistency
 from kf_calib.estimation.settings import Settings
 from kf_calib.estimation.signal_quality import ReadingsMonitor
 from kf_calib.support import stage
-
-LEAST_READINGS = 8
-"""Of a dwell that is used: fewer do not show their own noise."""
 
 _CARRIERS = 3  # largest number of passes in search of a carrier
 _CYCLES = 50.0  # cycles per dwell; a line below may be the remainder of a slow oscillation
@@ -115,7 +113,7 @@ class Pass:
         """The usable dwells so far: not left out by the settings and, but for those of a table, of at least 8 readings,
         since fewer do not show their own noise. Known errors of the bench are subtracted from their readings."""
         dwells, left_out = self.folded, self.settings.left_out
-        least = LEAST_READINGS if self.tabulated is None else 1
+        least = FEWEST_READINGS if self.tabulated is None else 1
         unused = (dwells.folded.counts < least) | np.isin(dwells.folded.numbers, left_out)
         if left_out:
             dwells = dwells.without(np.flatnonzero(unused).tolist())
@@ -155,7 +153,7 @@ def refuse_unusable(dwells: DwellTable, tally: Tally, bench: Bench) -> None:
     if not means_mps2.any():
         raise InputError("all readings are zero: check that this is the accelerometer, and that it is on.")
     still = not np.ptp(means_mps2, axis=0).any() and not dwells.folded.squares.any()
-    if still and dwells.folded.counts.sum() >= LEAST_READINGS * len(dwells):
+    if still and dwells.folded.counts.sum() >= FEWEST_READINGS * len(dwells):
         raise InputError(
             "the readings never change, not even by noise: the sensor or what logs it has stopped, or a channel is at "
             "the end of its range."

@@ -23,9 +23,10 @@ import numpy as np
 
 from kf_calib.bench.arrays import ROUNDING, Floats
 from kf_calib.bench.streams import Source, Table
+from kf_calib.dwells.limits import FEWEST_READINGS
 from kf_calib.dwells.qr import triangle
 from kf_calib.estimation.calibration import calibrate, filterpy_estimate
-from kf_calib.estimation.dwell_pass import LEAST_READINGS, Pass
+from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.estimate import Estimate
 from kf_calib.estimation.free_attitude import holding_frame
 from kf_calib.estimation.kalman_filterpy import Samples, samples_of
@@ -113,7 +114,7 @@ def compare(
     ways = {
         "block": Way(result.estimate, block_s, _peak_mb(lambda: calibrate(source, settings))),
         "filterpy": Way(
-            filterpy, filterpy_s, _peak_mb(lambda: filterpy_estimate(source, result, at_most=LEAST_READINGS))
+            filterpy, filterpy_s, _peak_mb(lambda: filterpy_estimate(source, result, at_most=FEWEST_READINGS))
         ),
         "batch": Way(least, batch_s, _peak_mb(batch)),
     }

@@ -25,9 +25,10 @@ from kf_calib.bench.arrays import Floats, one_blas_thread
 from kf_calib.bench.streams import Batch, Source
 from kf_calib.dwells.blocks import Tally
 from kf_calib.dwells.folding import Folder
+from kf_calib.dwells.limits import FEWEST_READINGS
 from kf_calib.dwells.sufficient_statistics import Dwell
 from kf_calib.errors import InputError, KfCalibError
-from kf_calib.estimation.dwell_pass import LEAST_READINGS, Pass
+from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.settings import Settings
 
@@ -278,7 +279,7 @@ class Evaluation(ABC, Generic[J, S]):
         aside = replace(self._passed, tally=Tally(), folder=folder)
         for rows in aside.rows_of(self._segmenter.waiting()):
             folder.add(rows)
-        if not folder.dwells or folder.dwells[-1].count < LEAST_READINGS:
+        if not folder.dwells or folder.dwells[-1].count < FEWEST_READINGS:
             return
         self._looked_s = elapsed_s - arrival_s
         here = self._seen(folder.dwells[-1])

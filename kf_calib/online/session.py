@@ -38,12 +38,13 @@ from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Source
 from kf_calib.design.sides import Sides, turn_in_words
 from kf_calib.diagnosis.candidate_tests import LEVEL
+from kf_calib.dwells.limits import FEWEST_READINGS
 from kf_calib.dwells.rest_in_readings import RestSegmenter
 from kf_calib.dwells.sufficient_statistics import Dwell
 from kf_calib.dwells.table import DwellTable
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.calibration import conclude, evaluate_fit, with_remarks
-from kf_calib.estimation.dwell_pass import LEAST_READINGS, Pass, refuse_unusable
+from kf_calib.estimation.dwell_pass import Pass, refuse_unusable
 from kf_calib.estimation.iterated_fit import fit
 from kf_calib.estimation.measurement_model import Model
 from kf_calib.estimation.results import Calibration
@@ -312,7 +313,7 @@ class HandSession(Evaluation[HandJudgement, HandStanding]):
         self._show_sides(judgement.sides)
 
     def _seen(self, dwell: Dwell) -> Held:
-        closed = [each for each in self._passed.folder.dwells[: self._closed] if each.count >= LEAST_READINGS]
+        closed = [each for each in self._passed.folder.dwells[: self._closed] if each.count >= FEWEST_READINGS]
         judgement = self.standing.judgement
         fitted = None if judgement is None or judgement.result is None else judgement.result.fit
         sides = Sides.of(DwellTable.of([*closed, dwell]), self.source.bench, fitted)
