@@ -119,9 +119,8 @@ class HypothesisTable:
 
     def with_dwell_alone(self, number: int) -> HypothesisTable:
         """The table where it turned out that all other dwells agree without one that is off."""
-        first = replace(
-            self.first, driver=f"dwell {number} alone", dwells=(number,), probability=self.probability_of_dwell(number)
-        )
+        share = self.probability_of_dwell(number)
+        first = replace(self.first, driver=f"dwell {number} alone", dwells=(number,), probability=share)
         return replace(self, rows=(first, *(row for row in self.rows if number not in row.dwells)))
 
     def probability_with(self, row: Hypothesis) -> float:

@@ -142,9 +142,8 @@ def _without_vibration(refits: Refits, before: Calibration, test: CandidateTests
         return test
     refit = refits.with_effects(before, (test.lines.oscillation,))
     # amplitude of the coherent fit over the whole run, over the amplitude seen in each stretch of readings
-    share = np.linalg.norm(refit.estimate.state[refit.model.parts[test.lines.oscillation]]) / np.linalg.norm(
-        test.lines.significant[0].amplitude_mps2
-    )
+    whole = np.linalg.norm(refit.estimate.state[refit.model.parts[test.lines.oscillation]])
+    share = whole / np.linalg.norm(test.lines.significant[0].amplitude_mps2)
     return test if share > 0.5 and _leaves_noise(refit, before) else test.without_lines
 
 
@@ -253,11 +252,8 @@ def _certain_part(first: Hypothesis, table: HypothesisTable, before: Calibration
     """Return the row of some of the effects of the likeliest row that are missing with 95 % probability, alone or with
     others, where all of them are not; None where there is none, or where all of them are likelier than not, and it is
     sure that one more is a known one."""
-    if (
-        table.probability(first.effects) >= SURE
-        and not first.formulas
-        and not _grown(before, first.effects, first.refit)
-    ):
+    is_sure = table.probability(first.effects) >= SURE and not first.formulas
+    if is_sure and not _grown(before, first.effects, first.refit):
         return None
     parts = [row for row in table.rows if row.refit is not None and row.effects and not row.formulas]
     parts = [row for row in parts if set(row.effects) < set(first.effects) and table.probability(row.effects) >= SURE]

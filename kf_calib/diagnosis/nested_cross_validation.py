@@ -74,7 +74,6 @@ def _prediction_errors(start: Calibration, result: Calibration, held_out: list[i
     means = linearised_at(start.fit.dwells, result.model, state, result.noise.weights).means[held_out]
     spread = means.design @ result.estimate.covariance @ np.swapaxes(means.design, 1, 2)
     spread = spread + mean_covariances(noise.of_readings, means, state)
-    errors = told_of(
-        means.readings - means.design @ result.estimate.state, spread, means, state, noise.attitude_unknown
-    )
+    left = means.readings - means.design @ result.estimate.state
+    errors = told_of(left, spread, means, state, noise.attitude_unknown)
     return (errors.errors_mps2**2).ravel(), np.einsum("dii->di", errors.covariance).ravel()

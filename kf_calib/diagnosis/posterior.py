@@ -393,12 +393,8 @@ class RunPosterior:
 
     def _likeliest(self, numbers: Iterable[int]) -> dict[str, int]:
         """Return the number of the likeliest of some terms of each row."""
-        best = dict[str, int]()
-        for k in numbers:
-            row = self._run.terms[k].row
-            if row not in best or self._log_evidence[k] > self._log_evidence[best[row]]:
-                best[row] = k
-        return best
+        least_first = sorted(numbers, key=lambda k: (float(self._log_evidence[k]), -k))
+        return {self._run.terms[k].row: k for k in least_first}
 
     def _log_share_of(self, k: int) -> float:
         """Return the log of the mean likelihood of an effect, in one accelerometer or in all as a term has it, over
@@ -434,8 +430,9 @@ class RunPosterior:
         single = sorted(single, key=lambda row: -row.statistic)[:_ALWAYS]  # large effects are far from linear
         likeliest = {id(row) for row in [*single, *(row for row in ahead[:_REFITTED] if row.log_evidence > least)]}
         fitted = self._steady([self._refitted(row) if id(row) in likeliest else row for row in rows])
-        while not (first := max(fitted, key=lambda row: row.log_evidence)).driver and first.effects and not first.refit:
-            fitted = self._steady([self._refitted(row) if row is first else row for row in fitted])
+        while more := _to_be_fitted(fitted):
+            fitted = self._steady([self._refitted(row) if id(row) in more else row for row in fitted])
+        first = max(fitted, key=lambda row: row.log_evidence)
         least = first.log_evidence + math.log(LISTED)  # others are not shown
         return [self._described(row) if row.driver and row.log_evidence > least else row for row in fitted]
 
@@ -568,6 +565,15 @@ class RunPosterior:
             chosen.append(rest[int(np.argmax(logs))])
             log = max(logs)
         return chosen
+
+
+def _to_be_fitted(rows: Sequence[Hypothesis]) -> set[int]:
+    """Return the ids of the likeliest row, if it is of effects and not fitted; where that is of an unknown function
+    beside effects, of the likeliest pairs of these: beside each other, constants are others than alone."""
+    first, *others = sorted(rows, key=lambda row: -row.log_evidence)
+    pairs = [row for row in others if first.driver and not row.driver and {*first.effects} < {*row.effects}]
+    likeliest = pairs[:_BESIDE] if first.effects and first.driver else [] if first.driver else [first]
+    return {id(row) for row in likeliest if row.effects and row.refit is None and math.isfinite(row.log_evidence)}
 
 
 def _beside_function(names: Sequence[str], log: float, alone: dict[str, float]) -> float:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats, one_blas_thread, sign
+from kf_calib.bench.arrays import ROUNDING, Floats, one_blas_thread, sign
 from kf_calib.effects.formula import formula, quantities
 from kf_calib.estimation.fit import Fit
 from kf_calib.estimation.residual_table import mean_sigmas, quantity_means
@@ -33,9 +33,6 @@ _WORDS = {"a": "force along the input axis", "p": "force along the pendulous axi
           "tau": "time since the arrival"}  # fmt: skip
 _NEARLY = 0.2
 """What may be left, of the standard deviation, of values that are said to be a function of a driver."""
-
-_ROUNDING = 1e-9
-"""Share of the largest value below which a driver is zero: a mean over a dwell holds rounding, which has a sign."""
 
 _CONSTANT = 1e-6
 """A quantity that varies by less than this share of its size, or of a typical size, drives nothing."""
@@ -122,9 +119,8 @@ def _delta_chi2(fitted: Fit, texts: dict[str, list[str]]) -> dict[str, tuple[flo
         for of_driver in texts.values()
     ]
     with one_blas_thread():
-        return dict(
-            zip(texts, joint_delta_chi2(fitted.linearised, fitted.noise.for_goodness_of_fit, groups), strict=True)
-        )
+        gains = joint_delta_chi2(fitted.linearised, fitted.noise.for_goodness_of_fit, groups)
+    return dict(zip(texts, gains, strict=True))
 
 
 def is_function_of(values: Floats, quantity: Floats, unit: str) -> bool:
@@ -140,7 +136,7 @@ def _is_function(x: Floats, y: Floats, of_an_angle: bool) -> bool:
     known = np.isfinite(x) & np.isfinite(y)
     x, y = x[known], y[known]
     unit = x / max(np.abs(x).max(initial=0.0), 1e-300)
-    columns = [np.ones_like(x), x, sign(unit, _ROUNDING)]
+    columns = [np.ones_like(x), x, sign(unit, ROUNDING)]  # a mean over a dwell holds rounding, which has a sign
     if of_an_angle:
         columns += [wave(turns * x) for turns in (1, 2, 3, 4) for wave in (np.sin, np.cos)]
     else:

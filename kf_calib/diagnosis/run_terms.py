@@ -155,9 +155,8 @@ class RunTerms:
                 bearers = len(self.formula_of(unknown.summands[k][0]).coefficients)
                 columns.term(f"?{number}", [block], math.log(shares[k]), summands=(k,), bearers=bearers)
             if not alone:
-                columns.term(
-                    f"?{number}", blocks, math.log(1.0 - _SPARSE - TWO_SUMMANDS), summands=(*range(len(blocks)),)
-                )
+                share = math.log(1.0 - _SPARSE - TWO_SUMMANDS)
+                columns.term(f"?{number}", blocks, share, summands=(*range(len(blocks)),))
 
     def _add_orientations(self, columns: _Columns) -> None:
         """Add an unknown cause that is alike at each visit of an orientation, where some are visited again."""
@@ -172,13 +171,17 @@ class RunTerms:
             columns.term(f"?{len(self.unknown) - 1}", [columns.block(columns.add([visits]))], 0.0)
 
     def _add_walk(self, columns: _Columns) -> None:
-        """Add a random walk of the biases and, unknown, biases that change as irregularly and come back: the spectrum
-        of a Gauss-Markov process of correlation time tau is that of a walk times w^2 tau^2 / (1 + w^2 tau^2)."""
+        """Add a random walk of the biases and, unknown, one of the scale factors, and biases that change as irregularly
+        and come back: the spectrum of a Gauss-Markov process of correlation time tau is that of a walk times
+        w^2 tau^2 / (1 + w^2 tau^2)."""
         dwells = self._linearised.dwells
         waves = _Walk(dwells[-1].end_s, min(len(dwells), _WAVES))
         block = columns.block(columns.add([waves]))
         columns.term(self.walk, [block], 0.0)
         times_s = [waves.run_s / share for share in _RETURNS if share < _PER_DWELL * len(dwells)]
+        of_scale = columns.block(columns.add([_Walk(waves.run_s, len(waves.rates), of_scale=True)]))
+        self.unknown.append(UnknownTerm("time and specific force (irregular)", "scale in time", ()))
+        columns.term(f"?{len(self.unknown) - 1}", [of_scale], 0.0)
         self.unknown.append(UnknownTerm(RETURNING, effect_named(self.walk, self.bench).family, ()))
         for time_s in times_s:
             scales = np.tile(1.0 / np.sqrt(1.0 + 1.0 / np.square(waves.rates * time_s)), 3)
@@ -358,12 +361,13 @@ class _Visits(Effect):
 
 
 class _Walk(Effect):
-    """The path of a random walk of the biases from its beginning: sums of waves (Karhunen and Loeve)."""
+    """The path of a random walk of the biases, or the scale factors, from its beginning: sums of waves (Karhunen and
+    Loeve)."""
 
     name, title, source = "walk", "", ""
 
-    def __init__(self, run_s: float, count: int) -> None:
-        self.run_s, self.count = run_s, count
+    def __init__(self, run_s: float, count: int, of_scale: bool = False) -> None:
+        self.run_s, self.count, self.of_scale = run_s, count, of_scale
         self.rates = (np.arange(count) + 0.5) * np.pi / run_s
 
     @property
@@ -373,7 +377,7 @@ class _Walk(Effect):
     def columns(self, s: Stimulus) -> Floats:
         waves = math.sqrt(2.0 / self.run_s) * np.sin(s.elapsed_s[:, None] * self.rates) / self.rates
         columns = np.zeros((len(s), 3, 3, self.count))
-        columns[:, range(3), range(3)] = waves[:, None]
+        columns[:, range(3), range(3)] = waves[:, None] * (s.along[:, :, None] if self.of_scale else 1.0)
         return columns.reshape(len(s), 3, -1)
 
 

@@ -58,11 +58,8 @@ def describe_irregular(
 def explained_share(before: Consistency, after: Consistency) -> float:
     """Share of the chi-squared beyond noise that a refit with further effects explains."""
     excess = before.statistic - before.dof
-    return (
-        min(max(before.statistic - after.statistic - (before.dof - after.dof), 0.0) / excess, 1.0)
-        if excess > 0
-        else 1.0
-    )
+    explained = before.statistic - after.statistic - (before.dof - after.dof)
+    return min(max(explained, 0.0) / excess, 1.0) if excess > 0 else 1.0
 
 
 def channel_of(residuals: Floats) -> str:

@@ -19,6 +19,7 @@ RETURNING = "time (irregular, and comes back)"
 """What biases depend on that change as irregularly as a random walk, and return to their mean."""
 
 _DECAYS = (1, 3, 10, 30, 100, 300, 1000, 3000)  # time constants, over the least
+_AFTER_JUMPS_S = (10, 30, 100, 300)  # time constants of what decays after a jump
 _STEADY_K = 0.1  # a temperature that changes by less drives nothing
 MOST_ALTERNATIVES = 100
 """Of one cause that are tried: moments of a jump, orientations to which something comes back."""
@@ -156,16 +157,17 @@ def _of_time(dwells: Sequence[Dwell], turns: bool) -> Iterator[UnknownTerm]:
     yield _term("time and specific force", "scale in time", products)
     decays = _decays("t", 10, 10.0 * dwells[-1].end_s)
     yield _one_of("time (a decay)", "bias in time", decays)
-    forces = [("a",), ("p", "o")]
     yield _one_of("time and specific force (a decay)", "scale in time",
-                  [tuple(f"{decay}*{f}" for f in force for decay in few)
-                   for few in decays for force in forces])  # fmt: skip
+                  [tuple(f"{decay}*{force}" for force in forces for decay in few)
+                   for few in decays for forces in ("a", "po")])  # fmt: skip
     waves = [tuple(f"{wave}({n}*2*pi*t/{run_s})" for wave in ("sin", "cos")) for n in _TURNS]
     yield _one_of("time (periodic)", "bias in time", waves)
     if turns:
         for place, words in (("base", "a tilt of the base"), ("platform", "a rotation of the platform")):
             turning = [f":{place} = {text}" for text in texts[:6]]
             yield _term(f"time ({words})", "base and platform", turning, weights[:6])
+            relaxing = [_turning(place, few) for few in decays]
+            yield _one_of(f"time ({words}, a decay)", "base and platform", relaxing)
         tilts = [_turning("base", pair) for pair in waves]
         yield _one_of("time (a periodic tilt of the base)", "base and platform", tilts)
 
@@ -179,6 +181,9 @@ def _of_jumps(dwells: Sequence[Dwell], turns: bool) -> Iterator[UnknownTerm]:
     if not between_s:
         return
     yield _one_of("time (a jump)", "bias in time", [(f"t > {s:.6g}*s",) for s in moments_s])
+    decaying = "(t > {0:.6g}*s)*exp(-abs(t-{0:.6g}*s)/({1}*s))"
+    yield _one_of("time (a jump that decays)", "bias in time",
+                  [tuple(decaying.format(s, decay_s) for decay_s in _AFTER_JUMPS_S) for s in between_s])  # fmt: skip
     steps = [f"(t > {s:.6g}*s)" for s in between_s]
     yield _one_of("time (a jump of the scale factors)", "scale in time", [(f"a*{step}",) for step in steps])
     across = [(f"p*{step}", f"o*{step}") for step in steps]

@@ -125,10 +125,8 @@ def second_pass_in_words(diagnosis: Diagnosis) -> str:
 def _named(diagnosis: Diagnosis, first: Hypothesis) -> str:
     """Return the likeliest effects in words, with the other explanations and their probabilities."""
     assert diagnosis.table is not None
-    share, rest = (
-        diagnosis.table.probability_of_class(first.effects),
-        _beside(diagnosis, first) or _unexplained(diagnosis, first),
-    )
+    share = diagnosis.table.probability_of_class(first.effects)
+    rest = _beside(diagnosis, first) or _unexplained(diagnosis, first)
     named = f"{_effects_of(first)}{_size(diagnosis)} ({_share(diagnosis)}){_same(diagnosis.table)}"
     others = _others(diagnosis) + rest
     if share >= SURE:

@@ -89,9 +89,8 @@ def _refuse_mounting(means: DwellMeans, stated: Mounting, affine: AffineFit | No
         return
     if 0 in likeliest.channels:
         _refuse_dead(means, bench, likeliest.channels.index(0))
-    alike = [
-        each for each in mendings if each.misfit < likeliest.misfit + _CHANGE and each.changes == likeliest.changes
-    ]
+    alive = [each for each in mendings if each.changes == likeliest.changes and 0 not in each.channels]
+    alike = [each for each in alive if each.misfit < likeliest.misfit + _CHANGE]
     alike.sort(key=lambda each: each.mounting.changes > 0 and each.channels != CHANNELS)  # mixed changes last
     options = "" if _words(bench, alike[0]) else " ".join(_options(bench, alike[0]))
     single = len({_advice(bench, each) for each in alike}) == 1

@@ -141,9 +141,8 @@ class Running:
         """State (p,) of the model, its covariance (p, p), and a basis (p, q) of the combinations not determined."""
         kept = self._model_columns
         around = self.model.nominal_state() - self.about[kept]
-        moved, covariance, undetermined = square_root_information.solve(
-            square_root_information.restrict(self.factor, kept), around
-        )
+        restricted = square_root_information.restrict(self.factor, kept)
+        moved, covariance, undetermined = square_root_information.solve(restricted, around)
         return self.about[kept] + moved, covariance, undetermined
 
     @property

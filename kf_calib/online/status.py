@@ -100,9 +100,8 @@ def _look(result: Calibration, watch: Watch | None, before: Look | None = None) 
     if not _alarmed(watch):
         return Look(result, watch)
     diagnosis = diagnose(result)
-    same = (
-        before is not None and before.diagnosed is not None and _conclusion(diagnosis) == _conclusion(before.diagnosed)
-    )
+    diagnosed = before.diagnosed if before else None
+    same = diagnosed is not None and _conclusion(diagnosis) == _conclusion(diagnosed)
     return Look(result, watch, diagnosis, before.agreed + 1 if before and same else 1)
 
 
