@@ -196,7 +196,7 @@ CEILINGS = {
     "noise": 3381,
     "estimation": 7876,
     "design": 1875,
-    "diagnosis": 5587,
+    "diagnosis": 5591,
     "online": 1648,
     "exchange": 1990,
     "views": 7091,

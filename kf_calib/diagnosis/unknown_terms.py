@@ -173,14 +173,18 @@ def _of_time(dwells: Sequence[Dwell], turns: bool) -> Iterator[UnknownTerm]:
 
 
 def _of_jumps(dwells: Sequence[Dwell], turns: bool) -> Iterator[UnknownTerm]:
-    """Jumps of biases at any time; of scale factors, alignment and base between dwells, in the middle of the way."""
+    """Jumps of biases at any time; of scale factors, alignment and base between dwells, in the middle of the way: what
+    shows in the first or the last dwell alone is that this one is off."""
     within_s = [0.5 * (dwell.start_s + dwell.end_s) for dwell in dwells]
-    between_s = [0.5 * (before.end_s + dwell.start_s) for before, dwell in itertools.pairwise(dwells)]
+    between_s = [0.5 * (before.end_s + dwell.start_s) for before, dwell in itertools.pairwise([*dwells][1:-1])]
     moments_s = sorted(within_s + between_s)
     moments_s, between_s = (each[:: len(each) // MOST_ALTERNATIVES + 1] for each in (moments_s, between_s))
     if not between_s:
         return
     yield _one_of("time (a jump)", "bias in time", [(f"t > {s:.6g}*s",) for s in moments_s])
+    bends = [f"(t > {s:.6g}*s)*(t-{s:.6g}*s)" for s in between_s]
+    rates = [("t", *both) for both in itertools.pairwise(bends)] or [("t", *bends)]
+    yield _one_of("time (a change of its rate)", "bias in time", rates)
     decaying = "(t > {0:.6g}*s)*exp(-abs(t-{0:.6g}*s)/({1}*s))"
     yield _one_of("time (a jump that decays)", "bias in time",
                   [tuple(decaying.format(s, decay_s) for decay_s in _AFTER_JUMPS_S) for s in between_s])  # fmt: skip
