@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from helpers.independent_bench import BENCH, DWELL_S, ROBOT, SLEW_S, IndependentBench, State
 from helpers.long_runs import slow
+from unknown_trials.faulty_bench import faulty_run
 
 import kf_calib
 from kf_calib.bench.bench import Bench
@@ -213,3 +214,43 @@ def test_what_decays_after_every_arrival_is_no_warm_up(time_constant_s: float, s
     for seed in seeds:
         found = diagnosed(IndependentBench(seed, bias=arriving))
         assert not found.missing and found.unknown and "time since arrival" in found.verdict, found.verdict
+
+
+@pytest.mark.parametrize("name", ["a cable winds up", "a gimbal creeps one way", *slow(
+    "a cable drags", "the table relaxes", "the block sags with the middle gimbal", "switched on again",
+    "a scale factor wanders", "a bias turns back",
+)])  # fmt: skip
+def test_a_fault_of_no_catalogue_has_no_known_name(name: str) -> None:
+    diagnosis = kf_calib.diagnose(faulty_run(name, 60.0, 7501), replicate=False)
+    assert diagnosis.unknown and not diagnosis.missing, diagnosis.verdict
+    assert diagnosis.table is not None
+    assert max((diagnosis.table.probability([effect]) for effect in ("bias-walk", "sinusoid", "warm-up",
+                "scale-warm-up", "platform-drift", "base-tilt", "cross-axis-square")), default=0.0) < 0.5  # fmt: skip
+
+
+def test_constants_of_two_effects_are_those_beside_each_other() -> None:
+    """A bias and a scale factor of one sensor warm up: alone, each of the two time constants is another."""
+
+    def warm(state: State) -> np.ndarray:
+        return (1.0 - np.exp(-state.time_s / 100.0))[:, None] * np.eye(3)[0]
+
+    bench = IndependentBench(5, bias=lambda s: 1.2e-4 * warm(s), scale=lambda s: 3e-5 * warm(s))
+    diagnosis = diagnosed(bench)
+    assert {*diagnosis.missing} == {"warm-up", "scale-warm-up"}, diagnosis.verdict
+    assert diagnosis.after is not None
+    for symbol in ("tauWarm", "tauScale"):
+        found = diagnosis.after.parameters[symbol]
+        assert abs(found.value - 100.0) < 4.0 * found.sigma < 100.0
+
+
+def test_a_run_that_agrees_without_its_vibration_says_so_first() -> None:
+    """A platform that rings after its moves."""
+
+    def ringing(state: State) -> np.ndarray:
+        swing = np.exp(-state.since_s / 1.5) * np.sin(1.6 * np.pi * state.since_s)
+        return of_gimbal(2, np.where(state.since_s > 0.0, 3e-4 * swing, 0.0))
+
+    verdict = kf_calib.diagnose(IndependentBench(5, gimbals=ringing), replicate=False).verdict
+    assert re.match(
+        r"The model agrees with the measurements once their vibration at 0\.\d+ Hz is averaged out", verdict
+    )
