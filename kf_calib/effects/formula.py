@@ -180,9 +180,9 @@ class Reading:
         decay of another run is."""
         size = np.abs(self(stimulus))
         largest = float(size.max())
-        if not checked and not largest:
-            return 1.0
         if not 1e-60 < largest < 1e60:
+            if not checked:
+                return 1.0
             raise InputError(f"{self.name} has values up to {largest:.1e}: multiply the formula by a constant.")
         return 10.0 ** round(math.log10(largest * np.sqrt(np.mean((size / largest) ** 2))))
 

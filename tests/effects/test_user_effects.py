@@ -33,7 +33,7 @@ from kf_calib.effects import (
 )
 from kf_calib.effects.checks import EXAMPLE, trial
 from kf_calib.effects.expression import LENGTH_LIMIT
-from kf_calib.effects.formula import Formula, quantities
+from kf_calib.effects.formula import Formula, formula, quantities
 from kf_calib.errors import InputError
 from kf_calib.estimation import model_file
 from kf_calib.estimation.calibration import calibrate
@@ -562,3 +562,10 @@ def test_a_bad_effect_is_refused_before_a_reading_is_read(
 
 def test_the_rate_of_temperature_needs_no_remark() -> None:
     assert remarks_of(made("dT")) == ()
+
+
+def test_a_decay_of_another_run_may_be_nothing_on_the_trial_run() -> None:
+    """The program writes jumps that decay for runs of days; after 300 of their time constants hardly anything is left."""
+    text = "mine = (t > 5*s)*exp(-abs(t-5*s)/(0.2*s))"
+    axes = ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
+    assert formula(text, axes, 9.81, checked=False).coefficients[0].scale > 0.0
