@@ -565,7 +565,7 @@ def test_the_rate_of_temperature_needs_no_remark() -> None:
 
 
 def test_a_decay_of_another_run_may_be_nothing_on_the_trial_run() -> None:
-    """The program writes jumps that decay for runs of days; after 300 of their time constants hardly anything is left."""
+    """The program writes jumps that decay for runs of days: after 300 time constants hardly anything is left."""
     text = "mine = (t > 5*s)*exp(-abs(t-5*s)/(0.2*s))"
     axes = ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
     assert formula(text, axes, 9.81, checked=False).coefficients[0].scale > 0.0
