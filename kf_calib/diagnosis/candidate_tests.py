@@ -250,7 +250,8 @@ def _with_lines(test: CandidateTests, fitted: Fit) -> CandidateTests:
         test, lines = replace(test, lines=LineTests(untested_band=str(effect))), lines_of(fitted.dwells, LEVEL * REST)
         return test.with_vibration(lines) if lines else replace(test, trend=trend(fitted))
     name, slow, (low_hz, high_hz, lowest_line_hz) = str(effect), slow_hz(fitted, effect), _searched_hz(fitted.dwells)
-    highest_hz, steady_hz = slow[-1] if len(slow) else low_hz, (low_hz, high_hz) if np.isfinite(low_hz) else ()
+    highest_hz = slow[-1] if len(slow) else low_hz
+    steady_hz = (low_hz, high_hz) if np.isfinite(low_hz) else ()
     edges_hz = [highest_hz, *steady_hz, lowest_line_hz]
     gaps_hz = zip(edges_hz[::2], edges_hz[1::2], strict=True)
     bands = [f"of {a:.2g} to {b:.2g} Hz" if np.isfinite(b) else f"above {a:.2g} Hz" for a, b in gaps_hz if b > 1.5 * a]

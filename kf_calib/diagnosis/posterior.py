@@ -571,8 +571,10 @@ def _to_be_fitted(rows: Sequence[Hypothesis]) -> set[int]:
     """Return the ids of the likeliest row, if it is of effects and not fitted; where that is of an unknown function
     beside effects, of the likeliest pairs of these: beside each other, constants are others than alone."""
     first, *others = sorted(rows, key=lambda row: -row.log_evidence)
-    pairs = [row for row in others if first.driver and not row.driver and {*first.effects} < {*row.effects}]
-    likeliest = pairs[:_BESIDE] if first.effects and first.driver else [] if first.driver else [first]
+    likeliest = [first]
+    if first.driver:
+        with_more = [row for row in others if not row.driver and {*first.effects} < {*row.effects}]
+        likeliest = with_more[:_BESIDE] if first.effects else []
     return {id(row) for row in likeliest if row.effects and row.refit is None and math.isfinite(row.log_evidence)}
 
 

@@ -19,7 +19,6 @@ RETURNING = "time (irregular, and comes back)"
 """What biases depend on that change as irregularly as a random walk, and return to their mean."""
 
 _DECAYS = (1, 3, 10, 30, 100, 300, 1000, 3000)  # time constants, over the least
-_AFTER_JUMPS_S = (10, 30, 100, 300)  # time constants of what decays after a jump
 _STEADY_K = 0.1  # a temperature that changes by less drives nothing
 MOST_ALTERNATIVES = 100
 """Of one cause that are tried: moments of a jump, orientations to which something comes back."""
@@ -187,7 +186,7 @@ def _of_jumps(dwells: Sequence[Dwell], turns: bool) -> Iterator[UnknownTerm]:
     yield _one_of("time (a change of its rate)", "bias in time", rates)
     decaying = "(t > {0:.6g}*s)*exp(-abs(t-{0:.6g}*s)/({1}*s))"
     yield _one_of("time (a jump that decays)", "bias in time",
-                  [tuple(decaying.format(s, decay_s) for decay_s in _AFTER_JUMPS_S) for s in between_s])  # fmt: skip
+                  [tuple(decaying.format(s, 10 * k) for k in _DECAYS[:4]) for s in between_s])  # fmt: skip
     steps = [f"(t > {s:.6g}*s)" for s in between_s]
     yield _one_of("time (a jump of the scale factors)", "scale in time", [(f"a*{step}",) for step in steps])
     across = [(f"p*{step}", f"o*{step}") for step in steps]

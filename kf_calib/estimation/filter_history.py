@@ -185,7 +185,7 @@ def _ratios(result: Calibration) -> Floats:
 
 
 def nis_band(dof: NDArray[np.int64]) -> Floats:
-    """The middle 95 % of chi-squared (n, 2); NaN without degrees of freedom. A smaller NIS is luck, a larger none."""
+    """The middle 95 % of chi-squared (n, 2); NaN without degrees of freedom."""
     known = np.where(dof > 0, dof, np.nan)
     return np.column_stack([chdtri(known, 0.5 * (1.0 + side * LEVEL)) for side in (1.0, -1.0)])
 

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from statistics import NormalDist
 
 import numpy as np
 
@@ -27,11 +26,12 @@ from kf_calib.noise.noise_model import mean_covariances
 from kf_calib.noise.random_walk import known_at_end
 from kf_calib.noise.reml import FREE, Part, with_shared_noise
 from kf_calib.noise.terms import FLOOR_MPS2
+from kf_calib.support.tail_probabilities import normal_quantile
 
 LEVEL = 0.95
 """Probability with which an interval holds a parameter."""
 
-NORMAL = NormalDist().inv_cdf(0.5 * (1.0 + LEVEL))
+NORMAL = normal_quantile(0.5 * (1.0 + LEVEL))
 """Half the length of the interval in sigmas where all noise is known."""
 
 _PARTS: tuple[Part, ...] = ("common", "setting")

@@ -270,21 +270,24 @@ def _words(stated: Bench, mending: Mending) -> list[str]:
     return words
 
 
+def _misfit_within_noise(means: DwellMeans, stated: Mounting) -> float:
+    """Return the misfit of a mounting with the channels as stated; infinite where noise would not leave so much."""
+    return float(Misfits.of_mounting(means, stated).within_noise([CHANNELS])[0])
+
+
 def _one_dwell(means: DwellMeans, stated: Mounting) -> tuple[float, str]:
     """Return the misfit where one dwell alone is off, which is told from its own misfit; of so few that the others do
     not tell their noise, where the sign of one of its readings is taken for wrong, and a sentence that says so."""
     count = len(means.numbers)
     if 3 * (count - 1) >= STATE_COUNT + FEWEST:
         rest = (means[np.arange(count) != k] for k in range(count))
-        least = min(float(Misfits.of_mounting(each, stated).within_noise([CHANNELS])[0]) for each in rest)
+        least = min(_misfit_within_noise(each, stated) for each in rest)
         return least + _CHANGE + math.log(count), ""
     places, misfits = list(np.ndindex(count, 3)), list[float]()
     for place in places:
         readings = means.readings.copy()
         readings[place] *= -1.0
-        misfits.append(
-            float(Misfits.of_mounting(replace(means, readings=readings), stated).within_noise([CHANNELS])[0])
-        )
+        misfits.append(_misfit_within_noise(replace(means, readings=readings), stated))
     k, i = places[int(np.argmin(misfits))]
     channel, reading, number = abs(stated.bench.input.channels[i]), means.readings[k, i], means.numbers[k]
     return min(misfits) + _CHANGE + math.log(len(places)), (
@@ -311,7 +314,7 @@ def _exchange(means: DwellMeans, stated: Mounting) -> tuple[float, str]:
     for k in range(1, count - 2):
         first, then = (int((part[:, k] + costs[:, 0]).argmin()) for part in (before, after))
         readings = np.vstack([wired[first, : k + 1], wired[then, k + 1 :]])
-        misfit = float(Misfits.of_mounting(replace(means, readings=readings), stated).within_noise([CHANNELS])[0])
+        misfit = _misfit_within_noise(replace(means, readings=readings), stated)
         misfit += _CHANGE + math.log(count) + float(costs[first, 0] + costs[then, 0])
         if misfit < least:
             parts = (" and ".join(_reasons(bench, Mending(stated, _WIRINGS[own]))) for own in (first, then))
