@@ -194,7 +194,7 @@ CEILINGS = {
     "sources": 11975,
     "dwells": 3805,
     "noise": 3381,
-    "estimation": 7879,
+    "estimation": 7881,
     "design": 1875,
     "diagnosis": 5593,
     "online": 1648,

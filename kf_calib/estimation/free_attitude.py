@@ -66,9 +66,11 @@ def covariance_of(linearised: LinearisedDwells, noise: Noise, square_rad: float 
     design = np.einsum("di,dip->dp", across, regressors_of(means))
     variance = across**2 @ (noise.scatter_mps2**2) + ((across * noise.effective_sigma_mps2) ** 2 / means.counts).sum(1)
     nine = np.ix_(_NINE, _NINE)
-    information = ((design.T / variance) @ design)[nine] + np.linalg.inv(weak_covariance(square_rad)[nine])
+    known = np.diag(weak_covariance(square_rad).diagonal()[_NINE] ** -0.5)
+    rows = np.vstack([design[:, _NINE] / np.sqrt(variance)[:, None], known])  # their squares would lose what is weak
+    root = np.linalg.inv(np.linalg.qr(rows, mode="r"))
     out = np.zeros((STATE_COUNT, STATE_COUNT))
-    out[nine] = np.linalg.inv(information)
+    out[nine] = root @ root.T
     return out
 
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from helpers.long_runs import slow
 
 import kf_calib
 from kf_calib.bench.streams import Table
-from kf_calib.errors import InputError
+from kf_calib.errors import InputError, UnobservableError
+from kf_calib.sources.opening import opened
 
 SENSITIVITY = np.array([[1.01, 0.0, 0.0], [0.004, 0.99, 0.0], [-0.003, 0.002, 1.02]])
 BIAS_MPS2 = np.array([0.2, -0.1, 0.3])
@@ -56,3 +59,12 @@ def test_what_the_noise_was_taken_from_is_not_diagnosed() -> None:
     with pytest.raises(InputError, match="so that no misfit can be diagnosed"):
         kf_calib.diagnose(bare_table(1))
     assert kf_calib.diagnose(bare_table(1, scatter_sigma_mps2=str(NOISE_MPS2))).test.consistent
+
+
+def test_equal_poses_without_noise_tell_no_scale_and_no_bias(tmp_path: Path) -> None:
+    """A sum of squares loses what is weak beside 1e-18: a sigma was no number, and K3 was taken for known."""
+    table = tmp_path / "three.csv"
+    table.write_text("t,ax,ay,az\n" + "".join(f"{t},0,0,9.8\n" for t in (5, 4, 3)))
+    source = opened(table, {"gravity_mps2": "9.81"}, angles=False)
+    with pytest.raises(UnobservableError, match="3 poses do not determine K1, K2, K3, b1, b2, b3"):
+        kf_calib.calibrate(source)
