@@ -30,6 +30,9 @@ from kf_calib.support.tail_probabilities import LEVEL, REST, SHARE, f_tail, sida
 
 _TIE = 1e-6  # of chi-squared: of values of a constant that explain as much, the first is taken, whatever rounding does
 _DRAWS = 4000
+GRID = 2.0
+"""Ratio of neighbouring values of a constant that are tried."""
+
 _FEWEST_WALKED = 8  # dwells that are needed before a random walk of the biases is tested
 
 
@@ -155,7 +158,7 @@ def candidates(model: Model) -> list[Effect]:
         effect = effect_named(name, model.bench)
         if name in in_model or not effect.scannable:
             continue
-        effects += [effect] if effect.unknown is None else [effect.at(value) for value in effect.unknown.grid(2.0)]
+        effects += [effect] if effect.unknown is None else [effect.at(value) for value in effect.unknown.grid(GRID)]
     return effects
 
 

@@ -38,10 +38,8 @@ from kf_calib.diagnosis.noise_sizes import INDEPENDENT, NoiseFamily, NoiseSizes
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.run_likelihood import Projected, RunLikelihood, log_bayes_together
 from kf_calib.diagnosis.run_terms import (
-    TWO_SUMMANDS,
     RunTerm,
     RunTerms,
-    bearers_of,
     log_bayes_of_columns,
     of_bearers,
     sizes_of,
@@ -85,7 +83,7 @@ class RunPosterior:
         self._noise = before.noise.without_estimates().without(RandomWalk)
         misfit_mps2 = float(np.sqrt(np.mean(before.residuals_mps2**2)))
         self._least_mps2 = (_ROUNDING if before.noise.within_seen else _UNSEEN) * misfit_mps2
-        self._run = RunTerms(before, self._noise, self._least_mps2, test)
+        self._run = RunTerms(before, self._noise, self._least_mps2, test, self._with_constants())
         measured = (1 if self._noise.attitude_unknown else 3) * len(before.fit.dwells)
         self._sizes = NoiseSizes(self._run.likelihood, self._noise, measured - model.count + len(model.fixed))
         self._no_oscillation = set[str]()
@@ -125,6 +123,23 @@ class RunPosterior:
             other for other, dof, statistic in zip(others, alone.tolist(), apart.tolist(), strict=True)
             if dof < rank and (not dof or chi_squared_tail(dof, statistic) > LEVEL)
         )  # fmt: skip
+
+    def _with_constants(self) -> list[tuple[Effect, float]]:
+        """Return the effects that explain most, of those with a constant, as they are fitted, and the sigma of the log
+        of the constant; none where nothing has to be missing."""
+        scanned, fitted = self._test.effects, list[tuple[Effect, float]]()
+        if self._test.consistent is not False:
+            return fitted
+        names = [name for name in scanned.best if effect_named(name, self._before.bench).unknown]
+        for name in sorted(names, key=lambda name: -self._tested(name)[0])[:_ALWAYS]:
+            try:
+                refit = self._refits.with_effects(self._before, (name,))
+            except UnobservableError:  # the run does not tell its coefficients
+                continue
+            effect, place = refit.model.effects[-1], refit.model.parts[name].start
+            if effect.smooth and not effect.held:
+                fitted.append((effect, float(refit.fit.sigma[place + len(effect.coefficients)])))
+        return fitted
 
     # The noise in which rows are weighed
 
@@ -310,7 +325,7 @@ class RunPosterior:
     def _pairs(self) -> list[Hypothesis]:
         """Return the rows of the likeliest effects, each with any other term beside it, and of the likeliest summand of
         an unknown function, with another one or an effect beside it."""
-        pairs, heads = dict[tuple[str, ...], float](), [*self._heads(), *self._summand()]
+        pairs, heads = dict[tuple[str, ...], float](), [*self._heads(), *self._summands_to_pair()]
         alone = [self._base + self._log_bayes[k] + self._log_share_of(k) for k in heads]
         # beside one more term less noise is likely, not more
         likely = [self._sizes.likely(logs, self._log_bayes.max(axis=0)) for logs in alone]
@@ -319,33 +334,36 @@ class RunPosterior:
             name = self._run.terms[head].row
             stage.say(f"weighing all beside {name.replace('?', 'unknown function ')}")
             logs = np.repeat(alone[h][None], len(self._run.terms), axis=0)
+            # of two unknown functions only those of one driver are weighed
+            some = np.array([term.is_known or term.row == name or name[0] != "?" for term in self._run.terms])
             for k in itertools.chain(*likely[h]):
                 family, size = self._at[k]
-                logs[:, k] += self._run.log_bayes(self._noises[family], size, explained[h, k])
+                logs[:, k] += self._run.log_bayes(self._noises[family], size, explained[h, k], some)
             logs = np.logaddexp.reduce(self._sizes.evidence(logs, likely[h]), axis=1)
             if name.startswith("?"):
                 pairs[(name,)] = self._of_two_summands(head, logs)
             for other, log in self._by_row(logs).items():
                 key = (other, name) if (other, name) in pairs else (name, other)
-                if other != name and not (name.startswith("?") and other.startswith("?")):
+                if other != name and not (name[0] == other[0] == "?"):
                     pairs[key] = max(pairs.get(key, -math.inf), log)
         alone_of = self._by_row(self._log_evidence) | {name: log for (name, *other), log in pairs.items() if not other}
         return [self._row_of(both, _beside_function(both, log, alone_of)) for both, log in pairs.items()]
 
-    def _summand(self) -> list[int]:
-        """Return the number of the likeliest summand of an unknown function, if there is one."""
-        of_one = [k for k, term in enumerate(self._run.terms) if len(term.summands) == 1]
-        return [max(of_one, key=lambda k: float(self._log_evidence[k]))] if of_one else []
+    def _summands_to_pair(self) -> list[int]:
+        """Return the numbers of the likeliest summands of the unknown functions in which one is likeliest."""
+        best = self._likeliest(k for k, term in enumerate(self._run.terms) if len(term.summands) == 1)
+        return sorted(best.values(), key=lambda k: -float(self._log_evidence[k]))[:_BESIDE]
 
     def _of_two_summands(self, one: int, logs: Floats) -> float:
         """Return the log evidence of two summands of an unknown function, from that of all terms beside one."""
         head, terms = self._run.terms[one], self._run.terms
         others = [k for k, term in enumerate(terms) if term.row == head.row and len(term.summands) == 1]
-        others = [k for k in others if not terms[k].alone and terms[k].summands != head.summands]
-        if len(others) < 2 or self._run.unknown[int(head.row[1:])].exclusive:
+        others = [k for k in others if terms[k].only == head.only and terms[k].summands != head.summands]
+        unknown = self._run.unknown[int(head.row[1:])]
+        if len(others) < 2 or unknown.at_once == 1:
             return -math.inf
-        share = math.log(TWO_SUMMANDS / math.comb(len(others) + 1, 2))
-        return _log_sum(logs[others].tolist()) - self._log_share_of(one) + share
+        share = math.log(unknown.share(2) / math.comb(len(others) + 1, 2))
+        return _log_sum(logs[others].tolist()) - self._log_share_of(one) + share + head.log_share_of_form
 
     def _explained(self, heads: Sequence[int], likely: Sequence[list[list[int]]]) -> dict[tuple[int, int], Floats]:
         """Return what each term alone explains of all columns, in each noise that is likely beside it."""
@@ -537,14 +555,11 @@ class RunPosterior:
         terms = [term for term in run.terms if term.row == f"?{number}" and not term.alone]
         places = np.unique(np.concatenate([term.columns for term in terms]))
         scores = np.array([self._scores(terms, places, flat, covariance) for covariance in self._sizes.covariances])
-        at, likeliest = np.unravel_index(int(np.argmax(scores)), scores.shape)
-        if not unknown.exclusive:  # of which there may be several
-            likeliest = max(range(len(terms)), key=lambda k: len(terms[k].columns))
+        at, _ = np.unravel_index(int(np.argmax(scores)), scores.shape)
+        parts = {k: columns for term in terms for k, columns in run.of_summands(term)}
         rows = run.likelihood.projected(self._sizes.covariances[int(at)], places, flat)
-        term = terms[int(likeliest)]
-        widths = [sum(len(run.formula_of(text).coefficients) for text in unknown.summands[k]) for k in term.summands]
-        parts = np.split(term.columns, np.cumsum(widths)[:-1])
-        return [text for k in self._summands(parts, rows) for text in unknown.summands[term.summands[k]]]
+        chosen = self._summands([*parts.values()], rows, unknown.at_once or _SUMMANDS)
+        return [text for k in chosen for text in unknown.summands[[*parts][k]]]
 
     def _scores(self, terms: Sequence[RunTerm], places: Indices, flat: Sequence[int],
                 covariance: Floats | None) -> list[float]:  # fmt: skip
@@ -553,10 +568,10 @@ class RunPosterior:
         found = ((rows.of(term.columns), term.log_share) for term in terms)
         return [rows.log + log_bayes_of_columns(columns, rows.readings) + share for columns, share in found]
 
-    def _summands(self, parts: Sequence[Indices], rows: Projected) -> list[int]:
+    def _summands(self, parts: Sequence[Indices], rows: Projected, most: int) -> list[int]:
         """Return the summands, by their columns, that explain most together, each of which gains evidence."""
         chosen, log = list[int](), -math.inf
-        while len(chosen) < min(_SUMMANDS, len(parts)):
+        while len(chosen) < min(most, len(parts)):
             rest = [k for k in range(len(parts)) if k not in chosen]
             both = [rows.of(np.concatenate([parts[j] for j in (*chosen, k)])) for k in rest]
             logs = [log_bayes_of_columns(columns, rows.readings) for columns in both]
@@ -605,7 +620,7 @@ def _gains(gram: Floats, along: Floats) -> Floats:
 def _relations(effect: Effect) -> list[tuple[float, Floats]]:
     """Return the matrices (q, k) that may combine the columns of an effect, with the logs of their shares."""
     matrices = [*effect.relations] or [np.eye(len(effect.coefficients))]
-    some = of_bearers(bearers_of(effect))
+    some = of_bearers(effect.bearers)
     return [(log - math.log(len(matrices)), matrix[:, only]) for matrix in matrices for log, only in some]
 
 

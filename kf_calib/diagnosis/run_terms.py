@@ -4,16 +4,17 @@ functions, a random walk of the biases. Each has sizes with a prior, and a share
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from scipy.special import softmax
 
-from kf_calib.bench.arrays import Floats, Indices
-from kf_calib.diagnosis.candidate_tests import CandidateTests
+from kf_calib.bench.arrays import Floats, Indices, Mask
+from kf_calib.diagnosis.candidate_tests import GRID, CandidateTests
 from kf_calib.diagnosis.coefficient_sizes import SizePrior, best_sigma, sensor_grade, usual_sizes
 from kf_calib.diagnosis.in_noises import InNoises
 from kf_calib.diagnosis.run_likelihood import Combination, RunLikelihood, Sizes, log_bayes
@@ -21,7 +22,7 @@ from kf_calib.diagnosis.unknown_terms import MOST_ALTERNATIVES, RETURNING, Unkno
 from kf_calib.diagnosis.within_rows import Courses
 from kf_calib.dwells.qr import orthonormal
 from kf_calib.effects import Coefficient, Effect, Stimulus, effect_named, walk_named
-from kf_calib.effects.effect import Grade, SensorEffect
+from kf_calib.effects.effect import Grade
 from kf_calib.effects.formula import formula
 from kf_calib.estimation.candidate_scan import SEEN
 from kf_calib.estimation.cross_validation import orientations
@@ -33,9 +34,6 @@ from kf_calib.noise.noise_model import Noise
 _DECADES = 7.0  # above one sigma: sizes of what has no usual size
 _NODES = 40  # sizes that are tried: the likelihood of q columns is as wide as 1 / sqrt(2 q) of its logarithm
 _FEW, _NODES_OF_FEW = 2, 20  # columns of which a step twice as long sums it to 1e-3
-_SPARSE = 0.5  # share of one summand alone in the unknown functions of a driver
-TWO_SUMMANDS = 0.25
-"""The same of two summands."""
 _SAME = 0.99  # cosine above which a summand is a known effect
 _END = 0.99  # of the range of a constant
 _LEAST = 1e-3  # share of the largest part of a term that a part of it has at least
@@ -52,8 +50,8 @@ class RunTerm:
 
     row: the name of an effect, or ``?`` and the number of an unknown function. log_share: log of its share in the prior
     of its row. effect: with the constant at which it has these columns. relation: the number of that of its
-    coefficients. summands: of the unknown function, those that it has. bearers: number of accelerometers, or of axes of
-    a rotation, of which each has columns of its own. only: which of the columns of all bearers these are. sizes: of its
+    coefficients. summands: of the unknown function, those that it has. bearers: columns of each accelerometer, or of
+    each axis of a rotation, that may have it alone. only: which of the columns of all bearers these are. sizes: of its
     coefficients. scales: factors (q,) of its columns.
     """
 
@@ -63,7 +61,7 @@ class RunTerm:
     effect: Effect | None = None
     relation: int = 0
     summands: tuple[int, ...] = ()
-    bearers: int = 1
+    bearers: tuple[slice, ...] = ()
     only: slice = field(default_factory=lambda: EVERY)
     sizes: Sizes = field(default_factory=lambda: Sizes(np.zeros(0), np.zeros(0)))
     scales: Floats | None = None
@@ -103,16 +101,18 @@ class RunTerms:
     """All terms of a run and its likelihood.
 
     before: the run without what is missing. noise, least_mps2: what was stated of it, and scatter that
-    there is in any case. test: its linear tests, with the candidates.
+    there is in any case. test: its linear tests, with the candidates. fitted: effects as they were fitted, with the
+    sigma of the logarithm of their constant.
     """
 
-    def __init__(self, before: Calibration, noise: Noise, least_mps2: float, test: CandidateTests) -> None:
+    def __init__(self, before: Calibration, noise: Noise, least_mps2: float, test: CandidateTests,
+                 fitted: Sequence[tuple[Effect, float]] = ()) -> None:  # fmt: skip
         self._linearised, self.bench = before.fit.linearised, before.bench
         self.grade: Grade = sensor_grade(before.fit)
         self.walk = "" if before.model.walks else walk_named(before.bench)
         self.unknown: list[UnknownTerm] = [*unknown_terms(before.bench, before.fit.dwells)]
         columns = _Columns()
-        self._add_effects(columns, test)
+        self._add_effects(columns, test, fitted)
         self._add_unknown(columns)
         self._add_orientations(columns)
         if self.walk:
@@ -124,8 +124,9 @@ class RunTerms:
         self.terms = [*self._of_bearers(self._seen(columns.terms))]
         self.names = tuple(dict.fromkeys(term.row for term in self.terms if term.is_known))
 
-    def _add_effects(self, columns: _Columns, test: CandidateTests) -> None:
-        """Add the candidates, each with every relation that its coefficients may have."""
+    def _add_effects(self, columns: _Columns, test: CandidateTests, fitted: Sequence[tuple[Effect, float]]) -> None:
+        """Add the candidates, each with every relation that its coefficients may have, and those that were fitted: of a
+        large effect no other value of its constant is near enough."""
         candidates = test.effects.scan.candidates
         effects, tried = [each.effect for each in candidates], [each.tried for each in candidates]
         stimulus = stimulus_of(self._linearised.dwells, self.bench, self._linearised.state)
@@ -134,29 +135,34 @@ class RunTerms:
             numbers = [k for k, effect in enumerate(effects) if str(effect) == name]
             most = max(len(numbers), *(tried[k] for k in numbers))
             logs[numbers] -= float(np.logaddexp.reduce(logs[numbers])) + math.log(most / len(numbers))
-        for effect, log in zip(effects, logs.tolist(), strict=True):
+        shares = logs.tolist()
+        for effect, sigma in fitted:
+            numbers = [k for k, each in enumerate(effects) if str(each) == str(effect)]
+            nearest = min(numbers, key=lambda k: abs(math.log(effects[k].value / effect.value)))
+            # of oscillations only the best is left, of those half a cycle in a run apart
+            step = math.log(GRID) if len(numbers) > 1 else 0.5 / (stimulus.elapsed_s[-1] * effect.value)
+            if (width := math.sqrt(2.0 * math.pi) * sigma) < step:
+                effects, shares = [*effects, effect], [*shares, shares[nearest] + math.log(width / step)]
+        for effect, log in zip(effects, shares, strict=True):
             part, relations = columns.add([effect]), [*effect.relations] or [None]
             for number, matrix in enumerate(relations):
                 block, share = columns.block(part, matrix), log - math.log(len(relations))
-                columns.term(str(effect), [block], share, effect, number, bearers=bearers_of(effect))
+                columns.term(str(effect), [block], share, effect, number, bearers=effect.bearers)
 
     def _add_unknown(self, columns: _Columns) -> None:
         """Add the unknown functions: each summand alone, and all together."""
+        block_of = cache(lambda text, weight: columns.block(columns.add([self.formula_of(text)]), weight=weight))
         for number, unknown in enumerate(self.unknown):
-            blocks = [
-                columns.block(columns.add([self.formula_of(text) for text in texts]), weight=unknown.weight(k))
-                for k, texts in enumerate(unknown.summands)
-            ]
-            alone = unknown.exclusive or len(blocks) == 1
+            blocks = [[block_of(text, unknown.weight(k)) for text in texts] for k, texts in enumerate(unknown.summands)]
             # the simplest come first, and are likeliest; of alternatives any is as likely
-            shares = np.ones(len(blocks)) if unknown.exclusive else np.arange(1.0, len(blocks) + 1.0) ** -2.0
-            shares *= (1.0 if alone else _SPARSE) / shares.sum()
-            for k, block in enumerate(blocks):
-                bearers = len(self.formula_of(unknown.summands[k][0]).coefficients)
-                columns.term(f"?{number}", [block], math.log(shares[k]), summands=(k,), bearers=bearers)
-            if not alone:
-                share = math.log(1.0 - _SPARSE - TWO_SUMMANDS)
-                columns.term(f"?{number}", blocks, share, summands=(*range(len(blocks)),))
+            shares = np.ones(len(blocks)) if unknown.at_once else np.arange(1.0, len(blocks) + 1.0) ** -2.0
+            shares *= unknown.share(1) / shares.sum()
+            for k, of_one in enumerate(blocks):
+                bearers = self.formula_of(unknown.summands[k][0]).bearers
+                columns.term(f"?{number}", of_one, math.log(shares[k]), summands=(k,), bearers=bearers)
+            if not (unknown.at_once or len(blocks) == 1):
+                every, share = [*itertools.chain(*blocks)], math.log(unknown.share(0))
+                columns.term(f"?{number}", every, share, summands=(*range(len(blocks)),))
 
     def _add_orientations(self, columns: _Columns) -> None:
         """Add an unknown cause that is alike at each visit of an orientation, where some are visited again."""
@@ -202,6 +208,12 @@ class RunTerms:
         coefficients = np.zeros(sum(len(effect.coefficients) for effect in effects))
         coefficients[term.only] = likeliest * self.likelihood.scales[term.columns]
         return self.likelihood.courses_at(self._linearised.state, effects, coefficients)
+
+    def of_summands(self, term: RunTerm) -> Iterator[tuple[int, Indices]]:
+        """Yield the number of each summand that an unknown function has in a term, with its columns."""
+        summands = self.unknown[int(term.row[1:])].summands
+        widths = [sum(len(self.formula_of(text).coefficients) for text in summands[k]) for k in term.summands]
+        yield from zip(term.summands, np.split(term.columns, np.cumsum(widths)[:-1]), strict=True)
 
     def formula_of(self, text: str) -> Effect:
         """The effect of a formula without a name."""
@@ -274,21 +286,24 @@ class RunTerms:
         """The products of the columns of all terms in noise of some sizes."""
         return self.likelihood.in_noises(shapes, squares, [alike.places for alike in self._alike])
 
-    def log_bayes(self, noises: InNoises, k: int, explained: Floats | None = None) -> Floats:
-        """Log Bayes factors (terms,) of all terms in noise of one size.
+    def log_bayes(self, noises: InNoises, k: int, explained: Floats | None = None, some: Mask | None = None) -> Floats:
+        """Log Bayes factors (terms,) of all terms, or of some, in noise of one size; of others 0.
 
         explained (f, C + 1): what columns beside them, of any size, explain of all columns and of the readings.
         """
-        logs = np.zeros(len(self.terms))
+        logs, every = np.zeros(len(self.terms)), slice(None)
         for alike, grams, lengths in zip(self._alike, noises.grams, noises.lengths, strict=True):
-            gram, along = grams[k], noises.along[k, alike.places]
+            few = every if some is None else some[alike.numbers]
+            places, scales = alike.places[few], alike.scales[few]
+            gram, along = grams[k][few], noises.along[k, places]
             if explained is not None:
-                parts = np.moveaxis(explained[:, alike.places], 0, 2)  # (n, q, f)
+                parts = np.moveaxis(explained[:, places], 0, 2)  # (n, q, f)
                 gram = gram - parts @ np.swapaxes(parts, 1, 2)
                 along = along - parts @ explained[:, -1]
-            gram, along = gram * alike.scales[:, :, None] * alike.scales[:, None], along * alike.scales
-            length = lengths[k] * alike.scales.max(axis=1) ** 2
-            logs[alike.numbers] = log_bayes(gram, along, alike.squares, alike.log_weights, alike.centres, length)
+            gram, along = gram * scales[:, :, None] * scales[:, None], along * scales
+            length = lengths[k][few] * scales.max(axis=1) ** 2
+            sizes = alike.squares[few], alike.log_weights[few], alike.centres[few]
+            logs[alike.numbers[few]] = log_bayes(gram, along, *sizes, length)
         return logs
 
     def bases(self, numbers: Sequence[int], covariance: Floats | None) -> tuple[Floats, Floats]:
@@ -332,7 +347,7 @@ class _Columns:
         return len(self.blocks) - 1
 
     def term(self, row: str, blocks: Sequence[int], log_share: float, effect: Effect | None = None,
-             relation: int = 0, summands: tuple[int, ...] = (), bearers: int = 1,
+             relation: int = 0, summands: tuple[int, ...] = (), bearers: tuple[slice, ...] = (),
              scales: Floats | None = None) -> None:  # fmt: skip
         """Add a term with the columns of some blocks."""
         places = np.concatenate([self._places[block] for block in blocks])
@@ -409,18 +424,12 @@ def _largest_cosine(bases: Sequence[Floats], basis: Floats) -> float:
     return float(np.linalg.svd(close, compute_uv=False).min(axis=1).max(initial=0.0))
 
 
-def bearers_of(effect: Effect) -> int:
-    """Of how many accelerometers each has coefficients of an effect of its own."""
-    return 3 if isinstance(effect, SensorEffect) else 1
-
-
-def of_bearers(count: int) -> list[tuple[float, slice]]:
-    """Columns that a term may have, with the logs of their shares: those of all accelerometers, or axes of a rotation,
-    or where each has its own, one of every so many, of one alone."""
-    if count == 1:
+def of_bearers(bearers: Sequence[slice]) -> list[tuple[float, slice]]:
+    """Columns that a term may have, with the logs of their shares: those of all bearers, or of one alone."""
+    if not bearers:
         return [(0.0, EVERY)]
-    alone = math.log((1.0 - _IN_ALL) / count)
-    return [(math.log(_IN_ALL), EVERY), *((alone, slice(k, None, count)) for k in range(count))]
+    alone = math.log((1.0 - _IN_ALL) / len(bearers))
+    return [(math.log(_IN_ALL), EVERY), *((alone, only) for only in bearers)]
 
 
 def sizes_of(least: float, usual: SizePrior | None, most: float = math.inf, nodes: int = _NODES) -> Sizes:

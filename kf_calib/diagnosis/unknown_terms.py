@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,9 +22,13 @@ _DECAYS = (1, 3, 10, 30, 100, 300, 1000, 3000)  # time constants, over the least
 _STEADY_K = 0.1  # a temperature that changes by less drives nothing
 MOST_ALTERNATIVES = 100
 """Of one cause that are tried: moments of a jump, orientations to which something comes back."""
+_SHARES = {1: 0.5, 2: 0.25, 0: 0.25}
+"""Of one, two and all of the summands of an unknown function."""
 
 _SUMS = ((1, 1), (1, -1), (2, 1), (2, -1), (1, 2), (1, -2), (2, 2), (2, -2))  # of two angles, in turns of each
-_TURNS = (0.5, 1, 1.5, 2, 3, 4, 6, 8)  # of what is periodic, in a run
+_END = 0.125  # of a run
+_LEVELS = (1, 2, 3, 4, 5, 6, 7, 8, 9)  # of the force at which a sensor may behave otherwise, in tenths of gravity
+_TURNS = 12  # of what oscillates, in a run, at most
 
 
 @dataclass(frozen=True)
@@ -33,18 +37,23 @@ class UnknownTerm:
 
     driver: in words. family: the physical class of effects to which such functions belong; "" for none. summands:
     formulas that belong together, as sine and cosine; ``:place = ...`` stands for a rotation. weights: the usual sizes
-    of the summands, of as many columns of equal rms. exclusive: only one of the summands is true; else one or all.
+    of the summands, of as many columns of equal rms. at_once: how many of the summands are true at most; 0: any number.
     """
 
     driver: str
     family: str
     summands: tuple[tuple[str, ...], ...]
     weights: tuple[float, ...] = ()
-    exclusive: bool = False
+    at_once: int = 0
 
     def weight(self, k: int) -> float:
         """The usual size of one of the summands."""
         return self.weights[k] if self.weights else 1.0
+
+    def share(self, count: int) -> float:
+        """The probability that so many of the summands are true: 1, 2, or 0 for all of them."""
+        may = [n for n in _SHARES if not self.at_once or 0 < n <= self.at_once]
+        return _SHARES[count] / sum(_SHARES[n] for n in may) if len(self.summands) > 1 else float(count == 1)
 
 
 def unknown_terms(bench: Bench, dwells: Sequence[Dwell]) -> Iterator[UnknownTerm]:
@@ -52,8 +61,9 @@ def unknown_terms(bench: Bench, dwells: Sequence[Dwell]) -> Iterator[UnknownTerm
     yield from _of_force()
     slow = [("time", "t"), *([("temperature", "T")] if _varies(dwells) else [])]
     yield from _of_gimbals(len(bench.axes), slow)
-    yield from _of_time(dwells, bench.angles)
-    yield from _of_jumps(dwells, bench.angles)
+    places = _places(len(bench.axes), bench.angles)
+    yield from _of_time(dwells, places)
+    yield from _of_jumps(dwells, places)
     yield from _of_arrival(len(bench.axes), dwells)
     yield from _of_surroundings(len(bench.axes), bench.angles)
     yield from _of_slow_changes(slow)
@@ -66,9 +76,38 @@ def _term(
     return UnknownTerm(driver, family, tuple((t,) if isinstance(t, str) else t for t in texts), tuple(weights))
 
 
+@dataclass(frozen=True)
+class _Place:
+    """Where something changes: in words ("" for the biases), the physical class, and formulas of what a function {0}
+    adds there."""
+
+    words: str
+    family: str
+    formulas: tuple[str, ...]
+
+    @property
+    def turns(self) -> bool:
+        """Whether it is a rotation."""
+        return self.formulas[0].startswith(":")
+
+    @property
+    def common(self) -> bool:
+        """Whether it is common that it changes: two formulas for each function are many columns."""
+        return len(self.formulas) == 1
+
+    def of(self, functions: Sequence[str]) -> tuple[str, ...]:
+        """The formulas of these functions together."""
+        return tuple(formula.format(function) for function in functions for formula in self.formulas)
+
+    def one_of(self, course: str, alternatives: Sequence[Sequence[str]]) -> UnknownTerm:
+        """A term of which one of these courses in time is true."""
+        words = f"{course} of {self.words}" if self.words else course
+        return _one_of(f"time ({words})", self.family, [self.of(functions) for functions in alternatives])
+
+
 def _one_of(driver: str, family: str, alternatives: Sequence[tuple[str, ...]]) -> UnknownTerm:
     """A term of which one alternative is true."""
-    return UnknownTerm(driver, family, tuple(alternatives), exclusive=True)
+    return UnknownTerm(driver, family, tuple(alternatives), at_once=1)
 
 
 def _of_force() -> Iterator[UnknownTerm]:
@@ -77,6 +116,11 @@ def _of_force() -> Iterator[UnknownTerm]:
     for axis, words, family in (("a", "input", "nonlinearity"), ("p", "pendulous", "cross-axis"),
                                 ("o", "output", "cross-axis")):  # fmt: skip
         yield _term(f"specific force along the {words} axis", family, [each.format(axis) for each in powers], weights)
+    # a value between two of those that are tried is told by both
+    steps = [f"(a > {0.1 * level:.1f}*g)" for level in (*(-level for level in reversed(_LEVELS)), *_LEVELS)]
+    ranges = [f"(abs(a) > {0.1 * level:.1f}*g)*a" for level in _LEVELS]
+    values = [*itertools.pairwise(steps), *itertools.pairwise(ranges)]
+    yield _one_of("specific force along the input axis (from a value on)", "nonlinearity", values)
     of_degree = {
         2: ["a*a", "a*p", "a*o", "p*o", "p*p"],
         3: ["a**3", "a*a*p", "a*a*o", "a*p*o", "a*p*p", "p**3", "o**3"],
@@ -107,6 +151,8 @@ def _of_gimbals(count: int, slow: Sequence[tuple[str, str]]) -> Iterator[Unknown
         yield _term(f"last move of gimbal {k}", "memory", [f"sign(q{k}_move)", f"q{k}_move"])
         before = (f"sin(q{k}_before)", f"cos(q{k}_before)")
         yield _term(f"previous orientation (angle of gimbal {k})", "memory", [before])
+        held = [_turning(str(k), _times(waves[n], f"sign(q{k}_move)")) for n in (1, 2)]
+        yield _term(f"angle and last move of gimbal {k} (as an error of its encoder)", "gimbal and encoder", held)
         turning = [(f"q{k}",), *waves.values()]
         for j in range(1, count + 1):
             words = "as an error of its encoder" if j == k else f"a rotation of gimbal {j}"
@@ -145,7 +191,23 @@ def _turning(place: str, texts: Sequence[str]) -> tuple[str, ...]:
     return tuple(f":{place} = {text}" for text in texts)
 
 
-def _of_time(dwells: Sequence[Dwell], turns: bool) -> Iterator[UnknownTerm]:
+def _places(gimbals: int, turns: bool) -> list[_Place]:
+    """What may change with time: in the accelerometers and, of a bench with angles, what turns it."""
+    places = [
+        _Place("", "bias in time", ("{0}",)),
+        _Place("the scale factors", "scale in time", ("{0}*a",)),
+        _Place("the alignment", "base and platform", ("{0}*p", "{0}*o")),
+    ]
+    if turns:
+        places += [_Place("the tilt of the base", "base and platform", (":base = {0}",)),
+                   _Place("the mounting", "base and platform", (":platform = {0}",))]  # fmt: skip
+        # the outer one turns the base, and the inner one the platform
+        places += [_Place(f"gimbal {k}", "gimbal and encoder", (f":{k} = {{0}}",)) for k in range(2, gimbals)]
+    return places
+
+
+def _of_time(dwells: Sequence[Dwell], places: Sequence[_Place]) -> Iterator[UnknownTerm]:
+    """Smooth functions of time, and courses of which one is true."""
     run_s = f"({dwells[-1].end_s:.0f}*s)"
     texts = ["t", "t*t", *(f"cos({n}*pi*t/{run_s})" for n in range(1, 9))]
     weights = (1.0, 0.5, *(1.0 / n for n in range(1, 9)))
@@ -154,47 +216,39 @@ def _of_time(dwells: Sequence[Dwell], turns: bool) -> Iterator[UnknownTerm]:
     products += [f"{power}*{force}" for power in ("t", "t*t") for force in ("a*a", "p*p", "a*p", "a*o", "p*o")]
     products += [f"cos({n}*pi*t/{run_s})*a" for n in range(1, 7)]
     yield _term("time and specific force", "scale in time", products)
+    for place in (place for place in places if place.turns):
+        yield _term(f"time ({place.words})", place.family, [text for t in texts[:6] for text in place.of([t])], weights)
     decays = _decays("t", 10, 10.0 * dwells[-1].end_s)
-    yield _one_of("time (a decay)", "bias in time", decays)
-    yield _one_of("time and specific force (a decay)", "scale in time",
-                  [tuple(f"{decay}*{force}" for force in forces for decay in few)
-                   for few in decays for forces in ("a", "po")])  # fmt: skip
-    waves = [tuple(f"{wave}({n}*2*pi*t/{run_s})" for wave in ("sin", "cos")) for n in _TURNS]
-    yield _one_of("time (periodic)", "bias in time", waves)
-    if turns:
-        for place, words in (("base", "a tilt of the base"), ("platform", "a rotation of the platform")):
-            turning = [f":{place} = {text}" for text in texts[:6]]
-            yield _term(f"time ({words})", "base and platform", turning, weights[:6])
-            relaxing = [_turning(place, few) for few in decays]
-            yield _one_of(f"time ({words}, a decay)", "base and platform", relaxing)
-        tilts = [_turning("base", pair) for pair in waves]
-        yield _one_of("time (a periodic tilt of the base)", "base and platform", tilts)
+    # between neighbouring frequencies all are sums of these
+    waves = {n: _waves(f"{n}*pi*t/{run_s}") for n in range(1, 2 * min(_TURNS, len(dwells) // 2) + 2)}
+    oscillations = [(*waves[n - 1], *waves[n], *waves[n + 1]) for n in range(2, len(waves), 2)]
+    for place in places:
+        yield place.one_of("a decay", decays)
+        if place.common:
+            yield place.one_of("an oscillation", oscillations)
 
 
-def _of_jumps(dwells: Sequence[Dwell], turns: bool) -> Iterator[UnknownTerm]:
-    """Jumps of biases at any time; of scale factors, alignment and base between dwells, in the middle of the way: what
-    shows in the first or the last dwell alone is that this one is off."""
+def _of_jumps(dwells: Sequence[Dwell], places: Sequence[_Place]) -> Iterator[UnknownTerm]:
+    """Jumps of biases at any time; of all else, and other changes, between dwells, in the middle of the way: what shows
+    in the first or the last dwell alone is that this one is off. Of two jumps the second may undo the first."""
     within_s = [0.5 * (dwell.start_s + dwell.end_s) for dwell in dwells]
     between_s = [0.5 * (before.end_s + dwell.start_s) for before, dwell in itertools.pairwise([*dwells][1:-1])]
     moments_s = sorted(within_s + between_s)
     moments_s, between_s = (each[:: len(each) // MOST_ALTERNATIVES + 1] for each in (moments_s, between_s))
     if not between_s:
         return
-    yield _one_of("time (a jump)", "bias in time", [(f"t > {s:.6g}*s",) for s in moments_s])
-    bends = [f"(t > {s:.6g}*s)*(t-{s:.6g}*s)" for s in between_s]
+    # of one at either end nearly all is a drift of one rate
+    inner_s = [s for s in between_s if _END < s / dwells[-1].end_s < 1.0 - _END] or between_s
+    bends = [f"(t > {s:.6g}*s)*(t-{s:.6g}*s)" for s in inner_s]
     rates = [("t", *both) for both in itertools.pairwise(bends)] or [("t", *bends)]
-    yield _one_of("time (a change of its rate)", "bias in time", rates)
     decaying = "(t > {0:.6g}*s)*exp(-abs(t-{0:.6g}*s)/({1}*s))"
-    yield _one_of("time (a jump that decays)", "bias in time",
-                  [tuple(decaying.format(s, 10 * k) for k in _DECAYS[:4]) for s in between_s])  # fmt: skip
-    steps = [f"(t > {s:.6g}*s)" for s in between_s]
-    yield _one_of("time (a jump of the scale factors)", "scale in time", [(f"a*{step}",) for step in steps])
-    across = [(f"p*{step}", f"o*{step}") for step in steps]
-    yield _one_of("time (a jump of the alignment)", "base and platform", across)
-    if turns:
-        for place, words in (("base", "a jump of the tilt of the base"), ("platform", "a jump of the mounting")):
-            turned = [(f":{place} = {step[1:-1]}",) for step in steps]
-            yield _one_of(f"time ({words})", "base and platform", turned)
+    decays = [tuple(decaying.format(s, 10 * k) for k in _DECAYS[:4]) for s in between_s]
+    for place in places:
+        steps = [(f"(t > {s:.6g}*s)",) for s in (between_s if place.words else moments_s)]
+        yield replace(place.one_of("a jump", steps), at_once=2)
+        if place.common:
+            yield place.one_of("a change of rate", rates)
+            yield place.one_of("a decaying jump", decays)
 
 
 def _of_arrival(gimbals: int, dwells: Sequence[Dwell]) -> Iterator[UnknownTerm]:

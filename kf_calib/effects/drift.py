@@ -180,6 +180,10 @@ class Sinusoid(Effect):
         kinds = [f"{kind}{i}" for i in (1, 2, 3) for kind in ("As", "Ac")]
         return tuple(Coefficient(symbol, "m/s^2", 1e-3) for symbol in kinds)
 
+    @property
+    def bearers(self) -> tuple[slice, ...]:
+        return tuple(slice(k, k + 2) for k in (0, 2, 4))
+
     def columns(self, s: Stimulus) -> Floats:
         at_s, shares = s.about
         sin, cos = _parts(s, (shares * self._wave(s, at_s)).sum(axis=1))
@@ -346,6 +350,10 @@ class ThermalMisalignment(Effect):
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
         return tuple(Coefficient(f"gamma{axis}{i}", "rad/K", 1e-5) for i in (1, 2, 3) for axis in ("P", "O"))
+
+    @property
+    def bearers(self) -> tuple[slice, ...]:
+        return tuple(slice(k, k + 2) for k in (0, 2, 4))
 
     def columns(self, s: Stimulus) -> Floats:
         columns = np.zeros((len(s), 3, 6))

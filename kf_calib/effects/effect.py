@@ -188,6 +188,12 @@ class Effect(ABC):
     @abstractmethod
     def coefficients(self) -> tuple[Coefficient, ...]: ...
 
+    @property
+    def bearers(self) -> tuple[slice, ...]:
+        """The coefficients of each accelerometer, or of each axis of a rotation, where one of these may have the effect
+        alone; empty where it is of all or none."""
+        return ()
+
     @abstractmethod
     def columns(self, s: Stimulus) -> Floats:
         """What each accelerometer reads more per unit of each coefficient: (m, 3, q), m/s^2."""
@@ -303,6 +309,10 @@ class SensorEffect(Effect):
     def coefficients(self) -> tuple[Coefficient, ...]:
         return _one_each(self.symbol, self.unit, self.scale, self.shown or field_unit(self.unit))
 
+    @property
+    def bearers(self) -> tuple[slice, ...]:
+        return every_one(3)
+
     @abstractmethod
     def terms(self, s: Stimulus) -> Floats: ...
 
@@ -313,6 +323,12 @@ class SensorEffect(Effect):
 
     def added(self, s: Stimulus, coefficients: Floats) -> Floats:
         return self.terms(s) * coefficients
+
+
+def every_one(count: int) -> tuple[slice, ...]:
+    """The places of each of so many bearers among coefficients, or columns, of which one of each follow each other;
+    nothing of one, which has all."""
+    return tuple(slice(k, None, count) for k in range(count)) if count > 1 else ()
 
 
 @functools.lru_cache(maxsize=512)

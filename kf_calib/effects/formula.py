@@ -37,7 +37,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, Vector
 from kf_calib.effects import checks
-from kf_calib.effects.effect import Bearer, Coefficient, FrameEffect, SensorEffect
+from kf_calib.effects.effect import Bearer, Coefficient, FrameEffect, SensorEffect, every_one
 from kf_calib.effects.expression import Expression
 from kf_calib.effects.frame import gimbal_number
 from kf_calib.effects.stimulus import Stimulus
@@ -175,14 +175,11 @@ class Reading:
         except InputError:
             return ""
 
-    def typical(self, stimulus: Stimulus, checked: bool) -> float:
-        """Rms on a trial run, to a power of ten; 1 where the program has written a formula that is none there, as a
-        decay of another run is."""
+    def typical(self, stimulus: Stimulus) -> float:
+        """Rms on a trial run, to a power of ten."""
         size = np.abs(self(stimulus))
         largest = float(size.max())
         if not 1e-60 < largest < 1e60:
-            if not checked:
-                return 1.0
             raise InputError(f"{self.name} has values up to {largest:.1e}: multiply the formula by a constant.")
         return 10.0 ** round(math.log10(largest * np.sqrt(np.mean((size / largest) ** 2))))
 
@@ -203,22 +200,23 @@ class Formula(SensorEffect):
 
     text: what gives the same effect again; remarks: what its checks had to say. The unit of the coefficients follows
     from that of the expression, their scale from what they add on a trial run: about 1e-3 m/s^2. Not ``checked`` are
-    formulas that the program has written itself, to see what they explain: they have no units.
+    formulas that the program has written itself, to see what they explain: they have no units, and the scale 1.
     """
 
     source, confused_with = "user's formula", ""
     borne_by = Bearer.EITHER
 
     def __init__(self, name: str, expression: str, bench: Bench, checked: bool = True) -> None:
-        self.reading, unit, shown = Reading(name, expression, bench), "", ("", 1.0)
+        self.reading = Reading(name, expression, bench)
+        self.text, self.remarks = f"{name} = {expression}", tuple[str, ...]()
+        # of the class in the catalogue; here each formula has its own
+        vars(self).update(name=name, title=expression, symbol=symbol_stem(name), unit="", shown=("", 1.0), scale=1.0)
         if checked:
             unit, shown = _units(self.reading, turning=False)
-        # of the class in the catalogue; here each formula has its own
-        vars(self).update(name=name, title=expression, symbol=symbol_stem(name), unit=unit, shown=shown, scale=1.0)
-        self.text = f"{name} = {expression}"
-        stimulus = _trial(bench.axes, bench.gravity_mps2)
-        self.remarks = checks.check_effect(self, stimulus) if checked else ()
-        vars(self).update(scale=_LARGE_MPS2 / self.reading.typical(stimulus, checked))
+            vars(self).update(unit=unit, shown=shown)
+            stimulus = _trial(bench.axes, bench.gravity_mps2)
+            self.remarks = checks.check_effect(self, stimulus)
+            vars(self).update(scale=_LARGE_MPS2 / self.reading.typical(stimulus))
 
     def terms(self, s: Stimulus) -> Floats:
         terms = np.array(np.broadcast_to(self.reading(s), (len(s), 3)), dtype=float)
@@ -238,25 +236,34 @@ class FrameFormula(FrameEffect):
 
     def __init__(self, name: str, place: str, expression: str, bench: Bench, checked: bool = True) -> None:
         self.reading, unit, shown = Reading(name, expression, bench), "", ("", 1.0)
+        self.text, self.remarks = f"{name}:{place} = {expression}", tuple[str, ...]()
         gimbal = None if place in (BASE, PLATFORM) else gimbal_number(place, gimbal_letters(bench.axes))
         self.place, self.gimbal = place, gimbal
         if checked:
             unit, shown = _units(self.reading, turning=True)
         vars(self).update(name=name, variant=place, title=expression)
-        self.text = f"{name}:{place} = {expression}"
-        stimulus = _trial(bench.axes, bench.gravity_mps2)
-        if self.reading(stimulus).shape[1] != 1:
-            raise InputError(f"{name}: an angle is one for the whole block: use fx, fy, fz in place of a, p, o and da.")
         axes = {BASE: "NE", PLATFORM: "XYZ"}.get(place, [f"_{place}"])
         symbols = [f"{symbol_stem(name)}{axis}" for axis in axes]
         self._coefficients = tuple(Coefficient(symbol, unit, 1.0, *shown) for symbol in symbols)
-        self.remarks = checks.check_effect(self, stimulus) if checked else ()
-        scale = _LARGE_RAD / self.reading.typical(stimulus, checked)
+        if checked:
+            self._check(_trial(bench.axes, bench.gravity_mps2))
+
+    def _check(self, stimulus: Stimulus) -> None:
+        """Raise InputError where it cannot be used; give the coefficients their scale."""
+        if self.reading(stimulus).shape[1] != 1:
+            words = "an angle is one for the whole block: use fx, fy, fz in place of a, p, o and da."
+            raise InputError(f"{self.name}: {words}")
+        self.remarks = checks.check_effect(self, stimulus)
+        scale = _LARGE_RAD / self.reading.typical(stimulus)
         self._coefficients = tuple(replace(each, scale=scale) for each in self._coefficients)
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
         return self._coefficients
+
+    @property
+    def bearers(self) -> tuple[slice, ...]:
+        return every_one(len(self._coefficients))
 
     def rotations(self, s: Stimulus) -> Floats:
         values = self.reading(s)
@@ -273,7 +280,7 @@ def _trial(axes: tuple[Vector, ...], gravity_mps2: float) -> Stimulus:
     return checks.trial(Bench(axes, gravity_mps2))
 
 
-@lru_cache(maxsize=1024)
+@lru_cache(maxsize=2048)
 def formula(text: str, axes: tuple[Vector, ...], gravity_mps2: float, checked: bool = True) -> Formula | FrameFormula:
     """The formula's effect, made once for each bench: a run asks for it many times."""
     (full, expression), bench = split(text), _trial(axes, gravity_mps2).bench

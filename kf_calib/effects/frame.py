@@ -10,7 +10,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
-from kf_calib.effects.effect import Bearer, Coefficient, Effect, FrameEffect, Regressor, Typical
+from kf_calib.effects.effect import Bearer, Coefficient, Effect, FrameEffect, Regressor, Typical, every_one
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.errors import InputError
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
@@ -27,6 +27,10 @@ class BaseTilt(FrameEffect):
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
         return tuple(Coefficient(f"delta{axis}", "rad", 1e-3) for axis in "NE")
+
+    @property
+    def bearers(self) -> tuple[slice, ...]:
+        return every_one(2)
 
     def rotations(self, s: Stimulus) -> Floats:
         return -np.stack([s.to_platform(axis) for axis in s.level_axes], axis=1)
@@ -65,6 +69,10 @@ class PlatformDrift(FrameEffect):
     def coefficients(self) -> tuple[Coefficient, ...]:
         return tuple(Coefficient(f"omega{axis}", "rad/s", 1e-6, "deg/h", np.degrees(3600.0)) for axis in "XYZ")
 
+    @property
+    def bearers(self) -> tuple[slice, ...]:
+        return every_one(3)
+
     def rotations(self, s: Stimulus) -> Floats:
         return -s.elapsed_s[:, None, None] * np.eye(3)
 
@@ -101,6 +109,10 @@ class Flexure(FrameEffect):
     def coefficients(self) -> tuple[Coefficient, ...]:
         return tuple(Coefficient(f"d{axis}", "rad s^2/m", 1e-4) for axis in "XYZ")
 
+    @property
+    def bearers(self) -> tuple[slice, ...]:
+        return every_one(3)
+
     def rotations(self, s: Stimulus) -> Floats:
         return -np.cross(s.force_mps2[:, None, :], np.eye(3))
 
@@ -118,6 +130,10 @@ class UnevenFlexure(Flexure):
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
         return tuple(Coefficient(f"c{i}d{j}", "rad s^2/m", 1e-4) for j in "XYZ" for i in "XYZ" if i != j)
+
+    @property
+    def bearers(self) -> tuple[slice, ...]:
+        return tuple(slice(k, k + 2) for k in (0, 2, 4))
 
     def rotations(self, s: Stimulus) -> Floats:
         parts = super().rotations(s)[..., None] * np.eye(3)  # (m, j, i, 3): by d_j, about axis i alone

@@ -17,10 +17,6 @@ SEEN = 1e-6
 """A candidate is invisible if the model leaves less than this share of its columns."""
 
 
-_SAME = 1.0 - 1e-6
-"""Two directions count as equal if the cosine of the angle between them is above this."""
-
-
 @dataclass(frozen=True, repr=False)
 class Candidate:
     """One candidate effect, with any unknown constant at one value, after projection off the model.
@@ -60,14 +56,6 @@ class Candidate:
     def scales(self) -> Floats:
         """Sizes (q,) of the coefficients that a user would call large, in SI."""
         return np.array([each.scale for each in self.effect.coefficients])
-
-    def within(self, other: Candidate, cosine: float = _SAME) -> bool:
-        """Tell whether the span of this candidate lies inside the span of the other.
-
-        The criterion is the cosine of the largest principal angle. If it holds, the other explains whatever this one
-        explains, so that no readings can favour this candidate over the other.
-        """
-        return is_within(self.basis.T @ other.basis, cosine)
 
     def overlap(self, other: Candidate) -> float:
         """Cosine of the smallest principal angle between the two spans; 1 if they share a direction, so that the run
@@ -115,14 +103,6 @@ class Scan:
     def coefficients(self, candidate: Candidate) -> Floats:
         """Estimated coefficients (q,) of a candidate if only this effect is added."""
         return candidate.inverse @ (candidate.basis.T @ self.residual)
-
-
-def is_within(cosines: Floats, cosine: float) -> bool:
-    """``Candidate.within`` from the products (k, l) of the two bases."""
-    dof, others = cosines.shape
-    if not 0 < dof <= others or np.vdot(cosines, cosines) <= dof * cosine**2:
-        return False  # the smallest cosine is no larger than their root mean square
-    return float(np.linalg.svd(cosines, compute_uv=False)[-1]) > cosine
 
 
 def counts_of(effects: Sequence[Effect]) -> list[int]:

@@ -78,7 +78,7 @@ OTHERS = {
     "time since arrival and last move of gimbal 2": {
         "gimbals": lambda s: of_gimbal(1, -3.0 * WITHIN_RAD * np.sign(s.moves_rad[:, 1]) * np.exp(-s.since_s / 3.0))
     },
-    "time (a periodic tilt of the base)": {
+    "time (an oscillation of the tilt of the base)": {
         "base": lambda s: WITHIN_RAD * np.column_stack([np.sin(wave(s)), 0.0 * wave(s), np.cos(wave(s))])
     },
     "angle of gimbal 1 (a tilt of the base)": {

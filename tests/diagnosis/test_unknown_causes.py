@@ -196,6 +196,9 @@ def test_memory_in_proportion_to_the_last_step_is_not_surely_settling() -> None:
     assert any(row.driver == "previous orientation" and row.probability > 0.05 for row in diagnosis.table.rows)
 
 
+OSCILLATION = "time (an oscillation)"
+
+
 def _texts_of(driver: str, dwells: Any) -> list[str]:
     """The formulas of unknown functions of one driver."""
     (term,) = [term for term in unknown_terms(Bench(axes_of("yzx"), 9.81), dwells) if term.driver == driver]
@@ -236,15 +239,20 @@ def test_a_formula_explains_a_share_of_the_misfit_beyond_noise(fall: float, take
     assert unknown_effect.explained_share(sound, sound) == 1.0
 
 
-def test_waves_over_time_have_half_a_cycle_to_eight() -> None:
-    """Powers of two, and from one on those half as fast again, so that what is between is explained by one of them."""
-    dwells = [stays(100.0 * k, 100.0 * k + 60.0) for k in range(24)]
-    end_s = dwells[-1].end_s
-    waves = _texts_of("time (periodic)", dwells)
-    phases = [eval(text.partition("(")[2][:-1], {"t": end_s, "s": 1.0, "pi": np.pi}) for text in waves]
-    cycles = np.array(sorted({round(float(phase / (2.0 * np.pi)), 6) for phase in phases}))
-    assert len(waves) == 2 * len(cycles)
-    assert cycles.tolist() == sorted([0.5, *(2.0**k for k in range(4)), *(1.5 * 2.0**k for k in range(3))])
+@pytest.mark.parametrize("cycles", [0.6, 1.37, 3.3, 7.71, 11.2])
+def test_an_oscillation_of_any_frequency_is_a_sum_of_neighbouring_ones(cycles: float) -> None:
+    dwells = [stays(12.0 * k, 12.0 * k + 8.0) for k in range(24)]
+    (term,) = [term for term in unknown_terms(Bench(axes_of("yzx"), 9.81), dwells) if term.driver == OSCILLATION]
+    time_s, run_s = np.concatenate([np.linspace(each.start_s, each.end_s, 9) for each in dwells]), dwells[-1].end_s
+    wave = np.sin(2.0 * np.pi * cycles * time_s / run_s + 0.4)
+    names = {"t": time_s, "s": 1.0, "pi": np.pi, "sin": np.sin, "cos": np.cos}
+    left = []
+    for texts in term.summands:
+        columns = np.column_stack([eval(text, names) for text in texts])
+        left.append(
+            np.linalg.norm(wave - columns @ np.linalg.lstsq(columns, wave, rcond=None)[0]) / np.linalg.norm(wave)
+        )
+    assert min(left) < 0.05
 
 
 @pytest.mark.parametrize("seed", [77001, *slow(77010)])

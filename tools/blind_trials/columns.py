@@ -7,16 +7,19 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.linalg import subspace_angles
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.keys import BenchKeys
-from kf_calib.diagnosis.candidate_tests import slow_hz
+from kf_calib.diagnosis.candidate_tests import GRID, slow_hz
 from kf_calib.effects import Effect, effect_named, names
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.candidate_scan import Candidate
 from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.score_test import scan
 from kf_calib.sources.files.recording import Recording
+
+_SAME_RAD = 1.4e-3  # two directions closer than this count as equal
 
 
 def scan_columns(
@@ -59,7 +62,7 @@ def column_effects(result: Calibration, wanted: Sequence[str] | None = None, slo
                 out.append(effect)
             else:
                 slow = effect.oscillates and slow_lines
-                values = slow_hz(result.fit, effect) if slow else effect.unknown.grid(2.0)
+                values = slow_hz(result.fit, effect) if slow else effect.unknown.grid(GRID)
                 out += [effect.at(value) for value in values]
     return out
 
@@ -74,4 +77,4 @@ def group_by_name(found: Iterable[Candidate]) -> dict[str, list[Candidate]]:
 
 def span_the_same(one: Candidate, other: Candidate) -> bool:
     """Tell whether two candidates can produce exactly the same readings."""
-    return one.dof == other.dof and one.within(other)
+    return one.dof == other.dof > 0 and subspace_angles(one.basis, other.basis)[0] < _SAME_RAD
