@@ -174,11 +174,7 @@ class Sinusoid(Effect):
     step = 1e-7  # the phase is thousands of rad
     value = 0.15
     typical = Typical((0.01 * MICRO_G, 1 * MICRO_G))
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        kinds = [f"{kind}{i}" for i in (1, 2, 3) for kind in ("As", "Ac")]
-        return tuple(Coefficient(symbol, "m/s^2", 1e-3) for symbol in kinds)
+    symbols, unit, scale = tuple(f"{kind}{i}" for i in (1, 2, 3) for kind in ("As", "Ac")), "m/s^2", 1e-3
 
     def columns(self, s: Stimulus) -> Floats:
         at_s, shares = s.about
@@ -252,16 +248,13 @@ class Magnetic(Effect):
     name, title, source = "magnetic", "response to the local magnetic field", "IEEE Std 1293, magnetic sensitivity"
     confused_with = "needs turns about the vertical"
     typical = Typical((1 * 0.2 * MICRO_G, 20 * 0.2 * MICRO_G))  # 1 to 20 ug/G in a horizontal field of 0.2 G
+    symbols, unit, scale = tuple(f"mB{part}{i}" for i in (1, 2, 3) for part in "NE"), "m/s^2", 1e-3
 
     @property
     def relations(self) -> Sequence[Floats]:
         """All sensors are in one field: (m_i B_N, m_i B_E) = m_i B (cos a, sin a), its direction a is not known."""
         directions = np.linspace(0.0, np.pi, _DIRECTIONS, endpoint=False)
         return [np.kron(np.eye(3), [[np.cos(a)], [np.sin(a)]]).astype(float) for a in directions]
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"mB{part}{i}", "m/s^2", 1e-3) for i in (1, 2, 3) for part in "NE")
 
     def columns(self, s: Stimulus) -> Floats:
         columns = np.zeros((len(s), 3, 6))
@@ -342,10 +335,7 @@ class ThermalMisalignment(Effect):
     borne_by = Bearer.SENSORS
     formulas = ("T*p", "T*o")
     typical = Typical((0.1e-6, 10e-6))
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"gamma{axis}{i}", "rad/K", 1e-5) for i in (1, 2, 3) for axis in ("P", "O"))
+    symbols, unit, scale = tuple(f"gamma{axis}{i}" for i in (1, 2, 3) for axis in "PO"), "rad/K", 1e-5
 
     def columns(self, s: Stimulus) -> Floats:
         columns = np.zeros((len(s), 3, 6))
@@ -365,9 +355,7 @@ class ThermalLag(SensorEffect):
     symbol, unit, scale = "alphaL", "m/s^2/K", 1e-3
     typical = ThermalBias.typical
     unknown = Unknown("tauLag", "s", 30.0, 7200.0, "min", 1.0 / 60.0)
-
-    def __init__(self) -> None:
-        self.value = 600.0
+    value = 600.0
 
     def terms(self, s: Stimulus) -> Floats:
         return np.repeat(s.lagged_warmth(self.value)[:, None], 3, axis=1)
@@ -384,9 +372,7 @@ class ThermalHysteresis(SensorEffect):
     symbol, unit, scale = "alphaH", "m/s^2/K", 1e-3
     typical = ThermalBias.typical
     unknown = Unknown("playT", "K", 0.02, 20.0, "K", 1.0)
-
-    def __init__(self) -> None:
-        self.value = 1.0
+    value = 1.0
 
     def terms(self, s: Stimulus) -> Floats:
         return np.repeat(s.played_warmth(self.value)[:, None], 3, axis=1)

@@ -139,6 +139,8 @@ class Effect(ABC):
     it (sigma); None where nature does not say. family: the physical class to which it belongs.
     prior: how much likelier it is than another effect before anything is measured, 1 for most.
     borne_by: what can have it at all; what nobody knows, as of a user's effect, may be of either.
+    symbols: of its coefficients, which have one unit (SI) and scale. shown: a unit of the field and how many of it make
+    one SI unit, where it is not that of ``support.units``.
     drawn_against: the quantity over which what it adds to readings has a shape (``effects.axis``); None: what it adds.
     """
 
@@ -159,6 +161,10 @@ class Effect(ABC):
     family: ClassVar[str] = "none of the known"
     prior: ClassVar[float] = 1.0
     borne_by: ClassVar[Bearer] = Bearer.EITHER
+    symbols: tuple[str, ...]
+    unit: ClassVar[str]
+    scale: ClassVar[float]
+    shown: ClassVar[tuple[str, float] | None] = None
     drawn_against: Regressor | None = None
     variant: str = ""
     """The axis of an axis-wise effect (``encoder-harmonic-2:z``)."""
@@ -185,8 +191,9 @@ class Effect(ABC):
         return other
 
     @property
-    @abstractmethod
-    def coefficients(self) -> tuple[Coefficient, ...]: ...
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        """Its coefficients: ``symbols``, all of one unit and scale."""
+        return _of_one_kind(self.symbols, self.unit, self.scale, self.shown or field_unit(self.unit))
 
     @abstractmethod
     def columns(self, s: Stimulus) -> Floats:
@@ -286,7 +293,7 @@ class Effect(ABC):
 class SensorEffect(Effect):
     """One coefficient for each accelerometer; ``terms`` (m, 3) is what each reads more per unit of its own.
 
-    shown: a unit of the field and how many of it make one SI unit, where it is not that of ``support.units``.
+    symbol: of the coefficients, before the number of the accelerometer.
     on_data_sheet: words for it on a data sheet; empty where it is on none. in_polynomial: whether it is estimated there
     together with others of the model equation.
     """
@@ -295,13 +302,11 @@ class SensorEffect(Effect):
     on_data_sheet: ClassVar[str] = ""
     in_polynomial: ClassVar[bool] = False
     symbol: ClassVar[str]
-    unit: ClassVar[str]
-    scale: ClassVar[float]
-    shown: ClassVar[tuple[str, float] | None] = None
 
     @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return _one_each(self.symbol, self.unit, self.scale, self.shown or field_unit(self.unit))
+    def symbols(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The symbol of each accelerometer's coefficient."""
+        return tuple(f"{self.symbol}{i}" for i in (1, 2, 3))
 
     @abstractmethod
     def terms(self, s: Stimulus) -> Floats: ...
@@ -316,9 +321,11 @@ class SensorEffect(Effect):
 
 
 @functools.lru_cache(maxsize=512)
-def _one_each(symbol: str, unit: str, scale: float, shown: tuple[str, float]) -> tuple[Coefficient, ...]:
-    """Return a coefficient for each accelerometer."""
-    return tuple(Coefficient(f"{symbol}{i}", unit, scale, *shown) for i in (1, 2, 3))
+def _of_one_kind(
+    symbols: tuple[str, ...], unit: str, scale: float, shown: tuple[str, float]
+) -> tuple[Coefficient, ...]:
+    """Return coefficients of one unit and scale."""
+    return tuple(Coefficient(symbol, unit, scale, *shown) for symbol in symbols)
 
 
 class FrameEffect(Effect):

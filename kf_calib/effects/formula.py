@@ -29,7 +29,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache, partial
 
 import numpy as np
@@ -37,7 +37,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, Vector
 from kf_calib.effects import checks
-from kf_calib.effects.effect import Bearer, Coefficient, FrameEffect, SensorEffect
+from kf_calib.effects.effect import Bearer, FrameEffect, SensorEffect
 from kf_calib.effects.expression import Expression
 from kf_calib.effects.frame import gimbal_number
 from kf_calib.effects.stimulus import Stimulus
@@ -187,10 +187,13 @@ class Reading:
         return 10.0 ** round(math.log10(largest * np.sqrt(np.mean((size / largest) ** 2))))
 
 
-def _units(reading: Reading, turning: bool) -> tuple[str, tuple[str, float]]:
-    """SI unit of a formula's coefficients, a unit of the field, and how many of it are one; of angles, or readings."""
+def _units(reading: Reading, turning: bool, checked: bool) -> tuple[str, tuple[str, float]]:
+    """SI unit of a formula's coefficients, a unit of the field, and how many of it are one; of angles, or readings.
+    None of a formula that is not ``checked``."""
     from kf_calib.effects.expression import coefficient_units, pint_unit_of, turning_units
 
+    if not checked:
+        return "", ("", 1.0)
     try:
         unit = pint_unit_of(reading.expression, reading.units)
         return turning_units(unit) if turning else coefficient_units(unit)
@@ -210,9 +213,8 @@ class Formula(SensorEffect):
     borne_by = Bearer.EITHER
 
     def __init__(self, name: str, expression: str, bench: Bench, checked: bool = True) -> None:
-        self.reading, unit, shown = Reading(name, expression, bench), "", ("", 1.0)
-        if checked:
-            unit, shown = _units(self.reading, turning=False)
+        self.reading = Reading(name, expression, bench)
+        unit, shown = _units(self.reading, turning=False, checked=checked)
         # of the class in the catalogue; here each formula has its own
         vars(self).update(name=name, title=expression, symbol=symbol_stem(name), unit=unit, shown=shown, scale=1.0)
         self.text = f"{name} = {expression}"
@@ -237,31 +239,25 @@ class FrameFormula(FrameEffect):
     borne_by = Bearer.EITHER
 
     def __init__(self, name: str, place: str, expression: str, bench: Bench, checked: bool = True) -> None:
-        self.reading, unit, shown = Reading(name, expression, bench), "", ("", 1.0)
-        gimbal = None if place in (BASE, PLATFORM) else gimbal_number(place, gimbal_letters(bench.axes))
-        self.place, self.gimbal = place, gimbal
-        if checked:
-            unit, shown = _units(self.reading, turning=True)
-        vars(self).update(name=name, variant=place, title=expression)
+        self.reading = Reading(name, expression, bench)
+        self.gimbal = None if place in (BASE, PLATFORM) else gimbal_number(place, gimbal_letters(bench.axes))
+        unit, shown = _units(self.reading, turning=True, checked=checked)
+        axes = {BASE: "NE", PLATFORM: "XYZ"}.get(place, [f"_{place}"])
+        symbols = tuple(f"{symbol_stem(name)}{axis}" for axis in axes)
+        vars(self).update(
+            name=name, variant=place, title=expression, symbols=symbols, unit=unit, shown=shown, scale=1.0
+        )
         self.text = f"{name}:{place} = {expression}"
         stimulus = _trial(bench.axes, bench.gravity_mps2)
         if self.reading(stimulus).shape[1] != 1:
             raise InputError(f"{name}: an angle is one for the whole block: use fx, fy, fz in place of a, p, o and da.")
-        axes = {BASE: "NE", PLATFORM: "XYZ"}.get(place, [f"_{place}"])
-        symbols = [f"{symbol_stem(name)}{axis}" for axis in axes]
-        self._coefficients = tuple(Coefficient(symbol, unit, 1.0, *shown) for symbol in symbols)
         self.remarks = checks.check_effect(self, stimulus) if checked else ()
-        scale = _LARGE_RAD / self.reading.typical(stimulus, checked)
-        self._coefficients = tuple(replace(each, scale=scale) for each in self._coefficients)
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return self._coefficients
+        vars(self).update(scale=_LARGE_RAD / self.reading.typical(stimulus, checked))
 
     def rotations(self, s: Stimulus) -> Floats:
         values = self.reading(s)
         checks.refuse_not_finite(self, values, s)
-        if self.place == PLATFORM:
+        if self.variant == PLATFORM:
             return -values[:, :, None] * np.eye(3)
         axes = [self.about(s)] if self.gimbal is not None else [-s.to_platform(n) for n in s.level_axes]
         return values[:, :, None] * np.stack(axes, axis=1)

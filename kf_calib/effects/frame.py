@@ -10,7 +10,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
-from kf_calib.effects.effect import Bearer, Coefficient, Effect, FrameEffect, Regressor, Typical
+from kf_calib.effects.effect import Bearer, Effect, FrameEffect, Regressor, Typical
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.errors import InputError
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
@@ -23,10 +23,7 @@ class BaseTilt(FrameEffect):
     name, title, source = "base-tilt", "tilt of the base", "geometry of the bench"
     confused_with = "about the outer axis it is the outer encoder's zero"
     typical = Typical((5e-6, 500e-6))
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"delta{axis}", "rad", 1e-3) for axis in "NE")
+    symbols, unit, scale = ("deltaN", "deltaE"), "rad", 1e-3
 
     def rotations(self, s: Stimulus) -> Floats:
         return -np.stack([s.to_platform(axis) for axis in s.level_axes], axis=1)
@@ -41,10 +38,7 @@ class BaseTiltDrift(BaseTilt):
     name, title = "base-tilt-drift", "tilt of the base that grows with time"
     confused_with = "scale-drift"
     typical = Typical((1e-6 / 86400, 50e-6 / 86400))
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"deltaRate{axis}", "rad/s", 1e-8) for axis in "NE")
+    symbols, unit, scale = ("deltaRateN", "deltaRateE"), "rad/s", 1e-8
 
     def rotations(self, s: Stimulus) -> Floats:
         return super().rotations(s) * s.elapsed_s[:, None, None]
@@ -60,10 +54,8 @@ class PlatformDrift(FrameEffect):
     name, title, source = "platform-drift", "drift of the platform", "geometry of the bench"
     borne_by = Bearer.EITHER  # a block that creeps on its mount drifts in the same way
     typical = Typical((np.radians(0.01) / 3600, np.radians(1.0) / 3600))
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"omega{axis}", "rad/s", 1e-6, "deg/h", np.degrees(3600.0)) for axis in "XYZ")
+    symbols, unit, scale = ("omegaX", "omegaY", "omegaZ"), "rad/s", 1e-6
+    shown = "deg/h", float(np.degrees(3600.0))
 
     def rotations(self, s: Stimulus) -> Floats:
         return -s.elapsed_s[:, None, None] * np.eye(3)
@@ -80,10 +72,7 @@ class EarthRotation(FrameEffect):
     confused_with = "platform-drift"
     typical = Typical((1.0, 1.0), (1.0, 1.0))
     expected = (1.0, 0.1)  # the direction of north and the latitude are not known better than that on every bench
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient("earth", "1", 1.0, "of Earth's rate", 1.0),)
+    symbols, unit, scale, shown = ("earth",), "1", 1.0, ("of Earth's rate", 1.0)
 
     def rotations(self, s: Stimulus) -> Floats:
         return (s.elapsed_s[:, None] * s.to_platform(s.bench.earth_rate_radps))[:, None, :]
@@ -96,10 +85,7 @@ class Flexure(FrameEffect):
     name, title, source = "flexure", "bending under the torque of gravity", "linear elasticity"
     confused_with = "encoder-harmonic-1, cross-coupling, uneven-flexure; the bias of a sensor that reports the attitude"
     typical = Typical((5e-6 / STANDARD_GRAVITY_MPS2, 100e-6 / STANDARD_GRAVITY_MPS2))
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"d{axis}", "rad s^2/m", 1e-4) for axis in "XYZ")
+    symbols, unit, scale = ("dX", "dY", "dZ"), "rad s^2/m", 1e-4
 
     def rotations(self, s: Stimulus) -> Floats:
         return -np.cross(s.force_mps2[:, None, :], np.eye(3))
@@ -114,10 +100,7 @@ class UnevenFlexure(Flexure):
     name, title = "uneven-flexure", "bending with another stiffness about each axis"
     confused_with = "flexure, cross-coupling, cross-axis-square"
     prior = 0.25  # it contains the flexure, from which readings alone tell it apart only by the price of coefficients
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"c{i}d{j}", "rad s^2/m", 1e-4) for j in "XYZ" for i in "XYZ" if i != j)
+    symbols = tuple(f"c{i}d{j}" for j in "XYZ" for i in "XYZ" if i != j)
 
     def rotations(self, s: Stimulus) -> Floats:
         parts = super().rotations(s)[..., None] * np.eye(3)  # (m, j, i, 3): by d_j, about axis i alone
@@ -133,10 +116,7 @@ class CrossTalk(Effect):
     formulas = ("before", "after")
     confused_with = "misalignment, always at rest"
     typical = Typical((1e-6, 100e-6))
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"X{i}{j}", "1", 1e-3) for i in (1, 2, 3) for j in (1, 2, 3) if i != j)
+    symbols, unit, scale = ("X12", "X13", "X21", "X23", "X31", "X32"), "1", 1e-3
 
     def columns(self, s: Stimulus) -> Floats:
         readings, columns = s.force_mps2 @ s.sensitivity.T, np.zeros((len(s), 3, 6))
@@ -149,12 +129,13 @@ class CrossTalk(Effect):
 
 
 class _GimbalEffect(FrameEffect):
-    """An effect of one gimbal, named by its letter or number after the colon."""
+    """An effect of one gimbal, named by its letter or number after the colon, which its symbols end in, too."""
 
-    family = "gimbal and encoder"
+    family, source = "gimbal and encoder", "geometry of the bench"
 
     def __init__(self, gimbal: int, variant: str) -> None:
         self.gimbal, self.variant = gimbal, variant
+        self.symbols = tuple(f"{stem}_{variant}" for stem in self.symbols)
 
     def _angle(self, s: Stimulus) -> Floats:
         assert self.gimbal is not None
@@ -164,12 +145,9 @@ class _GimbalEffect(FrameEffect):
 class EncoderOffset(_GimbalEffect):
     """q_k + epsilon_k."""
 
-    name, title, source = "encoder-offset", "zero of an encoder", "geometry of the bench"
+    name, title = "encoder-offset", "zero of an encoder"
     confused_with = "innermost: a misalignment; outermost: base-tilt"
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient(f"eps_{self.variant}", "rad", 1e-2),)
+    symbols, unit, scale = ("eps",), "rad", 1e-2
 
     def rotations(self, s: Stimulus) -> Floats:
         return self.about(s)[:, None, :]
@@ -191,11 +169,8 @@ class _OfItsAngle(_GimbalEffect):
 class EncoderScale(_OfItsAngle):
     """q_k (1 + epsilon_k)."""
 
-    name, title, source = "encoder-scale", "scale of an encoder", "geometry of the bench"
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient(f"epsS_{self.variant}", "1", 1e-3),)
+    name, title = "encoder-scale", "scale of an encoder"
+    symbols, unit, scale = ("epsS",), "1", 1e-3
 
     def rotations(self, s: Stimulus) -> Floats:
         return (self._angle(s)[:, None] * self.about(s))[:, None, :]
@@ -204,13 +179,10 @@ class EncoderScale(_OfItsAngle):
 class EncoderHarmonic1(_OfItsAngle):
     """s sin q_k + c cos q_k on the angle."""
 
-    name, title, source = "encoder-harmonic-1", "eccentricity of an encoder", "geometry of the bench"
+    name, title = "encoder-harmonic-1", "eccentricity of an encoder"
     order = 1
     typical = Typical((1e-6, 100e-6))
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"{part}{self.order}_{self.variant}", "rad", 1e-3) for part in "sc")
+    symbols, unit, scale = ("s1", "c1"), "rad", 1e-3
 
     def rotations(self, s: Stimulus) -> Floats:
         angle = self.order * self._angle(s)
@@ -222,25 +194,22 @@ class EncoderHarmonic2(EncoderHarmonic1):
 
     name, title = "encoder-harmonic-2", "second harmonic of an encoder"
     confused_with = "second-order"
-    order = 2
+    symbols, order = ("s2", "c2"), 2
 
 
 class Backlash(_GimbalEffect):
     """q_k - 1/2 p sgn(Delta q_k), Delta q_k the last move of the gimbal: it trails behind its encoder by half the play
     p, towards where it came from, and stays there while other gimbals move."""
 
-    name, title, source = "backlash", "play between a gimbal and its encoder", "geometry of the bench"
+    name, title = "backlash", "play between a gimbal and its encoder"
     confused_with = "encoder-scale, hysteresis; needs the same pose from two sides"
     typical = Typical((5e-6, 100e-6), (0.1e-3, 10e-3))
+    symbols, unit, scale = ("play",), "rad", 1e-3
 
     def __init__(self, gimbal: int, variant: str) -> None:
         super().__init__(gimbal, variant)
         number = gimbal + 1
         self.drawn_against = Regressor(f"q{number}_move", f"last move of gimbal {number}", "rad")
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient(f"play_{self.variant}", "rad", 1e-3),)
 
     def rotations(self, s: Stimulus) -> Floats:
         assert self.gimbal is not None
@@ -250,12 +219,9 @@ class Backlash(_GimbalEffect):
 class AxisNonorthogonality(_GimbalEffect):
     """Gimbal axis k tilted in its parent by tau: the child turns by tau - R^T tau, R the gimbal's own rotation."""
 
-    name, title, source = "axis-nonorthogonality", "tilt of a gimbal axis", "geometry of the bench"
+    name, title = "axis-nonorthogonality", "tilt of a gimbal axis"
     typical = Typical((5e-6, 50e-6))
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"tau{part}_{self.variant}", "rad", 1e-3) for part in "AB")
+    symbols, unit, scale = ("tauA", "tauB"), "rad", 1e-3
 
     def rotations(self, s: Stimulus) -> Floats:
         from kf_calib.bench.bench import turn
@@ -274,10 +240,7 @@ class GravityError(Effect):
     confused_with = "a common scale factor, always"
     borne_by = Bearer.BENCH
     typical = Typical((10e-6, 700e-6))
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient("epsG", "1", 1e-3),)
+    symbols, unit, scale = ("epsG",), "1", 1e-3
 
     def columns(self, s: Stimulus) -> Floats:
         return (s.force_mps2 @ s.sensitivity.T)[:, :, None]
@@ -304,10 +267,7 @@ class Latency(Effect):
     borne_by = Bearer.BENCH  # the clock and the acquisition are the bench's
     confused_with = "seen in slews only"
     dynamic = True
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient("tau_d", "s", 1e-2, "ms", 1e3),)
+    symbols, unit, scale, shown = ("tau_d",), "s", 1e-2, ("ms", 1e3)
 
     def columns(self, s: Stimulus) -> Floats:
         return -(s.force_rate_mps3 @ s.sensitivity.T)[:, :, None]
@@ -320,10 +280,8 @@ class LeverArm(Effect):
     name, title, source = "lever-arm", "place of each accelerometer", "rigid-body kinematics"
     confused_with = "seen in slews only, about several axes"
     dynamic = True
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"r{i}{axis}", "m", 0.1, "mm", 1e3) for i in (1, 2, 3) for axis in "xyz")
+    symbols = tuple(f"r{i}{axis}" for i in (1, 2, 3) for axis in "xyz")
+    unit, scale, shown = "m", 0.1, ("mm", 1e3)
 
     def columns(self, s: Stimulus) -> Floats:
         columns, turning = np.zeros((len(s), 3, 9)), _cross(s.rate_radps)

@@ -11,16 +11,18 @@ from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 IEEE = "IEEE Std 1293, model equation"
 _EDGES = 500
-_INPUT = Regressor("a", "force along the input axis", "m/s^2")
 
 
-class BiasAsymmetry(SensorEffect):
+class _Nonlinearity(SensorEffect):
+    family, source = "nonlinearity", IEEE
+    drawn_against = Regressor("a", "force along the input axis", "m/s^2")
+
+
+class BiasAsymmetry(_Nonlinearity):
     """1/2 K0' sgn a_i."""
 
-    family = "nonlinearity"
-    name, title, source = "bias-asymmetry", "bias that changes sign with the input", IEEE
+    name, title = "bias-asymmetry", "bias that changes sign with the input"
     on_data_sheet = "bias asymmetry"
-    drawn_against = _INPUT
     formulas = ("0.5*sign(a)",)
     confused_with = "odd-quadratic; invisible in six faces"
     symbol, unit, scale = "K0'", "m/s^2", 1e-3
@@ -30,13 +32,11 @@ class BiasAsymmetry(SensorEffect):
         return 0.5 * sign(s.along)
 
 
-class ScaleAsymmetry(SensorEffect):
+class ScaleAsymmetry(_Nonlinearity):
     """1/2 K1' |a_i|."""
 
-    family = "nonlinearity"
-    name, title, source = "scale-asymmetry", "scale factor that differs with the sign of the input", IEEE
+    name, title = "scale-asymmetry", "scale factor that differs with the sign of the input"
     on_data_sheet = "scale asymmetry"
-    drawn_against = _INPUT
     formulas = ("0.5*abs(a)",)
     confused_with = "second-order"
     symbol, unit, scale = "K1'", "1", 1e-3
@@ -46,13 +46,11 @@ class ScaleAsymmetry(SensorEffect):
         return 0.5 * np.abs(s.along)
 
 
-class SecondOrder(SensorEffect):
+class SecondOrder(_Nonlinearity):
     """K2 a_i^2."""
 
-    family = "nonlinearity"
-    name, title, source = "second-order", "second-order nonlinearity", IEEE
+    name, title = "second-order", "second-order nonlinearity"
     on_data_sheet, in_polynomial = "second order", True
-    drawn_against = _INPUT
     formulas = ("a**2",)
     confused_with = "scale-asymmetry"
     symbol, unit, scale = "K2_", "s^2/m", 1e-4
@@ -62,13 +60,11 @@ class SecondOrder(SensorEffect):
         return s.along**2
 
 
-class ThirdOrder(SensorEffect):
+class ThirdOrder(_Nonlinearity):
     """K3 a_i^3."""
 
-    family = "nonlinearity"
-    name, title, source = "third-order", "third-order nonlinearity", IEEE
+    name, title = "third-order", "third-order nonlinearity"
     on_data_sheet, in_polynomial = "third order", True
-    drawn_against = _INPUT
     formulas = ("a**3",)
     confused_with = "odd-quadratic; invisible in six faces"
     symbol, unit, scale = "K3_", "s^4/m^2", 1e-5
@@ -84,13 +80,11 @@ class ThirdOrder(SensorEffect):
         return coefficients * s.along * s.along * s.along  # ten times as fast as the power
 
 
-class OddQuadratic(SensorEffect):
+class OddQuadratic(_Nonlinearity):
     """Koq a_i |a_i|."""
 
-    family = "nonlinearity"
-    name, title, source = "odd-quadratic", "odd quadratic nonlinearity", IEEE
+    name, title = "odd-quadratic", "odd quadratic nonlinearity"
     on_data_sheet = "odd quadratic"
-    drawn_against = _INPUT
     formulas = ("a*abs(a)",)
     confused_with = "third-order; invisible in six faces"
     symbol, unit, scale = "Koq", "s^2/m", 1e-4
@@ -188,20 +182,16 @@ class VibrationRectification(SensorEffect):
         return np.broadcast_to(s.variance_mps2_2, (len(s), 3))
 
 
-class DeadZone(SensorEffect):
+class DeadZone(_Nonlinearity):
     """-a_i where |a_i| < d: a share of 1 is a reading that stays where it is over the whole zone."""
 
-    family = "nonlinearity"
-    name, title, source = "dead-zone", "no response to small inputs", IEEE
-    drawn_against = _INPUT
+    name, title = "dead-zone", "no response to small inputs"
     formulas = ("-a*(abs(a) < constant)",)
     confused_with = "needs poses that sweep through zero"
     symbol, unit, scale, shown = "Dz", "1", 1.0, ("of the input", 1.0)
     unknown = Unknown("dZone", "m/s^2", 1e-6, 1e-2)
     smooth = False
-
-    def __init__(self) -> None:
-        self.value = 1e-4
+    value = 1e-4
 
     def terms(self, s: Stimulus) -> Floats:
         return np.where(np.abs(s.along) < self.value, -s.along, 0.0)

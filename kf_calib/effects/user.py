@@ -101,16 +101,17 @@ def completed(kind: type[Effect], origin: str) -> type[Effect]:
     """The class with what it left out; raises InputError where that cannot be filled in."""
     who = f"class {kind.__name__} of {origin}"
     missing = sorted(getattr(kind, "__abstractmethods__", ()))
+    if kind.coefficients is Effect.coefficients and not hasattr(kind, "symbols"):
+        missing = ["coefficients", *missing]
     if missing:
         raise InputError(f"{who} lacks {' and '.join(missing)}: define {'it' if len(missing) == 1 else 'them'}.")
     given = getattr(kind, "name", None)
     name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", kind.__name__).lower() if given is None else given
     if not (isinstance(name, str) and is_name(name)):
         raise InputError(f"{who} is called {name!r}: a name is made of {NAME_RULE}.")
-    defaults: dict[str, object] = {"name": name, "title": name, "source": "user"}
+    defaults: dict[str, object] = {"name": name, "title": name, "source": "user", "unit": "SI", "scale": 1.0}
     if issubclass(kind, SensorEffect):
-        unit = getattr(kind, "unit", "SI")
-        defaults |= {"symbol": symbol_stem(name), "unit": unit, "scale": 1.0}
+        defaults["symbol"] = symbol_stem(name)
     for key, value in defaults.items():
         if not hasattr(kind, key):
             setattr(kind, key, value)
