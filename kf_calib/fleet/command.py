@@ -2,31 +2,25 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import rich_click as click
 from click import get_current_context  # rich_click declares that there may be none
 
-from kf_calib.cli.command import MODEL, OUTPUT, POSITIVE, argument, command, option, values_of
+from kf_calib.cli.command import MODEL, OUTPUT, POSITIVE, argument, command, option
 from kf_calib.cli.echo import complain, echo, print_json, progress, show
-from kf_calib.cli.failures import Interrupter, answered, sentence
+from kf_calib.cli.failures import Interrupter, answered
 from kf_calib.cli.files import Delivery, FigureFiles, ReportFile, claimed, commands_of, delivery
-from kf_calib.cli.options import EvaluationOptions, Json, Overwrite, ReadingOptions, ShownUnits, opened, target_option
+from kf_calib.cli.options import EvaluationOptions, Json, Overwrite, ReadingOptions, ShownUnits, target_option
 from kf_calib.errors import InputError, need
 from kf_calib.support import stage
 from kf_calib.support.leaves import leaf
 
 if TYPE_CHECKING:
-    from kf_calib.bench.streams import Source
-    from kf_calib.diagnosis.results import Diagnosis
-    from kf_calib.estimation.results import Calibration
     from kf_calib.fleet.batch import BatchProgress, RunEvaluation
     from kf_calib.fleet.results import BenchModelFiles
     from kf_calib.fleet.run_factor import ReferenceUnit
@@ -35,53 +29,6 @@ if TYPE_CHECKING:
 
 WORK = "Who does the work"
 _PACKAGES = ("distributed", "pyarrow", "fsspec")
-
-
-@dataclass(frozen=True)
-class SingleCommands:
-    """What ``replay`` and ``diagnose`` do with one recording and these options; sent to the workers."""
-
-    reading: ReadingOptions
-    evaluation: EvaluationOptions
-
-    def replay(self, path: Path) -> tuple[Source, Calibration]:
-        from kf_calib.estimation.calibration import calibrate
-
-        source, settings = opened(path, self.reading, self.evaluation)
-        return source, calibrate(source, settings)
-
-    def diagnose(self, source: Source, result: Calibration) -> Diagnosis:
-        from kf_calib.diagnosis.missing_effect import diagnose
-        from kf_calib.diagnosis.refits import Refits
-
-        return diagnose(result, Refits(source))
-
-    def replay_document(self, result: Calibration) -> dict[str, Any]:
-        from kf_calib.views.json import replay_object
-
-        return replay_object(result)
-
-    def diagnosis_document(self, diagnosis: Diagnosis) -> dict[str, Any]:
-        from kf_calib.views.diagnosis import diagnosis_object
-
-        return diagnosis_object(diagnosis)
-
-    def sentence(self, error: BaseException) -> str:
-        return sentence(error)
-
-    @property
-    def checksum(self) -> str:
-        """Of all that numbers depend on besides the recording: options, the files they name, and the program."""
-        told = {key: _content(value) for key, value in sorted(values_of(self.reading, self.evaluation))}
-        text = json.dumps(told | {"kf_calib": version("kf_calib")})
-        return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _content(value: Any) -> Any:
-    """An option as it counts: a file by what is in it."""
-    if isinstance(value, Path):
-        return hashlib.sha256(value.read_bytes()).hexdigest()
-    return [_content(each) for each in value] if isinstance(value, tuple | list) else value
 
 
 @dataclass(frozen=True)
@@ -154,8 +101,7 @@ def fleet(
         import kf_calib.views.figures  # noqa: F401
     wanted, reference = targets_of(options.targets), _reference(options.reference_unit)
     _refuse_impossible(reading, evaluation)
-    commands = SingleCommands(reading, evaluation)
-    one_run = RunEvaluation(commands, commands.checksum, options.limit_s)
+    one_run = RunEvaluation.of(reading, evaluation, options.limit_s)
     done = _evaluated(one_run, runs_of(runs), output, options.workers, options.scheduler, as_json)
     table = Fleet(output)
     with progress("diagnosing the runs together", as_json):
