@@ -127,6 +127,7 @@ COLUMNS = ("run", "unit", "bench", "date", "error", "consistent", "p_value", "mi
 """Columns of the table that an overview is made from."""
 _LEVEL = 0.01
 """Chance below which a unit is named."""
+_REASONS = 2  # that are told of a unit
 
 
 @dataclass(frozen=True)
@@ -189,6 +190,12 @@ class AnotherLook:
     unit: str
     chance: float
     reasons: tuple[str, ...]
+
+    @property
+    def why(self) -> str:
+        """The strongest reasons, and how many more there are."""
+        more = [f"{len(self.reasons) - _REASONS} more"] if len(self.reasons) > _REASONS else []
+        return "; ".join([*self.reasons[:_REASONS], *more])
 
 
 def looks(

@@ -102,11 +102,6 @@ class RunFactor:
         kept = [*(self.places[name] for name in columns), len(self.columns)]
         return triangle(self.factor[:, kept])
 
-    def shows(self, column: str) -> bool:
-        """Whether the run has a column of this name that is not zero."""
-        place = self.places.get(column)
-        return place is not None and bool(self.factor[:, place].any())
-
 
 def candidate_effects(model: Model) -> list[Effect]:
     """Effects of the catalogue that are not in the model and have columns in dwells; constants are at their usual

@@ -167,7 +167,6 @@ def _rows(name: str, values: Sequence[PooledEstimate]) -> Iterator[tuple[str, ..
 
 
 _SHOWN = 6
-_REASONS = 2
 
 
 def fleet_object(
@@ -221,10 +220,7 @@ def fleet_report(
 
 def look_table(overview: FleetOverview) -> ConsoleTable:
     """The units that need another look first, with the reasons."""
-    rows = list[tuple[str, ...]]()
-    for each in overview.looks[:_SHOWN]:
-        more = [f"{len(each.reasons) - _REASONS} more"] if len(each.reasons) > _REASONS else []
-        rows.append((short_name(each.unit), chance_words(each.chance), "; ".join([*each.reasons[:_REASONS], *more])))
+    rows = [(short_name(each.unit), chance_words(each.chance), each.why) for each in overview.looks[:_SHOWN]]
     if len(overview.looks) > _SHOWN:
         rows.append((f"{len(overview.looks) - _SHOWN} more", "", ""))
     return table("Units that need another look first", ("unit", ">chance by noise", "why"), rows)
