@@ -91,7 +91,7 @@ def fleet(
     from kf_calib.bench.paper_parameters import targets_of
     from kf_calib.fleet import text as views
     from kf_calib.fleet.batch import RunEvaluation
-    from kf_calib.fleet.results import BenchModelFiles, Fleet, populations
+    from kf_calib.fleet.results import BenchModelFiles, Fleet
     from kf_calib.fleet.run_list import runs_of
 
     outputs = claimed(overwrite=overwrite)
@@ -108,9 +108,9 @@ def fleet(
         overview = table.overview(wanted, pooled=options.pooled, reference_unit=reference)
     models = BenchModelFiles(output, overview.pooled, overwrite)
     if as_json:
-        print_json(views.fleet_object(table, populations(table), done, overview, list(models.models)))
+        print_json(views.fleet_object(table, done, overview, list(models.models)))
     else:
-        show(views.fleet_report(table, populations(table), done, overview))
+        show(views.fleet_report(table, done, overview))
     with delivery(outputs, as_json) as deliver, progress("drawing the pictures", as_json):
         _deliver_bench_models(models, outputs, deliver, as_json)
         if report:

@@ -59,6 +59,13 @@ class Track:
         """How many spreads each unit (u,) lies from the mean."""
         return (self.units - self.mean) / (self.spread or np.inf)
 
+    @property
+    def of_runs(self) -> dict[str, float]:
+        """Of the runs, whatever unit: their number, ``median`` and ``spread`` of their values as of the units, and
+        ``sigma``, the median of those that they give."""
+        median, spread = _middle(self.values)
+        return {"runs": len(self.values), "median": median, "spread": spread, "sigma": float(np.median(self.sigmas))}
+
 
 def tracks(rows: Sequence[Mapping[str, Any]], units: Sequence[str], targets: Mapping[str, float]) -> tuple[Track, ...]:
     """The track of each parameter that a run determines, in the order of the runs."""
@@ -86,13 +93,18 @@ def _track(
     runs = np.bincount(places, minlength=count)
     sums = np.bincount(places, values - values[0], minlength=count)
     means = values[0] + np.divide(sums, runs, out=np.full(count, np.nan), where=runs > 0)
-    low, median, high = np.quantile(means[runs > 0], _SIXTY_EIGHT).tolist()
-    spread = 0.5 * (high - low)
+    median, spread = _middle(means[runs > 0])
     deviations = _deviations(values, means[places], runs[places], median)
     return Track(
         symbol, unit, nominal, target, dates, places, values, sigmas, means, median, spread,
         _chances(means, median, spread, many), deviations, _pooled(deviations, runs[places]),
     )  # fmt: skip
+
+
+def _middle(values: Floats) -> tuple[float, float]:
+    """Return the median, and half the width of the middle 68 % of values, 1 sigma of a normal population."""
+    low, median, high = np.quantile(values, _SIXTY_EIGHT).tolist()
+    return median, 0.5 * (high - low)
 
 
 def _deviations(values: Floats, means: Floats, runs: NDArray[np.intp], mean: float) -> Floats:

@@ -16,7 +16,6 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.compute
 
@@ -31,7 +30,6 @@ from kf_calib.support.output_files import write_whole
 
 pc: Any = pyarrow.compute  # its functions are made when it is imported, which no type checker sees
 _HEAVY = ("replay", "diagnosis", "factor")
-_SIXTY_EIGHT = (0.1587, 0.5, 0.8413)
 _ALONE = "the runs were not diagnosed together"
 _IDENTITY = ("run", "unit", "bench", "date")
 
@@ -160,38 +158,6 @@ def _unnamed(count: int) -> str:
     one = "1 run has no unit, so it counts as a unit"
     each = one if count == 1 else f"{count} runs have no unit, so each counts as a unit"
     return f"{each} of its own: say which it is in a list of runs (.csv with the columns run and unit)."
-
-
-@dataclass(frozen=True)
-class ParameterPopulation:
-    """One parameter over the runs of a fleet.
-
-    - runs: number of runs that determine it. median: of their values. spread: half the width of the middle 68 % of
-      them, 1 sigma of a normal population. sigma: median of the sigma that a run gives of it. All in ``unit`` (SI).
-    """
-
-    symbol: str
-    unit: str
-    nominal: float
-    runs: int
-    median: float
-    spread: float
-    sigma: float
-
-
-def populations(fleet: Fleet) -> list[ParameterPopulation]:
-    """Each parameter over the runs that determine it, in the order of the first run."""
-    table = fleet.parameters()
-    table = table.filter(pc.is_valid(table["value"]))
-    spreads = list[ParameterPopulation]()
-    for symbol in dict.fromkeys(table["symbol"].to_pylist()):
-        rows = table.filter(pc.equal(table["symbol"], symbol))
-        values, sigmas = rows["value"].to_numpy(), rows["sigma"].to_numpy()
-        low, median, high = np.quantile(values, _SIXTY_EIGHT).tolist()
-        unit, nominal = rows["si_unit"][0].as_py(), rows["nominal"][0].as_py()
-        sigma = float(np.nanmedian(sigmas))
-        spreads.append(ParameterPopulation(symbol, unit, nominal, len(values), median, 0.5 * (high - low), sigma))
-    return spreads
 
 
 _NOT_IN_NAMES = re.compile(r"[^\w.-]+|^\.+")  # of files, on any system
