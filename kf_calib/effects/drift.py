@@ -21,6 +21,7 @@ from kf_calib.effects.effect import (
     SensorEffect,
     Typical,
     Unknown,
+    of_each,
 )
 from kf_calib.effects.stimulus import Stimulus
 
@@ -178,11 +179,8 @@ class Sinusoid(Effect):
 
     def columns(self, s: Stimulus) -> Floats:
         at_s, shares = s.about
-        sin, cos = _parts(s, (shares * self._wave(s, at_s)).sum(axis=1))
-        columns = np.zeros((len(s), 3, 6))
-        for i in range(3):
-            columns[:, i, 2 * i], columns[:, i, 2 * i + 1] = sin, cos
-        return columns
+        parts = np.stack(_parts(s, (shares * self._wave(s, at_s)).sum(axis=1)), axis=1)
+        return of_each(np.repeat(parts[:, None], 3, axis=1))
 
     def derivative(self, s: Stimulus, coefficients: Floats) -> Floats:
         """A_i and B_i times the changes of sine and cosine per unit of ln f: d(e^(i d)) = 2 pi i f t e^(i d)."""
@@ -257,11 +255,7 @@ class Magnetic(Effect):
         return [np.kron(np.eye(3), [[np.cos(a)], [np.sin(a)]]).astype(float) for a in directions]
 
     def columns(self, s: Stimulus) -> Floats:
-        columns = np.zeros((len(s), 3, 6))
-        along = np.stack([s.to_platform(axis) for axis in s.level_axes], axis=2)  # (m, 3, 2)
-        for i in range(3):
-            columns[:, i, 2 * i : 2 * i + 2] = np.einsum("x,mxk->mk", s.axes[i], along)
-        return columns
+        return of_each(s.axes @ np.stack([s.to_platform(axis) for axis in s.level_axes], axis=2))
 
 
 IEEE = "IEEE Std 1293, environmental sensitivities"
@@ -338,11 +332,7 @@ class ThermalMisalignment(Effect):
     symbols, unit, scale = tuple(f"gamma{axis}{i}" for i in (1, 2, 3) for axis in "PO"), "rad/K", 1e-5
 
     def columns(self, s: Stimulus) -> Floats:
-        columns = np.zeros((len(s), 3, 6))
-        for i in range(3):
-            columns[:, i, 2 * i] = s.warmth * s.pendulous[:, i]
-            columns[:, i, 2 * i + 1] = s.warmth * s.output[:, i]
-        return columns
+        return of_each(s.warmth[:, None, None] * np.stack([s.pendulous, s.output], axis=2))
 
 
 class ThermalLag(SensorEffect):

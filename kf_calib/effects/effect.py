@@ -312,9 +312,7 @@ class SensorEffect(Effect):
     def terms(self, s: Stimulus) -> Floats: ...
 
     def columns(self, s: Stimulus) -> Floats:
-        out = np.zeros((len(s), 3, 3))
-        out[:, range(3), range(3)] = self.terms(s)
-        return out
+        return of_each(np.broadcast_to(self.terms(s), (len(s), 3))[:, :, None])
 
     def added(self, s: Stimulus, coefficients: Floats) -> Floats:
         return self.terms(s) * coefficients
@@ -326,6 +324,14 @@ def _of_one_kind(
 ) -> tuple[Coefficient, ...]:
     """Return coefficients of one unit and scale."""
     return tuple(Coefficient(symbol, unit, scale, *shown) for symbol in symbols)
+
+
+def of_each(terms: Floats) -> Floats:
+    """Columns (m, 3, 3 k) of coefficients of which each accelerometer has k for itself: what it reads more per unit of
+    its own is ``terms`` (m, 3, k)."""
+    columns = np.zeros((len(terms), 3, *terms.shape[1:]))
+    columns[:, range(3), range(3)] = terms
+    return columns.reshape(len(terms), 3, -1)
 
 
 class FrameEffect(Effect):

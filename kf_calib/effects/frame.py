@@ -10,7 +10,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
-from kf_calib.effects.effect import Bearer, Effect, FrameEffect, Regressor, Typical
+from kf_calib.effects.effect import Bearer, Effect, FrameEffect, Regressor, Typical, of_each
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.errors import InputError
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
@@ -119,10 +119,7 @@ class CrossTalk(Effect):
     symbols, unit, scale = ("X12", "X13", "X21", "X23", "X31", "X32"), "1", 1e-3
 
     def columns(self, s: Stimulus) -> Floats:
-        readings, columns = s.force_mps2 @ s.sensitivity.T, np.zeros((len(s), 3, 6))
-        for k, (i, j) in enumerate((i, j) for i in range(3) for j in range(3) if i != j):
-            columns[:, i, k] = readings[:, j]
-        return columns
+        return of_each((s.force_mps2 @ s.sensitivity.T)[:, [[1, 2], [0, 2], [0, 1]]])
 
     def degeneracy(self, bench: Bench) -> str:
         return "at rest, cross-talk is exactly a misalignment: no orientation tells the two apart"
@@ -284,11 +281,9 @@ class LeverArm(Effect):
     unit, scale, shown = "m", 0.1, ("mm", 1e3)
 
     def columns(self, s: Stimulus) -> Floats:
-        columns, turning = np.zeros((len(s), 3, 9)), _cross(s.rate_radps)
+        turning = _cross(s.rate_radps)
         per_metre = turning @ turning + _cross(s.rate_change_radps2)  # what it does to r, (m, 3, 3)
-        for i in range(3):
-            columns[:, i, 3 * i : 3 * i + 3] = s.sensitivity[i] @ per_metre
-        return columns
+        return of_each(s.sensitivity @ per_metre)
 
 
 def _cross(vector: Floats) -> Floats:

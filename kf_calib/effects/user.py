@@ -63,7 +63,7 @@ def classes_in(source: bytes, path: Path) -> list[type[Effect]]:
     except (Exception, SystemExit) as error:
         del sys.modules[module.__name__]
         raise InputError(
-            f"{path}{_line(error, path)}: cannot be run ({checks.error_words(error)}): mend it there."
+            f"{path}{checks.line_in(error, str(path))}: cannot be run ({checks.error_words(error)}): mend it there."
         ) from None
     classes = effect_classes(module)
     if not classes:
@@ -72,17 +72,6 @@ def classes_in(source: bytes, path: Path) -> list[type[Effect]]:
             "(from kf_calib.effects import SensorEffect)."
         )
     return classes
-
-
-def _line(error: BaseException, path: Path) -> str:
-    """The last line of the file that an error passed through, as ``, line N``."""
-    if isinstance(error, SyntaxError) and error.filename == str(path):
-        return f", line {error.lineno}"
-    trace, line = error.__traceback__, None
-    while trace is not None:
-        line = trace.tb_lineno if trace.tb_frame.f_code.co_filename == str(path) else line
-        trace = trace.tb_next
-    return f", line {line}" if line else ""
 
 
 def effect_classes(module: ModuleType) -> list[type[Effect]]:
