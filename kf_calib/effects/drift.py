@@ -274,9 +274,6 @@ class ThermalBias(SensorEffect):
     symbol, unit, scale = "alpha", "m/s^2/K", 1e-3
     typical = Typical((5 * MICRO_G, 30 * MICRO_G), (0.15 * MILLI_G, 1 * MILLI_G))
 
-    def terms(self, s: Stimulus) -> Floats:
-        return np.repeat(s.warmth[:, None], 3, axis=1)
-
 
 class ThermalBias2(SensorEffect):
     """alpha_2 T^2."""
@@ -286,9 +283,6 @@ class ThermalBias2(SensorEffect):
     drawn_against = _TEMPERATURE
     formulas = ("T**2",)
     symbol, unit, scale = "alpha2_", "m/s^2/K^2", 1e-4
-
-    def terms(self, s: Stimulus) -> Floats:
-        return np.repeat(s.warmth[:, None] ** 2, 3, axis=1)
 
 
 class ThermalScale(SensorEffect):
@@ -302,9 +296,6 @@ class ThermalScale(SensorEffect):
     confused_with = "needs both signs of the input at two temperatures"
     symbol, unit, scale = "alphaS", "1/K", 1e-4
     typical = Typical((50e-6, 150e-6))
-
-    def terms(self, s: Stimulus) -> Floats:
-        return s.warmth[:, None] * s.along
 
 
 class ThermalRate(SensorEffect):

@@ -11,7 +11,7 @@ import copy
 import functools
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import ClassVar, Literal, Self
@@ -20,6 +20,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
+from kf_calib.effects.expression import Expression
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2, field_unit
 
@@ -193,7 +194,8 @@ class Effect(ABC):
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
         """Its coefficients: ``symbols``, all of one unit and scale."""
-        return _of_one_kind(self.symbols, self.unit, self.scale, self.shown or field_unit(self.unit))
+        shown = self.shown or field_unit(self.unit)
+        return tuple(Coefficient(symbol, self.unit, self.scale, *shown) for symbol in self.symbols)
 
     @abstractmethod
     def columns(self, s: Stimulus) -> Floats:
@@ -291,7 +293,8 @@ class Effect(ABC):
 
 
 class SensorEffect(Effect):
-    """One coefficient for each accelerometer; ``terms`` (m, 3) is what each reads more per unit of its own.
+    """One coefficient for each accelerometer; ``terms`` (m, 3) is what each reads more per unit of its own: that is its
+    formula, unless a class computes it.
 
     symbol: of the coefficients, before the number of the accelerometer.
     on_data_sheet: words for it on a data sheet; empty where it is on none. in_polynomial: whether it is estimated there
@@ -304,12 +307,13 @@ class SensorEffect(Effect):
     symbol: ClassVar[str]
 
     @property
-    def symbols(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The symbol of each accelerometer's coefficient."""
-        return tuple(f"{self.symbol}{i}" for i in (1, 2, 3))
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return _one_each(self.symbol, self.unit, self.scale, self.shown or field_unit(self.unit))
 
-    @abstractmethod
-    def terms(self, s: Stimulus) -> Floats: ...
+    def terms(self, s: Stimulus) -> Floats:
+        formula = own_formula(self.formulas[0])
+        values = {name: _OWN_QUANTITIES[name](self, s) for name in formula.names}
+        return np.broadcast_to(formula(values), (len(s), 3))
 
     def columns(self, s: Stimulus) -> Floats:
         return of_each(np.broadcast_to(self.terms(s), (len(s), 3))[:, :, None])
@@ -318,12 +322,22 @@ class SensorEffect(Effect):
         return self.terms(s) * coefficients
 
 
+_OWN_QUANTITIES: dict[str, Callable[[Effect, Stimulus], Floats | float]] = {
+    "a": lambda effect, s: s.along, "p": lambda effect, s: s.pendulous, "o": lambda effect, s: s.output,
+    "T": lambda effect, s: s.warmth[:, None], "constant": lambda effect, s: effect.value,
+}  # fmt: skip
+
+
+@functools.cache
+def own_formula(text: str) -> Expression:
+    """One of the ``formulas`` of an effect."""
+    return Expression(text, dict.fromkeys((*_OWN_QUANTITIES, "before", "after"), ""))
+
+
 @functools.lru_cache(maxsize=512)
-def _of_one_kind(
-    symbols: tuple[str, ...], unit: str, scale: float, shown: tuple[str, float]
-) -> tuple[Coefficient, ...]:
-    """Return coefficients of one unit and scale."""
-    return tuple(Coefficient(symbol, unit, scale, *shown) for symbol in symbols)
+def _one_each(symbol: str, unit: str, scale: float, shown: tuple[str, float]) -> tuple[Coefficient, ...]:
+    """Return a coefficient for each accelerometer."""
+    return tuple(Coefficient(f"{symbol}{i}", unit, scale, *shown) for i in (1, 2, 3))
 
 
 def of_each(terms: Floats) -> Floats:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats, sign
+from kf_calib.bench.arrays import Floats
 from kf_calib.effects.effect import MICRO_G, MICRO_PER_G, MILLI_PER_G, Bearer, Regressor, SensorEffect, Typical, Unknown
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
@@ -28,9 +28,6 @@ class BiasAsymmetry(_Nonlinearity):
     symbol, unit, scale = "K0'", "m/s^2", 1e-3
     typical = Typical((1 * MICRO_G, 10 * MICRO_G))
 
-    def terms(self, s: Stimulus) -> Floats:
-        return 0.5 * sign(s.along)
-
 
 class ScaleAsymmetry(_Nonlinearity):
     """1/2 K1' |a_i|."""
@@ -42,9 +39,6 @@ class ScaleAsymmetry(_Nonlinearity):
     symbol, unit, scale = "K1'", "1", 1e-3
     typical = Typical((1e-6, 30e-6), (0.1e-3, 1e-3))
 
-    def terms(self, s: Stimulus) -> Floats:
-        return 0.5 * np.abs(s.along)
-
 
 class SecondOrder(_Nonlinearity):
     """K2 a_i^2."""
@@ -55,9 +49,6 @@ class SecondOrder(_Nonlinearity):
     confused_with = "scale-asymmetry"
     symbol, unit, scale = "K2_", "s^2/m", 1e-4
     typical = Typical((1 * MICRO_PER_G, 20 * MICRO_PER_G), (0.1 * MILLI_PER_G, 3 * MILLI_PER_G))
-
-    def terms(self, s: Stimulus) -> Floats:
-        return s.along**2
 
 
 class ThirdOrder(_Nonlinearity):
@@ -73,9 +64,6 @@ class ThirdOrder(_Nonlinearity):
         (0.0, 5 * MILLI_PER_G / STANDARD_GRAVITY_MPS2),
     )
 
-    def terms(self, s: Stimulus) -> Floats:
-        return s.along**3
-
     def added(self, s: Stimulus, coefficients: Floats) -> Floats:
         return coefficients * s.along * s.along * s.along  # ten times as fast as the power
 
@@ -89,9 +77,6 @@ class OddQuadratic(_Nonlinearity):
     confused_with = "third-order; invisible in six faces"
     symbol, unit, scale = "Koq", "s^2/m", 1e-4
     typical = Typical((1 * MICRO_PER_G, 10 * MICRO_PER_G), (0.0, MILLI_PER_G))
-
-    def terms(self, s: Stimulus) -> Floats:
-        return s.along * np.abs(s.along)
 
 
 class _CrossCoupling(SensorEffect):
@@ -109,9 +94,6 @@ class CrossCouplingIP(_CrossCoupling):
     drawn_against = Regressor("a*p", "force along the input axis times that along the pendulous axis", "m^2/s^4")
     formulas = ("a*p",)
 
-    def terms(self, s: Stimulus) -> Floats:
-        return s.along * s.pendulous
-
 
 class CrossCouplingIO(_CrossCoupling):
     """Kio a_i a_o."""
@@ -121,9 +103,6 @@ class CrossCouplingIO(_CrossCoupling):
     drawn_against = Regressor("a*o", "force along the input axis times that along the output axis", "m^2/s^4")
     formulas = ("a*o",)
 
-    def terms(self, s: Stimulus) -> Floats:
-        return s.along * s.output
-
 
 class CrossCouplingPO(_CrossCoupling):
     """Kpo a_p a_o."""
@@ -132,9 +111,6 @@ class CrossCouplingPO(_CrossCoupling):
     on_data_sheet, in_polynomial = "coupling p × o", True
     drawn_against = Regressor("p*o", "force along the pendulous axis times that along the output axis", "m^2/s^4")
     formulas = ("p*o",)
-
-    def terms(self, s: Stimulus) -> Floats:
-        return s.pendulous * s.output
 
 
 class CrossAxisSquare(_CrossCoupling):
@@ -147,9 +123,6 @@ class CrossAxisSquare(_CrossCoupling):
     confused_with = "second-order, output-square, bias"
     typical = Typical((1 * MICRO_PER_G, 20 * MICRO_PER_G), (0.0, MILLI_PER_G))
 
-    def terms(self, s: Stimulus) -> Floats:
-        return s.pendulous**2
-
 
 class OutputSquare(_CrossCoupling):
     """Koo a_o^2; beside K2, Kpp and a bias it is redundant, because the squares sum to g^2, alone it is not."""
@@ -160,9 +133,6 @@ class OutputSquare(_CrossCoupling):
     formulas = ("o**2",)
     confused_with = "second-order and cross-axis-square together"
     typical = Typical((1 * MICRO_PER_G, 10 * MICRO_PER_G), (0.0, MILLI_PER_G))
-
-    def terms(self, s: Stimulus) -> Floats:
-        return s.output**2
 
 
 class VibrationRectification(SensorEffect):
@@ -192,9 +162,6 @@ class DeadZone(_Nonlinearity):
     unknown = Unknown("dZone", "m/s^2", 1e-6, 1e-2)
     smooth = False
     value = 1e-4
-
-    def terms(self, s: Stimulus) -> Floats:
-        return np.where(np.abs(s.along) < self.value, -s.along, 0.0)
 
     def edges(self, s: Stimulus) -> Floats:
         """At every input, or every so many: a pose that moves a little has one at each node."""

@@ -90,7 +90,9 @@ def completed(kind: type[Effect], origin: str) -> type[Effect]:
     """The class with what it left out; raises InputError where that cannot be filled in."""
     who = f"class {kind.__name__} of {origin}"
     missing = sorted(getattr(kind, "__abstractmethods__", ()))
-    if kind.coefficients is Effect.coefficients and not hasattr(kind, "symbols"):
+    if issubclass(kind, SensorEffect):
+        missing += ["terms"] if kind.terms is SensorEffect.terms and not kind.formulas else []
+    elif kind.coefficients is Effect.coefficients and not hasattr(kind, "symbols"):
         missing = ["coefficients", *missing]
     if missing:
         raise InputError(f"{who} lacks {' and '.join(missing)}: define {'it' if len(missing) == 1 else 'them'}.")

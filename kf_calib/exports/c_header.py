@@ -20,12 +20,12 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.effects import Effect
+from kf_calib.effects.effect import own_formula
 from kf_calib.effects.expression import FUNCTIONS, OPERATORS, Expression, numbers_stay
 from kf_calib.effects.formula import Formula, quantities
 from kf_calib.errors import InputError
 from kf_calib.exports.target import Target, in_comment
 
-_OWN_NAMES = ("a", "p", "o", "T", "constant", "before", "after")
 _SIZES = (1e-8, 1e-5, 1e-3, 1.0, 2.0)
 """Of specific force, in g: so that the rounds are enough in a dead zone, too."""
 
@@ -121,7 +121,7 @@ class CHeader(Target):
         if not effect.formulas:
             raise InputError(f"{effect} is a class in Python, which cannot be written in C: use kf-calib apply, or "
                              f"write the effect as a formula (--with 'my-{effect} = ...').")  # fmt: skip
-        return [Expression(text, dict.fromkeys(_OWN_NAMES, "")) for text in effect.formulas]
+        return [own_formula(text) for text in effect.formulas]
 
     def _rounds(self) -> int:
         """How often the correction has to be repeated, wherever the specific force points."""
