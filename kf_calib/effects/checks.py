@@ -14,7 +14,8 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, axes_of, turned
-from kf_calib.effects.effect import Effect, FrameEffect
+from kf_calib.effects.effect import Effect
+from kf_calib.effects.frame import FrameEffect
 from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C, Stimulus
 from kf_calib.errors import InputError
 

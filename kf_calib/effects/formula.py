@@ -37,9 +37,9 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, Vector
 from kf_calib.effects import checks
-from kf_calib.effects.effect import Bearer, FrameEffect, SensorEffect
+from kf_calib.effects.effect import Bearer, SensorEffect
 from kf_calib.effects.expression import Expression
-from kf_calib.effects.frame import gimbal_number
+from kf_calib.effects.frame import FrameEffect, gimbal_number
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.errors import InputError
 
@@ -88,21 +88,6 @@ QUANTITIES: dict[str, FormulaQuantity] = {
 }
 
 
-def _angle(s: Stimulus, gimbal: int) -> Floats:
-    """Return the angle of a gimbal (m, 1), rad."""
-    return s.pose[:, gimbal : gimbal + 1]
-
-
-def _angle_before(s: Stimulus, gimbal: int) -> Floats:
-    """Return the same in the dwell before."""
-    return s.previous_pose[:, gimbal : gimbal + 1]
-
-
-def _move(s: Stimulus, gimbal: int) -> Floats:
-    """Return the last move of a gimbal (m, 1), rad; 0 where it stood still."""
-    return s.move(gimbal)[:, None]
-
-
 def gimbal_letters(axes: tuple[Vector, ...]) -> str:
     """A letter for each gimbal: its axis, or ? where it is none of x, y, z."""
     return "".join(
@@ -115,15 +100,15 @@ def quantities(axes: tuple[Vector, ...]) -> dict[str, FormulaQuantity]:
     """Everything a formula may name on a bench with these gimbal axes."""
     letters, named = gimbal_letters(axes), dict(QUANTITIES)
     for k, letter in enumerate(letters):
-        angle = FormulaQuantity("rad", f"angle of gimbal {k + 1}", partial(_angle, gimbal=k))
-        names = [f"q{k + 1}", *([f"q_{letter}"] if letter != "?" and letters.count(letter) == 1 else [])]
+        angle, number = f"angle of gimbal {k + 1}", f"q{k + 1}"
+        names = [number, *([f"q_{letter}"] if letter != "?" and letters.count(letter) == 1 else [])]
         names += ["outer"] * (k == 0) + ["inner"] * (k == len(letters) - 1)
-        named |= dict.fromkeys(names, angle)
-        named[f"q{k + 1}_before"] = FormulaQuantity(
-            "rad", f"angle of gimbal {k + 1} in the dwell before", partial(_angle_before, gimbal=k)
+        named |= dict.fromkeys(names, FormulaQuantity("rad", angle, lambda s, k=k: s.pose[:, [k]]))
+        named[f"{number}_before"] = FormulaQuantity(
+            "rad", f"{angle} in the dwell before", lambda s, k=k: s.previous_pose[:, [k]]
         )
-        named[f"q{k + 1}_move"] = FormulaQuantity(
-            "rad", f"last move of gimbal {k + 1}, 0 where it stood still", partial(_move, gimbal=k)
+        named[f"{number}_move"] = FormulaQuantity(
+            "rad", f"last move of gimbal {k + 1}, 0 where it stood still", lambda s, k=k: s.move(k)[:, None]
         )
     return named
 

@@ -5,15 +5,79 @@ only while the platform turns: the time a reading was taken, and where each acce
 from __future__ import annotations
 
 import re
+from abc import abstractmethod
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
-from kf_calib.effects.effect import Bearer, Effect, FrameEffect, Regressor, Typical, of_each
+from kf_calib.effects.effect import Bearer, Effect, Regressor, Typical, of_each
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.errors import InputError
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
+
+
+class FrameEffect(Effect):
+    """The platform stands otherwise than its angles say; ``rotations`` (m, q, 3), rad per unit, in the platform frame.
+
+    A rotation vector rho changes the specific force f to exp([rho]) f. About a force that is turned by ``turned_rad``
+    already, a little more of each coefficient turns it by J(rho) alpha x f, J the left Jacobian of rotations, and
+    reading i changes by s_i times that. Where no angles are used, nothing is said of how the platform stands, and it
+    has no columns.
+    gimbal: number from 0 of the one whose angle is wrong; None of any other error, which may turn about any axis.
+    """
+
+    borne_by = Bearer.BENCH
+    gimbal: int | None = None
+
+    def shows_in(self, s: Stimulus) -> bool:
+        return s.bench.angles and super().shows_in(s)
+
+    @abstractmethod
+    def rotations(self, s: Stimulus) -> Floats: ...
+
+    def about(self, s: Stimulus) -> Floats:
+        """The axis (m, 3), of unit length, about which an error of its gimbal's angle turns the specific force."""
+        assert self.gimbal is not None
+        return -s.inner(np.array(s.bench.axes[self.gimbal]), self.gimbal)
+
+    def turned_rad(self, s: Stimulus, coefficients: Floats) -> Floats:
+        """The rotation vector (m, 3) with these ``coefficients`` (q,), rad."""
+        return np.einsum("mqx,q->mx", self.rotations(s), coefficients)
+
+    def added(self, s: Stimulus, coefficients: Floats) -> Floats:
+        rho = self.turned_rad(s, coefficients)
+        change = _left_jacobian(rho, np.cross(rho, s.force_mps2)[:, None])[:, 0]  # J(rho) rho x f = exp([rho]) f - f
+        return change @ s.sensitivity.T if self.shows_in(s) else np.zeros((len(s), 3))
+
+    def columns(self, s: Stimulus) -> Floats:
+        rotations = _turned_along(s.attitude_rad, _left_jacobian(s.turned_rad, self.rotations(s)))
+        turned = np.cross(rotations, s.force_mps2[:, None, :])
+        return np.einsum("mqx,ix->miq", turned, s.sensitivity)
+
+
+def _turned_along(alpha: Floats, vectors: Floats) -> Floats:
+    """Vectors v (m, q, 3) turned by small rotation vectors alpha (m, 3) or (1, 3), to their square."""
+    if not alpha.any():
+        return vectors
+    once = np.cross(alpha[:, None, :], vectors)
+    return vectors + once + 0.5 * np.cross(alpha[:, None, :], once)
+
+
+def _left_jacobian(rho: Floats, vectors: Floats) -> Floats:
+    """J(rho) v of vectors v (m, q, 3) and rotation vectors rho (m, 3) or (1, 3) of length r, by series to r^4.
+
+      J = 1 + (1 - cos r) / r^2 [rho] + (r - sin r) / r^3 [rho]^2, the mean of exp(t [rho]) over 0 < t < 1
+
+    exp([rho + d]) = exp([J(rho) d]) exp([rho]) for small d (J. Sola et al., 2018).
+    """
+    if not rho.any():
+        return vectors
+    squares = np.sum(rho**2, axis=1)[:, None, None]
+    once = np.cross(rho[:, None, :], vectors)
+    twice = np.cross(rho[:, None, :], once)
+    first, second = 1 / 2 - squares / 24 + squares**2 / 720, 1 / 6 - squares / 120 + squares**2 / 5040
+    return vectors + first * once + second * twice
 
 
 class BaseTilt(FrameEffect):

@@ -32,8 +32,9 @@ from pathlib import Path
 from types import ModuleType
 
 from kf_calib.effects import checks
-from kf_calib.effects.effect import Bearer, Effect, FrameEffect, SensorEffect
+from kf_calib.effects.effect import Bearer, Effect, SensorEffect
 from kf_calib.effects.formula import NAME_RULE, is_name, symbol_stem
+from kf_calib.effects.frame import FrameEffect
 from kf_calib.errors import InputError
 
 TWELVE = frozenset(f"{stem}{i}" for stem in ("theta", "phi", "nu", "K", "b") for i in (1, 2, 3))

@@ -292,9 +292,7 @@ def weeks_of(rows: Sequence[Mapping[str, Any]]) -> Weeks:
     dated = [(when.date() - timedelta(days=when.weekday()), verdict) for when, verdict in verdicts]
     mondays = sorted({monday for monday, _ in dated})
     count = (mondays[-1] - mondays[0]).days // 7 + 1 if mondays else 0
-    begins = [mondays[0] + timedelta(weeks=k) for k in range(count)]
-    counts = dict[str, list[int]]()
-    for monday, verdict in dated:
-        counts.setdefault(verdict, [0] * count)[(monday - mondays[0]).days // 7] += 1
-    ordered = sorted(counts.items(), key=lambda item: -sum(item[1]))
-    return Weeks(tuple(begins), {name: tuple(own) for name, own in ordered}, len(rows) - len(dated))
+    begins = tuple(mondays[0] + timedelta(weeks=k) for k in range(count))
+    counts, whole = Counter(dated), Counter(verdict for _, verdict in dated)
+    of_each = {verdict: tuple(counts[monday, verdict] for monday in begins) for verdict, _ in whole.most_common()}
+    return Weeks(begins, of_each, len(rows) - len(dated))
