@@ -111,10 +111,9 @@ def candidate_effects(model: Model) -> list[Effect]:
     return [effect for effect in tried if effect.scannable]
 
 
-def run_factor(
-    fitted: Fit, run: str = "", unit: str | None = None, bench: str | None = None, date: str | None = None
-) -> RunFactor:
-    """The reduced factor of a fit: its model and, where angles are known, all effects of the catalogue."""
+def run_factor(fitted: Fit) -> RunFactor:
+    """The reduced factor of a fit: its model and, where angles are known, all effects of the catalogue. Of which run it
+    is, the fit does not know."""
     linearised = fitted.linearised
     model, state, folded = linearised.model, linearised.state, linearised.dwells.folded
     added = candidate_effects(model) if model.bench.angles else []
@@ -127,7 +126,7 @@ def run_factor(
     kept = [k for k in range(len(upper)) if k not in model.fixed]
     inside = [*STATES, *_names(model.effects, states=True)]
     return RunFactor(
-        run, unit, bench, date,
+        "", None, None, None,
         columns=tuple(name for k, name in enumerate([*inside, *_names(added)]) if k not in model.fixed),
         width=model.count - len(model.fixed),
         factor=triangle(upper[:, kept]) if model.fixed else upper,
