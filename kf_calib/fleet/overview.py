@@ -214,12 +214,12 @@ def looks(
     rows: Sequence[Mapping[str, Any]], units: Sequence[str], tracks: Sequence[Track], pooled: PooledDiagnosis | None
 ) -> tuple[AnotherLook, ...]:
     """The units that need another look, first those that need it most."""
+    every = [*_of_runs(rows), *_of_parameters(units, tracks), *_of_effects(pooled)]
     reasons = dict[str, list[tuple[float, str]]]()
-    for unit, chance, said in [*_of_runs(rows), *_of_parameters(units, tracks), *_of_effects(pooled)]:
+    for unit, chance, said in sorted(every, key=lambda reason: reason[1]):
         if chance < _LEVEL:
             reasons.setdefault(unit, []).append((chance, said))
-    ordered = {unit: sorted(own, key=lambda each: each[0]) for unit, own in reasons.items()}
-    found = [AnotherLook(unit, own[0][0], tuple(said for _, said in own)) for unit, own in ordered.items()]
+    found = [AnotherLook(unit, own[0][0], tuple(said for _, said in own)) for unit, own in reasons.items()]
     return tuple(sorted(found, key=lambda look: (look.chance, -len(look.reasons), look.unit)))
 
 

@@ -84,13 +84,10 @@ class UnitsAndCommon:
     def joined(cls, parts: Sequence[UnitsAndCommon]) -> UnitsAndCommon:
         """All of several parts."""
         units = [unit for part in parts for unit in part.of_units.units]
-        info, score = (
-            np.concatenate(each) for each in zip(*((p.of_units.info, p.of_units.score) for p in parts), strict=True)
-        )
+        arrays = zip(*((part.of_units.info, part.of_units.score, part.across) for part in parts), strict=True)
+        info, score, across = map(np.concatenate, arrays)
         common = sum((part.common for part in parts[1:]), parts[0].common)
-        return cls(
-            UnitInformation(units, info, score), np.concatenate([p.across for p in parts]), common, parts[0].prior
-        )
+        return cls(UnitInformation(units, info, score), across, common, parts[0].prior)
 
     def by_unit(self) -> UnitsAndCommon:
         """With one entry for each unit, where a repair of the bench or another bench has parted its runs."""

@@ -233,27 +233,21 @@ def bench_model(diagnosis: PooledDiagnosis, bench: str) -> BenchModel:
     """
     if bench not in diagnosis.benches:
         raise InputError(f"no run is of the bench {bench!r}: name one of {', '.join(map(repr, diagnosis.benches))}.")
-    terms = list[BenchTerm]()
-    for finding in diagnosis.findings:
-        coefficients = [each for each in finding.benches if each.bench == bench]
-        if coefficients and (term := _term(finding.effect, coefficients[-1])).symbols:
-            terms.append(term)
-    if not terms:
+    if bench not in (models := bench_models(diagnosis)):
         raise InputError(
             f"no error of the bench {bench!r} was found in {diagnosis.runs} runs, so there is none to save."
         )
-    return BenchModel(tuple(terms), bench, diagnosis.runs)
+    return models[bench]
 
 
 def bench_models(diagnosis: PooledDiagnosis) -> dict[str, BenchModel]:
-    """The bench model of each bench that has errors which the runs determine, by its name."""
-    with_values = {
-        each.bench
-        for finding in diagnosis.findings
-        for each in finding.benches
-        if any(own.value is not None for own in each.coefficients)
-    }
-    return {bench: bench_model(diagnosis, bench) for bench in diagnosis.benches if bench in with_values}
+    """The bench model of each bench that has errors which its last runs determine, by its name."""
+    terms = {bench: list[BenchTerm]() for bench in diagnosis.benches}
+    for finding in diagnosis.findings:
+        for bench, estimate in {each.bench: each for each in finding.benches}.items():  # the last of each bench
+            if (term := _term(finding.effect, estimate)).symbols:
+                terms[bench].append(term)
+    return {bench: BenchModel(tuple(own), bench, diagnosis.runs) for bench, own in terms.items() if own}
 
 
 def _term(effect: str, estimate: BenchCoefficients) -> BenchTerm:
