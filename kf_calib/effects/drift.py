@@ -37,12 +37,10 @@ class BiasDrift(SensorEffect):
     name, title, source = "bias-drift", "bias that drifts with time", "IEEE Std 1293, drift"
     on_data_sheet = "bias drift"
     drawn_against = _TIME
+    formulas = ("t",)
     confused_with = "warm-up; a monotone order of poses mixes it with angle"
     symbol, unit, scale = "beta", "m/s^3", 1e-6
     typical = Typical((1 * MICRO_G / 3600, 10 * MICRO_G / 3600), (10 * MICRO_G / 60, MILLI_G / 60))
-
-    def terms(self, s: Stimulus) -> Floats:
-        return np.repeat(s.elapsed_s[:, None], 3, axis=1)
 
 
 class ScaleDrift(SensorEffect):
@@ -52,12 +50,10 @@ class ScaleDrift(SensorEffect):
     name, title, source = "scale-drift", "scale factor that drifts with time", "IEEE Std 1293, drift"
     on_data_sheet = "scale drift"
     drawn_against = Regressor("t*a", "time times force along the input axis", "m/s")
+    formulas = ("t*a",)
     confused_with = "base-tilt-drift"
     symbol, unit, scale = "kappa", "1/s", 1e-7
     typical = Typical((1e-6 / 86400, 10e-6 / 86400), (0.0, 1e-2 / 3600))  # a chip that warms by 20 K, at 0.05 %/K
-
-    def terms(self, s: Stimulus) -> Floats:
-        return s.elapsed_s[:, None] * s.along
 
 
 class Hysteresis(SensorEffect):
@@ -90,13 +86,11 @@ class WarmUp(_Decay):
     family = "bias in time"
     name, title, source = "warm-up", "bias that settles after switching on", "IEEE Std 1293, turn-on transient"
     drawn_against = _TIME
+    formulas = ("exp(-t/constant)",)
     confused_with = "bias-drift; needs an early long dwell"
     symbol, unit, scale = "B", "m/s^2", 1e-2
     unknown = Unknown("tauWarm", "s", 5.0, 10800.0, "min", 1.0 / 60.0)
     typical = Typical((10 * MICRO_G, 200 * MICRO_G), (1 * MILLI_G, 10 * MILLI_G))
-
-    def terms(self, s: Stimulus) -> Floats:
-        return np.repeat(np.exp(-s.elapsed_s / self.value)[:, None], 3, axis=1)
 
     def acts_for_s(self, s: Stimulus) -> float:
         return s.span_s
@@ -108,14 +102,12 @@ class ScaleWarmUp(WarmUp):
     family = "scale in time"
     name, title = "scale-warm-up", "scale factor that settles after switching on"
     drawn_against = Regressor("", "force along the input axis, fading with the warm-up", "m/s^2")
+    formulas = ("exp(-t/constant)*a",)
     confused_with = "scale-drift, warm-up; needs early orientations of both signs"
     symbol, unit, scale = "S", "1", 1e-3
     unknown = Unknown("tauScale", "s", 5.0, 10800.0, "min", 1.0 / 60.0)
     typical = Typical((1e-6, 100e-6), (0.1e-3, 10e-3))
     prior = 0.25  # in a run that is short beside its time constant it is a scale-drift, and cannot be told from it
-
-    def terms(self, s: Stimulus) -> Floats:
-        return super().terms(s) * s.along
 
 
 class Settling(_Decay):
@@ -124,13 +116,11 @@ class Settling(_Decay):
     family = "memory"
     name, title, source = "settling", "creep after a change of the input", "IEEE Std 1293, settling"
     drawn_against = _STEP
+    formulas = ("da*exp(-tau/constant)",)
     confused_with = "shows in early against late samples of a dwell"
     symbol, unit, scale = "C", "1", 1e-3
     unknown = Unknown("tauSettle", "s", 3.0, 600.0, "s", 1.0)
     typical = Typical((1e-6, 30e-6))
-
-    def terms(self, s: Stimulus) -> Floats:
-        return s.step * np.exp(-s.since_arrival_s / self.value)[:, None]
 
     def acts_for_s(self, s: Stimulus) -> float:
         return float(s.since_arrival_s.max())
@@ -304,12 +294,10 @@ class ThermalRate(SensorEffect):
     family = "temperature"
     name, title, source = "thermal-rate", "bias that follows the rate of the temperature", IEEE
     drawn_against = Regressor("dT")
+    formulas = ("dT",)
     confused_with = "warm-up"
     symbol, unit, scale = "kappaT", "m s^-1/K", 1e-1
     typical = Typical((1 * 60 * MICRO_G, 50 * 60 * MICRO_G))
-
-    def terms(self, s: Stimulus) -> Floats:
-        return np.repeat(s.warming[:, None], 3, axis=1)
 
 
 class ThermalMisalignment(Effect):

@@ -11,7 +11,7 @@ import copy
 import functools
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import ClassVar, Literal, Self
@@ -21,6 +21,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.effects.expression import Expression
+from kf_calib.effects.quantities import QUANTITIES
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2, field_unit
 
@@ -133,9 +134,9 @@ class Effect(ABC):
     ``columns`` gives the part that the stimulus asks for (``Stimulus.part``).
     averages: vibration goes with it, so readings are averaged over windows first, and their variance in these is known.
     step: of ln(value) in the differences of ``derivative``.
-    formulas: what an accelerometer reads more per unit of each coefficient that it has, where that depends on specific
-    force and temperature alone: of a, p, o (along its axes), before, after (readings of the two other accelerometers,
-    in their order), T and the constant. Empty where it cannot be written so.
+    formulas: what an accelerometer reads more per unit of each coefficient that it has, of ``QUANTITIES``, ``before``
+    and ``after`` (readings of the two other accelerometers, in their order) and ``constant``. Empty where it cannot be
+    written so.
     typical: usual sizes of its coefficients. expected: the value that they have by nature, and how far they may be from
     it (sigma); None where nature does not say. family: the physical class to which it belongs.
     prior: how much likelier it is than another effect before anything is measured, 1 for most.
@@ -312,7 +313,7 @@ class SensorEffect(Effect):
 
     def terms(self, s: Stimulus) -> Floats:
         formula = own_formula(self.formulas[0])
-        values = {name: _OWN_QUANTITIES[name](self, s) for name in formula.names}
+        values = {name: self.value if name == "constant" else QUANTITIES[name].of(s) for name in formula.names}
         return np.broadcast_to(formula(values), (len(s), 3))
 
     def columns(self, s: Stimulus) -> Floats:
@@ -322,16 +323,10 @@ class SensorEffect(Effect):
         return self.terms(s) * coefficients
 
 
-_OWN_QUANTITIES: dict[str, Callable[[Effect, Stimulus], Floats | float]] = {
-    "a": lambda effect, s: s.along, "p": lambda effect, s: s.pendulous, "o": lambda effect, s: s.output,
-    "T": lambda effect, s: s.warmth[:, None], "constant": lambda effect, s: effect.value,
-}  # fmt: skip
-
-
 @functools.cache
 def own_formula(text: str) -> Expression:
     """One of the ``formulas`` of an effect."""
-    return Expression(text, dict.fromkeys((*_OWN_QUANTITIES, "before", "after"), ""))
+    return Expression(text, dict.fromkeys((*QUANTITIES, "constant", "before", "after"), ""))
 
 
 @functools.lru_cache(maxsize=512)
