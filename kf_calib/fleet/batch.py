@@ -219,7 +219,10 @@ class RunEvaluation:
 
     @classmethod
     def of(cls, reading: ReadingOptions, evaluation: EvaluationOptions, limit_s: float = LIMIT_S) -> Self:
-        """The evaluation with these options, of which the files are as they are now."""
+        """The evaluation with these options, of which the files are as they are now. Raises KfCalibError at once for
+        options that would fail in every run."""
+        evaluation.settings()
+        _ = reading.keys
         told = {key: _content(value) for key, value in sorted(values_of(reading, evaluation))}
         text = json.dumps(told | {"kf_calib": version("kf_calib")})
         return cls(reading, evaluation, hashlib.sha256(text.encode()).hexdigest(), limit_s)

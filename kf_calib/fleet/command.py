@@ -100,7 +100,6 @@ def fleet(
     if figures != FigureFiles():
         import kf_calib.views.figures  # noqa: F401
     wanted, reference = targets_of(options.targets), _reference(options.reference_unit)
-    _refuse_impossible(reading, evaluation)
     one_run = RunEvaluation.of(reading, evaluation, options.limit_s)
     done = _evaluated(one_run, runs_of(runs), output, options.workers, options.scheduler, as_json)
     table = Fleet(output)
@@ -131,8 +130,8 @@ def _reference(path: Path | None) -> ReferenceUnit | None:
     unit = saved.provenance.bench.get("block_serial")
     if not unit:
         raise InputError(f"{path} does not say of which unit it is: name one made from a run with a block_serial.")
-    own = {each.symbol: each for each in saved.parameters if each.symbol in ("K1", "K2", "K3")}
-    scale, sigma = ([getattr(each, part) for each in own.values()] for part in ("value", "sigma"))
+    own = [each for each in saved.parameters if each.symbol in ("K1", "K2", "K3")]
+    scale, sigma = ([getattr(each, part) for each in own] for part in ("value", "sigma"))
     if None in (*scale, *sigma):
         raise InputError(f"{path} does not determine all three scale factors: name one that does.")
     known = (scale[0], scale[1], scale[2]), (sigma[0], sigma[1], sigma[2])
@@ -148,12 +147,6 @@ def _deliver_bench_models(files: BenchModelFiles, outputs: Outputs, deliver: Del
         done = deliver.keep(path, files.write if path in files.models else Path.unlink)
         if done and not quiet:
             echo(said)
-
-
-def _refuse_impossible(reading: ReadingOptions, evaluation: EvaluationOptions) -> None:
-    """Refuse at once the options that would fail in every run."""
-    evaluation.settings()
-    _ = reading.keys
 
 
 def _evaluated(

@@ -229,8 +229,6 @@ class _Misfits:
         """Return the spread at which the misfit is this; 0 where it is smaller without any."""
         from scipy.optimize import brentq
 
-        if self._misfit(0.0) <= misfit:
-            return 0.0
         ends = math.log(_NARROW * _NARROW), math.log(_WIDE)
         if self._misfit(math.exp(ends[0])) <= misfit:
             return 0.0
