@@ -59,6 +59,7 @@ _AHEAD = 4
 _CONFIG = {
     "distributed.scheduler.allowed-failures": 2,  # so often may a run take its process with it and be tried again
     "distributed.scheduler.worker-saturation": 1.0,  # no run waits at a process that another one takes with it
+    "distributed.deploy.lost-worker-timeout": "1d",  # a process takes its time to begin again on a busy machine
     "distributed.worker.profile.enabled": False,  # looks a hundred times a second at what a worker does
     # Dask would have free memory of 64 kB given back at once, and arrays of 128 kB fetched from the system each time.
     "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 1 << 28,
@@ -219,8 +220,7 @@ class RunEvaluation:
 
     @classmethod
     def of(cls, reading: ReadingOptions, evaluation: EvaluationOptions, limit_s: float = LIMIT_S) -> Self:
-        """The evaluation with these options, of which the files are as they are now. Raises KfCalibError at once for
-        options that would fail in every run."""
+        """The evaluation with these options; raises KfCalibError where every run would fail with them."""
         evaluation.settings()
         _ = reading.keys
         told = {key: _content(value) for key, value in sorted(values_of(reading, evaluation))}

@@ -197,6 +197,23 @@ def test_a_run_that_ends_its_process_is_tried_again_and_stops_no_other(
     assert place.endswith("run-000001.mcap") and "the process that evaluated it was ended 3 times" in said
 
 
+@pytest.mark.slow
+def test_a_process_that_is_long_in_beginning_again_goes_on(
+    campaign: Path, store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on a busy machine: Dask gives one up after 15 s, and the run would wait for ever."""
+    late, run = tmp_path / "late", shutil.copytree(campaign, tmp_path / "runs")
+    (tmp_path / "sitecustomize.py").write_text(
+        f"import os, time\nif os.path.exists({str(late)!r}):\n    time.sleep(20.0)\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]))
+    (path,) = run.rglob("run-000002.mcap")
+    with batch.cluster(1) as client:
+        late.touch()
+        progress = evaluate_all(client, _Deadly.of(ReadingOptions(), EvaluationOptions()), runs_of([str(path)]), store)
+    assert (progress.evaluated, progress.failed) == (1, 0)
+
+
 @contextmanager
 def running(*words: str) -> Iterator[None]:
     """A process of its own, ended with the block."""
