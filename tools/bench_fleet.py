@@ -27,9 +27,10 @@ from typing import Any
 
 from kf_calib.cli.options import EvaluationOptions, ReadingOptions
 from kf_calib.fleet.batch import RunEvaluation, cluster, evaluate_all
-from kf_calib.fleet.command import SingleCommands
 from kf_calib.fleet.run_list import ListedRun, Row, runs_of
 from kf_calib.fleet.store import Store
+from kf_calib.views.diagnosis import diagnosis_object
+from kf_calib.views.json import replay_object
 
 
 @dataclass(frozen=True)
@@ -44,8 +45,7 @@ class HandedOver:
 
 
 def evaluation() -> RunEvaluation:
-    commands = SingleCommands(ReadingOptions(), EvaluationOptions())
-    return RunEvaluation(commands, commands.checksum)
+    return RunEvaluation.of(ReadingOptions(), EvaluationOptions())
 
 
 def cost_of_a_row(runs: Sequence[ListedRun]) -> dict[str, float]:
@@ -53,9 +53,8 @@ def cost_of_a_row(runs: Sequence[ListedRun]) -> dict[str, float]:
     how = evaluation()
 
     def alone(run: ListedRun) -> None:
-        source, result = how.commands.replay(Path(run.place))
-        found = how.commands.diagnose(source, result)
-        json.dumps([how.commands.replay_document(result), how.commands.diagnosis_document(found)])
+        source, result = how.replay(Path(run.place))
+        json.dumps([replay_object(result), diagnosis_object(how.diagnose(source, result))])
 
     alone(runs[0])
     how(runs[0])

@@ -16,7 +16,8 @@ from pathlib import Path
 
 from kf_calib.bench.bench import Bench
 from kf_calib.effects import checks, drift, formula, frame, sensor, user
-from kf_calib.effects.effect import Bearer, Coefficient, Effect, FrameEffect, SensorEffect, Unknown
+from kf_calib.effects.effect import Bearer, Coefficient, Effect, SensorEffect, Unknown
+from kf_calib.effects.frame import FrameEffect
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.effects.user import Program
 from kf_calib.errors import InputError

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.bench.bench import Bench, axes_of
-from kf_calib.effects.effect import Effect, FrameEffect
+from kf_calib.bench.bench import Bench, axes_of, turned
+from kf_calib.effects.effect import Effect
+from kf_calib.effects.frame import FrameEffect
 from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C, Stimulus
 from kf_calib.errors import InputError
 
@@ -155,8 +156,15 @@ def error_words(error: BaseException) -> str:
 def line_of(error: BaseException, kind: type) -> str:
     """Where in the file of a class an error arose, as `` at FILE, line N``; empty where it is not known."""
     file = getattr(sys.modules.get(kind.__module__), "__file__", None)
+    return f" at {file}{line_in(error, file)}" if line_in(error, file) else ""
+
+
+def line_in(error: BaseException, file: str | None) -> str:
+    """The last line of a file that an error passed through, as ``, line N``; empty where it is not known."""
+    if isinstance(error, SyntaxError) and error.filename == file:
+        return f", line {error.lineno}"
     lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
-    return f" at {file}, line {lines[-1]}" if lines else ""
+    return f", line {lines[-1]}" if lines else ""
 
 
 def _refuse_shape(effect: Effect, columns: Floats, shape: tuple[int, int, int]) -> None:
@@ -184,8 +192,8 @@ def _refuse_wrong_derivative(effect: FrameEffect, columns: Floats, s: Stimulus) 
     for k, rotation in enumerate(np.moveaxis(rotations, 1, 0)):
         largest = max(float(np.linalg.norm(rotation, axis=1).max()), 1e-300)
         step = _LARGEST_TURN_RAD / largest
-        turned = (_rotate(s.force_mps2, step * rotation) - _rotate(s.force_mps2, -step * rotation)) / (2.0 * step)
-        expected = turned @ s.sensitivity.T
+        change = (turned(s.force_mps2, step * rotation) - turned(s.force_mps2, -step * rotation)) / (2.0 * step)
+        expected = change @ s.sensitivity.T
         off = np.abs(columns[:, :, k] - expected)
         if off.max() > _DERIVATIVE_LIMIT * largest * s.bench.gravity_mps2:
             row, i = (int(index) for index in np.unravel_index(off.argmax(), off.shape))
@@ -209,14 +217,6 @@ def _refuse_wrong_slope(effect: Effect, s: Stimulus, count: int) -> None:
             f"{effect}: its derivative is {given[row, :, 0]} at {s.elapsed_s[row]:.4g} s, and differences of its "
             f"columns give {expected[row, :, 0]}: it must be that by the logarithm of its unknown."
         )
-
-
-def _rotate(vector: Floats, rotation: Floats) -> Floats:
-    """Rows (m, 3) turned by rotation vectors (m, 3), rad (Rodrigues)."""
-    angle = np.linalg.norm(rotation, axis=1, keepdims=True)
-    axis = rotation / np.maximum(angle, 1e-300)
-    along = np.sum(axis * vector, axis=1, keepdims=True) * axis
-    return along + np.cos(angle) * (vector - along) + np.sin(angle) * np.cross(axis, vector)
 
 
 def _remarks(effect: Effect, columns: Floats, s: Stimulus) -> tuple[str, ...]:

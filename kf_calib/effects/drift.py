@@ -14,6 +14,7 @@ from kf_calib.bench.arrays import Floats, sign
 from kf_calib.effects.effect import (
     MICRO_G,
     MILLI_G,
+    PAIRS,
     Bearer,
     Coefficient,
     Effect,
@@ -21,6 +22,7 @@ from kf_calib.effects.effect import (
     SensorEffect,
     Typical,
     Unknown,
+    of_each,
 )
 from kf_calib.effects.stimulus import Stimulus
 
@@ -36,12 +38,10 @@ class BiasDrift(SensorEffect):
     name, title, source = "bias-drift", "bias that drifts with time", "IEEE Std 1293, drift"
     on_data_sheet = "bias drift"
     drawn_against = _TIME
+    formulas = ("t",)
     confused_with = "warm-up; a monotone order of poses mixes it with angle"
     symbol, unit, scale = "beta", "m/s^3", 1e-6
     typical = Typical((1 * MICRO_G / 3600, 10 * MICRO_G / 3600), (10 * MICRO_G / 60, MILLI_G / 60))
-
-    def terms(self, s: Stimulus) -> Floats:
-        return np.repeat(s.elapsed_s[:, None], 3, axis=1)
 
 
 class ScaleDrift(SensorEffect):
@@ -51,12 +51,10 @@ class ScaleDrift(SensorEffect):
     name, title, source = "scale-drift", "scale factor that drifts with time", "IEEE Std 1293, drift"
     on_data_sheet = "scale drift"
     drawn_against = Regressor("t*a", "time times force along the input axis", "m/s")
+    formulas = ("t*a",)
     confused_with = "base-tilt-drift"
     symbol, unit, scale = "kappa", "1/s", 1e-7
     typical = Typical((1e-6 / 86400, 10e-6 / 86400), (0.0, 1e-2 / 3600))  # a chip that warms by 20 K, at 0.05 %/K
-
-    def terms(self, s: Stimulus) -> Floats:
-        return s.elapsed_s[:, None] * s.along
 
 
 class Hysteresis(SensorEffect):
@@ -89,13 +87,11 @@ class WarmUp(_Decay):
     family = "bias in time"
     name, title, source = "warm-up", "bias that settles after switching on", "IEEE Std 1293, turn-on transient"
     drawn_against = _TIME
+    formulas = ("exp(-t/constant)",)
     confused_with = "bias-drift; needs an early long dwell"
     symbol, unit, scale = "B", "m/s^2", 1e-2
     unknown = Unknown("tauWarm", "s", 5.0, 10800.0, "min", 1.0 / 60.0)
     typical = Typical((10 * MICRO_G, 200 * MICRO_G), (1 * MILLI_G, 10 * MILLI_G))
-
-    def terms(self, s: Stimulus) -> Floats:
-        return np.repeat(np.exp(-s.elapsed_s / self.value)[:, None], 3, axis=1)
 
     def acts_for_s(self, s: Stimulus) -> float:
         return s.span_s
@@ -107,14 +103,12 @@ class ScaleWarmUp(WarmUp):
     family = "scale in time"
     name, title = "scale-warm-up", "scale factor that settles after switching on"
     drawn_against = Regressor("", "force along the input axis, fading with the warm-up", "m/s^2")
+    formulas = ("exp(-t/constant)*a",)
     confused_with = "scale-drift, warm-up; needs early orientations of both signs"
     symbol, unit, scale = "S", "1", 1e-3
     unknown = Unknown("tauScale", "s", 5.0, 10800.0, "min", 1.0 / 60.0)
     typical = Typical((1e-6, 100e-6), (0.1e-3, 10e-3))
     prior = 0.25  # in a run that is short beside its time constant it is a scale-drift, and cannot be told from it
-
-    def terms(self, s: Stimulus) -> Floats:
-        return super().terms(s) * s.along
 
 
 class Settling(_Decay):
@@ -123,13 +117,11 @@ class Settling(_Decay):
     family = "memory"
     name, title, source = "settling", "creep after a change of the input", "IEEE Std 1293, settling"
     drawn_against = _STEP
+    formulas = ("da*exp(-tau/constant)",)
     confused_with = "shows in early against late samples of a dwell"
     symbol, unit, scale = "C", "1", 1e-3
     unknown = Unknown("tauSettle", "s", 3.0, 600.0, "s", 1.0)
     typical = Typical((1e-6, 30e-6))
-
-    def terms(self, s: Stimulus) -> Floats:
-        return s.step * np.exp(-s.since_arrival_s / self.value)[:, None]
 
     def acts_for_s(self, s: Stimulus) -> float:
         return float(s.since_arrival_s.max())
@@ -174,23 +166,13 @@ class Sinusoid(Effect):
     step = 1e-7  # the phase is thousands of rad
     value = 0.15
     typical = Typical((0.01 * MICRO_G, 1 * MICRO_G))
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        kinds = [f"{kind}{i}" for i in (1, 2, 3) for kind in ("As", "Ac")]
-        return tuple(Coefficient(symbol, "m/s^2", 1e-3) for symbol in kinds)
-
-    @property
-    def bearers(self) -> tuple[slice, ...]:
-        return tuple(slice(k, k + 2) for k in (0, 2, 4))
+    symbols, unit, scale = tuple(f"{kind}{i}" for i in (1, 2, 3) for kind in ("As", "Ac")), "m/s^2", 1e-3
+    bearers = PAIRS
 
     def columns(self, s: Stimulus) -> Floats:
         at_s, shares = s.about
-        sin, cos = _parts(s, (shares * self._wave(s, at_s)).sum(axis=1))
-        columns = np.zeros((len(s), 3, 6))
-        for i in range(3):
-            columns[:, i, 2 * i], columns[:, i, 2 * i + 1] = sin, cos
-        return columns
+        parts = np.stack(_parts(s, (shares * self._wave(s, at_s)).sum(axis=1)), axis=1)
+        return of_each(np.repeat(parts[:, None], 3, axis=1))
 
     def derivative(self, s: Stimulus, coefficients: Floats) -> Floats:
         """A_i and B_i times the changes of sine and cosine per unit of ln f: d(e^(i d)) = 2 pi i f t e^(i d)."""
@@ -256,6 +238,7 @@ class Magnetic(Effect):
     name, title, source = "magnetic", "response to the local magnetic field", "IEEE Std 1293, magnetic sensitivity"
     confused_with = "needs turns about the vertical"
     typical = Typical((1 * 0.2 * MICRO_G, 20 * 0.2 * MICRO_G))  # 1 to 20 ug/G in a horizontal field of 0.2 G
+    symbols, unit, scale = tuple(f"mB{part}{i}" for i in (1, 2, 3) for part in "NE"), "m/s^2", 1e-3
 
     @property
     def relations(self) -> Sequence[Floats]:
@@ -263,16 +246,8 @@ class Magnetic(Effect):
         directions = np.linspace(0.0, np.pi, _DIRECTIONS, endpoint=False)
         return [np.kron(np.eye(3), [[np.cos(a)], [np.sin(a)]]).astype(float) for a in directions]
 
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"mB{part}{i}", "m/s^2", 1e-3) for i in (1, 2, 3) for part in "NE")
-
     def columns(self, s: Stimulus) -> Floats:
-        columns = np.zeros((len(s), 3, 6))
-        along = np.stack([s.to_platform(axis) for axis in s.level_axes], axis=2)  # (m, 3, 2)
-        for i in range(3):
-            columns[:, i, 2 * i : 2 * i + 2] = np.einsum("x,mxk->mk", s.axes[i], along)
-        return columns
+        return of_each(s.axes @ np.stack([s.to_platform(axis) for axis in s.level_axes], axis=2))
 
 
 IEEE = "IEEE Std 1293, environmental sensitivities"
@@ -291,9 +266,6 @@ class ThermalBias(SensorEffect):
     symbol, unit, scale = "alpha", "m/s^2/K", 1e-3
     typical = Typical((5 * MICRO_G, 30 * MICRO_G), (0.15 * MILLI_G, 1 * MILLI_G))
 
-    def terms(self, s: Stimulus) -> Floats:
-        return np.repeat(s.warmth[:, None], 3, axis=1)
-
 
 class ThermalBias2(SensorEffect):
     """alpha_2 T^2."""
@@ -303,9 +275,6 @@ class ThermalBias2(SensorEffect):
     drawn_against = _TEMPERATURE
     formulas = ("T**2",)
     symbol, unit, scale = "alpha2_", "m/s^2/K^2", 1e-4
-
-    def terms(self, s: Stimulus) -> Floats:
-        return np.repeat(s.warmth[:, None] ** 2, 3, axis=1)
 
 
 class ThermalScale(SensorEffect):
@@ -320,9 +289,6 @@ class ThermalScale(SensorEffect):
     symbol, unit, scale = "alphaS", "1/K", 1e-4
     typical = Typical((50e-6, 150e-6))
 
-    def terms(self, s: Stimulus) -> Floats:
-        return s.warmth[:, None] * s.along
-
 
 class ThermalRate(SensorEffect):
     """kappa dT/dt."""
@@ -330,12 +296,10 @@ class ThermalRate(SensorEffect):
     family = "temperature"
     name, title, source = "thermal-rate", "bias that follows the rate of the temperature", IEEE
     drawn_against = Regressor("dT")
+    formulas = ("dT",)
     confused_with = "warm-up"
     symbol, unit, scale = "kappaT", "m s^-1/K", 1e-1
     typical = Typical((1 * 60 * MICRO_G, 50 * 60 * MICRO_G))
-
-    def terms(self, s: Stimulus) -> Floats:
-        return np.repeat(s.warming[:, None], 3, axis=1)
 
 
 class ThermalMisalignment(Effect):
@@ -346,21 +310,11 @@ class ThermalMisalignment(Effect):
     borne_by = Bearer.SENSORS
     formulas = ("T*p", "T*o")
     typical = Typical((0.1e-6, 10e-6))
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"gamma{axis}{i}", "rad/K", 1e-5) for i in (1, 2, 3) for axis in ("P", "O"))
-
-    @property
-    def bearers(self) -> tuple[slice, ...]:
-        return tuple(slice(k, k + 2) for k in (0, 2, 4))
+    symbols, unit, scale = tuple(f"gamma{axis}{i}" for i in (1, 2, 3) for axis in "PO"), "rad/K", 1e-5
+    bearers = PAIRS
 
     def columns(self, s: Stimulus) -> Floats:
-        columns = np.zeros((len(s), 3, 6))
-        for i in range(3):
-            columns[:, i, 2 * i] = s.warmth * s.pendulous[:, i]
-            columns[:, i, 2 * i + 1] = s.warmth * s.output[:, i]
-        return columns
+        return of_each(s.warmth[:, None, None] * np.stack([s.pendulous, s.output], axis=2))
 
 
 class ThermalLag(SensorEffect):
@@ -373,9 +327,7 @@ class ThermalLag(SensorEffect):
     symbol, unit, scale = "alphaL", "m/s^2/K", 1e-3
     typical = ThermalBias.typical
     unknown = Unknown("tauLag", "s", 30.0, 7200.0, "min", 1.0 / 60.0)
-
-    def __init__(self) -> None:
-        self.value = 600.0
+    value = 600.0
 
     def terms(self, s: Stimulus) -> Floats:
         return np.repeat(s.lagged_warmth(self.value)[:, None], 3, axis=1)
@@ -392,9 +344,7 @@ class ThermalHysteresis(SensorEffect):
     symbol, unit, scale = "alphaH", "m/s^2/K", 1e-3
     typical = ThermalBias.typical
     unknown = Unknown("playT", "K", 0.02, 20.0, "K", 1.0)
-
-    def __init__(self) -> None:
-        self.value = 1.0
+    value = 1.0
 
     def terms(self, s: Stimulus) -> Floats:
         return np.repeat(s.played_warmth(self.value)[:, None], 3, axis=1)

@@ -1,8 +1,8 @@
 """What an effect is: a name, coefficients with unit and scale, and columns over the stimulus.
 
 Two kinds cover the catalogue: a ``SensorEffect`` has one coefficient for each accelerometer and says what it adds to a
-reading per unit of it; a ``FrameEffect`` turns the platform by a small rotation per unit of each coefficient,
-common to the three accelerometers. A new effect is a class with a docstring and one method.
+reading per unit of it; a ``FrameEffect`` (``effects.frame``) turns the platform by a small rotation per unit of each
+coefficient, common to the three accelerometers. A new effect is a class with a docstring, and a formula or one method.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
+from kf_calib.effects.expression import Expression
+from kf_calib.effects.quantities import QUANTITIES
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2, field_unit
 
@@ -121,6 +123,16 @@ class Bearer(StrEnum):
     EITHER = "either"
 
 
+def every_one(count: int) -> tuple[slice, ...]:
+    """The places of each of so many bearers among coefficients, or columns, of which one of each follow each other;
+    nothing of one, which has all."""
+    return tuple(slice(k, None, count) for k in range(count)) if count > 1 else ()
+
+
+PAIRS = tuple(slice(k, k + 2) for k in (0, 2, 4))
+"""The same of three bearers, each of which has two in turn."""
+
+
 class Effect(ABC):
     """A physical effect the readings may contain besides the twelve parameters.
 
@@ -132,13 +144,17 @@ class Effect(ABC):
     ``columns`` gives the part that the stimulus asks for (``Stimulus.part``).
     averages: vibration goes with it, so readings are averaged over windows first, and their variance in these is known.
     step: of ln(value) in the differences of ``derivative``.
-    formulas: what an accelerometer reads more per unit of each coefficient that it has, where that depends on specific
-    force and temperature alone: of a, p, o (along its axes), before, after (readings of the two other accelerometers,
-    in their order), T and the constant. Empty where it cannot be written so.
+    formulas: what an accelerometer reads more per unit of each coefficient that it has, of ``QUANTITIES``, ``before``
+    and ``after`` (readings of the two other accelerometers, in their order) and ``constant``. Empty where it cannot be
+    written so.
     typical: usual sizes of its coefficients. expected: the value that they have by nature, and how far they may be from
     it (sigma); None where nature does not say. family: the physical class to which it belongs.
     prior: how much likelier it is than another effect before anything is measured, 1 for most.
     borne_by: what can have it at all; what nobody knows, as of a user's effect, may be of either.
+    symbols: of its coefficients, which have one unit (SI) and scale. shown: a unit of the field and how many of it make
+    one SI unit, where it is not that of ``support.units``.
+    bearers: the coefficients of each accelerometer, or of each axis of a rotation, where one of these may have the
+    effect alone; empty where it is of all or none.
     drawn_against: the quantity over which what it adds to readings has a shape (``effects.axis``); None: what it adds.
     """
 
@@ -159,6 +175,11 @@ class Effect(ABC):
     family: ClassVar[str] = "none of the known"
     prior: ClassVar[float] = 1.0
     borne_by: ClassVar[Bearer] = Bearer.EITHER
+    symbols: tuple[str, ...]
+    unit: ClassVar[str]
+    scale: ClassVar[float]
+    shown: ClassVar[tuple[str, float] | None] = None
+    bearers: tuple[slice, ...] = ()
     drawn_against: Regressor | None = None
     variant: str = ""
     """The axis of an axis-wise effect (``encoder-harmonic-2:z``)."""
@@ -185,14 +206,10 @@ class Effect(ABC):
         return other
 
     @property
-    @abstractmethod
-    def coefficients(self) -> tuple[Coefficient, ...]: ...
-
-    @property
-    def bearers(self) -> tuple[slice, ...]:
-        """The coefficients of each accelerometer, or of each axis of a rotation, where one of these may have the effect
-        alone; empty where it is of all or none."""
-        return ()
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        """Its coefficients: ``symbols``, all of one unit and scale."""
+        shown = self.shown or field_unit(self.unit)
+        return tuple(Coefficient(symbol, self.unit, self.scale, *shown) for symbol in self.symbols)
 
     @abstractmethod
     def columns(self, s: Stimulus) -> Floats:
@@ -290,45 +307,40 @@ class Effect(ABC):
 
 
 class SensorEffect(Effect):
-    """One coefficient for each accelerometer; ``terms`` (m, 3) is what each reads more per unit of its own.
+    """One coefficient for each accelerometer; ``terms`` (m, 3) is what each reads more per unit of its own: that is its
+    formula, unless a class computes it.
 
-    shown: a unit of the field and how many of it make one SI unit, where it is not that of ``support.units``.
+    symbol: of the coefficients, before the number of the accelerometer.
     on_data_sheet: words for it on a data sheet; empty where it is on none. in_polynomial: whether it is estimated there
     together with others of the model equation.
     """
 
     borne_by = Bearer.SENSORS
+    bearers = every_one(3)
     on_data_sheet: ClassVar[str] = ""
     in_polynomial: ClassVar[bool] = False
     symbol: ClassVar[str]
-    unit: ClassVar[str]
-    scale: ClassVar[float]
-    shown: ClassVar[tuple[str, float] | None] = None
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
         return _one_each(self.symbol, self.unit, self.scale, self.shown or field_unit(self.unit))
 
-    @property
-    def bearers(self) -> tuple[slice, ...]:
-        return every_one(3)
-
-    @abstractmethod
-    def terms(self, s: Stimulus) -> Floats: ...
+    def terms(self, s: Stimulus) -> Floats:
+        formula = own_formula(self.formulas[0])
+        values = {name: self.value if name == "constant" else QUANTITIES[name].of(s) for name in formula.names}
+        return np.broadcast_to(formula(values), (len(s), 3))
 
     def columns(self, s: Stimulus) -> Floats:
-        out = np.zeros((len(s), 3, 3))
-        out[:, range(3), range(3)] = self.terms(s)
-        return out
+        return of_each(np.broadcast_to(self.terms(s), (len(s), 3))[:, :, None])
 
     def added(self, s: Stimulus, coefficients: Floats) -> Floats:
         return self.terms(s) * coefficients
 
 
-def every_one(count: int) -> tuple[slice, ...]:
-    """The places of each of so many bearers among coefficients, or columns, of which one of each follow each other;
-    nothing of one, which has all."""
-    return tuple(slice(k, None, count) for k in range(count)) if count > 1 else ()
+@functools.cache
+def own_formula(text: str) -> Expression:
+    """One of the ``formulas`` of an effect."""
+    return Expression(text, dict.fromkeys((*QUANTITIES, "constant", "before", "after"), ""))
 
 
 @functools.lru_cache(maxsize=512)
@@ -337,67 +349,12 @@ def _one_each(symbol: str, unit: str, scale: float, shown: tuple[str, float]) ->
     return tuple(Coefficient(f"{symbol}{i}", unit, scale, *shown) for i in (1, 2, 3))
 
 
-class FrameEffect(Effect):
-    """The platform stands otherwise than its angles say; ``rotations`` (m, q, 3), rad per unit, in the platform frame.
-
-    A rotation vector rho changes the specific force f to exp([rho]) f. About a force that is turned by ``turned_rad``
-    already, a little more of each coefficient turns it by J(rho) alpha x f, J the left Jacobian of rotations, and
-    reading i changes by s_i times that. Where no angles are used, nothing is said of how the platform stands, and it
-    has no columns.
-    gimbal: number from 0 of the one whose angle is wrong; None of any other error, which may turn about any axis.
-    """
-
-    borne_by = Bearer.BENCH
-    gimbal: int | None = None
-
-    def shows_in(self, s: Stimulus) -> bool:
-        return s.bench.angles and super().shows_in(s)
-
-    @abstractmethod
-    def rotations(self, s: Stimulus) -> Floats: ...
-
-    def about(self, s: Stimulus) -> Floats:
-        """The axis (m, 3), of unit length, about which an error of its gimbal's angle turns the specific force."""
-        assert self.gimbal is not None
-        return -s.inner(np.array(s.bench.axes[self.gimbal]), self.gimbal)
-
-    def turned_rad(self, s: Stimulus, coefficients: Floats) -> Floats:
-        """The rotation vector (m, 3) with these ``coefficients`` (q,), rad."""
-        return np.einsum("mqx,q->mx", self.rotations(s), coefficients)
-
-    def added(self, s: Stimulus, coefficients: Floats) -> Floats:
-        rho = self.turned_rad(s, coefficients)
-        change = _left_jacobian(rho, np.cross(rho, s.force_mps2)[:, None])[:, 0]  # J(rho) rho x f = exp([rho]) f - f
-        return change @ s.sensitivity.T if self.shows_in(s) else np.zeros((len(s), 3))
-
-    def columns(self, s: Stimulus) -> Floats:
-        rotations = _turned_along(s.attitude_rad, _left_jacobian(s.turned_rad, self.rotations(s)))
-        turned = np.cross(rotations, s.force_mps2[:, None, :])
-        return np.einsum("mqx,ix->miq", turned, s.sensitivity)
-
-
-def _turned_along(alpha: Floats, vectors: Floats) -> Floats:
-    """Vectors v (m, q, 3) turned by small rotation vectors alpha (m, 3) or (1, 3), to their square."""
-    if not alpha.any():
-        return vectors
-    once = np.cross(alpha[:, None, :], vectors)
-    return vectors + once + 0.5 * np.cross(alpha[:, None, :], once)
-
-
-def _left_jacobian(rho: Floats, vectors: Floats) -> Floats:
-    """J(rho) v of vectors v (m, q, 3) and rotation vectors rho (m, 3) or (1, 3) of length r, by series to r^4.
-
-      J = 1 + (1 - cos r) / r^2 [rho] + (r - sin r) / r^3 [rho]^2, the mean of exp(t [rho]) over 0 < t < 1
-
-    exp([rho + d]) = exp([J(rho) d]) exp([rho]) for small d (J. Sola et al., 2018).
-    """
-    if not rho.any():
-        return vectors
-    squares = np.sum(rho**2, axis=1)[:, None, None]
-    once = np.cross(rho[:, None, :], vectors)
-    twice = np.cross(rho[:, None, :], once)
-    first, second = 1 / 2 - squares / 24 + squares**2 / 720, 1 / 6 - squares / 120 + squares**2 / 5040
-    return vectors + first * once + second * twice
+def of_each(terms: Floats) -> Floats:
+    """Columns (m, 3, 3 k) of coefficients of which each accelerometer has k for itself: what it reads more per unit of
+    its own is ``terms`` (m, 3, k)."""
+    columns = np.zeros((len(terms), 3, *terms.shape[1:]))
+    columns[:, range(3), range(3)] = terms
+    return columns.reshape(len(terms), 3, -1)
 
 
 @dataclass(frozen=True)

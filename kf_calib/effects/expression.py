@@ -267,8 +267,10 @@ def _plain(what: str) -> Callable[..., PintUnit]:
     return rule
 
 
-def _numbers_stay(number: Callable[..., Any], rule: Callable[..., PintUnit]) -> Callable[..., PintUnit | float]:
-    def apply(*values: PintUnit | float) -> PintUnit | float:
+def numbers_stay(number: Callable[..., Any], rule: Callable[..., Any]) -> Callable[..., Any]:
+    """What gives a number for numbers, and what the rule of another algebra makes of anything else."""
+
+    def apply(*values: Any) -> Any:
         if all(isinstance(value, float) for value in values):
             return float(number(*values))
         return rule(*values)
@@ -283,5 +285,5 @@ _RULES: dict[str, Callable[..., PintUnit]] = {
     "minimum": _alike("compared"), "maximum": _alike("compared"),
     **{name: _plain(f"what {name} is taken of") for name in ("sin", "cos", "tan", "arctan", "tanh", "exp", "log")},
 }  # fmt: skip
-_OPERATORS = {sign: _numbers_stay(number, _RULES[sign]) for sign, number in OPERATORS.items()}
-_FUNCTIONS = {name: _numbers_stay(number, _RULES[name]) for name, number in FUNCTIONS.items()}
+_OPERATORS = {sign: numbers_stay(number, _RULES[sign]) for sign, number in OPERATORS.items()}
+_FUNCTIONS = {name: numbers_stay(number, _RULES[name]) for name, number in FUNCTIONS.items()}

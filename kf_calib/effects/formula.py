@@ -28,18 +28,17 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, Vector
 from kf_calib.effects import checks
-from kf_calib.effects.effect import Bearer, Coefficient, FrameEffect, SensorEffect, every_one
+from kf_calib.effects.effect import Bearer, SensorEffect, every_one
 from kf_calib.effects.expression import Expression
-from kf_calib.effects.frame import gimbal_number
+from kf_calib.effects.frame import FrameEffect, gimbal_number
+from kf_calib.effects.quantities import gimbal_letters, quantities
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.errors import InputError
 
@@ -49,83 +48,6 @@ BASE, PLATFORM = "base", "platform"
 
 _LARGE_RAD = 1e-3
 _LARGE_MPS2 = 1e-3  # what a prior lets a coefficient add to a typical reading
-
-
-@dataclass(frozen=True)
-class FormulaQuantity:
-    """A name in formulas: its SI unit, its meaning, and its values (m, 1), (m, 3) or a number."""
-
-    unit: str
-    meaning: str
-    of: Callable[[Stimulus], Floats | float]
-
-
-QUANTITIES: dict[str, FormulaQuantity] = {
-    "fx": FormulaQuantity("m/s^2", "specific force along x of the platform", lambda s: s.force_mps2[:, 0:1]),
-    "fy": FormulaQuantity("m/s^2", "specific force along y of the platform", lambda s: s.force_mps2[:, 1:2]),
-    "fz": FormulaQuantity("m/s^2", "specific force along z of the platform", lambda s: s.force_mps2[:, 2:3]),
-    "a": FormulaQuantity("m/s^2", "specific force along the input axis", lambda s: s.along),
-    "p": FormulaQuantity("m/s^2", "specific force along the pendulous axis", lambda s: s.pendulous),
-    "o": FormulaQuantity("m/s^2", "specific force along the output axis", lambda s: s.output),
-    "da": FormulaQuantity("m/s^2", "last step of a from dwell to dwell", lambda s: s.step),
-    **{
-        f"play{width:g}": FormulaQuantity(
-            "m/s^2", f"a through a play of {width:g} m/s^2", partial(Stimulus.played, half_width_mps2=width)
-        )
-        for width in (1.0, 3.0, 6.0)
-    },
-    "T": FormulaQuantity("K", "temperature less 25 degC", lambda s: s.warmth[:, None]),
-    "dT": FormulaQuantity("K/s", "rate of the temperature", lambda s: s.warming[:, None]),
-    "t": FormulaQuantity("s", "time since the first sample", lambda s: s.elapsed_s[:, None]),
-    "tau": FormulaQuantity("s", "time since the arrival in the dwell", lambda s: s.since_arrival_s[:, None]),
-    "g": FormulaQuantity("m/s^2", "local gravity", lambda s: s.bench.gravity_mps2),
-    "s": FormulaQuantity("s", "one second", lambda s: 1.0),
-    "m": FormulaQuantity("m", "one metre", lambda s: 1.0),
-    "K": FormulaQuantity("K", "one kelvin", lambda s: 1.0),
-    "rad": FormulaQuantity("rad", "one radian", lambda s: 1.0),
-    "deg": FormulaQuantity("rad", "one degree", lambda s: math.pi / 180.0),
-    "pi": FormulaQuantity("", "3.14159...", lambda s: math.pi),
-}
-
-
-def _angle(s: Stimulus, gimbal: int) -> Floats:
-    """Return the angle of a gimbal (m, 1), rad."""
-    return s.pose[:, gimbal : gimbal + 1]
-
-
-def _angle_before(s: Stimulus, gimbal: int) -> Floats:
-    """Return the same in the dwell before."""
-    return s.previous_pose[:, gimbal : gimbal + 1]
-
-
-def _move(s: Stimulus, gimbal: int) -> Floats:
-    """Return the last move of a gimbal (m, 1), rad; 0 where it stood still."""
-    return s.move(gimbal)[:, None]
-
-
-def gimbal_letters(axes: tuple[Vector, ...]) -> str:
-    """A letter for each gimbal: its axis, or ? where it is none of x, y, z."""
-    return "".join(
-        "xyz"[max(range(3), key=lambda k, a=axis: abs(a[k]))] if 1.0 in map(abs, axis) else "?" for axis in axes
-    )
-
-
-@lru_cache(maxsize=32)
-def quantities(axes: tuple[Vector, ...]) -> dict[str, FormulaQuantity]:
-    """Everything a formula may name on a bench with these gimbal axes."""
-    letters, named = gimbal_letters(axes), dict(QUANTITIES)
-    for k, letter in enumerate(letters):
-        angle = FormulaQuantity("rad", f"angle of gimbal {k + 1}", partial(_angle, gimbal=k))
-        names = [f"q{k + 1}", *([f"q_{letter}"] if letter != "?" and letters.count(letter) == 1 else [])]
-        names += ["outer"] * (k == 0) + ["inner"] * (k == len(letters) - 1)
-        named |= dict.fromkeys(names, angle)
-        named[f"q{k + 1}_before"] = FormulaQuantity(
-            "rad", f"angle of gimbal {k + 1} in the dwell before", partial(_angle_before, gimbal=k)
-        )
-        named[f"q{k + 1}_move"] = FormulaQuantity(
-            "rad", f"last move of gimbal {k + 1}, 0 where it stood still", partial(_move, gimbal=k)
-        )
-    return named
 
 
 def split(text: str) -> tuple[str, str]:
@@ -184,10 +106,13 @@ class Reading:
         return 10.0 ** round(math.log10(largest * np.sqrt(np.mean((size / largest) ** 2))))
 
 
-def _units(reading: Reading, turning: bool) -> tuple[str, tuple[str, float]]:
-    """SI unit of a formula's coefficients, a unit of the field, and how many of it are one; of angles, or readings."""
+def _units(reading: Reading, turning: bool, checked: bool) -> tuple[str, tuple[str, float]]:
+    """SI unit of a formula's coefficients, a unit of the field, and how many of it are one; of angles, or readings.
+    None of a formula that is not ``checked``."""
     from kf_calib.effects.expression import coefficient_units, pint_unit_of, turning_units
 
+    if not checked:
+        return "", ("", 1.0)
     try:
         unit = pint_unit_of(reading.expression, reading.units)
         return turning_units(unit) if turning else coefficient_units(unit)
@@ -209,11 +134,10 @@ class Formula(SensorEffect):
     def __init__(self, name: str, expression: str, bench: Bench, checked: bool = True) -> None:
         self.reading = Reading(name, expression, bench)
         self.text, self.remarks = f"{name} = {expression}", tuple[str, ...]()
+        unit, shown = _units(self.reading, turning=False, checked=checked)
         # of the class in the catalogue; here each formula has its own
-        vars(self).update(name=name, title=expression, symbol=symbol_stem(name), unit="", shown=("", 1.0), scale=1.0)
+        vars(self).update(name=name, title=expression, symbol=symbol_stem(name), unit=unit, shown=shown, scale=1.0)
         if checked:
-            unit, shown = _units(self.reading, turning=False)
-            vars(self).update(unit=unit, shown=shown)
             stimulus = _trial(bench.axes, bench.gravity_mps2)
             self.remarks = checks.check_effect(self, stimulus)
             vars(self).update(scale=_LARGE_MPS2 / self.reading.typical(stimulus))
@@ -235,16 +159,16 @@ class FrameFormula(FrameEffect):
     borne_by = Bearer.EITHER
 
     def __init__(self, name: str, place: str, expression: str, bench: Bench, checked: bool = True) -> None:
-        self.reading, unit, shown = Reading(name, expression, bench), "", ("", 1.0)
+        self.reading = Reading(name, expression, bench)
         self.text, self.remarks = f"{name}:{place} = {expression}", tuple[str, ...]()
-        gimbal = None if place in (BASE, PLATFORM) else gimbal_number(place, gimbal_letters(bench.axes))
-        self.place, self.gimbal = place, gimbal
-        if checked:
-            unit, shown = _units(self.reading, turning=True)
-        vars(self).update(name=name, variant=place, title=expression)
+        self.gimbal = None if place in (BASE, PLATFORM) else gimbal_number(place, gimbal_letters(bench.axes))
+        unit, shown = _units(self.reading, turning=True, checked=checked)
         axes = {BASE: "NE", PLATFORM: "XYZ"}.get(place, [f"_{place}"])
-        symbols = [f"{symbol_stem(name)}{axis}" for axis in axes]
-        self._coefficients = tuple(Coefficient(symbol, unit, 1.0, *shown) for symbol in symbols)
+        symbols = tuple(f"{symbol_stem(name)}{axis}" for axis in axes)
+        vars(self).update(
+            name=name, variant=place, title=expression, symbols=symbols, unit=unit, shown=shown, scale=1.0,
+            bearers=every_one(len(symbols)),
+        )  # fmt: skip
         if checked:
             self._check(_trial(bench.axes, bench.gravity_mps2))
 
@@ -254,21 +178,12 @@ class FrameFormula(FrameEffect):
             words = "an angle is one for the whole block: use fx, fy, fz in place of a, p, o and da."
             raise InputError(f"{self.name}: {words}")
         self.remarks = checks.check_effect(self, stimulus)
-        scale = _LARGE_RAD / self.reading.typical(stimulus)
-        self._coefficients = tuple(replace(each, scale=scale) for each in self._coefficients)
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return self._coefficients
-
-    @property
-    def bearers(self) -> tuple[slice, ...]:
-        return every_one(len(self._coefficients))
+        vars(self).update(scale=_LARGE_RAD / self.reading.typical(stimulus))
 
     def rotations(self, s: Stimulus) -> Floats:
         values = self.reading(s)
         checks.refuse_not_finite(self, values, s)
-        if self.place == PLATFORM:
+        if self.variant == PLATFORM:
             return -values[:, :, None] * np.eye(3)
         axes = [self.about(s)] if self.gimbal is not None else [-s.to_platform(n) for n in s.level_axes]
         return values[:, :, None] * np.stack(axes, axis=1)

@@ -5,15 +5,79 @@ only while the platform turns: the time a reading was taken, and where each acce
 from __future__ import annotations
 
 import re
+from abc import abstractmethod
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
-from kf_calib.effects.effect import Bearer, Coefficient, Effect, FrameEffect, Regressor, Typical, every_one
+from kf_calib.effects.effect import PAIRS, Bearer, Effect, Regressor, Typical, every_one, of_each
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.errors import InputError
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
+
+
+class FrameEffect(Effect):
+    """The platform stands otherwise than its angles say; ``rotations`` (m, q, 3), rad per unit, in the platform frame.
+
+    A rotation vector rho changes the specific force f to exp([rho]) f. About a force that is turned by ``turned_rad``
+    already, a little more of each coefficient turns it by J(rho) alpha x f, J the left Jacobian of rotations, and
+    reading i changes by s_i times that. Where no angles are used, nothing is said of how the platform stands, and it
+    has no columns.
+    gimbal: number from 0 of the one whose angle is wrong; None of any other error, which may turn about any axis.
+    """
+
+    borne_by = Bearer.BENCH
+    gimbal: int | None = None
+
+    def shows_in(self, s: Stimulus) -> bool:
+        return s.bench.angles and super().shows_in(s)
+
+    @abstractmethod
+    def rotations(self, s: Stimulus) -> Floats: ...
+
+    def about(self, s: Stimulus) -> Floats:
+        """The axis (m, 3), of unit length, about which an error of its gimbal's angle turns the specific force."""
+        assert self.gimbal is not None
+        return -s.inner(np.array(s.bench.axes[self.gimbal]), self.gimbal)
+
+    def turned_rad(self, s: Stimulus, coefficients: Floats) -> Floats:
+        """The rotation vector (m, 3) with these ``coefficients`` (q,), rad."""
+        return np.einsum("mqx,q->mx", self.rotations(s), coefficients)
+
+    def added(self, s: Stimulus, coefficients: Floats) -> Floats:
+        rho = self.turned_rad(s, coefficients)
+        change = _left_jacobian(rho, np.cross(rho, s.force_mps2)[:, None])[:, 0]  # J(rho) rho x f = exp([rho]) f - f
+        return change @ s.sensitivity.T if self.shows_in(s) else np.zeros((len(s), 3))
+
+    def columns(self, s: Stimulus) -> Floats:
+        rotations = _turned_along(s.attitude_rad, _left_jacobian(s.turned_rad, self.rotations(s)))
+        turned = np.cross(rotations, s.force_mps2[:, None, :])
+        return np.einsum("mqx,ix->miq", turned, s.sensitivity)
+
+
+def _turned_along(alpha: Floats, vectors: Floats) -> Floats:
+    """Vectors v (m, q, 3) turned by small rotation vectors alpha (m, 3) or (1, 3), to their square."""
+    if not alpha.any():
+        return vectors
+    once = np.cross(alpha[:, None, :], vectors)
+    return vectors + once + 0.5 * np.cross(alpha[:, None, :], once)
+
+
+def _left_jacobian(rho: Floats, vectors: Floats) -> Floats:
+    """J(rho) v of vectors v (m, q, 3) and rotation vectors rho (m, 3) or (1, 3) of length r, by series to r^4.
+
+      J = 1 + (1 - cos r) / r^2 [rho] + (r - sin r) / r^3 [rho]^2, the mean of exp(t [rho]) over 0 < t < 1
+
+    exp([rho + d]) = exp([J(rho) d]) exp([rho]) for small d (J. Sola et al., 2018).
+    """
+    if not rho.any():
+        return vectors
+    squares = np.sum(rho**2, axis=1)[:, None, None]
+    once = np.cross(rho[:, None, :], vectors)
+    twice = np.cross(rho[:, None, :], once)
+    first, second = 1 / 2 - squares / 24 + squares**2 / 720, 1 / 6 - squares / 120 + squares**2 / 5040
+    return vectors + first * once + second * twice
 
 
 class BaseTilt(FrameEffect):
@@ -23,14 +87,8 @@ class BaseTilt(FrameEffect):
     name, title, source = "base-tilt", "tilt of the base", "geometry of the bench"
     confused_with = "about the outer axis it is the outer encoder's zero"
     typical = Typical((5e-6, 500e-6))
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"delta{axis}", "rad", 1e-3) for axis in "NE")
-
-    @property
-    def bearers(self) -> tuple[slice, ...]:
-        return every_one(2)
+    symbols, unit, scale = ("deltaN", "deltaE"), "rad", 1e-3
+    bearers = every_one(2)
 
     def rotations(self, s: Stimulus) -> Floats:
         return -np.stack([s.to_platform(axis) for axis in s.level_axes], axis=1)
@@ -45,10 +103,7 @@ class BaseTiltDrift(BaseTilt):
     name, title = "base-tilt-drift", "tilt of the base that grows with time"
     confused_with = "scale-drift"
     typical = Typical((1e-6 / 86400, 50e-6 / 86400))
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"deltaRate{axis}", "rad/s", 1e-8) for axis in "NE")
+    symbols, unit, scale = ("deltaRateN", "deltaRateE"), "rad/s", 1e-8
 
     def rotations(self, s: Stimulus) -> Floats:
         return super().rotations(s) * s.elapsed_s[:, None, None]
@@ -64,14 +119,9 @@ class PlatformDrift(FrameEffect):
     name, title, source = "platform-drift", "drift of the platform", "geometry of the bench"
     borne_by = Bearer.EITHER  # a block that creeps on its mount drifts in the same way
     typical = Typical((np.radians(0.01) / 3600, np.radians(1.0) / 3600))
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"omega{axis}", "rad/s", 1e-6, "deg/h", np.degrees(3600.0)) for axis in "XYZ")
-
-    @property
-    def bearers(self) -> tuple[slice, ...]:
-        return every_one(3)
+    symbols, unit, scale = ("omegaX", "omegaY", "omegaZ"), "rad/s", 1e-6
+    shown = "deg/h", float(np.degrees(3600.0))
+    bearers = every_one(3)
 
     def rotations(self, s: Stimulus) -> Floats:
         return -s.elapsed_s[:, None, None] * np.eye(3)
@@ -88,10 +138,7 @@ class EarthRotation(FrameEffect):
     confused_with = "platform-drift"
     typical = Typical((1.0, 1.0), (1.0, 1.0))
     expected = (1.0, 0.1)  # the direction of north and the latitude are not known better than that on every bench
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient("earth", "1", 1.0, "of Earth's rate", 1.0),)
+    symbols, unit, scale, shown = ("earth",), "1", 1.0, ("of Earth's rate", 1.0)
 
     def rotations(self, s: Stimulus) -> Floats:
         return (s.elapsed_s[:, None] * s.to_platform(s.bench.earth_rate_radps))[:, None, :]
@@ -104,14 +151,8 @@ class Flexure(FrameEffect):
     name, title, source = "flexure", "bending under the torque of gravity", "linear elasticity"
     confused_with = "encoder-harmonic-1, cross-coupling, uneven-flexure; the bias of a sensor that reports the attitude"
     typical = Typical((5e-6 / STANDARD_GRAVITY_MPS2, 100e-6 / STANDARD_GRAVITY_MPS2))
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"d{axis}", "rad s^2/m", 1e-4) for axis in "XYZ")
-
-    @property
-    def bearers(self) -> tuple[slice, ...]:
-        return every_one(3)
+    symbols, unit, scale = ("dX", "dY", "dZ"), "rad s^2/m", 1e-4
+    bearers = every_one(3)
 
     def rotations(self, s: Stimulus) -> Floats:
         return -np.cross(s.force_mps2[:, None, :], np.eye(3))
@@ -126,14 +167,8 @@ class UnevenFlexure(Flexure):
     name, title = "uneven-flexure", "bending with another stiffness about each axis"
     confused_with = "flexure, cross-coupling, cross-axis-square"
     prior = 0.25  # it contains the flexure, from which readings alone tell it apart only by the price of coefficients
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"c{i}d{j}", "rad s^2/m", 1e-4) for j in "XYZ" for i in "XYZ" if i != j)
-
-    @property
-    def bearers(self) -> tuple[slice, ...]:
-        return tuple(slice(k, k + 2) for k in (0, 2, 4))
+    symbols = tuple(f"c{i}d{j}" for j in "XYZ" for i in "XYZ" if i != j)
+    bearers = PAIRS
 
     def rotations(self, s: Stimulus) -> Floats:
         parts = super().rotations(s)[..., None] * np.eye(3)  # (m, j, i, 3): by d_j, about axis i alone
@@ -149,28 +184,23 @@ class CrossTalk(Effect):
     formulas = ("before", "after")
     confused_with = "misalignment, always at rest"
     typical = Typical((1e-6, 100e-6))
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"X{i}{j}", "1", 1e-3) for i in (1, 2, 3) for j in (1, 2, 3) if i != j)
+    symbols, unit, scale = ("X12", "X13", "X21", "X23", "X31", "X32"), "1", 1e-3
 
     def columns(self, s: Stimulus) -> Floats:
-        readings, columns = s.force_mps2 @ s.sensitivity.T, np.zeros((len(s), 3, 6))
-        for k, (i, j) in enumerate((i, j) for i in range(3) for j in range(3) if i != j):
-            columns[:, i, k] = readings[:, j]
-        return columns
+        return of_each((s.force_mps2 @ s.sensitivity.T)[:, [[1, 2], [0, 2], [0, 1]]])
 
     def degeneracy(self, bench: Bench) -> str:
         return "at rest, cross-talk is exactly a misalignment: no orientation tells the two apart"
 
 
 class _GimbalEffect(FrameEffect):
-    """An effect of one gimbal, named by its letter or number after the colon."""
+    """An effect of one gimbal, named by its letter or number after the colon, which its symbols end in, too."""
 
-    family = "gimbal and encoder"
+    family, source = "gimbal and encoder", "geometry of the bench"
 
     def __init__(self, gimbal: int, variant: str) -> None:
         self.gimbal, self.variant = gimbal, variant
+        self.symbols = tuple(f"{stem}_{variant}" for stem in self.symbols)
 
     def _angle(self, s: Stimulus) -> Floats:
         assert self.gimbal is not None
@@ -180,12 +210,9 @@ class _GimbalEffect(FrameEffect):
 class EncoderOffset(_GimbalEffect):
     """q_k + epsilon_k."""
 
-    name, title, source = "encoder-offset", "zero of an encoder", "geometry of the bench"
+    name, title = "encoder-offset", "zero of an encoder"
     confused_with = "innermost: a misalignment; outermost: base-tilt"
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient(f"eps_{self.variant}", "rad", 1e-2),)
+    symbols, unit, scale = ("eps",), "rad", 1e-2
 
     def rotations(self, s: Stimulus) -> Floats:
         return self.about(s)[:, None, :]
@@ -207,11 +234,8 @@ class _OfItsAngle(_GimbalEffect):
 class EncoderScale(_OfItsAngle):
     """q_k (1 + epsilon_k)."""
 
-    name, title, source = "encoder-scale", "scale of an encoder", "geometry of the bench"
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient(f"epsS_{self.variant}", "1", 1e-3),)
+    name, title = "encoder-scale", "scale of an encoder"
+    symbols, unit, scale = ("epsS",), "1", 1e-3
 
     def rotations(self, s: Stimulus) -> Floats:
         return (self._angle(s)[:, None] * self.about(s))[:, None, :]
@@ -220,13 +244,10 @@ class EncoderScale(_OfItsAngle):
 class EncoderHarmonic1(_OfItsAngle):
     """s sin q_k + c cos q_k on the angle."""
 
-    name, title, source = "encoder-harmonic-1", "eccentricity of an encoder", "geometry of the bench"
+    name, title = "encoder-harmonic-1", "eccentricity of an encoder"
     order = 1
     typical = Typical((1e-6, 100e-6))
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"{part}{self.order}_{self.variant}", "rad", 1e-3) for part in "sc")
+    symbols, unit, scale = ("s1", "c1"), "rad", 1e-3
 
     def rotations(self, s: Stimulus) -> Floats:
         angle = self.order * self._angle(s)
@@ -238,25 +259,22 @@ class EncoderHarmonic2(EncoderHarmonic1):
 
     name, title = "encoder-harmonic-2", "second harmonic of an encoder"
     confused_with = "second-order"
-    order = 2
+    symbols, order = ("s2", "c2"), 2
 
 
 class Backlash(_GimbalEffect):
     """q_k - 1/2 p sgn(Delta q_k), Delta q_k the last move of the gimbal: it trails behind its encoder by half the play
     p, towards where it came from, and stays there while other gimbals move."""
 
-    name, title, source = "backlash", "play between a gimbal and its encoder", "geometry of the bench"
+    name, title = "backlash", "play between a gimbal and its encoder"
     confused_with = "encoder-scale, hysteresis; needs the same pose from two sides"
     typical = Typical((5e-6, 100e-6), (0.1e-3, 10e-3))
+    symbols, unit, scale = ("play",), "rad", 1e-3
 
     def __init__(self, gimbal: int, variant: str) -> None:
         super().__init__(gimbal, variant)
         number = gimbal + 1
         self.drawn_against = Regressor(f"q{number}_move", f"last move of gimbal {number}", "rad")
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient(f"play_{self.variant}", "rad", 1e-3),)
 
     def rotations(self, s: Stimulus) -> Floats:
         assert self.gimbal is not None
@@ -266,12 +284,9 @@ class Backlash(_GimbalEffect):
 class AxisNonorthogonality(_GimbalEffect):
     """Gimbal axis k tilted in its parent by tau: the child turns by tau - R^T tau, R the gimbal's own rotation."""
 
-    name, title, source = "axis-nonorthogonality", "tilt of a gimbal axis", "geometry of the bench"
+    name, title = "axis-nonorthogonality", "tilt of a gimbal axis"
     typical = Typical((5e-6, 50e-6))
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"tau{part}_{self.variant}", "rad", 1e-3) for part in "AB")
+    symbols, unit, scale = ("tauA", "tauB"), "rad", 1e-3
 
     def rotations(self, s: Stimulus) -> Floats:
         from kf_calib.bench.bench import turn
@@ -290,10 +305,7 @@ class GravityError(Effect):
     confused_with = "a common scale factor, always"
     borne_by = Bearer.BENCH
     typical = Typical((10e-6, 700e-6))
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient("epsG", "1", 1e-3),)
+    symbols, unit, scale = ("epsG",), "1", 1e-3
 
     def columns(self, s: Stimulus) -> Floats:
         return (s.force_mps2 @ s.sensitivity.T)[:, :, None]
@@ -320,10 +332,7 @@ class Latency(Effect):
     borne_by = Bearer.BENCH  # the clock and the acquisition are the bench's
     confused_with = "seen in slews only"
     dynamic = True
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient("tau_d", "s", 1e-2, "ms", 1e3),)
+    symbols, unit, scale, shown = ("tau_d",), "s", 1e-2, ("ms", 1e3)
 
     def columns(self, s: Stimulus) -> Floats:
         return -(s.force_rate_mps3 @ s.sensitivity.T)[:, :, None]
@@ -336,17 +345,13 @@ class LeverArm(Effect):
     name, title, source = "lever-arm", "place of each accelerometer", "rigid-body kinematics"
     confused_with = "seen in slews only, about several axes"
     dynamic = True
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(f"r{i}{axis}", "m", 0.1, "mm", 1e3) for i in (1, 2, 3) for axis in "xyz")
+    symbols = tuple(f"r{i}{axis}" for i in (1, 2, 3) for axis in "xyz")
+    unit, scale, shown = "m", 0.1, ("mm", 1e3)
 
     def columns(self, s: Stimulus) -> Floats:
-        columns, turning = np.zeros((len(s), 3, 9)), _cross(s.rate_radps)
+        turning = _cross(s.rate_radps)
         per_metre = turning @ turning + _cross(s.rate_change_radps2)  # what it does to r, (m, 3, 3)
-        for i in range(3):
-            columns[:, i, 3 * i : 3 * i + 3] = s.sensitivity[i] @ per_metre
-        return columns
+        return of_each(s.sensitivity @ per_metre)
 
 
 def _cross(vector: Floats) -> Floats:

@@ -14,9 +14,9 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
-from kf_calib.effects.effect import Effect, FrameEffect, Regressor, SensorEffect
+from kf_calib.effects.effect import Effect, Regressor, SensorEffect
 from kf_calib.effects.formula import Formula, FrameFormula, Reading, quantities
-from kf_calib.effects.frame import GravityError
+from kf_calib.effects.frame import FrameEffect, GravityError
 from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C, Stimulus
 
 _TRIALS = 64

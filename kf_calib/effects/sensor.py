@@ -4,71 +4,58 @@ from __future__ import annotations
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats, sign
+from kf_calib.bench.arrays import Floats
 from kf_calib.effects.effect import MICRO_G, MICRO_PER_G, MILLI_PER_G, Bearer, Regressor, SensorEffect, Typical, Unknown
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
 
 IEEE = "IEEE Std 1293, model equation"
 _EDGES = 500
-_INPUT = Regressor("a", "force along the input axis", "m/s^2")
 
 
-class BiasAsymmetry(SensorEffect):
+class _Nonlinearity(SensorEffect):
+    family, source = "nonlinearity", IEEE
+    drawn_against = Regressor("a", "force along the input axis", "m/s^2")
+
+
+class BiasAsymmetry(_Nonlinearity):
     """1/2 K0' sgn a_i."""
 
-    family = "nonlinearity"
-    name, title, source = "bias-asymmetry", "bias that changes sign with the input", IEEE
+    name, title = "bias-asymmetry", "bias that changes sign with the input"
     on_data_sheet = "bias asymmetry"
-    drawn_against = _INPUT
     formulas = ("0.5*sign(a)",)
     confused_with = "odd-quadratic; invisible in six faces"
     symbol, unit, scale = "K0'", "m/s^2", 1e-3
     typical = Typical((1 * MICRO_G, 10 * MICRO_G))
 
-    def terms(self, s: Stimulus) -> Floats:
-        return 0.5 * sign(s.along)
 
-
-class ScaleAsymmetry(SensorEffect):
+class ScaleAsymmetry(_Nonlinearity):
     """1/2 K1' |a_i|."""
 
-    family = "nonlinearity"
-    name, title, source = "scale-asymmetry", "scale factor that differs with the sign of the input", IEEE
+    name, title = "scale-asymmetry", "scale factor that differs with the sign of the input"
     on_data_sheet = "scale asymmetry"
-    drawn_against = _INPUT
     formulas = ("0.5*abs(a)",)
     confused_with = "second-order"
     symbol, unit, scale = "K1'", "1", 1e-3
     typical = Typical((1e-6, 30e-6), (0.1e-3, 1e-3))
 
-    def terms(self, s: Stimulus) -> Floats:
-        return 0.5 * np.abs(s.along)
 
-
-class SecondOrder(SensorEffect):
+class SecondOrder(_Nonlinearity):
     """K2 a_i^2."""
 
-    family = "nonlinearity"
-    name, title, source = "second-order", "second-order nonlinearity", IEEE
+    name, title = "second-order", "second-order nonlinearity"
     on_data_sheet, in_polynomial = "second order", True
-    drawn_against = _INPUT
     formulas = ("a**2",)
     confused_with = "scale-asymmetry"
     symbol, unit, scale = "K2_", "s^2/m", 1e-4
     typical = Typical((1 * MICRO_PER_G, 20 * MICRO_PER_G), (0.1 * MILLI_PER_G, 3 * MILLI_PER_G))
 
-    def terms(self, s: Stimulus) -> Floats:
-        return s.along**2
 
-
-class ThirdOrder(SensorEffect):
+class ThirdOrder(_Nonlinearity):
     """K3 a_i^3."""
 
-    family = "nonlinearity"
-    name, title, source = "third-order", "third-order nonlinearity", IEEE
+    name, title = "third-order", "third-order nonlinearity"
     on_data_sheet, in_polynomial = "third order", True
-    drawn_against = _INPUT
     formulas = ("a**3",)
     confused_with = "odd-quadratic; invisible in six faces"
     symbol, unit, scale = "K3_", "s^4/m^2", 1e-5
@@ -77,27 +64,19 @@ class ThirdOrder(SensorEffect):
         (0.0, 5 * MILLI_PER_G / STANDARD_GRAVITY_MPS2),
     )
 
-    def terms(self, s: Stimulus) -> Floats:
-        return s.along**3
-
     def added(self, s: Stimulus, coefficients: Floats) -> Floats:
         return coefficients * s.along * s.along * s.along  # ten times as fast as the power
 
 
-class OddQuadratic(SensorEffect):
+class OddQuadratic(_Nonlinearity):
     """Koq a_i |a_i|."""
 
-    family = "nonlinearity"
-    name, title, source = "odd-quadratic", "odd quadratic nonlinearity", IEEE
+    name, title = "odd-quadratic", "odd quadratic nonlinearity"
     on_data_sheet = "odd quadratic"
-    drawn_against = _INPUT
     formulas = ("a*abs(a)",)
     confused_with = "third-order; invisible in six faces"
     symbol, unit, scale = "Koq", "s^2/m", 1e-4
     typical = Typical((1 * MICRO_PER_G, 10 * MICRO_PER_G), (0.0, MILLI_PER_G))
-
-    def terms(self, s: Stimulus) -> Floats:
-        return s.along * np.abs(s.along)
 
 
 class _CrossCoupling(SensorEffect):
@@ -115,9 +94,6 @@ class CrossCouplingIP(_CrossCoupling):
     drawn_against = Regressor("a*p", "force along the input axis times that along the pendulous axis", "m^2/s^4")
     formulas = ("a*p",)
 
-    def terms(self, s: Stimulus) -> Floats:
-        return s.along * s.pendulous
-
 
 class CrossCouplingIO(_CrossCoupling):
     """Kio a_i a_o."""
@@ -127,9 +103,6 @@ class CrossCouplingIO(_CrossCoupling):
     drawn_against = Regressor("a*o", "force along the input axis times that along the output axis", "m^2/s^4")
     formulas = ("a*o",)
 
-    def terms(self, s: Stimulus) -> Floats:
-        return s.along * s.output
-
 
 class CrossCouplingPO(_CrossCoupling):
     """Kpo a_p a_o."""
@@ -138,9 +111,6 @@ class CrossCouplingPO(_CrossCoupling):
     on_data_sheet, in_polynomial = "coupling p × o", True
     drawn_against = Regressor("p*o", "force along the pendulous axis times that along the output axis", "m^2/s^4")
     formulas = ("p*o",)
-
-    def terms(self, s: Stimulus) -> Floats:
-        return s.pendulous * s.output
 
 
 class CrossAxisSquare(_CrossCoupling):
@@ -153,9 +123,6 @@ class CrossAxisSquare(_CrossCoupling):
     confused_with = "second-order, output-square, bias"
     typical = Typical((1 * MICRO_PER_G, 20 * MICRO_PER_G), (0.0, MILLI_PER_G))
 
-    def terms(self, s: Stimulus) -> Floats:
-        return s.pendulous**2
-
 
 class OutputSquare(_CrossCoupling):
     """Koo a_o^2; beside K2, Kpp and a bias it is redundant, because the squares sum to g^2, alone it is not."""
@@ -166,9 +133,6 @@ class OutputSquare(_CrossCoupling):
     formulas = ("o**2",)
     confused_with = "second-order and cross-axis-square together"
     typical = Typical((1 * MICRO_PER_G, 10 * MICRO_PER_G), (0.0, MILLI_PER_G))
-
-    def terms(self, s: Stimulus) -> Floats:
-        return s.output**2
 
 
 class VibrationRectification(SensorEffect):
@@ -188,23 +152,16 @@ class VibrationRectification(SensorEffect):
         return np.broadcast_to(s.variance_mps2_2, (len(s), 3))
 
 
-class DeadZone(SensorEffect):
+class DeadZone(_Nonlinearity):
     """-a_i where |a_i| < d: a share of 1 is a reading that stays where it is over the whole zone."""
 
-    family = "nonlinearity"
-    name, title, source = "dead-zone", "no response to small inputs", IEEE
-    drawn_against = _INPUT
+    name, title = "dead-zone", "no response to small inputs"
     formulas = ("-a*(abs(a) < constant)",)
     confused_with = "needs poses that sweep through zero"
     symbol, unit, scale, shown = "Dz", "1", 1.0, ("of the input", 1.0)
     unknown = Unknown("dZone", "m/s^2", 1e-6, 1e-2)
     smooth = False
-
-    def __init__(self) -> None:
-        self.value = 1e-4
-
-    def terms(self, s: Stimulus) -> Floats:
-        return np.where(np.abs(s.along) < self.value, -s.along, 0.0)
+    value = 1e-4
 
     def edges(self, s: Stimulus) -> Floats:
         """At every input, or every so many: a pose that moves a little has one at each node."""

@@ -32,8 +32,9 @@ from pathlib import Path
 from types import ModuleType
 
 from kf_calib.effects import checks
-from kf_calib.effects.effect import Bearer, Effect, FrameEffect, SensorEffect
+from kf_calib.effects.effect import Bearer, Effect, SensorEffect
 from kf_calib.effects.formula import NAME_RULE, is_name, symbol_stem
+from kf_calib.effects.frame import FrameEffect
 from kf_calib.errors import InputError
 
 TWELVE = frozenset(f"{stem}{i}" for stem in ("theta", "phi", "nu", "K", "b") for i in (1, 2, 3))
@@ -63,7 +64,7 @@ def classes_in(source: bytes, path: Path) -> list[type[Effect]]:
     except (Exception, SystemExit) as error:
         del sys.modules[module.__name__]
         raise InputError(
-            f"{path}{_line(error, path)}: cannot be run ({checks.error_words(error)}): mend it there."
+            f"{path}{checks.line_in(error, str(path))}: cannot be run ({checks.error_words(error)}): mend it there."
         ) from None
     classes = effect_classes(module)
     if not classes:
@@ -72,17 +73,6 @@ def classes_in(source: bytes, path: Path) -> list[type[Effect]]:
             "(from kf_calib.effects import SensorEffect)."
         )
     return classes
-
-
-def _line(error: BaseException, path: Path) -> str:
-    """The last line of the file that an error passed through, as ``, line N``."""
-    if isinstance(error, SyntaxError) and error.filename == str(path):
-        return f", line {error.lineno}"
-    trace, line = error.__traceback__, None
-    while trace is not None:
-        line = trace.tb_lineno if trace.tb_frame.f_code.co_filename == str(path) else line
-        trace = trace.tb_next
-    return f", line {line}" if line else ""
 
 
 def effect_classes(module: ModuleType) -> list[type[Effect]]:
@@ -101,16 +91,19 @@ def completed(kind: type[Effect], origin: str) -> type[Effect]:
     """The class with what it left out; raises InputError where that cannot be filled in."""
     who = f"class {kind.__name__} of {origin}"
     missing = sorted(getattr(kind, "__abstractmethods__", ()))
+    if issubclass(kind, SensorEffect):
+        missing += ["terms"] if kind.terms is SensorEffect.terms and not kind.formulas else []
+    elif kind.coefficients is Effect.coefficients and not hasattr(kind, "symbols"):
+        missing = ["coefficients", *missing]
     if missing:
         raise InputError(f"{who} lacks {' and '.join(missing)}: define {'it' if len(missing) == 1 else 'them'}.")
     given = getattr(kind, "name", None)
     name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", kind.__name__).lower() if given is None else given
     if not (isinstance(name, str) and is_name(name)):
         raise InputError(f"{who} is called {name!r}: a name is made of {NAME_RULE}.")
-    defaults: dict[str, object] = {"name": name, "title": name, "source": "user"}
+    defaults: dict[str, object] = {"name": name, "title": name, "source": "user", "unit": "SI", "scale": 1.0}
     if issubclass(kind, SensorEffect):
-        unit = getattr(kind, "unit", "SI")
-        defaults |= {"symbol": symbol_stem(name), "unit": unit, "scale": 1.0}
+        defaults["symbol"] = symbol_stem(name)
     for key, value in defaults.items():
         if not hasattr(kind, key):
             setattr(kind, key, value)

@@ -202,17 +202,9 @@ class Kalibr(AffineTarget):
     title, bias = "Kalibr", False
 
     def text(self) -> str:
-        rows = np.linalg.inv(self.affine.matrix).tolist()
-        lines = [
-            f"# {self.origin}.",
-            f"# It {self.takes}.",
-            "imu0:",
-            "  accelerometers:",
-            "    M:",
-            *(f"    - {row}" for row in rows),
-        ]
-        noise = [f"  {line}" for line in self.noise.yaml_lines] if self.noise else []
-        return "\n".join([*lines, "  model: scale-misalignment", *noise, ""])
+        rows = [f"    - {row}" for row in np.linalg.inv(self.affine.matrix).tolist()]
+        matrix = ["imu0:", "  accelerometers:", "    M:", *rows, "  model: scale-misalignment"]
+        return "\n".join([*self.heading, *matrix, *self.noise_in_yaml, ""])
 
 
 class OpenVins(AffineTarget):
@@ -234,8 +226,8 @@ class OpenVins(AffineTarget):
         lines = [
             line for name, own in matrices.items() for line in (f"  {name}:", *(f"    - {r}" for r in own.tolist()))
         ]
-        noise = [f"  {line}" for line in self.noise.yaml_lines] if self.noise else []
-        return "\n".join(["%YAML:1.0", *self.heading, "imu0:", '  model: "kalibr"', *lines, *noise, ""])
+        head = ["%YAML:1.0", *self.heading, "imu0:", '  model: "kalibr"']
+        return "\n".join([*head, *lines, *self.noise_in_yaml, ""])
 
 
 def rotation_and_lower(matrix: Floats) -> tuple[Floats, Floats]:

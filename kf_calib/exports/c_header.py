@@ -13,18 +13,19 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from functools import partial
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.effects import Effect
-from kf_calib.effects.expression import FUNCTIONS, OPERATORS, Expression
+from kf_calib.effects.effect import own_formula
+from kf_calib.effects.expression import FUNCTIONS, OPERATORS, Expression, numbers_stay
 from kf_calib.effects.formula import Formula, quantities
 from kf_calib.errors import InputError
 from kf_calib.exports.target import Target, in_comment
 
-_OWN_NAMES = ("a", "p", "o", "T", "constant", "before", "after")
 _SIZES = (1e-8, 1e-5, 1e-3, 1.0, 2.0)
 """Of specific force, in g: so that the rounds are enough in a dead zone, too."""
 
@@ -120,7 +121,7 @@ class CHeader(Target):
         if not effect.formulas:
             raise InputError(f"{effect} is a class in Python, which cannot be written in C: use kf-calib apply, or "
                              f"write the effect as a formula (--with 'my-{effect} = ...').")  # fmt: skip
-        return [Expression(text, dict.fromkeys(_OWN_NAMES, "")) for text in effect.formulas]
+        return [own_formula(text) for text in effect.formulas]
 
     def _rounds(self) -> int:
         """How often the correction has to be repeated, wherever the specific force points."""
@@ -172,21 +173,15 @@ def text_of_number(piece: TextOfC) -> str:
     return f"{float(piece)!r}" if piece >= 0.0 else f"({float(piece)!r})"
 
 
-def _operator(sign: str) -> Callable[..., TextOfC]:
+def _operation(sign: str, *pieces: TextOfC) -> str:
     """Return what an operator makes of pieces."""
-
-    def made(*pieces: TextOfC) -> TextOfC:
-        if not any(isinstance(piece, str) for piece in pieces):
-            return float(OPERATORS[sign](*pieces))
-        words = [text_of_number(piece) for piece in pieces]
-        if sign == "**":
-            return _power(words, pieces[1])
-        if len(words) == 1:
-            return f"(-{words[0]})" if sign == "neg" else words[0]
-        joined = f"({words[0]} {sign} {words[1]})"
-        return f"(double){joined}" if sign[0] in "<>" else joined
-
-    return made
+    words = [text_of_number(piece) for piece in pieces]
+    if sign == "**":
+        return _power(words, pieces[1])
+    if len(words) == 1:
+        return f"(-{words[0]})" if sign == "neg" else words[0]
+    joined = f"({words[0]} {sign} {words[1]})"
+    return f"(double){joined}" if sign[0] in "<>" else joined
 
 
 def _power(words: list[str], exponent: TextOfC) -> str:
@@ -196,16 +191,10 @@ def _power(words: list[str], exponent: TextOfC) -> str:
     return f"pow({', '.join(words)})"
 
 
-def _function(name: str) -> Callable[..., TextOfC]:
+def _call(name: str, *pieces: TextOfC) -> str:
     """Return what a function makes of pieces."""
-
-    def made(*pieces: TextOfC) -> TextOfC:
-        if not any(isinstance(piece, str) for piece in pieces):
-            return float(FUNCTIONS[name](*pieces))
-        return f"{(MATH | _OWN)[name]}({', '.join(map(text_of_number, pieces))})"
-
-    return made
+    return f"{(MATH | _OWN)[name]}({', '.join(map(text_of_number, pieces))})"
 
 
-_OPERATORS = {sign: _operator(sign) for sign in OPERATORS}
-_FUNCTIONS = {name: _function(name) for name in FUNCTIONS}
+_OPERATORS = {sign: numbers_stay(number, partial(_operation, sign)) for sign, number in OPERATORS.items()}
+_FUNCTIONS = {name: numbers_stay(number, partial(_call, name)) for name, number in FUNCTIONS.items()}

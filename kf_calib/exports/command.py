@@ -15,7 +15,6 @@ from kf_calib.errors import InputError
 
 if TYPE_CHECKING:
     from kf_calib.exports.noise_keys import NoiseExport
-    from kf_calib.support.output_files import Outputs
 
 
 ExportKind = Literal[
@@ -55,15 +54,16 @@ def export(
 
     outputs = claimed(overwrite=overwrite)
     if _is_noise_alone(calibration, to, noise):
-        _export_noise(outputs, calibration if noise is None else noise, to, output, as_json)
-        return
-    saved = calibration_file.open_calibration(calibration)
-    target = exported(saved, saved.correction(calibration, programs.effects_from, programs.trust), to, lossy)
-    if noise is not None:
-        target.noise = _noise_for(noise, to)
+        target = _noise_for(calibration if noise is None else noise, to)
+        shown_by = views.noise_export_object, views.noise_export_report
+    else:
+        saved = calibration_file.open_calibration(calibration)
+        target = exported(saved, saved.correction(calibration, programs.effects_from, programs.trust), to, lossy)
+        target.noise = None if noise is None else _noise_for(noise, to)
+        shown_by = views.exported_object, views.exported_report
     content = target.text().encode()
     outputs.write(output, lambda path: write_whole(path, content))
-    print_result(as_json, views.exported_object, views.exported_report, target, to, output)
+    print_result(as_json, *shown_by, target, to, output)
 
 
 def _is_noise_alone(path: Path, to: str, noise: Path | None) -> bool:
@@ -88,14 +88,3 @@ def _noise_for(path: Path, to: str) -> NoiseExport:
         if program == to:
             return NoiseExport(open_noise(path), program)
     raise InputError(f"{to} takes no noise: leave out --noise, or export to {', '.join(NoiseExport.titles)}.")
-
-
-def _export_noise(outputs: Outputs, path: Path, to: str, output: Path, as_json: bool) -> None:
-    """Write noise alone in the keys of a program."""
-    from kf_calib.exports import text as views
-    from kf_calib.support.output_files import write_whole
-
-    export = _noise_for(path, to)
-    content = export.text().encode()
-    outputs.write(output, lambda path: write_whole(path, content))
-    print_result(as_json, views.noise_export_object, views.noise_export_report, export, output)

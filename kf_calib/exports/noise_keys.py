@@ -16,17 +16,28 @@ trusts a sensor more than the recording shows.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from typing import ClassVar, Literal, NamedTuple
 
 from kf_calib.errors import InputError
 from kf_calib.exchange.noise_file import SavedChannel, SavedRestNoise, TermName
-from kf_calib.exports.target import in_comment
 
 NoiseProgram = Literal["kalibr", "openvins", "px4", "robot_localization"]
 PX4_STEP_S = 0.01
-_UNITS: dict[str, tuple[str, str]] = {"m/s^2": ("accelerometer", "ACC"), "rad/s": ("gyroscope", "GYR")}
-_RANDOM_WALK_UNITS = {"m/s^2": "m/s^3/sqrt(Hz)", "rad/s": "rad/s^2/sqrt(Hz)"}
+_UNITS = {"m/s^2": ("accelerometer", "ACC", "m/s^3"), "rad/s": ("gyroscope", "GYR", "rad/s^2")}
+"""Of readings, with the name of the sensor in full and in PX4, and the unit of its rate of change."""
+_LONGEST = 120
+
+
+def in_comment(text: str) -> str:
+    """The text without what could end a comment, or mean anything, in C, YAML or a list of parameters."""
+    return re.sub(r"[^\w.+:-]+", "_", text)[:_LONGEST]
+
+
+def origin_of(what: str, program: str, created: str) -> str:
+    """Where numbers come from, fit for a comment of any of the formats; what: fit for it already."""
+    return f"{what} by kf_calib {in_comment(program)}, {in_comment(created)}"
 
 
 class NoiseKey(NamedTuple):
@@ -56,18 +67,18 @@ class NoiseExport:
     def keys(self) -> list[NoiseKey]:
         """Keys and values; of robot_localization there are none, but two matrices."""
         keys = list[NoiseKey]()
-        for unit, (sensor, word) in _UNITS.items():
+        for unit, (sensor, word, per_s) in _UNITS.items():
             channels = self.noise.of_unit(unit)
             if not channels:
                 continue
             (white, white_limit), (walk, walk_limit) = (_largest(channels, term) for term in ("white", "random_walk"))
             if self.to == "px4":
-                scale, per_s = PX4_STEP_S**-0.5, {"m/s^2": "m/s^3", "rad/s": "rad/s^2"}[unit]
+                scale = PX4_STEP_S**-0.5
                 keys.append(NoiseKey(f"EKF2_{word}_NOISE", white * scale, unit, white_limit))
                 keys.append(NoiseKey(f"EKF2_{word}_B_NOISE", walk * scale, per_s, walk_limit))
             elif self.to != "robot_localization":
                 keys.append(NoiseKey(f"{sensor}_noise_density", white, f"{unit}/sqrt(Hz)", white_limit))
-                keys.append(NoiseKey(f"{sensor}_random_walk", walk, _RANDOM_WALK_UNITS[unit], walk_limit))
+                keys.append(NoiseKey(f"{sensor}_random_walk", walk, f"{per_s}/sqrt(Hz)", walk_limit))
         return keys
 
     @property
@@ -96,7 +107,7 @@ class NoiseExport:
     def origin(self) -> str:
         """Where the numbers come from, fit for a comment of any of the formats."""
         name = in_comment(self.noise.recording) or "a recording"
-        return f"noise of {name} by kf_calib {in_comment(self.noise.program)}, {in_comment(self.noise.created)}"
+        return origin_of(f"noise of {name}", self.noise.program, self.noise.created)
 
     @property
     def parameter_lines(self) -> list[str]:

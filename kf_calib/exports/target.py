@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import csv
 import io
-import re
 import unicodedata
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar, NamedTuple, Protocol
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -19,17 +18,7 @@ from kf_calib.bench.raw_input import PLAIN, RawInput
 from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C
 from kf_calib.estimation.correction import Correction
 from kf_calib.exchange.calibration_file import SavedCalibration
-
-
-class NoiseLines(Protocol):
-    """The noise in the keys of a program: lines of a mapping in YAML, or of a list of parameters, and what to know."""
-
-    @property
-    def yaml_lines(self) -> list[str]: ...
-    @property
-    def parameter_lines(self) -> list[str]: ...
-    @property
-    def remarks(self) -> tuple[str, ...]: ...
+from kf_calib.exports.noise_keys import NoiseExport, in_comment, origin_of
 
 
 class Target(ABC):
@@ -45,7 +34,7 @@ class Target(ABC):
 
     def __init__(self, saved: SavedCalibration, correction: Correction) -> None:
         self.saved, self.correction = saved, correction
-        self.noise: NoiseLines | None = None
+        self.noise: NoiseExport | None = None
 
     @abstractmethod
     def text(self) -> str:
@@ -94,6 +83,11 @@ class Target(ABC):
         return self.grid.error_of(self.correction, self.corrected) if self.lost else None
 
     @property
+    def noise_in_yaml(self) -> list[str]:
+        """The lines of the noise as they are indented in YAML."""
+        return [f"  {line}" for line in self.noise.yaml_lines] if self.noise else []
+
+    @property
     def heading(self) -> tuple[str, str]:
         """The lines of a comment that a file begins with: where the numbers come from, and what it takes."""
         return f"# {self.origin}.", f"# It {self.takes}."
@@ -103,8 +97,7 @@ class Target(ABC):
         """Where the numbers come from, fit for a comment of any of the formats."""
         made = self.saved.provenance
         name = in_comment(made.recording) or "a run that was not recorded"
-        version, created = in_comment(made.versions.get("kf_calib", "")), in_comment(made.created)
-        return f"calibration of {name} by kf_calib {version}, {created}"
+        return origin_of(f"calibration of {name}", made.versions.get("kf_calib", ""), made.created)
 
 
 _DIRECTIONS = 10_000  # with the opposite of each, so that odd powers of the force cancel exactly
@@ -152,14 +145,6 @@ def force_grid(gravity_mps2: float, low_c: float | None, high_c: float | None) -
         low,
         high,
     )
-
-
-_LONGEST = 120
-
-
-def in_comment(text: str) -> str:
-    """The text without what could end a comment, or mean anything, in C, YAML or a list of parameters."""
-    return re.sub(r"[^\w.+:-]+", "_", text)[:_LONGEST]
 
 
 def in_cell(text: str) -> str:

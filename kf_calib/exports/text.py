@@ -50,12 +50,12 @@ def exported_report(target: Target, to: str, path: Path) -> RenderableType:
     return Group(*lines, *map(note, [*target.remarks, *(target.noise.remarks if target.noise else ())]))
 
 
-def noise_export_object(export: NoiseExport, path: Path) -> dict[str, Any]:
+def noise_export_object(export: NoiseExport, to: str, path: Path) -> dict[str, Any]:
     """The JSON object of ``export`` of noise alone."""
     return clean(
         {
             "out": str(path),
-            "format": export.to,
+            "format": to,
             "keys": {key.name: key.value for key in export.keys},
             "limits": [key.name for key in export.keys if key.is_limit],
             "warnings": list(export.remarks),
@@ -63,6 +63,6 @@ def noise_export_object(export: NoiseExport, path: Path) -> dict[str, Any]:
     )
 
 
-def noise_export_report(export: NoiseExport, path: Path) -> RenderableType:
+def noise_export_report(export: NoiseExport, to: str, path: Path) -> RenderableType:
     """The report of ``export`` of noise alone."""
     return Group(Text(f"{path} is the noise for {export.title}.", style="bold"), *map(note, export.remarks))

@@ -25,7 +25,16 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.fleet.campaign import Blocks, Campaign, Group, log_evidence, log_evidence_of_modes, log_mean, modes, sizes
 from kf_calib.fleet.own_coefficients import UnitInformation, UnitsAndCommon
-from kf_calib.fleet.pooled_terms import Attribution, Common, DatedSums, PooledTerms, Sums, Term, shares_of
+from kf_calib.fleet.pooled_terms import (
+    Attribution,
+    Common,
+    DatedSums,
+    PooledTerms,
+    Sums,
+    Term,
+    WeighedTerm,
+    shares_of,
+)
 from kf_calib.fleet.shape import SomeUnits
 from kf_calib.support.tail_probabilities import weights
 
@@ -39,8 +48,6 @@ _HAS_IT = 0.5  # probability above which a unit counts as one that has the effec
 _MAY_HAVE_IT = 0.05  # and as one that may have it
 
 
-_Weighed = tuple[Term, float]
-"""A term and its log evidence against none."""
 _LEAST = 0.25  # sigma of one run: the smallest spread that is expected
 _RATIOS = np.array([0.0, 1.0, 3.0])  # of the mean of a population to its spread
 
@@ -152,44 +159,37 @@ def attribution_table(campaign: Campaign, terms: PooledTerms) -> AttributionTabl
     return AttributionTable(tuple(rows), found[1:], float(found[0]))
 
 
-def _of_runs(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) -> list[_Weighed]:
+def _of_runs(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) -> list[WeighedTerm]:
     """Return the terms of coefficients of benches and, if units were measured again, of single runs."""
     of_bench = [group for group in groups if Attribution.BENCH.possible(group.borne_by)]
-    dated, weighed = DatedSums(campaign, terms), list[_Weighed]()
-    sums = [OwnCoefficients(group, terms) for group in groups] if campaign.repeats else []
+    dated = DatedSums(campaign, terms)
+    sums = [OwnCoefficients(group, Attribution.RUN, terms) for group in groups] if campaign.repeats else []
     for blocks in campaign.runs():
         rest = terms.beside_own(blocks)
         dated.add(rest)
         for coefficients in sums:
             coefficients.add(rest)
-    for group in of_bench:
-        one, two = dated.constant(group), dated.repaired(group)
-        weighed.append((Term(group, Attribution.BENCH, one.size), one.log_odds))
-        if two is not None:
-            term = Term(group, Attribution.REPAIRED, two.size, repair=two.repair)
-            weighed.append((term, two.log_odds))
-    return [
-        *weighed,
-        *(_drawn(group, Attribution.RUN, coefficients) for group, coefficients in zip(groups, sums, strict=False)),
-    ]
+    of_benches = [each for group in of_bench for each in (dated.constant(group), dated.repaired(group))]
+    return [*filter(None, of_benches), *(coefficients.evidence() for coefficients in sums)]
 
 
-def _of_units(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) -> list[_Weighed]:
+def _of_units(campaign: Campaign, terms: PooledTerms, groups: Sequence[Group]) -> list[WeighedTerm]:
     """Return the terms of coefficients that units have, all of them or some."""
     groups = [group for group in groups if Attribution.SENSORS.possible(group.borne_by)]
-    sums, parts = [OwnCoefficients(group, terms) for group in groups], [list[UnitsAndCommon]() for _ in groups]
+    sums = [OwnCoefficients(group, Attribution.SENSORS, terms) for group in groups]
+    parts = [list[UnitsAndCommon]() for _ in groups]
     for blocks in campaign.units(terms.repairs):
         rest = terms.beside_own(blocks)
         for group, coefficients, part in zip(groups, sums, parts, strict=True):
             coefficients.add(rest)
             part.append(UnitsAndCommon.of(group, terms, rest))
-    weighed = list[_Weighed]()
+    weighed = list[WeighedTerm]()
     for group, coefficients, part in zip(groups, sums, parts, strict=True):
-        information, (term, log_odds) = UnitsAndCommon.joined(part), _drawn(group, Attribution.SENSORS, coefficients)
+        information, (term, log_odds) = UnitsAndCommon.joined(part), coefficients.evidence()
         units, too_much = information.integrated(), information.explained_by_common()
         some = SomeUnits(group, units, with_mean=log_odds > 0.0)  # where nothing speaks for a mean of all, none
-        weighed.append((term, float(np.logaddexp(log_odds, some.log_odds_of_all - too_much) - np.log(2.0))))
-        weighed.append((_of_some(group, units, some), some.log_odds - too_much))
+        every = float(np.logaddexp(log_odds, some.log_odds_of_all - too_much) - np.log(2.0))
+        weighed += [WeighedTerm(term, every), WeighedTerm(_of_some(group, units, some), some.log_odds - too_much)]
     return weighed
 
 
@@ -201,32 +201,17 @@ def _of_some(group: Group, information: UnitInformation, some: SomeUnits) -> Ter
     return Term(group, Attribution.SOME, some.size, units=has, unsure=may_have - has)
 
 
-def _drawn(group: Group, attribution: Attribution, coefficients: OwnCoefficients) -> _Weighed:
-    found = coefficients.evidence()
-    return Term(group, attribution, found.spread, found.mean_size), found.log_odds
-
-
 def _log_prior(term: Term, tried: set[Attribution], groups: int) -> float:
     """Return the log of the probability of a term before the runs."""
     share = _RARELY.get(term.attribution, 1.0) / sum(_RARELY.get(each, 1.0) for each in tried)
     return float(np.log((1.0 - _NONE) / groups * share))
 
 
-@dataclass(frozen=True)
-class PopulationEvidence:
-    """Log evidence of own coefficients against none, and the likeliest spread and size of the mean, in
-    ``Group.sigma``."""
-
-    log_odds: float
-    spread: float
-    mean_size: float
-
-
 class OwnCoefficients:
-    """Sums over units (or runs) for one effect, for each spread of a grid."""
+    """Sums over units (or runs, by the attribution) for one effect, for each spread of a grid."""
 
-    def __init__(self, group: Group, terms: PooledTerms) -> None:
-        self._terms, self._group = terms, group
+    def __init__(self, group: Group, attribution: Attribution, terms: PooledTerms) -> None:
+        self._terms, self._group, self._attribution = terms, group, attribution
         self._spreads = sizes(_LEAST, group.largest)
         self._more = [Common(k, 1.0) for k in range(group.columns.start, group.columns.stop)]
         count = len(terms.common) + len(self._more)
@@ -248,16 +233,17 @@ class OwnCoefficients:
             self._lost.score[k] += (gain * rows).T @ scores
         self._total = self._total + self._terms.sums(blocks, self._more)
 
-    def evidence(self) -> PopulationEvidence:
-        """The evidence of all blocks that were added."""
+    def evidence(self) -> WeighedTerm:
+        """The term, with the likeliest spread and size of the mean, by all blocks that were added."""
         count = len(self._terms.common)
-        info, score = self._total.info - self._lost.info, self._total.score - self._lost.score
+        left = self._total - self._lost
         means = self._spreads[:, None] * _RATIOS
         prior = np.concatenate([
             np.broadcast_to(self._terms.prior, (*means.shape, count)),
             np.repeat(means[..., None], len(self._more), axis=2),
         ], axis=2)  # fmt: skip
-        logs = log_evidence(info[:, None], score[:, None], prior) + self._own[:, None]
+        logs = log_evidence(left.info[:, None], left.score[:, None], prior) + self._own[:, None]
         logs -= log_evidence(self._total.info[:count, :count], self._total.score[:count], self._terms.prior)
         best = np.unravel_index(np.argmax(logs), logs.shape)
-        return PopulationEvidence(float(log_mean(logs)), float(self._spreads[best[0]]), float(means[best]))
+        term = Term(self._group, self._attribution, float(self._spreads[best[0]]), float(means[best]))
+        return WeighedTerm(term, float(log_mean(logs)))

@@ -24,9 +24,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Protocol, TypeVar
+from typing import Any, Self, TypeVar
 
 import dask.config
 from distributed import Client, Future, KilledWorker, LocalCluster, Worker, WorkerPlugin, as_completed
@@ -35,8 +36,14 @@ from fsspec.implementations.local import LocalFileSystem
 
 from kf_calib.bench.arrays import one_blas_thread
 from kf_calib.bench.streams import Source
+from kf_calib.cli.command import values_of
+from kf_calib.cli.failures import sentence
+from kf_calib.cli.options import EvaluationOptions, ReadingOptions, opened
+from kf_calib.diagnosis.missing_effect import diagnose
+from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.errors import InputError, KfCalibError
+from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.results import Calibration
 from kf_calib.fleet import run_list
 from kf_calib.fleet.run_factor import run_factor
@@ -44,12 +51,15 @@ from kf_calib.fleet.run_list import ListedRun, Row
 from kf_calib.fleet.store import Known, Store
 from kf_calib.sources.files.record_files import fingerprint
 from kf_calib.sources.opening import run_date
+from kf_calib.views.diagnosis import diagnosis_object
+from kf_calib.views.json import replay_object
 
 _AHEAD = 4
 """Runs under way for each process, so that none waits for its next one; what is under way bounds the memory."""
 _CONFIG = {
     "distributed.scheduler.allowed-failures": 2,  # so often may a run take its process with it and be tried again
     "distributed.scheduler.worker-saturation": 1.0,  # no run waits at a process that another one takes with it
+    "distributed.deploy.lost-worker-timeout": "1d",  # a process takes its time to begin again on a busy machine
     "distributed.worker.profile.enabled": False,  # looks a hundred times a second at what a worker does
     # Dask would have free memory of 64 kB given back at once, and arrays of 128 kB fetched from the system each time.
     "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 1 << 28,
@@ -194,34 +204,37 @@ _GRACE_S = 60.0  # at most, before a process is ended
 T = TypeVar("T")
 
 
-class Commands(Protocol):
-    """What the single commands do with a recording, and how they say what failed.
-
-    They are given to a fleet from above, because it knows neither their options nor their documents; they are sent to
-    the workers by pickle.
-    """
-
-    def replay(self, path: Path) -> tuple[Source, Calibration]: ...
-
-    def diagnose(self, source: Source, result: Calibration) -> Diagnosis: ...
-
-    def replay_document(self, result: Calibration) -> dict[str, Any]: ...
-
-    def diagnosis_document(self, diagnosis: Diagnosis) -> dict[str, Any]: ...
-
-    def sentence(self, error: BaseException) -> str: ...
-
-
 @dataclass(frozen=True)
 class RunEvaluation:
-    """How each run of a fleet is evaluated; calling it evaluates one.
+    """How each run of a fleet is evaluated: as ``replay`` and ``diagnose`` do it with these options. Calling it
+    evaluates one; it is sent to the workers by pickle.
 
-    settings: checksum of all that the numbers depend on besides the recording. limit_s: how long a run may take.
+    settings: checksum of all that numbers depend on besides the recording: options, the files they name, and the
+    program. limit_s: how long a run may take.
     """
 
-    commands: Commands
+    reading: ReadingOptions
+    evaluation: EvaluationOptions
     settings: str
     limit_s: float = LIMIT_S
+
+    @classmethod
+    def of(cls, reading: ReadingOptions, evaluation: EvaluationOptions, limit_s: float = LIMIT_S) -> Self:
+        """The evaluation with these options; raises KfCalibError where every run would fail with them."""
+        evaluation.settings()
+        _ = reading.keys
+        told = {key: _content(value) for key, value in sorted(values_of(reading, evaluation))}
+        text = json.dumps(told | {"kf_calib": version("kf_calib")})
+        return cls(reading, evaluation, hashlib.sha256(text.encode()).hexdigest(), limit_s)
+
+    def replay(self, path: Path) -> tuple[Source, Calibration]:
+        """What ``replay`` evaluates of a recording."""
+        source, settings = opened(path, self.reading, self.evaluation)
+        return source, calibrate(source, settings)
+
+    def diagnose(self, source: Source, result: Calibration) -> Diagnosis:
+        """What ``diagnose`` then does."""
+        return diagnose(result, Refits(source))
 
     def settings_of(self, run: ListedRun) -> str:
         """Checksum of all that the row of a run depends on besides its recording: what a list says of it, too."""
@@ -253,24 +266,30 @@ class RunEvaluation:
                 try:
                     self._evaluate(row, path)
                 except Exception as error:
-                    row["error"] = self.commands.sentence(error)
+                    row["error"] = sentence(error)
                 _call_by_place(row, path, run)
         except Exception as error:  # could not be fetched
-            row["error"] = self.commands.sentence(error)
+            row["error"] = sentence(error)
         return True
 
     def _evaluate(self, row: Row, path: Path) -> None:
         """Fill in the row as far as the evaluation comes."""
-        source, result = self.commands.replay(path)
+        source, result = self.replay(path)
         notes = result.bench.notes
         row["unit"] = row["unit"] or notes.get("block_serial")
         row["bench"] = row["bench"] or notes.get("bench")
         row["date"] = row["date"] or run_date(source)
-        row |= run_list.of_replay(self.commands.replay_document(result))
+        row |= run_list.of_replay(replay_object(result))
         row |= run_list.of_factor(run_factor(result.fit))
         if result.bench.angles:  # without them there is no telling what depends on the attitude
-            document = self.commands.diagnosis_document(self.commands.diagnose(source, result))
-            row |= run_list.of_diagnosis(document)
+            row |= run_list.of_diagnosis(diagnosis_object(self.diagnose(source, result)))
+
+
+def _content(value: Any) -> Any:
+    """Return an option as it counts: a file by what is in it."""
+    if isinstance(value, Path):
+        return hashlib.sha256(value.read_bytes()).hexdigest()
+    return [_content(each) for each in value] if isinstance(value, tuple | list) else value
 
 
 def begun(run: ListedRun, settings: str) -> Row:

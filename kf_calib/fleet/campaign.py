@@ -130,14 +130,10 @@ class Campaign:
 
     def runs(self) -> Iterator[Blocks]:
         """Blocks of runs, in the order in which they are read."""
-        part = list[_Part]()
-        for key, info, score in self._run_information():
-            part.append((key.run, key.unit, self.benches.index(key.bench), key.rank, info, score))
-            if len(part) == _TOGETHER:
-                yield _stacked(part)
-                part = []
-        if part:
-            yield _stacked(part)
+        return _stacked(
+            (key.run, key.unit, self.benches.index(key.bench), key.rank, info, score)
+            for key, info, score in self._run_information()
+        )
 
     def units(self, repairs: Sequence[tuple[int, int]] = ()) -> Iterator[Blocks]:
         """Blocks of units, each the sum of its runs on one bench; repairs: bench and first rank after a repair, at
@@ -145,7 +141,11 @@ class Campaign:
 
         Memory is small if the runs of a unit are read one after another.
         """
-        part, begun = list[_Part](), dict[Hashable, _Part]()
+        return _stacked(self._unit_sums(repairs))
+
+    def _unit_sums(self, repairs: Sequence[tuple[int, int]]) -> Iterator[_Part]:
+        """Yield each unit when the last of its runs has been read."""
+        begun = dict[Hashable, _Part]()
         runs_to_come = Counter(self._unit_key(key, repairs) for key in self.keys)
         for key, info, score in self._run_information():
             parted, rank = self._unit_key(key, repairs), key.rank
@@ -155,12 +155,7 @@ class Campaign:
             begun[parted] = key.unit, key.unit, self.benches.index(key.bench), rank, info, score
             runs_to_come[parted] -= 1
             if not runs_to_come[parted]:
-                part.append(begun.pop(parted))
-            if len(part) == _TOGETHER:
-                yield _stacked(part)
-                part = []
-        if part:
-            yield _stacked(part)
+                yield begun.pop(parted)
 
     def _unit_key(self, key: RunKey, repairs: Sequence[tuple[int, int]]) -> Hashable:
         bench = self.benches.index(key.bench)
@@ -229,9 +224,11 @@ def _hidden(upper: Floats, width: int, places: NDArray[np.intp]) -> Mask:
     return np.asarray(rest <= SEEN * whole)
 
 
-def _stacked(part: Sequence[_Part]) -> Blocks:
-    labels, units, benches, ranks, infos, scores = zip(*part, strict=True)
-    return Blocks(labels, units, np.array(benches), np.array(ranks), np.array(infos), np.array(scores))
+def _stacked(parts: Iterator[_Part]) -> Iterator[Blocks]:
+    """Yield blocks of as many parts as are computed at once."""
+    while some := list(itertools.islice(parts, _TOGETHER)):
+        labels, units, *arrays = zip(*some, strict=True)
+        yield Blocks(labels, units, *map(np.array, arrays))
 
 
 def _not_measured(unit: str, units: Sequence[str]) -> str:

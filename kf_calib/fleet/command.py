@@ -2,31 +2,25 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import rich_click as click
 from click import get_current_context  # rich_click declares that there may be none
 
-from kf_calib.cli.command import MODEL, OUTPUT, POSITIVE, argument, command, option, values_of
+from kf_calib.cli.command import MODEL, OUTPUT, POSITIVE, argument, command, option
 from kf_calib.cli.echo import complain, echo, print_json, progress, show
-from kf_calib.cli.failures import Interrupter, answered, sentence
+from kf_calib.cli.failures import Interrupter, answered
 from kf_calib.cli.files import Delivery, FigureFiles, ReportFile, claimed, commands_of, delivery
-from kf_calib.cli.options import EvaluationOptions, Json, Overwrite, ReadingOptions, ShownUnits, opened, target_option
+from kf_calib.cli.options import EvaluationOptions, Json, Overwrite, ReadingOptions, ShownUnits, target_option
 from kf_calib.errors import InputError, need
 from kf_calib.support import stage
 from kf_calib.support.leaves import leaf
 
 if TYPE_CHECKING:
-    from kf_calib.bench.streams import Source
-    from kf_calib.diagnosis.results import Diagnosis
-    from kf_calib.estimation.results import Calibration
     from kf_calib.fleet.batch import BatchProgress, RunEvaluation
     from kf_calib.fleet.results import BenchModelFiles
     from kf_calib.fleet.run_factor import ReferenceUnit
@@ -35,53 +29,6 @@ if TYPE_CHECKING:
 
 WORK = "Who does the work"
 _PACKAGES = ("distributed", "pyarrow", "fsspec")
-
-
-@dataclass(frozen=True)
-class SingleCommands:
-    """What ``replay`` and ``diagnose`` do with one recording and these options; sent to the workers."""
-
-    reading: ReadingOptions
-    evaluation: EvaluationOptions
-
-    def replay(self, path: Path) -> tuple[Source, Calibration]:
-        from kf_calib.estimation.calibration import calibrate
-
-        source, settings = opened(path, self.reading, self.evaluation)
-        return source, calibrate(source, settings)
-
-    def diagnose(self, source: Source, result: Calibration) -> Diagnosis:
-        from kf_calib.diagnosis.missing_effect import diagnose
-        from kf_calib.diagnosis.refits import Refits
-
-        return diagnose(result, Refits(source))
-
-    def replay_document(self, result: Calibration) -> dict[str, Any]:
-        from kf_calib.views.json import replay_object
-
-        return replay_object(result)
-
-    def diagnosis_document(self, diagnosis: Diagnosis) -> dict[str, Any]:
-        from kf_calib.views.diagnosis import diagnosis_object
-
-        return diagnosis_object(diagnosis)
-
-    def sentence(self, error: BaseException) -> str:
-        return sentence(error)
-
-    @property
-    def checksum(self) -> str:
-        """Of all that numbers depend on besides the recording: options, the files they name, and the program."""
-        told = {key: _content(value) for key, value in sorted(values_of(self.reading, self.evaluation))}
-        text = json.dumps(told | {"kf_calib": version("kf_calib")})
-        return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _content(value: Any) -> Any:
-    """An option as it counts: a file by what is in it."""
-    if isinstance(value, Path):
-        return hashlib.sha256(value.read_bytes()).hexdigest()
-    return [_content(each) for each in value] if isinstance(value, tuple | list) else value
 
 
 @dataclass(frozen=True)
@@ -144,7 +91,7 @@ def fleet(
     from kf_calib.bench.paper_parameters import targets_of
     from kf_calib.fleet import text as views
     from kf_calib.fleet.batch import RunEvaluation
-    from kf_calib.fleet.results import BenchModelFiles, Fleet, populations
+    from kf_calib.fleet.results import BenchModelFiles, Fleet
     from kf_calib.fleet.run_list import runs_of
 
     outputs = claimed(overwrite=overwrite)
@@ -153,18 +100,16 @@ def fleet(
     if figures != FigureFiles():
         import kf_calib.views.figures  # noqa: F401
     wanted, reference = targets_of(options.targets), _reference(options.reference_unit)
-    _refuse_impossible(reading, evaluation)
-    commands = SingleCommands(reading, evaluation)
-    one_run = RunEvaluation(commands, commands.checksum, options.limit_s)
+    one_run = RunEvaluation.of(reading, evaluation, options.limit_s)
     done = _evaluated(one_run, runs_of(runs), output, options.workers, options.scheduler, as_json)
     table = Fleet(output)
     with progress("diagnosing the runs together", as_json):
         overview = table.overview(wanted, pooled=options.pooled, reference_unit=reference)
     models = BenchModelFiles(output, overview.pooled, overwrite)
     if as_json:
-        print_json(views.fleet_object(table, populations(table), done, overview, list(models.models)))
+        print_json(views.fleet_object(table, done, overview, list(models.models)))
     else:
-        show(views.fleet_report(table, populations(table), done, overview))
+        show(views.fleet_report(table, done, overview))
     with delivery(outputs, as_json) as deliver, progress("drawing the pictures", as_json):
         _deliver_bench_models(models, outputs, deliver, as_json)
         if report:
@@ -185,8 +130,8 @@ def _reference(path: Path | None) -> ReferenceUnit | None:
     unit = saved.provenance.bench.get("block_serial")
     if not unit:
         raise InputError(f"{path} does not say of which unit it is: name one made from a run with a block_serial.")
-    own = {each.symbol: each for each in saved.parameters if each.symbol in ("K1", "K2", "K3")}
-    scale, sigma = ([getattr(each, part) for each in own.values()] for part in ("value", "sigma"))
+    own = [each for each in saved.parameters if each.symbol in ("K1", "K2", "K3")]
+    scale, sigma = ([getattr(each, part) for each in own] for part in ("value", "sigma"))
     if None in (*scale, *sigma):
         raise InputError(f"{path} does not determine all three scale factors: name one that does.")
     known = (scale[0], scale[1], scale[2]), (sigma[0], sigma[1], sigma[2])
@@ -202,12 +147,6 @@ def _deliver_bench_models(files: BenchModelFiles, outputs: Outputs, deliver: Del
         done = deliver.keep(path, files.write if path in files.models else Path.unlink)
         if done and not quiet:
             echo(said)
-
-
-def _refuse_impossible(reading: ReadingOptions, evaluation: EvaluationOptions) -> None:
-    """Refuse at once the options that would fail in every run."""
-    evaluation.settings()
-    _ = reading.keys
 
 
 def _evaluated(

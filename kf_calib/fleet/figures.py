@@ -253,11 +253,10 @@ def another_look(figure: Figure, overview: FleetOverview) -> None:
     for x, words in ((0.0, ""), (0.03, "unit"), (0.2, "chance by noise"), (0.32, "why")):
         axes.text(x, -0.7, words, color=GREY, va="center")
     for k, look in enumerate(shown_here):
-        more = f"; {len(look.reasons) - 2} more" if len(look.reasons) > 2 else ""
         axes.text(0.0, k, f"{k + 1}", color=GREY, va="center")
         axes.text(0.03, k, plain(short_name(look.unit)), va="center", fontweight="bold")
         axes.text(0.2, k, chance_words(look.chance), va="center")
-        axes.text(0.32, k, plain(wrapped("; ".join(look.reasons[:2]) + more, 120)), va="center", fontsize=8.0)
+        axes.text(0.32, k, plain(wrapped(look.why, 120)), va="center", fontsize=8.0)
     if len(overview.looks) > len(shown_here):
         axes.text(0.03, len(shown_here) - 0.5, f"{len(overview.looks) - len(shown_here)} more", color=GREY)
 

@@ -59,6 +59,13 @@ class Track:
         """How many spreads each unit (u,) lies from the mean."""
         return (self.units - self.mean) / (self.spread or np.inf)
 
+    @property
+    def of_runs(self) -> dict[str, float]:
+        """Of the runs, whatever unit: their number, ``median`` and ``spread`` of their values as of the units, and
+        ``sigma``, the median of those that they give."""
+        median, spread = _middle(self.values)
+        return {"runs": len(self.values), "median": median, "spread": spread, "sigma": float(np.median(self.sigmas))}
+
 
 def tracks(rows: Sequence[Mapping[str, Any]], units: Sequence[str], targets: Mapping[str, float]) -> tuple[Track, ...]:
     """The track of each parameter that a run determines, in the order of the runs."""
@@ -86,13 +93,18 @@ def _track(
     runs = np.bincount(places, minlength=count)
     sums = np.bincount(places, values - values[0], minlength=count)
     means = values[0] + np.divide(sums, runs, out=np.full(count, np.nan), where=runs > 0)
-    low, median, high = np.quantile(means[runs > 0], _SIXTY_EIGHT).tolist()
-    spread = 0.5 * (high - low)
+    median, spread = _middle(means[runs > 0])
     deviations = _deviations(values, means[places], runs[places], median)
     return Track(
         symbol, unit, nominal, target, dates, places, values, sigmas, means, median, spread,
         _chances(means, median, spread, many), deviations, _pooled(deviations, runs[places]),
     )  # fmt: skip
+
+
+def _middle(values: Floats) -> tuple[float, float]:
+    """Return the median, and half the width of the middle 68 % of values, 1 sigma of a normal population."""
+    low, median, high = np.quantile(values, _SIXTY_EIGHT).tolist()
+    return median, 0.5 * (high - low)
 
 
 def _deviations(values: Floats, means: Floats, runs: NDArray[np.intp], mean: float) -> Floats:
@@ -127,6 +139,7 @@ COLUMNS = ("run", "unit", "bench", "date", "error", "consistent", "p_value", "mi
 """Columns of the table that an overview is made from."""
 _LEVEL = 0.01
 """Chance below which a unit is named."""
+_REASONS = 2  # that are told of a unit
 
 
 @dataclass(frozen=True)
@@ -190,17 +203,23 @@ class AnotherLook:
     chance: float
     reasons: tuple[str, ...]
 
+    @property
+    def why(self) -> str:
+        """The strongest reasons, and how many more there are."""
+        more = [f"{len(self.reasons) - _REASONS} more"] if len(self.reasons) > _REASONS else []
+        return "; ".join([*self.reasons[:_REASONS], *more])
+
 
 def looks(
     rows: Sequence[Mapping[str, Any]], units: Sequence[str], tracks: Sequence[Track], pooled: PooledDiagnosis | None
 ) -> tuple[AnotherLook, ...]:
     """The units that need another look, first those that need it most."""
+    every = [*_of_runs(rows), *_of_parameters(units, tracks), *_of_effects(pooled)]
     reasons = dict[str, list[tuple[float, str]]]()
-    for unit, chance, said in [*_of_runs(rows), *_of_parameters(units, tracks), *_of_effects(pooled)]:
+    for unit, chance, said in sorted(every, key=lambda reason: reason[1]):
         if chance < _LEVEL:
             reasons.setdefault(unit, []).append((chance, said))
-    ordered = {unit: sorted(own, key=lambda each: each[0]) for unit, own in reasons.items()}
-    found = [AnotherLook(unit, own[0][0], tuple(said for _, said in own)) for unit, own in ordered.items()]
+    found = [AnotherLook(unit, own[0][0], tuple(said for _, said in own)) for unit, own in reasons.items()]
     return tuple(sorted(found, key=lambda look: (look.chance, -len(look.reasons), look.unit)))
 
 
@@ -273,9 +292,7 @@ def weeks_of(rows: Sequence[Mapping[str, Any]]) -> Weeks:
     dated = [(when.date() - timedelta(days=when.weekday()), verdict) for when, verdict in verdicts]
     mondays = sorted({monday for monday, _ in dated})
     count = (mondays[-1] - mondays[0]).days // 7 + 1 if mondays else 0
-    begins = [mondays[0] + timedelta(weeks=k) for k in range(count)]
-    counts = dict[str, list[int]]()
-    for monday, verdict in dated:
-        counts.setdefault(verdict, [0] * count)[(monday - mondays[0]).days // 7] += 1
-    ordered = sorted(counts.items(), key=lambda item: -sum(item[1]))
-    return Weeks(tuple(begins), {name: tuple(own) for name, own in ordered}, len(rows) - len(dated))
+    begins = tuple(mondays[0] + timedelta(weeks=k) for k in range(count))
+    counts, whole = Counter(dated), Counter(verdict for _, verdict in dated)
+    of_each = {verdict: tuple(counts[monday, verdict] for monday in begins) for verdict, _ in whole.most_common()}
+    return Weeks(begins, of_each, len(rows) - len(dated))

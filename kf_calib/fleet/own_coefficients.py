@@ -77,23 +77,17 @@ class UnitsAndCommon:
         of_group, columns = group.columns, [each.column for each in terms.common]
         info, score = blocks.info[:, of_group, of_group].copy(), blocks.score[:, of_group].copy()  # no views of all
         across = blocks.info[:, of_group][:, :, columns] * shares_of(terms.common, blocks)[:, None, :]
-        gains = np.linalg.solve(_not_singular(info), np.concatenate([across, score[:, :, None]], axis=2))
-        lost = np.einsum("nqi,nqj->ij", across, gains)
-        total = terms.sums(blocks)
-        common = Sums(total.info - lost[:, :-1], total.score - lost[:, -1])
-        return cls(UnitInformation(blocks.labels, info, score), across, common, terms.prior)
+        own = UnitInformation(blocks.labels, info, score)
+        return cls(own, across, terms.sums(blocks) - _taken(own, across), terms.prior)
 
     @classmethod
     def joined(cls, parts: Sequence[UnitsAndCommon]) -> UnitsAndCommon:
         """All of several parts."""
         units = [unit for part in parts for unit in part.of_units.units]
-        info, score = (
-            np.concatenate(each) for each in zip(*((p.of_units.info, p.of_units.score) for p in parts), strict=True)
-        )
+        arrays = zip(*((part.of_units.info, part.of_units.score, part.across) for part in parts), strict=True)
+        info, score, across = map(np.concatenate, arrays)
         common = sum((part.common for part in parts[1:]), parts[0].common)
-        return cls(
-            UnitInformation(units, info, score), np.concatenate([p.across for p in parts]), common, parts[0].prior
-        )
+        return cls(UnitInformation(units, info, score), across, common, parts[0].prior)
 
     def by_unit(self) -> UnitsAndCommon:
         """With one entry for each unit, where a repair of the bench or another bench has parted its runs."""
@@ -122,13 +116,16 @@ class UnitsAndCommon:
         Without own coefficients, the common ones change to explain what they can of what is alike in units. What each
         unit by itself tells knows nothing of that.
         """
-        info, score = _not_singular(self.of_units.info), self.of_units.score
-        gains = np.linalg.solve(info, np.concatenate([self.across, score[:, :, None]], axis=2))
-        lost = np.einsum("nqi,nqj->ij", self.across, gains)
-        without = Sums(self.common.info + lost[:, :-1], self.common.score + lost[:, -1])
-        together = _fit(self.common, self.prior) + _fits(info, score) - _fit(without, self.prior)
-        apart = self.integrated()
-        return _fits(_not_singular(apart.info), apart.score) - together
+        without = self.common + _taken(self.of_units, self.across)
+        together = _fit(self.common, self.prior) + _fits(self.of_units) - _fit(without, self.prior)
+        return _fits(self.integrated()) - together
+
+
+def _taken(own: UnitInformation, across: Floats) -> Sums:
+    """Return what own coefficients that are free take of what units tell of the common ones."""
+    gains = np.linalg.solve(_not_singular(own.info), np.concatenate([across, own.score[:, :, None]], axis=2))
+    taken = np.einsum("nqi,nqj->ij", across, gains)
+    return Sums(taken[:, :-1], taken[:, -1])
 
 
 def _fit(sums: Sums, prior: Floats) -> float:
@@ -136,9 +133,9 @@ def _fit(sums: Sums, prior: Floats) -> float:
     return 0.5 * float(sums.score @ posterior(sums.info, sums.score, prior)[0])
 
 
-def _fits(info: Floats, score: Floats) -> float:
-    """Return the same of own coefficients (n, q) without a prior."""
-    return 0.5 * float(np.sum(score * np.linalg.solve(info, score[:, :, None])[:, :, 0]))
+def _fits(own: UnitInformation) -> float:
+    """Return the same of own coefficients without a prior."""
+    return 0.5 * float(np.sum(own.score * np.linalg.solve(_not_singular(own.info), own.score[:, :, None])[:, :, 0]))
 
 
 def _not_singular(info: Floats) -> Floats:
@@ -232,8 +229,6 @@ class _Misfits:
         """Return the spread at which the misfit is this; 0 where it is smaller without any."""
         from scipy.optimize import brentq
 
-        if self._misfit(0.0) <= misfit:
-            return 0.0
         ends = math.log(_NARROW * _NARROW), math.log(_WIDE)
         if self._misfit(math.exp(ends[0])) <= misfit:
             return 0.0

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -129,10 +128,6 @@ class PooledDiagnosis:
     findings: tuple[Finding, ...]
     effects: tuple[EffectRow, ...]
     no_more: float
-
-    def document(self) -> dict[str, Any]:
-        """The same as JSON; numbers are SI."""
-        return asdict(self)
 
 
 def pooled_diagnosis(factors: Factors, *, reference_unit: ReferenceUnit | None = None) -> PooledDiagnosis:

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,6 +78,14 @@ class Term:
         return replace(self, size=FLAT, mean_size=0.0, units=units)
 
 
+class WeighedTerm(NamedTuple):
+    """A term with what is not known of it where it is likeliest, and its log evidence against none, averaged over what
+    is not known."""
+
+    term: Term
+    log_odds: float
+
+
 @dataclass(frozen=True)
 class Common:
     """A coefficient that runs have in common: its column, the runs that have it, and the size of its prior.
@@ -106,6 +115,9 @@ class Sums:
 
     def __add__(self, other: Sums) -> Sums:
         return Sums(self.info + other.info, self.score + other.score)
+
+    def __sub__(self, other: Sums) -> Sums:
+        return Sums(self.info - other.info, self.score - other.score)
 
 
 class PooledTerms:
@@ -148,12 +160,6 @@ class PooledTerms:
         info = np.einsum("nij,ni,nj->ij", blocks.info[:, columns][:, :, columns], shares, shares)
         return Sums(info, np.sum(blocks.score[:, columns] * shares, axis=0))
 
-    def solved(self, campaign: Campaign) -> tuple[Floats, Floats]:
-        """Mean (j,) and covariance (j, j) of the common coefficients from all runs."""
-        parts = [self.sums(self.beside_own(blocks)) for blocks in campaign.units(self.repairs)]
-        total = sum(parts[1:], parts[0])
-        return posterior(total.info, total.score, self.prior)
-
 
 def shares_of(common: Sequence[Common], blocks: Blocks) -> Floats:
     """``Common.within`` of several coefficients (n, j)."""
@@ -190,19 +196,6 @@ _PERIODS = 12  # at most as many parts in which a coefficient is followed over t
 _LEAST = 0.5  # sigma of all runs together: the smallest size that is expected
 _SIDES = np.array([[1.0, 1.0], [1.0, 0.0], [0.0, 1.0]])  # of a repair on which there is an error: both, or only one
 _COARSE = 4.0  # ratio of the sizes of a coefficient that changes
-
-
-@dataclass(frozen=True)
-class BenchEvidence:
-    """Log evidence of a common coefficient, averaged over what is not known, and where it is largest.
-
-    - log_odds: against no such term. size: of the prior, in ``Group.sigma``.
-    - repair: number of the bench and first rank after the repair, if there is one.
-    """
-
-    log_odds: float
-    size: float
-    repair: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True)
@@ -255,15 +248,7 @@ class DatedSums:
     def estimates(self, group: Group, repair: tuple[int, int] | None = None) -> list[BenchEstimate]:
         """The coefficients of each bench beside the terms, with nothing known of them before."""
         term = Term(group, Attribution.REPAIRED if repair else Attribution.BENCH, FLAT, repair=repair)
-        more = list(commons_of(term, len(self._first)))
-        sums = self._terms.sums(self._slots, more)
-        prior = np.append(self._terms.prior, np.full(len(more), FLAT))
-        mean, covariance = posterior(sums.info, sums.score, prior)
-        count, estimates = len(_range(group)), list[BenchEstimate]()
-        for k in range(0, len(more), count):
-            part = slice(len(self._terms.prior) + k, len(self._terms.prior) + k + count)
-            estimates.append(BenchEstimate(more[k].bench, more[k].since, mean[part], covariance[part, part]))
-        return estimates
+        return self._estimated(group, list(commons_of(term, len(self._first))))
 
     def over_time(self, group: Group, bench: int) -> list[BenchEstimate]:
         """The coefficients of one bench in each of a few parts of the campaign, as if it were repaired between them."""
@@ -272,24 +257,30 @@ class DatedSums:
         ends = [*edges[1:].tolist(), Common.until]
         parts = [Common(k, FLAT, bench, since, until)
                  for since, until in zip(edges.tolist(), ends, strict=True) for k in _range(group)]  # fmt: skip
-        others = [Common(k, FLAT, own) for own in range(len(self._first)) if own != bench for k in _range(group)]
-        sums = self._terms.sums(self._slots, [*parts, *others])
-        prior = np.append(self._terms.prior, np.full(len(parts) + len(others), FLAT))
-        mean, covariance = posterior(sums.info, sums.score, prior)
-        begin, count = len(self._terms.prior), len(_range(group))
-        slices = [slice(begin + k * count, begin + (k + 1) * count) for k in range(len(edges))]
-        return [BenchEstimate(bench, int(since), mean[own], covariance[own, own])
-                for since, own in zip(edges, slices, strict=True)]  # fmt: skip
+        return self._estimated(group, [*parts, *self._of_others(group, bench, FLAT)])[: len(edges)]
 
-    def constant(self, group: Group) -> BenchEvidence:
+    def _estimated(self, group: Group, more: Sequence[Common]) -> list[BenchEstimate]:
+        """Return the estimates of further coefficients beside the terms: those of the group, again and again."""
+        sums = self._terms.sums(self._slots, more)
+        known, count = len(self._terms.prior), len(_range(group))
+        mean, covariance = posterior(sums.info, sums.score, np.append(self._terms.prior, np.full(len(more), FLAT)))
+        parts = [slice(known + k, known + k + count) for k in range(0, len(more), count)]
+        return [BenchEstimate(first.bench, first.since, mean[part], covariance[part, part])
+                for first, part in zip(more[::count], parts, strict=True)]  # fmt: skip
+
+    def _of_others(self, group: Group, bench: int, size: float) -> list[Common]:
+        """Return the coefficients of all benches but one."""
+        return [Common(k, size, other) for other in range(len(self._first)) if other != bench for k in _range(group)]
+
+    def constant(self, group: Group) -> WeighedTerm:
         """The evidence that the runs of each bench have one coefficient vector."""
         sizes_tried = self._sizes(group, STEP)
         more = [Common(k, 1.0, bench) for bench in range(len(self._first)) for k in _range(group)]
         sums = self._terms.sums(self._slots, more)
         logs = log_evidence(sums.info, sums.score, self._priors(sizes_tried, len(more))) - self._nothing()
-        return BenchEvidence(float(log_mean(logs)), float(sizes_tried[np.argmax(logs)]))
+        return WeighedTerm(Term(group, Attribution.BENCH, float(sizes_tried[np.argmax(logs)])), float(log_mean(logs)))
 
-    def repaired(self, group: Group) -> BenchEvidence | None:
+    def repaired(self, group: Group) -> WeighedTerm | None:
         """The evidence that on one bench it is another vector from some run on; None if no bench has two runs."""
         tried = self._sizes(group, _COARSE)
         benches = [k for k, firsts in enumerate(self._first) if len(firsts) > 1]
@@ -299,7 +290,8 @@ class DatedSums:
         bench = max(benches, key=lambda k: float(logs[k].max()))
         place, size = np.unravel_index(np.argmax(logs[bench]), logs[bench].shape)
         mean = log_mean(np.array([log_mean(own, axis=0) for own in logs.values()]))
-        return BenchEvidence(float(mean), float(tried[size]), (bench, int(self._first[bench][place + 1])))
+        repair = bench, int(self._first[bench][place + 1])
+        return WeighedTerm(Term(group, Attribution.REPAIRED, float(tried[size]), repair=repair), float(mean))
 
     def dates(self, group: Group, bench: int) -> tuple[NDArray[np.intp], Floats]:
         """First ranks (k,) after a repair of a bench between its parts, and the probability of each."""
@@ -312,7 +304,7 @@ class DatedSums:
 
         It is as likely that there is an error before and after it as that there is none before, or none after.
         """
-        others = [Common(k, 1.0, other) for other in range(len(self._first)) if other != bench for k in _range(group)]
+        others = self._of_others(group, bench, 1.0)
         fixed = [*self._terms.common, *others]
         whole = self._terms.sums(self._slots, others)
         part = slice(self._starts[bench], self._starts[bench + 1])

@@ -16,7 +16,6 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.compute
 
@@ -31,7 +30,6 @@ from kf_calib.support.output_files import write_whole
 
 pc: Any = pyarrow.compute  # its functions are made when it is imported, which no type checker sees
 _HEAVY = ("replay", "diagnosis", "factor")
-_SIXTY_EIGHT = (0.1587, 0.5, 0.8413)
 _ALONE = "the runs were not diagnosed together"
 _IDENTITY = ("run", "unit", "bench", "date")
 
@@ -162,38 +160,6 @@ def _unnamed(count: int) -> str:
     return f"{each} of its own: say which it is in a list of runs (.csv with the columns run and unit)."
 
 
-@dataclass(frozen=True)
-class ParameterPopulation:
-    """One parameter over the runs of a fleet.
-
-    - runs: number of runs that determine it. median: of their values. spread: half the width of the middle 68 % of
-      them, 1 sigma of a normal population. sigma: median of the sigma that a run gives of it. All in ``unit`` (SI).
-    """
-
-    symbol: str
-    unit: str
-    nominal: float
-    runs: int
-    median: float
-    spread: float
-    sigma: float
-
-
-def populations(fleet: Fleet) -> list[ParameterPopulation]:
-    """Each parameter over the runs that determine it, in the order of the first run."""
-    table = fleet.parameters()
-    table = table.filter(pc.is_valid(table["value"]))
-    spreads = list[ParameterPopulation]()
-    for symbol in dict.fromkeys(table["symbol"].to_pylist()):
-        rows = table.filter(pc.equal(table["symbol"], symbol))
-        values, sigmas = rows["value"].to_numpy(), rows["sigma"].to_numpy()
-        low, median, high = np.quantile(values, _SIXTY_EIGHT).tolist()
-        unit, nominal = rows["si_unit"][0].as_py(), rows["nominal"][0].as_py()
-        sigma = float(np.nanmedian(sigmas))
-        spreads.append(ParameterPopulation(symbol, unit, nominal, len(values), median, 0.5 * (high - low), sigma))
-    return spreads
-
-
 _NOT_IN_NAMES = re.compile(r"[^\w.-]+|^\.+")  # of files, on any system
 _LONGEST = 60
 
@@ -267,27 +233,21 @@ def bench_model(diagnosis: PooledDiagnosis, bench: str) -> BenchModel:
     """
     if bench not in diagnosis.benches:
         raise InputError(f"no run is of the bench {bench!r}: name one of {', '.join(map(repr, diagnosis.benches))}.")
-    terms = list[BenchTerm]()
-    for finding in diagnosis.findings:
-        coefficients = [each for each in finding.benches if each.bench == bench]
-        if coefficients and (term := _term(finding.effect, coefficients[-1])).symbols:
-            terms.append(term)
-    if not terms:
+    if bench not in (models := bench_models(diagnosis)):
         raise InputError(
             f"no error of the bench {bench!r} was found in {diagnosis.runs} runs, so there is none to save."
         )
-    return BenchModel(tuple(terms), bench, diagnosis.runs)
+    return models[bench]
 
 
 def bench_models(diagnosis: PooledDiagnosis) -> dict[str, BenchModel]:
-    """The bench model of each bench that has errors which the runs determine, by its name."""
-    with_values = {
-        each.bench
-        for finding in diagnosis.findings
-        for each in finding.benches
-        if any(own.value is not None for own in each.coefficients)
-    }
-    return {bench: bench_model(diagnosis, bench) for bench in diagnosis.benches if bench in with_values}
+    """The bench model of each bench that has errors which its last runs determine, by its name."""
+    terms = {bench: list[BenchTerm]() for bench in diagnosis.benches}
+    for finding in diagnosis.findings:
+        for bench, estimate in {each.bench: each for each in finding.benches}.items():  # the last of each bench
+            if (term := _term(finding.effect, estimate)).symbols:
+                terms[bench].append(term)
+    return {bench: BenchModel(tuple(own), bench, diagnosis.runs) for bench, own in terms.items() if own}
 
 
 def _term(effect: str, estimate: BenchCoefficients) -> BenchTerm:

@@ -102,11 +102,6 @@ class RunFactor:
         kept = [*(self.places[name] for name in columns), len(self.columns)]
         return triangle(self.factor[:, kept])
 
-    def shows(self, column: str) -> bool:
-        """Whether the run has a column of this name that is not zero."""
-        place = self.places.get(column)
-        return place is not None and bool(self.factor[:, place].any())
-
 
 def candidate_effects(model: Model) -> list[Effect]:
     """Effects of the catalogue that are not in the model and have columns in dwells; constants are at their usual
@@ -116,10 +111,9 @@ def candidate_effects(model: Model) -> list[Effect]:
     return [effect for effect in tried if effect.scannable]
 
 
-def run_factor(
-    fitted: Fit, run: str = "", unit: str | None = None, bench: str | None = None, date: str | None = None
-) -> RunFactor:
-    """The reduced factor of a fit: its model and, where angles are known, all effects of the catalogue."""
+def run_factor(fitted: Fit) -> RunFactor:
+    """The reduced factor of a fit: its model and, where angles are known, all effects of the catalogue. Of which run it
+    is, the fit does not know."""
     linearised = fitted.linearised
     model, state, folded = linearised.model, linearised.state, linearised.dwells.folded
     added = candidate_effects(model) if model.bench.angles else []
@@ -132,7 +126,7 @@ def run_factor(
     kept = [k for k in range(len(upper)) if k not in model.fixed]
     inside = [*STATES, *_names(model.effects, states=True)]
     return RunFactor(
-        run, unit, bench, date,
+        "", None, None, None,
         columns=tuple(name for k, name in enumerate([*inside, *_names(added)]) if k not in model.fixed),
         width=model.count - len(model.fixed),
         factor=triangle(upper[:, kept]) if model.fixed else upper,

@@ -156,8 +156,8 @@ class Store:
         """Tell whether a file has columns of the table; one that is damaged is said to be when its rows are read."""
         if file not in self._tables:
             try:
-                schema = pq.read_schema(file) if file.match(_LARGE) else _schema_of_small(file)
-                types = {field.name: field.type for field in schema}
+                form = "parquet" if file.match(_LARGE) else "ipc"
+                types = {field.name: field.type for field in ds.dataset(str(file), format=form).schema}
             except _DAMAGE:
                 return True
             alike = all(types[field.name].equals(field.type) for field in SCHEMA if field.name in types)
@@ -167,11 +167,6 @@ class Store:
     def _new(self, kind: str) -> Path:
         self._written += 1
         return self.folder / kind.replace("*", f"runs-{time.time_ns():020d}-{self._written}")
-
-
-def _schema_of_small(file: Path) -> pa.Schema:
-    with pa.OSFile(str(file)) as opened:
-        return pa.ipc.open_file(opened).schema
 
 
 def _latest(batches: Iterable[pa.RecordBatch]) -> dict[str, Known]:

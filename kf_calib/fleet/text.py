@@ -15,10 +15,10 @@ from rich.text import Text
 
 from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.fleet.batch import BatchProgress
-from kf_calib.fleet.overview import FleetOverview
+from kf_calib.fleet.overview import FleetOverview, Track
 from kf_calib.fleet.pooled_diagnosis import EffectRow, Finding, PooledDiagnosis, PooledEstimate
 from kf_calib.fleet.pooled_terms import Attribution
-from kf_calib.fleet.results import Fleet, ParameterPopulation
+from kf_calib.fleet.results import Fleet
 from kf_calib.support.units import shown
 from kf_calib.views.json import clean, members
 from kf_calib.views.notation import symbol
@@ -167,15 +167,10 @@ def _rows(name: str, values: Sequence[PooledEstimate]) -> Iterator[tuple[str, ..
 
 
 _SHOWN = 6
-_REASONS = 2
 
 
 def fleet_object(
-    fleet: Fleet,
-    populations: Sequence[ParameterPopulation],
-    done: BatchProgress,
-    overview: FleetOverview,
-    bench_models: Sequence[Path],
+    fleet: Fleet, done: BatchProgress, overview: FleetOverview, bench_models: Sequence[Path]
 ) -> dict[str, Any]:
     """The JSON object of ``fleet``."""
     failures = fleet.failures()
@@ -188,7 +183,7 @@ def fleet_object(
             "units": fleet.distinct("unit"),
             "benches": fleet.distinct("bench"),
             "verdicts": fleet.verdicts(),
-            "parameters": [vars(each) for each in populations],
+            "parameters": [members(each, "symbol", "unit", "nominal") | each.of_runs for each in overview.tracks],
             "failures": [{"run": run, "error": error} for run, error in failures.items()],
             "pooled": pooled_objects(overview.pooled) if overview.pooled else None,
             "bench_models": [str(path) for path in bench_models],
@@ -198,9 +193,7 @@ def fleet_object(
     )
 
 
-def fleet_report(
-    fleet: Fleet, populations: Sequence[ParameterPopulation], done: BatchProgress, overview: FleetOverview
-) -> RenderableType:
+def fleet_report(fleet: Fleet, done: BatchProgress, overview: FleetOverview) -> RenderableType:
     """The report of ``fleet``."""
     failures = fleet.failures()
     counts = ", ".join(f"{count} {verdict}" for verdict, count in fleet.verdicts().items())
@@ -208,7 +201,7 @@ def fleet_report(
     parts: list[RenderableType] = [
         Text(f"{len(fleet)} runs in {fleet.path}: {counts}.", style="bold"),
         Text(f"{done.evaluated} evaluated now{cost}; {done.kept} were there already."),
-        *([_population_table(populations)] if populations else []),
+        *([_population_table(overview.tracks)] if overview.tracks else []),
     ]
     parts += [note(said) for said in done.notes]
     parts += [note(error if run in error else f"{run}: {error}") for run, error in [*failures.items()][:_SHOWN]]
@@ -221,24 +214,19 @@ def fleet_report(
 
 def look_table(overview: FleetOverview) -> ConsoleTable:
     """The units that need another look first, with the reasons."""
-    rows = list[tuple[str, ...]]()
-    for each in overview.looks[:_SHOWN]:
-        more = [f"{len(each.reasons) - _REASONS} more"] if len(each.reasons) > _REASONS else []
-        rows.append((short_name(each.unit), chance_words(each.chance), "; ".join([*each.reasons[:_REASONS], *more])))
+    rows = [(short_name(each.unit), chance_words(each.chance), each.why) for each in overview.looks[:_SHOWN]]
     if len(overview.looks) > _SHOWN:
         rows.append((f"{len(overview.looks) - _SHOWN} more", "", ""))
     return table("Units that need another look first", ("unit", ">chance by noise", "why"), rows)
 
 
-def _population_table(populations: Sequence[ParameterPopulation]) -> ConsoleTable:
+def _population_table(tracks: Sequence[Track]) -> ConsoleTable:
     rows = list[tuple[str, ...]]()
-    for population in populations:
-        unit = shown(population.unit)
-        cells = (
-            unit.number(value, 3)
-            for value in (population.median - population.nominal, population.spread, population.sigma)
-        )
-        rows.append((symbol(population.symbol), str(population.runs), *cells, unit.label))
+    for track in tracks:
+        unit, of_runs = shown(track.unit), track.of_runs
+        values = of_runs["median"] - track.nominal, of_runs["spread"], of_runs["sigma"]
+        cells = (unit.number(value, 3) for value in values)
+        rows.append((symbol(track.symbol), str(of_runs["runs"]), *cells, unit.label))
     headings = "parameter", ">runs", ">median less nominal", ">spread", ">sigma of a run", "unit"
     return table("Parameters over the runs (spread, sigma: 1σ)", headings, rows)
 

@@ -100,7 +100,11 @@ class Evaluation(ABC, Generic[J, S]):
         self._last: _Closed | None = None
         self._before: J | None = None
         self._taken, self._is_judging = 0, False
-        self._refuse_engine()
+        if self.settings.engine != "block":
+            raise InputError(
+                "a live run is evaluated from folded dwells, as the block engine does: leave out --engine, and check "
+                "the recording with replay --engine filterpy."
+            )
         self._refuse(self._passed.model)
 
     @abstractmethod
@@ -155,7 +159,6 @@ class Evaluation(ABC, Generic[J, S]):
                     try:
                         if failure is None:
                             self._take(batch)
-                            self._count_taken(batch)
                     except Exception as error:
                         failure = error
                         self.say(f"the evaluation stopped: {error}")
@@ -177,7 +180,6 @@ class Evaluation(ABC, Generic[J, S]):
         """
         with one_blas_thread():
             self._take(batch)
-            self._count_taken(batch)
             self._judge_waiting()
 
     def finish(self) -> J:
@@ -212,16 +214,8 @@ class Evaluation(ABC, Generic[J, S]):
         with self._lock:
             self._publish(notice=notice)
 
-    def _refuse_engine(self) -> None:
-        """Raise InputError for an engine that does not work on folded dwells."""
-        if self.settings.engine != "block":
-            raise InputError(
-                "a live run is evaluated from folded dwells, as the block engine does: leave out --engine, and check "
-                "the recording with replay --engine filterpy."
-            )
-
     def _take(self, batch: Batch) -> None:
-        """Fold a batch, hand over the dwells that it closes, and evaluate the open dwell when that is due."""
+        """Fold a batch, hand over the dwells that it closes, evaluate the open dwell when that is due, and count it."""
         passed, segmenter = self._passed, self._segmenter
         for rows in passed.rows_of(segmenter.push(batch)):
             passed.add(rows)
@@ -234,9 +228,6 @@ class Evaluation(ABC, Generic[J, S]):
             self._publish(samples=passed.tally.read, elapsed_s=elapsed_s, **self._progress())
         self._close_next(closed, elapsed_s)
         self._look(standing, elapsed_s)
-
-    def _count_taken(self, batch: Batch) -> None:
-        """Count the readings of a batch that was taken in."""
         with self._lock:
             self._taken += len(batch.accel)
             self._lock.notify_all()

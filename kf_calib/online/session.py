@@ -260,31 +260,6 @@ class HandStanding(Progress):
         return "every target is reached: end the run, or go on with more sides" if done else otherwise
 
 
-def judge_poses(passed: Pass, wanted: Floats, before: HandJudgement | None = None) -> HandJudgement:
-    """The judgement of the poses so far; before: that of fewer poses.
-
-    Raises InputError where the readings cannot be used as they are.
-    """
-    dwells, model, settings = passed.dwells, passed.model, passed.settings
-    with one_blas_thread():
-        refuse_unusable(dwells, passed.tally, passed.source.bench)
-        try:
-            result = with_remarks(evaluate_fit(fit(dwells, model, settings.walk_mps2_per_sqrt_s), settings), passed)
-        except UnobservableError:
-            result = None
-        sides = Sides.of(dwells, passed.source.bench, None if result is None else result.fit)
-    tested = result is not None and result.consistency.p_value is not None
-    return HandJudgement(result, dwells, sides, wanted, (before.looks if before else 0) + tested)
-
-
-def judge_all_poses(passed: Pass, wanted: Floats, looks: int, again: Source | None) -> HandJudgement:
-    """The final judgement: what ``replay`` of the recording gives. Raises KfCalibError as that does."""
-    with one_blas_thread():
-        result = conclude(passed, again)
-        sides = Sides.of(passed.dwells, passed.source.bench, result.fit)
-    return HandJudgement(result, passed.dwells, sides, wanted, looks, final=True)
-
-
 class HandSession(Evaluation[HandJudgement, HandStanding]):
     """The evaluation of a sensor in the hand; see ``Evaluation``. Raises InputError for a model that needs angles."""
 
@@ -304,10 +279,21 @@ class HandSession(Evaluation[HandJudgement, HandStanding]):
         return {"rest_s": self._segmenter.rest_s}
 
     def _judged(self, passed: Pass, before: HandJudgement | None) -> HandJudgement:
-        return judge_poses(passed, self.wanted, before)
+        dwells, settings, bench = passed.dwells, passed.settings, self.source.bench
+        refuse_unusable(dwells, passed.tally, bench)
+        try:
+            fitted = fit(dwells, passed.model, settings.walk_mps2_per_sqrt_s)
+            result = with_remarks(evaluate_fit(fitted, settings), passed)
+        except UnobservableError:
+            result = None
+        tested = result is not None and result.consistency.p_value is not None
+        sides = Sides.of(dwells, bench, None if result is None else result.fit)
+        return HandJudgement(result, dwells, sides, self.wanted, (before.looks if before else 0) + tested)
 
     def _judged_whole(self, passed: Pass, before: HandJudgement | None, again: Source | None) -> HandJudgement:
-        return judge_all_poses(passed, self.wanted, before.looks if before else 0, again)
+        result, looks = conclude(passed, again), before.looks if before else 0
+        sides = Sides.of(passed.dwells, self.source.bench, result.fit)
+        return HandJudgement(result, passed.dwells, sides, self.wanted, looks, final=True)
 
     def _judged_next(self, judgement: HandJudgement) -> None:
         self._show_sides(judgement.sides)

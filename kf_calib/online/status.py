@@ -18,7 +18,7 @@ from kf_calib.bench.arrays import Floats, one_blas_thread
 from kf_calib.bench.streams import Source
 from kf_calib.design.gimbal_limits import wrap
 from kf_calib.design.next_orientation import Advice, Course, course
-from kf_calib.diagnosis.candidate_tests import LEVEL, assess_candidates
+from kf_calib.diagnosis.candidate_tests import assess_candidates
 from kf_calib.diagnosis.missing_effect import diagnose
 from kf_calib.diagnosis.refits import Refits
 from kf_calib.diagnosis.results import Diagnosis
@@ -404,6 +404,3 @@ def _saturated(before: Floats, now: Floats, doubled: Floats) -> bool | None:
         return None
     gained, further = (before - now)[known] / now[known], (now - doubled)[known] / now[known]
     return bool(further.max() < _LITTLE * gained.max())
-
-
-__all__ = ["LEVEL", "Current", "Judgement", "Standing", "current", "judge_so_far", "judge_whole_run"]

@@ -124,7 +124,7 @@ def suggest(itinerary: Itinerary, visited: Visited, judgement: Judgement | None)
     judgement: the latest (None: there is none yet).
     """
     outlook = None if judgement is None else _outlook(itinerary, visited, judgement)
-    is_reached = outlook is not None and judgement is not None and _is_reached(outlook, judgement)
+    is_reached = outlook is not None and judgement is not None and judgement.reached(outlook.sigma)
     if judgement is not None and (end := _end(itinerary, visited, judgement, is_reached)) is not None:
         return end
     left = [pose for pose in itinerary.opening_poses if not visited.has(pose)]
@@ -151,11 +151,6 @@ def _outlook(itinerary: Itinerary, visited: Visited, judgement: Judgement) -> Ou
         gravity = judgement.result.bench.gravity_mps2
         wanted = _UNREACHABLE * np.array([gravity if u == "m/s^2" else 1.0 for u in paper_parameters.UNITS])
     return Outlook(judgement.result.fit, wanted, visited.pending or visited.stays[-1:], itinerary.reach, itinerary.pace)
-
-
-def _is_reached(outlook: Outlook, judgement: Judgement) -> bool:
-    """Tell whether there are targets, and all are reached with the stays that are not judged yet."""
-    return judgement.reached(outlook.sigma)
 
 
 def _end(itinerary: Itinerary, visited: Visited, judgement: Judgement, is_reached: bool) -> Suggestion | None:

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from contextvars import copy_context
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -295,14 +295,9 @@ def _itinerary(bench: Bench, most: int, options: DriveOptions) -> Itinerary:
     from kf_calib.design.next_orientation import Pace
     from kf_calib.online.suggestion import Itinerary
 
-    pace = Pace()
-    if bench.rate_degps is not None:
-        pace = replace(pace, rate_degps=bench.rate_degps)
-    if bench.acceleration_degps2 is not None:
-        pace = replace(pace, acceleration_degps2=bench.acceleration_degps2)
-    return Itinerary(
-        bench, pace, most=most, stay_s=options.stay_s, ends_when_named=not options.improve,
-    )  # fmt: skip
+    stated = {"rate_degps": bench.rate_degps, "acceleration_degps2": bench.acceleration_degps2}
+    pace = Pace(**{name: value for name, value in stated.items() if value is not None})
+    return Itinerary(bench, pace, most=most, stay_s=options.stay_s, ends_when_named=not options.improve)
 
 
 def _drive(device: Opened, most: int, options: DriveOptions, running: DrivenRun) -> Drive:

@@ -63,14 +63,13 @@ class SimulatedPositioner:
             return self.bench.fault
 
 
-class _told:
-    """Turns what a link raises into an error of the positioner."""
-
-    def __enter__(self) -> None: ...
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, OSError):
-            raise PositionerError(f"the positioner does not answer ({error})") from error
+@contextmanager
+def _told() -> Iterator[None]:
+    """Turn what a link raises into an error of the positioner."""
+    try:
+        yield
+    except OSError as error:
+        raise PositionerError(f"the positioner does not answer ({error})") from error
 
 
 class DrivenFeed(Feed):

@@ -5,7 +5,6 @@ positioner.
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -87,17 +86,15 @@ class HandPositioner:
     """
 
     def __init__(self, start_deg: Sequence[float], say: Callable[[str], None]) -> None:
-        self._say, self._lock = say, threading.Lock()
-        self._stands, self._asked = tuple(start_deg), tuple(start_deg)
+        self._say = say
+        self._stands = self._asked = tuple(start_deg)
 
     def move_to(self, gimbal_deg: Sequence[float]) -> None:
-        with self._lock:
-            self._asked = tuple(gimbal_deg)
+        self._asked = tuple(gimbal_deg)
         self._say(f"turn the gimbals to {', '.join(f'{angle:.1f}' for angle in gimbal_deg)} deg, then press Enter")
 
     def read(self) -> tuple[float, ...]:
-        with self._lock:
-            return self._stands
+        return self._stands
 
     def stop(self) -> None:
         self._say("stop: leave the gimbals where they are")
@@ -107,5 +104,4 @@ class HandPositioner:
 
     def done(self) -> None:
         """The gimbals stand where they were asked to be."""
-        with self._lock:
-            self._stands = self._asked
+        self._stands = self._asked

@@ -282,16 +282,17 @@ class LinePositioner:
         self.link.close()
 
     def _say(self, text: str, angles: Sequence[float]) -> None:
-        for gimbal in range(len(self.profile.gimbals) if is_for_each(text) else 1):
-            line = said_for(self.profile, text, angles, gimbal)
-            if self.profile.answers:
-                self.link.ask(line)
-            else:
-                self.link.say(line)
+        say = self.link.ask if self.profile.answers else self.link.say
+        for line in self._lines(text, angles):
+            say(line)
 
     def _ask(self, text: str) -> list[str]:
+        return [self.link.ask(line) for line in self._lines(text, [])]
+
+    def _lines(self, text: str, angles: Sequence[float]) -> list[str]:
+        """Return a text for each gimbal, or once where it is for all."""
         count = len(self.profile.gimbals) if is_for_each(text) else 1
-        return [self.link.ask(said_for(self.profile, text, [], gimbal)) for gimbal in range(count)]
+        return [said_for(self.profile, text, angles, gimbal) for gimbal in range(count)]
 
 
 _SLICE_S = 0.05  # of waiting, after which is looked whether the run is broken off

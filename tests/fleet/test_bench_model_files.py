@@ -66,3 +66,13 @@ def test_a_file_in_place_of_the_folder_is_one_sentence(found: PooledDiagnosis, t
     with pytest.raises(InputError, match=r"bench_models cannot be made \(File exists\): move away what is there"):
         files.write(next(iter(files.models)))
     assert files.outdated == []
+
+
+def test_a_bench_whose_last_runs_determine_nothing_has_no_model(found: PooledDiagnosis, tmp_path: Path) -> None:
+    """Since a repair, say: the command once ended there with a sentence that no error was found."""
+    finding = found.findings[0]
+    before, other = finding.benches
+    unseen = tuple(replace(each, value=None, sigma=None) for each in before.coefficients)
+    benches = before, replace(before, since="2026-01-01", coefficients=unseen), other
+    repaired = replace(found, findings=(replace(finding, benches=benches),))
+    assert [model.bench for model in BenchModelFiles(tmp_path, repaired).models.values()] == [BENCHES[1]]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -149,7 +150,8 @@ def simulated(campaign: Campaign) -> tuple[list[RunFactor], dict[str, Floats]]:
         unit = plain.bench.notes["block_serial"]
         fit = calibrate(plain.hiding([each for own in hidden.values() for each in own])).fit
         date = f"2026-01-01T{number // 60:02d}:{number % 60:02d}"
-        factors.append(run_factor(fit, f"run {number}", unit, plain.bench.notes["bench"], date))
+        named = {"run": f"run {number}", "unit": unit, "bench": plain.bench.notes["bench"], "date": date}
+        factors.append(replace(run_factor(fit), **named))
         for each in hidden["of_unit"]:
             truth[unit] = np.array(list(each.truth["sizes"].values()))
     return factors, truth

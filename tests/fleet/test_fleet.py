@@ -23,10 +23,10 @@ from fleet_generator import Campaign, record
 from helpers.fleet_workers import evaluation, threads, used
 
 import kf_calib
+from kf_calib.cli.options import EvaluationOptions, ReadingOptions
 from kf_calib.errors import InputError
 from kf_calib.fleet import batch
 from kf_calib.fleet.batch import RunEvaluation, evaluate_all
-from kf_calib.fleet.command import SingleCommands
 from kf_calib.fleet.run_list import ListedRun, runs_of
 from kf_calib.fleet.store import Store
 
@@ -158,7 +158,7 @@ def test_other_files_in_the_folder_of_the_table_stay_and_are_not_read(
         store.known()
 
 
-class _Deadly(SingleCommands):
+class _Deadly(RunEvaluation):
     """Ends its process: at one run each time, at the others the first time."""
 
     def replay(self, path: Path) -> Any:
@@ -188,14 +188,30 @@ def test_a_run_that_ends_its_process_is_tried_again_and_stops_no_other(
     campaign: Path, store: Store, tmp_path: Path
 ) -> None:
     own = shutil.copytree(campaign, tmp_path / "runs")
-    normal = evaluation()
-    deadly = RunEvaluation(_Deadly(normal.commands.reading, normal.commands.evaluation), normal.settings)
+    deadly = _Deadly.of(ReadingOptions(), EvaluationOptions())
     runs = runs_of([str(path) for path in sorted(own.rglob("*.mcap"))[:2]])
     with batch.cluster(1) as client:
         progress = evaluate_all(client, deadly, runs, store)
     assert (progress.evaluated, progress.failed) == (2, 1)
     ((place, said),) = kf_calib.open_fleet(tmp_path / "fleet").failures().items()
     assert place.endswith("run-000001.mcap") and "the process that evaluated it was ended 3 times" in said
+
+
+@pytest.mark.slow
+def test_a_process_that_is_long_in_beginning_again_goes_on(
+    campaign: Path, store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on a busy machine: Dask gives one up after 15 s, and the run would wait for ever."""
+    late, run = tmp_path / "late", shutil.copytree(campaign, tmp_path / "runs")
+    (tmp_path / "sitecustomize.py").write_text(
+        f"import os, time\nif os.path.exists({str(late)!r}):\n    time.sleep(20.0)\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]))
+    (path,) = run.rglob("run-000002.mcap")
+    with batch.cluster(1) as client:
+        late.touch()
+        progress = evaluate_all(client, _Deadly.of(ReadingOptions(), EvaluationOptions()), runs_of([str(path)]), store)
+    assert (progress.evaluated, progress.failed) == (1, 0)
 
 
 @contextmanager

@@ -24,9 +24,9 @@ from helpers.fleet_workers import evaluation, threads, used
 from helpers.long_runs import slow
 
 import kf_calib
+from kf_calib.cli.options import EvaluationOptions, ReadingOptions
 from kf_calib.fleet import batch
 from kf_calib.fleet.batch import OverTime, RunEvaluation, evaluate_all, in_time
-from kf_calib.fleet.command import SingleCommands
 from kf_calib.fleet.run_list import SCHEMA, ListedRun, runs_of
 from kf_calib.fleet.store import Store
 
@@ -60,7 +60,7 @@ def store(tmp_path: Path) -> Iterator[Store]:
         yield own
 
 
-class _Endless(SingleCommands):
+class _Endless(RunEvaluation):
     """Never comes to an end with one of the runs."""
 
     def replay(self, path: Path) -> Any:
@@ -69,7 +69,7 @@ class _Endless(SingleCommands):
         return super().replay(path)
 
 
-class _Deaf(SingleCommands):
+class _Deaf(RunEvaluation):
     """Waits in the system for what never comes, with one of the runs."""
 
     def replay(self, path: Path) -> Any:
@@ -78,9 +78,8 @@ class _Deaf(SingleCommands):
         return super().replay(path)
 
 
-def with_limit(kind: type[SingleCommands], limit_s: float) -> RunEvaluation:
-    usual = evaluation()
-    return RunEvaluation(kind(usual.commands.reading, usual.commands.evaluation), usual.settings, limit_s)
+def with_limit(kind: type[RunEvaluation], limit_s: float) -> RunEvaluation:
+    return kind.of(ReadingOptions(), EvaluationOptions(), limit_s)
 
 
 def test_a_run_that_never_ends_is_a_row_that_says_so_and_is_tried_again(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -91,12 +91,12 @@ def test_spread_of_the_units_is_that_from_which_they_were_drawn(both: PooledDiag
     assert interval is not None and interval[1] == 1.0
 
 
-def test_report_and_document_say_what_was_found(both: PooledDiagnosis) -> None:
+def test_report_and_result_say_what_was_found(both: PooledDiagnosis) -> None:
     text = " ".join(rendered(pooled_report(both)).split())
     assert "30 runs of 30 units on 1 bench show" in text
     assert "flexure is of the bench, changed once" in text and "between 2026-01-01 00:12 and 2026-01-01 00:13" in text
     assert "second-order is of the type of sensor" in text
-    document = json.loads(json.dumps(both.document(), allow_nan=False))
+    document = json.loads(json.dumps(asdict(both), allow_nan=False))
     row = next(each for each in document["effects"] if each["effect"] == "second-order")
     assert sum(row["probabilities"].values()) + row["no_one"] == pytest.approx(1.0)
 

@@ -45,7 +45,10 @@ def test_common_coefficients_are_those_of_one_least_squares_of_all_runs() -> Non
     groups = {group.name: group for group in campaign.groups}
     bench = Term(groups["flexure"], Attribution.BENCH, 3.0)
     own = Term(groups["second-order"], Attribution.SENSORS, spread, mean_size=2.0)
-    mean, covariance = PooledTerms([bench, own], 1).solved(campaign)
+    terms = PooledTerms([bench, own], 1)
+    first, *others = [terms.sums(terms.beside_own(blocks)) for blocks in campaign.units()]
+    total = sum(others, first)
+    mean, covariance = posterior(total.info, total.score, terms.prior)
 
     def columns(name: str, run: int) -> np.ndarray:
         factor, group = runs[run], groups[name]
@@ -96,7 +99,7 @@ def test_the_evidence_of_an_error_of_a_bench_and_of_its_repair_is_that_of_normal
     logs = [log_odds(*benches, size=size) for size in tried]
     constant = dated.constant(tilt)
     assert constant.log_odds == pytest.approx(mean(logs), rel=1e-6)
-    assert constant.size == pytest.approx(tried[int(np.argmax(logs))])
+    assert constant.term.size == pytest.approx(tried[int(np.argmax(logs))])
 
     coarse = sizes(0.5 / np.sqrt(8.0), tilt.largest, 4.0)
     sides = {
@@ -111,8 +114,8 @@ def test_the_evidence_of_an_error_of_a_bench_and_of_its_repair_is_that_of_normal
     repaired, best = dated.repaired(tilt), max(by_date, key=lambda date: max(by_date[date]))
     assert repaired is not None
     assert repaired.log_odds == pytest.approx(mean([log for logs in by_date.values() for log in logs]), rel=1e-6)
-    assert repaired.repair == (best[0], benches[best[0]][best[1]])
-    assert repaired.size == pytest.approx(coarse[int(np.argmax(by_date[best]))])
+    assert repaired.term.repair == (best[0], benches[best[0]][best[1]])
+    assert repaired.term.size == pytest.approx(coarse[int(np.argmax(by_date[best]))])
 
 
 def test_runs_of_a_unit_are_summed_however_they_are_mixed() -> None:

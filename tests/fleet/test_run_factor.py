@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[2]
 def test_an_effect_that_is_added_by_the_factor_is_that_of_a_refit() -> None:
     path = ROOT / "recordings" / "hidden.mcap"
     before, after = kf_calib.calibrate(path), kf_calib.calibrate(path, kf_calib.Settings(effects="hysteresis"))
-    found = run_factor(before.fit, str(path))
+    found = run_factor(before.fit)
     columns = [*found.model, *found.effects["hysteresis"]]
     around = np.concatenate([found.nominal, np.zeros(3)])
     state, covariance, lost = square_root_information.solve(found.of(columns)[:-1], around)

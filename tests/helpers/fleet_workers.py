@@ -15,20 +15,19 @@ from kf_calib.bench.streams import Source
 from kf_calib.cli.options import EvaluationOptions, ReadingOptions, opened
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.estimation.results import Calibration
-from kf_calib.fleet import batch, command
+from kf_calib.fleet import batch
 from kf_calib.fleet.batch import RunEvaluation
-from kf_calib.fleet.command import SingleCommands
 
 _calibrations = dict[tuple[str, str], Calibration]()
 _diagnoses = dict[int, Diagnosis]()
 
 
-class RememberingCommands(SingleCommands):
-    """Commands that evaluate the same content with the same options once a process: most tests of a fleet are about
-    its table, and evaluate the same few recordings."""
+class RememberingEvaluation(RunEvaluation):
+    """Evaluates the same content with the same options once a process: most tests of a fleet are about its table, and
+    evaluate the same few recordings."""
 
     def replay(self, path: Path) -> tuple[Source, Calibration]:
-        key = hashlib.sha256(path.read_bytes()).hexdigest(), self.checksum
+        key = hashlib.sha256(path.read_bytes()).hexdigest(), self.settings
         if key not in _calibrations:
             source, _calibrations[key] = super().replay(path)
             return source, _calibrations[key]
@@ -59,11 +58,10 @@ def used(client: Client) -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(batch, "cluster", running)
-        patch.setattr(command, "SingleCommands", RememberingCommands)
+        patch.setattr(batch, "RunEvaluation", RememberingEvaluation)
         yield
 
 
 def evaluation(**given: Any) -> RunEvaluation:
     """What ``kf-calib fleet`` does with each run, with some options."""
-    commands = RememberingCommands(ReadingOptions(), EvaluationOptions(**given))
-    return RunEvaluation(commands, commands.checksum)
+    return RememberingEvaluation.of(ReadingOptions(), EvaluationOptions(**given))
