@@ -249,7 +249,7 @@ def test_one_name_stands_for_one_thing() -> None:
     classes = {name for name, where in homes.items() if name[0].isupper() and len(where) > 1}
     assert not classes, {name: homes[name] for name in classes}
     verbs = {name: where for name, where in homes.items() if name in VERBS and len(where) > 1}
-    assert verbs == {"save": {"kf_calib.views.figures.collection", "kf_calib.report.page"}}
+    assert verbs == {"save": {"kf_calib.views.figures", "kf_calib.report.page"}}
 
 
 FILLERS = {"found", "own", "each", "out"}

@@ -27,8 +27,7 @@ from kf_calib.report.drawing import Drawing
 from kf_calib.report.explorer import Explorer, explorer
 from kf_calib.report.page import Agreement, Facts, Page, PagePart, Section
 from kf_calib.views import console, diagnosis, improvement
-from kf_calib.views.figures import figures
-from kf_calib.views.figures.collection import DIRECTIONS, FALL, NO_FALL, ON_THEIR_WAY, PROBABILITIES
+from kf_calib.views.figures import DIRECTIONS, FALL, NO_FALL, ON_THEIR_WAY, PROBABILITIES, figures
 from kf_calib.views.html import Paragraph, parts_of
 
 _PACKAGE = Path(__file__).parents[1]

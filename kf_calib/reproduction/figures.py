@@ -16,7 +16,7 @@ from kf_calib.reproduction.grebenkin2019 import (
     falling_sigma,
     printed_column,
 )
-from kf_calib.views.figures.collection import Figures, figures
+from kf_calib.views.figures import Figures, figures
 from kf_calib.views.figures.convergence import parameter_panels
 from kf_calib.views.figures.style import GREY, drawn_on, log_scale, twelve, written
 

@@ -32,11 +32,14 @@ from kf_calib.views.figures.style import (
     PALE,
     UNIT_KINDS,
     Shown,
+    accelerometer_of,
     dated,
     drawn_on,
     log_scale,
+    mark_of,
     panels_of,
     say_once,
+    say_within,
     twelve,
     whole_numbers,
     with_coefficients,
@@ -177,9 +180,7 @@ def draw_nis(axes: Axes, tests: InnovationTests) -> None:
     axes.set_ylabel("NIS (no unit)")
     if not judged.any():
         axes.set_title("NIS by dwell: no degrees of freedom")
-        axes.text(0.5, 0.5, "nothing is left over\nto judge the model by", transform=axes.transAxes, ha="center",
-                  va="center", color=GREY)  # fmt: skip
-        return
+        return say_within(axes, "nothing is left over\nto judge the model by")
     band, ends = tests.band[judged], (tests.numbers[:, None] + [-0.5, 0.5]).ravel()  # a step a dwell
     axes.fill_between(ends, *np.repeat(tests.band, 2, axis=0).T, color=PALE, alpha=0.6, linewidth=0.0,
                       label="95 % of noise alone")  # fmt: skip
@@ -215,8 +216,7 @@ def draw_ratios(axes: Axes, tests: InnovationTests) -> None:
         axes.legend(loc="upper right", fontsize=7.5, ncols=3, title="accelerometer", columnspacing=1.0)
     else:
         axes.set_yticks([])
-        axes.text(0.5, 0.25, "the dwells before determine\nno prediction", transform=axes.transAxes, ha="center",
-                  va="center", color=GREY)  # fmt: skip
+        say_within(axes, "the dwells before determine\nno prediction", 0.25)
 
 
 @drawn_on()
@@ -271,7 +271,7 @@ def _chart(axes: Axes, calibrations: History, track: ParameterTrack) -> None:
     """Draw one parameter."""
     unit = shown(track.unit)
     zero, scale = float(track.values[-1]), unit.per_si
-    accelerometer = int(track.symbol[-1]) - 1 if track.symbol[-1] in "123" else 0
+    marker, colour = mark_of(accelerometer_of(track.symbol) or 0)
     dates = date2num(calibrations.dates)
     predicted, reach = (track.predicted - zero) * scale, _SIGMAS * track.predicted_sigma * scale
     known = np.isfinite(predicted)
@@ -283,8 +283,8 @@ def _chart(axes: Axes, calibrations: History, track: ParameterTrack) -> None:
     to_come = dates[-1] + ahead
     axes.plot(to_come, middle, color=BEST, linewidth=1.0, label="expected in use")
     axes.fill_between(to_come, middle - wide, middle + wide, color=BAND, linewidth=0.0, label="its 2σ")
-    axes.errorbar(dates, (track.values - zero) * scale, _SIGMAS * track.sigmas * scale, fmt=MARKERS[accelerometer],
-                  color=ACCELEROMETERS[accelerometer], elinewidth=0.9, label="found (2σ)", zorder=3)  # fmt: skip
+    axes.errorbar(dates, (track.values - zero) * scale, _SIGMAS * track.sigmas * scale, fmt=marker, color=colour,
+                  elinewidth=0.9, label="found (2σ)", zorder=3)  # fmt: skip
     tolerance = calibrations.tolerances.get(track.symbol)
     if tolerance is not None:
         for sign in (-1.0, 1.0):

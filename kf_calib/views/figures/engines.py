@@ -24,6 +24,7 @@ from kf_calib.views.figures.style import (
     drawn_on,
     log_scale,
     say,
+    say_within,
     whole_numbers,
 )
 from kf_calib.views.notation import written
@@ -96,8 +97,7 @@ def draw_cumulative(axes: Axes, tests: InnovationTests) -> None:
     axes.set_title("Sum of the NIS so far over its degrees of freedom")
     axes.set_ylabel("NIS / degrees of freedom")
     if not known.any():
-        axes.text(0.5, 0.5, "no degrees of freedom", transform=axes.transAxes, ha="center", va="center", color=GREY)
-        return
+        return say_within(axes, "no degrees of freedom")
     band = tests.per_dof_band[known]
     axes.fill_between(tests.numbers[known], band[:, 0], band[:, 1], color=PALE, alpha=0.6, linewidth=0.0,
                       label="95 % of noise alone")  # fmt: skip
@@ -135,8 +135,7 @@ def _autocorrelation(axes: Axes, values: Floats, white: Floats, bound: Floats, i
     """Draw an autocorrelation as stems, with the band that white noise keeps within in 95 % of all lags."""
     if not len(values) or not np.isfinite(values).any():
         axes.set_xticks([])
-        axes.text(0.5, 0.5, "too few to tell", transform=axes.transAxes, ha="center", va="center", color=GREY)
-        return
+        return say_within(axes, "too few to tell")
     lags = np.arange(1, len(values) + 1)
     axes.fill_between(lags, white - bound, white + bound, color=PALE, alpha=0.6, linewidth=0.0,
                       label="white noise, 95 %")  # fmt: skip

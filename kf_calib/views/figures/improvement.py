@@ -18,7 +18,17 @@ from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration, Parameter, format_p
 from kf_calib.support.units import shown
 from kf_calib.views.figures.residuals import driver_axis, driver_to_show
-from kf_calib.views.figures.style import ACCELEROMETERS, GREY, MARKERS, PLATFORM, drawn_on, say, wrapped
+from kf_calib.views.figures.style import (
+    ACCELEROMETERS,
+    GREY,
+    MARKERS,
+    accelerometer_of,
+    drawn_on,
+    mark_of,
+    rows_of,
+    say,
+    wrapped,
+)
 from kf_calib.views.notation import symbol
 
 _COLUMNS = 5  # models whose residuals are drawn
@@ -126,17 +136,13 @@ def _of_effect(axes: Axes, name: str, parameters: Sequence[Parameter]) -> None:
     unit = shown(parameters[0])
     for k, parameter in enumerate(parameters):
         assert parameter.value is not None and parameter.sigma is not None
-        sensor = int(parameter.symbol[-1]) - 1 if parameter.symbol[-1] in "123" else None
-        mark, colour = ("D", PLATFORM) if sensor is None else (MARKERS[sensor], ACCELEROMETERS[sensor])
+        mark, colour = mark_of(accelerometer_of(parameter.symbol))
         value, sigma = parameter.value * unit.per_si, parameter.sigma * unit.per_si
         axes.errorbar(value, k, xerr=2.0 * sigma, fmt="none", color=colour, elinewidth=1.0, capsize=3.0)
         axes.errorbar(value, k, xerr=sigma, fmt=mark, color=colour, elinewidth=3.5, markersize=5.5)
     said = [" ± ".join(unit.rounded(p.value or 0.0, p.sigma or np.nan)) for p in parameters]
-    rows = [f"{symbol(p.symbol)} = {text}" for p, text in zip(parameters, said, strict=True)]
-    axes.set_yticks(range(len(rows)), rows, fontsize=8.5)
-    axes.set_ylim(len(rows) - 0.4, -0.6)
+    rows_of(axes, [f"{symbol(p.symbol)} = {text}" for p, text in zip(parameters, said, strict=True)], fontsize=8.5)
     axes.axvline(0.0, color=GREY, linewidth=1.0)
-    axes.grid(visible=False, axis="y")
     axes.xaxis.set_major_locator(MaxNLocator(5))
     axes.set_xlabel(f"coefficient ± 1σ and 2σ, {unit.label}")
     axes.set_title(wrapped(name, 40))

@@ -31,8 +31,8 @@ from kf_calib.views.figures.style import (
     GREY,
     MARKERS,
     PALE,
-    PLATFORM,
     drawn_on,
+    mark_of,
     say,
     wrapped,
 )
@@ -148,7 +148,7 @@ def _points(
     alone, and with what was estimated."""
     many, per_si = len(x) > _MANY, shown(quantity).per_si
     axes.axhline(0.0, color=GREY, linewidth=0.8)
-    mark, colour = ("D", PLATFORM) if i is None else (MARKERS[i], ACCELEROMETERS[i])
+    mark, colour = mark_of(i)
     alone, estimated = sigmas
     if not many and np.nanmax(estimated / alone) > _LARGER:
         axes.errorbar(x, values * per_si, estimated * per_si, fmt="none", ecolor=PALE, elinewidth=1.0,

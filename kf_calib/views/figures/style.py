@@ -138,9 +138,14 @@ def content_of(
     return memory.getvalue()
 
 
-def letter(axes: Axes, text: str) -> None:
-    """Write a few words in the upper left corner of a panel."""
-    axes.text(0.015, 0.97, text, transform=axes.transAxes, va="top", ha="left", fontsize=8.5, color="#222222")
+def mark_of(i: int | None) -> tuple[str, str]:
+    """Marker and colour of accelerometer i, from 0; None: of the platform."""
+    return ("D", PLATFORM) if i is None else (MARKERS[i], ACCELEROMETERS[i])
+
+
+def accelerometer_of(symbol: str) -> int | None:
+    """The number, from 0, of the accelerometer whose parameter a symbol is; None where it ends in no such number."""
+    return int(symbol[-1]) - 1 if symbol[-1] in "123" else None
 
 
 def say(where: FigureBase, text: str, colour: str = GREY) -> None:
@@ -148,6 +153,18 @@ def say(where: FigureBase, text: str, colour: str = GREY) -> None:
     axes = where.subplots()
     axes.set_axis_off()
     axes.text(0.5, 0.5, text, ha="center", va="center", color=colour, wrap=True, fontsize=10.0)
+
+
+def say_within(axes: Axes, text: str, up: float = 0.5) -> None:
+    """Write in the middle of a panel, or so far up in it, why there is nothing to draw."""
+    axes.text(0.5, up, text, transform=axes.transAxes, ha="center", va="center", color=GREY)
+
+
+def rows_of(axes: Axes, names: Sequence[str], count: int = 0, **text: Any) -> None:
+    """Name the rows of a panel from above, as bars lie; count: the rows that there is room for, where it is more."""
+    axes.set_yticks(range(len(names)), names, **text)
+    axes.set_ylim(max(len(names), count) - 0.4, -0.6)
+    axes.grid(visible=False, axis="y")
 
 
 _LEAST_RANGE = 4.0  # between the ends of an axis, so that two labels at least are on it
@@ -210,11 +227,6 @@ class Shown(NamedTuple):
     per_si: float
 
 
-def plain(text: str) -> str:
-    """Text of the user as it is: matplotlib would read what is between two dollar signs as a formula."""
-    return text.replace("$", r"\$")
-
-
 def twelve() -> tuple[Shown, ...]:
     """How the twelve parameters are written, in the units that are asked for."""
     pairs = zip(paper_parameters.SYMBOLS, paper_parameters.UNITS, strict=True)
@@ -224,7 +236,7 @@ def twelve() -> tuple[Shown, ...]:
 def with_coefficients(coefficients: Iterable[Parameter | Coefficient]) -> tuple[Shown, ...]:
     """The same, followed by coefficients of effects."""
     found = [(each.symbol, units.shown(each)) for each in coefficients]
-    return (*twelve(), *(Shown(plain(label(symbol)), plain(unit.label), unit.per_si) for symbol, unit in found))
+    return (*twelve(), *(Shown(label(symbol), unit.label, unit.per_si) for symbol, unit in found))
 
 
 _WIDE = 4
