@@ -38,7 +38,7 @@ from kf_calib.estimation.estimate import correlation
 from kf_calib.estimation.results import Calibration
 from kf_calib.online.status import Judgement
 from kf_calib.support import units
-from kf_calib.support.text import angles_in_words, counted, printable
+from kf_calib.support.text import angles_in_words, counted
 from kf_calib.support.units import shown
 from kf_calib.views.console import effect_table, noise_table, parameter_table, verdict, without_table
 from kf_calib.views.markdown import markdown
@@ -49,12 +49,14 @@ from kf_calib.views.rerun.names import (
     CHANNELS,
     DARK,
     KINDS,
-    ON_DARK,
     ORIENTATION,
     Colour,
+    curves_panel,
+    page_of,
     quantities,
     rrd_file,
     strict,
+    window,
 )
 from kf_calib.views.rerun.series import (
     VisitHistory,
@@ -133,7 +135,7 @@ def _log(
         log_nis(fresh, stream, shown)
         log_bench(result, stream, shown)
     text = "\n\n".join([*([heading] if heading else []), markdown_summary(result)])
-    stream.log("summary", rr.TextDocument(printable(text), media_type=rr.MediaType.MARKDOWN), static=True)
+    stream.log("summary", page_of(text), static=True)
 
 
 def judgement_text(judgement: Judgement) -> str:
@@ -190,12 +192,7 @@ def layout(result: Calibration, history: VisitHistory, goes_on: bool = False) ->
     """The blueprint for a window of about 1600 x 1000, the overview in front; ``goes_on``: more dwells are to come."""
     tabs = [_overview(result, history, predicted(result) or goes_on), _parameters(history)]
     tabs += [_innovations(result)] if predicted(result) else []
-    return rrb.Blueprint(
-        rrb.Tabs(*tabs),
-        rrb.BlueprintPanel(state="hidden"),
-        rrb.SelectionPanel(state="hidden"),
-        rrb.TimePanel(state="collapsed", timeline=ORIENTATION, play_state="following"),
-    )
+    return window(rrb.Tabs(*tabs), ORIENTATION, "following")
 
 
 def _overview(result: Calibration, history: VisitHistory, is_predicted: bool) -> rrb.Horizontal:
@@ -262,15 +259,8 @@ def _innovations(result: Calibration) -> rrb.Vertical:
 def _series(
     contents: list[str], name: str, legend: rrb.Corner2D | None = None, around: tuple[float, float] | None = None
 ) -> rrb.TimeSeriesView:
-    """Curves over the timeline in use; no legend unless a corner is given for it."""
-    return rrb.TimeSeriesView(
-        contents=contents,
-        name=name,
-        plot_legend=rrb.PlotLegend(legend, visible=legend is not None),
-        axis_x=WHOLE_RUN,
-        axis_y=None if around is None else rrb.ScalarAxis(range=around),
-        background=ON_DARK,
-    )
+    """Curves over the timeline in use."""
+    return curves_panel(contents, name, WHOLE_RUN, legend, around)
 
 
 def _pose(result: Calibration) -> rrb.TimeSeriesView:

@@ -31,7 +31,19 @@ from kf_calib.support.text import printable
 from kf_calib.support.units import shown_whole
 from kf_calib.views.diagnosis import disturbed_dwells, name_of, verdict
 from kf_calib.views.markdown import literal, markdown
-from kf_calib.views.rerun.names import ACCELEROMETERS, CHANNELS, DARK, GOLD, GREY, MAUVE, Colour, rrd_file, thin
+from kf_calib.views.rerun.names import (
+    ACCELEROMETERS,
+    CHANNELS,
+    DARK,
+    GOLD,
+    GREY,
+    MAUVE,
+    Colour,
+    page_of,
+    rrd_file,
+    thin,
+    window,
+)
 from kf_calib.views.rerun.spheres import Log, at_step, forever, log_key, log_spheres, spheres
 from kf_calib.views.terminal import ConsoleTable, table
 
@@ -53,8 +65,7 @@ def save_diagnosis_view(diagnosis: Diagnosis, path: str | Path) -> Path:
             for shape in explanation.shapes[:1]:
                 _log_shape(shape, log)
             log_spheres(before, explanation.unexplained_ratios, "spheres/left", 1, stream, log)
-        text = rr.TextDocument(printable(_summary(diagnosis)), media_type=rr.MediaType.MARKDOWN)
-        stream.log("summary", text, static=True)
+        stream.log("summary", page_of(_summary(diagnosis)), static=True)
     return Path(path)
 
 
@@ -140,17 +151,13 @@ def _probabilities(hypotheses: HypothesisTable) -> ConsoleTable:
 def _layout(diagnosis: Diagnosis) -> rrb.Blueprint:
     name = "what the effect must explain" if diagnosis.explanations else "what residuals go with"
     charts = [charts_view(name)] if diagnosis.drivers else []
-    return rrb.Blueprint(
-        rrb.Horizontal(
-            spheres("spheres", 2 if diagnosis.explanations else 1),
-            *charts,
-            rrb.TextDocumentView(origin="summary", name="verdict"),
-            column_shares=[5, *(4.4 for _ in charts), 3.8],
-        ),
-        rrb.BlueprintPanel(state="hidden"),
-        rrb.SelectionPanel(state="hidden"),
-        rrb.TimePanel(state="collapsed", timeline=EXPLANATION, play_state="paused"),
+    beside = rrb.Horizontal(
+        spheres("spheres", 2 if diagnosis.explanations else 1),
+        *charts,
+        rrb.TextDocumentView(origin="summary", name="verdict"),
+        column_shares=[5, *(4.4 for _ in charts), 3.8],
     )
+    return window(beside, EXPLANATION, "paused")
 
 
 _WIDTH, _HEIGHT, _PITCH = 450.0, 220.0, 300.0

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -92,6 +93,36 @@ def quantities(model: Model) -> tuple[DrawnParameter, ...]:
         for each in model.coefficients
     ]  # fmt: skip
     return (*parameters, *coefficients)
+
+
+def page_of(text: str) -> rr.TextDocument:
+    """A page of text in Markdown."""
+    return rr.TextDocument(printable(text), media_type=rr.MediaType.MARKDOWN)
+
+
+def window(content: rrb.Container, timeline: str, play_state: Literal["paused", "following"]) -> rrb.Blueprint:
+    """A window that opens with all of its room for the content, at the end of a timeline or at its beginning."""
+    return rrb.Blueprint(
+        content,
+        rrb.BlueprintPanel(state="hidden"),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.TimePanel(state="collapsed", timeline=timeline, play_state=play_state),
+    )
+
+
+def curves_panel(
+    contents: list[str], name: str, axis_x: rrb.TimeAxis, legend: rrb.Corner2D | None = None,
+    reach: tuple[float, float] | None = None,
+) -> rrb.TimeSeriesView:  # fmt: skip
+    """Curves over a timeline; no legend unless a corner is given for it. reach: of the axis that points up."""
+    return rrb.TimeSeriesView(
+        contents=contents,
+        name=name,
+        plot_legend=rrb.PlotLegend(legend, visible=legend is not None),
+        axis_x=axis_x,
+        axis_y=None if reach is None else rrb.ScalarAxis(range=reach),
+        background=ON_DARK,
+    )
 
 
 def new_stream() -> rr.RecordingStream:
