@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, date, datetime, timedelta
+from datetime import date, datetime, timedelta
 from typing import Literal
 
 import numpy as np
@@ -40,6 +40,7 @@ from kf_calib.exchange.calibration_file import SavedCalibration, SavedParameter
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise, lift_rounding, mean_covariances
 from kf_calib.noise.terms import Scatter, SettingError
+from kf_calib.support.text import parse_date
 from kf_calib.support.units import quantity
 
 COVERAGE = math.erf(math.sqrt(2.0))
@@ -393,7 +394,7 @@ def _dates(saved: SavedCalibration) -> tuple[date, date] | tuple[None, None]:
     """The days on which the measurements began and ended, in UTC; None where the stamps are no dates."""
     if saved.conditions.began is None:
         return None, None
-    began = datetime.fromisoformat(saved.conditions.began).astimezone(UTC)
+    began = parse_date(saved.conditions.began)
     return began.date(), (began + timedelta(seconds=saved.conditions.duration_s)).date()
 
 

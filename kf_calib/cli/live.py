@@ -18,7 +18,7 @@ from kf_calib.cli.echo import complain, json_line, rendered
 from kf_calib.cli.failures import answered
 from kf_calib.cli.files import RerunFile, claimed, delivery, output_option, write_view
 from kf_calib.cli.live_page import PageOptions, page_server, page_state
-from kf_calib.cli.live_run import LiveRun, by_hand, on_bench, pressed_keys
+from kf_calib.cli.live_run import LiveRun, pressed_keys
 from kf_calib.cli.options import (
     BenchOptions,
     Device,
@@ -101,6 +101,7 @@ def live(
     Ctrl-C ends the run: the recording is finished and the summary printed.
     """
     from kf_calib.bench.paper_parameters import targets_of
+    from kf_calib.online.session import HandSession, Session
     from kf_calib.sources.live import files_of, open_live
 
     outputs, record = claimed(files_of(source), overwrite=overwrite), options.record
@@ -111,8 +112,10 @@ def live(
         header=options.header, give_up_s=options.give_up_s, idle_s=options.idle_s, angles=not options.no_angles,
     )  # fmt: skip
     with page_server(page) as server, opening() as opened:
-        begin = by_hand(settings, wanted) if options.no_angles else on_bench(settings, wanted, options.auto)
-        run = LiveRun(opened, begin, record, not sys.stdout.isatty() or as_json)
+        begin = HandSession if options.no_angles else partial(Session, auto=options.auto)
+        run = LiveRun(
+            opened, partial(begin, settings=settings, wanted=wanted), record, not sys.stdout.isatty() or as_json
+        )
         view = _view(rrd, options)
         if view is not None:
             run.listeners.append(partial(_offer, view))
@@ -257,13 +260,13 @@ def outcome(run: LiveRun, as_json: bool) -> Judgement | HandJudgement | None:
         from kf_calib.online.status import Judgement
         from kf_calib.views import diagnosis
         from kf_calib.views.console import summary
+        from kf_calib.views.terminal import VERDICT_STYLES
 
         assert final.result is not None
         diagnosed = isinstance(final, Judgement)
         parts: list[RenderableType] = [summary(final.result, diagnosed)]
         if diagnosed:
-            style = {True: "bold green", False: "bold yellow", None: "bold"}[final.consistent]
-            parts.append(Text(diagnosis.verdict(final.diagnosis), style=style))
+            parts.append(Text(diagnosis.verdict(final.diagnosis), style=VERDICT_STYLES[final.consistent]))
         run.print(rendered(Group(*parts)), end=False)
     return final
 

@@ -18,7 +18,8 @@ from kf_calib.reproduction.grebenkin2019 import (
 )
 from kf_calib.views.figures import Figures, figures
 from kf_calib.views.figures.convergence import parameter_panels
-from kf_calib.views.figures.style import GREY, drawn_on, log_scale, twelve, written
+from kf_calib.views.figures.style import GREY, drawn_on, log_scale
+from kf_calib.views.notation import twelve, written
 
 _SETS = {"optimal": ("#0072b2", "-"), "non-optimal": ("#d55e00", "--")}
 

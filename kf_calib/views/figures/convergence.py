@@ -31,7 +31,6 @@ from kf_calib.views.figures.style import (
     MARKERS,
     PALE,
     UNIT_KINDS,
-    Shown,
     accelerometer_of,
     dated,
     drawn_on,
@@ -40,11 +39,9 @@ from kf_calib.views.figures.style import (
     panels_of,
     say_once,
     say_within,
-    twelve,
     whole_numbers,
-    with_coefficients,
 )
-from kf_calib.views.notation import symbol, written
+from kf_calib.views.notation import Shown, symbol, twelve, with_coefficients, written
 
 MANY = 60
 """Dwells, above which curves have no markers."""
@@ -162,12 +159,7 @@ def convergence(figure: Figure, result: Calibration) -> None:
     figure.set_size_inches(11.0, 7.0 + 1.3 * -(-len(_by_unit(names)) // 3))
     left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[2.1, 1.0])[0]
     draw_sigmas(left, history.numbers.astype(float), history.sigmas, names)
-    draw_innovations(right, innovation_tests(result))
-
-
-def draw_innovations(figure: FigureBase, tests: InnovationTests) -> None:
-    """NIS of each dwell above, innovations over their sigma below."""
-    above, below = figure.subplots(2, 1, sharex=True)
+    tests, (above, below) = innovation_tests(result), right.subplots(2, 1, sharex=True)
     draw_nis(above, tests)
     draw_ratios(below, tests)
     for axes, words in ((above, ""), (below, "orientation")):

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure, FigureBase
+from matplotlib.figure import Figure
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.estimation.engine_comparison import Comparison
@@ -42,7 +42,9 @@ def three_ways(figure: Figure, compared: Comparison) -> None:
     above, below = figure.subfigures(2, 1, squeeze=False)[:, 0]
     left, right = above.subfigures(1, 2, squeeze=False, width_ratios=[1.6, 1.0])[0]
     draw_differences(left.subplots(), compared)
-    draw_costs(right, compared)
+    time, memory = right.subplots(2, 1)
+    _bars(time, "Time", "s", {name: way.wall_s for name, way in compared.ways.items()})
+    _bars(memory, "Peak memory of Python and numpy", "MB", {name: way.peak_mb for name, way in compared.ways.items()})
     tests = innovation_tests(compared.result)
     first, second = below.subplots(1, 2)
     draw_nis(first, tests)
@@ -67,13 +69,6 @@ def draw_differences(axes: Axes, compared: Comparison) -> None:
     axes.set_ylabel("largest difference, σ")
     axes.set_title("Largest difference of a parameter from the block engine, in its σ then")
     axes.legend(loc="best")
-
-
-def draw_costs(figure: FigureBase, compared: Comparison) -> None:
-    """Draw time and memory of each way as bars."""
-    time, memory = figure.subplots(2, 1)
-    _bars(time, "Time", "s", {name: way.wall_s for name, way in compared.ways.items()})
-    _bars(memory, "Peak memory of Python and numpy", "MB", {name: way.peak_mb for name, way in compared.ways.items()})
 
 
 def _bars(axes: Axes, title: str, unit: str, sizes: dict[str, float]) -> None:

@@ -35,13 +35,10 @@ from kf_calib.views.figures.style import (
     drawn_on,
     log_scale,
     say,
-    twelve,
     whole_numbers,
-    with_coefficients,
     wrapped,
 )
-from kf_calib.views.notation import written
-from kf_calib.views.plan import gimbal_names
+from kf_calib.views.notation import gimbal_names, twelve, with_coefficients, written
 
 _AXES = {"+x": (0.0, 0.0, -9.0, -9.0), "+z": (-90.0, 0.0, -9.0, -9.0), "−z": (90.0, 0.0, -9.0, -9.0),
          "−x": (180.0, 0.0, 10.0, 0.0), "+y": (0.0, 90.0, -16.0, 6.0), "−y": (0.0, -90.0, -16.0, -7.0)}  # fmt: skip
@@ -150,7 +147,9 @@ def draw_tour(figure: FigureBase, made: Plan) -> None:
 def draw_angles(axes: Axes, made: Plan) -> None:
     """Draw the angles of the gimbals in the order of the visits."""
     numbers = np.arange(1, len(made.poses) + 1)
-    for angles, name, colour, marker in zip(made.gimbal_deg.T, gimbal_names(made), _GIMBALS, "osDv", strict=False):
+    for angles, name, colour, marker in zip(
+        made.gimbal_deg.T, gimbal_names(made.prospect.model.bench), _GIMBALS, "osDv", strict=False
+    ):
         axes.plot(numbers, angles, f":{marker}", color=colour, markersize=4.0, linewidth=0.9,
                   label=f"gimbal {name.replace('_', ' ')}")  # fmt: skip
     reach = float(np.abs(made.gimbal_deg).max(initial=90.0))

@@ -3,8 +3,6 @@
 Figures are matplotlib's, on white, for a report; they need no screen, no viewer and no graphics driver.
 
 Axes that can be read: logarithms with their values as labels, orientations as whole numbers.
-
-Words and numbers in figures, symbols as in the paper, and the units that parameters are shown in.
 """
 
 from __future__ import annotations
@@ -17,7 +15,7 @@ from contextlib import contextmanager
 from functools import update_wrapper
 from inspect import Signature, signature
 from textwrap import fill
-from typing import Any, Concatenate, Literal, NamedTuple, ParamSpec
+from typing import Any, Concatenate, Literal, ParamSpec
 
 import matplotlib
 import numpy as np
@@ -28,11 +26,7 @@ from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import Figure, FigureBase
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter, NullLocator
 
-from kf_calib.bench import paper_parameters
-from kf_calib.effects import Coefficient
-from kf_calib.estimation.results import Parameter
-from kf_calib.support import units
-from kf_calib.views.notation import label, written
+from kf_calib.views.notation import written
 
 ACCELEROMETERS = ("#d55e00", "#009e73", "#0072b2")
 """One colour an accelerometer, from Okabe and Ito's palette; markers differ, too."""
@@ -219,26 +213,6 @@ def whole_numbers(axes: Axes, first: float, last: float, words: str = "orientati
 UNIT_KINDS = {"rad": "angle", "1": "scale factor", "m/s^2": "bias"}
 
 
-class Shown(NamedTuple):
-    """How a parameter is written: its symbol, its unit, and how many of the unit make one SI unit."""
-
-    label: str
-    unit: str
-    per_si: float
-
-
-def twelve() -> tuple[Shown, ...]:
-    """How the twelve parameters are written, in the units that are asked for."""
-    pairs = zip(paper_parameters.SYMBOLS, paper_parameters.UNITS, strict=True)
-    return tuple(Shown(label(symbol), *units.shown(unit)) for symbol, unit in pairs)
-
-
-def with_coefficients(coefficients: Iterable[Parameter | Coefficient]) -> tuple[Shown, ...]:
-    """The same, followed by coefficients of effects."""
-    found = [(each.symbol, units.shown(each)) for each in coefficients]
-    return (*twelve(), *(Shown(label(symbol), unit.label, unit.per_si) for symbol, unit in found))
-
-
 _WIDE = 4
 
 
@@ -252,7 +226,7 @@ def panels_of(figure: Figure, count: int, around_in: float, high_in: float) -> l
     return panels[:count]
 
 
-def say_once(figure: Figure, panels: Sequence[Axes], place: str = "outside lower left", columns: int = 6) -> None:
+def say_once(figure: FigureBase, panels: Iterable[Axes], place: str = "outside lower left", columns: int = 6) -> None:
     """Say once beside the panels what is drawn in them."""
     said = dict[str, Any]()
     for axes in panels:

@@ -17,6 +17,7 @@ from kf_calib.support.text import angles_in_words, counted, sentence
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2, shown, span
 from kf_calib.views import diagnosis
 from kf_calib.views.notation import symbol
+from kf_calib.views.terminal import VERDICT_STYLES
 
 if TYPE_CHECKING:
     from kf_calib.sources.live import Status
@@ -137,7 +138,7 @@ def _of_bench(standing: Standing, source: Sequence[Line], remarks: Sequence[str]
     task, (headings, rows) = _bench_task(standing, doing), _bench_rows(standing)
     if judgement is None:
         return Content(task, None, remarks, line, source, headings, rows, ())
-    verdict = judgement.verdict, {True: "bold green", False: "bold yellow", None: "bold"}[judgement.consistent]
+    verdict = judgement.verdict, VERDICT_STYLES[judgement.consistent]
     model = [((_fit(judgement), ""),)]
     if judgement.risen is not None:
         risen, factor = judgement.risen
@@ -251,8 +252,12 @@ def _of_hand(standing: HandStanding, source: Sequence[Line], remarks: Sequence[s
     colour = "green" if is_enough else "yellow" if standing.rest_s else "cyan"
     share = min(standing.rest_s / standing.enough_s, 1.0)
     task = Task(sentence(standing.task), f"{done}; {where}{resting}", colour, share)
-    style = {True: "bold green", False: "bold yellow", None: "bold"}[judgement.consistent] if judgement else ""
-    verdict = None if judgement is None else (_sides_in_words(judgement), style)
+    verdict = None
+    if judgement is not None:
+        nis = None if judgement.result is None else judgement.result.consistency.nis_per_dof
+        misfit = "" if nis is None else f"NIS/dof {nis:.3g}; "
+        said = f"{counted(judgement.sides.count, 'side')} seen; {misfit}{judgement.verdict}"
+        verdict = said, VERDICT_STYLES[judgement.consistent]
     headings: Headings = ("less nominal", "right"), ("σ", "right"), ("", "left"), ("target", "right")
     return Content(task, verdict, remarks, "", source, headings, _hand_rows(judgement), ())
 
@@ -273,10 +278,3 @@ def _hand_rows(judgement: HandJudgement | None) -> list[SigmaRow]:
         target = unit.number(wanted) if math.isfinite(wanted) else ""
         rows.append(SigmaRow(symbol(name), (off, f"± {spread}", unit.label, target), bar(sigma, wanted, k)))
     return rows
-
-
-def _sides_in_words(judgement: HandJudgement) -> str:
-    """Return the line about sides and misfit."""
-    nis = None if judgement.result is None else judgement.result.consistency.nis_per_dof
-    misfit = "" if nis is None else f"NIS/dof {nis:.3g}; "
-    return f"{counted(judgement.sides.count, 'side')} seen; {misfit}{judgement.verdict}"

@@ -196,8 +196,9 @@ def layout(result: Calibration, history: VisitHistory, goes_on: bool = False) ->
 
 
 def _overview(result: Calibration, history: VisitHistory, is_predicted: bool) -> rrb.Horizontal:
+    pose = "gimbal angles, deg" if result.bench.axes else "attitude, quaternion"
     return rrb.Horizontal(
-        rrb.Vertical(*sigma_panels(history), _pose(result)),
+        rrb.Vertical(*sigma_panels(history), _series(["bench/pose/**"], pose, rrb.Corner2D.RightTop)),
         rrb.Vertical(platform_panel(result), *_fit(is_predicted), row_shares=[2, 1, 1] if is_predicted else [1, 1]),
         rrb.TextDocumentView(origin="summary", name="result"),
         column_shares=[4.55, 4.25, 4.4],
@@ -261,11 +262,6 @@ def _series(
 ) -> rrb.TimeSeriesView:
     """Curves over the timeline in use."""
     return curves_panel(contents, name, WHOLE_RUN, legend, around)
-
-
-def _pose(result: Calibration) -> rrb.TimeSeriesView:
-    name = "gimbal angles, deg" if result.bench.axes else "attitude, quaternion"
-    return _series(["bench/pose/**"], name, rrb.Corner2D.RightTop)
 
 
 def eye(bench: Bench, position: Vector, target: Vector) -> rrb.EyeControls3D:

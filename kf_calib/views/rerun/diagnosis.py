@@ -26,11 +26,10 @@ from kf_calib.diagnosis.residual_drivers import Driver
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.estimation.residual_table import mean_sigmas
-from kf_calib.estimation.results import format_p
 from kf_calib.support.text import printable
-from kf_calib.support.units import shown_whole
-from kf_calib.views.diagnosis import disturbed_dwells, name_of, verdict
+from kf_calib.views.diagnosis import advice_sentence, disturbed_dwells, name_of, share_in_words, verdict
 from kf_calib.views.markdown import literal, markdown
+from kf_calib.views.notation import p_cell, unit_across
 from kf_calib.views.rerun.names import (
     ACCELEROMETERS,
     CHANNELS,
@@ -71,7 +70,7 @@ def save_diagnosis_view(diagnosis: Diagnosis, path: str | Path) -> Path:
 
 def _log_residuals(driver: Driver, ratios: Floats, log: Log) -> None:
     """Send the residuals over their sigma against the quantity that they go with most."""
-    unit = shown_whole(driver.unit, float(np.abs(driver.values).max()))
+    unit = unit_across(driver)
     titles = [f"accelerometer {i}: residual / σ" for i in (1, 2, 3)]
     for k, chart in enumerate(charts_of(driver.values * unit.per_si, titles, ratios)):
         chart.log_frame(log)
@@ -84,7 +83,7 @@ def _log_shape(shape: EffectShape, log: Log) -> None:
 
     Where it does not go with its quantity alone there is a dash a dwell instead of the curve.
     """
-    unit = shown_whole(shape.unit, float(np.nanmax(np.abs(shape.values))))
+    unit = unit_across(shape)
     ratios = shape.readings / shape.sigma
     charts = charts_of(shape.values * unit.per_si, [f"{channel}, σ" for channel in shape.channels], ratios)
     clear(log, range(len(charts), 3))
@@ -117,28 +116,19 @@ def _summary(diagnosis: Diagnosis) -> str:
     if diagnosis.table is not None:
         blocks.append(markdown(_probabilities(diagnosis.table)))
     if diagnosis.next_orientation is not None:
-        advice, why = diagnosis.next_orientation
-        angles = ", ".join(f"{angle:.4g}" for angle in advice.gimbal_deg)
-        blocks.append(f"**Next orientation**: gimbals at {angles} deg: {why}.")
+        head, _, advice = advice_sentence(*diagnosis.next_orientation).partition(":")
+        blocks.append(f"**{head}**:{advice}")
     if explanations := diagnosis.explanations[:_MOST]:
         rows = [
-            (f"{k} {each.name}", "yes" if each.fits else "no",
-             format_p(each.after.consistency.p_value).removeprefix("= "))
+            (f"{k} {each.name}", "yes" if each.fits else "no", p_cell(each.after.consistency.p_value))
             for k, each in enumerate(explanations, 1)
-        ]  # fmt: skip
+        ]
         blocks.append(markdown(table("", ("explanation", "fits", "p with it"), rows)))
         blocks.append("Move the cursor of the timeline *explanation* to see what each leaves.")
     if diagnosis.drivers:
-        shares = [(each.words, _share(each)) for each in diagnosis.drivers]
+        shares = [(each.words, share_in_words(each)) for each in diagnosis.drivers]
         blocks.append(markdown(table("", ("quantity", "goes with"), shares)))
     return "\n\n".join(blocks) + "\n"
-
-
-def _share(driver: Driver) -> str:
-    """How much of the misfit goes with a driver, in a few words."""
-    if driver.p_value > 0.01 or driver.share < 0.005:
-        return "no more than noise"
-    return f"{100 * driver.share:.0f} % of the misfit (p {format_p(driver.p_value)})"
 
 
 def _probabilities(hypotheses: HypothesisTable) -> ConsoleTable:

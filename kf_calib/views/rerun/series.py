@@ -18,6 +18,7 @@ from kf_calib.estimation.filter_history import history_of, nis_band
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration, Visit
 from kf_calib.support import units
+from kf_calib.views.notation import gimbal_names
 from kf_calib.views.rerun.names import (
     ACCELEROMETERS,
     BENCH_TIME,
@@ -70,13 +71,10 @@ class VisitHistory:
         power = 10.0 ** np.ceil(np.log10(top))
         return 0.0, float(max(top, 1.05 * power if top > 0.6 * power else 0.0))
 
-    def _only(self, rows: NDArray[np.bool_]) -> VisitHistory:
-        """Return the same with these rows only."""
-        return VisitHistory(self.shown, *(getattr(self, each.name)[rows] for each in fields(self)[1:]))
-
     def after(self, visits: Sequence[Visit]) -> VisitHistory:
         """What came after these visits; the prior only where there were none."""
-        return self._only(self.orientation > (visits[-1].dwell.number if visits else -1))
+        rows = self.orientation > (visits[-1].dwell.number if visits else -1)
+        return VisitHistory(self.shown, *(getattr(self, each.name)[rows] for each in fields(self)[1:]))
 
     @classmethod
     def of(cls, result: Calibration) -> VisitHistory:
@@ -221,16 +219,9 @@ def log_bench(result: Calibration, stream: rr.RecordingStream, before: int = 0) 
     visits = result.visits[before:]
     poses = np.array([visit.dwell.recorded_pose for visit in visits])
     poses = np.degrees(poses) if result.bench.axes else poses
-    for k, (name, angle) in enumerate(zip(pose_names(result), poses.T, strict=True)):
+    names = gimbal_names(result.bench) if result.bench.axes else ["q_x", "q_y", "q_z", "q_w"]
+    for k, (name, angle) in enumerate(zip(names, poses.T, strict=True)):
         colour, path = GIMBALS[k % len(GIMBALS)], f"bench/pose/{name}"
         step = rr.SeriesLines(names=name.replace("_", " "), colors=colour, widths=1.5, interpolation_mode="StepMid")
         send_curve(stream, path, ends(visits), angle, step)
         send_curve(stream, path, begins(visits), angle)
-
-
-def pose_names(result: Calibration) -> list[str]:
-    """Of the gimbals, outer first, with their axes; of the quaternion's parts where there are no gimbals."""
-    if not result.bench.axes:
-        return ["q_x", "q_y", "q_z", "q_w"]
-    axes = result.bench.to_metadata()["axes"].split()
-    return [f"{k}_{axis}" for k, axis in enumerate(axes, 1)]
