@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -11,10 +11,10 @@ from statistics import median
 from typing import TYPE_CHECKING, Annotated
 
 import rich_click as click
-from click.core import ParameterSource
 
 from kf_calib.cli.command import argument, command
 from kf_calib.cli.echo import print_result, progress
+from kf_calib.cli.files import given, words_of
 from kf_calib.cli.options import OF_DWELLS, Json, ReadingOptions, not_of_text
 from kf_calib.errors import BenchError, BlunderError, CountsError, KfCalibError
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
@@ -194,7 +194,7 @@ def _of_messages(ctx: click.Context, path: Path, reading: ReadingOptions, tick: 
     fields = _fields(inventory)
     by_hand = inventory.has_readings and inventory.has_angles is None and not fields
     is_attitude = inventory.has_angles is False or any(" attitude=" in field for field in fields)
-    proposal = _Proposal(_given(ctx, _not_of(ctx, ("columns", "g_unit"))) + fields)
+    proposal = _Proposal(_given(ctx, ("columns", "g_unit")) + fields)
     proposal.ask_for_bench(bench, not (is_attitude or by_hand or reading.no_angles))
     if by_hand and not reading.no_angles:
         proposal.words.append("--no-angles")
@@ -220,7 +220,7 @@ def _of_lines(
     from kf_calib.sources.files.inventory import inventory_of_lines
     from kf_calib.sources.text.lines import Lines
 
-    proposal = _Proposal(_given(ctx, _not_of(ctx, not_of_text(path))) + _options(told))
+    proposal = _Proposal(_given(ctx, not_of_text(path)) + _options(told))
     proposal.missing |= {"accel_scale": reason} if reason else {}
     units = _units(reading, told)
     inventory = inventory_of_lines(path, reading.renamed, units)
@@ -262,7 +262,7 @@ def _of_table(ctx: click.Context, path: Path, reading: ReadingOptions, told: Sta
     stated: BenchKeys = {**reading.keys, **_bench_keys(told)}
     bench = _in_words(stated)
     table = Survey(path, stated, reading.renamed, _units(reading, told), angles=not reading.no_angles)
-    proposal = _Proposal(_given(ctx, _not_of(ctx, not_of_text(path) + OF_DWELLS)) + _options(told))
+    proposal = _Proposal(_given(ctx, not_of_text(path) + OF_DWELLS) + _options(told))
     proposal.missing |= {"counts": reason} if reason else {}
     if not table.columns.orientation and not reading.no_angles:
         proposal.ask("angles", _BY_HAND.format(or_else=", attitude or face"), "--no-angles")
@@ -315,25 +315,14 @@ def _wrong_unit(norms_mps2: Sequence[float], taken: RawInput, *, are_named: bool
     return wrong._replace(option=wrong.option + " --restate-input") if is_named else wrong
 
 
-def _not_of(ctx: click.Context, names: Sequence[str]) -> set[str]:
-    """Names of the options but for these, and but for the form of what is printed."""
-    return {param.name for param in ctx.command.params if param.name} - {*names, "as_json"}
-
-
-def _given(ctx: click.Context, taken: Set[str]) -> list[str]:
-    """The options of this command line, as they were written, of those that the command to try takes."""
-    words = list[str]()
-    for param in ctx.command.params:
-        name = param.name or ""
-        is_given = ctx.get_parameter_source(name) is ParameterSource.COMMANDLINE
-        if name in taken and is_given and isinstance(param, click.Option):
-            value = ctx.params[name]
-            if param.is_flag:
-                words += [param.opts[0]]
-                continue
-            words += [f"{param.opts[0]} {_quoted(str(each))}" for each in
-                      (value if isinstance(value, tuple) else [value])]  # fmt: skip
-    return words
+def _given(ctx: click.Context, less: Sequence[str]) -> list[str]:
+    """The options of this command line, as they were written, but for those that the command to try does not take."""
+    return [
+        " ".join([option, *map(_quoted, value)])
+        for param, values in given(ctx)
+        if isinstance(param, click.Option) and param.name not in (*less, "as_json")
+        for option, *value in words_of(param, values)
+    ]
 
 
 def _quoted(text: str) -> str:

@@ -153,23 +153,15 @@ def magnification(final: Sequence[Ellipsoid]) -> float | None:
     return rounded(FINAL_SIZE / largest) if largest > 0.0 else None
 
 
-def ellipsoids(sensitivities: Floats) -> list[Ellipsoid]:
-    """Those of covariances (3, 3, 3) of the three sensitivities; NaN where one is not determined."""
-    determined = list[Ellipsoid]()
-    for i, covariance in enumerate(sensitivities):
-        if np.isfinite(covariance).all():
-            variance, directions = np.linalg.eigh(covariance)
-            determined.append((i, np.sqrt(np.maximum(variance, 0.0)), directions * np.linalg.det(directions)))
-    return determined
-
-
 def ellipsoids_of(estimate: Estimate) -> list[Ellipsoid]:
     """Return those of the sensitivities that are determined."""
-    covariances = np.full((3, 3, 3), np.nan)
+    determined = list[Ellipsoid]()
     for i in range(3):
-        if not estimate.unseen[4 * i : 4 * i + 3].any():
-            covariances[i] = estimate.covariance[4 * i : 4 * i + 3, 4 * i : 4 * i + 3]
-    return ellipsoids(covariances)
+        states = slice(4 * i, 4 * i + 3)
+        if not estimate.unseen[states].any():
+            variance, directions = np.linalg.eigh(estimate.covariance[states, states])
+            determined.append((i, np.sqrt(np.maximum(variance, 0.0)), directions * np.linalg.det(directions)))
+    return determined
 
 
 def magnified(estimate: Estimate) -> str:
