@@ -120,7 +120,7 @@ def live(
         if view is not None:
             run.listeners.append(partial(_offer, view))
         with answered(run.handle_signal):  # until all is written: who closes a terminal sends several
-            follow(run, source, record, as_json, server)
+            follow(run, source, as_json, server)
             if view is not None:
                 view.close()
             opened.close()
@@ -146,14 +146,14 @@ def _offer(view: GrowingView, judgement: Judgement | HandJudgement) -> None:
         view.offer(judgement.result, judgement if isinstance(judgement, Judgement) else None)
 
 
-def follow(run: LiveRun, name: str, record: Path | None, as_json: bool, page: PageServer | None) -> None:
+def follow(run: LiveRun, name: str, as_json: bool, page: PageServer | None) -> None:
     """The run to its end, with a screen, lines or objects, and a page where there is one."""
     if page is not None:
-        page.state = partial(page_state, run, name, record)
+        page.state = partial(page_state, run, name)
     run.start()
     if not as_json and sys.stdout.isatty():
         try:
-            _on_screen(run, name, record, "" if page is None else f"   page: {page.url}")
+            _on_screen(run, name, "" if page is None else f"   page: {page.url}")
         except OSError as error:  # the terminal is gone: the run is not
             run.print.fail(error)
     told = dict[str, str]()
@@ -207,12 +207,10 @@ def _echo(run: LiveRun, text: str) -> None:
             complain("nobody reads this output any more; the recording goes on.")
 
 
-def _on_screen(run: LiveRun, name: str, record: Path | None, where: str) -> None:
+def _on_screen(run: LiveRun, name: str, where: str) -> None:
     from rich.live import Live
 
-    from kf_calib.online.session import HandStanding
-    from kf_calib.online.status import Standing
-    from kf_calib.views.live.content import content_of
+    from kf_calib.online.session import HandSession
     from kf_calib.views.live.screen import screen
     from kf_calib.views.terminal import PlainConsole
 
@@ -223,14 +221,12 @@ def _on_screen(run: LiveRun, name: str, record: Path | None, where: str) -> None
             with contextlib.suppress(queue.Empty):
                 run.judgements.get_nowait()
             run.warn()
-            standing = run.session.standing if run.session else Standing()
-            keys = "" if isinstance(standing, HandStanding) else "a: accept what is missing   "
+            keys = "" if isinstance(run.session, HandSession) else "a: accept what is missing   "
             hint = "ending ..." if run.stopped else f"{keys}q: end the run{where}"
-            content = content_of(standing, run.source.status, name, str(record or ""), run.doing())
             if display.console.size != size:  # what was drawn for another width would stay in pieces
                 size = display.console.size
                 display.console.clear()
-            display.update(screen(content, hint), refresh=True)
+            display.update(screen(run.content(name), hint), refresh=True)
             key = pressed(_REFRESH_S)
             if key == "a":
                 run.accept()

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from kf_calib.online.session import HandJudgement, HandSession, Session
     from kf_calib.online.status import Judgement
     from kf_calib.sources.live import LiveSource
-    from kf_calib.views.live.content import Doing
+    from kf_calib.views.live.content import Content, Doing
 
 
 class LiveRun:
@@ -59,6 +59,14 @@ class LiveRun:
         self._record, self._begin = record, begin
         work = self._work, every
         self._thread = threading.Thread(target=copy_context().run, args=work, daemon=True)  # in the units chosen
+
+    def content(self, name: str) -> Content:
+        """What is shown of the run now; name: of its source."""
+        from kf_calib.online.status import Standing
+        from kf_calib.views.live.content import content_of
+
+        standing = self.session.standing if self.session else Standing()
+        return content_of(standing, self.source.status, name, str(self._record or ""), self.doing())
 
     def start(self) -> None:
         self._thread.start()

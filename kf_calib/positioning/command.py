@@ -241,7 +241,7 @@ def run(
         begin = partial(Session, settings=settings, wanted=wanted, auto=options.improve)
         running = DrivenRun(opened, begin, record, not sys.stdout.isatty() or as_json, make)
         with answered(running.handle_signal):
-            _follow(running, positioner, driven, record, as_json, server)
+            _follow(running, positioner, driven, as_json, server)
             opened.close()
             code = _code(running)
             final = None if running.drive_error else outcome(running, as_json)
@@ -336,7 +336,7 @@ def _trouble(running: DrivenRun) -> str:
     return ""
 
 
-def _follow(running: DrivenRun, name: str, device: Opened, record: Path | None, as_json: bool,
+def _follow(running: DrivenRun, name: str, device: Opened, as_json: bool,
             page: PageServer | None) -> None:  # fmt: skip
     """The run to its end; with a person as the positioner, Enter says that the gimbals stand."""
     from kf_calib.positioning.positioner import HandPositioner
@@ -349,7 +349,7 @@ def _follow(running: DrivenRun, name: str, device: Opened, record: Path | None, 
                 hand.done()
 
         threading.Thread(target=listen, name="enter", daemon=True).start()
-    follow(running, name, record, as_json, page)
+    follow(running, name, as_json, page)
 
 
 def _code(running: DrivenRun) -> int:

@@ -284,5 +284,5 @@ def _with_what_is_missing(diagnosed: Diagnosis) -> tuple[PagePart, ...]:
     return (*parts_of(table), *parts_of(console.effect_table(diagnosed.after)))
 
 
-def warnings_of(said: Iterable[str], title: str = "Warnings") -> Section:
-    return Section(title, tuple(Paragraph(text, "note") for text in said))
+def warnings_of(said: Iterable[str]) -> Section:
+    return Section("Warnings", tuple(Paragraph(text, "note") for text in said))

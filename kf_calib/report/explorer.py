@@ -38,7 +38,7 @@ def explorer(first: Calibration, others: Mapping[str, Floats], shapes: Sequence[
     dwells = first.linearised.dwells
     models, unit = {f"{first.model.sum}": first.residuals_mps2, **others}, shown("m/s^2")
     return Explorer(
-        _short(
+        clean(
             {
                 "dwells": [dwell.number for dwell in dwells],
                 "begin_s": [dwell.start_s for dwell in dwells],
@@ -47,7 +47,8 @@ def explorer(first: Calibration, others: Mapping[str, Floats], shapes: Sequence[
                 "sigma": mean_sigmas(first) * unit.per_si,
                 "drivers": [*map(_shape, shapes), *map(_driver, drivers_of(first))],
                 "models": [{"name": name, "residual": left_mps2 * unit.per_si} for name, left_mps2 in models.items()],
-            }
+            },
+            _DIGITS,
         )
     )
 
@@ -68,13 +69,3 @@ def _driver(driver: Driver) -> dict[str, Any]:
     unit, share = unit_across(driver), f"explains {driver.share:.0%}" if explains(driver) else ""
     of_all = driver.values[:, 0] if np.ptp(driver.values, axis=1).max() == 0.0 else driver.values  # such as an angle
     return {"name": driver.words, "unit": unit.label, "explains": share, "values": of_all * unit.per_si}
-
-
-def _short(value: Any) -> Any:
-    """Return what JSON can hold, with numbers of a few digits."""
-    if isinstance(value, dict):
-        return {key: _short(each) for key, each in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
-        return [_short(each) for each in value]
-    value = clean(value)
-    return float(f"{value:.{_DIGITS}g}") if isinstance(value, float) else value
