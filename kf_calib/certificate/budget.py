@@ -105,9 +105,9 @@ class Budget:
 
     @property
     def dof(self) -> Floats:
-        """u^4 / sum_i (u_i^4 / nu_i) (GUM G.4.1)."""
-        parts = [own.parts**4 / own.dof for own in self.contributions]
-        return welch_satterthwaite(self.combined, sum(parts, np.zeros(STATE_COUNT)))
+        """u^4 / sum_i (u_i^4 / nu_i), of Welch and Satterthwaite (GUM G.4.1)."""
+        quartics = sum((own.parts**4 / own.dof for own in self.contributions), np.zeros(STATE_COUNT))
+        return np.where(quartics > 0.0, self.combined**4 / np.where(quartics > 0.0, quartics, 1.0), np.inf)
 
     @property
     def k(self) -> Floats:
@@ -118,12 +118,6 @@ class Budget:
     def expanded(self) -> Floats:
         """U = k u."""
         return self.k * self.combined
-
-
-def welch_satterthwaite(combined: Floats, quartics: Floats) -> Floats:
-    """Effective degrees of freedom of combined uncertainties; quartics: the sums of u_i^4 / nu_i."""
-    with np.errstate(divide="ignore"):
-        return np.where(quartics > 0.0, combined**4 / np.where(quartics > 0.0, quartics, 1.0), np.inf)
 
 
 def coverage_factor(dof: Floats) -> Floats:

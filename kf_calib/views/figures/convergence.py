@@ -269,7 +269,10 @@ def _chart(axes: Axes, calibrations: History, track: ParameterTrack) -> None:
     known = np.isfinite(predicted)
     axes.errorbar(dates[known], predicted[known], reach[known], fmt="none", ecolor=PALE, elinewidth=7.0,
                   label="predicted by those before (2σ)")  # fmt: skip
-    ahead = np.linspace(0.0, _days_ahead(calibrations), 60)
+    span_days = _AHEAD * float(calibrations.days[-1])
+    if calibrations.due is not None:  # to the next one, and a little beyond
+        span_days = max(span_days, 1.1 * ((calibrations.due - calibrations.dates[-1]) / timedelta(days=1)))
+    ahead = np.linspace(0.0, span_days, 60)
     value, sigma = track.known_after(ahead)
     middle, wide = (value - zero) * scale, _SIGMAS * sigma * scale
     to_come = dates[-1] + ahead
@@ -287,11 +290,3 @@ def _chart(axes: Axes, calibrations: History, track: ParameterTrack) -> None:
         axes.axvline(float(date2num(calibrations.due)), label="may leave it", color=ALARM, linewidth=1.2)
     axes.set_title(f"{symbol(track.symbol)}, {unit.label} from the last")
     dated(axes)
-
-
-def _days_ahead(calibrations: History) -> float:
-    """Return for how many days after the last calibration the bands are drawn: to the next one, and a little beyond."""
-    span = _AHEAD * float(calibrations.days[-1])
-    if calibrations.due is None:
-        return span
-    return max(span, 1.1 * ((calibrations.due - calibrations.dates[-1]) / timedelta(days=1)))

@@ -156,11 +156,13 @@ def suspects(figure: Figure, diagnosis: Diagnosis) -> None:
     explained = diagnosis.explanations[:_MOST]
     if not explained:
         return say(figure, wrapped(diagnosis.verdict, 90))
-    rows, names = figure.add_gridspec(2, 1, height_ratios=(1.5, 1.0)), _alike(diagnosis)
+    names = dict.fromkeys([*diagnosis.missing, *diagnosis.ambiguity, *(each.name for each in diagnosis.suspects)])
+    names.pop(diagnosis.test.effects.walk, None)  # which takes any path, and so overlaps with all
+    rows = figure.add_gridspec(2, 1, height_ratios=(1.5, 1.0))
     above = rows[0].subgridspec(1, 2, width_ratios=(1.15, 1.0))
     below = rows[1].subgridspec(1, 2, width_ratios=(1.15, 1.0))
     _suspect_bars(figure.add_subplot(above[0]), explained)
-    _overlaps(figure.add_subplot(above[1]), diagnosis, names)
+    _overlaps(figure.add_subplot(above[1]), diagnosis, list(names)[:_ALIKE])
     _drivers(figure.add_subplot(below[0]), diagnosis.drivers[:_DRIVERS])
     _separation(figure.add_subplot(below[1]), diagnosis)
 
@@ -177,19 +179,10 @@ def _suspect_bars(axes: Axes, explained: Sequence[Explanation]) -> None:
         said, ink = ("fits", "#222222") if explanation.fits else ("does not fit", GREY)
         p_value = "" if explanation.p_value is None else f", p {format_p(explanation.p_value)}"
         axes.text(103.0, k, said + p_value, va="center", fontsize=8.5, color=ink)
-    rows_of(axes, [wrapped(explanation.name, _SUSPECT_NAME) for explanation in explained])
-    axes.set_xlim(0.0, 100.0)
-    axes.set_xlabel("explained part of the misfit beyond noise, %")
+    _share_axis(axes, [explanation.name for explanation in explained], "explained part of the misfit beyond noise, %")
     if all(explanation.share is None for explanation in explained):
         axes.text(50.0, 0.5 * (len(explained) - 1.0), _NO_MISFIT, color=GREY, ha="center", va="center")
     axes.set_title("What each explains; p: that noise alone would do so\nhatched: the model with it does not fit")
-
-
-def _alike(diagnosis: Diagnosis) -> list[str]:
-    """Return names of suspects and their look-alikes, the best first."""
-    names = dict.fromkeys([*diagnosis.missing, *diagnosis.ambiguity, *(each.name for each in diagnosis.suspects)])
-    names.pop(diagnosis.test.effects.walk, None)  # which takes any path, and so overlaps with all
-    return list(names)[:_ALIKE]
 
 
 def _overlaps(axes: Axes, diagnosis: Diagnosis, names: Sequence[str]) -> None:
@@ -218,10 +211,15 @@ def _drivers(axes: Axes, drivers: Sequence[Driver]) -> None:
     for k, driver in enumerate(drivers):
         axes.barh(k, 100.0 * driver.share, color=PALE, height=0.62)
         axes.text(103.0, k, f"p {format_p(driver.p_value)}", va="center", fontsize=8.5, color=GREY)
-    rows_of(axes, [wrapped(driver.words, _SUSPECT_NAME) for driver in drivers])
-    axes.set_xlim(0.0, 100.0)
-    axes.set_xlabel("part of the misfit beyond noise, %")
+    _share_axis(axes, [driver.words for driver in drivers], "part of the misfit beyond noise, %")
     axes.set_title("What goes with each quantity, beyond what any would by chance")
+
+
+def _share_axis(axes: Axes, names: Sequence[str], words: str) -> None:
+    """Name the rows of bars of a share, and what it is of."""
+    rows_of(axes, [wrapped(name, _SUSPECT_NAME) for name in names])
+    axes.set_xlim(0.0, 100.0)
+    axes.set_xlabel(words)
 
 
 def _separation(axes: Axes, diagnosis: Diagnosis) -> None:

@@ -86,7 +86,8 @@ def _log_shape(shape: EffectShape, log: Log) -> None:
     unit = unit_across(shape)
     ratios = shape.readings / shape.sigma
     charts = charts_of(shape.values * unit.per_si, [f"{channel}, σ" for channel in shape.channels], ratios)
-    clear(log, range(len(charts), 3))
+    for channel in CHANNELS[len(charts) :]:  # of what was shown before
+        log(f"driver/{channel}", rr.Clear(recursive=True))
     for k, chart in enumerate(charts):
         chart.log_frame(log)
         log(f"{chart.path}/residuals", chart.points(ratios[:, k]))
@@ -140,7 +141,9 @@ def _probabilities(hypotheses: HypothesisTable) -> ConsoleTable:
 
 def _layout(diagnosis: Diagnosis) -> rrb.Blueprint:
     name = "what the effect must explain" if diagnosis.explanations else "what residuals go with"
-    charts = [charts_view(name)] if diagnosis.drivers else []
+    bounds = rrb.VisualBounds2D(x_range=[-_LEFT, _WIDTH + 20.0], y_range=[-3.0 * _ABOVE, 3.0 * _PITCH - _ABOVE])
+    view = rrb.Spatial2DView(origin="driver", name=name, visual_bounds=bounds, background=DARK)
+    charts = [view] if diagnosis.drivers else []
     beside = rrb.Horizontal(
         spheres("spheres", 2 if diagnosis.explanations else 1),
         *charts,
@@ -222,22 +225,10 @@ def charts_of(values: Floats, titles: Sequence[str], ratios: Floats) -> list[Cha
     ]
 
 
-def clear(log: Log, places: range) -> None:
-    """Take away what charts at these places have shown."""
-    for place in places:
-        log(f"driver/{CHANNELS[place]}", rr.Clear(recursive=True))
-
-
 def heading(text: str) -> rr.Points2D:
     """What stands above the charts."""
     place = (0.5 * _WIDTH, -2.4 * _ABOVE)
     return rr.Points2D([place], labels=[text], radii=0.0, colors=GOLD, show_labels=True)
-
-
-def charts_view(name: str) -> rrb.Spatial2DView:
-    """The view that holds the three charts."""
-    bounds = rrb.VisualBounds2D(x_range=[-_LEFT, _WIDTH + 20.0], y_range=[-3.0 * _ABOVE, 3.0 * _PITCH - _ABOVE])
-    return rrb.Spatial2DView(origin="driver", name=name, visual_bounds=bounds, background=DARK)
 
 
 def round_numbers(low: float, high: float, at_most: int) -> Floats:

@@ -264,19 +264,17 @@ def with_y_up(bench: Bench, *vectors: Vector) -> Floats:
 
 
 def _log_directions(result: Calibration, stream: rr.RecordingStream) -> None:
-    """Specific force of each dwell on the unit sphere: a point that stays, and an arrow while the dwell lasts."""
+    """Specific force of each dwell on the unit sphere: a point that stays, and an arrow while the dwell lasts.
+
+    The point is grey where the dwell could not be judged, red where its NIS is above chi-squared's band, else white.
+    """
     direction, done, count = _directions(result), ends(result.visits), len(result.visits)
-    points = rr.Points3D.columns(positions=direction, colors=_verdicts(result), radii=[0.025 * crowd(count)] * count)
+    dof, nis = (np.array([getattr(visit, name) for visit in result.visits]) for name in ("dof", "nis"))
+    high = nis > nis_band(dof)[:, 1]
+    colours = [GREY if free <= 0 else RED if bad else WHITE for free, bad in zip(dof, high, strict=True)]
+    points = rr.Points3D.columns(positions=direction, colors=colours, radii=[0.025 * crowd(count)] * count)
     rr.send_columns("platform/visited", columns_of(done), points, recording=stream)
     arrows = rr.Arrows3D.columns(
         vectors=1.25 * direction, colors=[GOLD] * count, radii=[0.016] * count, labels=["up"] * count
     )
     rr.send_columns("platform/up", columns_of(done | begins(result.visits)), arrows, recording=stream)
-
-
-def _verdicts(result: Calibration) -> list[tuple[int, int, int]]:
-    """Grey where a dwell could not be judged, red where its NIS is above chi-squared's 95 % band, else white."""
-    dof = np.array([visit.dof for visit in result.visits])
-    nis = np.array([visit.nis for visit in result.visits])
-    bad = nis > nis_band(dof)[:, 1]
-    return [GREY if free <= 0 else RED if out else WHITE for free, out in zip(dof, bad, strict=True)]
