@@ -139,9 +139,12 @@ def bounds(lower: str, upper: str) -> rr.SeriesLines:
 def log_parameters(history: VisitHistory, stream: rr.RecordingStream, target: Floats, styled: bool) -> None:
     """Sigma, deviation from nominal, and the deviation less and plus one sigma; ``styled``: how they look was sent.
 
-    target (12,): sigmas that are wanted, in SI, NaN where there is none.
+    Complete dwells are on both timelines, points within them in bench time only: one point an orientation. target
+    (12,): sigmas that are wanted, in SI, NaN where there is none.
     """
     whole = history.whole
+    of_dwells = {BENCH_TIME: history.elapsed_s[whole], ORIENTATION: history.orientation[whole]}
+    within = {BENCH_TIME: history.elapsed_s[~whole]}
     for k, shown in enumerate(history.shown):
         value, sigma = history.deviation[:, k], history.sigma[:, k]
         wanted = target[k] * shown.per_si if k < len(target) else np.nan
@@ -152,10 +155,8 @@ def log_parameters(history: VisitHistory, stream: rr.RecordingStream, target: Fl
             ("band", np.column_stack([value - sigma, value + sigma]), bounds("−σ", "+σ")),
             ("target", np.full(len(sigma), wanted), line(f"target {shown.label}", shown.colour, 1.0)),
         ):
-            path, times = f"{shown.path}/{name}", {BENCH_TIME: history.elapsed_s, ORIENTATION: history.orientation}
-            of_dwells = {timeline: when[whole] for timeline, when in times.items()}
-            send_curve(stream, path, of_dwells, values[whole], *([] if styled else [style]))
-            send_curve(stream, path, {BENCH_TIME: history.elapsed_s[~whole]}, values[~whole])  # one point a dwell there
+            send_curve(stream, f"{shown.path}/{name}", of_dwells, values[whole], *([] if styled else [style]))
+            send_curve(stream, f"{shown.path}/{name}", within, values[~whole])
 
 
 def log_innovations(visits: Sequence[Visit], stream: rr.RecordingStream, before: int = 0) -> None:
