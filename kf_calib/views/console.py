@@ -99,6 +99,11 @@ def with_sigma(parameter: Parameter, less: float = 0.0) -> tuple[str, str, str]:
     return value, f"± {sigma}", shown(parameter).label
 
 
+def p_cell(p_value: float | None) -> str:
+    """A p-value in a table; empty where there is none."""
+    return "" if p_value is None else format_p(p_value).removeprefix("= ")
+
+
 def clearest(parameters: Iterable[Parameter]) -> str:
     """The parameter that stands out most from its sigma, in words; "" where none is known."""
     sized = [p for p in parameters if p.value is not None and p.sigma]

@@ -25,9 +25,9 @@ from kf_calib.estimation.remarks import MISSING_OR_NOISE
 from kf_calib.estimation.results import Calibration, Condition, format_p
 from kf_calib.support.text import angles_in_words, printed
 from kf_calib.support.units import shown
-from kf_calib.views.console import clearest, plain, with_sigma
+from kf_calib.views.console import clearest, p_cell, plain, with_sigma
 from kf_calib.views.json import clean, condition_object, members, outlying_object, readings_object
-from kf_calib.views.notation import p_cell, symbol
+from kf_calib.views.notation import symbol
 from kf_calib.views.terminal import VERDICT_STYLES, ConsoleTable, TextPlot, note, table
 
 _ANY = 1e-6  # probability of rows that are in the JSON object

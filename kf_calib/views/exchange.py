@@ -20,9 +20,9 @@ from kf_calib.exchange.verification import Verification
 from kf_calib.sources.files.contents import CALIBRATED_TOPIC
 from kf_calib.support.text import counted
 from kf_calib.support.units import field_unit, shown
-from kf_calib.views.console import table_of_parameters
+from kf_calib.views.console import p_cell, table_of_parameters
 from kf_calib.views.json import clean, members
-from kf_calib.views.notation import p_cell, signed, symbol
+from kf_calib.views.notation import signed, symbol
 from kf_calib.views.terminal import VERDICT_STYLES, ConsoleTable, note, table
 
 _SHOWN = 12

@@ -15,7 +15,7 @@ from kf_calib.diagnosis.stepwise_selection import Improvement, Removal, Selectio
 from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.support.units import shown
-from kf_calib.views.console import clearest, effect_table, parameter_table
+from kf_calib.views.console import clearest, effect_table, p_cell, parameter_table
 from kf_calib.views.diagnosis import (
     advice_sentence,
     description_object,
@@ -24,7 +24,7 @@ from kf_calib.views.diagnosis import (
     orientation_object,
 )
 from kf_calib.views.json import clean, condition_object, members, parameters_object
-from kf_calib.views.notation import p_cell, symbol
+from kf_calib.views.notation import symbol
 from kf_calib.views.terminal import BARE, FOURS, VERDICT_STYLES, Bar, ConsoleTable, note, table
 
 _WIDTH = 30  # length of the longest bar in characters

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from kf_calib.bench import paper_parameters
-from kf_calib.bench.bench import Bench
-from kf_calib.effects import Coefficient
-from kf_calib.estimation.results import Parameter, format_p
 from kf_calib.support.units import RAISED, Unit, shown, shown_whole
 
 if TYPE_CHECKING:
+    from kf_calib.bench.bench import Bench
     from kf_calib.diagnosis.explanation import EffectShape
     from kf_calib.diagnosis.residual_drivers import Driver
+    from kf_calib.effects import Coefficient
+    from kf_calib.estimation.results import Parameter
 
 _OF_THE_PAPER = {"theta": "θ", "phi": "φ", "nu": "ν"}
 _GREEK = {**_OF_THE_PAPER, "alpha": "α", "beta": "β", "kappa": "κ", "gamma": "γ", "delta": "δ", "omega": "ω",
@@ -66,11 +66,6 @@ def gimbal_names(bench: Bench) -> list[str]:
 def signed(text: str) -> str:
     """A number that was written, with its sign: of a change, or of what a value is less another."""
     return text if text.startswith("-") else f"+{text}"
-
-
-def p_cell(p_value: float | None) -> str:
-    """A p-value in a table; empty where there is none."""
-    return "" if p_value is None else format_p(p_value).removeprefix("= ")
 
 
 def unit_across(drawn: Driver | EffectShape) -> Unit:

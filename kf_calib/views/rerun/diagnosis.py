@@ -27,9 +27,10 @@ from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.support.text import printable
+from kf_calib.views.console import p_cell
 from kf_calib.views.diagnosis import advice_sentence, disturbed_dwells, name_of, share_in_words, verdict
 from kf_calib.views.markdown import literal, markdown
-from kf_calib.views.notation import p_cell, unit_across
+from kf_calib.views.notation import unit_across
 from kf_calib.views.rerun.names import (
     ACCELEROMETERS,
     CHANNELS,
