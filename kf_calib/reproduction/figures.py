@@ -64,8 +64,7 @@ def falling(figure: Figure, experiment: Experiment) -> None:
             axes.annotate(last, (len(values) - 1, values[-1]), xytext=(3, 0), textcoords="offset points", fontsize=7.5,
                           color=colour, va="center", annotation_clip=False)  # fmt: skip
         axes.text(0.985, 0.97, twelve()[k].label, transform=axes.transAxes, ha="right", va="top", fontweight="bold")
-        axes.set_xticks(range(0, len(both[0]), READINGS_PER_DWELL))
-        axes.set_xlim(0, 1.16 * len(both[0]))
+        axes.set(xticks=range(0, len(both[0]), READINGS_PER_DWELL), xlim=(0, 1.16 * len(both[0])))
     for k in range(4):
         shown = np.array(both)[:, :, k::4] * twelve()[k].per_si
         log_scale(panels[k], [0.7 * shown, shown])

@@ -52,7 +52,7 @@ from kf_calib.views.rerun.names import (
     ORIENTATION,
     Colour,
     curves_panel,
-    page_of,
+    markdown_page,
     quantities,
     rrd_file,
     strict,
@@ -135,7 +135,7 @@ def _log(
         log_nis(fresh, stream, shown)
         log_bench(result, stream, shown)
     text = "\n\n".join([*([heading] if heading else []), markdown_summary(result)])
-    stream.log("summary", page_of(text), static=True)
+    stream.log("summary", markdown_page(text), static=True)
 
 
 def judgement_text(judgement: Judgement) -> str:

@@ -39,7 +39,7 @@ from kf_calib.views.rerun.names import (
     GREY,
     MAUVE,
     Colour,
-    page_of,
+    markdown_page,
     rrd_file,
     thin,
     window,
@@ -65,7 +65,7 @@ def save_diagnosis_view(diagnosis: Diagnosis, path: str | Path) -> Path:
             for shape in explanation.shapes[:1]:
                 _log_shape(shape, log)
             log_spheres(before, explanation.unexplained_ratios, "spheres/left", 1, stream, log)
-        stream.log("summary", page_of(_summary(diagnosis)), static=True)
+        stream.log("summary", markdown_page(_summary(diagnosis)), static=True)
     return Path(path)
 
 

@@ -34,11 +34,11 @@ from kf_calib.views.rerun.names import (
     Colour,
     curves_panel,
     entity,
-    page_of,
+    markdown_page,
     rrd_file,
     window,
 )
-from kf_calib.views.rerun.series import Times, bounds, line, send_curve
+from kf_calib.views.rerun.series import Timelines, bounds, line, send_curve
 from kf_calib.views.rerun.spheres import at_step, forever, log_key, log_spheres, spheres
 
 STEP = "step"
@@ -107,7 +107,7 @@ def save_improvement_view(improvement: Improvement, path: str | Path) -> Path:
             log = at_step(stream, STEP, step)
             marked = disturbed_dwells(view.diagnoses[step])
             log_spheres(result, result.residuals_mps2 / sigmas, "spheres", 0, stream, log, marked)
-            log("summary", page_of(_summary(view, step)))
+            log("summary", markdown_page(_summary(view, step)))
     return Path(path)
 
 
@@ -115,7 +115,9 @@ def _line_and_marks(name: str, colour: Colour) -> tuple[rr.SeriesLines, rr.Serie
     return line(name, colour), rr.SeriesPoints(names=name, colors=colour, markers="circle", marker_sizes=4.0)
 
 
-def _log_coefficient(stream: rr.RecordingStream, path: str, times: Times, values: Sequence[Parameter | None]) -> None:
+def _log_coefficient(
+    stream: rr.RecordingStream, path: str, steps: Timelines, values: Sequence[Parameter | None]
+) -> None:
     """Send what a coefficient is in each step that has it, less and plus its sigma."""
     known = [
         np.array([parameter.value, parameter.sigma]) * units.shown(parameter).per_si
@@ -124,8 +126,8 @@ def _log_coefficient(stream: rr.RecordingStream, path: str, times: Times, values
         for parameter in values
     ]
     value, sigma = np.array(known).T
-    send_curve(stream, f"{path}/value", times, value, *_line_and_marks("value", MAUVE))
-    send_curve(stream, f"{path}/band", times, np.column_stack([value - sigma, value + sigma]), bounds("−σ", "+σ"))
+    send_curve(stream, f"{path}/value", steps, value, *_line_and_marks("value", MAUVE))
+    send_curve(stream, f"{path}/band", steps, np.column_stack([value - sigma, value + sigma]), bounds("−σ", "+σ"))
 
 
 def _summary(view: View, number: int) -> str:

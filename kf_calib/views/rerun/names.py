@@ -88,7 +88,7 @@ def quantities(model: Model) -> tuple[DrawnParameter, ...]:
     return (*parameters, *coefficients)
 
 
-def page_of(text: str) -> rr.TextDocument:
+def markdown_page(text: str) -> rr.TextDocument:
     """A page of text in Markdown."""
     return rr.TextDocument(printable(text), media_type=rr.MediaType.MARKDOWN)
 

@@ -86,11 +86,11 @@ class VisitHistory:
         return cls(shown, history.elapsed_s, history.numbers, whole, deviation, sigma)
 
 
-Times = Mapping[str, Floats | Counts]
+Timelines = Mapping[str, Floats | Counts]
 """Timelines with when each row is: s on ``bench_time``, else numbers."""
 
 
-def columns_of(times: Times) -> list[rr.TimeColumn]:
+def columns_of(times: Timelines) -> list[rr.TimeColumn]:
     """The same as Rerun takes them."""
     return [
         rr.TimeColumn(name, duration=np.round(when * 1e9).astype("timedelta64[ns]"))
@@ -113,7 +113,7 @@ def begins(visits: Sequence[Visit]) -> dict[str, Floats | Counts]:
 
 
 def send_curve(
-    stream: rr.RecordingStream, path: str, times: Times, values: Floats, *styles: rr.SeriesLines | rr.SeriesPoints
+    stream: rr.RecordingStream, path: str, times: Timelines, values: Floats, *styles: rr.SeriesLines | rr.SeriesPoints
 ) -> None:
     """Send a row of scalars (n,) or (n, k) a time, and how they look; rows that are not finite are left out."""
     for style in styles:
