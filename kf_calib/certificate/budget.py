@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, date, datetime, timedelta
+from datetime import date, datetime, timedelta
 from typing import Literal
 
 import numpy as np
@@ -40,6 +40,7 @@ from kf_calib.exchange.calibration_file import SavedCalibration, SavedParameter
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise, lift_rounding, mean_covariances
 from kf_calib.noise.terms import Scatter, SettingError
+from kf_calib.support.text import parse_date
 from kf_calib.support.units import quantity
 
 COVERAGE = math.erf(math.sqrt(2.0))
@@ -104,9 +105,9 @@ class Budget:
 
     @property
     def dof(self) -> Floats:
-        """u^4 / sum_i (u_i^4 / nu_i) (GUM G.4.1)."""
-        parts = [own.parts**4 / own.dof for own in self.contributions]
-        return welch_satterthwaite(self.combined, sum(parts, np.zeros(STATE_COUNT)))
+        """u^4 / sum_i (u_i^4 / nu_i), of Welch and Satterthwaite (GUM G.4.1)."""
+        quartics = sum((own.parts**4 / own.dof for own in self.contributions), np.zeros(STATE_COUNT))
+        return np.where(quartics > 0.0, self.combined**4 / np.where(quartics > 0.0, quartics, 1.0), np.inf)
 
     @property
     def k(self) -> Floats:
@@ -117,12 +118,6 @@ class Budget:
     def expanded(self) -> Floats:
         """U = k u."""
         return self.k * self.combined
-
-
-def welch_satterthwaite(combined: Floats, quartics: Floats) -> Floats:
-    """Effective degrees of freedom of combined uncertainties; quartics: the sums of u_i^4 / nu_i."""
-    with np.errstate(divide="ignore"):
-        return np.where(quartics > 0.0, combined**4 / np.where(quartics > 0.0, quartics, 1.0), np.inf)
 
 
 def coverage_factor(dof: Floats) -> Floats:
@@ -393,7 +388,7 @@ def _dates(saved: SavedCalibration) -> tuple[date, date] | tuple[None, None]:
     """The days on which the measurements began and ended, in UTC; None where the stamps are no dates."""
     if saved.conditions.began is None:
         return None, None
-    began = datetime.fromisoformat(saved.conditions.began).astimezone(UTC)
+    began = parse_date(saved.conditions.began)
     return began.date(), (began + timedelta(seconds=saved.conditions.duration_s)).date()
 
 

@@ -69,9 +69,10 @@ def xml(certificate: Certificate) -> bytes:
     return b'<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root, encoding="utf-8") + b"\n"
 
 
-def _in(parent: ET.Element, name: str, text: str | None = None, space: str = DCC) -> ET.Element:
-    """A new element at the end of its parent."""
-    own = ET.SubElement(parent, f"{{{space}}}{name}")
+def _in(parent: ET.Element, name: str, text: str | None = None) -> ET.Element:
+    """A new element at the end of its parent; a name of D-SI begins with ``si:``."""
+    space = SI if name.startswith("si:") else DCC
+    own = ET.SubElement(parent, f"{{{space}}}{name.removeprefix('si:')}")
     own.text = text if text is None else _NOT_XML.sub("\ufffd", text)
     return own
 
@@ -206,19 +207,18 @@ def _multivariate(
     of freedom of the covariance."""
     element = _in(parent, "quantity")
     _words(element, "name", name)
-    listed = _in(element, "realListXMLList", space=SI)
-    _in(listed, "labelXMLList", " ".join(symbols), SI)
-    _in(listed, "valueXMLList", " ".join(map(repr, values.tolist())), SI)
-    _in(listed, "unitXMLList", " ".join(UNITS[unit] for unit in units), SI)
-    region = _in(_in(listed, "measurementUncertaintyMultivariateXMLList", space=SI), "ellipsoidalRegionMUXMLList",
-                 space=SI)  # fmt: skip
-    matrix = _in(region, "covarianceMatrixXMLList", space=SI)
+    listed = _in(element, "si:realListXMLList")
+    _in(listed, "si:labelXMLList", " ".join(symbols))
+    _in(listed, "si:valueXMLList", " ".join(map(repr, values.tolist())))
+    _in(listed, "si:unitXMLList", " ".join(UNITS[unit] for unit in units))
+    region = _in(_in(listed, "si:measurementUncertaintyMultivariateXMLList"), "si:ellipsoidalRegionMUXMLList")
+    matrix = _in(region, "si:covarianceMatrixXMLList")
     for unit, column in zip(units, covariance.T.tolist(), strict=True):
-        own = _in(_in(matrix, "columnXMLList", space=SI), "covarianceXMLList", space=SI)
-        _in(own, "valueXMLList", " ".join(map(repr, column)), SI)
-        _in(own, "unitXMLList", " ".join(_product(unit, other) for other in units), SI)
-    _in(region, "coverageFactorXMLList", repr(ellipsoid_factor(len(values), dof)), SI)
-    _in(region, "coverageProbabilityXMLList", f"{COVERAGE:.4f}", SI)
+        own = _in(_in(matrix, "si:columnXMLList"), "si:covarianceXMLList")
+        _in(own, "si:valueXMLList", " ".join(map(repr, column)))
+        _in(own, "si:unitXMLList", " ".join(_product(unit, other) for other in units))
+    _in(region, "si:coverageFactorXMLList", repr(ellipsoid_factor(len(values), dof)))
+    _in(region, "si:coverageProbabilityXMLList", f"{COVERAGE:.4f}")
 
 
 def _product(one: str, other: str) -> str:
@@ -257,10 +257,10 @@ def _quantity(parent: ET.Element, result: CertifiedResult) -> None:
         _words(element, "noQuantity", "not determined by this run")
         return
     real = _real(element, result.symbol, result.value, UNITS[result.unit])
-    spread = _in(_in(real, "measurementUncertaintyUnivariate", space=SI), "expandedMU", space=SI)
-    _in(spread, "valueExpandedMU", repr(result.expanded), SI)
-    _in(spread, "coverageFactor", repr(result.k), SI)
-    _in(spread, "coverageProbability", f"{COVERAGE:.4f}", SI)
+    spread = _in(_in(real, "si:measurementUncertaintyUnivariate"), "si:expandedMU")
+    _in(spread, "si:valueExpandedMU", repr(result.expanded))
+    _in(spread, "si:coverageFactor", repr(result.k))
+    _in(spread, "si:coverageProbability", f"{COVERAGE:.4f}")
     if result.conformity is not None:
         judged = _in(_in(element, "measurementMetaData"), "metaData")
         _words(judged, "name", "conformity of the deviation from nominal")
@@ -268,11 +268,11 @@ def _quantity(parent: ET.Element, result: CertifiedResult) -> None:
 
 
 def _real(parent: ET.Element, label: str | None, value: float, unit: str) -> ET.Element:
-    element = _in(parent, "real", space=SI)
+    element = _in(parent, "si:real")
     if label is not None:
-        _in(element, "label", label, SI)
-    _in(element, "value", repr(value), SI)
-    _in(element, "unit", unit, SI)
+        _in(element, "si:label", label)
+    _in(element, "si:value", repr(value))
+    _in(element, "si:unit", unit)
     return element
 
 

@@ -20,12 +20,16 @@ from kf_calib.certificate.budget import OUTCOMES, Certificate, CertifiedResult, 
 from kf_calib.certificate.statement import Party
 from kf_calib.errors import InputError, need
 from kf_calib.estimation.results import format_p
+from kf_calib.exchange.calibration_parts import SavedParameter
 from kf_calib.support.text import cut
 from kf_calib.support.units import Unit, field_unit
 from kf_calib.views.notation import symbol
 
 ATTACHED = "certificate.xml"
 _UNITS = {"rad": Unit("°", math.degrees(1.0)), "1": Unit("1", 1.0), "m/s^2": Unit("m/s²", 1.0)}
+
+_INCOMPLETE = ("Incomplete: not stated are {}. The attached XML is not a DCC (Digital Calibration Certificate), which "
+               "must have these.")  # fmt: skip
 
 TableRow = dict[str, Any]
 
@@ -69,7 +73,7 @@ def content(certificate: Certificate, standing: str) -> TableRow:
         "number": stated.number,
         "laboratory": {"name": stated.laboratory.name},
         "attachment": ATTACHED,
-        "missing": _missing(certificate),
+        "missing": None if not certificate.missing else _INCOMPLETE.format(", ".join(certificate.missing)),
         "facts": _facts(certificate),
         "method": _method(certificate),
         "results": _results(certificate.results),
@@ -86,17 +90,10 @@ def content(certificate: Certificate, standing: str) -> TableRow:
         "sensitivities": [
             _sensitivity(certificate, line) for line in certificate.budget.contributions if line.sensitivity is not None
         ],
-        "further": [_coefficient(each.symbol, each.value, each.sigma, each.unit) for each in certificate.further],
+        "further": list(map(_coefficient, certificate.further)),
         "remarks": _remarks(certificate, standing),
         "persons": [each.model_dump() for each in stated.persons],
     }
-
-
-def _missing(certificate: Certificate) -> str | None:
-    if not certificate.missing:
-        return None
-    return (f"Incomplete: not stated are {', '.join(certificate.missing)}. The attached XML is not a DCC (Digital "
-            "Calibration Certificate), which must have these.")  # fmt: skip
 
 
 def _facts(certificate: Certificate) -> list[list[str | None]]:
@@ -254,10 +251,10 @@ def _sensitivity(certificate: Certificate, line: Contribution) -> TableRow:
     return {"symbol": symbol(line.name), "values": [_minus(form.format(value)) for value in values.tolist()]}
 
 
-def _coefficient(name: str, value: float | None, sigma: float | None, unit: str) -> TableRow:
-    shown = field_unit(unit)
-    first, second = _pair(value, sigma, shown)
-    return {"name": symbol(name), "value": first or "–", "sigma": second or "–", "unit": shown.label}
+def _coefficient(each: SavedParameter) -> TableRow:
+    unit = field_unit(each.unit)
+    value, sigma = _pair(each.value, each.sigma, unit)
+    return {"name": symbol(each.symbol), "value": value or "–", "sigma": sigma or "–", "unit": unit.label}
 
 
 def _remarks(certificate: Certificate, standing: str) -> list[str]:

@@ -40,19 +40,15 @@ def monte_carlo(budget: Budget, draws: int) -> MonteCarloCheck:
 
 def _drawn(line: Contribution, rng: np.random.Generator, count: int) -> Floats:
     """Return what a line of the budget adds to the twelve, (count, 12)."""
-    scales = _scales(line.dof, rng, count)[:, None]
+    scales = np.ones((count, 1))  # by which draws of a normal distribution become Student's (JCGM 101, 6.4.9)
+    if not math.isinf(line.dof):
+        scales = np.sqrt(line.dof / rng.chisquare(line.dof, count))[:, None]
     if line.changes is None:  # of the filter: one size of all noise that was estimated
         values, vectors = np.linalg.eigh(line.covariance)
         return (rng.standard_normal((count, len(values))) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T) * scales
     assert line.standard is not None
     inputs = line.standard * _standardised(line.distribution, rng, (count, line.changes.shape[1]))
     return (inputs * scales) @ line.changes.T
-
-
-def _scales(dof: float, rng: np.random.Generator, count: int) -> Floats:
-    """Return by what draws of a normal distribution are multiplied to be of Student's with so many degrees of freedom
-    (JCGM 101, 6.4.9)."""
-    return np.ones(count) if math.isinf(dof) else np.sqrt(dof / rng.chisquare(dof, count))
 
 
 def _standardised(distribution: str, rng: np.random.Generator, shape: tuple[int, int]) -> Floats:

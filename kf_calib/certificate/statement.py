@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, Validation
 
 from kf_calib.bench.paper_parameters import targets_of
 from kf_calib.errors import InputError
+from kf_calib.exchange.calibration_parts import first_misfit
 from kf_calib.support.text import COMMANDS, cut
 from kf_calib.support.toml_files import toml_table
 
@@ -25,6 +26,14 @@ Rule = Literal["simple acceptance", "guard band"]
 
 DIVISORS = {"rectangular": math.sqrt(3.0), "triangular": math.sqrt(6.0), "arcsine": math.sqrt(2.0)}
 """What a size, half the width of a distribution, is divided by for a standard uncertainty; a normal one has ``k``."""
+
+
+_OF_KINDS = {
+    "extra_forbidden": "this key is not known",
+    "date_type": "must be a date without quotes, such as 2026-11-23",
+    "string_pattern_mismatch": "must be text without control characters (of a country, two capital letters)",
+}
+"""What is said of values that pydantic refuses."""
 
 
 class _Table(BaseModel):
@@ -133,15 +142,10 @@ def read_statement(path: Path | None) -> Statement:
     try:
         stated = Statement.model_validate(toml_table(path, 'number = "2026-0147"'))
     except ValidationError as error:
-        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-        place, said = ".".join(map(str, first["loc"])), first["msg"]
-        if first["type"] == "extra_forbidden":
-            said = "this key is not known"
-        elif first["type"] == "date_type":
-            said = "must be a date without quotes, such as 2026-11-23"
-        elif first["type"] == "string_pattern_mismatch":
-            said = "must be text without control characters (of a country, two capital letters)"
-        raise InputError(f"{path}: {cut(place, 100)}: {said}: see docs/certificate.md for the keys.") from None
+        place, said, kind = first_misfit(error)
+        raise InputError(
+            f"{path}: {place}: {_OF_KINDS.get(kind, said)}: see docs/certificate.md for the keys."
+        ) from None
     if stated.before is not None:
         stated = stated.model_copy(update={"before": path.parent / stated.before})
     try:

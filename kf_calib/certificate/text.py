@@ -15,10 +15,11 @@ from kf_calib.views.notation import symbol
 from kf_calib.views.terminal import ConsoleTable, note, table
 
 if TYPE_CHECKING:
-    from kf_calib.certificate.budget import Certificate, CertifiedResult, Contribution
+    from kf_calib.certificate.budget import Certificate, CertifiedResult
     from kf_calib.certificate.monte_carlo import MonteCarloCheck
 
 
+_OF_A_LINE = "title", "kind", "standard", "unit", "distribution", "dof", "source", "sensitivity"
 _OF_A_RESULT = "symbol", "value", "unit", "nominal", "standard", "expanded", "k", "dof"
 
 
@@ -37,18 +38,16 @@ def certificate_object(
             "parameters": [
                 members(each, *_OF_A_RESULT, "before", "limit", "conformity") for each in certificate.results
             ],
-            "budget": [_line_object(line) for line in certificate.budget.contributions],
+            "budget": [
+                {"symbol": line.name, **members(line, *_OF_A_LINE), "contribution": line.parts}
+                for line in certificate.budget.contributions
+            ],
             "left_out": list(certificate.budget.left_out),
             "covariance": None if certificate.twelve is None else certificate.twelve[1].tolist(),
             "intrinsic": [members(each, *_OF_A_RESULT) for each in certificate.intrinsic],
             "monte_carlo": None if check is None else members(check, "draws", "expanded", "agrees"),
         }
     )
-
-
-def _line_object(line: Contribution) -> dict[str, Any]:
-    known = members(line, "title", "kind", "standard", "unit", "distribution", "dof", "source", "sensitivity")
-    return {"symbol": line.name, **known, "contribution": line.parts}
 
 
 def certificate_report(

@@ -185,7 +185,16 @@ class Number(click.ParamType[float]):
     name = "number"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        return _finite(value, param, ctx)
+        try:
+            number = number_from(value) if isinstance(value, str) else float(value)
+        except ValueError:
+            raise click.BadParameter(f"{value!r} is not a number{how_to_write(str(value))}.", ctx, param) from None
+        if isinstance(value, str) and not math.isfinite(number):  # one that is no word is a default: never, say
+            raise click.BadParameter(f"{value!r} is not a finite number.", ctx, param)
+        return number
+
+
+NUMBER = Number()
 
 
 class NumberInRange(click.FloatRange):
@@ -194,20 +203,8 @@ class NumberInRange(click.FloatRange):
     name = "number"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        return super().convert(_finite(value, param, ctx), param, ctx)
+        return super().convert(NUMBER.convert(value, param, ctx), param, ctx)
 
 
-def _finite(value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-    """The number that ``value`` is, in words; one that is no word is a default, and may be infinite: never."""
-    try:
-        number = number_from(value) if isinstance(value, str) else float(value)
-    except ValueError:
-        raise click.BadParameter(f"{value!r} is not a number{how_to_write(str(value))}.", ctx, param) from None
-    if isinstance(value, str) and not math.isfinite(number):
-        raise click.BadParameter(f"{value!r} is not a finite number.", ctx, param)
-    return number
-
-
-NUMBER = Number()
 NOT_NEGATIVE = NumberInRange(min=0)
 POSITIVE = NumberInRange(min=0, min_open=True)

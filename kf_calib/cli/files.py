@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any
@@ -185,20 +186,26 @@ def commands_of(ctx: click.Context) -> list[str]:
     return [*commands, *(f"sha256sum {shlex.quote(str(path))}" for path in [*named, *others] if path.is_file())]
 
 
+def given(ctx: click.Context) -> Iterator[tuple[click.Parameter, Any]]:
+    """The arguments and options that the command line has, with their values."""
+    for param in ctx.command.params:
+        if param.name and ctx.get_parameter_source(param.name) is ParameterSource.COMMANDLINE:
+            yield param, ctx.params[param.name]
+
+
+def words_of(option: click.Option, value: Any) -> list[list[str]]:
+    """An option as words of a shell, each time that it was given."""
+    if option.is_flag:
+        return [[option.opts[-1] if value else option.secondary_opts[-1]]]
+    return [[option.opts[-1], str(each)] for each in (value if isinstance(value, tuple) else [value])]
+
+
 def typed(ctx: click.Context, less: Sequence[str]) -> str:
     """Return the arguments and options that were given, but for some, as words of a shell."""
     words = list[str]()
-    for param in ctx.command.params:
-        name = param.name or ""
-        given = ctx.get_parameter_source(name) is ParameterSource.COMMANDLINE
-        if name in (*less, "units") or not given:
-            continue
-        value = ctx.params[name]
+    for param, value in given(ctx):
         if isinstance(param, click.Argument):
             words.insert(0, str(value))
-        elif isinstance(param, click.Option) and param.is_flag:
-            words.append(param.opts[-1] if value else param.secondary_opts[-1])
-        else:
-            words += [word for each in (value if isinstance(value, tuple) else [value])
-                      for word in (param.opts[-1], str(each))]  # fmt: skip
+        elif isinstance(param, click.Option) and param.name not in (*less, "units"):
+            words += chain.from_iterable(words_of(param, value))
     return shlex.join(words)

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated
 
 import rich_click as click
-from click.core import ParameterSource
 
 from kf_calib.cli.command import argument, command
 from kf_calib.cli.echo import print_result, progress
+from kf_calib.cli.files import given, words_of
 from kf_calib.cli.options import OF_DWELLS, Json, ReadingOptions, not_of_text
 from kf_calib.errors import BenchError, BlunderError, CountsError, KfCalibError
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
@@ -24,8 +25,9 @@ if TYPE_CHECKING:
     from kf_calib.bench.streams import Source
     from kf_calib.dwells.rest_in_readings import DwellSummary
     from kf_calib.sources.files.inventory import Inventory
+    from kf_calib.sources.text.means import Survey
     from kf_calib.sources.text.units import Units
-    from kf_calib.views.overview import Overview, TableOverview
+    from kf_calib.views.overview import Overview
 
 Tick = Callable[[float], None]
 
@@ -37,9 +39,8 @@ _NAMED = {
 _AXES = {1: '--axes "z"', 2: '--axes "z x"'}
 """The same of axes where there are so many angles."""
 _BY_HAND = (
-    "--no-angles",
     "orientations: no column was taken for gimbal angles{or_else} (--column says which is one); the command does "
-    "without",
+    "without"
 )
 
 
@@ -63,24 +64,23 @@ def info(
         saved = open_calibration(recording)
         print_result(as_json, calibration_object, calibration_report, saved, recording)
         return
-    if kind is FileKind.TABLE:
-        _show_table(ctx, recording, reading, as_json)
-        return
-    with progress(f"reading {recording.name}", as_json) as tick:
-        if kind is FileKind.SAMPLES:
-            overview = _with_counts(partial(_of_lines, ctx, recording, reading, tick))
-        else:
-            overview = _of_messages(ctx, recording, reading, tick)
     from kf_calib.views.overview import overview_object, overview_report
 
+    if kind is FileKind.TABLE:
+        overview = _with_counts(partial(_of_table, ctx, recording, reading))
+    else:
+        with progress(f"reading {recording.name}", as_json) as tick:
+            if kind is FileKind.SAMPLES:
+                overview = _with_counts(partial(_of_lines, ctx, recording, reading, tick))
+            else:
+                overview = _of_messages(ctx, recording, reading, tick)
     print_result(as_json, overview_object, overview_report, overview)
 
 
 Stated = Mapping[str, str]
-AnyOverview = TypeVar("AnyOverview")
 
 
-def _with_counts(show: Callable[[Stated, str], AnyOverview]) -> AnyOverview:
+def _with_counts(show: Callable[[Stated, str], Overview]) -> Overview:
     """What is shown of a file, with what its readings tell of their counts; that is missing then, and has a reason."""
     stated, reason = dict[str, str](), ""
     while True:
@@ -117,6 +117,74 @@ def _in_words(keys: BenchKeys) -> dict[str, str]:
     return metadata_of(keys)
 
 
+@dataclass
+class _Proposal:
+    """What a file lacks to be evaluated, by bench key, and the options of the command to try.
+
+    lacking: keys whose values in these options are examples. is_hopeless: no option would do.
+    """
+
+    words: list[str]
+    missing: dict[str, str] = field(default_factory=dict[str, str])
+    lacking: list[str] = field(default_factory=list[str])
+    is_hopeless: bool = False
+
+    def ask(self, key: str, what: str, *options: str) -> None:
+        """Ask for what an option states."""
+        self.missing[key] = what
+        self.words += options
+
+    def ask_for_bench(self, bench: Mapping[str, str], has_angles: bool, gimbals: int = 0) -> None:
+        """Ask for what a bench's description lacks; gimbals: their number, where it is known."""
+        if has_angles and not bench.get("axes"):
+            self.lacking.append("axes")
+        if not bench.get("gravity_mps2") and not bench.get("latitude_deg"):
+            self.lacking.append("gravity_mps2")
+        for key in self.lacking:
+            option, what = _NAMED[key]
+            self.ask(key, what, _AXES.get(gimbals, option) if key == "axes" else option)
+
+    def ask_for_unit(self, wrong: WrongUnit | None) -> None:
+        """Ask for another unit in place of one that was given."""
+        if wrong is not None:
+            self.words = [word for word in self.words if word.split()[0] not in wrong.option.split()]
+            self.ask("accel_unit", wrong.sentence + ".", wrong.option)
+
+    def refuse(self, error: KfCalibError | str) -> None:
+        """Put first why it cannot be evaluated."""
+        self.missing = {"": str(error), **self.missing}
+
+    def try_out(self, source: Source) -> None:
+        """Evaluate the file; where that fails, say why, and what would help."""
+        from kf_calib.estimation.calibration import calibrate
+
+        try:
+            calibrate(source)
+        except BlunderError as error:
+            if "axes" not in self.missing:  # else those that were tried are an example
+                self.refuse(error)
+                self.words.append(error.options)
+                self.is_hopeless = not error.options
+        except KfCalibError as error:
+            self.refuse(error)
+            self.is_hopeless = True
+
+    def overview(
+        self, path: Path, content: Inventory | Survey, bench: dict[str, str], warnings: list[str],
+        dwells: list[DwellSummary] | None = None,
+    ) -> Overview:  # fmt: skip
+        """What is shown of the file; its dwells are those of a recording."""
+        from kf_calib.views.overview import Overview
+
+        if dwells is not None and not dwells:
+            said = "a stretch in which the platform stands still: --still-deg says what counts as standing still"
+            self.missing.setdefault("", said)
+        command = "" if self.is_hopeless else " ".join(["kf-calib replay", _quoted(str(path)), *self.words])
+        named = (_NAMED[key][0].split()[0] for key in self.lacking)
+        examples = tuple(option for option in named if option in command)
+        return Overview(content, bench, list(self.missing.values()), command, examples, warnings, dwells)
+
+
 def _of_messages(ctx: click.Context, path: Path, reading: ReadingOptions, tick: Tick) -> Overview:
     """What is in files of messages."""
     from kf_calib.sources.files.inventory import inventory_of
@@ -126,22 +194,19 @@ def _of_messages(ctx: click.Context, path: Path, reading: ReadingOptions, tick: 
     fields = _fields(inventory)
     by_hand = inventory.has_readings and inventory.has_angles is None and not fields
     is_attitude = inventory.has_angles is False or any(" attitude=" in field for field in fields)
-    lacking = _lacks(bench, not (is_attitude or by_hand or reading.no_angles))
-    missing = {key: _NAMED[key][1] for key in lacking}
-    dwells, warnings, wrong = None, list(inventory.warnings), None
+    proposal = _Proposal(_given(ctx, ("columns", "g_unit")) + fields)
+    proposal.ask_for_bench(bench, not (is_attitude or by_hand or reading.no_angles))
+    if by_hand and not reading.no_angles:
+        proposal.words.append("--no-angles")
+    dwells, warnings = None, list(inventory.warnings)
     try:
-        source = reading.messages(path, not reading.no_angles)
-        dwells = _dwells(source, tick)
-        warnings = list(dict.fromkeys([*warnings, *source.warnings]))
-        wrong = _wrong_unit([dwell.norm_mps2 for dwell in dwells], source.bench.input)
+        dwells, warnings, wrong = _at_rest(reading.messages(path, not reading.no_angles), warnings, tick)
+        proposal.ask_for_unit(wrong)
     except BenchError as error:
-        missing = missing or {"": str(error)}
+        proposal.missing = proposal.missing or {"": str(error)}
     except KfCalibError as error:
-        missing = {"": str(error), **missing}
-    words = _given(ctx, _not_of(ctx, ("columns", "g_unit"))) + fields + [_NAMED[key][0] for key in lacking]
-    words += ["--no-angles"] if by_hand and not reading.no_angles else []
-    missing, words = _with_unit(missing, words, wrong)
-    return _overview(inventory, bench, dwells, missing, words, warnings, lacking)
+        proposal.refuse(error)
+    return proposal.overview(inventory.path, inventory, bench, warnings, dwells)
 
 
 def _of_lines(
@@ -155,21 +220,18 @@ def _of_lines(
     from kf_calib.sources.files.inventory import inventory_of_lines
     from kf_calib.sources.text.lines import Lines
 
-    missing, words = {"accel_scale": reason} if reason else {}, _given(ctx, _not_of(ctx, not_of_text(path)))
-    words += _options(told)
+    proposal = _Proposal(_given(ctx, not_of_text(path)) + _options(told))
+    proposal.missing |= {"accel_scale": reason} if reason else {}
     units = _units(reading, told)
     inventory = inventory_of_lines(path, reading.renamed, units)
     bench = inventory.bench | _in_words({**reading.keys, **_bench_keys(told)})
     angles = not reading.no_angles
     if angles and inventory.has_angles is None:
-        angles, missing["angles"] = False, _BY_HAND[1].format(or_else=" or attitude")
-        words.append(_BY_HAND[0])
-    axes = _AXES.get(inventory.angles or 0, _NAMED["axes"][0])
-    lacking = _lacks(bench, bool(inventory.has_angles) and angles)
-    for key in lacking:
-        missing[key] = _NAMED[key][1]
-        words.append(axes if key == "axes" else _NAMED[key][0])
-    provisional = {"axes": shlex.split(axes)[1]} if angles and inventory.has_angles else {}
+        angles = False
+        proposal.ask("angles", _BY_HAND.format(or_else=" or attitude"), "--no-angles")
+    has_gimbals, gimbals = bool(inventory.has_angles) and angles, inventory.angles or 0
+    proposal.ask_for_bench(bench, has_gimbals, gimbals)
+    provisional = {"axes": _axes_of(gimbals)} if has_gimbals else {}
     if not bench.get("latitude_deg"):
         provisional["gravity_mps2"] = str(STANDARD_GRAVITY_MPS2)
     is_bare = inventory.is_bare and not {"accel_unit", "accel_scale"} & bench.keys()
@@ -178,36 +240,64 @@ def _of_lines(
     dwells, warnings, wrong, source = None, list(inventory.warnings), None, None
     try:
         source = Lines(path, checked_keys(provisional | bench), reading.renamed, units=units, angles=angles)
-        dwells = _dwells(source, tick)
-        warnings = list(dict.fromkeys([*warnings, *source.warnings]))
-        wrong = _wrong_unit([dwell.norm_mps2 for dwell in dwells], source.bench.input, are_named=not is_bare)
+        dwells, warnings, wrong = _at_rest(source, warnings, tick, are_named=not is_bare)
     except CountsError:
         raise
     except KfCalibError as error:
-        missing = {"": str(error), **missing}
+        proposal.refuse(error)
     if is_bare:
-        missing["accel_unit"] = "the unit of the readings, which their names do not tell: --accel-unit or --accel-scale"
-        words.append("--accel-unit m/s2" if wrong is None else wrong.option)
+        what = "the unit of the readings, which their names do not tell: --accel-unit or --accel-scale"
+        proposal.ask("accel_unit", what, "--accel-unit m/s2" if wrong is None else wrong.option)
     else:
-        missing, words = _with_unit(missing, words, wrong)
+        proposal.ask_for_unit(wrong)
     if source is not None and dwells is not None and wrong is None:
-        missing, words = _tried(source, missing, words)
-    return _overview(inventory, bench, dwells, missing, words, warnings, lacking)
+        proposal.try_out(source)
+    return proposal.overview(inventory.path, inventory, bench, warnings, dwells)
 
 
-def _tried(source: Source, missing: dict[str, str], words: list[str]) -> tuple[dict[str, str], list[str] | None]:
-    """What is missing, and the words of the command to try, after it was tried; None where no option would do."""
-    from kf_calib.estimation.calibration import calibrate
+def _of_table(ctx: click.Context, path: Path, reading: ReadingOptions, told: Stated, reason: str) -> Overview:
+    """What is in a table of orientations; told, reason: as of ``_of_lines``."""
+    from kf_calib.sources.text.means import Survey
 
-    try:
-        calibrate(source)
-    except BlunderError as error:
-        if "axes" in missing:  # those that were tried are an example
-            return missing, words
-        return {"": str(error), **missing}, [*words, error.options] if error.options else None
-    except KfCalibError as error:
-        return {"": str(error), **missing}, None
-    return missing, words
+    stated: BenchKeys = {**reading.keys, **_bench_keys(told)}
+    bench = _in_words(stated)
+    table = Survey(path, stated, reading.renamed, _units(reading, told), angles=not reading.no_angles)
+    proposal = _Proposal(_given(ctx, not_of_text(path) + OF_DWELLS) + _options(told))
+    proposal.missing |= {"counts": reason} if reason else {}
+    if not table.columns.orientation and not reading.no_angles:
+        proposal.ask("angles", _BY_HAND.format(or_else=", attitude or face"), "--no-angles")
+    gimbals = len(table.columns.angles)
+    proposal.ask_for_bench(bench, table.orientation == "angles", gimbals)
+    taken = table.evaluated.bench.input if table.evaluated else None
+    wrong = taken and _wrong_unit([row["norm_mps2"] for row in table.described_rows], taken, are_named=True)
+    proposal.ask_for_unit(wrong)
+    if table.trouble:
+        proposal.refuse(table.trouble)
+        proposal.is_hopeless = True
+    elif wrong is None:
+        examples = {"axes": _axes_of(gimbals), "gravity_mps2": str(STANDARD_GRAVITY_MPS2)}
+        keys = _bench_keys({**{key: examples[key] for key in proposal.lacking}, **told})
+        proposal.try_out(reading.table(path, keys, bool(table.orientation)))
+    return proposal.overview(path, table, bench, table.warnings)
+
+
+def _axes_of(gimbals: int) -> str:
+    """Axes that as many gimbals may have."""
+    return shlex.split(_AXES.get(gimbals, _NAMED["axes"][0]))[1]
+
+
+def _at_rest(
+    source: Source, warnings: list[str], tick: Tick, *, are_named: bool = False
+) -> tuple[list[DwellSummary], list[str], WrongUnit | None]:
+    """The dwells of a source, all that was told with what it tells, and the unit that its readings rather have.
+
+    are_named: whether names of columns tell the unit, too.
+    """
+    from kf_calib.dwells.rest_in_readings import dwell_summaries
+
+    dwells = dwell_summaries(source, on_progress=tick)
+    wrong = _wrong_unit([dwell.norm_mps2 for dwell in dwells], source.bench.input, are_named=are_named)
+    return dwells, list(dict.fromkeys([*warnings, *source.warnings])), wrong
 
 
 def _wrong_unit(norms_mps2: Sequence[float], taken: RawInput, *, are_named: bool = False) -> WrongUnit | None:
@@ -225,113 +315,14 @@ def _wrong_unit(norms_mps2: Sequence[float], taken: RawInput, *, are_named: bool
     return wrong._replace(option=wrong.option + " --restate-input") if is_named else wrong
 
 
-def _with_unit(missing: dict[str, str], words: list[str], wrong: WrongUnit | None) -> tuple[dict[str, str], list[str]]:
-    """What is missing, and the words of the command to try, with another unit in place of one that was given."""
-    if wrong is None:
-        return missing, words
-    kept = [word for word in words if word.split()[0] not in wrong.option.split()]
-    return missing | {"accel_unit": wrong.sentence + "."}, [*kept, wrong.option]
-
-
-def _overview(
-    inventory: Inventory,
-    bench: dict[str, str],
-    dwells: list[DwellSummary] | None,
-    missing: dict[str, str],
-    words: list[str] | None,
-    warnings: list[str],
-    lacking: Sequence[str],
-) -> Overview:
-    from kf_calib.views.overview import Overview
-
-    if dwells is not None and not dwells:
-        said = "a stretch in which the platform stands still: --still-deg says what counts as standing still"
-        missing.setdefault("", said)
-    command = _replay(inventory.path, words)
-    return Overview(inventory, bench, dwells, list(missing.values()), command, warnings, _examples(command, lacking))
-
-
-def _examples(command: str, lacking: Sequence[str]) -> tuple[str, ...]:
-    """Return the options of a command that have example values."""
-    return tuple(option for key in lacking if (option := _NAMED[key][0].split()[0]) in command)
-
-
-def _replay(path: Path, words: Sequence[str] | None) -> str:
-    """The command to try with these options; empty where there is none."""
-    return "" if words is None else " ".join(["kf-calib replay", _quoted(str(path)), *words])
-
-
-def _show_table(ctx: click.Context, path: Path, reading: ReadingOptions, as_json: bool) -> None:
-    """Print what is in a table of orientations."""
-    from kf_calib.views.overview import table_object, table_report
-
-    overview = _with_counts(partial(_of_table, ctx, path, reading))
-    print_result(as_json, table_object, table_report, overview)
-
-
-def _of_table(ctx: click.Context, path: Path, reading: ReadingOptions, told: Stated, reason: str) -> TableOverview:
-    """What is in a table of orientations; told, reason: as of ``_of_lines``."""
-    from kf_calib.sources.text.means import Survey
-    from kf_calib.views.overview import TableOverview
-
-    stated: BenchKeys = {**reading.keys, **_bench_keys(told)}
-    bench = _in_words(stated)
-    table = Survey(path, stated, reading.renamed, _units(reading, told), angles=not reading.no_angles)
-    lacking = _lacks(bench, table.orientation == "angles")
-    missing = {"counts": reason} if reason else {}
-    words = _given(ctx, _not_of(ctx, not_of_text(path) + OF_DWELLS))
-    words += _options(told)
-    if not table.columns.orientation and not reading.no_angles:
-        words.append(_BY_HAND[0])
-        missing["angles"] = _BY_HAND[1].format(or_else=", attitude or face")
-    missing |= {key: _NAMED[key][1] for key in lacking}
-    axes = _AXES.get(len(table.columns.angles), _NAMED["axes"][0])
-    words += [axes if key == "axes" else _NAMED[key][0] for key in lacking]
-    taken = table.evaluated.bench.input if table.evaluated else None
-    wrong = taken and _wrong_unit([row["norm_mps2"] for row in table.described_rows], taken, are_named=True)
-    missing, words = _with_unit(missing, words, wrong)
-    if table.trouble:
-        missing, words = {"": table.trouble, **missing}, None
-    elif wrong is None:
-        examples = {"axes": shlex.split(axes)[1], "gravity_mps2": str(STANDARD_GRAVITY_MPS2)}
-        keys = _bench_keys({**{key: examples[key] for key in lacking}, **told})
-        missing, words = _tried(reading.table(path, keys, bool(table.orientation)), missing, words)
-    command = _replay(path, words)
-    return TableOverview(table, bench, list(missing.values()), command, _examples(command, lacking))
-
-
-def _lacks(bench: Mapping[str, str], has_angles: bool) -> list[str]:
-    """Keys that the bench's description lacks."""
-    keys = {"axes": has_angles and not bench.get("axes"),
-            "gravity_mps2": not bench.get("gravity_mps2") and not bench.get("latitude_deg")}  # fmt: skip
-    return [key for key, lacks in keys.items() if lacks]
-
-
-def _dwells(source: Source, tick: Tick) -> list[DwellSummary]:
-    from kf_calib.dwells.rest_in_readings import dwell_summaries
-
-    return dwell_summaries(source, on_progress=tick)
-
-
-def _not_of(ctx: click.Context, names: Sequence[str]) -> set[str]:
-    """Names of the options but for these, and but for the form of what is printed."""
-    return {param.name for param in ctx.command.params if param.name} - {*names, "as_json"}
-
-
-def _given(ctx: click.Context, taken: Set[str]) -> list[str]:
-    """The options of this command line, as they were written, of those that the command to try takes."""
-    words = list[str]()
-    for param in ctx.command.params:
-        name = param.name or ""
-        is_given = ctx.get_parameter_source(name) is ParameterSource.COMMANDLINE
-        if name in taken and is_given and isinstance(param, click.Option):
-            value = ctx.params[name]
-            if param.is_flag:
-                words += [param.opts[0]]
-                continue
-            words += [f"{param.opts[0]} {_quoted(str(each))}" for each in
-                      (value if isinstance(value, tuple) else [value])]  # fmt: skip
-    return words
+def _given(ctx: click.Context, less: Sequence[str]) -> list[str]:
+    """The options of this command line, as they were written, but for those that the command to try does not take."""
+    return [
+        " ".join([option, *map(_quoted, value)])
+        for param, values in given(ctx)
+        if isinstance(param, click.Option) and param.name not in (*less, "as_json")
+        for option, *value in words_of(param, values)
+    ]
 
 
 def _quoted(text: str) -> str:

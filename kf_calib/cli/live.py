@@ -18,7 +18,7 @@ from kf_calib.cli.echo import complain, json_line, rendered
 from kf_calib.cli.failures import answered
 from kf_calib.cli.files import RerunFile, claimed, delivery, output_option, write_view
 from kf_calib.cli.live_page import PageOptions, page_server, page_state
-from kf_calib.cli.live_run import LiveRun, by_hand, on_bench, pressed_keys
+from kf_calib.cli.live_run import LiveRun, pressed_keys
 from kf_calib.cli.options import (
     BenchOptions,
     Device,
@@ -101,6 +101,7 @@ def live(
     Ctrl-C ends the run: the recording is finished and the summary printed.
     """
     from kf_calib.bench.paper_parameters import targets_of
+    from kf_calib.online.session import HandSession, Session
     from kf_calib.sources.live import files_of, open_live
 
     outputs, record = claimed(files_of(source), overwrite=overwrite), options.record
@@ -111,13 +112,15 @@ def live(
         header=options.header, give_up_s=options.give_up_s, idle_s=options.idle_s, angles=not options.no_angles,
     )  # fmt: skip
     with page_server(page) as server, opening() as opened:
-        begin = by_hand(settings, wanted) if options.no_angles else on_bench(settings, wanted, options.auto)
-        run = LiveRun(opened, begin, record, not sys.stdout.isatty() or as_json)
+        begin = HandSession if options.no_angles else partial(Session, auto=options.auto)
+        run = LiveRun(
+            opened, partial(begin, settings=settings, wanted=wanted), record, not sys.stdout.isatty() or as_json
+        )
         view = _view(rrd, options)
         if view is not None:
             run.listeners.append(partial(_offer, view))
         with answered(run.handle_signal):  # until all is written: who closes a terminal sends several
-            follow(run, source, record, as_json, server)
+            follow(run, source, as_json, server)
             if view is not None:
                 view.close()
             opened.close()
@@ -143,14 +146,14 @@ def _offer(view: GrowingView, judgement: Judgement | HandJudgement) -> None:
         view.offer(judgement.result, judgement if isinstance(judgement, Judgement) else None)
 
 
-def follow(run: LiveRun, name: str, record: Path | None, as_json: bool, page: PageServer | None) -> None:
+def follow(run: LiveRun, name: str, as_json: bool, page: PageServer | None) -> None:
     """The run to its end, with a screen, lines or objects, and a page where there is one."""
     if page is not None:
-        page.state = partial(page_state, run, name, record)
+        page.state = partial(page_state, run, name)
     run.start()
     if not as_json and sys.stdout.isatty():
         try:
-            _on_screen(run, name, record, "" if page is None else f"   page: {page.url}")
+            _on_screen(run, name, "" if page is None else f"   page: {page.url}")
         except OSError as error:  # the terminal is gone: the run is not
             run.print.fail(error)
     told = dict[str, str]()
@@ -204,12 +207,10 @@ def _echo(run: LiveRun, text: str) -> None:
             complain("nobody reads this output any more; the recording goes on.")
 
 
-def _on_screen(run: LiveRun, name: str, record: Path | None, where: str) -> None:
+def _on_screen(run: LiveRun, name: str, where: str) -> None:
     from rich.live import Live
 
-    from kf_calib.online.session import HandStanding
-    from kf_calib.online.status import Standing
-    from kf_calib.views.live.content import content_of
+    from kf_calib.online.session import HandSession
     from kf_calib.views.live.screen import screen
     from kf_calib.views.terminal import PlainConsole
 
@@ -220,14 +221,12 @@ def _on_screen(run: LiveRun, name: str, record: Path | None, where: str) -> None
             with contextlib.suppress(queue.Empty):
                 run.judgements.get_nowait()
             run.warn()
-            standing = run.session.standing if run.session else Standing()
-            keys = "" if isinstance(standing, HandStanding) else "a: accept what is missing   "
+            keys = "" if isinstance(run.session, HandSession) else "a: accept what is missing   "
             hint = "ending ..." if run.stopped else f"{keys}q: end the run{where}"
-            content = content_of(standing, run.source.status, name, str(record or ""), run.doing())
             if display.console.size != size:  # what was drawn for another width would stay in pieces
                 size = display.console.size
                 display.console.clear()
-            display.update(screen(content, hint), refresh=True)
+            display.update(screen(run.content(name), hint), refresh=True)
             key = pressed(_REFRESH_S)
             if key == "a":
                 run.accept()
@@ -257,13 +256,13 @@ def outcome(run: LiveRun, as_json: bool) -> Judgement | HandJudgement | None:
         from kf_calib.online.status import Judgement
         from kf_calib.views import diagnosis
         from kf_calib.views.console import summary
+        from kf_calib.views.terminal import VERDICT_STYLES
 
         assert final.result is not None
         diagnosed = isinstance(final, Judgement)
         parts: list[RenderableType] = [summary(final.result, diagnosed)]
         if diagnosed:
-            style = {True: "bold green", False: "bold yellow", None: "bold"}[final.consistent]
-            parts.append(Text(diagnosis.verdict(final.diagnosis), style=style))
+            parts.append(Text(diagnosis.verdict(final.diagnosis), style=VERDICT_STYLES[final.consistent]))
         run.print(rendered(Group(*parts)), end=False)
     return final
 

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import rich_click as click
@@ -49,18 +48,15 @@ def page_server(options: PageOptions) -> Iterator[PageServer | None]:
         server.close()
 
 
-def page_state(run: LiveRun, name: str, record: Path | None) -> Mapping[str, Any]:
+def page_state(run: LiveRun, name: str) -> Mapping[str, Any]:
     """What the page shows of a run now."""
-    from kf_calib.online.status import Standing
-    from kf_calib.views.live.content import content_of, ended
+    from kf_calib.views.live.content import ended
     from kf_calib.views.live.page import directions_of, gimbals_of, page_object
 
-    session, doing = run.session, run.doing()
-    standing = session.standing if session else Standing()
-    content = content_of(standing, run.source.status, name, str(record or ""), doing)
+    session, doing, content = run.session, run.doing(), run.content(name)
     if run.final is not None or run.error is not None:
         content = ended(content, run.final, run.error)
     if session is None:  # the bench is not known yet, and asking for it would wait
         return page_object(content, [], [])
-    bench, heading = session.source.bench, doing.heading_deg if doing else ()
+    standing, bench, heading = session.standing, session.source.bench, doing.heading_deg if doing else ()
     return page_object(content, directions_of(standing, bench, heading), gimbals_of(standing, bench, heading))

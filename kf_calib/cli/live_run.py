@@ -25,32 +25,18 @@ from kf_calib.support.text import counted
 
 if TYPE_CHECKING:
     from kf_calib.bench.streams import Source
-    from kf_calib.estimation.settings import Settings
     from kf_calib.online.session import HandJudgement, HandSession, Session
     from kf_calib.online.status import Judgement
     from kf_calib.sources.live import LiveSource
-    from kf_calib.views.live.content import Doing
-
-
-def on_bench(settings: Settings, wanted: Mapping[str, float], auto: bool) -> Callable[..., Session]:
-    """How the session of a bench is begun."""
-    from kf_calib.online.session import Session
-
-    return lambda source, every, again: Session(source, settings, wanted, every=every, auto=auto, again=again)
-
-
-def by_hand(settings: Settings, wanted: Mapping[str, float]) -> Callable[..., HandSession]:
-    """How the session of a sensor in the hand is begun."""
-    from kf_calib.online.session import HandSession
-
-    return lambda source, every, again: HandSession(source, settings, wanted, every=every, again=again)
+    from kf_calib.views.live.content import Content, Doing
 
 
 class LiveRun:
     """A session in a thread of its own: the main thread has the screen, the keys and the signals.
 
-    judgements: those not shown yet. stopped: by a key or a signal. print: to standard output. further_keys: of every
-    JSON object. doing: what a bench that drives itself does; None for another.
+    begin: a class of sessions, with how it evaluates. judgements: those not shown yet. stopped: by a key or a signal.
+    print: to standard output. further_keys: of every JSON object. doing: what a bench that drives itself does; None for
+    another.
     """
 
     further_keys: Callable[[], Mapping[str, object]] = staticmethod(dict)
@@ -59,7 +45,7 @@ class LiveRun:
     def __init__(
         self,
         source: LiveSource,
-        begin: Callable[[LiveSource, bool, Callable[[], Source | None]], Session | HandSession],
+        begin: Callable[..., Session | HandSession],
         record: Path | None,
         every: bool,
     ) -> None:
@@ -73,6 +59,14 @@ class LiveRun:
         self._record, self._begin = record, begin
         work = self._work, every
         self._thread = threading.Thread(target=copy_context().run, args=work, daemon=True)  # in the units chosen
+
+    def content(self, name: str) -> Content:
+        """What is shown of the run now; name: of its source."""
+        from kf_calib.online.status import Standing
+        from kf_calib.views.live.content import content_of
+
+        standing = self.session.standing if self.session else Standing()
+        return content_of(standing, self.source.status, name, str(self._record or ""), self.doing())
 
     def start(self) -> None:
         self._thread.start()
@@ -148,7 +142,7 @@ class LiveRun:
 
     def _work(self, every: bool) -> None:
         try:
-            self.session = self._begin(self.source, every, self.recording)
+            self.session = self._begin(self.source, every=every, again=self.recording)
             for listener in self.listeners:
                 self.session.listeners.append(listener)
             self.final = self.session.run()

@@ -25,7 +25,7 @@ _SIZES = {"rad/s": 1.0, "deg/s": 0.017453292519943295}
 # fmt: off
 @command("noise rest.csv --png noise.png --save noise.json", "noise run.mcap --json",
          "noise bag --gyro /imu:angular_velocity.x,angular_velocity.y,angular_velocity.z",
-         seldom=("axes", "joints", "angle_unit", "no_angles", "azimuth_deg", "reference", "nominal", "date"))
+         seldom=("axes", "angle_unit", "no_angles"))
 def noise(
     recording: Annotated[Path, argument()], reading: ReadingOptions,
     gyro: Annotated[str | None, option(

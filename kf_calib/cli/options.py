@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import rich_click as click
 from click import get_current_context  # rich_click declares that there may be none
-from click.core import ParameterSource
 
 from kf_calib.bench.keys import UNSTATED, BenchKeys, StatedBench, StatedInput
 from kf_calib.cli.command import INPUT, MODEL, NOT_NEGATIVE, OUTPUT, POSITIVE, NumberInRange, argument, option
 from kf_calib.cli.echo import complain
-from kf_calib.cli.files import output_option
+from kf_calib.cli.files import given, output_option
 from kf_calib.errors import BenchError, InputError
 from kf_calib.support.units import shown_in, si
 
@@ -364,9 +363,9 @@ def refuse_given(names: Sequence[str], what: str) -> None:
     ctx = get_current_context(silent=True)
     if ctx is None:
         return
-    for param in ctx.command.params:
-        if param.name in names and ctx.get_parameter_source(param.name) is ParameterSource.COMMANDLINE:
-            name = [*param.opts, *param.secondary_opts][-1 if ctx.params[param.name] is False else 0]
+    for param, value in given(ctx):
+        if param.name in names:
+            name = [*param.opts, *param.secondary_opts][-1 if value is False else 0]
             raise InputError(f"{what}, on which {name} has nothing to act: leave it out.")
 
 

@@ -123,34 +123,23 @@ def plan(
 def _refuse_contradictions(
     options: PlanOptions, figures: FigureFiles, reading: ReadingOptions, evaluation: EvaluationOptions
 ) -> None:
-    unused = (
-        options.targets,
-        options.fewest,
-        options.limits,
-        options.zones,
-        options.grid_deg,
-        options.positions,
-        options.beside_paper,
-        options.csv_file,
-        figures != FigureFiles(),
-    )
-    if reading.no_angles and any(unused):
-        raise click.UsageError(
-            "--no-angles plans sides to turn up by hand: leave out targets, limits of gimbals, pictures, files of "
-            "angles and --beside-paper."
-        )
-    if options.fewest and not options.targets:
-        raise click.UsageError("--fewest needs a target to reach, for example --target K=2ppm.")
-    if options.fewest and options.count:
-        raise click.UsageError("--fewest finds the count itself: leave out --count.")
-    if options.targets and options.criterion not in ("D", "minimax"):
-        raise click.UsageError("--target has a criterion of its own, the worst sigma: leave out --criterion.")
-    if options.grid_deg and options.positions:
-        raise click.UsageError("--grid-deg and --positions are two answers to one question: choose one.")
-    if evaluation.effects and not options.recording:
-        raise click.UsageError(
-            "--with needs a recording (--recording): a plan from nothing is for the twelve parameters."
-        )
+    of_gimbals = (options.targets, options.fewest, options.limits, options.zones, options.grid_deg, options.positions,
+                  options.beside_paper, options.csv_file, figures != FigureFiles())  # fmt: skip
+    contradictions = {
+        "--no-angles plans sides to turn up by hand: leave out targets, limits of gimbals, pictures, files of "
+        "angles and --beside-paper.": reading.no_angles and any(of_gimbals),
+        "--fewest needs a target to reach, for example --target K=2ppm.": options.fewest and not options.targets,
+        "--fewest finds the count itself: leave out --count.": options.fewest and options.count,
+        "--target has a criterion of its own, the worst sigma: leave out --criterion.":
+            options.targets and options.criterion not in ("D", "minimax"),
+        "--grid-deg and --positions are two answers to one question: choose one.":
+            options.grid_deg and options.positions,
+        "--with needs a recording (--recording): a plan from nothing is for the twelve parameters.":
+            evaluation.effects and not options.recording,
+    }  # fmt: skip
+    for said, holds in contradictions.items():
+        if holds:
+            raise click.UsageError(said)
 
 
 def _plan_by_hand(options: PlanOptions, reading: ReadingOptions, evaluation: EvaluationOptions, as_json: bool) -> None:

@@ -1,1 +1,1 @@
-"""Calibrations in and out: saved, applied, verified, compared over time, exported to other programs, certified."""
+"""Calibrations in and out: saved, applied to other readings, verified, compared over time; and the noise of sensors."""

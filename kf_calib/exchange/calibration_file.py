@@ -55,6 +55,7 @@ from kf_calib.exchange.calibration_parts import (
     SavedState,
     States,
     Text,
+    first_misfit,
 )
 from kf_calib.sources.files.contents import CALIBRATION_FORMAT
 from kf_calib.sources.files.record_files import fingerprint
@@ -344,11 +345,10 @@ def _checked(path: Path, content: dict[str, Any]) -> SavedCalibration:
 
 def _said(error: ValidationError) -> str:
     """The first thing that does not fit, and where."""
-    first = error.errors(include_url=False, include_input=False)[0]
-    place, said = ".".join(map(str, first["loc"])), first["msg"].removeprefix("Value error, ")
-    if first["type"] == "string_pattern_mismatch" and "sha256" not in first["loc"]:
+    place, said, kind = first_misfit(error)
+    if kind == "string_pattern_mismatch" and not place.endswith("sha256"):
         said = "it must be text on one line, without control characters"
-    return f"{cut(place, 100)}: {said}" if place else said
+    return f"{place}: {said}" if place else said
 
 
 def schema() -> dict[str, Any]:

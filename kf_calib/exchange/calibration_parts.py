@@ -10,11 +10,10 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
-from datetime import UTC, datetime
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.arrays import Floats
@@ -22,7 +21,7 @@ from kf_calib.bench.bench import Bench
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.estimation.measurement_model import FRAME, SQUARE, Model
 from kf_calib.support.tail_probabilities import LEVEL
-from kf_calib.support.text import CONTROLS, LONGEST
+from kf_calib.support.text import CONTROLS, LONGEST, cut, parse_date
 
 Text = Annotated[str, StringConstraints(max_length=LONGEST, pattern=rf"^[^{CONTROLS}]*$")]
 FiniteNumber = Annotated[float, Field(allow_inf_nan=False)]
@@ -42,6 +41,12 @@ class FilePart(BaseModel):
     """What all parts have in common: exact types, no key that is not known."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+def first_misfit(error: ValidationError) -> tuple[str, str, str]:
+    """The place of the first thing that does not fit, what does not fit there, and pydantic's name for that."""
+    first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+    return cut(".".join(map(str, first["loc"])), 100), first["msg"].removeprefix("Value error, "), first["type"]
 
 
 class SavedParameter(FilePart):
@@ -305,8 +310,8 @@ def refuse_conditions(conditions: SavedConditions, provenance: SavedProvenance, 
 def _is_date(text: str) -> bool:
     """Whether it is a date of ISO 8601 that can be told in UTC."""
     try:
-        return datetime.fromisoformat(text).astimezone(UTC).year in _YEARS
-    except (ValueError, OverflowError):
+        return parse_date(text).year in _YEARS
+    except ValueError:
         return False
 
 

@@ -15,7 +15,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from kf_calib.errors import InputError
 from kf_calib.exchange.calibration_file import now
-from kf_calib.exchange.calibration_parts import FilePart, FiniteNumber, Positive, Sha256, Text
+from kf_calib.exchange.calibration_parts import FilePart, FiniteNumber, Positive, Sha256, Text, first_misfit
 from kf_calib.noise.power_laws import TERMS
 from kf_calib.noise.rest_noise import ChannelNoise, RestNoise
 from kf_calib.support.output_files import write_whole
@@ -41,11 +41,6 @@ class SavedSize(FilePart):
         if not self.low <= high or (self.value is not None and not self.low <= self.value <= (self.high or self.value)):
             raise ValueError("low, value and high are not in ascending order")
         return self
-
-    @property
-    def to_be_used(self) -> float | None:
-        """The value, or where there is none the limit."""
-        return self.high if self.value is None else self.value
 
 
 class SavedChannel(FilePart):
@@ -125,9 +120,8 @@ def open_noise(path: str | Path) -> SavedRestNoise:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}): {_HOW}.") from None
     except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        place = ".".join(map(str, first["loc"]))
-        raise InputError(f"{path}: {cut(f'{place}: ' * bool(place) + first['msg'], 200)}: {_HOW}.") from None
+        place, said, _ = first_misfit(error)
+        raise InputError(f"{path}: {cut(f'{place}: ' * bool(place) + said, 200)}: {_HOW}.") from None
 
 
 def is_noise_file(path: Path) -> bool:

@@ -16,7 +16,7 @@ from kf_calib.fleet.overview import FleetOverview, Track
 from kf_calib.fleet.pooled_diagnosis import BenchCoefficients, Finding
 from kf_calib.fleet.text import chance_words, short_name
 from kf_calib.support.units import shown
-from kf_calib.views.figures.collection import Figures, figures
+from kf_calib.views.figures import Figures, figures
 from kf_calib.views.figures.style import (
     ACCELEROMETERS,
     ALARM,
@@ -25,11 +25,12 @@ from kf_calib.views.figures.style import (
     GREY,
     MARKERS,
     PALE,
+    accelerometer_of,
     dated,
     drawn_on,
     log_scale,
+    mark_of,
     panels_of,
-    plain,
     say,
     say_once,
     wrapped,
@@ -69,7 +70,7 @@ def _population(axes: Axes, names: Sequence[str], track: Track) -> None:
     )
     axes.axhline(middle, color=GREY, linewidth=0.8)
     axes.plot(track.places, values, ".", color=PALE, markersize=4.0, label="run")
-    marker, colour = _own(track.symbol)
+    marker, colour = mark_of(accelerometer_of(track.symbol) or 0)
     axes.plot(range(len(means)), means, marker, color=colour, markersize=4.0, label="mean of a unit")
     outside = np.flatnonzero(track.chances < _OUTSIDE)
     axes.plot(outside, means[outside], "o", markersize=9.0, markerfacecolor="none", markeredgecolor=ALARM,
@@ -109,7 +110,7 @@ def _chart(axes: Axes, track: Track) -> None:
         axes.annotate(f"{name} {unit.number(sign * 3.0 * track.scatter)}".replace("-", "−"), (1.0, sign * 3.0 * sigma),
                       xytext=(0, 2 if sign > 0 else -2), xycoords=("axes fraction", "data"), textcoords="offset points",
                       ha="right", va="bottom" if sign > 0 else "top", color=ALARM, fontsize=7.0)  # fmt: skip
-    marker, colour = _own(track.symbol)
+    marker, colour = mark_of(accelerometer_of(track.symbol) or 0)
     axes.plot(dates, values, marker=marker, color=colour, markersize=3.0, linewidth=0.6,
               label="run less the mean of its unit")  # fmt: skip
     outside = np.abs(values) > 3.0 * sigma
@@ -137,7 +138,7 @@ def _achieved(axes: Axes, tracks: Sequence[Track]) -> None:
     unit = shown(tracks[0].unit)
     for k, track in enumerate(tracks):
         low, inner, middle, outer, high = np.quantile(track.sigmas * unit.per_si, [0.05, 0.25, 0.5, 0.75, 0.95])
-        colour = _own(track.symbol)[1]
+        _, colour = mark_of(accelerometer_of(track.symbol) or 0)
         axes.plot([k, k], [low, high], color=colour, linewidth=1.2, label="middle 90 % of the runs")
         axes.plot([k, k], [inner, outer], color=colour, linewidth=5.0, solid_capstyle="butt", label="middle 50 %")
         axes.plot(k, middle, "o", color="white", markeredgecolor=colour, markersize=5.0, label="median")
@@ -168,7 +169,7 @@ def verdicts(figure: Figure, overview: FleetOverview) -> None:
         runs_by_label[label] = runs_by_label.get(label, np.zeros(len(begins))) + np.array(counts)
     for label, counts in runs_by_label.items():
         colour = _KNOWN.get(label) or next(colours, BEST)
-        axes.bar(begins + 3.5, counts, width=6.0, bottom=bottom, color=colour, label=plain(label))
+        axes.bar(begins + 3.5, counts, width=6.0, bottom=bottom, color=colour, label=label)
         bottom = bottom + counts
     axes.set_ylabel("runs a week")
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
@@ -216,7 +217,7 @@ def _followed(axes: Axes, term: Finding, bench: str) -> None:
         first, constants, _ = _curve(whole, k, unit.per_si)
         first = [dates[0], *first[1:]]  # the first values hold from the first run on
         axes.step([*first, places[-1]], [*constants, constants[-1]], where="post", color=colour, linewidth=1.1)
-    axes.set_title(f"{plain(term.effect)}, {plain(bench or 'the bench')}, {unit.label} (2σ)")
+    axes.set_title(f"{term.effect}, {bench or 'the bench'}, {unit.label} (2σ)")
     if all(coefficient.since for coefficient in parts):
         dated(axes)
     axes.legend(loc="best", fontsize=7.5)
@@ -254,17 +255,11 @@ def another_look(figure: Figure, overview: FleetOverview) -> None:
         axes.text(x, -0.7, words, color=GREY, va="center")
     for k, look in enumerate(shown_here):
         axes.text(0.0, k, f"{k + 1}", color=GREY, va="center")
-        axes.text(0.03, k, plain(short_name(look.unit)), va="center", fontweight="bold")
+        axes.text(0.03, k, short_name(look.unit), va="center", fontweight="bold")
         axes.text(0.2, k, chance_words(look.chance), va="center")
-        axes.text(0.32, k, plain(wrapped(look.why, 120)), va="center", fontsize=8.0)
+        axes.text(0.32, k, wrapped(look.why, 120), va="center", fontsize=8.0)
     if len(overview.looks) > len(shown_here):
         axes.text(0.03, len(shown_here) - 0.5, f"{len(overview.looks) - len(shown_here)} more", color=GREY)
-
-
-def _own(name: str) -> tuple[str, str]:
-    """Return marker and colour of a parameter, those of its accelerometer."""
-    place = int(name[-1]) - 1 if name[-1] in "123" else 0
-    return MARKERS[place], ACCELEROMETERS[place]
 
 
 def _say_alone(figure: Figure, text: str) -> None:

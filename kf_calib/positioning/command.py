@@ -28,7 +28,7 @@ from kf_calib.cli.failures import answered
 from kf_calib.cli.files import claimed, delivery, output_option
 from kf_calib.cli.live import follow, outcome
 from kf_calib.cli.live_page import PageOptions, page_server
-from kf_calib.cli.live_run import LiveRun, on_bench
+from kf_calib.cli.live_run import LiveRun
 from kf_calib.cli.options import (
     BenchOptions,
     Device,
@@ -220,6 +220,7 @@ def run(
     substitute for interlocks and an emergency stop.
     """
     from kf_calib.bench.paper_parameters import targets_of
+    from kf_calib.online.session import Session
     from kf_calib.positioning.opening import open_positioner
     from kf_calib.sources.live import files_of
 
@@ -227,8 +228,7 @@ def run(
     keys: BenchKeys = {**bench.keys, **device}
     source, record = options.source, options.record
     if options.dry_run:
-        _show_dry_run(positioner, keys, options, as_json)
-        return
+        return _show_dry_run(positioner, keys, options, as_json)
     if not options.trust_profile:
         _ask_for_programs(positioner)
     outputs = claimed(files_of(source) if source else [], overwrite=overwrite)
@@ -238,10 +238,10 @@ def run(
         opened = stack.enter_context(live)
         driven = emulated or stack.enter_context(open_positioner(positioner, opened.bench, complain))
         make = partial(_drive, driven, options.most or (60 if wanted else 24), options)
-        begin = on_bench(settings, wanted, options.improve)
+        begin = partial(Session, settings=settings, wanted=wanted, auto=options.improve)
         running = DrivenRun(opened, begin, record, not sys.stdout.isatty() or as_json, make)
         with answered(running.handle_signal):
-            _follow(running, positioner, driven, record, as_json, server)
+            _follow(running, positioner, driven, as_json, server)
             opened.close()
             code = _code(running)
             final = None if running.drive_error else outcome(running, as_json)
@@ -331,7 +331,7 @@ def _trouble(running: DrivenRun) -> str:
     return ""
 
 
-def _follow(running: DrivenRun, name: str, device: Opened, record: Path | None, as_json: bool,
+def _follow(running: DrivenRun, name: str, device: Opened, as_json: bool,
             page: PageServer | None) -> None:  # fmt: skip
     """The run to its end; with a person as the positioner, Enter says that the gimbals stand."""
     from kf_calib.positioning.positioner import HandPositioner
@@ -344,7 +344,7 @@ def _follow(running: DrivenRun, name: str, device: Opened, record: Path | None, 
                 hand.done()
 
         threading.Thread(target=listen, name="enter", daemon=True).start()
-    follow(running, name, record, as_json, page)
+    follow(running, name, as_json, page)
 
 
 def _code(running: DrivenRun) -> int:

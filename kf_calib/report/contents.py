@@ -27,8 +27,7 @@ from kf_calib.report.drawing import Drawing
 from kf_calib.report.explorer import Explorer, explorer
 from kf_calib.report.page import Agreement, Facts, Page, PagePart, Section
 from kf_calib.views import console, diagnosis, improvement
-from kf_calib.views.figures import figures
-from kf_calib.views.figures.collection import DIRECTIONS, FALL, NO_FALL, ON_THEIR_WAY, PROBABILITIES
+from kf_calib.views.figures import DIRECTIONS, FALL, NO_FALL, ON_THEIR_WAY, PROBABILITIES, figures
 from kf_calib.views.html import Paragraph, parts_of
 
 _PACKAGE = Path(__file__).parents[1]
@@ -104,49 +103,51 @@ _EXPLORED = 3
 """Explanations, at most, of which the explorer offers what they leave."""
 
 
-@singledispatch
 def page_of(result: Any, measured: Sequence[Measured], commands: Sequence[str], remarks: Sequence[str] = ()) -> Page:
     """The page of a result.
 
     measured: its recordings, one or two. commands: what gives the numbers again, a line each. remarks: sentences that
     go with the verdict.
     """
+    page = _page(result, measured)
+    return replace(page, verdict=(*page.verdict, *remarks), commands=tuple(commands))
+
+
+@singledispatch
+def _page(result: Any, measured: Sequence[Measured]) -> Page:
+    """Return the same without commands and remarks."""
     raise TypeError(f"there is no report of {type(result).__name__}: give what diagnose, improve or compare returns, "
                     "or two diagnoses side by side.")  # fmt: skip
 
 
-@page_of.register
-def _(diagnosed: Diagnosis, measured: Sequence[Measured], commands: Sequence[str], remarks: Sequence[str] = ()) -> Page:
-    likely, drawn = (
-        figures_of("Probabilities", diagnosed, "likely", [PROBABILITIES]),
-        figures_of("Residuals", diagnosed, "found", less=[PROBABILITIES]),
-    )
+@_page.register
+def _(diagnosed: Diagnosis, measured: Sequence[Measured]) -> Page:
     return Page(
-        measured[0].name, "Calibration report", *_standing(diagnosed.test.consistent),
-        (diagnosis.verdict(diagnosed), *remarks),
+        measured[0].name, "Calibration report", *_HEADLINES[diagnosed.test.consistent],
+        (diagnosis.verdict(diagnosed),),
         (
-            likely,
+            figures_of("Probabilities", diagnosed, "likely", [PROBABILITIES]),
             measured_section(facts(measured[0], diagnosed.before)),
-            drawn,
+            figures_of("Residuals", diagnosed, "found", less=[PROBABILITIES]),
             Section("Explore the residuals", (_explorer_of(diagnosed),)),
             Section("Parameters", (*_tables(diagnosed.before), *_with_what_is_missing(diagnosed))),
             figures_of("The calibration", diagnosed.before, "run", less=[ON_THEIR_WAY, DIRECTIONS]),
             Section("Suspects, and what this run could show", _evidence(diagnosed)),
             *_of_leaves(measured[0]),
             warnings_of(diagnosed.before.warnings),
-        ), tuple(commands),
+        ),
     )  # fmt: skip
 
 
-@page_of.register
-def _(state: Improvement, measured: Sequence[Measured], commands: Sequence[str], remarks: Sequence[str] = ()) -> Page:
+@_page.register
+def _(state: Improvement, measured: Sequence[Measured]) -> Page:
     start, last, steps = state.start.before, state.result, improvement.progress(state)
     explanation = Explanation(state.effects, start, last)
     explained = {f"{last.model.sum}": explanation.unexplained_mps2} if state.steps else {}
     fall = figures_of("The error, step by step", state, "fall", [FALL, NO_FALL])
     return Page(
-        measured[0].name, "Improvement of the model", *_standing(state.diagnosis.test.consistent),
-        (*improvement.story(state), *remarks),
+        measured[0].name, "Improvement of the model", *_HEADLINES[state.diagnosis.test.consistent],
+        tuple(improvement.story(state)),
         (
             Section(fall.title, (*fall.parts, *in_text(steps))),
             measured_section(facts(measured[0], last)),
@@ -156,17 +157,17 @@ def _(state: Improvement, measured: Sequence[Measured], commands: Sequence[str],
             figures_of("The calibration with the last model", last, "run", less=[ON_THEIR_WAY]),
             Section("What is left, and what this run could show", _evidence(state.diagnosis)),
             warnings_of(state.warnings),
-        ), tuple(commands),
+        ),
     )  # fmt: skip
 
 
-@page_of.register
-def _(compared: Comparison, measured: Sequence[Measured], commands: Sequence[str], remarks: Sequence[str] = ()) -> Page:
+@_page.register
+def _(compared: Comparison, measured: Sequence[Measured]) -> Page:
     result = compared.result
     said = f"Filter, filterpy and batch least squares differ by at most {compared.max_difference_sigma:.1e} σ."
     return Page(
-        measured[0].name, "Filter against batch", *_standing(result.consistency.consistent),
-        (said, console.verdict(result), *remarks),
+        measured[0].name, "Filter against batch", *_HEADLINES[result.consistency.consistent],
+        (said, console.verdict(result)),
         (
             measured_section(facts(measured[0], result)),
             Section("Time, memory and difference", in_text(console.comparison_table(compared), with_notes=True)),
@@ -175,30 +176,30 @@ def _(compared: Comparison, measured: Sequence[Measured], commands: Sequence[str
             Section("Explore the residuals", (explorer(result, {}),)),
             figures_of("The calibration", result, "run"),
             warnings_of(result.warnings),
-        ), tuple(commands),
+        ),
     )  # fmt: skip
 
 
-@page_of.register
-def _(pair: SideBySide, measured: Sequence[Measured], commands: Sequence[str], remarks: Sequence[str] = ()) -> Page:
+@_page.register
+def _(pair: SideBySide, measured: Sequence[Measured]) -> Page:
     both = pair.first, pair.second
     recordings = [measured[0], measured[-1]]
     names = [each.before.model.sum if pair.same_recording else own.name
              for each, own in zip(both, recordings, strict=True)]  # fmt: skip
     told = [f"{name}: {diagnosis.verdict(each)}" for name, each in zip(names, both, strict=True)]
     table = console.difference_table(pair.differences, names[0], names[1])
-    standing, headline = _standing(pair.second.test.consistent)
+    standing, headline = _HEADLINES[pair.second.test.consistent]
     measurements = [("" if pair.same_recording else name, tuple(facts(own, each.before)))
                     for name, own, each in zip(names, recordings, both, strict=True)]  # fmt: skip
     return Page(
         measured[0].name if pair.same_recording else f"{names[1]} beside {names[0]}", "Side by side",
         standing, f"{names[1]}: {headline[0].lower()}{headline[1:]}",
-        (console.difference_in_words(pair), *told, *remarks),
+        (console.difference_in_words(pair), *told),
         (
             Section("Difference of the parameters", tuple(parts_of(table))),
             Section(MEASURED, (Facts(tuple(measurements[1:] if pair.same_recording else measurements)),)),
             *(_run(name, each, f"found{k}-") for k, (name, each) in enumerate(zip(names, both, strict=True))),
-        ), tuple(commands),
+        ),
     )  # fmt: skip
 
 
@@ -226,10 +227,6 @@ _HEADLINES: dict[bool | None, tuple[Agreement, str]] = {
     False: ("disagrees", "Model and measurements disagree"),
     None: ("open", "There is nothing to judge the model by"),
 }
-
-
-def _standing(consistent: bool | None) -> tuple[Agreement, str]:
-    return _HEADLINES[consistent]
 
 
 def figures_of(title: str, result: object, prefix: str, only: Sequence[str] = (), less: Sequence[str] = ()) -> Section:
@@ -287,5 +284,5 @@ def _with_what_is_missing(diagnosed: Diagnosis) -> tuple[PagePart, ...]:
     return (*parts_of(table), *parts_of(console.effect_table(diagnosed.after)))
 
 
-def warnings_of(said: Iterable[str], title: str = "Warnings") -> Section:
-    return Section(title, tuple(Paragraph(text, "note") for text in said))
+def warnings_of(said: Iterable[str]) -> Section:
+    return Section("Warnings", tuple(Paragraph(text, "note") for text in said))

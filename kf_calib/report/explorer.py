@@ -13,8 +13,10 @@ from kf_calib.diagnosis.explanation import EffectShape
 from kf_calib.diagnosis.residual_drivers import Driver, drivers_of
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration
-from kf_calib.support.units import shown, shown_whole
+from kf_calib.support.units import shown
+from kf_calib.views.diagnosis import explains
 from kf_calib.views.json import clean
+from kf_calib.views.notation import unit_across
 
 _DIGITS = 5  # significant ones, which a page needs
 
@@ -36,7 +38,7 @@ def explorer(first: Calibration, others: Mapping[str, Floats], shapes: Sequence[
     dwells = first.linearised.dwells
     models, unit = {f"{first.model.sum}": first.residuals_mps2, **others}, shown("m/s^2")
     return Explorer(
-        _short(
+        clean(
             {
                 "dwells": [dwell.number for dwell in dwells],
                 "begin_s": [dwell.start_s for dwell in dwells],
@@ -45,14 +47,15 @@ def explorer(first: Calibration, others: Mapping[str, Floats], shapes: Sequence[
                 "sigma": mean_sigmas(first) * unit.per_si,
                 "drivers": [*map(_shape, shapes), *map(_driver, drivers_of(first))],
                 "models": [{"name": name, "residual": left_mps2 * unit.per_si} for name, left_mps2 in models.items()],
-            }
+            },
+            _DIGITS,
         )
     )
 
 
 def _shape(shape: EffectShape) -> dict[str, Any]:
     """Return what an effect must explain, over the quantity that it goes with, in the units of people."""
-    across, unit = shown_whole(shape.unit, float(np.nanmax(np.abs(shape.values)))), shown(shape.quantity)
+    across, unit = unit_across(shape), shown(shape.quantity)
     return {
         "name": shape.words, "unit": across.label, "explains": "", "values": shape.values * across.per_si,
         "shown": f"what {shape.effect} must explain", "shown_unit": unit.label, "channels": shape.channels,
@@ -63,17 +66,6 @@ def _shape(shape: EffectShape) -> dict[str, Any]:
 
 def _driver(driver: Driver) -> dict[str, Any]:
     """Return a driver with its values in the unit in which people read them."""
-    unit = shown_whole(driver.unit, float(np.abs(driver.values).max()))
-    explains = f"explains {driver.share:.0%}" if driver.share >= 0.005 and driver.p_value <= 0.01 else ""
+    unit, share = unit_across(driver), f"explains {driver.share:.0%}" if explains(driver) else ""
     of_all = driver.values[:, 0] if np.ptp(driver.values, axis=1).max() == 0.0 else driver.values  # such as an angle
-    return {"name": driver.words, "unit": unit.label, "explains": explains, "values": of_all * unit.per_si}
-
-
-def _short(value: Any) -> Any:
-    """Return what JSON can hold, with numbers of a few digits."""
-    if isinstance(value, dict):
-        return {key: _short(each) for key, each in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
-        return [_short(each) for each in value]
-    value = clean(value)
-    return float(f"{value:.{_DIGITS}g}") if isinstance(value, float) else value
+    return {"name": driver.words, "unit": unit.label, "explains": share, "values": of_all * unit.per_si}

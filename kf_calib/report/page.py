@@ -48,7 +48,7 @@ class Page:
     headline: str
     verdict: tuple[str, ...]
     sections: tuple[Section, ...]
-    commands: tuple[str, ...]
+    commands: tuple[str, ...] = ()
 
     @property
     def html(self) -> str:

@@ -16,9 +16,10 @@ from kf_calib.reproduction.grebenkin2019 import (
     falling_sigma,
     printed_column,
 )
-from kf_calib.views.figures.collection import Figures, figures
+from kf_calib.views.figures import Figures, figures
 from kf_calib.views.figures.convergence import parameter_panels
-from kf_calib.views.figures.style import GREY, drawn_on, log_scale, twelve, written
+from kf_calib.views.figures.style import GREY, drawn_on, log_scale
+from kf_calib.views.notation import twelve, written
 
 _SETS = {"optimal": ("#0072b2", "-"), "non-optimal": ("#d55e00", "--")}
 
@@ -63,8 +64,7 @@ def falling(figure: Figure, experiment: Experiment) -> None:
             axes.annotate(last, (len(values) - 1, values[-1]), xytext=(3, 0), textcoords="offset points", fontsize=7.5,
                           color=colour, va="center", annotation_clip=False)  # fmt: skip
         axes.text(0.985, 0.97, twelve()[k].label, transform=axes.transAxes, ha="right", va="top", fontweight="bold")
-        axes.set_xticks(range(0, len(both[0]), READINGS_PER_DWELL))
-        axes.set_xlim(0, 1.16 * len(both[0]))
+        axes.set(xticks=range(0, len(both[0]), READINGS_PER_DWELL), xlim=(0, 1.16 * len(both[0])))
     for k in range(4):
         shown = np.array(both)[:, :, k::4] * twelve()[k].per_si
         log_scale(panels[k], [0.7 * shown, shown])

@@ -133,7 +133,7 @@ def _seen_object(sight: Visibility) -> dict[str, Any]:
 
 def effects_object(effects: Sequence[Effect]) -> dict[str, Any]:
     """The JSON object of ``effects``."""
-    return {"effects": [_object(effect) for effect in effects]}
+    return clean({"effects": [_object(effect) for effect in effects]})
 
 
 def _object(effect: Effect) -> dict[str, Any]:
@@ -144,17 +144,11 @@ def _object(effect: Effect) -> dict[str, Any]:
         "title": effect.title,
         "formula": formula_of(effect),
         "coefficients": [
-            members(each, "symbol", "unit", "scale", "shown_unit") | {"per_si": float(each.per_si)}
-            for each in effect.coefficients
+            members(each, "symbol", "unit", "scale", "shown_unit", "per_si") for each in effect.coefficients
         ],
         "unknown": None if unknown is None else members(unknown, "symbol", "unit", "low", "high"),
-        "typical": {"navigation": _bounds(effect.typical.navigation), "mems": _bounds(effect.typical.mems)},
+        "typical": members(effect.typical, "navigation", "mems"),
         "borne_by": effect.borne_by.value,
         **members(effect, "confused_with", "source"),
         "remarks": list(remarks_of(effect)),
     }
-
-
-def _bounds(sizes: tuple[float, float] | None) -> list[float] | None:
-    """Return usual sizes as JSON: from ... to, SI."""
-    return None if sizes is None else [float(size) for size in sizes]

@@ -21,8 +21,8 @@ from kf_calib.noise.reml import FEWEST, degrees_of_freedom
 from kf_calib.support.tail_probabilities import LEVEL
 from kf_calib.support.text import printed
 from kf_calib.support.units import rounded, shown, shown_whole
-from kf_calib.views.notation import symbol
-from kf_calib.views.terminal import FOURS, ConsoleTable, PlainConsole, note, table
+from kf_calib.views.notation import signed, symbol
+from kf_calib.views.terminal import FOURS, VERDICT_STYLES, ConsoleTable, PlainConsole, note, table
 
 if TYPE_CHECKING:
     from kf_calib.diagnosis.results import Difference, SideBySide
@@ -48,10 +48,8 @@ def parameter_row(parameter: Parameter, fixed_by: str = "") -> tuple[str, str, s
     """Return symbol, value, deviation from nominal, sigma and unit of a parameter, or what it is fixed by."""
     if parameter.value is None or parameter.sigma is None:
         return symbol(parameter.symbol), fixed_by or "not seen", "", "", ""
-    unit = shown(parameter)
-    deviation, sigma = unit.rounded(parameter.value - parameter.nominal, parameter.sigma)
-    sign = "" if deviation.startswith("-") else "+"
-    return symbol(parameter.symbol), whole_value(parameter), f"{sign}{deviation}", f"± {sigma}", unit.label
+    deviation, sigma, unit = with_sigma(parameter, less=parameter.nominal)
+    return symbol(parameter.symbol), whole_value(parameter), signed(deviation), sigma, unit
 
 
 def parameter_table(result: Calibration) -> ConsoleTable:
@@ -73,8 +71,7 @@ def without_table(result: Calibration, outlying: OutlyingDwell) -> ConsoleTable:
     for before, parameter in zip(result.parameters.values(), outlying.without.parameters.values(), strict=True):
         name, value, _, sigma, unit = parameter_row(parameter)
         known = parameter.value is not None and before.value is not None
-        moved = shown(parameter).number(parameter.value - before.value) if known else ""  # type: ignore[operator]
-        moved = moved if not moved or moved.startswith("-") else f"+{moved}"
+        moved = signed(shown(parameter).number(parameter.value - before.value)) if known else ""  # type: ignore[operator]
         rows.append((name, value, sigma, unit, moved))
     headings = "parameter", ">value", ">sigma", "unit", ">less with it"
     return table(f"Without dwell {outlying.number} (1σ)", headings, rows, FOURS)
@@ -94,12 +91,17 @@ def effect_table(result: Calibration) -> ConsoleTable:
     return table("Effects in the model (1σ)", headings, rows)
 
 
-def with_sigma(parameter: Parameter) -> tuple[str, str, str]:
-    """Value, sigma and unit of a parameter or coefficient in a table, or that it was not seen."""
+def with_sigma(parameter: Parameter, less: float = 0.0) -> tuple[str, str, str]:
+    """Value (less another one), sigma and unit of a parameter or coefficient in a table, or that it was not seen."""
     if parameter.value is None or parameter.sigma is None:
         return "not seen", "", ""
-    value, sigma = shown(parameter).rounded(parameter.value, parameter.sigma)
+    value, sigma = shown(parameter).rounded(parameter.value - less, parameter.sigma)
     return value, f"± {sigma}", shown(parameter).label
+
+
+def p_cell(p_value: float | None) -> str:
+    """A p-value in a table; empty where there is none."""
+    return "" if p_value is None else format_p(p_value).removeprefix("= ")
 
 
 def clearest(parameters: Iterable[Parameter]) -> str:
@@ -225,7 +227,7 @@ def summary(result: Calibration, diagnosed: bool = False) -> RenderableType:
         head, *([] if result.bench.input.is_plain else [Text(f"Input: {result.bench.input}.")]),
         parameter_table(result), *intervals_in_words(result),
         *([effect_table(result)] if result.model.effects else []), noise_table(result),
-        Text(verdict(result, diagnosed), style="bold green" if result.consistency.unconditional else "bold yellow"),
+        Text(verdict(result, diagnosed), style=VERDICT_STYLES[bool(result.consistency.unconditional)]),
     ]  # fmt: skip
     parts += [note(warning) for warning in result.warnings]
     parts += [without_table(result, found) for found in result.outlying]
@@ -260,21 +262,13 @@ def difference_table(differences: Sequence[Difference], first: str, second: str)
     """The table of the parameters in both, less nominal, and of their differences; first, second: what they are of."""
     rows = list[tuple[str, ...]]()
     for difference in differences:
-        both = *_cells_less_nominal(difference.first), *_cells_less_nominal(difference.second)
+        both = [cell for each in (difference.first, difference.second) for cell in with_sigma(each, each.nominal)[:2]]
         moved = "", ""
         if difference.value is not None and difference.sigma is not None and difference.sigmas is not None:
             moved = shown(difference.first).rounded(difference.value, difference.sigma)[0], f"{difference.sigmas:+.1f}"
         rows.append((symbol(difference.symbol), *both, shown(difference.first).label, *moved))
     headings = "parameter", f">{first}", ">sigma", f">{second}", ">sigma", "unit", ">difference", ">in σ"
     return table("Parameters less nominal (1σ)", headings, rows, FOURS)
-
-
-def _cells_less_nominal(parameter: Parameter) -> tuple[str, str]:
-    """Return a parameter less its nominal value, and its sigma."""
-    if parameter.value is None or parameter.sigma is None:
-        return "not seen", ""
-    value, sigma = shown(parameter).rounded(parameter.value - parameter.nominal, parameter.sigma)
-    return value, f"± {sigma}"
 
 
 def plain(renderable: RenderableType, width: int = 110) -> str:

@@ -17,6 +17,7 @@ from kf_calib.diagnosis.coefficient_sizes import Detectable
 from kf_calib.diagnosis.explanation import EffectShape
 from kf_calib.diagnosis.hypothesis_table import Hypothesis, HypothesisTable
 from kf_calib.diagnosis.replication import Replication
+from kf_calib.diagnosis.residual_drivers import Driver
 from kf_calib.diagnosis.results import Diagnosis, Suspect
 from kf_calib.diagnosis.unknown_effect import Description
 from kf_calib.diagnosis.verdict import format_probability
@@ -24,14 +25,15 @@ from kf_calib.estimation.remarks import MISSING_OR_NOISE
 from kf_calib.estimation.results import Calibration, Condition, format_p
 from kf_calib.support.text import angles_in_words, printed
 from kf_calib.support.units import shown
-from kf_calib.views.console import clearest, plain, with_sigma
+from kf_calib.views.console import clearest, p_cell, plain, with_sigma
 from kf_calib.views.json import clean, condition_object, members, outlying_object, readings_object
 from kf_calib.views.notation import symbol
-from kf_calib.views.terminal import ConsoleTable, TextPlot, note, table
+from kf_calib.views.terminal import VERDICT_STYLES, ConsoleTable, TextPlot, note, table
 
 _ANY = 1e-6  # probability of rows that are in the JSON object
 _MOST = 5
 """Explanations in the table on one screen."""
+_SIGNIFICANT, _SOME = 0.01, 0.005  # p-value and share above and below which a quantity explains nothing
 _TELLS = 1.0  # sigma; an orientation that separates explanations by less tells nothing
 
 
@@ -137,6 +139,11 @@ def orientation_object(advice: Advice, why: str) -> dict[str, Any]:
     return clean({"gimbal_deg": list(advice.gimbal_deg), "stay_s": advice.stay_s, "why": why})
 
 
+def advice_sentence(advice: Advice, why: str) -> str:
+    """The same in a sentence."""
+    return f"Next orientation: gimbals at {angles_in_words(advice.gimbal_deg)}: {why}."
+
+
 def description_object(unknown: Description | None) -> dict[str, Any] | None:
     """The description of an unknown misfit as a JSON object, or None."""
     return None if unknown is None else {**vars(unknown), "formula": unknown.formula}
@@ -201,8 +208,7 @@ def diagnosis_report(diagnosis: Diagnosis, typed: str = "", details: bool = Fals
 
     typed: recording and options of the command, which the next ones have, too. details: with the evidence below.
     """
-    style = {True: "bold green", False: "bold yellow", None: "bold"}[diagnosis.consistent]
-    parts: list[RenderableType] = [Text(verdict(diagnosis), style=style)]
+    parts: list[RenderableType] = [Text(verdict(diagnosis), style=VERDICT_STYLES[diagnosis.consistent])]
     if replicates := replication_in_words(diagnosis):
         parts.append(Text(replicates))
     if diagnosis.table and diagnosis.test.consistent is False and not details:
@@ -251,7 +257,7 @@ def details_of(diagnosis: Diagnosis) -> list[RenderableType]:
         lines = diagnosis.test.lines.vibration_in_words
         parts.append(Text(f"Vibration at {lines} changes its amplitude during the run, so {treated}."))
     if going is not None:
-        parts.append(Text(f"Next orientation: gimbals at {angles_in_words(going[0].gimbal_deg)}: {going[1]}."))
+        parts.append(Text(advice_sentence(*going)))
     if diagnosis.test.invisible:
         parts.append(Text(f"Effects that this run cannot show: {', '.join(diagnosis.test.invisible)}."))
     parts.append(_detectable_table(diagnosis.detectable))
@@ -300,6 +306,18 @@ def held_out_ratio(refit: Calibration | None, floor_mps2: float | None) -> str:
     return f"{refit.held_out_rms_mps2 / floor_mps2:.2f}"
 
 
+def explains(driver: Driver) -> bool:
+    """Whether a quantity explains more of the misfit than noise would."""
+    return driver.p_value <= _SIGNIFICANT and driver.share >= _SOME
+
+
+def share_in_words(driver: Driver) -> str:
+    """How much of the misfit goes with a quantity, in a few words."""
+    if not explains(driver):
+        return "no more than noise"
+    return f"{100 * driver.share:.0f} % of the misfit (p {format_p(driver.p_value)})"
+
+
 def name_of(row: Hypothesis) -> str:
     """An explanation in a few words, for a line of a table or figure."""
     if row.formulas:
@@ -313,7 +331,7 @@ def _suspect_table(diagnosis: Diagnosis) -> ConsoleTable:
     rows, ends = list[tuple[str, ...]](), set[int]()
     for suspect in diagnosis.suspects:
         ratio = held_out_ratio(suspect.refit, diagnosis.floor_mps2)
-        head = [suspect.name, format_p(suspect.p_value).removeprefix("= "), f"{suspect.statistic:.1f} / {suspect.dof}",
+        head = [suspect.name, p_cell(suspect.p_value), f"{suspect.statistic:.1f} / {suspect.dof}",
                 "yes" if suspect.fits else "no"]  # fmt: skip
         for k, p in enumerate(suspect.coefficients):
             first, last = (head, ratio) if k == 0 else ([""] * 4, "")

@@ -20,10 +20,10 @@ from kf_calib.exchange.verification import Verification
 from kf_calib.sources.files.contents import CALIBRATED_TOPIC
 from kf_calib.support.text import counted
 from kf_calib.support.units import field_unit, shown
-from kf_calib.views.console import table_of_parameters
+from kf_calib.views.console import p_cell, table_of_parameters
 from kf_calib.views.json import clean, members
-from kf_calib.views.notation import symbol
-from kf_calib.views.terminal import ConsoleTable, note, table
+from kf_calib.views.notation import signed, symbol
+from kf_calib.views.terminal import VERDICT_STYLES, ConsoleTable, note, table
 
 _SHOWN = 12
 _OF_A_MOVE = "symbol", "difference", "sigma", "unit", "p_value"
@@ -86,7 +86,7 @@ def verification_object(verification: Verification) -> dict[str, Any]:
 def verification_report(verification: Verification) -> RenderableType:
     """The report of ``verify``."""
     head = "The calibration still holds" if verification.holds else "The calibration does NOT hold any more"
-    style = "bold green" if verification.holds else "bold yellow"
+    style = VERDICT_STYLES[verification.holds]
     dwells, test = counted(verification.dwells, "dwell"), f"χ² {verification.statistic:.1f} of {verification.dof} dof"
     parts: list[RenderableType] = [Text(f"{head} (p {format_p(verification.p_value)}; {dwells}, {test}).", style=style)]
     unit = shown("m/s^2")
@@ -110,10 +110,9 @@ def _moves_table(verification: Verification) -> ConsoleTable:
     for move in verification.moves[:_SHOWN]:
         unit = shown(move.unit)
         change, sigma = unit.rounded(move.difference, move.sigma)
-        sign = "" if change.startswith("-") else "+"
         rows.append(
-            (symbol(move.symbol), f"{sign}{change}", f"± {sigma}", unit.label, f"{move.difference / move.sigma:+.1f}",
-             format_p(move.p_value).removeprefix("= "), "moved" if move in moved else "")
+            (symbol(move.symbol), signed(change), f"± {sigma}", unit.label, f"{move.difference / move.sigma:+.1f}",
+             p_cell(move.p_value), "moved" if move in moved else "")
         )  # fmt: skip
     headings = "parameter", ">change", ">sigma", "unit", ">change / sigma", ">p", ""
     return table("Changes (1σ of both; p: of one so large, of all, by noise alone)", headings, rows)
@@ -170,12 +169,9 @@ def _track_row(track: ParameterTrack) -> list[str]:
     drift = "not seen"
     if track.drift is not None and track.drift_sigma is not None:
         drift = " ± ".join(unit.rounded(track.drift * year, track.drift_sigma * year))
-    change = unit.number(float(track.values[-1] - track.values[0]))
-    return [
-        symbol(track.symbol), change if change.startswith("-") else f"+{change}", drift,
-        unit.number(track.repeatability, 2), unit.number(track.walk * year**0.5, 2), unit.label,
-        format_p(track.constant_p).removeprefix("= "),
-    ]  # fmt: skip
+    change = signed(unit.number(float(track.values[-1] - track.values[0])))
+    sizes = unit.number(track.repeatability, 2), unit.number(track.walk * year**0.5, 2)
+    return [symbol(track.symbol), change, drift, *sizes, unit.label, p_cell(track.constant_p)]
 
 
 def calibration_object(saved: SavedCalibration, path: Path) -> dict[str, Any]:

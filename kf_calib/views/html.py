@@ -80,15 +80,11 @@ class PageTable:
     ends: frozenset[int]
 
 
-def parts_of(drawn: RenderableType) -> list[Paragraph | PageTable]:
+def parts_of(drawn: RenderableType) -> Iterator[Paragraph | PageTable]:
     """The parts of what the console draws, in its order; a text without words is none."""
-    return list(_parts(drawn))
-
-
-def _parts(drawn: RenderableType) -> Iterator[Paragraph | PageTable]:
     if isinstance(drawn, Group):
         for each in drawn.renderables:
-            yield from _parts(each)
+            yield from parts_of(each)
     elif isinstance(drawn, ConsoleTable):
         yield _table(drawn)
     elif isinstance(drawn, Text | str) and str(drawn).strip():

@@ -15,11 +15,17 @@ from kf_calib.diagnosis.stepwise_selection import Improvement, Removal, Selectio
 from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.estimation.results import Calibration, format_p
 from kf_calib.support.units import shown
-from kf_calib.views.console import clearest, effect_table, parameter_table
-from kf_calib.views.diagnosis import description_object, description_sentence, held_out_ratio, orientation_object
+from kf_calib.views.console import clearest, effect_table, p_cell, parameter_table
+from kf_calib.views.diagnosis import (
+    advice_sentence,
+    description_object,
+    description_sentence,
+    held_out_ratio,
+    orientation_object,
+)
 from kf_calib.views.json import clean, condition_object, members, parameters_object
 from kf_calib.views.notation import symbol
-from kf_calib.views.terminal import BARE, FOURS, Bar, ConsoleTable, note, table
+from kf_calib.views.terminal import BARE, FOURS, VERDICT_STYLES, Bar, ConsoleTable, note, table
 
 _WIDTH = 30  # length of the longest bar in characters
 _EIGHTHS = " ▏▎▍▌▋▊▉"
@@ -124,7 +130,7 @@ def improvement_report(state: Improvement, honest: NestedCrossValidation | None)
 
     state: the improvement. honest: its nested cross-validation (None: not made).
     """
-    style = "bold green" if state.because == "consistent" else "bold yellow"
+    style = VERDICT_STYLES[state.because == "consistent"]
     parts: list[RenderableType] = [
         *(Text(told) for told in story(state)[:-1]),
         progress(state), Text(f"Stopped, {state.because}: {state.reason}", style=style),
@@ -184,24 +190,25 @@ def progress(state: Improvement) -> RenderableType:
     """The steps as a table: held-out and in-sample rms over the noise floor as numbers and bars, with remarks below."""
     floor = state.floor_mps2
     rows = [("start", state.start.before, None, state.start.test.p_value)]
-    rows += [(_label(step), step.result, step.probability, step.diagnosis.test.p_value) for step in state.steps]
-    others = [each for each in state.alternatives if each.result is not state.result]
-    word = "+" if len(others) == len(state.alternatives) else "or"  # an effect to add, or one to replace the one taken
-    rows += [(f"({word} {each.name})", each.result, None, None) for each in others]
+    rows += [(changes(step), step.result, step.probability, step.diagnosis.test.p_value) for step in state.steps]
+    rows += [(f"({name})", each, None, None) for name, each in equally_good(state)]
     errors = [_errors(result, floor) for _, result, _, _ in rows]
     longest = max(error for both in errors for error in both if error is not None)
     unit, alone = shown("m/s^2"), "without any one orientation the model is not determined"
     head = "over the noise floor" if floor else f"{unit.label} ({alone})"
     bars = list[tuple[RenderableType, ...]]()
     for (label, _, probability, p_value), (held_out, fitted) in zip(rows, errors, strict=True):
-        p_text = "" if p_value is None else format_p(p_value).removeprefix("= ")
+        p_text = p_cell(p_value)
         below = "" if probability is None else f"  probability {format_probability(probability)}"
         if held_out is not None:
             bars.append((label, p_text, "held out", f"{held_out:.2f}", Bar(bar(held_out, longest), style="cyan")))
             label, p_text, below = below, "", ""
         number = f"{fitted:.2f}" if floor else unit.number(fitted, 2)
         bars.append((f"{label}{below}", p_text, "fitted", number, Bar(bar(fitted, longest), style="dim")))
-    said = [Text(line) for step in state.steps for line in (*map(_out, step.dropped), *step.remarks)]
+    said = list[RenderableType]()
+    for step in state.steps:
+        said += [Text(f"{each.name} was taken out: {_test(each)}.") for each in step.dropped]
+        said += map(Text, step.remarks)
     tests = [Text(f"Tested: {_test(each)}.") for each in state.removals]
     headings = "step", "p", "", "", ""
     return Group(table(f"Rms error, {head}", headings, bars, whole=headings, **BARE), *said, *tests)
@@ -221,15 +228,17 @@ def bar(value: float, longest: float) -> str:
     return "█" * (eighths // 8) + _EIGHTHS[eighths % 8].strip()
 
 
-def _label(step: SelectionStep) -> str:
-    """Return the effects added and dropped in a step as a label."""
+def changes(step: SelectionStep) -> str:
+    """The effects added and dropped in a step as a label."""
     said = [f"+ {step.added}"] if step.added else []
     return ", ".join([*said, *(f"- {each.name}" for each in step.dropped)])
 
 
-def _out(each: Removal) -> str:
-    """Return a sentence about an effect that was taken out."""
-    return f"{each.name} was taken out: {_test(each)}."
+def equally_good(state: Improvement) -> list[tuple[str, Calibration]]:
+    """Models that are as good as the last, by what each adds to it (+) or has in place of what was taken (or)."""
+    others = [each for each in state.alternatives if each.result is not state.result]
+    word = "+" if len(others) == len(state.alternatives) else "or"
+    return [(f"{word} {each.name}", each.result) for each in others]
 
 
 def _test(removal: Removal) -> str:
@@ -261,8 +270,7 @@ def _settling(state: Improvement) -> list[str]:
     if unknown is not None:
         sentences.append(description_sentence(unknown, [unknown.formula]))
     if going is not None:
-        angles = ", ".join(f"{angle:g}" for angle in going[0].gimbal_deg)
-        sentences.append(f"Next orientation: gimbals at {angles} deg: {going[1]}.")
+        sentences.append(advice_sentence(*going))
     return sentences
 
 
@@ -291,7 +299,7 @@ def _numbered(diagnosis: Diagnosis, choices: Sequence[tuple[str, ...]]) -> list[
     for number, names in enumerate(choices, start=1):
         suspect = refits.get(names[0]) if len(names) == 1 else None
         result = suspect.refit if suspect is not None else diagnosis.after
-        p_value = "" if suspect is None else format_p(suspect.p_value).removeprefix("= ")
+        p_value = "" if suspect is None else p_cell(suspect.p_value)
         fits = "yes" if suspect is None or suspect.fits else "no"
         share = "" if diagnosis.table is None else format_probability(diagnosis.table.probability_of_just(names))
         ratio = held_out_ratio(result, diagnosis.floor_mps2)

@@ -147,16 +147,21 @@ def members(of: object, *names: str) -> dict[str, Any]:
     return {name: getattr(of, name) for name in names}
 
 
-def clean(value: Any) -> Any:
-    """A value in types that JSON can hold: lists and plain numbers, with null for what is not finite."""
+def clean(value: Any, digits: int | None = None) -> Any:
+    """A value in types that JSON can hold: lists and plain numbers, with null for what is not finite.
+
+    digits: significant ones of the numbers; None: all of them.
+    """
     if isinstance(value, dict):
-        return {key: clean(item) for key, item in value.items()}
+        return {key: clean(item, digits) for key, item in value.items()}
     if isinstance(value, np.ndarray | list | tuple):
-        return [clean(item) for item in value]
+        return [clean(item, digits) for item in value]
     if isinstance(value, np.bool_ | bool):
         return bool(value)
     if isinstance(value, np.integer | int):
         return int(value)
     if isinstance(value, np.floating | float):
-        return float(value) if math.isfinite(value) else None
+        if not math.isfinite(value):
+            return None
+        return float(value if digits is None else f"{value:.{digits}g}")
     return value

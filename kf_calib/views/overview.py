@@ -1,7 +1,4 @@
-"""What is in a recording, as tables and as a JSON object.
-
-What is in a table of orientations, as tables and as a JSON object.
-"""
+"""What is in a recording, or in a table of orientations, as tables and as a JSON object."""
 
 from __future__ import annotations
 
@@ -24,39 +21,56 @@ from kf_calib.views.terminal import LINED, ConsoleTable, note, table
 
 _FORMATS = {"mcap": "MCAP", "db3": "SQLite of ROS 2", "lines": "lines of text", "mcap+db3": "MCAP and SQLite of ROS 2"}
 _FORMATS |= {"bag": "bag of ROS 1"} | {kind.name.lower(): f"a file of {kind.value}" for kind in ContainerKind}
+_ORIENTATIONS = {"angles": "gimbal angles", "attitude": "attitude", "face": "axis up", "": "up by the readings"}
+_QUANTITIES = {
+    "a": "mean", "s": "standard deviation", "angle": "gimbal angle", "face": "axis that points up",
+    "time": "time", "count": "number of readings", "temperature": "temperature", "q": "attitude",
+}  # fmt: skip
+_TOLD = {
+    "name": "by its name", "content": "by what stands in it", "size": "by its name, the unit by its numbers",
+    "content and size": "by what stands in it, the unit by its numbers", "--column": "by --column", "": "",
+}  # fmt: skip
+_UNITS = {"c": "°C", "k": "K", "f": "°F", "count": "counts", "m/s2": "m/s^2"}
 _SHOWN = 40  # dwells
 _PATHS = 12  # of a message
 
 
 @dataclass(frozen=True)
 class Overview:
-    """What is in a recording, what it lacks to be evaluated, and the command that evaluates it then.
+    """What is in a recording or a table, what it lacks to be evaluated, and the command that evaluates it then.
 
-    dwells: None where it cannot be said which there are. bench: keys of the file's record with those of options.
-    examples: options of the command whose values nobody stated.
+    bench: keys of the file's record with those of options. examples: options of the command whose values nobody stated.
+    dwells: of a recording; None where it cannot be said which there are.
     """
 
-    inventory: Inventory
+    content: Inventory | Survey
     bench: dict[str, str]
-    dwells: list[DwellSummary] | None
     missing: list[str]
     command: str
-    warnings: list[str] = field(default_factory=list[str])
     examples: tuple[str, ...] = ()
+    warnings: list[str] = field(default_factory=list[str])
+    dwells: list[DwellSummary] | None = None
 
 
 def overview_object(overview: Overview) -> dict[str, Any]:
     """One JSON object."""
-    inventory = overview.inventory
-    return clean(
-        {
-            "recording": str(inventory.path), "format": inventory.format,
-            "files": [str(file) for file in inventory.files], "bytes": inventory.size,
-            "topics": [_topic_object(topic) for topic in inventory.topics], "bench": overview.bench,
-            "dwells": None if overview.dwells is None else [vars(dwell) for dwell in overview.dwells],
-            **members(overview, "missing", "command", "examples", "warnings"),
-        }
-    )  # fmt: skip
+    content = overview.content
+    if isinstance(content, Inventory):
+        dwells = None if overview.dwells is None else [vars(dwell) for dwell in overview.dwells]
+        keys = {
+            "recording": str(content.path), "format": content.format,
+            "files": [str(file) for file in content.files], "bytes": content.size,
+            "topics": [_topic_object(topic) for topic in content.topics],
+        }  # fmt: skip
+    else:
+        dwells = content.described_rows
+        keys = {
+            "recording": content.name, "format": "table", "files": [content.name],
+            "bytes": Path(content.name).stat().st_size, "topics": [],
+            "columns": content.described_columns, "orientation": content.orientation or None,
+        }  # fmt: skip
+    keys |= {"bench": overview.bench, "dwells": dwells}
+    return clean(keys | members(overview, "missing", "command", "examples", "warnings"))
 
 
 def _topic_object(topic: Topic) -> dict[str, Any]:
@@ -71,29 +85,43 @@ def _topic_object(topic: Topic) -> dict[str, Any]:
 
 def overview_report(overview: Overview) -> RenderableType:
     """What ``info`` prints."""
-    inventory = overview.inventory
+    content, bench = overview.content, ", ".join(f"{key} = {value}" for key, value in overview.bench.items())
+    is_recording = isinstance(content, Inventory)
+    parts = _recording_parts(content) if is_recording else _table_parts(content)
+    parts.append(Text(f"Bench: {bench or 'not described'}"))
+    parts += _dwell_parts(overview.dwells) if is_recording else _orientation_parts(content)
+    parts += [note(said) for said in overview.warnings]
+    if not is_recording and content.described_rows and content.described_rows[0]["readings"] is None:
+        parts.append(
+            note(
+                "no standard deviation with a number of readings is given, so that the noise will be taken from the "
+                "misfit, and the misfit cannot be judged."
+            )
+        )
+    parts += [Text(f"Missing: {said}") for said in overview.missing]
+    return Group(*parts, *([Text(_proposal(overview))] if overview.command else []))
+
+
+def _recording_parts(inventory: Inventory) -> list[RenderableType]:
+    """Return kind, topics and messages."""
     kind = _FORMATS.get(inventory.format, inventory.format)
     files = f"{len(inventory.files)} files, " if len(inventory.files) > 1 else ""
-    parts: list[RenderableType] = [
-        Text(f"{inventory.path}: {kind}, {files}{inventory.size / 1e6:.3g} MB"),
-        _topic_table(inventory.topics),
+    head = Text(f"{inventory.path}: {kind}, {files}{inventory.size / 1e6:.3g} MB")
+    with_paths = [topic for topic in inventory.topics if topic.paths]
+    messages = [
+        Text(f"A message of {topic.name} has {', '.join(topic.paths[:_PATHS])}{' ...' * (len(topic.paths) > _PATHS)}")
+        for topic in with_paths
     ]
-    for topic in inventory.topics:
-        if topic.paths:
-            more = " ..." * (len(topic.paths) > _PATHS)
-            parts.append(Text(f"A message of {topic.name} has {', '.join(topic.paths[:_PATHS])}{more}"))
-    bench = ", ".join(f"{key} = {value}" for key, value in overview.bench.items())
-    parts.append(Text(f"Bench: {bench or 'not described'}"))
-    if overview.dwells is not None:
-        parts += _dwell_parts(overview.dwells)
-    parts += [note(said) for said in overview.warnings]
-    parts += [Text(f"Missing: {said}") for said in overview.missing]
-    if overview.command:
-        parts.append(Text(_proposal(overview)))
-    return Group(*parts)
+    return [head, _topic_table(inventory.topics), *messages]
 
 
-def _proposal(overview: Overview | TableOverview) -> str:
+def _table_parts(survey: Survey) -> list[RenderableType]:
+    """Return how many rows there are, and the columns."""
+    head = f"{survey.name}: a table of orientations, {counted(len(survey.rows), 'row')}"
+    return [Text(head), _column_table(survey.described_columns)]
+
+
+def _proposal(overview: Overview) -> str:
     """Return the command to try, with what in it is only an example."""
     if not overview.examples:
         return f"{'Then try' if overview.missing else 'Try'}: {overview.command}"
@@ -120,23 +148,38 @@ def _gaps(topic: Topic) -> str:
     return ", ".join(said)
 
 
-def _dwell_parts(dwells: Sequence[DwellSummary]) -> list[RenderableType]:
+def _dwell_parts(dwells: Sequence[DwellSummary] | None) -> list[RenderableType]:
+    """Return the dwells of a recording; nothing where it cannot be said which there are."""
     if not dwells:
-        return [Text("No dwell was found.")]
+        return [] if dwells is None else [Text("No dwell was found.")]
     lasts = [dwell.lasts_s for dwell in dwells]
     rows = [
         (str(dwell.number), f"{dwell.arrival_s:.2f}", f"{dwell.lasts_s:.2f}", str(dwell.readings),
          pose_text(dwell.pose) or up_text(dwell.up), f"{dwell.norm_mps2:.4f}")
-        for dwell in dwells[:_SHOWN]
+        for dwell in dwells
     ]  # fmt: skip
     platform = ">platform" if dwells[0].pose else ">up by the readings"
-    parts: list[RenderableType] = [
-        Text(f"{len(dwells)} dwells of {min(lasts):.3g} to {max(lasts):.3g} s:"),
-        table("", (">dwell", ">at s", ">lasts s", ">readings", platform, ">norm m/s^2"), rows, **LINED),
-    ]
-    if len(dwells) > _SHOWN:
-        parts.append(Text(f"and {len(dwells) - _SHOWN} more, all of them by --json"))
-    return parts
+    headings = ">dwell", ">at s", ">lasts s", ">readings", platform, ">norm m/s^2"
+    return _first_rows(f"{len(dwells)} dwells of {min(lasts):.3g} to {max(lasts):.3g} s", headings, rows)
+
+
+def _orientation_parts(survey: Survey) -> list[RenderableType]:
+    """Return the orientations of a table; nothing where it cannot be evaluated."""
+    rows = [
+        (str(row["number"]), str(row["row"]), f"{row['at_s']:g}",
+         row["face"] or pose_text(row["pose"]) or up_text(row["up"]), f"{row['norm_mps2']:.4f}",
+         "" if row["readings"] is None else str(row["readings"]),
+         "" if math.isnan(row["temperature_c"]) else f"{row['temperature_c']:.2f}")
+        for row in survey.described_rows
+    ]  # fmt: skip
+    headings = ">dwell", ">row", ">at s", f">{_ORIENTATIONS[survey.orientation]}", ">norm m/s^2", ">readings", ">°C"
+    return _first_rows(counted(len(rows), "orientation"), headings, rows) if rows else []
+
+
+def _first_rows(title: str, headings: Sequence[str], rows: Sequence[tuple[str, ...]]) -> list[RenderableType]:
+    """Return a table of the first rows with its title, and how many more there are."""
+    more = [Text(f"and {len(rows) - _SHOWN} more, all of them by --json")] if len(rows) > _SHOWN else []
+    return [Text(f"{title}:"), table("", headings, rows[:_SHOWN], **LINED), *more]
 
 
 def up_text(up: Sequence[float]) -> str:
@@ -149,73 +192,6 @@ def pose_text(pose: Sequence[float]) -> str:
     if len(pose) == 4:
         return " ".join(f"{each:.4f}" for each in pose)
     return " ".join(f"{round(math.degrees(each), 2) + 0.0:.2f}°" for each in pose)
-
-
-_SHOWN_ROWS = 40  # orientations
-_ORIENTATIONS = {"angles": "gimbal angles", "attitude": "attitude", "face": "axis up", "": "up by the readings"}
-_QUANTITIES = {
-    "a": "mean", "s": "standard deviation", "angle": "gimbal angle", "face": "axis that points up",
-    "time": "time", "count": "number of readings", "temperature": "temperature", "q": "attitude",
-}  # fmt: skip
-_TOLD = {
-    "name": "by its name", "content": "by what stands in it", "size": "by its name, the unit by its numbers",
-    "content and size": "by what stands in it, the unit by its numbers", "--column": "by --column", "": "",
-}  # fmt: skip
-_UNITS = {"c": "°C", "k": "K", "f": "°F", "count": "counts", "m/s2": "m/s^2"}
-
-
-@dataclass(frozen=True)
-class TableOverview:
-    """What is in a table, what it lacks to be evaluated, and the command that evaluates it then. bench: its keys as
-    options state them. examples: as of an ``Overview``."""
-
-    survey: Survey
-    bench: dict[str, str]
-    missing: list[str]
-    command: str
-    examples: tuple[str, ...] = ()
-
-
-def table_object(overview: TableOverview) -> dict[str, Any]:
-    """One JSON object."""
-    survey = overview.survey
-    return clean(
-        {
-            "recording": survey.name, "format": "table", "files": [survey.name],
-            "bytes": Path(survey.name).stat().st_size, "topics": [],
-            "columns": survey.described_columns,
-            "orientation": survey.orientation or None, "bench": overview.bench,
-            "dwells": survey.described_rows,
-            **members(overview, "missing", "command", "examples"), "warnings": survey.warnings,
-        }
-    )  # fmt: skip
-
-
-def table_report(overview: TableOverview) -> RenderableType:
-    """What ``info`` prints of a table."""
-    survey = overview.survey
-    parts: list[RenderableType] = [
-        Text(f"{survey.name}: a table of orientations, {counted(len(survey.rows), 'row')}"),
-        _column_table(survey.described_columns),
-    ]
-    bench = ", ".join(f"{key} = {value}" for key, value in overview.bench.items())
-    parts.append(Text(f"Bench: {bench or 'not described'}"))
-    if survey.described_rows:
-        parts += [Text(f"{counted(len(survey.described_rows), 'orientation')}:"), _row_table(survey)]
-        if len(survey.described_rows) > _SHOWN_ROWS:
-            parts.append(Text(f"and {len(survey.described_rows) - _SHOWN_ROWS} more, all of them by --json"))
-    parts += [note(said) for said in survey.warnings]
-    if survey.described_rows and survey.described_rows[0]["readings"] is None:
-        parts.append(
-            note(
-                "no standard deviation with a number of readings is given, so that the noise will be taken from the "
-                "misfit, and the misfit cannot be judged."
-            )
-        )
-    parts += [Text(f"Missing: {said}") for said in overview.missing]
-    if overview.command:
-        parts.append(Text(_proposal(overview)))
-    return Group(*parts)
 
 
 def _column_table(columns: Sequence[dict[str, str]]) -> ConsoleTable:
@@ -236,15 +212,3 @@ def _quantity(meaning: str) -> str:
         return name if component == "d" else f"accelerometer {'xyz'.index(component) + 1}, {name}"
     name, _, number = meaning.partition(" ")
     return f"{_QUANTITIES[name]}{' ' * bool(number)}{number}"
-
-
-def _row_table(survey: Survey) -> ConsoleTable:
-    rows = [
-        (str(row["number"]), str(row["row"]), f"{row['at_s']:g}",
-         row["face"] or pose_text(row["pose"]) or up_text(row["up"]), f"{row['norm_mps2']:.4f}",
-         "" if row["readings"] is None else str(row["readings"]),
-         "" if math.isnan(row["temperature_c"]) else f"{row['temperature_c']:.2f}")
-        for row in survey.described_rows[:_SHOWN_ROWS]
-    ]  # fmt: skip
-    headings = ">dwell", ">row", ">at s", f">{_ORIENTATIONS[survey.orientation]}", ">norm m/s^2", ">readings", ">°C"
-    return table("", headings, rows, **LINED)

@@ -5,6 +5,7 @@ plan of sides to turn up.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +23,8 @@ from kf_calib.support.output_files import write_whole
 from kf_calib.support.text import counted
 from kf_calib.support.units import Unit, shown
 from kf_calib.views.json import clean, members
-from kf_calib.views.notation import symbol
+from kf_calib.views.notation import gimbal_names, symbol
 from kf_calib.views.terminal import FOURS, ConsoleTable, note, table
-
-
-def gimbal_names(made: Plan) -> list[str]:
-    """Number and axis of each gimbal from the outermost inwards, such as ``1_y`` and ``2_z``."""
-    axes = made.prospect.model.bench.to_metadata()["axes"].split()
-    return [f"{k}_{axis.replace(',', ';')}" for k, axis in enumerate(axes, 1)]
 
 
 def plan_object(plan: Plan, beside_paper: bool = False) -> dict[str, Any]:
@@ -49,30 +44,28 @@ def plan_object(plan: Plan, beside_paper: bool = False) -> dict[str, Any]:
         "slew_s": float(plan.slews_s.sum()),
         "criterion": plan.search.aim.name,
         "cost": plan.cost,
-        "sigma": dict(zip(symbols, plan.sigma[-1], strict=True)),
-        "sigma_before": dict(zip(symbols, plan.sigma[0], strict=True)) if before else None,
-        "sigma_balanced": _named(symbols, plan.balanced_sigma),
+        "sigma": _by_symbol(symbols, plan.sigma[-1]),
+        "sigma_before": _by_symbol(symbols, plan.sigma[0] if before else None),
+        "sigma_balanced": _by_symbol(symbols, plan.balanced_sigma),
         **members(plan, "condition_number", "d_efficiency", "d_efficiency_within_reach", "largest_variance"),
         "parameters": len(symbols),
         "time_correlation": plan.correlation,
         "remarks": plan.remarks,
     }
     if beside_paper:
-        theirs = papers_sigma(plan.prospect)
+        theirs, twelve = papers_sigma(plan.prospect), paper_parameters.SYMBOLS
         document["paper"] = {
-            "sigma": dict(zip(paper_parameters.SYMBOLS, theirs, strict=True)),
-            "mean_error_percent": dict(zip(paper_parameters.SYMBOLS, mean_error_percent(theirs), strict=True)),
-            "plan_mean_error_percent": dict(
-                zip(paper_parameters.SYMBOLS, mean_error_percent(plan.sigma[-1, :12]), strict=True)
-            ),
+            "sigma": _by_symbol(twelve, theirs),
+            "mean_error_percent": _by_symbol(twelve, mean_error_percent(theirs)),
+            "plan_mean_error_percent": _by_symbol(twelve, mean_error_percent(plan.sigma[-1, :STATE_COUNT])),
             "generalised_sigma_ratio": generalised_ratio(plan),
         }
     return clean(document)
 
 
-def _named(symbols: tuple[str, ...], values: Floats | None) -> dict[str, float] | None:
+def _by_symbol(symbols: Sequence[str], values: Floats | None) -> dict[str, Any] | None:
     """Return values by symbol, or None."""
-    return None if values is None else dict(zip(symbols, values.tolist(), strict=True))
+    return None if values is None else dict(zip(symbols, values, strict=True))
 
 
 def mean_error_percent(sigma: Floats) -> Floats:
@@ -98,7 +91,7 @@ def _orientations(made: Plan) -> ConsoleTable:
         (str(k), f"{begin:.0f}", *(f"{angle:.2f}" for angle in angles), " ".join(f"{part:+.3f}" for part in up))
         for k, (begin, angles, up) in enumerate(zip(begins, made.gimbal_deg, made.directions, strict=True), 1)
     ]
-    gimbals = [f">{name.replace('_', ' ')}, deg" for name in gimbal_names(made)]
+    gimbals = [f">{name.replace('_', ' ')}, deg" for name in gimbal_names(made.prospect.model.bench)]
     title = f"{counted(len(made.poses), 'orientation')}, in this order"
     return table(title, (">", ">begins, s", *gimbals, ">up, in the platform"), rows)
 
@@ -159,7 +152,7 @@ def sentences(made: Plan, beside_paper: bool = False) -> list[str]:
 
 def write_csv(made: Plan, path: Path) -> None:
     """Write a CSV file with the names of the gimbals, then one line of angles in deg for each dwell."""
-    header = ",".join(f"gimbal_{name}_deg" for name in gimbal_names(made))
+    header = ",".join(f"gimbal_{name}_deg" for name in gimbal_names(made.prospect.model.bench))
     rows = [",".join(repr(float(angle)) for angle in row) for row in made.gimbal_deg]
     write_whole(path, ("\n".join([header, *rows]) + "\n").encode())
 
@@ -180,6 +173,6 @@ def hand_plan_report(made: HandPlan) -> RenderableType:
 
 def hand_plan_object(made: HandPlan) -> dict[str, Any]:
     """The JSON object of ``plan --no-angles``; sigmas in SI."""
-    before, after = (dict(zip(SYMBOLS, made.sigma[k], strict=True)) for k in (0, -1))
+    before, after = (_by_symbol(SYMBOLS, made.sigma[k]) for k in (0, -1))
     return clean({"axes": None, "count": len(made.up), "gimbal_deg": None, "up": made.up, "sigma": after,
                   "sigma_before": before})  # fmt: skip

@@ -24,7 +24,8 @@ from rich.text import Text
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.support.text import printable, sentence
-from kf_calib.support.units import Unit, shown, shown_whole, significant
+from kf_calib.support.units import Unit, shown, significant
+from kf_calib.views.notation import unit_across
 
 if TYPE_CHECKING:
     from kf_calib.diagnosis.explanation import EffectShape
@@ -51,6 +52,8 @@ def note(said: str) -> Note:
     return Note(f"Note: {sentence(said)}", style="yellow")
 
 
+VERDICT_STYLES: Mapping[bool | None, str] = {True: "bold green", False: "bold yellow", None: "bold"}
+"""Of what is said of an agreement: there is one, there is none, it cannot be judged."""
 _GLUE = "\u00a0"  # a space at which no line is broken
 _READABLE = 16  # smallest width of a column of text that is longer than this, in characters
 _NARROWEST = 20  # smallest width of a record, in characters
@@ -201,7 +204,7 @@ class TextPlot:
         """The plot, as wide as there is room, and its axes in words."""
         shape, k = self.shape, self.shape.clearest
         width = min(_WIDTH, options.max_width - _LEFT)
-        across = shown_whole(shape.unit, float(np.nanmax(np.abs(shape.values))))
+        across = unit_across(shape)
         symbol = f" ({shape.symbol})" if "·" in shape.symbol else ""
         of = f"{shape.channels[k]}, {shown(shape.quantity).label}"
         yield Text(f"What {shape.effect} must explain {_READING} and what it adds {_FITTED} ({of})")

@@ -31,17 +31,17 @@ from kf_calib.views.figures.style import (
     MARKERS,
     PALE,
     UNIT_KINDS,
-    Shown,
+    accelerometer_of,
     dated,
     drawn_on,
     log_scale,
+    mark_of,
     panels_of,
     say_once,
-    twelve,
+    say_within,
     whole_numbers,
-    with_coefficients,
 )
-from kf_calib.views.notation import symbol, written
+from kf_calib.views.notation import Shown, symbol, twelve, with_coefficients, written
 
 MANY = 60
 """Dwells, above which curves have no markers."""
@@ -159,12 +159,7 @@ def convergence(figure: Figure, result: Calibration) -> None:
     figure.set_size_inches(11.0, 7.0 + 1.3 * -(-len(_by_unit(names)) // 3))
     left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[2.1, 1.0])[0]
     draw_sigmas(left, history.numbers.astype(float), history.sigmas, names)
-    draw_innovations(right, innovation_tests(result))
-
-
-def draw_innovations(figure: FigureBase, tests: InnovationTests) -> None:
-    """NIS of each dwell above, innovations over their sigma below."""
-    above, below = figure.subplots(2, 1, sharex=True)
+    tests, (above, below) = innovation_tests(result), right.subplots(2, 1, sharex=True)
     draw_nis(above, tests)
     draw_ratios(below, tests)
     for axes, words in ((above, ""), (below, "orientation")):
@@ -177,9 +172,7 @@ def draw_nis(axes: Axes, tests: InnovationTests) -> None:
     axes.set_ylabel("NIS (no unit)")
     if not judged.any():
         axes.set_title("NIS by dwell: no degrees of freedom")
-        axes.text(0.5, 0.5, "nothing is left over\nto judge the model by", transform=axes.transAxes, ha="center",
-                  va="center", color=GREY)  # fmt: skip
-        return
+        return say_within(axes, "nothing is left over\nto judge the model by")
     band, ends = tests.band[judged], (tests.numbers[:, None] + [-0.5, 0.5]).ravel()  # a step a dwell
     axes.fill_between(ends, *np.repeat(tests.band, 2, axis=0).T, color=PALE, alpha=0.6, linewidth=0.0,
                       label="95 % of noise alone")  # fmt: skip
@@ -215,8 +208,7 @@ def draw_ratios(axes: Axes, tests: InnovationTests) -> None:
         axes.legend(loc="upper right", fontsize=7.5, ncols=3, title="accelerometer", columnspacing=1.0)
     else:
         axes.set_yticks([])
-        axes.text(0.5, 0.25, "the dwells before determine\nno prediction", transform=axes.transAxes, ha="center",
-                  va="center", color=GREY)  # fmt: skip
+        say_within(axes, "the dwells before determine\nno prediction", 0.25)
 
 
 @drawn_on()
@@ -271,20 +263,23 @@ def _chart(axes: Axes, calibrations: History, track: ParameterTrack) -> None:
     """Draw one parameter."""
     unit = shown(track.unit)
     zero, scale = float(track.values[-1]), unit.per_si
-    accelerometer = int(track.symbol[-1]) - 1 if track.symbol[-1] in "123" else 0
+    marker, colour = mark_of(accelerometer_of(track.symbol) or 0)
     dates = date2num(calibrations.dates)
     predicted, reach = (track.predicted - zero) * scale, _SIGMAS * track.predicted_sigma * scale
     known = np.isfinite(predicted)
     axes.errorbar(dates[known], predicted[known], reach[known], fmt="none", ecolor=PALE, elinewidth=7.0,
                   label="predicted by those before (2σ)")  # fmt: skip
-    ahead = np.linspace(0.0, _days_ahead(calibrations), 60)
+    span_days = _AHEAD * float(calibrations.days[-1])
+    if calibrations.due is not None:  # to the next one, and a little beyond
+        span_days = max(span_days, 1.1 * ((calibrations.due - calibrations.dates[-1]) / timedelta(days=1)))
+    ahead = np.linspace(0.0, span_days, 60)
     value, sigma = track.known_after(ahead)
     middle, wide = (value - zero) * scale, _SIGMAS * sigma * scale
     to_come = dates[-1] + ahead
     axes.plot(to_come, middle, color=BEST, linewidth=1.0, label="expected in use")
     axes.fill_between(to_come, middle - wide, middle + wide, color=BAND, linewidth=0.0, label="its 2σ")
-    axes.errorbar(dates, (track.values - zero) * scale, _SIGMAS * track.sigmas * scale, fmt=MARKERS[accelerometer],
-                  color=ACCELEROMETERS[accelerometer], elinewidth=0.9, label="found (2σ)", zorder=3)  # fmt: skip
+    axes.errorbar(dates, (track.values - zero) * scale, _SIGMAS * track.sigmas * scale, fmt=marker, color=colour,
+                  elinewidth=0.9, label="found (2σ)", zorder=3)  # fmt: skip
     tolerance = calibrations.tolerances.get(track.symbol)
     if tolerance is not None:
         for sign in (-1.0, 1.0):
@@ -295,11 +290,3 @@ def _chart(axes: Axes, calibrations: History, track: ParameterTrack) -> None:
         axes.axvline(float(date2num(calibrations.due)), label="may leave it", color=ALARM, linewidth=1.2)
     axes.set_title(f"{symbol(track.symbol)}, {unit.label} from the last")
     dated(axes)
-
-
-def _days_ahead(calibrations: History) -> float:
-    """Return for how many days after the last calibration the bands are drawn: to the next one, and a little beyond."""
-    span = _AHEAD * float(calibrations.days[-1])
-    if calibrations.due is None:
-        return span
-    return max(span, 1.1 * ((calibrations.due - calibrations.dates[-1]) / timedelta(days=1)))

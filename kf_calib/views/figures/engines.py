@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure, FigureBase
+from matplotlib.figure import Figure
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.estimation.engine_comparison import Comparison
@@ -24,6 +24,7 @@ from kf_calib.views.figures.style import (
     drawn_on,
     log_scale,
     say,
+    say_within,
     whole_numbers,
 )
 from kf_calib.views.notation import written
@@ -41,7 +42,9 @@ def three_ways(figure: Figure, compared: Comparison) -> None:
     above, below = figure.subfigures(2, 1, squeeze=False)[:, 0]
     left, right = above.subfigures(1, 2, squeeze=False, width_ratios=[1.6, 1.0])[0]
     draw_differences(left.subplots(), compared)
-    draw_costs(right, compared)
+    time, memory = right.subplots(2, 1)
+    _bars(time, "Time", "s", {name: way.wall_s for name, way in compared.ways.items()})
+    _bars(memory, "Peak memory of Python and numpy", "MB", {name: way.peak_mb for name, way in compared.ways.items()})
     tests = innovation_tests(compared.result)
     first, second = below.subplots(1, 2)
     draw_nis(first, tests)
@@ -68,13 +71,6 @@ def draw_differences(axes: Axes, compared: Comparison) -> None:
     axes.legend(loc="best")
 
 
-def draw_costs(figure: FigureBase, compared: Comparison) -> None:
-    """Draw time and memory of each way as bars."""
-    time, memory = figure.subplots(2, 1)
-    _bars(time, "Time", "s", {name: way.wall_s for name, way in compared.ways.items()})
-    _bars(memory, "Peak memory of Python and numpy", "MB", {name: way.peak_mb for name, way in compared.ways.items()})
-
-
 def _bars(axes: Axes, title: str, unit: str, sizes: dict[str, float]) -> None:
     """Draw a bar a way from zero, with its size beside it."""
     names = list(sizes)
@@ -96,8 +92,7 @@ def draw_cumulative(axes: Axes, tests: InnovationTests) -> None:
     axes.set_title("Sum of the NIS so far over its degrees of freedom")
     axes.set_ylabel("NIS / degrees of freedom")
     if not known.any():
-        axes.text(0.5, 0.5, "no degrees of freedom", transform=axes.transAxes, ha="center", va="center", color=GREY)
-        return
+        return say_within(axes, "no degrees of freedom")
     band = tests.per_dof_band[known]
     axes.fill_between(tests.numbers[known], band[:, 0], band[:, 1], color=PALE, alpha=0.6, linewidth=0.0,
                       label="95 % of noise alone")  # fmt: skip
@@ -135,8 +130,7 @@ def _autocorrelation(axes: Axes, values: Floats, white: Floats, bound: Floats, i
     """Draw an autocorrelation as stems, with the band that white noise keeps within in 95 % of all lags."""
     if not len(values) or not np.isfinite(values).any():
         axes.set_xticks([])
-        axes.text(0.5, 0.5, "too few to tell", transform=axes.transAxes, ha="center", va="center", color=GREY)
-        return
+        return say_within(axes, "too few to tell")
     lags = np.arange(1, len(values) + 1)
     axes.fill_between(lags, white - bound, white + bound, color=PALE, alpha=0.6, linewidth=0.0,
                       label="white noise, 95 %")  # fmt: skip

@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from kf_calib.design.next_orientation import ENOUGH, Advice
+from kf_calib.design.next_orientation import ENOUGH
 from kf_calib.diagnosis.candidate_tests import overlap_matrix
 from kf_calib.diagnosis.coefficient_sizes import Detectable, Unseen
 from kf_calib.diagnosis.explanation import Explanation
@@ -25,11 +25,23 @@ from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.effects.effect import Grade
 from kf_calib.estimation.results import format_p
-from kf_calib.support.text import counted
+from kf_calib.support.text import angles_in_words, counted
 from kf_calib.support.units import shown, span
 from kf_calib.views.console import GRADES, size_range
 from kf_calib.views.diagnosis import name_of
-from kf_calib.views.figures.style import BEST, GREY, PALE, RUNNER_UP, drawn_on, label_ticks, say, ticks, wrapped
+from kf_calib.views.figures.style import (
+    BEST,
+    GREY,
+    PALE,
+    RUNNER_UP,
+    drawn_on,
+    label_ticks,
+    rows_of,
+    say,
+    say_within,
+    ticks,
+    wrapped,
+)
 
 _FAMILIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # Okabe and Ito's, the likeliest first
 _NO_EFFECT = {NOTHING: PALE, NOISE: GREY, NONE: BEST}
@@ -144,11 +156,13 @@ def suspects(figure: Figure, diagnosis: Diagnosis) -> None:
     explained = diagnosis.explanations[:_MOST]
     if not explained:
         return say(figure, wrapped(diagnosis.verdict, 90))
-    rows, names = figure.add_gridspec(2, 1, height_ratios=(1.5, 1.0)), _alike(diagnosis)
+    names = dict.fromkeys([*diagnosis.missing, *diagnosis.ambiguity, *(each.name for each in diagnosis.suspects)])
+    names.pop(diagnosis.test.effects.walk, None)  # which takes any path, and so overlaps with all
+    rows = figure.add_gridspec(2, 1, height_ratios=(1.5, 1.0))
     above = rows[0].subgridspec(1, 2, width_ratios=(1.15, 1.0))
     below = rows[1].subgridspec(1, 2, width_ratios=(1.15, 1.0))
     _suspect_bars(figure.add_subplot(above[0]), explained)
-    _overlaps(figure.add_subplot(above[1]), diagnosis, names)
+    _overlaps(figure.add_subplot(above[1]), diagnosis, list(names)[:_ALIKE])
     _drivers(figure.add_subplot(below[0]), diagnosis.drivers[:_DRIVERS])
     _separation(figure.add_subplot(below[1]), diagnosis)
 
@@ -165,21 +179,10 @@ def _suspect_bars(axes: Axes, explained: Sequence[Explanation]) -> None:
         said, ink = ("fits", "#222222") if explanation.fits else ("does not fit", GREY)
         p_value = "" if explanation.p_value is None else f", p {format_p(explanation.p_value)}"
         axes.text(103.0, k, said + p_value, va="center", fontsize=8.5, color=ink)
-    axes.set_yticks(range(len(explained)), [wrapped(explanation.name, _SUSPECT_NAME) for explanation in explained])
-    axes.set_ylim(len(explained) - 0.4, -0.6)
-    axes.grid(visible=False, axis="y")
-    axes.set_xlim(0.0, 100.0)
-    axes.set_xlabel("explained part of the misfit beyond noise, %")
+    _share_axis(axes, [explanation.name for explanation in explained], "explained part of the misfit beyond noise, %")
     if all(explanation.share is None for explanation in explained):
         axes.text(50.0, 0.5 * (len(explained) - 1.0), _NO_MISFIT, color=GREY, ha="center", va="center")
     axes.set_title("What each explains; p: that noise alone would do so\nhatched: the model with it does not fit")
-
-
-def _alike(diagnosis: Diagnosis) -> list[str]:
-    """Return names of suspects and their look-alikes, the best first."""
-    names = dict.fromkeys([*diagnosis.missing, *diagnosis.ambiguity, *(each.name for each in diagnosis.suspects)])
-    names.pop(diagnosis.test.effects.walk, None)  # which takes any path, and so overlaps with all
-    return list(names)[:_ALIKE]
 
 
 def _overlaps(axes: Axes, diagnosis: Diagnosis, names: Sequence[str]) -> None:
@@ -208,12 +211,15 @@ def _drivers(axes: Axes, drivers: Sequence[Driver]) -> None:
     for k, driver in enumerate(drivers):
         axes.barh(k, 100.0 * driver.share, color=PALE, height=0.62)
         axes.text(103.0, k, f"p {format_p(driver.p_value)}", va="center", fontsize=8.5, color=GREY)
-    axes.set_yticks(range(len(drivers)), [wrapped(driver.words, _SUSPECT_NAME) for driver in drivers])
-    axes.set_ylim(max(len(drivers), 1) - 0.4, -0.6)
-    axes.grid(visible=False, axis="y")
-    axes.set_xlim(0.0, 100.0)
-    axes.set_xlabel("part of the misfit beyond noise, %")
+    _share_axis(axes, [driver.words for driver in drivers], "part of the misfit beyond noise, %")
     axes.set_title("What goes with each quantity, beyond what any would by chance")
+
+
+def _share_axis(axes: Axes, names: Sequence[str], words: str) -> None:
+    """Name the rows of bars of a share, and what it is of."""
+    rows_of(axes, [wrapped(name, _SUSPECT_NAME) for name in names])
+    axes.set_xlim(0.0, 100.0)
+    axes.set_xlabel(words)
 
 
 def _separation(axes: Axes, diagnosis: Diagnosis) -> None:
@@ -226,27 +232,20 @@ def _separation(axes: Axes, diagnosis: Diagnosis) -> None:
     for k, value in enumerate((advice.before, advice.after)):
         _beside(axes, value, k, f"{value:.0f}" if advice.shows else f"{value:.1f} σ", 9.0)
     stay = "a dwell" if advice.stay_s is None else span(advice.stay_s)
-    axes.set_yticks([0, 1], ["now", f"after {stay} there"])
-    axes.set_ylim(1.6, -0.6)
+    rows_of(axes, ["now", f"after {stay} there"])
     axes.set_xlim(0.0, 1.2 * max(advice.before, advice.after, 1.0))
-    axes.grid(visible=False, axis="y")
     axes.set_xlabel("effects that become visible" if advice.shows else "separation, σ")
     axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10], integer=bool(advice.shows)))
     if not advice.shows and axes.get_xlim()[1] > ENOUGH:
         axes.axvline(ENOUGH, color=GREY, linestyle=":", linewidth=1.0)
         axes.text(ENOUGH, -0.55, " enough", color=GREY, fontsize=8.0, va="top")
-    axes.set_title(f"Next: gimbals at {_angles(advice)} deg\n{wrapped(why.partition(':')[0], 50)}")
-
-
-def _angles(advice: Advice) -> str:
-    """Return the advised gimbal angles as text."""
-    return ", ".join(f"{angle:g}" for angle in advice.gimbal_deg)
+    axes.set_title(f"Next: gimbals at {angles_in_words(advice.gimbal_deg)}\n{wrapped(why.partition(':')[0], 50)}")
 
 
 def _words(axes: Axes, text: str) -> None:
     """Write in the middle of a panel why there is nothing to draw."""
     axes.set_axis_off()
-    axes.text(0.5, 0.5, text, ha="center", va="center", color=GREY, transform=axes.transAxes)
+    say_within(axes, text)
 
 
 _LOW, _HIGH = 0.01, 1000.0  # smallest detectable sizes that the axis spans
@@ -304,9 +303,7 @@ def _size_bars(axes: Axes, sizes: Sequence[Detectable], rows: int, grade: Grade,
             smallest += f"  ({size_range(usual, detectable.coefficient)})"
         axes.text(1.02, k, smallest, transform=axes.get_yaxis_transform(), va="center", fontsize=7.5)
     axes.axvline(1.0, color="#222222", linewidth=1.2)
-    axes.set_yticks(range(len(sizes)), [detectable.name for detectable in sizes], fontsize=8.0)
-    axes.set_ylim(max(rows, 3) - 0.4, -0.6)
-    axes.grid(visible=False, axis="y")
+    rows_of(axes, [detectable.name for detectable in sizes], max(rows, 3), fontsize=8.0)
     label_ticks(axes.xaxis, ticks(_LOW, _HIGH))
     axes.set_xlabel("usual size / smallest size that would be found")
     if first:

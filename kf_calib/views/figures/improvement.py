@@ -13,13 +13,24 @@ from matplotlib.figure import Figure, FigureBase, SubFigure
 from matplotlib.ticker import MaxNLocator
 
 from kf_calib.diagnosis.residual_drivers import unexplained_mps2
-from kf_calib.diagnosis.stepwise_selection import Improvement, SelectionStep
+from kf_calib.diagnosis.stepwise_selection import Improvement
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration, Parameter, format_p
 from kf_calib.support.units import shown
-from kf_calib.views.figures.residuals import driver_axis, driver_to_show
-from kf_calib.views.figures.style import ACCELEROMETERS, GREY, MARKERS, PLATFORM, drawn_on, say, wrapped
-from kf_calib.views.notation import symbol
+from kf_calib.views.figures.residuals import driver_to_show
+from kf_calib.views.figures.style import (
+    ACCELEROMETERS,
+    GREY,
+    MARKERS,
+    accelerometer_of,
+    drawn_on,
+    mark_of,
+    rows_of,
+    say,
+    wrapped,
+)
+from kf_calib.views.improvement import changes, equally_good
+from kf_calib.views.notation import symbol, unit_across
 
 _COLUMNS = 5  # models whose residuals are drawn
 _PANELS = 4  # of coefficients
@@ -57,17 +68,9 @@ def improvement(figure: Figure, state: Improvement) -> None:
 def _models(state: Improvement) -> list[_Model]:
     """Return the models from the first to the last, undone ones where they stood, then those that are equally good."""
     models = [_Model("start", state.start.before, state.start.test.p_value)]
-    models += [_Model(_label(step), step.result, step.diagnosis.test.p_value) for step in state.history]
-    others = [each for each in state.alternatives if each.result is not state.result]
-    word = "+" if len(others) == len(state.alternatives) else "or"
-    return [*models, *(_Model(f"{word} {each.name}?", each.result) for each in others)]
-
-
-def _label(step: SelectionStep) -> str:
-    """Return what a step added and took out."""
-    said = [f"+ {step.added}"] if step.added else []
-    said += [f"− {each.name}" for each in step.dropped]
-    return ", ".join(said) + (" (undone)" if step.undone else "")
+    models += [_Model(changes(step).replace("- ", "− ") + " (undone)" * step.undone, step.result,
+                      step.diagnosis.test.p_value) for step in state.history]  # fmt: skip
+    return [*models, *(_Model(f"{name}?", result) for name, result in equally_good(state))]
 
 
 def _residuals(figure: FigureBase, state: Improvement, models: Sequence[_Model]) -> None:
@@ -76,7 +79,7 @@ def _residuals(figure: FigureBase, state: Improvement, models: Sequence[_Model])
     if driver is None:
         return say(figure, "Nothing that was recorded varies in this run.")
     drawn = [0, *range(max(1, len(models) - _COLUMNS + 1), len(models))]
-    unit, scale = driver_axis(driver)
+    unit, scale = unit_across(driver)
     sigmas = mean_sigmas(state.start.before)
     panels: Any = figure.subplots(3, len(drawn), sharex=True, sharey=True, squeeze=False)
     for column, number in enumerate(drawn):
@@ -126,17 +129,13 @@ def _of_effect(axes: Axes, name: str, parameters: Sequence[Parameter]) -> None:
     unit = shown(parameters[0])
     for k, parameter in enumerate(parameters):
         assert parameter.value is not None and parameter.sigma is not None
-        sensor = int(parameter.symbol[-1]) - 1 if parameter.symbol[-1] in "123" else None
-        mark, colour = ("D", PLATFORM) if sensor is None else (MARKERS[sensor], ACCELEROMETERS[sensor])
+        mark, colour = mark_of(accelerometer_of(parameter.symbol))
         value, sigma = parameter.value * unit.per_si, parameter.sigma * unit.per_si
         axes.errorbar(value, k, xerr=2.0 * sigma, fmt="none", color=colour, elinewidth=1.0, capsize=3.0)
         axes.errorbar(value, k, xerr=sigma, fmt=mark, color=colour, elinewidth=3.5, markersize=5.5)
     said = [" ± ".join(unit.rounded(p.value or 0.0, p.sigma or np.nan)) for p in parameters]
-    rows = [f"{symbol(p.symbol)} = {text}" for p, text in zip(parameters, said, strict=True)]
-    axes.set_yticks(range(len(rows)), rows, fontsize=8.5)
-    axes.set_ylim(len(rows) - 0.4, -0.6)
+    rows_of(axes, [f"{symbol(p.symbol)} = {text}" for p, text in zip(parameters, said, strict=True)], fontsize=8.5)
     axes.axvline(0.0, color=GREY, linewidth=1.0)
-    axes.grid(visible=False, axis="y")
     axes.xaxis.set_major_locator(MaxNLocator(5))
     axes.set_xlabel(f"coefficient ± 1σ and 2σ, {unit.label}")
     axes.set_title(wrapped(name, 40))

@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from kf_calib.bench.arrays import Floats
 from kf_calib.noise.power_laws import FACTORS, POWERS, TERMS
 from kf_calib.noise.rest_noise import ChannelNoise, RestNoise
 from kf_calib.support.units import Unit
@@ -67,21 +66,15 @@ def _draw(panel: Axes, channel: ChannelNoise, unit: Unit, colour: str, marker: s
         return
     panel.plot(channel.tau_s[used], channel.model(channel.tau_s[used]) * unit.per_si, color="#222222", linewidth=1.6,
                label="sum of the terms")  # fmt: skip
-    for term, line in _lines(channel):
-        where = used & (line > channel.deviation.min() / _ROOM)
-        style = _STYLES[term]
-        panel.plot(channel.tau_s[where], line[where] * unit.per_si, linestyle=style, color="#222222", linewidth=0.9,
-                   label=f"{TITLES[term]} {_SYMBOLS[term]}, slope {_SLOPES[term]}")  # fmt: skip
+    for term, factor, power, square in zip(TERMS, FACTORS, POWERS, channel.squares, strict=True):
+        if square > 0.0:
+            line = np.sqrt(square * factor * channel.tau_s**power)
+            where = used & (line > channel.deviation.min() / _ROOM)
+            panel.plot(channel.tau_s[where], line[where] * unit.per_si, linestyle=_STYLES[term], color="#222222",
+                       linewidth=0.9, label=f"{TITLES[term]} {_SYMBOLS[term]}, slope {_SLOPES[term]}")  # fmt: skip
     text = "\n".join(_sizes(channel))
     panel.text(0.97, 0.97, text, transform=panel.transAxes, ha="right", va="top", fontsize=8.0, color="#222222",
                bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.5})  # fmt: skip
-
-
-def _lines(channel: ChannelNoise) -> Iterator[tuple[str, Floats]]:
-    """The terms that are needed, and what each gives of the Allan deviation."""
-    for term, factor, power, square in zip(TERMS, FACTORS, POWERS, channel.squares, strict=True):
-        if square > 0.0:
-            yield term, np.sqrt(square * factor * channel.tau_s**power)
 
 
 def _sizes(channel: ChannelNoise) -> Iterator[str]:

@@ -35,13 +35,10 @@ from kf_calib.views.figures.style import (
     drawn_on,
     log_scale,
     say,
-    twelve,
     whole_numbers,
-    with_coefficients,
     wrapped,
 )
-from kf_calib.views.notation import written
-from kf_calib.views.plan import gimbal_names
+from kf_calib.views.notation import gimbal_names, twelve, with_coefficients, written
 
 _AXES = {"+x": (0.0, 0.0, -9.0, -9.0), "+z": (-90.0, 0.0, -9.0, -9.0), "−z": (90.0, 0.0, -9.0, -9.0),
          "−x": (180.0, 0.0, 10.0, 0.0), "+y": (0.0, 90.0, -16.0, 6.0), "−y": (0.0, -90.0, -16.0, -7.0)}  # fmt: skip
@@ -150,7 +147,9 @@ def draw_tour(figure: FigureBase, made: Plan) -> None:
 def draw_angles(axes: Axes, made: Plan) -> None:
     """Draw the angles of the gimbals in the order of the visits."""
     numbers = np.arange(1, len(made.poses) + 1)
-    for angles, name, colour, marker in zip(made.gimbal_deg.T, gimbal_names(made), _GIMBALS, "osDv", strict=False):
+    for angles, name, colour, marker in zip(
+        made.gimbal_deg.T, gimbal_names(made.prospect.model.bench), _GIMBALS, "osDv", strict=False
+    ):
         axes.plot(numbers, angles, f":{marker}", color=colour, markersize=4.0, linewidth=0.9,
                   label=f"gimbal {name.replace('_', ' ')}")  # fmt: skip
     reach = float(np.abs(made.gimbal_deg).max(initial=90.0))
@@ -177,9 +176,7 @@ def draw_predicted(figure: FigureBase, made: Plan) -> None:
     panels = figure.subplots(len(groups), 1, height_ratios=[len(group) for group in groups])
     for axes, group, kind in zip(panels, groups, UNIT_KINDS.values(), strict=True):
         per_si, unit = twelve()[group[0]].per_si, twelve()[group[0]].unit
-        _sigma_bars(axes, group, made.sigma[-1] * per_si, made.targets * per_si)
-        _before(axes, group, made.sigma[0] * per_si)
-        _values(axes, group, made.sigma[[0, -1]] * per_si)
+        _sigma_bars(axes, group, made.sigma[0] * per_si, made.sigma[-1] * per_si, made.targets * per_si)
         axes.set_xlabel(f"predicted σ of {kind}, {unit}")
     panels[0].set_title("Predicted σ after the last orientation")
     marked = [axes for axes in panels if axes.get_legend_handles_labels()[1]]
@@ -187,11 +184,12 @@ def draw_predicted(figure: FigureBase, made: Plan) -> None:
         figure.legend(*marked[0].get_legend_handles_labels(), loc="outside lower right", ncols=2)
 
 
-def _sigma_bars(axes: Axes, group: list[int], sigma: Floats, targets: Floats) -> None:
-    """Draw sigmas as bars of a logarithmic axis with their values, and what was asked for as lines across them."""
+def _sigma_bars(axes: Axes, group: list[int], before: Floats, sigma: Floats, targets: Floats) -> None:
+    """Draw sigmas as bars of a logarithmic axis with their values, what was asked for as lines across them, and those
+    before the first orientation as marks, as far as they are known and on the axis."""
     known = np.isfinite(targets[group])
     log_scale(axes, [0.3 * sigma[group], 2.0 * sigma[group], targets[group][known]], "x")
-    left = axes.get_xlim()[0]
+    left, right = axes.get_xlim()
     for row, k in enumerate(group):
         if not np.isfinite(sigma[k]):
             axes.text(left, row, " not determined", va="center", fontsize=8.0, color=GREY)
@@ -201,26 +199,16 @@ def _sigma_bars(axes: Axes, group: list[int], sigma: Floats, targets: Floats) ->
         if np.isfinite(targets[k]):
             axes.plot([targets[k]] * 2, [row - 0.45, row + 0.45], color=ALARM, linewidth=2.0,
                       label="" if "target" in axes.get_legend_handles_labels()[1] else "target")  # fmt: skip
+        end = max(sigma[k], before[k]) if before[k] < right else sigma[k]
+        axes.annotate(written(float(f"{sigma[k]:.3g}")), (end, row), (6, 0), textcoords="offset points", va="center",
+                      fontsize=8.0)  # fmt: skip
     axes.set_yticks(range(len(group)), [twelve()[k].label for k in group])
     axes.invert_yaxis()
     axes.grid(visible=False, axis="y")
-
-
-def _before(axes: Axes, group: list[int], sigma: Floats) -> None:
-    """Mark the sigmas before the first orientation, as far as they are known and on the axis."""
-    seen = [row for row, k in enumerate(group) if sigma[k] < axes.get_xlim()[1]]
+    seen = [row for row, k in enumerate(group) if before[k] < right]
     if seen:
-        before = [sigma[group[row]] for row in seen]
-        axes.plot(before, seen, "D", color="#222222", markersize=4.0, label="before the plan")
-
-
-def _values(axes: Axes, group: list[int], sigmas: Floats) -> None:
-    """Write the last of some sigmas (n, p) to the right of all that are on the axis."""
-    for row, k in enumerate(group):
-        seen = sigmas[:, k][sigmas[:, k] < axes.get_xlim()[1]]
-        if np.isfinite(sigmas[-1, k]):
-            axes.annotate(written(float(f"{sigmas[-1, k]:.3g}")), (seen.max(initial=sigmas[-1, k]), row), (6, 0),
-                          textcoords="offset points", va="center", fontsize=8.0)  # fmt: skip
+        axes.plot(before[[group[row] for row in seen]], seen, "D", color="#222222", markersize=4.0,
+                  label="before the plan")  # fmt: skip
 
 
 @drawn_on()

@@ -5,7 +5,7 @@ One dwell reading by reading: readings less what the model says, and their mean 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -21,8 +21,9 @@ from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.errors import InputError
 from kf_calib.estimation.filter_history import DwellReadings, readings_of
 from kf_calib.estimation.residual_table import mean_sigmas
-from kf_calib.estimation.results import Calibration, format_p
-from kf_calib.support.units import Unit, rounded, shown, shown_whole, significant
+from kf_calib.estimation.results import Calibration
+from kf_calib.support.units import Unit, rounded, shown, significant
+from kf_calib.views.diagnosis import explains, share_in_words
 from kf_calib.views.figures.style import (
     ACCELEROMETERS,
     ALARM,
@@ -31,13 +32,14 @@ from kf_calib.views.figures.style import (
     GREY,
     MARKERS,
     PALE,
-    PLATFORM,
     drawn_on,
+    mark_of,
     say,
+    say_once,
     wrapped,
 )
+from kf_calib.views.notation import unit_across
 
-_SIGNIFICANT, _SOME = 0.01, 0.005  # p-value and share above and below which a driver explains nothing
 _TITLE, _LABEL = 36, 44  # letters in a line of a title, and below an axis
 _PANELS = 4  # drivers in small panels; the explorer of the report has all
 _LARGER = 1.1  # times sigma of noise alone, from which that with what was estimated is drawn, too
@@ -71,7 +73,7 @@ def residuals(figure: Figure, diagnosis: Diagnosis, driver: str | None = None) -
 
 def _draw_alone(figure: FigureBase, diagnosis: Diagnosis, driver: Driver) -> None:
     """Draw the residuals of each accelerometer over a quantity."""
-    before, unit, panels = diagnosis.before, driver_axis(driver), figure.subplots(3, 1, sharex=True)
+    before, unit, panels = diagnosis.before, unit_across(driver), figure.subplots(3, 1, sharex=True)
     residuals, (alone, estimated) = before.residuals_mps2, bars_of(before)
     wrong = np.array([visit.dwell.number == diagnosis.disturbed_dwell for visit in before.visits])
     for i, axes in enumerate(panels):
@@ -81,14 +83,14 @@ def _draw_alone(figure: FigureBase, diagnosis: Diagnosis, driver: Driver) -> Non
         _rms(axes, residuals[:, i])
         axes.set_ylabel(f"accelerometer {i + 1}, {shown('m/s^2').label}")
     panels[0].set_title(wrapped(f"Residuals of {before.model.sum}", 3 * _TITLE))
-    _say_bars(figure, panels)
+    say_once(figure, panels)
     _say_quantity(panels[-1], driver.words, unit)
 
 
 def draw_shape(figure: FigureBase, shape: EffectShape) -> None:
     """Draw residuals, what the effect must explain of the readings, and what it leaves: a row a channel."""
     panels = figure.subplots(len(shape.channels), 3, sharex=True, sharey="row", squeeze=False)
-    across = shown_whole(shape.unit, float(np.nanmax(np.abs(shape.values))))
+    across = unit_across(shape)
     for i, row in enumerate(panels):
         x, colour = shape.values[:, i] * across.per_si, i if len(panels) > 1 else None
         for axes, values in zip(row, (shape.residuals, shape.readings, shape.left), strict=True):
@@ -99,17 +101,13 @@ def draw_shape(figure: FigureBase, shape: EffectShape) -> None:
                     linestyle="none", color=BEST, label=f"what the model with {shape.effect} predicts")  # fmt: skip
         _curve(row[1], across.per_si, shape, i)
         row[0].set_ylabel(f"{shape.channels[i]}, {shown(shape.quantity).label}")
-    _say_bars(figure, panels[:, 0])
+    say_once(figure, panels[:, 0])
     titles = ["Residuals without it", f"What {shape.effect} must explain", "What it leaves"]
     for axes, title in zip(panels[0], titles, strict=True):
         axes.set_title(wrapped(title, _TITLE))
+    has_letters = "·" in shape.symbol or "²" in shape.symbol
     for axes in panels[-1]:
-        _say_quantity(axes, _of_quantity(shape), across)
-
-
-def _of_quantity(shape: EffectShape) -> str:
-    """Return what a shape is drawn over, in words and letters."""
-    return f"{shape.words} ({shape.symbol})" if "·" in shape.symbol or "²" in shape.symbol else shape.words
+        _say_quantity(axes, f"{shape.words} ({shape.symbol})" if has_letters else shape.words, across)
 
 
 def _say_quantity(axes: Axes, words: str, unit: Unit) -> None:
@@ -126,19 +124,9 @@ def follows(diagnosis: Diagnosis) -> bool:
 
 def driver_to_show(drivers: Sequence[Driver], follows: bool = True) -> Driver | None:
     """The quantity that explains most; time where the misfit follows none, and None where nothing varies."""
-    if drivers and follows and _explains(drivers[0]):
+    if drivers and follows and explains(drivers[0]):
         return drivers[0]
     return next((each for each in drivers if each.symbol == "t"), drivers[0] if drivers else None)
-
-
-def driver_axis(driver: Driver) -> Unit:
-    """The unit in which a quantity is drawn."""
-    return shown_whole(driver.unit, float(np.abs(driver.values).max()))
-
-
-def _explains(driver: Driver) -> bool:
-    """Tell whether a quantity explains more of the misfit than noise would."""
-    return driver.p_value <= _SIGNIFICANT and driver.share >= _SOME
 
 
 def _points(
@@ -148,7 +136,7 @@ def _points(
     alone, and with what was estimated."""
     many, per_si = len(x) > _MANY, shown(quantity).per_si
     axes.axhline(0.0, color=GREY, linewidth=0.8)
-    mark, colour = ("D", PLATFORM) if i is None else (MARKERS[i], ACCELEROMETERS[i])
+    mark, colour = mark_of(i)
     alone, estimated = sigmas
     if not many and np.nanmax(estimated / alone) > _LARGER:
         axes.errorbar(x, values * per_si, estimated * per_si, fmt="none", ecolor=PALE, elinewidth=1.0,
@@ -162,13 +150,6 @@ def _mark(axes: Axes, x: Floats, values_mps2: Floats, number: int) -> None:
     for at, value in zip(x, values_mps2 * shown("m/s^2").per_si, strict=True):
         axes.plot(at, value, "o", markersize=11.0, markerfacecolor="none", color=ALARM, zorder=4)
         axes.annotate(f"dwell {number}", (at, value), (9, 0), textcoords="offset points", color=ALARM, va="center")
-
-
-def _say_bars(figure: FigureBase, panels: Iterable[Axes]) -> None:
-    """Write below a figure what dashes and pale bars are that one of its panels has; nothing where none has any."""
-    said = {label: mark for axes in panels for mark, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    if said:
-        figure.legend(said.values(), said.keys(), loc="outside lower left", ncols=len(said))
 
 
 def _rms(axes: Axes, residuals: Floats, quantity: str = "m/s^2") -> None:
@@ -204,27 +185,20 @@ def what_they_go_with(figure: Figure, diagnosis: Diagnosis) -> None:
     before = diagnosis.before.residuals_mps2 / mean_sigmas(diagnosis.before)
     for k, driver in enumerate(drawn):
         row, column = divmod(k, wide)
-        unit, scale = driver_axis(driver)
+        unit, scale = unit_across(driver)
         values = [before, *(each.unexplained_ratios for each in others)]
         for below, (ratios, axes) in enumerate(zip(values, panels[row * len(values) :, column], strict=False)):
             _ratios(axes, driver.values * scale, ratios)
             axes.set_xlabel("" if below < len(values) - 1 else f"{driver.symbol}, {unit}")
             axes.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
             if not below:
-                axes.set_title(f"{driver.words}\n{_of_share(driver)}", fontsize=8.5)
+                axes.set_title(f"{driver.words}\n{share_in_words(driver)}", fontsize=8.5)
             if not column:
                 axes.set_ylabel("residual / σ" if not below else f"with\n{wrapped(others[0].name, 18)}")
     for axes in panels.flat[: panels.size]:
         if not axes.has_data():
             axes.set_axis_off()
-    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower left", ncols=3)
-
-
-def _of_share(driver: Driver) -> str:
-    """Return in a few words how much of the misfit goes with a driver."""
-    if not _explains(driver):
-        return "no more than by chance"
-    return f"{driver.share:.0%} of the misfit, p {format_p(driver.p_value)}"
+    say_once(figure, [panels[0, 0]])
 
 
 def _ratios(axes: Axes, x: Floats, ratios: Floats) -> None:

@@ -3,8 +3,6 @@
 Figures are matplotlib's, on white, for a report; they need no screen, no viewer and no graphics driver.
 
 Axes that can be read: logarithms with their values as labels, orientations as whole numbers.
-
-Words and numbers in figures, symbols as in the paper, and the units that parameters are shown in.
 """
 
 from __future__ import annotations
@@ -17,7 +15,7 @@ from contextlib import contextmanager
 from functools import update_wrapper
 from inspect import Signature, signature
 from textwrap import fill
-from typing import Any, Concatenate, Literal, NamedTuple, ParamSpec
+from typing import Any, Concatenate, Literal, ParamSpec
 
 import matplotlib
 import numpy as np
@@ -28,11 +26,7 @@ from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import Figure, FigureBase
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter, NullLocator
 
-from kf_calib.bench import paper_parameters
-from kf_calib.effects import Coefficient
-from kf_calib.estimation.results import Parameter
-from kf_calib.support import units
-from kf_calib.views.notation import label, written
+from kf_calib.views.notation import written
 
 ACCELEROMETERS = ("#d55e00", "#009e73", "#0072b2")
 """One colour an accelerometer, from Okabe and Ito's palette; markers differ, too."""
@@ -138,9 +132,14 @@ def content_of(
     return memory.getvalue()
 
 
-def letter(axes: Axes, text: str) -> None:
-    """Write a few words in the upper left corner of a panel."""
-    axes.text(0.015, 0.97, text, transform=axes.transAxes, va="top", ha="left", fontsize=8.5, color="#222222")
+def mark_of(i: int | None) -> tuple[str, str]:
+    """Marker and colour of accelerometer i, from 0; None: of the platform."""
+    return ("D", PLATFORM) if i is None else (MARKERS[i], ACCELEROMETERS[i])
+
+
+def accelerometer_of(symbol: str) -> int | None:
+    """The number, from 0, of the accelerometer whose parameter a symbol is; None where it ends in no such number."""
+    return int(symbol[-1]) - 1 if symbol[-1] in "123" else None
 
 
 def say(where: FigureBase, text: str, colour: str = GREY) -> None:
@@ -148,6 +147,18 @@ def say(where: FigureBase, text: str, colour: str = GREY) -> None:
     axes = where.subplots()
     axes.set_axis_off()
     axes.text(0.5, 0.5, text, ha="center", va="center", color=colour, wrap=True, fontsize=10.0)
+
+
+def say_within(axes: Axes, text: str, up: float = 0.5) -> None:
+    """Write in the middle of a panel, or so far up in it, why there is nothing to draw."""
+    axes.text(0.5, up, text, transform=axes.transAxes, ha="center", va="center", color=GREY)
+
+
+def rows_of(axes: Axes, names: Sequence[str], count: int = 0, **text: Any) -> None:
+    """Name the rows of a panel from above, as bars lie; count: the rows that there is room for, where it is more."""
+    axes.set_yticks(range(len(names)), names, **text)
+    axes.set_ylim(max(len(names), count) - 0.4, -0.6)
+    axes.grid(visible=False, axis="y")
 
 
 _LEAST_RANGE = 4.0  # between the ends of an axis, so that two labels at least are on it
@@ -202,31 +213,6 @@ def whole_numbers(axes: Axes, first: float, last: float, words: str = "orientati
 UNIT_KINDS = {"rad": "angle", "1": "scale factor", "m/s^2": "bias"}
 
 
-class Shown(NamedTuple):
-    """How a parameter is written: its symbol, its unit, and how many of the unit make one SI unit."""
-
-    label: str
-    unit: str
-    per_si: float
-
-
-def plain(text: str) -> str:
-    """Text of the user as it is: matplotlib would read what is between two dollar signs as a formula."""
-    return text.replace("$", r"\$")
-
-
-def twelve() -> tuple[Shown, ...]:
-    """How the twelve parameters are written, in the units that are asked for."""
-    pairs = zip(paper_parameters.SYMBOLS, paper_parameters.UNITS, strict=True)
-    return tuple(Shown(label(symbol), *units.shown(unit)) for symbol, unit in pairs)
-
-
-def with_coefficients(coefficients: Iterable[Parameter | Coefficient]) -> tuple[Shown, ...]:
-    """The same, followed by coefficients of effects."""
-    found = [(each.symbol, units.shown(each)) for each in coefficients]
-    return (*twelve(), *(Shown(plain(label(symbol)), plain(unit.label), unit.per_si) for symbol, unit in found))
-
-
 _WIDE = 4
 
 
@@ -240,7 +226,7 @@ def panels_of(figure: Figure, count: int, around_in: float, high_in: float) -> l
     return panels[:count]
 
 
-def say_once(figure: Figure, panels: Sequence[Axes], place: str = "outside lower left", columns: int = 6) -> None:
+def say_once(figure: FigureBase, panels: Iterable[Axes], place: str = "outside lower left", columns: int = 6) -> None:
     """Say once beside the panels what is drawn in them."""
     said = dict[str, Any]()
     for axes in panels:

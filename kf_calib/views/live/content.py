@@ -17,6 +17,7 @@ from kf_calib.support.text import angles_in_words, counted, sentence
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2, shown, span
 from kf_calib.views import diagnosis
 from kf_calib.views.notation import symbol
+from kf_calib.views.terminal import VERDICT_STYLES
 
 if TYPE_CHECKING:
     from kf_calib.sources.live import Status
@@ -108,14 +109,21 @@ def content_of(
     standing: what is known. status: of the source (None: it has none). name: of the source. recording: path of the file
     that is written. doing: what a bench that drives itself does; None for another.
     """
-    source = source_lines(standing, status, name, recording)
-    remarks = [sentence(text) for text in (standing.problem, standing.notice) if text]
+    judgement = standing.judgement
     if isinstance(standing, HandStanding):
-        content = _of_hand(standing, source, remarks)
+        task, (headings, rows) = _hand_task(standing), _hand_rows(standing.judgement)
     else:
-        content = _of_bench(standing, source, remarks, doing)
-    is_over = status is not None and status.link == "ended"
-    return replace(content, task=_LAST) if is_over else content
+        task, (headings, rows) = _bench_task(standing, doing), _bench_rows(standing)
+    return Content(
+        task=_LAST if status is not None and status.link == "ended" else task,
+        verdict=None if judgement is None else (_verdict(judgement), VERDICT_STYLES[judgement.consistent]),
+        remarks=[sentence(text) for text in (standing.problem, standing.notice) if text],
+        doing=doing.line if doing else "",
+        source=source_lines(standing, status, name, recording),
+        headings=headings,
+        rows=rows,
+        model=_model_lines(judgement) if isinstance(judgement, Judgement) else (),
+    )
 
 
 def ended(content: Content, final: Judgement | HandJudgement | None, error: BaseException | None) -> Content:
@@ -131,20 +139,24 @@ def ended(content: Content, final: Judgement | HandJudgement | None, error: Base
     return replace(content, task=Task("THE RUN HAS ENDED", count, "green"), verdict=verdict)
 
 
-def _of_bench(standing: Standing, source: Sequence[Line], remarks: Sequence[str], doing: Doing | None
-              ) -> Content:  # fmt: skip
-    judgement, line = standing.judgement, doing.line if doing else ""
-    task, (headings, rows) = _bench_task(standing, doing), _bench_rows(standing)
-    if judgement is None:
-        return Content(task, None, remarks, line, source, headings, rows, ())
-    verdict = judgement.verdict, {True: "bold green", False: "bold yellow", None: "bold"}[judgement.consistent]
-    model = [((_fit(judgement), ""),)]
+def _verdict(judgement: Judgement | HandJudgement) -> str:
+    """Return the verdict so far; of a sensor in the hand, with the sides that were seen and the misfit."""
+    if isinstance(judgement, Judgement):
+        return judgement.verdict
+    nis = None if judgement.result is None else judgement.result.consistency.nis_per_dof
+    misfit = "" if nis is None else f"NIS/dof {nis:.3g}; "
+    return f"{counted(judgement.sides.count, 'side')} seen; {misfit}{judgement.verdict}"
+
+
+def _model_lines(judgement: Judgement) -> list[Line]:
+    """Return how well the model fits, and whether a sigma has risen."""
+    lines: list[Line] = [((_fit(judgement), ""),)]
     if judgement.risen is not None:
         risen, factor = judgement.risen
         said = (f"σ of {symbol(risen)} rose {factor:.1f} times with the last orientation: the orientations scatter "
                 "more than was known before, or the model has more to determine.")  # fmt: skip
-        model.append(((said, "yellow"),))
-    return Content(task, verdict, remarks, line, source, headings, rows, model)
+        lines.append(((said, "yellow"),))
+    return lines
 
 
 def source_lines(standing: Progress, status: Status | None, name: str, recording: str) -> list[Line]:
@@ -242,23 +254,20 @@ def _fit(judgement: Judgement) -> str:
     return text
 
 
-def _of_hand(standing: HandStanding, source: Sequence[Line], remarks: Sequence[str]) -> Content:
-    judgement, here = standing.judgement, standing.current
-    is_enough = standing.rest_s >= standing.enough_s
+def _hand_task(standing: HandStanding) -> Task:
+    """Return what to do now, and how long it has rested in this pose."""
+    here, is_enough = standing.current, standing.rest_s >= standing.enough_s
     resting = f"still for {standing.rest_s:.0f} s of {standing.enough_s:g} s" if standing.rest_s else "it moves"
     where = f"pose {here.number}, {here.up} up: " if here is not None and standing.rest_s else ""
     done = f"{counted(standing.dwells, 'pose')} in {span(standing.elapsed_s)}"
     colour = "green" if is_enough else "yellow" if standing.rest_s else "cyan"
-    share = min(standing.rest_s / standing.enough_s, 1.0)
-    task = Task(sentence(standing.task), f"{done}; {where}{resting}", colour, share)
-    style = {True: "bold green", False: "bold yellow", None: "bold"}[judgement.consistent] if judgement else ""
-    verdict = None if judgement is None else (_sides_in_words(judgement), style)
-    headings: Headings = ("less nominal", "right"), ("σ", "right"), ("", "left"), ("target", "right")
-    return Content(task, verdict, remarks, "", source, headings, _hand_rows(judgement), ())
+    return Task(
+        sentence(standing.task), f"{done}; {where}{resting}", colour, min(standing.rest_s / standing.enough_s, 1.0)
+    )
 
 
-def _hand_rows(judgement: HandJudgement | None) -> list[SigmaRow]:
-    """Return rows of the nine parameters with their sigmas and targets; what the frame fixes is left out."""
+def _hand_rows(judgement: HandJudgement | None) -> tuple[Headings, list[SigmaRow]]:
+    """Return headings and rows of the nine parameters with sigmas and targets; what the frame fixes is left out."""
     rows, result = list[SigmaRow](), None if judgement is None else judgement.result
     for k, name in enumerate(paper_parameters.SYMBOLS):
         if name in ("theta1", "phi1", "nu2"):
@@ -272,11 +281,4 @@ def _hand_rows(judgement: HandJudgement | None) -> list[SigmaRow]:
         off, spread = unit.rounded(parameter.value - parameter.nominal, sigma)
         target = unit.number(wanted) if math.isfinite(wanted) else ""
         rows.append(SigmaRow(symbol(name), (off, f"± {spread}", unit.label, target), bar(sigma, wanted, k)))
-    return rows
-
-
-def _sides_in_words(judgement: HandJudgement) -> str:
-    """Return the line about sides and misfit."""
-    nis = None if judgement.result is None else judgement.result.consistency.nis_per_dof
-    misfit = "" if nis is None else f"NIS/dof {nis:.3g}; "
-    return f"{counted(judgement.sides.count, 'side')} seen; {misfit}{judgement.verdict}"
+    return (("less nominal", "right"), ("σ", "right"), ("", "left"), ("target", "right")), rows

@@ -38,7 +38,7 @@ from kf_calib.estimation.estimate import correlation
 from kf_calib.estimation.results import Calibration
 from kf_calib.online.status import Judgement
 from kf_calib.support import units
-from kf_calib.support.text import angles_in_words, counted, printable
+from kf_calib.support.text import angles_in_words, counted
 from kf_calib.support.units import shown
 from kf_calib.views.console import effect_table, noise_table, parameter_table, verdict, without_table
 from kf_calib.views.markdown import markdown
@@ -49,12 +49,14 @@ from kf_calib.views.rerun.names import (
     CHANNELS,
     DARK,
     KINDS,
-    ON_DARK,
     ORIENTATION,
     Colour,
+    curves_panel,
+    markdown_page,
     quantities,
     rrd_file,
     strict,
+    window,
 )
 from kf_calib.views.rerun.series import (
     VisitHistory,
@@ -133,7 +135,7 @@ def _log(
         log_nis(fresh, stream, shown)
         log_bench(result, stream, shown)
     text = "\n\n".join([*([heading] if heading else []), markdown_summary(result)])
-    stream.log("summary", rr.TextDocument(printable(text), media_type=rr.MediaType.MARKDOWN), static=True)
+    stream.log("summary", markdown_page(text), static=True)
 
 
 def judgement_text(judgement: Judgement) -> str:
@@ -190,17 +192,13 @@ def layout(result: Calibration, history: VisitHistory, goes_on: bool = False) ->
     """The blueprint for a window of about 1600 x 1000, the overview in front; ``goes_on``: more dwells are to come."""
     tabs = [_overview(result, history, predicted(result) or goes_on), _parameters(history)]
     tabs += [_innovations(result)] if predicted(result) else []
-    return rrb.Blueprint(
-        rrb.Tabs(*tabs),
-        rrb.BlueprintPanel(state="hidden"),
-        rrb.SelectionPanel(state="hidden"),
-        rrb.TimePanel(state="collapsed", timeline=ORIENTATION, play_state="following"),
-    )
+    return window(rrb.Tabs(*tabs), ORIENTATION, "following")
 
 
 def _overview(result: Calibration, history: VisitHistory, is_predicted: bool) -> rrb.Horizontal:
+    pose = "gimbal angles, deg" if result.bench.axes else "attitude, quaternion"
     return rrb.Horizontal(
-        rrb.Vertical(*sigma_panels(history), _pose(result)),
+        rrb.Vertical(*sigma_panels(history), _series(["bench/pose/**"], pose, rrb.Corner2D.RightTop)),
         rrb.Vertical(platform_panel(result), *_fit(is_predicted), row_shares=[2, 1, 1] if is_predicted else [1, 1]),
         rrb.TextDocumentView(origin="summary", name="result"),
         column_shares=[4.55, 4.25, 4.4],
@@ -262,20 +260,8 @@ def _innovations(result: Calibration) -> rrb.Vertical:
 def _series(
     contents: list[str], name: str, legend: rrb.Corner2D | None = None, around: tuple[float, float] | None = None
 ) -> rrb.TimeSeriesView:
-    """Curves over the timeline in use; no legend unless a corner is given for it."""
-    return rrb.TimeSeriesView(
-        contents=contents,
-        name=name,
-        plot_legend=rrb.PlotLegend(legend, visible=legend is not None),
-        axis_x=WHOLE_RUN,
-        axis_y=None if around is None else rrb.ScalarAxis(range=around),
-        background=ON_DARK,
-    )
-
-
-def _pose(result: Calibration) -> rrb.TimeSeriesView:
-    name = "gimbal angles, deg" if result.bench.axes else "attitude, quaternion"
-    return _series(["bench/pose/**"], name, rrb.Corner2D.RightTop)
+    """Curves over the timeline in use."""
+    return curves_panel(contents, name, WHOLE_RUN, legend, around)
 
 
 def eye(bench: Bench, position: Vector, target: Vector) -> rrb.EyeControls3D:

@@ -26,12 +26,24 @@ from kf_calib.diagnosis.residual_drivers import Driver
 from kf_calib.diagnosis.results import Diagnosis
 from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.estimation.residual_table import mean_sigmas
-from kf_calib.estimation.results import format_p
 from kf_calib.support.text import printable
-from kf_calib.support.units import shown_whole
-from kf_calib.views.diagnosis import disturbed_dwells, name_of, verdict
+from kf_calib.views.console import p_cell
+from kf_calib.views.diagnosis import advice_sentence, disturbed_dwells, name_of, share_in_words, verdict
 from kf_calib.views.markdown import literal, markdown
-from kf_calib.views.rerun.names import ACCELEROMETERS, CHANNELS, DARK, GOLD, GREY, MAUVE, Colour, rrd_file, thin
+from kf_calib.views.notation import unit_across
+from kf_calib.views.rerun.names import (
+    ACCELEROMETERS,
+    CHANNELS,
+    DARK,
+    GOLD,
+    GREY,
+    MAUVE,
+    Colour,
+    markdown_page,
+    rrd_file,
+    thin,
+    window,
+)
 from kf_calib.views.rerun.spheres import Log, at_step, forever, log_key, log_spheres, spheres
 from kf_calib.views.terminal import ConsoleTable, table
 
@@ -53,14 +65,13 @@ def save_diagnosis_view(diagnosis: Diagnosis, path: str | Path) -> Path:
             for shape in explanation.shapes[:1]:
                 _log_shape(shape, log)
             log_spheres(before, explanation.unexplained_ratios, "spheres/left", 1, stream, log)
-        text = rr.TextDocument(printable(_summary(diagnosis)), media_type=rr.MediaType.MARKDOWN)
-        stream.log("summary", text, static=True)
+        stream.log("summary", markdown_page(_summary(diagnosis)), static=True)
     return Path(path)
 
 
 def _log_residuals(driver: Driver, ratios: Floats, log: Log) -> None:
     """Send the residuals over their sigma against the quantity that they go with most."""
-    unit = shown_whole(driver.unit, float(np.abs(driver.values).max()))
+    unit = unit_across(driver)
     titles = [f"accelerometer {i}: residual / σ" for i in (1, 2, 3)]
     for k, chart in enumerate(charts_of(driver.values * unit.per_si, titles, ratios)):
         chart.log_frame(log)
@@ -73,10 +84,11 @@ def _log_shape(shape: EffectShape, log: Log) -> None:
 
     Where it does not go with its quantity alone there is a dash a dwell instead of the curve.
     """
-    unit = shown_whole(shape.unit, float(np.nanmax(np.abs(shape.values))))
+    unit = unit_across(shape)
     ratios = shape.readings / shape.sigma
     charts = charts_of(shape.values * unit.per_si, [f"{channel}, σ" for channel in shape.channels], ratios)
-    clear(log, range(len(charts), 3))
+    for channel in CHANNELS[len(charts) :]:  # of what was shown before
+        log(f"driver/{channel}", rr.Clear(recursive=True))
     for k, chart in enumerate(charts):
         chart.log_frame(log)
         log(f"{chart.path}/residuals", chart.points(ratios[:, k]))
@@ -106,28 +118,19 @@ def _summary(diagnosis: Diagnosis) -> str:
     if diagnosis.table is not None:
         blocks.append(markdown(_probabilities(diagnosis.table)))
     if diagnosis.next_orientation is not None:
-        advice, why = diagnosis.next_orientation
-        angles = ", ".join(f"{angle:.4g}" for angle in advice.gimbal_deg)
-        blocks.append(f"**Next orientation**: gimbals at {angles} deg: {why}.")
+        head, _, advice = advice_sentence(*diagnosis.next_orientation).partition(":")
+        blocks.append(f"**{head}**:{advice}")
     if explanations := diagnosis.explanations[:_MOST]:
         rows = [
-            (f"{k} {each.name}", "yes" if each.fits else "no",
-             format_p(each.after.consistency.p_value).removeprefix("= "))
+            (f"{k} {each.name}", "yes" if each.fits else "no", p_cell(each.after.consistency.p_value))
             for k, each in enumerate(explanations, 1)
-        ]  # fmt: skip
+        ]
         blocks.append(markdown(table("", ("explanation", "fits", "p with it"), rows)))
         blocks.append("Move the cursor of the timeline *explanation* to see what each leaves.")
     if diagnosis.drivers:
-        shares = [(each.words, _share(each)) for each in diagnosis.drivers]
+        shares = [(each.words, share_in_words(each)) for each in diagnosis.drivers]
         blocks.append(markdown(table("", ("quantity", "goes with"), shares)))
     return "\n\n".join(blocks) + "\n"
-
-
-def _share(driver: Driver) -> str:
-    """How much of the misfit goes with a driver, in a few words."""
-    if driver.p_value > 0.01 or driver.share < 0.005:
-        return "no more than noise"
-    return f"{100 * driver.share:.0f} % of the misfit (p {format_p(driver.p_value)})"
 
 
 def _probabilities(hypotheses: HypothesisTable) -> ConsoleTable:
@@ -139,18 +142,16 @@ def _probabilities(hypotheses: HypothesisTable) -> ConsoleTable:
 
 def _layout(diagnosis: Diagnosis) -> rrb.Blueprint:
     name = "what the effect must explain" if diagnosis.explanations else "what residuals go with"
-    charts = [charts_view(name)] if diagnosis.drivers else []
-    return rrb.Blueprint(
-        rrb.Horizontal(
-            spheres("spheres", 2 if diagnosis.explanations else 1),
-            *charts,
-            rrb.TextDocumentView(origin="summary", name="verdict"),
-            column_shares=[5, *(4.4 for _ in charts), 3.8],
-        ),
-        rrb.BlueprintPanel(state="hidden"),
-        rrb.SelectionPanel(state="hidden"),
-        rrb.TimePanel(state="collapsed", timeline=EXPLANATION, play_state="paused"),
+    bounds = rrb.VisualBounds2D(x_range=[-_LEFT, _WIDTH + 20.0], y_range=[-3.0 * _ABOVE, 3.0 * _PITCH - _ABOVE])
+    view = rrb.Spatial2DView(origin="driver", name=name, visual_bounds=bounds, background=DARK)
+    charts = [view] if diagnosis.drivers else []
+    beside = rrb.Horizontal(
+        spheres("spheres", 2 if diagnosis.explanations else 1),
+        *charts,
+        rrb.TextDocumentView(origin="summary", name="verdict"),
+        column_shares=[5, *(4.4 for _ in charts), 3.8],
     )
+    return window(beside, EXPLANATION, "paused")
 
 
 _WIDTH, _HEIGHT, _PITCH = 450.0, 220.0, 300.0
@@ -225,22 +226,10 @@ def charts_of(values: Floats, titles: Sequence[str], ratios: Floats) -> list[Cha
     ]
 
 
-def clear(log: Log, places: range) -> None:
-    """Take away what charts at these places have shown."""
-    for place in places:
-        log(f"driver/{CHANNELS[place]}", rr.Clear(recursive=True))
-
-
 def heading(text: str) -> rr.Points2D:
     """What stands above the charts."""
     place = (0.5 * _WIDTH, -2.4 * _ABOVE)
     return rr.Points2D([place], labels=[text], radii=0.0, colors=GOLD, show_labels=True)
-
-
-def charts_view(name: str) -> rrb.Spatial2DView:
-    """The view that holds the three charts."""
-    bounds = rrb.VisualBounds2D(x_range=[-_LEFT, _WIDTH + 20.0], y_range=[-3.0 * _ABOVE, 3.0 * _PITCH - _ABOVE])
-    return rrb.Spatial2DView(origin="driver", name=name, visual_bounds=bounds, background=DARK)
 
 
 def round_numbers(low: float, high: float, at_most: int) -> Floats:

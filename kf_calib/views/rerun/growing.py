@@ -28,6 +28,8 @@ from kf_calib.views.rerun import grow
 from kf_calib.views.rerun.names import new_stream
 
 PORT = 9876
+_ADDRESS = "http://127.0.0.1:{web_port}/?url=rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{port}%2Fproxy"
+"""Where a browser finds the viewer, and the data."""
 _HEADER = 12  # bytes before the first message of what Rerun encoded
 _LAST_S = 1.0  # in which a browser gets what was sent last
 _WAITING = 4  # results; the next one that comes through shows what those left out would have
@@ -57,7 +59,7 @@ class GrowingView:
         self._log = tempfile.TemporaryFile()  # noqa: SIM115  # closed with the viewer's pipe
         if port is not None:
             self._viewer = _viewer(port, bind, self._log, web)
-        self.url = "" if port is None or not web else _url(port)
+        self.url = "" if port is None or not web else _ADDRESS.format(web_port=port + 1, port=port)
         self._thread = threading.Thread(target=copy_context().run, args=(self._show,), name="rerun", daemon=True)
         self._thread.start()
 
@@ -212,11 +214,6 @@ def _listens(port: int) -> bool:
     except OSError:
         return False
     return True
-
-
-def _url(port: int) -> str:
-    """Return where a browser finds the viewer that listens on this port, and the data."""
-    return f"http://127.0.0.1:{port + 1}/?url=rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{port}%2Fproxy"
 
 
 def _viewer(port: int, bind: str, log: IO[bytes], web: bool) -> subprocess.Popen[bytes]:

@@ -25,7 +25,20 @@ from kf_calib.support.text import printable
 from kf_calib.views.console import effect_table
 from kf_calib.views.diagnosis import disturbed_dwells
 from kf_calib.views.markdown import markdown
-from kf_calib.views.rerun.names import GOLD, GREY, MAUVE, ON_DARK, RED, WHITE, Colour, entity, rrd_file
+from kf_calib.views.rerun.names import (
+    GOLD,
+    GREY,
+    MAUVE,
+    RED,
+    WHITE,
+    Colour,
+    curves_panel,
+    entity,
+    markdown_page,
+    rrd_file,
+    window,
+)
+from kf_calib.views.rerun.series import Timelines, bounds, line, send_curve
 from kf_calib.views.rerun.spheres import at_step, forever, log_key, log_spheres, spheres
 
 STEP = "step"
@@ -79,41 +92,32 @@ def _shown(values_mps2: Sequence[float | None]) -> Floats:
 def save_improvement_view(improvement: Improvement, path: str | Path) -> Path:
     """Write the view of an improvement to an .rrd file that opens laid out."""
     view = View(improvement)
+    times = {STEP: np.arange(len(view.results))}
     with rrd_file(Path(path), _layout(view)) as stream:
         for name, (words, values, colour) in view.errors.items():
-            _curve(stream, f"error/{name}", values, *_lines_and_marks(words, colour))
-        _curve(stream, "log10_p/model", view.log10_p, *_lines_and_marks("model", GOLD))
+            send_curve(stream, f"error/{name}", times, values, *_line_and_marks(words, colour))
+        send_curve(stream, "log10_p/model", times, view.log10_p, *_line_and_marks("model", GOLD))
         level = np.full(len(view.log10_p), np.log10(_LEVEL))
-        _curve(stream, "log10_p/accepted", level, rr.SeriesLines(names="accepted above", colors=RED, widths=1.0))
+        send_curve(stream, "log10_p/accepted", times, level, line("accepted above", RED, 1.0))
         for symbol, values in view.coefficients.items():
-            _log_coefficient(stream, entity("coefficients", symbol), values)
+            _log_coefficient(stream, entity("coefficients", symbol), times, values)
         sigmas = mean_sigmas(improvement.start.before)
         log_key("spheres", ["in this step"], forever(stream))
         for step, result in enumerate(view.results):
             log = at_step(stream, STEP, step)
             marked = disturbed_dwells(view.diagnoses[step])
             log_spheres(result, result.residuals_mps2 / sigmas, "spheres", 0, stream, log, marked)
-            log("summary", rr.TextDocument(printable(_summary(view, step)), media_type=rr.MediaType.MARKDOWN))
+            log("summary", markdown_page(_summary(view, step)))
     return Path(path)
 
 
-def _lines_and_marks(name: str, colour: Colour) -> tuple[rr.SeriesLines, rr.SeriesPoints]:
-    return (rr.SeriesLines(names=name, colors=colour, widths=2.0),
-            rr.SeriesPoints(names=name, colors=colour, markers="circle", marker_sizes=4.0))  # fmt: skip
+def _line_and_marks(name: str, colour: Colour) -> tuple[rr.SeriesLines, rr.SeriesPoints]:
+    return line(name, colour), rr.SeriesPoints(names=name, colors=colour, markers="circle", marker_sizes=4.0)
 
 
-def _curve(stream: rr.RecordingStream, path: str, values: Floats, *styles: rr.SeriesLines | rr.SeriesPoints) -> None:
-    """Send a row of scalars (n,) or (n, k) a step; steps whose values are not finite are left out."""
-    rows = values.reshape(len(values), -1)
-    known = np.flatnonzero(np.isfinite(rows).all(axis=1))
-    for style in styles:
-        stream.log(path, style, static=True)
-    if len(known):
-        columns = rr.Scalars.columns(scalars=rows[known].ravel()).partition([rows.shape[1]] * len(known))
-        rr.send_columns(path, [rr.TimeColumn(STEP, sequence=known)], columns, recording=stream)
-
-
-def _log_coefficient(stream: rr.RecordingStream, path: str, values: Sequence[Parameter | None]) -> None:
+def _log_coefficient(
+    stream: rr.RecordingStream, path: str, steps: Timelines, values: Sequence[Parameter | None]
+) -> None:
     """Send what a coefficient is in each step that has it, less and plus its sigma."""
     known = [
         np.array([parameter.value, parameter.sigma]) * units.shown(parameter).per_si
@@ -122,9 +126,8 @@ def _log_coefficient(stream: rr.RecordingStream, path: str, values: Sequence[Par
         for parameter in values
     ]
     value, sigma = np.array(known).T
-    _curve(stream, f"{path}/value", value, *_lines_and_marks("value", MAUVE))
-    band = np.column_stack([value - sigma, value + sigma])
-    _curve(stream, f"{path}/band", band, rr.SeriesLines(names=["−σ", "+σ"], colors=[GREY, GREY], widths=[1.0, 1.0]))
+    send_curve(stream, f"{path}/value", steps, value, *_line_and_marks("value", MAUVE))
+    send_curve(stream, f"{path}/band", steps, np.column_stack([value - sigma, value + sigma]), bounds("−σ", "+σ"))
 
 
 def _summary(view: View, number: int) -> str:
@@ -167,22 +170,13 @@ def _layout(view: View) -> rrb.Blueprint:
         for symbol, values in view.coefficients.items()
         if (known := [each for each in values if each is not None])
     ]
-    return rrb.Blueprint(
-        rrb.Tabs(first, *([rrb.Grid(*panels, grid_columns=3, name="Coefficients")] if panels else [])),
-        rrb.BlueprintPanel(state="hidden"),
-        rrb.SelectionPanel(state="hidden"),
-        rrb.TimePanel(state="collapsed", timeline=STEP, play_state="following"),
-    )
+    tabs = [first, *([rrb.Grid(*panels, grid_columns=3, name="Coefficients")] if panels else [])]
+    return window(rrb.Tabs(*tabs), STEP, "following")
 
 
 def _series(path: str, name: str, steps: int, reach: tuple[float, float] | None = None) -> rrb.TimeSeriesView:
     """The curves below a path over the steps, with room beside the first and the last; reach: of those that fall."""
     first, last = (rr.TimeRangeBoundary.absolute(seq=number) for number in (-1, steps + 1))
-    return rrb.TimeSeriesView(
-        contents=[f"{path}/**"],
-        name=name,
-        plot_legend=rrb.Corner2D.RightTop if reach else rrb.Corner2D.RightBottom,
-        axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=first, end=last)),
-        axis_y=None if reach is None else rrb.ScalarAxis(range=reach),
-        background=ON_DARK,
-    )
+    axis_x = rrb.TimeAxis(view_range=rr.TimeRange(start=first, end=last))
+    corner = rrb.Corner2D.RightTop if reach else rrb.Corner2D.RightBottom
+    return curves_panel([f"{path}/**"], name, axis_x, corner, reach)

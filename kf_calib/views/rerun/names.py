@@ -10,8 +10,8 @@ from __future__ import annotations
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, NamedTuple
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -22,7 +22,7 @@ from kf_calib.estimation.measurement_model import Model
 from kf_calib.support.output_files import write_whole
 from kf_calib.support.text import printable
 from kf_calib.support.units import shown
-from kf_calib.views.notation import label
+from kf_calib.views.notation import twelve
 
 BENCH_TIME = "bench_time"
 ORIENTATION = "orientation"
@@ -32,6 +32,7 @@ ACCELEROMETERS: tuple[Colour, Colour, Colour] = ((235, 115, 40), (40, 185, 130),
 """One colour an accelerometer in all panels: in the order of x, y, z, and told apart by colour-blind eyes."""
 PALE: tuple[Colour, Colour, Colour] = ((255, 190, 130), (150, 235, 195), (175, 215, 255))
 """The same accelerometers' second angle."""
+_OF_TWELVE = [colour for full, pale in zip(ACCELEROMETERS, PALE, strict=True) for colour in (full, pale, full, full)]
 GREY: Colour = (135, 135, 140)
 WHITE: Colour = (235, 235, 235)
 GIMBALS: tuple[Colour, ...] = ((205, 160, 255), (255, 160, 205), (225, 215, 130), (200, 200, 205))
@@ -58,19 +59,12 @@ def thin(pixels: float) -> float:
     return -pixels
 
 
-def colour_of(symbol: str) -> Colour:
-    """The accelerometer's colour, paler for its second angle."""
-    accelerometer, place = divmod(paper_parameters.SYMBOLS.index(symbol), 4)
-    return PALE[accelerometer] if place == 1 else ACCELEROMETERS[accelerometer]
-
-
 def path_of(symbol: str) -> str:
     """The parameter's entity; the accelerometer comes first, so that legends list one after the other."""
     return f"parameters/a{paper_parameters.SYMBOLS.index(symbol) // 4 + 1}/{symbol}"
 
 
-@dataclass(frozen=True)
-class DrawnParameter:
+class DrawnParameter(NamedTuple):
     """What is estimated and drawn as one curve: the SI value times ``per_si`` is in ``unit``."""
 
     label: str
@@ -83,8 +77,8 @@ class DrawnParameter:
 def quantities(model: Model) -> tuple[DrawnParameter, ...]:
     """The twelve parameters in the units that people are shown, then the coefficients of the effects in the model."""
     parameters = [
-        DrawnParameter(label(symbol), shown(unit).label, shown(unit).per_si, colour_of(symbol), path_of(symbol))
-        for symbol, unit in zip(paper_parameters.SYMBOLS, paper_parameters.UNITS, strict=True)
+        DrawnParameter(*own, colour, path_of(symbol))
+        for symbol, own, colour in zip(paper_parameters.SYMBOLS, twelve(), _OF_TWELVE, strict=True)
     ]
     coefficients = [
         DrawnParameter(printable(each.symbol), printable(shown(each).label), shown(each).per_si, MAUVE,
@@ -92,6 +86,36 @@ def quantities(model: Model) -> tuple[DrawnParameter, ...]:
         for each in model.coefficients
     ]  # fmt: skip
     return (*parameters, *coefficients)
+
+
+def markdown_page(text: str) -> rr.TextDocument:
+    """A page of text in Markdown."""
+    return rr.TextDocument(printable(text), media_type=rr.MediaType.MARKDOWN)
+
+
+def window(content: rrb.Container, timeline: str, play_state: Literal["paused", "following"]) -> rrb.Blueprint:
+    """A window that opens with all of its room for the content, at the end of a timeline or at its beginning."""
+    return rrb.Blueprint(
+        content,
+        rrb.BlueprintPanel(state="hidden"),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.TimePanel(state="collapsed", timeline=timeline, play_state=play_state),
+    )
+
+
+def curves_panel(
+    contents: list[str], name: str, axis_x: rrb.TimeAxis, legend: rrb.Corner2D | None = None,
+    reach: tuple[float, float] | None = None,
+) -> rrb.TimeSeriesView:  # fmt: skip
+    """Curves over a timeline; no legend unless a corner is given for it. reach: of the axis that points up."""
+    return rrb.TimeSeriesView(
+        contents=contents,
+        name=name,
+        plot_legend=rrb.PlotLegend(legend, visible=legend is not None),
+        axis_x=axis_x,
+        axis_y=None if reach is None else rrb.ScalarAxis(range=reach),
+        background=ON_DARK,
+    )
 
 
 def new_stream() -> rr.RecordingStream:

@@ -6,7 +6,7 @@ over decades, end above where they are after a third of the run, and are read in
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -18,6 +18,7 @@ from kf_calib.estimation.filter_history import history_of, nis_band
 from kf_calib.estimation.residual_table import mean_sigmas
 from kf_calib.estimation.results import Calibration, Visit
 from kf_calib.support import units
+from kf_calib.views.notation import gimbal_names
 from kf_calib.views.rerun.names import (
     ACCELEROMETERS,
     BENCH_TIME,
@@ -70,13 +71,10 @@ class VisitHistory:
         power = 10.0 ** np.ceil(np.log10(top))
         return 0.0, float(max(top, 1.05 * power if top > 0.6 * power else 0.0))
 
-    def _only(self, rows: NDArray[np.bool_]) -> VisitHistory:
-        """Return the same with these rows only."""
-        return VisitHistory(self.shown, *(getattr(self, each.name)[rows] for each in fields(self)[1:]))
-
     def after(self, visits: Sequence[Visit]) -> VisitHistory:
         """What came after these visits; the prior only where there were none."""
-        return self._only(self.orientation > (visits[-1].dwell.number if visits else -1))
+        rows = self.orientation > (visits[-1].dwell.number if visits else -1)
+        return VisitHistory(self.shown, *(getattr(self, each.name)[rows] for each in fields(self)[1:]))
 
     @classmethod
     def of(cls, result: Calibration) -> VisitHistory:
@@ -88,60 +86,77 @@ class VisitHistory:
         return cls(shown, history.elapsed_s, history.numbers, whole, deviation, sigma)
 
 
-def times(elapsed_s: Floats, orientation: Counts | None = None) -> list[rr.TimeColumn]:
-    """Rows on ``bench_time``, and on ``orientation`` where given."""
-    nanoseconds = np.round(np.asarray(elapsed_s) * 1e9).astype("timedelta64[ns]")
-    bench_time = rr.TimeColumn(BENCH_TIME, duration=nanoseconds)
-    return [bench_time] if orientation is None else [bench_time, rr.TimeColumn(ORIENTATION, sequence=orientation)]
+Timelines = Mapping[str, Floats | Counts]
+"""Timelines with when each row is: s on ``bench_time``, else numbers."""
 
 
-def ends(visits: Sequence[Visit]) -> tuple[Floats, Counts]:
+def columns_of(times: Timelines) -> list[rr.TimeColumn]:
+    """The same as Rerun takes them."""
+    return [
+        rr.TimeColumn(name, duration=np.round(when * 1e9).astype("timedelta64[ns]"))
+        if name == BENCH_TIME
+        else rr.TimeColumn(name, sequence=when)
+        for name, when in times.items()
+    ]
+
+
+def ends(visits: Sequence[Visit]) -> dict[str, Floats | Counts]:
     """When each dwell ended, and its number."""
     dwells = [visit.dwell for visit in visits]
-    return np.array([dwell.end_s for dwell in dwells]), np.array([dwell.number for dwell in dwells])
+    return {BENCH_TIME: np.array([dwell.end_s for dwell in dwells]),
+            ORIENTATION: np.array([dwell.number for dwell in dwells])}  # fmt: skip
+
+
+def begins(visits: Sequence[Visit]) -> dict[str, Floats | Counts]:
+    """When each dwell began."""
+    return {BENCH_TIME: np.array([visit.dwell.start_s for visit in visits])}
+
+
+def send_curve(
+    stream: rr.RecordingStream, path: str, times: Timelines, values: Floats, *styles: rr.SeriesLines | rr.SeriesPoints
+) -> None:
+    """Send a row of scalars (n,) or (n, k) a time, and how they look; rows that are not finite are left out."""
+    for style in styles:
+        stream.log(path, style, static=True)
+    rows = values.reshape(len(values), -1) if len(values) else np.empty((0, 1))
+    keep = np.isfinite(rows).all(axis=1)
+    if keep.any():
+        columns = rr.Scalars.columns(scalars=rows[keep].ravel()).partition([rows.shape[1]] * int(keep.sum()))
+        kept = {name: when[keep] for name, when in times.items()}
+        rr.send_columns(path, columns_of(kept), columns, recording=stream)
+
+
+def line(name: str, colour: Colour, width: float = 2.0) -> rr.SeriesLines:
+    """How a curve looks."""
+    return rr.SeriesLines(names=name, colors=colour, widths=width)
+
+
+def bounds(lower: str, upper: str) -> rr.SeriesLines:
+    """How the two ends of a band look."""
+    return rr.SeriesLines(names=[lower, upper], colors=[GREY, GREY], widths=[1.0, 1.0])
 
 
 def log_parameters(history: VisitHistory, stream: rr.RecordingStream, target: Floats, styled: bool) -> None:
     """Sigma, deviation from nominal, and the deviation less and plus one sigma; ``styled``: how they look was sent.
 
-    target (12,): sigmas that are wanted, in SI, NaN where there is none.
+    Complete dwells are on both timelines, points within them in bench time only: one point an orientation. target
+    (12,): sigmas that are wanted, in SI, NaN where there is none.
     """
+    whole = history.whole
+    of_dwells = {BENCH_TIME: history.elapsed_s[whole], ORIENTATION: history.orientation[whole]}
+    within = {BENCH_TIME: history.elapsed_s[~whole]}
     for k, shown in enumerate(history.shown):
-        path, colour, label = shown.path, shown.colour, shown.label
         value, sigma = history.deviation[:, k], history.sigma[:, k]
-        _log_curve(stream, f"{path}/sigma", history, sigma)
-        _log_curve(stream, f"{path}/deviation", history, value)
-        _log_curve(stream, f"{path}/band", history, np.column_stack([value - sigma, value + sigma]))
-        if k < len(target) and np.isfinite(target[k]):
-            _log_curve(stream, f"{path}/target", history, np.full(len(sigma), target[k] * shown.per_si))
-        if styled:
-            continue
-        named = label if k < 12 else f"{label}, {shown.unit}"
-        _style(stream, f"{path}/sigma", rr.SeriesLines(names=named, colors=colour, widths=2.0))
-        _style(stream, f"{path}/target", rr.SeriesLines(names=f"target {label}", colors=colour, widths=1.0))
-        _style(stream, f"{path}/deviation", rr.SeriesLines(names=label, colors=colour, widths=2.0))
-        _style(stream, f"{path}/band", rr.SeriesLines(names=["−σ", "+σ"], colors=[GREY] * 2, widths=[1.0] * 2))
-
-
-def _log_curve(stream: rr.RecordingStream, path: str, history: VisitHistory, values: Floats) -> None:
-    """Complete dwells on both timelines, points within a dwell in bench time only: one point an orientation."""
-    whole, elapsed_s = history.whole, history.elapsed_s
-    _send(stream, path, elapsed_s[whole], history.orientation[whole], values[whole])
-    _send(stream, path, elapsed_s[~whole], None, values[~whole])
-
-
-def _send(stream: rr.RecordingStream, path: str, elapsed_s: Floats, orientation: Counts | None, values: Floats) -> None:
-    """One row of scalars (n,) or (n, k) a time; rows that are not finite are left out."""
-    rows = values.reshape(len(elapsed_s), -1) if len(elapsed_s) else np.empty((0, 1))
-    keep = np.isfinite(rows).all(axis=1)
-    if keep.any():
-        columns = rr.Scalars.columns(scalars=rows[keep].ravel()).partition([rows.shape[1]] * int(keep.sum()))
-        index = times(elapsed_s[keep], None if orientation is None else orientation[keep])
-        rr.send_columns(path, index, columns, recording=stream)
-
-
-def _style(stream: rr.RecordingStream, path: str, style: rr.SeriesLines | rr.SeriesPoints) -> None:
-    stream.log(path, style, static=True)
+        wanted = target[k] * shown.per_si if k < len(target) else np.nan
+        named = shown.label if k < len(target) else f"{shown.label}, {shown.unit}"
+        for name, values, style in (
+            ("sigma", sigma, line(named, shown.colour)),
+            ("deviation", value, line(shown.label, shown.colour)),
+            ("band", np.column_stack([value - sigma, value + sigma]), bounds("−σ", "+σ")),
+            ("target", np.full(len(sigma), wanted), line(f"target {shown.label}", shown.colour, 1.0)),
+        ):
+            send_curve(stream, f"{shown.path}/{name}", of_dwells, values[whole], *([] if styled else [style]))
+            send_curve(stream, f"{shown.path}/{name}", within, values[~whole])
 
 
 def log_innovations(visits: Sequence[Visit], stream: rr.RecordingStream, before: int = 0) -> None:
@@ -149,21 +164,17 @@ def log_innovations(visits: Sequence[Visit], stream: rr.RecordingStream, before:
 
     ``before``: how many dwells were sent before these.
     """
-    (elapsed_s, number), count = ends(visits), before + len(visits)
+    times, count = ends(visits), before + len(visits)
     unit = units.shown("m/s^2")
     innovation = np.array([visit.innovation_mps2 for visit in visits]) * unit.per_si
     sigma = np.array([visit.innovation_sigma_mps2 for visit in visits]) * unit.per_si
     for i, (channel, colour) in enumerate(zip(CHANNELS, ACCELEROMETERS, strict=True)):
-        path, bound = f"innovation/{channel}", 2 * sigma[:, i]
-        _send(stream, f"{path}/value", elapsed_s, number, innovation[:, i])
-        _send(stream, f"{path}/bound", elapsed_s, number, np.column_stack([-bound, bound]))
-        _send(stream, f"{path}/in_sigma", elapsed_s, number, innovation[:, i] / sigma[:, i])
-        _style(stream, f"{path}/value", _points(channel, colour, count))
-        _style(stream, f"{path}/bound", _bounds("−2σ", "+2σ"))
-        _style(stream, f"{path}/in_sigma", _points(channel, colour, count))
+        path, bound, points = f"innovation/{channel}", 2 * sigma[:, i], _points(channel, colour, count)
+        send_curve(stream, f"{path}/value", times, innovation[:, i], points)
+        send_curve(stream, f"{path}/bound", times, np.column_stack([-bound, bound]), bounds("−2σ", "+2σ"))
+        send_curve(stream, f"{path}/in_sigma", times, innovation[:, i] / sigma[:, i], points)
     known = np.where(np.isfinite(sigma).all(axis=1), 2.0, np.nan)
-    _send(stream, "innovation/bound", elapsed_s, number, np.column_stack([-known, known]))
-    _style(stream, "innovation/bound", _bounds("−2σ", "+2σ"))
+    send_curve(stream, "innovation/bound", times, np.column_stack([-known, known]), bounds("−2σ", "+2σ"))
 
 
 def log_nis(visits: Sequence[Visit], stream: rr.RecordingStream, before: int = 0) -> None:
@@ -171,15 +182,13 @@ def log_nis(visits: Sequence[Visit], stream: rr.RecordingStream, before: int = 0
     judged = [visit for visit in visits if visit.dof > 0]
     if not judged:
         return
-    elapsed_s, number = ends(judged)
-    value = np.array([visit.nis for visit in judged])
+    times, value = ends(judged), np.array([visit.nis for visit in judged])
     band = nis_band(np.array([visit.dof for visit in judged]))
     high = value > band[:, 1]
     for name, place, colour in (("value", ~high, WHITE), ("above", high, RED)):
-        _send(stream, f"nis/{name}", elapsed_s[place], number[place], value[place])
-        _style(stream, f"nis/{name}", _points(name, colour, before + len(visits)))
-    _send(stream, "nis/band", elapsed_s, number, band)
-    _style(stream, "nis/band", _bounds("2.5 %", "97.5 %"))
+        points = _points(name, colour, before + len(visits))
+        send_curve(stream, f"nis/{name}", times, np.where(place, value, np.nan), points)
+    send_curve(stream, "nis/band", times, band, bounds("2.5 %", "97.5 %"))
 
 
 def predicted(result: Calibration) -> bool:
@@ -190,13 +199,11 @@ def predicted(result: Calibration) -> bool:
 
 def log_residuals(result: Calibration, stream: rr.RecordingStream) -> None:
     """Residual of each dwell and channel over the sigma of its mean, for runs whose dwells were hardly predicted."""
-    elapsed_s, number = ends(result.visits)
-    ratios = result.residuals_mps2 / mean_sigmas(result)
+    times, ratios = ends(result.visits), result.residuals_mps2 / mean_sigmas(result)
     for i, (channel, colour) in enumerate(zip(CHANNELS, ACCELEROMETERS, strict=True)):
-        _send(stream, f"residual/{channel}", elapsed_s, number, ratios[:, i])
-        _style(stream, f"residual/{channel}", _points(channel, colour, len(ratios)))
-    _send(stream, "residual/bound", elapsed_s, number, np.tile([-2.0, 2.0], (len(ratios), 1)))
-    _style(stream, "residual/bound", _bounds("−2σ", "+2σ"))
+        send_curve(stream, f"residual/{channel}", times, ratios[:, i], _points(channel, colour, len(ratios)))
+    level = np.tile([-2.0, 2.0], (len(ratios), 1))
+    send_curve(stream, "residual/bound", times, level, bounds("−2σ", "+2σ"))
 
 
 def _points(name: str, colour: Colour, count: int) -> rr.SeriesPoints:
@@ -208,28 +215,14 @@ def crowd(count: int) -> float:
     return max(0.4, min(1.0, (100 / count) ** 0.5))
 
 
-def _bounds(lower: str, upper: str) -> rr.SeriesLines:
-    return rr.SeriesLines(names=[lower, upper], colors=[GREY, GREY], widths=[1.0, 1.0])
-
-
 def log_bench(result: Calibration, stream: rr.RecordingStream, before: int = 0) -> None:
     """The pose of each dwell: gimbal angles in deg, or the quaternion."""
-    dwells = [visit.dwell for visit in result.visits[before:]]
-    begun = np.array([dwell.start_s for dwell in dwells])
-    done, number = ends(result.visits[before:])
-    poses = np.array([dwell.recorded_pose for dwell in dwells])
+    visits = result.visits[before:]
+    poses = np.array([visit.dwell.recorded_pose for visit in visits])
     poses = np.degrees(poses) if result.bench.axes else poses
-    for k, (name, angle) in enumerate(zip(pose_names(result), poses.T, strict=True)):
-        colour = GIMBALS[k % len(GIMBALS)]
+    names = gimbal_names(result.bench) if result.bench.axes else ["q_x", "q_y", "q_z", "q_w"]
+    for k, (name, angle) in enumerate(zip(names, poses.T, strict=True)):
+        colour, path = GIMBALS[k % len(GIMBALS)], f"bench/pose/{name}"
         step = rr.SeriesLines(names=name.replace("_", " "), colors=colour, widths=1.5, interpolation_mode="StepMid")
-        _send(stream, f"bench/pose/{name}", done, number, angle)
-        _send(stream, f"bench/pose/{name}", begun, None, angle)
-        _style(stream, f"bench/pose/{name}", step)
-
-
-def pose_names(result: Calibration) -> list[str]:
-    """Of the gimbals, outer first, with their axes; of the quaternion's parts where there are no gimbals."""
-    if not result.bench.axes:
-        return ["q_x", "q_y", "q_z", "q_w"]
-    axes = result.bench.to_metadata()["axes"].split()
-    return [f"{k}_{axis}" for k, axis in enumerate(axes, 1)]
+        send_curve(stream, path, ends(visits), angle, step)
+        send_curve(stream, path, begins(visits), angle)

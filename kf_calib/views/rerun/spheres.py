@@ -26,7 +26,7 @@ from kf_calib.estimation.results import Calibration
 from kf_calib.support.units import shown
 from kf_calib.views.notation import written
 from kf_calib.views.rerun.names import ACCELEROMETERS, DARK, GOLD, GREY, RED, WHITE, thin
-from kf_calib.views.rerun.series import crowd, ends, times
+from kf_calib.views.rerun.series import begins, columns_of, crowd, ends
 
 NEGATIVE, POSITIVE, NONE = np.array([70, 140, 255]), np.array([255, 110, 50]), np.array([150, 150, 155])
 _FULL = 4.0  # sigma at which the colour of a residual is full
@@ -81,14 +81,10 @@ def log_spheres(
     disturbed: numbers of dwells that get a red ring.
     """
     marked = {k: visit.dwell.number for k, visit in enumerate(result.visits) if visit.dwell.number in disturbed}
-    force = np.array([visit.dwell.means[1:4] for visit in result.visits])
-    directions = force / np.linalg.norm(force, axis=1, keepdims=True)
-    turn = np.linspace(0, 2 * np.pi, 73)
-    circle = np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
+    directions = _directions(result)
     for i in range(3):
         middle = np.array([column * _PITCH, -i * _PITCH, 0.0])
-        circles = [np.roll(circle, k, axis=1) + middle for k in range(3)]
-        stream.log(f"{path}/{i + 1}/sphere", rr.LineStrips3D(circles, colors=(75, 75, 80), radii=0.004), static=True)
+        stream.log(f"{path}/{i + 1}/sphere", _sphere(middle, 73, 0.004), static=True)
         sensitivity = result.estimate.state[4 * i : 4 * i + 3]
         axis = sensitivity / np.linalg.norm(sensitivity)
         arrow = rr.Arrows3D(origins=[middle], vectors=[1.3 * axis], colors=ACCELEROMETERS[i], radii=0.02,
@@ -99,6 +95,20 @@ def log_spheres(
         rings = [_ring(middle, directions[k]) for k in marked]
         names = [f"dwell {number}: disturbed" for number in marked.values()] if i == 0 else None
         log(f"{path}/{i + 1}/disturbed", rr.LineStrips3D(rings, colors=RED, radii=0.012, labels=names))
+
+
+def _directions(result: Calibration) -> Floats:
+    """Return the directions (n, 3) of specific force in the platform, by the mean readings of each dwell."""
+    force = np.array([visit.dwell.means[1:4] for visit in result.visits])
+    return force / np.linalg.norm(force, axis=1, keepdims=True)
+
+
+def _sphere(middle: Floats, points: int, radius: float) -> rr.LineStrips3D:
+    """Return three circles on a unit sphere, about its axes, of so many points each."""
+    turn = np.linspace(0, 2 * np.pi, points)
+    circle = np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
+    circles = [np.roll(circle, k, axis=1) + middle for k in range(3)]
+    return rr.LineStrips3D(circles, colors=(75, 75, 80), radii=radius)
 
 
 def _radii(ratios: Floats) -> Floats:
@@ -143,23 +153,15 @@ def magnification(final: Sequence[Ellipsoid]) -> float | None:
     return rounded(FINAL_SIZE / largest) if largest > 0.0 else None
 
 
-def ellipsoids(sensitivities: Floats) -> list[Ellipsoid]:
-    """Those of covariances (3, 3, 3) of the three sensitivities; NaN where one is not determined."""
-    determined = list[Ellipsoid]()
-    for i, covariance in enumerate(sensitivities):
-        if np.isfinite(covariance).all():
-            variance, directions = np.linalg.eigh(covariance)
-            determined.append((i, np.sqrt(np.maximum(variance, 0.0)), directions * np.linalg.det(directions)))
-    return determined
-
-
 def ellipsoids_of(estimate: Estimate) -> list[Ellipsoid]:
     """Return those of the sensitivities that are determined."""
-    covariances = np.full((3, 3, 3), np.nan)
+    determined = list[Ellipsoid]()
     for i in range(3):
-        if not estimate.unseen[4 * i : 4 * i + 3].any():
-            covariances[i] = estimate.covariance[4 * i : 4 * i + 3, 4 * i : 4 * i + 3]
-    return ellipsoids(covariances)
+        states = slice(4 * i, 4 * i + 3)
+        if not estimate.unseen[states].any():
+            variance, directions = np.linalg.eigh(estimate.covariance[states, states])
+            determined.append((i, np.sqrt(np.maximum(variance, 0.0)), directions * np.linalg.det(directions)))
+    return determined
 
 
 def magnified(estimate: Estimate) -> str:
@@ -177,20 +179,17 @@ def _axes(estimate: Estimate) -> Floats:
 def log_platform(result: Calibration, stream: rr.RecordingStream) -> None:
     log_frame(stream)
     _log_axes(result, stream)
-    numbers = ends(result.visits)[1].tolist()
+    numbers = [visit.dwell.number for visit in result.visits]
     steps = [ellipsoids_of(visit.estimate) for visit in result.visits]
     tips = [_axes(visit.estimate) for visit in result.visits]
-    _log_ellipsoids(stream, times(*ends(result.visits)), numbers, steps, tips, result.bench)
+    _log_ellipsoids(stream, columns_of(ends(result.visits)), numbers, steps, tips, result.bench)
     _log_directions(result, stream)
 
 
 def log_frame(stream: rr.RecordingStream) -> None:
     """What stands still: the sphere of directions, the platform's axes, the nominal sensitive axes."""
     stream.log("platform", rr.ViewCoordinates.RIGHT_HAND_Y_UP, static=True)
-    turn = np.linspace(0, 2 * np.pi, 97)
-    circle = np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
-    circles = [np.roll(circle, k, axis=1) for k in range(3)]
-    stream.log("platform/sphere", rr.LineStrips3D(circles, colors=(75, 75, 80), radii=0.003), static=True)
+    stream.log("platform/sphere", _sphere(np.zeros(3), 97, 0.003), static=True)
     stream.log("platform/frame", rr.Arrows3D(vectors=1.4 * np.eye(3), colors=GREY, radii=0.008), static=True)
     letters = rr.Points3D(1.5 * np.eye(3), radii=0.0, colors=GREY, labels=["X", "Y", "Z"], show_labels=True)
     stream.log("platform/frame/letters", letters, static=True)
@@ -207,7 +206,7 @@ def _log_axes(result: Calibration, stream: rr.RecordingStream) -> None:
         labels=[f"E{'₁₂₃'[i]}" for i in which],
         radii=[0.016] * len(which),
     ).partition([len(own) for own in seen])
-    rr.send_columns("platform/axes", times(*ends(result.visits)), columns, recording=stream)
+    rr.send_columns("platform/axes", columns_of(ends(result.visits)), columns, recording=stream)
 
 
 def _log_ellipsoids(
@@ -265,24 +264,17 @@ def with_y_up(bench: Bench, *vectors: Vector) -> Floats:
 
 
 def _log_directions(result: Calibration, stream: rr.RecordingStream) -> None:
-    """Specific force of each dwell on the unit sphere: a point that stays, and an arrow while the dwell lasts."""
-    visits = result.visits
-    force = np.array([visit.dwell.means[1:4] for visit in visits])
-    direction = force / np.linalg.norm(force, axis=1, keepdims=True)
-    done, number = ends(visits)
-    begun = np.array([visit.dwell.start_s for visit in visits])
-    count = len(visits)
-    points = rr.Points3D.columns(positions=direction, colors=_verdicts(result), radii=[0.025 * crowd(count)] * count)
-    rr.send_columns("platform/visited", times(done, number), points, recording=stream)
+    """Specific force of each dwell on the unit sphere: a point that stays, and an arrow while the dwell lasts.
+
+    The point is grey where the dwell could not be judged, red where its NIS is above chi-squared's band, else white.
+    """
+    direction, done, count = _directions(result), ends(result.visits), len(result.visits)
+    dof, nis = (np.array([getattr(visit, name) for visit in result.visits]) for name in ("dof", "nis"))
+    high = nis > nis_band(dof)[:, 1]
+    colours = [GREY if free <= 0 else RED if bad else WHITE for free, bad in zip(dof, high, strict=True)]
+    points = rr.Points3D.columns(positions=direction, colors=colours, radii=[0.025 * crowd(count)] * count)
+    rr.send_columns("platform/visited", columns_of(done), points, recording=stream)
     arrows = rr.Arrows3D.columns(
         vectors=1.25 * direction, colors=[GOLD] * count, radii=[0.016] * count, labels=["up"] * count
     )
-    rr.send_columns("platform/up", times(begun, number), arrows, recording=stream)
-
-
-def _verdicts(result: Calibration) -> list[tuple[int, int, int]]:
-    """Grey where a dwell could not be judged, red where its NIS is above chi-squared's 95 % band, else white."""
-    dof = np.array([visit.dof for visit in result.visits])
-    nis = np.array([visit.nis for visit in result.visits])
-    bad = nis > nis_band(dof)[:, 1]
-    return [GREY if free <= 0 else RED if out else WHITE for free, out in zip(dof, bad, strict=True)]
+    rr.send_columns("platform/up", columns_of(done | begins(result.visits)), arrows, recording=stream)
