@@ -160,7 +160,7 @@ class Lines:
                 blank = first_line(first)
                 account.lines += blank
                 del first[:blank]
-                if len(first) > _TELLING_ROWS or (first and is_json(first[0])):
+                if first and are_telling(first):
                     break
             if not first:
                 raise InputError(f"{self.name} holds no lines: check that the logger wrote any.")
@@ -206,6 +206,11 @@ class Lines:
             theirs = [name for name, ours in self._columns.items() if ours in POSE_KEYS]
             angles = holds_any(self.path, [f'"{name}"'.encode() for name in (*POSE_KEYS, *theirs)])
         return reader_for(lines, self._columns, self._account, angles=angles, units=self._units, stated=self._stated)
+
+
+def are_telling(lines: Sequence[str]) -> bool:
+    """Whether these are enough of the first lines, of which the first is not blank, to choose a reader by."""
+    return len(lines) > _TELLING_ROWS or is_json(lines[0])
 
 
 def reader_for(
