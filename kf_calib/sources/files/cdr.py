@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import SECOND_NS, Stream
 from kf_calib.sources.files.fields import Joints, JointsError
+from kf_calib.sources.files.mcap_records import at_every_byte
 
 Offsets = NDArray[np.int64]
 
@@ -296,7 +297,7 @@ class Decoder:
             start = int(at[rest[0]])
             layout = self._layout(buffer[start : start + size])
             columns = self._columns(layout)
-            every = np.ndarray((len(buffer) - layout.size + 1,), dtype_of(layout), buffer, strides=(1,))
+            every = at_every_byte(buffer, dtype_of(layout))
             head = every["head"][at[rest]].view(_HEAD)
             alike = (head["kind"] == head["kind"][0]) & (head["frame"] == head["frame"][0])
             if every["names"].shape[1]:

@@ -15,7 +15,7 @@ from kf_calib.sources.files.cdr import IMU, JOINT_STATE, QUATERNION, TEMPERATURE
 from kf_calib.sources.files.field_messages import CDR, ENCODINGS, FieldDecoder
 from kf_calib.sources.files.fields import FieldError, Fields, Joints, known_fields
 from kf_calib.sources.files.mcap_file import Warn
-from kf_calib.sources.files.mcap_records import DamagedError, parse_record
+from kf_calib.sources.files.mcap_records import DamagedError, Summary, parse_record
 from kf_calib.sources.files.record_files import RecordFile
 
 BENCH_RECORD = "kf_calib.bench"
@@ -93,6 +93,13 @@ class Contents:
     channels: dict[int, Channel] = field(default_factory=dict[int, Channel])
     bench: dict[str, str] | None = None
     bench_damaged: bool = False
+
+    @classmethod
+    def listed_in(cls, file: RecordFile, stated: Mapping[Role, Fields]) -> Contents:
+        """What the summary of a file lists."""
+        summary = file.summary or Summary(0)
+        schemas = {schema.id: schema for schema in summary.schemas}
+        return cls(file.path, stated, schemas, {channel.id: channel for channel in summary.channels})
 
     def add(self, opcode: int, content: bytes, warn: Warn) -> None:
         """Takes note of a record that is not a message."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import struct
 from collections.abc import Callable
 from contextlib import redirect_stderr
 from typing import Any
@@ -16,13 +15,12 @@ from kf_calib.bench.streams import Stream
 from kf_calib.errors import MissingExtraError
 from kf_calib.sources.files.cdr import IMU, JOINT_STATE, QUATERNION, TEMPERATURE, Offsets
 from kf_calib.sources.files.fields import LOG_TIME, FieldError, Fields, Joints, JointsError, time_ns
+from kf_calib.sources.files.mcap_records import log_times
 
 ENCODINGS = ("json", "protobuf")
 """Those in which messages are told by their fields, whatever their type; in CDR only where fields are stated."""
 CDR = "cdr"
 _ANEW = "record it anew, or name another topic"
-_LOG_TIME = struct.Struct("<Q")
-LOG_TIME_BEFORE = 16  # bytes from a record's log time to its message
 _Parse = Callable[[bytes], Any]
 _DEFINED = {name: kind.schema.encode() for kind in (IMU, JOINT_STATE, QUATERNION, TEMPERATURE) for name in kind.names}
 """Definitions of types that bags may leave out."""
@@ -68,10 +66,11 @@ class FieldDecoder:
                 continue
             if numbers is not None:
                 kept.append(start)
-                stamps.append(self._stamp(message, buffer, start))
+                stamps.append(self._stamp(message))
                 values.append(numbers)
-        table = np.array(values, float).reshape(len(values), self.width)
-        return np.array(kept, np.int64), Stream(np.array(stamps, np.int64), table)
+        table, messages = np.array(values, float).reshape(len(values), self.width), np.array(kept, np.int64)
+        times = log_times(buffer, messages) if self._time == LOG_TIME else np.array(stamps, np.int64)
+        return messages, Stream(times, table)
 
     def _read(self, data: bytes) -> tuple[Any, list[float] | None]:
         """A message, and the numbers in it that are sought."""
@@ -97,7 +96,8 @@ class FieldDecoder:
             )
         return numbers
 
-    def _stamp(self, message: Any, buffer: bytes, start: int) -> int:
+    def _stamp(self, message: Any) -> int:
+        """The time in a message; 0 where that of receipt is taken."""
         if not self._time:
             self._time = self._fields.timed_by(message)
             if self._time == LOG_TIME and self._fields.time is None:
@@ -105,9 +105,7 @@ class FieldDecoder:
                     "its messages have no time of their own that is known, so the time of receipt is taken; --field "
                     "names another behind @"
                 )
-        if self._time != LOG_TIME:
-            return time_ns(message, self._time)
-        return min(_LOG_TIME.unpack_from(buffer, start - LOG_TIME_BEFORE)[0], (1 << 63) - 1)
+        return 0 if self._time == LOG_TIME else time_ns(message, self._time)
 
 
 def parser_of(encoding: str, schema: Schema | None) -> Callable[[bytes], Any]:

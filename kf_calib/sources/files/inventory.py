@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from kf_calib.errors import MissingExtraError
 from kf_calib.sources.containers.opening import dataset_of, datasets_in, kind_of_container
 from kf_calib.sources.files.contents import POSES, READINGS, USABLE_SCHEMAS, Contents, fields_by_role
-from kf_calib.sources.files.field_messages import CDR, ENCODINGS, LOG_TIME_BEFORE, parser_of
+from kf_calib.sources.files.field_messages import CDR, ENCODINGS, parser_of
 from kf_calib.sources.files.fields import FieldError, paths_of
 from kf_calib.sources.files.mcap_file import McapFile, Warn
-from kf_calib.sources.files.mcap_records import MAX_CHUNK_MB, MessageFinder
+from kf_calib.sources.files.mcap_records import MAX_CHUNK_MB, MessageFinder, log_times
 from kf_calib.sources.files.record_files import (
     ROS1_BAG,
     ListsMessages,
@@ -33,7 +33,6 @@ TopicTimes = NDArray[np.int64]
 _GAP = 5  # times the usual interval
 _USUAL = 1000  # intervals from which the usual one is taken
 _LEAST = 10  # intervals, for one to be usual
-_LATEST = (1 << 63) - 1
 
 
 @dataclass
@@ -131,7 +130,7 @@ def inventory_of(path: Path, fields: Sequence[str] = ()) -> Inventory:
     topics, bench, has_readings, has_angles = dict[str, Topic](), dict[str, str](), False, None
     for part in parts:
         warnings += [part.trouble] if part.trouble else []
-        contents = Contents(part.path, stated)
+        contents = Contents.listed_in(part, stated)
         _count(part, contents, topics, warnings.append)
         bench = bench or contents.bench or {}
         has_readings |= bool(contents.topics(READINGS))
@@ -189,9 +188,6 @@ def _other_datasets(path: Path, units: Units | None) -> Iterator[Topic]:
 
 def _count(file: RecordFile, contents: Contents, topics: dict[str, Topic], warn: Warn) -> None:
     """Adds what a file holds to the topics met so far."""
-    if file.summary:
-        contents.schemas = {schema.id: schema for schema in file.summary.schemas}
-        contents.channels = {channel.id: channel for channel in file.summary.channels}
     for channel in contents.channels.values():
         _topic(channel, contents, topics)
         if isinstance(file, ListsMessages):
@@ -236,8 +232,7 @@ def _from_blocks(
         for number in dict.fromkeys(group.channel for group in messages.groups if len(group.at)):
             groups = [group for group in messages.groups if group.channel == number and len(group.at)]
             at = np.sort(np.concatenate([group.at for group in groups]))
-            every = np.ndarray((len(block.data) - 7,), "<u8", block.data, strides=(1,))
-            yield number, np.minimum(every[at - LOG_TIME_BEFORE], _LATEST).astype(np.int64)
+            yield number, log_times(block.data, at)
             first = block.data[int(groups[0].at[0]) : int(groups[0].at[0]) + groups[0].size]
             _look_into(first, number, contents, topics)
 

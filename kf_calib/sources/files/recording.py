@@ -36,7 +36,7 @@ from kf_calib.sources.files.contents import (
     Role,
     fields_by_role,
 )
-from kf_calib.sources.files.field_messages import LOG_TIME_BEFORE, FieldDecoder
+from kf_calib.sources.files.field_messages import FieldDecoder
 from kf_calib.sources.files.fields import FieldError, Joints
 from kf_calib.sources.files.mcap_file import Warn
 from kf_calib.sources.files.mcap_records import (
@@ -47,6 +47,7 @@ from kf_calib.sources.files.mcap_records import (
     Messages,
     RecordBlock,
     are_packed,
+    log_times,
     parse_record,
     unpacked,
 )
@@ -211,16 +212,13 @@ class Recording:
     def _survey(self, file: RecordFile) -> Contents:
         """Topics and bench: from the summary, else by reading on until no better choice of topics can come, and where
         something is damaged the bench."""
-        contents, summary = Contents(file.path, self._stated), file.summary
-        if summary:
-            contents.schemas = {schema.id: schema for schema in summary.schemas}
-            contents.channels = {channel.id: channel for channel in summary.channels}
-            for index in summary.metadata:
-                if index.name == BENCH_RECORD and contents.bench is None:
-                    try:
-                        contents.add(Opcode.METADATA, file.record_at(index.offset, Opcode.METADATA), warn=_ignore)
-                    except DamagedError:
-                        contents.bench_damaged = True
+        contents = Contents.listed_in(file, self._stated)
+        for index in file.summary.metadata if file.summary else ():
+            if index.name == BENCH_RECORD and contents.bench is None:
+                try:
+                    contents.add(Opcode.METADATA, file.record_at(index.offset, Opcode.METADATA), warn=_ignore)
+                except DamagedError:
+                    contents.bench_damaged = True
         lists_topics = bool(contents.channels and contents.schemas)
         if lists_topics and (contents.bench is not None or contents.bench_damaged):
             return contents
@@ -406,9 +404,7 @@ class _Track:
         self.by_receipt |= len(stream) > 1 and not stream.time_ns.any()
         if not self.by_receipt:
             return stream
-        every = np.ndarray((max(len(data) - 7, 0),), "<u8", data, strides=(1,))
-        receipts = np.minimum(every[at - LOG_TIME_BEFORE], np.iinfo(np.int64).max).astype(np.int64)
-        return Stream(np.where(stream.time_ns == 0, receipts, stream.time_ns), stream.values)
+        return Stream(np.where(stream.time_ns == 0, log_times(data, at), stream.time_ns), stream.values)
 
 
 def _scaled(stream: Stream, scale: float) -> Stream:
