@@ -202,7 +202,7 @@ def base_with_up(up: str) -> Rotation:
     return Rotation.from_matrix(bench_from_base[None])
 
 
-@dataclass(frozen=True)
+@dataclass
 class Motion:
     """Dwells at ``angles_rad`` (m, k), each from ``arrive_ns`` to ``leave_ns`` (m,); slews between, all axes at once.
 
@@ -231,8 +231,12 @@ class Motion:
         """Per instant (n,): the dwell it is in or was last in, and the share of the way to the next one, 0 to 1."""
         dwell = np.searchsorted(self.arrive_ns, time_ns, side="right") - 1
         slew_ns = np.append(self.arrive_ns[1:] - self.leave_ns[:-1], 0)
-        u = np.clip((time_ns - self.leave_ns[dwell]) / np.maximum(slew_ns[dwell], 1), 0.0, 1.0)
-        return dwell, u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
+        share = np.clip((time_ns - self.leave_ns[dwell]) / np.maximum(slew_ns[dwell], 1), 0.0, 1.0)
+        return dwell, self._profile(share)
+
+    def _profile(self, share: Floats) -> Floats:
+        """The share of the way that is behind it, by that of the time."""
+        return share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
 
     def angles_at(self, time_ns: Times) -> Floats:
         """Gimbal angles (n, k), rad."""
