@@ -9,11 +9,11 @@ from kf_calib.bench.streams import Batch
 from kf_calib.errors import InputError
 from kf_calib.sources.live.feed import nothing
 from kf_calib.sources.live.frames import FrameReader
-from kf_calib.sources.text.columns import Columns
 from kf_calib.sources.text.csv_lines import CsvLines
 from kf_calib.sources.text.encoding import Cutter
 from kf_calib.sources.text.heading import TextHeading
 from kf_calib.sources.text.json_lines import JsonLines
+from kf_calib.sources.text.lines import reader_for
 from kf_calib.sources.text.reader import Account, LineReader
 from kf_calib.sources.text.units import Units
 
@@ -40,7 +40,7 @@ class LineProtocol:
         self._waiting = list[str]()
         self.reader: LineReader | None = None
         if self._heading:
-            self.reader = self._csv(self._heading, account, angles)
+            self.reader = self._reader(self._heading, account, angles)
         self._is_first = False
 
     def push(self, block: bytes) -> Batch:
@@ -98,13 +98,13 @@ class LineProtocol:
                 self._account.refuse(self._account.lines, "it is neither a JSON object nor a header of CSV")
         return []
 
-    def _csv(self, heading: list[str], account: Account, angles: bool) -> CsvLines:
-        return CsvLines(Columns(TextHeading.of(heading), self._columns, self._units), account, angles)
+    def _reader(self, first: list[str], account: Account, angles: bool) -> LineReader:
+        return reader_for(first, self._columns, account, angles=angles, units=self._units)[0]
 
     def _has_readings(self, heading: list[str]) -> bool:
         """Whether a header lacks nothing but angles."""
         try:
-            self._csv(heading, Account(), angles=False)
+            self._reader(heading, Account(), angles=False)
         except InputError:
             return False
         return True
@@ -116,7 +116,7 @@ class LineProtocol:
                 json.loads(text)
             except (ValueError, RecursionError):
                 return False
-            self.reader = JsonLines(self._columns, self._account)
+            self.reader = self._reader([text], self._account, self._angles)
             return True
         cells = text.split(max(",;\t", key=text.count))
         if (
@@ -130,7 +130,7 @@ class LineProtocol:
             if self._angles and len(cells) < _FEWEST_CELLS and not self._has_readings(heading):
                 continue
             try:
-                self.reader, self._heading = self._csv(heading, self._account, self._angles), heading
+                self.reader, self._heading = self._reader(heading, self._account, self._angles), heading
             except InputError as error:
                 lacks = error
                 continue
