@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import SECOND_NS, Stream
-from kf_calib.sources.files.fields import Joints, JointsError
+from kf_calib.sources.files.fields import Joints, MessageError
 from kf_calib.sources.files.mcap_records import at_every_byte
 
 Offsets = NDArray[np.int64]
@@ -28,10 +28,6 @@ _FRAME = 12  # byte offset of frame_id in every message that starts with a std_m
 _HEAD = np.dtype([("kind", "<u4"), ("sec", "<i4"), ("nanosec", "<u4"), ("frame", "<u4")])
 _MAX_PADDING = 7
 _ANEW = "the messages are not of the type that the topic has, so record it anew, or choose another topic"
-
-
-class CdrError(ValueError):
-    """A message does not have the layout its schema promises."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +95,7 @@ def _uint32(message: bytes, offset: int) -> int:
 def _after_string(message: bytes, offset: int) -> int:
     end = offset + 4 + _uint32(message, offset)
     if end > len(message):
-        raise CdrError(f"a string of the message ends at byte {end} of {len(message)}: {_ANEW}")
+        raise MessageError(f"a string of the message ends at byte {end} of {len(message)}: {_ANEW}")
     return end
 
 
@@ -121,7 +117,7 @@ def _joint_state_layout(message: bytes) -> Layout:
     width, offset = _uint32(message, offset), offset + 4
     values = _align(offset, 8) if width else offset
     if count not in (0, width):
-        raise CdrError(f"it names {count} joints but gives {width} positions")
+        raise MessageError(f"it names {count} joints but gives {width} positions")
     end = values + 8 * width
     for _ in ("velocity", "effort"):
         offset = _align(end, 4)
@@ -246,21 +242,21 @@ def temperature_message(frame_id: str) -> bytes:
 def filled(kind: MessageType, template: bytes, stream: Stream) -> NDArray[np.void]:
     """One message (n,) for each sample of ``stream``: ``template`` with its stamp and values put in.
 
-    Raises CdrError where the number of values is not the template's or a stamp does not fit the message.
+    Raises MessageError where the number of values is not the template's or a stamp does not fit the message.
     """
     layout = kind.layout(template)
     if stream.values.shape != (len(stream), layout.width):
-        raise CdrError(f"{kind.name} holds {layout.width} values a sample here, not {stream.values.shape[1:]}")
+        raise MessageError(f"{kind.name} holds {layout.width} values a sample here, not {stream.values.shape[1:]}")
     messages = np.frombuffer(bytearray(template * len(stream)), dtype_of(layout))
     fill(messages, stream)
     return messages
 
 
 def fill(messages: NDArray[np.void], stream: Stream) -> None:
-    """Put stamps and values, of their number, into messages (n,); raises CdrError where a stamp does not fit."""
+    """Put stamps and values, of their number, into messages (n,); raises MessageError where a stamp does not fit."""
     seconds, nanoseconds = np.divmod(stream.time_ns, SECOND_NS)
     if len(seconds) and not (0 <= seconds.min() and seconds.max() < 2**31):
-        raise CdrError("stamps must be nanoseconds between the years 1970 and 2038")
+        raise MessageError("stamps must be nanoseconds between the years 1970 and 2038")
     messages["sec"], messages["nanosec"], messages["values"] = seconds, nanoseconds, stream.values
 
 
@@ -285,7 +281,7 @@ class Decoder:
     def __call__(self, buffer: bytes, at: Offsets, size: int) -> Stream:
         """The messages of ``size`` bytes each that start at offsets ``at`` (n,) of ``buffer``, all within it.
 
-        Raises CdrError for a message of another layout.
+        Raises MessageError for a message of another layout.
         """
         return self.stream_with_offsets(buffer, at, size)[1]
 
@@ -316,32 +312,29 @@ class Decoder:
 
     def _layout(self, message: bytes) -> Layout:
         if len(message) < len(_LITTLE_ENDIAN):
-            raise CdrError(f"a {self.kind.name} does not fit in its {len(message)} bytes: {_ANEW}")
+            raise MessageError(f"a {self.kind.name} does not fit in its {len(message)} bytes: {_ANEW}")
         if message[:2] != _LITTLE_ENDIAN[:2]:
-            raise CdrError(
+            raise MessageError(
                 f"its encapsulation is {message[:2].hex(' ')}, only 00 01 (little-endian CDR) can be read: convert it"
             )
         try:
             layout = self.kind.layout(message)
         except struct.error:
-            raise CdrError(f"a {self.kind.name} does not fit in its {len(message)} bytes: {_ANEW}") from None
+            raise MessageError(f"a {self.kind.name} does not fit in its {len(message)} bytes: {_ANEW}") from None
         if not layout.size <= len(message) <= layout.size + _MAX_PADDING:
-            raise CdrError(f"a {self.kind.name} takes {layout.size} bytes, the message has {len(message)}: {_ANEW}")
+            raise MessageError(f"a {self.kind.name} takes {layout.size} bytes, the message has {len(message)}: {_ANEW}")
         return layout
 
     def _columns(self, layout: Layout) -> tuple[int, ...] | None:
         """Which values of a message are wanted; None: none of them."""
         if self.kind is not JOINT_STATE:
             return tuple(range(layout.width))
-        try:
-            return self._joints(layout.names, layout.width)
-        except JointsError as error:
-            raise CdrError(str(error)) from None
+        return self._joints(layout.names, layout.width)
 
     def _values(self, numbers: NDArray[np.void], layout: Layout, columns: tuple[int, ...]) -> Floats:
         table = numbers.view("<f8").reshape(len(numbers), -1)
         if layout.flagged and np.any(table[:, layout.width] == -1.0):
-            raise CdrError(
+            raise MessageError(
                 "linear_acceleration is marked as not measured (-1 in its covariance): choose another topic by "
                 "--accel-topic"
             )

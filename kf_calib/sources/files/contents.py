@@ -13,7 +13,7 @@ from mcap.records import Channel, Metadata, Schema
 from kf_calib.errors import InputError
 from kf_calib.sources.files.cdr import IMU, JOINT_STATE, QUATERNION, TEMPERATURE, Decoder, MessageType
 from kf_calib.sources.files.field_messages import CDR, ENCODINGS, FieldDecoder
-from kf_calib.sources.files.fields import FieldError, Fields, Joints, known_fields
+from kf_calib.sources.files.fields import Fields, Joints, MessageError, known_fields
 from kf_calib.sources.files.mcap_file import Warn
 from kf_calib.sources.files.mcap_records import DamagedError, Summary, parse_record
 from kf_calib.sources.files.record_files import RecordFile
@@ -187,7 +187,7 @@ class Contents:
             return FieldDecoder(
                 channel.message_encoding, schema, fields, width, joints, lambda text: warn(f"{said}: {text}.")
             )
-        except FieldError as error:
+        except MessageError as error:
             raise InputError(f"{said} cannot be used: {error}.") from None
 
     @property

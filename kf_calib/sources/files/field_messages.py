@@ -14,7 +14,7 @@ from mcap.records import Schema
 from kf_calib.bench.streams import Stream
 from kf_calib.errors import MissingExtraError
 from kf_calib.sources.files.cdr import IMU, JOINT_STATE, QUATERNION, TEMPERATURE, Offsets
-from kf_calib.sources.files.fields import LOG_TIME, FieldError, Fields, Joints, JointsError, time_ns
+from kf_calib.sources.files.fields import LOG_TIME, Fields, Joints, MessageError, time_ns
 from kf_calib.sources.files.mcap_records import log_times
 
 ENCODINGS = ("json", "protobuf")
@@ -26,7 +26,7 @@ _DEFINED = {name: kind.schema.encode() for kind in (IMU, JOINT_STATE, QUATERNION
 """Definitions of types that bags may leave out."""
 
 
-class _UnreadError(FieldError):
+class _UnreadError(MessageError):
     """A message is not in the encoding that its topic is said to have."""
 
 
@@ -34,7 +34,7 @@ class FieldDecoder:
     """Samples from messages of one topic, ``width`` numbers each, taken from where ``fields`` says.
 
     encoding: of ``ENCODINGS``, or ``CDR``. joints: finds the gimbals among numbers that have names. warn: is told once
-    where the messages have no time of their own. Raises FieldError where the schema does not say what the messages are.
+    where the messages have no time of their own. Raises MessageError where the schema does not say what they are.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class FieldDecoder:
 
     def stream_with_offsets(self, buffer: bytes, at: Offsets, size: int) -> tuple[Offsets, Stream]:
         """Those of the messages of ``size`` bytes each at offsets ``at`` of ``buffer``, after the offsets that they are
-        from. Raises FieldError; a message that cannot be read is left out, if any before it could be."""
+        from. Raises MessageError; a message that cannot be read is left out, if any before it could be."""
         kept, stamps, values = list[int](), list[int](), list[list[float]]()
         for start in at.tolist():
             try:
@@ -83,14 +83,11 @@ class FieldDecoder:
     def _chosen(self, numbers: list[float], names: tuple[str, ...]) -> list[float] | None:
         if self._joints and names:
             if len(names) != len(numbers):
-                raise FieldError(f"a message names {len(names)} joints but gives {len(numbers)} positions")
-            try:
-                columns = self._joints(names, len(numbers))
-            except JointsError as error:
-                raise FieldError(str(error)) from None
+                raise MessageError(f"a message names {len(names)} joints but gives {len(numbers)} positions")
+            columns = self._joints(names, len(numbers))
             return None if columns is None else [numbers[k] for k in columns]
         if len(numbers) != self.width:
-            raise FieldError(
+            raise MessageError(
                 f"{', '.join(self._fields.paths)} gives {len(numbers)} numbers a message in place of {self.width}: "
                 "name as many by --field"
             )
@@ -109,7 +106,7 @@ class FieldDecoder:
 
 
 def parser_of(encoding: str, schema: Schema | None) -> Callable[[bytes], Any]:
-    """What makes an object of a message in one of ``ENCODINGS`` or ``CDR``; raises FieldError, as this does."""
+    """What makes an object of a message in one of ``ENCODINGS`` or ``CDR``; raises MessageError, as this does."""
     if encoding == CDR:
         return _of_cdr(schema)
     return _of_protobuf(schema) if encoding == "protobuf" else _of_json
@@ -149,7 +146,7 @@ def _of_protobuf(schema: Schema | None) -> _Parse:
             add(file)
         kind = GetMessageClass(pool.FindMessageTypeByName(name))
     except Exception:  # of many kinds, for the schema may say anything
-        raise FieldError(f"its schema {name!r} does not say what its protobuf messages are: record it anew") from None
+        raise MessageError(f"its schema {name!r} does not say what its protobuf messages are: record it anew") from None
 
     def parse(data: bytes) -> Any:
         try:
@@ -173,7 +170,7 @@ def _of_cdr(schema: Schema | None) -> _Parse:
     encoding = schema.encoding if schema else "ros2msg"
     text = text or _DEFINED.get(name, b"")
     if not text:
-        raise FieldError(
+        raise MessageError(
             f"the file does not define its messages, {name}: convert it to MCAP, which does, by `ros2 bag convert` on "
             "a computer that knows them"
         )
@@ -181,9 +178,9 @@ def _of_cdr(schema: Schema | None) -> _Parse:
         with redirect_stderr(io.StringIO()):  # it prints what it cannot read
             decode = DecoderFactory().decoder_for(CDR, Schema(id=1, name=name, encoding=encoding, data=text))
     except Exception:  # of many kinds, for the definition may say anything
-        raise FieldError(f"the definition of its messages, {name}, cannot be read: record it anew") from None
+        raise MessageError(f"the definition of its messages, {name}, cannot be read: record it anew") from None
     if decode is None:
-        raise FieldError(
+        raise MessageError(
             f"its messages, {name}, are defined in {encoding!r} and can be read if defined in 'ros2msg': convert the "
             "file by `ros2 bag convert`"
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -15,8 +15,8 @@ from kf_calib.errors import MissingExtraError
 from kf_calib.sources.containers.opening import dataset_of, datasets_in, kind_of_container
 from kf_calib.sources.files.contents import POSES, READINGS, USABLE_SCHEMAS, Contents, fields_by_role
 from kf_calib.sources.files.field_messages import CDR, ENCODINGS, parser_of
-from kf_calib.sources.files.fields import FieldError, paths_of
-from kf_calib.sources.files.mcap_file import McapFile, Warn
+from kf_calib.sources.files.fields import MessageError, paths_of
+from kf_calib.sources.files.mcap_file import Warn
 from kf_calib.sources.files.mcap_records import MAX_CHUNK_MB, MessageFinder, log_times
 from kf_calib.sources.files.record_files import (
     ROS1_BAG,
@@ -193,7 +193,8 @@ def _count(file: RecordFile, contents: Contents, topics: dict[str, Topic], warn:
         if isinstance(file, ListsMessages):
             _look_into(file.first(channel.id), channel.id, contents, topics)
     stray = 0
-    for number, times in _receipts(file, contents, topics, warn):
+    lists_messages = isinstance(file, ListsMessages)
+    for number, times in file.receipts(warn) if lists_messages else _from_blocks(file, contents, topics, warn):
         channel = contents.channels.get(number)
         if channel is None:
             stray += len(times)
@@ -209,19 +210,10 @@ def _topic(channel: Channel, contents: Contents, topics: dict[str, Topic]) -> To
     return topics.setdefault(channel.topic, made)
 
 
-def _receipts(
-    file: RecordFile, contents: Contents, topics: dict[str, Topic], warn: Warn
-) -> Iterable[tuple[int, TopicTimes]]:
-    """Channel and times of receipt of messages of it, some thousands at a time."""
-    if isinstance(file, ListsMessages):
-        return file.receipts(warn)
-    assert isinstance(file, McapFile)
-    return _from_blocks(file, contents, topics, warn)
-
-
 def _from_blocks(
-    file: McapFile, contents: Contents, topics: dict[str, Topic], warn: Warn
+    file: RecordFile, contents: Contents, topics: dict[str, Topic], warn: Warn
 ) -> Iterator[tuple[int, TopicTimes]]:
+    """Yield channel and times of receipt of messages of it, and take note of what else there is."""
     find = MessageFinder()
     for block in file.blocks(warn):
         messages = find(block)
@@ -255,5 +247,5 @@ def _look_into(message: bytes, number: int, contents: Contents, topics: dict[str
         try:
             parse = parser_of(channel.message_encoding, contents.schemas.get(channel.schema_id))
             topic.paths = tuple(paths_of(parse(message)))
-        except (FieldError, MissingExtraError):
+        except (MessageError, MissingExtraError):
             pass

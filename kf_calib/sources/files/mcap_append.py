@@ -147,7 +147,7 @@ class TopicAppender:
         records["log_time"] = records["publish_time"] = stream.time_ns
         try:
             cdr.fill(records["message"], stream)
-        except cdr.CdrError as error:
+        except cdr.MessageError as error:
             raise InputError(f"{self._topic} cannot be written: {error}.") from None
         index = np.column_stack([stream.time_ns, np.arange(count) * records.itemsize]).astype("<u8")
         self._put_chunk(records.view("u1").data, [(self._channel, index)], stream.time_ns)

@@ -43,6 +43,12 @@ from kf_calib.sources.files.mcap_records import (
 )
 
 Warn = Callable[[str], None]
+
+
+def ignore(said: str) -> None:
+    """A ``Warn`` where nothing can be lost, or what is lost is told another time."""
+
+
 _BLOCK = 1 << 22  # smaller chunks are joined: every block costs some hundred microseconds besides its messages
 _PIECE = 1 << 20
 _AHEAD = 2 * _BLOCK  # bytes unpacked and not yet asked for
@@ -306,14 +312,10 @@ class _Walk:
         while place < self.end and self.next_chunk == self.end:
             self.file.seek(place)
             piece = self.file.read(min(_PIECE + overlap, self.end - place))
-            found = (place + at for at in chunk_heads(piece) if place + at + self._chunk_length(piece, at) <= self.end)
-            self.next_chunk = next(found, self.end)
+            ends = ((place + at, place + at + HEAD.size + HEAD.unpack_from(piece, at)[1]) for at in chunk_heads(piece))
+            self.next_chunk = next((start for start, end in ends if end <= self.end), self.end)
             place += _PIECE
         return self.next_chunk
-
-    @staticmethod
-    def _chunk_length(piece: bytes, at: int) -> int:
-        return HEAD.size + HEAD.unpack_from(piece, at)[1]
 
     def _loose(self, opcode: int, content: bytes) -> bytes:
         self.unchecked |= opcode == Opcode.MESSAGE

@@ -26,7 +26,7 @@ from mcap.opcode import Opcode
 from mcap.records import Metadata
 
 from kf_calib.errors import InputError, KfCalibError
-from kf_calib.sources.files.mcap_file import McapFile, Warn
+from kf_calib.sources.files.mcap_file import McapFile, Warn, ignore
 from kf_calib.sources.files.mcap_records import (
     DamagedError,
     Integers,
@@ -229,7 +229,7 @@ def decision_records(path: Path, name: str = DECISION_RECORD) -> list[Mapping[st
     """The records of a name in an MCAP file, in their order; none in a file that is none or cannot be read."""
     find, records = MessageFinder(), list[Mapping[str, str]]()
     try:
-        for block in McapFile(path).blocks(lambda said: None):
+        for block in McapFile(path).blocks(ignore):
             for opcode, content in find(block).others:
                 if opcode == Opcode.METADATA and (record := parse_record(Metadata.read, content)).name == name:
                     records.append(record.metadata)

@@ -35,7 +35,7 @@ from kf_calib.sources.files.contents import (
     bench_checksum,
 )
 from kf_calib.sources.files.fields import Joints, gimbal_names
-from kf_calib.sources.files.mcap_file import McapFile
+from kf_calib.sources.files.mcap_file import McapFile, ignore
 from kf_calib.sources.files.mcap_records import HEAD, MAGIC, MessageFinder
 from kf_calib.support.output_files import Growing, refuse_output
 
@@ -155,7 +155,7 @@ class Recorder:
         """What was written between two sizes that the file had after a ``flush``, as a replay gives it."""
         find, joints = MessageFinder(), Joints(len(self._joints), self._joints)
         decoders = [cdr.Decoder(channel.kind, channel.width, joints) for channel in self._channels]
-        for block in McapFile(self._place.at).blocks(_ignore, start, end):
+        for block in McapFile(self._place.at).blocks(ignore, start, end):
             streams = [Stream.empty(channel.width) for channel in self._channels]
             for group in find(block).groups:
                 k = next(k for k, channel in enumerate(self._channels) if channel.id == group.channel)
@@ -211,7 +211,7 @@ class Recorder:
     def _pack(self, channel: _Channel, stream: Stream) -> list[bytes]:
         try:
             return cdr.pack(channel.kind, channel.template, stream)
-        except cdr.CdrError as error:
+        except cdr.MessageError as error:
             raise InputError(f"samples for {channel.topic} do not fit into {self.path}: {error}.") from error
 
     def _repeat_when_due(self) -> None:
@@ -304,10 +304,6 @@ def _finish(path: Path) -> int:
         file.seek(whole)
         file.write(_END)
         return whole
-
-
-def _ignore(_: str) -> None:
-    """Of a file written here and now nothing is lost."""
 
 
 @dataclass

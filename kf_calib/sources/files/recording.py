@@ -24,7 +24,7 @@ from kf_calib.bench.keys import UNSTATED, BenchKeys, checked_keys
 from kf_calib.bench.raw_input import Conversion, RawInput, conversion, merged_metadata
 from kf_calib.bench.streams import Batch, Stream, bench_without_angles
 from kf_calib.errors import BenchError, InputError
-from kf_calib.sources.files.cdr import CdrError, Decoder
+from kf_calib.sources.files.cdr import Decoder
 from kf_calib.sources.files.contents import (
     BENCH_RECORD,
     POSES,
@@ -37,8 +37,8 @@ from kf_calib.sources.files.contents import (
     fields_by_role,
 )
 from kf_calib.sources.files.field_messages import FieldDecoder
-from kf_calib.sources.files.fields import FieldError, Joints
-from kf_calib.sources.files.mcap_file import Warn
+from kf_calib.sources.files.fields import Joints, MessageError
+from kf_calib.sources.files.mcap_file import Warn, ignore
 from kf_calib.sources.files.mcap_records import (
     MAX_CHUNK_MB,
     DamagedError,
@@ -211,12 +211,12 @@ class Recording:
 
     def _survey(self, file: RecordFile) -> Contents:
         """Topics and bench: from the summary, else by reading on until no better choice of topics can come, and where
-        something is damaged the bench."""
+        something is damaged the bench. Warnings come when the file is read."""
         contents = Contents.listed_in(file, self._stated)
         for index in file.summary.metadata if file.summary else ():
             if index.name == BENCH_RECORD and contents.bench is None:
                 try:
-                    contents.add(Opcode.METADATA, file.record_at(index.offset, Opcode.METADATA), warn=_ignore)
+                    contents.add(Opcode.METADATA, file.record_at(index.offset, Opcode.METADATA), warn=ignore)
                 except DamagedError:
                     contents.bench_damaged = True
         lists_topics = bool(contents.channels and contents.schemas)
@@ -225,7 +225,7 @@ class Recording:
         find, damage = MessageFinder(), list[str]()
         for block in file.blocks(warn=damage.append):
             for opcode, content in find(block).others:
-                contents.add(opcode, content, warn=_ignore)
+                contents.add(opcode, content, warn=ignore)
             may_come_again = contents.bench is None and bool(contents.bench_damaged or damage)
             if lists_topics or (self._is_settled(contents) and not may_come_again):
                 break
@@ -391,7 +391,7 @@ class _Track:
         try:
             parts = [self.decode.stream_with_offsets(block.data, group.at, group.size) for group in groups]
             parts = [(at, self._stamped(stream, at, block.data)) for at, stream in parts]
-        except (CdrError, FieldError) as error:
+        except MessageError as error:
             raise InputError(f"{self.contents.path}: topic {self.topic} cannot be used: {error}.") from error
         if len(parts) == 1:
             return parts[0][1]
@@ -421,7 +421,3 @@ def _mark(opcode: int, content: bytes) -> list[Metadata]:
     except DamagedError:  # told already
         return []
     return [record] if record.name in (*_MARKS, RUN_RECORD) else []
-
-
-def _ignore(_: str) -> None:
-    """While surveying: the warnings come again when the file is read."""
