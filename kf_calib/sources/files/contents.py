@@ -42,7 +42,7 @@ def bench_checksum(metadata: Mapping[str, str]) -> str:
 class Role:
     """What a topic is wanted for. ``preferred`` topics win, in this order, where several have a fitting schema.
 
-    fields: what its numbers are called in ``Fields``.
+    fields: what the numbers of its kinds are called in ``Fields``.
     """
 
     quantity: str
@@ -135,14 +135,16 @@ class Contents:
 
     def topics(self, role: Role) -> list[str]:
         """Topics with a schema that ``role`` can use, in the order of the file."""
-        fitting = [channel.topic for channel in self.channels.values() if self._fits(role, channel)]
+        fitting = [channel.topic for channel in self.channels.values() if self._quantity(role, channel) in role.fields]
         return list(dict.fromkeys(fitting))
 
-    def _fits(self, role: Role, channel: Channel) -> bool:
+    def _quantity(self, role: Role, channel: Channel) -> str:
+        """What the messages of a channel give, as ``Fields`` call it; empty where nothing is known to be of use."""
         if channel.message_encoding in ENCODINGS or role in self.stated:
             fields = self._fields(role, channel)
-            return fields is not None and fields.quantity in role.fields
-        return role.kind(self._schema(channel)) is not None
+            return fields.quantity if fields else ""
+        kind = role.kind(self._schema(channel))
+        return role.fields[role.kinds.index(kind)] if kind else ""
 
     def _fields(self, role: Role, channel: Channel) -> Fields | None:
         stated = self.stated.get(role)
@@ -155,11 +157,7 @@ class Contents:
 
     def has_angles(self, topic: str) -> bool:
         """Whether a chosen topic gives the platform's angles, not its attitude."""
-        channel = self.channels[self.ids(topic)[0]]
-        if channel.message_encoding in ENCODINGS or POSES in self.stated:
-            fields = self._fields(POSES, channel)
-            return fields is not None and fields.quantity == "angles"
-        return POSES.kind(self._schema(channel)) is JOINT_STATE
+        return self._quantity(POSES, self.channels[self.ids(topic)[0]]) == "angles"
 
     def refuse_unreadable(self, role: Role, topic: str) -> None:
         """Raises InputError where nothing reads the messages of a chosen topic."""

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime
+from functools import cache
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -62,6 +63,7 @@ CLOCK_RECORD = "kf_calib.clock"
 """Where the bench's clock was set: after_ns, begin_ns (the first new stamp), shift_ns (from there on), reason."""
 RUN_RECORD = "kf_calib.run"
 """Before the first reading, where stamps are no dates: when the computer received it (received, ISO 8601)."""
+_DecoderOf = Callable[[Role, str], Decoder | FieldDecoder]
 _MARKS = {GAP_RECORD: "the link to the bench was lost", CLOCK_RECORD: "the bench's clock was set during the run"}
 
 
@@ -151,10 +153,17 @@ class Recording:
         del self.warnings[self._opening_warnings :]
         self.fraction, begun, parts = 0.0, 0, self._parts
         joints = Joints(len(self.bench.axes), self.bench.joints, self.bench.axis_letters, self._warn_of_joints)
-        decoders = _Decoders(parts, self.bench.pose_width, joints, self.warnings.append)
+
+        @cache
+        def decoder(role: Role, topic: str) -> Decoder | FieldDecoder:
+            """What reads the messages of a topic, in all of the files."""
+            width = {READINGS: 3, POSES: self.bench.pose_width, TEMPERATURES: 1}[role]
+            of_poses = joints if role is POSES else None
+            return parts.having(topic).decoder(role, topic, width, of_poses, self.warnings.append)
+
         for file, contents in zip(parts.files, parts.contents, strict=True):
             passage = _Passage(contents, self._limit, self._warn_of_damage)
-            batches = self._part(file, passage, decoders, growing and file is parts.files[-1])
+            batches = self._part(file, passage, decoder, growing and file is parts.files[-1])
             for end, batch in batches if growing else self._ordered(batches, file.size):
                 self.fraction = math.nan if growing else min((begun + end) / parts.size, 1.0)
                 if self._begin_ns is None and len(batch.accel):
@@ -171,16 +180,16 @@ class Recording:
         self.fraction = 1.0
 
     def _part(
-        self, file: RecordFile, passage: _Passage, decoders: _Decoders, growing: bool
+        self, file: RecordFile, passage: _Passage, decoder: _DecoderOf, growing: bool
     ) -> Iterator[tuple[int, Batch]]:
         """The batches of one file, and up to which byte it has been read then."""
-        accel = passage.track(self._accel, decoders.of(READINGS, self._accel))
-        pose = passage.track(self._pose, decoders.of(POSES, self._pose)) if self._pose else None
+        accel = passage.track(self._accel, decoder(READINGS, self._accel))
+        pose = passage.track(self._pose, decoder(POSES, self._pose)) if self._pose else None
         temperature = None
         for block in file.blocks(self._warn_of_damage, growing=growing):
             block, messages = passage.find(block)
             if not temperature and (topic := self._parts.choose(TEMPERATURES, self._wanted[TEMPERATURES])):
-                temperature = passage.track(topic, decoders.of(TEMPERATURES, topic))
+                temperature = passage.track(topic, decoder(TEMPERATURES, topic))
             batch = Batch(
                 self._converted(accel.read(block, messages)),
                 _scaled(pose.read(block, messages), self._angle_scale) if pose else Stream.empty(self.bench.pose_width),
@@ -282,24 +291,6 @@ class Recording:
             return merged_metadata(recorded, overrides, "the recording", default)
         except BenchError as error:
             raise BenchError(f"{self.path}: {error}") from None
-
-
-@dataclass
-class _Decoders:
-    """What reads the messages of a recording's topics, in all of its files."""
-
-    parts: RecordingParts
-    pose_width: int
-    joints: Joints
-    warn: Warn
-    known: dict[Role, Decoder | FieldDecoder] = field(default_factory=dict[Role, Decoder | FieldDecoder])
-
-    def of(self, role: Role, topic: str) -> Decoder | FieldDecoder:
-        if role not in self.known:
-            width = {READINGS: 3, POSES: self.pose_width, TEMPERATURES: 1}[role]
-            joints = self.joints if role is POSES else None
-            self.known[role] = self.parts.having(topic).decoder(role, topic, width, joints, self.warn)
-        return self.known[role]
 
 
 class _Passage:
