@@ -8,12 +8,11 @@ import struct
 import time
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from types import TracebackType
-from typing import IO, Self
+from typing import IO
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -46,7 +45,7 @@ _END = (  # of a file without a summary: all fields are zero
 )
 
 
-class Recorder:
+class Recorder(AbstractContextManager["Recorder"]):
     """An open recording of ``bench``; a context manager that finishes the file.
 
     An earlier file of that name (``overwrite``) stays till the first readings are on the disk; a failure before that
@@ -190,13 +189,8 @@ class Recorder:
             file.close()
         self._place.discard()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if error is None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
             self.close()
         else:
             self.finish()

@@ -6,11 +6,11 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Stream
@@ -83,7 +83,7 @@ def _size(batch: Batch) -> int:
     return sum(map(len, _streams(batch)))
 
 
-class LiveSource:
+class LiveSource(AbstractContextManager["LiveSource"]):
     """A ``Source`` that is read while it comes; iterated once. A context manager that finishes the recording.
 
     Batches hold exactly the samples, in each stream in the order, that a replay of the recording gives. A consumer that
@@ -185,12 +185,7 @@ class LiveSource:
         self.stop()
         self._worker.join()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def __iter__(self) -> Iterator[Batch]:
