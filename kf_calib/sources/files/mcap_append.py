@@ -162,7 +162,7 @@ class TopicAppender:
         return np.frombuffer(bytearray(record * _MESSAGES), kind)
 
     def _put_chunk(self, data: bytes | memoryview, times: Times = _NO_TIMES) -> None:
-        """Write a chunk, with the index of its messages of one size if it has any; summary and statistics have it, too."""
+        """Write a chunk, with the index of its messages, of one size, if it has any; the summary has it, too."""
         start, count = self._position, len(times)
         first, last = (int(times.min()), int(times.max())) if count else (0, 0)
         packed = zstandard.ZstdCompressor(level=1).compress(data)

@@ -108,6 +108,13 @@ class FrameReader(Described):
             self._account.refuse(self._account.lines, "the link broke in it")
         self._tail = b""
 
+    def joined_amid(self) -> None:
+        """What comes next may begin within a frame, which its checksum tells."""
+
+    def rest(self) -> Batch:
+        """Nothing: a frame without an end is none."""
+        return Batch(Stream.empty(3), Stream.empty(self.pose_width))
+
     def _settle(self, frames: list[bytes]) -> None:
         """Learns from the first pose of all what poses are: below, frames are read by their lengths."""
         for frame in frames:

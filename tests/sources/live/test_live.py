@@ -89,7 +89,7 @@ def test_what_a_server_sends_is_got_to_the_last_byte_and_replayed_the_same(tmp_p
 def test_however_the_bytes_are_cut_the_samples_are_the_same(talk, size: int) -> None:
     whole, protocol = talk(0, 40), Protocol("script", {}, "")
     got = [protocol.push(whole[k : k + size]) for k in range(0, len(whole), size)]
-    assert [number for batch in [*got, protocol.rest()] for number in numbers(batch)] == list(range(40))
+    assert [number for batch in [*got, protocol.form.rest()] for number in numbers(batch)] == list(range(40))
     assert protocol.account.sentences() == []
 
 
