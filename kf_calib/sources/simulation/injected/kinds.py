@@ -237,10 +237,11 @@ def column(values: Floats) -> Floats:
     return values[:, None]
 
 
+def putting(quantity: str, value: Callable[[TrueState], Any]) -> TrueStep:
+    """The step that puts a value in the place of a quantity of the state."""
+    return lambda state: setattr(state, quantity, value(state))
+
+
 def adding(contribution: Callable[[TrueState], Floats]) -> TrueStep:
     """The step that adds to the readings."""
-
-    def step(state: TrueState) -> None:
-        state.reading_mps2 = state.reading_mps2 + contribution(state)
-
-    return step
+    return putting("reading_mps2", lambda state: state.reading_mps2 + contribution(state))
