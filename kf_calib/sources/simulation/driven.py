@@ -187,7 +187,7 @@ class DrivenBench:
         self._motion = DrivenMotion(list(start_deg), self.servo, run.motion.end_ns)
         self.run = run.moved_by(self._motion, _MOST_DWELLS, self._motion.trail)
         self._make = self.run.batch_maker()
-        self._now_ns, self._readings = 0, 0
+        self._now_ns = 0
         self._rng = generator(run.seed, "read-back")
         self._tripped = False
 
@@ -240,9 +240,7 @@ class DrivenBench:
         if self._failing == "drive" and not self._tripped:
             self._tripped = True
             self._motion.brake(self._now_ns)
-        last = self.run.first_reading_at(self._now_ns)
-        first, self._readings = self._readings, last
-        return self._make(first, last, last * self.run.reading_period_ns)
+        return self._make(self.run.next_reading_ns(self._now_ns))
 
     @property
     def _failing(self) -> str:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
-from kf_calib.sources.simulation.injected.kinds import Rig, adding, made, putting
-from kf_calib.sources.simulation.physics import Disturbance, TrueState, TrueStep, along
+from kf_calib.sources.simulation.injected.kinds import Rig, made
+from kf_calib.sources.simulation.physics import Disturbance, TrueState, TrueStep, adding, along, putting
 from kf_calib.sources.simulation.sensors import OutlierProcess
 
 _PAIRS = ("12", "13", "21", "23", "31", "32")

@@ -15,15 +15,19 @@ from scipy.spatial.transform import Rotation
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Vector
-from kf_calib.sources.simulation.injected.kinds import Rig, adding, column, made, putting
+from kf_calib.sources.simulation.injected.kinds import Rig, column, made
 from kf_calib.sources.simulation.physics import (
     TrueState,
     TrueStep,
+    adding,
     along,
     carried_by_earth,
     earth_rate_radps,
+    putting,
     rotate,
     to_bench,
+    turning_base,
+    turning_platform,
 )
 from kf_calib.sources.simulation.visit_plans import attitude
 
@@ -183,18 +187,13 @@ def base_turning(delta: Floats, rig: Rig, multiple: Callable[[TrueState], Floats
     return turning_base(lambda state: column(multiple(state)) * vector)
 
 
-def turning_base(rotation_rad: Callable[[TrueState], Floats]) -> TrueStep:
-    """The step that turns the base by rotation vectors (n, 3)."""
-    return putting("attitude", lambda state: Rotation.from_rotvec(rotation_rad(state)) * state.attitude)
-
-
 @made(
     "platform-drift", "rad/s", ("0.01deg/h", "1deg/h"), ("1deg/h", "30deg/h"),
     stage="attitude", coefficients=("x", "y", "z"),
 )  # fmt: skip
 def platform_drift(rate: Floats, rig: Rig) -> TrueStep:
     """Drift of the platform: turned in its own axes by the rotation vector omega_d t, from its gyros (IEEE Std 813)."""
-    return putting("attitude", lambda state: state.attitude * Rotation.from_rotvec(column(state.time_s) * rate))
+    return turning_platform(lambda state: column(state.time_s) * rate)
 
 
 @made(

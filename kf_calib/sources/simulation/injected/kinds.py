@@ -12,7 +12,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, Vector
 from kf_calib.errors import InputError
-from kf_calib.sources.simulation.physics import TrueState, TrueStep
+from kf_calib.sources.simulation.physics import TrueState, TrueStep, adding
 from kf_calib.sources.simulation.sensors import Sensors, generator
 from kf_calib.sources.simulation.visit_plans import Motion
 from kf_calib.support.units import si
@@ -235,13 +235,3 @@ def above(state: TrueState, reference_c: float) -> Floats:
 def column(values: Floats) -> Floats:
     """One value a sample (n,) as a column (n, 1)."""
     return values[:, None]
-
-
-def putting(quantity: str, value: Callable[[TrueState], Any]) -> TrueStep:
-    """The step that puts a value in the place of a quantity of the state."""
-    return lambda state: setattr(state, quantity, value(state))
-
-
-def adding(contribution: Callable[[TrueState], Floats]) -> TrueStep:
-    """The step that adds to the readings."""
-    return putting("reading_mps2", lambda state: state.reading_mps2 + contribution(state))

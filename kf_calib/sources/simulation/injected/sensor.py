@@ -13,18 +13,8 @@ from itertools import accumulate
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, sign
-from kf_calib.sources.simulation.injected.kinds import (
-    Rig,
-    above,
-    added,
-    adding,
-    column,
-    made,
-    output,
-    pendulous,
-    putting,
-)
-from kf_calib.sources.simulation.physics import TrueState, TrueStep, WalkingBias
+from kf_calib.sources.simulation.injected.kinds import Rig, above, added, column, made, output, pendulous
+from kf_calib.sources.simulation.physics import TrueState, TrueStep, WalkingBias, adding, putting
 from kf_calib.sources.simulation.sensors import FirstOrder
 
 _PENDULOUS_AND_OUTPUT = ("1p", "1o", "2p", "2o", "3p", "3o")
