@@ -142,6 +142,13 @@ class Simulation:
         other.warnings = list[str]()
         return other
 
+    def by_hand(self) -> Simulation:
+        """The same run as a recording of a board that is turned by hand has it: without its angles and its gimbals."""
+        other = self.hiding(self.hidden)
+        square = {"theta1": 0.0, "theta3": 0.0}
+        other.bench = replace(self.bench, axes=(), angles=False, angle_sigma_deg=None, nominal=square)
+        return other
+
     def parameters_at_end(self) -> dict[str, float] | None:
         """The parameters at the last reading, where the biases have walked there; None where they have not."""
         rig, noise = self._rig, TrueNoise(walk_mps2_per_sqrt_s=self.noise.walk_mps2_per_sqrt_s)
@@ -228,7 +235,9 @@ class Simulation:
         )
 
     def _poses(self, time_ns: Times, rng: np.random.Generator) -> Stream:
-        """Encoder readings, or the attitude they make where the bench has no axes."""
+        """Encoder readings, or the attitude they make where the bench has no axes; none where they do not count."""
+        if not self.bench.angles:
+            return Stream.empty(self.bench.pose_width)
         angles_deg = np.degrees(self.motion.angles_at(time_ns))
         if self.noise.encoder_sigma_deg:
             angles_deg += self.noise.encoder_sigma_deg * rng.standard_normal(angles_deg.shape)
@@ -298,25 +307,3 @@ _ANY_DEG = 1e3  # a setting error that leaves the size of f alone, and rounding 
 def without_angles(run: Simulation) -> Simulation:
     """The run as an evaluation without angles sees it, for sizes in sigma: every orientation may be any."""
     return run.hiding(run.hidden, replace(run.noise, setting_sigma_deg=_ANY_DEG))
-
-
-class ByHand:
-    """The readings and temperatures of a simulated run, without its angles and without its gimbals.
-
-    - bench: what is known without them.
-    - warnings, fraction: as of every source.
-    """
-
-    def __init__(self, run: Simulation) -> None:
-        self._run, self.warnings = run, list[str]()
-        square = {"theta1": 0.0, "theta3": 0.0}
-        self.bench: Bench = replace(run.bench, axes=(), angles=False, angle_sigma_deg=None, nominal=square)
-
-    @property
-    def fraction(self) -> float:
-        """The share of the run that has passed."""
-        return self._run.fraction
-
-    def __iter__(self) -> Iterator[Batch]:
-        for batch in self._run:
-            yield Batch(batch.accel, Stream.empty(4), batch.temperature)
