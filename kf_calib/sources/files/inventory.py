@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from kf_calib.errors import MissingExtraError
 from kf_calib.sources.containers.opening import dataset_of, datasets_in, kind_of_container
-from kf_calib.sources.files.contents import POSES, READINGS, USABLE_SCHEMAS, Contents, fields_by_role
+from kf_calib.sources.files.contents import POSES, READINGS, USABLE_SCHEMAS, Contents, RecordingParts, fields_by_role
 from kf_calib.sources.files.field_messages import CDR, ENCODINGS, parser_of
 from kf_calib.sources.files.fields import MessageError, paths_of
 from kf_calib.sources.files.mcap_file import Warn
@@ -123,30 +123,22 @@ def inventory_of(path: Path, fields: Sequence[str] = ()) -> Inventory:
 
     Raises InputError.
     """
-    stated = fields_by_role(fields)
-    files = files_of(path)
-    warnings = list[str]()
-    parts = [open_record_file(file, int(MAX_CHUNK_MB * (1 << 20)), USABLE_SCHEMAS) for file in files]
-    topics, bench, has_readings, has_angles = dict[str, Topic](), dict[str, str](), False, None
-    for part in parts:
-        warnings += [part.trouble] if part.trouble else []
-        contents = Contents.listed_in(part, stated)
-        _count(part, contents, topics, warnings.append)
-        bench = bench or contents.bench or {}
-        has_readings |= bool(contents.topics(READINGS))
-        poses = contents.topics(POSES)
-        has_angles = contents.has_angles(poses[0]) if poses and has_angles is None else has_angles
+    stated, files = fields_by_role(fields), files_of(path)
+    parts = RecordingParts(path, [open_record_file(file, int(MAX_CHUNK_MB * (1 << 20)), USABLE_SCHEMAS)
+                                  for file in files])  # fmt: skip
+    topics, warnings, kinds = dict[str, Topic](), list[str](), dict[str, None]()
+    for file in parts.files:
+        warnings += [file.trouble] if file.trouble else []
+        parts.contents.append(Contents.listed_in(file, stated))
+        _count(file, parts.contents[-1], topics, warnings.append)
+        is_ros1 = first_bytes(file.path).startswith(ROS1_BAG)
+        kinds["db3" if isinstance(file, ListsMessages) else "bag" if is_ros1 else "mcap"] = None
     for topic in topics.values():
         topic.settle()
-    kind = "+".join(dict.fromkeys(map(_kind, parts)))
-    size = sum(part.size for part in parts)
-    return Inventory(path, kind, files, size, list(topics.values()), bench, has_readings, has_angles, warnings)
-
-
-def _kind(part: RecordFile) -> str:
-    if isinstance(part, ListsMessages):
-        return "db3"
-    return "bag" if first_bytes(part.path).startswith(ROS1_BAG) else "mcap"
+    bench, poses = next((own.bench for own in parts.contents if own.bench), {}), parts.topics(POSES)
+    has_angles = parts.having(poses[0]).has_angles(poses[0]) if poses else None
+    return Inventory(path, "+".join(kinds), files, parts.size, list(topics.values()), bench,
+                     bool(parts.topics(READINGS)), has_angles, warnings)  # fmt: skip
 
 
 def inventory_of_lines(
