@@ -99,10 +99,14 @@ def _after_string(message: bytes, offset: int) -> int:
     return end
 
 
-def _imu_layout(message: bytes) -> Layout:
-    """Orientation (4) and covariance (9), angular velocity (3) and covariance (9) come before the acceleration."""
-    values = _align(_after_string(message, _FRAME), 8) + (4 + 9 + 3 + 9) * 8
-    return Layout(size=values + (3 + 9) * 8, values=values, width=3, flagged=True)
+def _numbers(width: int, *, before: int = 0, after: int = 0, flagged: bool = False) -> Callable[[bytes], Layout]:
+    """What tells the layout of messages that are a header and numbers: so many before the values and after them."""
+
+    def layout(message: bytes) -> Layout:
+        values = _align(_after_string(message, _FRAME), 8) + 8 * before
+        return Layout(size=values + 8 * (width + after), values=values, width=width, flagged=flagged)
+
+    return layout
 
 
 def _joint_state_layout(message: bytes) -> Layout:
@@ -124,17 +128,6 @@ def _joint_state_layout(message: bytes) -> Layout:
         more = _uint32(message, offset)
         end = _align(offset + 4, 8) + 8 * more if more else offset + 4
     return Layout(size=end, values=values, width=width, names=tuple(names), names_at=(start, values))
-
-
-def _quaternion_layout(message: bytes) -> Layout:
-    values = _align(_after_string(message, _FRAME), 8)
-    return Layout(size=values + 4 * 8, values=values, width=4)
-
-
-def _temperature_layout(message: bytes) -> Layout:
-    """The variance follows the temperature."""
-    values = _align(_after_string(message, _FRAME), 8)
-    return Layout(size=values + 2 * 8, values=values, width=1)
 
 
 _RULER = "=" * 80
@@ -171,7 +164,7 @@ float64[9] angular_velocity_covariance
 geometry_msgs/Vector3 linear_acceleration
 float64[9] linear_acceleration_covariance
 {_HEADER_SCHEMA}{_QUATERNION_SCHEMA}{_VECTOR_SCHEMA}""",
-    _imu_layout,
+    _numbers(3, before=4 + 9 + 3 + 9, after=9, flagged=True),  # orientation and rates come first, with covariances
 )
 JOINT_STATE = MessageType(
     "sensor_msgs/msg/JointState",
@@ -188,7 +181,7 @@ QUATERNION = MessageType(
     f"""std_msgs/Header header
 geometry_msgs/Quaternion quaternion
 {_HEADER_SCHEMA}{_QUATERNION_SCHEMA}""",
-    _quaternion_layout,
+    _numbers(4),
 )
 TEMPERATURE = MessageType(
     "sensor_msgs/msg/Temperature",
@@ -196,7 +189,7 @@ TEMPERATURE = MessageType(
 float64 temperature
 float64 variance
 {_HEADER_SCHEMA}""",
-    _temperature_layout,
+    _numbers(1, after=1),
 )
 
 
@@ -239,19 +232,6 @@ def temperature_message(frame_id: str) -> bytes:
     return _append(_header(frame_id), 8, bytes(2 * 8))
 
 
-def filled(kind: MessageType, template: bytes, stream: Stream) -> NDArray[np.void]:
-    """One message (n,) for each sample of ``stream``: ``template`` with its stamp and values put in.
-
-    Raises MessageError where the number of values is not the template's or a stamp does not fit the message.
-    """
-    layout = kind.layout(template)
-    if stream.values.shape != (len(stream), layout.width):
-        raise MessageError(f"{kind.name} holds {layout.width} values a sample here, not {stream.values.shape[1:]}")
-    messages = np.frombuffer(bytearray(template * len(stream)), dtype_of(layout))
-    fill(messages, stream)
-    return messages
-
-
 def fill(messages: NDArray[np.void], stream: Stream) -> None:
     """Put stamps and values, of their number, into messages (n,); raises MessageError where a stamp does not fit."""
     seconds, nanoseconds = np.divmod(stream.time_ns, SECOND_NS)
@@ -261,8 +241,15 @@ def fill(messages: NDArray[np.void], stream: Stream) -> None:
 
 
 def pack(kind: MessageType, template: bytes, stream: Stream) -> list[bytes]:
-    """The same, the bytes of each message."""
-    messages = filled(kind, template, stream)
+    """One message for each sample of ``stream``: ``template`` with its stamp and values put in.
+
+    Raises MessageError where the number of values is not the template's or a stamp does not fit the message.
+    """
+    layout = kind.layout(template)
+    if stream.values.shape != (len(stream), layout.width):
+        raise MessageError(f"{kind.name} holds {layout.width} values a sample here, not {stream.values.shape[1:]}")
+    messages = np.frombuffer(bytearray(template * len(stream)), dtype_of(layout))
+    fill(messages, stream)
     packed, size = messages.tobytes(), messages.itemsize
     return [packed[start : start + size] for start in range(0, len(packed), size)]
 
