@@ -115,11 +115,6 @@ def chunk_heads(piece: bytes) -> Iterator[int]:
             yield at
 
 
-def chunk_times(content: bytes) -> tuple[int, int]:
-    """First and last time in the first bytes of a chunk's content; no times at all where they are not there."""
-    return struct.unpack("<QQ", content) if len(content) == 16 else (1, 0)
-
-
 MAGIC = b"\x89MCAP0\r\n"
 HEAD = struct.Struct("<BQ")  # opcode, length of the content
 MESSAGE_FIELDS = 22  # channel u16, sequence u32, log time u64, publish time u64; then the message itself

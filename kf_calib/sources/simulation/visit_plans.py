@@ -81,7 +81,8 @@ def six_faces(axes: Sequence[Vector] = YZX, dwell_s: float = 60.0, up: str = "y"
 
     Raises InputError where quarter turns of these axes do not show all six faces to gravity.
     """
-    quarters = sorted(itertools.product((0.0, 90.0, -90.0, 180.0), repeat=len(axes)), key=_total_turn)
+    quarters = list(itertools.product((0.0, 90.0, -90.0, 180.0), repeat=len(axes)))
+    quarters.sort(key=lambda angles_deg: sum(map(abs, angles_deg)))
     seen = up_directions(axes, np.radians(quarters), up)
     plan = list[PlannedVisit]()
     for face in np.vstack([np.eye(3), -np.eye(3)])[[0, 3, 1, 4, 2, 5]]:
@@ -140,10 +141,6 @@ def _quaternion(x: float, y: float, z: float) -> tuple[float, float, float, floa
     square = angle * angle
     scale = math.sin(angle / 2.0) / angle if angle > 1e-3 else 0.5 - square / 48.0 + square * square / 3840.0
     return scale * x, scale * y, scale * z, math.cos(angle / 2.0)
-
-
-def _total_turn(angles_deg: Sequence[float]) -> float:
-    return sum(map(abs, angles_deg))
 
 
 def _fibonacci_lattice(count: int) -> Floats:
