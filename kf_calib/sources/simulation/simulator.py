@@ -20,7 +20,7 @@ from kf_calib.bench.arrays import Floats, Times
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import InputError
-from kf_calib.sources.simulation.injected import Hidden, Rig, Stage, steps_of
+from kf_calib.sources.simulation.injected.kinds import Hidden, Rig, Stage, steps_of
 from kf_calib.sources.simulation.physics import (
     Ambient,
     Disturbance,
