@@ -315,16 +315,14 @@ class LiveSource(AbstractContextManager["LiveSource"]):
             return None
 
     def _mark_gap(self, reason: str, seconds: float) -> None:
-        facts = {"after_ns": str(self._continuity.last_ns or 0), "seconds": f"{seconds:.6f}", "reason": reason}
-        with self._lock:
-            self._store_if_open(lambda recorder: recorder.mark(GAP_RECORD, facts))
+        after_ns = str(self._continuity.last_ns or 0)
+        self.mark(GAP_RECORD, {"after_ns": after_ns, "seconds": f"{seconds:.6f}", "reason": reason})
 
     def _mark_restart(self, restart: Restart) -> None:
         facts = {"after_ns": restart.after_ns, "begin_ns": restart.begin_ns, "shift_ns": restart.shift_ns}
         texts = {key: str(value) for key, value in facts.items()} | {"reason": restart.reason}
         self._begins.append(restart.begin_ns)
-        with self._lock:
-            self._store_if_open(lambda recorder: recorder.mark(CLOCK_RECORD, texts))
+        self.mark(CLOCK_RECORD, texts)
 
     def _storable(self, stream: Stream) -> Stream:
         """The samples whose stamps a recording can hold; the others are refused."""
