@@ -73,10 +73,10 @@ class CsvLines(LineReader):
     def _row(self, line: str) -> SampleRow | None:
         if not (cells := self._heading.cells(line)):
             return None  # of something else than readings
-        number, self._count = self._count, self._count + 1
-        row = without_empty_end(cells, len(self._header))
-        if len(row) != len(self._header):
-            raise LineError(f"it has {len(row)} cells, the header has {len(self._header)}")
+        number, self._count, width = self._count, self._count + 1, len(self._header)
+        row = cells if len(cells) == width else without_empty_end(cells, width)
+        if len(row) != width:
+            raise LineError(f"it has {len(row)} cells, the header has {width}")
         if self._columns.chosen is not None and not self._columns.is_chosen(row):
             self._count -= 1
             return None
