@@ -22,7 +22,7 @@ Stage = Literal["angles", "attitude", "force", "input", "reading", "record"]
 platform, the acceleration along the input axes, the readings before noise, the readings as they are recorded."""
 
 SENSORS = ("1", "2", "3")
-Sizes = tuple[str, str]
+TypicalSizes = tuple[str, str]
 """Typical ones of an effect, from ... to, in units of data sheets."""
 
 
@@ -94,8 +94,8 @@ class EffectKind:
 
     name: str
     unit: str
-    navigation: Sizes
-    mems: Sizes
+    navigation: TypicalSizes
+    mems: TypicalSizes
     make: Callable[..., TrueStep] = field(repr=False)
     inner: Mapping[str, float]
     title: str
@@ -184,7 +184,7 @@ def steps_of(effects: Iterable[Hidden], rig: Rig) -> dict[Stage, list[TrueStep]]
 
 
 def made(
-    name: str, unit: str, navigation: Sizes, mems: Sizes | None = None, **facts: Any
+    name: str, unit: str, navigation: TypicalSizes, mems: TypicalSizes | None = None, **facts: Any
 ) -> Callable[[Callable[..., TrueStep]], Callable[..., TrueStep]]:
     """Registers a maker of steps; facts: further fields of its kind. Its docstring is "Title: physics (source)."; its
     keyword-only arguments are the inner constants with their usual values."""
@@ -201,7 +201,7 @@ def made(
 
 
 def added(
-    name: str, unit: str, navigation: Sizes, mems: Sizes | None = None, **facts: Any
+    name: str, unit: str, navigation: TypicalSizes, mems: TypicalSizes | None = None, **facts: Any
 ) -> Callable[[Callable[..., Floats]], Callable[..., Floats]]:
     """Registers what adds to each reading, a function of three coefficients, the state and inner constants."""
 
