@@ -176,13 +176,12 @@ def simulate(
     """Record a simulated bench run to OUT; its truth goes to a side file that no estimator opens."""
     from kf_calib.sources.simulation.detectability import truth_file, write_truth
     from kf_calib.sources.simulation.options import simulation
-    from kf_calib.sources.simulation.simulator import ByHand
 
     claimed([Path(options.plan)], {"OUT, whose truth goes there": truth_file(output)}, overwrite)
     foresee = partial(_foresee, path=output, large=large)
     source = simulation(options, bench.keys, angles=not no_angles, begin=foresee)
     with progress(f"simulating {output.name}", as_json) as tick:
-        recorded = _record(ByHand(source) if no_angles else source, output, overwrite, tick)
+        recorded = _record(source.by_hand() if no_angles else source, output, overwrite, tick)
     truth = write_truth(source, output, not no_angles)
     if as_json:
         print_json({"recording": str(output), "truth": str(truth), **recorded.keys})

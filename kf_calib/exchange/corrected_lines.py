@@ -12,7 +12,7 @@ or other signs of the channels, these are others.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
 import numpy as np
@@ -24,8 +24,8 @@ from kf_calib.bench.streams import Stream
 from kf_calib.errors import InputError
 from kf_calib.estimation.correction import Correction
 from kf_calib.sources.text.encoding import Cutter
-from kf_calib.sources.text.lines import reader_for
-from kf_calib.sources.text.reader import Account, LineReader, first_line, is_json, named
+from kf_calib.sources.text.lines import are_telling, reader_for
+from kf_calib.sources.text.reader import Account, LineReader, first_line, named
 from kf_calib.sources.text.units import Units
 
 _WINDOW_NS = 500_000_000
@@ -126,10 +126,8 @@ def _distinct(means: Floats) -> list[int]:
     return kept
 
 
-_TELLING_LINES = 9
-"""Of CSV: the heading and rows that tell what it does not."""
-RawLine = tuple[int, str, str]
-"""Number of a line, its text, and what ends it."""
+_Sample = tuple[int, int, list[float], float]
+"""Number of a line, its stamp, its readings, and the temperature then."""
 
 
 class CorrectedLines:
@@ -157,7 +155,7 @@ class CorrectedLines:
         self._needs_temperature = bool(correction.needs_temperature)
         self._account, self._temperature_c = Account(), np.nan
         self._cutter = Cutter(self._account.refuse, keeps_ends=True)
-        self._waiting = list[RawLine]()  # while it is not known what the lines are
+        self._waiting = list[str]()  # while it is not known what the lines are
         self._reader: LineReader | None = None
         self._input: RawInput | None = None
         self._norm = None if unchecked else NormAtRest(correction)
@@ -165,11 +163,11 @@ class CorrectedLines:
 
     def push(self, block: bytes) -> bytes:
         """The lines that end in ``block``, corrected."""
-        return self._corrected(self._numbered(self._cutter.push(block)), ended=False)
+        return self._corrected(self._cutter.push(block))
 
     def rest(self) -> bytes:
         """The line without an end, if there is one. Raises InputError where no readings have come at all."""
-        last = self._corrected(self._numbered(self._cutter.rest()), ended=True)
+        last = self._corrected(self._cutter.rest(), is_end=True)
         if not self.readings:
             self._account.unknown.clear()  # they pass
             advice = self._reader.advice if self._reader else "check that the logger wrote any"
@@ -189,89 +187,64 @@ class CorrectedLines:
         """What the lines hold, as far as that is known."""
         return self._input or PLAIN
 
-    def _numbered(self, lines: Sequence[str]) -> list[RawLine]:
-        """Return the next lines with their numbers."""
-        texts, first = [line.rstrip("\r\n") for line in lines], self._account.lines + 1
-        self._account.lines += len(lines)
-        numbered = enumerate(zip(lines, texts, strict=True), first)
-        return [(number, text, line[len(text) :]) for number, (line, text) in numbered]
-
-    def _corrected(self, lines: list[RawLine], ended: bool) -> bytes:
+    def _corrected(self, lines: list[str], *, is_end: bool = False) -> bytes:
         """Return lines, corrected; the readings of all of them at once."""
-        corrected = dict[int, str]()
-        for number, text, end in self._started(lines, ended):
-            corrected[number] = text + end
-        lines, self._waiting = self._waiting, []
-        if self._reader is None:
-            self._waiting = lines
-            return _bytes(corrected)
-        raw = list[tuple[RawLine, int, list[float], float]]()  # line, stamp, readings, temperature
-        for line in lines:
-            for time_ns, readings in self._read(line, corrected):
-                raw.append((line, time_ns, readings, self._temperature_c))
-        if raw:
-            self._put(corrected, raw)
-        return _bytes(corrected)
-
-    def _started(self, lines: list[RawLine], ended: bool) -> list[RawLine]:
-        """Add lines to those that wait, and return what of them is a heading, once it is known what they are."""
+        self._account.lines += len(lines)
         self._waiting += lines
-        if self._reader is not None:
-            return []
-        blank = first_line([text for _, text, _ in self._waiting])
-        told = self._waiting[blank:]
-        if not told or not (ended or len(told) >= _TELLING_LINES or is_json(told[0][1])):
+        heading = self._begun(is_end) if self._reader is None else []
+        if self._reader is None:
+            return b""
+        lines, self._waiting = self._waiting, []
+        first, passed, samples = self._account.lines - len(lines) + 1, dict[int, str](), list[_Sample]()
+        for number, row in self._reader.rows([line.rstrip("\r\n").lstrip("\ufeff") for line in lines], first):
+            time_ns, readings, _, degrees = row or (0, None, None, None)
+            self._temperature_c = degrees[0] if degrees else self._temperature_c
+            if readings and self._needs_temperature and np.isnan(self._temperature_c):
+                self._account.refuse(number, "it came before the first temperature, which the calibration needs")
+                continue
+            passed[number] = lines[number - first]
+            if readings:
+                samples.append((number, time_ns, readings, self._temperature_c))
+        if samples:
+            self._put(passed, samples)
+        return "".join([*heading, *passed.values()]).encode("utf-8", errors="surrogateescape")
+
+    def _begun(self, is_end: bool) -> list[str]:
+        """Choose the reader, once it is known what the lines are that wait, and return what of them is a heading."""
+        texts = [line.rstrip("\r\n") for line in self._waiting]
+        blank = first_line(texts)
+        told = texts[blank:]
+        if not told or not (is_end or are_telling(told)):
             return []
         with named(self._name):
-            self._reader, count = reader_for(
-                [text for _, text, _ in told], self._columns, self._account, angles=False, units=self._units
-            )
-        texts = self._reader.heading_of_forces([text for _, text, _ in told[:count]])
-        heading = [(number, text, end) for (number, _, end), text in zip(told[:count], texts, strict=True)]
-        self._waiting, passed = told[count:], self._waiting[:blank]
-        return passed + heading
+            self._reader, count = reader_for(told, self._columns, self._account, angles=False, units=self._units)
+        heading, self._waiting = self._waiting[: blank + count], self._waiting[blank + count :]
+        forces = [*texts[:blank], *self._reader.heading_of_forces(told[:count])]
+        return [force + line[len(text) :] for force, text, line in zip(forces, texts, heading, strict=False)]
 
-    def _read(self, line: RawLine, corrected: dict[int, str]) -> Iterator[tuple[int, list[float]]]:
-        """Yield the stamp and the readings of a line; one that has none passes, one that cannot be used is left out."""
-        assert self._reader is not None
-        number, text, end = line
-        before = self._account.malformed
-        batch = self._reader.read([text.lstrip("\ufeff")], number)
-        if len(batch.temperature):
-            self._temperature_c = float(batch.temperature.values[-1, 0])
-        if not len(batch.accel):
-            if self._account.malformed == before:
-                corrected[number] = text + end
-        elif self._needs_temperature and np.isnan(self._temperature_c):
-            self._account.refuse(number, "it came before the first temperature, which the calibration needs")
-        else:
-            yield int(batch.accel.time_ns[0]), batch.accel.values[0].tolist()
-
-    def _put(self, corrected: dict[int, str], raw: Sequence[tuple[RawLine, int, list[float], float]]) -> None:
-        """Add corrected lines."""
+    def _put(self, passed: dict[int, str], samples: Sequence[_Sample]) -> None:
+        """Correct the lines that hold readings."""
         assert self._reader is not None
         if self._input is None:
             stated = self._reader.stated(self._name, self._overrides, self._correction.input)
             self._input = RawInput.from_metadata(stated)
-        readings = self._input.readings(np.array([values for _, _, values, _ in raw]))
-        forces = self._correction.of_readings(readings, np.array([temperature for *_, temperature in raw]))
+        numbers, stamps, values, temperatures = zip(*samples, strict=True)
+        readings = self._input.readings(np.array(values))
+        forces = self._correction.of_readings(readings, np.array(temperatures))
         if self._norm is not None:
-            self._norm.add(Stream(np.array([time_ns for _, time_ns, *_ in raw]), readings))
+            self._norm.add(Stream(np.array(stamps), readings))
             self._checked(final=False)
-        for ((number, text, end), *_), force in zip(raw, forces, strict=True):
+        for number, force in zip(numbers, forces, strict=True):
             if np.isfinite(force).all():
-                corrected[number] = self._reader.with_readings(text, force.tolist()) + end
+                text = passed[number].rstrip("\r\n")
+                passed[number] = self._reader.with_readings(text, force.tolist()) + passed[number][len(text) :]
                 self.readings += 1
             else:
                 self._account.refuse(number, "no specific force gives these readings")
+                del passed[number]
 
     def _checked(self, final: bool) -> None:
         """Raise InputError where the norm at rest shows that the readings are not what they are taken for."""
         assert self._norm is not None
         if said := self._norm.misfit(self.input, final):
             raise InputError(f"{self._name}: {said}.")
-
-
-def _bytes(lines: Mapping[int, str]) -> bytes:
-    """The lines in their order; bytes that are no UTF-8 are what they were."""
-    return "".join(lines[number] for number in sorted(lines)).encode("utf-8", errors="surrogateescape")

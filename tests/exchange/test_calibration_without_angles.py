@@ -23,7 +23,7 @@ from kf_calib.exchange.history import history
 from kf_calib.exchange.verification import verify
 from kf_calib.exports import TARGETS, exported
 from kf_calib.sources.simulation.sensors import Sensors, TrueNoise
-from kf_calib.sources.simulation.simulator import ByHand, Simulation
+from kf_calib.sources.simulation.simulator import Simulation
 from kf_calib.sources.simulation.visit_plans import PlannedVisit
 
 FRAME = ["theta1", "phi1", "nu2"]
@@ -89,13 +89,14 @@ def test_six_faces_are_saved_with_axes_taken_for_square(tmp_path: Path) -> None:
     assert np.isfinite(saved.correction()(np.array([[0.0, 9.81, 0.0]]), 25.0)).all()
 
 
-def _with_axis_3_off_square(off_deg: float, seed: int, plan: list[PlannedVisit]) -> ByHand:
+def _with_axis_3_off_square(off_deg: float, seed: int, plan: list[PlannedVisit]) -> Simulation:
     """A run of a board whose axes are square but for one."""
     bench = Bench(axes_of("yzx"), 9.81, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
     square = dict.fromkeys(SYMBOLS, 0.0) | dict.fromkeys(("K1", "K2", "K3"), 1.0)
     sensors = Sensors(square | {"b1": 0.01, "b2": 0.02, "b3": 0.03, "phi3": np.radians(off_deg - 90.0)})
     noise = TrueNoise(white_mps2=2e-4)
-    return ByHand(Simulation(bench, sensors, noise, plan, sample_hz=50.0, slew_rate_degps=180.0, seed=seed))
+    run = Simulation(bench, sensors, noise, plan, sample_hz=50.0, slew_rate_degps=180.0, seed=seed)
+    return run.by_hand()
 
 
 @pytest.mark.parametrize(("off_deg", "holds"), [(0.0, True), (1.0, True), (2.0, True), (6.0, False)])

@@ -18,6 +18,7 @@ import pytest
 from click.testing import CliRunner
 from exchange.test_raw_input import forces_in_csv
 from exports.test_c_header import compiled, compiled_only
+from helpers import sent_frames
 from helpers.long_runs import slow
 
 from kf_calib.cli import cli
@@ -88,10 +89,10 @@ def as_json_lines(run: Run) -> bytes:
 
 def as_frames(run: Run) -> bytes:
     """With a first frame that says what the bench is and what the device sends."""
-    sent = [frames.bench({key: str(value) for key, value in {**BENCH, **STATED}.items()})]
+    sent = [sent_frames.bench({key: str(value) for key, value in {**BENCH, **STATED}.items()})]
     for number, (time_ns, counts, angles) in enumerate(zip(*(part.tolist() for part in run[:3]), strict=True)):
-        sent.append(frames.sample(frames.ANGLES, number, time_ns, np.radians(angles).tolist()))
-        sent.append(frames.sample(frames.ACCEL, number, time_ns, counts))
+        sent.append(sent_frames.sample(frames.ANGLES, number, time_ns, np.radians(angles).tolist()))
+        sent.append(sent_frames.sample(frames.ACCEL, number, time_ns, counts))
     return b"".join(sent)
 
 

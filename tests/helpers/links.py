@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from helpers import sent_frames
 from helpers.recordings import BENCH, START_NS, streams_of
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch
@@ -38,10 +39,10 @@ def json_rows(start: int, end: int) -> bytes:
 
 
 def frame_rows(start: int, end: int) -> bytes:
-    out = [frames.bench(KEYS)]
+    out = [sent_frames.bench(KEYS)]
     for i in range(start, end):
-        out.append(frames.sample(frames.ACCEL, i, START_NS + i * 1_000_000, (float(i), 9.8, -0.25)))
-        out.append(frames.sample(frames.ANGLES, i, START_NS + i * 1_000_000, (0.1, 0.2, 0.3)))
+        out.append(sent_frames.sample(frames.ACCEL, i, START_NS + i * 1_000_000, (float(i), 9.8, -0.25)))
+        out.append(sent_frames.sample(frames.ANGLES, i, START_NS + i * 1_000_000, (0.1, 0.2, 0.3)))
     return b"".join(out)
 
 

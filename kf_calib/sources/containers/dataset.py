@@ -43,7 +43,8 @@ class Dataset:
         if not is_nameless(names):
             return meanings_of(names, MappingProxyType({}))
         first = [column[:_TELLING_ROWS] for column in self.columns.values()]
-        return meanings_by_numbers(np.column_stack(first).astype(float)) if _are_numbers(first) else []
+        are_numbers = all(column.dtype.kind in "biuf" for column in first)
+        return meanings_by_numbers(np.column_stack(first).astype(float)) if are_numbers else []
 
     @property
     def has_readings(self) -> bool:
@@ -76,10 +77,6 @@ class Dataset:
         for begin in range(0, len(self), _BLOCK_ROWS):
             cells = [_texts(column[begin : begin + _BLOCK_ROWS]) for column in self.columns.values()]
             yield ("\n".join(map(",".join, zip(*cells, strict=True))) + "\n").encode()
-
-
-def _are_numbers(columns: Sequence[ArrayColumn]) -> bool:
-    return all(column.dtype.kind in "biuf" for column in columns)
 
 
 def _texts(values: ArrayColumn) -> list[str]:

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.streams import SECOND_NS, Stream
-from kf_calib.sources.files.fields import Joints, JointsError
+from kf_calib.sources.files.fields import Joints, MessageError
+from kf_calib.sources.files.mcap_records import at_every_byte
 
 Offsets = NDArray[np.int64]
 
@@ -27,10 +28,6 @@ _FRAME = 12  # byte offset of frame_id in every message that starts with a std_m
 _HEAD = np.dtype([("kind", "<u4"), ("sec", "<i4"), ("nanosec", "<u4"), ("frame", "<u4")])
 _MAX_PADDING = 7
 _ANEW = "the messages are not of the type that the topic has, so record it anew, or choose another topic"
-
-
-class CdrError(ValueError):
-    """A message does not have the layout its schema promises."""
 
 
 @dataclass(frozen=True)
@@ -98,14 +95,18 @@ def _uint32(message: bytes, offset: int) -> int:
 def _after_string(message: bytes, offset: int) -> int:
     end = offset + 4 + _uint32(message, offset)
     if end > len(message):
-        raise CdrError(f"a string of the message ends at byte {end} of {len(message)}: {_ANEW}")
+        raise MessageError(f"a string of the message ends at byte {end} of {len(message)}: {_ANEW}")
     return end
 
 
-def _imu_layout(message: bytes) -> Layout:
-    """Orientation (4) and covariance (9), angular velocity (3) and covariance (9) come before the acceleration."""
-    values = _align(_after_string(message, _FRAME), 8) + (4 + 9 + 3 + 9) * 8
-    return Layout(size=values + (3 + 9) * 8, values=values, width=3, flagged=True)
+def _numbers(width: int, *, before: int = 0, after: int = 0, flagged: bool = False) -> Callable[[bytes], Layout]:
+    """What tells the layout of messages that are a header and numbers: so many before the values and after them."""
+
+    def layout(message: bytes) -> Layout:
+        values = _align(_after_string(message, _FRAME), 8) + 8 * before
+        return Layout(size=values + 8 * (width + after), values=values, width=width, flagged=flagged)
+
+    return layout
 
 
 def _joint_state_layout(message: bytes) -> Layout:
@@ -120,24 +121,13 @@ def _joint_state_layout(message: bytes) -> Layout:
     width, offset = _uint32(message, offset), offset + 4
     values = _align(offset, 8) if width else offset
     if count not in (0, width):
-        raise CdrError(f"it names {count} joints but gives {width} positions")
+        raise MessageError(f"it names {count} joints but gives {width} positions")
     end = values + 8 * width
     for _ in ("velocity", "effort"):
         offset = _align(end, 4)
         more = _uint32(message, offset)
         end = _align(offset + 4, 8) + 8 * more if more else offset + 4
     return Layout(size=end, values=values, width=width, names=tuple(names), names_at=(start, values))
-
-
-def _quaternion_layout(message: bytes) -> Layout:
-    values = _align(_after_string(message, _FRAME), 8)
-    return Layout(size=values + 4 * 8, values=values, width=4)
-
-
-def _temperature_layout(message: bytes) -> Layout:
-    """The variance follows the temperature."""
-    values = _align(_after_string(message, _FRAME), 8)
-    return Layout(size=values + 2 * 8, values=values, width=1)
 
 
 _RULER = "=" * 80
@@ -174,7 +164,7 @@ float64[9] angular_velocity_covariance
 geometry_msgs/Vector3 linear_acceleration
 float64[9] linear_acceleration_covariance
 {_HEADER_SCHEMA}{_QUATERNION_SCHEMA}{_VECTOR_SCHEMA}""",
-    _imu_layout,
+    _numbers(3, before=4 + 9 + 3 + 9, after=9, flagged=True),  # orientation and rates come first, with covariances
 )
 JOINT_STATE = MessageType(
     "sensor_msgs/msg/JointState",
@@ -191,7 +181,7 @@ QUATERNION = MessageType(
     f"""std_msgs/Header header
 geometry_msgs/Quaternion quaternion
 {_HEADER_SCHEMA}{_QUATERNION_SCHEMA}""",
-    _quaternion_layout,
+    _numbers(4),
 )
 TEMPERATURE = MessageType(
     "sensor_msgs/msg/Temperature",
@@ -199,7 +189,7 @@ TEMPERATURE = MessageType(
 float64 temperature
 float64 variance
 {_HEADER_SCHEMA}""",
-    _temperature_layout,
+    _numbers(1, after=1),
 )
 
 
@@ -242,30 +232,24 @@ def temperature_message(frame_id: str) -> bytes:
     return _append(_header(frame_id), 8, bytes(2 * 8))
 
 
-def filled(kind: MessageType, template: bytes, stream: Stream) -> NDArray[np.void]:
-    """One message (n,) for each sample of ``stream``: ``template`` with its stamp and values put in.
-
-    Raises CdrError where the number of values is not the template's or a stamp does not fit the message.
-    """
-    layout = kind.layout(template)
-    if stream.values.shape != (len(stream), layout.width):
-        raise CdrError(f"{kind.name} holds {layout.width} values a sample here, not {stream.values.shape[1:]}")
-    messages = np.frombuffer(bytearray(template * len(stream)), dtype_of(layout))
-    fill(messages, stream)
-    return messages
-
-
 def fill(messages: NDArray[np.void], stream: Stream) -> None:
-    """Put stamps and values, of their number, into messages (n,); raises CdrError where a stamp does not fit."""
+    """Put stamps and values, of their number, into messages (n,); raises MessageError where a stamp does not fit."""
     seconds, nanoseconds = np.divmod(stream.time_ns, SECOND_NS)
     if len(seconds) and not (0 <= seconds.min() and seconds.max() < 2**31):
-        raise CdrError("stamps must be nanoseconds between the years 1970 and 2038")
+        raise MessageError("stamps must be nanoseconds between the years 1970 and 2038")
     messages["sec"], messages["nanosec"], messages["values"] = seconds, nanoseconds, stream.values
 
 
 def pack(kind: MessageType, template: bytes, stream: Stream) -> list[bytes]:
-    """The same, the bytes of each message."""
-    messages = filled(kind, template, stream)
+    """One message for each sample of ``stream``: ``template`` with its stamp and values put in.
+
+    Raises MessageError where the number of values is not the template's or a stamp does not fit the message.
+    """
+    layout = kind.layout(template)
+    if stream.values.shape != (len(stream), layout.width):
+        raise MessageError(f"{kind.name} holds {layout.width} values a sample here, not {stream.values.shape[1:]}")
+    messages = np.frombuffer(bytearray(template * len(stream)), dtype_of(layout))
+    fill(messages, stream)
     packed, size = messages.tobytes(), messages.itemsize
     return [packed[start : start + size] for start in range(0, len(packed), size)]
 
@@ -284,7 +268,7 @@ class Decoder:
     def __call__(self, buffer: bytes, at: Offsets, size: int) -> Stream:
         """The messages of ``size`` bytes each that start at offsets ``at`` (n,) of ``buffer``, all within it.
 
-        Raises CdrError for a message of another layout.
+        Raises MessageError for a message of another layout.
         """
         return self.stream_with_offsets(buffer, at, size)[1]
 
@@ -296,7 +280,7 @@ class Decoder:
             start = int(at[rest[0]])
             layout = self._layout(buffer[start : start + size])
             columns = self._columns(layout)
-            every = np.ndarray((len(buffer) - layout.size + 1,), dtype_of(layout), buffer, strides=(1,))
+            every = at_every_byte(buffer, dtype_of(layout))
             head = every["head"][at[rest]].view(_HEAD)
             alike = (head["kind"] == head["kind"][0]) & (head["frame"] == head["frame"][0])
             if every["names"].shape[1]:
@@ -315,32 +299,29 @@ class Decoder:
 
     def _layout(self, message: bytes) -> Layout:
         if len(message) < len(_LITTLE_ENDIAN):
-            raise CdrError(f"a {self.kind.name} does not fit in its {len(message)} bytes: {_ANEW}")
+            raise MessageError(f"a {self.kind.name} does not fit in its {len(message)} bytes: {_ANEW}")
         if message[:2] != _LITTLE_ENDIAN[:2]:
-            raise CdrError(
+            raise MessageError(
                 f"its encapsulation is {message[:2].hex(' ')}, only 00 01 (little-endian CDR) can be read: convert it"
             )
         try:
             layout = self.kind.layout(message)
         except struct.error:
-            raise CdrError(f"a {self.kind.name} does not fit in its {len(message)} bytes: {_ANEW}") from None
+            raise MessageError(f"a {self.kind.name} does not fit in its {len(message)} bytes: {_ANEW}") from None
         if not layout.size <= len(message) <= layout.size + _MAX_PADDING:
-            raise CdrError(f"a {self.kind.name} takes {layout.size} bytes, the message has {len(message)}: {_ANEW}")
+            raise MessageError(f"a {self.kind.name} takes {layout.size} bytes, the message has {len(message)}: {_ANEW}")
         return layout
 
     def _columns(self, layout: Layout) -> tuple[int, ...] | None:
         """Which values of a message are wanted; None: none of them."""
         if self.kind is not JOINT_STATE:
             return tuple(range(layout.width))
-        try:
-            return self._joints(layout.names, layout.width)
-        except JointsError as error:
-            raise CdrError(str(error)) from None
+        return self._joints(layout.names, layout.width)
 
     def _values(self, numbers: NDArray[np.void], layout: Layout, columns: tuple[int, ...]) -> Floats:
         table = numbers.view("<f8").reshape(len(numbers), -1)
         if layout.flagged and np.any(table[:, layout.width] == -1.0):
-            raise CdrError(
+            raise MessageError(
                 "linear_acceleration is marked as not measured (-1 in its covariance): choose another topic by "
                 "--accel-topic"
             )

@@ -13,9 +13,9 @@ from mcap.records import Channel, Metadata, Schema
 from kf_calib.errors import InputError
 from kf_calib.sources.files.cdr import IMU, JOINT_STATE, QUATERNION, TEMPERATURE, Decoder, MessageType
 from kf_calib.sources.files.field_messages import CDR, ENCODINGS, FieldDecoder
-from kf_calib.sources.files.fields import FieldError, Fields, Joints, known_fields
+from kf_calib.sources.files.fields import Fields, Joints, MessageError, known_fields
 from kf_calib.sources.files.mcap_file import Warn
-from kf_calib.sources.files.mcap_records import DamagedError, parse_record
+from kf_calib.sources.files.mcap_records import DamagedError, Summary, parse_record
 from kf_calib.sources.files.record_files import RecordFile
 
 BENCH_RECORD = "kf_calib.bench"
@@ -42,7 +42,7 @@ def bench_checksum(metadata: Mapping[str, str]) -> str:
 class Role:
     """What a topic is wanted for. ``preferred`` topics win, in this order, where several have a fitting schema.
 
-    fields: what its numbers are called in ``Fields``.
+    fields: what the numbers of its kinds are called in ``Fields``.
     """
 
     quantity: str
@@ -94,6 +94,13 @@ class Contents:
     bench: dict[str, str] | None = None
     bench_damaged: bool = False
 
+    @classmethod
+    def listed_in(cls, file: RecordFile, stated: Mapping[Role, Fields]) -> Contents:
+        """What the summary of a file lists."""
+        summary = file.summary or Summary(0)
+        schemas = {schema.id: schema for schema in summary.schemas}
+        return cls(file.path, stated, schemas, {channel.id: channel for channel in summary.channels})
+
     def add(self, opcode: int, content: bytes, warn: Warn) -> None:
         """Takes note of a record that is not a message."""
         try:
@@ -128,14 +135,16 @@ class Contents:
 
     def topics(self, role: Role) -> list[str]:
         """Topics with a schema that ``role`` can use, in the order of the file."""
-        fitting = [channel.topic for channel in self.channels.values() if self._fits(role, channel)]
+        fitting = [channel.topic for channel in self.channels.values() if self._quantity(role, channel) in role.fields]
         return list(dict.fromkeys(fitting))
 
-    def _fits(self, role: Role, channel: Channel) -> bool:
+    def _quantity(self, role: Role, channel: Channel) -> str:
+        """What the messages of a channel give, as ``Fields`` call it; empty where nothing is known to be of use."""
         if channel.message_encoding in ENCODINGS or role in self.stated:
             fields = self._fields(role, channel)
-            return fields is not None and fields.quantity in role.fields
-        return role.kind(self._schema(channel)) is not None
+            return fields.quantity if fields else ""
+        kind = role.kind(self._schema(channel))
+        return role.fields[role.kinds.index(kind)] if kind else ""
 
     def _fields(self, role: Role, channel: Channel) -> Fields | None:
         stated = self.stated.get(role)
@@ -148,11 +157,7 @@ class Contents:
 
     def has_angles(self, topic: str) -> bool:
         """Whether a chosen topic gives the platform's angles, not its attitude."""
-        channel = self.channels[self.ids(topic)[0]]
-        if channel.message_encoding in ENCODINGS or POSES in self.stated:
-            fields = self._fields(POSES, channel)
-            return fields is not None and fields.quantity == "angles"
-        return POSES.kind(self._schema(channel)) is JOINT_STATE
+        return self._quantity(POSES, self.channels[self.ids(topic)[0]]) == "angles"
 
     def refuse_unreadable(self, role: Role, topic: str) -> None:
         """Raises InputError where nothing reads the messages of a chosen topic."""
@@ -180,7 +185,7 @@ class Contents:
             return FieldDecoder(
                 channel.message_encoding, schema, fields, width, joints, lambda text: warn(f"{said}: {text}.")
             )
-        except FieldError as error:
+        except MessageError as error:
             raise InputError(f"{said} cannot be used: {error}.") from None
 
     @property

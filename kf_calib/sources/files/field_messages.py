@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import struct
 from collections.abc import Callable
 from contextlib import redirect_stderr
 from typing import Any
@@ -15,20 +14,19 @@ from mcap.records import Schema
 from kf_calib.bench.streams import Stream
 from kf_calib.errors import MissingExtraError
 from kf_calib.sources.files.cdr import IMU, JOINT_STATE, QUATERNION, TEMPERATURE, Offsets
-from kf_calib.sources.files.fields import LOG_TIME, FieldError, Fields, Joints, JointsError, time_ns
+from kf_calib.sources.files.fields import LOG_TIME, Fields, Joints, MessageError, time_ns
+from kf_calib.sources.files.mcap_records import log_times
 
 ENCODINGS = ("json", "protobuf")
 """Those in which messages are told by their fields, whatever their type; in CDR only where fields are stated."""
 CDR = "cdr"
 _ANEW = "record it anew, or name another topic"
-_LOG_TIME = struct.Struct("<Q")
-LOG_TIME_BEFORE = 16  # bytes from a record's log time to its message
 _Parse = Callable[[bytes], Any]
 _DEFINED = {name: kind.schema.encode() for kind in (IMU, JOINT_STATE, QUATERNION, TEMPERATURE) for name in kind.names}
 """Definitions of types that bags may leave out."""
 
 
-class _UnreadError(FieldError):
+class _UnreadError(MessageError):
     """A message is not in the encoding that its topic is said to have."""
 
 
@@ -36,7 +34,7 @@ class FieldDecoder:
     """Samples from messages of one topic, ``width`` numbers each, taken from where ``fields`` says.
 
     encoding: of ``ENCODINGS``, or ``CDR``. joints: finds the gimbals among numbers that have names. warn: is told once
-    where the messages have no time of their own. Raises FieldError where the schema does not say what the messages are.
+    where the messages have no time of their own. Raises MessageError where the schema does not say what they are.
     """
 
     def __init__(
@@ -56,7 +54,7 @@ class FieldDecoder:
 
     def stream_with_offsets(self, buffer: bytes, at: Offsets, size: int) -> tuple[Offsets, Stream]:
         """Those of the messages of ``size`` bytes each at offsets ``at`` of ``buffer``, after the offsets that they are
-        from. Raises FieldError; a message that cannot be read is left out, if any before it could be."""
+        from. Raises MessageError; a message that cannot be read is left out, if any before it could be."""
         kept, stamps, values = list[int](), list[int](), list[list[float]]()
         for start in at.tolist():
             try:
@@ -68,10 +66,11 @@ class FieldDecoder:
                 continue
             if numbers is not None:
                 kept.append(start)
-                stamps.append(self._stamp(message, buffer, start))
+                stamps.append(self._stamp(message))
                 values.append(numbers)
-        table = np.array(values, float).reshape(len(values), self.width)
-        return np.array(kept, np.int64), Stream(np.array(stamps, np.int64), table)
+        table, messages = np.array(values, float).reshape(len(values), self.width), np.array(kept, np.int64)
+        times = log_times(buffer, messages) if self._time == LOG_TIME else np.array(stamps, np.int64)
+        return messages, Stream(times, table)
 
     def _read(self, data: bytes) -> tuple[Any, list[float] | None]:
         """A message, and the numbers in it that are sought."""
@@ -84,20 +83,18 @@ class FieldDecoder:
     def _chosen(self, numbers: list[float], names: tuple[str, ...]) -> list[float] | None:
         if self._joints and names:
             if len(names) != len(numbers):
-                raise FieldError(f"a message names {len(names)} joints but gives {len(numbers)} positions")
-            try:
-                columns = self._joints(names, len(numbers))
-            except JointsError as error:
-                raise FieldError(str(error)) from None
+                raise MessageError(f"a message names {len(names)} joints but gives {len(numbers)} positions")
+            columns = self._joints(names, len(numbers))
             return None if columns is None else [numbers[k] for k in columns]
         if len(numbers) != self.width:
-            raise FieldError(
+            raise MessageError(
                 f"{', '.join(self._fields.paths)} gives {len(numbers)} numbers a message in place of {self.width}: "
                 "name as many by --field"
             )
         return numbers
 
-    def _stamp(self, message: Any, buffer: bytes, start: int) -> int:
+    def _stamp(self, message: Any) -> int:
+        """The time in a message; 0 where that of receipt is taken."""
         if not self._time:
             self._time = self._fields.timed_by(message)
             if self._time == LOG_TIME and self._fields.time is None:
@@ -105,13 +102,11 @@ class FieldDecoder:
                     "its messages have no time of their own that is known, so the time of receipt is taken; --field "
                     "names another behind @"
                 )
-        if self._time != LOG_TIME:
-            return time_ns(message, self._time)
-        return min(_LOG_TIME.unpack_from(buffer, start - LOG_TIME_BEFORE)[0], (1 << 63) - 1)
+        return 0 if self._time == LOG_TIME else time_ns(message, self._time)
 
 
 def parser_of(encoding: str, schema: Schema | None) -> Callable[[bytes], Any]:
-    """What makes an object of a message in one of ``ENCODINGS`` or ``CDR``; raises FieldError, as this does."""
+    """What makes an object of a message in one of ``ENCODINGS`` or ``CDR``; raises MessageError, as this does."""
     if encoding == CDR:
         return _of_cdr(schema)
     return _of_protobuf(schema) if encoding == "protobuf" else _of_json
@@ -151,7 +146,7 @@ def _of_protobuf(schema: Schema | None) -> _Parse:
             add(file)
         kind = GetMessageClass(pool.FindMessageTypeByName(name))
     except Exception:  # of many kinds, for the schema may say anything
-        raise FieldError(f"its schema {name!r} does not say what its protobuf messages are: record it anew") from None
+        raise MessageError(f"its schema {name!r} does not say what its protobuf messages are: record it anew") from None
 
     def parse(data: bytes) -> Any:
         try:
@@ -175,7 +170,7 @@ def _of_cdr(schema: Schema | None) -> _Parse:
     encoding = schema.encoding if schema else "ros2msg"
     text = text or _DEFINED.get(name, b"")
     if not text:
-        raise FieldError(
+        raise MessageError(
             f"the file does not define its messages, {name}: convert it to MCAP, which does, by `ros2 bag convert` on "
             "a computer that knows them"
         )
@@ -183,9 +178,9 @@ def _of_cdr(schema: Schema | None) -> _Parse:
         with redirect_stderr(io.StringIO()):  # it prints what it cannot read
             decode = DecoderFactory().decoder_for(CDR, Schema(id=1, name=name, encoding=encoding, data=text))
     except Exception:  # of many kinds, for the definition may say anything
-        raise FieldError(f"the definition of its messages, {name}, cannot be read: record it anew") from None
+        raise MessageError(f"the definition of its messages, {name}, cannot be read: record it anew") from None
     if decode is None:
-        raise FieldError(
+        raise MessageError(
             f"its messages, {name}, are defined in {encoding!r} and can be read if defined in 'ros2msg': convert the "
             "file by `ros2 bag convert`"
         )

@@ -40,8 +40,8 @@ _MOST_PATHS, _DEEPEST = 1000, 12
 _LONGEST_TIME = 64  # characters of one in ISO 8601
 
 
-class FieldError(ValueError):
-    """A message does not have what is sought in it."""
+class MessageError(ValueError):
+    """A message is not of the type, or does not have what is sought in it, that its topic promises."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class Fields:
         return [path.split(".") for path in self.paths]
 
     def numbers(self, message: Any) -> list[float]:
-        """The numbers in a message. Raises FieldError."""
+        """The numbers in a message. Raises MessageError."""
         numbers = list[float]()
         for path, steps in zip(self.paths, self._steps, strict=True):
             value = _at(message, steps, path)
@@ -133,7 +133,7 @@ def known_fields(schema: str) -> Fields | None:
 
 
 def time_ns(message: Any, path: str) -> int:
-    """The time in a message: an object with seconds and nanoseconds, a number, or text. Raises FieldError."""
+    """The time in a message: an object with seconds and nanoseconds, a number, or text. Raises MessageError."""
     value = _at(message, path.split("."), path)
     if isinstance(value, str):
         return _time_of_text(value, path)
@@ -143,10 +143,10 @@ def time_ns(message: Any, path: str) -> int:
     seconds, nanoseconds = (next((name for name in names if _has(value, name)), None) for names in
                             (_SECONDS, _NANOSECONDS))  # fmt: skip
     if seconds is None:
-        raise FieldError(f"{path} in a message is no time: name another by @, or the time of receipt, @{LOG_TIME}")
+        raise MessageError(f"{path} in a message is no time: name another by @, or the time of receipt, @{LOG_TIME}")
     parts = _at(value, [seconds], path), _at(value, [nanoseconds], path) if nanoseconds else 0
     if not all(isinstance(part, int) for part in parts):
-        raise FieldError(f"{path} in a message has seconds and nanoseconds that are no whole numbers")
+        raise MessageError(f"{path} in a message has seconds and nanoseconds that are no whole numbers")
     return _within(parts[0] * 1_000_000_000 + parts[1], path)
 
 
@@ -172,12 +172,12 @@ def _exactly(value: float, unit: int, path: str) -> int:
     try:
         return int((Decimal(repr(value)) * unit).to_integral_value())
     except (ArithmeticError, ValueError):
-        raise FieldError(f"{path} in a message is {value}, which is no time") from None
+        raise MessageError(f"{path} in a message is {value}, which is no time") from None
 
 
 def _within(value: int, path: str) -> int:
     if not -_INT64 <= value < _INT64:
-        raise FieldError(f"{path} in a message is too large for a time: name its unit by its end, _ns, _us or _ms")
+        raise MessageError(f"{path} in a message is too large for a time: name its unit by its end, _ns, _us or _ms")
     return value
 
 
@@ -188,7 +188,7 @@ def _time_of_text(text: str, path: str) -> int:
     except ValueError:
         stamp = np.datetime64("NaT")
     if np.isnat(stamp):
-        raise FieldError(
+        raise MessageError(
             f"{path} in a message is {text[:40]!r}, not a time such as 2026-05-04T12:00:00.25Z (in UTC): name another "
             f"by @, or the time of receipt, @{LOG_TIME}"
         )
@@ -200,7 +200,7 @@ def _number(value: Any, path: str) -> float:
         return float("nan")
     if isinstance(value, bool) or not isinstance(value, int | float):
         kind = f"an object with {_names(value)}" if _is_object(value) else repr(value)[:40]
-        raise FieldError(f"{path} in a message is {kind} in place of a number: name the right one by --field")
+        raise MessageError(f"{path} in a message is {kind} in place of a number: name the right one by --field")
     try:
         return float(value)
     except OverflowError:
@@ -228,7 +228,7 @@ def _at(value: Any, steps: Sequence[str], path: str) -> Any:
         try:
             value = value[step] if isinstance(value, Mapping) else _part(value, step)
         except (KeyError, IndexError, AttributeError, TypeError):
-            raise FieldError(
+            raise MessageError(
                 f"a message has no {path}: it has {_names(value)}, so name what is to be used by --field"
             ) from None
     return value
@@ -245,7 +245,7 @@ def _part(value: Any, step: str) -> Any:
 def _has(value: Any, path: str) -> bool:
     try:
         _at(value, path.split("."), path)
-    except FieldError:
+    except MessageError:
         return False
     return True
 
@@ -278,10 +278,6 @@ def _names(value: Any) -> str:
 _USUAL = {2: ("outer", "inner"), 3: ("outer", "middle", "inner")}
 _OURS = re.compile(r"outer|middle|inner|axis\d+")
 _UNITS = ("deg", "rad")
-
-
-class JointsError(ValueError):
-    """The names do not tell which joints are the gimbals."""
 
 
 def gimbal_names(count: int) -> tuple[str, ...]:
@@ -321,7 +317,7 @@ class Joints:
     def __call__(self, names: tuple[str, ...], width: int) -> tuple[int, ...] | None:
         """Where the gimbals are among ``width`` positions; None: the message is of other joints only.
 
-        Raises JointsError where the names do not tell.
+        Raises MessageError where the names do not tell.
         """
         if self._stated:
             return self._by_statement(names)
@@ -333,7 +329,7 @@ class Joints:
             self._tell(names, known)
             return known
         if width != self._count:
-            raise JointsError(self._unclear(names, width))
+            raise MessageError(self._unclear(names, width))
         self._refuse_change(names)
         return tuple(names.index(name) for name in self._first) if names else tuple(range(width))
 
@@ -345,8 +341,8 @@ class Joints:
         if names and len(missing) == len(self._stated):
             self.others = self.others or names
             return None
-        given = f"names {', '.join(names)}" if names else "gives joints without names"
-        raise JointsError(f"a message {given}, so that {', '.join(missing)} of the stated joints cannot be found in it")
+        given, lost = f"names {', '.join(names)}" if names else "gives joints without names", ", ".join(missing)
+        raise MessageError(f"a message {given}, so that {lost} of the stated joints cannot be found in it")
 
     def _by_meaning(self, names: tuple[str, ...]) -> tuple[int, ...] | None:
         usual = gimbal_names(self._count)
@@ -361,7 +357,7 @@ class Joints:
     def _refuse_change(self, names: tuple[str, ...]) -> None:
         assert self._first is not None
         if sorted(names) != sorted(self._first):
-            raise JointsError(
+            raise MessageError(
                 f"joint names change from {' '.join(self._first)} to {' '.join(names)}: name the gimbals, outer to "
                 "inner, by --joints"
             )

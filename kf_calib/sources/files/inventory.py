@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from kf_calib.errors import MissingExtraError
 from kf_calib.sources.containers.opening import dataset_of, datasets_in, kind_of_container
-from kf_calib.sources.files.contents import POSES, READINGS, USABLE_SCHEMAS, Contents, fields_by_role
-from kf_calib.sources.files.field_messages import CDR, ENCODINGS, LOG_TIME_BEFORE, parser_of
-from kf_calib.sources.files.fields import FieldError, paths_of
-from kf_calib.sources.files.mcap_file import McapFile, Warn
-from kf_calib.sources.files.mcap_records import MAX_CHUNK_MB, MessageFinder
+from kf_calib.sources.files.contents import POSES, READINGS, USABLE_SCHEMAS, Contents, RecordingParts, fields_by_role
+from kf_calib.sources.files.field_messages import CDR, ENCODINGS, parser_of
+from kf_calib.sources.files.fields import MessageError, paths_of
+from kf_calib.sources.files.mcap_file import Warn
+from kf_calib.sources.files.mcap_records import MAX_CHUNK_MB, MessageFinder, log_times
 from kf_calib.sources.files.record_files import (
     ROS1_BAG,
     ListsMessages,
@@ -33,7 +33,6 @@ TopicTimes = NDArray[np.int64]
 _GAP = 5  # times the usual interval
 _USUAL = 1000  # intervals from which the usual one is taken
 _LEAST = 10  # intervals, for one to be usual
-_LATEST = (1 << 63) - 1
 
 
 @dataclass
@@ -124,30 +123,22 @@ def inventory_of(path: Path, fields: Sequence[str] = ()) -> Inventory:
 
     Raises InputError.
     """
-    stated = fields_by_role(fields)
-    files = files_of(path)
-    warnings = list[str]()
-    parts = [open_record_file(file, int(MAX_CHUNK_MB * (1 << 20)), USABLE_SCHEMAS) for file in files]
-    topics, bench, has_readings, has_angles = dict[str, Topic](), dict[str, str](), False, None
-    for part in parts:
-        warnings += [part.trouble] if part.trouble else []
-        contents = Contents(part.path, stated)
-        _count(part, contents, topics, warnings.append)
-        bench = bench or contents.bench or {}
-        has_readings |= bool(contents.topics(READINGS))
-        poses = contents.topics(POSES)
-        has_angles = contents.has_angles(poses[0]) if poses and has_angles is None else has_angles
+    stated, files = fields_by_role(fields), files_of(path)
+    parts = RecordingParts(path, [open_record_file(file, int(MAX_CHUNK_MB * (1 << 20)), USABLE_SCHEMAS)
+                                  for file in files])  # fmt: skip
+    topics, warnings, kinds = dict[str, Topic](), list[str](), dict[str, None]()
+    for file in parts.files:
+        warnings += [file.trouble] if file.trouble else []
+        parts.contents.append(Contents.listed_in(file, stated))
+        _count(file, parts.contents[-1], topics, warnings.append)
+        is_ros1 = first_bytes(file.path).startswith(ROS1_BAG)
+        kinds["db3" if isinstance(file, ListsMessages) else "bag" if is_ros1 else "mcap"] = None
     for topic in topics.values():
         topic.settle()
-    kind = "+".join(dict.fromkeys(map(_kind, parts)))
-    size = sum(part.size for part in parts)
-    return Inventory(path, kind, files, size, list(topics.values()), bench, has_readings, has_angles, warnings)
-
-
-def _kind(part: RecordFile) -> str:
-    if isinstance(part, ListsMessages):
-        return "db3"
-    return "bag" if first_bytes(part.path).startswith(ROS1_BAG) else "mcap"
+    bench, poses = next((own.bench for own in parts.contents if own.bench), {}), parts.topics(POSES)
+    has_angles = parts.having(poses[0]).has_angles(poses[0]) if poses else None
+    return Inventory(path, "+".join(kinds), files, parts.size, list(topics.values()), bench,
+                     bool(parts.topics(READINGS)), has_angles, warnings)  # fmt: skip
 
 
 def inventory_of_lines(
@@ -189,15 +180,13 @@ def _other_datasets(path: Path, units: Units | None) -> Iterator[Topic]:
 
 def _count(file: RecordFile, contents: Contents, topics: dict[str, Topic], warn: Warn) -> None:
     """Adds what a file holds to the topics met so far."""
-    if file.summary:
-        contents.schemas = {schema.id: schema for schema in file.summary.schemas}
-        contents.channels = {channel.id: channel for channel in file.summary.channels}
     for channel in contents.channels.values():
         _topic(channel, contents, topics)
         if isinstance(file, ListsMessages):
             _look_into(file.first(channel.id), channel.id, contents, topics)
     stray = 0
-    for number, times in _receipts(file, contents, topics, warn):
+    lists_messages = isinstance(file, ListsMessages)
+    for number, times in file.receipts(warn) if lists_messages else _from_blocks(file, contents, topics, warn):
         channel = contents.channels.get(number)
         if channel is None:
             stray += len(times)
@@ -213,19 +202,10 @@ def _topic(channel: Channel, contents: Contents, topics: dict[str, Topic]) -> To
     return topics.setdefault(channel.topic, made)
 
 
-def _receipts(
-    file: RecordFile, contents: Contents, topics: dict[str, Topic], warn: Warn
-) -> Iterable[tuple[int, TopicTimes]]:
-    """Channel and times of receipt of messages of it, some thousands at a time."""
-    if isinstance(file, ListsMessages):
-        return file.receipts(warn)
-    assert isinstance(file, McapFile)
-    return _from_blocks(file, contents, topics, warn)
-
-
 def _from_blocks(
-    file: McapFile, contents: Contents, topics: dict[str, Topic], warn: Warn
+    file: RecordFile, contents: Contents, topics: dict[str, Topic], warn: Warn
 ) -> Iterator[tuple[int, TopicTimes]]:
+    """Yield channel and times of receipt of messages of it, and take note of what else there is."""
     find = MessageFinder()
     for block in file.blocks(warn):
         messages = find(block)
@@ -236,8 +216,7 @@ def _from_blocks(
         for number in dict.fromkeys(group.channel for group in messages.groups if len(group.at)):
             groups = [group for group in messages.groups if group.channel == number and len(group.at)]
             at = np.sort(np.concatenate([group.at for group in groups]))
-            every = np.ndarray((len(block.data) - 7,), "<u8", block.data, strides=(1,))
-            yield number, np.minimum(every[at - LOG_TIME_BEFORE], _LATEST).astype(np.int64)
+            yield number, log_times(block.data, at)
             first = block.data[int(groups[0].at[0]) : int(groups[0].at[0]) + groups[0].size]
             _look_into(first, number, contents, topics)
 
@@ -260,5 +239,5 @@ def _look_into(message: bytes, number: int, contents: Contents, topics: dict[str
         try:
             parse = parser_of(channel.message_encoding, contents.schemas.get(channel.schema_id))
             topic.paths = tuple(paths_of(parse(message)))
-        except (FieldError, MissingExtraError):
+        except (MessageError, MissingExtraError):
             pass

@@ -13,7 +13,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
 import zstandard
@@ -22,14 +22,16 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, Footer, McapRecord, Schema, Statistics, SummaryOffset
 from numpy.typing import NDArray
 
+from kf_calib.bench.arrays import Times
 from kf_calib.bench.streams import Stream
 from kf_calib.errors import InputError
 from kf_calib.sources.files import cdr
 from kf_calib.sources.files.mcap_file import McapFile
-from kf_calib.sources.files.mcap_records import FOOTER_BYTES, HEAD, MAGIC, parse_record, records_of
+from kf_calib.sources.files.mcap_records import FOOTER_BYTES, HEAD, MAGIC, Summary, parse_record, records_of
 
 _PIECE = 1 << 22
 _MESSAGES = 1 << 14  # in a chunk
+_NO_TIMES = np.empty(0, np.int64)
 _GROUPS = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX,
            Opcode.METADATA_INDEX)  # fmt: skip
 
@@ -50,7 +52,7 @@ class TopicAppender:
         template: bytes,
         on_progress: Callable[[float], None] | None = None,
     ) -> None:
-        if source.summary is None:
+        if (summary := source.summary) is None:
             raise InputError(
                 f"{source.trouble} Make a finished copy of it first: kf-calib record {source.path.name} whole.mcap."
             )
@@ -59,12 +61,12 @@ class TopicAppender:
         self._crc = self._position = 0
         self._groups = dict[int, list[bytes]]({opcode: [] for opcode in _GROUPS})
         self._statistics = Statistics(0, 0, {}, 0, 0, 0, 0, 0, 0)
-        self._read_summary(source)
-        self._channel = self._new_channel(source, topic, kind)
+        self._read_summary(source, summary)
+        self._channel = self._new_channel(source, summary, kind)
         self._count, self._waiting = 0, Stream.empty(self._layout.width)
         self._records = self._blank_records(template)
-        self._copy(source, on_progress)
-        self._put_chunk(b"".join(self._defined), [])
+        self._copy(source, summary.start - len(_bytes(DataEnd(0))), on_progress)
+        self._put_chunk(b"".join(self._defined))
 
     def add(self, stream: Stream) -> None:
         """Add a message for each sample; raises InputError where a stamp does not fit a message."""
@@ -93,22 +95,20 @@ class TopicAppender:
         self._put(footer[:-4] + zlib.crc32(footer[:-4], section).to_bytes(4, "little"))
         self._put(MAGIC)
 
-    def _read_summary(self, source: McapFile) -> None:
+    def _read_summary(self, source: McapFile, summary: Summary) -> None:
         """Take the records of the original's summary as they are; its statistics are counted on."""
-        assert source.summary is not None
         with source.open() as file:
-            file.seek(source.summary.start)
-            section = file.read(source.size - source.summary.start - FOOTER_BYTES)
+            file.seek(summary.start)
+            section = file.read(source.size - summary.start - FOOTER_BYTES)
         for opcode, content in records_of(section):
             if opcode == Opcode.STATISTICS:
                 self._statistics = parse_record(Statistics.read, content)
             elif opcode in self._groups:
                 self._groups[opcode].append(HEAD.pack(opcode, len(content)) + content)
 
-    def _new_channel(self, source: McapFile, topic: str, kind: cdr.MessageType) -> int:
+    def _new_channel(self, source: McapFile, summary: Summary, kind: cdr.MessageType) -> int:
         """Return the number of the new channel; its definition goes into the data section and the summary."""
-        assert source.summary is not None
-        channels, schemas = source.summary.channels, source.summary.schemas
+        topic, channels, schemas = self._topic, summary.channels, summary.schemas
         if any(channel.topic == topic for channel in channels):
             raise InputError(f"{source.path} has a topic {topic} already: take the one it was made from.")
         numbers = {channel.id for channel in channels}, {schema.id for schema in schemas}
@@ -122,10 +122,8 @@ class TopicAppender:
         self._statistics.channel_count += 1
         return channel_id
 
-    def _copy(self, source: McapFile, on_progress: Callable[[float], None] | None) -> None:
-        """Copy the original up to the record that ends its data section."""
-        assert source.summary is not None
-        end = source.summary.start - len(_bytes(DataEnd(0)))
+    def _copy(self, source: McapFile, end: int, on_progress: Callable[[float], None] | None) -> None:
+        """Copy the original up to ``end``, where the record begins that ends its data section."""
         with source.open() as file:
             while self._position < end:
                 piece = file.read(min(_PIECE, end - self._position))
@@ -147,10 +145,9 @@ class TopicAppender:
         records["log_time"] = records["publish_time"] = stream.time_ns
         try:
             cdr.fill(records["message"], stream)
-        except cdr.CdrError as error:
+        except cdr.MessageError as error:
             raise InputError(f"{self._topic} cannot be written: {error}.") from None
-        index = np.column_stack([stream.time_ns, np.arange(count) * records.itemsize]).astype("<u8")
-        self._put_chunk(records.view("u1").data, [(self._channel, index)], stream.time_ns)
+        self._put_chunk(records.view("u1").data, stream.time_ns)
         self._count += count
 
     def _blank_records(self, template: bytes) -> NDArray[np.void]:
@@ -164,39 +161,27 @@ class TopicAppender:
         record = blank.tobytes()[: -len(template)] + template
         return np.frombuffer(bytearray(record * _MESSAGES), kind)
 
-    def _put_chunk(
-        self, data: bytes | memoryview, indexes: list[tuple[int, NDArray[Any]]],
-        times: NDArray[np.int64] | None = None,
-    ) -> None:  # fmt: skip
-        """Write a chunk and the indexes of its messages, and remember it for the summary."""
-        start = self._position
-        first, last = (0, 0) if times is None else (int(times.min()), int(times.max()))
+    def _put_chunk(self, data: bytes | memoryview, times: Times = _NO_TIMES) -> None:
+        """Write a chunk, with the index of its messages, of one size, if it has any; the summary has it, too."""
+        start, count = self._position, len(times)
+        first, last = (int(times.min()), int(times.max())) if count else (0, 0)
         packed = zstandard.ZstdCompressor(level=1).compress(data)
         self._put(_bytes(Chunk("zstd", packed, last, first, zlib.crc32(data), len(data))))
-        length, offsets = self._position - start, dict[int, int]()
-        for channel, rows in indexes:
-            offsets[channel] = self._position
-            content = channel.to_bytes(2, "little") + rows.nbytes.to_bytes(4, "little") + rows.tobytes()
+        length, offsets, statistics = self._position - start, dict[int, int](), self._statistics
+        statistics.chunk_count += 1
+        if count:
+            offsets[self._channel] = self._position
+            rows = np.column_stack([times, np.arange(count) * (len(data) // count)]).astype("<u8")
+            content = self._channel.to_bytes(2, "little") + rows.nbytes.to_bytes(4, "little") + rows.tobytes()
             self._put(HEAD.pack(Opcode.MESSAGE_INDEX, len(content)) + content)
+            counts, earliest = statistics.channel_message_counts, statistics.message_start_time
+            counts[self._channel] = counts.get(self._channel, 0) + count
+            statistics.message_start_time = min(earliest, first) if statistics.message_count else first
+            statistics.message_end_time = max(statistics.message_end_time, last)
+            statistics.message_count += count
         index = ChunkIndex(length, start, "zstd", len(packed), last, self._position - start - length, offsets, first,
                            len(data))  # fmt: skip
         self._groups[Opcode.CHUNK_INDEX].append(_bytes(index))
-        self._count_in(times)
-
-    def _count_in(self, times: NDArray[np.int64] | None) -> None:
-        """Count a chunk and its messages in the statistics."""
-        statistics = self._statistics
-        statistics.chunk_count += 1
-        if times is None:
-            return
-        counts = statistics.channel_message_counts
-        counts[self._channel] = counts.get(self._channel, 0) + len(times)
-        none = not statistics.message_count
-        statistics.message_start_time = (
-            int(times.min()) if none else min(statistics.message_start_time, int(times.min()))
-        )
-        statistics.message_end_time = max(statistics.message_end_time, int(times.max()))
-        statistics.message_count += len(times)
 
     def _put(self, data: bytes, section: int = 0) -> int:
         """Write bytes, keep the checksum of all so far, and return that of a section continued by them."""

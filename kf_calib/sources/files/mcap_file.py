@@ -9,6 +9,7 @@ one chunk where that is larger: what claims to unpack to more than is allowed is
 
 from __future__ import annotations
 
+import struct
 import zlib
 from bisect import bisect_right
 from collections import deque
@@ -35,7 +36,6 @@ from kf_calib.sources.files.mcap_records import (
     Summary,
     allowed_sizes,
     chunk_heads,
-    chunk_times,
     megabytes,
     packed_start,
     parse_record,
@@ -43,10 +43,17 @@ from kf_calib.sources.files.mcap_records import (
 )
 
 Warn = Callable[[str], None]
+
+
+def ignore(said: str) -> None:
+    """A ``Warn`` where nothing can be lost, or what is lost is told another time."""
+
+
 _BLOCK = 1 << 22  # smaller chunks are joined: every block costs some hundred microseconds besides its messages
 _PIECE = 1 << 20
 _AHEAD = 2 * _BLOCK  # bytes unpacked and not yet asked for
 _LONGEST_SPAN_S = 1e7  # a longer one is damage itself
+_TIMES = struct.Struct("<QQ")  # first and last, with which a chunk begins
 
 # What may stand in the data section, with the least length of its content
 _LEAST: dict[int, int] = {
@@ -282,8 +289,11 @@ class _Walk:
     def _lose(self, start: int, opcode: int, limit: int) -> None:
         """Goes on at ``limit``, or the next chunk: nothing tells where the record at ``start`` ends."""
         self.whole = False
-        index, times = self.chunks.get(start), self.file.read(16) if opcode == Opcode.CHUNK else b""
-        span = _span(index.message_start_time, index.message_end_time) if index else _span(*chunk_times(times))
+        index, times = self.chunks.get(start), self.file.read(_TIMES.size) if opcode == Opcode.CHUNK else b""
+        if index:
+            span = _span(index.message_start_time, index.message_end_time)
+        else:
+            span = _span(*_TIMES.unpack(times)) if len(times) == _TIMES.size else ""
         resumed = limit if self.indexed else self._chunk_after(start)
         count = resumed - start
         if self.indexed or resumed < limit:
@@ -306,14 +316,10 @@ class _Walk:
         while place < self.end and self.next_chunk == self.end:
             self.file.seek(place)
             piece = self.file.read(min(_PIECE + overlap, self.end - place))
-            found = (place + at for at in chunk_heads(piece) if place + at + self._chunk_length(piece, at) <= self.end)
-            self.next_chunk = next(found, self.end)
+            ends = ((place + at, place + at + HEAD.size + HEAD.unpack_from(piece, at)[1]) for at in chunk_heads(piece))
+            self.next_chunk = next((start for start, end in ends if end <= self.end), self.end)
             place += _PIECE
         return self.next_chunk
-
-    @staticmethod
-    def _chunk_length(piece: bytes, at: int) -> int:
-        return HEAD.size + HEAD.unpack_from(piece, at)[1]
 
     def _loose(self, opcode: int, content: bytes) -> bytes:
         self.unchecked |= opcode == Opcode.MESSAGE

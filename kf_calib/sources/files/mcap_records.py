@@ -11,7 +11,7 @@ from bisect import bisect_right
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
-from typing import IO, TypeVar
+from typing import IO, Any, TypeVar
 
 import lz4.frame
 import numpy as np
@@ -20,7 +20,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, MetadataIndex, Schema, Statistics
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 MAX_CHUNK_MB = 256.0
 """A chunk that unpacks to more is passed over: recorders write some MB, and a few kB of zeros claim a GB."""
@@ -115,15 +115,11 @@ def chunk_heads(piece: bytes) -> Iterator[int]:
             yield at
 
 
-def chunk_times(content: bytes) -> tuple[int, int]:
-    """First and last time in the first bytes of a chunk's content; no times at all where they are not there."""
-    return struct.unpack("<QQ", content) if len(content) == 16 else (1, 0)
-
-
 MAGIC = b"\x89MCAP0\r\n"
 HEAD = struct.Struct("<BQ")  # opcode, length of the content
 MESSAGE_FIELDS = 22  # channel u16, sequence u32, log time u64, publish time u64; then the message itself
 MESSAGE_RECORD = struct.Struct("<BQHIQQ")  # head and fields of a message's record
+_LOG_TIME_BEFORE = 16  # bytes before the message itself
 Integers = NDArray[np.int64]
 _MOST_KINDS = 16  # of record heads; beyond that, searching for them costs more than walking
 _FEW_OTHERS = 256  # among messages that are found all at once
@@ -260,10 +256,21 @@ def _candidates(data: bytes) -> Integers:
     return np.flatnonzero(has_opcode) if is_sparse else np.empty(0, np.int64)
 
 
+def at_every_byte(data: bytes, dtype: DTypeLike) -> NDArray[Any]:
+    """What would stand at each byte if it began there, as a view."""
+    kind = np.dtype(dtype)
+    return np.ndarray((max(len(data) - kind.itemsize + 1, 0),), kind, data, strides=(1,))
+
+
+def log_times(data: bytes, at: Integers) -> Integers:
+    """When the messages of a block that start at these bytes were received, ns, as its records say."""
+    received = at_every_byte(data, "<u8")[at - _LOG_TIME_BEFORE]
+    return np.minimum(received, np.iinfo(np.int64).max).astype(np.int64)
+
+
 def _kinds(data: bytes, start: Integers) -> Integers:
     """Opcode, channel and length of the records at ``start`` in one number each."""
-    every = np.ndarray((max(len(data) - _HEADS.itemsize + 1, 0),), f"V{_HEADS.itemsize}", data, strides=(1,))
-    heads = every[start].view(_HEADS)
+    heads = at_every_byte(data, f"V{_HEADS.itemsize}")[start].view(_HEADS)
     channel = heads["channel"].astype(np.int64) << _CHANNEL_SHIFT
     return (heads["length"] << _LENGTH_SHIFT) | channel | heads["opcode"]
 

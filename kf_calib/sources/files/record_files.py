@@ -14,18 +14,19 @@ import os
 import re
 import tempfile
 import weakref
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from functools import partial
 from itertools import takewhile
 from pathlib import Path
-from typing import IO, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import zstandard
 from mcap.opcode import Opcode
 from mcap.records import Metadata
 
 from kf_calib.errors import InputError, KfCalibError
-from kf_calib.sources.files.mcap_file import McapFile, Warn
+from kf_calib.sources.files.mcap_file import McapFile, Warn, ignore
 from kf_calib.sources.files.mcap_records import (
     DamagedError,
     Integers,
@@ -38,6 +39,7 @@ from kf_calib.sources.files.mcap_records import (
 from kf_calib.support.leaves import leaf
 from kf_calib.support.text import cut, number_from
 
+_PIECE = 1 << 20
 _USUAL_RATIO = 20  # sizes of a recording unpacked and packed, at most
 SQLITE, ROS1_BAG, _ZSTD = b"SQLite format 3\0", b"#ROSBAG V2.0", b"\x28\xb5\x2f\xfd"
 
@@ -84,10 +86,12 @@ def open_record_file(path: Path, max_chunk: int, usable: frozenset[str]) -> Reco
         else:
             file = McapFile(path, max_chunk, place)
     except BaseException:
-        _remover(place, path)()
+        if place != path:
+            _remove(place)
         raise
     file.trouble = " ".join(filter(None, (file.trouble, said)))
-    weakref.finalize(file, _remover(place, path))
+    if place != path:
+        weakref.finalize(file, _remove, place)
     return file
 
 
@@ -100,32 +104,9 @@ def first_bytes(path: Path) -> bytes:
         return b""
 
 
-def _remover(place: Path, path: Path) -> Callable[[], None]:
-    """Removes what was unpacked, where anything was."""
-
-    def remove() -> None:
-        if place != path:
-            with suppress(OSError):
-                place.unlink()
-
-    return remove
-
-
-class _Bounded:
-    """A file that holds no more than so many bytes."""
-
-    def __init__(self, file: IO[bytes], most: int) -> None:
-        self._file, self._left = file, most
-
-    def write(self, data: bytes) -> int:
-        self._left -= len(data)
-        if self._left < 0:
-            raise _TooLargeError
-        return self._file.write(data)
-
-
-class _TooLargeError(Exception):
-    pass
+def _remove(place: Path) -> None:
+    with suppress(OSError):
+        place.unlink()
 
 
 def _unpacked(path: Path, max_chunk: int) -> Path:
@@ -134,17 +115,19 @@ def _unpacked(path: Path, max_chunk: int) -> Path:
     descriptor, name = tempfile.mkstemp(prefix="kf_calib_", suffix=Path(path.stem).suffix)
     try:
         with os.fdopen(descriptor, "wb") as target, path.open("rb") as packed:
-            bounded = _Bounded(target, max(max_chunk, _USUAL_RATIO * path.stat().st_size))
-            _, written = zstandard.ZstdDecompressor().copy_stream(packed, bounded)  # pyright: ignore[reportArgumentType]
-            if not written:
+            most = max(max_chunk, _USUAL_RATIO * path.stat().st_size)
+            reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
+            for piece in iter(partial(reader.read, _PIECE), b""):
+                if target.tell() + len(piece) > most:
+                    raise InputError(
+                        f"{path} unpacks to {allowed_sizes(max_chunk)}: unpack it yourself if it is sound (zstd -d), "
+                        "or allow more."
+                    )
+                target.write(piece)
+            if not target.tell():
                 raise zstandard.ZstdError("it ends before anything of it can be unpacked")
     except BaseException as error:
         Path(name).unlink()
-        if isinstance(error, _TooLargeError):
-            raise InputError(
-                f"{path} unpacks to {allowed_sizes(max_chunk)}: unpack it yourself if it is sound (zstd -d), or allow "
-                "more."
-            ) from None
         if isinstance(error, zstandard.ZstdError):
             raise InputError(f"{path} does not decompress ({error}): it is damaged, copy it anew.") from None
         if isinstance(error, OSError):
@@ -246,7 +229,7 @@ def decision_records(path: Path, name: str = DECISION_RECORD) -> list[Mapping[st
     """The records of a name in an MCAP file, in their order; none in a file that is none or cannot be read."""
     find, records = MessageFinder(), list[Mapping[str, str]]()
     try:
-        for block in McapFile(path).blocks(lambda said: None):
+        for block in McapFile(path).blocks(ignore):
             for opcode, content in find(block).others:
                 if opcode == Opcode.METADATA and (record := parse_record(Metadata.read, content)).name == name:
                     records.append(record.metadata)

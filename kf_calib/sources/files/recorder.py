@@ -8,12 +8,11 @@ import struct
 import time
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from types import TracebackType
-from typing import IO, Self
+from typing import IO
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -35,7 +34,7 @@ from kf_calib.sources.files.contents import (
     bench_checksum,
 )
 from kf_calib.sources.files.fields import Joints, gimbal_names
-from kf_calib.sources.files.mcap_file import McapFile
+from kf_calib.sources.files.mcap_file import McapFile, ignore
 from kf_calib.sources.files.mcap_records import HEAD, MAGIC, MessageFinder
 from kf_calib.support.output_files import Growing, refuse_output
 
@@ -46,7 +45,7 @@ _END = (  # of a file without a summary: all fields are zero
 )
 
 
-class Recorder:
+class Recorder(AbstractContextManager["Recorder"]):
     """An open recording of ``bench``; a context manager that finishes the file.
 
     An earlier file of that name (``overwrite``) stays till the first readings are on the disk; a failure before that
@@ -155,7 +154,7 @@ class Recorder:
         """What was written between two sizes that the file had after a ``flush``, as a replay gives it."""
         find, joints = MessageFinder(), Joints(len(self._joints), self._joints)
         decoders = [cdr.Decoder(channel.kind, channel.width, joints) for channel in self._channels]
-        for block in McapFile(self._place.at).blocks(_ignore, start, end):
+        for block in McapFile(self._place.at).blocks(ignore, start, end):
             streams = [Stream.empty(channel.width) for channel in self._channels]
             for group in find(block).groups:
                 k = next(k for k, channel in enumerate(self._channels) if channel.id == group.channel)
@@ -190,13 +189,8 @@ class Recorder:
             file.close()
         self._place.discard()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if error is None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
             self.close()
         else:
             self.finish()
@@ -211,7 +205,7 @@ class Recorder:
     def _pack(self, channel: _Channel, stream: Stream) -> list[bytes]:
         try:
             return cdr.pack(channel.kind, channel.template, stream)
-        except cdr.CdrError as error:
+        except cdr.MessageError as error:
             raise InputError(f"samples for {channel.topic} do not fit into {self.path}: {error}.") from error
 
     def _repeat_when_due(self) -> None:
@@ -304,10 +298,6 @@ def _finish(path: Path) -> int:
         file.seek(whole)
         file.write(_END)
         return whole
-
-
-def _ignore(_: str) -> None:
-    """Of a file written here and now nothing is lost."""
 
 
 @dataclass

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime
+from functools import cache
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from kf_calib.bench.keys import UNSTATED, BenchKeys, checked_keys
 from kf_calib.bench.raw_input import Conversion, RawInput, conversion, merged_metadata
 from kf_calib.bench.streams import Batch, Stream, bench_without_angles
 from kf_calib.errors import BenchError, InputError
-from kf_calib.sources.files.cdr import CdrError, Decoder
+from kf_calib.sources.files.cdr import Decoder
 from kf_calib.sources.files.contents import (
     BENCH_RECORD,
     POSES,
@@ -36,9 +37,9 @@ from kf_calib.sources.files.contents import (
     Role,
     fields_by_role,
 )
-from kf_calib.sources.files.field_messages import LOG_TIME_BEFORE, FieldDecoder
-from kf_calib.sources.files.fields import FieldError, Joints
-from kf_calib.sources.files.mcap_file import Warn
+from kf_calib.sources.files.field_messages import FieldDecoder
+from kf_calib.sources.files.fields import Joints, MessageError
+from kf_calib.sources.files.mcap_file import Warn, ignore
 from kf_calib.sources.files.mcap_records import (
     MAX_CHUNK_MB,
     DamagedError,
@@ -47,6 +48,7 @@ from kf_calib.sources.files.mcap_records import (
     Messages,
     RecordBlock,
     are_packed,
+    log_times,
     parse_record,
     unpacked,
 )
@@ -61,6 +63,7 @@ CLOCK_RECORD = "kf_calib.clock"
 """Where the bench's clock was set: after_ns, begin_ns (the first new stamp), shift_ns (from there on), reason."""
 RUN_RECORD = "kf_calib.run"
 """Before the first reading, where stamps are no dates: when the computer received it (received, ISO 8601)."""
+_DecoderOf = Callable[[Role, str], Decoder | FieldDecoder]
 _MARKS = {GAP_RECORD: "the link to the bench was lost", CLOCK_RECORD: "the bench's clock was set during the run"}
 
 
@@ -150,10 +153,17 @@ class Recording:
         del self.warnings[self._opening_warnings :]
         self.fraction, begun, parts = 0.0, 0, self._parts
         joints = Joints(len(self.bench.axes), self.bench.joints, self.bench.axis_letters, self._warn_of_joints)
-        decoders = _Decoders(parts, self.bench.pose_width, joints, self.warnings.append)
+
+        @cache
+        def decoder(role: Role, topic: str) -> Decoder | FieldDecoder:
+            """What reads the messages of a topic, in all of the files."""
+            width = {READINGS: 3, POSES: self.bench.pose_width, TEMPERATURES: 1}[role]
+            of_poses = joints if role is POSES else None
+            return parts.having(topic).decoder(role, topic, width, of_poses, self.warnings.append)
+
         for file, contents in zip(parts.files, parts.contents, strict=True):
             passage = _Passage(contents, self._limit, self._warn_of_damage)
-            batches = self._part(file, passage, decoders, growing and file is parts.files[-1])
+            batches = self._part(file, passage, decoder, growing and file is parts.files[-1])
             for end, batch in batches if growing else self._ordered(batches, file.size):
                 self.fraction = math.nan if growing else min((begun + end) / parts.size, 1.0)
                 if self._begin_ns is None and len(batch.accel):
@@ -170,16 +180,16 @@ class Recording:
         self.fraction = 1.0
 
     def _part(
-        self, file: RecordFile, passage: _Passage, decoders: _Decoders, growing: bool
+        self, file: RecordFile, passage: _Passage, decoder: _DecoderOf, growing: bool
     ) -> Iterator[tuple[int, Batch]]:
         """The batches of one file, and up to which byte it has been read then."""
-        accel = passage.track(self._accel, decoders.of(READINGS, self._accel))
-        pose = passage.track(self._pose, decoders.of(POSES, self._pose)) if self._pose else None
+        accel = passage.track(self._accel, decoder(READINGS, self._accel))
+        pose = passage.track(self._pose, decoder(POSES, self._pose)) if self._pose else None
         temperature = None
         for block in file.blocks(self._warn_of_damage, growing=growing):
             block, messages = passage.find(block)
             if not temperature and (topic := self._parts.choose(TEMPERATURES, self._wanted[TEMPERATURES])):
-                temperature = passage.track(topic, decoders.of(TEMPERATURES, topic))
+                temperature = passage.track(topic, decoder(TEMPERATURES, topic))
             batch = Batch(
                 self._converted(accel.read(block, messages)),
                 _scaled(pose.read(block, messages), self._angle_scale) if pose else Stream.empty(self.bench.pose_width),
@@ -210,24 +220,21 @@ class Recording:
 
     def _survey(self, file: RecordFile) -> Contents:
         """Topics and bench: from the summary, else by reading on until no better choice of topics can come, and where
-        something is damaged the bench."""
-        contents, summary = Contents(file.path, self._stated), file.summary
-        if summary:
-            contents.schemas = {schema.id: schema for schema in summary.schemas}
-            contents.channels = {channel.id: channel for channel in summary.channels}
-            for index in summary.metadata:
-                if index.name == BENCH_RECORD and contents.bench is None:
-                    try:
-                        contents.add(Opcode.METADATA, file.record_at(index.offset, Opcode.METADATA), warn=_ignore)
-                    except DamagedError:
-                        contents.bench_damaged = True
+        something is damaged the bench. Warnings come when the file is read."""
+        contents = Contents.listed_in(file, self._stated)
+        for index in file.summary.metadata if file.summary else ():
+            if index.name == BENCH_RECORD and contents.bench is None:
+                try:
+                    contents.add(Opcode.METADATA, file.record_at(index.offset, Opcode.METADATA), warn=ignore)
+                except DamagedError:
+                    contents.bench_damaged = True
         lists_topics = bool(contents.channels and contents.schemas)
         if lists_topics and (contents.bench is not None or contents.bench_damaged):
             return contents
         find, damage = MessageFinder(), list[str]()
         for block in file.blocks(warn=damage.append):
             for opcode, content in find(block).others:
-                contents.add(opcode, content, warn=_ignore)
+                contents.add(opcode, content, warn=ignore)
             may_come_again = contents.bench is None and bool(contents.bench_damaged or damage)
             if lists_topics or (self._is_settled(contents) and not may_come_again):
                 break
@@ -284,24 +291,6 @@ class Recording:
             return merged_metadata(recorded, overrides, "the recording", default)
         except BenchError as error:
             raise BenchError(f"{self.path}: {error}") from None
-
-
-@dataclass
-class _Decoders:
-    """What reads the messages of a recording's topics, in all of its files."""
-
-    parts: RecordingParts
-    pose_width: int
-    joints: Joints
-    warn: Warn
-    known: dict[Role, Decoder | FieldDecoder] = field(default_factory=dict[Role, Decoder | FieldDecoder])
-
-    def of(self, role: Role, topic: str) -> Decoder | FieldDecoder:
-        if role not in self.known:
-            width = {READINGS: 3, POSES: self.pose_width, TEMPERATURES: 1}[role]
-            joints = self.joints if role is POSES else None
-            self.known[role] = self.parts.having(topic).decoder(role, topic, width, joints, self.warn)
-        return self.known[role]
 
 
 class _Passage:
@@ -393,7 +382,7 @@ class _Track:
         try:
             parts = [self.decode.stream_with_offsets(block.data, group.at, group.size) for group in groups]
             parts = [(at, self._stamped(stream, at, block.data)) for at, stream in parts]
-        except (CdrError, FieldError) as error:
+        except MessageError as error:
             raise InputError(f"{self.contents.path}: topic {self.topic} cannot be used: {error}.") from error
         if len(parts) == 1:
             return parts[0][1]
@@ -406,9 +395,7 @@ class _Track:
         self.by_receipt |= len(stream) > 1 and not stream.time_ns.any()
         if not self.by_receipt:
             return stream
-        every = np.ndarray((max(len(data) - 7, 0),), "<u8", data, strides=(1,))
-        receipts = np.minimum(every[at - LOG_TIME_BEFORE], np.iinfo(np.int64).max).astype(np.int64)
-        return Stream(np.where(stream.time_ns == 0, receipts, stream.time_ns), stream.values)
+        return Stream(np.where(stream.time_ns == 0, log_times(data, at), stream.time_ns), stream.values)
 
 
 def _scaled(stream: Stream, scale: float) -> Stream:
@@ -425,7 +412,3 @@ def _mark(opcode: int, content: bytes) -> list[Metadata]:
     except DamagedError:  # told already
         return []
     return [record] if record.name in (*_MARKS, RUN_RECORD) else []
-
-
-def _ignore(_: str) -> None:
-    """While surveying: the warnings come again when the file is read."""

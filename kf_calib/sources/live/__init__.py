@@ -25,7 +25,7 @@ from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.files.fields import as_columns
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.live.feed import IDLE_S, Feed, GrowingFile, Link, SerialPort, StandardInput, Status, Tcp, nothing
-from kf_calib.sources.live.source import QUEUED, LiveSource
+from kf_calib.sources.live.source import LiveSource
 from kf_calib.sources.live.streamed import StreamedFeed
 from kf_calib.sources.simulation.simulator import Simulation
 from kf_calib.sources.text.grid import EXCEL_SUFFIXES
@@ -54,7 +54,6 @@ def open_live(
     give_up_s: float = 600.0,
     idle_s: float = math.inf,
     silent_s: float = 60.0,
-    queued: int = QUEUED,
     angles: bool = True,
 ) -> LiveSource:
     """A bench while it runs: a serial port, ``socket://host:port``, ``-``, a growing file, ``sim://?speed=20``.
@@ -62,7 +61,7 @@ def open_live(
     overrides: bench metadata keys that win over what the bench says. record: file to record to. columns: our name for
     each foreign column or key. header: of CSV rows that come without one. give_up_s: how long a lost link is tried
     again. idle_s: ends the source where nothing has come for so long. silent_s: a connection over a network on which
-    nothing more has come for so long is opened again. queued: samples that may wait for the consumer.
+    nothing more has come for so long is opened again.
     angles: False to do without platform angles: readings only are taken and recorded.
     Raises InputError where it cannot be opened.
     """
@@ -81,7 +80,7 @@ def open_live(
         name = "standard input" if address == "-" else address.removeprefix("tail:")
         columns = {**as_columns(overrides.get("joints", "")), **columns}
         feed = StreamedFeed(name, link, overrides, columns, header, give_up_s, idle_s, silent_s, angles=angles)
-    return LiveSource(feed, record, overwrite, queued)
+    return LiveSource(feed, record, overwrite)
 
 
 def files_of(url: str) -> list[Path]:

@@ -152,13 +152,14 @@ _ASKED = (2, 3)  # every so many seconds, and so many times
 
 class Link(ABC):
     """reopens: it may come back after it broke. patient: what is not read yet stays where it is. breaks_unseen: the
-    other side may be gone without a sign."""
+    other side may be gone without a sign. opened: what is to be closed, if anything is open that is ours."""
 
     reopens = True
     patient = False
     breaks_unseen = False
     starts_amid = False
     """What is read first after opening may be the end of a line."""
+    opened: Any = None
 
     @abstractmethod
     def open(self) -> None: ...
@@ -166,8 +167,10 @@ class Link(ABC):
     @abstractmethod
     def read(self) -> bytes: ...
 
-    @abstractmethod
-    def close(self) -> None: ...
+    def close(self) -> None:
+        opened, self.opened = self.opened, None
+        if opened is not None:
+            opened.close()
 
 
 class Tcp(Link):
@@ -177,30 +180,23 @@ class Tcp(Link):
 
     def __init__(self, host: str, port: int) -> None:
         self._address = (host, port)
-        self._socket: socket.socket | None = None
 
     def open(self) -> None:
         try:
-            self._socket = socket.create_connection(self._address, timeout=_CONNECT_S)
+            self.opened = socket.create_connection(self._address, timeout=_CONNECT_S)
         except UnicodeError as error:  # a name that cannot be one
             raise OSError(str(error)) from None
-        _ask_when_silent(self._socket)
-        self._socket.settimeout(_WAIT_S)
+        _ask_when_silent(self.opened)
+        self.opened.settimeout(_WAIT_S)
 
     def read(self) -> bytes:
-        assert self._socket is not None
         try:
-            block = self._socket.recv(_BLOCK_BYTES)
+            block = self.opened.recv(_BLOCK_BYTES)
         except TimeoutError:
             return b""
         if not block:
             raise ConnectionError("the other side closed the connection")
         return block
-
-    def close(self) -> None:
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
 
 
 def _ask_when_silent(connection: socket.socket) -> None:
@@ -229,28 +225,22 @@ class SerialPort(Link):
     def __init__(self, url: str, settings: Mapping[str, Any]) -> None:
         self._url, self._settings = url, settings
         self.breaks_unseen = url.startswith(("rfc2217://", "socket://"))
-        self.port: Any = None
 
     def open(self) -> None:
         import serial
 
         try:
-            self.port = serial.serial_for_url(self._url, timeout=_WAIT_S, **self._settings)
+            self.opened = serial.serial_for_url(self._url, timeout=_WAIT_S, **self._settings)
         except ValueError as error:  # settings that the port does not know
             raise OSError(str(error)) from None
 
     def read(self) -> bytes:
         try:
-            return self.port.read(min(max(self.port.in_waiting, 1), _BLOCK_BYTES))
+            return self.opened.read(min(max(self.opened.in_waiting, 1), _BLOCK_BYTES))
         except OSError:
             raise
         except Exception as error:  # pyserial lets TypeError, termios.error ... through where a port is pulled out
             raise OSError(str(error) or type(error).__name__) from error
-
-    def close(self) -> None:
-        if self.port is not None:
-            self.port.close()
-            self.port = None
 
 
 class StandardInput(Link):
@@ -270,9 +260,6 @@ class StandardInput(Link):
             raise EOFError
         return block
 
-    def close(self) -> None:
-        """It is not ours."""
-
 
 class GrowingFile(Link):
     """A text file that a logger appends to, from its start; a file that was cut or replaced is begun anew."""
@@ -281,21 +268,15 @@ class GrowingFile(Link):
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._file: Any = None
 
     def open(self) -> None:
-        self._file = self._path.open("rb", buffering=0)
+        self.opened = self._path.open("rb", buffering=0)
 
     def read(self) -> bytes:
-        block = self._file.read(_BLOCK_BYTES)
+        block = self.opened.read(_BLOCK_BYTES)
         if not block:
-            here, now = os.fstat(self._file.fileno()), self._path.stat()
-            if now.st_size < self._file.tell() or (here.st_ino, here.st_dev) != (now.st_ino, now.st_dev):
+            here, now = os.fstat(self.opened.fileno()), self._path.stat()
+            if now.st_size < self.opened.tell() or (here.st_ino, here.st_dev) != (now.st_ino, now.st_dev):
                 raise OSError("the file was cut or replaced")
             time.sleep(IDLE_S)
         return block
-
-    def close(self) -> None:
-        if self._file is not None:
-            self._file.close()
-            self._file = None

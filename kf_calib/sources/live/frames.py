@@ -12,11 +12,9 @@ text of a JSON object in place of values.
 from __future__ import annotations
 
 import json
-import struct
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,12 +26,11 @@ from kf_calib.sources.text.reader import Account, Described
 
 FRAME_VERSION = 1
 BENCH, ACCEL, ANGLES, ATTITUDE, TEMPERATURE = b"BAGQT"
-FRAME_HEAD = struct.Struct("<BBHIq")  # kind, version, reserved, number, time_ns
-_CRC = struct.Struct("<I")
 _LONGEST = 1 << 16  # bytes of a frame; one of samples has 254 at most
 _SHORT = 254  # up to this many bytes COBS adds one byte and no more
 _PLAUSIBLE = 1 << 20  # frames lost at once; more is a bench that counts anew
 _HEADS = np.dtype([("kind", "u1"), ("version", "u1"), ("reserved", "<u2"), ("number", "<u4"), ("time_ns", "<i8")])
+_HEAD_BYTES, _CRC_BYTES = _HEADS.itemsize, 4
 Bytes = NDArray[np.uint8]
 FramePlaces = NDArray[np.int64]
 
@@ -48,36 +45,8 @@ class _Found:
     values: Floats
 
 
-def encode(kind: int, number: int, time_ns: int, content: bytes) -> bytes:
-    """One frame, with the zero byte that ends it."""
-    body = FRAME_HEAD.pack(kind, FRAME_VERSION, 0, number & 0xFFFFFFFF, time_ns) + content
-    return cobs(body + _CRC.pack(zlib.crc32(body))) + b"\0"
-
-
-def sample(kind: int, number: int, time_ns: int, values: Sequence[float]) -> bytes:
-    """A frame of one reading (m/s^2), pose (rad, or a quaternion) or temperature (degC)."""
-    return encode(kind, number, time_ns, struct.pack(f"<{len(values)}d", *values))
-
-
-def bench(metadata: Mapping[str, Any]) -> bytes:
-    """The frame that describes the bench; to be sent first, and again whenever a link begins."""
-    return encode(BENCH, 0, 0, json.dumps(metadata).encode())
-
-
-def cobs(data: bytes) -> bytes:
-    """Consistent Overhead Byte Stuffing (Cheshire and Baker, 1999): no zero byte is left."""
-    encoded = bytearray()
-    for part in data.split(b"\0"):
-        while len(part) >= 254:
-            encoded += b"\xff" + part[:254]
-            part = part[254:]
-        encoded.append(len(part) + 1)
-        encoded += part
-    return bytes(encoded)
-
-
 def uncobs(data: bytes) -> bytes | None:
-    """What was encoded, None where that cannot be."""
+    """What was encoded by Consistent Overhead Byte Stuffing (Cheshire and Baker, 1999); None where that cannot be."""
     decoded, position = bytearray(), 0
     while position < len(data):
         code = data[position]
@@ -139,13 +108,20 @@ class FrameReader(Described):
             self._account.refuse(self._account.lines, "the link broke in it")
         self._tail = b""
 
+    def joined_amid(self) -> None:
+        """What comes next may begin within a frame, which its checksum tells."""
+
+    def rest(self) -> Batch:
+        """Nothing: a frame without an end is none."""
+        return Batch(Stream.empty(3), Stream.empty(self.pose_width))
+
     def _settle(self, frames: list[bytes]) -> None:
         """Learns from the first pose of all what poses are: below, frames are read by their lengths."""
         for frame in frames:
-            if not (FRAME_HEAD.size < len(frame) <= _SHORT + 1 and frame[0] > 1 and frame[1] in (ANGLES, ATTITUDE)):
+            if not (_HEAD_BYTES < len(frame) <= _SHORT + 1 and frame[0] > 1 and frame[1] in (ANGLES, ATTITUDE)):
                 continue
             body = _sound_body(frame)
-            size = len(body) - FRAME_HEAD.size - _CRC.size if body else 0
+            size = len(body) - _HEAD_BYTES - _CRC_BYTES if body else 0
             if body and body[1] == FRAME_VERSION and size and size % 8 == 0 and (frame[1] == ANGLES or size == 32):
                 self.has_angles, self.pose_width = frame[1] == ANGLES, size // 8
                 return
@@ -160,7 +136,7 @@ class FrameReader(Described):
             if length > _SHORT + 1:
                 for i in at.tolist():
                     self._read_long(frames[i], first + i)
-            elif length > FRAME_HEAD.size + _CRC.size:
+            elif length > _HEAD_BYTES + _CRC_BYTES:
                 table = np.frombuffer(b"".join([frames[i] for i in at.tolist()]), np.uint8).reshape(-1, length)
                 samples += self._read_alike(table, first + at)
             else:
@@ -173,15 +149,15 @@ class FrameReader(Described):
     def _read_alike(self, table: Bytes, places: FramePlaces) -> Iterator[_Found]:
         """The samples in frames (n, m) of one encoded length, by kind."""
         bodies, sound = _uncobs_alike(table)
-        size = bodies.shape[1] - _CRC.size
+        size = bodies.shape[1] - _CRC_BYTES
         stated = np.ascontiguousarray(bodies[:, size:]).view("<u4")[:, 0]
         texts = np.ascontiguousarray(bodies[:, :size]).tobytes()
         sound &= stated == np.array([zlib.crc32(texts[k : k + size]) for k in range(0, len(texts), size)], np.uint32)
         self._refuse(places[~sound], "its checksum does not fit")
         for kind in np.unique(bodies[sound, 0]).tolist():
             of_kind = sound & (bodies[:, 0] == kind)
-            heads = np.frombuffer(np.ascontiguousarray(bodies[of_kind, : FRAME_HEAD.size]).tobytes(), _HEADS)
-            contents = np.ascontiguousarray(bodies[of_kind, FRAME_HEAD.size : size])
+            heads = np.frombuffer(np.ascontiguousarray(bodies[of_kind, :_HEAD_BYTES]).tobytes(), _HEADS)
+            contents = np.ascontiguousarray(bodies[of_kind, _HEAD_BYTES:size])
             if kind == BENCH:
                 for content, place in zip(contents, places[of_kind].tolist(), strict=True):
                     self._learn(content.tobytes(), place)
@@ -217,9 +193,9 @@ class FrameReader(Described):
         if body is None:
             self._account.refuse(place, "its checksum does not fit")
         elif body[0] != BENCH:
-            self._account.refuse(place, f"it has {len(body) - FRAME_HEAD.size - 4} bytes of values")
+            self._account.refuse(place, f"it has {len(body) - _HEAD_BYTES - 4} bytes of values")
         else:
-            self._learn(body[FRAME_HEAD.size : -4], place)
+            self._learn(body[_HEAD_BYTES:-4], place)
 
     def _learn(self, text: bytes, place: int) -> None:
         try:
@@ -246,7 +222,11 @@ class FrameReader(Described):
 def _sound_body(frame: bytes) -> bytes | None:
     """A frame decoded, with its checksum; None where that does not fit."""
     body = uncobs(frame)
-    if body is None or len(body) < FRAME_HEAD.size + _CRC.size or _CRC.unpack(body[-4:])[0] != zlib.crc32(body[:-4]):
+    if (
+        body is None
+        or len(body) < _HEAD_BYTES + _CRC_BYTES
+        or int.from_bytes(body[-4:], "little") != zlib.crc32(body[:-4])
+    ):
         return None
     return body
 

@@ -9,11 +9,11 @@ from kf_calib.bench.streams import Batch
 from kf_calib.errors import InputError
 from kf_calib.sources.live.feed import nothing
 from kf_calib.sources.live.frames import FrameReader
-from kf_calib.sources.text.columns import Columns
 from kf_calib.sources.text.csv_lines import CsvLines
 from kf_calib.sources.text.encoding import Cutter
 from kf_calib.sources.text.heading import TextHeading
 from kf_calib.sources.text.json_lines import JsonLines
+from kf_calib.sources.text.lines import reader_for
 from kf_calib.sources.text.reader import Account, LineReader
 from kf_calib.sources.text.units import Units
 
@@ -28,7 +28,10 @@ class LineProtocol:
 
     header: of CSV rows that come without one. angles: whether poses must come. A header that does not say what is
     needed waits for the next line, which may be a row of units; InputError is raised where that does not say it either.
+    lost: readings are not numbered.
     """
+
+    lost = None
 
     def __init__(
         self, name: str, columns: Mapping[str, str], header: str, account: Account, angles: bool, units: Units
@@ -40,7 +43,7 @@ class LineProtocol:
         self._waiting = list[str]()
         self.reader: LineReader | None = None
         if self._heading:
-            self.reader = self._csv(self._heading, account, angles)
+            self.reader = self._reader(self._heading, account, angles)
         self._is_first = False
 
     def push(self, block: bytes) -> Batch:
@@ -98,13 +101,13 @@ class LineProtocol:
                 self._account.refuse(self._account.lines, "it is neither a JSON object nor a header of CSV")
         return []
 
-    def _csv(self, heading: list[str], account: Account, angles: bool) -> CsvLines:
-        return CsvLines(Columns(TextHeading.of(heading), self._columns, self._units), account, angles)
+    def _reader(self, first: list[str], account: Account, angles: bool) -> LineReader:
+        return reader_for(first, self._columns, account, angles=angles, units=self._units)[0]
 
     def _has_readings(self, heading: list[str]) -> bool:
         """Whether a header lacks nothing but angles."""
         try:
-            self._csv(heading, Account(), angles=False)
+            self._reader(heading, Account(), angles=False)
         except InputError:
             return False
         return True
@@ -116,7 +119,7 @@ class LineProtocol:
                 json.loads(text)
             except (ValueError, RecursionError):
                 return False
-            self.reader = JsonLines(self._columns, self._account)
+            self.reader = self._reader([text], self._account, self._angles)
             return True
         cells = text.split(max(",;\t", key=text.count))
         if (
@@ -130,7 +133,7 @@ class LineProtocol:
             if self._angles and len(cells) < _FEWEST_CELLS and not self._has_readings(heading):
                 continue
             try:
-                self.reader, self._heading = self._csv(heading, self._account, self._angles), heading
+                self.reader, self._heading = self._reader(heading, self._account, self._angles), heading
             except InputError as error:
                 lacks = error
                 continue
@@ -145,45 +148,32 @@ class LineProtocol:
 
 
 class Protocol:
-    """Finds out what the bytes are, then reads them."""
+    """Finds out what the bytes are, then has them read: by ``form``, which is for lines until frames are found."""
 
     def __init__(
         self, name: str, columns: Mapping[str, str], header: str, angles: bool = True, units: Units | None = None
     ) -> None:
         self.account = Account()
         self._name = name
-        self._lines: LineProtocol | None = LineProtocol(name, columns, header, self.account, angles, units or Units())
-        self._frames: FrameReader | None = None
-        self._held = b""
-        self._seen = 0
+        self.form: LineProtocol | FrameReader = LineProtocol(
+            name, columns, header, self.account, angles, units or Units()
+        )
+        self._held, self._seen = b"", 0
 
     @property
     def reader(self) -> LineReader | FrameReader | None:
         """What has been learnt of the bench; None while it is not known what it speaks."""
-        return self._frames or (self._lines.reader if self._lines else None)
-
-    @property
-    def lost(self) -> int | None:
-        """Readings known to be lost by their numbers."""
-        return self._frames.lost if self._frames else None
+        return self.form if isinstance(self.form, FrameReader) else self.form.reader
 
     def push(self, block: bytes) -> Batch:
         """The samples that are whole with this block. Raises InputError where it makes no sense at all."""
-        if self._frames:
-            return self._frames.push(block)
-        assert self._lines is not None
-        if self._lines.reader is None:
-            held = self._held + block
-            if b"\0" in held and (found := self._frames_in(held)) is not None:
-                return found
-            self._held = held[-_HELD_BYTES:]
-        batch = self._lines.push(block)
-        if self._lines.reader is None:
-            self._seen += len(block)
-            if self.account.lines > _MOST_LINES or self._seen > _MOST_BYTES:
-                raise self.unusable("no header of CSV, no JSON object and no binary frame")
-        else:
-            self._held = b""
+        if self.reader is None:
+            self._held, self._seen = (self._held + block)[-_HELD_BYTES - len(block) :], self._seen + len(block)
+            if b"\0" in self._held and (batch := self._frames_in(self._held)) is not None:
+                return batch
+        batch = self.form.push(block)
+        if self.reader is None and (self.account.lines > _MOST_LINES or self._seen > _MOST_BYTES):
+            raise self.unusable("no header of CSV, no JSON object and no binary frame")
         return batch
 
     def _frames_in(self, held: bytes) -> Batch | None:
@@ -192,21 +182,8 @@ class Protocol:
         batch = frames.push(held)
         if account.malformed == account.lines:
             return None
-        self.account, self._frames, self._lines, self._held = account, frames, None, b""
+        self.account, self.form = account, frames
         return batch
-
-    def joined_amid(self) -> None:
-        if self._lines:
-            self._lines.joined_amid()
-
-    def cut_off(self) -> None:
-        """The link broke: what has begun will not end."""
-        for each in (self._lines, self._frames):
-            if each:
-                each.cut_off()
-
-    def rest(self) -> Batch:
-        return self._lines.rest() if self._lines else nothing(0)
 
     def unusable(self, what: str) -> InputError:
         """That the bytes cannot be used, with what was seen of them."""

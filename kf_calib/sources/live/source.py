@@ -6,11 +6,11 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Stream
@@ -83,7 +83,7 @@ def _size(batch: Batch) -> int:
     return sum(map(len, _streams(batch)))
 
 
-class LiveSource:
+class LiveSource(AbstractContextManager["LiveSource"]):
     """A ``Source`` that is read while it comes; iterated once. A context manager that finishes the recording.
 
     Batches hold exactly the samples, in each stream in the order, that a replay of the recording gives. A consumer that
@@ -185,12 +185,7 @@ class LiveSource:
         self.stop()
         self._worker.join()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def __iter__(self) -> Iterator[Batch]:
@@ -320,16 +315,14 @@ class LiveSource:
             return None
 
     def _mark_gap(self, reason: str, seconds: float) -> None:
-        facts = {"after_ns": str(self._continuity.last_ns or 0), "seconds": f"{seconds:.6f}", "reason": reason}
-        with self._lock:
-            self._store_if_open(lambda recorder: recorder.mark(GAP_RECORD, facts))
+        after_ns = str(self._continuity.last_ns or 0)
+        self.mark(GAP_RECORD, {"after_ns": after_ns, "seconds": f"{seconds:.6f}", "reason": reason})
 
     def _mark_restart(self, restart: Restart) -> None:
         facts = {"after_ns": restart.after_ns, "begin_ns": restart.begin_ns, "shift_ns": restart.shift_ns}
         texts = {key: str(value) for key, value in facts.items()} | {"reason": restart.reason}
         self._begins.append(restart.begin_ns)
-        with self._lock:
-            self._store_if_open(lambda recorder: recorder.mark(CLOCK_RECORD, texts))
+        self.mark(CLOCK_RECORD, texts)
 
     def _storable(self, stream: Stream) -> Stream:
         """The samples whose stamps a recording can hold; the others are refused."""

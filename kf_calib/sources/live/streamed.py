@@ -91,7 +91,7 @@ class StreamedFeed(Feed):
             ) from None
         self.link = "live"
         if link.starts_amid:
-            self._protocol.joined_amid()
+            self._protocol.form.joined_amid()
         self._reader = threading.Thread(target=self._read, name="reader", daemon=True)
 
     def begin(self) -> Bench:
@@ -173,7 +173,6 @@ class StreamedFeed(Feed):
     def _understood(self) -> Iterator[Batch | Lost | Regained]:
         while True:
             item = self._next()
-            self.account, self.lost = self._protocol.account, self._protocol.lost
             match item:
                 case bytes():
                     for at in range(0, len(item) or 1, _PUSHED_BYTES):
@@ -182,17 +181,17 @@ class StreamedFeed(Feed):
                             break
                         yield self._protocol.push(item[at : at + _PUSHED_BYTES]) if item else nothing(0)
                 case Lost():
-                    self._protocol.cut_off()
+                    self._protocol.form.cut_off()
                     yield item
                 case Regained():
                     if self._link.starts_amid:
-                        self._protocol.joined_amid()
+                        self._protocol.form.joined_amid()
                     yield item
                 case _Ended():
-                    yield self._protocol.rest()
-                    self.account, self.lost = self._protocol.account, self._protocol.lost
-                    return
-            self.account, self.lost = self._protocol.account, self._protocol.lost
+                    yield self._protocol.form.rest()
+            self.account, self.lost = self._protocol.account, self._protocol.form.lost
+            if isinstance(item, _Ended):
+                return
 
     def _is_late(self) -> bool:
         """Whether the end was asked for, and the time for what had come till then is over."""

@@ -23,7 +23,7 @@ from kf_calib.errors import InputError, check_number
 from kf_calib.sources.simulation.physics import TrueState
 from kf_calib.sources.simulation.sensors import generator
 from kf_calib.sources.simulation.simulator import Simulation
-from kf_calib.sources.simulation.visit_plans import Motion, between
+from kf_calib.sources.simulation.visit_plans import Motion
 
 FAULTS = ("stuck", "stall", "off", "drive", "link", "readback", "runaway")
 """What can fail: a move does not begin; it ends half-way; it ends off its target; the drive trips; the link breaks; the
@@ -126,69 +126,53 @@ class DrivenMotion(Motion):
     """The motion so far and what is under way; see ``Motion``. The angles of the last dwell hold until a command."""
 
     def __init__(self, start_deg: Sequence[float], servo: Servo, end_ns: int) -> None:
-        arrive_ns, leave_ns = np.array([0]), np.array([_NEVER_NS])
-        super().__init__(np.radians([start_deg]), arrive_ns, leave_ns)
-        self._set(servo=servo, courses=[_Course(angle) for angle in start_deg], planned_end_ns=end_ns)
-        self._set(play_deg=[np.zeros(len(start_deg))])
-
-    servo: Servo
-    courses: list[_Course]
-    planned_end_ns: int
-    play_deg: list[Floats]
-
-    def _set(self, **values: object) -> None:
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+        super().__init__(np.radians([start_deg]), np.array([0]), np.array([_NEVER_NS]))
+        self.servo, self._planned_end_ns = servo, end_ns
+        self._courses, self._play_deg = [_Course(angle) for angle in start_deg], [np.zeros(len(start_deg))]
 
     @property
     def end_ns(self) -> int:
         """About when the run will end: what is drawn for a whole run is drawn for so long."""
-        return self.planned_end_ns
+        return self._planned_end_ns
 
-    def locate(self, time_ns: Times) -> tuple[Times, Floats]:
-        dwell = np.searchsorted(self.arrive_ns, time_ns, side="right") - 1
-        slew_ns = np.append(self.arrive_ns[1:] - self.leave_ns[:-1], 0)
-        share = np.clip((time_ns - self.leave_ns[dwell]) / np.maximum(slew_ns[dwell], 1), 0.0, 1.0)
-        return dwell, share
+    def _profile(self, share: Floats) -> Floats:
+        return share
 
     def angles_at(self, time_ns: Times) -> Floats:
         time_s = np.multiply(time_ns, 1e-9)
-        return np.radians(np.column_stack([course.at(time_s, self.servo.ringing_s) for course in self.courses]))
+        return np.radians(np.column_stack([course.at(time_s, self.servo.ringing_s) for course in self._courses]))
 
     def leave(self, now_ns: int, targets_deg: Sequence[float]) -> None:
         """Begins to move there, from where it stands or is."""
         now_s, before = now_ns * 1e-9, self.angles_at(np.array([now_ns]))[0]
-        ends_s = [course.go(now_s, angle, self.servo) for course, angle in zip(self.courses, targets_deg, strict=True)]
+        ends_s = [course.go(now_s, angle, self.servo) for course, angle in zip(self._courses, targets_deg, strict=True)]
         way = np.asarray(targets_deg, float) - np.degrees(before)
-        play = np.where(np.abs(way) > 1e-9, -0.5 * self.servo.backlash_deg * np.sign(way), self.play_deg[-1])
-        if self.is_moving(now_ns):
-            self._arrive_at(max(ends_s), play)
-            return
-        self._set(leave_ns=np.append(self.leave_ns[:-1], [now_ns, _NEVER_NS]))
-        self._set(arrive_ns=np.append(self.arrive_ns, 0), angles_rad=np.vstack([self.angles_rad, before]))
-        self.play_deg.append(play)
+        play = np.where(np.abs(way) > 1e-9, -0.5 * self.servo.backlash_deg * np.sign(way), self._play_deg[-1])
+        if not self.is_moving(now_ns):
+            self.leave_ns = np.append(self.leave_ns[:-1], [now_ns, _NEVER_NS])
+            self.arrive_ns, self.angles_rad = np.append(self.arrive_ns, 0), np.vstack([self.angles_rad, before])
+            self._play_deg.append(play)
         self._arrive_at(max(ends_s), play)
 
     def brake(self, now_ns: int) -> None:
         """Comes to rest as soon as it can."""
         if self.is_moving(now_ns):
-            ends_s = [course.brake(now_ns * 1e-9, self.servo.acceleration_degps2) for course in self.courses]
-            self._arrive_at(max(ends_s), self.play_deg[-1])
+            ends_s = [course.brake(now_ns * 1e-9, self.servo.acceleration_degps2) for course in self._courses]
+            self._arrive_at(max(ends_s), self._play_deg[-1])
 
     def is_moving(self, now_ns: int) -> bool:
         return now_ns < int(self.arrive_ns[-1])
 
     def _arrive_at(self, end_s: float, play_deg: Floats) -> None:
         end_ns = math.ceil(end_s * 1e9) + 1
-        self._set(arrive_ns=np.append(self.arrive_ns[:-1], end_ns))
-        self.play_deg[-1] = play_deg
+        self.arrive_ns = np.append(self.arrive_ns[:-1], end_ns)
+        self._play_deg[-1] = play_deg
         self.angles_rad[-1] = self.angles_at(np.array([end_ns]))[0]
 
     def trail(self, state: TrueState) -> None:
         """The step that lets the platform trail behind the encoders."""
         if self.servo.backlash_deg:
-            play = np.radians(self.play_deg)
-            state.angles_rad = state.angles_rad + between(play, np.full(len(state.share), state.dwell), state.share)
+            state.angles_rad = state.angles_rad + state.of_dwells(np.radians(self._play_deg))
 
 
 class DrivenBench:
@@ -203,7 +187,7 @@ class DrivenBench:
         self._motion = DrivenMotion(list(start_deg), self.servo, run.motion.end_ns)
         self.run = run.moved_by(self._motion, _MOST_DWELLS, self._motion.trail)
         self._make = self.run.batch_maker()
-        self._now_ns, self._readings = 0, 0
+        self._now_ns = 0
         self._rng = generator(run.seed, "read-back")
         self._tripped = False
 
@@ -256,9 +240,7 @@ class DrivenBench:
         if self._failing == "drive" and not self._tripped:
             self._tripped = True
             self._motion.brake(self._now_ns)
-        last = self.run.first_reading_at(self._now_ns)
-        first, self._readings = self._readings, last
-        return self._make(first, last, last * self.run.reading_period_ns)
+        return self._make(self.run.next_reading_ns(self._now_ns))
 
     @property
     def _failing(self) -> str:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -74,26 +75,33 @@ def set_attitudes(states: Sequence[TrueState], up: str) -> None:
             state.attitude = whole[end - len(state.angles_rad) : end]
 
 
-@dataclass(frozen=True)
-class DwellRotation:
-    """The platform turned in itself by a small rotation vector in each dwell, ``rotation_rad`` (m, 3)."""
-
-    rotation_rad: Floats
-
-    def __call__(self, state: TrueState) -> None:
-        state.attitude = state.attitude * Rotation.from_rotvec(state.of_dwells(self.rotation_rad))
+def putting(quantity: str, value: Callable[[TrueState], Any]) -> TrueStep:
+    """The step that puts a value in the place of a quantity of the state."""
+    return lambda state: setattr(state, quantity, value(state))
 
 
-@dataclass(frozen=True)
-class Gravity:
+def adding(contribution_mps2: Callable[[TrueState], Floats]) -> TrueStep:
+    """The step that adds to the readings."""
+    return putting("reading_mps2", lambda state: state.reading_mps2 + contribution_mps2(state))
+
+
+def turning_base(rotation_rad: Callable[[TrueState], Floats]) -> TrueStep:
+    """The step that turns the base by rotation vectors (n, 3)."""
+    return putting("attitude", lambda state: Rotation.from_rotvec(rotation_rad(state)) * state.attitude)
+
+
+def turning_platform(rotation_rad: Callable[[TrueState], Floats]) -> TrueStep:
+    """The step that turns the platform in itself by rotation vectors (n, 3)."""
+    return putting("attitude", lambda state: state.attitude * Rotation.from_rotvec(rotation_rad(state)))
+
+
+def gravity(bench: Bench) -> TrueStep:
     """Specific force seen by the platform: f_p = C_bp^T f_b, f_b = (0, g, 0), which turns with the Earth where the
     platform is held in inertial space."""
-
-    bench: Bench
-
-    def __call__(self, state: TrueState) -> None:
-        up = carried_by_earth(self.bench, np.array([[0.0, self.bench.gravity_mps2, 0.0]]), state.time_s)
-        state.force_mps2 = rotate(state.attitude.inv(), up)
+    up_mps2 = np.array([[0.0, bench.gravity_mps2, 0.0]])
+    return putting(
+        "force_mps2", lambda state: rotate(state.attitude.inv(), carried_by_earth(bench, up_mps2, state.time_s))
+    )
 
 
 def carried_by_earth(bench: Bench, vector: Floats, time_s: Floats) -> Floats:
@@ -117,14 +125,9 @@ def to_bench(north_up_east: ArrayLike, azimuth_deg: float) -> Floats:
     return from_north.inv().apply(north_up_east)
 
 
-@dataclass(frozen=True)
-class Inputs:
+def inputs(sensors: Sensors) -> TrueStep:
     """Accelerations along the input axes of the three accelerometers: a_i = E_i . f."""
-
-    sensors: Sensors
-
-    def __call__(self, state: TrueState) -> None:
-        state.input_mps2 = along(state.force_mps2, self.sensors.input_axes)
+    return putting("input_mps2", lambda state: along(state.force_mps2, sensors.input_axes))
 
 
 def rotate(rotation: Rotation, vector: Floats) -> Floats:
@@ -140,24 +143,9 @@ def along(vector: Floats, axes: Floats) -> Floats:
     return vector[:, 0:1] * axes[..., 0] + vector[:, 1:2] * axes[..., 1] + vector[:, 2:3] * axes[..., 2]
 
 
-@dataclass(frozen=True)
-class Response:
+def response(sensors: Sensors) -> TrueStep:
     """Readings of the three accelerometers: K_i a_i + b_i."""
-
-    sensors: Sensors
-
-    def __call__(self, state: TrueState) -> None:
-        state.reading_mps2 = self.sensors.scales * state.input_mps2 + self.sensors.biases_mps2
-
-
-@dataclass(frozen=True)
-class DwellOffset:
-    """An offset of each accelerometer in each dwell, ``offset_mps2`` (m, 3)."""
-
-    offset_mps2: Floats
-
-    def __call__(self, state: TrueState) -> None:
-        state.reading_mps2 = state.reading_mps2 + state.of_dwells(self.offset_mps2)
+    return putting("reading_mps2", lambda state: sensors.scales * state.input_mps2 + sensors.biases_mps2)
 
 
 @dataclass(frozen=True)

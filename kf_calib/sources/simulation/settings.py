@@ -31,10 +31,9 @@ class Ambient:
         for words, value_s in (("period of the temperature", self.period_s), ("warm-up time", self.warm_up_s)):
             if not value_s > 0.0:
                 raise InputError(f"the {words} is {value_s:g} s: give a positive time.")
-        if self.sigma_c < 0.0:
-            raise InputError(f"the noise of the thermometer is {self.sigma_c:g} K: give zero or a positive number.")
-        if self.step_c < 0.0:
-            raise InputError(f"the resolution of the thermometer is {self.step_c:g} K: give zero or a positive number.")
+        for words, value_c in (("noise", self.sigma_c), ("resolution", self.step_c)):
+            if value_c < 0.0:
+                raise InputError(f"the {words} of the thermometer is {value_c:g} K: give zero or a positive number.")
         coldest_c = self.constant_c - abs(self.swing_c) - max(self.warm_up_c, 0.0)
         if coldest_c < -273.15:
             raise InputError(f"the temperature falls to {coldest_c:g} degC, below absolute zero: give a warmer one.")

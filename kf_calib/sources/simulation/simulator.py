@@ -20,19 +20,19 @@ from kf_calib.bench.arrays import Floats, Times
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import InputError
-from kf_calib.sources.simulation.injected import Hidden, Rig, Stage, steps_of
+from kf_calib.sources.simulation.injected.kinds import Hidden, Rig, Stage, steps_of
 from kf_calib.sources.simulation.physics import (
     Ambient,
     Disturbance,
-    DwellOffset,
-    DwellRotation,
-    Gravity,
-    Inputs,
-    Response,
     TrueState,
     TrueStep,
     WalkingBias,
+    adding,
+    gravity,
+    inputs,
+    response,
     set_attitudes,
+    turning_platform,
 )
 from kf_calib.sources.simulation.sensors import Sensors, TrueNoise, generator
 from kf_calib.sources.simulation.visit_plans import YZX, Motion, PlannedVisit, attitude, stays
@@ -102,34 +102,28 @@ class Simulation:
         make = self.batch_maker()
         for first in range(0, len(self), self._batch_samples):
             last = min(first + self._batch_samples, len(self))
-            yield make(first, last, last * self._accel.period_ns if last < len(self) else self.motion.end_ns)
+            yield make(last * self._accel.period_ns if last < len(self) else self.motion.end_ns)
             self.fraction = last / len(self)
 
-    def batch_maker(self) -> Callable[[int, int, int], Batch]:
-        """What makes the batch of readings number ``first`` to ``last``, and of all else before ``end_ns``.
-
-        It is to be asked for one stretch after the other, from the first reading on.
-        """
-        steps = self._steps()
+    def batch_maker(self) -> Callable[[int], Batch]:
+        """What makes the batch of all before a time since the first reading that was not in the batch before."""
+        steps, begin_ns = self._steps(), 0
         encoder_rng, thermometer_rng = generator(self.seed, "encoders"), generator(self.seed, "thermometer")
 
-        def make(first: int, last: int, end_ns: int) -> Batch:
-            start_ns = first * self._accel.period_ns
+        def make(end_ns: int) -> Batch:
+            nonlocal begin_ns
+            start_ns, begin_ns = begin_ns, end_ns
             return Batch(
-                self._readings(first, last, steps),
+                self._readings(self._accel.between(start_ns, end_ns), steps),
                 self._poses(self._pose.between(start_ns, end_ns), encoder_rng),
                 self._temperatures(self._temperature.between(start_ns, end_ns), thermometer_rng),
             )
 
         return make
 
-    @property
-    def reading_period_ns(self) -> int:
-        return self._accel.period_ns
-
-    def first_reading_at(self, time_ns: int) -> int:
-        """Number of the first reading at or after a time since the first one."""
-        return self._accel.first_at(time_ns)
+    def next_reading_ns(self, time_ns: int) -> int:
+        """When the first reading at or after a time comes, both since the first one."""
+        return self._accel.first_at(time_ns) * self._accel.period_ns
 
     def moved_by(self, motion: Motion, most_dwells: int, platform: TrueStep) -> Simulation:
         """The same bench whose platform moves otherwise, and goes through a further step before its hidden effects.
@@ -146,6 +140,13 @@ class Simulation:
         other = copy.copy(self)
         other.hidden, other.noise, other.fraction = tuple(hidden), noise or self.noise, 0.0
         other.warnings = list[str]()
+        return other
+
+    def by_hand(self) -> Simulation:
+        """The same run as a recording of a board that is turned by hand has it: without its angles and its gimbals."""
+        other = self.hiding(self.hidden)
+        square = {"theta1": 0.0, "theta3": 0.0}
+        other.bench = replace(self.bench, axes=(), angles=False, angle_sigma_deg=None, nominal=square)
         return other
 
     def parameters_at_end(self) -> dict[str, float] | None:
@@ -168,9 +169,9 @@ class Simulation:
         hidden = self._hidden_steps()
         turned: list[TrueStep] = [*self._further, *hidden["angles"]]
         platform: list[TrueStep] = [*hidden["attitude"], *self._setting_steps()]
-        response: list[TrueStep] = [Inputs(self.sensors), *hidden["input"], Response(self.sensors), *hidden["reading"]]
-        force: list[TrueStep] = [Gravity(self.bench), *hidden["force"]]
-        return turned, [*platform, *force, *response, *self._noise_steps(), *hidden["record"]]
+        sensed: list[TrueStep] = [inputs(self.sensors), *hidden["input"], response(self.sensors), *hidden["reading"]]
+        force: list[TrueStep] = [gravity(self.bench), *hidden["force"]]
+        return turned, [*platform, *force, *sensed, *self._noise_steps(), *hidden["record"]]
 
     def _hidden_steps(self) -> dict[Stage, list[TrueStep]]:
         return steps_of(self.hidden, self._rig)
@@ -183,14 +184,16 @@ class Simulation:
     def _setting_steps(self) -> list[TrueStep]:
         if not self.noise.setting_sigma_deg:
             return []
-        return [DwellRotation(self._drawn_per_dwell("setting", math.radians(self.noise.setting_sigma_deg)))]
+        rotation_rad = self._drawn_per_dwell("setting", math.radians(self.noise.setting_sigma_deg))
+        return [turning_platform(lambda state: state.of_dwells(rotation_rad))]
 
     def _noise_steps(self) -> list[TrueStep]:
         noise, period_s = self.noise, self._accel.period_ns * 1e-9
         processes = noise.processes(self.seed, period_s, len(self) * period_s)
         steps: list[TrueStep] = [Disturbance(process) for process in processes]
         if noise.scatter_mps2:
-            steps.append(DwellOffset(self._drawn_per_dwell("scatter", noise.scatter_mps2)))
+            offset_mps2 = self._drawn_per_dwell("scatter", noise.scatter_mps2)
+            steps.append(adding(lambda state: state.of_dwells(offset_mps2)))
         if noise.vibration_mps2:
             rng = generator(self.seed, "vibration")
             steps.append(Disturbance(lambda n: noise.vibration_mps2 * rng.standard_normal((n, 3)), when_moving=True))
@@ -199,12 +202,11 @@ class Simulation:
     def _drawn_per_dwell(self, quantity: str, sigma: float) -> Floats:
         return sigma * generator(self.seed, quantity).standard_normal((len(self.plan), 3))
 
-    def _readings(self, first: int, last: int, steps: tuple[Sequence[TrueStep], Sequence[TrueStep]]) -> Stream:
+    def _readings(self, time_ns: Times, steps: tuple[Sequence[TrueStep], Sequence[TrueStep]]) -> Stream:
         before, after = steps
-        time_ns = np.arange(first, last) * self._accel.period_ns
-        values = np.empty((last - first, 3))
+        values = np.empty((len(time_ns), 3))
         turning_points = np.searchsorted(time_ns, np.concatenate([self.motion.arrive_ns, self.motion.leave_ns]))
-        cuts = np.unique([0, last - first, *turning_points])
+        cuts = np.unique([0, len(time_ns), *turning_points])
         stretches = [slice(start, end) for start, end in pairwise(cuts.tolist())]
         dwells = self.motion.locate(time_ns[cuts[:-1]])[0].tolist()
         states = [self._state(time_ns[part], dwell) for part, dwell in zip(stretches, dwells, strict=True)]
@@ -233,7 +235,9 @@ class Simulation:
         )
 
     def _poses(self, time_ns: Times, rng: np.random.Generator) -> Stream:
-        """Encoder readings, or the attitude they make where the bench has no axes."""
+        """Encoder readings, or the attitude they make where the bench has no axes; none where they do not count."""
+        if not self.bench.angles:
+            return Stream.empty(self.bench.pose_width)
         angles_deg = np.degrees(self.motion.angles_at(time_ns))
         if self.noise.encoder_sigma_deg:
             angles_deg += self.noise.encoder_sigma_deg * rng.standard_normal(angles_deg.shape)
@@ -303,25 +307,3 @@ _ANY_DEG = 1e3  # a setting error that leaves the size of f alone, and rounding 
 def without_angles(run: Simulation) -> Simulation:
     """The run as an evaluation without angles sees it, for sizes in sigma: every orientation may be any."""
     return run.hiding(run.hidden, replace(run.noise, setting_sigma_deg=_ANY_DEG))
-
-
-class ByHand:
-    """The readings and temperatures of a simulated run, without its angles and without its gimbals.
-
-    - bench: what is known without them.
-    - warnings, fraction: as of every source.
-    """
-
-    def __init__(self, run: Simulation) -> None:
-        self._run, self.warnings = run, list[str]()
-        square = {"theta1": 0.0, "theta3": 0.0}
-        self.bench: Bench = replace(run.bench, axes=(), angles=False, angle_sigma_deg=None, nominal=square)
-
-    @property
-    def fraction(self) -> float:
-        """The share of the run that has passed."""
-        return self._run.fraction
-
-    def __iter__(self) -> Iterator[Batch]:
-        for batch in self._run:
-            yield Batch(batch.accel, Stream.empty(4), batch.temperature)

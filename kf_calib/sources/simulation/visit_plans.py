@@ -81,7 +81,8 @@ def six_faces(axes: Sequence[Vector] = YZX, dwell_s: float = 60.0, up: str = "y"
 
     Raises InputError where quarter turns of these axes do not show all six faces to gravity.
     """
-    quarters = sorted(itertools.product((0.0, 90.0, -90.0, 180.0), repeat=len(axes)), key=_total_turn)
+    quarters = list(itertools.product((0.0, 90.0, -90.0, 180.0), repeat=len(axes)))
+    quarters.sort(key=lambda angles_deg: sum(map(abs, angles_deg)))
     seen = up_directions(axes, np.radians(quarters), up)
     plan = list[PlannedVisit]()
     for face in np.vstack([np.eye(3), -np.eye(3)])[[0, 3, 1, 4, 2, 5]]:
@@ -142,10 +143,6 @@ def _quaternion(x: float, y: float, z: float) -> tuple[float, float, float, floa
     return scale * x, scale * y, scale * z, math.cos(angle / 2.0)
 
 
-def _total_turn(angles_deg: Sequence[float]) -> float:
-    return sum(map(abs, angles_deg))
-
-
 def _fibonacci_lattice(count: int) -> Floats:
     """``count`` unit vectors (n, 3) of equal area each: equal steps along an axis, the golden angle about it."""
     i = np.arange(count)
@@ -202,7 +199,7 @@ def base_with_up(up: str) -> Rotation:
     return Rotation.from_matrix(bench_from_base[None])
 
 
-@dataclass(frozen=True)
+@dataclass
 class Motion:
     """Dwells at ``angles_rad`` (m, k), each from ``arrive_ns`` to ``leave_ns`` (m,); slews between, all axes at once.
 
@@ -231,8 +228,12 @@ class Motion:
         """Per instant (n,): the dwell it is in or was last in, and the share of the way to the next one, 0 to 1."""
         dwell = np.searchsorted(self.arrive_ns, time_ns, side="right") - 1
         slew_ns = np.append(self.arrive_ns[1:] - self.leave_ns[:-1], 0)
-        u = np.clip((time_ns - self.leave_ns[dwell]) / np.maximum(slew_ns[dwell], 1), 0.0, 1.0)
-        return dwell, u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
+        share = np.clip((time_ns - self.leave_ns[dwell]) / np.maximum(slew_ns[dwell], 1), 0.0, 1.0)
+        return dwell, self._profile(share)
+
+    def _profile(self, share: Floats) -> Floats:
+        """The share of the way that is behind it, by that of the time."""
+        return share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
 
     def angles_at(self, time_ns: Times) -> Floats:
         """Gimbal angles (n, k), rad."""

@@ -68,7 +68,9 @@ class Numbers:
     def values(self, cells: Sequence[str]) -> list[float]:
         """The numbers in cells, as by ``value``; at once where all are as programs write them."""
         try:
-            if self.decimal == "." or "." not in "".join(cells):
+            if self.decimal == ".":
+                return list(map(number_of, cells))
+            if "." not in "".join(cells):
                 return [number_of(cell.replace(self.decimal, ".")) for cell in cells]
         except ValueError:
             pass

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Container, Sequence
+from collections.abc import Container, Iterator, Sequence
 from itertools import pairwise
 
 import numpy as np
 
-from kf_calib.bench.streams import Batch
 from kf_calib.errors import CountsError
 from kf_calib.sources.text.cells import DECIMAL_POINT, LineError, written
 from kf_calib.sources.text.columns import READINGS, WANTED, Columns
@@ -66,18 +65,18 @@ class CsvLines(LineReader):
                 lines[k] = with_texts(lines[k], self._heading.spans(lines[k]), texts)
         return lines
 
-    def read(self, lines: Sequence[str], first_line: int) -> Batch:
+    def rows(self, lines: Sequence[str], first_line: int) -> Iterator[tuple[int, SampleRow | None]]:
         if self._numbers is None:
             self._numbers = self._columns.numbers_in(list(map(self._heading.cells, lines)))
-        return super().read(lines, first_line)
+        return super().rows(lines, first_line)
 
     def _row(self, line: str) -> SampleRow | None:
         if not (cells := self._heading.cells(line)):
             return None  # of something else than readings
-        number, self._count = self._count, self._count + 1
-        row = without_empty_end(cells, len(self._header))
-        if len(row) != len(self._header):
-            raise LineError(f"it has {len(row)} cells, the header has {len(self._header)}")
+        number, self._count, width = self._count, self._count + 1, len(self._header)
+        row = cells if len(cells) == width else without_empty_end(cells, width)
+        if len(row) != width:
+            raise LineError(f"it has {len(row)} cells, the header has {width}")
         if self._columns.chosen is not None and not self._columns.is_chosen(row):
             self._count -= 1
             return None

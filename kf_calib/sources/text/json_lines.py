@@ -138,7 +138,10 @@ class JsonLines(LineReader):
 
 def _first_of(entry: Mapping[str, Any], names: Sequence[str]) -> str:
     """Return the first of these names under which there is anything; empty where there is none."""
-    return next((name for name in names if entry.get(name) is not None), "")
+    for name in names:
+        if entry.get(name) is not None:
+            return name
+    return ""
 
 
 def _spans(line: str) -> dict[str, tuple[tuple[int, int], tuple[int, int]]]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import deque
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
@@ -36,7 +36,6 @@ _BLOCK_BYTES = 1 << 18
 _SAMPLED, _BLOCKS_SAMPLED = 64, 1000  # readings of a block that tell how numbers are to be read, and blocks
 _TELLING_ROWS = 8  # of CSV, at the beginning of a stream
 _SURVEY_LINES = 1_000_000  # without a pose in them, none will come
-Batches = Generator[Batch, None, None]
 
 
 class Lines:
@@ -73,17 +72,13 @@ class Lines:
         self._file: TextFile | None = None
         self._begin_ns: int | None = None
         self._bench: Bench | None = None
-        self._ahead = deque[Batch]()  # read up to the first readings and pose
-        self._waiting: Batches | None = None  # begun to learn of the bench, not yet iterated
+        self._waiting: Iterator[Batch] | None = None  # begun to learn of the bench, not yet iterated
 
     @property
     def bench(self) -> Bench:
         """The bench; a stream is read for it up to the first pose, which shows how the platform is described."""
         if self._bench is None:
-            batches, default = self._begun(), self._units.input
-            if self.path:  # it is read from its beginning again, if it is
-                batches.close()
-            reader = self.described
+            batches, reader, default = self._begun(), self.described, self._units.input
             assert reader
             if reader.wants_pose:
                 self._bench = reader.bench(self.name, self._overrides, default)
@@ -91,7 +86,7 @@ class Lines:
                 stated = reader.stated(self.name, self._overrides, default)
                 lacking = self._angles is None
                 self._bench, self._said = bench_without_angles(self.name, stated, are_lacking=lacking)
-            self._waiting = None if self.path else batches
+            self._waiting = None if self.path else batches  # a file is read from its beginning again
         return self._bench
 
     @property
@@ -115,8 +110,7 @@ class Lines:
     def batches(self) -> Iterator[Batch]:
         """What the lines hold, whatever the bench may be: raw readings."""
         batches, self._waiting = self._waiting or self._begun(), None
-        ahead = self._ahead
-        for batch in itertools.chain((ahead.popleft() for _ in range(len(ahead))), batches):
+        for batch in batches:
             if self._begin_ns is None and len(batch.accel):
                 self._begin_ns = int(batch.accel.time_ns[0])
             yield batch
@@ -128,8 +122,8 @@ class Lines:
             next((batch for batch in self if len(batch.accel)), None)
         return self._begin_ns
 
-    def _begun(self) -> Batches:
-        """Begin to read, up to the first readings and pose, if there must be one; return what is to come."""
+    def _begun(self) -> Iterator[Batch]:
+        """Begin to read, up to the first readings and pose, if there must be one; return what all lines hold."""
         stream, self._stream = self._stream, None
         try:
             self._file = TextFile(self.path, self._units.dataset) if self.path else None
@@ -137,18 +131,18 @@ class Lines:
             raise InputError(f"{self.name}: cannot be read ({error.strerror}).") from None
         if (opened := self._file or stream) is None:
             raise InputError(f"{self.name} can be read only once: record it to a file to read it again.")
-        batches, self._ahead, has_accel = self._read(opened), deque[Batch](), False
+        batches, ahead, has_accel = self._read(opened), deque[Batch](), False
         for batch in batches:
-            self._ahead.append(batch)
+            ahead.append(batch)
             has_accel |= len(batch.accel) > 0
             lacks_pose = self.described is None or (self.described.wants_pose and not self.described.pose_width)
             if has_accel and not lacks_pose:
                 break
             if self._account.lines > _SURVEY_LINES:
                 raise self._unusable("platform angles" if lacks_pose else "readings")
-        return batches
+        return itertools.chain((ahead.popleft() for _ in range(len(ahead))), batches)
 
-    def _read(self, stream: BinaryIO | TextFile) -> Batches:
+    def _read(self, stream: BinaryIO | TextFile) -> Iterator[Batch]:
         """Yield what all lines hold. The first of them choose the reader, of CSV with some rows, which tell what the
         header may not."""
         account = self._account = Account()
@@ -160,7 +154,7 @@ class Lines:
                 blank = first_line(first)
                 account.lines += blank
                 del first[:blank]
-                if len(first) > _TELLING_ROWS or (first and is_json(first[0])):
+                if first and are_telling(first):
                     break
             if not first:
                 raise InputError(f"{self.name} holds no lines: check that the logger wrote any.")
@@ -206,6 +200,11 @@ class Lines:
             theirs = [name for name, ours in self._columns.items() if ours in POSE_KEYS]
             angles = holds_any(self.path, [f'"{name}"'.encode() for name in (*POSE_KEYS, *theirs)])
         return reader_for(lines, self._columns, self._account, angles=angles, units=self._units, stated=self._stated)
+
+
+def are_telling(lines: Sequence[str]) -> bool:
+    """Whether these are enough of the first lines, of which the first is not blank, to choose a reader by."""
+    return len(lines) > _TELLING_ROWS or is_json(lines[0])
 
 
 def reader_for(

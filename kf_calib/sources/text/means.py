@@ -241,7 +241,8 @@ class TableOfMeans:
                 raise self._refusal(faces.index(None), place, wanted)
             self.said.append(f"axis that points up from {columns.named([place])}")
             up = self.overrides.get("up", "y").strip().lower()
-            return np.array([_attitude(*face, up) for face in faces if face])
+            attitudes = {face: _attitude(*face, up) for face in set(faces) if face}
+            return np.array([attitudes[face] for face in faces if face])
         quaternion = columns.pose(needed=True)
         pose = self._values(quaternion, "a number")
         norms = lengths(pose)

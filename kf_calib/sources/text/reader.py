@@ -161,14 +161,16 @@ class LineReader(Described, ABC):
 
     def read(self, lines: Sequence[str], first_line: int) -> Batch:
         """The batch of consecutive lines, the first of them of that number."""
-        rows = list[SampleRow]()
+        rows = [row for _, row in self.rows(lines, first_line) if row]
+        return Batch(_stream(rows, 1, 3), _stream(rows, 2, self.pose_width), _stream(rows, 3, 1))
+
+    def rows(self, lines: Sequence[str], first_line: int) -> Iterator[tuple[int, SampleRow | None]]:
+        """The number of each line that can be used, and what it holds; None where that is no sample."""
         for number, line in enumerate(lines, start=first_line):
             try:
-                if line and not line.isspace() and (row := self._row(line)):
-                    rows.append(row)
+                yield number, self._row(line) if line and not line.isspace() else None
             except LineError as error:
                 self._account.refuse(number, str(error))
-        return Batch(_stream(rows, 1, 3), _stream(rows, 2, self.pose_width), _stream(rows, 3, 1))
 
     @abstractmethod
     def _row(self, line: str) -> SampleRow | None:

@@ -3,155 +3,133 @@
 A file of a few kB can unpack to gigabytes, name a cell in the last row and column, or say that it has one row where it
 has seven. All of it is bounded before and while it is read, and what no program writes is refused.
 
-A table of 100 000 rows has a million cells, and a parser of XML makes several objects of each cell. Rows of which all
-cells hold numbers or plain texts, as most programs write them, are therefore read by a regular expression, and cut out
-of what the parser reads.
+openpyxl reads all but the sheets: their texts, the styles of dates, names. It makes several objects of each cell, so
+that sheets go to expat, which makes none.
 """
 
 from __future__ import annotations
 
 import functools
-import heapq
 import io
-import itertools
 import re
 import warnings
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from datetime import datetime
-from operator import itemgetter
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from xml.parsers import expat
 
 from kf_calib.errors import InputError, need
 from kf_calib.support.text import cut
 
-BEGIN_OF_ROW = re.compile(rb"<(?:\w+:)?row\b")
-NUMBERED_ROW = re.compile(rb'<(?:\w+:)?row\b[^<>]*?\sr\s*=\s*["\'](\d{1,9})["\']')
-_ATTRIBUTE = rb' [\w:]+="[ !#-%\'-;=?-~]*+"'
-_TEXT = rb"[ -%'-;=?-~]"  # ASCII without references to characters
-_FORMULA = rb"<f(?:%b)*+(?: ?/>|>%b*+</f>)" % (_ATTRIBUTE, _TEXT)
-_NUMBER = rb"(?!-0*<)-?\d{1,20}(?:\.\d{0,25})?+(?:[eE][+-]?\d{1,3})?+"  # -0 is the whole number 0 for a parser
-_CELL = (
-    rb'<c r="([A-Z]{1,3})[1-9]\d{0,6}"(?: s="(0|[1-9]\d{0,5})")?+'
-    rb'(?:(?: t="([ns])")?+(?: ?/>|></c>|>(?:%b)?+<v>(%b)</v></c>)'
-    rb'| t="inlineStr"><is><t(?: xml:space="preserve")?+>(%b++)</t></is></c>)'
-) % (_FORMULA, _NUMBER, _TEXT)  # column, style, kind, number and text
-_CELLS, _NO_GROUPS = re.compile(_CELL), re.sub(rb"\((?!\?)", rb"(?:", _CELL)
-_PLAIN_ROW = re.compile(rb'<row r="(\d{1,7})"(?:%b)*+>((?:%b)++)</row>' % (_ATTRIBUTE, _NO_GROUPS))
-_NAMESPACE = re.compile(rb"\sxmlns\s*=")
-_SHEET = re.compile(
-    rb"(?:\xef\xbb\xbf)?\s*(?:<\?xml[^<>]*\?>\s*)?<worksheet\b[^<>]*?"
-    rb'\sxmlns="http://schemas\.openxmlformats\.org/spreadsheetml/2006/main"'
-)
-
-
-@dataclass(frozen=True)
-class CellContext:
-    """What the cells of a sheet refer to: shared texts, the styles of dates and of durations, and the day from which
-    dates count."""
-
-    texts: Sequence[str]
-    dates: set[int]
-    durations: set[int]
-    epoch: datetime
-
-    def value(self, style: bytes, kind: bytes, text: bytes) -> Any:
-        """The value of a cell with a style or a kind; what is no date of Excel is its error, as openpyxl has it."""
-        from openpyxl.utils.datetime import from_excel
-
-        if kind == b"s":
-            return self.texts[int(text.decode())]
-        if not style or int(style) not in self.dates:
-            return float(text)
-        try:
-            return from_excel(float(text), self.epoch, timedelta=int(style) in self.durations)
-        except (OverflowError, ValueError):
-            return "#VALUE!"
-
-
-@dataclass(frozen=True)
-class PlainRows:
-    """The plain rows of a part of an Excel file: the number of each, and where its cells begin and end in ``content``.
-
-    rest: the part without them.
-    """
-
-    content: bytes
-    rest: bytes
-    spans: list[tuple[int, int, int]]
-
-    @classmethod
-    def of(cls, content: bytes) -> PlainRows:
-        """The plain rows of a part; none where ``<row`` could mean something else there, or where the number of another
-        row follows from the rows before it."""
-        begin = _SHEET.match(content)
-        if not begin or len(_NAMESPACE.findall(content)) > 1:
-            return cls(content, content, [])
-        if b"<!" in content or content.find(b"<?", begin.end()) >= 0:
-            return cls(content, content, [])
-        spans, others, end = list[tuple[int, int, int]](), list[bytes](), 0
-        for row in _PLAIN_ROW.finditer(content):
-            spans.append((int(row[1]), row.start(2), row.end(2)))
-            others.append(content[end : row.start()])
-            end = row.end()
-        rest = b"".join([*others, content[end:]])
-        if len(BEGIN_OF_ROW.findall(rest)) != len(NUMBERED_ROW.findall(rest)):
-            return cls(content, content, [])
-        return cls(content, rest, spans)
-
-    def rows(self, context: CellContext) -> Iterator[tuple[int, list[Any]]]:
-        """The number of each row, and its cells up to that which is written last."""
-        for number, begin, end in self.spans:
-            cells = _CELLS.findall(self.content, begin, end)
-            values = list[Any]([None]) * column_number(cells[-1][0])
-            for letters, style, kind, number_text, text in cells:
-                place = column_number(letters)
-                if place > len(values) or not (number_text or text):
-                    continue
-                if text:
-                    values[place - 1] = text.decode()
-                elif style or kind == b"s":
-                    values[place - 1] = context.value(style, kind, number_text)
-                else:
-                    values[place - 1] = float(number_text)
-            yield number, values
-
-
-@functools.cache
-def column_number(letters: bytes) -> int:
-    """The number of a column from 1, of its one to three letters."""
-    return functools.reduce(lambda number, letter: 26 * number + letter - 64, letters, 0)
-
-
 SheetRow = tuple[int, list[Any]]
 """Number of a row in its sheet, from 1, and its cells up to the last that is filled."""
-_MOST_ROWS = 1 << 20  # of a sheet of Excel
+_MOST_ROWS, _MOST_COLUMNS = 1 << 20, 1 << 14  # of a sheet of Excel
 _MOST_VISITED = 20_000_000  # cells of a sheet, empty ones too
 _MOST_FILLED = 2_000_000  # cells from the first to the last of each row
 _MOST_BYTES, _MOST_TAGS = 64_000_000, 2_000_000  # unpacked, of all parts but pictures; a tag takes some 120 bytes
-_MOST_TAGS_OF_SHEETS, _MOST_TAGS_OF_A_ROW = 10_000_000, 200_000  # rows are forgotten one by one as they are read
+_MOST_TAGS_OF_SHEETS = 10_000_000  # which are forgotten as they are read
 _PICTURES, _SHEETS = "xl/media/", "xl/worksheets/"
-_HIDDEN_ROW = re.compile(
-    rb'<(?:\w+:)?row\b(?=[^<>]*?\shidden\s*=\s*["\'](?:1|true)["\'])[^<>]*?\sr\s*=\s*["\'](\d{1,9})["\']'
-)
 _LONG_FORMAT = re.compile(rb"formatCode\s*=\s*([\"'])[^\"'<>]{1000}")  # of a number; Excel's have at most 255 letters
-_MERGED = re.compile(
-    rb'<(?:\w+:)?mergeCell\b[^<>]*?\sref\s*=\s*["\']\$?([A-Z]{1,3})\$?(\d{1,9}):\$?([A-Z]{1,3})\$?(\d{1,9})["\']'
-)
+_MERGED = re.compile(rb'<(?:\w+:)?mergeCell\b[^<>]*?\sref\s*=\s*["\']([A-Z0-9$:]+)["\']')
 _DECLARED = (b"<!DOCTYPE", b"<!ENTITY", b"<\0!\0D\0", b"\0<\0!\0D")  # in UTF-8, and in both kinds of UTF-16
+_XML = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
+_ROW, _CELL, *_TEXTS = (f"{_XML} {tag}" for tag in ("row", "c", "v", "t"))
+_NO_CELLS = f'<worksheet xmlns="{_XML}"/>'
 
 
-@dataclass(frozen=True)
 class Sheet:
-    """A sheet of a file: what is filled in it and not hidden. left_out: numbers of filled rows that are hidden, by hand
-    or by a filter."""
+    """A sheet of a file: what is filled in it and not hidden, as a parser of XML comes by it.
 
-    name: str
-    hidden: bool
-    lines: list[SheetRow]
-    left_out: list[int]
+    name, hidden: of the sheet. lines: rows that are filled. left_out: numbers of filled rows that are hidden, by hand
+    or by a filter. Raises InputError where it has more cells than any table, or rows out of order.
+    """
+
+    def __init__(self, sheet: Any, content: bytes) -> None:
+        """sheet: of openpyxl, content: its part of the file."""
+        self.name, self.hidden = str(sheet.title), sheet.sheet_state != "visible"
+        self.lines, self.left_out = list[SheetRow](), list[int]()
+        self._book, self._texts = sheet.parent, sheet._shared_strings
+        self._dates = {str(style) for style in self._book._date_formats}
+        self._number = self._column = self._visited = self._filled = 0  # of rows and of cells
+        self._row, self._is_hidden = list[Any](), False
+        self._cell, self._letters = dict[str, str](), list[str]()  # attributes, and the text in it
+        parser = expat.ParserCreate(namespace_separator=" ")
+        parser.buffer_text = True
+        parser.StartElementHandler, parser.EndElementHandler = self._begin, self._end
+        parser.CharacterDataHandler = self._letters.append
+        parser.Parse(content, True)
+
+    def _begin(self, tag: str, attributes: dict[str, str]) -> None:
+        self._letters.clear()
+        if tag == _CELL:
+            place = attributes.get("r", "").rstrip("0123456789")
+            self._column = _column_number(place) if place else self._column + 1
+            if self._column > _MOST_COLUMNS:
+                raise self._too_large
+            self._cell = attributes
+        elif tag == _ROW:
+            before, self._number = self._number, int(attributes.get("r", self._number + 1))
+            if self._number <= before:
+                raise InputError("has rows that are out of order, which would be lost: save it again.")
+            self._row, self._column = [], 0
+            self._is_hidden = attributes.get("hidden") in ("1", "true")
+
+    def _end(self, tag: str) -> None:
+        if tag in _TEXTS and (text := "".join(self._letters)):
+            self._row += [None] * (self._column - len(self._row))
+            before = self._row[self._column - 1]  # of a text in several fonts
+            self._row[self._column - 1] = self._value(text) if before is None else f"{before}{text}"
+        elif tag == _ROW:
+            self._end_row()
+
+    def _value(self, text: str) -> Any:
+        """What a cell with this text holds."""
+        match self._cell.get("t", "n"):
+            case "n":
+                style = self._cell.get("s")
+                return self._date(float(text), int(style or 0)) if style in self._dates else float(text)
+            case "s":
+                return self._texts[int(text)]
+            case "b":
+                return bool(int(text))
+            case "d":
+                from openpyxl.utils.datetime import from_ISO8601
+
+                return from_ISO8601(text)
+            case _:
+                return text
+
+    def _date(self, day: float, style: int) -> Any:
+        """The date or the duration that is meant, or the error that Excel shows where it is none."""
+        from openpyxl.utils.datetime import from_excel
+
+        try:
+            return from_excel(day, self._book.epoch, timedelta=style in self._book._timedelta_formats)
+        except (OverflowError, ValueError):
+            return "#VALUE!"
+
+    def _end_row(self) -> None:
+        self._visited, self._filled = self._visited + self._column, self._filled + len(self._row)
+        if self._number > _MOST_ROWS or self._visited > _MOST_VISITED or self._filled > _MOST_FILLED:
+            raise self._too_large
+        if not self._row:
+            return
+        if self._is_hidden:
+            self.left_out.append(self._number)
+        else:
+            self.lines.append((self._number, self._row))
+
+    @property
+    def _too_large(self) -> InputError:
+        return InputError(f"sheet {self.name!r} has more cells than any table of orientations: leave out what is not "
+                          "part of it, empty rows and columns too.")  # fmt: skip
+
+
+@functools.cache
+def _column_number(letters: str) -> int:
+    """The number of a column from 1, of its one to three letters."""
+    return functools.reduce(lambda number, letter: 26 * number + int(letter, 36) - 9, letters, 0)
 
 
 def sheets_of(path: Path) -> list[Sheet]:
@@ -162,10 +140,10 @@ def sheets_of(path: Path) -> list[Sheet]:
 
     try:
         with path.open("rb") as file:
-            parts = {name: PlainRows.of(content) for name, content in _fit_parts(file).items()}
+            parts = _fit_parts(file)
         with warnings.catch_warnings(action="ignore"):  # of what openpyxl leaves out, which no cell is part of
-            book: Any = openpyxl.load_workbook(_archive_of_rest(parts), read_only=True, data_only=True)
-            sheets = [_sheet(sheet, parts[sheet._worksheet_path.lstrip("/")]) for sheet in book.worksheets]
+            book: Any = openpyxl.load_workbook(_archive_without_cells(parts), read_only=True, data_only=True)
+            sheets = [Sheet(sheet, parts[sheet._worksheet_path.lstrip("/")]) for sheet in book.worksheets]
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except Exception as error:
@@ -194,8 +172,10 @@ def workbook_of(path: Path) -> Any:
 
 def _merged(content: bytes) -> int:
     """Return how many cells of a sheet are merged with others: all of them are made when it is read as a whole."""
-    places = [(column_number(a), int(b), column_number(c), int(d)) for a, b, c, d in _MERGED.findall(content)]
-    return sum((abs(right - left) + 1) * (abs(below - above) + 1) for left, above, right, below in places)
+    from openpyxl.worksheet.cell_range import CellRange
+
+    sizes = [CellRange(place.decode()).size for place in _MERGED.findall(content)]
+    return sum(size["rows"] * size["columns"] for size in sizes)
 
 
 def _unreadable(path: Path, error: Exception) -> InputError:
@@ -211,73 +191,29 @@ def _fit_parts(file: Any) -> dict[str, bytes]:
     size, tags, tags_of_sheets, parts = 0, 0, 0, dict[str, bytes]()
     with zipfile.ZipFile(file) as archive:
         for part in archive.infolist():
-            size += part.file_size  # no more than this is ever unpacked
-            if size > _MOST_BYTES and not part.filename.startswith(_PICTURES):
-                raise InputError("unpacks to more than any table of orientations: leave out what is not part of it.")
             if part.filename.startswith(_PICTURES):
-                size -= part.file_size
                 continue
+            size += part.file_size  # no more than this is ever unpacked
+            if size > _MOST_BYTES:
+                raise InputError("unpacks to more than any table of orientations: leave out what is not part of it.")
             parts[part.filename] = content = archive.read(part)
-            is_sheet, count = part.filename.startswith(_SHEETS), content.count(b"<")
-            tags += _most_tags_of_a_row(content) if is_sheet else count
-            tags_of_sheets += count if is_sheet else 0
+            if part.filename.startswith(_SHEETS):
+                tags_of_sheets += content.count(b"<")
+            else:
+                tags += content.count(b"<")
             if tags > _MOST_TAGS or tags_of_sheets > _MOST_TAGS_OF_SHEETS:
                 raise InputError("has more cells than any table of orientations: leave out what is not part of it.")
-            _refuse_part(content)
+            if any(word in content for word in _DECLARED):
+                raise InputError("has XML that declares entities, as no spreadsheet does: save it again.")
+            if _LONG_FORMAT.search(content):
+                raise InputError("has a number format longer than Excel allows: save it again.")
     return parts
 
 
-def _archive_of_rest(parts: Mapping[str, PlainRows]) -> io.BytesIO:
-    """Return an archive of parts without their plain rows."""
+def _archive_without_cells(parts: Mapping[str, bytes]) -> io.BytesIO:
+    """Return an archive of parts in which sheets are empty."""
     archive = io.BytesIO()
-    with zipfile.ZipFile(archive, "w") as rest:
-        for name, part in parts.items():
-            rest.writestr(name, part.rest)
+    with zipfile.ZipFile(archive, "w") as empty:
+        for name, content in parts.items():
+            empty.writestr(name, _NO_CELLS if name.startswith(_SHEETS) and name.endswith(".xml") else content)
     return archive
-
-
-def _most_tags_of_a_row(content: bytes) -> int:
-    """Return the largest number of tags from the beginning of a row, or of the sheet, to that of the next row.
-
-    It is as if there were too many in all if there are more than Excel has columns for.
-    """
-    begins = [0, *(found.start() for found in BEGIN_OF_ROW.finditer(content)), len(content)]
-    most = max(content.count(b"<", begin, end) for begin, end in itertools.pairwise(begins))
-    return most if most <= _MOST_TAGS_OF_A_ROW else _MOST_TAGS + 1
-
-
-def _refuse_part(content: bytes) -> None:
-    if any(word in content for word in _DECLARED):
-        raise InputError("has XML that declares entities, as no spreadsheet does: save it again.")
-    if _LONG_FORMAT.search(content):
-        raise InputError("has a number format longer than Excel allows: save it again.")
-    numbers = list(map(int, NUMBERED_ROW.findall(content)))
-    if any(after <= before for before, after in itertools.pairwise(numbers)):
-        raise InputError("has rows that are out of order, which would be lost: save it again.")
-
-
-def _sheet(sheet: Any, part: PlainRows) -> Sheet:
-    hidden_rows = set(map(int, _HIDDEN_ROW.findall(part.content)))  # openpyxl does not tell them row by row
-    lines = _lines(sheet, part)
-    seen = [line for line in lines if line[0] not in hidden_rows]
-    left_out = [number for number, _ in lines if number in hidden_rows]
-    return Sheet(sheet.title, sheet.sheet_state != "visible", seen, left_out)
-
-
-def _lines(sheet: Any, part: PlainRows) -> list[SheetRow]:
-    """Return the rows of a sheet that hold anything."""
-    sheet.reset_dimensions()  # what the file says of its size may be wrong
-    lines, visited, filled, book = list[SheetRow](), 0, 0, sheet.parent
-    plain = part.rows(CellContext(sheet._shared_strings, book._date_formats, book._timedelta_formats, book.epoch))
-    for number, row in heapq.merge(enumerate(sheet.iter_rows(values_only=True), 1), plain, key=itemgetter(0)):
-        visited += len(row)
-        last = len(row)
-        while last and row[last - 1] is None:
-            last -= 1
-        filled += last
-        if number > _MOST_ROWS or number + visited > _MOST_VISITED or filled > _MOST_FILLED:
-            raise InputError(f"sheet {sheet.title!r} has more cells than any table of orientations: leave out what is "
-                             "not part of it, empty rows and columns too.")  # fmt: skip
-        if last:
-            lines.append((number, list(row[:last])))
-    return lines

@@ -105,7 +105,7 @@ def joint_states(samples: Stream, strings: list[tuple[str, list[str]]]) -> list[
 
 def test_refuses_joints_that_become_others() -> None:
     messages = joint_states(stream(2, count=2), [("f", ["x", "yy"]), ("f", ["x", "zz"])])
-    with pytest.raises(cdr.CdrError, match="joint names change from x yy to x zz"):
+    with pytest.raises(cdr.MessageError, match="joint names change from x yy to x zz"):
         decode(cdr.Decoder(cdr.JOINT_STATE, 2), messages)
 
 
@@ -146,7 +146,7 @@ JOINTS = cdr.joint_state_message("platform", ["outer", "inner"])
     ],
 )
 def test_refuses_what_it_cannot_read(kind, width, message, says) -> None:
-    with pytest.raises(cdr.CdrError, match=says):
+    with pytest.raises(cdr.MessageError, match=says):
         decode(cdr.Decoder(kind, width), [message])
 
 
@@ -157,14 +157,14 @@ def joint_state(names: list[str], position: list[float], velocity: list[float], 
 
 @pytest.mark.parametrize("count", [0, 1, 3])
 def test_refuses_joints_with_another_number_of_positions(count: int) -> None:
-    with pytest.raises(cdr.CdrError, match=f"names 2 joints but gives {count} positions"):
+    with pytest.raises(cdr.MessageError, match=f"names 2 joints but gives {count} positions"):
         decode(cdr.Decoder(cdr.JOINT_STATE, 2), [joint_state(["a", "b"], [1.0] * count, [], [])])
 
 
 def test_joints_without_names_of_one_length_but_other_counts_are_told_apart() -> None:
     messages = [joint_state([], [1.0, 2.0], [3.0], []), joint_state([], [1.0], [2.0, 3.0], [])]
     assert len(messages[0]) == len(messages[1])
-    with pytest.raises(cdr.CdrError, match="gives 1 positions for 2 gimbal axes"):
+    with pytest.raises(cdr.MessageError, match="gives 1 positions for 2 gimbal axes"):
         decode(cdr.Decoder(cdr.JOINT_STATE, 2), messages)
 
 
@@ -175,10 +175,10 @@ def test_reads_past_velocities_and_efforts() -> None:
 
 @pytest.mark.parametrize("time_ns", [-1, 2**31 * 10**9])
 def test_refuses_stamps_that_do_not_fit(time_ns: int) -> None:
-    with pytest.raises(cdr.CdrError, match="between the years 1970 and 2038"):
+    with pytest.raises(cdr.MessageError, match="between the years 1970 and 2038"):
         cdr.pack(cdr.IMU, IMU, Stream(np.array([time_ns]), np.zeros((1, 3))))
 
 
 def test_refuses_values_of_another_width() -> None:
-    with pytest.raises(cdr.CdrError, match="holds 3 values"):
+    with pytest.raises(cdr.MessageError, match="holds 3 values"):
         cdr.pack(cdr.IMU, IMU, stream(2))

@@ -12,7 +12,7 @@ from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.bench.streams import Stream
 from kf_calib.errors import BenchError, InputError
 from kf_calib.sources.files import cdr
-from kf_calib.sources.files.fields import Joints, JointsError
+from kf_calib.sources.files.fields import Joints, MessageError
 from kf_calib.sources.files.recorder import Recorder
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.text.lines import Lines
@@ -68,7 +68,7 @@ def test_letters_of_the_axes_are_names_too() -> None:
     assert joints(("axis_x", "axis_y", "axis_z"), 3) == (1, 2, 0) and len(told) == 1
     assert BENCH.axis_letters == ("y", "z", "x")
     assert Bench(axes_of("zxz"), 9.81).axis_letters == ()
-    with pytest.raises(JointsError, match="do not tell"):  # of an arm, perhaps: among others letters say too little
+    with pytest.raises(MessageError, match="do not tell"):  # of an arm, perhaps: among others letters say too little
         Joints(3, letters=("y", "z", "x"))(("arm_x", "arm_y", "arm_z", "wheel"), 4)
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import struct
 from collections import Counter
 from collections.abc import Callable
 
 import pytest
+from helpers import sent_frames
 from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
 
@@ -44,7 +46,7 @@ JSON_LINES = st.builds(_object, STAMPS, st.lists(st.tuples(KEYS, st.one_of(LISTS
 CSV_LINES = st.lists(st.one_of(NUMBERS, STAMPS), min_size=7, max_size=9).map(",".join)
 KINDS = st.sampled_from([*b"BAGQT", 0, 255])
 CONTENTS = st.one_of(
-    st.lists(st.floats(), max_size=9).map(lambda values: frames.struct.pack(f"<{len(values)}d", *values)),
+    st.lists(st.floats(), max_size=9).map(lambda values: struct.pack(f"<{len(values)}d", *values)),
     st.binary(max_size=70),
     JSON_LINES.map(str.encode),
     st.integers(200, 400).map(bytes),
@@ -64,7 +66,7 @@ def bent(draw: Callable, whole: st.SearchStrategy[bytes]) -> bytes:
 
 
 def _frame(kind: int, number: int, time_ns: int, content: bytes) -> bytes:
-    return frames.encode(kind, number, time_ns, content).removesuffix(b"\0")
+    return sent_frames.encode(kind, number, time_ns, content).removesuffix(b"\0")
 
 
 FRAMES = st.builds(_frame, KINDS, st.integers(0, 2**32 - 1), st.integers(-(2**63), 2**63 - 1), CONTENTS)
@@ -79,7 +81,7 @@ def _sound(form: str, i: int) -> bytes:
     """A reading with its pose."""
     if form == "frames":
         stamp = START_NS + i * 10**6
-        return frames.sample(frames.ACCEL, i, stamp, (1.0, 9.8, 0.0)) + frames.sample(
+        return sent_frames.sample(frames.ACCEL, i, stamp, (1.0, 9.8, 0.0)) + sent_frames.sample(
             frames.ANGLES, i, stamp, (0.1, 0.2, 0.3)
         )
     if form == "csv":
@@ -94,7 +96,7 @@ class _Chain:
     def __init__(self, form: str, *, is_begun: bool) -> None:
         self.protocol, self.form = Protocol("fuzz", {}, CELLS if form == "csv" else ""), form
         self._clock, self._continuity = Clock(), Continuity()
-        opening = {"json": b'{"bench": {}}\n', "csv": b"", "frames": b"\0" + frames.bench({})}[form]
+        opening = {"json": b'{"bench": {}}\n', "csv": b"", "frames": b"\0" + sent_frames.bench({})}[form]
         self.push(opening + (_sound(form, 0) if is_begun else b""))
         assert self.protocol.reader is not None
 

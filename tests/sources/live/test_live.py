@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import serial
+from helpers import sent_frames
 from helpers.full_disk import full_disk
 from helpers.links import (
     HEADER,
@@ -88,7 +89,7 @@ def test_what_a_server_sends_is_got_to_the_last_byte_and_replayed_the_same(tmp_p
 def test_however_the_bytes_are_cut_the_samples_are_the_same(talk, size: int) -> None:
     whole, protocol = talk(0, 40), Protocol("script", {}, "")
     got = [protocol.push(whole[k : k + size]) for k in range(0, len(whole), size)]
-    assert [number for batch in [*got, protocol.rest()] for number in numbers(batch)] == list(range(40))
+    assert [number for batch in [*got, protocol.form.rest()] for number in numbers(batch)] == list(range(40))
     assert protocol.account.sentences() == []
 
 
@@ -380,7 +381,7 @@ def test_readings_are_recorded_though_no_angles_have_come_yet(tmp_path: Path, ki
     late = json_rows(1500, 1502)
     if kind == "frames":
         early = b"".join(
-            frames.sample(frames.ACCEL, i, START_NS + i * 1_000_000, (float(i), 9.8, -0.25)) for i in range(1500)
+            sent_frames.sample(frames.ACCEL, i, START_NS + i * 1_000_000, (float(i), 9.8, -0.25)) for i in range(1500)
         )
         late = frame_rows(1500, 1502)
     link = Gated(early[: len(early) // 2], early[len(early) // 2 :], late)
@@ -492,7 +493,7 @@ def test_stamps_no_recording_can_hold_are_refused(tmp_path: Path) -> None:
 @settings(max_examples=200, deadline=None)
 @given(st.binary(max_size=1200))
 def test_cobs_has_no_zero_and_comes_back(data: bytes) -> None:
-    encoded = frames.cobs(data)
+    encoded = sent_frames.cobs(data)
     assert b"\0" not in encoded and frames.uncobs(encoded) == data
 
 
@@ -501,11 +502,11 @@ def test_the_frame_is_what_the_documentation_says() -> None:
 
     body = struct.pack("<BBHIq3d", ord("A"), 1, 0, 7, START_NS, 1.0, 2.0, 3.0)
     data = body + struct.pack("<I", zlib.crc32(body))
-    assert frames.sample(frames.ACCEL, 7, START_NS, (1.0, 2.0, 3.0)) == frames.cobs(data) + b"\0"
+    assert sent_frames.sample(frames.ACCEL, 7, START_NS, (1.0, 2.0, 3.0)) == sent_frames.cobs(data) + b"\0"
 
 
 def test_every_damaged_byte_is_found_and_numbers_tell_what_is_lost() -> None:
-    good = [frames.sample(frames.ACCEL, i, START_NS + i, (float(i), 1.0, -2.0)) for i in range(60)]
+    good = [sent_frames.sample(frames.ACCEL, i, START_NS + i, (float(i), 1.0, -2.0)) for i in range(60)]
     damaged = good.copy()
     for k in range(45):
         damaged[k + 5] = good[k + 5][:k] + bytes([good[k + 5][k] ^ 0x55 or 1]) + good[k + 5][k + 1 :]
@@ -529,11 +530,11 @@ def test_poses_of_another_kind_and_numbers_that_are_not_finite_are_refused() -> 
     account = Account()
     reader = frames.FrameReader(account)
     batch = reader.push(
-        frames.sample(frames.ANGLES, 0, 1, (0.1, 0.2, 0.3))
-        + frames.sample(frames.ATTITUDE, 0, 2, (0.0, 0.0, 0.0, 1.0))
-        + frames.sample(frames.ANGLES, 1, 3, (0.1, 0.2))
-        + frames.sample(frames.ACCEL, 0, 4, (float("nan"), 0.0, 0.0))
-        + frames.sample(ord("?"), 0, 5, (1.0,))
+        sent_frames.sample(frames.ANGLES, 0, 1, (0.1, 0.2, 0.3))
+        + sent_frames.sample(frames.ATTITUDE, 0, 2, (0.0, 0.0, 0.0, 1.0))
+        + sent_frames.sample(frames.ANGLES, 1, 3, (0.1, 0.2))
+        + sent_frames.sample(frames.ACCEL, 0, 4, (float("nan"), 0.0, 0.0))
+        + sent_frames.sample(ord("?"), 0, 5, (1.0,))
     )
     assert (len(batch.pose), len(batch.accel), account.malformed) == (1, 0, 4)
 

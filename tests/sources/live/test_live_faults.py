@@ -128,8 +128,7 @@ def test_the_system_asks_a_silent_peer_within_seconds() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listening:
         link = Tcp(*listening.getsockname())
         link.open()
-        connection = link._socket
-        assert connection is not None
+        connection = link.opened
         assert connection.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE) != 0
         names = ("TCP_KEEPIDLE", "TCP_KEEPINTVL", "TCP_KEEPCNT", "TCP_USER_TIMEOUT")
         found = [connection.getsockopt(socket.IPPROTO_TCP, getattr(socket, n)) for n in names if hasattr(socket, n)]

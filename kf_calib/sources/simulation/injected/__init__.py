@@ -34,31 +34,16 @@ from kf_calib.sources.simulation.injected import gimbal, sensor, outside, electr
 # isort: on
 import contextlib
 import difflib
-import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
 from kf_calib.bench.bench import Vector
 from kf_calib.errors import InputError, how_to_write
-from kf_calib.sources.simulation.injected.kinds import (
-    INNER,
-    EffectKind,
-    Hidden,
-    NoSizeError,
-    Rig,
-    Stage,
-    catalogue,
-    steps_of,
-)
+from kf_calib.sources.simulation.injected.kinds import INNER, EffectKind, Hidden, NoSizeError, catalogue
 from kf_calib.sources.simulation.sensors import generator
 from kf_calib.support.units import si
-
-__all__ = [
-    "INNER", "EffectKind", "Hidden", "NoSizeError", "Rig", "Stage", "catalogue", "parse", "si", "steps_of",
-]  # fmt: skip
-
 
 RANDOM = {"random": (True, False), "random-known": (True,), "random-unknown": (False,)}
 """What may be drawn: effects that are in the catalogue of the diagnosis (True), and those that are not."""
@@ -229,7 +214,10 @@ def _drawn(
     resized: Callable[[Hidden], Hidden] | None,
 ) -> Hidden:
     """An effect that is not ``taken`` and, where a size in sigma is asked for, can have it."""
-    for effect in itertools.islice(_draws(known, axes, seed, number, grade), _DRAWS):
+    rng = generator(seed, f"hidden random {number}")
+    kinds = [kind for kind in catalogue().values() if kind.known in known]
+    for _ in range(_DRAWS):
+        effect = _draw(rng, kinds, axes, grade)
         if effect.name in taken:
             continue
         with contextlib.suppress(NoSizeError):
@@ -237,18 +225,15 @@ def _drawn(
     raise InputError("no effect that was drawn can be seen with these orientations: give one by name, with a unit.")
 
 
-def _draws(known: Sequence[bool], axes: Sequence[Vector], seed: int, number: int, grade: str) -> Iterator[Hidden]:
-    """Effects without end: kind and axis evenly, sizes and constants evenly in their logarithm."""
-    rng = generator(seed, f"hidden random {number}")
-    kinds = [kind for kind in catalogue().values() if kind.known in known]
-    while True:
-        kind = kinds[rng.integers(len(kinds))]
-        axis = int(rng.integers(len(axes))) if kind.per_axis else 0
-        size = float(np.exp(rng.uniform(*np.log(kind.typical(grade)))))
-        signs = rng.choice([-1.0, 1.0], len(kind.coefficients)) if kind.signed else np.ones(len(kind.coefficients))
-        inner = {
-            name: value * float(2.0 ** rng.uniform(-1.0, 1.0)) if INNER[name].free else value
-            for name, value in kind.inner.items()
-        }
-        axis_name = axis_names(axes)[axis] if kind.per_axis else ""
-        yield Hidden(kind, tuple((size * signs).tolist()), inner, axis, axis_name)
+def _draw(rng: np.random.Generator, kinds: Sequence[EffectKind], axes: Sequence[Vector], grade: str) -> Hidden:
+    """An effect: kind and axis evenly, sizes and constants evenly in their logarithm."""
+    kind = kinds[int(rng.integers(len(kinds)))]
+    axis = int(rng.integers(len(axes))) if kind.per_axis else 0
+    size = float(np.exp(rng.uniform(*np.log(kind.typical(grade)))))
+    signs = rng.choice([-1.0, 1.0], len(kind.coefficients)) if kind.signed else np.ones(len(kind.coefficients))
+    inner = {
+        name: value * float(2.0 ** rng.uniform(-1.0, 1.0)) if INNER[name].free else value
+        for name, value in kind.inner.items()
+    }
+    axis_name = axis_names(axes)[axis] if kind.per_axis else ""
+    return Hidden(kind, tuple((size * signs).tolist()), inner, axis, axis_name)

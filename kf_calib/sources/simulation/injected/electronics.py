@@ -6,7 +6,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.sources.simulation.injected.kinds import Rig, made
-from kf_calib.sources.simulation.physics import Disturbance, TrueState, TrueStep
+from kf_calib.sources.simulation.physics import Disturbance, TrueState, TrueStep, adding, along, putting
 from kf_calib.sources.simulation.sensors import OutlierProcess
 
 _PAIRS = ("12", "13", "21", "23", "31", "32")
@@ -17,12 +17,7 @@ def cross_talk(x: Floats, rig: Rig) -> TrueStep:
     """Cross-talk: X_ij A_j of the other two readings, without their noise (acquisition chain)."""
     mixing = np.zeros((3, 3))
     mixing[~np.eye(3, dtype=bool)] = x
-
-    def step(state: TrueState) -> None:
-        a1, a2, a3 = (state.reading_mps2[:, [j]] for j in range(3))
-        state.reading_mps2 = state.reading_mps2 + (a1 * mixing[:, 0] + a2 * mixing[:, 1] + a3 * mixing[:, 2])
-
-    return step
+    return adding(lambda state: along(state.reading_mps2, mixing))
 
 
 @made("outliers", "m/s^2", ("1mg", "100mg"), ("10mg", "1g"), stage="record", signed=False)
@@ -36,11 +31,7 @@ def outliers(size: Floats, rig: Rig, *, rate: float = 1e-3) -> TrueStep:
 def saturation(limit: Floats, rig: Rig) -> TrueStep:
     """Saturation: readings stop at -limit and +limit; 0 is no limit (IEEE Std 528, full range)."""
     least = np.where(limit > 0.0, limit, np.inf)
-
-    def step(state: TrueState) -> None:
-        state.reading_mps2 = np.clip(state.reading_mps2, -least, least)
-
-    return step
+    return putting("reading_mps2", lambda state: np.clip(state.reading_mps2, -least, least))
 
 
 @made("quantisation", "m/s^2", ("10ug", "1mg"), ("1mg", "50mg"), stage="record", signed=False)
@@ -49,7 +40,7 @@ def quantisation(step_size: Floats, rig: Rig) -> TrueStep:
     coarse = step_size > 0.0
     width = np.where(coarse, step_size, 1.0)
 
-    def step(state: TrueState) -> None:
-        state.reading_mps2 = np.where(coarse, width * np.rint(state.reading_mps2 / width), state.reading_mps2)
+    def rounded(state: TrueState) -> Floats:
+        return np.where(coarse, width * np.rint(state.reading_mps2 / width), state.reading_mps2)
 
-    return step
+    return putting("reading_mps2", rounded)

@@ -15,15 +15,19 @@ from scipy.spatial.transform import Rotation
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Vector
-from kf_calib.sources.simulation.injected.kinds import Rig, adding, column, made
+from kf_calib.sources.simulation.injected.kinds import Rig, column, made
 from kf_calib.sources.simulation.physics import (
     TrueState,
     TrueStep,
+    adding,
     along,
     carried_by_earth,
     earth_rate_radps,
+    putting,
     rotate,
     to_bench,
+    turning_base,
+    turning_platform,
 )
 from kf_calib.sources.simulation.visit_plans import attitude
 
@@ -48,21 +52,13 @@ def earth_rotation(share: Floats, rig: Rig, *, latitude: float = _LATITUDE_RAD) 
     stated_deg = rig.bench.latitude_deg
     latitude_deg = math.degrees(latitude) if stated_deg is None else stated_deg
     rate_radps = share[0] * earth_rate_radps(latitude_deg, rig.bench.azimuth_deg)
-
-    def step(state: TrueState) -> None:
-        state.attitude = Rotation.from_rotvec(-column(state.time_s) * rate_radps) * state.attitude
-
-    return step
+    return turning_base(lambda state: -column(state.time_s) * rate_radps)
 
 
 @made("gravity-error", "1", ("10ppm", "700ppm"), ("10ppm", "700ppm"), stage="force", coefficients=("epsilon",))
 def gravity_error(epsilon: Floats, rig: Rig) -> TrueStep:
     """Wrong gravity: true is g (1 + epsilon), g is stated (gravimetry)."""
-
-    def step(state: TrueState) -> None:
-        state.force_mps2 = state.force_mps2 * (1.0 + epsilon[0])
-
-    return step
+    return putting("force_mps2", lambda state: state.force_mps2 * (1.0 + epsilon[0]))
 
 
 @made("magnetic", "m/s^2/T", ("1ug/G", "20ug/G"), ("20ug/G", "400ug/G"))
@@ -84,16 +80,16 @@ _PROBE_S = 2e-4  # of the second difference that makes an acceleration
 
 def encoder_error(axis: int, error: Callable[[Floats], Floats]) -> TrueStep:
     """The step that makes the true angle of one gimbal differ from its reading."""
-
-    def step(state: TrueState) -> None:
-        turn_gimbal(state, axis, error(state.angles_rad[:, axis]))
-
-    return step
+    return turning_gimbal(axis, lambda state: error(state.angles_rad[:, axis]))
 
 
-def turn_gimbal(state: TrueState, axis: int, error_rad: Floats) -> None:
-    """Turns one gimbal by so much (n,) more."""
-    state.angles_rad = state.angles_rad + column(error_rad) * np.eye(state.angles_rad.shape[1])[axis]
+def turning_gimbal(axis: int, error_rad: Callable[[TrueState], Floats]) -> TrueStep:
+    """The step that turns one gimbal by so much (n,) more."""
+
+    def turned(state: TrueState) -> Floats:
+        return state.angles_rad + column(error_rad(state)) * np.eye(state.angles_rad.shape[1])[axis]
+
+    return putting("angles_rad", turned)
 
 
 @made(
@@ -141,12 +137,12 @@ def backlash(play: Floats, rig: Rig, axis: int) -> TrueStep:
     """Play between a gimbal and its encoder: the true angle is q less half the play where the gimbal was last moved
     forward, and q more half of it where it was last moved back; it changes sides on the way (gears, belts, worms)."""
 
-    def step(state: TrueState) -> None:
+    def error_rad(state: TrueState) -> Floats:
         moves = np.diff(rig.motion.angles_rad[:, axis], prepend=rig.motion.angles_rad[:1, axis])
         senses = list(accumulate(np.sign(moves).tolist(), lambda before, sense: sense or before))
-        turn_gimbal(state, axis, -0.5 * play[0] * state.of_dwells(column(np.array(senses)))[:, 0])
+        return -0.5 * play[0] * state.of_dwells(column(np.array(senses)))[:, 0]
 
-    return step
+    return turning_gimbal(axis, error_rad)
 
 
 @made(
@@ -158,11 +154,7 @@ def axis_nonorthogonality(tilt: Floats, rig: Rig, axis: int) -> TrueStep:
     cyclic order, for y about z and x; at zero angles the frames coincide."""
     nominal = rig.axes[axis]
     true = tuple(Rotation.from_rotvec(tilt @ across(nominal)).apply(nominal).tolist())
-
-    def step(state: TrueState) -> None:
-        state.axes = [true if number == axis else other for number, other in enumerate(state.axes)]
-
-    return step
+    return putting("axes", lambda state: [*state.axes[:axis], true, *state.axes[axis + 1 :]])
 
 
 def across(axis: Vector) -> Floats:
@@ -192,11 +184,7 @@ def base_tilt_drift(rate: Floats, rig: Rig) -> TrueStep:
 def base_turning(delta: Floats, rig: Rig, multiple: Callable[[TrueState], Floats]) -> TrueStep:
     """The step that turns the base about horizontal axes by (delta N, delta E) times something (n,)."""
     vector = to_bench([delta[0], 0.0, delta[1]], rig.bench.azimuth_deg)
-
-    def step(state: TrueState) -> None:
-        state.attitude = Rotation.from_rotvec(column(multiple(state)) * vector) * state.attitude
-
-    return step
+    return turning_base(lambda state: column(multiple(state)) * vector)
 
 
 @made(
@@ -205,11 +193,7 @@ def base_turning(delta: Floats, rig: Rig, multiple: Callable[[TrueState], Floats
 )  # fmt: skip
 def platform_drift(rate: Floats, rig: Rig) -> TrueStep:
     """Drift of the platform: turned in its own axes by the rotation vector omega_d t, from its gyros (IEEE Std 813)."""
-
-    def step(state: TrueState) -> None:
-        state.attitude = state.attitude * Rotation.from_rotvec(column(state.time_s) * rate)
-
-    return step
+    return turning_platform(lambda state: column(state.time_s) * rate)
 
 
 @made(

@@ -12,7 +12,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, Vector
 from kf_calib.errors import InputError
-from kf_calib.sources.simulation.physics import TrueState, TrueStep
+from kf_calib.sources.simulation.physics import TrueState, TrueStep, adding
 from kf_calib.sources.simulation.sensors import Sensors, generator
 from kf_calib.sources.simulation.visit_plans import Motion
 from kf_calib.support.units import si
@@ -22,6 +22,8 @@ Stage = Literal["angles", "attitude", "force", "input", "reading", "record"]
 platform, the acceleration along the input axes, the readings before noise, the readings as they are recorded."""
 
 SENSORS = ("1", "2", "3")
+TypicalSizes = tuple[str, str]
+"""Typical ones of an effect, from ... to, in units of data sheets."""
 
 
 class NoSizeError(InputError):
@@ -82,9 +84,9 @@ INNER: Mapping[str, Inner] = {
 class EffectKind:
     """A kind of effect.
 
-    unit: of a coefficient. coefficients: their names, one for each size. navigation, mems: typical sizes, from ... to,
-    in units of data sheets. make: (coefficients, rig, gimbal axis where ``per_axis``, inner constants) -> step.
-    signed: false where a coefficient cannot be negative. known: it is in the catalogue of the diagnosis. counted: makes
+    unit: of a coefficient. navigation, mems: typical sizes of these grades. make: (coefficients, rig, gimbal axis where
+    ``per_axis``, inner constants) -> step. stage: where in the chain it stands. coefficients: their names, one for each
+    size. signed: false where one cannot be negative. known: it is in the catalogue of the diagnosis. counted: makes
     the part that counts to its size in sigma, where something comes with the effect whatever its size. driver: of an
     effect outside the catalogue, the quantity it goes with. family: of an effect outside the catalogue, the physical
     class to which it belongs; that of an effect of the catalogue is told there.
@@ -92,14 +94,14 @@ class EffectKind:
 
     name: str
     unit: str
-    stage: Stage
-    coefficients: tuple[str, ...]
-    navigation: tuple[str, str]
-    mems: tuple[str, str]
+    navigation: TypicalSizes
+    mems: TypicalSizes
     make: Callable[..., TrueStep] = field(repr=False)
     inner: Mapping[str, float]
     title: str
     physics: str
+    stage: Stage = "reading"
+    coefficients: tuple[str, ...] = SENSORS
     signed: bool = True
     per_axis: bool = False
     known: bool = True
@@ -182,47 +184,24 @@ def steps_of(effects: Iterable[Hidden], rig: Rig) -> dict[Stage, list[TrueStep]]
 
 
 def made(
-    name: str,
-    unit: str,
-    navigation: tuple[str, str],
-    mems: tuple[str, str] | None = None,
-    *,
-    stage: Stage = "reading",
-    coefficients: tuple[str, ...] = SENSORS,
-    signed: bool = True,
-    per_axis: bool = False,
-    known: bool = True,
-    counted: Callable[..., TrueStep] | None = None,
-    driver: str = "",
-    family: str = "",
+    name: str, unit: str, navigation: TypicalSizes, mems: TypicalSizes | None = None, **facts: Any
 ) -> Callable[[Callable[..., TrueStep]], Callable[..., TrueStep]]:
-    """Registers a maker of steps. Its docstring is "Title: physics (source)."; its keyword-only arguments are the inner
-    constants with their usual values."""
+    """Registers a maker of steps; facts: further fields of its kind. Its docstring is "Title: physics (source)."; its
+    keyword-only arguments are the inner constants with their usual values."""
 
     def register(make: Callable[..., TrueStep]) -> Callable[..., TrueStep]:
         assert name not in _KINDS, name
         title, _, physics = " ".join((make.__doc__ or "").split()).partition(": ")
         parameters = inspect.signature(make).parameters.values()
         inner = {item.name: float(item.default) for item in parameters if item.kind is item.KEYWORD_ONLY}
-        typical = navigation, mems or navigation
-        _KINDS[name] = EffectKind(
-            name, unit, stage, coefficients, *typical, make, inner, title, physics, signed, per_axis, known,
-            counted, driver, family,
-        )  # fmt: skip
+        _KINDS[name] = EffectKind(name, unit, navigation, mems or navigation, make, inner, title, physics, **facts)
         return make
 
     return register
 
 
 def added(
-    name: str,
-    unit: str,
-    navigation: tuple[str, str],
-    mems: tuple[str, str] | None = None,
-    *,
-    known: bool = True,
-    driver: str = "",
-    family: str = "",
+    name: str, unit: str, navigation: TypicalSizes, mems: TypicalSizes | None = None, **facts: Any
 ) -> Callable[[Callable[..., Floats]], Callable[..., Floats]]:
     """Registers what adds to each reading, a function of three coefficients, the state and inner constants."""
 
@@ -232,7 +211,7 @@ def added(
 
         make.__doc__ = contribution.__doc__
         make.__signature__ = inspect.signature(contribution)  # shows the inner constants
-        made(name, unit, navigation, mems, known=known, driver=driver, family=family)(make)
+        made(name, unit, navigation, mems, **facts)(make)
         return contribution
 
     return register
@@ -256,12 +235,3 @@ def above(state: TrueState, reference_c: float) -> Floats:
 def column(values: Floats) -> Floats:
     """One value a sample (n,) as a column (n, 1)."""
     return values[:, None]
-
-
-def adding(contribution: Callable[[TrueState], Floats]) -> TrueStep:
-    """The step that adds to the readings."""
-
-    def step(state: TrueState) -> None:
-        state.reading_mps2 = state.reading_mps2 + contribution(state)
-
-    return step

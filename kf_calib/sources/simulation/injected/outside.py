@@ -9,8 +9,8 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.sources.simulation.injected.gimbal import axis_nonorthogonality, base_turning, harmonic
-from kf_calib.sources.simulation.injected.kinds import Rig, above, added, adding, column, made, output, pendulous
-from kf_calib.sources.simulation.physics import DwellRotation, TrueState, TrueStep, carried_by_earth, rotate
+from kf_calib.sources.simulation.injected.kinds import Rig, above, added, column, made, output, pendulous
+from kf_calib.sources.simulation.physics import TrueState, TrueStep, adding, carried_by_earth, rotate, turning_platform
 from kf_calib.sources.simulation.sensors import FirstOrder
 from kf_calib.sources.simulation.visit_plans import attitude
 
@@ -158,7 +158,8 @@ def loose_mount(play: Floats, rig: Rig) -> TrueStep:
     upward = carried_by_earth(rig.bench, np.array([[0.0, 1.0, 0.0]]), np.multiply(rig.motion.arrive_ns, 1e-9))
     pull = rotate(attitude(rig.axes, angles_rad, rig.bench.up).inv(), upward)[:, [1, 2, 0]]
     friction = rig.generator("loose-mount").standard_normal((count, 3))
-    return DwellRotation(play * np.clip(pull + friction, -1.0, 1.0))
+    turns_rad = play * np.clip(pull + friction, -1.0, 1.0)
+    return turning_platform(lambda state: state.of_dwells(turns_rad))
 
 
 @_made("eccentric-bearing", "rad", ("5urad", "50urad"), ("0.1mrad", "5mrad"), stage="angles", coefficients=("s", "c"),

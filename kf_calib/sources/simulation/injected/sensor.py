@@ -13,8 +13,8 @@ from itertools import accumulate
 import numpy as np
 
 from kf_calib.bench.arrays import Floats, sign
-from kf_calib.sources.simulation.injected.kinds import Rig, above, added, adding, column, made, output, pendulous
-from kf_calib.sources.simulation.physics import TrueState, TrueStep, WalkingBias
+from kf_calib.sources.simulation.injected.kinds import Rig, above, added, column, made, output, pendulous
+from kf_calib.sources.simulation.physics import TrueState, TrueStep, WalkingBias, adding, putting
 from kf_calib.sources.simulation.sensors import FirstOrder
 
 _PENDULOUS_AND_OUTPUT = ("1p", "1o", "2p", "2o", "3p", "3o")
@@ -28,12 +28,11 @@ def thermal_misalignment(gamma: Floats, rig: Rig, *, reference: float = 25.0) ->
     """Thermal misalignment: the input axis leans to (1, gamma_p T, gamma_o T), a_i + gamma_p T a_p + gamma_o T a_o."""
     to_pendulous, to_output = gamma[0::2], gamma[1::2]
 
-    def step(state: TrueState) -> None:
+    def leaning(state: TrueState) -> Floats:
         p, o = to_pendulous * above(state, reference), to_output * above(state, reference)
-        leaning = state.input_mps2 + p * pendulous(state) + o * output(state)
-        state.input_mps2 = leaning / np.sqrt(1.0 + p**2 + o**2)
+        return (state.input_mps2 + p * pendulous(state) + o * output(state)) / np.sqrt(1.0 + p**2 + o**2)
 
-    return step
+    return putting("input_mps2", leaning)
 
 
 @added("thermal-bias", "m/s^2/K", ("5ug/K", "30ug/K"), ("0.15mg/K", "1mg/K"))
@@ -108,11 +107,7 @@ class Lag:
 @made("dead-zone", "m/s^2", ("1ug", "5ug"), ("0.1mg", "1mg"), stage="input", signed=False)
 def dead_zone(d: Floats, rig: Rig) -> TrueStep:
     """Dead zone: no response, -a_i, where |a_i| < d (IEEE Std 528, dead band without hysteresis)."""
-
-    def step(state: TrueState) -> None:
-        state.input_mps2 = np.where(np.abs(state.input_mps2) < d, 0.0, state.input_mps2)
-
-    return step
+    return putting("input_mps2", lambda state: np.where(np.abs(state.input_mps2) < d, 0.0, state.input_mps2))
 
 
 @added("bias-asymmetry", "m/s^2", ("1ug", "10ug"), ("0.1mg", "1mg"))
@@ -215,11 +210,7 @@ def bias_walk(q: Floats, rig: Rig) -> TrueStep:
 
 def _vibration_rectification(k: Floats, rig: Rig, *, rms: float, frequency: float, period: float) -> TrueStep:
     """K2 <v^2> of the vibration below, the mean over its cycles."""
-
-    def step(state: TrueState) -> None:
-        state.reading_mps2 = state.reading_mps2 + k * (rms * np.sin(np.pi * column(state.time_s) / period) ** 2) ** 2
-
-    return step
+    return adding(lambda state: k * (rms * np.sin(np.pi * column(state.time_s) / period) ** 2) ** 2)
 
 
 @made(
@@ -236,13 +227,13 @@ def vibration_rectification(
     phase, in the readings too, whose effective value rises and falls as rms sin^2(pi t / period) (IEEE Std 1293)."""
     phases = rig.generator("vibration-rectification").uniform(0.0, 2.0 * np.pi, 3)
 
-    def step(state: TrueState) -> None:
+    def vibrating(state: TrueState) -> Floats:
         t = column(state.time_s)
         envelope = math.sqrt(2.0) * rms * np.sin(np.pi * t / period) ** 2
         shaken = envelope * np.sin(2.0 * np.pi * frequency * t + phases)
-        state.reading_mps2 = state.reading_mps2 + shaken + k * shaken**2
+        return state.reading_mps2 + shaken + k * shaken**2
 
-    return step
+    return putting("reading_mps2", vibrating)
 
 
 class LastStep:
