@@ -206,7 +206,6 @@ def test_mutated_files_are_read_or_refused_in_a_sentence(cases: int, tmp_path: P
 
 def test_a_hidden_row_is_not_read(tmp_path: Path) -> None:
     """Nor is one that a filter hides; the warning names the rows of the sheet."""
-    openpyxl = pytest.importorskip("openpyxl", reason="openpyxl is not there")
     book = openpyxl.Workbook()
     book.active.append(["face", "ax [g]", "ay [g]", "az [g]"])
     for face, *reading in (("+x", 1, 0, 0), ("-x", -1, 0, 0), ("+y", 9, 9, 9), ("-y", 0, -1, 0), ("+z", 8, 8, 8)):
@@ -232,8 +231,8 @@ def test_merged_cells_end_no_copy(merged: bytes, says: str, run: Any, tmp_path: 
     assert len(table_of(content, path).orientations) == len(ROWS)
     kf_calib.save_calibration(kf_calib.calibrate(ROOT / "recordings" / "mems_faces.mcap"), calibration)
     with bounded():
-        code, _, err = run("apply", calibration, path, "-o", out, "--axes", "z x", "--gravity", "9.81", "--unchecked")
-    assert code == 2 and says in err and err.count("\n") == 1 and not out.exists()
+        err = run.refused("apply", calibration, path, "-o", out, "--axes", "z x", "--gravity", "9.81", "--unchecked")
+    assert says in err and not out.exists()
 
 
 def test_plain_rows_are_what_a_parser_of_xml_makes_of_them(tmp_path: Path) -> None:
