@@ -25,8 +25,8 @@ pytestmark = [pytest.mark.xdist_group("fleet"), pytest.mark.usefixtures("at_once
 
 @pytest.fixture(scope="module")
 def bent(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four runs of four units on a bench that bends by more than each run alone could miss."""
-    return recorded(tmp_path_factory.mktemp("bent"), runs=4, units=4, dwells=10, of_bench=("flexure=8sigma",))
+    """Three runs of three units on a bench that bends by more than each run alone could miss."""
+    return recorded(tmp_path_factory.mktemp("bent"), runs=3, units=3, dwells=9, of_bench=("flexure=8sigma",))
 
 
 def test_the_command_ends_with_what_all_runs_show_together(bent: Path, run: Any, tmp_path: Path) -> None:
@@ -37,7 +37,7 @@ def test_the_command_ends_with_what_all_runs_show_together(bent: Path, run: Any,
     assert {each["borne_by"] for each in others} <= {"none", None} and printed["remarks"] == []
     (model,) = printed["bench_models"]
     known = bench_model.read_bench_model(model)
-    assert (known.bench, known.runs, known.terms[0].effect) == ("bench-1", 4, "flexure")
+    assert (known.bench, known.runs, known.terms[0].effect) == ("bench-1", 3, "flexure")
     one = next(bent.rglob("*.mcap"))
     rows = kf_calib.open_fleet(tmp_path / "fleet").rows(["run", "diagnosis"]).to_pylist()
     (alone,) = (row["diagnosis"] for row in rows if row["run"] == str(one))
