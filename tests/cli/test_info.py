@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import shlex
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,8 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.paths import ROOT
-from helpers.recordings import ACCEL, ANGLES, BATCH, START_NS, read, record, write_db3, write_officially
-from mcap.writer import Writer
+from helpers.recordings import ACCEL, ANGLES, BATCH, START_NS, read, record, write_db3, write_messages, write_officially
 
 from kf_calib.bench.bench import Bench
 from kf_calib.sources.files.inventory import Topic
@@ -76,26 +73,12 @@ def test_lines(facts: Any, run: Any, tmp_path: Path) -> None:
     assert len(facts(table, "--column", "when_s=time_s", "--axes", "y z x", "--gravity", "9.81")["dwells"]) == 6
 
 
-def in_json(path: Path, schema: str = "", **topics: Callable[[int], Any]) -> Path:
-    """Twenty messages a topic, 10 ms apart, by their numbers."""
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        number = writer.register_schema(schema, "jsonschema", b"") if schema else 0
-        channels = {writer.register_channel(f"/{name}", "json", number): message for name, message in topics.items()}
-        for k in range(20):
-            for channel, message in channels.items():
-                writer.add_message(channel, k * 10**7, json.dumps(message(k)).encode(), 0)
-        writer.finish()
-    return path
-
-
-def stamp(k: int) -> dict[str, Any]:
-    return {"header": {"stamp": {"sec": 1, "nanosec": k * 10**7}}}
+STAMPS = [{"header": {"stamp": {"sec": 1, "nanosec": k * 10**7}}} for k in range(20)]
 
 
 def test_what_messages_in_json_have(facts: Any, tmp_path: Path) -> None:
-    path = in_json(tmp_path / "json.mcap", imu=lambda k: {"t": k / 100, "acc": {"x": 0}, "l": [{"v": 1}]})
+    messages = [{"t": k / 100, "acc": {"x": 0}, "l": [{"v": 1}]} for k in range(20)]
+    path = write_messages(tmp_path / "json.mcap", {"/imu": messages})
     found = facts(path)
     assert found["topics"][0]["fields"] == ["t", "acc.x", "l.v"]
     assert len(found["missing"]) == 3 and "has no accelerometer topic" in found["missing"][0]
@@ -111,10 +94,9 @@ def test_a_quaternion_in_messages_is_proposed_as_attitude(
 ) -> None:
     """As of the pose of a robot's tool; axes of gimbals are not asked for then."""
     turned = {"position": {"x": 0, "y": 0, "z": 0}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}
-    at = stamp if stamped else lambda k: {}
-    path = in_json(
-        tmp_path / "json.mcap", imu=lambda k: at(k) | {"acc": [0, 0, 9.81]}, tool=lambda k: at(k) | {"pose": turned}
-    )
+    at = STAMPS if stamped else [{}] * 20
+    topics = {"/imu": [own | {"acc": [0, 0, 9.81]} for own in at], "/tool": [own | {"pose": turned} for own in at]}
+    path = write_messages(tmp_path / "json.mcap", topics)
     found = facts(path, "--field", "accel=/imu:acc")
     assert found["command"].endswith(f"--field attitude={proposed} --gravity 9.81")
     assert not any("axes" in each for each in found["missing"])
@@ -123,7 +105,8 @@ def test_a_quaternion_in_messages_is_proposed_as_attitude(
 def test_the_orientation_in_an_imu_is_not_proposed(facts: Any, tmp_path: Path) -> None:
     """It is what that sensor makes of the readings that are to be calibrated."""
     fields = {"orientation": {"x": 0, "y": 0, "z": 0, "w": 1}, "linear_acceleration": {"x": 0, "y": 0, "z": 9.81}}
-    path = in_json(tmp_path / "json.mcap", "sensor_msgs/msg/Imu", imu=lambda k: stamp(k) | fields)
+    topics = {"/imu": [own | fields for own in STAMPS]}
+    path = write_messages(tmp_path / "json.mcap", topics, schema="sensor_msgs/msg/Imu")
     command = facts(path)["command"]
     assert "--field" not in command and command.endswith("--no-angles")
 

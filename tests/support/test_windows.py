@@ -169,11 +169,8 @@ def test_a_console_that_is_closed_ends_the_run_in_good_order(monkeypatch: pytest
 @pytest.mark.parametrize("code_page", ["cp1252", "cp437", "cp850", "latin-1", "ascii"])
 def test_a_pipe_gets_utf_8_where_a_code_page_lacks_signs(code_page: str) -> None:
     environment = {**os.environ, "PYTHONIOENCODING": code_page, "PYTHONUTF8": "0"}
-    words = [
-        sys.executable,
-        "-c",
-        "from kf_calib.cli.echo import open_streams, echo; open_streams(); echo('σ ┃ µg χ²')",
-    ]
+    code = "from kf_calib.cli.echo import open_streams, echo; open_streams(); echo('σ ┃ µg χ²')"
+    words = [sys.executable, "-c", code]
     done = subprocess.run(words, env=environment, capture_output=True, check=True, timeout=120)
     assert done.stdout.decode("utf-8").strip() == "σ ┃ µg χ²"
 
