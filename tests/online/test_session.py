@@ -281,23 +281,6 @@ def test_a_failing_evaluation_still_reads_the_source_to_its_end() -> None:
     assert len(read) == len(list(bench(orientations=5))) and "the evaluation stopped" in session.standing.notice
 
 
-@pytest.mark.slow
-def test_memory_is_that_of_the_dwells() -> None:
-    """Ten times the samples in the same dwells: no more is kept of them."""
-
-    def kept(count: int) -> int:
-        session = Session(Run(dwells=3, count=count, rate_hz=1000.0, batch=500))
-        tracemalloc.start()
-        for batch in session.source:
-            session._take(batch)
-        used = tracemalloc.get_traced_memory()[0]
-        tracemalloc.stop()
-        return used
-
-    kept(5_000)
-    assert kept(50_000) < kept(5_000) + 1_000_000
-
-
 @pytest.mark.parametrize("hours", [6, *slow(30)])
 def test_memory_of_a_bench_that_stands_for_hours_is_flat(hours: int) -> None:
     """What is kept of a dwell does not grow with its length: pieces are merged, and its trace ends."""

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.bounded import traced
+from helpers.damage import damaged
 from helpers.long_runs import slow
 from helpers.paths import REAL, ROOT
 from helpers.recordings import read
@@ -377,20 +378,6 @@ SCRAPS = (
 )
 
 
-def damaged(content: bytes, rng: random.Random) -> bytes:
-    """A file with bytes changed, lost, repeated, or put in."""
-    out = bytearray(content)
-    for _ in range(rng.choice((1, 2, 5, 30))):
-        at, what = rng.randrange(len(out)), rng.random()
-        if what < 0.4:
-            out[at] = rng.randrange(256)
-        elif what < 0.6:
-            del out[at : at + rng.randrange(1, 50)]
-        else:
-            out[at:at] = rng.choice(SCRAPS) if what < 0.8 else out[max(0, at - 80) : at]
-    return bytes(out) or b"x"
-
-
 @pytest.mark.parametrize("seed", [1, *slow(*range(2, 20))])
 def test_a_damaged_log_or_table_raises_nothing_but_input_errors(seed: int, tmp_path: Path) -> None:
     rng, path = random.Random(seed), tmp_path / "damaged.csv"
@@ -398,7 +385,7 @@ def test_a_damaged_log_or_table_raises_nothing_but_input_errors(seed: int, tmp_p
     plain += [gzip.compress(plain[0]), (ROOT / "recordings" / "twelve_poses.csv").read_bytes()]
     kinds = set[FileKind]()
     for _ in range(100):
-        path.write_bytes(damaged(rng.choice(plain), rng))
+        path.write_bytes(damaged(rng.choice(plain), rng, SCRAPS) or b"x")
         kind = kind_of(path)
         kinds.add(kind)
         for angles in (True, False):

@@ -255,20 +255,6 @@ def test_it_opens_as_a_picture(recording: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.draws
-@pytest.mark.slow
-def test_the_picture_is_not_that_of_an_empty_file(recording: Path, tmp_path: Path) -> None:
-    import rerun as rr
-
-    shown = _drawn(recording, tmp_path / "run.png")
-    with rr.RecordingStream("empty") as stream:
-        stream.save(tmp_path / "empty.rrd")
-        stream.log("nothing", rr.TextDocument(""), static=True)
-        stream.disconnect()
-    empty = _drawn(tmp_path / "empty.rrd", tmp_path / "empty.png")
-    assert (empty != shown).any(axis=2).mean() > 0.05
-
-
-@pytest.mark.draws
 def test_no_panel_complains(recording: Path) -> None:
     from rerun.experimental import ViewerClient
 

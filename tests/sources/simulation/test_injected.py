@@ -544,13 +544,6 @@ def test_small_effects_are_linear_in_their_size(name):
     np.testing.assert_allclose(two - none, 2 * (one - none), rtol=0, atol=2e-3 * np.abs(two - none).max() + 1e-13)
 
 
-@pytest.mark.slow  # all at once, below, in short
-@pytest.mark.parametrize("name", catalogue())
-def test_batches_do_not_matter_to_an_effect(name):
-    text = f"{name}={VISIBLE[name]}"
-    assert np.array_equal(run(text, batch_samples=17).accel.values, run(text).accel.values)
-
-
 @pytest.mark.parametrize("batch_samples", [97, *slow(1, 7)])
 def test_batches_do_not_matter_to_all_effects_at_once(batch_samples):
     texts = [f"{name}={size}" for name, size in VISIBLE.items() if name not in ("saturation", "quantisation")]

@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.bounded import traced
 from helpers.long_runs import slow
 from helpers.recordings import read, streams_of
 from scipy.signal import welch
@@ -161,20 +160,6 @@ def test_a_run_repeats_itself_and_another_seed_differs():
     other = Simulation(BENCH, ORTHOGONAL, EVERYTHING, spread_plan(3, dwell_s=2.0), seed=2)
     assert np.array_equal(read(simulation).accel.values, read(simulation).accel.values)
     assert not np.any(read(simulation).accel.values == read(other).accel.values)
-
-
-@pytest.mark.slow
-def test_memory_does_not_grow_with_the_run():
-    def peak(dwell_s: float) -> int:
-        plan = explicit_plan([(0, 0, 0), (0, 90, 0)], dwell_s)
-        simulation = Simulation(BENCH, ORTHOGONAL, TrueNoise(1e-4), plan, sample_hz=1000.0, batch_samples=2000)
-        with traced() as found:
-            for _ in simulation:
-                pass
-        return found.bytes
-
-    peak(1.0)
-    assert peak(200.0) < 1.2 * peak(10.0)
 
 
 # -- noise --

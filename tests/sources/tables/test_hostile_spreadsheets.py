@@ -15,6 +15,7 @@ import numpy as np
 import openpyxl
 import pytest
 from helpers.bounded import bounded
+from helpers.damage import damaged
 from helpers.long_runs import slow
 from helpers.paths import ROOT
 
@@ -162,32 +163,16 @@ def test_a_table_of_a_wide_header_and_many_rows_is_refused(tmp_path: Path) -> No
         kf_calib.open_table(path, {})
 
 
+SCRAPS = [b"-", b"9" * 9, b"<", b">", b'"', b"&x;", b"\0", b"e99", b"1E400"]
+
+
 def mutated(rng: random.Random) -> bytes:
-    """The plain file with bytes of it, or of one of its parts, flipped, cut out, doubled or put from elsewhere."""
-
-    def change(content: bytes) -> bytes:
-        made = bytearray(content)
-        for _ in range(rng.choice([1, 1, 2, 5])):
-            at, size = rng.randrange(len(made)), rng.choice([1, 4, 40])
-            kind = rng.randrange(5)
-            if kind == 0:
-                made[at] ^= 1 << rng.randrange(8)
-            elif kind == 1:
-                del made[at : at + size]
-            elif kind == 2:
-                made[at:at] = made[at : at + size]
-            elif kind == 3:
-                source = rng.randrange(len(made))
-                made[at : at + size] = made[source : source + size]
-            else:
-                made[at : at + 1] = rng.choice([b"-", b"9" * 9, b"<", b">", b'"', b"&x;", b"\0", b"e99", b"1E400"])
-        return bytes(made)
-
+    """The plain file, or one of its parts, damaged."""
     if rng.random() < 0.3:
-        return change(plain())
+        return damaged(plain(), rng, SCRAPS)
     with zipfile.ZipFile(io.BytesIO(plain())) as archive:
         part = rng.choice([SHEET, SHEET, "xl/sharedStrings.xml", STYLES, *archive.namelist()])
-    return changed(part, lambda content: change(content) + b" ")
+    return changed(part, lambda content: damaged(content, rng, SCRAPS) + b" ")
 
 
 @pytest.mark.parametrize("cases", [50, *slow(2000)])
