@@ -11,8 +11,10 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+from helpers.browser import chromium
 from helpers.slow_share import Share, SlowShare
 from hypothesis import settings
 
@@ -135,3 +137,9 @@ def unmeasured(monkeypatch: pytest.MonkeyPatch) -> None:
 def run() -> CommandLine:
     """The command line: exit code, what it prints, what it prints to the error stream."""
     return CommandLine()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as opened:
+        yield opened

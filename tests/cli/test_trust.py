@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.long_runs import slow
+from helpers.own_effect import TEN_LINES
 
 from kf_calib import effects
 from kf_calib.bench.bench import Bench, axes_of
@@ -23,18 +24,9 @@ from kf_calib.sources.files.recording import Recording
 from kf_calib.support.text import LONGEST, cut, printable, sentence
 
 ESCAPES = "\x1b[31m\x1b]0;title\x07\x9b2J\x7f\u202e[red]"
-ALARM = """
-from pathlib import Path
-from kf_calib.effects import SensorEffect
 
-Path(__file__).with_name("RAN").touch()
 
-class Bend(SensorEffect):
-    unit = "s^2/m"
-
-    def terms(self, s):
-        return s.along**2
-"""
+ALARM = f'{TEN_LINES}\nfrom pathlib import Path\nPath(__file__).with_name("RAN").touch()\n'
 
 
 @pytest.fixture(scope="module")

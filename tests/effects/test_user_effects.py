@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.long_runs import slow
+from helpers.own_effect import TEN_LINES
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -45,15 +46,6 @@ from kf_calib.sources.simulation.visit_plans import spread_plan
 from kf_calib.views.console import model_table, plain
 
 BENCH = checks.EXAMPLE
-TEN_LINES = """
-from kf_calib.effects import SensorEffect
-
-class Bend(SensorEffect):
-    unit = "s^2/m"
-
-    def terms(self, s):
-        return s.along**2
-"""
 
 
 @pytest.fixture(autouse=True)

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.browser import chromium
 from helpers.known_runs import hidden_diagnosed, hidden_improved
 from matplotlib.figure import Figure
 from PIL import Image
@@ -48,12 +47,6 @@ def path(found: kf_calib.Diagnosis, tmp_path_factory: pytest.TempPathFactory) ->
     page = page_of(replace(found, before=before), [measured], [EVIL], [EVIL])
     save(page, place)
     return place
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as opened:
-        yield opened
 
 
 @pytest.fixture

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 from helpers.full_disk import full_disk
 from helpers.long_runs import slow
+from helpers.own_effect import TEN_LINES
 from helpers.warm_command import warm
 
 from kf_calib import effects
@@ -35,15 +36,6 @@ from kf_calib.support.output_files import Growing, Outputs, whole, write_whole
 
 QUICK = ["--orientations", "12", "--dwell-s", "6", "--slew-degps", "360", "--sample-hz", "50", "--seed", "3"]
 MINE = b"the user's own"
-OWN = """
-from kf_calib.effects import SensorEffect
-
-class Bend(SensorEffect):
-    unit = "s^2/m"
-
-    def terms(self, s):
-        return s.along**2
-"""
 BENCH = Bench(parse_axes("y z x"), 9.81)
 
 
@@ -63,7 +55,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, original: bytes) -> Pa
     Path("lines.csv").write_text("time_s,ax_g,ay_g,az_g,outer_deg,middle_deg,inner_deg\n" + rows)
     Path("bench.toml").write_text("gravity_mps2 = 9.81\n")
     Path("model.toml").write_text('effects = []\neffects_from = ["own.py"]\n')
-    Path("own.py").write_text(OWN)
+    Path("own.py").write_text(TEN_LINES)
     monkeypatch.setattr(effects, "_registered", {})  # what own.py defines is for one test
     Path("angles.csv").write_text("0,0,0\n90,0,0\n0,90,0\n0,0,90\n90,90,0\n0,90,90\n")
     return tmp_path

@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.browser import chromium
 from helpers.by_hand import by_hand
 from helpers.synthetic import Run
 from helpers.warm_command import warm
@@ -210,12 +209,6 @@ def live(*words: object, command: str = "live", **streams: Any) -> Iterator[tupl
             process.kill()
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as opened:
-        yield opened
-
-
 class Visit:
     """A page that is open in a browser, and what the browser complained of or asked for elsewhere."""
 
@@ -303,7 +296,7 @@ def test_a_page_that_is_opened_late_has_all_and_one_whose_recorder_is_killed_say
     ("command", "words"),
     [
         ("live", ("sim://?speed=60&grade=mems&orientations=14&dwell_s=7&sample_hz=50&seed=2", "--no-angles")),
-        ("run", ("--positioner", "sim://?seed=4&sample_hz=20&speed=60", "--target", "K=8ppm")),
+        ("run", ("--positioner", "sim://?seed=4&sample_hz=20&speed=60", "--target", "K=20ppm")),
     ],
 )
 def test_the_end_of_a_run_by_hand_and_of_a_bench_that_drives_itself_is_seen(
