@@ -259,7 +259,7 @@ def test_memory_is_that_of_a_short_rest_however_long_it_is() -> None:
             found = noise_at_rest(source)
         return memory.bytes, found
 
-    peak(1)
+    peak(16)
     (half, _), (whole, found) = peak(16), peak(32)
     assert found.readings == 320_000 and found.stretches == 1
     assert whole < 1.15 * half < 30e6
