@@ -1,7 +1,5 @@
 """Paths and fixtures shared by the tests."""
 
-from __future__ import annotations
-
 import functools
 import gc
 import math

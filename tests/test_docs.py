@@ -1,7 +1,5 @@
 """The documentation as a reader has it: it builds, its links lead somewhere, a browser shows it without the network."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

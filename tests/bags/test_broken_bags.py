@@ -1,7 +1,5 @@
 """Broken bags: each is refused in one sentence that names the file and says what to do, and nothing else is printed."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from pathlib import Path

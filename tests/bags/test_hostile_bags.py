@@ -1,7 +1,5 @@
 """Bags that no recorder writes: reading them ends soon, in bounded memory, and uses what is sound in them."""
 
-from __future__ import annotations
-
 import random
 import sqlite3
 from contextlib import closing

@@ -1,7 +1,5 @@
 """Bags in SQLite hold what the same samples recorded as MCAP do, compressed or not, in one file or several."""
 
-from __future__ import annotations
-
 import sqlite3
 from contextlib import closing
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The gimbal chain, the Earth and gravity against scipy's rotations and closed forms."""
 
-from __future__ import annotations
-
 import math
 import re
 

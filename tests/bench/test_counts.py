@@ -1,7 +1,5 @@
 """Numbers of converters without a sign, or about another code than 0: told by the data, and read with one option."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

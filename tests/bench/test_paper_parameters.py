@@ -1,7 +1,5 @@
 """The paper's parameters in closed form against finite differences."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Certificates: the budget against recalibrations, the XML and the PDF against the calibration."""
 
-from __future__ import annotations
-
 import io
 import json
 import shutil

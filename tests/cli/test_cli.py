@@ -1,7 +1,5 @@
 """The command line as a user meets it: keys, exit codes, one sentence on stderr."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import is_dataclass

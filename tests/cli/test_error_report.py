@@ -1,7 +1,5 @@
 """The report of an error that was not foreseen: what a maintainer needs, and nothing of the user's data."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import tempfile

@@ -1,7 +1,5 @@
 """``info`` says what is in a file, what it lacks, and a command that then works."""
 
-from __future__ import annotations
-
 import shlex
 from functools import partial
 from pathlib import Path

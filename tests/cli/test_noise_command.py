@@ -1,7 +1,5 @@
 """``kf-calib noise``: what it prints and writes, and its way into other programs' files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

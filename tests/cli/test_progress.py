@@ -1,7 +1,5 @@
 """What a person who waits is told: that work goes on, how far it is where that is known, and nothing in a pipe."""
 
-from __future__ import annotations
-
 import io
 import re
 import time

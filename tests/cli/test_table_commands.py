@@ -1,7 +1,5 @@
 """Tables of orientations on the command line."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

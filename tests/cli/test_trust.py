@@ -1,7 +1,5 @@
 """Files from others: they run no code that was not asked for, and command no terminal."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

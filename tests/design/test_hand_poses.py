@@ -1,7 +1,5 @@
 """Which sides to turn up where there are no angles."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Plans against closed forms, the equivalence theorem, brute force and simulated runs."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Every effect of the catalogue against a truth that was made without its columns."""
 
-from __future__ import annotations
-
 import ast
 import functools
 from functools import partial

@@ -1,7 +1,5 @@
 """Effects of the user's own: formulas, classes in files and packages, model files, and the checks they must pass."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re

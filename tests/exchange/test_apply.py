@@ -1,7 +1,5 @@
 """A copy of a recording with corrected readings: the original byte for byte, and one topic more; lines as they come."""
 
-from __future__ import annotations
-
 import io
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A calibration file holds all of a calibration, and refuses what is none in one sentence."""
 
-from __future__ import annotations
-
 import copy
 import json
 import math

@@ -1,7 +1,5 @@
 """From what a device sends to corrected readings: three devices, every way in and every way out."""
 
-from __future__ import annotations
-
 import csv
 import io
 import itertools

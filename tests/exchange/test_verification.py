@@ -1,7 +1,5 @@
 """An old calibration is said not to hold no more often than agreed, and what has moved is named."""
 
-from __future__ import annotations
-
 from collections import Counter
 from functools import cache
 

@@ -1,7 +1,5 @@
 """The function in C, compiled and compared with the correction in Python."""
 
-from __future__ import annotations
-
 import ctypes
 import re
 import shutil

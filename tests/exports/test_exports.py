@@ -1,7 +1,5 @@
 """What is exported, read as the receiving program reads it and applied by its formula."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

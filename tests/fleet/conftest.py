@@ -1,7 +1,5 @@
 """Workers, a table and an object store for the tests of fleets."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@
 Which units have an effect is enumerated: all subsets of five units, each with the covariance of all readings.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass

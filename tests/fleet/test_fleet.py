@@ -1,7 +1,5 @@
 """Many recordings into one table: the same numbers as alone, whatever fails on the way, nothing done twice or lost."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

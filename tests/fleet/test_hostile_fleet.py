@@ -1,7 +1,5 @@
 """Runs that never end, pipes with names of recordings, and tables that somebody else wrote: the fleet goes on."""
 
-from __future__ import annotations
-
 import math
 import os
 import resource

@@ -1,7 +1,5 @@
 """Many runs together: the command's last word, the page and the figures, and what is said where something lacks."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

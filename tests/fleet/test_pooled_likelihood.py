@@ -1,7 +1,5 @@
 """The likelihoods of many runs against what they are by definition, from all rows at once."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any

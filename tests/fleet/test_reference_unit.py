@@ -1,7 +1,5 @@
 """A calibration from elsewhere of a unit among the runs: which files are taken, and what is said of the others."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from datetime import UTC, datetime

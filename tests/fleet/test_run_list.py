@@ -1,7 +1,5 @@
 """Which recordings the words of a fleet lead to, here and in an object store."""
 
-from __future__ import annotations
-
 import socket
 from pathlib import Path
 from typing import Any

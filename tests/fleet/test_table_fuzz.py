@@ -3,8 +3,6 @@
 What damage does to the bytes of Parquet is seen by its checksums; what somebody else writes has none that are wrong.
 """
 
-from __future__ import annotations
-
 import copy
 import random
 import subprocess

@@ -1,7 +1,5 @@
 """A limit of time and memory for one case: a hostile file fails its test, and not the machine."""
 
-from __future__ import annotations
-
 import re
 import resource
 import signal

@@ -1,7 +1,5 @@
 """Bytes of a file as a bad disk or cable leaves them."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable, Sequence
 

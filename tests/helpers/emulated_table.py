@@ -1,7 +1,5 @@
 """A driven bench with its controller on a socket, whose time passes in a thread."""
 
-from __future__ import annotations
-
 import threading
 import time
 from pathlib import Path

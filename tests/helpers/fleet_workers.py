@@ -1,7 +1,5 @@
 """Workers of the command fleet that are threads of this process, which start at once, and what they evaluate."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager

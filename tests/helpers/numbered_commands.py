@@ -1,7 +1,5 @@
 """Commands whose numbers are stored: what they print with ``--json``, and the files that they write."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable, Mapping

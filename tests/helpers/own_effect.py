@@ -1,7 +1,5 @@
 """A file of a user's own effect, as docs have it: ten lines."""
 
-from __future__ import annotations
-
 TEN_LINES = """
 from kf_calib.effects import SensorEffect
 

@@ -1,7 +1,5 @@
 """Streams to record, and recordings read back whole."""
 
-from __future__ import annotations
-
 import json
 import sqlite3
 from collections.abc import Callable, Mapping, Sequence

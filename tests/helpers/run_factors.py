@@ -1,7 +1,5 @@
 """Reduced factors of runs with random columns, whose readings are noise and a given effect."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Files of arrays: which dataset is read, what of it, and that damaged and hostile ones are refused in a sentence."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path

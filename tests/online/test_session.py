@@ -1,7 +1,5 @@
 """A run evaluated while it goes on: what replay gives, to the bit; nobody who looks on can hold it up."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import os

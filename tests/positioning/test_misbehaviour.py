@@ -1,7 +1,5 @@
 """A controller that lies in every way: what is told of it is true, and no table is said to stand that may move."""
 
-from __future__ import annotations
-
 import json
 import os
 import stat

@@ -1,7 +1,5 @@
 """Positioners over a socket, by commands and by hand; profiles; the lock."""
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """kf-calib run: a rehearsal on the emulated bench, its lines, its recording, and how it ends where anything fails."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """The coefficients of a data sheet are those of a sensor that nobody here simulates, within their sigmas."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path

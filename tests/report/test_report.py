@@ -1,7 +1,5 @@
 """The report as its reader has it: in a browser, light, dark and printed, without the network, whatever is in it."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Iterator

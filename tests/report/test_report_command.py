@@ -1,7 +1,5 @@
 """The command report and the option --report: the files they write, what they print, and what they refuse."""
 
-from __future__ import annotations
-
 import re
 import sys
 from pathlib import Path

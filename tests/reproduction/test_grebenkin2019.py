@@ -1,7 +1,5 @@
 """The paper's experiment: its matrices against finite differences, its Table 2 against runs and closed form."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

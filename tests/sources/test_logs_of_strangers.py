@@ -1,7 +1,5 @@
 """Logs as other programs write them: with what stands beside the readings, without an option but gravity."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from typing import Any

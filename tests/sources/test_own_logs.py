@@ -1,7 +1,5 @@
 """Logs and tables as others write them: ``info`` proposes a command that works, and gives what the recording gives."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import random

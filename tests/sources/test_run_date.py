@@ -1,7 +1,5 @@
 """The date of a run: as stated, by its stamps, or by the computer that received them; never that of its evaluation."""
 
-from __future__ import annotations
-
 import time
 from datetime import UTC, datetime, timedelta
 from pathlib import Path

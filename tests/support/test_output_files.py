@@ -1,7 +1,5 @@
 """Nothing of the user's is harmed: what a command may write, when it does, and what it says where it cannot."""
 
-from __future__ import annotations
-
 import errno
 import json
 import multiprocessing

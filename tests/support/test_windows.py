@@ -4,8 +4,6 @@ Its locks are those of a file's bytes, no open file can be renamed or removed, k
 consoles have code pages without the signs of this field.
 """
 
-from __future__ import annotations
-
 import ctypes
 import importlib
 import io

@@ -1,7 +1,5 @@
 """Power that goes: a share of the cuts of tools/power_cuts.py, and the order in which result files reach the disk."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Every slow test has its turn within a round of commits, whatever the commits' hashes are."""
 
-from __future__ import annotations
-
 import itertools
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """The page of a live run: it shows what the terminal shows, and no browser disturbs the run or is led astray."""
 
-from __future__ import annotations
-
 import json
 import re
 import signal

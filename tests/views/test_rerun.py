@@ -1,7 +1,5 @@
 """The Rerun view: what is in the file equals the calibration, and the file opens as a picture with something in it."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections import defaultdict

@@ -1,7 +1,5 @@
 """A folder is a recording as a file is; what is none says what to do with it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

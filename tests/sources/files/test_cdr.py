@@ -1,7 +1,5 @@
 """CDR layouts against the official encoder, and what a decoder refuses."""
 
-from __future__ import annotations
-
 import struct
 from types import SimpleNamespace as Message
 

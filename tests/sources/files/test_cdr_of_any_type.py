@@ -1,7 +1,5 @@
 """Messages in CDR of types that nobody knows are read by their definition in the file."""
 
-from __future__ import annotations
-
 import sqlite3
 import struct
 from contextlib import closing

@@ -1,7 +1,5 @@
 """JSON and protobuf messages give the streams that the same samples recorded here give."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Mapping

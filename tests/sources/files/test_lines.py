@@ -1,7 +1,5 @@
 """JSON and CSV lines: what goes in comes out, to the nanosecond; what is broken is counted and never stops the rest."""
 
-from __future__ import annotations
-
 import io
 import json
 import math

@@ -1,7 +1,5 @@
 """Reading recordings: our own, others', unfinished, damaged and impossible ones."""
 
-from __future__ import annotations
-
 import random
 import struct
 import subprocess

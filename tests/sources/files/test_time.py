@@ -1,7 +1,5 @@
 """Stamps that were never filled, messages out of order, clocks that go back, and rows without a time."""
 
-from __future__ import annotations
-
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Live sources: every sample that came is recorded, handed on and replayed the same; what was lost is counted."""
 
-from __future__ import annotations
-
 import json
 import os
 import random

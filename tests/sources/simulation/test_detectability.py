@@ -1,7 +1,5 @@
 """Sizes of hidden effects in sigma, against generalised least squares written out sample by sample."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

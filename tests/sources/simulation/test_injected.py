@@ -1,7 +1,5 @@
 """Hidden effects of the simulator against closed forms on poses with known numbers."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Options of ``simulate`` that say what is hidden and how warm it is."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

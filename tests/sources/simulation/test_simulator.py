@@ -1,7 +1,5 @@
 """The simulator against closed forms and against the statistics its noise is stated to have."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

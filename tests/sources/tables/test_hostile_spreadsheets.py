@@ -1,7 +1,5 @@
 """Excel files that no program writes: nothing is lost in silence, and none takes long, fills the memory or crashes."""
 
-from __future__ import annotations
-
 import io
 import random
 import zipfile

@@ -1,7 +1,5 @@
 """Tables of orientations: the same numbers as the recording they are made of, however they are written."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 from pathlib import Path

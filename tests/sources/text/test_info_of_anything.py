@@ -1,7 +1,5 @@
 """``info`` on logs and tables in any layout, unit and encoding: the command that it proposes works, and is right."""
 
-from __future__ import annotations
-
 import gzip
 import itertools
 import random

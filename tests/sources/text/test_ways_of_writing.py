@@ -1,7 +1,5 @@
 """One log and one table, written in every usual way: both are read, and alike."""
 
-from __future__ import annotations
-
 import gzip
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Files that name no column, or each cell, and tables that hold of each axis its own reading alone."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
