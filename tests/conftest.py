@@ -1,7 +1,5 @@
 """Paths and fixtures shared by the tests."""
 
-from __future__ import annotations
-
 import functools
 import gc
 import math
@@ -11,8 +9,10 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+from helpers.browser import chromium
 from helpers.slow_share import Share, SlowShare
 from hypothesis import settings
 
@@ -22,8 +22,9 @@ os.environ.pop("PYTHONUNBUFFERED", None)  # streams keep what they are to write,
 os.environ["COLUMNS"] = ""
 del os.environ["COLUMNS"]  # readline sets it behind Python's back, and a child would print tables that narrow
 
+from helpers.command_line import CommandLine
+
 import kf_calib.views.diagnosis  # noqa: F401 (with it results print themselves, as with the public names)
-from kf_calib.cli import main
 
 settings.register_profile("fixed", derandomize=True)  # what is tried is the same on every machine, every day
 settings.load_profile("fixed")
@@ -130,15 +131,13 @@ def unmeasured(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(engine_comparison, "_peak_mb", lambda run: 1.0)
 
 
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+@pytest.fixture(scope="session")
+def run() -> CommandLine:
     """The command line: exit code, what it prints, what it prints to the error stream."""
+    return CommandLine()
 
-    def call(*words: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["kf-calib", *map(str, words)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        out, err = capsys.readouterr()
-        return int(ended.value.code or 0), out, err
 
-    return call
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as opened:
+        yield opened

@@ -1,12 +1,9 @@
 """The documentation as a reader has it: it builds, its links lead somewhere, a browser shows it without the network."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -14,7 +11,6 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 import reference_pages
-from helpers.browser import chromium
 from helpers.long_runs import slow
 
 import kf_calib
@@ -97,12 +93,6 @@ def test_equations_are_mathml_without_a_command_of_tex_left_over(site: Path) -> 
         equations = re.findall(r"<math\b.*?</math>", path.read_text(), re.DOTALL)
         assert len(equations) > 50 or path.stem != "filter"
         assert [each for each in equations if "\\" in each] == [], path.name
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as opened:
-        yield opened
 
 
 @pytest.mark.parametrize("pages", ["filter index search", *slow("*")])

@@ -1,7 +1,5 @@
 """The numbers of the program are those that are stored: a change of any of them is meant, or is found here."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The keys of every command's JSON are those of docs/json.md: none is missing there, none is made up."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What is published: metadata, licences, the tutorial's recordings, and the wheel without the checkout."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import re

@@ -1,7 +1,5 @@
 """The numbers that are stored come out on processors that round otherwise: without the widest instructions, or old."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """What a script may write: paths for open recordings, one effect by its name; and sentences for what cannot be."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

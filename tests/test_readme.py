@@ -1,7 +1,5 @@
 """What the README and the pages of docs print is what their commands give."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re

@@ -1,7 +1,5 @@
 """What the program can say stands on one page that a person reads: a sentence that changes changes the page, too."""
 
-from __future__ import annotations
-
 import sys
 
 from helpers.paths import ROOT

@@ -1,7 +1,5 @@
 """Bags that no recorder writes: reading them ends soon, in bounded memory, and uses what is sound in them."""
 
-from __future__ import annotations
-
 import random
 import sqlite3
 from contextlib import closing
@@ -11,7 +9,7 @@ import pytest
 import zstandard
 from helpers.bounded import bounded
 from helpers.long_runs import slow
-from helpers.recordings import ACCEL, ANGLES, BATCH, BENCH, HEAT, assert_equal, read, write_db3
+from helpers.recordings import ACCEL, ANGLES, BATCH, BENCH, HEAT, altered, assert_equal, read, write_db3
 
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.sources.files.fields import paths_of
@@ -25,12 +23,8 @@ ENDLESS = ("SELECT n AS id, 1 AS topic_id, n AS timestamp, zeroblob(100) AS data
 HUGE = "SELECT 1 AS id, 1 AS topic_id, 1 AS timestamp, zeroblob(900000000) AS data"
 
 
-def altered(path: Path, *statements: str) -> Path:
-    write_db3(path)
-    with closing(sqlite3.connect(path, isolation_level=None)) as base:
-        for statement in statements:
-            base.execute(statement)
-    return path
+def changed(path: Path, *statements: str) -> Path:
+    return altered(write_db3(path), *statements)
 
 
 def refused(path: Path) -> str:
@@ -43,25 +37,25 @@ def refused(path: Path) -> str:
 
 @pytest.mark.parametrize("view", [ENDLESS, HUGE])
 def test_a_view_is_no_table(view: str, tmp_path: Path) -> None:
-    path = altered(tmp_path / "a.db3", "DROP TABLE messages", f"CREATE VIEW messages AS {view}")
+    path = changed(tmp_path / "a.db3", "DROP TABLE messages", f"CREATE VIEW messages AS {view}")
     assert "its messages are no table but computed" in refused(path)
 
 
 def test_computed_columns_are_no_messages(tmp_path: Path) -> None:
     columns = "id INTEGER PRIMARY KEY, topic_id INT, timestamp INT, data BLOB GENERATED ALWAYS AS (zeroblob(900000000))"
-    path = altered(tmp_path / "a.db3", "DROP TABLE messages", f"CREATE TABLE messages({columns})",
+    path = changed(tmp_path / "a.db3", "DROP TABLE messages", f"CREATE TABLE messages({columns})",
                    "INSERT INTO messages(topic_id, timestamp) VALUES (1, 1), (1, 2)")  # fmt: skip
     assert "its table messages has columns that are computed" in refused(path)
 
 
 def test_a_virtual_table_is_none(tmp_path: Path) -> None:
-    path = altered(tmp_path / "a.db3", "DROP TABLE messages",
+    path = changed(tmp_path / "a.db3", "DROP TABLE messages",
                    "CREATE VIRTUAL TABLE messages USING fts5(id, topic_id, timestamp, data)")  # fmt: skip
     assert "its messages are no table but computed" in refused(path)
 
 
 def test_a_trigger_is_never_run(tmp_path: Path) -> None:
-    path = altered(tmp_path / "a.db3", "CREATE TRIGGER t AFTER INSERT ON messages BEGIN DELETE FROM messages; END",
+    path = changed(tmp_path / "a.db3", "CREATE TRIGGER t AFTER INSERT ON messages BEGIN DELETE FROM messages; END",
                    "CREATE VIEW other AS " + ENDLESS)  # fmt: skip
     with bounded():
         assert_equal(read(Recording(path, KEYS)), BATCH)
@@ -69,7 +63,7 @@ def test_a_trigger_is_never_run(tmp_path: Path) -> None:
 
 def test_numbers_up_to_the_last_that_there_is(tmp_path: Path) -> None:
     """Rows that cannot be read around 2^63 - 1: the loop over numbers has to end."""
-    path = altered(
+    path = changed(
         tmp_path / "a.db3", f"UPDATE messages SET id = {2**63 - 1} WHERE id = (SELECT max(id) FROM messages)"
     )
     content = bytearray(path.read_bytes())
@@ -84,7 +78,7 @@ def test_numbers_up_to_the_last_that_there_is(tmp_path: Path) -> None:
 
 
 def test_negative_numbers_are_read_as_they_are_counted(tmp_path: Path) -> None:
-    path = altered(tmp_path / "a.db3", "UPDATE messages SET id = id - 1000000")
+    path = changed(tmp_path / "a.db3", "UPDATE messages SET id = id - 1000000")
     assert_equal(read(Recording(path, KEYS)), BATCH)
     assert sum(topic.count for topic in inventory_of(path).topics) == sum(map(len, (ACCEL[3], ANGLES[3], HEAT[3])))
 
@@ -117,7 +111,7 @@ def test_what_is_unfit_is_left_out_and_counted(tmp_path: Path) -> None:
 
 
 def test_one_message_that_is_too_long_costs_itself_alone(tmp_path: Path) -> None:
-    path = altered(tmp_path / "a.db3", "UPDATE messages SET data = zeroblob(3000000) WHERE id = "
+    path = changed(tmp_path / "a.db3", "UPDATE messages SET data = zeroblob(3000000) WHERE id = "
                    "(SELECT id FROM messages WHERE topic_id = 1 LIMIT 1 OFFSET 100)")  # fmt: skip
     recording = Recording(path, KEYS, max_chunk_mb=2.0)
     kept = read(recording)

@@ -1,14 +1,25 @@
 """Bags in SQLite hold what the same samples recorded as MCAP do, compressed or not, in one file or several."""
 
-from __future__ import annotations
-
 import sqlite3
 from contextlib import closing
 from pathlib import Path
 
 import pytest
 import zstandard
-from helpers.recordings import ACCEL, ANGLES, BATCH, BENCH, HEAT, Topic, assert_equal, read, record, write_db3
+from helpers.recordings import (
+    ACCEL,
+    ANGLES,
+    BATCH,
+    BENCH,
+    HEAT,
+    Topic,
+    altered,
+    assert_equal,
+    part_of,
+    read,
+    record,
+    write_db3,
+)
 
 from kf_calib.bench.streams import Stream
 from kf_calib.sources.files.recording import Recording
@@ -28,19 +39,6 @@ def pack_file(path: Path) -> Path:
     return packed
 
 
-def part(topic: Topic, k: int, share: int) -> Topic:
-    name, kind, template, stream = topic
-    own = slice(len(stream) * k // share, len(stream) * (k + 1) // share)
-    return name, kind, template, Stream(stream.time_ns[own], stream.values[own])
-
-
-def altered(path: Path, *statements: str) -> Path:
-    with closing(sqlite3.connect(path)) as base, base:
-        for statement in statements:
-            base.execute(statement)
-    return path
-
-
 def test_streams_are_those_of_the_recorder(tmp_path: Path) -> None:
     expected = read(Recording(record(tmp_path / "run.mcap", BATCH)))
     found = Recording(write_db3(tmp_path / "run.db3"), KEYS)
@@ -57,7 +55,7 @@ def test_messages_compressed_one_by_one(tmp_path: Path) -> None:
 @pytest.mark.parametrize("packed", [True, False])
 def test_files_of_one_run_follow_each_other(tmp_path: Path, packed: bool, with_metadata: bool) -> None:
     bag = tmp_path / "bag"
-    files = [write_db3(bag / f"bag_{n}.db3", tuple(part(topic, k, 3) for topic in (ACCEL, ANGLES, HEAT)))
+    files = [write_db3(bag / f"bag_{n}.db3", tuple(part_of(topic, k, 3) for topic in (ACCEL, ANGLES, HEAT)))
              for k, n in enumerate((0, 2, 10))]  # fmt: skip
     if packed:
         files = [pack_file(file) for file in files]

@@ -1,7 +1,5 @@
 """Choices that do not depend on how a processor rounds."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kf_calib.bench.arrays import first_least, sign

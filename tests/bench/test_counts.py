@@ -1,9 +1,5 @@
 """Numbers of converters without a sign, or about another code than 0: told by the data, and read with one option."""
 
-from __future__ import annotations
-
-import json
-import shlex
 from pathlib import Path
 from typing import Any
 
@@ -82,24 +78,16 @@ def table(path: Path, numbers: np.ndarray, names: str) -> None:
     path.write_text(f"face,{names}\n" + "\n".join(rows) + "\n")
 
 
-def proposed(run: Any, path: Path) -> list[str]:
-    code, out, _ = run("info", path, "--gravity", G, "--json")
-    assert code == 0
-    return shlex.split(json.loads(out)["command"])[1:]
-
-
 def test_what_info_proposes_for_a_log_without_a_sign_works(run: Any, tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
     directions = np.concatenate([FACES, EDGES])
     log(path, 256.0 * in_g(directions))
-    command = proposed(run, path)
+    _, command = run.proposed(path, "--gravity", G)
     assert "unsigned16" in command and "0.00390625" in command
-    code, out, _ = run(*command, "--json")
-    assert code == 0
-    found = {each["symbol"]: each["value"] for each in json.loads(out)["parameters"]}
-    assert [found[f"K{k}"] for k in (1, 2, 3)] == pytest.approx(K.tolist(), abs=3e-3)
-    code, _, err = run("replay", path, "--gravity", G, "--no-angles", "--accel-unit", "g", "--accel-scale", 1 / 256)
-    assert code == 2 and "add --counts unsigned16" in err
+    found = run.parameters(*command)
+    assert [found[f"K{k}"]["value"] for k in (1, 2, 3)] == pytest.approx(K.tolist(), abs=3e-3)
+    err = run.refused("replay", path, "--gravity", G, "--no-angles", "--accel-unit", "g", "--accel-scale", 1 / 256)
+    assert "add --counts unsigned16" in err
 
 
 def test_a_recording_without_a_sign_is_told_by_its_dwells() -> None:
@@ -119,11 +107,8 @@ def test_what_info_proposes_for_a_table_without_a_sign_works(
 ) -> None:
     path = tmp_path / "table.csv"
     table(path, numbers, names)
-    command = proposed(run, path)
+    _, command = run.proposed(path, "--gravity", G)
     assert option in " ".join(command)
-    code, out, err = run(*command, "--json")
-    assert code == 0, err
-    found = {each["symbol"]: each["value"] for each in json.loads(out)["parameters"]}
-    assert [found[f"K{k}"] for k in (1, 2, 3)] == pytest.approx(K.tolist(), abs=0.03)
-    code, _, err = run("replay", path, "--gravity", G, "--accel-unit", "g")
-    assert code == 2 and f"add --counts {option}" in err
+    found = run.parameters(*command)
+    assert [found[f"K{k}"]["value"] for k in (1, 2, 3)] == pytest.approx(K.tolist(), abs=0.03)
+    assert f"add --counts {option}" in run.refused("replay", path, "--gravity", G, "--accel-unit", "g")

@@ -1,7 +1,5 @@
 """What ``--target`` of live and plan says."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """The nine parameters that no choice of a frame changes, their covariance, and a check of the budget by drawing."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The uncertainty budget: sensitivities against recalibrations, degrees of freedom in closed form."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The report of an error that was not foreseen: what a maintainer needs, and nothing of the user's data."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import tempfile
@@ -35,9 +33,9 @@ def test_the_sentence_names_a_report_that_holds_none_of_the_data(
 ) -> None:
     (temporary := tmp_path / "temporary").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))
-    code, _, err = run("replay", failing, "--with=second-order", "--gravity", "9.81")
+    err = run.refused("replay", failing, "--with=second-order", "--gravity", "9.81")
     (report,) = temporary.iterdir()
-    assert code == 2 and f"{report}, which holds none of your data" in err and err.count("\n") == 1
+    assert f"{report}, which holds none of your data" in err
     text = report.read_text(encoding="utf-8")
     assert SECRET not in text and str(tmp_path) not in text and str(Path.home()) not in text
     assert "command: replay · --with --gravity ·\n" in text and "\nKeyError\n" in text and "\nValueError\n" in text

@@ -1,17 +1,14 @@
 """``info`` says what is in a file, what it lacks, and a command that then works."""
 
-from __future__ import annotations
-
-import json
 import shlex
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from helpers.paths import ROOT
-from helpers.recordings import ACCEL, ANGLES, BATCH, START_NS, read, record, write_db3, write_officially
-from mcap.writer import Writer
+from helpers.recordings import ACCEL, ANGLES, BATCH, START_NS, read, record, write_db3, write_messages, write_officially
 
 from kf_calib.bench.bench import Bench
 from kf_calib.sources.files.inventory import Topic
@@ -24,13 +21,7 @@ REAL = Path("/work/shared/recordings/ferraris_hand.mcap")
 @pytest.fixture
 def facts(run: Any) -> Any:
     """The object that ``info --json`` prints."""
-
-    def told(*words: object) -> dict[str, Any]:
-        code, out, err = run("info", *words, "--json")
-        assert (code, err) == (0, ""), err
-        return json.loads(out)
-
-    return told
+    return partial(run.json, "info")
 
 
 def test_a_recording(facts: Any, run: Any) -> None:
@@ -42,8 +33,7 @@ def test_a_recording(facts: Any, run: Any) -> None:
     first = found["topics"][0]
     assert (first["first_ns"], first["last_ns"]) == (whole.accel.time_ns[0], whole.accel.time_ns[-1])
     assert first["rate_hz"] == pytest.approx(50) and first["gaps"] == 0
-    code, out, _ = run("replay", FACES, "--json")
-    assert code == 0 and len(found["dwells"]) == json.loads(out)["dwells"] == 6
+    assert len(found["dwells"]) == run.json("replay", FACES)["dwells"] == 6
     assert [round(angle, 3) for angle in found["dwells"][1]["pose"]] == [0.0, -1.571, 0.0]
     assert found["missing"] == [] and found["command"] == f"kf-calib replay {FACES}"
     assert found["bench"]["gravity_mps2"] == "9.81"
@@ -61,10 +51,8 @@ def test_the_command_of_a_bag_that_lacks_its_bench_works(facts: Any, run: Any, t
     assert [text.partition(":")[0] for text in found["missing"]] == ["the gimbal axes, outer to inner", "local gravity"]
     assert found["command"] == f'kf-calib replay "{bag}" --angle-sigma 0.2 --axes "y z x" --gravity 9.81'
     words = shlex.split(found["command"])[1:]
-    code, out, err = run(*words, "--json")
-    assert code == 0, err
     again = facts(*words[1:])
-    assert again["missing"] == [] and len(again["dwells"]) == json.loads(out)["dwells"] == 6
+    assert again["missing"] == [] and len(again["dwells"]) == run.json(*words)["dwells"] == 6
 
 
 def test_lines(facts: Any, run: Any, tmp_path: Path) -> None:
@@ -79,23 +67,16 @@ def test_lines(facts: Any, run: Any, tmp_path: Path) -> None:
                                                                                 ("platform angles", 1200)]  # fmt: skip
     assert len(found["missing"]) == 2 and "--column when_s=time_s" in found["command"]
     assert [round(dwell["norm_mps2"], 3) for dwell in found["dwells"]] == [9.807] * 6
-    code, out, err = run(*shlex.split(found["command"])[1:], "--json")
-    assert code == 0, err
-    assert json.loads(out)["samples"] > 1000
+    assert run.json(*shlex.split(found["command"])[1:])["samples"] > 1000
     assert len(facts(table, "--column", "when_s=time_s", "--axes", "y z x", "--gravity", "9.81")["dwells"]) == 6
 
 
+STAMPS = [{"header": {"stamp": {"sec": 1, "nanosec": k * 10**7}}} for k in range(20)]
+
+
 def test_what_messages_in_json_have(facts: Any, tmp_path: Path) -> None:
-    path = tmp_path / "json.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        channel = writer.register_channel("/imu", "json", 0)
-        for k in range(20):
-            writer.add_message(
-                channel, k * 10**7, json.dumps({"t": k / 100, "acc": {"x": 0}, "l": [{"v": 1}]}).encode(), 0
-            )
-        writer.finish()
+    messages = [{"t": k / 100, "acc": {"x": 0}, "l": [{"v": 1}]} for k in range(20)]
+    path = write_messages(tmp_path / "json.mcap", {"/imu": messages})
     found = facts(path)
     assert found["topics"][0]["fields"] == ["t", "acc.x", "l.v"]
     assert len(found["missing"]) == 3 and "has no accelerometer topic" in found["missing"][0]
@@ -110,17 +91,10 @@ def test_a_quaternion_in_messages_is_proposed_as_attitude(
     facts: Any, tmp_path: Path, stamped: bool, proposed: str
 ) -> None:
     """As of the pose of a robot's tool; axes of gimbals are not asked for then."""
-    path = tmp_path / "json.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        imu, tool = (writer.register_channel(topic, "json", 0) for topic in ("/imu", "/tool"))
-        for k in range(20):
-            at = {"header": {"stamp": {"sec": 1, "nanosec": k * 10**7}}} if stamped else {}
-            turned = {"position": {"x": 0, "y": 0, "z": 0}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}
-            writer.add_message(imu, k * 10**7, json.dumps(at | {"acc": [0, 0, 9.81]}).encode(), 0)
-            writer.add_message(tool, k * 10**7, json.dumps(at | {"pose": turned}).encode(), 0)
-        writer.finish()
+    turned = {"position": {"x": 0, "y": 0, "z": 0}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}
+    at = STAMPS if stamped else [{}] * 20
+    topics = {"/imu": [own | {"acc": [0, 0, 9.81]} for own in at], "/tool": [own | {"pose": turned} for own in at]}
+    path = write_messages(tmp_path / "json.mcap", topics)
     found = facts(path, "--field", "accel=/imu:acc")
     assert found["command"].endswith(f"--field attitude={proposed} --gravity 9.81")
     assert not any("axes" in each for each in found["missing"])
@@ -128,18 +102,9 @@ def test_a_quaternion_in_messages_is_proposed_as_attitude(
 
 def test_the_orientation_in_an_imu_is_not_proposed(facts: Any, tmp_path: Path) -> None:
     """It is what that sensor makes of the readings that are to be calibrated."""
-    path = tmp_path / "json.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        schema = writer.register_schema("sensor_msgs/msg/Imu", "jsonschema", b"")
-        imu = writer.register_channel("/imu", "json", schema)
-        for k in range(20):
-            message = {"header": {"stamp": {"sec": 1, "nanosec": k * 10**7}},
-                       "orientation": {"x": 0, "y": 0, "z": 0, "w": 1},
-                       "linear_acceleration": {"x": 0, "y": 0, "z": 9.81}}  # fmt: skip
-            writer.add_message(imu, k * 10**7, json.dumps(message).encode(), 0)
-        writer.finish()
+    fields = {"orientation": {"x": 0, "y": 0, "z": 0, "w": 1}, "linear_acceleration": {"x": 0, "y": 0, "z": 9.81}}
+    topics = {"/imu": [own | fields for own in STAMPS]}
+    path = write_messages(tmp_path / "json.mcap", topics, schema="sensor_msgs/msg/Imu")
     command = facts(path)["command"]
     assert "--field" not in command and command.endswith("--no-angles")
 
@@ -186,8 +151,7 @@ def test_damage_is_told_beside_what_is_there(facts: Any, tmp_path: Path) -> None
 def test_what_cannot_be_read_is_one_sentence(run: Any, tmp_path: Path, content: bytes, says: str) -> None:
     path = tmp_path / "broken"
     path.write_bytes(content)
-    code, out, err = run("info", path)
-    assert (code, out) == (2, "") and says in err and err.count("\n") == 1
+    assert says in run.refused("info", path)
 
 
 def test_a_calibration_says_what_it_holds(facts: Any, run: Any, tmp_path: Path) -> None:
@@ -198,13 +162,11 @@ def test_a_calibration_says_what_it_holds(facts: Any, run: Any, tmp_path: Path) 
     assert "It takes readings in m/s^2" in said and "Model and measurements agree" in said and "1.02273" in said
     told = facts(saved)
     assert told["kind"] == "calibration" and len(told["parameters"]) == 12
-    code, _, refused = run("replay", saved)
-    assert code == 2 and "is a calibration, not a recording" in refused
+    assert "is a calibration, not a recording" in run.refused("replay", saved)
 
 
 def test_a_file_that_is_not_there(run: Any, tmp_path: Path) -> None:
-    code, _, err = run("info", tmp_path / "none.mcap")
-    assert code == 2 and "does not exist" in err
+    assert "does not exist" in run.refused("info", tmp_path / "none.mcap")
 
 
 @pytest.mark.skipif(not REAL.exists(), reason="the real recordings are not on this machine")

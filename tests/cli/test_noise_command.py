@@ -1,8 +1,5 @@
 """``kf-calib noise``: what it prints and writes, and its way into other programs' files."""
 
-from __future__ import annotations
-
-import json
 from pathlib import Path
 from typing import Any
 
@@ -34,9 +31,7 @@ def rest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_rest_of_a_minute_has_its_noise(run: Any, rest: Path) -> None:
-    code, out, err = run("noise", rest, "--json")
-    assert (code, err) == (0, "")
-    found = json.loads(out)
+    found = run.json("noise", rest)
     assert found["readings"] == 6000 and found["rate_hz"] == pytest.approx(100.0) and len(found["channels"]) == 3
     for channel in found["channels"]:
         assert channel["white_mps2_per_sqrt_hz"] == pytest.approx(1e-3, rel=0.05)
@@ -55,9 +50,8 @@ def test_it_prints_a_table_and_says_what_was_left_out(run: Any, rest: Path) -> N
 
 @pytest.mark.parametrize(("unit", "size"), [("rad/s", 1.0), ("deg/s", np.radians(1.0))])
 def test_gyroscopes_and_thermometer_are_taken_along(run: Any, rest: Path, unit: str, size: float) -> None:
-    code, out, err = run("noise", rest, "--gyro", "wx,wy,wz", "--gyro-unit", unit, "--temperature", "--json")
-    assert code == 0, err
-    channels = {channel["channel"]: channel for channel in json.loads(out)["channels"]}
+    found = run.json("noise", rest, "--gyro", "wx,wy,wz", "--gyro-unit", unit, "--temperature")
+    channels = {channel["channel"]: channel for channel in found["channels"]}
     assert len(channels) == 7
     assert channels["gyroscope y"]["white_radps_per_sqrt_hz"] == pytest.approx(1e-3 * size, rel=0.05)
     assert channels["temperature"]["white_k_per_sqrt_hz"] == pytest.approx(1e-3, rel=0.05)
@@ -69,8 +63,7 @@ def test_gyroscopes_and_thermometer_are_taken_along(run: Any, rest: Path, unit: 
     [("wx,wy", "three names"), ("a", "three names"), ("wx,wy,w", "no column 'w'"), ("wx,wy,wz,wx", "three")],
 )
 def test_gyroscopes_that_are_not_there_are_refused(run: Any, rest: Path, gyro: str, said: str) -> None:
-    code, _, err = run("noise", rest, "--gyro", gyro)
-    assert code == 2 and said in err
+    assert said in run.refused("noise", rest, "--gyro", gyro)
 
 
 def imu_bag(path: Path) -> Path:
@@ -95,29 +88,24 @@ def imu_bag(path: Path) -> Path:
 def test_gyroscopes_of_a_bag_are_named_by_their_paths(run: Any, tmp_path: Path) -> None:
     bag = imu_bag(tmp_path / "imu.mcap")
     paths = "/imu:angular_velocity.x,angular_velocity.y,angular_velocity.z"
-    code, out, err = run("noise", bag, "--gyro", paths, "--json")
-    assert code == 0, err
-    channels = json.loads(out)["channels"]
+    channels = run.json("noise", bag, "--gyro", paths)["channels"]
     assert channels[0]["white_mps2_per_sqrt_hz"] == pytest.approx(1e-3, rel=0.05)
     assert channels[3]["white_radps_per_sqrt_hz"] == pytest.approx(1e-4, rel=0.05)
-    code, _, err = run("noise", bag, "--gyro", "wx,wy,wz")
-    assert code == 2 and "names no topic" in err
+    assert "names no topic" in run.refused("noise", bag, "--gyro", "wx,wy,wz")
 
 
 def test_what_is_saved_goes_into_other_programs(run: Any, rest: Path) -> None:
     assert run("noise", rest, "--gyro", "wx,wy,wz", "--save", "noise.json")[0] == 0
     assert run("noise", rest, "--save", "noise.json")[0] == 2  # it is there already
-    code, out, err = run("export", "noise.json", "--to", "kalibr", "-o", "imu.yaml", "--json")
-    assert code == 0, err
+    printed = run.json("export", "noise.json", "--to", "kalibr", "-o", "imu.yaml")
     content = yaml.safe_load(Path("imu.yaml").read_text())
     assert content["accelerometer_noise_density"] == pytest.approx(1e-3, rel=0.05)
-    printed = json.loads(out)
     assert printed["keys"]["gyroscope_noise_density"] == pytest.approx(content["gyroscope_noise_density"], rel=1e-6)
     assert "accelerometer_random_walk" in printed["limits"]
     code, out, _ = run("export", "noise.json", "--to", "robot_localization", "-o", "covariance.yaml")
     assert code == 0 and "is the noise for robot_localization" in out
-    code, _, err = run("export", "noise.json", "--to", "ardupilot", "-o", "a.param")
-    assert code == 2 and "takes no noise" in err and not Path("a.param").exists()
+    err = run.refused("export", "noise.json", "--to", "ardupilot", "-o", "a.param")
+    assert "takes no noise" in err and not Path("a.param").exists()
 
 
 @pytest.mark.parametrize("to", ["kalibr", "openvins", "px4"])
@@ -139,14 +127,12 @@ def test_a_calibration_takes_the_noise_into_its_file(run: Any, rest: Path, to: s
 
 def test_noise_where_none_can_be_is_refused(run: Any, rest: Path) -> None:
     assert run("noise", rest, "--save", "noise.json")[0] == 0
-    code, _, err = run("export", "noise.json", "--noise", "noise.json", "--to", "px4", "-o", "x")
-    assert code == 2 and "noise already" in err
+    assert "noise already" in run.refused("export", "noise.json", "--noise", "noise.json", "--to", "px4", "-o", "x")
     recording = ROOT / "recordings" / "mems_faces.mcap"
     kf_calib.save_calibration(kf_calib.calibrate(recording), "cal.json", recording)
-    code, _, err = run("export", "cal.json", "--to", "robot_localization", "-o", "x")
-    assert code == 2 and "--noise" in err
-    code, _, err = run("export", "cal.json", "--noise", "noise.json", "--to", "csv", "-o", "x")
-    assert code == 2 and "takes no noise" in err and not Path("x").exists()
+    assert "--noise" in run.refused("export", "cal.json", "--to", "robot_localization", "-o", "x")
+    err = run.refused("export", "cal.json", "--noise", "noise.json", "--to", "csv", "-o", "x")
+    assert "takes no noise" in err and not Path("x").exists()
     code, _, _ = run("export", "cal.json", "--noise", "noise.json", "--to", "robot_localization", "-o", "x")
     assert code == 0 and "linear_acceleration_covariance" in Path("x").read_text()
 

@@ -1,7 +1,5 @@
 """What a person who waits is told: that work goes on, how far it is where that is known, and nothing in a pipe."""
 
-from __future__ import annotations
-
 import io
 import re
 import time
@@ -9,7 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 from helpers.long_runs import slow
 from helpers.synthetic import Run
 
@@ -106,16 +103,16 @@ def test_a_share_is_shown_where_it_is_known_and_else_what_is_done(terminal) -> N
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recording(run, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("progress") / "run.mcap"
     words = "--hide second-order=40sigma --orientations 9 --dwell-s 4 --slew-degps 180"
-    assert CliRunner().invoke(cli, ["simulate", str(out), *words.split()]).exit_code == 0
+    assert run("simulate", out, *words.split())[0] == 0
     return out
 
 
-def test_a_terminal_sees_what_a_command_does(run, terminal, recording: Path) -> None:
+def test_a_terminal_sees_what_a_command_does(terminal, recording: Path) -> None:
     terminal()
-    assert run("diagnose", recording)[0] == 0
+    cli.main(["diagnose", str(recording)], standalone_mode=False)
     texts = {text for _, text in terminal()}
     assert len(texts) > 2 and all(text.startswith("diagnosing run.mcap") for text in texts)
     assert any("refitting with" in text or "scanning" in text for text in texts)

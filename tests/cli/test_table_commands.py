@@ -1,8 +1,5 @@
 """Tables of orientations on the command line."""
 
-from __future__ import annotations
-
-import json
 import re
 from pathlib import Path
 
@@ -27,31 +24,21 @@ FACES = "face,A,B,C\n+x,1,0,0\n-x,-1,0,0.001\n+y,0,1.002,0\n-y,0,-1,0.001\n+z,0.
 
 @pytest.mark.parametrize("command", [("replay",), ("diagnose",), *slow((("improve",),), (("compare",),))])
 def test_a_table_goes_where_a_recording_goes(command: tuple[str, ...], run) -> None:
-    code, out, err = run(*command, *OPTIONS, "--json")
-    assert (code, err) == (0, "")
-    assert (
-        sum("1 g = 9.80665 m/s^2" in warning for warning in json.loads(out).get("warnings", ["1 g = 9.80665 m/s^2"]))
-        == 1
-    )
+    said = run.json(*command, *OPTIONS).get("warnings", ["1 g = 9.80665 m/s^2"])
+    assert sum("1 g = 9.80665 m/s^2" in warning for warning in said) == 1
 
 
 def test_a_plan_goes_on_from_a_table(run) -> None:
-    code, out, err = run("plan", "--recording", *OPTIONS, "--json")
-    assert (code, err) == (0, "") and json.loads(out)["gimbal_deg"]
+    assert run.json("plan", "--recording", *OPTIONS)["gimbal_deg"]
 
 
 def test_columns_and_g_are_settled_by_options(run, tmp_path: Path) -> None:
     path = tmp_path / "faces.csv"
     path.write_text(FACES)
-    columns = ("--column", "A=ay_g", "--column", "B=ax_g", "--column", "C=az_g")
-    code, out, _ = run("replay", path, "--gravity", "9.81", "--g-unit", "local", "--json", *columns)
-    assert code == 2 and out == ""  # x and y exchanged are no calibration of this bench
-    columns = ("--column", "A=ax_g", "--column", "B=ay_g", "--column", "C=az_g")
-    code, out, _ = run("replay", path, "--gravity", "9.81", "--g-unit", "local", "--json", *columns)
-    assert code == 0
-    found = json.loads(out)
-    (value,) = [each["value"] for each in found["parameters"] if each["symbol"] == "K1"]
-    assert value == pytest.approx(1.0, abs=1e-5)
+    words = ("replay", path, "--gravity", "9.81", "--g-unit", "local", "--column", "C=az_g")
+    run.refused(*words, "--column", "A=ay_g", "--column", "B=ax_g")  # x and y exchanged
+    found = run.json(*words, "--column", "A=ax_g", "--column", "B=ay_g")
+    assert found["parameters"][2]["value"] == pytest.approx(1.0, abs=1e-5)
     assert found["consistency"]["p_value"] is None
     assert any("1 g = 9.81 m/s^2" in warning for warning in found["warnings"])
 
@@ -65,13 +52,8 @@ def test_samples_in_a_spreadsheet_are_to_be_saved_as_csv(run, tmp_path: Path) ->
     book.save(tmp_path / "log.xlsx")
     for command in (("replay", tmp_path / "log.xlsx", "--axes", "y z x", "--gravity", "9.81"),
                     ("info", tmp_path / "log.xlsx")):  # fmt: skip
-        code, out, err = run(*command)
-        assert (code, out) == (2, "") and "are samples, 0.01 s apart" in err and "in a CSV file" in err
-
-
-def test_a_recording_has_no_columns(run) -> None:
-    code, _, err = run("replay", ROOT / "recordings" / "hidden.mcap", "--column", "a=ax_g")
-    assert code == 2 and "is no table (.csv, .xlsx)" in err
+        err = run.refused(*command)
+        assert "are samples, 0.01 s apart" in err and "in a CSV file" in err
 
 
 OF_SAMPLES = [("--settle-s", "1"), ("--still-deg", "1"), ("--no-gate",), ("--gate-sigma", "5"), ("--accel-topic", "/a"),
@@ -81,14 +63,8 @@ OF_SAMPLES = [("--settle-s", "1"), ("--still-deg", "1"), ("--no-gate",), ("--gat
 
 @pytest.mark.parametrize("option", OF_SAMPLES, ids=lambda option: option[0])
 def test_options_of_samples_are_refused_for_a_table(option: tuple[str, ...], run) -> None:
-    code, out, err = run("replay", *OPTIONS, *option)
-    assert (code, out) == (2, "")
+    err = run.refused("replay", *OPTIONS, *option)
     assert f"is a table of mean readings, on which {option[0]} has nothing to act: leave it out." in err
-
-
-def test_what_1_g_is_does_not_act_on_a_recording(run) -> None:
-    code, _, err = run("replay", RECORDINGS / "hidden.mcap", "--g-unit", "local")
-    assert code == 2 and "is no table (.csv, .xlsx) and no log in lines of text, on which --g-unit has nothing" in err
 
 
 @pytest.mark.parametrize(
@@ -99,36 +75,35 @@ def test_what_1_g_is_does_not_act_on_a_recording(run) -> None:
         (("replay", *OPTIONS, "--angle-unit", "rad"), "'außen [°]' is in deg by its name, and --angle-unit is rad"),
         (("replay", "faces.csv", "--gravity", "9.81", "--angle-unit", "rad"), "has no gimbal angles, so leave out"),
         (("replay", *OPTIONS, "--with", "vibration-rectification"), "needs the readings themselves"),
+        (("replay", RECORDINGS / "hidden.mcap", "--column", "a=ax_g"), "is no table (.csv, .xlsx)"),
+        (
+            ("replay", RECORDINGS / "hidden.mcap", "--g-unit", "local"),
+            "is no table (.csv, .xlsx) and no log in lines of text, on which --g-unit has nothing",
+        ),
     ],
 )
 def test_what_a_table_cannot_do_is_told(words: tuple[object, ...], says: str, run, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("faces.csv").write_text(FACES.replace("A,B,C", "ax,ay,az"))
-    code, out, err = run(*words)
-    assert (code, out) == (2, "") and says in err and err.count("\n") == 1
+    assert says in run.refused(*words)
 
 
 def test_means_without_sigma_are_compared_planned_from_and_verified(run, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("faces.csv").write_text(FACES.replace("A,B,C", "ax,ay,az"))
     own = ("faces.csv", "--gravity", "9.81")
-    code, out, err = run("compare", *own, "--json")
-    assert (code, err) == (0, "") and json.loads(out)["max_difference_sigma"] < 1e-5
-    code, out, err = run("plan", "--recording", *own, "--axes", "y z x", "--json")
-    planned = json.loads(out)
-    assert (code, err) == (0, "") and planned["duration_s"] > 30.0
+    assert run.json("compare", *own)["max_difference_sigma"] < 1e-5
+    planned = run.json("plan", "--recording", *own, "--axes", "y z x")
+    assert planned["duration_s"] > 30.0
     assert all(planned["sigma"][name] < before for name, before in planned["sigma_before"].items())
     assert run("replay", *own, "--save", "cal.json")[0] == 0
-    code, out, err = run("verify", "cal.json", *own, "--json")
-    assert (code, err) == (0, "") and json.loads(out)["holds"]
+    assert run.json("verify", "cal.json", *own)["holds"]
 
 
 def test_info_of_a_table_says_what_was_taken_for_what(run, tmp_path: Path) -> None:
     path = tmp_path / "gaps.csv"
     path.write_text(GAPS)
-    code, out, err = run("info", path, "--json")
-    found = json.loads(out)
-    assert (code, err) == (0, "")
+    found, command = run.proposed(path)
     told = {own["header"]: (own["meaning"], own["unit"], own["told_by"]) for own in found["columns"]}
     assert told == {"Lage": ("face", "", "name"), "Kanal A": ("ax", "mg", "content and size"),
                     "Kanal B": ("ay", "mg", "content and size"), "Kanal C": ("az", "mg", "content and size"),
@@ -137,8 +112,7 @@ def test_info_of_a_table_says_what_was_taken_for_what(run, tmp_path: Path) -> No
     assert [row["temperature_c"] for row in found["dwells"]] == pytest.approx([24.1, 24.3, 24.5, 24.4, 24.5, 24.6])
     assert [said.partition(":")[0] for said in found["missing"]] == ["local gravity"]
     assert any("has no temperature in rows 3, 6: it is interpolated in time" in said for said in found["warnings"])
-    code, out, err = run(*found["command"].split()[1:], "--json")
-    assert (code, err) == (0, "") and json.loads(out)["dwells"] == 6
+    assert run.json(*command)["dwells"] == 6
     path.write_text(GAPS.replace("999", "foo"))
     code, out, _ = run("info", path)
     assert code == 0 and "Missing: " in out and "row 6, column 'Kanal C' is 'foo'" in " ".join(out.split())
@@ -155,9 +129,9 @@ def test_a_reversed_channel_of_the_table_of_the_docs_is_told_by_the_option_that_
         rows[k] = ",".join(cells)
     path = tmp_path / "faces.csv"
     path.write_text("\n".join([header, *rows]))
-    code, out, err = run("replay", path, "--gravity", "9.81")
     order = ",".join(str(-k if k == channel else k) for k in (1, 2, 3))
-    assert (code, out) == (2, "") and err.endswith(f"channel {channel} reversed? Try --channels {order}.\n")
+    said = run.refused("replay", path, "--gravity", "9.81")
+    assert said.endswith(f"channel {channel} reversed? Try --channels {order}.\n")
     assert run("replay", path, "--gravity", "9.81", "--channels", order, "--save", tmp_path / "cal.json")[0] == 0
     saved = kf_calib.open_calibration(tmp_path / "cal.json")
     assert saved.bench.input == RawInput.from_metadata({"channels": order, "accel_unit": "g"})
@@ -168,14 +142,10 @@ def test_counts_get_a_size_to_try(run, tmp_path: Path) -> None:
     path = tmp_path / "counts.csv"
     path.write_text("face,raw_x,raw_y,raw_z\n+x,16420,30,-20\n-x,-16350,20,10\n+y,20,16400,20\n-y,30,-16330,10\n"
                     "+z,15,25,16390\n-z,25,20,-16360\n")  # fmt: skip
-    _, out, _ = run("info", path, "--gravity", "9.81", "--json")
-    found = json.loads(out)
+    found, command = run.proposed(path, "--gravity", "9.81")
     (missing,) = found["missing"]
     assert "so they are counts: give the size of one by --accel-scale" in missing
-    code, out, err = run(*found["command"].split()[1:], "--json")
-    assert (code, err) == (0, "")
-    (value,) = [each["value"] for each in json.loads(out)["parameters"] if each["symbol"] == "K1"]
-    assert value == pytest.approx(1.0, abs=0.01)
+    assert run.parameters(*command)["K1"]["value"] == pytest.approx(1.0, abs=0.01)
 
 
 @pytest.mark.parametrize("name", ["twelve_poses.csv", "six_faces.xlsx"])
@@ -186,21 +156,18 @@ def test_the_examples_lack_nothing_but_their_bench(name: str, run) -> None:
     assert code == 0 and "Missing: local gravity" in out
     assert f"--gravity:\nkf-calib replay {RECORDINGS / name}" in out and "Then try, with your own" in out
     bench = ("--axes", "y z x", "--gravity", "9.81")
-    code, out, _ = run("info", RECORDINGS / name, *bench, "--json")
-    found = json.loads(out)
+    found = run.json("info", RECORDINGS / name, *bench)
     assert found["missing"] == [] and found["orientation"] == ("face" if name.endswith("xlsx") else "angles")
 
 
 def test_the_spreadsheet_of_a_run_gives_what_the_run_does(run) -> None:
     """All of it was rounded to what a display shows."""
     pytest.importorskip("openpyxl", reason="openpyxl is not there")
-    _, out, _ = run("info", RECORDINGS / "mems_faces.mcap", "--json")
-    bench = json.loads(out)["bench"]
-    _, out, _ = run("replay", RECORDINGS / "mems_faces.mcap", "--json")
+    bench = run.json("info", RECORDINGS / "mems_faces.mcap")["bench"]
     stated = ("--gravity", "9.81", "--angle-sigma", bench["angle_sigma_deg"], "--scatter-sigma",
               bench["scatter_sigma_mps2"])  # fmt: skip
-    code, written, err = run("replay", RECORDINGS / "six_faces.xlsx", *stated, "--json")
-    assert code == 0, err
-    for one, other in zip(json.loads(out)["parameters"], json.loads(written)["parameters"], strict=True):
+    written = run.parameters("replay", RECORDINGS / "six_faces.xlsx", *stated)
+    for symbol, one in run.parameters("replay", RECORDINGS / "mems_faces.mcap").items():
+        other = written[symbol]
         assert abs(one["value"] - other["value"]) < 0.02 * one["sigma"]
         assert other["sigma"] == pytest.approx(one["sigma"], rel=0.01)

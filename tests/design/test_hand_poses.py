@@ -1,8 +1,5 @@
 """Which sides to turn up where there are no angles."""
 
-from __future__ import annotations
-
-import json
 from typing import Any
 
 import numpy as np
@@ -36,9 +33,7 @@ def test_six_faces_come_first_and_nine_poses_and_more_determine_all() -> None:
 
 
 def test_the_command_plans_after_a_run_and_refuses_what_belongs_to_gimbals(run: Any) -> None:
-    code, out, _ = run("plan", "--no-angles", "--recording", RECORDINGS / "mems_faces.mcap", "--json")
-    printed = json.loads(out)
-    assert code == 0 and printed["up"] == ["+x +y +z"] and printed["gimbal_deg"] is None
+    printed = run.json("plan", "--no-angles", "--recording", RECORDINGS / "mems_faces.mcap")
+    assert printed["up"] == ["+x +y +z"] and printed["gimbal_deg"] is None
     assert all(printed["sigma"][symbol] <= printed["sigma_before"][symbol] for symbol in SYMBOLS)
-    code, _, err = run("plan", "--no-angles", "--grid-deg", "5")
-    assert code == 2 and "sides to turn up by hand" in err
+    assert "sides to turn up by hand" in run.refused("plan", "--no-angles", "--grid-deg", "5")

@@ -1,7 +1,5 @@
 """Where to go next: what is predicted of it, against a run that went there."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.hidden_effects import noisy_run as run

@@ -133,7 +133,7 @@ def test_a_formula_that_explains_more_than_a_known_effect_speaks_against_it() ->
     assert found.unknown and shape is not None and shape.formula == "mine = a**5"
 
 
-@pytest.mark.slow  # test_improvement.py adds the same two
+@pytest.mark.slow  # test_stepwise_selection.py adds the same two
 def test_two_effects_at_once_are_both_found() -> None:
     found = diagnose(source("hysteresis=15sigma", "thermal-scale=15sigma"))
     assert set(found.missing) == {"hysteresis", "thermal-scale"}

@@ -37,8 +37,7 @@ def after(state: State, dwell: int) -> np.ndarray:
     return np.where(state.dwell >= dwell, 1.0, 0.0)[:, None]
 
 
-@pytest.mark.parametrize("gimbal, seed", [(1, 1), pytest.param(2, 2, marks=pytest.mark.slow),
-                                          pytest.param(2, 3, marks=pytest.mark.slow)])  # fmt: skip
+@pytest.mark.parametrize("gimbal, seed", [(1, 1), *slow((2, 2), (2, 3))])
 def test_play_of_a_gimbal_is_no_error_of_its_encoder(gimbal: int, seed: int) -> None:
     """In a random order the sense of the last move goes with the angle, as an encoder's scale would."""
     play = 2.0 * WITHIN_RAD
@@ -58,9 +57,13 @@ SLIPS = {
 }
 
 
-@pytest.mark.parametrize("what, bench", [("a jump of the tilt of the base", ROBOT), *(
-    pytest.param(what, BENCH, marks=pytest.mark.slow) for what in SLIPS),
-    pytest.param("a jump of the mounting", ROBOT, marks=pytest.mark.slow)])  # fmt: skip
+@pytest.mark.parametrize(
+    "what, bench",
+    [
+        ("a jump of the tilt of the base", ROBOT),
+        *slow(*((what, BENCH) for what in SLIPS), ("a jump of the mounting", ROBOT)),
+    ],
+)
 def test_a_bump_is_told_with_its_moment(what: str, bench: Bench) -> None:
     """It comes on the way to the tenth orientation; a drift is nine tenths of it. Gimbals, or a robot's attitude."""
     ((where, direction),) = SLIPS[what].items()
@@ -104,7 +107,7 @@ def test_what_no_effect_of_the_catalogue_is_gets_no_name(driver: str) -> None:
     assert diagnosis.likeliest is not None and diagnosis.likeliest.driver == driver
 
 
-@pytest.mark.parametrize("seeds", [(1,), pytest.param(range(2, 8), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seeds", [(1,), *slow(range(2, 8))])
 def test_a_bias_that_toggles_by_chance_has_no_name_but_its_accelerometer(seeds: Sequence[int]) -> None:
     """As by a bad contact. Where scatter was that of all accelerometers, such a run was told as ``magnetic`` with
     98 %."""
@@ -130,14 +133,14 @@ def test_a_scale_factor_that_warms_up_is_no_bias_that_does() -> None:
     assert float(np.sum(np.square(errors))) < 20.0
 
 
-@pytest.mark.parametrize("seeds, most", [((1,), 0), pytest.param(range(1, 61), 4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seeds, most", [((1,), 0), *slow((range(1, 61), 4))])
 def test_a_sound_bench_agrees(seeds: Sequence[int], most: int) -> None:
     """But for 1 run of 100: five or more of sixty have a chance of 1 in 3000."""
     p_values = [assess_candidates(calibrate(IndependentBench(seed)).fit).p_value for seed in seeds]
     assert sum(p_value < 0.01 for p_value in p_values) <= most
 
 
-@pytest.mark.parametrize("seed", [2, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (0, 3, 9, 10, 11))])
+@pytest.mark.parametrize("seed", [2, *slow(0, 3, 9, 10, 11)])
 def test_a_fit_that_runs_away_names_nothing(seed: int) -> None:
     """Beside a drift of the scale factors their warm-up has no time constant: scale factors of thousands left a misfit
     of 1e8, and the pair was named with 99.5 %. Such a fit is refused, if it does not end at a warm-up that is
@@ -161,7 +164,7 @@ def test_a_fit_that_runs_away_names_nothing(seed: int) -> None:
 
 
 @pytest.mark.parametrize("bench", [BENCH, ROBOT])
-@pytest.mark.parametrize("seeds", [(1,), pytest.param(range(2, 22), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seeds", [(1,), *slow(range(2, 22))])
 def test_poses_that_are_read_with_noise(bench: Bench, seeds: Sequence[int]) -> None:
     """Three times what counts as standing still: each dwell is found, and as a setting error the noise is in sigma."""
     for seed in seeds:

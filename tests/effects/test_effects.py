@@ -1,7 +1,5 @@
 """Every effect of the catalogue against a truth that was made without its columns."""
 
-from __future__ import annotations
-
 import ast
 import functools
 from functools import partial
@@ -46,7 +44,7 @@ pytestmark = pytest.mark.usefixtures("unmeasured")
 
 BENCH = Bench(axes_of("yzx"), 9.81, latitude_deg=50.0, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0)
 PLAN = plan_of(30, dwell_s=6.0, seed=4)
-NAMES = [name for name in names(BENCH) if not effect_named(name, BENCH).dynamic]  # tests/test_slews.py has these
+NAMES = [name for name in names(BENCH) if not effect_named(name, BENCH).dynamic]  # tests/diagnosis/test_slew_effects.py
 OWN_TEST = {"memory",
     "vibration-rectification", "dead-zone", "bias-walk", "magnetic", "warm-up", "scale-warm-up", "settling",
     "thermal-lag", "sinusoid", "uneven-flexure",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -59,13 +58,12 @@ def test_commands_take_a_bench_model_and_say_so(run: Any, tmp_path: Path) -> Non
     path = tmp_path / "bench.toml"
     MODEL.write(path)
     assert bench_model.read_bench_model(path) == MODEL
-    code, out, _ = run("replay", RECORDING, "--bench-model", path, "--json")
-    said = json.loads(out)["warnings"]
-    assert code == 0 and any("encoder-harmonic-1:z of the bench is taken from the bench model" in each for each in said)
-    code, out, _ = run("diagnose", RECORDING, "--bench-model", path, "--json")
-    assert code == 0 and json.loads(out)["suspects"][0]["effect"] == "encoder-harmonic-1:z"  # it is not in this run
-    code, _, err = run("replay", RECORDING, "--bench-model", path, "--engine", "filterpy")
-    assert code == 2 and "the filterpy engine takes no bench model (--bench-model): use --engine block." in err
+    said = run.json("replay", RECORDING, "--bench-model", path)["warnings"]
+    assert any("encoder-harmonic-1:z of the bench is taken from the bench model" in each for each in said)
+    suspects = run.json("diagnose", RECORDING, "--bench-model", path)["suspects"]
+    assert suspects[0]["effect"] == "encoder-harmonic-1:z"  # it is not in this run
+    refusal = run.refused("replay", RECORDING, "--bench-model", path, "--engine", "filterpy")
+    assert "the filterpy engine takes no bench model (--bench-model): use --engine block." in refusal
 
 
 @pytest.mark.parametrize(
@@ -88,5 +86,5 @@ def test_what_is_no_bench_model_is_refused_in_words(text: str, said: str, tmp_pa
 def test_a_term_that_the_bench_cannot_have_is_refused(run: Any, tmp_path: Path) -> None:
     path = tmp_path / "bench.toml"
     BenchModel((BenchTerm("flexure", ("dQ",), (1.0,), ((1.0,),)),)).write(path)
-    code, _, err = run("replay", RECORDING, "--bench-model", path)
-    assert code == 2 and "has the term flexure, which has no coefficient dQ: it has dX, dY, dZ." in err
+    refusal = run.refused("replay", RECORDING, "--bench-model", path)
+    assert "has the term flexure, which has no coefficient dQ: it has dX, dY, dZ." in refusal

@@ -19,7 +19,7 @@ from kf_calib.diagnosis.refits import Refits
 from kf_calib.dwells.table import DwellTable
 from kf_calib.errors import BlunderError, InputError, UnobservableError
 from kf_calib.estimation import square_root_information, whitened_rows
-from kf_calib.estimation.calibration import calibrate
+from kf_calib.estimation.calibration import calibrate, evaluate
 from kf_calib.estimation.cross_validation import orientations
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.iterated_fit import fit
@@ -94,7 +94,9 @@ def test_a_setting_error_that_is_estimated_takes_a_degree_of_freedom(
 
 def test_where_nothing_is_left_to_judge_there_is_no_verdict() -> None:
     """Of twelve means and twelve parameters."""
-    found = calibrate(Run(seed=2, dwells=4)).consistency
+    result = calibrate(Run(seed=2, dwells=4))
+    found = result.consistency
+    assert any("too few to test the model" in warning for warning in result.warnings)
     assert (found.dof, found.p_value, found.consistent, found.nis_per_dof) == (0, None, None, None)
     assert found.statistic == pytest.approx(0.0, abs=1e-6)
 
@@ -110,12 +112,9 @@ def test_what_a_run_does_not_determine_is_named() -> None:
 
 def test_held_out_equals_refits_without_the_orientation() -> None:
     run = Run(seed=2, dwells=8)
-    run.accel = Stream(run.accel.time_ns, run.accel.values)
     result = calibrate(run)
     errors = []
     for left_out in range(8):
-        from kf_calib.estimation.calibration import evaluate
-
         kept = result.fit.dwells.take([k for k in range(8) if k != left_out])
         rest = evaluate(kept, replace(run.bench, angle_sigma_deg=0.0, scatter_sigma_mps2=0.0), Settings())
         means = result.visits[left_out].dwell.means
@@ -147,12 +146,6 @@ def test_two_faces_name_the_unseen_and_give_the_rest() -> None:
     assert result.consistency.consistent is None and abs(error[6]) < 5 * result.parameters["K2"].sigma
 
 
-def test_four_orientations_leave_nothing_to_judge_by() -> None:
-    result = calibrate(Run(seed=6, dwells=4))
-    assert result.consistency.consistent is None
-    assert any("too few to test the model" in warning for warning in result.warnings)
-
-
 @pytest.mark.parametrize("unit, factor", [("g", 1 / 9.80665), ("mg", 1e3 / 9.80665)])
 def test_readings_in_g_are_noticed(unit: str, factor: float) -> None:
     run = Run(seed=7, dwells=6)
@@ -172,13 +165,6 @@ def test_wrong_axes_are_noticed() -> None:
     run = Run(seed=8)
     run.bench = replace(run.bench, axes=axes_of("xzy"))
     with pytest.raises(BlunderError, match="gimbal axes are, outer to inner, y z x"):
-        calibrate(run)
-
-
-def test_degrees_taken_for_radians_are_noticed() -> None:
-    run = Run(seed=8)
-    run.pose = replace(run.pose, values=np.degrees(run.pose.values))
-    with pytest.raises(BlunderError, match="--angle-unit deg"):
         calibrate(run)
 
 
@@ -211,11 +197,6 @@ def test_nothing_at_all_is_refused() -> None:
         calibrate(Empty())
 
 
-def test_the_result_prints_itself() -> None:
-    text = str(calibrate(Run(seed=11)))
-    assert "θ1" in text and "ppm" in text and "Model and measurements agree" in text and "\x1b" not in text
-
-
 @pytest.mark.parametrize("reference", ["base", "inertial"])
 def test_an_attitude_in_place_of_angles(reference: str) -> None:
     """A quaternion stream, base-fixed and inertially held."""
@@ -245,6 +226,12 @@ def test_a_dwell_on_one_or_two_messages_of_a_noisy_encoder_is_left_out(seed: int
     assert len(exact.visits) == 24
 
 
+def assert_tells_the_same(rows: np.ndarray, others: np.ndarray) -> None:
+    """Of the states, and of the readings through them."""
+    left, right = rows[:, :-1].T @ rows, others[:, :-1].T @ others
+    np.testing.assert_allclose(left, right, rtol=0, atol=1e-9 * np.abs(right).max())
+
+
 def of_unequal_lengths(dwells: DwellTable) -> DwellTable:
     """The dwells, of two in three their first piece alone."""
     return DwellTable.of([next(dwells.prefixes(k))[0] if k % 3 else dwell for k, dwell in enumerate(dwells)])
@@ -260,8 +247,7 @@ def test_a_dwell_whose_columns_are_constant_tells_its_mean_alone() -> None:
         whole = whitened_rows.whiten(dwells, columns, noise, state, reduced=False)
         for all_rows, rows in zip(whole, whitened_rows.whiten(dwells, columns, noise, state), strict=True):
             assert len(rows) == 3 < len(all_rows)
-            left, right = rows[:, :-1].T @ rows, all_rows[:, :-1].T @ all_rows
-            np.testing.assert_allclose(left, right, rtol=0, atol=1e-9 * np.abs(right).max())
+            assert_tells_the_same(rows, all_rows)
 
 
 def test_a_column_that_changes_from_piece_to_piece_tells_more_than_a_mean() -> None:
@@ -273,8 +259,7 @@ def test_a_column_that_changes_from_piece_to_piece_tells_more_than_a_mean() -> N
     assert len(dwells[3].pieces) > 1
     whole = whitened_rows.whiten(dwells, columns, noise, state, reduced=False)
     for all_rows, rows in zip(whole, whitened_rows.whiten(dwells, columns, noise, state), strict=True):
-        left, right = rows[:, :-1].T @ rows, all_rows[:, :-1].T @ all_rows
-        np.testing.assert_allclose(left, right, rtol=0, atol=1e-9 * np.abs(right).max())
+        assert_tells_the_same(rows, all_rows)
 
 
 def test_dwells_whitened_together_are_those_whitened_alone() -> None:
@@ -292,8 +277,7 @@ def test_dwells_whitened_together_are_those_whitened_alone() -> None:
         few = whitened_rows.whiten(dwells, columns, noise, state)
         for whole, rows in zip(together, few, strict=True):
             assert len(rows) < len(whole)
-            left, right = rows[:, :-1].T @ rows, whole[:, :-1].T @ whole
-            np.testing.assert_allclose(left, right, rtol=0, atol=1e-9 * np.abs(right).max())
+            assert_tells_the_same(rows, whole)
     factors = [square_root_information.accumulate(fitted.rows()[:count])[:-1] for count in (1, 3, 14)]
     around = fitted.linearised.model.nominal_state()
     for factor, (state, covariance, lost) in zip(

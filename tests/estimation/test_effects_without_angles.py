@@ -62,21 +62,26 @@ EFFECTS: dict[str, tuple[float, Callable[[Felt], np.ndarray]]] = {
 """A size of each that is large, SI, and what it adds to the readings per unit of the coefficient."""
 
 
+def fitted(
+    means: np.ndarray, time_s: np.ndarray, celsius: np.ndarray, rng: np.random.Generator, bench: Bench, effect: str
+) -> Calibration:
+    """The calibration, with the effect in the model, of means (D, 3) to which white noise is added."""
+    means = means + rng.normal(size=means.shape) * SIGMA_MPS2
+    sigmas = SIGMA_MPS2 * np.sqrt(COUNT * rng.chisquare(COUNT - 3, means.shape) / (COUNT - 3))
+    unknown = np.tile([0.0, 0.0, 0.0, 1.0], (POSES, 1))
+    table = Orientations(means, unknown, time_s, sigmas, np.full(POSES, COUNT), celsius)
+    with one_blas_thread():
+        return evaluate(dwells_of_table(table, bench), bench, Settings(effects=(effect,)))
+
+
 def walking(seed: int) -> Calibration:
     """A calibration with a warm-up in the model of biases that walk, by 3e-4 m/s^2 from pose to pose."""
     rng = np.random.default_rng([3, seed])
     force = Rotation.random(POSES, rng).apply([0.0, 0.0, G])
     lower = np.eye(3) + np.tril(rng.normal(size=(3, 3)) * 0.01)
     biases = rng.normal(size=3) * 0.1 + np.cumsum(rng.normal(size=(POSES, 3)) * 3e-4, axis=0)
-    means = force @ lower.T + biases + rng.normal(size=(POSES, 3)) * SIGMA_MPS2
-    sigmas = SIGMA_MPS2 * np.sqrt(COUNT * rng.chisquare(COUNT - 3, means.shape) / (COUNT - 3))
-    unknown = np.tile([0.0, 0.0, 0.0, 1.0], (POSES, 1))
-    table = Orientations(
-        means, unknown, 15.0 * np.arange(POSES), sigmas, np.full(POSES, COUNT), np.full(POSES, 25.0)
-    )  # fmt: skip
     bench = replace(BENCH, scatter_sigma_mps2=None)
-    with one_blas_thread():
-        return evaluate(dwells_of_table(table, bench), bench, Settings(effects=("warm-up",)))
+    return fitted(force @ lower.T + biases, 15.0 * np.arange(POSES), np.full(POSES, 25.0), rng, bench, "warm-up")
 
 
 def calibrated(name: str, seed: int) -> tuple[Calibration, np.ndarray]:
@@ -92,13 +97,7 @@ def calibrated(name: str, seed: int) -> tuple[Calibration, np.ndarray]:
     scale, added = EFFECTS[name]
     truth = 0.5 * scale * rng.normal(size=3)
     means = force @ lower.T + rng.normal(size=3) * 0.1 + added(felt) * truth
-    means += rng.normal(size=means.shape) * SIGMA_MPS2
-    white = SIGMA_MPS2 * np.sqrt(COUNT)
-    sigmas = white * np.sqrt(rng.chisquare(COUNT - 3, means.shape) / (COUNT - 3))
-    unknown = np.tile([0.0, 0.0, 0.0, 1.0], (POSES, 1))
-    table = Orientations(means, unknown, time_s, sigmas, np.full(POSES, COUNT), 25.0 + warmth_k)
-    with one_blas_thread():
-        return evaluate(dwells_of_table(table, BENCH), BENCH, Settings(effects=(name,))), truth
+    return fitted(means, time_s, 25.0 + warmth_k, rng, BENCH, name), truth
 
 
 FEW = dict.fromkeys(list(EFFECTS)[::2], 2) | {"second-order": 4, "cross-coupling-po": 4}
@@ -135,7 +134,7 @@ def test_what_is_printed_of_an_effect_is_covered_by_its_sigma(name: str, runs: i
 def test_a_fit_of_what_is_hardly_determined_settles(seed: int) -> None:
     """Forces, noise and the time constant are found in turn: a fit that swings between two places, or creeps, is no
     estimate (the first three swung by 0.4 sigma for as long as they were followed, or were refused)."""
-    fitted = walking(seed).fit
-    sigma = fitted.sigma_of_determined
-    moves = np.abs(fitted.state - fitted.linearised.state)[:12] / np.where(sigma > 0.0, sigma, np.inf)[:12]
+    fit = walking(seed).fit
+    sigma = fit.sigma_of_determined
+    moves = np.abs(fit.state - fit.linearised.state)[:12] / np.where(sigma > 0.0, sigma, np.inf)[:12]
     assert moves.max() < 1e-3, moves

@@ -12,7 +12,6 @@ import kf_calib
 from kf_calib.estimation.calibration import calibrate
 from kf_calib.estimation.dwell_pass import Pass
 from kf_calib.estimation.engine_comparison import compare, least_squares, running_states
-from kf_calib.estimation.estimate import correlation
 from kf_calib.estimation.filter_history import InnovationTests, history_of, innovation_tests, reading_correlation
 from kf_calib.estimation.kalman_filterpy import samples_of
 from kf_calib.estimation.results import Calibration
@@ -46,17 +45,6 @@ def test_a_stated_prior_comes_first() -> None:
     assert history.numbers.tolist() == [0, 1, 2, 3, 4, 5]
     assert np.isfinite(history.sigmas).all() and (np.diff(history.sigmas, axis=0) <= 1e-15).all()
     assert history.shares.sum(axis=0) == pytest.approx(1.0) and (history.shares[0] > 0.0).all()
-
-
-def test_correlations_are_those_of_the_covariance_and_of_coefficients(result: Calibration) -> None:
-    estimate = result.estimate
-    matrix = correlation(estimate)
-    assert np.diag(matrix) == pytest.approx(1.0)
-    twelve = estimate.parameter_covariance / np.outer(estimate.sigma, estimate.sigma)
-    assert matrix[:12, :12] == pytest.approx(twelve, abs=1e-12)
-    effects = estimate.covariance[12:, 12:] / np.outer(estimate.effect_sigma, estimate.effect_sigma)
-    assert matrix[12:, 12:] == pytest.approx(effects, abs=1e-12)
-    assert np.abs(matrix[2, 12]) > 0.5, "K1 and h1 of this plan"
 
 
 def test_innovations_are_those_of_the_filter_and_more_where_readings_are_predicted() -> None:

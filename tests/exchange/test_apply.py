@@ -1,7 +1,5 @@
 """A copy of a recording with corrected readings: the original byte for byte, and one topic more; lines as they come."""
 
-from __future__ import annotations
-
 import io
 import json
 from pathlib import Path
@@ -12,6 +10,7 @@ import numpy as np
 import pytest
 from helpers.calibrations import simulated
 from helpers.paths import ROOT
+from helpers.recordings import read, record
 from helpers.synthetic import G
 from mcap.reader import make_reader
 from mcap.records import DataEnd
@@ -23,7 +22,6 @@ from kf_calib.bench.raw_input import PLAIN
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.exchange.corrected_file import apply_to_file
 from kf_calib.exchange.corrected_lines import CorrectedLines, NormAtRest
-from kf_calib.sources.files.recorder import Recorder
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.simulation.physics import Ambient
 
@@ -33,13 +31,22 @@ TOPIC, RAW = "/accelerometer/calibrated", "/accelerometer"
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """With a calibration, one that needs the temperature, a recording, and a copy of it with corrected readings."""
+    """With a calibration, and one that needs the temperature."""
     folder = tmp_path_factory.mktemp("apply")
     run = kf_calib.calibrate(RECORDING)
     kf_calib.save_calibration(run, folder / "cal.json", RECORDING)
     warm = simulated(0, 20, ambient=Ambient(swing_c=10.0, period_s=40.0))
     kf_calib.save_calibration(kf_calib.calibrate(warm, kf_calib.Settings(effects="thermal-bias")), folder / "warm.json")
     return folder
+
+
+@pytest.fixture(scope="module")
+def copied(folder: Path, run: Any) -> tuple[Path, str]:
+    """The recording with corrected readings beside its own, and what is said of it."""
+    out = folder / "out.mcap"
+    code, said, err = run("apply", folder / "cal.json", RECORDING, "-o", out)
+    assert code == 0 and err == ""
+    return out, said
 
 
 def messages(path: Path, topic: str) -> list[Any]:
@@ -79,47 +86,9 @@ def test_a_window_at_rest_has_eight_readings(folder: Path, count: int, told: boo
     assert bool(at_rest.misfit(PLAIN, final=True)) == told and not at_rest.misfit(PLAIN, final=False)
 
 
-def turned_means(count: int) -> np.ndarray:
-    """Readings at rest (count, 3) in different directions, with a bias of the first channel as large as gravity."""
-    drawn = np.random.default_rng(3).normal(size=(60, 3))
-    unit = drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
-    kept = [0]
-    for k in range(1, 60):
-        if np.all(unit[k] @ unit[kept].T < 0.95):
-            kept.append(k)
-    return G * unit[kept[:count]]
-
-
-def test_another_order_of_channels_is_told_from_six_directions_and_six_sigma(folder: Path) -> None:
-    """Of means that are each uncertain by as much as is said; repeated directions count once."""
-    correction = kf_calib.open_calibration(folder / "cal.json").correction()
-    readings = turned_means(8) @ np.linalg.inv(correction.matrix).T + correction.bias_mps2
-    swapped = readings[:, [1, 0, 2]]
-    norms = np.linalg.norm((swapped - correction.bias_mps2) @ correction.matrix.T, axis=1)
-
-    def said(means: np.ndarray, sigma_mps2: float, final: bool = True) -> str:
-        at_rest = NormAtRest(correction)
-        at_rest.add_means(means, sigma_mps2)
-        return at_rest.misfit(PLAIN, final)
-
-    assert said(swapped, norms.std() / 6.5).partition("--channels ")[2].startswith("2,1,3")
-    assert said(swapped, norms.std() / 5.5) == "" == said(readings, 0.0) == said(swapped, 0.0, final=False)
-    for share, told in ((8.0, True), (4.0, False)):  # of windows of ten readings that scatter so much in all
-        scatter = norms.std() / share * np.sqrt(10.0) / np.sqrt(3.0)
-        noise = np.random.default_rng(1).normal(size=(len(swapped), 10, 3))
-        noise = (noise - noise.mean(axis=1, keepdims=True)) / noise.std(axis=1, keepdims=True, ddof=1)
-        at_rest = NormAtRest(correction)
-        values = (swapped[:, None] + scatter * noise).reshape(-1, 3)
-        at_rest.add(Stream(np.arange(len(values)) * 50_000_000, values))
-        assert bool(at_rest.misfit(PLAIN, final=True)) == told
-    few = np.vstack([swapped[:5], swapped[:5] * 1.0001])
-    assert said(few, 0.0) == "" != said(np.vstack([few, swapped[5:6]]), 0.0)
-
-
-def test_the_original_stays_byte_for_byte_and_one_topic_comes_to_it(folder: Path, run: Any) -> None:
-    out = folder / "out.mcap"
-    code, said, err = run("apply", folder / "cal.json", RECORDING, "-o", out)
-    assert code == 0 and err == "" and TOPIC in said
+def test_the_original_stays_byte_for_byte_and_one_topic_comes_to_it(copied: tuple[Path, str]) -> None:
+    out, said = copied
+    assert TOPIC in said
     with RECORDING.open("rb") as file:
         records, end = StreamReader(file).records, 0
         for record in records:
@@ -145,10 +114,8 @@ def test_the_original_stays_byte_for_byte_and_one_topic_comes_to_it(folder: Path
         assert count_of(out, topic) == count_of(RECORDING, topic) > 0
 
 
-def test_its_messages_are_the_corrected_readings_with_their_covariance(folder: Path, run: Any) -> None:
-    out = folder / "values.mcap"
-    assert run("apply", folder / "cal.json", RECORDING, "-o", out)[0] == 0
-    before, after = messages(out, RAW), messages(out, TOPIC)
+def test_its_messages_are_the_corrected_readings_with_their_covariance(folder: Path, copied: tuple[Path, str]) -> None:
+    before, after = (messages(copied[0], topic) for topic in (RAW, TOPIC))
     raw, found = (
         np.array([(v.x, v.y, v.z) for v in (each.linear_acceleration for each in own)]) for own in (before, after)
     )
@@ -174,12 +141,8 @@ def test_progress_rises_to_the_whole_one_half_copied_and_one_half_corrected(fold
     assert any(share == pytest.approx(0.5, abs=1e-3) for share in told)
 
 
-def test_the_copy_is_evaluated_as_the_original_is(folder: Path, run: Any) -> None:
-    out = folder / "again.mcap"
-    assert run("apply", folder / "cal.json", RECORDING, "-o", out)[0] == 0
-    _, one, _ = run("replay", RECORDING, "--json")
-    _, other, err = run("replay", out, "--accel-topic", RAW, "--json")
-    assert json.loads(one)["parameters"] == json.loads(other)["parameters"], err
+def test_the_copy_is_evaluated_as_the_original_is(copied: tuple[Path, str], run: Any) -> None:
+    assert run.parameters("replay", RECORDING) == run.parameters("replay", copied[0], "--accel-topic", RAW)
 
 
 @pytest.mark.parametrize(
@@ -202,26 +165,23 @@ def test_what_cannot_be_copied_is_refused_in_a_sentence_and_nothing_is_left(
         assert run("apply", folder / "cal.json", RECORDING, "-o", path)[0] == 0
     elif name == "text":
         path.write_text("time_s,ax_g,ay_g,az_g\n" + "".join(f"{k / 100},0,1,0\n" for k in range(100)))
-    code, _, err = run("apply", folder / "cal.json", path, "-o", tmp_path / "out.mcap")
-    assert code == 2 and says in err and err.count("\n") == 1
+    assert says in run.refused("apply", folder / "cal.json", path, "-o", tmp_path / "out.mcap")
     assert [each.name for each in tmp_path.iterdir() if each != path] == []
 
 
 def test_a_recording_without_the_temperature_that_is_needed_is_refused(folder: Path, run: Any, tmp_path: Path) -> None:
     source = simulated(3, 2)
-    with Recorder(tmp_path / "cold.mcap", source.bench) as recorder:
-        for batch in source:
-            recorder.write(Batch(batch.accel, batch.pose))
-    code, _, err = run("apply", folder / "warm.json", tmp_path / "cold.mcap", "-o", tmp_path / "out.mcap")
-    assert code == 2 and "has no temperature, which the calibration needs" in err
+    whole, cold = read(source), tmp_path / "cold.mcap"
+    record(cold, Batch(whole.accel, whole.pose), source.bench)
+    err = run.refused("apply", folder / "warm.json", cold, "-o", tmp_path / "out.mcap")
+    assert "has no temperature, which the calibration needs" in err
     assert not (tmp_path / "out.mcap").exists()
 
 
 def test_the_output_is_none_of_the_inputs(folder: Path, run: Any) -> None:
     before = (folder / "cal.json").read_bytes()
     for words in ((RECORDING, "-o", RECORDING), (RECORDING, "-o", folder / "cal.json")):
-        code, _, err = run("apply", folder / "cal.json", *words, "--overwrite")
-        assert code == 2 and "is read by this very command" in err
+        assert "is read by this very command" in run.refused("apply", folder / "cal.json", *words, "--overwrite")
     assert (folder / "cal.json").read_bytes() == before
 
 
@@ -286,14 +246,14 @@ def test_standard_input_without_readings_is_refused_in_a_sentence(
     text: str, says: str, folder: Path, run: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sys.stdin", SimpleNamespace(buffer=io.BytesIO(text.encode())))
-    code, _, err = run("apply", folder / "cal.json", "-")
-    assert code == 2 and err.startswith("kf-calib: standard input: ") and says in err and err.count("\n") == 1
+    err = run.refused("apply", folder / "cal.json", "-")
+    assert err.startswith("kf-calib: standard input: ") and says in err
 
 
 def test_standard_input_and_a_copy_exclude_each_other(folder: Path, run: Any) -> None:
     for words in (("-", "-o", "x.mcap"), ("-", "--json"), (RECORDING,)):
-        code, _, err = run("apply", folder / "cal.json", *words)
-        assert code == 2 and ("leave out" in err or "name it by -o OUT" in err)
+        err = run.refused("apply", folder / "cal.json", *words)
+        assert "leave out" in err or "name it by -o OUT" in err
 
 
 def test_all_other_bytes_stay_as_they_are(folder: Path) -> None:

@@ -1,28 +1,23 @@
 """A calibration file holds all of a calibration, and refuses what is none in one sentence."""
 
-from __future__ import annotations
-
 import copy
-import io
 import json
 import math
 import re
-import sys
 from collections.abc import Callable
-from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from helpers.calibrations import SENSORS, simulated, warming_up
+from helpers.command_line import CommandLine
 from helpers.paths import ROOT
 
 import kf_calib
 from kf_calib import effects
 from kf_calib.bench import paper_parameters
 from kf_calib.bench.bench import Bench
-from kf_calib.cli import main
 from kf_calib.errors import InputError
 from kf_calib.exchange import calibration_file
 from kf_calib.sources.simulation.sensors import TrueNoise
@@ -120,30 +115,22 @@ def test_the_model_option_reads_its_effects(run: kf_calib.Calibration, tmp_path:
     assert calibration_file.read_model(tmp_path / "named.toml").effects == ("second-order", "warm-up", "mine = fx*fy")
 
 
-def test_programs_are_run_only_where_allowed(tmp_path: Path) -> None:
+def test_programs_are_run_only_where_allowed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     own, cal, recording = tmp_path / "my.py", tmp_path / "cal.json", ROOT / "recordings" / "navigation_24.mcap"
     own.write_text(OWN)
-    code, _, err = _called(tmp_path, "replay", recording, "--with", "my-cube", "--effects-from", own, "--save", cal)
+    monkeypatch.chdir(tmp_path)
+
+    def called(*words: object) -> tuple[int, str, str]:
+        """Where no effect of a user's is known yet."""
+        monkeypatch.setattr(effects, "_registered", {})
+        return CommandLine()(*words)
+
+    code, _, err = called("replay", recording, "--with", "my-cube", "--effects-from", own, "--save", cal)
     assert code == 0, err
     for words in (["replay", recording, "--model", cal], ["verify", cal, recording]):
-        code, _, err = _called(tmp_path, *words)
+        code, _, err = called(*words)
         assert code == 2 and "would run the Python file" in err and err.count("\n") == 1
-        assert _called(tmp_path, *words, "--trust")[0] == 0
-        assert _called(tmp_path, *words, "--effects-from", own)[0] == 0
-
-
-def _called(folder: Path, *words: object) -> tuple[int, str, str]:
-    """The command line in a folder, where no effect of a user's is known yet."""
-    out, err = io.StringIO(), io.StringIO()
-    with (
-        pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err),
-        pytest.raises(SystemExit) as ended,
-    ):  # fmt: skip
-        patch.setattr(effects, "_registered", {})
-        patch.setattr(sys, "argv", ["kf-calib", *map(str, words)])
-        patch.chdir(folder)
-        main()
-    return int(ended.value.code or 0), out.getvalue(), err.getvalue()
+        assert called(*words, "--trust")[0] == called(*words, "--effects-from", own)[0] == 0
 
 
 def put(*path: str | int, value: object) -> Callable[[dict[str, Any]], None]:

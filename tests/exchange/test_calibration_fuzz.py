@@ -3,8 +3,6 @@
 Whatever a mutation changes, no number that is printed may differ from the one that is applied.
 """
 
-from __future__ import annotations
-
 import copy
 import csv
 import json

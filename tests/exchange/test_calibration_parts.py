@@ -1,7 +1,5 @@
 """By how much the numbers of a calibration file may differ from each other before it is refused."""
 
-from __future__ import annotations
-
 import copy
 import json
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """What a calibration without angles is good for once it is saved."""
 
-from __future__ import annotations
-
 import re
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Copies of tables with corrected readings, and temperatures of readings that are corrected batch by batch."""
 
-from __future__ import annotations
-
 import csv
 import gzip
 from pathlib import Path

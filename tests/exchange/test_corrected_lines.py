@@ -1,7 +1,5 @@
 """When readings that are corrected line by line are told not to be what they are taken for."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Corrected readings are the specific force that was, within the sigma that is given."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

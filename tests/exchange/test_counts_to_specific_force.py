@@ -3,8 +3,6 @@
 Accelerometers 1, 2, 3 are wired to channels 3, 2 reversed, and 1. A count is 3.9 ug (of standard gravity).
 """
 
-from __future__ import annotations
-
 import json
 import re
 import socket

@@ -1,7 +1,5 @@
 """Level, drift and the date of the next calibration are as sure as they are said to be."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The file of noise and its keys in other programs."""
 
-from __future__ import annotations
-
 import json
 from functools import cache
 from pathlib import Path

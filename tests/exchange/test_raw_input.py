@@ -1,13 +1,10 @@
 """From what a device sends to corrected readings: three devices, every way in and every way out."""
 
-from __future__ import annotations
-
 import csv
 import io
 import itertools
 import json
 import re
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,6 +18,7 @@ from exports.test_c_header import compiled_only, compiled_together
 from exports.test_exports import READERS, ROUNDING
 from helpers.altered import short_run
 from helpers.long_runs import slow
+from helpers.recordings import record
 from helpers.stated_sensors import correction, samples, saved
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
@@ -31,7 +29,6 @@ from kf_calib.bench.raw_input import UNITS, RawInput, merged_metadata
 from kf_calib.bench.streams import Batch, Stream
 from kf_calib.errors import BenchError
 from kf_calib.exports import exported
-from kf_calib.sources.files.recorder import Recorder
 
 ORDERS = [
     tuple(sign * place for sign, place in zip(signs, places, strict=True))
@@ -173,26 +170,9 @@ def device(request: Any, tmp_path_factory: pytest.TempPathFactory, run: Any) -> 
     return taken
 
 
-@pytest.fixture(scope="module")
-def run() -> Any:
-    """The command line, as it is called."""
-    from contextlib import redirect_stderr, redirect_stdout
-
-    from kf_calib.cli import main
-
-    def called(*words: Any) -> tuple[int, str, str]:
-        out, err = io.StringIO(), io.StringIO()
-        with redirect_stdout(out), redirect_stderr(err):
-            try:
-                with pytest.MonkeyPatch.context() as patch:
-                    patch.setattr("sys.argv", ["kf-calib", *map(str, words)])
-                    main()
-                code: Any = 0
-            except SystemExit as end:
-                code = end.code
-        return int(code or 0), out.getvalue(), err.getvalue()
-
-    return called
+def without_keys(path: Path, accel: Stream) -> Path:
+    """Readings as a driver records them, which says nothing of the bench."""
+    return record(path, Batch(accel, Stream.empty(4)), Bench((), 9.81, angles=False))
 
 
 def forces_in_csv(text: str) -> np.ndarray:
@@ -224,14 +204,8 @@ def test_every_way_in_gives_the_same_specific_force(
         line.split(",")[0] for line in lines.read_text().splitlines()
     ]
 
-    buffer = io.BytesIO()
     monkeypatch.setattr("sys.stdin", SimpleNamespace(buffer=io.BytesIO(lines.read_bytes())))
-    monkeypatch.setattr(sys, "stdout", SimpleNamespace(buffer=buffer, isatty=lambda: False, flush=lambda: None))
-    from kf_calib.cli.exchange import apply
-
-    apply.main([str(cal), "-"], standalone_mode=False)
-    monkeypatch.undo()
-    assert buffer.getvalue() == (tmp_path / "lines.csv").read_bytes()
+    assert run("apply", cal, "-")[1] == text
 
     key = {"g": "accel_g", "m/s2": "accel_mps2"}[device.input.unit]
     pairs = zip(device.time_ns.tolist(), device.raw.tolist(), strict=True)
@@ -241,16 +215,14 @@ def test_every_way_in_gives_the_same_specific_force(
     found = np.array([json.loads(line)[key] for line in (tmp_path / "out.jsonl").read_text().splitlines()])
     np.testing.assert_allclose(found * UNITS[device.input.unit], expected, **close)
 
-    with Recorder(tmp_path / "raw.mcap", Bench((), 9.81, angles=False)) as recorder:  # as a driver writes it: no keys
-        recorder.write(Batch(Stream(device.time_ns, device.raw.astype(float)), Stream.empty(4)))
+    without_keys(tmp_path / "raw.mcap", Stream(device.time_ns, device.raw.astype(float)))
     for recording in (tmp_path / "raw.mcap", folder / "run.mcap"):
         out = tmp_path / f"out_{recording.name}"
         code, _, err = run("apply", cal, recording, "-o", out)
         assert code == 0, err
         with out.open("rb") as file:
-            every = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages(
-                ["/accelerometer/calibrated"]
-            )
+            reader = make_reader(file, decoder_factories=[DecoderFactory()])
+            every = reader.iter_decoded_messages(["/accelerometer/calibrated"])
             found = np.array([[v.x, v.y, v.z] for v in (each.decoded_message.linear_acceleration for each in every)])
         np.testing.assert_allclose(found, expected, **close)
 
@@ -283,9 +255,9 @@ def test_an_option_that_contradicts_what_is_stored_is_refused(device: Taken, run
     for words in (("replay", folder / "run.mcap"), ("apply", cal, folder / "run.mcap", "-o", tmp_path / "o.mcap"),
                   ("apply", cal, folder / "lines.csv", "-o", tmp_path / "o.csv"),
                   ("verify", cal, folder / "run.mcap")):  # fmt: skip
-        code, _, err = run(*words, "--channels", "1,2,-3")
-        assert code == 2 and f"1,2,-3, and the {'calibration' if 'lines' in str(words) else 'recording'}" in err
-        assert f"states {device.input.order}" in err and "--restate-input" in err and err.count("\n") == 1
+        err = run.refused(*words, "--channels", "1,2,-3")
+        assert f"1,2,-3, and the {'calibration' if 'lines' in str(words) else 'recording'}" in err
+        assert f"states {device.input.order}" in err and "--restate-input" in err
     assert run("replay", folder / "run.mcap", *device.options)[0] == 0  # to repeat it does no harm
 
 
@@ -294,22 +266,18 @@ def test_what_was_stated_wrongly_can_be_restated(device: Taken, run: Any, tmp_pa
     folder = device.calibration.parent
     words = ("record", tmp_path / "wrong.mcap", folder / "lines.csv", "--axes", "y z x", "--gravity", "9.81", *wrong)
     assert run(*words)[0] == 0
-    code, _, err = run("replay", tmp_path / "wrong.mcap")
-    assert code == 2 and f"--channels {device.input.order}" in err
-    _, one, err = run("replay", tmp_path / "wrong.mcap", "--channels", device.input.order, "--restate-input", "--json")
-    _, other, _ = run("replay", folder / "run.mcap", "--json")
-    for mine, theirs in zip(json.loads(one)["parameters"], json.loads(other)["parameters"], strict=True):
-        assert mine["value"] == pytest.approx(theirs["value"], rel=1e-9, abs=1e-10)
+    assert f"--channels {device.input.order}" in run.refused("replay", tmp_path / "wrong.mcap")
+    found = run.parameters("replay", tmp_path / "wrong.mcap", "--channels", device.input.order, "--restate-input")
+    for symbol, expected in run.parameters("replay", folder / "run.mcap").items():
+        assert found[symbol]["value"] == pytest.approx(expected["value"], rel=1e-9, abs=1e-10)
 
 
 def test_readings_of_another_unit_are_refused_with_the_likely_cause(device: Taken, run: Any, tmp_path: Path) -> None:
     factor = 1e3 if device.input.sizes == RawInput().sizes else 1e-3
-    with Recorder(tmp_path / "other.mcap", Bench((), 9.81, angles=False)) as recorder:
-        recorder.write(Batch(Stream(device.time_ns, factor * device.raw), Stream.empty(4)))
-    code, _, err = run("apply", device.calibration, tmp_path / "other.mcap", "-o", tmp_path / "out.mcap")
-    assert code == 2 and "have a norm of" in err and "--accel-" in err and err.count("\n") == 1
-    assert not (tmp_path / "out.mcap").exists()
-    assert run("apply", device.calibration, tmp_path / "other.mcap", "-o", tmp_path / "o.mcap", "--unchecked")[0] == 0
+    other, out = without_keys(tmp_path / "other.mcap", Stream(device.time_ns, factor * device.raw)), tmp_path / "o.mcap"
+    err = run.refused("apply", device.calibration, other, "-o", out)
+    assert "have a norm of" in err and "--accel-" in err and not out.exists()
+    assert run("apply", device.calibration, other, "-o", out, "--unchecked")[0] == 0
 
 
 @pytest.mark.parametrize("sent", [RawInput(), RawInput(unit="g"), RawInput((2, -1, 3), (1e-4,) * 3)], ids=str)
@@ -318,17 +286,15 @@ def test_another_order_of_channels_shows_in_the_norm_at_rest(sent: RawInput, run
     source = short_run(count=16, dwell_s=2.0, seed=4, grade="mems")
     readings = Stream.joined([batch.accel for batch in source])
     pose = Stream.joined([batch.pose for batch in source])
-    with Recorder(tmp_path / "run.mcap", source.bench) as recorder:
-        recorder.write(Batch(Stream(readings.time_ns, sent.raw(readings.values)), pose))
+    raw = Stream(readings.time_ns, sent.raw(readings.values))
+    record(tmp_path / "run.mcap", Batch(raw, pose), source.bench)
     stated = [] if sent.is_plain else ["--channels", sent.order, "--accel-scale", sent.scale, "--accel-unit", sent.unit]
     code, _, err = run("replay", tmp_path / "run.mcap", *stated, "--save", tmp_path / "cal.json")
     assert code == 0, err
     orders = ((True, (1, -2, 3)), (True, (2, 1, 3)), (False, sent.channels))
     for refused, channels in orders:
         path, copy = tmp_path / f"{channels}.mcap", tmp_path / f"o{channels}.mcap"
-        with Recorder(path, Bench((), 9.81, angles=False)) as recorder:
-            raw = replace(sent, channels=channels).raw(readings.values)
-            recorder.write(Batch(Stream(readings.time_ns, raw), Stream.empty(4)))
+        without_keys(path, Stream(readings.time_ns, replace(sent, channels=channels).raw(readings.values)))
         code, _, err = run("apply", tmp_path / "cal.json", path, "-o", copy)
         assert code == (2 if refused else 0), err
         if refused:

@@ -1,7 +1,5 @@
 """An old calibration is said not to hold no more often than agreed, and what has moved is named."""
 
-from __future__ import annotations
-
 from collections import Counter
 from functools import cache
 
@@ -193,12 +191,3 @@ def test_a_calibration_that_determined_too_little_predicts_nothing() -> None:
     assert own.state.undetermined
     with pytest.raises(UnobservableError, match=r"did not determine .*: verify one that did"):
         verification.refuse_incomplete(own)
-
-
-def test_directions_are_spread_evenly() -> None:
-    """None is farther from the nearest than one and a half radii of a disc that is the share of one."""
-    lattice = verification._sphere(500)
-    np.testing.assert_allclose(np.linalg.norm(lattice, axis=1), 1.0)
-    anywhere = np.random.default_rng(1).normal(size=(20000, 3))
-    nearest = (anywhere / np.linalg.norm(anywhere, axis=1, keepdims=True)) @ lattice.T
-    assert np.arccos(nearest.max(axis=1)).max() < 1.5 * np.arccos(1.0 - 2.0 / 500)

@@ -1,7 +1,5 @@
 """The function in C, compiled and compared with the correction in Python."""
 
-from __future__ import annotations
-
 import ctypes
 import re
 import shutil
@@ -50,14 +48,8 @@ def compiled_together(texts: Sequence[str], folder: Path) -> list[Formula]:
         ]  # fmt: skip
     (folder / "shim.c").write_text("\n".join([*shim, ""]))
     flags = ["-std=c99", "-O2", "-ffp-contract=off", "-Wall", "-Wextra", "-Werror", "-pedantic", "-shared", "-fPIC"]
-    words = [
-        str(COMPILER),
-        *flags,
-        "shim.c",
-        "-o",
-        "shim.so",
-        *(["-lm"] if any("math.h" in text for text in texts) else []),
-    ]
+    libraries = ["-lm"] if any("math.h" in text for text in texts) else []
+    words = [str(COMPILER), *flags, "shim.c", "-o", "shim.so", *libraries]
     done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     library = ctypes.CDLL(str(folder / "shim.so"))

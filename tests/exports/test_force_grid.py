@@ -1,7 +1,5 @@
 """Means over the grid on which the error of an export is judged, against means in closed form."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.integrate import quad

@@ -3,8 +3,6 @@
 Which units have an effect is enumerated: all subsets of five units, each with the covariance of all readings.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.drawn_fleets import Plan, drawn_fleet
+from helpers.run_factors import columns_of, readings_of_run
 from scipy.special import logsumexp
 
 from kf_calib.effects import Bearer, described
@@ -110,12 +109,8 @@ def readings_of(seed: int, affected: int, *known: str, their_mean: float = 12.0)
     groups = {group.name: group for group in campaign.groups}
     terms = {FLEXURE: Term(groups[FLEXURE], BENCH, plan.of_bench),
              HYSTERESIS: Term(groups[HYSTERESIS], SENSORS, plan.spread, mean_size=plan.mean)}  # fmt: skip
-    rows = {
-        name: [run.factor[run.width :, [run.places[f"{name}/{symbol}"] for symbol in group.symbols]] * group.sigma
-               for run in fleet.runs]
-        for name, group in groups.items()
-    }  # fmt: skip
-    read = np.concatenate([run.factor[run.width :, -1] for run in fleet.runs])
+    rows = {name: [columns_of(run, group) for run in fleet.runs] for name, group in groups.items()}
+    read = np.concatenate(list(map(readings_of_run, fleet.runs)))
     return Readings(campaign, PooledTerms([terms[name] for name in known], 1), read, rows, [r.unit for r in fleet.runs])
 
 

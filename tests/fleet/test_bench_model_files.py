@@ -1,7 +1,5 @@
 """The files of bench models: what the fleet wrote is replaced and removed, what anybody else did is left alone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

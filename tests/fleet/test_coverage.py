@@ -4,8 +4,6 @@ In each, all benches have a flexure and all units a hysteresis about a mean, and
 have a second-order term; columns of the three overlap. Nothing of the simulator or the estimator draws them.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace

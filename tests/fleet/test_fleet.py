@@ -1,7 +1,5 @@
 """Many recordings into one table: the same numbers as alone, whatever fails on the way, nothing done twice or lost."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -19,8 +17,7 @@ from typing import Any
 import dask.config
 import pytest
 from distributed import Client
-from fleet_generator import Campaign, record
-from helpers.fleet_workers import evaluation, threads, used
+from helpers.fleet_workers import evaluation, recorded
 
 import kf_calib
 from kf_calib.cli.options import EvaluationOptions, ReadingOptions
@@ -37,29 +34,7 @@ pytestmark = pytest.mark.xdist_group("fleet")  # recorded once
 @pytest.fixture(scope="module")
 def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four runs of two units."""
-    own = Campaign(tmp_path_factory.mktemp("campaign"), runs=4, units=2, benches=1, dwells=6, dwell_s=3.0)
-    for run in range(own.runs):
-        record(own, run)
-    return own.folder / "runs"
-
-
-@pytest.fixture(scope="module")
-def client() -> Iterator[Client]:
-    with threads() as own:
-        yield own
-
-
-@pytest.fixture
-def at_once(client: Client) -> Iterator[None]:
-    with used(client):
-        yield
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
-    own = Store(tmp_path / "fleet")
-    with own.taken():
-        yield own
+    return recorded(tmp_path_factory.mktemp("campaign"), runs=4, units=2, dwells=6)
 
 
 @pytest.mark.usefixtures("at_once")
@@ -75,8 +50,7 @@ def test_each_run_has_the_numbers_that_it_has_alone(campaign: Path, run: Any, tm
     alone = campaign / "bench-1" / "unit-0002" / "run-000002.mcap"
     row = rows[str(alone)]
     for command in ("replay", "diagnose"):
-        _, printed, _ = run(command, alone, "--json")
-        assert json.loads(printed) == json.loads(row[{"diagnose": "diagnosis"}.get(command, command)])
+        assert run.json(command, alone) == json.loads(row[{"diagnose": "diagnosis"}.get(command, command)])
     whole = json.loads(row["replay"])["parameters"]
     assert row["parameters"] == [{key: own[key] for key in own if key not in ("low", "high")} for own in whole]
     assert (row["unit"], row["bench"], row["error"]) == ("unit-0002", "bench-1", None)
@@ -227,20 +201,10 @@ def running(*words: str) -> Iterator[None]:
 
 @pytest.mark.slow
 def test_a_scheduler_and_workers_elsewhere_read_an_object_store(
-    campaign: Path, run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    campaign: Path, lab: Any, run: Any, tmp_path: Path
 ) -> None:
     """Separate processes over TCP, which fetch from a server with the interface of S3; one of them is killed."""
-    moto, s3fs = pytest.importorskip("moto.server"), pytest.importorskip("s3fs")
-    server = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0)
-    server.start()
-    host, port = server.get_host_and_port()
-    monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
-    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
-        monkeypatch.setenv(name, "test")
-    s3fs.S3FileSystem.clear_instance_cache()
-    files = s3fs.S3FileSystem()
-    files.mkdir("lab")
-    files.put(str(campaign), "lab/runs", recursive=True)
+    lab.put(str(campaign), "lab/runs", recursive=True)
     with socket.create_server(("127.0.0.1", 0)) as free:
         url = f"tcp://127.0.0.1:{free.getsockname()[1]}"
     scheduler = ("distributed.cli.dask_scheduler", "--host", url, "--dashboard-address", "127.0.0.1:0")
@@ -252,8 +216,6 @@ def test_a_scheduler_and_workers_elsewhere_read_an_object_store(
             doomed = client.submit(os.getpid, workers=[first]).result()
             os.kill(doomed, signal.SIGKILL)
         code, out, err = run("fleet", "s3://lab/runs", "-o", tmp_path / "fleet", "--scheduler", url, "--json")
-    server.stop()
-    s3fs.S3FileSystem.clear_instance_cache()
     assert code == 0, err
     printed = json.loads(out.splitlines()[-1])  # the server has a word to say before
     assert (printed["runs"], printed["failed"]) == (4, 0)
@@ -265,5 +227,5 @@ def test_a_scheduler_and_workers_elsewhere_read_an_object_store(
 
 def test_a_scheduler_that_does_not_answer_is_one_sentence(campaign: Path, run: Any, tmp_path: Path) -> None:
     with dask.config.set({"distributed.comm.timeouts.connect": "1s"}):
-        code, _, err = run("fleet", campaign, "-o", tmp_path / "fleet", "--scheduler", "tcp://127.0.0.1:9")
-    assert code == 2 and "no scheduler answers at tcp://127.0.0.1:9" in err and len(err.splitlines()) == 1
+        err = run.refused("fleet", campaign, "-o", tmp_path / "fleet", "--scheduler", "tcp://127.0.0.1:9")
+    assert "no scheduler answers at tcp://127.0.0.1:9" in err

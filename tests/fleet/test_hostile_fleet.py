@@ -1,7 +1,5 @@
 """Runs that never end, pipes with names of recordings, and tables that somebody else wrote: the fleet goes on."""
 
-from __future__ import annotations
-
 import math
 import os
 import resource
@@ -9,7 +7,7 @@ import shutil
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -19,8 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from distributed import Client
-from fleet_generator import Campaign, record
-from helpers.fleet_workers import evaluation, threads, used
+from helpers.fleet_workers import evaluation, recorded, used
 from helpers.long_runs import slow
 
 import kf_calib
@@ -36,28 +33,12 @@ pytestmark = pytest.mark.xdist_group("fleet")
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two runs of two units."""
-    own = Campaign(tmp_path_factory.mktemp("campaign"), runs=2, units=2, benches=1, dwells=6, dwell_s=3.0)
-    for number in range(own.runs):
-        record(own, number)
-    return own.folder / "runs"
-
-
-@pytest.fixture(scope="module")
-def client() -> Iterator[Client]:
-    with threads() as own:
-        yield own
+    return recorded(tmp_path_factory.mktemp("campaign"), runs=2, units=2, dwells=6)
 
 
 @pytest.fixture
 def runs(recordings: Path, tmp_path: Path) -> Path:
     return shutil.copytree(recordings, tmp_path / "runs")
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
-    own = Store(tmp_path / "fleet")
-    with own.taken():
-        yield own
 
 
 class _Endless(RunEvaluation):
@@ -171,42 +152,26 @@ def test_a_pipe_with_the_name_of_a_recording_is_refused_and_the_others_are_evalu
     assert "holds no .mcap and no .db3 file" in failures["bag"]
 
 
-def rewritten(store: Store, change: Callable[[list[dict[str, Any]]], None]) -> Path:
-    """Change the rows of the table as somebody else might."""
-    (file,) = store.folder.glob("*.parquet")
-    rows = pq.read_table(file).to_pylist()
-    change(rows)
-    pq.write_table(pa.Table.from_pylist(rows, SCHEMA), file)
-    return file
+CHANGES: dict[str, Callable[[dict[str, Any]], Any]] = {
+    "short": lambda row: row["factor"].update(upper=row["factor"]["upper"][:-3]),
+    "not finite": lambda row: row["factor"]["upper"].__setitem__(5, math.nan),
+    "without columns": lambda row: row["factor"].update(columns=None),
+    "nameless": lambda row: row.update(run=None),
+    "undated": lambda row: row.update(evaluated=None),
+}
+"""Of a row of the table, as somebody else might make them."""
 
 
-def _nameless(rows: list[dict[str, Any]]) -> None:
-    rows[0]["run"] = None
-
-
-def _undated(rows: list[dict[str, Any]]) -> None:
-    rows[0]["evaluated"] = None
-
-
-def _short(rows: list[dict[str, Any]]) -> None:
-    rows[0]["factor"]["upper"] = rows[0]["factor"]["upper"][:-3]
-
-
-def _not_finite(rows: list[dict[str, Any]]) -> None:
-    rows[0]["factor"]["upper"][5] = math.nan
-
-
-def _without_columns(rows: list[dict[str, Any]]) -> None:
-    rows[0]["factor"]["columns"] = None
-
-
-@pytest.mark.parametrize("change", [_short, *slow(_without_columns, _nameless, _undated, _not_finite)])
+@pytest.mark.parametrize("change", ["short", *slow(*list(CHANGES)[1:])])
 def test_a_row_that_is_not_whole_is_evaluated_again_and_the_fleet_goes_on(
-    change: Callable[[list[dict[str, Any]]], None], runs: Path, client: Client, store: Store, tmp_path: Path
+    change: str, runs: Path, client: Client, store: Store, tmp_path: Path
 ) -> None:
     named = runs_of([str(runs)])
     evaluate_all(client, evaluation(), named, store)
-    rewritten(store, change)
+    (file,) = store.folder.glob("*.parquet")
+    rows = pq.read_table(file).to_pylist()
+    CHANGES[change](rows[0])
+    pq.write_table(pa.Table.from_pylist(rows, SCHEMA), file)
     again = evaluate_all(client, evaluation(), named, store)
     assert (again.evaluated, again.kept, again.failed) == (1, 1, 0)
     assert "1 row of the table is not whole: its run is evaluated again" in again.notes[0]

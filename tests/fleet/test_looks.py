@@ -1,7 +1,5 @@
 """Which units need another look, in which order, and what their runs say of them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

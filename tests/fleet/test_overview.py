@@ -1,17 +1,13 @@
 """Many runs together: the command's last word, the page and the figures, and what is said where something lacks."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from fleet_generator import Campaign, record
 from helpers.fleet_overviews import BENT, overview_with, rows_of
-from helpers.fleet_workers import threads, used
+from helpers.fleet_workers import recorded
 from helpers.run_factors import run_factor_of
 
 import kf_calib
@@ -22,48 +18,29 @@ from kf_calib.fleet.pooled_diagnosis import pooled_diagnosis
 from kf_calib.fleet.text import short_name
 from kf_calib.views.figures import figures
 
-pytestmark = pytest.mark.xdist_group("fleet")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def at_once() -> Iterator[None]:
-    with threads() as client, used(client):
-        yield
+pytestmark = [pytest.mark.xdist_group("fleet"), pytest.mark.usefixtures("at_once")]
 
 
 @pytest.fixture(scope="module")
 def bent(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four runs of four units on a bench that bends by more than each run alone could miss."""
-    own = Campaign(
-        tmp_path_factory.mktemp("bent"),
-        runs=4,
-        units=4,
-        benches=1,
-        dwells=10,
-        dwell_s=3.0,
-        of_bench=("flexure=8sigma",),
-    )
-    for run in range(own.runs):
-        record(own, run)
-    return own.folder / "runs"
+    """Three runs of three units on a bench that bends by more than each run alone could miss."""
+    return recorded(tmp_path_factory.mktemp("bent"), runs=3, units=3, dwells=9, of_bench=("flexure=8sigma",))
 
 
 def test_the_command_ends_with_what_all_runs_show_together(bent: Path, run: Any, tmp_path: Path) -> None:
-    code, out, err = run("fleet", bent, "-o", tmp_path / "fleet", "--json")
-    assert code == 0, err
-    printed = json.loads(out)
+    printed = run.json("fleet", bent, "-o", tmp_path / "fleet")
     first, *others = printed["pooled"]
     assert (first["effect"], first["borne_by"]) == ("flexure", "bench") and first["probability"] > 0.9
     assert [each["of"] for each in first["coefficients"]] == ["bench-1"] * 3
     assert {each["borne_by"] for each in others} <= {"none", None} and printed["remarks"] == []
     (model,) = printed["bench_models"]
     known = bench_model.read_bench_model(model)
-    assert (known.bench, known.runs, known.terms[0].effect) == ("bench-1", 4, "flexure")
+    assert (known.bench, known.runs, known.terms[0].effect) == ("bench-1", 3, "flexure")
     one = next(bent.rglob("*.mcap"))
     rows = kf_calib.open_fleet(tmp_path / "fleet").rows(["run", "diagnosis"]).to_pylist()
     (alone,) = (row["diagnosis"] for row in rows if row["run"] == str(one))
-    _, with_model, _ = run("diagnose", one, "--bench-model", model, "--json")
-    assert json.loads(alone)["p_value"] < 1e-3 < 0.01 < json.loads(with_model)["p_value"]
+    with_model = run.json("diagnose", one, "--bench-model", model)
+    assert json.loads(alone)["p_value"] < 1e-3 < 0.01 < with_model["p_value"]
     assert kf_calib.open_fleet(tmp_path / "fleet").pooled().findings[0].effect == "flexure"
     Path(model).write_text("# mine\n")
     code, out, err = run("fleet", bent, "-o", tmp_path / "fleet")
@@ -81,9 +58,7 @@ def test_what_is_lacking_is_said(bent: Path, run: Any, tmp_path: Path, given: li
     bad = tmp_path / "bad.mcap"
     bad.write_text("no recording")
     runs = [next(bent.rglob("*.mcap")), bad]
-    code, out, err = run("fleet", *runs, "-o", tmp_path / "fleet", "--json", *given)
-    assert code == 0, err
-    printed = json.loads(out)
+    printed = run.json("fleet", *runs, "-o", tmp_path / "fleet", *given)
     assert (printed["pooled"], printed["bench_models"], printed["remarks"]) == (None, [], says)
     assert {"unit": str(bad), "chance": 0.0, "reasons": ["bad.mcap failed"]} in printed["another_look"]
 

@@ -1,7 +1,5 @@
 """Many runs together: what is the bench's, what the sensors', and which units have it."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping

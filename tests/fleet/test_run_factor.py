@@ -1,7 +1,5 @@
 """The reduced factor of one run holds all that linear models can ask of it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -3,8 +3,6 @@
 What damage does to the bytes of Parquet is seen by its checksums; what somebody else writes has none that are wrong.
 """
 
-from __future__ import annotations
-
 import copy
 import random
 import subprocess
@@ -19,6 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from helpers.bounded import bounded
+from helpers.damage import damaged
 from helpers.fleet_overviews import BEGIN, rows_of
 from helpers.long_runs import slow
 from helpers.paths import ROOT
@@ -67,24 +66,11 @@ def written(own: list[Row], kind: str) -> bytes:
     return sink.getvalue().to_pybytes()
 
 
-def damaged(content: bytes, rng: random.Random) -> bytes:
-    """The bytes of a file flipped, cut out, doubled, overwritten or put from elsewhere, those at its end above all."""
-    made = bytearray(content)
-    for _ in range(rng.choice([1, 1, 2, 5])):
-        at = rng.randrange(len(made)) if rng.random() < 0.6 else len(made) - 1 - rng.randrange(9000)
-        size, kind = rng.choice([1, 4, 40]), rng.randrange(5)
-        if kind == 0:
-            made[at] ^= 1 << rng.randrange(8)
-        elif kind == 1:
-            del made[at : at + size]
-        elif kind == 2:
-            made[at:at] = made[at : at + size]
-        elif kind == 3:
-            source = rng.randrange(len(made))
-            made[at : at + size] = made[source : source + size]
-        else:
-            made[at : at + size] = rng.choice([b"\x00", b"\xff", b"\x7f"]) * size
-    return bytes(made)
+def bent(content: bytes, rng: random.Random) -> bytes:
+    """A damaged file, at its end above all."""
+    scraps = [byte * size for byte in (b"\x00", b"\xff", b"\x7f") for size in (1, 4, 40)]
+    place = lambda n: rng.randrange(n) if rng.random() < 0.6 else n - 1 - rng.randrange(min(n, 9000))  # noqa: E731
+    return damaged(content, rng, scraps, place)
 
 
 def renamed(content: bytes) -> bytes:
@@ -146,7 +132,7 @@ def case(content: bytes, kind: str, folder: Path) -> dict[str, np.ndarray] | Non
 @pytest.mark.parametrize("cases", [15, *slow(1000)])
 def test_damaged_tables_are_refused_in_a_sentence_or_read_as_they_were(cases: int, tmp_path: Path) -> None:
     rng, whole, read = random.Random(1), {row["run"]: row["factor"]["upper"] for row in rows()}, 0
-    for content in (renamed(plain("parquet")), *(damaged(plain("parquet"), rng) for _ in range(cases))):
+    for content in (renamed(plain("parquet")), *(bent(plain("parquet"), rng) for _ in range(cases))):
         factors = case(content, "parquet", tmp_path)
         for run, factor in (factors or {}).items():
             np.testing.assert_array_equal(factor[np.triu_indices(len(factor))], whole[run])
@@ -175,7 +161,7 @@ def test_damaged_small_files_are_refused_in_a_sentence_or_read(cases: int, tmp_p
 _SMALL_FILES = """
 import random, sys
 from pathlib import Path
-from fleet.test_table_fuzz import case, damaged, plain
+from fleet.test_table_fuzz import bent, case, plain
 rng = random.Random(3)
-print(sum(case(damaged(plain("arrow"), rng), "arrow", Path(sys.argv[1])) is not None for _ in range(int(sys.argv[2]))))
+print(sum(case(bent(plain("arrow"), rng), "arrow", Path(sys.argv[1])) is not None for _ in range(int(sys.argv[2]))))
 """

@@ -1,7 +1,5 @@
 """A simulated run whose record is altered on its way: as a wrong cable, a wrong unit or a mistyped pose would."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 

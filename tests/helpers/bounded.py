@@ -1,13 +1,13 @@
 """A limit of time and memory for one case: a hostile file fails its test, and not the machine."""
 
-from __future__ import annotations
-
 import re
 import resource
 import signal
+import tracemalloc
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 
 class TooLongError(BaseException):
@@ -43,3 +43,15 @@ def _status(key: str) -> float:
     found = re.search(rf"{key}:\s*(\d+) kB", Path("/proc/self/status").read_text())
     assert found
     return int(found[1]) / 1024.0
+
+
+@contextmanager
+def traced() -> Iterator[SimpleNamespace]:
+    """The most ``bytes`` that Python's objects take inside."""
+    peak = SimpleNamespace(bytes=0)
+    tracemalloc.start()
+    try:
+        yield peak
+    finally:
+        peak.bytes = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()

@@ -1,7 +1,5 @@
 """Simulated runs of a board that is turned by hand: nobody records angles."""
 
-from __future__ import annotations
-
 from functools import partial
 
 from helpers.synthetic import plan_of

@@ -1,7 +1,5 @@
 """Short simulated runs of one bench, and calibrations of them as they are saved."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

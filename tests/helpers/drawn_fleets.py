@@ -3,8 +3,6 @@
 Nothing of the program is used but the form in which it takes a run (``RunFactor``).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

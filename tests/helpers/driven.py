@@ -1,7 +1,5 @@
 """A driven simulated bench whose time passes and whose readings are judged in the calling thread."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

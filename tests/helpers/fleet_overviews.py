@@ -1,7 +1,5 @@
 """Fleets as their overviews, from rows and factors that are made up."""
 
-from __future__ import annotations
-
 from datetime import UTC, datetime, timedelta
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Workers of the command fleet that are threads of this process, which start at once, and what they evaluate."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,6 +8,7 @@ from typing import Any
 
 import pytest
 from distributed import Client, LocalCluster
+from fleet_generator import Campaign, record
 
 from kf_calib.bench.streams import Source
 from kf_calib.cli.options import EvaluationOptions, ReadingOptions, opened
@@ -60,6 +59,14 @@ def used(client: Client) -> Iterator[None]:
         patch.setattr(batch, "cluster", running)
         patch.setattr(batch, "RunEvaluation", RememberingEvaluation)
         yield
+
+
+def recorded(folder: Path, **given: Any) -> Path:
+    """The folder of the recordings of a campaign on one bench."""
+    own = Campaign(folder, benches=1, dwell_s=3.0, **given)
+    for run in range(own.runs):
+        record(own, run)
+    return own.folder / "runs"
 
 
 def evaluation(**given: Any) -> RunEvaluation:

@@ -3,8 +3,6 @@
 docs/logs.md shows the beginning of each file; tests/sources/test_logs_of_strangers.py reads them all.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Callable, Mapping, Sequence

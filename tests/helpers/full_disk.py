@@ -1,7 +1,5 @@
 """A disk without room, as a limit to the size of files."""
 
-from __future__ import annotations
-
 import resource
 import sys
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Simulated runs with hidden effects, calibrated without them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 from typing import Any

@@ -2,8 +2,6 @@
 knows nothing. What is wrong with it is given as functions of its state.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property

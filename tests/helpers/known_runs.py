@@ -3,8 +3,6 @@
 Those of the recording with a hidden hysteresis, and of simulated runs by what is hidden in them.
 """
 
-from __future__ import annotations
-
 from functools import cache
 
 from helpers.hidden_effects import run

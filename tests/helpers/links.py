@@ -1,7 +1,5 @@
 """Links and feeds that give what a test has written."""
 
-from __future__ import annotations
-
 import json
 import threading
 import time

@@ -1,7 +1,5 @@
 """Cases of a test that take long: left out unless asked for with ``-m slow``."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -1,7 +1,5 @@
 """All cases whose numbers are stored, by the names of their files."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any

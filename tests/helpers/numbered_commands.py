@@ -1,7 +1,5 @@
 """Commands whose numbers are stored: what they print with ``--json``, and the files that they write."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable, Mapping
@@ -10,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from click.testing import CliRunner
 
 from helpers.calibrations import simulated
+from helpers.command_line import CommandLine
 from helpers.paths import RECORDINGS
 from helpers.recordings import read
 from helpers.result_numbers import ResultNumbers
@@ -20,7 +18,6 @@ from helpers.run_factors import campaign_of
 from helpers.synthetic import Run
 from kf_calib import calibrate
 from kf_calib.bench.streams import Batch
-from kf_calib.cli import cli
 from kf_calib.exchange import calibration_file
 from kf_calib.exchange.verification import verify
 from kf_calib.exports import TARGETS
@@ -32,6 +29,8 @@ from kf_calib.sources.opening import opened
 from kf_calib.views.exchange import verification_object
 from kf_calib.views.json import replay_object
 from kf_calib.views.live.objects import live_object
+
+printed = CommandLine().json
 
 Made = Callable[[Path], Mapping[str, Any]]
 """Numbers of a case, made with a folder to write to."""
@@ -58,13 +57,6 @@ PLANS: Mapping[str, str] = {
     "minimax": "--count 12 --criterion minimax --target K=5ppm --target b=10ug",
     "hand": "--no-angles --count 12",
 }  # fmt: skip
-
-
-def printed(*words: object) -> Any:
-    """What a command prints with ``--json``."""
-    ended = CliRunner().invoke(cli, [*map(str, words), "--json"], catch_exceptions=False)
-    assert ended.exit_code == 0, ended.output
-    return json.loads(ended.stdout)
 
 
 def plans(folder: Path) -> Mapping[str, Any]:

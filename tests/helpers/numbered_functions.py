@@ -1,7 +1,5 @@
 """Functions whose numbers are stored, over grids that pass each of their thresholds."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 

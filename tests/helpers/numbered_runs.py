@@ -1,7 +1,5 @@
 """Runs whose numbers are stored: of every kind of noise, of benches that state little, of sensors without a bench."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 

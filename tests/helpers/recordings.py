@@ -1,9 +1,8 @@
 """Streams to record, and recordings read back whole."""
 
-from __future__ import annotations
-
+import json
 import sqlite3
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -145,4 +144,36 @@ def write_db3(
             base.execute("INSERT INTO topics VALUES(?, ?, ?, 'cdr', '')", (k, name, kind.name))
         rows = [(k, stamp, pack(data)) for stamp, k, data in stamped(topics)]
         base.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES(?, ?, ?)", rows)
+    return path
+
+
+def altered(path: Path, *statements: str) -> Path:
+    """A bag's SQLite file that some statements have changed."""
+    with closing(sqlite3.connect(path, isolation_level=None)) as base:
+        for statement in statements:
+            base.execute(statement)
+    return path
+
+
+def part_of(topic: Topic, number: int, count: int) -> Topic:
+    """A share of the messages of a topic, of so many alike."""
+    name, kind, template, stream = topic
+    own = slice(len(stream) * number // count, len(stream) * (number + 1) // count)
+    return name, kind, template, Stream(stream.time_ns[own], stream.values[own])
+
+
+def write_messages(
+    path: Path, topics: Mapping[str, Sequence[object]], encoding: str = "json", schema: str = ""
+) -> Path:
+    """Messages of each topic, 10 ms apart: bytes as they are, others in JSON."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        number = writer.register_schema(schema, "jsonschema", b"") if schema else 0
+        for topic, messages in topics.items():
+            channel = writer.register_channel(topic, encoding, number)
+            for k, message in enumerate(messages):
+                data = message if isinstance(message, bytes) else json.dumps(message).encode()
+                writer.add_message(channel, START_NS + k * 10**7, data, 0)
+        writer.finish()
     return path

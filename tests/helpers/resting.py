@@ -1,7 +1,5 @@
 """Readings at rest with known noise, and sources of them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The restricted likelihood itself, of which the product needs only differences and slopes."""
 
-from __future__ import annotations
-
 from kf_calib.bench.arrays import Floats
 from kf_calib.noise import reml
 from kf_calib.noise.means import Means

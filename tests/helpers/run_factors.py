@@ -1,13 +1,12 @@
 """Reduced factors of runs with random columns, whose readings are noise and a given effect."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.dwells.qr import triangle
+from kf_calib.fleet.campaign import Group
 from kf_calib.fleet.run_factor import STATES, RunFactor
 
 EFFECTS: Mapping[str, tuple[str, ...]] = {
@@ -53,3 +52,12 @@ def run_factor_of(
 def campaign_of(count: int, hidden: Hidden = nothing) -> list[RunFactor]:
     """The factors of runs of as many units."""
     return [run_factor_of(number, hidden) for number in range(count)]
+
+
+def columns_of(run: RunFactor, group: Group) -> Floats:
+    """Of an effect, in sigma, whitened and without what the states of the run absorb (n, k)."""
+    return run.factor[run.width :, [run.places[f"{group.name}/{symbol}"] for symbol in group.symbols]] * group.sigma
+
+
+def readings_of_run(run: RunFactor) -> Floats:
+    return run.factor[run.width :, -1]

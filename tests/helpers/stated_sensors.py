@@ -1,7 +1,5 @@
 """Calibrations of sensors that are stated, and readings to correct with them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 

@@ -6,8 +6,6 @@ of their terms, as if these had independent errors. Names, lengths and whole num
 but for the numbers in them. ``LOOSE`` has the cases in which numbers may differ by more.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

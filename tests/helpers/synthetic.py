@@ -1,7 +1,5 @@
 """A small nonlinear bench for the tests, by scipy's rotations: it shares no formula with the package."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cache

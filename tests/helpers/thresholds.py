@@ -1,7 +1,5 @@
 """Where a decision changes, as one number of what it is made from grows."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 

@@ -10,8 +10,6 @@ does. Of the server, all is as in a fresh process but what is imported.
 Run as a script, this file is the server (``serve SOCKET``) or the launcher (``launch SOCKET WORD ...``).
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

@@ -1,8 +1,5 @@
 """Files of arrays: which dataset is read, what of it, and that damaged and hostile ones are refused in a sentence."""
 
-from __future__ import annotations
-
-import json
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -109,15 +106,13 @@ def test_kinds_are_told_by_the_first_bytes(file: str, tmp_path: Path) -> None:
 def test_of_several_datasets_the_one_with_the_most_rows_is_read_and_any_can_be_chosen(tmp_path: Path, run: Any) -> None:
     of_two_units(tmp_path / "two.mat")
     np.testing.assert_array_equal(read(tmp_path / "two.mat", "/imu1")[1], readings()[::-1])
-    code, out, err = run("replay", tmp_path / "two.mat", "--gravity", G, "--json")
-    assert code == 0, err
-    assert any("/imu0 was read, not /imu1 (4320 rows): --accel-topic" in said for said in json.loads(out)["warnings"])
-    code, out, _ = run("info", tmp_path / "two.mat", "--accel-topic", "/imu1", "--json")
-    told = json.loads(out)
+    warnings = run.json("replay", tmp_path / "two.mat", "--gravity", G)["warnings"]
+    assert any("/imu0 was read, not /imu1 (4320 rows): --accel-topic" in said for said in warnings)
+    told = run.json("info", tmp_path / "two.mat", "--accel-topic", "/imu1")
     assert told["format"] == "matlab" and [each["topic"] for each in told["topics"]] == ["readings", "/imu0"]
     assert "--accel-topic /imu1" in told["command"] and told["topics"][1]["rate_hz"] == pytest.approx(RATE_HZ)
-    code, _, err = run("replay", tmp_path / "two.mat", "--gravity", G, "--accel-topic", "/imu2")
-    assert code == 2 and "has no dataset '/imu2' (--accel-topic), it has /imu0 (4320 rows), /imu1" in err
+    err = run.refused("replay", tmp_path / "two.mat", "--gravity", G, "--accel-topic", "/imu2")
+    assert "has no dataset '/imu2' (--accel-topic), it has /imu0 (4320 rows), /imu1" in err
     ulog(tmp_path / "log.ulg")
     dataflash(tmp_path / "log.bin")
     assert [each.name for each in datasets_in(tmp_path / "log.bin")] == ["IMU.0", "IMU.1"]
@@ -144,8 +139,7 @@ def test_a_rate_beside_the_readings_gives_their_time_and_is_said(tmp_path: Path,
     assert code == 0, err
     assert "time of / from 100 rows a second, as 'dt' states" in out + err
     savemat(tmp_path / "none.mat", {"accel": readings()})
-    code, _, err = run("replay", tmp_path / "none.mat", "--gravity", G)
-    assert code == 2 and "--rate 100" in err
+    assert "--rate 100" in run.refused("replay", tmp_path / "none.mat", "--gravity", G)
     code, out, err = run("replay", tmp_path / "none.mat", "--gravity", G, "--rate", "100")
     assert code == 0, err
 
@@ -224,8 +218,7 @@ def test_what_is_no_log_is_refused_in_a_sentence(name: str, run: Any, tmp_path: 
     write(tmp_path / file)
     for command in (["info"], ["replay", "--gravity", "9.81"]):
         with bounded(megabytes=900.0):
-            code, _, err = run(command[0], tmp_path / file, *command[1:])
-        assert code == 2 and said in err and err.count("\n") == 1, err
+            assert said in run.refused(command[0], tmp_path / file, *command[1:])
 
 
 @pytest.mark.parametrize("file", [*LOGS, "log.bag"])
@@ -275,9 +268,8 @@ def test_gyroscopes_are_those_of_the_dataset_that_is_chosen(tmp_path: Path, run:
     savemat(tmp_path / "two.mat", {"imu0": unit, "imu1": unit | {"gyro": 3.0 * others()}})
     white = list[float]()
     for dataset in ("/imu0", "/imu1"):
-        code, out, err = run("noise", tmp_path / "two.mat", "--accel-topic", dataset, "--gyro", "gyro_x,gyro_y,gyro_z",
-                             "--json")  # fmt: skip
-        assert code == 0, err
-        channel = next(each for each in json.loads(out)["channels"] if each["unit"] == "rad/s")
+        words = ("--accel-topic", dataset, "--gyro", "gyro_x,gyro_y,gyro_z")
+        channels = run.json("noise", tmp_path / "two.mat", *words)["channels"]
+        channel = next(each for each in channels if each["unit"] == "rad/s")
         white.append(channel["intervals"]["white"]["value"])
     assert white[1] == pytest.approx(3.0 * white[0])

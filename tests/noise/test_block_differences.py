@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import tracemalloc
-
 import allantools
 import numpy as np
 import pytest
+from helpers.bounded import traced
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.noise.block_differences import EVERY, BlockDifferences
@@ -104,15 +103,13 @@ def test_memory_is_that_of_a_few_blocks_whatever_comes() -> None:
     block = walks(20_000)
 
     def peak(times: int) -> int:
-        tracemalloc.start()
-        differences = BlockDifferences(3)
-        for _ in range(times):
-            differences.push(block)
-        differences.end_stretch()
+        with traced() as memory:
+            differences = BlockDifferences(3)
+            for _ in range(times):
+                differences.push(block)
+            differences.end_stretch()
         assert differences.count == 20_000 * times
-        largest = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        return largest
+        return memory.bytes
 
     peak(1)
     assert peak(40) < 1.15 * peak(20) < 5e6

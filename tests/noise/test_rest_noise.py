@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import tracemalloc
 from collections import defaultdict
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from helpers.bounded import traced
 from helpers.long_runs import slow
 from helpers.paths import REAL, ROOT
 from helpers.resting import PERIOD_S, G, Resting, flicker, level, noisy
@@ -255,15 +255,13 @@ def test_memory_is_that_of_a_short_rest_however_long_it_is() -> None:
     def peak(times: int) -> tuple[int, RestNoise]:
         source = Repeated(rest(10_000))
         source.times = times
-        tracemalloc.start()
-        found = noise_at_rest(source)
-        largest = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        return largest, found
+        with traced() as memory:
+            found = noise_at_rest(source)
+        return memory.bytes, found
 
-    peak(32)
-    (half, _), (whole, found) = peak(32), peak(64)
-    assert found.readings == 640_000 and found.stretches == 1
+    peak(16)
+    (half, _), (whole, found) = peak(16), peak(32)
+    assert found.readings == 320_000 and found.stretches == 1
     assert whole < 1.15 * half < 30e6
 
 

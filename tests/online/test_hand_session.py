@@ -1,7 +1,5 @@
 """A sensor in the hand evaluated while it is turned: what replay gives, and which side is next."""
 
-from __future__ import annotations
-
 import sys
 import threading
 from collections.abc import Iterator

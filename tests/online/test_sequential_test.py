@@ -1,7 +1,5 @@
 """A run judged dwell by dwell: as a scan from the start would, and with one chance of a false alarm for all looks."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.hidden_effects import run

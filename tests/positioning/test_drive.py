@@ -1,7 +1,5 @@
 """A simulated bench that drives itself: to its targets, round forbidden zones, to a stop where anything fails."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.driven import driven

@@ -1,7 +1,5 @@
 """The loop as a function of values: no clock, no thread, no device."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A controller that lies in every way: what is told of it is true, and no table is said to stand that may move."""
 
-from __future__ import annotations
-
 import json
 import os
 import stat
@@ -9,14 +7,16 @@ import threading
 import time
 import tomllib
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from helpers.emulated_table import Table, said
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from positioner_emulator import MISBEHAVIOURS, Server
+from positioner_emulator import MISBEHAVIOURS
 
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.design.gimbal_limits import Reach
@@ -27,56 +27,25 @@ from kf_calib.positioning.command import halt_in_words
 from kf_calib.positioning.drive import Drive
 from kf_calib.positioning.link import device_of, refuse_address
 from kf_calib.positioning.loop import Rules
-from kf_calib.positioning.opening import _locked, open_positioner, programs_of
+from kf_calib.positioning.opening import Opened, _locked, open_positioner, programs_of
 from kf_calib.positioning.positioner import PositionerError
 from kf_calib.positioning.profile import SHIPPED, angles_in, read_profile
-from kf_calib.sources.simulation.driven import DrivenBench, Servo
-from kf_calib.sources.simulation.options import simulation
-from kf_calib.sources.simulation.settings import SimulationOptions
+from kf_calib.sources.simulation.driven import Servo
 
 pytest.importorskip("pyvisa_py", reason="PyVISA is not there")
 
 BENCH = Bench(axes_of("yzx"), 9.81)
 
 
-class Table:
-    """A driven bench with its controller on a socket; its time passes as that of the wall."""
-
-    def __init__(self, misbehaviour: str = "") -> None:
-        run, self.lock = simulation(SimulationOptions(sample_hz=20), {}), threading.Lock()
-        self.bench = DrivenBench(run, Servo(rate_degps=10.0), [0.0, 0.0, 0.0])
-        self.server, self._is_over = Server(self.bench, self.lock, misbehaviour=misbehaviour), False
-        self._thread = threading.Thread(target=self._pass, daemon=True)
-        self._thread.start()
-
-    def _pass(self) -> None:
-        while not self._is_over:
-            with self.lock:
-                self.bench.advance(0.02)
-            time.sleep(0.02)
-
-    def profile(self, folder: Path, more: str = "") -> str:
-        """The path of a profile with the address of the controller."""
-        text = (SHIPPED / "lines.toml").read_text().replace("TCPIP::127.0.0.1::5025::SOCKET", self.server.url)
-        path = folder / "lines.toml"
-        path.write_text(f"{text}\ntimeout_s = 0.4\nstand_s = 0.3\n{more}")
-        return str(path)
-
-    def close(self) -> None:
-        self._is_over = True
-        self._thread.join()
-        self.server.close()
-
-
 @pytest.fixture
 def table() -> Iterator[Table]:
-    made = Table()
-    yield made
-    made.close()
+    """Whose time passes as that of the wall."""
+    with Table(Servo(rate_degps=10.0)) as made:
+        yield made
 
 
-def said(text: str) -> None:
-    """What a person is told; nobody is there."""
+def opened_at(table: Table, folder: Path, timeout_s: float = 0.4) -> AbstractContextManager[Opened]:
+    return open_positioner(table.profile(folder, more=f"timeout_s = {timeout_s}\nstand_s = 0.3\n"), BENCH, said)
 
 
 @pytest.mark.parametrize(("misbehaviour", "words"), [
@@ -87,7 +56,7 @@ def said(text: str) -> None:
 def test_an_answer_is_the_angle_whole_and_in_time_or_it_is_none(
     misbehaviour: str, words: str, table: Table, tmp_path: Path
 ) -> None:
-    with open_positioner(table.profile(tmp_path), BENCH, said) as opened:
+    with opened_at(table, tmp_path) as opened:
         assert opened.positioner.read() == (0.0, 0.0, 0.0)
         table.server.misbehaviour, began_s = misbehaviour, time.monotonic()
         with pytest.raises(PositionerError, match=words):
@@ -99,7 +68,7 @@ def test_an_answer_is_the_angle_whole_and_in_time_or_it_is_none(
 def test_what_comes_too_late_or_unasked_answers_no_later_question(
     misbehaviour: str, table: Table, tmp_path: Path
 ) -> None:
-    with open_positioner(table.profile(tmp_path), BENCH, said) as opened:
+    with opened_at(table, tmp_path) as opened:
         opened.positioner.move_to((0.0, 3.0, -2.0))
         until_s = time.monotonic() + 5.0
         while np.abs(np.array(table.bench.read_deg()) - [0.0, 3.0, -2.0]).max() > 1e-3 and time.monotonic() < until_s:
@@ -113,68 +82,64 @@ def test_what_comes_too_late_or_unasked_answers_no_later_question(
         assert opened.positioner.read() == pytest.approx((0.0, 3.0, -2.0), abs=1e-3)
 
 
-def halted(table: Table, folder: Path, after_s: float, misbehaviour: str) -> tuple[Drive, float]:
-    """A drive that is broken off amid a move, with a controller that misbehaves from then on, and how long it takes."""
-    with open_positioner(table.profile(folder), BENCH, said) as opened:
-        session = Session.fed(table.bench.run.bench)
-        drive = Drive(
-            opened.positioner, session, Itinerary(session.source.bench), Rules(Reach.of(BENCH), watch=opened.watch)
-        )
+def drive_of(opened: Opened, table: Table) -> Drive:
+    session = Session.fed(table.bench.run.bench)
+    return Drive(
+        opened.positioner, session, Itinerary(session.source.bench), Rules(Reach.of(BENCH), watch=opened.watch)
+    )
+
+
+def halted(table: Table, folder: Path, after_s: float, misbehaviour: str) -> Drive:
+    """A drive that is broken off amid a move, with a controller that misbehaves from then on."""
+    with opened_at(table, folder) as opened:
+        drive = drive_of(opened, table)
         opened.positioner.move_to((170.0, 60.0, -60.0))
         time.sleep(after_s)
-        table.server.misbehaviour, began_s = misbehaviour, time.monotonic()
+        table.server.misbehaviour = misbehaviour
         thread = threading.Thread(target=drive.run)
         thread.start()
         drive.break_off("Ctrl-C was pressed")
         thread.join(30.0)
         assert drive.outcome is not None
-        return drive, time.monotonic() - began_s
+        return drive
 
 
 def test_a_table_that_ignores_the_stop_is_said_to_move(table: Table, tmp_path: Path) -> None:
-    drive, _ = halted(table, tmp_path, 0.3, "ignores-stop")
+    drive = halted(table, tmp_path, 0.3, "ignores-stop")
     assert drive.outcome is not None and not drive.outcome.stopped
     assert "IT MAY STILL MOVE" in halt_in_words(drive.outcome) and "stands at" not in halt_in_words(drive.outcome)
 
 
 def test_a_table_that_stops_is_said_to_stand_where_it_does(table: Table, tmp_path: Path) -> None:
-    drive, _ = halted(table, tmp_path, 0.3, "")
+    drive = halted(table, tmp_path, 0.3, "")
     assert drive.outcome is not None and drive.outcome.stopped
     assert drive.outcome.stands_at == pytest.approx(table.bench.read_deg(), abs=0.01)
 
 
 @pytest.mark.parametrize("misbehaviour", ["far", "error-text", "silent"])
 def test_where_no_place_can_be_believed_none_is_told(misbehaviour: str, table: Table, tmp_path: Path) -> None:
-    drive, _ = halted(table, tmp_path, 0.2, misbehaviour)
+    drive = halted(table, tmp_path, 0.2, misbehaviour)
     assert drive.outcome is not None and not drive.outcome.stopped
     assert all(abs(angle) < 90.0 for angle in drive.outcome.stands_at)
     assert "IT MAY STILL MOVE" in halt_in_words(drive.outcome) and "100000" not in halt_in_words(drive.outcome)
 
 
-def test_the_stop_is_said_within_half_a_second_though_answers_take_longer(tmp_path: Path) -> None:
-    table = Table()
-    try:
-        path = table.profile(tmp_path)
-        Path(path).write_text(Path(path).read_text().replace("timeout_s = 0.4", "timeout_s = 5.0"))
-        with open_positioner(path, BENCH, said) as opened:
-            session = Session.fed(table.bench.run.bench)
-            rules = Rules(Reach.of(BENCH), watch=opened.watch)
-            drive = Drive(opened.positioner, session, Itinerary(session.source.bench), rules)
-            table.server.misbehaviour = "slow"
-            thread = threading.Thread(target=drive.run)
-            thread.start()
-            time.sleep(0.5)
-            before, began_s = len(table.server.lines), time.monotonic()
-            drive.break_off("Ctrl-C was pressed")
-            table.server.misbehaviour = ""
-            while not any("STOP" in line for line in table.server.lines[before:]) and time.monotonic() - began_s < 3.0:
-                time.sleep(0.01)
-            waited_s = time.monotonic() - began_s
-            thread.join(20.0)
-        assert drive.outcome is not None and drive.outcome.why == "Ctrl-C was pressed"
-        assert waited_s < 2.0  # the emulator itself reads the line after its answer of 1.8 s
-    finally:
-        table.close()
+def test_the_stop_is_said_within_half_a_second_though_answers_take_longer(table: Table, tmp_path: Path) -> None:
+    with opened_at(table, tmp_path, timeout_s=5.0) as opened:
+        drive = drive_of(opened, table)
+        table.server.misbehaviour = "slow"
+        thread = threading.Thread(target=drive.run)
+        thread.start()
+        time.sleep(0.5)
+        before, began_s = len(table.server.lines), time.monotonic()
+        drive.break_off("Ctrl-C was pressed")
+        table.server.misbehaviour = ""
+        while not any("STOP" in line for line in table.server.lines[before:]) and time.monotonic() - began_s < 3.0:
+            time.sleep(0.01)
+        waited_s = time.monotonic() - began_s
+        thread.join(20.0)
+    assert drive.outcome is not None and drive.outcome.why == "Ctrl-C was pressed"
+    assert waited_s < 2.0  # the emulator itself reads the line after its answer of 1.8 s
 
 
 @pytest.mark.parametrize("answer", ["12.5", " 12.5 ", "outer 12.5", "OUTER: 12.5", "[12.5]", "+1.25e1"])
@@ -233,8 +198,8 @@ def test_programs_of_a_profile_run_only_where_they_are_trusted(tmp_path: Path, r
     profile.write_text((SHIPPED / "command.toml").read_text().replace("my-robot where", f"touch {made}"))
     source.write_text('{"bench": {"axes": "y z x", "gravity_mps2": 9.81}}\n')
     assert programs_of(str(profile))[1] == f"touch {made}" and programs_of("command") == []
-    code, _, err = run("run", "--positioner", profile, "--source", source)
-    assert code == 2 and "add --trust-profile" in err and not made.exists()
+    assert "add --trust-profile" in run.refused("run", "--positioner", profile, "--source", source)
+    assert not made.exists()
 
 
 def test_one_device_has_one_name(tmp_path: Path) -> None:

@@ -1,74 +1,38 @@
 """Positioners over a socket, by commands and by hand; profiles; the lock."""
 
-from __future__ import annotations
-
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from positioner_emulator import Server
+from helpers.emulated_table import Table, said
 
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.errors import InputError
 from kf_calib.positioning.opening import open_positioner
 from kf_calib.positioning.positioner import Positioner, PositionerError
 from kf_calib.positioning.profile import SHIPPED, read_profile
-from kf_calib.sources.simulation.driven import DrivenBench, Servo
-from kf_calib.sources.simulation.options import simulation
-from kf_calib.sources.simulation.settings import SimulationOptions
+from kf_calib.sources.simulation.driven import Servo
 
 BENCH = Bench(axes_of("yzx"), 9.81)
 
 
-def said(text: str) -> None:
-    """What a person is told; nobody is there."""
-
-
-class Table:
-    """A driven bench whose time passes fast, with its controller on a socket."""
-
-    def __init__(self, servo: Servo) -> None:
-        run, self.lock = simulation(SimulationOptions(sample_hz=50), {}), threading.Lock()
-        self.bench = DrivenBench(run, servo, [0.0, 0.0, 0.0])
-        self.server, self._is_over = Server(self.bench, self.lock), False
-        self._thread = threading.Thread(target=self._pass, daemon=True)
-        self._thread.start()
-
-    def _pass(self) -> None:
-        while not self._is_over:
-            with self.lock:
-                self.bench.advance(0.1)
-            time.sleep(0.005)
-
-    def close(self) -> None:
-        self._is_over = True
-        self._thread.join()
-        self.server.close()
-
-
 @pytest.fixture
 def table() -> Iterator[Table]:
-    made = Table(Servo(rate_degps=40.0))
-    yield made
-    made.close()
+    with fast_table(Servo(rate_degps=40.0)) as made:
+        yield made
 
 
-def profile_for(table: Table, name: str, folder: Path, more: str = "") -> str:
-    """The path of a shipped profile with the address of the emulated controller, and further keys."""
-    text = (SHIPPED / f"{name}.toml").read_text()
-    lines = [f'address = "{table.server.url}"' if line.startswith("address") else line for line in text.splitlines()]
-    path = folder / f"{name}.toml"
-    path.write_text("\n".join([*lines, more]))
-    return str(path)
+def fast_table(servo: Servo) -> Table:
+    """Whose time passes twenty times as fast as that of the wall."""
+    return Table(servo, tick_s=0.1, pause_s=0.005, sample_hz=50.0)
 
 
 @pytest.mark.parametrize("name", ["acutrol3000", "lines"])
 def test_a_shipped_profile_moves_reads_and_stops_a_table_over_a_socket(name: str, table: Table, tmp_path: Path) -> None:
     pytest.importorskip("pyvisa_py", reason="PyVISA is not there")
-    with open_positioner(profile_for(table, name, tmp_path), BENCH, said) as opened:
+    with open_positioner(table.profile(tmp_path, name), BENCH, said) as opened:
         positioner = opened.positioner
         assert isinstance(positioner, Positioner)
         assert positioner.read() == pytest.approx((0.0, 0.0, 0.0), abs=1e-4) and positioner.fault() == ""
@@ -93,7 +57,7 @@ def wait_until(is_so: object, seconds: float = 20.0) -> None:
 
 def test_signs_zeros_and_units_are_those_of_the_profile(table: Table, tmp_path: Path) -> None:
     pytest.importorskip("pyvisa_py", reason="PyVISA is not there")
-    path = profile_for(table, "lines", tmp_path, "signs = [1, -1, 1]\nzeros_deg = [10.0, 0.0, -5.0]")
+    path = table.profile(tmp_path, more="signs = [1, -1, 1]\nzeros_deg = [10.0, 0.0, -5.0]")
     with open_positioner(path, BENCH, said) as opened:
         opened.positioner.move_to((20.0, 30.0, 40.0))
         wait_until(lambda: not table.bench.moving and table.bench.read_deg()[0] > 29.0)
@@ -103,16 +67,17 @@ def test_signs_zeros_and_units_are_those_of_the_profile(table: Table, tmp_path: 
 
 def test_a_fault_of_the_drive_is_told_and_a_link_that_is_lost_raises(tmp_path: Path) -> None:
     pytest.importorskip("pyvisa_py", reason="PyVISA is not there")
-    table = Table(Servo(fault="drive"))
-    with open_positioner(profile_for(table, "acutrol3000", tmp_path), BENCH, said) as opened:
+    with (
+        fast_table(Servo(fault="drive")) as table,
+        open_positioner(table.profile(tmp_path, "acutrol3000"), BENCH, said) as opened,
+    ):
         wait_until(lambda: "overcurrent" in opened.positioner.fault())
-    table.close()
-    table = Table(Servo(fault="link", fault_s=1.0))
-    path = profile_for(table, "acutrol3000", tmp_path, "timeout_s = 0.3")
-    refusal = pytest.raises(PositionerError, match="acutrol3000 at TCPIP")
-    with open_positioner(path, BENCH, said) as opened, refusal:
+    with (
+        fast_table(Servo(fault="link", fault_s=1.0)) as table,
+        open_positioner(table.profile(tmp_path, "acutrol3000", "timeout_s = 0.3"), BENCH, said) as opened,
+        pytest.raises(PositionerError, match="acutrol3000 at TCPIP"),
+    ):
         wait_until(lambda: opened.positioner.read() is None)
-    table.close()
 
 
 def test_nobody_at_the_address_is_told_in_a_sentence(tmp_path: Path) -> None:
@@ -125,7 +90,7 @@ def test_nobody_at_the_address_is_told_in_a_sentence(tmp_path: Path) -> None:
 
 def test_two_programs_at_one_positioner_are_refused(table: Table, tmp_path: Path) -> None:
     pytest.importorskip("pyvisa_py", reason="PyVISA is not there")
-    path = profile_for(table, "lines", tmp_path)
+    path = table.profile(tmp_path)
     refusal = pytest.raises(InputError, match="drives the positioner")
     with open_positioner(path, BENCH, said), refusal, open_positioner(path, BENCH, said):
         pass

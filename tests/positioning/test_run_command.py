@@ -1,7 +1,5 @@
 """kf-calib run: a rehearsal on the emulated bench, its lines, its recording, and how it ends where anything fails."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -22,7 +20,7 @@ SIM = "sim://?seed=4&sample_hz=20"
 
 def test_a_rehearsal_reaches_its_targets_and_the_recording_tells_every_decision(run: Any, tmp_path: Path) -> None:
     recording = tmp_path / "run.mcap"
-    words = ("--record", recording, "--target", "K=8ppm", "--json", "--save", tmp_path / "cal.json")
+    words = ("--record", recording, "--target", "K=16ppm", "--json", "--save", tmp_path / "cal.json")
     code, out, err = run("run", "--positioner", SIM, *words)
     assert code == 0, err
     lines = [json.loads(line) for line in out.splitlines()]
@@ -38,7 +36,7 @@ def test_a_rehearsal_reaches_its_targets_and_the_recording_tells_every_decision(
     again = kf_calib.calibrate(recording)
     sigmas = {row["symbol"]: row["sigma"] for row in final["parameters"]}
     assert {name: parameter.sigma for name, parameter in again.parameters.items()} == pytest.approx(sigmas, rel=1e-12)
-    assert sigmas["K1"] <= 8e-6 and len(again.visits) == final["dwells"] == len(decisions) + 3  # first small moves
+    assert sigmas["K1"] <= 16e-6 and len(again.visits) == final["dwells"] == len(decisions) + 3  # first small moves
     assert kf_calib.open_calibration(tmp_path / "cal.json").correction() is not None
 
 
@@ -85,9 +83,7 @@ def test_a_full_disk_stops_the_table(tmp_path: Path) -> None:
 def test_a_dry_run_moves_nothing_and_tells_ways_and_duration(run: Any, tmp_path: Path) -> None:
     bench = tmp_path / "bench.toml"
     bench.write_text('axes = "y z x"\ngravity_mps2 = 9.81\nforbidden_deg = "middle=80:100,inner=-15:15"\n')
-    code, out, err = run("run", "--positioner", "acutrol3000", "--bench", bench, "--dry-run", "--json")
-    assert code == 0, err
-    told = json.loads(out)
+    told = run.json("run", "--positioner", "acutrol3000", "--bench", bench, "--dry-run")
     assert len(told["gimbal_deg"]) == 12 and told["duration_s"] > 12 * 30.0
     assert [stations[-1] for stations in told["stations_deg"]] == told["gimbal_deg"]
     code, out, _ = run("run", "--positioner", "acutrol3000", "--bench", bench, "--dry-run")
@@ -105,12 +101,10 @@ def test_a_dry_run_moves_nothing_and_tells_ways_and_duration(run: Any, tmp_path:
     ],
 )
 def test_what_cannot_be_run_is_refused_in_a_sentence(words: tuple[str, ...], said: str, run: Any) -> None:
-    code, out, err = run("run", *words)
-    assert code == 2 and said in err and out == "", err
+    assert said in run.refused("run", *words)
 
 
 def test_limits_of_the_bench_file_are_checked(run: Any, tmp_path: Path) -> None:
     bench = tmp_path / "bench.toml"
     bench.write_text('axes = "y z x"\ngravity_mps2 = 9.81\nlimits_deg = "w=1:2"\n')
-    code, _, err = run("run", "--positioner", "sim://", "--bench", bench)
-    assert code == 2 and "gimbal 'w' is not known" in err
+    assert "gimbal 'w' is not known" in run.refused("run", "--positioner", "sim://", "--bench", bench)

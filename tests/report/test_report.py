@@ -1,7 +1,5 @@
 """The report as its reader has it: in a browser, light, dark and printed, without the network, whatever is in it."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Iterator
@@ -14,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.browser import chromium
 from helpers.known_runs import hidden_diagnosed, hidden_improved
 from matplotlib.figure import Figure
 from PIL import Image
@@ -48,12 +45,6 @@ def path(found: kf_calib.Diagnosis, tmp_path_factory: pytest.TempPathFactory) ->
     page = page_of(replace(found, before=before), [measured], [EVIL], [EVIL])
     save(page, place)
     return place
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as opened:
-        yield opened
 
 
 @pytest.fixture

@@ -1,8 +1,5 @@
 """The paper's experiment: its matrices against finite differences, its Table 2 against runs and closed form."""
 
-from __future__ import annotations
-
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -262,9 +259,7 @@ def test_gravity_fixed_is_what_a_base_bench_gives() -> None:
 
 @pytest.mark.slow
 def test_command_prints_the_agreed_keys_and_saves_the_figures(run: Any, tmp_path: Path) -> None:
-    code, out, err = run("paper", "--json", "--repetitions", 50, "--seed", 4, "--pdf", tmp_path / "paper.pdf")
-    assert code == 0 and err == "" and out.count("\n") == 1
-    result = json.loads(out)
+    result = run.json("paper", "--repetitions", 50, "--seed", 4, "--pdf", tmp_path / "paper.pdf")
     assert len(result["table2"]) == 12
     for row in result["table2"]:
         assert row["optimal_printed"] == OPTIMAL_PRINTED[row["parameter"]]
@@ -282,6 +277,4 @@ def test_command_prints_the_agreed_keys_and_saves_the_figures(run: Any, tmp_path
      (["--png", "/no/such/folder/x.png", "--repetitions", 1], "no folder")],
 )  # fmt: skip
 def test_bad_usage_is_one_sentence(run: Any, words: list[object], says: str) -> None:
-    code, out, err = run("paper", *words)
-    assert (code, out) == (2, "")
-    assert says in err and err.count("\n") == 1
+    assert says in run.refused("paper", *words)

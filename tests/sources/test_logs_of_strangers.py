@@ -1,8 +1,5 @@
 """Logs as other programs write them: with what stands beside the readings, without an option but gravity."""
 
-from __future__ import annotations
-
-import json
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -97,9 +94,7 @@ def test_the_command_of_the_page_gives_its_verdict(name: str, run: Any, tmp_path
 @pytest.mark.parametrize("name", [*IN_BRIEF, *slow(*(name for name in FOREIGN_LOGS if name not in IN_BRIEF))])
 def test_the_command_that_info_proposes_works(name: str, run: Any, tmp_path: Path) -> None:
     path = FOREIGN_LOGS[name].at(tmp_path)
-    code, out, err = run("info", path, "--gravity", G, "--json")
-    assert code == 0, err
-    code, out, err = run(*json.loads(out)["command"].split()[1:])
+    code, out, err = run(*run.proposed(path, "--gravity", G)[1])
     assert code == 0 and " ".join(VERDICT.split()) in " ".join(out.split()), err
 
 
@@ -186,15 +181,14 @@ def two_units(path: Path) -> Path:
 
 def test_one_of_several_sensors_is_chosen(tmp_path: Path, run: Any) -> None:
     path = two_units(tmp_path / "two.csv")
-    code, _, err = run("replay", path, "--no-angles", "--gravity", G)
-    assert code == 2 and "told apart by the column 'unit' (0, b): choose one, for example by --where 'unit=0'" in err
+    words = ("replay", path, "--no-angles", "--gravity", G)
+    said = "told apart by the column 'unit' (0, b): choose one, for example by --where 'unit=0'"
+    assert said in run.refused(*words)
     for unit, bias in (("0", B[0]), ("b", B[0] + 0.1 * G)):
-        code, out, err = run("replay", path, "--no-angles", "--gravity", G, "--where", f"unit={unit}", "--json")
-        assert code == 0, err
-        found = {each["symbol"]: each["value"] for each in json.loads(out)["parameters"]}
-        assert found["K1"] == pytest.approx(K[0], abs=5e-4) and found["b1"] == pytest.approx(bias, abs=5e-3)
-    code, _, err = run("replay", path, "--no-angles", "--gravity", G, "--where", "unit")
-    assert code == 2 and "write --where COLUMN=VALUE" in err
+        found = run.parameters(*words, "--where", f"unit={unit}")
+        assert found["K1"]["value"] == pytest.approx(K[0], abs=5e-4)
+        assert found["b1"]["value"] == pytest.approx(bias, abs=5e-3)
+    assert "write --where COLUMN=VALUE" in run.refused(*words, "--where", "unit")
 
 
 def test_rows_of_a_table_are_chosen(tmp_path: Path) -> None:

@@ -1,12 +1,8 @@
 """Logs and tables as others write them: ``info`` proposes a command that works, and gives what the recording gives."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import random
-import shlex
-import tracemalloc
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
@@ -14,6 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.bounded import traced
+from helpers.damage import damaged
 from helpers.long_runs import slow
 from helpers.paths import REAL, ROOT
 from helpers.recordings import read
@@ -114,22 +112,6 @@ def written(folder: Path, content: bytes) -> Path:
     return path
 
 
-def proposed(run: Any, path: Path, *words: str) -> tuple[dict[str, Any], list[str]]:
-    """What ``info`` says, and the words of the command that it proposes."""
-    code, out, err = run("info", path, *words, "--json")
-    assert (code, err) == (0, ""), err
-    found = json.loads(out)
-    program, *rest = shlex.split(found["command"])
-    assert program == "kf-calib"
-    return found, rest
-
-
-def parameters(run: Any, *words: object) -> dict[str, dict[str, Any]]:
-    code, out, err = run(*words, "--json")
-    assert (code, err) == (0, ""), err
-    return {own["symbol"]: own for own in json.loads(out)["parameters"]}
-
-
 RECORDED = dict[tuple[str, ...], dict[str, Any]]()
 """Parameters of the recording, by what is stated of the bench."""
 
@@ -141,14 +123,14 @@ def test_a_foreign_log_is_evaluated_by_the_command_that_info_proposes(how: str, 
     content, options = (WITH_ANGLES | BY_READINGS)[how]
     path = written(tmp_path, content)
     stated = BENCH if how in WITH_ANGLES else BY_HAND[:2]
-    found, command = proposed(run, path, *options, *stated)
+    found, command = run.proposed(path, *options, *stated)
     assert len(found["dwells"]) == 6 and set(options) | set(stated) <= set(command)
     norms = [dwell["norm_mps2"] for dwell in found["dwells"]]
     assert 8.5 < min(norms) < max(norms) < 11.5
-    values = parameters(run, *command)
+    values = run.parameters(*command)
     stated = BENCH if how in WITH_ANGLES else BY_HAND
     if stated not in RECORDED:
-        RECORDED[stated] = parameters(run, "replay", FACES, *stated)
+        RECORDED[stated] = run.parameters("replay", FACES, *stated)
     expected = RECORDED[stated]
     for symbol, own in expected.items():
         if own["value"] is not None and own["sigma"]:
@@ -161,12 +143,11 @@ def test_counts_get_a_size_to_try(run: Any, tmp_path: Path) -> None:
     path = tmp_path / "counts.csv"
     path.write_text("time_ms,ax_raw,ay_raw,az_raw\n"
                     + rows(lambda t, f, _: (1000 * t, *(str(round(c)) for c in 16384 * f / G))))  # fmt: skip
-    found, command = proposed(run, path, "--gravity", "9.81")
+    found, command = run.proposed(path, "--gravity", "9.81")
     assert any("so they are counts: give the size of one by --accel-scale" in said for said in found["missing"])
     assert "--accel-scale" in command and "--no-angles" in command
-    assert parameters(run, *command)["K1"]["value"] == pytest.approx(1.0, abs=0.15)
-    code, _, err = run("replay", path, *BY_HAND)
-    assert code == 2 and "so they are counts" in err and err.count("\n") == 1
+    assert run.parameters(*command)["K1"]["value"] == pytest.approx(1.0, abs=0.15)
+    assert "so they are counts" in run.refused("replay", path, *BY_HAND)
 
 
 IN_OTHER_UNITS = {
@@ -181,18 +162,17 @@ def test_a_unit_that_is_not_that_of_the_name_is_told_by_the_norm(how: str, run: 
     header, factor, option = IN_OTHER_UNITS[how]
     path = tmp_path / "log.csv"
     path.write_text(header + ",outer_deg,middle_deg,inner_deg\n" + rows(lambda t, f, q: (t, *(factor * f), *q)))
-    found, command = proposed(run, path, *BENCH)
+    found, command = run.proposed(path, *BENCH)
     assert any("have a norm of" in said for said in found["missing"])
     assert [*BENCH, *option.split()] == [word for word in command if word not in ("replay", str(path))]
-    values = parameters(run, *command)
-    expected = parameters(run, "replay", FACES, *BENCH)
+    values = run.parameters(*command)
+    expected = run.parameters("replay", FACES, *BENCH)
     for symbol in ("K1", "K2", "K3"):
         assert values[symbol]["value"] == pytest.approx(expected[symbol]["value"], rel=0.05)
-    code, _, err = run("replay", path, *BENCH)
-    assert code == 2 and option.split()[0] in err and err.count("\n") == 1
+    assert option.split()[0] in run.refused("replay", path, *BENCH)
     if "--accel-unit" in option:
-        code, _, err = run("replay", path, *BENCH, "--accel-unit", "g")
-        assert code == 2 and "in m/s2 by its name" in err and "--restate-input" in err
+        err = run.refused("replay", path, *BENCH, "--accel-unit", "g")
+        assert "in m/s2 by its name" in err and "--restate-input" in err
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.0 / G, 2.5e5], ids=["m/s2", "g", "counts"])
@@ -200,16 +180,16 @@ def test_json_lines_without_a_unit_get_one_to_try(factor: float, run: Any, tmp_p
     path = tmp_path / "log.jsonl"
     path.write_text("".join(json.dumps({"time_s": float(t), "accel": (factor * f).tolist(), "angles_deg": q.tolist()})
                             + "\n" for t, f, q in zip(*samples(), strict=True)))  # fmt: skip
-    _, command = proposed(run, path, *BENCH)
-    assert parameters(run, *command)["K1"]["value"] == pytest.approx(1.0, abs=0.15)
+    _, command = run.proposed(path, *BENCH)
+    assert run.parameters(*command)["K1"]["value"] == pytest.approx(1.0, abs=0.15)
 
 
 def test_two_angles_get_two_axes(run: Any, tmp_path: Path) -> None:
     path = tmp_path / "two.csv"
     path.write_text("time_s,ax_g,ay_g,az_g,outer_deg,inner_deg\n" + rows(lambda t, f, q: (t, *(f / G), *q[1:])))
-    found, command = proposed(run, path)
+    found, command = run.proposed(path)
     assert command[-4:] == ["--axes", "z x", "--gravity", "9.81"] and len(found["dwells"]) == 6
-    assert len(parameters(run, *command)) == 12
+    assert len(run.parameters(*command)) == 12
 
 
 ANGLES = "time_s,ax_g,ay_g,az_g,outer_deg,middle_deg,inner_deg\n"
@@ -230,8 +210,8 @@ BROKEN = {
 def test_a_log_that_cannot_be_used_is_one_sentence(how: str, run: Any, tmp_path: Path) -> None:
     text, says = BROKEN[how]
     (tmp_path / "log.csv").write_text(text)
-    code, out, err = run("replay", tmp_path / "log.csv", *BENCH)
-    assert (code, out) == (2, "") and says in err and err.count("\n") == 1 and len(err) < 700, err
+    err = run.refused("replay", tmp_path / "log.csv", *BENCH)
+    assert says in err and len(err) < 700, err
 
 
 def test_numbers_of_two_kinds_are_not_mixed(tmp_path: Path) -> None:
@@ -294,12 +274,9 @@ def test_a_packed_file_is_unpacked_piece_by_piece(tmp_path: Path) -> None:
     with gzip.open(bomb, "wb", 1) as file:
         for _ in range(64):
             file.write(b" " * (1 << 20))
-    tracemalloc.start()
-    with pytest.raises(InputError, match="holds no lines"):
+    with traced() as peak, pytest.raises(InputError, match="holds no lines"):
         list(Lines(bomb, {"gravity_mps2": "9.81"}, angles=False))
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 40 << 20
+    assert peak.bytes < 40 << 20
 
 
 def test_a_packed_file_that_lost_its_end_is_used_as_far_as_it_goes(tmp_path: Path) -> None:
@@ -334,10 +311,10 @@ def test_a_table_without_angles_gives_what_least_squares_of_the_norms_gives(
     optimize = pytest.importorskip("scipy.optimize")
     path = tmp_path / "hand.csv"
     path.write_text(hand_table(has_spread))
-    found, command = proposed(run, path, "--gravity", "9.81", "--g-unit", "local")
+    found, command = run.proposed(path, "--gravity", "9.81", "--g-unit", "local")
     assert "--no-angles" in command and found["orientation"] is None and len(found["dwells"]) == 18
     assert found["dwells"][0]["pose"] == [] and found["dwells"][0]["up"] == pytest.approx([1.0, 0.0, 0.0], abs=0.04)
-    values = parameters(run, *command)
+    values = run.parameters(*command)
     means = np.loadtxt(path, delimiter=",", skiprows=1)[:, 1:4]
 
     def size_of(q: np.ndarray) -> np.ndarray:
@@ -354,18 +331,15 @@ def test_a_table_without_angles_gives_what_least_squares_of_the_norms_gives(
     for k in range(3):
         for symbol, expected in ((f"K{k + 1}", scales[k]), (f"b{k + 1}", 9.81 * best[6 + k])):
             assert values[symbol]["value"] == pytest.approx(expected, abs=0.05 * values[symbol]["sigma"]), symbol
-    assert parameters(run, "replay", path, *BY_HAND)["K1"]["sigma"] > 0.0
+    assert run.parameters("replay", path, *BY_HAND)["K1"]["sigma"] > 0.0
 
 
 def test_a_table_with_faces_may_do_without_them(run: Any) -> None:
     twelve = ROOT / "recordings" / "twelve_poses.csv"
-    code, out, err = run("replay", twelve, "--no-angles", "--gravity", "9.8123", "--json")
-    assert (code, err) == (0, "")
-    found = json.loads(out)
+    found = run.json("replay", twelve, "--no-angles", "--gravity", "9.8123")
     assert found["dwells"] == 12
     assert any("'außen [°]', 'mitte [°]', 'innen [°]'" in said and "not used" in said for said in found["warnings"])
-    code, out, err = run("diagnose", twelve, "--no-angles", "--gravity", "9.8123", "--json")
-    assert (code, err) == (0, "")
+    run.json("diagnose", twelve, "--no-angles", "--gravity", "9.8123")
 
 
 @pytest.mark.skipif(not REAL.exists(), reason="the real recordings are not on this machine")
@@ -374,10 +348,10 @@ def test_a_table_with_faces_may_do_without_them(run: Any) -> None:
 )
 def test_real_logs_are_evaluated_as_they_are(name: str, poses: int, run: Any) -> None:
     path = REAL / f"{name}.csv.gz"
-    found, command = proposed(run, path)
+    found, command = run.proposed(path)
     assert len(found["dwells"]) == poses and "--no-angles" in command
     assert all(0.8 * G < dwell["norm_mps2"] < 1.2 * G for dwell in found["dwells"])
-    values = parameters(run, *command)
+    values = run.parameters(*command)
     assert all(0.9 < values[f"K{k}"]["value"] < 1.1 for k in (1, 2, 3))
 
 
@@ -402,20 +376,6 @@ SCRAPS = (
 )
 
 
-def damaged(content: bytes, rng: random.Random) -> bytes:
-    """A file with bytes changed, lost, repeated, or put in."""
-    out = bytearray(content)
-    for _ in range(rng.choice((1, 2, 5, 30))):
-        at, what = rng.randrange(len(out)), rng.random()
-        if what < 0.4:
-            out[at] = rng.randrange(256)
-        elif what < 0.6:
-            del out[at : at + rng.randrange(1, 50)]
-        else:
-            out[at:at] = rng.choice(SCRAPS) if what < 0.8 else out[max(0, at - 80) : at]
-    return bytes(out) or b"x"
-
-
 @pytest.mark.parametrize("seed", [1, *slow(*range(2, 20))])
 def test_a_damaged_log_or_table_raises_nothing_but_input_errors(seed: int, tmp_path: Path) -> None:
     rng, path = random.Random(seed), tmp_path / "damaged.csv"
@@ -423,7 +383,7 @@ def test_a_damaged_log_or_table_raises_nothing_but_input_errors(seed: int, tmp_p
     plain += [gzip.compress(plain[0]), (ROOT / "recordings" / "twelve_poses.csv").read_bytes()]
     kinds = set[FileKind]()
     for _ in range(100):
-        path.write_bytes(damaged(rng.choice(plain), rng))
+        path.write_bytes(damaged(rng.choice(plain), rng, SCRAPS) or b"x")
         kind = kind_of(path)
         kinds.add(kind)
         for angles in (True, False):

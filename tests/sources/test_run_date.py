@@ -1,7 +1,5 @@
 """The date of a run: as stated, by its stamps, or by the computer that received them; never that of its evaluation."""
 
-from __future__ import annotations
-
 import time
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -10,13 +8,12 @@ import pytest
 from helpers.calibrations import simulated
 from helpers.links import Given
 from helpers.paths import RECORDINGS
-from helpers.recordings import BENCH, START_NS, made_batch, read
+from helpers.recordings import START_NS, made_batch, read, record
 
 import kf_calib
 from kf_calib.bench.bench import Bench
 from kf_calib.errors import BenchError
 from kf_calib.exchange import calibration_file
-from kf_calib.sources.files.recorder import Recorder
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.live import LiveSource
 from kf_calib.sources.opening import run_date
@@ -54,8 +51,7 @@ def test_what_was_written_beforehand_was_not_received_now(tmp_path: Path) -> Non
 
 
 def test_a_stated_date_goes_before_all_others(tmp_path: Path) -> None:
-    with Recorder(tmp_path / "a.mcap", BENCH) as recorder:
-        recorder.write(made_batch(20))
+    record(tmp_path / "a.mcap", made_batch(20))
     stated = Recording(tmp_path / "a.mcap", {"date": "2021-03-04T05:06+01:00"})
     assert run_date(stated) == datetime(2021, 3, 4, 4, 6, tzinfo=UTC)
     assert Bench.from_metadata(stated.bench.to_metadata()) == stated.bench

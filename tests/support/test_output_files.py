@@ -1,7 +1,5 @@
 """Nothing of the user's is harmed: what a command may write, when it does, and what it says where it cannot."""
 
-from __future__ import annotations
-
 import errno
 import json
 import multiprocessing
@@ -19,9 +17,9 @@ from typing import Any
 import click
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from helpers.full_disk import full_disk
 from helpers.long_runs import slow
+from helpers.own_effect import TEN_LINES
 from helpers.warm_command import warm
 
 from kf_calib import effects
@@ -36,22 +34,13 @@ from kf_calib.support.output_files import Growing, Outputs, whole, write_whole
 
 QUICK = ["--orientations", "12", "--dwell-s", "6", "--slew-degps", "360", "--sample-hz", "50", "--seed", "3"]
 MINE = b"the user's own"
-OWN = """
-from kf_calib.effects import SensorEffect
-
-class Bend(SensorEffect):
-    unit = "s^2/m"
-
-    def terms(self, s):
-        return s.along**2
-"""
 BENCH = Bench(parse_axes("y z x"), 9.81)
 
 
 @pytest.fixture(scope="module")
-def original(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+def original(run, tmp_path_factory: pytest.TempPathFactory) -> bytes:
     path = tmp_path_factory.mktemp("outputs") / "run.mcap"
-    assert CliRunner().invoke(cli, ["simulate", str(path), *QUICK]).exit_code == 0
+    assert run("simulate", path, *QUICK)[0] == 0
     return path.read_bytes()
 
 
@@ -64,7 +53,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, original: bytes) -> Pa
     Path("lines.csv").write_text("time_s,ax_g,ay_g,az_g,outer_deg,middle_deg,inner_deg\n" + rows)
     Path("bench.toml").write_text("gravity_mps2 = 9.81\n")
     Path("model.toml").write_text('effects = []\neffects_from = ["own.py"]\n')
-    Path("own.py").write_text(OWN)
+    Path("own.py").write_text(TEN_LINES)
     monkeypatch.setattr(effects, "_registered", {})  # what own.py defines is for one test
     Path("angles.csv").write_text("0,0,0\n90,0,0\n0,90,0\n0,0,90\n90,90,0\n0,90,90\n")
     return tmp_path
@@ -110,8 +99,7 @@ def test_an_input_is_never_written(run, here: Path, words: str) -> None:
     Path("hard.mcap").hardlink_to("run.mcap")
     Path("soft.mcap").symlink_to("run.mcap")
     before = contents(here)
-    code, out, err = run(*words.split(), "--overwrite")
-    assert code == 2 and out == "" and "read by this very command" in err and err.count("\n") == 1
+    assert "read by this very command" in run.refused(*words.split(), "--overwrite")
     assert contents(here) == before
 
 
@@ -186,8 +174,8 @@ def idle(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_nothing_is_replaced_unasked(run, here: Path, words: str, option: str) -> None:
     Path("there").write_bytes(MINE)
     after = ["lines.csv"] if words == "record" else []
-    code, out, err = run(*words.split(), *option.split(), "there", *after)
-    assert code == 2 and out == "" and "there exists already" in err and "--overwrite" in err
+    err = run.refused(*words.split(), *option.split(), "there", *after)
+    assert "there exists already" in err and "--overwrite" in err
     assert Path("there").read_bytes() == MINE
 
 
@@ -204,22 +192,21 @@ def test_what_cannot_be_written_is_told_before_the_work(
     Path("shut").write_bytes(MINE)
     Path("shut").chmod(0o444)
     after = ["lines.csv"] if words == "record" else []
-    code, out, err = run(*words.split(), *option.split(), path, *after, "--overwrite")
-    assert code == 2 and out == "" and says in err and err.count("\n") == 1
+    assert says in run.refused(*words.split(), *option.split(), path, *after, "--overwrite")
     assert Path("device").is_symlink() and Path("shut").read_bytes() == MINE
 
 
 def test_the_truth_of_a_simulation_is_an_output(run, here: Path) -> None:
     Path("sim.truth.json").write_bytes(MINE)
-    code, _, err = run("simulate", "sim.mcap", *QUICK)
-    assert code == 2 and "sim.truth.json exists already" in err and not Path("sim.mcap").exists()
+    assert "sim.truth.json exists already" in run.refused("simulate", "sim.mcap", *QUICK)
+    assert not Path("sim.mcap").exists()
     assert Path("sim.truth.json").read_bytes() == MINE
 
 
 def test_two_outputs_are_two_files(run, here: Path) -> None:
     Path("link").symlink_to("new.rrd")
-    code, _, err = run("replay", "run.mcap", "--rrd", "new.rrd", "--save-model", "link")
-    assert code == 2 and "name the same file" in err and not Path("new.rrd").exists()
+    err = run.refused("replay", "run.mcap", "--rrd", "new.rrd", "--save-model", "link")
+    assert "name the same file" in err and not Path("new.rrd").exists()
 
 
 def test_a_link_stays_and_what_it_points_to_is_replaced(run, here: Path) -> None:
@@ -386,8 +373,7 @@ def test_a_recording_that_fails_leaves_no_stub(run, here: Path, text: str, overw
     if overwrite:
         Path("out.mcap").write_bytes(MINE)
     before = contents(here)
-    code, _, err = run("record", "out.mcap", "bad.csv", "--axes", "y z x", "--gravity", "9.81", "--overwrite")
-    assert code == 2 and err.count("\n") == 1
+    run.refused("record", "out.mcap", "bad.csv", "--axes", "y z x", "--gravity", "9.81", "--overwrite")
     assert contents(here) == before
 
 
@@ -395,8 +381,8 @@ def test_a_live_run_without_a_reading_leaves_the_earlier_recording(run, here: Pa
     Path("poses.csv").write_text("time_s,ax_g,ay_g,az_g,outer_deg,middle_deg,inner_deg\n" + "1,,,,0,0,0\n" * 20)
     Path("out.mcap").write_bytes(MINE)
     words = ["--axes", "y z x", "--gravity", "9.81", "--idle-s", "0.5", "--record", "out.mcap", "--overwrite"]
-    code, printed, err = run("live", "poses.csv", *words)
-    assert (code, printed) == (2, "") and "nothing was recorded: no reading came from poses.csv, but 20 angles" in err
+    err = run.refused("live", "poses.csv", *words)
+    assert "nothing was recorded: no reading came from poses.csv, but 20 angles" in err
     assert Path("out.mcap").read_bytes() == MINE and not list(here.glob(".*"))
 
 
@@ -441,8 +427,7 @@ def test_a_file_that_is_being_recorded_is_for_no_other_run(
     with Recorder("out.mcap", BENCH, overwrite=there) as recorder:
         for _ in range(2):
             before = contents(here)
-            code, out, err = run(*words.split(), *option)
-            assert code == 2 and out == "" and err.count("\n") == 1, err
+            err = run.refused(*words.split(), *option)
             assert f"out.mcap is being written by another run (process {os.getpid()}): end that one first" in err
             assert contents(here) == before
             recorder.write(batch())
@@ -532,8 +517,8 @@ def test_whatever_goes_wrong_is_one_sentence_and_exit_2(
         raise error
 
     monkeypatch.setattr("kf_calib.views.console.summary", fail)
-    code, out, err = run("replay", "run.mcap")
-    assert code == 2 and out == "" and err.startswith("kf-calib: ") and says in err and err.count("\n") == 1
+    err = run.refused("replay", "run.mcap")
+    assert says in err
     assert "kf_calib/cli/replay.py:" in err or isinstance(error, MemoryError)
     monkeypatch.setenv("KF_CALIB_TRACEBACK", "1")
     code, _, err = run("replay", "run.mcap")

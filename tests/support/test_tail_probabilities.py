@@ -1,7 +1,5 @@
 """The chance of an F ratio, against a finite sum in 60 digits, and against scipy's."""
 
-from __future__ import annotations
-
 import math
 from decimal import Decimal, localcontext
 

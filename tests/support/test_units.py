@@ -1,7 +1,5 @@
 """Units against closed forms, and every printed unit read back."""
 
-from __future__ import annotations
-
 import math
 import threading
 from contextvars import copy_context

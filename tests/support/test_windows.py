@@ -4,8 +4,6 @@ Its locks are those of a file's bytes, no open file can be renamed or removed, k
 consoles have code pages without the signs of this field.
 """
 
-from __future__ import annotations
-
 import ctypes
 import importlib
 import io
@@ -169,11 +167,8 @@ def test_a_console_that_is_closed_ends_the_run_in_good_order(monkeypatch: pytest
 @pytest.mark.parametrize("code_page", ["cp1252", "cp437", "cp850", "latin-1", "ascii"])
 def test_a_pipe_gets_utf_8_where_a_code_page_lacks_signs(code_page: str) -> None:
     environment = {**os.environ, "PYTHONIOENCODING": code_page, "PYTHONUTF8": "0"}
-    words = [
-        sys.executable,
-        "-c",
-        "from kf_calib.cli.echo import open_streams, echo; open_streams(); echo('σ ┃ µg χ²')",
-    ]
+    code = "from kf_calib.cli.echo import open_streams, echo; open_streams(); echo('σ ┃ µg χ²')"
+    words = [sys.executable, "-c", code]
     done = subprocess.run(words, env=environment, capture_output=True, check=True, timeout=120)
     assert done.stdout.decode("utf-8").strip() == "σ ┃ µg χ²"
 

@@ -1,7 +1,5 @@
 """Odds averaged over directions, against plain averages."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from blind_trials.bayes_factor import log_odds

@@ -1,7 +1,5 @@
 """The best possible share of right names, against theory and plain averages."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The blind trial: a handful of trials played, and its command."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Set-up of a checkout where there is no shell."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Sequence

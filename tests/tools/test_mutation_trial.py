@@ -1,7 +1,5 @@
 """The mutation tester makes the change that it names, has its tests run, and tells whether one fails."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import signal

@@ -1,7 +1,5 @@
 """The pictures of README and docs are those that tools/pictures draws today."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The blind trial of the pooled diagnosis: what it hides is what it counts, and the diagnosis passes it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.run_factors import campaign_of

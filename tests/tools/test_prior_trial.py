@@ -1,7 +1,5 @@
 """The trial that draws from the program's own priors: what it reports is so, and what it draws is in the readings."""
 
-from __future__ import annotations
-
 import numpy as np
 import pyarrow.parquet as pq
 import pytest

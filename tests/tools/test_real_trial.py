@@ -1,7 +1,5 @@
 """The trial on real noise: sizes of what is injected, by a refit; and its command."""
 
-from __future__ import annotations
-
 import json
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Every slow test has its turn within a round of commits, whatever the commits' hashes are."""
 
-from __future__ import annotations
-
 import itertools
 import re
 import subprocess
@@ -84,7 +82,7 @@ def test_the_option_leaves_the_tests_of_the_share(history: tuple[Path, list[str]
     if subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, timeout=300).returncode:
         pytest.skip("this is no checkout")
     words = [sys.executable, "-m", "pytest", "-n", "0", "-p", "no:cacheprovider", "-q", "--collect-only", "-m", "slow",
-             "tests/sources/simulation/test_injected.py"]  # fmt: skip
+             "tests/estimation/test_setup_blunders.py"]  # fmt: skip
     share = Share.of_commit(ROOT, "HEAD")
     every, taken = (
         set(re.findall(r"^tests/.*::.*$", done.stdout, re.MULTILINE))

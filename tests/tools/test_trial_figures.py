@@ -1,7 +1,5 @@
 """Figures of the blind trial, computed from outcomes that are made up."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Stated probabilities of the blind trial against the truth, in outcomes that are made up."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Colours that mean something are told apart by eyes that lack a kind of cone, on paper and on a dark screen."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from importlib import import_module

@@ -1,7 +1,5 @@
 """Figures of a diagnosis and of an improvement: ink in every panel, real units, and the numbers of the results."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The Rerun view: what is in the file equals the calibration, and the file opens as a picture with something in it."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections import defaultdict
@@ -252,20 +250,6 @@ def test_it_opens_as_a_picture(recording: Path, tmp_path: Path) -> None:
         assert (np.abs(shown.astype(int) - colour).max(axis=2) < 12).sum() > 300
     early = _drawn(recording, tmp_path / "early.png", timeline=view.ORIENTATION, time=3)
     assert (early != shown).any(axis=2).mean() > 0.003  # ellipsoids, and the cursor in each panel
-
-
-@pytest.mark.draws
-@pytest.mark.slow
-def test_the_picture_is_not_that_of_an_empty_file(recording: Path, tmp_path: Path) -> None:
-    import rerun as rr
-
-    shown = _drawn(recording, tmp_path / "run.png")
-    with rr.RecordingStream("empty") as stream:
-        stream.save(tmp_path / "empty.rrd")
-        stream.log("nothing", rr.TextDocument(""), static=True)
-        stream.disconnect()
-    empty = _drawn(tmp_path / "empty.rrd", tmp_path / "empty.png")
-    assert (empty != shown).any(axis=2).mean() > 0.05
 
 
 @pytest.mark.draws

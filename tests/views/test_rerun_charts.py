@@ -1,7 +1,5 @@
 """Views of a run, of a diagnosis and of an improvement hold the numbers of their results."""
 
-from __future__ import annotations
-
 import time
 from collections import defaultdict
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Figures of runs, comparisons, plans and the paper's experiment: what they draw is what the results say."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Tables on screens of any width: a number of the wide one is in the narrow one, whole."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Callable

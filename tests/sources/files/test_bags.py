@@ -1,15 +1,12 @@
 """A folder is a recording as a file is; what is none says what to do with it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
 import zstandard
-from helpers.recordings import ACCEL, ANGLES, BATCH, BENCH, HEAT, Topic, assert_equal, read, stamped, write_officially
+from helpers.recordings import ACCEL, ANGLES, BATCH, BENCH, HEAT, assert_equal, part_of, read, stamped, write_officially
 from mcap.writer import Writer
 
-from kf_calib.bench.streams import Stream
 from kf_calib.errors import InputError
 from kf_calib.sources.files.record_files import fingerprint
 from kf_calib.sources.files.recording import Recording
@@ -26,18 +23,11 @@ METADATA = """rosbag2_bagfile_information:
 """
 
 
-def cut(topic: Topic, part: slice) -> Topic:
-    name, kind, template, stream = topic
-    return name, kind, template, Stream(stream.time_ns[part], stream.values[part])
-
-
 def split(folder: Path, names: list[str], **options: object) -> Path:
     """Our batch in several files, whose topics come in another order each; the temperature from the second on."""
     folder.mkdir()
     for k, name in enumerate(names):
-        share = len(names)
-        own = [cut(topic, slice(len(topic[3]) * k // share, len(topic[3]) * (k + 1) // share)) for topic in
-               (ACCEL, ANGLES, HEAT)]  # fmt: skip
+        own = [part_of(topic, k, len(names)) for topic in (ACCEL, ANGLES, HEAT)]
         own = own[:2] if k == 0 else own[::-1]
         write_officially(folder / name, tuple(own), **({} if k == 0 else {"metadata": {}}), **options)
     return folder

@@ -1,7 +1,5 @@
 """CDR layouts against the official encoder, and what a decoder refuses."""
 
-from __future__ import annotations
-
 import struct
 from types import SimpleNamespace as Message
 
@@ -73,18 +71,12 @@ CASES = [
 
 
 @pytest.mark.parametrize(("kind", "template", "frame", "names", "width"), CASES)
-def test_packs_the_same_bytes_as_the_official_encoder(kind, template, frame, names, width) -> None:
-    samples = stream(width, count=3)
-    for packed, time_ns, values in zip(
-        cdr.pack(kind, template, samples), samples.time_ns, samples.values.tolist(), strict=True
-    ):
-        assert packed == encode_officially(kind, frame, names, time_ns, values)
-
-
-@pytest.mark.parametrize(("kind", "template", "frame", "names", "width"), CASES)
-def test_unpacks_what_it_packed_bit_for_bit(kind, template, frame, names, width) -> None:
+def test_packs_as_the_official_encoder_does_and_unpacks_it_bit_for_bit(kind, template, frame, names, width) -> None:
     samples = stream(width)
-    found = decode(cdr.Decoder(kind, width), cdr.pack(kind, template, samples))
+    packed = cdr.pack(kind, template, samples)
+    for message, time_ns, values in zip(packed[:3], samples.time_ns, samples.values.tolist(), strict=False):
+        assert message == encode_officially(kind, frame, names, time_ns, values)
+    found = decode(cdr.Decoder(kind, width), packed)
     assert np.array_equal(found.time_ns, samples.time_ns)
     assert found.values.tobytes() == samples.values.tobytes()
 
@@ -155,16 +147,17 @@ def joint_state(names: list[str], position: list[float], velocity: list[float], 
     return official(cdr.JOINT_STATE, fields)
 
 
-@pytest.mark.parametrize("count", [0, 1, 3])
-def test_refuses_joints_with_another_number_of_positions(count: int) -> None:
-    with pytest.raises(cdr.MessageError, match=f"names 2 joints but gives {count} positions"):
-        decode(cdr.Decoder(cdr.JOINT_STATE, 2), [joint_state(["a", "b"], [1.0] * count, [], [])])
-
-
-def test_joints_without_names_of_one_length_but_other_counts_are_told_apart() -> None:
-    messages = [joint_state([], [1.0, 2.0], [3.0], []), joint_state([], [1.0], [2.0, 3.0], [])]
-    assert len(messages[0]) == len(messages[1])
-    with pytest.raises(cdr.MessageError, match="gives 1 positions for 2 gimbal axes"):
+@pytest.mark.parametrize(
+    ("messages", "says"),
+    [
+        ([joint_state(["a", "b"], [], [], [])], "names 2 joints but gives 0 positions"),
+        ([joint_state(["a", "b"], [1.0] * 3, [], [])], "names 2 joints but gives 3 positions"),
+        ([joint_state([], [1.0, 2.0], [3.0], []), joint_state([], [1.0], [2.0, 3.0], [])], "gives 1 positions for 2 g"),
+    ],
+)
+def test_refuses_joints_with_another_number_of_positions(messages: list[bytes], says: str) -> None:
+    """The last two are of one length."""
+    with pytest.raises(cdr.MessageError, match=says):
         decode(cdr.Decoder(cdr.JOINT_STATE, 2), messages)
 
 

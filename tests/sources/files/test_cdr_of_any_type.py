@@ -1,8 +1,5 @@
 """Messages in CDR of types that nobody knows are read by their definition in the file."""
 
-from __future__ import annotations
-
-import json
 import sqlite3
 import struct
 from contextlib import closing
@@ -91,10 +88,9 @@ def test_a_known_type_by_its_fields(tmp_path: Path) -> None:
 @pytest.mark.parametrize("write", [write_mcap, write_bag])
 def test_info_shows_what_is_in_them(write: Any, run: Any, tmp_path: Path) -> None:
     path = write(tmp_path / "run")
-    code, out, _ = run("info", path, "--json")
-    found = json.loads(out)
+    found = run.json("info", path)
     paths = {topic["topic"]: topic["fields"] for topic in found["topics"]}
-    assert code == 0 and paths == {"/block": ["t_ns", "serial", "force.xyz"], "/platform/angles": []}
+    assert paths == {"/block": ["t_ns", "serial", "force.xyz"], "/platform/angles": []}
     assert "--field accel=TOPIC:X,Y,Z@TIME" in found["command"] and "--field angles" not in found["command"]
 
 

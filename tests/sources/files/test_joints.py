@@ -1,7 +1,5 @@
 """Gimbals are found by the names of a joint state, whatever the order and whatever else is in it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

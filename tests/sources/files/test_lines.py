@@ -1,22 +1,20 @@
 """JSON and CSV lines: what goes in comes out, to the nanosecond; what is broken is counted and never stops the rest."""
 
-from __future__ import annotations
-
 import io
 import json
 import math
 import os
 import threading
 import time
-import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.bounded import traced
+from helpers.recordings import read
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kf_calib.bench.streams import Batch
 from kf_calib.errors import InputError
 from kf_calib.sources.text.lines import Lines
 from kf_calib.sources.text.units import Units
@@ -30,12 +28,6 @@ START_NS = 1_750_000_000_123_456_789
 
 def lines_of(text: str | bytes, bench=BENCH, **options) -> Lines:
     return Lines(io.BytesIO(text.encode() if isinstance(text, str) else text), bench, **options)
-
-
-def read(lines: Lines) -> Batch:
-    batches = list(lines)
-    parts = ([getattr(batch, name) for batch in batches] for name in ("accel", "pose", "temperature"))
-    return Batch(*(sum(streams[1:], streams[0]) for streams in parts))
 
 
 def json_text(*entries) -> str:
@@ -148,11 +140,6 @@ def test_empty_cells_are_not_measured():
     assert stamps == [[1, 4, 5], [2, 5], [3]]
 
 
-@pytest.mark.parametrize("delimiter", [";", "\t"])
-def test_other_delimiters(delimiter):
-    assert len(read(lines_of(f"{HEADER}\n{ROW}".replace(",", delimiter))).accel) == 1
-
-
 def test_foreign_names_are_renamed():
     csv = "Stamp,acc_x[g],acc_y[g],acc_z[g],Outer_Deg,mid,inner_deg\n1,0,1,0,1,2,3"
     ours = {"Stamp": "time_s", "acc_x[g]": "ax_g", "acc_y[g]": "ay_g", "acc_z[g]": "az_g", "mid": "middle_deg"}
@@ -214,10 +201,15 @@ BROKEN_JSON = [
 
 @pytest.mark.parametrize("line", BROKEN_JSON, ids=lambda line: line[:40])
 def test_a_broken_json_line_costs_itself_only(line):
-    source = lines_of(json_text(OBJECT, line, OBJECT))
+    check_broken(json_text(OBJECT, line, OBJECT), 2)
+
+
+def check_broken(text: str, number: int) -> None:
+    """All lines but one are used, and the warning names it."""
+    source = lines_of(text)
     assert len(read(source).accel) == 2
     (warning,) = source.warnings
-    assert "1 of 3 lines were malformed and skipped (first line 2: " in warning
+    assert f"1 of {number + 1} lines were malformed and skipped (first line {number}: " in warning
 
 
 BROKEN_CSV = [
@@ -244,10 +236,7 @@ BROKEN_CSV = [
 
 @pytest.mark.parametrize("line", BROKEN_CSV, ids=lambda line: line[:40])
 def test_a_broken_csv_line_costs_itself_only(line):
-    source = lines_of("\n".join([HEADER, ROW, line, ROW]))
-    assert len(read(source).accel) == 2
-    (warning,) = source.warnings
-    assert "1 of 4 lines were malformed and skipped (first line 3: " in warning
+    check_broken("\n".join([HEADER, ROW, line, ROW]), 3)
 
 
 def test_the_first_malformed_line_is_named_by_its_number_in_the_file():
@@ -271,14 +260,11 @@ def test_garbage_raises_nothing_but_input_errors(garbage, before):
 
 @pytest.mark.parametrize("text", [b"\x00" * (32 << 20), b"{" * (32 << 20), b"\xff\xfe\n" * 100_000, b"\n" * (1 << 20)])
 def test_hostile_input_ends_soon_and_in_little_memory(text):
-    tracemalloc.start()
     start = time.perf_counter()
-    with pytest.raises(InputError):
+    with traced() as peak, pytest.raises(InputError):
         read(lines_of(text))
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
     assert time.perf_counter() - start < 10.0
-    assert peak < 40 << 20
+    assert peak.bytes < 40 << 20
 
 
 @pytest.mark.slow
@@ -295,11 +281,9 @@ def test_memory_does_not_grow_with_the_lines():
 
     def peak(blocks: int) -> int:
         source = Lines(Feed(blocks), BENCH)
-        tracemalloc.start()
-        assert sum(len(batch.accel) for batch in source) == 400 * blocks
-        found = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        return found
+        with traced() as found:
+            assert sum(len(batch.accel) for batch in source) == 400 * blocks
+        return found.bytes
 
     peak(2)
     assert peak(18) < 1.3 * peak(6)
@@ -345,10 +329,7 @@ def test_a_live_stream_is_read_as_it_arrives():
         ("time_s,ax_g,ay_g,az_g,outer\n1,1,1,1,1", "name them outer_deg"),
         ("time_s,ax_g,ay_g,az_g,ax_g,outer_deg\n", "two columns are named 'ax_g'"),
         ("time_s,ax_g,ay_g,az_g,outer_deg\n1,1,1,1,1", "1 angles and the bench has 3 axes"),
-        (
-            json_text({"time_ns": 1, "acc": [1, 2, 3], "angles_rad": [1]}),
-            "'acc'.*name the readings accel_mps2 or accel",
-        ),
+        (json_text({"time_ns": 1, "acc": [1, 2, 3], "angles_rad": [1]}), "'acc'.*name the readings accel_mps2 or acc"),
         (json_text({"time_ns": 1, "accel": [1, 2, 3], "angles_rad": [1]}), "do not tell their unit: name them"),
         (json_text({"time_ns": 1, "accel_g": [1, 2, 3]}), "no platform angles in 1 lines"),
         (json_text({"time_ns": 1, "angles_rad": [1, 2, 3]}), "no readings in 1 lines"),
@@ -372,27 +353,6 @@ def test_a_bench_that_is_not_described_is_asked_for():
 def test_a_file_that_is_not_there_is_named(tmp_path):
     with pytest.raises(InputError, match=r"absent\.csv: cannot be read"):
         list(Lines(tmp_path / "absent.csv", BENCH))
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "time_s,ax_g,ay_g,az_g\n1.5,0.25,1,-0.5,\n2.5,0.25,1,-0.5,\n",
-        "time_s,ax_g,ay_g,az_g,\n1.5,0.25,1,-0.5,\n2.5,0.25,1,-0.5\n",
-        "time_s;ax_g;ay_g;az_g;\n1,5;0,25;1;-0,5;;\n2,5;0,25;1;-0,5;\n",
-        '"time_s","ax_g","ay_g","az_g"\n"1,5","0,25","1","-0,5"\n"2,5","0,25","1","-0,5"\n',
-        "time_s|ax_g|ay_g|az_g\n1.5|0.25|1|-0.5\n2.5|0.25|1|-0.5\n",
-        "time_s\tax_g\tay_g\taz_g\n1,5\t0,25\t1\t-0,5\n2,5\t0,25\t1\t−0,5\n",
-        "sep=;\ntime_s;ax_g;ay_g;az_g\n1,5;0,25;1;-0,5\n2,5;0,25;1;-0,5\n",
-        "Time [s] , ax_g , ay_g , az_g\n 1.5 , 0.25 , 1 , -0.5\n 2.5 , 0.25 , 1 , -0.5\n",
-    ],
-)
-def test_the_same_rows_written_in_another_way_are_the_same(text: str) -> None:
-    source = lines_of(text, {"gravity_mps2": "9.81"}, angles=False)
-    batch = read(source)
-    assert batch.accel.time_ns.tolist() == [1_500_000_000, 2_500_000_000]
-    np.testing.assert_allclose(batch.accel.values / 9.80665, [[0.25, 1.0, -0.5]] * 2, rtol=1e-12)
-    assert not any("malformed" in said for said in source.warnings)
 
 
 # -- what other programs write --
@@ -461,7 +421,6 @@ def test_rows_of_several_sensors_are_told_and_no_other_column_is(tmp_path: Path)
 def test_info_proposes_one_of_several_sensors(run, tmp_path: Path) -> None:
     path = tmp_path / "two.csv"
     path.write_text(rows_of_units(0.5))
-    code, out, _ = run("info", path, "--gravity", "9.81", "--no-angles", "--json")
-    said = json.loads(out)
-    assert code == 0 and "--where 'I=0'" in " ".join(said["missing"])
+    said = run.json("info", path, "--gravity", "9.81", "--no-angles")
+    assert "--where 'I=0'" in " ".join(said["missing"])
     assert not said["command"], "one pose, which no option makes a calibration of"

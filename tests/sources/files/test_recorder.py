@@ -1,7 +1,5 @@
 """What the recorder writes, as the official tools see it, and what is left of it when it dies."""
 
-from __future__ import annotations
-
 import errno
 import os
 import random

@@ -1,7 +1,5 @@
 """Whatever lines and frames hold, they are refused and counted, and the run goes on: inputs close to sound ones."""
 
-from __future__ import annotations
-
 import json
 import struct
 from collections import Counter

@@ -1,7 +1,5 @@
 """A live run goes on whatever its link and the bench's clock do, and says what they did."""
 
-from __future__ import annotations
-
 import shutil
 import socket
 import subprocess

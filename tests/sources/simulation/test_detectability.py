@@ -1,20 +1,18 @@
 """Sizes of hidden effects in sigma, against generalised least squares written out sample by sample."""
 
-from __future__ import annotations
-
 import json
 import math
-import tracemalloc
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
+from helpers.bounded import traced
 from helpers.long_runs import slow
+from helpers.recordings import read, record
 
 from kf_calib.bench.bench import Bench, axes_of
 from kf_calib.errors import InputError
-from kf_calib.sources.files.recorder import Recorder
 from kf_calib.sources.simulation.detectability import sized, sizes_in_sigma, truth_of, write_truth
 from kf_calib.sources.simulation.injected import Hidden, NoSizeError, catalogue, parse
 from kf_calib.sources.simulation.physics import Ambient
@@ -135,9 +133,7 @@ def test_where_attitudes_are_not_known_the_size_is_that_along_the_force(setting_
 def test_what_is_asked_for_is_what_generalised_least_squares_finds(name, noise):
     run = simulation(NOISES[noise])
     effect = asked(run, f"{name}=10sigma")
-    with_effect, without = (
-        np.concatenate([batch.accel.values for batch in run.hiding(hidden, TrueNoise())]) for hidden in ([effect], [])
-    )
+    with_effect, without = (read(run.hiding(hidden, TrueNoise())).accel.values for hidden in ([effect], []))
     v = covariance(NOISES[noise], FORCE[COUNTS], DWELL[COUNTS])
     assert np.linalg.norm(left_over((with_effect - without)[COUNTS], v, FORCE[COUNTS])) == pytest.approx(10, rel=0.02)
 
@@ -147,7 +143,7 @@ def test_on_a_stabilised_platform_the_force_turns_within_a_dwell():
     noise, nominal = NOISES["all"], Sensors({"theta1": 0.0, "theta3": 0.0})  # whose readings are the specific force
     run = simulation(noise, bench, plan=[PlannedVisit(visit.gimbal_deg, 60.0) for visit in PLAN], sample_hz=0.5)
     felt, without, with_effect = (
-        np.concatenate([batch.accel.values for batch in some])
+        read(some).accel.values
         for some in (
             simulation(TrueNoise(), bench, plan=run.plan, sample_hz=0.5, sensors=nominal),
             run.hiding([], TrueNoise()),
@@ -167,7 +163,7 @@ def test_misfit_rises_by_the_square():
     noise = replace(NOISES["all"], ar1_phi=0.0, flicker_mps2=0.0)
     effect = asked(simulation(noise), "second-order=10sigma")
     runs = [simulation(noise, seed=seed, hidden=hidden) for hidden in ([effect], []) for seed in range(60)]
-    values = np.stack([np.concatenate([batch.accel.values for batch in run]) for run in runs], axis=2)
+    values = np.stack([read(run).accel.values for run in runs], axis=2)
     left = left_over(values[COUNTS], covariance(noise, FORCE[COUNTS], DWELL[COUNTS]), FORCE[COUNTS])
     with_effect, without = np.sum(left**2, axis=0).reshape(2, 60)
     assert np.mean(without) == pytest.approx(3 * np.count_nonzero(COUNTS) - 12, rel=0.03)
@@ -255,11 +251,9 @@ def test_memory_stays_flat():
     def peak(dwell_s: float) -> int:
         plan = spread_plan(4, dwell_s=dwell_s)
         run = simulation(plan=plan, sample_hz=500.0, batch_samples=1000)
-        tracemalloc.start()
-        size(run, "settling=1e-4")
-        peak = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        return peak
+        with traced() as found:
+            size(run, "settling=1e-4")
+        return found.bytes
 
     peak(1.0)
     assert peak(20.0) < 1.2 * peak(4.0)
@@ -348,9 +342,7 @@ def test_truth_tells_the_size_of_every_effect_and_the_recording_none(tmp_path):
     texts = ["second-order=10sigma", "bias-drift=2e-5", "gravity-error=1e-4", "outliers=0.1"]
     run = bare.hiding(parse(texts, BENCH.axes, sized=partial(sized, bare)))
     path = tmp_path / "run.mcap"
-    with Recorder(path, BENCH) as recorder:
-        for batch in run:
-            recorder.write(batch)
+    record(path, read(run), BENCH)
     effects = {effect["name"]: effect for effect in json.loads(write_truth(run, path).read_text())["effects"]}
     assert effects["second-order"]["size_sigma"] == pytest.approx(10, rel=0.01)
     assert effects["bias-drift"]["size_sigma"] == pytest.approx(size(bare, "bias-drift=2e-5"), rel=1e-9)
@@ -361,9 +353,9 @@ def test_truth_tells_the_size_of_every_effect_and_the_recording_none(tmp_path):
 
 def test_hiding_leaves_the_run_as_it_was():
     run = simulation()
-    before = np.concatenate([batch.accel.values for batch in run])
+    before = read(run).accel.values
     other = run.hiding(parse(["second-order=1e-3"], BENCH.axes))
-    changed = np.concatenate([batch.accel.values for batch in other])
+    changed = read(other).accel.values
     assert run.hidden == () and len(other.hidden) == 1 and other.noise is run.noise
-    np.testing.assert_array_equal(np.concatenate([batch.accel.values for batch in run]), before)
+    np.testing.assert_array_equal(read(run).accel.values, before)
     assert np.abs(changed - before).max() > 1e-3

@@ -1,27 +1,25 @@
 """Hidden effects of the simulator against closed forms on poses with known numbers."""
 
-from __future__ import annotations
-
 import json
 import math
-import tracemalloc
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.bounded import traced
 from helpers.long_runs import slow
+from helpers.recordings import read, record
 from scipy.optimize import brentq
 
 from kf_calib.bench.bench import Bench, axes_of, parse_axes
 from kf_calib.bench.streams import Batch
 from kf_calib.errors import InputError
-from kf_calib.sources.files.recorder import Recorder
 from kf_calib.sources.files.recording import Recording
 from kf_calib.sources.simulation.detectability import truth_of, write_truth
 from kf_calib.sources.simulation.injected import catalogue, parse, si
 from kf_calib.sources.simulation.physics import Ambient
 from kf_calib.sources.simulation.sensors import GRADES, Sensors, TrueNoise
-from kf_calib.sources.simulation.simulator import START_NS, Simulation
+from kf_calib.sources.simulation.simulator import Simulation
 from kf_calib.sources.simulation.visit_plans import YZX, explicit_plan, spread_plan
 
 G = 9.81
@@ -40,13 +38,6 @@ KNOWN = """
     earth-rotation gravity-error cross-talk latency lever-arm uneven-flexure
     """
 """The catalogue's names, fixed."""
-
-
-def read(simulation: Simulation) -> Batch:
-    """All batches as one."""
-    batches = list(simulation)
-    parts = ([getattr(batch, name) for batch in batches] for name in ("accel", "pose", "temperature"))
-    return Batch(*(sum(streams[1:], streams[0]) for streams in parts))
 
 
 def readings(text: str, poses, *, dwell_s=1.0, sample_hz=1.0, slew=math.inf, bench=BENCH, **options) -> np.ndarray:
@@ -551,13 +542,6 @@ def test_small_effects_are_linear_in_their_size(name):
     np.testing.assert_allclose(two - none, 2 * (one - none), rtol=0, atol=2e-3 * np.abs(two - none).max() + 1e-13)
 
 
-@pytest.mark.slow  # all at once, below, in short
-@pytest.mark.parametrize("name", catalogue())
-def test_batches_do_not_matter_to_an_effect(name):
-    text = f"{name}={VISIBLE[name]}"
-    assert np.array_equal(run(text, batch_samples=17).accel.values, run(text).accel.values)
-
-
 @pytest.mark.parametrize("batch_samples", [97, *slow(1, 7)])
 def test_batches_do_not_matter_to_all_effects_at_once(batch_samples):
     texts = [f"{name}={size}" for name, size in VISIBLE.items() if name not in ("saturation", "quantisation")]
@@ -580,12 +564,10 @@ def test_memory_does_not_grow_with_the_run():
             BENCH, ORTHOGONAL, QUIET, explicit_plan([(0, 0, 0), (0, 90, 0)], dwell_s),
             ambient=AMBIENT, sample_hz=250.0, batch_samples=500, hidden=parse(texts, BENCH.axes),
         )  # fmt: skip
-        tracemalloc.start()
-        for _ in simulation:
-            pass
-        peak = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        return peak
+        with traced() as found:
+            for _ in simulation:
+                pass
+        return found.bytes
 
     peak(1.0)
     assert peak(12.0) < 1.2 * peak(4.0)
@@ -610,9 +592,7 @@ def test_truth_tells_and_the_recording_does_not(tmp_path):
     for label, hidden in (("with", parse(texts, BENCH.axes)), ("without", [])):
         path = tmp_path / f"{label}.mcap"
         simulation = Simulation(BENCH, ORTHOGONAL, QUIET, spread_plan(2, dwell_s=2.0), hidden=hidden)
-        with Recorder(path, BENCH) as recorder:
-            for batch in simulation:
-                recorder.write(batch)
+        record(path, read(simulation), BENCH)
         truth = json.loads(write_truth(simulation, path).read_text())
         recorded[label] = Recording(path).bench, truth["effects"]
         assert not any(word in path.read_bytes() for word in (b"second-order", b"harmonic", b"warm-up", b"hidden"))
@@ -688,17 +668,13 @@ def test_axis_wise_effects_have_the_names_of_the_axes(axes, names):
         ("warm-up=1;tau=-3", "positive"),
         ("dead-zone=-1", "zero or a positive"),
         ("encoder-offset:w=1", "use y, z, x, outer or inner"),
+        ("encoder-offset=1e-5 encoder-offset:z=1e-5", "twice"),
     ],
 )
 def test_what_cannot_be_is_refused_in_one_sentence(text, words):
     with pytest.raises(InputError, match=words) as caught:
-        parse([text], BENCH.axes)
+        parse(text.split(), BENCH.axes)
     assert "\n" not in str(caught.value)
-
-
-def test_twice_is_refused():
-    with pytest.raises(InputError, match="twice"):
-        parse(["encoder-offset=1e-5", "encoder-offset:z=1e-5"], BENCH.axes)
 
 
 def test_random_draws_from_the_seed_and_to_the_grade():
@@ -718,7 +694,3 @@ def test_random_draws_from_the_seed_and_to_the_grade():
     assert nav.truth == parse(["random"], BENCH.axes, seed=6)[0].truth
     several = parse(["random"] * 5, BENCH.axes, seed=1)
     assert len({effect.name for effect in several}) == 5
-
-
-def test_stamps_are_those_of_the_run():
-    assert run("latency=0.005").accel.time_ns[0] == START_NS

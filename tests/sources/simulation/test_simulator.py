@@ -1,19 +1,17 @@
 """The simulator against closed forms and against the statistics its noise is stated to have."""
 
-from __future__ import annotations
-
 import json
 import math
-import tracemalloc
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from helpers.long_runs import slow
+from helpers.recordings import read, streams_of
 from scipy.signal import welch
 
 from kf_calib.bench.bench import Bench, axes_of, parse_axes
-from kf_calib.bench.streams import Batch, Stream
+from kf_calib.bench.streams import Batch
 from kf_calib.errors import InputError, KfCalibError
 from kf_calib.sources.simulation.detectability import write_truth
 from kf_calib.sources.simulation.sensors import GRADES, NOMINAL, Sensors, TrueNoise
@@ -25,13 +23,6 @@ BENCH = Bench(axes=axes_of("yzx"), gravity_mps2=G)
 ORTHOGONAL = Sensors({"theta1": 0.0, "theta3": 0.0})
 QUIET = TrueNoise()
 STILL = explicit_plan([(0, 0, 0)], dwell_s=1000.0)
-
-
-def read(simulation: Simulation) -> Batch:
-    """All batches as one."""
-    batches = list(simulation)
-    parts = ([getattr(batch, name) for batch in batches] for name in ("accel", "pose", "temperature"))
-    return Batch(*(sum(streams[1:], streams[0]) for streams in parts))
 
 
 def noise_of(noise: TrueNoise, count: int = 100_000, rate_hz: float = 100.0, seed: int = 1) -> np.ndarray:
@@ -157,7 +148,7 @@ def test_samples_do_not_depend_on_the_size_of_batches(batch_samples):
         plan = spread_plan(4, dwell_s=2.0)
         return read(Simulation(bench, GRADES["mems"].sensors(), EVERYTHING, plan, seed=8, batch_samples=size))
 
-    for one, other in zip(_streams(run(batch_samples)), _streams(run(1 << 20)), strict=True):
+    for one, other in zip(streams_of(run(batch_samples)), streams_of(run(1 << 20)), strict=True):
         assert np.array_equal(one.time_ns, other.time_ns)
         np.testing.assert_allclose(one.values, other.values, rtol=0, atol=1e-12)
 
@@ -167,26 +158,6 @@ def test_a_run_repeats_itself_and_another_seed_differs():
     other = Simulation(BENCH, ORTHOGONAL, EVERYTHING, spread_plan(3, dwell_s=2.0), seed=2)
     assert np.array_equal(read(simulation).accel.values, read(simulation).accel.values)
     assert not np.any(read(simulation).accel.values == read(other).accel.values)
-
-
-@pytest.mark.slow
-def test_memory_does_not_grow_with_the_run():
-    def peak(dwell_s: float) -> int:
-        plan = explicit_plan([(0, 0, 0), (0, 90, 0)], dwell_s)
-        simulation = Simulation(BENCH, ORTHOGONAL, TrueNoise(1e-4), plan, sample_hz=1000.0, batch_samples=2000)
-        tracemalloc.start()
-        for _ in simulation:
-            pass
-        peak = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        return peak
-
-    peak(1.0)
-    assert peak(200.0) < 1.2 * peak(10.0)
-
-
-def _streams(batch: Batch) -> list[Stream]:
-    return [batch.accel, batch.pose, batch.temperature]
 
 
 # -- noise --

@@ -1,7 +1,5 @@
 """Plans: where gravity points in them, and in which order."""
 
-from __future__ import annotations
-
 import ast
 import os
 import subprocess

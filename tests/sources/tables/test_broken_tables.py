@@ -1,7 +1,5 @@
 """Broken tables: each is refused in one sentence that names the place and says what to write."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

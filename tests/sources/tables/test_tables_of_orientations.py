@@ -1,7 +1,5 @@
 """Tables of orientations: the same numbers as the recording they are made of, however they are written."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -129,22 +127,14 @@ LINES = ["0,0,0,0.003,1.001,-0.002,0.5,900", "0,90,0,1.002,0.002,0.001,0.5,900",
          "0,0,270,-0.001,0.001,0.997,0.5,900"]  # fmt: skip
 PLAIN = "\n".join([HEADER, *LINES]) + "\n"
 WRITTEN = {
-    "semicolons and decimal commas": PLAIN.replace(",", ";").replace(".", ","),
-    "tabs": PLAIN.replace(",", "\t"),
-    "a mark of byte order": "\ufeff" + PLAIN,
-    "lines of Windows": PLAIN.replace("\n", "\r\n"),
     "a title and blank lines": "Block 0417\n\n" + PLAIN.replace("\n", "\n\n"),
     "a line of units": PLAIN.replace(" [deg]", "").replace(" [g]", "").replace(" [mg]", "").replace(
         "count\n", "count\ndeg,deg,deg,g,g,g,mg,-\n"),
-    "a delimiter stated": "sep=;\n" + PLAIN.replace(",", ";"),
-    "quoted": "\n".join(",".join(f'"{cell}"' for cell in line.split(",")) for line in PLAIN.splitlines()),
-    "comments": "# measured on Monday\n" + PLAIN,
     "other names": PLAIN.replace(HEADER,
                                  "outer_deg,middle_deg,inner_deg,Acc1 (g),Acc2 (g),Acc3 (g),Stabw. [mg],Anzahl"),
     "names in Russian": PLAIN.replace(HEADER, "наружный [град],средний [град],внутренний [град],Среднее X [g],"
                                       "Среднее Y [g],Среднее Z [g],СКО [мg],Число"),
     "other order": "\n".join(",".join(line.split(",")[::-1]) for line in PLAIN.splitlines()),
-    "minus of a typesetter": PLAIN.replace("-0", "−0").replace("-1", "−1"),
     "angles of which one is in another unit": PLAIN.replace("inner [deg]", "inner [mrad]").replace(
         ",90,0.002,", f",{500 * np.pi!r},0.002,").replace(",270,-0.001,0.001", f",{1500 * np.pi!r},-0.001,0.001"),
     "no unit at all": PLAIN.replace(" [deg]", "").replace(" [g]", ""),
@@ -153,6 +143,7 @@ WRITTEN = {
 
 @pytest.mark.parametrize("how", WRITTEN)
 def test_the_same_table_written_in_another_way_is_the_same(how: str, tmp_path: Path) -> None:
+    """tests/sources/text/test_ways_of_writing.py has encodings, delimiters and decimal signs."""
     (tmp_path / "plain.csv").write_text(PLAIN)
     (tmp_path / "other.csv").write_text(WRITTEN[how], newline="")
     one, other = (kf_calib.open_table(tmp_path / name, BENCH).orientations for name in ("plain.csv", "other.csv"))
@@ -162,12 +153,6 @@ def test_the_same_table_written_in_another_way_is_the_same(how: str, tmp_path: P
         assert a.sigma_mps2 is not None and b.sigma_mps2 is not None
         np.testing.assert_allclose(a.sigma_mps2, b.sigma_mps2, rtol=1e-12)
         assert a.count == b.count == 900
-
-
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
-def test_any_usual_encoding_is_read(encoding: str, tmp_path: Path) -> None:
-    (tmp_path / "table.csv").write_bytes(TWELVE.read_text(encoding="utf-8-sig").encode(encoding))
-    assert len(kf_calib.open_table(tmp_path / "table.csv", BENCH).orientations) == 12
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,8 @@
 """``info`` on logs and tables in any layout, unit and encoding: the command that it proposes works, and is right."""
 
-from __future__ import annotations
-
 import gzip
 import itertools
-import json
 import random
-import shlex
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -101,14 +97,8 @@ def test_the_command_that_info_proposes_gives_the_calibration(
     if is_packed:
         path = tmp_path / "file.csv.gz"
         path.write_bytes(gzip.compress((tmp_path / "file.csv").read_bytes()))
-    code, out, err = run("info", path, "--gravity", G, "--json")
-    assert code == 0, err
-    said = json.loads(out)
-    assert said["command"], said["missing"]
-    _, *words = shlex.split(said["command"])
-    code, out, err = run(*words, "--json")
-    assert code == 0, (said["missing"], err)
-    found = {own["symbol"]: own["value"] for own in json.loads(out)["parameters"]}
+    said, words = run.proposed(path, "--gravity", G)
+    found = run.parameters(*words)
     loose = 10.0 if not layout.is_log else 1.0
-    assert [found[f"K{i}"] for i in (1, 2, 3)] == pytest.approx(K, abs=1e-3 * loose), said
-    assert [found[f"b{i}"] for i in (1, 2, 3)] == pytest.approx(B, abs=1e-2 * loose), said
+    assert [found[f"K{i}"]["value"] for i in (1, 2, 3)] == pytest.approx(K, abs=1e-3 * loose), said
+    assert [found[f"b{i}"]["value"] for i in (1, 2, 3)] == pytest.approx(B, abs=1e-2 * loose), said

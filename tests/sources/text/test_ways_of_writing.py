@@ -1,7 +1,5 @@
 """One log and one table, written in every usual way: both are read, and alike."""
 
-from __future__ import annotations
-
 import gzip
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -12,7 +10,7 @@ import pytest
 from kf_calib.bench.streams import Table
 from kf_calib.errors import InputError
 from kf_calib.sources.opening import opened
-from kf_calib.sources.text.encoding import Cutter, encoding_of
+from kf_calib.sources.text.encoding import Cutter, TextFile, encoding_of
 from kf_calib.sources.text.heading import TextHeading
 
 UP = np.array([(0, 1, 0), (0, -1, 0), (1, 0, 0), (-1, 0, 0), (0, 0, 1), (0, 0, -1),
@@ -52,6 +50,7 @@ WAYS: dict[str, Callable[[Rows], bytes]] = {
     "Russian in 1251": lambda rows: text(rows, RUSSIAN, ";").encode("cp1251"),
     "packed": lambda rows: gzip.compress(text(rows).encode()),
     "packed UTF-16": lambda rows: gzip.compress(text(rows).encode("utf-16")),
+    "packed Russian in 1251": lambda rows: gzip.compress(text(rows, RUSSIAN, ";").encode("cp1251")),
     "a comment": lambda rows: text(rows, before="# my logger\n").encode(),
     "a comment of another kind": lambda rows: text(rows, before="% a, comment, with, commas\n").encode(),
     "names in a comment": lambda rows: text(rows, before="#").encode(),
@@ -65,13 +64,19 @@ WAYS: dict[str, Callable[[Rows], bytes]] = {
     "blanks": lambda rows: text(rows, between=" ").encode(),
     "columns of blanks": lambda rows: text(rows, between="   ").encode(),
     "a delimiter at the end": lambda rows: text(rows).replace("\n", ",\n").encode(),
+    "a delimiter at the end of the names alone": lambda rows: text(rows).replace("\n", ",\n", 1).encode(),
+    "two at the end": lambda rows: text(rows, between=";", point=",").replace("\n", ";;\n").encode(),
     "quotes": lambda rows: text(rows, [f'"{name}"' for name in ENGLISH]).encode(),
+    "decimal commas in quotes": lambda rows: "\n".join(
+        f'"{line}"' for line in text(rows, between='","', point=",").splitlines()).encode(),
+    "tabs and decimal commas": lambda rows: text(rows, between="\t", point=",").encode(),
+    "blanks about commas": lambda rows: text(rows, between=" , ").encode(),
     "CR": lambda rows: text(rows).replace("\n", "\r").encode(),
     "CRLF": lambda rows: text(rows).replace("\n", "\r\n").encode(),
     "empty lines": lambda rows: text(rows).replace("\n", "\n\n").encode(),
     "typographic minus": lambda rows: text(rows).replace("-", "\u2212").encode(),
     "zeros at the end": lambda rows: text(rows).encode() + bytes(10),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -99,9 +104,30 @@ def test_lines_are_the_same_wherever_blocks_end(end: bytes) -> None:
         assert [line for line in [*lines, *cutter.rest()] if line] == ["time_s,x", "1,2", "µ,4", "5,6"]
 
 
-def test_a_letter_that_a_block_ends_in_is_no_other_encoding() -> None:
+def test_a_letter_that_a_block_ends_in_is_no_other_encoding(tmp_path: Path) -> None:
+    """Nor one that the first 64 KiB, which decide, cut in two."""
     content = "Größe µ".encode()
     assert {encoding_of(content[:k]) for k in range(len(content) + 1)} == {"utf-8"}
+    path, long = tmp_path / "cut.txt", ("x" * ((1 << 16) - 1) + "é" + "\n") * 2
+    path.write_text(long, encoding="utf-8")
+    with TextFile(path) as file:
+        assert b"".join(iter(lambda: file.read(1 << 14), b"")).decode() == long
+
+
+@pytest.mark.parametrize(
+    ("content", "encoding"),
+    [(b"a", "utf-8"), ("ä b".encode("cp1252"), "cp1252"), ("привет".encode("cp1251"), "cp1251"),
+     ("ab".encode("utf-16-le"), "utf-16-le")],
+)  # fmt: skip
+def test_the_encoding_is_told_by_the_beginning(content: bytes, encoding: str) -> None:
+    assert encoding_of(content) == encoding
+
+
+def test_zeros_amid_a_table_are_told(tmp_path: Path) -> None:
+    path = tmp_path / "hole.csv"
+    path.write_bytes(text(table()).encode().replace(b"\n120", b"\n" + bytes(64) + b"120"))
+    with pytest.raises(InputError, match="is no text"):
+        opened(path, {"gravity_mps2": "9.81"}, angles=False)
 
 
 def test_a_table_that_is_packed_and_torn_is_refused(tmp_path: Path) -> None:

@@ -1,9 +1,5 @@
 """Files that name no column, or each cell, and tables that hold of each axis its own reading alone."""
 
-from __future__ import annotations
-
-import json
-import shlex
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +15,8 @@ K, BIAS = np.array([1.01, 0.99, 1.005]), np.array([0.02, -0.015, 0.03])
 
 def found(run: Any, path: Path, *options: Any) -> dict[str, float]:
     """The parameters by the command that ``info`` proposes."""
-    code, out, _ = run("info", path, "--gravity", G, *options, "--json")
-    assert code == 0
-    code, out, err = run(*shlex.split(json.loads(out)["command"])[1:], "--json")
-    assert code == 0, err
-    return {each["symbol"]: each["value"] for each in json.loads(out)["parameters"]}
+    command = run.proposed(path, "--gravity", G, *options)[1]
+    return {symbol: each["value"] for symbol, each in run.parameters(*command).items()}
 
 
 def check(parameters: dict[str, float]) -> None:
@@ -100,7 +93,6 @@ OWN = {
 def test_readings_of_own_axes_alone_have_no_freedom(how: str, run: Any, tmp_path: Path) -> None:
     path = tmp_path / "own.csv"
     path.write_text(OWN[how])
-    code, _, err = run("replay", path, "--gravity", G, "--accel-unit", "g", "--accel-scale", 1 / 256)
-    assert code == 2 and err.count("\n") == 1
+    err = run.refused("replay", path, "--gravity", G, "--accel-unit", "g", "--accel-scale", 1 / 256)
     assert "six numbers for six unknowns, K1 = 1.0039, K2 = 1.0098, K3 = 0.9883, and b1 = 7, b2 = -0.5, b3 = 23" in err
     assert "no degree of freedom" in err
