@@ -125,13 +125,13 @@ class RunPosterior:
         )  # fmt: skip
 
     def _with_constants(self) -> list[tuple[Effect, float]]:
-        """Return the effects that explain most, of those with a constant, as they are fitted, and the sigma of the log
-        of the constant; none where nothing has to be missing."""
-        scanned, fitted = self._test.effects, list[tuple[Effect, float]]()
+        """Return those of the effects that explain most that have a constant, as they are fitted, and the sigma of the
+        log of the constant; none where nothing has to be missing."""
+        fitted = list[tuple[Effect, float]]()
         if self._test.consistent is not False:
             return fitted
-        names = [name for name in scanned.best if effect_named(name, self._before.bench).unknown]
-        for name in sorted(names, key=lambda name: -self._tested(name)[0])[:_ALWAYS]:
+        most = sorted(self._test.effects.best, key=lambda name: -self._tested(name)[0])[:_ALWAYS]
+        for name in (name for name in most if effect_named(name, self._before.bench).unknown):
             try:
                 refit = self._refits.with_effects(self._before, (name,))
             except UnobservableError:  # the run does not tell its coefficients
@@ -346,7 +346,8 @@ class RunPosterior:
                 key = (other, name) if (other, name) in pairs else (name, other)
                 if other != name and not (name[0] == other[0] == "?"):
                     pairs[key] = max(pairs.get(key, -math.inf), log)
-        alone_of = self._by_row(self._log_evidence) | {name: log for (name, *other), log in pairs.items() if not other}
+        alone_of = self._by_row(self._log_evidence)
+        alone_of |= {name: max(log, alone_of[name]) for (name, *other), log in pairs.items() if not other}
         return [self._row_of(both, _beside_function(both, log, alone_of)) for both, log in pairs.items()]
 
     def _summands_to_pair(self) -> list[int]:
@@ -594,11 +595,12 @@ def _to_be_fitted(rows: Sequence[Hypothesis]) -> set[int]:
 
 
 def _beside_function(names: Sequence[str], log: float, alone: dict[str, float]) -> float:
-    """Return the log evidence of a row where what an effect gains beside an unknown function that explains more counts
-    in part: no function is just one that is tried, and what it leaves is no noise of independent dwells."""
-    function = max((alone[name] for name in names if name.startswith("?")), default=math.inf)
+    """Return the log evidence of a row where what an effect gains beside an unknown function counts in part, as far as
+    this explains more alone: no function is just one that is tried, and what it leaves is no noise of independent
+    dwells."""
+    function = max((alone[name] for name in names if name.startswith("?")), default=-math.inf)
     effect = max((alone[name] for name in names if not name.startswith("?")), default=math.inf)
-    return log if log < function or effect > function else function + INDEPENDENT * (log - function)
+    return log - (1.0 - INDEPENDENT) * max(min(function - effect, log - function), 0.0)
 
 
 def _with_sure_dwells(rows: list[Hypothesis], beside: list[Hypothesis]) -> list[Hypothesis]:

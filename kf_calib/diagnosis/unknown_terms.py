@@ -61,9 +61,11 @@ def unknown_terms(bench: Bench, dwells: Sequence[Dwell]) -> Iterator[UnknownTerm
     yield from _of_force()
     slow = [("time", "t"), *([("temperature", "T")] if _varies(dwells) else [])]
     yield from _of_gimbals(len(bench.axes), slow)
-    places = _places(len(bench.axes), bench.angles)
+    places = _places(bench.angles)
     yield from _of_time(dwells, places)
-    yield from _of_jumps(dwells, places)
+    # a slip of the outer gimbal is one of the base, and of the inner one a slip of the mounting
+    slipping = [_Place(f"gimbal {k}", "gimbal and encoder", (f":{k} = {{0}}",)) for k in range(2, len(bench.axes))]
+    yield from _of_jumps(dwells, [*places, *(slipping if bench.angles else [])])
     yield from _of_arrival(len(bench.axes), dwells)
     yield from _of_surroundings(len(bench.axes), bench.angles)
     yield from _of_slow_changes(slow)
@@ -79,21 +81,17 @@ def _term(
 @dataclass(frozen=True)
 class _Place:
     """Where something changes: in words ("" for the biases), the physical class, and formulas of what a function {0}
-    adds there."""
+    adds there. lively: whether it changes not just steadily, or at once."""
 
     words: str
     family: str
     formulas: tuple[str, ...]
+    lively: bool = False
 
     @property
     def turns(self) -> bool:
         """Whether it is a rotation."""
         return self.formulas[0].startswith(":")
-
-    @property
-    def common(self) -> bool:
-        """Whether it is common that it changes: two formulas for each function are many columns."""
-        return len(self.formulas) == 1
 
     def of(self, functions: Sequence[str]) -> tuple[str, ...]:
         """The formulas of these functions together."""
@@ -191,18 +189,16 @@ def _turning(place: str, texts: Sequence[str]) -> tuple[str, ...]:
     return tuple(f":{place} = {text}" for text in texts)
 
 
-def _places(gimbals: int, turns: bool) -> list[_Place]:
+def _places(turns: bool) -> list[_Place]:
     """What may change with time: in the accelerometers and, of a bench with angles, what turns it."""
     places = [
-        _Place("", "bias in time", ("{0}",)),
-        _Place("the scale factors", "scale in time", ("{0}*a",)),
+        _Place("", "bias in time", ("{0}",), lively=True),
+        _Place("the scale factors", "scale in time", ("{0}*a",), lively=True),
         _Place("the alignment", "base and platform", ("{0}*p", "{0}*o")),
     ]
     if turns:
-        places += [_Place("the tilt of the base", "base and platform", (":base = {0}",)),
+        places += [_Place("the tilt of the base", "base and platform", (":base = {0}",), lively=True),
                    _Place("the mounting", "base and platform", (":platform = {0}",))]  # fmt: skip
-        # the outer one turns the base, and the inner one the platform
-        places += [_Place(f"gimbal {k}", "gimbal and encoder", (f":{k} = {{0}}",)) for k in range(2, gimbals)]
     return places
 
 
@@ -224,7 +220,7 @@ def _of_time(dwells: Sequence[Dwell], places: Sequence[_Place]) -> Iterator[Unkn
     oscillations = [(*waves[n - 1], *waves[n], *waves[n + 1]) for n in range(2, len(waves), 2)]
     for place in places:
         yield place.one_of("a decay", decays)
-        if place.common:
+        if place.lively and oscillations:
             yield place.one_of("an oscillation", oscillations)
 
 
@@ -246,7 +242,7 @@ def _of_jumps(dwells: Sequence[Dwell], places: Sequence[_Place]) -> Iterator[Unk
     for place in places:
         steps = [(f"(t > {s:.6g}*s)",) for s in (between_s if place.words else moments_s)]
         yield replace(place.one_of("a jump", steps), at_once=2)
-        if place.common:
+        if place.lively:
             yield place.one_of("a change of rate", rates)
             yield place.one_of("a decaying jump", decays)
 

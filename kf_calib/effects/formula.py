@@ -195,7 +195,7 @@ def _trial(axes: tuple[Vector, ...], gravity_mps2: float) -> Stimulus:
     return checks.trial(Bench(axes, gravity_mps2))
 
 
-@lru_cache(maxsize=2048)
+@lru_cache(maxsize=1024)
 def formula(text: str, axes: tuple[Vector, ...], gravity_mps2: float, checked: bool = True) -> Formula | FrameFormula:
     """The formula's effect, made once for each bench: a run asks for it many times."""
     (full, expression), bench = split(text), _trial(axes, gravity_mps2).bench

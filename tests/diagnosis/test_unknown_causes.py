@@ -59,7 +59,7 @@ def test_what_depends_on_two_drivers_or_on_the_past_is_unknown_and_goes_with_the
     ("name", "driver"),
     [
         ("temperature x force across", "temperature and specific force"),
-        *slow(("decay x force across", "time and specific force (a decay)"), ("play", "previous orientation")),
+        *slow(("decay x force across", "time (a decay of the alignment)"), ("play", "previous orientation")),
     ],
 )
 @pytest.mark.parametrize("known", ["second-order", *slow("cross-coupling-ip")])

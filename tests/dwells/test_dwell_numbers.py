@@ -16,7 +16,7 @@ from kf_calib.views import console
 from kf_calib.views.diagnosis import diagnosis_report
 from kf_calib.views.json import replay_object
 from kf_calib.views.live import objects
-from kf_calib.views.rerun.series import VisitHistory, ends
+from kf_calib.views.rerun.series import ORIENTATION, VisitHistory, ends
 
 pytestmark = pytest.mark.filterwarnings("error")
 COUNT = 300
@@ -50,7 +50,7 @@ def test_findings_name_dwells_by_these_numbers(result: Calibration) -> None:
 
 
 def test_the_rerun_timeline_counts_by_these_numbers(result: Calibration) -> None:
-    assert ends(result.visits)[1].tolist() == USED
+    assert ends(result.visits)[ORIENTATION].tolist() == USED
     history = VisitHistory.of(result)
     assert history.orientation[history.whole].tolist() == USED
     assert set(history.after(result.visits[:4]).orientation.tolist()) == set(USED[4:])

@@ -89,7 +89,7 @@ def test_a_walk_in_the_model_is_expected_within_dwells_too() -> None:
 
 def test_what_dwells_hide_shows_within_them() -> None:
     """A period that falls below a dwell's length: no column follows it, and it is no line."""
-    found = diagnose(noisy_source("chirp=25sigma;frequency=0.02;chirp=2e-4", seed=4, dwells=12))
+    found = diagnose(noisy_source("chirp=25sigma;frequency=0.02;chirp=4e-4", seed=4, dwells=12))
     assert found.unknown and found.test.trend is not None and found.test.trend.p_value < 1e-6, found.verdict
     told = found.description
     assert told is not None and told.driver in (WITHIN_DWELLS, RETURNING) and told.formula == "bias-walk"

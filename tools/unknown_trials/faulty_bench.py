@@ -63,6 +63,16 @@ def _turning_point(at: State, rng: np.random.Generator) -> Floats:
     return np.abs(_gone(at) - rng.uniform(0.35, 0.65))
 
 
+def _thermostat(cycles: float) -> Course:
+    """A triangle wave, of so many cycles in the run."""
+    return lambda at, rng: np.abs((cycles * _gone(at) + rng.uniform()) % 1.0 - 0.5)
+
+
+def _bend(at: State, rng: np.random.Generator) -> Floats:
+    """What changes its rate in the middle of the run."""
+    return np.maximum(_gone(at) - rng.uniform(0.3, 0.7), 0.0) + rng.uniform(-0.5, 0.5) * _gone(at)
+
+
 def _before(gimbal: int) -> Course:
     """With the angle of a gimbal in the orientation before."""
 
@@ -79,15 +89,25 @@ FAULTS: dict[str, tuple[str, Course]] = {
     "a gimbal errs with the angle of another": ("gimbals", _angle(1, np.sin)),
     "a saw-tooth error of an encoder": ("gimbals", lambda at, rng: (at.angles_rad[:, 2] / np.radians(72.0)) % 1.0),
     "an encoder slips": ("gimbals", _from),
+    "an encoder is off for a while": ("gimbals", _leaning),
+    "a play that goes with the angle": (
+        "gimbals",
+        lambda at, rng: np.sign(at.moves_rad[:, 2]) * np.abs(np.sin(at.angles_rad[:, 2])),
+    ),
     "somebody leans on the table": ("base", _leaning),
     "the table relaxes": ("base", _decay),
     "the table tilts with the outer gimbal": ("base", _angle(0, np.cos)),
+    "the table is loaded, and relaxes": ("base", _switched_on_again),
     "the table tilts twice a turn": ("base", lambda at, rng: np.cos(2.0 * at.angles_rad[:, 0])),
     "the block slips": ("mount", _from),
     "the block relaxes": ("mount", _decay),
     "the block sags with the middle gimbal": ("mount", _angle(1, np.sin)),
     "the block wobbles twice a turn": ("mount", lambda at, rng: np.sin(2.0 * at.angles_rad[:, 2] + rng.uniform(0, 6))),
     "a gain switches": ("scale", _from),
+    "a gain of two levels": ("scale", _telegraph),
+    "scale factors change their rate": ("scale", _bend),
+    "scale factors follow a thermostat": ("scale", _thermostat(4.4)),
+    "scale factors, switched on again": ("scale", _switched_on_again),
     "a scale factor wanders": ("scale", _wandering),
     "scale factors go with the outer gimbal": ("scale", _angle(0, np.cos)),
     "scale factors turn back": ("scale", _turning_point),
