@@ -188,7 +188,7 @@ CEILINGS = {
     "kf_calib": 188,
     "support": 1066,
     "bench": 1704,
-    "effects": 3041,
+    "effects": 3038,
     "sources": 11627,
     "dwells": 3805,
     "noise": 3381,

@@ -323,28 +323,28 @@ class RunPosterior:
         return next((k for k, term in enumerate(self._run.unknown) if term.driver == row.driver), None)
 
     def _pairs(self) -> list[Hypothesis]:
-        """Return the rows of the likeliest effects, each with any other term beside it, and of the likeliest summand of
-        an unknown function, with another one or an effect beside it."""
-        pairs, heads = dict[tuple[str, ...], float](), [*self._heads(), *self._summands_to_pair()]
+        """Return the rows of the likeliest effects, each with any other term beside it, and of the likeliest summands
+        of unknown functions, with another one of the same function or an effect beside it."""
+        terms, pairs = self._run.terms, dict[tuple[str, ...], float]()
+        heads = [*self._heads(), *self._summands_to_pair()]
         alone = [self._base + self._log_bayes[k] + self._log_share_of(k) for k in heads]
         # beside one more term less noise is likely, not more
         likely = [self._sizes.likely(logs, self._log_bayes.max(axis=0)) for logs in alone]
         explained = self._explained(heads, likely)
         for h, head in enumerate(heads):
-            name = self._run.terms[head].row
+            name, is_known = terms[head].row, terms[head].is_known
             stage.say(f"weighing all beside {name.replace('?', 'unknown function ')}")
-            logs = np.repeat(alone[h][None], len(self._run.terms), axis=0)
-            # of two unknown functions only those of one driver are weighed
-            some = np.array([term.is_known or term.row == name or name[0] != "?" for term in self._run.terms])
+            logs = np.repeat(alone[h][None], len(terms), axis=0)
+            some = None if is_known else np.array([term.is_known or term.row == name for term in terms])
             for k in itertools.chain(*likely[h]):
                 family, size = self._at[k]
                 logs[:, k] += self._run.log_bayes(self._noises[family], size, explained[h, k], some)
             logs = np.logaddexp.reduce(self._sizes.evidence(logs, likely[h]), axis=1)
-            if name.startswith("?"):
+            if not is_known:
                 pairs[(name,)] = self._of_two_summands(head, logs)
             for other, log in self._by_row(logs).items():
                 key = (other, name) if (other, name) in pairs else (name, other)
-                if other != name and not (name[0] == other[0] == "?"):
+                if other != name and (is_known or not other.startswith("?")):
                     pairs[key] = max(pairs.get(key, -math.inf), log)
         alone_of = self._by_row(self._log_evidence)
         alone_of |= {name: max(log, alone_of[name]) for (name, *other), log in pairs.items() if not other}

@@ -140,7 +140,7 @@ class RunTerms:
             numbers = [k for k, each in enumerate(effects) if str(each) == str(effect)]
             nearest = min(numbers, key=lambda k: abs(math.log(effects[k].value / effect.value)))
             # of oscillations only the best is left, of those half a cycle in a run apart
-            step = math.log(GRID) if len(numbers) > 1 else 0.5 / (stimulus.elapsed_s[-1] * effect.value)
+            step = math.log(GRID) if len(numbers) > 1 else 0.5 / (stimulus.span_s * effect.value)
             if (width := math.sqrt(2.0 * math.pi) * sigma) < step:
                 effects, shares = [*effects, effect], [*shares, shares[nearest] + math.log(width / step)]
         for effect, log in zip(effects, shares, strict=True):

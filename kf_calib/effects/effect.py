@@ -123,14 +123,14 @@ class Bearer(StrEnum):
     EITHER = "either"
 
 
-def every_one(count: int) -> tuple[slice, ...]:
-    """The places of each of so many bearers among coefficients, or columns, of which one of each follow each other;
-    nothing of one, which has all."""
+def interleaved(count: int) -> tuple[slice, ...]:
+    """The places of each of so many bearers among coefficients, or columns, that are theirs in turn; nothing of one
+    bearer, which has all."""
     return tuple(slice(k, None, count) for k in range(count)) if count > 1 else ()
 
 
 PAIRS = tuple(slice(k, k + 2) for k in (0, 2, 4))
-"""The same of three bearers, each of which has two in turn."""
+"""The places of three bearers, each of which has two that follow each other."""
 
 
 class Effect(ABC):
@@ -316,7 +316,7 @@ class SensorEffect(Effect):
     """
 
     borne_by = Bearer.SENSORS
-    bearers = every_one(3)
+    bearers = interleaved(3)
     on_data_sheet: ClassVar[str] = ""
     in_polynomial: ClassVar[bool] = False
     symbol: ClassVar[str]

@@ -35,7 +35,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, Vector
 from kf_calib.effects import checks
-from kf_calib.effects.effect import Bearer, SensorEffect, every_one
+from kf_calib.effects.effect import Bearer, SensorEffect, interleaved
 from kf_calib.effects.expression import Expression
 from kf_calib.effects.frame import FrameEffect, gimbal_number
 from kf_calib.effects.quantities import gimbal_letters, quantities
@@ -106,18 +106,27 @@ class Reading:
         return 10.0 ** round(math.log10(largest * np.sqrt(np.mean((size / largest) ** 2))))
 
 
-def _units(reading: Reading, turning: bool, checked: bool) -> tuple[str, tuple[str, float]]:
-    """SI unit of a formula's coefficients, a unit of the field, and how many of it are one; of angles, or readings.
-    None of a formula that is not ``checked``."""
+def _units(reading: Reading, turning: bool) -> tuple[str, tuple[str, float]]:
+    """SI unit of a formula's coefficients, a unit of the field, and how many of it are one; of angles, or readings."""
     from kf_calib.effects.expression import coefficient_units, pint_unit_of, turning_units
 
-    if not checked:
-        return "", ("", 1.0)
     try:
         unit = pint_unit_of(reading.expression, reading.units)
         return turning_units(unit) if turning else coefficient_units(unit)
     except InputError as error:
         raise InputError(f"{reading.name}: {error}") from None
+
+
+def _check(effect: Formula | FrameFormula, bench: Bench, large: float) -> None:
+    """Give an effect its units, what its checks say, and the scale of its coefficients: with it, it adds ``large`` on a
+    trial run. Raises InputError where it cannot be used."""
+    reading, stimulus, turning = effect.reading, _trial(bench.axes, bench.gravity_mps2), isinstance(effect, FrameEffect)
+    unit, shown = _units(reading, turning)
+    if turning and reading(stimulus).shape[1] != 1:
+        words = "an angle is one for the whole block: use fx, fy, fz in place of a, p, o and da."
+        raise InputError(f"{effect.name}: {words}")
+    vars(effect).update(unit=unit, shown=shown)
+    vars(effect).update(remarks=checks.check_effect(effect, stimulus), scale=large / reading.typical(stimulus))
 
 
 class Formula(SensorEffect):
@@ -134,13 +143,10 @@ class Formula(SensorEffect):
     def __init__(self, name: str, expression: str, bench: Bench, checked: bool = True) -> None:
         self.reading = Reading(name, expression, bench)
         self.text, self.remarks = f"{name} = {expression}", tuple[str, ...]()
-        unit, shown = _units(self.reading, turning=False, checked=checked)
         # of the class in the catalogue; here each formula has its own
-        vars(self).update(name=name, title=expression, symbol=symbol_stem(name), unit=unit, shown=shown, scale=1.0)
+        vars(self).update(name=name, title=expression, symbol=symbol_stem(name), unit="", shown=("", 1.0), scale=1.0)
         if checked:
-            stimulus = _trial(bench.axes, bench.gravity_mps2)
-            self.remarks = checks.check_effect(self, stimulus)
-            vars(self).update(scale=_LARGE_MPS2 / self.reading.typical(stimulus))
+            _check(self, bench, _LARGE_MPS2)
 
     def terms(self, s: Stimulus) -> Floats:
         terms = np.array(np.broadcast_to(self.reading(s), (len(s), 3)), dtype=float)
@@ -162,23 +168,14 @@ class FrameFormula(FrameEffect):
         self.reading = Reading(name, expression, bench)
         self.text, self.remarks = f"{name}:{place} = {expression}", tuple[str, ...]()
         self.gimbal = None if place in (BASE, PLATFORM) else gimbal_number(place, gimbal_letters(bench.axes))
-        unit, shown = _units(self.reading, turning=True, checked=checked)
         axes = {BASE: "NE", PLATFORM: "XYZ"}.get(place, [f"_{place}"])
         symbols = tuple(f"{symbol_stem(name)}{axis}" for axis in axes)
         vars(self).update(
-            name=name, variant=place, title=expression, symbols=symbols, unit=unit, shown=shown, scale=1.0,
-            bearers=every_one(len(symbols)),
+            name=name, variant=place, title=expression, symbols=symbols, unit="", shown=("", 1.0), scale=1.0,
+            bearers=interleaved(len(symbols)),
         )  # fmt: skip
         if checked:
-            self._check(_trial(bench.axes, bench.gravity_mps2))
-
-    def _check(self, stimulus: Stimulus) -> None:
-        """Raise InputError where it cannot be used; give the coefficients their scale."""
-        if self.reading(stimulus).shape[1] != 1:
-            words = "an angle is one for the whole block: use fx, fy, fz in place of a, p, o and da."
-            raise InputError(f"{self.name}: {words}")
-        self.remarks = checks.check_effect(self, stimulus)
-        vars(self).update(scale=_LARGE_RAD / self.reading.typical(stimulus))
+            _check(self, bench, _LARGE_RAD)
 
     def rotations(self, s: Stimulus) -> Floats:
         values = self.reading(s)

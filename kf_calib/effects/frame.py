@@ -11,7 +11,7 @@ import numpy as np
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
-from kf_calib.effects.effect import PAIRS, Bearer, Effect, Regressor, Typical, every_one, of_each
+from kf_calib.effects.effect import PAIRS, Bearer, Effect, Regressor, Typical, interleaved, of_each
 from kf_calib.effects.stimulus import Stimulus
 from kf_calib.errors import InputError
 from kf_calib.support.units import STANDARD_GRAVITY_MPS2
@@ -88,7 +88,7 @@ class BaseTilt(FrameEffect):
     confused_with = "about the outer axis it is the outer encoder's zero"
     typical = Typical((5e-6, 500e-6))
     symbols, unit, scale = ("deltaN", "deltaE"), "rad", 1e-3
-    bearers = every_one(2)
+    bearers = interleaved(2)
 
     def rotations(self, s: Stimulus) -> Floats:
         return -np.stack([s.to_platform(axis) for axis in s.level_axes], axis=1)
@@ -121,7 +121,7 @@ class PlatformDrift(FrameEffect):
     typical = Typical((np.radians(0.01) / 3600, np.radians(1.0) / 3600))
     symbols, unit, scale = ("omegaX", "omegaY", "omegaZ"), "rad/s", 1e-6
     shown = "deg/h", float(np.degrees(3600.0))
-    bearers = every_one(3)
+    bearers = interleaved(3)
 
     def rotations(self, s: Stimulus) -> Floats:
         return -s.elapsed_s[:, None, None] * np.eye(3)
@@ -152,7 +152,7 @@ class Flexure(FrameEffect):
     confused_with = "encoder-harmonic-1, cross-coupling, uneven-flexure; the bias of a sensor that reports the attitude"
     typical = Typical((5e-6 / STANDARD_GRAVITY_MPS2, 100e-6 / STANDARD_GRAVITY_MPS2))
     symbols, unit, scale = ("dX", "dY", "dZ"), "rad s^2/m", 1e-4
-    bearers = every_one(3)
+    bearers = interleaved(3)
 
     def rotations(self, s: Stimulus) -> Floats:
         return -np.cross(s.force_mps2[:, None, :], np.eye(3))
