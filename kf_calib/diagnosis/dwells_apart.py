@@ -65,9 +65,5 @@ class DwellsApart:
     def _log_bayes(self, without: Sequence[int]) -> Floats:
         """Return log Bayes factors (D, noises) of changes of each dwell, as the dwells without some of them tell."""
         changes = self.courses.log_bayes(math.exp(self._log_prior))
-        means = [
-            log_bayes_of_any_size(*of_family.dwells(size, self.rows, without))
-            for of_family in self.noises
-            for size in range(len(of_family.logs))
-        ]
-        return np.array(means).T + np.logaddexp(0.0, changes)[:, None] - math.log(2.0)
+        means = [log_bayes_of_any_size(*of_family.dwells(self.rows, without)) for of_family in self.noises]
+        return np.concatenate(means).T + np.logaddexp(0.0, changes)[:, None] - math.log(2.0)

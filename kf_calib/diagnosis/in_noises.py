@@ -120,33 +120,34 @@ class InNoises:
         off = np.moveaxis(self._off[:, :, group], 1, 2)  # (K, n, k, q)
         return gram - np.swapaxes(off, 2, 3) @ off, lengths
 
-    def dwells(self, k: int, rows: Spanned, without: Sequence[int] = ()) -> tuple[Floats, Floats]:
-        """G^T W G (D, 3, 3) and G^T W z (D, 3) of offsets of the three accelerometers in one dwell, as the others tell,
-        without some of them.
+    def dwells(self, rows: Spanned, without: Sequence[int] = ()) -> tuple[Floats, Floats]:
+        """G^T W G (K, D, 3, 3) and G^T W z (K, D, 3) of offsets of the three accelerometers in one dwell, as the others
+        tell, without some of them.
 
         rows: of the run, with or without columns that are in the model. Raises LinAlgError where the other dwells do
         not determine it.
         """
         kept = np.ones((len(rows), 1, 1))
         kept[list(without)] = 0.0
-        weights = self._turns @ (self._weights[k][:, :, None] * np.swapaxes(self._turns, 1, 2))
-        weighted, both = weights @ rows.basis, ((0, 1), (0, 1))
-        more = rows.more_basis.T @ rows.more_basis
-        lower = np.linalg.cholesky(np.tensordot(rows.basis * kept, weighted, axes=both) + more)
-        whole = np.linalg.cholesky(np.tensordot(rows.basis, weighted, axes=both) + more) if len(without) else lower
-        if np.min(np.diag(lower) / np.diag(whole)) < _LOST:
+        weights = self._turns @ (self._weights[..., None] * np.swapaxes(self._turns, 1, 2))
+        weighted, more = weights @ rows.basis, rows.more_basis.T @ rows.more_basis
+        lower = np.linalg.cholesky(_summed(rows.basis * kept, weighted) + more)
+        whole = np.linalg.cholesky(_summed(rows.basis, weighted) + more) if len(without) else lower
+        if np.min(np.einsum("kpp->kp", lower) / np.einsum("kpp->kp", whole)) < _LOST:
             raise np.linalg.LinAlgError("the others do not determine the model")
         inverse = np.linalg.inv(lower)
-        along = np.tensordot(weighted * kept, rows.readings, axes=both) + rows.more_basis.T @ rows.more_readings
-        left = (rows.readings - rows.basis @ (inverse.T @ (inverse @ along))) * kept[..., 0]
-        off = inverse @ np.swapaxes(weighted * kept, 1, 2)
-        gram = weights - np.swapaxes(off, 1, 2) @ off
-        seen = np.einsum("dii->d", gram) > ROUNDING * np.einsum("dii->d", weights)  # what the model leaves of them
-        return gram * seen[:, None, None], (weights @ left[..., None])[..., 0] * seen[:, None]
+        along = _summed(rows.readings[..., None] * kept, weighted)[:, 0] + rows.more_basis.T @ rows.more_readings
+        states = np.swapaxes(inverse, 1, 2) @ (inverse @ along[..., None])
+        left = (rows.readings[..., None] - rows.basis @ states[:, None]) * kept
+        off = inverse[:, None] @ np.swapaxes(weighted * kept, 2, 3)
+        gram = weights - np.swapaxes(off, 2, 3) @ off
+        traces = np.einsum("kdii->kd", gram), np.einsum("kdii->kd", weights)
+        seen = traces[0] > ROUNDING * traces[1]  # what the model leaves of them
+        return gram * seen[..., None, None], (weights @ left)[..., 0] * seen[..., None]
 
-    def explained_by(self, groups: Sequence[Indices], sizes: Sequence[int]) -> list[list[Floats]]:
-        """What the columns (q,) of each group explain of all columns and of the readings, (f, C + 1) in some of the
-        sizes: products with an orthonormal basis of f vectors, of those columns that the model leaves."""
+    def explained_by(self, groups: Sequence[Indices], sizes: Sequence[int]) -> list[Floats]:
+        """What the columns (q,) of each group explain of all columns and of the readings, (K, q, C + 1) in K of the
+        sizes: products with an orthonormal basis of those columns that the model leaves, filled up with zeros."""
         places, chosen = np.concatenate(groups), np.array(sizes, np.intp)
         columns = self._spanned + places
         products = np.zeros((len(chosen), len(places), self._rows.columns.shape[2] + 1))
@@ -158,10 +159,8 @@ class InNoises:
         lengths = np.diagonal(products[:, :, places], axis1=1, axis2=2).copy()
         products -= np.swapaxes(self._off[chosen][:, :, places], 1, 2) @ self._off[chosen]
         ends = np.cumsum([0, *map(len, groups)])
-        return [
-            [_explained(products[k, a:b], group, lengths[k, a:b]) for k in range(len(chosen))]
-            for group, a, b in zip(groups, ends[:-1].tolist(), ends[1:].tolist(), strict=True)
-        ]
+        parts = zip(groups, ends[:-1].tolist(), ends[1:].tolist(), strict=True)
+        return [_explained(products[:, a:b], group, lengths[:, a:b]) for group, a, b in parts]
 
     def _parts(self) -> list[slice]:
         """Return few dwells at a time."""
@@ -171,6 +170,11 @@ class InNoises:
     def _of_rows(self, part: slice) -> Floats:
         """Return the weights (K, r) of the rows of some dwells."""
         return self._weights[:, part].reshape(len(self._weights), -1)
+
+
+def _summed(some: Floats, others: Floats) -> Floats:
+    """Return the products (K, m, n), summed over all rows, of columns (D, 3, m) with others (K, D, 3, n)."""
+    return some.reshape(-1, some.shape[2]).T @ others.reshape(len(others), -1, others.shape[3])
 
 
 def _products(some: Floats, others: Floats, weights: Floats) -> Floats:
@@ -191,9 +195,9 @@ def _add_products(columns: Floats, group: Indices, weights: Floats, sums: Floats
 
 
 def _explained(products: Floats, group: Indices, lengths: Floats) -> Floats:
-    """Return what columns explain, (f, C + 1), from their products (q, C + 1) with all, and with
-    themselves (q,) before the model's part was subtracted."""
+    """Return what columns explain, (K, q, C + 1), from their products (K, q, C + 1) with all, and with themselves
+    (K, q) before the model's part was subtracted."""
     scales = 1.0 / np.sqrt(np.maximum(lengths, 1e-300))
-    values, vectors = np.linalg.eigh(scales[:, None] * products[:, group] * scales)
-    seen = values > ROUNDING
-    return (vectors[:, seen] / np.sqrt(values[seen])).T @ (scales[:, None] * products)
+    values, vectors = np.linalg.eigh(scales[..., None] * products[..., group] * scales[:, None])
+    inverse = np.where(values > ROUNDING, 1.0 / np.sqrt(np.maximum(values, ROUNDING)), 0.0)
+    return np.swapaxes(vectors * inverse[:, None], 1, 2) @ (scales[..., None] * products)

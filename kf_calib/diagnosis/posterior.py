@@ -148,10 +148,10 @@ class RunPosterior:
         """The products of all columns in the noises of each family."""
         return self._sizes.in_families(self._run.in_noises)
 
-    @cached_property
-    def _at(self) -> list[tuple[int, int]]:
-        """The number of the family of each noise, and that of its size."""
-        return [(family, size) for family, noises in enumerate(self._noises) for size in range(len(noises.logs))]
+    @property
+    def _firsts(self) -> list[int]:
+        """The number, among all noises, of the first of each family."""
+        return [0, *itertools.accumulate(len(noises.logs) for noises in self._noises)][:-1]
 
     @cached_property
     def _base(self) -> Floats:
@@ -161,7 +161,7 @@ class RunPosterior:
     @cached_property
     def _log_bayes(self) -> Floats:
         """Log Bayes factors (terms, noises) of all terms."""
-        return np.array([self._run.log_bayes(self._noises[family], size) for family, size in self._at]).T
+        return np.hstack([self._run.log_bayes(noises, range(len(noises.logs))) for noises in self._noises])
 
     @cached_property
     def _log_evidence(self) -> Floats:
@@ -336,9 +336,9 @@ class RunPosterior:
             stage.say(f"weighing all beside {name.replace('?', 'unknown function ')}")
             logs = np.repeat(alone[h][None], len(terms), axis=0)
             some = None if is_known else np.array([term.is_known or term.row == name for term in terms])
-            for k in itertools.chain(*likely[h]):
-                family, size = self._at[k]
-                logs[:, k] += self._run.log_bayes(self._noises[family], size, explained[h, k], some)
+            for family, (noises, first) in enumerate(zip(self._noises, self._firsts, strict=True)):
+                sizes = [k - first for k in likely[h][family]]
+                logs[:, likely[h][family]] += self._run.log_bayes(noises, sizes, explained[h, family], some)
             logs = np.logaddexp.reduce(self._sizes.evidence(logs, likely[h]), axis=1)
             if not is_known:
                 pairs[(name,)] = self._of_two_summands(head, logs)
@@ -367,13 +367,14 @@ class RunPosterior:
         return _log_sum(logs[others].tolist()) - self._log_share_of(one) + share + head.log_share_of_form
 
     def _explained(self, heads: Sequence[int], likely: Sequence[list[list[int]]]) -> dict[tuple[int, int], Floats]:
-        """Return what each term alone explains of all columns, in each noise that is likely beside it."""
+        """Return what each term alone explains of all columns, in the noises of each family that are likely beside
+        it."""
         groups = [self._run.terms[k].columns for k in heads]
         explained = dict[tuple[int, int], Floats]()
-        for family, noises in enumerate(self._noises):
+        for family, (noises, first) in enumerate(zip(self._noises, self._firsts, strict=True)):
             numbers = sorted({k for of_head in likely for k in of_head[family]})
-            of_heads = noises.explained_by(groups, [self._at[k][1] for k in numbers])
-            explained |= {(h, k): own[n] for h, own in enumerate(of_heads) for n, k in enumerate(numbers)}
+            of_heads = noises.explained_by(groups, [k - first for k in numbers])
+            explained |= {(h, family): own[np.isin(numbers, likely[h][family])] for h, own in enumerate(of_heads)}
         return explained
 
     def _heads(self) -> list[int]:

@@ -260,23 +260,28 @@ def _off(
 
 def log_bayes(gram: Floats, along: Floats, squares: Floats, log_weights: Floats, centres: Floats,
               lengths: Floats | None = None) -> Floats:  # fmt: skip
-    """Log Bayes factors (n,) of n terms of q columns: gram (n, q, q), along (n, q) = G^T z, each averaged over its
-    sizes, of which the squares (n, m), the logs (n, m) of their probabilities and the centres (n,) are given.
+    """Log Bayes factors (..., n) of n terms of q columns, in several noises or one: gram (..., n, q, q) and along
+    (..., n, q) = G^T z, each averaged over its sizes, of which the squares (..., n, m), the logs (n, m) of their
+    probabilities and the centres (n,) are given.
 
-    lengths: the largest squares (n,) of columns before others were subtracted from them; None: those of gram.
+    lengths: the largest squares (..., n) of columns before others were subtracted from them; None: those of gram.
     """
-    largest = np.einsum("nqq->nq", gram).max(axis=1) if lengths is None else lengths
+    largest = np.einsum("...qq->...q", gram).max(axis=-1) if lengths is None else lengths
     scales = np.sqrt(np.maximum(largest, 1e-300))
-    scaled = gram / scales[:, None, None] ** 2
-    values, vectors = np.linalg.eigh(scaled) if gram.shape[1] > 1 else (scaled[:, 0], np.ones_like(scaled))
+    scaled = gram / scales[..., None, None] ** 2
+    values, vectors = np.linalg.eigh(scaled) if gram.shape[-1] > 1 else (scaled[..., 0], np.ones_like(scaled))
     values = np.where(values > ROUNDING, values, 0.0)
-    shifted = along - (gram @ np.ones(gram.shape[1])) * centres[:, None] if centres.any() else along
-    shift = along.sum(axis=1) * centres - 0.5 * gram.sum(axis=(1, 2)) * centres**2 if centres.any() else 0.0
-    turned = np.einsum("nqk,nq->nk", vectors, shifted / scales[:, None]) ** 2 * (values > 0.0)
-    squares = (squares * scales[:, None] ** 2)[:, :, None]
-    spread = squares * values[:, None]
-    logs = 0.5 * np.sum(squares * turned[:, None] / (1.0 + spread) - np.log1p(spread), axis=2)
-    return np.logaddexp.reduce(logs + log_weights, axis=1) + shift
+    shifted, shift = along, 0.0
+    if centres.any():
+        shifted = along - gram.sum(axis=-1) * centres[:, None]
+        shift = along.sum(axis=-1) * centres - 0.5 * gram.sum(axis=(-2, -1)) * centres**2
+    turned = ((shifted / scales[..., None])[..., None, :] @ vectors)[..., 0, :] ** 2 * (values > 0.0)
+    squares = squares * scales[..., None] ** 2
+    logs = log_weights + np.zeros_like(squares)
+    for k in range(values.shape[-1]):
+        spread = squares * values[..., k, None]
+        logs += 0.5 * (squares * turned[..., k, None] / (1.0 + spread) - np.log1p(spread))
+    return np.logaddexp.reduce(logs, axis=-1) + shift
 
 
 def log_bayes_together(gram: Floats, along: Floats, widths: Sequence[int], sizes: Sequence[Sizes]) -> Floats:

@@ -286,24 +286,25 @@ class RunTerms:
         """The products of the columns of all terms in noise of some sizes."""
         return self.likelihood.in_noises(shapes, squares, [alike.places for alike in self._alike])
 
-    def log_bayes(self, noises: InNoises, k: int, explained: Floats | None = None, some: Mask | None = None) -> Floats:
-        """Log Bayes factors (terms,) of all terms, or of some, in noise of one size; of others 0.
+    def log_bayes(self, noises: InNoises, sizes: Sequence[int], explained: Floats | None = None,
+                  some: Mask | None = None) -> Floats:  # fmt: skip
+        """Log Bayes factors (terms, K) of all terms, or of some, in noise of K of the sizes; of others 0.
 
-        explained (f, C + 1): what columns beside them, of any size, explain of all columns and of the readings.
+        explained (K, f, C + 1): what columns beside them, of any size, explain of all columns and of the readings.
         """
-        logs, every = np.zeros(len(self.terms)), slice(None)
+        logs, every = np.zeros((len(self.terms), len(sizes))), slice(None)
         for alike, grams, lengths in zip(self._alike, noises.grams, noises.lengths, strict=True):
             few = every if some is None else some[alike.numbers]
             places, scales = alike.places[few], alike.scales[few]
-            gram, along = grams[k][few], noises.along[k, places]
+            gram, along = grams[sizes][:, few], noises.along[sizes][:, places]
             if explained is not None:
-                parts = np.moveaxis(explained[:, places], 0, 2)  # (n, q, f)
-                gram = gram - parts @ np.swapaxes(parts, 1, 2)
-                along = along - parts @ explained[:, -1]
+                parts = np.moveaxis(explained[..., places], 1, 3)  # (K, n, q, f)
+                gram -= parts @ np.swapaxes(parts, 2, 3)
+                along -= (parts @ explained[:, None, :, -1:])[..., 0]
             gram, along = gram * scales[:, :, None] * scales[:, None], along * scales
-            length = lengths[k][few] * scales.max(axis=1) ** 2
-            sizes = alike.squares[few], alike.log_weights[few], alike.centres[few]
-            logs[alike.numbers[few]] = log_bayes(gram, along, *sizes, length)
+            length = lengths[sizes][:, few] * scales.max(axis=1) ** 2
+            of_sizes = alike.squares[few], alike.log_weights[few], alike.centres[few]
+            logs[alike.numbers[few]] = log_bayes(gram, along, *of_sizes, length).T
         return logs
 
     def bases(self, numbers: Sequence[int], covariance: Floats | None) -> tuple[Floats, Floats]:
@@ -459,7 +460,8 @@ def log_bayes_of_columns(columns: Floats, readings: Floats) -> float:
 
 
 def log_bayes_of_any_size(gram: Floats, along: Floats) -> Floats:
-    """Log Bayes factors (n,) of terms of any size from G^T G (n, q, q) and G^T z (n, q)."""
-    sizes = sizes_of(1.0 / math.sqrt(max(float(np.einsum("nqq->nq", gram).max()), 1e-40)), None)
-    squares, logs = (np.broadcast_to(values, (len(gram), _NODES)) for values in (sizes.values**2, sizes.logs))
-    return log_bayes(gram, along, squares, logs, np.zeros(len(gram)))
+    """Log Bayes factors (..., n) of n terms of any size from G^T G (..., n, q, q) and G^T z (..., n, q)."""
+    largest = np.einsum("...qq->...q", gram).max(axis=(-2, -1))
+    sizes = sizes_of(1.0, None)
+    squares = sizes.values**2 / np.maximum(largest, 1e-40)[..., None, None]
+    return log_bayes(gram, along, squares, sizes.logs, np.zeros(gram.shape[-3]))
