@@ -67,6 +67,7 @@ def unknown_terms(bench: Bench, dwells: Sequence[Dwell]) -> Iterator[UnknownTerm
     slipping = [_Place(f"gimbal {k}", "gimbal and encoder", (f":{k} = {{0}}",)) for k in range(2, len(bench.axes))]
     yield from _of_jumps(dwells, [*places, *(slipping if bench.angles else [])])
     yield from _of_arrival(len(bench.axes), dwells)
+    yield from _of_way(len(bench.axes), dwells, places)
     yield from _of_surroundings(len(bench.axes), bench.angles)
     yield from _of_slow_changes(slow)
 
@@ -257,6 +258,20 @@ def _of_arrival(gimbals: int, dwells: Sequence[Dwell]) -> Iterator[UnknownTerm]:
         sizes = (f"q{k}_move", f"sign(q{k}_move)", f"abs(q{k}_move)", f"abs(sign(q{k}_move))")
         texts = [tuple(f":{k} = {size}*{decay}" for decay in few) for few in decays for size in sizes]
         yield _one_of(f"time since arrival and last move of gimbal {k}", "gimbal and encoder", texts)
+
+
+def _of_way(gimbals: int, dwells: Sequence[Dwell], places: Sequence[_Place]) -> Iterator[UnknownTerm]:
+    """What goes with the way that gimbals have turned, as wear does, or is lost again, as the warmth of motors."""
+    ways = [(f"gimbal {k}", f"q{k}_way") for k in range(1, gimbals + 1)]
+    if gimbals > 1:
+        ways.append(("all gimbals", f"({'+'.join(way for _, way in ways)})"))
+    constants_s = [10 * k for k in _DECAYS if 10 * k <= 10.0 * dwells[-1].end_s]
+    for words, way in ways:
+        lost = [f"({way}-lag({way},{tau_s}*s))" for tau_s in constants_s]
+        courses = [(way,), *(tuple(lost[k : k + 3]) for k in range(max(len(lost) - 2, 1)))]
+        for place in (place for place in places if place.lively):
+            where = f" ({place.words})" if place.words else ""
+            yield _one_of(f"way of {words}{where}", "temperature", [place.of(course) for course in courses])
 
 
 def _of_surroundings(gimbals: int, turns: bool) -> Iterator[UnknownTerm]:

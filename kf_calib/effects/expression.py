@@ -24,6 +24,9 @@ from kf_calib.errors import InputError
 from kf_calib.support.units import RAISED, field_unit, per_power_of_g
 
 LENGTH_LIMIT = 300
+LAG = "lag"
+"""The function of a value and a time constant that needs the course of a run: it follows the value."""
+
 _DEPTH_LIMIT = 30  # simpleeval takes three frames of Python's stack a level
 _SIGNS: dict[type[ast.AST], str] = {
     ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.Pow: "**", ast.USub: "neg", ast.UAdd: "pos",
@@ -35,16 +38,21 @@ OPERATORS: dict[str, Callable[..., Any]] = {
     "<": lambda a, b: np.less(a, b) * 1.0, "<=": lambda a, b: np.less_equal(a, b) * 1.0,
     ">": lambda a, b: np.greater(a, b) * 1.0, ">=": lambda a, b: np.greater_equal(a, b) * 1.0,
 }  # fmt: skip
-FUNCTIONS: dict[str, np.ufunc] = {
+FUNCTIONS: dict[str, Callable[..., Any]] = {
     "sin": np.sin, "cos": np.cos, "tan": np.tan, "arctan": np.arctan, "tanh": np.tanh, "exp": np.exp, "log": np.log,
     "sqrt": np.sqrt, "abs": np.abs, "sign": np.sign, "minimum": np.minimum, "maximum": np.maximum,
+    LAG: lambda value, tau: value,
 }  # fmt: skip
-_VALUES: Mapping[str, Callable[..., Any]] = {**FUNCTIONS, "sign": sign}
+"""Of numbers; what lags behind one that stays is the same."""
+_OF_TWO = ("minimum", "maximum", LAG)
+VALUES: dict[str, Callable[..., Any]] = {**FUNCTIONS, "sign": sign}
+"""The functions as they are evaluated: what is next to 0 has no sign."""
 _ALLOWED = (ast.BinOp, ast.UnaryOp, ast.Compare, ast.Call, ast.Name, ast.Constant, ast.Load, *_SIGNS)
 
 
 class Expression:
-    """An expression that was looked at and found harmless; names: the quantities in it, in the order they appear.
+    """An expression that was looked at and found harmless; names: the quantities in it, in the order they appear;
+    lags: whether it needs the course of a run.
 
     Raises InputError where the text is no such expression. ``meanings``: the names it may use, and what they are.
     """
@@ -53,12 +61,13 @@ class Expression:
         self.text = text.strip()
         self._tree = _parse(self.text)
         self.names = tuple(dict.fromkeys(_look(self._tree, meanings)))
+        self.lags = any(isinstance(each, ast.Name) and each.id == LAG for each in ast.walk(self._tree))
 
     def __call__(
         self,
         names: Mapping[str, Any],
         operators: Mapping[str, Callable[..., Any]] = OPERATORS,
-        functions: Mapping[str, Callable[..., Any]] = _VALUES,
+        functions: Mapping[str, Callable[..., Any]] = VALUES,
     ) -> Any:
         """Its value for these values of its names; other operators and functions evaluate it in another algebra."""
         from simpleeval import SimpleEval
@@ -146,8 +155,9 @@ def _arguments(call: ast.Call) -> list[ast.AST]:
     name = call.func.id if isinstance(call.func, ast.Name) else ""
     if name not in FUNCTIONS:
         raise InputError(f"{_words(call.func)} is not a function of formulas: use {_functions()}.")
-    if call.keywords or len(call.args) != FUNCTIONS[name].nin:
-        raise InputError(f"{name} takes {FUNCTIONS[name].nin} value{'s' * (FUNCTIONS[name].nin > 1)} in parentheses.")
+    count = 2 if name in _OF_TWO else 1
+    if call.keywords or len(call.args) != count:
+        raise InputError(f"{name} takes {count} value{'s' * (count > 1)} in parentheses.")
     return list[ast.AST](call.args)
 
 
@@ -240,6 +250,14 @@ def _compared(one: PintUnit | float, other: PintUnit | float) -> PintUnit:
     return _alike("compared")(one, other) ** 0
 
 
+def _lagging(value: PintUnit | float, tau: PintUnit | float) -> PintUnit:
+    if not _unit(tau).is_compatible_with(_registry().Unit("s")):
+        raise InputError(
+            f"the time constant of {LAG} is in {text(_unit(tau))}: write it with a unit of time, as in {LAG}(T, 60*s)."
+        )
+    return _unit(value)
+
+
 def _zero(value: PintUnit | float) -> bool:
     return isinstance(value, float) and value == 0.0
 
@@ -282,7 +300,7 @@ _RULES: dict[str, Callable[..., PintUnit]] = {
     "+": _alike("added"), "-": _alike("subtracted"), **dict.fromkeys(("<", "<=", ">", ">="), _compared),
     "*": lambda a, b: _unit(a) * _unit(b), "/": lambda a, b: _unit(a) / _unit(b), "**": _power,
     "neg": _unit, "pos": _unit, "abs": _unit, "sqrt": lambda a: _unit(a) ** 0.5, "sign": lambda a: _unit(a) ** 0,
-    "minimum": _alike("compared"), "maximum": _alike("compared"),
+    "minimum": _alike("compared"), "maximum": _alike("compared"), LAG: _lagging,
     **{name: _plain(f"what {name} is taken of") for name in ("sin", "cos", "tan", "arctan", "tanh", "exp", "log")},
 }  # fmt: skip
 _OPERATORS = {sign: numbers_stay(number, _RULES[sign]) for sign, number in OPERATORS.items()}

@@ -19,15 +19,20 @@ tau                s        time since the arrival in the dwell
 q1 q2 q3 ...       rad      gimbal angles, outer first; also outer, inner, and q_x q_y q_z where one is
 q1_before ...      rad      the same in the dwell before
 q1_move ...        rad      last move of a gimbal; 0 where it stood still, but for noise and rounding
+q1_way ...         rad      way that a gimbal has turned since the first dwell, in either sense
 g                  m/s^2    local gravity
 s m K rad deg pi            units and the number, to make a formula's units agree: exp(-tau/(60*s))
 =================  =======  ============================================================================
+
+``lag(T, 60*s)`` is what follows T with a time constant of 60 s, and was in balance at first; so of any quantity.
+``q1_way - lag(q1_way, 600*s)`` is what a gimbal's motor has warmed, and has not yet lost.
 """
 
 from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
@@ -36,7 +41,7 @@ from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench, Vector
 from kf_calib.effects import checks
 from kf_calib.effects.effect import Bearer, SensorEffect, interleaved
-from kf_calib.effects.expression import Expression
+from kf_calib.effects.expression import LAG, VALUES, Expression
 from kf_calib.effects.frame import FrameEffect, gimbal_number
 from kf_calib.effects.quantities import gimbal_letters, quantities
 from kf_calib.effects.stimulus import Stimulus
@@ -79,8 +84,25 @@ class Reading:
 
     def __call__(self, s: Stimulus) -> Floats:
         """Values (m, 1) or (m, 3)."""
-        values = self.expression({name: self._known[name].of(s) for name in self.expression.names})
+        if self.expression.lags and s.whole is not None:
+            known, key = s.whole.known, ("formula", self.expression.text)
+            if key not in known:
+                known[key] = self(s.whole)
+            return known[key][s.places]
+        names = {name: self._known[name].of(s) for name in self.expression.names}
+        values = self.expression(names, functions=VALUES | {LAG: self._lag(s)})
         return np.array(np.broadcast_to(values, (len(s), np.shape(values)[-1] if np.ndim(values) else 1)), dtype=float)
+
+    def _lag(self, s: Stimulus) -> Callable[[Floats | float, Floats | float], Floats]:
+        """Return what ``lag`` is in a run; it raises InputError where its time constant is none."""
+
+        def lag(values: Floats | float, tau_s: Floats | float) -> Floats:
+            constants = np.unique(tau_s)
+            if not (len(constants) == 1 and 0.0 < constants[0] < np.inf):
+                raise InputError(f"{self.name}: {LAG} needs one time constant above 0, as in {LAG}(T, 60*s).")
+            return s.lag(values, float(constants[0]))
+
+        return lag
 
     @property
     def units(self) -> dict[str, str]:

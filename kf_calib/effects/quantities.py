@@ -71,4 +71,7 @@ def quantities(axes: tuple[Vector, ...]) -> dict[str, FormulaQuantity]:
         named[f"{number}_move"] = FormulaQuantity(
             "rad", f"last move of gimbal {k + 1}, 0 where it stood still", lambda s, k=k: s.move(k)[:, None]
         )
+        named[f"{number}_way"] = FormulaQuantity(
+            "rad", f"way that gimbal {k + 1} has turned since the first dwell", lambda s, k=k: s.way(k)[:, None]
+        )
     return named

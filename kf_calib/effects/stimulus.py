@@ -224,6 +224,24 @@ class Stimulus:
         return np.where(np.abs(moves) > max(_LEAST_MOVE_RAD, self.unsure_rad), moves, 0.0)
 
     @_of_the_whole
+    def way(self, gimbal: int) -> Floats:
+        """The way (m,) that a gimbal has turned since the first dwell, rad: the sum of its moves, of either sense."""
+        order = np.argsort(self.elapsed_s, kind="stable")
+        arrives = np.append(False, np.diff(self.since_arrival_s[order]) < 0.0)
+        way = np.empty(len(self))
+        way[order] = np.cumsum(np.where(arrives, np.abs(self.move(gimbal)[order]), 0.0))
+        return way
+
+    def lag(self, values: Floats | float, tau_s: float) -> Floats:
+        """L (m, n): tau dL/dt = x - L, in balance at first; x, the values (m, n), in straight lines from instant to
+        instant. Of the whole run: a part does not know what came before."""
+        columns = np.broadcast_to(values, (len(self), *(np.shape(values)[1:] or (1,))))
+        order, lags = np.argsort(self.elapsed_s, kind="stable"), np.empty(columns.shape)
+        for k, column in enumerate(columns.T):
+            lags[order, k] = lagged(self.elapsed_s[order], column[order], tau_s)
+        return lags
+
+    @_of_the_whole
     def side(self, gimbal: int) -> Floats:
         """The sense (m,) of the last move of a gimbal, 1 or -1, which it keeps while it stands still; 0 until it moves.
 

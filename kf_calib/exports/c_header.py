@@ -21,7 +21,7 @@ import numpy as np
 from kf_calib.bench.arrays import Floats
 from kf_calib.effects import Effect
 from kf_calib.effects.effect import own_formula
-from kf_calib.effects.expression import FUNCTIONS, OPERATORS, Expression, numbers_stay
+from kf_calib.effects.expression import FUNCTIONS, LAG, OPERATORS, Expression, numbers_stay
 from kf_calib.effects.formula import Formula, quantities
 from kf_calib.errors import InputError
 from kf_calib.exports.target import Target, in_comment
@@ -192,7 +192,9 @@ def _power(words: list[str], exponent: TextOfC) -> str:
 
 
 def _call(name: str, *pieces: TextOfC) -> str:
-    """Return what a function makes of pieces."""
+    """Return what a function makes of pieces; what lags behind one that stays, as all does here, is the same."""
+    if name == LAG:
+        return text_of_number(pieces[0])
     return f"{(MATH | _OWN)[name]}({', '.join(map(text_of_number, pieces))})"
 
 

@@ -221,7 +221,7 @@ def test_what_decays_after_every_arrival_is_no_warm_up(time_constant_s: float, s
 
 @pytest.mark.parametrize("name", ["a cable winds up", "a gimbal creeps one way", *slow(
     "a cable drags", "the table relaxes", "the block sags with the middle gimbal", "switched on again",
-    "a scale factor wanders", "a bias turns back",
+    "a scale factor wanders", "a bias turns back", "motors warm the biases", "motors warm the scale factors",
 )])  # fmt: skip
 def test_a_fault_of_no_catalogue_has_no_known_name(name: str) -> None:
     diagnosis = kf_calib.diagnose(faulty_run(name, 60.0, 7501), replicate=False)

@@ -13,6 +13,7 @@ from helpers.long_runs import slow
 from helpers.own_effect import TEN_LINES
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
 
 from kf_calib import effects
 from kf_calib.bench.bench import Bench, axes_of
@@ -494,6 +495,34 @@ def test_the_last_move_is_zero_where_a_gimbal_stood_still_whatever_its_encoder_s
     np.testing.assert_array_equal(senses, np.resize([1.0, -1.0, 0.0, 0.0, 0.0], len(pose)))
     moves = effect_named("mine = q2_move", EXAMPLE).columns(stimulus)[:, 0, 0]
     np.testing.assert_allclose(moves, 0.5 * senses)
+
+
+def test_what_follows_a_quantity_is_its_differential_equation() -> None:
+    """tau dL/dt = x - L, by scipy; a part of the run has what the whole has, and the way of a gimbal sums its moves."""
+    stimulus = trial(EXAMPLE)
+    pose = stimulus.pose[:, 1]
+    way = effect_named("mine = q2_way", EXAMPLE).columns(stimulus)[:, 0, 0]
+    np.testing.assert_allclose(way[4::5], np.append(0.0, np.abs(np.diff(pose[::5])).cumsum()), atol=1e-2)
+    times_s = stimulus.elapsed_s
+    solved = solve_ivp(
+        lambda at_s, lag: (np.interp(at_s, times_s, way) - lag) / 60.0, times_s[[0, -1]], way[:1], t_eval=times_s,
+        max_step=1.0, rtol=1e-8, atol=1e-8,
+    )  # fmt: skip
+    warmth = effect_named("mine = q2_way - lag(q2_way, 60*s)", EXAMPLE)
+    np.testing.assert_allclose(warmth.columns(stimulus)[:, 0, 0], way - solved.y[0], atol=1e-4)
+    part = slice(100, 130)
+    np.testing.assert_array_equal(warmth.columns(stimulus.at(part)), warmth.columns(stimulus)[part])
+    assert warmth.remarks == ()
+
+
+@pytest.mark.parametrize(
+    "text, words",
+    [("lag(T, 60)", "unit of time"), ("lag(T, t)", "one time constant"), ("lag(T, -5*s)", "one time constant"),
+     ("lag(T)", "takes 2 values"), ("lag + 1", "in parentheses")],
+)  # fmt: skip
+def test_a_time_constant_is_one_constant_time(text: str, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        effect_named(f"mine = {text}", EXAMPLE)
 
 
 def test_what_a_recording_shows_of_an_effect(run, recording: Path) -> None:

@@ -83,6 +83,21 @@ def _before(gimbal: int) -> Course:
     return course
 
 
+def _way(at: State) -> Floats:
+    """The way (n, 3) that each gimbal has turned."""
+    return np.abs(np.diff(at.angles_rad, axis=0, prepend=at.angles_rad[:1])).cumsum(axis=0)
+
+
+def _motors(at: State, rng: np.random.Generator) -> Floats:
+    """The warmth of the motors: each turn adds to it, and it goes, step by step."""
+    way = _way(at) @ rng.uniform(0.2, 1.0, 3)
+    lost = np.exp(-np.diff(at.time_s) / (at.time_s[-1] * rng.uniform(0.05, 0.3)))
+    warmth = np.zeros(len(way))
+    for k, (kept, added) in enumerate(zip(lost, np.diff(way), strict=True), start=1):
+        warmth[k] = kept * warmth[k - 1] + added
+    return warmth
+
+
 FAULTS: dict[str, tuple[str, Course]] = {
     "a gimbal creeps by its move": ("gimbals", lambda at, rng: _since(at, rng) * at.moves_rad[:, 2]),
     "a gimbal creeps one way": ("gimbals", lambda at, rng: _since(at, rng) * (at.dwell > 0)),
@@ -119,6 +134,10 @@ FAULTS: dict[str, tuple[str, Course]] = {
     "a bias jumps": ("bias", _from),
     "a bias turns back": ("bias", _turning_point),
     "switched on again": ("bias", _switched_on_again),
+    "motors warm the biases": ("bias", _motors),
+    "motors warm the scale factors": ("scale", _motors),
+    "a bearing wears": ("base", lambda at, rng: _way(at)[:, 1]),
+    "a cable wears": ("bias", lambda at, rng: _way(at)[:, 2]),
 }
 
 
