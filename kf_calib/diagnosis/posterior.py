@@ -137,7 +137,8 @@ class RunPosterior:
             except UnobservableError:  # the run does not tell its coefficients
                 continue
             effect, place = refit.model.effects[-1], refit.model.parts[name].start
-            if effect.smooth and not effect.held:
+            constant = refit.parameters[effect.unknown.symbol] if effect.unknown else None
+            if constant is not None and constant.value is not None and effect.smooth and not effect.held:
                 fitted.append((effect, float(refit.fit.sigma[place + len(effect.coefficients)])))
         return fitted
 

@@ -34,7 +34,7 @@ from kf_calib.noise.noise_model import Noise
 _DECADES = 7.0  # above one sigma: sizes of what has no usual size
 _NODES = 40  # sizes that are tried: the likelihood of q columns is as wide as 1 / sqrt(2 q) of its logarithm
 _FEW, _NODES_OF_FEW = 2, 20  # columns of which a step twice as long sums it to 1e-3
-_SAME = 0.99  # cosine above which a summand is a known effect
+_SAME = 0.999  # cosine above which a summand is a known effect
 _END = 0.99  # of the range of a constant
 _LEAST = 1e-3  # share of the largest part of a term that a part of it has at least
 _WAVES = 40  # of a random walk

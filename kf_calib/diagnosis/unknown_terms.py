@@ -26,7 +26,9 @@ _SHARES = {1: 0.5, 2: 0.25, 0: 0.25}
 """Of one, two and all of the summands of an unknown function."""
 
 _SUMS = ((1, 1), (1, -1), (2, 1), (2, -1), (1, 2), (1, -2), (2, 2), (2, -2))  # of two angles, in turns of each
+_CAGE = 0.4  # turns of the cage of a bearing in one of the gimbal
 _END = 0.125  # of a run
+_OF_TWO = ("a*a", "p*p", "a*p", "a*o", "p*o", "abs(a)")  # of the force, that change with time or temperature
 _LEVELS = (1, 2, 3, 4, 5, 6, 7, 8, 9)  # of the force at which a sensor may behave otherwise, in tenths of gravity
 _TURNS = 12  # of what oscillates, in a run, at most
 
@@ -68,6 +70,7 @@ def unknown_terms(bench: Bench, dwells: Sequence[Dwell]) -> Iterator[UnknownTerm
     yield from _of_jumps(dwells, [*places, *(slipping if bench.angles else [])])
     yield from _of_arrival(len(bench.axes), dwells)
     yield from _of_way(len(bench.axes), dwells, places)
+    yield from _of_history(len(bench.axes), dwells, slow)
     yield from _of_surroundings(len(bench.axes), bench.angles)
     yield from _of_slow_changes(slow)
 
@@ -140,6 +143,7 @@ def _of_gimbals(count: int, slow: Sequence[tuple[str, str]]) -> Iterator[Unknown
     """slow: what changes slowly, in words and as formulas have it."""
     for k in range(1, count + 1):
         waves = {n: _waves(_turned(n, k)) for n in (1, 2, 3, 4, 6)}
+        cage = _waves(f"{_CAGE}*q{k}")
         weights = [n**-0.5 for n in waves]
         yield _term(f"angle of gimbal {k}", "", [(f"q{k}",), *waves.values()], (1.0, *weights))
         products = [_times(waves[n], force) for n in (1, 2) for force in ("a", "p", "o")]
@@ -152,11 +156,11 @@ def _of_gimbals(count: int, slow: Sequence[tuple[str, str]]) -> Iterator[Unknown
         yield _term(f"previous orientation (angle of gimbal {k})", "memory", [before])
         held = [_turning(str(k), _times(waves[n], f"sign(q{k}_move)")) for n in (1, 2)]
         yield _term(f"angle and last move of gimbal {k} (as an error of its encoder)", "gimbal and encoder", held)
-        turning = [(f"q{k}",), *waves.values()]
+        turning = [(f"q{k}",), *waves.values(), cage]
         for j in range(1, count + 1):
             words = "as an error of its encoder" if j == k else f"a rotation of gimbal {j}"
             yield _term(f"angle of gimbal {k} ({words})", "gimbal and encoder",
-                        [_turning(str(j), texts) for texts in turning], (1.0, *weights))  # fmt: skip
+                        [_turning(str(j), texts) for texts in turning], (1.0, *weights, 1.0))  # fmt: skip
         for place, words in (("base", "a tilt of the base"), ("platform", "a rotation of the platform")):
             yield _term(f"angle of gimbal {k} ({words})", "gimbal and encoder",
                         [_turning(place, texts) for texts in turning[:5]], (1.0, *weights[:4]))  # fmt: skip
@@ -210,17 +214,20 @@ def _of_time(dwells: Sequence[Dwell], places: Sequence[_Place]) -> Iterator[Unkn
     weights = (1.0, 0.5, *(1.0 / n for n in range(1, 9)))
     yield _term("time", "bias in time", texts, weights)
     products = [f"{power}*{force}" for power in ("t", "t*t") for force in ("a", "p", "o")]
-    products += [f"{power}*{force}" for power in ("t", "t*t") for force in ("a*a", "p*p", "a*p", "a*o", "p*o")]
+    products += [f"{power}*{force}" for power in ("t", "t*t") for force in _OF_TWO]
     products += [f"cos({n}*pi*t/{run_s})*a" for n in range(1, 7)]
     yield _term("time and specific force", "scale in time", products)
     for place in (place for place in places if place.turns):
         yield _term(f"time ({place.words})", place.family, [text for t in texts[:6] for text in place.of([t])], weights)
     decays = _decays("t", 10, 10.0 * dwells[-1].end_s)
+    creeps = [f"log(1+t/({tau_s}*s))" for tau_s in (1, *(10 * k for k in _DECAYS if 10 * k <= dwells[-1].end_s))]
     # between neighbouring frequencies all are sums of these
     waves = {n: _waves(f"{n}*pi*t/{run_s}") for n in range(1, 2 * min(_TURNS, len(dwells) // 2) + 2)}
     oscillations = [(*waves[n - 1], *waves[n], *waves[n + 1]) for n in range(2, len(waves), 2)]
     for place in places:
         yield place.one_of("a decay", decays)
+        if place.lively:
+            yield place.one_of("a creep", [("sqrt(t/s)",), *itertools.pairwise(creeps)])
         if place.lively and oscillations:
             yield place.one_of("an oscillation", oscillations)
 
@@ -274,10 +281,30 @@ def _of_way(gimbals: int, dwells: Sequence[Dwell], places: Sequence[_Place]) -> 
             yield _one_of(f"way of {words}{where}", "temperature", [place.of(course) for course in courses])
 
 
+def _of_history(gimbals: int, dwells: Sequence[Dwell], slow: Sequence[tuple[str, str]]) -> Iterator[UnknownTerm]:
+    """What follows the force across, an angle or the temperature with a time constant: between two all others are sums
+    of both."""
+    constants_s = [10 * k for k in _DECAYS if k == 1 or 10 * k <= dwells[-1].end_s]
+    between = [*itertools.pairwise(constants_s)] or [(constants_s[0],)]
+
+    def lagging(*quantities: str, times: str = "") -> list[tuple[str, ...]]:
+        """Return the alternatives of these quantities together, times a force."""
+        return [tuple(f"lag({each},{tau_s}*s){times}" for tau_s in few for each in quantities) for few in between]
+
+    yield _one_of("specific force before, across", "memory", [*lagging("p"), *lagging("o")])
+    yield _one_of(
+        "specific force before, and now", "memory", [*lagging("a", times="*a"), *lagging("abs(a)", times="*a")]
+    )
+    for k in range(1, gimbals + 1):
+        yield _one_of(f"angle of gimbal {k} before", "memory", lagging(*_waves(f"q{k}")))
+    for words, symbol in slow[1:]:
+        yield _one_of(f"{words} before, and specific force", "temperature", lagging(symbol, times="*a"))
+
+
 def _of_surroundings(gimbals: int, turns: bool) -> Iterator[UnknownTerm]:
     yield _term("temperature", "temperature", ["T", "T*T", "T**3"])
     products = [f"{power}*{force}" for power in ("T", "T*T") for force in ("a", "p", "o")]
-    products += [f"{power}*{force}" for power in ("T", "T*T") for force in ("a*a", "p*p", "a*p", "a*o", "p*o")]
+    products += [f"{power}*{force}" for power in ("T", "T*T") for force in _OF_TWO]
     yield _term("temperature and specific force", "temperature", products)
     yield _term("rate of temperature", "temperature", ["dT", "a*dT"])
     if turns:

@@ -34,6 +34,7 @@ import math
 import re
 from collections.abc import Callable
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -84,13 +85,20 @@ class Reading:
 
     def __call__(self, s: Stimulus) -> Floats:
         """Values (m, 1) or (m, 3)."""
-        if self.expression.lags and s.whole is not None:
-            known, key = s.whole.known, ("formula", self.expression.text)
-            if key not in known:
-                known[key] = self(s.whole)
-            return known[key][s.places]
+        if not self.expression.lags:
+            return self._values(s, VALUES)
+        whole, key = s if s.whole is None else s.whole, ("formula", self.expression.text)
+        if whole.whole is not None:
+            return self(whole)[s.places]
+        if key not in whole.known:
+            course, places = whole.with_ways
+            whole.known[key] = self._values(course, VALUES | {LAG: self._lag(course)})[places]
+        return whole.known[key][s.places]
+
+    def _values(self, s: Stimulus, functions: dict[str, Callable[..., Any]]) -> Floats:
+        """Return values (m, 1) or (m, 3), with these functions."""
         names = {name: self._known[name].of(s) for name in self.expression.names}
-        values = self.expression(names, functions=VALUES | {LAG: self._lag(s)})
+        values = self.expression(names, functions=functions)
         return np.array(np.broadcast_to(values, (len(s), np.shape(values)[-1] if np.ndim(values) else 1)), dtype=float)
 
     def _lag(self, s: Stimulus) -> Callable[[Floats | float, Floats | float], Floats]:

@@ -28,6 +28,15 @@ _RATE_STILL = 0.02
 _UNSURE = 5.0  # sigmas of a setting error
 _LEAST_MOVE_RAD = 1e-4  # of a gimbal: less is noise of its encoder, or creep
 _ON_WAY = 8  # parts of a way from dwell to dwell
+_COURSE = (
+    "elapsed_s",
+    "since_arrival_s",
+    "force_mps2",
+    "previous_force_mps2",
+    "pose",
+    "previous_pose",
+    "temperature_c",
+)
 _OF_ALL = ("bench", "sensitivity", "carrier_hz", "part", "whole", "places")  # is the same at all instants
 
 
@@ -227,19 +236,16 @@ class Stimulus:
     def way(self, gimbal: int) -> Floats:
         """The way (m,) that a gimbal has turned since the first dwell, rad: the sum of its moves, of either sense."""
         order = np.argsort(self.elapsed_s, kind="stable")
-        arrives = np.append(False, np.diff(self.since_arrival_s[order]) < 0.0)
+        moves, leaves = np.abs(self.move(gimbal)[order]), np.diff(self.since_arrival_s[order]) < 0.0
         way = np.empty(len(self))
-        way[order] = np.cumsum(np.where(arrives, np.abs(self.move(gimbal)[order]), 0.0))
+        way[order] = moves + np.append(0.0, np.where(leaves, moves[:-1], 0.0)).cumsum()
         return way
 
     def lag(self, values: Floats | float, tau_s: float) -> Floats:
-        """L (m, n): tau dL/dt = x - L, in balance at first; x, the values (m, n), in straight lines from instant to
-        instant. Of the whole run: a part does not know what came before."""
+        """L (m, n): tau dL/dt = x - L, in balance at first; x, the values (m, n), in straight lines between instants,
+        which are all of a run in order of time (``with_ways``)."""
         columns = np.broadcast_to(values, (len(self), *(np.shape(values)[1:] or (1,))))
-        order, lags = np.argsort(self.elapsed_s, kind="stable"), np.empty(columns.shape)
-        for k, column in enumerate(columns.T):
-            lags[order, k] = lagged(self.elapsed_s[order], column[order], tau_s)
-        return lags
+        return np.stack([lagged(self.elapsed_s, column, tau_s) for column in columns.T], axis=1)
 
     @_of_the_whole
     def side(self, gimbal: int) -> Floats:
@@ -338,36 +344,48 @@ class Stimulus:
 
     @_of_the_whole
     def remembered(self, tau_s: float) -> Floats:
-        """x (m, 3), m/s^2: tau dx/dt = a_i - x, in balance at first; a_i in straight lines from instant to instant."""
-        at_s, along, places = self._way
-        return np.stack([lagged(at_s, along[:, i], tau_s)[places] for i in range(3)], axis=1)
+        """x (m, 3), m/s^2: tau dx/dt = a_i - x, in balance at first."""
+        course, places = self.with_ways
+        return course.lag(course.along, tau_s)[places]
 
     @cached_property
-    def _way(self) -> tuple[Floats, Floats, Indices]:
-        """Rising instants (n,), a_i (n, 3) at these, and which of them the instants of this are: on the way from dwell
-        to dwell the platform turns from pose to pose until it has arrived, all gimbals at once, slowly at both ends."""
+    def with_ways(self) -> tuple[Stimulus, Indices]:
+        """The whole run in order of time with instants on the ways from dwell to dwell, and which of all its own are:
+        there the platform turns from pose to pose until it has arrived, all gimbals at once, slowly at both ends."""
         order = np.argsort(self.elapsed_s, kind="stable")
-        times_s, since_s, along = self.elapsed_s[order], self.since_arrival_s[order], self.along[order]
-        arrived = np.flatnonzero(np.diff(since_s) < 0.0) + 1
-        left_s, pose, before = times_s[arrived - 1], self.pose[order][arrived], self.previous_pose[order][arrived]
-        arrived_s = np.maximum(times_s[arrived] - since_s[arrived], left_s)
-        if not self.bench.axes:  # a quaternion and its negative are the same
-            before = np.where(np.sum(before * pose, axis=1, keepdims=True) < 0.0, -before, before)
-        on_way_s, on_way = list[Floats](), list[Floats]()
-        for share in np.arange(1, _ON_WAY + 1) / _ON_WAY:
-            at_s = left_s + share * (arrived_s - left_s)
-            turned = share**2 * (3.0 - 2.0 * share)
-            force = along[arrived - 1] + turned * (along[arrived] - along[arrived - 1])
-            if self.bench.angles and np.isfinite(before).all() and share < 1.0:
-                force = self.bench.specific_force(at_s, before + turned * (pose - before)) @ self.axes.T
-            on_way_s.append(at_s)
-            on_way.append(force)
-        all_s = np.concatenate([times_s, *on_way_s])
+        arrived = np.flatnonzero(np.diff(self.since_arrival_s[order]) < 0.0) + 1
+        leaving, arriving = self.at_instants(order[arrived - 1]), self.at_instants(order[arrived])
+        arrived_s = np.maximum(arriving.elapsed_s - arriving.since_arrival_s, leaving.elapsed_s)
+        parts = [self.at_instants(order), *(
+            leaving.on_way_to(arriving, arrived_s, share) for share in np.arange(1, _ON_WAY + 1) / _ON_WAY
+        )]  # fmt: skip
+        joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _COURSE}
+        all_s = joined["elapsed_s"]
         in_time = np.lexsort((np.arange(len(all_s)) < len(order), all_s))  # at the same time the way comes first
         rank, places = np.empty(len(all_s), np.intp), np.empty(len(order), np.intp)
         rank[in_time] = np.arange(len(all_s))
         places[order] = rank[: len(order)]
-        return all_s[in_time], np.concatenate([along, *on_way])[in_time], places
+        course = replace(self.at_instants(order[:1]), **{name: values[in_time] for name, values in joined.items()})
+        vars(course)["warming"] = np.interp(course.elapsed_s, self.elapsed_s[order], self.warming[order])
+        return course, places
+
+    def at_instants(self, numbers: Indices) -> Stimulus:
+        """Another run, of some of the instants alone, by what a course is made of."""
+        kept = {name: getattr(self, name)[numbers] for name in _COURSE}
+        return Stimulus(self.bench, **kept, sensitivity=self.sensitivity)
+
+    def on_way_to(self, arriving: Stimulus, arrived_s: Floats, share: float) -> Stimulus:
+        """Instants at a share of the time of ways that begin here and end at another's."""
+        turned, pose, before = share**2 * (3.0 - 2.0 * share), arriving.pose, arriving.previous_pose
+        if not self.bench.axes:  # a quaternion and its negative are the same
+            before = np.where(np.sum(before * pose, axis=1, keepdims=True) < 0.0, -before, before)
+        at_s, pose = self.elapsed_s + share * (arrived_s - self.elapsed_s), before + turned * (pose - before)
+        force = self.force_mps2 + turned * (arriving.force_mps2 - self.force_mps2)
+        if self.bench.angles and np.isfinite(before).all() and share < 1.0:
+            force = self.bench.specific_force(at_s, pose)
+        warm = self.temperature_c + share * (arriving.temperature_c - self.temperature_c)
+        return replace(arriving, elapsed_s=at_s, force_mps2=force, pose=pose, temperature_c=warm,
+                       since_arrival_s=0.0 * at_s)  # fmt: skip
 
     @_of_the_whole
     def played_warmth(self, half_width_k: float) -> Floats:

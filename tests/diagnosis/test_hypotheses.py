@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
+from blind_trials.recording import simulate_trial
+from blind_trials.task import Task
 from helpers.hidden_effects import noisy_run, noisy_source, run, source
 from helpers.known_runs import diagnosed
 from helpers.synthetic import plan_of
@@ -19,6 +22,7 @@ from kf_calib.diagnosis.verdict import format_probability
 from kf_calib.effects import effect_named, names
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation.results import Calibration
+from kf_calib.sources.files.recording import Recording
 from kf_calib.support.tail_probabilities import log_odds_of
 from kf_calib.views.diagnosis import diagnosis_object
 
@@ -202,3 +206,11 @@ def test_what_an_effect_leaves_is_tested_in_the_noise_that_it_leaves() -> None:
     np.testing.assert_allclose(again.noise.scatter_mps2, after.noise.scatter_mps2)
     assert again.noise.setting_rad == pytest.approx(after.noise.setting_rad)
     assert again.consistency.consistent is False
+
+
+def test_a_constant_that_the_run_does_not_tell_is_no_value_to_be_weighed(tmp_path: Path) -> None:
+    """To a jump a play is fitted that is wider than the swing of the temperature: it has no sigma."""
+    task = Task("outside@15", "outside", 5151510500017, ("bias-jump=15sigma",), (), "0.0002")
+    simulate_trial(task, tmp_path / "run.mcap")
+    found = diagnose(Recording(tmp_path / "run.mcap"), replicate=False)
+    assert found.unknown and "a jump" in found.verdict, found.verdict
