@@ -247,7 +247,7 @@ class Magnetic(Effect):
         return [np.kron(np.eye(3), [[np.cos(a)], [np.sin(a)]]).astype(float) for a in directions]
 
     def columns(self, s: Stimulus) -> Floats:
-        return of_each(s.axes @ np.stack([s.to_platform(axis) for axis in s.level_axes], axis=2))
+        return of_each(s.axes @ np.swapaxes(s.level_in_platform, 1, 2))
 
 
 IEEE = "IEEE Std 1293, environmental sensitivities"

@@ -61,7 +61,7 @@ class Expression:
         self.text = text.strip()
         self._tree = _parse(self.text)
         self.names = tuple(dict.fromkeys(_look(self._tree, meanings)))
-        self.lags = any(isinstance(each, ast.Name) and each.id == LAG for each in ast.walk(self._tree))
+        self.lags = f"{LAG}(" in self.text.replace(" ", "")
 
     def __call__(
         self,

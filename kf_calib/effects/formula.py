@@ -212,8 +212,8 @@ class FrameFormula(FrameEffect):
         checks.refuse_not_finite(self, values, s)
         if self.variant == PLATFORM:
             return -values[:, :, None] * np.eye(3)
-        axes = [self.about(s)] if self.gimbal is not None else [-s.to_platform(n) for n in s.level_axes]
-        return values[:, :, None] * np.stack(axes, axis=1)
+        axes = self.about(s)[:, None] if self.gimbal is not None else -s.level_in_platform
+        return values[:, :, None] * axes
 
 
 @lru_cache(maxsize=8)
@@ -222,7 +222,7 @@ def _trial(axes: tuple[Vector, ...], gravity_mps2: float) -> Stimulus:
     return checks.trial(Bench(axes, gravity_mps2))
 
 
-@lru_cache(maxsize=1024)
+@lru_cache(maxsize=1 << 12)
 def formula(text: str, axes: tuple[Vector, ...], gravity_mps2: float, checked: bool = True) -> Formula | FrameFormula:
     """The formula's effect, made once for each bench: a run asks for it many times."""
     (full, expression), bench = split(text), _trial(axes, gravity_mps2).bench

@@ -39,7 +39,7 @@ class FrameEffect(Effect):
     def about(self, s: Stimulus) -> Floats:
         """The axis (m, 3), of unit length, about which an error of its gimbal's angle turns the specific force."""
         assert self.gimbal is not None
-        return -s.inner(np.array(s.bench.axes[self.gimbal]), self.gimbal)
+        return -s.gimbal_axes[:, self.gimbal]
 
     def turned_rad(self, s: Stimulus, coefficients: Floats) -> Floats:
         """The rotation vector (m, 3) with these ``coefficients`` (q,), rad."""
@@ -91,7 +91,7 @@ class BaseTilt(FrameEffect):
     bearers = interleaved(2)
 
     def rotations(self, s: Stimulus) -> Floats:
-        return -np.stack([s.to_platform(axis) for axis in s.level_axes], axis=1)
+        return -s.level_in_platform
 
     def degeneracy(self, bench: Bench) -> str:
         return "about the outer gimbal axis, a tilt of the base is exactly the zero of the outer encoder"

@@ -396,6 +396,17 @@ class Stimulus:
         through[order] = through_play(warm, half_width_k, float(warm[0]))
         return through
 
+    @cached_property
+    def level_in_platform(self) -> Floats:
+        """North and East seen in the platform, (m, 2, 3)."""
+        return np.stack([self.to_platform(axis) for axis in self.level_axes], axis=1)
+
+    @cached_property
+    def gimbal_axes(self) -> Floats:
+        """The axis of each gimbal seen in the platform, (m, k, 3)."""
+        axes = [self.inner(np.array(axis), k) for k, axis in enumerate(self.bench.axes)]
+        return np.stack(axes, axis=1)
+
     def to_platform(self, vector: Floats) -> Floats:
         """A bench vector (3,) seen in the platform, (m, 3)."""
         return np.broadcast_to(self.bench.to_platform(vector, self.pose), (len(self), 3))
