@@ -26,4 +26,4 @@ def test_a_number_is_alike_within_a_hundred_thousandth_or_a_ten_thousandth_of_it
 
 
 def test_all_cases_are_small() -> None:
-    assert sum(path.stat().st_size for path in stored_numbers.FOLDER.glob("*.json")) < 700_000
+    assert sum(path.stat().st_size for path in stored_numbers.FOLDER.glob("*.json")) < 750_000
