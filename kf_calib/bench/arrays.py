@@ -25,6 +25,8 @@ ROUNDING = 1e-9
 """Share of the largest of numbers below which another is what rounding leaves of zero."""
 LAST_DIGITS = 1e-12
 """The same of a difference of two numbers, which has lost nothing but its last digits."""
+EXACT = 1e-14
+"""The same of a number that lost nothing: a few units of its last place."""
 DIFFERENCE = float(np.finfo(float).eps) ** (1.0 / 3.0)
 """Step of central differences, of what counts from 1: rounding and curvature then leave errors alike."""
 AT_ONCE = 1024

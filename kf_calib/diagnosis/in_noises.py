@@ -17,10 +17,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats, Indices
+from kf_calib.bench.arrays import IN_CACHE, Floats, Indices
 from kf_calib.estimation.candidate_scan import SEEN
 
-_AT_ONCE = 1 << 20  # products that are computed together, so that they stay in the cache
 ROUNDING = 1e-10
 """Share of the square of a column below which what the model, or other columns, leave of it is rounding."""
 
@@ -164,7 +163,7 @@ class InNoises:
 
     def _parts(self) -> list[slice]:
         """Return few dwells at a time."""
-        most = max(_AT_ONCE // (3 * (self._rows.columns.shape[2] + 1)), 1)
+        most = max(8 * IN_CACHE // (3 * (self._rows.columns.shape[2] + 1)), 1)
         return [slice(k, k + most) for k in range(0, len(self._rows), most)]
 
     def _of_rows(self, part: slice) -> Floats:
@@ -186,7 +185,7 @@ def _products(some: Floats, others: Floats, weights: Floats) -> Floats:
 def _add_products(columns: Floats, group: Indices, weights: Floats, sums: Floats) -> None:
     """Add to sums (K, n, pairs) the products of columns (C, r) of a group in all weights (K, r)."""
     first, second = np.triu_indices(group.shape[1])
-    most = max(_AT_ONCE // (len(first) * columns.shape[1]), 1)
+    most = max(8 * IN_CACHE // (len(first) * columns.shape[1]), 1)
     for k in range(0, len(group), most):
         few = columns[group[k : k + most]]
         products = few[:, first] * few[:, second]

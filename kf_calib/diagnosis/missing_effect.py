@@ -45,10 +45,9 @@ from kf_calib.effects import effect_named
 from kf_calib.estimation.filter_history import readings_of
 from kf_calib.estimation.outlying_dwell import wrong_dwell
 from kf_calib.estimation.results import Calibration
-from kf_calib.support.tail_probabilities import LEVEL, chi_squared_tail, log_odds_of
+from kf_calib.support.tail_probabilities import LEVEL, NO_CHANCE, chi_squared_tail, log_odds_of
 
 _SHOWN = 6  # number of suspects that are shown
-_NOISE = 1e-6  # p-value below which readings within dwells hold more than an oscillation and noise
 
 
 def diagnose(
@@ -151,7 +150,7 @@ def _leaves_noise(refit: Calibration, before: Calibration) -> bool:
     """Tell whether a fitted oscillation leaves noise in what is kept of the readings within dwells for its sake."""
     with_oscillation, without = refit.consistency, before.consistency
     rows = with_oscillation.dof - without.dof
-    return rows <= 0 or chi_squared_tail(rows, max(with_oscillation.statistic - without.statistic, 0.0)) > _NOISE
+    return rows <= 0 or chi_squared_tail(rows, max(with_oscillation.statistic - without.statistic, 0.0)) > NO_CHANCE
 
 
 def _explained(refits: Refits, before: Calibration, test: CandidateTests) -> Diagnosis:

@@ -53,14 +53,13 @@ from kf_calib.estimation.results import Calibration
 from kf_calib.estimation.within_dwell_trend import p_of_steady_oscillation, trend
 from kf_calib.noise.terms import RandomWalk, ThermometerError
 from kf_calib.support import stage
-from kf_calib.support.tail_probabilities import LEVEL, chi_squared_tail, log_odds_of
+from kf_calib.support.tail_probabilities import CLEAR, LEVEL, chi_squared_tail, log_odds_of
 
 _IRREGULAR = 0.1  # share of an unknown cause in scatter that was not stated
 _BESIDE = 2  # rows of effects, and of unknown functions, beside which dwells are tried
 _AGAINST_STATED = 0.5  # the same of scatter beyond what was stated
 _OF_ORIENTATION = 0.8  # share of unknown causes that depend on the orientation alone, and come back with it
 _WITHIN = 0.01  # prior probability of irregular changes that show within dwells only
-_APART = 1e-4  # p-value of an oscillation that does not go on alike in all dwells
 _HEADS = 3  # effects beside which all other terms are tried: likeliest in any noise, in that stated, and in pairs
 _NO_SIGN, _ONE = 0.5, 1e-3  # what is left of an effect beside one that is the same: of chi-squared, and a share
 _SAME = 1e-6  # squared sine of the angle below which two effects are one
@@ -467,7 +466,7 @@ class RunPosterior:
             refit = self._refits.with_effects(self._before, row.effects)
         except UnobservableError:  # the run does not tell its coefficients: nothing speaks for it
             return replace(row, log_evidence=-math.inf)
-        if refit.model.oscillates and not self._before.model.oscillates and p_of_steady_oscillation(refit.fit) < _APART:
+        if refit.model.oscillates and not self._before.model.oscillates and p_of_steady_oscillation(refit.fit) < CLEAR:
             self._no_oscillation |= {str(effect) for effect in refit.model.effects if effect.oscillates}
             return row
         folded, before = refit.fit.dwells.folded, self._before.fit.dwells.folded

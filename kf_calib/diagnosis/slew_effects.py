@@ -13,9 +13,8 @@ from kf_calib.diagnosis.refits import Refits
 from kf_calib.effects import effect_named, slew_effects
 from kf_calib.errors import InputError, UnobservableError
 from kf_calib.estimation.results import Calibration
-from kf_calib.support.tail_probabilities import log_odds_of, sidak
+from kf_calib.support.tail_probabilities import CLEAR, log_odds_of, sidak
 
-_NAMED = 1e-4  # p-value from which an effect is named
 _CORRELATED = 4.0  # by so much sigmas may be too small: noise while the platform turns is neither white nor modelled
 _FEWEST = 100  # readings of slews
 
@@ -34,7 +33,7 @@ def of_slews(refits: Refits, before: Calibration) -> tuple[HypothesisTable, floa
     if not together.linearised.slews:
         return None
     p_values = {name: _p_value(together, name, len(names)) for name in names}
-    missing = tuple(sorted((name for name in names if p_values[name] < _NAMED), key=lambda name: p_values[name]))
+    missing = tuple(sorted((name for name in names if p_values[name] < CLEAR), key=lambda name: p_values[name]))
     if not missing:
         return None
     after, p_value = refits.of(together, (*before.settings.effects, *missing)), p_values[missing[0]]

@@ -24,6 +24,7 @@ from kf_calib.estimation.measurement_model import Model
 from kf_calib.noise.means import Means
 from kf_calib.noise.noise_model import Noise
 from kf_calib.noise.rotations import rotation_map, tangents
+from kf_calib.support.searches import MOST_STEPS
 
 _ABRUPT = 0.5  # a bending beyond this is a jump of an effect's column, which has no derivative
 _UNTOLD = 10.0  # setting errors: where the poses spread less, the attitudes would tell as much as they
@@ -32,8 +33,6 @@ SETTLED = 2.5e-4
 """A smaller step ends the search: in sigmas of each state, or as a share of the largest that a constant may take."""
 UNSETTLED = 1.0
 """In sigmas: a fit whose last step was larger has not converged."""
-MOST_ROUNDS = 50
-"""Of a search that settles in a few."""
 
 
 def at_their_modes(
@@ -242,7 +241,7 @@ def linearised_at(
     if noise.attitude_unknown:
         dwells = facing_readings(dwells, state, model.bench.gravity_mps2)
     linearised = LinearisedDwells(dwells, model, state)
-    for _ in range(MOST_ROUNDS if noise.setting_rad else 1):
+    for _ in range(MOST_STEPS if noise.setting_rad else 1):
         before, linearised = linearised, relinearised(linearised, noise, model, state, untold)
         if _farthest_rad(before, linearised) < ROUNDING:
             break

@@ -21,7 +21,7 @@ from functools import cached_property
 import numpy as np
 
 from kf_calib.bench import paper_parameters
-from kf_calib.bench.arrays import IN_CACHE, Floats
+from kf_calib.bench.arrays import EXACT, IN_CACHE, Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.bench.raw_input import RawInput
@@ -29,8 +29,8 @@ from kf_calib.effects import Effect
 from kf_calib.effects.inputs import beyond_force_and_temperature, depends_on_temperature, stimulus_of
 from kf_calib.effects.stimulus import REFERENCE_TEMPERATURE_C, Stimulus
 from kf_calib.errors import InputError, UnobservableError
-from kf_calib.estimation.attitude import MOST_ROUNDS
-from kf_calib.estimation.measurement_model import EXACT, Model
+from kf_calib.estimation.measurement_model import Model
+from kf_calib.support.searches import MOST_STEPS
 
 _BLOCK = IN_CACHE // 32  # readings at a time
 
@@ -194,7 +194,7 @@ class Correction:
         at_rest = stimulus_of(start, temperature_c, self.bench, self.sensitivity)
         force, change, size = start, np.full_like(start, np.inf), np.abs(start).max(initial=tolerance)
         with np.errstate(over="ignore", invalid="ignore"):  # where it diverges
-            for number in range(MOST_ROUNDS):
+            for number in range(MOST_STEPS):
                 stimulus = replace(at_rest, force_mps2=force, previous_force_mps2=force)
                 now = start - self._added(stimulus) @ inverse
                 change = np.abs(now - force)
@@ -203,7 +203,7 @@ class Correction:
                     return now, number + 1
                 force, size = now, step
             force[~(change <= tolerance).all(axis=1)] = np.nan
-        return force, MOST_ROUNDS
+        return force, MOST_STEPS
 
     def _added(self, stimulus: Stimulus) -> Floats:
         """Return what the effects add to the readings (n, 3)."""

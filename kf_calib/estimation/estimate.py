@@ -17,7 +17,8 @@ from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.errors import need
 from kf_calib.estimation import square_root_information
 
-_HOPELESS = {"rad": np.radians(10.0), "1": 0.2, "m/s^2": 2.0}  # larger sigmas: not determined
+HOPELESS = {"rad": np.radians(10.0), "1": 0.2, "m/s^2": 2.0}
+"""Sigmas from which on a parameter is not determined, by its unit."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class Estimate:
     def unseen(self) -> Mask:
         """Mask (12,) of the parameters that the orientations do not determine."""
         sigma = np.sqrt(np.diag(self.parameter_covariance))
-        unseen = sigma > np.array([_HOPELESS[unit] for unit in paper_parameters.UNITS])
+        unseen = sigma > np.array([HOPELESS[unit] for unit in paper_parameters.UNITS])
         if self.undetermined.size:
             jacobian = paper_parameters.jacobian(self.state[:STATE_COUNT])
             unseen |= np.linalg.norm(jacobian @ self._lost[:STATE_COUNT], axis=1) > 1e-6

@@ -25,6 +25,7 @@ from kf_calib.dwells.pieces import OfPieces
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation.attitude import added_by, bent_effects, matrix_of
 from kf_calib.estimation.dwell_columns import LinearisedDwells, stimulus_of
+from kf_calib.estimation.estimate import HOPELESS
 from kf_calib.estimation.kalman_filterpy import Samples
 from kf_calib.estimation.measurement_model import FRAME, SQUARE, Model
 from kf_calib.noise.means import Means
@@ -40,7 +41,6 @@ DIRECTIONS: dict[str, Floats] = {
 """Faces, edges and corners of a cube by the axes that point up."""
 
 _NINE = [k for k in range(STATE_COUNT) if k not in FRAME]
-_HOPELESS_SCALE, _HOPELESS_MPS2 = 0.2, 2.0
 
 
 def weights_of_size(means: Means, state: Floats) -> Floats:
@@ -146,8 +146,8 @@ def triad_changes(linearised: LinearisedDwells) -> OfPieces:
 def undetermined(covariance: Floats) -> list[str]:
     """The scale factors and biases that are not determined at all, by the covariance (12, 12)."""
     sigma = np.sqrt(covariance.diagonal()).reshape(3, 4)
-    poor = [f"K{i + 1}" for i in range(3) if sigma[i, i] > _HOPELESS_SCALE]
-    return poor + [f"b{i + 1}" for i in range(3) if sigma[i, 3] > _HOPELESS_MPS2]
+    poor = [f"K{i + 1}" for i in range(3) if sigma[i, i] > HOPELESS["1"]]
+    return poor + [f"b{i + 1}" for i in range(3) if sigma[i, 3] > HOPELESS["m/s^2"]]
 
 
 def refuse_poses(linearised: LinearisedDwells, noise: Noise) -> None:

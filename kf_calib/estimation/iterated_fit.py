@@ -27,7 +27,6 @@ from kf_calib.effects import Effect
 from kf_calib.errors import UnobservableError
 from kf_calib.estimation import free_attitude, square_root_information
 from kf_calib.estimation.attitude import (
-    MOST_ROUNDS,
     SETTLED,
     UNSETTLED,
     descended,
@@ -56,6 +55,7 @@ from kf_calib.noise.terms import (
     ThermometerError,
 )
 from kf_calib.noise.within_dwells import within_dwells
+from kf_calib.support.searches import MOST_STEPS
 
 _PASSES = 3
 _PASSES_WITH_UNKNOWNS = 10
@@ -228,7 +228,7 @@ def _not_sensible(model: Model) -> str:
 
 def _most_passes(model: Model) -> int:
     """Return how often noise, linearisation and constants are estimated in turn at most."""
-    return _PASSES_WITH_UNKNOWNS if model.bench.angles or model.stepped else MOST_ROUNDS
+    return _PASSES_WITH_UNKNOWNS if model.bench.angles or model.stepped else MOST_STEPS
 
 
 def _begun(
@@ -276,7 +276,7 @@ def _nine_parameters(dwells: DwellTable, bench: Bench, walk_mps2_per_sqrt_s: flo
 
 def _settled(fitted: Fit) -> Fit:
     """Return the fit of the nine parameters with forces and state found in turn until neither moves."""
-    for _ in range(MOST_ROUNDS):
+    for _ in range(MOST_STEPS):
         state = fitted.state
         if not _sensible(state, fitted.linearised.model):
             break

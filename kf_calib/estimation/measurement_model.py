@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from kf_calib.bench import paper_parameters
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import EXACT, Floats
 from kf_calib.bench.bench import Bench
 from kf_calib.bench.paper_parameters import STATE_COUNT
 from kf_calib.effects import Coefficient, Effect, FrameEffect, Stimulus, effect_named
@@ -26,8 +26,6 @@ from kf_calib.support.text import printed
 if TYPE_CHECKING:  # a replay without a bench model does not import what reads one
     from kf_calib.estimation.bench_model import BenchModel
 
-EXACT = 1e-14
-"""Of gravity: less in a reading is rounding."""
 FRAME = tuple(4 * i + j for i, j in itertools.combinations(range(3), 2))
 """s1y, s1z, s2z: without angles the frame is that in which accelerometer 1 is x and 2 lies in the plane of x and y."""
 SQUARE = {"nu1": 4, "phi3": 8, "theta3": 9}

@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import Floats
 from kf_calib.bench.bench import Bench
+from kf_calib.dwells.limits import SIMPSON
 from kf_calib.effects import Stimulus
 from kf_calib.effects.formula import quantities
 from kf_calib.errors import InputError, need
 from kf_calib.estimation.dwell_columns import LinearisedDwells, stimulus_of
 from kf_calib.noise.noise_model import Noise, mean_covariances
-
-_SIMPSON = np.array([1.0, 4.0, 1.0]) / 6.0  # weights of begin, middle and end of a piece in its mean
 
 
 class Step(Protocol):
@@ -67,7 +66,7 @@ def means_over_dwells(result: Run, functions: Sequence[Callable[[Stimulus], Floa
     dwells = result.linearised.dwells
     stimulus = stimulus_of(dwells, result.bench, result.linearised.state)
     folded = dwells.folded
-    weights = np.outer(folded.piece_counts / np.repeat(folded.counts, folded.piece_numbers), _SIMPSON).ravel()
+    weights = np.outer(folded.piece_counts / np.repeat(folded.counts, folded.piece_numbers), SIMPSON).ravel()
     values = [np.broadcast_to(function(stimulus), (len(stimulus), 3)) for function in functions]
     return [np.add.reduceat(each * weights[:, None], 3 * folded.ends[:-1]) for each in values]
 

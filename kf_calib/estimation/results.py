@@ -34,12 +34,11 @@ from kf_calib.estimation.within_dwell_trend import Trend, trend, unless_lines_ma
 from kf_calib.noise.means import means_of
 from kf_calib.noise.noise_model import Noise, considered_information, steps
 from kf_calib.noise.terms import ATTITUDE_UNKNOWN_RAD, SettingError
-from kf_calib.support.tail_probabilities import LEVEL, f_tail
+from kf_calib.support.tail_probabilities import LEVEL, NO_CHANCE, f_tail
 from kf_calib.support.text import as_html, printed
 from kf_calib.support.units import field_unit, shown
 
 _WEAK = 5.0  # times the size that a coefficient may well have
-_QUIET = 1e-6  # probability that dwells differ as little by noise, below which the noise is taken for too large
 
 
 @dataclass(frozen=True)
@@ -412,7 +411,7 @@ def consistency(fitted: Fit) -> Consistency:
     condition, known = None, replace(fitted, noise=noise.without_estimates())
     if estimated and p_value >= LEVEL and consistency(known).consistent is False:
         condition = Condition("angle_sigma_deg", math.degrees(noise.setting_rad), "deg")
-    return Consistency(statistic, dof, p_value, p_value >= LEVEL, condition, quiet=1.0 - p_value < _QUIET)
+    return Consistency(statistic, dof, p_value, p_value >= LEVEL, condition, quiet=1.0 - p_value < NO_CHANCE)
 
 
 def _freedom_of_noise(fitted: Fit) -> float:

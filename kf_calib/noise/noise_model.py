@@ -16,7 +16,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats
+from kf_calib.bench.arrays import EXACT, Floats
 from kf_calib.dwells.limits import FEWEST_COMPARED
 from kf_calib.dwells.sufficient_statistics import Dwell
 from kf_calib.dwells.table import DwellTable
@@ -33,8 +33,6 @@ from kf_calib.noise.terms import (
     WavesOverRun,
     setting_covariances,
 )
-
-_ROUNDING = 1e-14  # relative to a dwell's variance
 
 _T = TypeVar("_T", bound=NoiseTerm)
 
@@ -195,7 +193,7 @@ def lift_rounding(covariances: Floats) -> Floats:
     The covariance of a setting error is singular along the specific force. If the other noise is far below the setting
     error, rounding would decide whether the matrix is positive definite.
     """
-    least = _ROUNDING * np.einsum("dii->d", covariances)
+    least = EXACT * np.einsum("dii->d", covariances)
     return np.asarray(covariances + least[:, None, None] * np.eye(covariances.shape[-1]), float)
 
 

@@ -30,7 +30,7 @@ from kf_calib.dwells.limits import FEWEST_COMPARED
 from kf_calib.dwells.sufficient_statistics import Autocovariance
 from kf_calib.dwells.table import DwellTable, FoldedDwells, computed_once
 from kf_calib.support.searches import MOST_STEPS
-from kf_calib.support.tail_probabilities import chi_squared_tail
+from kf_calib.support.tail_probabilities import CLEAR, chi_squared_tail
 
 _STILL = 1e-3  # relative change of kappa
 _LONG = 500  # in blocks of more readings than this, a parabola removes almost nothing of white noise
@@ -140,10 +140,9 @@ def are_alike(total: Autocovariance) -> bool:
     r = total.products[1, varying] / total.products[0, varying] * total.pairs[0] / max(total.pairs[1], 1.0)
     places, freedom = np.arctanh(np.clip(r, -0.999, 0.999)), total.count / _lost_to_correlation(total)[varying]
     common = np.average(places, weights=freedom)
-    return chi_squared_tail(len(r) - 1, float(freedom @ (places - common) ** 2)) >= _CLEAR_P
+    return chi_squared_tail(len(r) - 1, float(freedom @ (places - common) ** 2)) >= CLEAR
 
 
-_CLEAR_P = 1e-4  # of equal noise; with p-values above it, dwells keep one noise
 _LEAST_FREEDOM = 2.0  # of a dwell whose own noise counts: with less, chi-squared is infinitely dense at zero
 _SHAPES = np.geomspace(1.0, 1e4, 61)  # nu_0
 _QUIETEST = 0.1  # variance of a dwell, in the median of all
@@ -217,7 +216,7 @@ def weights_of(variances: Floats, freedom: Floats) -> Floats:
     if known.sum() < FEWEST_COMPARED or np.median(variances[known]) <= 0.0:
         return weights
     variances = np.maximum(variances, _QUIETEST * np.median(variances[known]))
-    if _equal_p(variances[known], freedom[known]) > _CLEAR_P:
+    if _equal_p(variances[known], freedom[known]) > CLEAR:
         return weights
     shape, level = _prior(variances[known], freedom[known])
     own = np.where(known, freedom, 0.0)

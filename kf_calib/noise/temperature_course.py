@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kf_calib.bench.arrays import LAST_DIGITS, Floats
-from kf_calib.dwells.limits import CUBIC, FEWEST_COMPARED, FEWEST_READINGS
+from kf_calib.dwells.limits import CUBIC, FEWEST_COMPARED, FEWEST_READINGS, SIMPSON
 from kf_calib.dwells.pieces import OfPieces
 from kf_calib.dwells.sufficient_statistics import Dwell
 from kf_calib.dwells.table import DwellTable, FoldedDwells, computed_once
@@ -35,7 +35,6 @@ _ORDER = CUBIC + 1  # of the differences that are held small: cubics are free, w
 _CARRIED_S = 1.5  # readings once a second are carried on to the next one, which adds to the noise of short pieces
 _STEPS = 2.0  # the curve leaves at most this times the variance that parabolas within the dwells leave
 _KEPT = 1e-4  # share of the variance of the errors that may be left out
-_SIMPSON = np.array([1.0, 4.0, 1.0]) / 6.0
 _PENALTIES = np.geomspace(1e-12, 1e12, 241)
 
 _MATTERS = 0.1  # share of the sigma of the mean of a dwell above which the error counts
@@ -97,7 +96,7 @@ def _smooth(folded: FoldedDwells, read: Floats) -> TemperatureCourse | None:
         return None
     knots = min(_KNOTS * int(standing.sum()), _MOST_KNOTS)
     begin, spacing = ends[0, 0], (ends[-1, 2] - ends[0, 0]) / (knots - 3)
-    over_piece = np.einsum("j,njk->nk", _SIMPSON, _bumps((ends - begin) / spacing, knots))
+    over_piece = np.einsum("j,njk->nk", SIMPSON, _bumps((ends - begin) / spacing, knots))
     spline = _Spline.through(over_piece, levels, weights)
     if spline.variance > _STEPS * within:
         return None

@@ -20,6 +20,11 @@ SHARE = 0.4
 REST = 0.5 * (1.0 - 2.0 * SHARE)
 """Share that is given to the test of spectral lines, and as much to that of trends within dwells."""
 
+CLEAR = LEVEL**2
+"""p-value below which something is told, or given up, that an alarm by chance must not bring with it."""
+NO_CHANCE = LEVEL**3
+"""p-value of what is no chance, however many runs and dwells there are."""
+
 SIGMAS_95 = NormalDist().inv_cdf(0.975)
 """Within so many sigmas lie 95 % of normal numbers: 1.96; its square, 3.84, is the 95 % point of chi-squared with one
 degree of freedom, and the 2.5 % point of the likelihood ratio of a variance against zero, half of it."""

@@ -32,7 +32,7 @@ from typing import Any
 
 import numpy as np
 
-from kf_calib.bench.arrays import Floats, Times
+from kf_calib.bench.arrays import EXACT, Floats, Times
 from kf_calib.errors import InputError
 from kf_calib.sources.simulation.injected.kinds import Hidden, NoSizeError
 from kf_calib.sources.simulation.sensors import Sensors, TrueNoise
@@ -41,7 +41,6 @@ from kf_calib.support.output_files import write_whole
 
 _SETTLE_NS, _LEAD_NS = 1_000_000_000, 250_000_000
 _SEEN = 1e-6  # of the effect before projection; below it is what absorbing leaves by rounding
-_ROUNDING = 1e-14  # of gravity, in the difference of two readings
 _TOLERANCE = 2e-3
 _ROUNDS = 12
 _RANK = 1e-12
@@ -103,7 +102,7 @@ def _sizes_in_sigma(simulation: Simulation, effects: Sequence[Hidden]) -> list[f
     unknowns, added = (np.concatenate(parts) for parts in zip(*rows, strict=True))
     unknowns[:, [0, 1, 2, 4, 5, 6, 8, 9, 10]] /= gravity_mps2
     left = added - unknowns @ np.linalg.lstsq(unknowns, added, rcond=_RANK)[0]
-    least = _ROUNDING * gravity_mps2 * math.sqrt(3.0 * sum(dwell.count for dwell in dwells)) / sigma
+    least = EXACT * gravity_mps2 * math.sqrt(3.0 * sum(dwell.count for dwell in dwells)) / sigma
     sizes = zip(np.linalg.norm(left, axis=0).tolist(), np.linalg.norm(added, axis=0).tolist(), strict=True)
     return [size if size > max(least, _SEEN * before) else None for size, before in sizes]
 
