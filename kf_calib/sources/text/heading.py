@@ -19,7 +19,8 @@ _TELLING = 200  # lines by which the delimiter is told
 _FEWEST_CELLS = 3
 """Of a header; a line of fewer is a title, a date or a serial number."""
 _ROWS = 1000  # that are looked at
-_MARK = re.compile(r"\s*(?:#|%|//)+\s*")
+_RUN = 50  # rows of values that are no list above a heading
+_MARK = re.compile(r"\s*(?:#|%|;|//)+\s*")
 """Before a comment, or before names."""
 _NUMBER = re.compile(r"[+\-−]?[\d.,]*\d[\d.,]*(?:[eE][+\-]?\d+)?|[+\-]?nan", re.IGNORECASE)
 _BLANK_CELL = re.compile(r'"[^"]*"|\S+')
@@ -69,6 +70,8 @@ class TextHeading(NamedTuple):
         """The heading of cells with the number of the line of each."""
         filled = [own for own in cells if any(own[1])]
         header, begin, named = _header_in([own for _, own in filled]) if filled else ([], 0, ())
+        widest = max((len(own) for _, own in filled[begin:]), default=0)
+        header = header[:widest] if widest >= _FEWEST_CELLS else header
         rows = [(k, without_empty_end(own, len(header))) for k, own in filled[begin:] if not _is_comment(own)]
         behind = filled[begin][0] if begin < len(filled) else cells[-1][0] + 1 if cells else 0
         names = tuple(filled[k][0] for k in named)
@@ -164,25 +167,42 @@ def _header_in(rows: Sequence[Sequence[str]]) -> tuple[list[str], int, tuple[int
     """Return the names of the columns, the place of the first row of values, and those of names and units.
 
     rows: cells of lines that have any. Comments and titles are passed over. The names are the first line of three cells
-    or more, or, where that holds numbers, the comment before it that has as many; where there is none, columns have
-    numbers.
+    or more that tell three readings, or else the first such line that is not followed by another one above all values,
+    or, where that holds numbers, the comment before it that has as many; where there is none, columns have numbers.
     """
-    at = next((k for k, row in enumerate(rows) if sum(map(bool, row)) >= _FEWEST_CELLS and not _is_comment(row)), None)
-    if at is None:  # whatever it is, it is told by its first line
+    wide = [k for k, row in enumerate(rows) if sum(map(bool, row)) >= _FEWEST_CELLS and not _is_comment(row)]
+    if not wide:  # whatever it is, it is told by its first line
         return _names(rows[0]), 1, (0,)
+    at = next((k for k in wide[:_TELLING] if _tell_readings(_names(rows[k]))), _above_values(rows, wide))
     first = _names(rows[at])
     if _are_values(first):
         above = _names(rows[at - 1]) if at and _is_comment(rows[at - 1]) else [""]
         name = _MARK.sub("", above[0], count=1)
-        names = [name] * bool(name) + above[1:]  # the mark may stand in a cell of its own
+        names = [name] * bool(name) + above[1:]  # the mark, or a word for the names, may stand in a cell of its own
+        names = names[1:] if len(names) == len(first) + 1 else names
         if len(names) != len(first) or _are_values(names):
             return [NAMELESS.format(k + 1) for k in range(len(first))], at, ()
         return names, at, (at - 1,)
     units = _names(rows[at + 1]) if at + 1 < len(rows) else []
-    if any(map(str.isalpha, "".join(units))) and all(not text or is_unit(text) for text in units):
+    if any(is_unit(text) and text.strip("-1") for text in units) and not any(map(_NUMBER.fullmatch, units)):
         padded = zip(first, [*units, *[""] * len(first)], strict=False)
-        return [f"{name} [{unit}]" if unit else name for name, unit in padded], at + 2, (at, at + 1)
+        named = [f"{name} [{unit[1:-1] if unit[0] in '[(' else unit}]" if unit else name for name, unit in padded]
+        return named, at + 2, (at, at + 1)
     return first, at + 1, (at,)
+
+
+def _tell_readings(names: Sequence[str]) -> bool:
+    """Return whether names are those of columns with three readings."""
+    return not _are_values(names) and {own.ours for own in meanings_of(names, {})} >= {"ax", "ay", "az"}
+
+
+def _above_values(rows: Sequence[Sequence[str]], wide: Sequence[int]) -> int:
+    """Return which of the wide rows is the last before a long run of values; the first where there is none."""
+    are_values = [_are_values(rows[k]) for k in wide]
+    for k in range(1, len(wide) - _RUN):
+        if not are_values[k - 1] and all(are_values[k : k + _RUN]):
+            return wide[k - 1]
+    return wide[0]
 
 
 def _are_values(cells: Sequence[str]) -> bool:
