@@ -121,9 +121,10 @@ class Columns:
         if len(places) > 1:
             if len({self.names[at].lower() for at in places}) == 1:
                 raise InputError(f"two columns are named {self.names[places[0]]!r}: rename or remove one of them.")
+            kinds = READINGS if ours in READINGS and self.has(*READINGS) else (ours,)
+            example = " ".join(f"--column {f'{self.header[self.places(kind)[0]]}={kind}'!r}" for kind in kinds)
             raise InputError(
-                f"columns {self.named(places)} are all taken for {ours}: say which it is, for example by "
-                f"--column {f'{self.header[places[0]]}={ours}'!r}."
+                f"columns {self.named(places)} are all taken for {ours}: say which it is, for example by {example}."
             )
         return places[0] if places else None
 

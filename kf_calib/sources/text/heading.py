@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
+from kf_calib.sources.text.cells import are_stamps
 from kf_calib.sources.text.names import NAMELESS, face_of, is_unit, meanings_of
 
 _DELIMITERS = ";\t,|"
@@ -29,6 +30,14 @@ _LABELLED = re.compile(
     r"(?:\s*((?:[^\s\d:=,;|][^\s:=,;|]*)(?=[\s,;|]|$)(?!\s*[:=])))?"
 )
 _FEWEST_LABELS, _LONGEST_LABELLED = 3, 1000
+_AMID = "0"
+"""The delimiter of lines whose cells are the numbers and stamps in them, whatever stands between."""
+_IN_TEXT = re.compile(
+    r"(?<![\w.*])(?:\d{1,4}[./-]\d\d?[./-]\d{1,4}[T ])?(?:\d\d?:\d\d:\d\d(?:[.,]\d+)?"
+    r"|[+\-−]?(?:\d+\.?\d*|\.\d+)(?:[eE][+\-]?\d+)?)(?![\w.])"
+)
+_JSON = "{"
+_JSON_TOKEN = re.compile(r'"((?:[^"\\]|\\.)*)"(\s*:)?|[{}\[\],]|[^\s{}\[\],:"]+')
 
 
 class TextHeading(NamedTuple):
@@ -63,7 +72,32 @@ class TextHeading(NamedTuple):
             return cls.of_cells(cells, delimiter)
         first = enumerate(lines[start : start + 2 * _ROWS], start)
         heading = cls.of_cells([(k, cells_of(line.lstrip("\ufeff"), delimiter)) for k, line in first], delimiter)
-        return heading._replace(rows=heading.rows[:_ROWS])
+        return cls._of_numbers(lines, heading) or heading._replace(rows=heading.rows[:_ROWS])
+
+    @classmethod
+    def of_json(cls, lines: Sequence[str]) -> TextHeading | None:
+        """The heading of lines with an object each, of which the scalars are the cells; None where these tell no
+        readings."""
+        found = [{path: line[start:end] for path, start, end in _scalars(line)} for line in lines[:_ROWS]]
+        header = list(dict.fromkeys(path for cells in found for path in cells if path))
+        rows = [[cells.get(path, "").strip('"') for path in header] for cells in found]
+        return cls(header, _JSON, 0, rows, labels=header, numbers=range(len(rows))) if _tell_readings(header) else None
+
+    @classmethod
+    def _of_numbers(cls, lines: Sequence[str], heading: TextHeading) -> TextHeading | None:
+        """The heading of lines as of a print, where numbers stand amid other text; None where they do not."""
+        rows = heading.rows[:_TELLING]
+        if _tell_readings(heading.header):
+            return None
+        amid = sum(any(not _is_value(cell) and _IN_TEXT.search(cell) for cell in row) for row in rows)
+        found = [_IN_TEXT.findall(line) for line in lines[:_ROWS]]
+        widths = [len(cells) for cells in found if len(cells) >= _FEWEST_CELLS]
+        if 2 * amid <= len(rows) or len(widths) <= len(found) // 2:
+            return None
+        width = max(set(widths), key=widths.count)
+        numbers = [k for k, cells in enumerate(found) if len(cells) == width]
+        header = [NAMELESS.format(k + 1) for k in range(width)]
+        return cls(header, _AMID, numbers[0], [found[k] for k in numbers], labels=header, numbers=numbers)
 
     @classmethod
     def of_cells(cls, cells: Sequence[tuple[int, list[str]]], delimiter: str) -> TextHeading:
@@ -96,12 +130,18 @@ class TextHeading(NamedTuple):
     def cells(self, line: str) -> list[str]:
         """The cells of a line below; none where it has other labels than those of readings."""
         if self.labels:
-            return [line[start:end] for start, end in self.spans(line)]
+            return [line[start:end].strip('"') for start, end in self.spans(line)]
         return cells_of(line, self.delimiter)
 
     def spans(self, line: str) -> list[tuple[int, int]]:
         """Where the cells of a line stand, with their quotes and without blanks around them, those of columns that it
         does not have at its beginning; the mark of a comment in a cell of its own is none."""
+        if self.delimiter == _JSON:
+            places = {path: (start, end) for path, start, end in _scalars(line)}
+            return [places.get(path, (0, 0)) for path in self.labels] if places else []
+        if self.delimiter == _AMID:
+            spans = [match.span() for match in _IN_TEXT.finditer(line)]
+            return spans if len(spans) == len(self.labels) else []
         if self.labels:
             lacking = len(self.header) - len(self.labels)  # of a face that stands in a line of its own
             return [(0, 0)] * lacking + _labelled_spans(line, self.labels)
@@ -115,6 +155,22 @@ class TextHeading(NamedTuple):
         return [
             (start + len(cell) - len(cell.lstrip()), end - len(cell) + len(cell.rstrip())) for cell, start, end in cells
         ]
+
+
+def _scalars(line: str) -> Iterator[tuple[str, int, int]]:
+    """Yield the path of each scalar in an object of JSON, as ``acc.x``, and where it stands; null is none."""
+    keys = list[str | int]()
+    for match in _JSON_TOKEN.finditer(line):
+        if match[2] and keys:
+            keys[-1] = match[1]
+        elif match[0] in ("{", "["):
+            keys.append("" if match[0] == "{" else 0)
+        elif match[0] in ("}", "]"):
+            del keys[-1:]
+        elif match[0] == ",":
+            keys[-1:] = [key + 1 if isinstance(key, int) else key for key in keys[-1:]]
+        elif match[0] != "null":
+            yield ".".join(map(str, keys)), *match.span()
 
 
 def _first_labelled(lines: Sequence[str]) -> tuple[list[str], list[str]] | None:
@@ -173,7 +229,8 @@ def _header_in(rows: Sequence[Sequence[str]]) -> tuple[list[str], int, tuple[int
     wide = [k for k, row in enumerate(rows) if sum(map(bool, row)) >= _FEWEST_CELLS and not _is_comment(row)]
     if not wide:  # whatever it is, it is told by its first line
         return _names(rows[0]), 1, (0,)
-    at = next((k for k in wide[:_TELLING] if _tell_readings(_names(rows[k]))), _above_values(rows, wide))
+    at = next((k for k in wide[:_TELLING] if _tell_readings(_names(rows[k]))), -1)
+    at = at if at >= 0 else _above_values(rows, wide)
     first = _names(rows[at])
     if _are_values(first):
         above = _names(rows[at - 1]) if at and _is_comment(rows[at - 1]) else [""]
@@ -203,6 +260,11 @@ def _above_values(rows: Sequence[Sequence[str]], wide: Sequence[int]) -> int:
         if not are_values[k - 1] and all(are_values[k : k + _RUN]):
             return wide[k - 1]
     return wide[0]
+
+
+def _is_value(cell: str) -> bool:
+    """Return whether a cell is a number or a stamp."""
+    return _NUMBER.fullmatch(cell) is not None or are_stamps([cell])
 
 
 def _are_values(cells: Sequence[str]) -> bool:

@@ -34,6 +34,14 @@ _BETWEEN = " \t\r\n,:"
 _find_tiny = re.compile(r"[0-9][eE]-[0-9]{3}").search  # a number as small as this is rare, and may be two
 
 
+def are_ours(lines: Sequence[str], columns: Mapping[str, str]) -> bool:
+    """Whether lines of JSON have names of ours, or such as ``columns`` say are."""
+    theirs = [name for name, ours in columns.items() if ours in _KNOWN]
+    lists = "|".join(map(re.escape, (*_READINGS, *POSE_KEYS, *theirs)))
+    ours = re.compile(rf'"(?:bench|{lists})"\s*:\s*[\[{{]'), re.compile(r'"(?:bench|time_[num]?s)"\s*:')
+    return bool(theirs) or all(any(map(name.search, lines)) for name in ours)
+
+
 class JsonLines(LineReader):
     """Reads JSON lines block by block.
 

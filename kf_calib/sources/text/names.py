@@ -78,7 +78,7 @@ _TRUTH = _words("true truth ref reference wahr soll expected истинное э
 _QUATERNION = _words("q quat quaternion quaternions кватернион")
 _ESTIMATED = _words("roll pitch yaw heading euler attitude крен тангаж курс")
 _TIME = _words(
-    "time times zeit date datum stamp stamps timestamp timestamps uhrzeit datetime elapsed zeitstempel время дата"
+    "time times ts zeit date datum stamp stamps timestamp timestamps uhrzeit datetime elapsed zeitstempel время дата"
 )
 _LENGTH = _words("dwell duration dauer length lange длительность")
 _AXIS = _words("achse axis ось")
@@ -273,7 +273,7 @@ def _unit_of(name: str) -> tuple[str, str]:
 def _tokens(text: str) -> list[str]:
     """Return the words of a name, without accents; a channel that ends a known word becomes a word of its own."""
     tokens = list[str]()
-    for word in re.findall(r"[a-zа-я]+|\d+", _plain(text)):
+    for word in re.findall(r"[a-z]+|[а-я]+|\d+", _plain(text)):
         stem, last = word[:-1], word[-1]
         known = (last in "xyz" and stem in _PREFIXES) or (last in "wxyz" and stem in _QUATERNION - {"q"})
         tokens += [stem, last] if known else [word]
