@@ -91,8 +91,7 @@ class Columns:
             self._recognise_contents({k for k, name in enumerate(self.header) if name in stated})
         elif not self.has("time"):
             alone = [k for k, name in enumerate(self.names) if name.strip().lower() in _TIME_ALONE]
-            texts = (k for k in self.unknown if self.rows and not self._are_numbers(k))
-            for k in alone[:1] or [k for k in texts if are_stamps([row[k] for row in self.rows])]:
+            for k in alone[:1] or list(filter(self._are_stamps, self.unknown)):
                 self._guess(k, "time")
 
     def _choose_rows(self, where: str) -> None:
@@ -420,6 +419,13 @@ class Columns:
         if norms.size and 0 < norms.max() < _ALIKE * norms.min():
             for k, ours in zip(numeric, READINGS, strict=True):
                 self._guess(k, ours)
+
+    def _are_stamps(self, place: int) -> bool:
+        """Whether a column holds stamps of a calendar or, without a name, seconds that go up."""
+        if not (self.rows and self._are_numbers(place)):
+            return are_stamps([row[place] for row in self.rows])
+        steps = np.diff(self.values([place])[:, 0])
+        return not self.header[place] and bool((steps > 0.0).all() and (steps % 1.0).any())
 
     def _guess(self, place: int, ours: str) -> None:
         self.meanings[place] = self.meanings[place]._replace(ours=ours)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 from kf_calib.sources.text.cells import are_stamps
@@ -25,17 +26,14 @@ _MARK = re.compile(r"\s*(?:#|%|;|//)+\s*")
 """Before a comment, or before names."""
 _NUMBER = re.compile(r"[+\-−]?[\d.,]*\d[\d.,]*(?:[eE][+\-]?\d+)?|[+\-]?nan", re.IGNORECASE)
 _BLANK_CELL = re.compile(r'"[^"]*"|\S+')
-_LABELLED = re.compile(
-    r"(?<!\w)([^\W\d][^:=,;|\t\"{}]{0,40}?)\s*[:=]\s*([+\-−]?\d[\d.]*(?:[eE][+\-]?\d+)?|[+\-−]?\.\d+)"
-    r"(?:\s*((?:[^\s\d:=,;|][^\s:=,;|]*)(?=[\s,;|]|$)(?!\s*[:=])))?"
-)
-_FEWEST_LABELS, _LONGEST_LABELLED = 3, 1000
-_AMID = "0"
-"""The delimiter of lines whose cells are the numbers and stamps in them, whatever stands between."""
 _IN_TEXT = re.compile(
     r"(?<![\w.*])(?:\d{1,4}[./-]\d\d?[./-]\d{1,4}[T ])?(?:\d\d?:\d\d:\d\d(?:[.,]\d+)?"
-    r"|[+\-−]?(?:\d+\.?\d*|\.\d+)(?:[eE][+\-]?\d+)?)(?![\w.])"
+    r"|[+\-−]?(?:\d+\.?\d*|\.\d+)(?:[eE][+\-]?\d+)?)(?![\d.xX])"
 )
+"""A number or a stamp amid other text; what follows an asterisk is a sum of a check."""
+_LABEL = re.compile(r"([^\W\d][^:=,;|\t\"{}]{0,40}?)\s*[:=]\s*[(\[]?\s*$")
+_UNIT_BEHIND = re.compile(r"\s*([^\s\d:=,;|][^\s:=,;|]*)(?=[\s,;|]|$)(?!\s*[:=])")
+_FEWEST_LABELS, _LONGEST_LABELLED = 3, 1000
 _JSON = "{"
 _JSON_TOKEN = re.compile(r'"((?:[^"\\]|\\.)*)"(\s*:)?|[{}\[\],]|[^\s{}\[\],:"]+')
 
@@ -69,10 +67,14 @@ class TextHeading(NamedTuple):
         if is_whole:
             reader = csv.reader(lines[start:], delimiter=delimiter, skipinitialspace=True)
             cells = [(start + reader.line_num - 1, [cell.strip() for cell in row]) for row in reader]
-            return cls.of_cells(cells, delimiter)
-        first = enumerate(lines[start : start + 2 * _ROWS], start)
-        heading = cls.of_cells([(k, cells_of(line.lstrip("\ufeff"), delimiter)) for k, line in first], delimiter)
-        return cls._of_numbers(lines, heading) or heading._replace(rows=heading.rows[:_ROWS])
+        else:
+            first = enumerate(lines[start : start + 2 * _ROWS], start)
+            cells = [(k, cells_of(line.lstrip("\ufeff"), delimiter)) for k, line in first]
+        heading = cls.of_cells(cells, delimiter)
+        if count := _numbers_amid(lines[:_ROWS], heading):
+            names = [NAMELESS.format(k + 1) for k in range(count)]
+            return cls._of_labelled(lines if is_whole else lines[: 2 * _ROWS], [""] * count, names, is_whole)
+        return heading if is_whole else heading._replace(rows=heading.rows[:_ROWS])
 
     @classmethod
     def of_json(cls, lines: Sequence[str]) -> TextHeading | None:
@@ -82,22 +84,6 @@ class TextHeading(NamedTuple):
         header = list(dict.fromkeys(path for cells in found for path in cells if path))
         rows = [[cells.get(path, "").strip('"') for path in header] for cells in found]
         return cls(header, _JSON, 0, rows, labels=header, numbers=range(len(rows))) if _tell_readings(header) else None
-
-    @classmethod
-    def _of_numbers(cls, lines: Sequence[str], heading: TextHeading) -> TextHeading | None:
-        """The heading of lines as of a print, where numbers stand amid other text; None where they do not."""
-        rows = heading.rows[:_TELLING]
-        if _tell_readings(heading.header):
-            return None
-        amid = sum(any(not _is_value(cell) and _IN_TEXT.search(cell) for cell in row) for row in rows)
-        found = [_IN_TEXT.findall(line) for line in lines[:_ROWS]]
-        widths = [len(cells) for cells in found if len(cells) >= _FEWEST_CELLS]
-        if 2 * amid <= len(rows) or len(widths) <= len(found) // 2:
-            return None
-        width = max(set(widths), key=widths.count)
-        numbers = [k for k, cells in enumerate(found) if len(cells) == width]
-        header = [NAMELESS.format(k + 1) for k in range(width)]
-        return cls(header, _AMID, numbers[0], [found[k] for k in numbers], labels=header, numbers=numbers)
 
     @classmethod
     def of_cells(cls, cells: Sequence[tuple[int, list[str]]], delimiter: str) -> TextHeading:
@@ -139,9 +125,6 @@ class TextHeading(NamedTuple):
         if self.delimiter == _JSON:
             places = {path: (start, end) for path, start, end in _scalars(line)}
             return [places.get(path, (0, 0)) for path in self.labels] if places else []
-        if self.delimiter == _AMID:
-            spans = [match.span() for match in _IN_TEXT.finditer(line)]
-            return spans if len(spans) == len(self.labels) else []
         if self.labels:
             lacking = len(self.header) - len(self.labels)  # of a face that stands in a line of its own
             return [(0, 0)] * lacking + _labelled_spans(line, self.labels)
@@ -178,28 +161,53 @@ def _first_labelled(lines: Sequence[str]) -> tuple[list[str], list[str]] | None:
     that they make; None where none do."""
     seen = list[list[str]]()
     for line in lines:
-        labelled = _labelled_in(line)
-        labels = [match[1] for match in labelled]
-        if len(labels) < _FEWEST_LABELS or labels in seen:
+        labels, units, _ = _labelled_in(line) if ":" in line or "=" in line else ([], [], [])
+        if sum(map(bool, labels)) < _FEWEST_LABELS or labels in seen:
             continue
         seen.append(labels)
-        units = [match[3] if is_unit(match[3] or "") else "" for match in labelled]
-        header = [f"{label} [{unit}]" if (unit := own or units[-1]) else label
-                  for label, own in zip(labels, units, strict=True)]  # fmt: skip
-        if {own.ours for own in meanings_of(header, {})} >= {"ax", "ay", "az"}:
+        header = [f"{label} [{unit or units[-1]}]" if label and (unit or units[-1]) else label
+                  for label, unit in zip(labels, units, strict=True)]  # fmt: skip
+        if _tell_readings(header):
             return labels, header
     return None
 
 
 def _labelled_spans(line: str, labels: Sequence[str]) -> list[tuple[int, int]]:
     """Return where the values stand in a line; none where it has other labels."""
-    labelled = _labelled_in(line)
-    return [match.span(2) for match in labelled] if [match[1] for match in labelled] == labels else []
+    found, _, spans = _labelled_in(line)
+    return spans if found == labels else []
 
 
-def _labelled_in(line: str) -> list[re.Match[str]]:
-    """Return label, value and what follows it, of all in a line."""
-    return list(_LABELLED.finditer(line)) if (":" in line or "=" in line) and len(line) < _LONGEST_LABELLED else []
+def _labelled_in(line: str) -> tuple[list[str], list[str], list[tuple[int, int]]]:
+    """Return the labels and units of all numbers and stamps in a line, empty where there are none, and where they
+    stand; a label before three numbers is that of a vector."""
+    spans = [match.span() for match in _IN_TEXT.finditer(line)] if len(line) < _LONGEST_LABELLED else []
+    labels, units, end = list[str](), list[str](), 0
+    for (start, behind), (after, _) in pairwise([*spans, (len(line), 0)]):
+        label, unit = _LABEL.search(line[end:start]), _UNIT_BEHIND.match(line, behind, after)
+        labels.append(label[1] if label else "")
+        units.append(unit[1] if unit and is_unit(unit[1]) else "")
+        end = unit.end() if unit and units[-1] else behind
+    for k, label in enumerate(labels):
+        if label and labels[k + 1 : k + 3] == ["", ""] and all(labels[k + 3 : k + 4]):
+            labels[k : k + 3] = [f"{label} {axis}" for axis in "xyz"]
+    return labels, units, spans
+
+
+def _numbers_amid(lines: Sequence[str], heading: TextHeading) -> int:
+    """Return how many numbers most lines of a print have, amid other text and without labels; 0 where cells are told
+    better by a delimiter."""
+    rows = heading.rows[:_TELLING]
+    if _tell_readings(heading.header) or 2 * sum(any(map(_is_amid, row)) for row in rows) <= len(rows):
+        return 0
+    counts = [len(labels) for line in lines if not any(labels := _labelled_in(line)[0])]
+    counts = [count for count in counts if count >= _FEWEST_CELLS]
+    return max(set(counts), key=counts.count) if 2 * len(counts) > len(lines) else 0
+
+
+def _is_amid(cell: str) -> bool:
+    """Return whether a number stands amid other text in a cell."""
+    return not _NUMBER.fullmatch(cell) and _IN_TEXT.search(cell) is not None and not are_stamps([cell])
 
 
 def _delimiter_in(lines: Sequence[str]) -> tuple[str, int]:
@@ -260,11 +268,6 @@ def _above_values(rows: Sequence[Sequence[str]], wide: Sequence[int]) -> int:
         if not are_values[k - 1] and all(are_values[k : k + _RUN]):
             return wide[k - 1]
     return wide[0]
-
-
-def _is_value(cell: str) -> bool:
-    """Return whether a cell is a number or a stamp."""
-    return _NUMBER.fullmatch(cell) is not None or are_stamps([cell])
 
 
 def _are_values(cells: Sequence[str]) -> bool:
