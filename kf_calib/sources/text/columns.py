@@ -7,7 +7,6 @@ means is read as a log of samples is; it has all rows at hand, so that what stan
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -226,13 +225,16 @@ class Columns:
 
     def _parts_of_time(self, ways: Sequence[Stamps]) -> Stamps | None:
         """The sum of columns of which each counts on what one of the next coarser unit has begun, as nanoseconds beside
-        seconds; None where there are none such."""
-        places = {way.units_ns[0]: way.at[0] for way in reversed(ways) if way.units_ns}
-        units = sorted(places, reverse=True)
-        for coarse, fine in itertools.pairwise(units):
-            if not np.nanmax(self.values([places[fine]]), initial=0.0) * fine <= coarse:
-                return None
-        return Stamps(tuple(places[unit] for unit in units), tuple(units)) if len(units) > 1 else None
+        whole seconds; None where there are none such."""
+        numbers = [(way.units_ns[0], way.at[0], self.values(way.at)) for way in reversed(ways) if way.units_ns]
+        parts = {unit: (at, values) for unit, at, values in numbers if not (values % 1.0).any()}
+        finest = min(parts, default=0)
+        parts |= {unit: (at, values) for unit, at, values in numbers if unit < finest}
+        units = sorted(parts, reverse=True)
+        sizes = [float(np.nanmax(parts[unit][1], initial=0.0)) * unit for unit in units]
+        if len(units) < 2 or any(size > unit for size, unit in zip(sizes[1:], units, strict=False)):
+            return None
+        return Stamps(tuple(parts[unit][0] for unit in units), tuple(units))
 
     def _unevenness(self, stamps: Stamps) -> float:
         """Return how much the steps of stamps differ from the usual one, and how often they do not go up."""
