@@ -168,6 +168,11 @@ class Columns:
         values = [self.numbers.values([row[at] for at in places]) for row in self.rows]
         return np.array(values, float).reshape(-1, len(places))
 
+    def _finite(self, place: int) -> Floats:
+        """Return the numbers (n,) in a column, without what is none."""
+        values = self.values([place])[:, 0]
+        return values[np.isfinite(values)]
+
     # -- what kind of text it is --
 
     @property
@@ -216,22 +221,21 @@ class Columns:
     def _stamps_in(self, place: int, places: Sequence[int]) -> Stamps | None:
         """How stamps in a column are written, of which the next of ``places`` may have the time of day; None where this
         or their unit is not told."""
-        unit, values = self.meanings[place].unit, self.values([place])[:, 0]
-        values = values[[bool(row[place]) for row in self.rows]]
-        if not unit and len(values) and math.isnan(values[0]):
+        first = next((row[place] for row in self.rows if row[place]), "0")
+        if not self.meanings[place].unit and math.isnan(self.numbers.value(first)):
             return self._dates(places[:2] if place == places[0] else [place])
-        unit = unit or self._unit_of_time(values[np.isfinite(values)])
+        unit = self.meanings[place].unit or self._unit_of_time(self._finite(place))
         return Stamps((place,), (round(TIME[unit] * 1e9),)) if unit else None
 
     def _parts_of_time(self, ways: Sequence[Stamps]) -> Stamps | None:
         """The sum of columns of which each counts on what one of the next coarser unit has begun, as nanoseconds beside
         whole seconds; None where there are none such."""
-        numbers = [(way.units_ns[0], way.at[0], self.values(way.at)) for way in reversed(ways) if way.units_ns]
-        parts = {unit: (at, values) for unit, at, values in numbers if not (values % 1.0).any()}
+        numbers = [(way.units_ns[0], way.at[0], self._finite(way.at[0])) for way in reversed(ways) if way.units_ns]
+        parts = {unit: (at, values) for unit, at, values in numbers if (values == np.rint(values)).all()}
         finest = min(parts, default=0)
         parts |= {unit: (at, values) for unit, at, values in numbers if unit < finest}
         units = sorted(parts, reverse=True)
-        sizes = [float(np.nanmax(parts[unit][1], initial=0.0)) * unit for unit in units]
+        sizes = [float(parts[unit][1].max(initial=0.0)) * unit for unit in units]
         if len(units) < 2 or any(size > unit for size, unit in zip(sizes[1:], units, strict=False)):
             return None
         return Stamps(tuple(parts[unit][0] for unit in units), tuple(units))
@@ -426,7 +430,7 @@ class Columns:
         """Whether a column holds stamps of a calendar or, without a name, seconds that go up."""
         if not (self.rows and self._are_numbers(place)):
             return are_stamps([row[place] for row in self.rows])
-        steps = np.diff(self.values([place])[:, 0])
+        steps = np.diff(self._finite(place))
         return not self.header[place] and bool((steps > 0.0).all() and (steps % 1.0).any())
 
     def _guess(self, place: int, ours: str) -> None:

@@ -80,7 +80,7 @@ class TextHeading(NamedTuple):
     def of_json(cls, lines: Sequence[str]) -> TextHeading | None:
         """The heading of lines with an object each, of which the scalars are the cells; None where these tell no
         readings."""
-        found = [{path: line[start:end] for path, start, end in _scalars(line)} for line in lines[:_ROWS]]
+        found = [{path: line[start:end] for path, start, end in scalars(line)} for line in lines[:_ROWS]]
         header = list(dict.fromkeys(path for cells in found for path in cells if path))
         rows = [[cells.get(path, "").strip('"') for path in header] for cells in found]
         return cls(header, _JSON, 0, rows, labels=header, numbers=range(len(rows))) if _tell_readings(header) else None
@@ -123,7 +123,7 @@ class TextHeading(NamedTuple):
         """Where the cells of a line stand, with their quotes and without blanks around them, those of columns that it
         does not have at its beginning; the mark of a comment in a cell of its own is none."""
         if self.delimiter == _JSON:
-            places = {path: (start, end) for path, start, end in _scalars(line)}
+            places = {path: (start, end) for path, start, end in scalars(line)}
             return [places.get(path, (0, 0)) for path in self.labels] if places else []
         if self.labels:
             lacking = len(self.header) - len(self.labels)  # of a face that stands in a line of its own
@@ -140,8 +140,8 @@ class TextHeading(NamedTuple):
         ]
 
 
-def _scalars(line: str) -> Iterator[tuple[str, int, int]]:
-    """Yield the path of each scalar in an object of JSON, as ``acc.x``, and where it stands; null is none."""
+def scalars(line: str) -> Iterator[tuple[str, int, int]]:
+    """The path of each scalar in an object of JSON, as ``acc.x``, and where it stands; null is none."""
     keys = list[str | int]()
     for match in _JSON_TOKEN.finditer(line):
         if match[2] and keys:
