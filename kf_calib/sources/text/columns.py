@@ -22,6 +22,7 @@ from kf_calib.sources.text.heading import TextHeading
 from kf_calib.sources.text.names import (
     ACCEL,
     ANGLE,
+    NAMELESS,
     QUATERNION,
     TIME,
     Meaning,
@@ -431,7 +432,9 @@ class Columns:
         if not (self.rows and self._are_numbers(place)):
             return are_stamps([row[place] for row in self.rows])
         steps = np.diff(self._finite(place))
-        return not self.header[place] and bool((steps > 0.0).all() and (steps % 1.0).any())
+        return self.header[place] in ("", NAMELESS.format(place + 1)) and bool(
+            (steps > 0.0).all() and (steps % 1.0).any()
+        )
 
     def _guess(self, place: int, ours: str) -> None:
         self.meanings[place] = self.meanings[place]._replace(ours=ours)

@@ -117,7 +117,7 @@ def _refuse_several_units(columns: Columns, used: Container[int]) -> None:
     for at, name in enumerate(columns.names):
         labels = [row[at].strip() for row in columns.rows]
         shares, turns = Counter(labels), np.flatnonzero([one != other for one, other in pairwise(labels)])
-        are_few = name and at not in used and 2 <= len(shares) <= _MOST_UNITS and max(map(len, shares)) <= 16
+        are_few = name and at not in used and 2 <= len(shares) <= _MOST_UNITS and max(map(len, shares)) <= 40
         if not are_few or "" in shares or min(shares.values()) < 0.1 * len(labels) or len(turns) < 0.3 * len(labels):
             continue
         first = min(shares)

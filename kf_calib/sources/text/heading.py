@@ -165,8 +165,9 @@ def _first_labelled(lines: Sequence[str]) -> tuple[list[str], list[str]] | None:
         if sum(map(bool, labels)) < _FEWEST_LABELS or labels in seen:
             continue
         seen.append(labels)
-        header = [f"{label} [{unit or units[-1]}]" if label and (unit or units[-1]) else label
-                  for label, unit in zip(labels, units, strict=True)]  # fmt: skip
+        named = [label or NAMELESS.format(k + 1) for k, label in enumerate(labels)]
+        header = [f"{name} [{unit or units[-1]}]" if label and (unit or units[-1]) else name
+                  for name, label, unit in zip(named, labels, units, strict=True)]  # fmt: skip
         if _tell_readings(header):
             return labels, header
     return None

@@ -100,8 +100,8 @@ _RANKS = (
 _CHANNELS = frozenset("xyz123ху")
 _AXES = str.maketrans("123ху", "xyzxy")  # the last two are Cyrillic letters
 _RATE = re.compile(r"(?:deg|degrees?|rad|radians?|°)(?:\s*(?:/|p|per)\s*s|[\s·]*s\s*\^?-1)|dps")
-_OF_EPOCH = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
-"""From which size on a stamp without a unit is one since 1970 in this unit."""
+_OF_EPOCH = ((1e18, "ns"), (1e15, "us"), (1e12, "ms"))
+"""From which size on, and up to five times it, a stamp without a unit is one since 1970 in this unit: 2001 to 2128."""
 _CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z])")
 _LONGEST = 300  # characters of a name: it is looked at in many ways
 _FACES = re.compile(r"['’]?([+\-−–]?)\s*([xyz123])\s*([+\-−–]?|up|down|oben|unten)", re.IGNORECASE)
@@ -233,8 +233,9 @@ def _tell_families(names: Sequence[str], meanings: list[Meaning]) -> None:
 
 
 def unit_of_epoch(size: float) -> str:
-    """The unit of a stamp of that size that counts since 1970; empty where it is too small to."""
-    return next((unit for least, unit in _OF_EPOCH if size >= least), "")
+    """The unit of a stamp of that size that counts since 1970; empty where none of this size does, as none since a
+    device was started."""
+    return next((unit for least, unit in _OF_EPOCH if least <= size < 5.0 * least), "")
 
 
 def face_of(text: str) -> tuple[int, int] | None:

@@ -53,6 +53,8 @@ LAYOUTS: dict[str, tuple[str, Row]] = {
     "a date and a time without names": ("日期,时间,X(m/s2),Y(m/s2),Z(m/s2)",
                                         lambda t, *f: f"2026-05-27,09:30:{t:06.3f},{','.join(f)}"),
     "a stamp, and no names": ("", lambda t, *f: f"2026-05-27 09:30:{t:06.3f},{','.join(f)},12,0,24.8"),
+    "nanoseconds since the device was started": ("timestamp,x,y,z",
+                                                 lambda t, *f: f"{81_234_000_000_000 + round(1e9 * t)},{','.join(f)}"),
     "an empty time beside a full one": ("Timestamp,UTC Time [s],ax,ay,az", lambda t, *f: f",{t:.2f},{','.join(f)}"),
     "an axis of a plot": ("X[s],ACC.X,X[s],ACC.Y,X[s],ACC.Z",
                           lambda t, x, y, z: f"{t:.2f},{x},{t:.2f},{y},{t:.2f},{z}"),
