@@ -21,7 +21,7 @@ _TELLING = 200  # lines by which the delimiter is told
 _FEWEST_CELLS = 3
 """Of a header; a line of fewer is a title, a date or a serial number."""
 _ROWS = 1000  # that are looked at
-_RUN = 50  # rows of values that are no list above a heading
+_TITLES, _RUN = 30, 50  # rows among which the names are, and rows of values that are no list above them
 _MARK = re.compile(r"\s*(?:#|%|;|//)+\s*")
 """Before a comment, or before names."""
 _NUMBER = re.compile(r"[+\-−]?[\d.,]*\d[\d.,]*(?:[eE][+\-]?\d+)?|[+\-]?nan", re.IGNORECASE)
@@ -33,7 +33,7 @@ _IN_TEXT = re.compile(
 """A number or a stamp amid other text; what follows an asterisk is a sum of a check."""
 _LABEL = re.compile(r"([^\W\d][^:=,;|\t\"{}]{0,40}?)\s*[:=]\s*[(\[]?\s*$")
 _UNIT_BEHIND = re.compile(r"\s*([^\s\d:=,;|][^\s:=,;|]*)(?=[\s,;|]|$)(?!\s*[:=])")
-_FEWEST_LABELS, _LONGEST_LABELLED = 3, 1000
+_FEWEST_LABELS, _LONGEST_LABELLED, _LONGEST_LABEL = 3, 1000, 60
 _JSON = "{"
 _JSON_TOKEN = re.compile(r'"((?:[^"\\]|\\.)*)"(\s*:)?|[{}\[\],]|[^\s{}\[\],:"]+')
 
@@ -185,7 +185,10 @@ def _labelled_in(line: str) -> tuple[list[str], list[str], list[tuple[int, int]]
     spans = [match.span() for match in _IN_TEXT.finditer(line)] if len(line) < _LONGEST_LABELLED else []
     labels, units, end = list[str](), list[str](), 0
     for (start, behind), (after, _) in pairwise([*spans, (len(line), 0)]):
-        label, unit = _LABEL.search(line[end:start]), _UNIT_BEHIND.match(line, behind, after)
+        label, unit = (
+            _LABEL.search(line[max(end, start - _LONGEST_LABEL) : start]),
+            _UNIT_BEHIND.match(line, behind, after),
+        )
         labels.append(label[1] if label else "")
         units.append(unit[1] if unit and is_unit(unit[1]) else "")
         end = unit.end() if unit and units[-1] else behind
@@ -238,7 +241,7 @@ def _header_in(rows: Sequence[Sequence[str]]) -> tuple[list[str], int, tuple[int
     wide = [k for k, row in enumerate(rows) if sum(map(bool, row)) >= _FEWEST_CELLS and not _is_comment(row)]
     if not wide:  # whatever it is, it is told by its first line
         return _names(rows[0]), 1, (0,)
-    at = next((k for k in wide[:_TELLING] if _tell_readings(_names(rows[k]))), -1)
+    at = next((k for k in wide[:_TITLES] if _tell_readings(_names(rows[k]))), -1)
     at = at if at >= 0 else _above_values(rows, wide)
     first = _names(rows[at])
     if _are_values(first):

@@ -132,8 +132,9 @@ def meaning_of(name: str) -> Meaning:
     """What the name of a column says; nothing, where it is longer than any name."""
     name = name if len(name) <= _LONGEST else ""
     channel = name.rpartition(":")[2]  # behind the name of its device
-    told = [_meaning_of(way) for way in dict.fromkeys([channel, _CAMEL.sub(" ", channel), name, _CAMEL.sub(" ", name)])]
-    return next((own for own in told if own.ours or own.other), told[-1])
+    ways = map(_meaning_of, dict.fromkeys([channel, _CAMEL.sub(" ", channel), name, _CAMEL.sub(" ", name)]))
+    first = next((told for told in ways if told.ours or told.other), None)
+    return first or Meaning("", _unit_of(name.strip().lower())[1])
 
 
 def _meaning_of(name: str) -> Meaning:
