@@ -152,8 +152,9 @@ def written(value: float) -> float:
 class Stamps:
     """How a row's time is written: a number of a unit, or the stamp of a calendar, in one column or in several.
 
-    units_ns: nanoseconds in the unit of each column; none of stamps of a calendar. month_first: how these are written;
-    has_zone: whether they name their time zone. rate_hz: of the rows, which have no time then.
+    units_ns: nanoseconds in the unit of each of the last columns; stamps of a calendar have none, to which these are
+    added. month_first: how stamps of a calendar are written; has_zone: whether they name their time zone. rate_hz: of
+    the rows, which have no time then.
     """
 
     at: tuple[int, ...]
@@ -173,15 +174,19 @@ class Stamps:
         """The stamp of a row in nanoseconds; number: of the row, from 0. Raises LineError where it has none."""
         if self.rate_hz is not None:
             return round(number * 1e9 / self.rate_hz)
-        cell = row[self.at[0]] if len(self.at) == 1 else " ".join(row[at] for at in self.at)
+        begin, parts = len(self.at) - len(self.units_ns), self.at
+        cell = row[parts[0]] if len(parts) == 1 else " ".join(row[at] for at in parts[: begin or None])
         try:
+            since_ns = 0
             if self.units_ns:
-                parts = zip(self.at, self.units_ns, strict=True)
-                return sum([stamp_ns(numbers.exact(row[at]), unit) for at, unit in parts])
+                counted = zip(parts[begin:], self.units_ns, strict=True)
+                since_ns = sum([stamp_ns(numbers.exact(row[at]), unit) for at, unit in counted])
+                if not begin:
+                    return since_ns
             stamp, why = _stamp_of(cell, self.month_first), "whose time zone other stamps do not have"
             if (stamp.tzinfo is not None) is self.has_zone:
                 since = (stamp if self.has_zone else stamp.replace(tzinfo=UTC)) - _FIRST
-                return stamp_ns(since // timedelta(microseconds=1), 1000)
+                return stamp_ns(since // timedelta(microseconds=1), 1000) + since_ns
         except LineError:
             raise
         except (ValueError, ArithmeticError):

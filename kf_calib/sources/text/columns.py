@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 
@@ -230,16 +231,19 @@ class Columns:
 
     def _parts_of_time(self, ways: Sequence[Stamps]) -> Stamps | None:
         """The sum of columns of which each counts on what one of the next coarser unit has begun, as nanoseconds beside
-        whole seconds; None where there are none such."""
+        whole seconds or beside stamps of a calendar that have no more; None where there are none such."""
         numbers = [(way.units_ns[0], way.at[0], self._finite(way.at[0])) for way in reversed(ways) if way.units_ns]
         parts = {unit: (at, values) for unit, at, values in numbers if (values == np.rint(values)).all()}
         finest = min(parts, default=0)
         parts |= {unit: (at, values) for unit, at, values in numbers if unit < finest}
         units = sorted(parts, reverse=True)
         sizes = [float(parts[unit][1].max(initial=0.0)) * unit for unit in units]
-        if len(units) < 2 or any(size > unit for size, unit in zip(sizes[1:], units, strict=False)):
-            return None
-        return Stamps(tuple(parts[unit][0] for unit in units), tuple(units))
+        dated = next((way for way in ways if not way.units_ns), None)
+        if len(units) > 1 and all(size <= unit for size, unit in zip(sizes[1:], units, strict=False)):
+            return Stamps(tuple(parts[unit][0] for unit in units), tuple(units))
+        if dated and units and sizes[0] <= 1e9 and not (self.stamps_ns(dated) % 1e9).any():
+            return replace(dated, at=(*dated.at, parts[units[0]][0]), units_ns=(units[0],))
+        return None
 
     def _unevenness(self, stamps: Stamps) -> float:
         """Return how much the steps of stamps differ from the usual one, and how often they do not go up."""

@@ -83,7 +83,7 @@ class CsvLines(LineReader):
             return None
         numbers = self._numbers or DECIMAL_POINT
         time_ns = self._time.ns(row, self._header, numbers, number)
-        if not self._time.units_ns and self._time.rate_hz is None:
+        if len(self._time.at) > len(self._time.units_ns):
             time_ns = self._of_even_clock(time_ns)
         readings = self._accel.values(row, self._header, numbers)
         angles = self._pose.values(row, self._header, numbers)

@@ -29,13 +29,15 @@ _UNITS = {
     "ft/s2": "ft/s2 fts-2", "in/s2": "in/s2", "g": "g gn g0", "mg": "mg мg", "ug": "ug μg мкg",
     "count": "count counts lsb digit digits raw adc",
     "rad": "rad radian radians рад", "mrad": "mrad мрад", "deg": "deg degree degrees grad град ° º",
-    "s": "s sec secs second seconds sekunden с сек", "ms": "ms msec millis milliseconds мс",
-    "us": "us μs usec micros microseconds мкс", "ns": "ns nsec nsecs nanosec nanoseconds", "min": "min minute мин",
-    "h": "h hour hours ч", "c": "°c c degc degreesc celsius °с", "k": "k kelvin", "f": "°f f degf fahrenheit",
+    "s": "s sec secs second seconds sekunde sekunden с сек",
+    "ms": "ms msec millis millisecond milliseconds мс",
+    "us": "us μs usec micros microsecond microseconds мкс",
+    "ns": "ns nsec nsecs nanosec nanosecond nanoseconds", "min": "min minute мин", "h": "h hour hours ч",
+    "c": "°c c degc degreesc celsius °с", "k": "k kelvin", "f": "°f f degf fahrenheit",
 }  # fmt: skip
 """As they are written, but for signs of powers and products."""
 _OF_WORD = {word: unit for unit, words in _UNITS.items() for word in words.split()}
-_SHORTEST_TIME = 3
+_SHORTEST_TIME = 2
 """Letters of a unit that is the name of a time; a shorter one may be a letter for something else."""
 
 

@@ -45,6 +45,9 @@ LAYOUTS: dict[str, tuple[str, Row]] = {
         lambda t, *f: ",".join(map(str, (1.7e9 + t + t % 0.04 / 8, *whole(t, 1.0), *f)))),
     "hours, minutes and seconds": ("Year,Month,Day,Hour,Minute,Second,ax,ay,az",
                                    lambda t, *f: f"2026,5,4,13,{50 + int(t // 60)},{t % 60:.2f},{','.join(f)}"),
+    "a date, a time to the second, and milliseconds": (
+        "Date,Time,ms,X (m/s2),Y (m/s2),Z (m/s2)",
+        lambda t, *f: f"2026-05-27,{of_clock(t - 20)[:8]},{of_clock(t)[9:]},{','.join(f)}"),
     "the time of day": ("Time,ax,ay,az", lambda t, *f: ",".join((of_clock(t), *f))),
     "a time difference": ("time,ax,ay,az", lambda t, *f: ",".join((f"0 days 00:00:{t:09.6f}", *f))),
     "minutes and seconds": ("elapsed,ax,ay,az", lambda t, *f: ",".join((f"00:{t:06.3f}", *f))),
