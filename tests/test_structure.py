@@ -189,7 +189,7 @@ CEILINGS = {
     "support": 1066,
     "bench": 1704,
     "effects": 3038,
-    "sources": 11820,
+    "sources": 11824,
     "dwells": 3805,
     "noise": 3381,
     "estimation": 7861,

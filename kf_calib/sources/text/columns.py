@@ -156,8 +156,8 @@ class Columns:
 
     @property
     def _left_over(self) -> str:
-        """The name of a column that means nothing yet, for an example."""
-        return next((self.header[k] for k in self.unused), "THEIRS")
+        """The name of a column that means nothing yet, if possible one of numbers, for an example."""
+        return next((self.header[k] for k in sorted(self.unused, key=self._are_numbers, reverse=True)), "THEIRS")
 
     def numbers_in(self, rows: Sequence[CsvRow]) -> Numbers | None:
         """How the numbers in rows are written; None where these do not tell."""

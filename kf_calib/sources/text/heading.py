@@ -78,12 +78,16 @@ class TextHeading(NamedTuple):
 
     @classmethod
     def of_json(cls, lines: Sequence[str]) -> TextHeading | None:
-        """The heading of lines with an object each, of which the scalars are the cells; None where these tell no
-        readings."""
+        """The heading of lines with an object each, of which the scalars are the cells; None where these are too few
+        for three readings."""
         found = [{path: line[start:end] for path, start, end in scalars(line)} for line in lines[:_ROWS]]
         header = list(dict.fromkeys(path for cells in found for path in cells if path))
         rows = [[cells.get(path, "").strip('"') for path in header] for cells in found]
-        return cls(header, _JSON, 0, rows, labels=header, numbers=range(len(rows))) if _tell_readings(header) else None
+        return (
+            cls(header, _JSON, 0, rows, labels=header, numbers=range(len(rows)))
+            if len(header) >= _FEWEST_CELLS
+            else None
+        )
 
     @classmethod
     def of_cells(cls, cells: Sequence[tuple[int, list[str]]], delimiter: str) -> TextHeading:
